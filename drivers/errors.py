@@ -1,0 +1,51 @@
+"""The error tree of the project. Each class also is the matching builtin.
+
+    ImuError
+      ConfigError(ValueError)        only while starting; the service refuses to start
+      LinkError(OSError)
+        LinkUnavailable              cannot open: no port, no library, no permission; retried
+        LinkLost                     was open, is gone; retried with back-off
+        LinkEnded                    a replay has given all it had; not retried
+      DecodeError(ValueError)        from one frame only; ``feed`` counts it and goes on
+      RecordingError(ValueError)     a file that is not a recording, or an empty one
+      NotReady                       too few samples for an answer
+
+Vendor exceptions are turned into these at the link, with ``from``. Any other exception out of a
+pure room is a bug.
+"""
+
+
+class ImuError(Exception):
+    """Root of all that this project raises on purpose."""
+
+
+class ConfigError(ImuError, ValueError):
+    """What was asked for is wrong: names the file, key or line, and what would be right."""
+
+
+class LinkError(ImuError, OSError):
+    """A link cannot do its work."""
+
+
+class LinkUnavailable(LinkError):
+    """The link cannot be opened now; it will be tried again."""
+
+
+class LinkLost(LinkError):
+    """The link was open and is gone; it will be opened again."""
+
+
+class LinkEnded(LinkError):
+    """A replayed source has come to its end."""
+
+
+class DecodeError(ImuError, ValueError):
+    """One frame does not follow its format."""
+
+
+class RecordingError(ImuError, ValueError):
+    """A file cannot be read as a recording."""
+
+
+class NotReady(ImuError):
+    """Too few samples for an answer."""

@@ -1,0 +1,1 @@
+"""Links move bytes and know no IMU: one file each, see ``base`` for what one is."""

@@ -1,0 +1,29 @@
+"""Finds the members of a folder of plug-ins by listing it, and imports one when it is asked for."""
+
+import importlib
+import pkgutil
+from collections.abc import Sequence
+from difflib import get_close_matches
+from types import ModuleType
+
+from drivers.errors import ConfigError
+
+
+def names(package: ModuleType, suffix: str = "") -> tuple[str, ...]:
+    """Names of the members of ``package``, sorted, without their suffix; ``base`` is none of them."""
+    found = (module.name for module in pkgutil.iter_modules(package.__path__))
+    return tuple(sorted(n.removesuffix(suffix) for n in found if n != "base" and n.endswith(suffix)))
+
+
+def load(package: ModuleType, name: str, suffix: str = "") -> ModuleType:
+    """The module of one member; ConfigError with the nearest name when there is none."""
+    known = names(package, suffix)
+    if name not in known:
+        raise ConfigError(f'unknown name "{name}"{nearest(name, known)}')
+    return importlib.import_module(f"{package.__name__}.{name}{suffix}")
+
+
+def nearest(word: str, known: Sequence[str]) -> str:
+    """The end of an error line about an unknown word: the nearest known one, or all of them."""
+    close = get_close_matches(word, known, n=1, cutoff=0.5)
+    return f'; did you mean "{close[0]}"?' if close else f"; known are {', '.join(known)}"

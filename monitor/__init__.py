@@ -1,0 +1,1 @@
+"""Numbers to meaning: noise models, estimation, and what is published of it."""

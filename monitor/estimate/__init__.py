@@ -1,0 +1,1 @@
+"""What the samples say: windowed Allan variance, its uncertainty, and the coefficients fitted to it."""

@@ -1,0 +1,1 @@
+"""Where results leave the process: zenoh, Rerun, the terminal, plots."""

@@ -1,0 +1,38 @@
+"""The table of all that leaves the process over zenoh: name, key, encoding, rate.
+
+Keys are ``<prefix>/<device>/<name>``; the prefix is ``imu`` unless ``[zenoh] prefix`` says otherwise.
+"""
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+JSON: Final = "application/json"
+MSGPACK: Final = "application/msgpack"
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One row of the table."""
+
+    name: str
+    encoding: str
+    when: Literal["batches", "publish", "event", "1 Hz", "presence", "query"]
+
+    def key(self, prefix: str, device: str) -> str:
+        """The key expression of this topic for one device."""
+        return f"{prefix}/{device}/{self.name}"
+
+    def schema(self) -> str:
+        """The payload's ``schema`` field."""
+        return f"imu-monitor/{self.name.split('/')[-1]}/1"
+
+
+SAMPLES: Final = Topic("samples", MSGPACK, "batches")
+ALLAN: Final = Topic("allan", JSON, "publish")
+COEFFICIENTS: Final = Topic("coefficients", JSON, "publish")
+EVENT: Final = Topic("event", JSON, "event")
+STATUS: Final = Topic("status", JSON, "1 Hz")
+ALIVE: Final = Topic("alive", "", "presence")
+RESET: Final = Topic("command/reset", JSON, "query")
+
+TOPICS: Final = (SAMPLES, ALLAN, COEFFICIENTS, EVENT, STATUS, ALIVE, RESET)
