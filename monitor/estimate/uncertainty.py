@@ -1,0 +1,212 @@
+"""How sure an Allan variance is: covariances of the estimates, degrees of freedom, χ² intervals.
+
+The covariance of two overlapping Allan variances of Gaussian noise is a quadratic form in the
+variances θ = (Q², N², B², K²) of its terms (Isserlis: Cov(d², e²) = 2 Cov(d, e)²),
+
+    Cov(σ²_i, σ²_j) = Σ_ab θ_a θ_b C^ab_ij,   C^ab_ij = 1/(2 M_i M_j) Σ_c w(c) r^a_ij(c) r^b_ij(c)
+
+with r the second differences, over clusters of m_i and of m_j samples, of the generalised
+autocovariance of phase (Q δ, N −|t|/2, B t² ln|t| / 2π, K (|t|³ − |t|)/12: discrete sums of white
+noise), w(c) how many pairs of terms stand c samples apart, and M the number of terms. ``table``
+computes C once for a window length and a list of cluster sizes; a fit then costs products only.
+
+It gives the exact degrees of freedom of mixed noise, edf = 2 σ⁴ / Cov_ii. The usual formulas
+(Greenhall & Riley, PTTI 2003) hold for one power law at a time and are 15–25 % off near m = 1;
+since the exact sum takes milliseconds, they are not used. Everything here is in units of one
+sample: τ0 = 1, and θ stands for Q²/τ0², N²/τ0, B², K² τ0, R² τ0².
+"""
+
+from dataclasses import dataclass
+from math import ceil
+
+import numpy as np
+from scipy.special import chdtri
+
+from drivers.sample import Floats, Ints
+from monitor.compiled import compiled
+
+NOISES = 4
+"""Random terms of the table, Q N B K; the ramp R is deterministic and adds no variance of its own."""
+
+LAG_STEP = 0.5
+"""Lags are summed in blocks of this share of their distance to the nearest kink of r."""
+
+TAIL = 8.0
+"""Beyond this many (m_i + m_j) the differences of t² ln t are taken from their series."""
+
+TABLE_STEP = 1.1
+"""While a window grows, its table is renewed at this ratio of lengths; terms rescale it between."""
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """C for one window length; read-only arrays."""
+
+    n: int  # samples in the window
+    factors: Ints  # [m] cluster sizes
+    terms: Ints  # [m] second differences in a window without gaps; ≤ 0 where it is too short
+    covariance: Floats  # [4, 4, m, m] C^ab_ij; NaN where the window is too short
+
+
+class Tables:
+    """Hands out the table that fits a window, and makes a new one when the window has outgrown it."""
+
+    def __init__(self, factors: Ints, capacity: int) -> None:
+        self._factors = factors
+        self._capacity = capacity
+        self._table: Table | None = None
+
+    def at(self, n: int) -> Table:
+        """A table of n samples, or of up to a tenth fewer while the window is growing."""
+        known = self._table
+        if known is None or not (known.n == n or known.n < n < min(self._capacity, TABLE_STEP * known.n)):
+            known = self._table = table(n, self._factors)
+        return known
+
+
+def table(n: int, factors: Ints) -> Table:
+    """Covariances of overlapping Allan variances of ``n`` samples at these cluster sizes.
+
+    White noise, m = 1: neighbours share one sample, edf = 2/3 of the terms.
+
+    >>> t = table(30_001, np.array([1, 2]))
+    >>> round(2 * 1.0**2 / t.covariance[1, 1, 0, 0])
+    20000
+    """
+    factors = np.ascontiguousarray(factors, np.int64)
+    covariance = np.full((NOISES, NOISES, factors.size, factors.size), np.nan)
+    _fill(n, factors, covariance)
+    terms = n + 1 - 2 * factors
+    for array in (terms, covariance):
+        array.flags.writeable = False
+    return Table(n, factors, terms, covariance)
+
+
+def intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Floats, Floats]:
+    """Ends of the two-sided χ² interval of the Allan deviation, edf s²/χ² (NIST SP 1065 eq. 45).
+
+    Shapes of ``avar`` and ``edf`` alike; NaN stays NaN.
+
+    >>> lo, hi = intervals(np.array([1.0]), np.array([10.0]))
+    >>> print(f"{lo[0]:.3f} {hi[0]:.3f}")
+    0.699 1.755
+    """
+    tail = (1.0 - probability) / 2.0
+    safe = np.where(edf > 0.0, edf, np.nan)
+    return (
+        np.sqrt(avar * safe / chdtri(safe, tail)),
+        np.sqrt(avar * safe / chdtri(safe, 1.0 - tail)),
+    )
+
+
+def next_length(n: int) -> int:
+    """Window length at which a growing window gets its next table."""
+    return ceil(TABLE_STEP * n)
+
+
+@compiled
+def _fill(n, factors, covariance):  # type: ignore[no-untyped-def]
+    sums = np.empty((NOISES, NOISES))
+    for i in range(factors.size):
+        for j in range(i, factors.size):
+            small, large = min(factors[i], factors[j]), max(factors[i], factors[j])
+            if n + 1 - 2 * large <= 0:
+                continue
+            _sum_lags(n, small, large, sums)
+            scale = 0.5 / ((n + 1.0 - 2 * small) * (n + 1.0 - 2 * large))
+            for a in range(NOISES):
+                for b in range(NOISES):
+                    value = scale * sums[min(a, b), max(a, b)]
+                    covariance[a, b, i, j] = value
+                    covariance[a, b, j, i] = value
+
+
+@compiled
+def _sum_lags(n, small, large, sums):  # type: ignore[no-untyped-def]
+    """Σ w(c) r^a(c) r^b(c) over all lags c of the terms' centres: kinks one by one, between them blocks."""
+    sums[:] = 0.0
+    end = n + 1 - small - large  # w(end) = 0
+    kinks = np.array([0, large - small, small, large, large + small, end])
+    kinks.sort()
+    previous = -1
+    for kink in kinks:
+        if kink >= end:
+            break
+        if kink == previous:
+            continue
+        _add(kink, 1.0 if kink == 0 else 2.0, n, small, large, sums)
+        if previous >= 0:
+            _add_between(previous, kink, n, small, large, sums)
+        previous = kink
+    reach = min(end, large + small)
+    if previous < reach:
+        _add_between(previous, reach, n, small, large, sums)
+    if end > large + small:
+        _add_blocks(large + small, end - large - small - 1, 1, n, small, large, sums)
+
+
+@compiled
+def _add_between(left, right, n, small, large, sums):  # type: ignore[no-untyped-def]
+    """The lags strictly between two kinks: from each kink to the middle."""
+    half = (right - left) // 2
+    _add_blocks(left, half, 1, n, small, large, sums)
+    _add_blocks(right, right - left - 1 - half, -1, n, small, large, sums)
+
+
+@compiled
+def _add_blocks(kink, count, side, n, small, large, sums):  # type: ignore[no-untyped-def]
+    """``count`` lags beside a kink in growing blocks, each by the three-point Gauss rule of a block.
+
+    Nodes and weights integrate polynomials of degree 5 exactly over L equally spaced points: the
+    second and fourth moments are (L² − 1)/12 and (L² − 1)(3L² − 7)/240.
+    """
+    done = 0
+    while done < count:
+        length = min(max(1, int(LAG_STEP * (done + 1))), count - done)
+        centre = kink + side * (done + 0.5 * (length + 1))
+        if length == 1:
+            _add(centre, 2.0, n, small, large, sums)
+        else:
+            square = (3.0 * length * length - 7.0) / 20.0
+            outer = (length * length - 1.0) / 24.0 / square
+            reach = np.sqrt(square)
+            _add(centre - reach, 2.0 * length * outer, n, small, large, sums)
+            _add(centre + reach, 2.0 * length * outer, n, small, large, sums)
+            _add(centre, 2.0 * length * (1.0 - 2.0 * outer), n, small, large, sums)
+        done += length
+
+
+@compiled
+def _add(lag, weight, n, small, large, sums):  # type: ignore[no-untyped-def]
+    """One lag: the products of the differences of every two noises, times the pairs so far apart."""
+    weight *= min(n + 1.0 - 2 * large, n + 1.0 - small - large - lag)
+    if lag > TAIL * (small + large):
+        r = small * large / (np.pi * lag * lag) * (1.0 + 0.5 * (small * small + large * large) / (lag * lag))
+        sums[2, 2] += weight * r * r
+        return
+    q, white, flicker, walk = 0.0, 0.0, 0.0, 0.0
+    for p in range(-1, 2):
+        for s in range(-1, 2):
+            t = abs(lag + p * small + s * large)
+            c = (1.0 if p else -2.0) * (1.0 if s else -2.0)
+            if t == 0.0:
+                q += c
+                continue
+            white -= 0.5 * c * t
+            flicker += c * t * t * np.log(t)
+            walk += c * (t * t - 1.0) * t
+    scale = 1.0 / (small * large)
+    q *= scale
+    white *= scale
+    flicker *= scale / (2.0 * np.pi)
+    walk *= scale / 12.0
+    sums[0, 0] += weight * q * q
+    sums[0, 1] += weight * q * white
+    sums[0, 2] += weight * q * flicker
+    sums[0, 3] += weight * q * walk
+    sums[1, 1] += weight * white * white
+    sums[1, 2] += weight * white * flicker
+    sums[1, 3] += weight * white * walk
+    sums[2, 2] += weight * flicker * flicker
+    sums[2, 3] += weight * flicker * walk
+    sums[3, 3] += weight * walk * walk
