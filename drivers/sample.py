@@ -20,6 +20,12 @@ AXES: Final = ("gx", "gy", "gz", "ax", "ay", "az")
 NO_TICK: Final = -1
 """``ticks`` of a sample whose frame carried no counter."""
 
+EXTENDED_ID: Final = 1 << 31
+"""Flag of a CAN address: a 29-bit identifier."""
+
+ANY_SOURCE: Final = 1 << 30
+"""Flag of a CAN address to listen for: J1939, only its parameter group counts, not who sends it."""
+
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
@@ -70,6 +76,27 @@ def block(
     for array in (t_ns, values, temperature_c, ticks):
         array.flags.writeable = False
     return SampleBlock(t_ns, values, temperature_c, ticks, lost)
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """No counter on the wire: a sample's time is regressed from when its bytes arrived."""
+
+
+@dataclass(frozen=True, slots=True)
+class Counter:
+    """The frame carries a counter. ``tick_s``: seconds a tick, or None where it counts samples."""
+
+    modulus: int
+    tick_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """The payload carries Unix times; ``Chunk.t_ns`` is not used."""
+
+
+Timing = Arrival | Counter | Given
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,33 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.sample import NO_TICK, Chunk, Floats, Ints, SampleBlock, block
+from drivers.sample import Arrival as Arrival
+from drivers.sample import Counter as Counter
+from drivers.sample import Given as Given
+from drivers.sample import Timing as Timing
 
 GYRO_LIMIT: Final = 1000.0
 """rad/s; no MEMS gyroscope turns this fast (the widest range sold is 4000 °/s = 70 rad/s)."""
 ACCEL_LIMIT: Final = 10_000.0
 """m/s²; about 1000 g, above every inertial-grade MEMS range."""
 TEMPERATURE_LIMITS_C: Final = (-100.0, 300.0)
-
-
-@dataclass(frozen=True, slots=True)
-class Arrival:
-    """No counter on the wire: a sample's time is regressed from when its bytes arrived."""
-
-
-@dataclass(frozen=True, slots=True)
-class Counter:
-    """The frame carries a counter. ``tick_s``: seconds a tick, or None where it counts samples."""
-
-    modulus: int
-    tick_s: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Given:
-    """The payload carries Unix times; ``Chunk.t_ns`` is not used."""
-
-
-Timing = Arrival | Counter | Given
 
 
 class DecoderSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -119,9 +102,9 @@ def plausible(values: Floats) -> NDArray[np.bool_]:
     """Rows [n] with at least one measured axis and none infinite or beyond what a MEMS IMU can show."""
     size = np.abs(values)
     limits = np.repeat([GYRO_LIMIT, ACCEL_LIMIT], 3)
-    too_large = (size > limits).any(axis=1)
-    result: NDArray[np.bool_] = ~too_large & ~np.isnan(values).all(axis=1)
-    return result
+    too_large: NDArray[np.bool_] = np.any(size > limits, axis=1)
+    absent: NDArray[np.bool_] = np.all(np.isnan(values), axis=1)
+    return ~too_large & ~absent
 
 
 def _possible_temperature(temperature_c: Floats) -> NDArray[np.bool_]:
@@ -138,29 +121,45 @@ class Frames:
     t_ns: Ints  # [n] arrival of the chunk that completed each frame
     bad_before: Ints  # [n] frames rejected just before each
 
+    def keep(self, rows: Sequence[int]) -> tuple["Frames", int]:
+        """Those frames alone, and how many were rejected behind the last of them.
+
+        Rejected frames that stood before a frame left out count before the next kept one.
+        """
+        places = np.cumsum(self.bad_before)
+        at_kept = places[list(rows)]
+        after = int(places[-1] if places.size else 0) - int(at_kept[-1] if at_kept.size else 0)
+        kept = Frames([self.data[i] for i in rows], self.t_ns[list(rows)], np.diff(at_kept, prepend=0))
+        return kept, after
+
 
 NEED_MORE: Final = 0
 REJECT: Final = -1
 
-Match = Callable[[bytearray, int], int]
+Match = Callable[[bytes, int], int]
 """(buffer, offset of a sync) -> length of the valid frame there, NEED_MORE, or REJECT."""
+
+MUTE_BYTES: Final = 2000
+"""So many bytes without one valid frame are worth a hint; no supported frame is as long."""
+QUIET_FRAMES: Final = 1000
+"""After so many good frames a rejected one is no longer worth a hint."""
 
 
 class FrameBuffer:
     """Finds frames in a byte stream that may be cut, damaged or joined late.
 
-    ``sync`` is the fixed start of a frame, ``match`` checks one candidate. After a rejection the search
-    goes on one byte further in the same bytes, as a sync may occur inside a payload. A hole between two
-    frames counts as the larger of: candidates rejected a frame's length apart, and whole frames that
-    would fit in it. What comes before the first frame (joined mid-stream) is not counted. Memory: never more
-    than ``longest`` bytes are kept.
+    ``sync`` is the fixed start of a frame (it may be changed between frames; empty = any byte), ``match``
+    checks one candidate. After a rejection the search goes on one byte further in the same bytes, as a
+    sync may occur inside a payload. A hole between two frames counts as the larger of: candidates rejected
+    a frame's length apart, and whole frames that would fit in it. What comes before the first frame
+    (joined mid-stream) is not counted. Memory: never more than ``longest`` bytes are kept between feeds.
     """
 
     def __init__(self, sync: bytes, match: Match, longest: int) -> None:
-        self._sync = sync
+        self.sync = sync
         self._match = match
         self._longest = longest
-        self._buffer = bytearray()
+        self._buffer = b""
         self._arrivals: deque[tuple[int, int]] = deque()  # (stream offset of a chunk's end, t_ns)
         self._dropped = 0  # stream offset of the buffer's first byte
         self.reset()
@@ -168,56 +167,70 @@ class FrameBuffer:
     def reset(self) -> None:
         """Forget buffered bytes and being in step."""
         self._dropped += len(self._buffer)
-        self._buffer.clear()
+        self._buffer = b""
         self._arrivals.clear()
         self._in_step = False
         self._frame_length = 0
         self._hole = 0  # bytes skipped since the last frame
         self._rejected = 0  # candidates rejected in the hole
         self._last_rejected = -(1 << 62)  # stream offset
+        self._quiet = QUIET_FRAMES  # good frames since the last rejected one
+
+    @property
+    def hint(self) -> str:
+        """Why there are rejected frames, or none at all; "" while all is well."""
+        if self._hole >= MUTE_BYTES:
+            return f"{self._hole} bytes without a valid frame: is the baud rate right, and the decoder?"
+        if self._quiet < QUIET_FRAMES:
+            return "frames fail their check: bytes are lost or damaged on the line"
+        return ""
 
     def feed(self, chunks: Sequence[Chunk]) -> Frames:
         """All frames that these chunks complete."""
-        for chunk in chunks:
-            self._buffer += chunk.data
-            self._arrivals.append((self._dropped + len(self._buffer), chunk.t_ns))
+        buffer, match, longest = self._join(chunks), self._match, self._longest
         found: list[bytes] = []
-        t_ns: list[int] = []
+        ends: list[int] = []  # offset in the buffer behind each frame
         bad_before: list[int] = []
         at = 0
-        buffer, sync, match = self._buffer, self._sync, self._match
         while True:
-            start = buffer.find(sync, at)
+            start = buffer.find(self.sync, at)
             if start < 0:
                 # the tail may be the first part of a sync
-                start = max(at, len(buffer) - len(sync) + 1)
-                self._skip(start - at)
+                start = max(at, len(buffer) - len(self.sync) + 1)
+                self._hole += start - at
                 at = start
                 break
-            self._skip(start - at)
+            self._hole += start - at
             length = match(buffer, start)
-            if length == NEED_MORE and len(buffer) - start < self._longest:
+            if length > 0:
+                at = start + length
+                found.append(buffer[start:at])
+                ends.append(at)
+                bad_before.append(self._close_hole() if self._hole else 0)
+                self._frame_length = length
+                self._in_step = True
+            elif length == NEED_MORE and len(buffer) - start < longest:
                 at = start
                 break
-            if length <= 0:
+            else:
                 self._reject(start)
-                at = start + 1
                 self._hole += 1
-                continue
-            at = start + length
-            found.append(bytes(buffer[start:at]))
-            t_ns.append(self._arrival(at))
-            bad_before.append(self._close_hole())
-            self._frame_length = length
-            self._in_step = True
-        del buffer[:at]
+                at = start + 1
+        frames = Frames(found, self._arrived(ends), np.array(bad_before, np.int64))
+        self._buffer = buffer[at:]
         self._dropped += at
         while len(self._arrivals) > 1 and self._arrivals[0][0] <= self._dropped:
             self._arrivals.popleft()
-        return Frames(found, np.array(t_ns, np.int64), np.array(bad_before, np.int64))
+        self._quiet += len(found)
+        return frames
 
-    def _skip(self, n: int) -> None:
-        self._hole += n
+    def _join(self, chunks: Sequence[Chunk]) -> bytes:
+        end = self._dropped + len(self._buffer)
+        for chunk in chunks:
+            if chunk.data:
+                end += len(chunk.data)
+                self._arrivals.append((end, chunk.t_ns))
+        return b"".join((self._buffer, *[chunk.data for chunk in chunks]))
 
     def _reject(self, at: int) -> None:
         offset = self._dropped + at
@@ -230,13 +243,47 @@ class FrameBuffer:
         count = max(self._rejected, fitting) if self._in_step else 0
         self._hole = self._rejected = 0
         self._last_rejected = -(1 << 62)
+        if count:
+            self._quiet = 0
         return count
 
-    def _arrival(self, at: int) -> int:
-        offset = self._dropped + at
-        while self._arrivals[0][0] < offset:
-            self._arrivals.popleft()
-        return self._arrivals[0][1]
+    def _arrived(self, ends: list[int]) -> Ints:
+        """[n] arrival of the chunk that holds the byte before each end."""
+        if not ends:
+            return np.empty(0, np.int64)
+        offsets, t_ns = np.array(self._arrivals, np.int64).T
+        arrived: Ints = t_ns[np.searchsorted(offsets, np.array(ends) + self._dropped)]
+        return arrived
+
+
+def invalid(values: Floats) -> Floats:
+    """The values with NaN turned to infinity: for formats where every number sent is a measurement."""
+    return np.where(np.isnan(values), np.inf, values)
+
+
+def quantize(values: Floats, step: float, bits: int) -> Ints:
+    """Signed integers of so many bits, values / step rounded and clipped as sensors saturate; NaN gives 0."""
+    top = 1 << (bits - 1)
+    return np.clip(np.rint(np.nan_to_num(values / step, nan=0.0)), -top, top - 1).astype(np.int64)
+
+
+def one_chunk_each(frames: Sequence[bytes], t_ns: Ints) -> list[Chunk]:
+    """A chunk for every sample's bytes, arrived at that sample's time."""
+    return [Chunk(data, t) for data, t in zip(frames, t_ns.tolist(), strict=True)]
+
+
+def xor(data: bytes) -> int:
+    """Exclusive or of all bytes, by folding one long integer in halves: 1 µs for a sentence.
+
+    >>> xor(b"VNRRG,8") == 0x4B
+    True
+    """
+    bits = 8 << max(len(data) - 1, 0).bit_length()
+    folded = int.from_bytes(data, "little")
+    while bits > 8:
+        bits >>= 1
+        folded = (folded >> bits) ^ (folded & ((1 << bits) - 1))
+    return folded
 
 
 class Unmeasured:

@@ -17,7 +17,6 @@ sample: τ0 = 1, and θ stands for Q²/τ0², N²/τ0, B², K² τ0, R² τ0².
 """
 
 from dataclasses import dataclass
-from math import ceil
 
 import numpy as np
 from scipy.special import chdtri
@@ -99,11 +98,6 @@ def intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Flo
     )
 
 
-def next_length(n: int) -> int:
-    """Window length at which a growing window gets its next table."""
-    return ceil(TABLE_STEP * n)
-
-
 @compiled
 def _fill(n, factors, covariance):  # type: ignore[no-untyped-def]
     sums = np.empty((NOISES, NOISES))
@@ -124,33 +118,25 @@ def _fill(n, factors, covariance):  # type: ignore[no-untyped-def]
 @compiled
 def _sum_lags(n, small, large, sums):  # type: ignore[no-untyped-def]
     """Σ w(c) r^a(c) r^b(c) over all lags c of the terms' centres: kinks one by one, between them blocks."""
-    sums[:] = 0.0
+    for a in range(NOISES):
+        for b in range(NOISES):
+            sums[a, b] = 0.0
     end = n + 1 - small - large  # w(end) = 0
-    kinks = np.array([0, large - small, small, large, large + small, end])
-    kinks.sort()
-    previous = -1
-    for kink in kinks:
-        if kink >= end:
-            break
-        if kink == previous:
+    lower = min(small, large - small)
+    kinks = (0, lower, large - lower, large, large + small, end)
+    for step in range(6):
+        kink = kinks[step]
+        if kink >= end or (step > 0 and kink == kinks[step - 1]):
             continue
-        _add(kink, 1.0 if kink == 0 else 2.0, n, small, large, sums)
-        if previous >= 0:
-            _add_between(previous, kink, n, small, large, sums)
-        previous = kink
-    reach = min(end, large + small)
-    if previous < reach:
-        _add_between(previous, reach, n, small, large, sums)
-    if end > large + small:
-        _add_blocks(large + small, end - large - small - 1, 1, n, small, large, sums)
-
-
-@compiled
-def _add_between(left, right, n, small, large, sums):  # type: ignore[no-untyped-def]
-    """The lags strictly between two kinks: from each kink to the middle."""
-    half = (right - left) // 2
-    _add_blocks(left, half, 1, n, small, large, sums)
-    _add_blocks(right, right - left - 1 - half, -1, n, small, large, sums)
+        _add(float(kink), 1.0 if step == 0 else 2.0, n, small, large, sums)
+        behind = end
+        for other in kinks:
+            if kink < other < behind:
+                behind = other
+        count = behind - kink - 1
+        ahead = count if kink == large + small else (count + 1) // 2
+        for done_by in ((1.0, kink, ahead), (-1.0, behind, count - ahead)):
+            _add_blocks(done_by[1], done_by[2], done_by[0], n, small, large, sums)
 
 
 @compiled
@@ -164,15 +150,15 @@ def _add_blocks(kink, count, side, n, small, large, sums):  # type: ignore[no-un
     while done < count:
         length = min(max(1, int(LAG_STEP * (done + 1))), count - done)
         centre = kink + side * (done + 0.5 * (length + 1))
-        if length == 1:
-            _add(centre, 2.0, n, small, large, sums)
-        else:
+        inner, reach = 1.0, 0.0
+        if length > 1:
             square = (3.0 * length * length - 7.0) / 20.0
-            outer = (length * length - 1.0) / 24.0 / square
+            inner = 1.0 - (length * length - 1.0) / 12.0 / square
             reach = np.sqrt(square)
-            _add(centre - reach, 2.0 * length * outer, n, small, large, sums)
-            _add(centre + reach, 2.0 * length * outer, n, small, large, sums)
-            _add(centre, 2.0 * length * (1.0 - 2.0 * outer), n, small, large, sums)
+        _add(centre, 2.0 * length * inner, n, small, large, sums)
+        if reach > 0.0:
+            _add(centre - reach, length * (1.0 - inner), n, small, large, sums)
+            _add(centre + reach, length * (1.0 - inner), n, small, large, sums)
         done += length
 
 

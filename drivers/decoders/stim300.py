@@ -1,0 +1,235 @@
+"""Sensonor STIM300 normal-mode datagrams over RS-422.
+
+Big-endian, no sync word: ``id | gyro 3 x i24, status | [acceleration 3 x i24, status] | [inclinometer ...] |
+[temperature 3 x i16, status of each included sensor] | [aux or PPS i24, status] | counter u8 | latency u16 |
+CRC u32``, then CR LF where that is switched on. The identifier says which parts follow. CRC-32 of polynomial
+0x04C11DB7, start 0xFFFFFFFF, not reflected, over all before it and zeros up to a multiple of four bytes.
+Sources: vortexntnu/stim300-driver, and the frame published in geirhovland/stim300; data sheet TS1524 tables
+5-21 to 5-23 as restated by public drivers.
+
+Neither the accelerometer's range nor the output units are in the datagram: they must be configured. An
+"increment" is the angle or velocity of one sample, and needs ``rate`` to become a rate. Integrated outputs
+are not supported. The counter runs with the internal 2000 Hz sampling (unconfirmed: it steps by 4 at 500 Hz).
+
+Status byte of the gyro and accelerometer: system integrity error (bit 7), start-up (6), overload (4) and
+channel error (3) make the sample bad: its values are wrong or unsettled. Outside operating conditions (5)
+is let through: the sensor still measures, as in a climate chamber beyond its stated range. The temperature
+is the mean of the gyro's three sensors, not measured when their status shows an error.
+"""
+
+import zlib
+from collections.abc import Sequence
+from typing import ClassVar, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.decoders.base import (
+    NEED_MORE,
+    REJECT,
+    Counter,
+    DecoderSettings,
+    FrameBuffer,
+    Rows,
+    Timing,
+    one_chunk_each,
+    quantize,
+)
+from drivers.errors import ConfigError
+from drivers.sample import Chunk, Floats, Ints, SampleBlock
+from drivers.units import DEGREE, G0
+
+ACCEL_PART, INCL_PART, TEMPERATURE_PART, AUX_PART = 1, 2, 4, 8
+# in the order of the parts' bits; F0..F7 carry PPS in the place of aux; 97 is A7 of hardware up to revision C
+IDENTIFIERS: Final = {
+    **dict(zip((0x90, 0x91, 0x92, 0x93, 0x94, 0xA5, 0xA6, 0xA7), range(8), strict=True)),
+    **dict(zip((0x98, 0x99, 0x9A, 0x9B, 0x9C, 0xAD, 0xAE, 0xAF), range(8, 16), strict=True)),
+    **dict(zip(range(0xF0, 0xF8), range(8, 16), strict=True)),
+    0x97: 7,
+}
+"""Identifier -> parts beside the gyro."""
+
+
+def size(parts: int) -> int:
+    """Bytes of a datagram with these parts, CRC included, CR LF not."""
+    sensors = 1 + (parts & (ACCEL_PART | INCL_PART)).bit_count()
+    warm = sensors if parts & TEMPERATURE_PART else 0
+    return 1 + 10 * sensors + 7 * warm + (4 if parts & AUX_PART else 0) + 1 + 2 + 4
+
+
+SIZES: Final = {identifier: size(parts) for identifier, parts in IDENTIFIERS.items()}
+LONGEST: Final = max(SIZES.values())
+
+ACCEL_BITS: Final = {"2g": 21, "5g": 20, "10g": 19, "30g": 18, "80g": 16}
+"""Least significant bit is 2**-bits g by accelerometer range; 8 times finer in m/s for an increment."""
+ERRORS: Final = 0x80 | 0x40 | 0x10 | 0x08
+START_UP: Final = 0x40
+CHANNEL_ERROR: Final = 0x08
+
+_BITS = np.arange(256, dtype=np.uint8)[:, None] >> np.arange(8, dtype=np.uint8) & 1
+MIRRORED: Final = np.packbits(_BITS, axis=1).tobytes()
+"""Each byte with its bits in reverse order: turns the CRC into zlib's, which is the reflected one."""
+
+
+class Settings(DecoderSettings, frozen=True):
+    """Keys of ``[device.driver.decoder_options]``."""
+
+    accelerometer_range: Literal["2g", "5g", "10g", "30g", "80g"] = "10g"
+    """Range of the accelerometers built in: it sets the scale."""
+    gyro_output: Literal["rate", "increment"] = "rate"
+    """rate: angular rate or its mean, °/s; increment: angle of one sample, °."""
+    accelerometer_output: Literal["acceleration", "increment"] = "acceleration"
+    """acceleration, or its mean, g; increment: velocity of one sample, m/s."""
+    rate: float | None = None
+    """Sample rate in Hz; needed where an output is an increment."""
+    identifier: int | Literal["auto"] = "auto"
+    """First byte of the datagrams, as 0x93; auto takes that of the first whose CRC holds."""
+    crlf: bool = False
+    """``encode`` ends datagrams with CR LF; reading takes both."""
+
+
+class Stim300Decoder:
+    """STIM300 datagrams <-> SampleBlock."""
+
+    carrier: ClassVar[str] = "bytes"
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self.timing: Timing = Counter(256, 1.0 / 2000.0)
+        rate = settings.rate or 1.0
+        self._gyro_step = DEGREE * (rate / 2**21 if settings.gyro_output == "increment" else 1 / 2**14)
+        bits = ACCEL_BITS[settings.accelerometer_range]
+        increment = settings.accelerometer_output == "increment"
+        self._accel_step = rate / 2 ** (bits + 3) if increment else G0 / 2**bits
+        self._wanted = b"" if settings.identifier == "auto" else bytes([settings.identifier])
+        self._buffer = FrameBuffer(self._wanted, self._match, LONGEST)
+        self._rows = Rows()
+        self._status = 0
+
+    @property
+    def bad(self) -> int:
+        """Datagrams that failed their CRC, and samples whose status or value is wrong."""
+        return self._rows.bad
+
+    @property
+    def hint(self) -> str:
+        """What the status byte says, or why datagrams are rejected."""
+        if self._status & START_UP:
+            return "the sensor is starting up"
+        if self._status:
+            return f"the sensor reports an error: status 0x{self._status:02X}"
+        return self._buffer.hint
+
+    def reset(self) -> None:
+        """Forget half a datagram, and with auto which identifier it had."""
+        self._buffer.reset()
+        self._buffer.sync = self._wanted
+        self._rows.reset()
+
+    def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
+        """Samples of the datagrams that these chunks complete."""
+        frames = self._buffer.feed(chunks)
+        n = len(frames.data)
+        if not n:
+            return []
+        data = np.frombuffer(b"".join(frames.data), np.uint8).reshape(n, -1)
+        parts = IDENTIFIERS[int(data[0, 0])]
+        values = np.full((n, 6), np.nan)
+        values[:, :3] = triples(data, 1) * self._gyro_step
+        status = data[:, 10]
+        if parts & ACCEL_PART:
+            values[:, 3:] = triples(data, 11) * self._accel_step
+            status = status | data[:, 20]
+        values[status & ERRORS != 0] = np.inf
+        self._status = int(status[-1]) & ERRORS
+        temperature_c = np.full(n, np.nan)
+        if parts & TEMPERATURE_PART:
+            at = _temperature_at(parts)
+            mean = np.ascontiguousarray(data[:, at : at + 6]).view(">i2").mean(axis=1) / 2**8
+            temperature_c = np.where(data[:, at + 6] & ERRORS, np.nan, mean)
+        ticks = data[:, -7].astype(np.int64)
+        return self._rows.blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before)
+
+    def _match(self, buffer: bytes, at: int) -> int:
+        if at >= len(buffer):
+            return NEED_MORE
+        length = SIZES.get(buffer[at])
+        if length is None:
+            return REJECT
+        if len(buffer) < at + length:
+            return NEED_MORE
+        if not crc_holds(buffer[at : at + length]):
+            return REJECT
+        self._buffer.sync = buffer[at : at + 1]
+        return length
+
+    def encode(self, samples: SampleBlock) -> list[Chunk]:
+        """Datagrams of the identifier set; with auto those with acceleration, and temperature where there is one.
+
+        A row with an axis that is not measured has the channel error set.
+        """
+        identifier = self._settings.identifier
+        if identifier == "auto":
+            identifier = 0xA5 if np.isfinite(samples.temperature_c).any() else 0x91
+        parts = IDENTIFIERS[identifier]
+        data = np.zeros((len(samples), SIZES[identifier] - 4), np.uint8)
+        data[:, 0] = identifier
+        _put(data, 1, samples.values[:, :3], self._gyro_step)
+        if parts & ACCEL_PART:
+            _put(data, 11, samples.values[:, 3:], self._accel_step)
+        if parts & TEMPERATURE_PART:
+            at = _temperature_at(parts)
+            raw = quantize(samples.temperature_c, 2**-8, 16).astype(">i2")
+            data[:, at : at + 6] = np.repeat(raw[:, None], 3, axis=1).view(np.uint8)
+            data[:, at + 6] = np.where(np.isnan(samples.temperature_c), CHANNEL_ERROR, 0)
+        data[:, -3] = samples.ticks & 0xFF
+        tail = b"\r\n" if self._settings.crlf else b""
+        return one_chunk_each([row + crc(row) + tail for row in map(bytes, data)], samples.t_ns)
+
+
+def _temperature_at(parts: int) -> int:
+    """Offset of the gyro's temperatures."""
+    return 1 + 10 * (1 + (parts & (ACCEL_PART | INCL_PART)).bit_count())
+
+
+def triples(data: NDArray[np.uint8], at: int) -> Ints:
+    """[n, 3] signed 24-bit big-endian integers at an offset of each row."""
+    wide = np.zeros((len(data), 3, 4), np.uint8)
+    wide[:, :, :3] = data[:, at : at + 9].reshape(-1, 3, 3)
+    raised: Ints = wide.view(">i4")[:, :, 0].astype(np.int64) >> 8
+    return raised
+
+
+def _put(data: NDArray[np.uint8], at: int, values: Floats, step: float) -> None:
+    raw = quantize(values, step, 24).astype(">i4").reshape(-1, 3, 1).view(np.uint8)
+    data[:, at : at + 9] = raw[:, :, 1:].reshape(-1, 9)
+    data[:, at + 9] = np.where(np.isnan(values).any(axis=1), CHANNEL_ERROR, 0)
+
+
+def crc(body: bytes) -> bytes:
+    """The four bytes that follow a datagram's body."""
+    mirrored = zlib.crc32(bytes(-len(body) % 4), zlib.crc32(body.translate(MIRRORED))) ^ 0xFFFFFFFF
+    return mirrored.to_bytes(4, "little").translate(MIRRORED)
+
+
+def crc_holds(frame: bytes) -> bool:
+    """Whether a whole datagram ends in its own CRC."""
+    mirrored = frame.translate(MIRRORED)
+    stated = int.from_bytes(mirrored[-4:], "little")
+    # zeros mirror to zeros, so that the padding can be appended after
+    return zlib.crc32(PADDING[-len(frame) % 4], zlib.crc32(mirrored[:-4])) ^ 0xFFFFFFFF == stated
+
+
+PADDING: Final = (b"", b"\0", b"\0\0", b"\0\0\0")
+
+
+def build(settings: Settings) -> Stim300Decoder:
+    """A decoder with these settings; ConfigError for an unknown identifier or a missing rate."""
+    if settings.identifier != "auto" and settings.identifier not in IDENTIFIERS:
+        known = ", ".join(f"0x{identifier:02X}" for identifier in sorted(IDENTIFIERS))
+        raise ConfigError(f"identifier {settings.identifier}: the STIM300 has {known}")
+    if "increment" in (settings.gyro_output, settings.accelerometer_output) and not settings.rate:
+        raise ConfigError('an output of "increment" needs rate, the sample rate in Hz')
+    if settings.rate is not None and not settings.rate > 0.0:
+        raise ConfigError(f"rate {settings.rate}: must be above 0 Hz")
+    return Stim300Decoder(settings)

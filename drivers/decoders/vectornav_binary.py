@@ -1,0 +1,236 @@
+"""VectorNav VN-100/200/300 binary messages.
+
+``FA | groups u8 | a field mask u16le for each group | payload little-endian | CRC u16be``. The masks say
+which fields follow, in group then bit order, so any message of groups 1, 2, 3 and 5 is understood; others
+are rejected, as the size of their fields is not known here. CRC-16 of polynomial 0x1021, start 0, over all
+behind 0xFA; run over the CRC as well it gives 0 (VN-100 user manual UM001 v2.1, pages 27-43).
+
+Recommended for noise work: TimeStartup and Imu of group 1 (``FA 01 01 02``, 38 bytes). Imu and the Uncomp
+fields are the sensor's own; AngularRate and Accel have the on-board filter's bias taken out, and hide the
+bias instability and random walk one wants to see. Where a message holds both, ``compensated`` chooses.
+A message with only accelerations or only rates leaves the other axes unmeasured, one with neither is
+ignored. VectorNav's z axis points down: at rest it reads -9.8.
+"""
+
+import binascii
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar, Final, Literal
+
+import numpy as np
+
+from drivers.decoders.base import (
+    NEED_MORE,
+    REJECT,
+    Arrival,
+    Counter,
+    DecoderSettings,
+    FrameBuffer,
+    Frames,
+    Rows,
+    Timing,
+    invalid,
+    one_chunk_each,
+)
+from drivers.sample import NO_TICK, Chunk, SampleBlock
+
+FIELD_SIZES: Final = {
+    1: (8, 8, 8, 12, 16, 12, 24, 12, 12, 24, 20, 28, 2, 4, 8),
+    2: (8, 8, 8, 2, 8, 8, 8, 4, 4),
+    3: (2, 12, 12, 12, 4, 4, 16, 12, 12, 12, 12),
+    5: (2, 12, 16, 36, 12, 12, 12, 12, 12, 12, 28),
+}
+"""Bytes of each field, by group and bit."""
+LONGEST: Final = 1 + 1 + 2 * len(FIELD_SIZES) + sum(map(sum, FIELD_SIZES.values())) + 2
+
+# (group, bit, offset of the part inside the field), the preferred one first
+TIME: Final = ((1, 0, 0), (2, 0, 0))
+UNCOMPENSATED_GYRO: Final = ((1, 9, 12), (3, 3, 0))
+UNCOMPENSATED_ACCEL: Final = ((1, 9, 0), (3, 2, 0))
+COMPENSATED_GYRO: Final = ((1, 5, 0), (3, 10, 0))
+COMPENSATED_ACCEL: Final = ((1, 8, 0), (3, 9, 0))
+TEMPERATURE: Final = ((1, 10, 12), (3, 4, 0))
+
+TICKS: Final = 1 << 62
+"""TimeStartup is an unsigned 64-bit count of ns; 62 bits of it last 146 years and fit signed arithmetic."""
+
+
+class Settings(DecoderSettings, frozen=True):
+    """Keys of ``[device.driver.decoder_options]``."""
+
+    compensated: bool = False
+    """Where a message holds both: take the rates and accelerations that the on-board filter corrected."""
+    clock: Literal["time_startup", "arrival"] = "time_startup"
+    """Sample times from TimeStartup (ns, of the device), or from arrival where messages do not hold it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """One combination of masks: ``row`` has those of time, gyro, accel, temperature that it holds."""
+
+    row: np.dtype[np.void]
+    names: tuple[str, ...]
+
+    @property
+    def length(self) -> int:
+        """Bytes of the whole message."""
+        return self.row.itemsize
+
+    @property
+    def inertial(self) -> bool:
+        """Whether a message of this layout is a sample."""
+        return "gyro" in self.names or "accel" in self.names
+
+
+@lru_cache(maxsize=256)
+def layout(header: bytes, compensated: bool) -> Layout | None:
+    """Layout of the messages with this header (group byte and masks); None for one not understood."""
+    groups = [g for g in range(1, 9) if header[0] >> (g - 1) & 1]
+    masks = struct.unpack(f"<{len(groups)}H", header[1:])
+    at: dict[tuple[int, int], int] = {}
+    end = 1 + len(header)
+    for group, mask in zip(groups, masks, strict=True):
+        sizes = FIELD_SIZES.get(group, ())
+        if mask >> len(sizes) or not mask:
+            return None
+        for bit, size in enumerate(sizes):
+            if mask >> bit & 1:
+                at[group, bit] = end
+                end += size
+    return _rows(at, end + 2, compensated)
+
+
+def _rows(at: dict[tuple[int, int], int], length: int, compensated: bool) -> Layout:
+    order = -1 if compensated else 1
+    gyro = (UNCOMPENSATED_GYRO, COMPENSATED_GYRO)[::order]
+    accel = (UNCOMPENSATED_ACCEL, COMPENSATED_ACCEL)[::order]
+    wanted = (
+        ("time", "<u8", TIME),
+        ("gyro", "<3f4", gyro[0] + gyro[1]),
+        ("accel", "<3f4", accel[0] + accel[1]),
+        ("temperature", "<f4", TEMPERATURE),
+    )
+    names, formats, offsets = [], [], []
+    for name, form, places in wanted:
+        found = [at[group, bit] + inside for group, bit, inside in places if (group, bit) in at]
+        if found:
+            names.append(name)
+            formats.append(form)
+            offsets.append(found[0])
+    row = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": length})
+    return Layout(row, tuple(names))
+
+
+def _header_end(groups: int) -> int:
+    """Offset behind the masks; 0 where there is no group, or a second group byte."""
+    return 0 if groups == 0 or groups & 0x80 else 2 + 2 * groups.bit_count()
+
+
+HEADER_END: Final = tuple(map(_header_end, range(256)))
+
+
+class VectornavBinaryDecoder:
+    """VectorNav binary messages <-> SampleBlock."""
+
+    carrier: ClassVar[str] = "bytes"
+
+    def __init__(self, settings: Settings) -> None:
+        self._compensated = settings.compensated
+        self._counts = settings.clock == "time_startup"
+        self.timing: Timing = Counter(TICKS, 1e-9) if self._counts else Arrival()
+        self._buffer = FrameBuffer(b"\xfa", self._match, LONGEST)
+        self._rows = Rows()
+        self._timeless = False
+
+    @property
+    def bad(self) -> int:
+        """Messages that failed their CRC, and samples that cannot be."""
+        return self._rows.bad
+
+    @property
+    def hint(self) -> str:
+        """What to do about messages that are rejected or lack their time."""
+        if self._timeless:
+            return 'messages hold no TimeStartup: switch it on in the sensor, or set clock = "arrival"'
+        return self._buffer.hint
+
+    def reset(self) -> None:
+        """Forget a half-received message."""
+        self._buffer.reset()
+        self._rows.reset()
+
+    def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
+        """Samples of the messages that these chunks complete."""
+        frames = self._buffer.feed(chunks)
+        if not frames.data:
+            return []
+        headers = [f[1 : HEADER_END[f[1]]] for f in frames.data]
+        layouts = {header: self._layout(header) for header in dict.fromkeys(headers)}
+        rows = [i for i, header in enumerate(headers) if layouts[header].inertial]
+        groups: dict[bytes, list[int]] = {}
+        for at, i in enumerate(rows):
+            groups.setdefault(headers[i], []).append(at)
+        kept, bad_after = frames.keep(rows)
+        return self._decode(kept, [(layouts[h], at) for h, at in groups.items()], bad_after)
+
+    def _layout(self, header: bytes) -> Layout:
+        found = layout(header, self._compensated)
+        assert found is not None, "the buffer lets through only messages that have one"
+        return found
+
+    def _decode(self, frames: Frames, groups: list[tuple[Layout, list[int]]], bad_after: int) -> list[SampleBlock]:
+        n = len(frames.data)
+        values = np.full((n, 6), np.nan)
+        temperature_c = np.full(n, np.nan)
+        ticks = np.full(n, NO_TICK, np.int64)
+        for form, at in groups:
+            got = np.frombuffer(b"".join([frames.data[i] for i in at]), form.row)
+            if "gyro" in form.names:
+                values[at, :3] = invalid(got["gyro"])
+            if "accel" in form.names:
+                values[at, 3:] = invalid(got["accel"])
+            if "temperature" in form.names:
+                temperature_c[at] = got["temperature"]
+            if "time" in form.names and self._counts:
+                ticks[at] = got["time"] & np.uint64(TICKS - 1)
+        if n:
+            self._timeless = self._counts and int(ticks[-1]) == NO_TICK
+        return self._rows.blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before, bad_after)
+
+    def _match(self, buffer: bytes, at: int) -> int:
+        if len(buffer) < at + 2:
+            return NEED_MORE
+        header_end = HEADER_END[buffer[at + 1]]
+        if not header_end:
+            return REJECT
+        if len(buffer) < at + header_end:
+            return NEED_MORE
+        found = layout(buffer[at + 1 : at + header_end], self._compensated)
+        if found is None:
+            return REJECT
+        length = found.length
+        if len(buffer) < at + length:
+            return NEED_MORE
+        return REJECT if binascii.crc_hqx(buffer[at + 1 : at + length], 0) else length
+
+    def encode(self, samples: SampleBlock) -> list[Chunk]:
+        """TimeStartup and Imu of group 1, with MagPres where the block has temperatures."""
+        warm = bool(np.isfinite(samples.temperature_c).any())
+        header = bytes.fromhex("01 01 06" if warm else "01 01 02")
+        form = layout(header, compensated=False)
+        assert form is not None, "this header is in the tables"
+        rows = np.zeros(len(samples), form.row)
+        rows["time"] = samples.ticks & (TICKS - 1)
+        rows["gyro"], rows["accel"] = samples.values[:, :3], samples.values[:, 3:]
+        if warm:
+            rows["temperature"] = samples.temperature_c
+        inner = [header + row.tobytes()[1 + len(header) : -2] for row in rows]
+        frames = [b"\xfa" + part + binascii.crc_hqx(part, 0).to_bytes(2, "big") for part in inner]
+        return one_chunk_each(frames, samples.t_ns)
+
+
+def build(settings: Settings) -> VectornavBinaryDecoder:
+    """A decoder with these settings."""
+    return VectornavBinaryDecoder(settings)

@@ -1,0 +1,201 @@
+"""One device's reader: bytes from its link to samples with times, for ever.
+
+``Driver.step`` is the corridor: read, feed, stamp, push; it decides nothing. ``Driver.run`` keeps it going in a
+thread of its own: a link that cannot be opened, is lost or falls silent is closed, reported, and opened again with
+growing pauses until the driver is stopped or a replay has ended. Nothing that happens to one device reaches another.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from drivers.clock import SampleClock
+from drivers.decoders.base import Decoder
+from drivers.errors import LinkEnded, LinkError, LinkLost
+from drivers.links.base import Link
+from drivers.sample import AXES, Event, Given, SampleBlock, block
+
+READ_TIMEOUT_S: Final = 0.2
+FIRST_PAUSE_S: Final = 0.1
+LONGEST_PAUSE_S: Final = 5.0
+UNDECODED_BYTES: Final = 2000
+"""So many bytes without one sample: probably the wrong baud rate or decoder, and said so."""
+EVENTS_KEPT: Final = 1000
+
+State = Literal["waiting", "running", "lost", "ended"]
+
+
+@dataclass(frozen=True, slots=True)
+class AxisMap:
+    """Which measured axis goes where: column i of the output is sign[i] · column source[i] of the decoder's."""
+
+    source: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+    sign: tuple[float, ...] = (1.0,) * 6
+
+    def apply(self, samples: SampleBlock) -> SampleBlock:
+        """The samples on the axes of the configuration."""
+        if self == AxisMap():
+            return samples
+        values = samples.values[:, self.source] * np.array(self.sign)
+        return block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
+
+
+@dataclass(slots=True)
+class Counts:
+    """Samples of one device since its start; received + bad + lost = sent."""
+
+    received: int = 0
+    bad: int = 0
+    lost: int = 0
+
+
+class Driver:
+    """Reads one device.
+
+    Args:
+        name: the device's name in the configuration
+        link, decoder, clock: what it is read with
+        axes: the mounting
+        push: takes each stamped block; must not block
+        silence_s: the link is opened anew after so long without a byte; 0 = never
+    """
+
+    def __init__(
+        self,
+        name: str,
+        link: Link,
+        decoder: Decoder,
+        clock: SampleClock,
+        push: Callable[[SampleBlock], None],
+        axes: AxisMap | None = None,
+        silence_s: float = 3.0,
+    ) -> None:
+        self.name = name
+        self.link = link
+        self.decoder = decoder
+        self.clock = clock
+        self.counts = Counts()
+        self.state: State = "waiting"
+        self.text = f"waiting for {link.name}"
+        self.times_are_unix = link.epoch == "unix" or isinstance(decoder.timing, Given)
+        self._push = push
+        self._axes = axes or AxisMap()
+        self._silence_s = silence_s
+        self._events: deque[Event] = deque(maxlen=EVENTS_KEPT)
+        self._stop = threading.Event()
+        self._undecoded = 0
+        self._heard_s = 0.0
+        self._newest_t_ns = 0
+
+    def take_events(self) -> list[Event]:
+        """Events since the last call, oldest first."""
+        return [self._events.popleft() for _ in range(len(self._events))]
+
+    def stop(self) -> None:
+        """Ask ``run`` to end; a waiting read is ended too."""
+        self._stop.set()
+        self.link.close()
+
+    def run(self) -> None:
+        """Read until stopped; to be called in the device's own thread."""
+        pause_s = FIRST_PAUSE_S
+        while not self._stop.is_set():
+            received = self.counts.received
+            try:
+                self.link.open()
+                self._heard_s = time.monotonic()
+                while not self._stop.is_set():
+                    self.step()
+            except LinkEnded as error:
+                self.state, self.text = "ended", str(error)
+                self.link.close()
+                return
+            except LinkError as error:
+                if not self._stop.is_set():
+                    self._gone(error)
+            if self.counts.received > received:
+                pause_s = FIRST_PAUSE_S
+            self._stop.wait(pause_s)
+            pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
+        self.link.close()
+
+    def step(self) -> None:
+        """One read and all that follows from it."""
+        chunks = self.link.read(READ_TIMEOUT_S)
+        if chunks is None:
+            self._watch_silence()
+            return
+        self._heard_s = time.monotonic()
+        samples = self.decoder.feed(chunks)
+        if not samples:
+            self._watch_undecoded(sum(len(chunk.data) for chunk in chunks))
+            return
+        for one in samples:
+            for stamped in self.clock.stamp(one):
+                self._count(stamped, rejected=one.lost)
+                self._push(self._axes.apply(stamped))
+        self.counts.bad = self.decoder.bad
+        self._events.extend(self.clock.take_events())
+        if self.state != "running":
+            self._back()
+
+    def _count(self, stamped: SampleBlock, rejected: int) -> None:
+        self.counts.received += len(stamped)
+        self._newest_t_ns = int(stamped.t_ns[-1])
+        if stamped.lost:
+            self.counts.lost += max(0, stamped.lost - rejected)
+            self._event("samples_lost", f"{stamped.lost} samples missing")
+
+    def _watch_silence(self) -> None:
+        silent_s = time.monotonic() - self._heard_s
+        if self._silence_s and silent_s > self._silence_s:
+            raise LinkLost(f"{self.link.name} silent for {silent_s:.1f} s")
+
+    def _watch_undecoded(self, size: int) -> None:
+        self.counts.bad = self.decoder.bad
+        if self.state == "running":
+            return
+        self._undecoded += size
+        if self._undecoded >= UNDECODED_BYTES:
+            why = self.decoder.hint or "wrong baud rate, or another protocol than the configured one"
+            self.text = f"{self.link.name}: {self._undecoded} bytes and no sample in them; {why}"
+
+    def _back(self) -> None:
+        if self.state == "lost":
+            self._event("link_back", f"{self.link.name} is back")
+        self.state, self.text, self._undecoded = "running", "", 0
+
+    def _gone(self, error: LinkError) -> None:
+        if self.state == "running":
+            self._event("link_lost", str(error))
+            self.state = "lost"
+        self.text = f"{error}; trying again"
+        self.link.close()
+        self.decoder.reset()
+        self.clock.pause()
+
+    def _event(self, kind: str, text: str) -> None:
+        # the host's clock at the moment, in the epoch of the samples
+        t_ns = self._newest_t_ns if self.times_are_unix else time.monotonic_ns()
+        self._events.append(Event(kind, t_ns, text))
+
+
+def axis_map(table: dict[str, str]) -> AxisMap:
+    """The map of ``[device.axes]``, e.g. ``{"gz": "-gy"}``: output axis <- signed measured axis.
+
+    Raises:
+        KeyError: an axis that is none of AXES, as ``KeyError(key, word)``
+    """
+    source, sign = list(range(6)), [1.0] * 6
+    for axis, word in table.items():
+        bare = word.lstrip("+-")
+        if axis not in AXES or bare not in AXES or len(word) - len(bare) > 1:
+            raise KeyError(axis, word)
+        source[AXES.index(axis)] = AXES.index(bare)
+        sign[AXES.index(axis)] = -1.0 if word.startswith("-") else 1.0
+    return AxisMap(tuple(source), tuple(sign))

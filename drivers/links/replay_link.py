@@ -1,0 +1,331 @@
+"""A file in place of a device: recordings, CAN logs and captured bytes, at their own pace or another.
+
+What the file is decides what the link carries:
+
+- recordings (``drivers.recording``: CSV, .npz, Parquet, Arrow, a folder) travel as messages for the decoder
+  ``samples``;
+- CAN logs (.asc .blf .log .trc, CSV of python-can, CSV with ``t``, ``id_hex``, ``data_hex``) travel as frames;
+- captured bytes (.bin .raw .txt, also with .gz) travel as bytes.
+
+Recordings and logs keep their own times (``epoch`` unix). Bytes have none: with ``bytes_per_second`` each
+chunk gets the time at which that rate brings it, without it the time it was read.
+
+``read`` raises ``LinkEnded`` once all was given. A file cut off in the middle is given up to the cut, and
+the ending says so. ``build`` looks at a CSV's header, since the decoder must fit; all else waits for ``open``.
+"""
+
+import binascii
+import csv
+import gzip
+import io
+import struct
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Final, Literal
+
+from drivers.errors import ConfigError, LinkEnded, LinkLost, LinkUnavailable, RecordingError
+from drivers.links.base import Carrier, Link, LinkSettings
+from drivers.plugin import nearest
+from drivers.recording import FORMATS, Recording, iter_blocks, load_samples
+from drivers.sample import EXTENDED_ID, Chunk
+from drivers.sample_message import pack
+
+if TYPE_CHECKING:
+    import can
+
+DEFAULT_DECODER: Final = "samples"
+CAN_LOGS: Final = (".asc", ".blf", ".log", ".trc")
+CAPTURES: Final = (".bin", ".raw", ".txt")
+BATCH: Final = 1000
+"""Chunks a read gives at most, so that none is without end."""
+ROWS_AT_ONCE: Final = 4096
+STEP_S: Final = 0.02
+"""Paced recordings and bytes come in pieces of this length, as from a device with a small buffer."""
+CHUNK_BYTES: Final = 4096
+PYTHON_CAN_HEADER: Final = "timestamp,arbitration_id"
+LARGEST_STANDARD_ID: Final = 0x7FF
+DAMAGE: Final = (EOFError, zlib.error, gzip.BadGzipFile, struct.error, binascii.Error)
+"""What readers raise at a place where a file is cut or damaged, beside ValueError."""
+
+Kind = Literal["recording", "log", "capture"]
+Timed = tuple[float, Chunk]
+"""Seconds from the start of the file, and what comes then."""
+CARRIERS: Final[dict[Kind, Carrier]] = {"recording": "messages", "log": "frames", "capture": "bytes"}
+
+
+class Settings(LinkSettings, frozen=True, kw_only=True):
+    """Keys of a replay."""
+
+    path: str
+    speed: str | float = "recorded"
+    """"recorded", "max", or a factor: 10 = ten times as fast."""
+    rate: float | None = None
+    """Hz; for a recording with neither t nor fs."""
+    bytes_per_second: float | None = None
+    """Pace of captured bytes, a tenth of the baud rate; absent: as fast as they are read."""
+    channel: str | None = None
+    """Only frames of this channel of a CAN log."""
+
+
+@dataclass(slots=True)
+class _Source:
+    """An opened file: what it still has to give."""
+
+    items: Iterator[Timed]
+    close: Callable[[], object]
+
+
+class ReplayLink:
+    """One file, given once for each time it is opened."""
+
+    def __init__(self, settings: Settings, kind: Kind, pace: float) -> None:
+        self._settings = settings
+        self._path = Path(settings.path).expanduser()
+        self._kind: Kind = kind
+        self._pace = pace  # file seconds a second; inf = no waiting
+        self.carrier: Carrier = CARRIERS[kind]
+        self.epoch: Literal["monotonic", "unix"] = "monotonic" if kind == "capture" else "unix"
+        self.name = f"replay of {settings.path}"
+        self.notes: tuple[str, ...] = ()
+        self._source: _Source | None = None
+        self._next: Timed | None = None
+        self._closing = threading.Event()
+        self._in_use = threading.Lock()
+        self._started_s = 0.0
+
+    def open(self) -> None:
+        """Open the file at its start; ``LinkUnavailable`` when it is not there or not what it seemed."""
+        with self._in_use:
+            if self._source is not None:
+                return
+            self.notes = ()
+            try:
+                self._source = self._open_source()
+                self._advance()
+            except OSError as error:
+                self._shut()
+                why = error.strerror or " ".join(str(error).split())
+                raise LinkUnavailable(f"{self._path}: cannot be replayed: {why}") from error
+            except (RecordingError, ConfigError, ValueError) as error:
+                self._shut()
+                raise LinkUnavailable(f"{self._path}: cannot be replayed: {error}") from error
+            self._started_s = time.monotonic()
+            self._closing.clear()
+
+    def read(self, timeout_s: float) -> list[Chunk] | None:
+        """What is due, waiting up to ``timeout_s`` for the first of it."""
+        deadline = time.monotonic() + timeout_s
+        with self._in_use:
+            while self._source is not None and not self._closing.is_set():
+                if self._next is None:
+                    raise LinkEnded(" ".join((f"{self._path}: the end of the file.", *self.notes)))
+                now = time.monotonic()
+                due = self._started_s + self._next[0] / self._pace
+                if due <= now:
+                    return self._take((now - self._started_s) * self._pace)
+                if now >= deadline:
+                    return None
+                self._closing.wait(min(due, deadline) - now)
+        raise LinkLost(f"{self.name}: the link is closed")
+
+    def close(self) -> None:
+        """Close the file; ends a waiting ``read``."""
+        self._closing.set()
+        with self._in_use:
+            self._shut()
+
+    def _take(self, until_s: float) -> list[Chunk]:
+        chunks: list[Chunk] = []
+        while self._next is not None and self._next[0] <= until_s and len(chunks) < BATCH:
+            chunks.append(self._next[1])
+            self._advance()
+        return chunks
+
+    def _advance(self) -> None:
+        """Fetch the next item; a file that is damaged from here on ends here."""
+        assert self._source is not None
+        try:
+            self._next = next(self._source.items, None)
+        except (*DAMAGE, ValueError) as error:
+            self._next = None
+            self.notes += (f"It is cut off or damaged there: {' '.join(str(error).split())}.",)
+
+    def _shut(self) -> None:
+        source, self._source = self._source, None
+        self._next = None
+        if source is not None:
+            source.close()
+
+    def _open_source(self) -> _Source:
+        if self._kind == "recording":
+            recording = load_samples(self._path, self._settings.rate)
+            self.notes = recording.notes
+            return _Source(_messages(recording, self._rows(recording)), lambda: None)
+        if self._kind == "log":
+            return _log(self._path, self._settings.channel)
+        return _capture(self._path, self._settings.bytes_per_second)
+
+    def _rows(self, recording: Recording) -> int:
+        """Rows a message: few where somebody waits for each, many where nobody does."""
+        t, n = recording.t_s, len(recording)
+        if self._pace == float("inf") or n < 2:
+            return ROWS_AT_ONCE
+        rate = recording.rate_hz if t is None else (n - 1) / max(float(t[-1] - t[0]), 1e-9)
+        return min(max(1, round((rate or 1.0) * STEP_S * self._pace)), ROWS_AT_ONCE)
+
+
+def _messages(recording: Recording, rows: int) -> Iterator[Timed]:
+    """Messages of ``rows`` samples, each due with its newest sample."""
+    given = 0
+    start_ns: int | None = None
+    for samples in iter_blocks(recording, rows):
+        given += len(samples)
+        start_ns = int(samples.t_ns[0]) if start_ns is None else start_ns
+        newest_ns = int(samples.t_ns[-1])
+        yield (newest_ns - start_ns) * 1e-9, Chunk(pack("replay", given, samples), newest_ns)
+
+
+# --- CAN logs ------------------------------------------------------------------------------------
+
+
+def _log(path: Path, channel: str | None) -> _Source:
+    if _plain_suffix(path) == ".csv" and not _header(path).startswith(PYTHON_CAN_HEADER):
+        stream = _text(path)
+        return _Source(_from_start(_csv_frames(stream, channel)), stream.close)
+    import can
+
+    reader = can.LogReader(path)
+    return _Source(_from_start(_log_frames(iter(reader), channel)), reader.stop)
+
+
+def _log_frames(messages: "Iterator[can.Message]", channel: str | None) -> Iterator[Chunk]:
+    """Data frames of a log that python-can reads."""
+    for message in messages:
+        if message.is_error_frame or message.is_remote_frame:
+            continue
+        if channel is None or str(message.channel) == channel:
+            address = message.arbitration_id | (EXTENDED_ID if message.is_extended_id else 0)
+            yield Chunk(bytes(message.data), round(message.timestamp * 1e9), address)
+
+
+def _csv_frames(stream: IO[str], channel: str | None) -> Iterator[Chunk]:
+    """Data frames of a CSV with t (s), id_hex, data_hex and perhaps channel or bus, and extended (0 or 1)."""
+    rows = csv.reader(stream)
+    columns = {name: i for i, name in enumerate(next(rows))}
+    t, identifier, data = columns["t"], columns["id_hex"], columns["data_hex"]
+    lane = columns.get("channel", columns.get("bus"))
+    extended = columns.get("extended")
+    for row in rows:
+        if len(row) != len(columns):
+            raise ValueError(f"line {rows.line_num} has {len(row)} fields, not {len(columns)}")
+        if channel is not None and (lane is None or row[lane] != channel):
+            continue
+        address = int(row[identifier], 16)
+        wide = address > LARGEST_STANDARD_ID if extended is None else row[extended] == "1"
+        flag = EXTENDED_ID if wide else 0
+        yield Chunk(bytes.fromhex(row[data]), round(float(row[t]) * 1e9), address | flag)
+
+
+def _from_start(chunks: Iterator[Chunk]) -> Iterator[Timed]:
+    start_ns: int | None = None
+    for chunk in chunks:
+        start_ns = chunk.t_ns if start_ns is None else start_ns
+        yield (chunk.t_ns - start_ns) * 1e-9, chunk
+
+
+# --- captured bytes ------------------------------------------------------------------------------
+
+
+def _capture(path: Path, bytes_per_second: float | None) -> _Source:
+    stream = _binary(path)
+    if bytes_per_second is None:
+        return _Source(_bytes_now(stream), stream.close)
+    return _Source(_bytes_paced(stream, bytes_per_second), stream.close)
+
+
+def _bytes_now(stream: IO[bytes]) -> Iterator[Timed]:
+    while data := stream.read(CHUNK_BYTES):
+        yield 0.0, Chunk(data, time.monotonic_ns())
+
+
+def _bytes_paced(stream: IO[bytes], bytes_per_second: float) -> Iterator[Timed]:
+    start_ns = time.monotonic_ns()
+    size = min(max(1, round(bytes_per_second * STEP_S)), CHUNK_BYTES)
+    given = 0
+    while data := stream.read(size):
+        given += len(data)
+        at_s = given / bytes_per_second
+        yield at_s, Chunk(data, start_ns + round(at_s * 1e9))
+
+
+# --- what kind of file ---------------------------------------------------------------------------
+
+
+def _kind(path: Path) -> Kind:
+    """What the path holds, by its suffix and, for CSV, its header. Raises ConfigError for neither."""
+    suffix = _plain_suffix(path)
+    if suffix in CAN_LOGS:
+        return "log"
+    if suffix in CAPTURES:
+        return "capture"
+    if path.is_dir():
+        return "recording"
+    if suffix == ".csv":
+        header = _header(path)
+        is_log = header.startswith(PYTHON_CAN_HEADER) or {"t", "id_hex", "data_hex"} <= {*header.split(",")}
+        return "log" if is_log else "recording"
+    if suffix in FORMATS:
+        return "recording"
+    known = (*FORMATS, *CAN_LOGS, *CAPTURES)
+    raise ConfigError(f'path "{path}": nothing to replay by its suffix{nearest(suffix, known)}')
+
+
+def _plain_suffix(path: Path) -> str:
+    """The last suffix, or the one before .gz."""
+    suffixes = [s.lower() for s in path.suffixes]
+    if suffixes and suffixes[-1] == ".gz":
+        suffixes.pop()
+    return suffixes[-1] if suffixes else ""
+
+
+def _header(path: Path) -> str:
+    """First line of a text file; "" while there is none to read."""
+    try:
+        with _text(path) as stream:
+            return stream.readline(1000).strip()
+    except (OSError, UnicodeDecodeError, *DAMAGE):
+        return ""  # open, or the recording's reader, says what is wrong with it
+
+
+def _binary(path: Path) -> IO[bytes]:
+    stream: IO[bytes] = gzip.open(path, "rb") if path.suffix.lower() == ".gz" else path.open("rb")  # type: ignore[assignment]
+    return stream
+
+
+def _text(path: Path) -> IO[str]:
+    return io.TextIOWrapper(_binary(path), "utf-8", newline="")
+
+
+def build(settings: Settings) -> Link:
+    """The link of these settings.
+
+    Raises ``ConfigError`` for a speed that is none, and for a file that is nothing to replay.
+    """
+    return ReplayLink(settings, _kind(Path(settings.path).expanduser()), _pace(settings))
+
+
+def _pace(settings: Settings) -> float:
+    """File seconds a second."""
+    for key, value in (("rate", settings.rate), ("bytes_per_second", settings.bytes_per_second)):
+        if value is not None and not 0.0 < value < float("inf"):
+            raise ConfigError(f"{key} = {value:g}; it is above 0")
+    words = {"recorded": 1.0, "max": float("inf")}
+    speed = settings.speed
+    factor = words.get(speed, 0.0) if isinstance(speed, str) else speed
+    if not factor > 0.0:
+        raise ConfigError(f'speed = "{speed}"; known are "recorded", "max", or a factor above 0')
+    return factor

@@ -1,0 +1,197 @@
+"""Serial ports, local or networked: any URL that pyserial knows.
+
+Bytes come out as they arrived, cut anywhere. One thread reads up to 4096 bytes with the port's own
+short timeout (10 ms): that costs a tenth of reading frame by frame, and no byte waits longer than that
+timeout. ``close`` only raises a flag and ends the pending read; the port itself is closed once the reader
+has left it, as a file number closed under a waiting reader may by then belong to another file.
+
+Outcomes of ``open``: the port, or ``LinkUnavailable`` that says what to do about it (absent: which
+ports there are; no permission; held by another program). Of ``read``: bytes, None, or ``LinkLost``
+when the device was unplugged or the other end hung up. Nothing is ever written to the device.
+"""
+
+import contextlib
+import errno
+import importlib.util
+import threading
+import time
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from drivers.errors import ConfigError, LinkLost, LinkUnavailable
+from drivers.links.base import Carrier, Link, LinkSettings
+from drivers.plugin import nearest
+from drivers.sample import Chunk
+
+if TYPE_CHECKING:
+    import serial
+
+DEFAULT_DECODER: Final = ""
+READ_SIZE: Final = 4096
+"""Bytes; more than 10 ms at 3 Mbit/s."""
+LONGEST_READ_TIMEOUT_S: Final = 0.1
+"""A port without ``cancel_read`` is closed after at most this long."""
+STOP_BITS: Final = (1.0, 1.5, 2.0)
+SCHEMES: Final = ("socket", "rfc2217", "loop", "spy", "alt", "hwgrep", "cp2110")
+"""URL schemes that come with pyserial."""
+
+
+class Settings(LinkSettings, frozen=True, kw_only=True):
+    """Keys of a serial link."""
+
+    port: str
+    """/dev/ttyUSB0, COM3, socket://host:port, rfc2217://host:port, hwgrep://REGEX."""
+    baudrate: int = 115200
+    bytesize: Literal[5, 6, 7, 8] = 8
+    parity: Literal["N", "E", "O", "M", "S"] = "N"
+    stopbits: float = 1.0
+    rtscts: bool = False
+    xonxoff: bool = False
+    exclusive: bool = True
+    """Keep every other program from reading the same port; where the system can."""
+    read_timeout: float = 0.01
+    """Seconds that bytes may wait for more to join them; at most 0.1."""
+
+
+class SerialLink:
+    """One serial port."""
+
+    carrier: Carrier = "bytes"
+    epoch: Literal["monotonic", "unix"] = "monotonic"
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._port: serial.SerialBase | None = None
+        self._closing = threading.Event()
+        self._in_use = threading.Lock()  # held while the port is read, opened or closed
+        self.name = f"{settings.port} at {settings.baudrate} baud"
+
+    def open(self) -> None:
+        """Open the port; ``LinkUnavailable`` says why it cannot be, and what to do."""
+        import serial
+
+        with self._in_use:
+            if self._port is not None:
+                return
+            s = self._settings
+            try:
+                self._port = serial.serial_for_url(
+                    s.port,
+                    baudrate=s.baudrate,
+                    bytesize=s.bytesize,
+                    parity=s.parity,
+                    stopbits=s.stopbits,
+                    rtscts=s.rtscts,
+                    xonxoff=s.xonxoff,
+                    timeout=s.read_timeout,
+                    # URL handlers without a lock take the key and leave it aside
+                    **({"exclusive": True} if s.exclusive else {}),
+                )
+            except (OSError, ValueError, NotImplementedError) as error:
+                raise LinkUnavailable(_why_not_open(s.port, error)) from error
+            self._closing.clear()
+
+    def read(self, timeout_s: float) -> list[Chunk] | None:
+        """Bytes that came, as one chunk; None after ``timeout_s`` without any."""
+        deadline = time.monotonic() + timeout_s
+        with self._in_use:
+            port = self._port
+            while port is not None and not self._closing.is_set():
+                data = self._read_some(port)
+                if data:
+                    return [Chunk(data, time.monotonic_ns())]
+                if time.monotonic() >= deadline:
+                    return None
+        raise LinkLost(f"{self._settings.port}: the link is closed")
+
+    def close(self) -> None:
+        """Close the port, once a waiting ``read`` has ended."""
+        self._closing.set()
+        port = self._port
+        cancel = getattr(port, "cancel_read", None)  # not every URL handler has it
+        if cancel is not None:
+            # it fails when the reader dropped the port in this very moment: then nothing waits
+            with contextlib.suppress(OSError, TypeError):
+                cancel()
+        with self._in_use:
+            self._drop_port()
+
+    def _read_some(self, port: "serial.SerialBase") -> bytes:
+        try:
+            data: bytes = port.read(READ_SIZE)
+        except OSError as error:
+            self._drop_port()
+            raise LinkLost(
+                f"{self._settings.port}: the device is gone (unplugged, switched off, or read by "
+                f"another program): {_plain(error)}"
+            ) from error
+        return data
+
+    def _drop_port(self) -> None:
+        port, self._port = self._port, None
+        if port is not None:
+            port.close()
+
+
+def _why_not_open(port: str, error: Exception) -> str:
+    """One line: what is wrong with the port, and what would help."""
+    number = getattr(error, "errno", None)
+    if number == errno.ENOENT:
+        return f"{port}: no such port; {_ports()}"
+    if number in (errno.EACCES, errno.EPERM):
+        return f"{port}: no permission; add the user to the group dialout (sudo usermod -aG dialout $USER)"
+    if number in (errno.EAGAIN, errno.EBUSY):
+        return f"{port}: held by another program; close it, or see who it is with: fuser {port}"
+    if number in (errno.ENODEV, errno.ENXIO, errno.EIO):
+        return f"{port}: no device behind this port; is it plugged in and switched on? {_ports()}"
+    if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR):
+        return f"{port}: not a serial port; {_ports()}"
+    return f"{port}: cannot be opened: {_plain(error)}"
+
+
+def _ports() -> str:
+    """What ports there are, for people."""
+    from serial.tools import list_ports
+
+    found = sorted(info.device for info in list_ports.comports())
+    return f"ports here: {', '.join(found)}" if found else "this computer shows no serial port"
+
+
+def _plain(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def build(settings: Settings) -> Link:
+    """The link of these settings; opens nothing.
+
+    Raises ``ConfigError`` for a URL scheme, stop bits or a timeout that cannot be.
+    """
+    if not settings.port:
+        raise ConfigError('port is empty; it is a port ("/dev/ttyUSB0") or a URL ("socket://host:port")')
+    if settings.baudrate <= 0:
+        raise ConfigError(f"baudrate = {settings.baudrate}; it is above 0")
+    if settings.stopbits not in STOP_BITS:
+        raise ConfigError(f"stopbits = {settings.stopbits}; known are 1, 1.5, 2")
+    if not 0.0 < settings.read_timeout <= LONGEST_READ_TIMEOUT_S:
+        raise ConfigError(
+            f"read_timeout = {settings.read_timeout}; it is above 0 and at most {LONGEST_READ_TIMEOUT_S} s"
+        )
+    _check_scheme(settings.port)
+    return SerialLink(settings)
+
+
+def _check_scheme(port: str) -> None:
+    scheme, found, _ = port.partition("://")
+    if found and scheme.lower() not in SCHEMES and not _handler(scheme.lower()):
+        raise ConfigError(f'port "{port}": unknown kind of URL "{scheme}"{nearest(scheme, SCHEMES)}')
+
+
+def _handler(scheme: str) -> bool:
+    """Whether pyserial, or a package that extends it, has a handler for this scheme."""
+    import serial
+
+    packages: Any = serial.protocol_handler_packages
+    return any(
+        importlib.util.find_spec(f"{package}.protocol_{scheme}") is not None
+        for package in packages
+        if scheme.isidentifier() and importlib.util.find_spec(package) is not None
+    )

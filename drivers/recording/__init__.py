@@ -1,0 +1,313 @@
+"""Recordings in and out: CSV (plain or gzip), .npz, Parquet and Arrow IPC, or a folder of segments.
+
+In comes a path, out comes one ``Recording``: times, six axes, temperature, a stated rate, and notes
+that say in plain sentences what was found and what was done about it. Each format has one module
+that only finds columns (``Table``); what columns mean is decided once, here in ``_assemble``.
+
+Outcomes: a ``Recording`` with at least one sample; ``RecordingError`` when the file is none (one
+line: file, what is wrong, what would be right); ``ConfigError`` when the file is one but more has to
+be said (``--rate``) or installed (pyarrow). A file cut off in the middle is read up to the cut.
+What is doubtful is never passed on as a number: a line without its end, an unreadable field or an
+infinite value becomes missing, and a note counts it.
+
+Time stamps are passed on as stored, with their jitter, gaps and steps back. Nothing is resampled,
+sorted or filled here, no unit is guessed, and nothing is ever unpickled.
+"""
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import ConfigError, RecordingError
+from drivers.recording.arrow_format import (
+    read_ipc,
+    read_parquet,
+    write_ipc_file,
+    write_ipc_stream,
+    write_parquet,
+)
+from drivers.recording.csv_format import read_csv, write_csv, write_csv_gz
+from drivers.recording.npz_format import read_npz, write_npz
+from drivers.recording.table import EXAMPLE_HEADER, Table, listed
+from drivers.sample import AXES, Floats, SampleBlock, block
+
+T_LIMIT_S: Final = 9.2e9  # int64 nanoseconds end at 9.22e9 s; beyond it t is not in seconds
+
+
+@dataclass(frozen=True, slots=True)
+class _Format:
+    read: Callable[[Path], Table]
+    write: Callable[[Path, Mapping[str, Floats]], None]
+
+
+FORMATS: Final[Mapping[str, _Format]] = {
+    ".csv": _Format(read_csv, write_csv),
+    ".csv.gz": _Format(read_csv, write_csv_gz),
+    ".npz": _Format(read_npz, write_npz),
+    ".parquet": _Format(read_parquet, write_parquet),
+    ".arrow": _Format(read_ipc, write_ipc_file),
+    ".feather": _Format(read_ipc, write_ipc_file),
+    ".arrows": _Format(read_ipc, write_ipc_stream),
+}
+"""Suffixes of recordings, how each is read and written."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """All samples of one file or folder, in stored order; arrays are read-only."""
+
+    t_s: Floats | None  # [n] s as stored, any origin; None where only a rate is known
+    values: Floats  # [n, 6] in AXES order, rad/s and m/s²; NaN = missing or absent
+    temperature_c: Floats  # [n] °C; NaN = missing or absent
+    rate_hz: float | None  # stated (fs of the file, or the caller's), not measured
+    axes: tuple[str, ...]  # axes present as columns, in AXES order
+    notes: tuple[str, ...]  # what was found and done
+
+    def __len__(self) -> int:
+        return int(self.values.shape[0])
+
+
+def load_samples(path: Path, rate_hz: float | None = None) -> Recording:
+    """Read a recording, or a folder of segments sorted by name as one recording.
+
+    ``rate_hz`` is used where the file has no ``t``, and goes before the file's own ``fs``.
+
+    Raises RecordingError when the path holds no recording, ConfigError when a rate or a library is missing
+    or the suffix is unknown.
+    """
+    if rate_hz is not None and not (np.isfinite(rate_hz) and rate_hz > 0.0):
+        raise ConfigError(f"--rate {rate_hz:g}: a sample rate is a positive number of Hz")
+    try:
+        return _load_folder(path, rate_hz) if path.is_dir() else _load_file(path, rate_hz)
+    except OSError as error:
+        raise RecordingError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
+
+
+def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]:
+    """The recording as blocks of ``rows`` samples at most; ``t_ns`` are the recording's own times.
+
+    Without ``t`` the first sample is at 0 and the rest follow at the stated rate.
+    """
+    for start in range(0, len(recording), rows):
+        part = slice(start, min(start + rows, len(recording)))
+        yield block(_times_ns(recording, part), recording.values[part], recording.temperature_c[part])
+
+
+def save_samples(
+    path: Path,
+    t_s: Floats,
+    values: Floats,
+    temperature_c: Floats | None = None,
+    axes: Sequence[str] | None = None,
+) -> None:
+    """Write a recording in the format of the path's suffix; float64 comes back bit for bit.
+
+    ``t_s`` [n] s, ``values`` [n, 6] in AXES order, ``temperature_c`` [n] °C. ``axes`` names the columns
+    to write; by default those with at least one value. The file appears whole or not at all.
+
+    Raises ConfigError for a suffix or place that cannot be written, RecordingError for unfit arrays.
+    """
+    columns = _columns_to_save(path, t_s, values, temperature_c, axes)
+    write = _format(path).write
+    if not path.parent.is_dir():
+        raise ConfigError(f"{path}: cannot be written: there is no folder {path.parent}")
+    part = path.with_name(path.name + ".part")
+    try:
+        write(part, columns)
+        os.replace(part, path)
+    except (IsADirectoryError, PermissionError) as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def is_recording(path: Path) -> bool:
+    """Whether the path's suffix is that of a recording; the file itself is not looked at."""
+    return _suffix(path) in FORMATS
+
+
+# --- from columns to a recording -----------------------------------------------------------------
+
+
+def _load_file(path: Path, rate_hz: float | None) -> Recording:
+    if path.stat().st_size == 0:
+        raise RecordingError(f"{path}: the file is empty; a recording has columns {EXAMPLE_HEADER}")
+    return _assemble(path, _format(path).read(path), rate_hz)
+
+
+def _assemble(path: Path, table: Table, rate_hz: float | None) -> Recording:
+    """Give columns their meaning: lengths, times, rate, missing values."""
+    n = _common_length(path, table.columns)
+    notes = list(table.notes)
+    rate = _stated_rate(table.fs, rate_hz, notes)
+    t_s, rows = _usable_times(path, table.columns.get("t"), rate, notes)
+    if t_s is None and rate is None:
+        raise ConfigError(f"{path}: has neither t nor fs, so its rate is not known; give it with --rate HZ")
+    axes = tuple(a for a in AXES if a in table.columns)
+    values = np.full((n, len(AXES)), np.nan)
+    for axis in axes:
+        values[:, AXES.index(axis)] = table.columns[axis]
+    temperature_c = table.columns.get("temperature", np.full(n, np.nan))
+    values, temperature_c = values[rows], temperature_c[rows].copy()
+    _drop_infinite(values, temperature_c, notes)
+    return _recording(t_s, values, temperature_c, rate, axes, notes)
+
+
+def _recording(
+    t_s: Floats | None,
+    values: Floats,
+    temperature_c: Floats,
+    rate_hz: float | None,
+    axes: tuple[str, ...],
+    notes: Sequence[str],
+) -> Recording:
+    for array in (t_s, values, temperature_c):
+        if array is not None:
+            array.flags.writeable = False
+    return Recording(t_s, values, temperature_c, rate_hz, axes, tuple(notes))
+
+
+def _common_length(path: Path, columns: Mapping[str, Floats]) -> int:
+    first = next(iter(columns))
+    n = columns[first].size
+    for name, column in columns.items():
+        if column.size != n:
+            raise RecordingError(
+                f"{path}: {name} has {column.size} values but {first} has {n}; columns must be equally long"
+            )
+    if n == 0:
+        raise RecordingError(f"{path}: has columns but no samples")
+    return n
+
+
+def _stated_rate(fs: float | None, rate_hz: float | None, notes: list[str]) -> float | None:
+    if rate_hz is not None and fs is not None and rate_hz != fs:
+        notes.append(f"The file states {fs:g} Hz; {rate_hz:g} Hz was asked for and is used.")
+    return fs if rate_hz is None else float(rate_hz)
+
+
+def _usable_times(
+    path: Path, t: Floats | None, rate_hz: float | None, notes: list[str]
+) -> tuple[Floats | None, NDArray[np.bool_] | slice]:
+    """The times that can be used, and the rows they stand in; None and all rows where t is of no use."""
+    if t is None:
+        return None, slice(None)
+    usable = np.abs(t) < T_LIMIT_S  # false for NaN too
+    lost = int(t.size - np.count_nonzero(usable))
+    if 2 * lost > t.size:
+        what = f"{lost} of {t.size} values of t are no time in seconds (first: {t[~usable][0]:g})"
+        if rate_hz is None:
+            raise RecordingError(f"{path}: {what}; t must be in seconds, or absent and --rate HZ given")
+        notes.append(f"{what}; t was left aside and the stated rate of {rate_hz:g} Hz used.")
+        return None, slice(None)
+    if lost:
+        notes.append(f"{lost} of {t.size} rows have no usable time and were left out.")
+    return t[usable], usable
+
+
+def _drop_infinite(values: Floats, temperature_c: Floats, notes: list[str]) -> None:
+    count = 0
+    for array in (values, temperature_c):
+        infinite = np.isinf(array)
+        count += int(np.count_nonzero(infinite))
+        array[infinite] = np.nan
+    if count:
+        notes.append(f"{count} infinite values were read as missing.")
+
+
+def _times_ns(recording: Recording, part: slice) -> NDArray[np.int64]:
+    if recording.t_s is not None:
+        seconds = recording.t_s[part]
+    elif recording.rate_hz is not None:
+        seconds = np.arange(part.start, part.stop) / recording.rate_hz
+    else:
+        raise RecordingError("a recording needs times or a rate")
+    return np.rint(seconds * 1e9).astype(np.int64)
+
+
+# --- folders -------------------------------------------------------------------------------------
+
+
+def _load_folder(path: Path, rate_hz: float | None) -> Recording:
+    """Segments in the order of their names; one that cannot be read is left out, with a note."""
+    segments = sorted(p for p in path.iterdir() if is_recording(p) and p.name[0] != "." and p.is_file())
+    if not segments:
+        raise RecordingError(f"{path}: no recordings in this folder; known are {' '.join(FORMATS)}")
+    parts: list[Recording] = []
+    notes: list[str] = []
+    for segment in segments:
+        try:
+            part = _load_file(segment, rate_hz)
+        except RecordingError as error:
+            notes.append(f"A segment was left out: {error}.")
+            continue
+        parts.append(part)
+        notes += [f"{segment.name}: {note}" for note in part.notes]
+    if not parts:
+        raise RecordingError(f"{path}: none of {len(segments)} segments can be read; {notes[0]}")
+    return _joined(path, parts, notes)
+
+
+def _joined(path: Path, parts: Sequence[Recording], notes: list[str]) -> Recording:
+    times = [part.t_s for part in parts if part.t_s is not None]
+    rates = {part.rate_hz for part in parts}
+    if 0 < len(times) < len(parts):
+        raise RecordingError(f"{path}: some segments have t and some have not; all must, or none")
+    if not times and len(rates) > 1:
+        raise RecordingError(f"{path}: its segments state different rates and have no t; give --rate HZ")
+    back = sum(a[-1] >= b[0] for a, b in pairwise(times))
+    if back:
+        notes.append(f"t does not go on from one segment to the next at {back} of {len(times) - 1} joints.")
+    if not times and len(parts) > 1:
+        notes.append("The segments have no t; each is taken to follow the one before without a gap.")
+    return _recording(
+        np.concatenate(times) if times else None,
+        np.concatenate([part.values for part in parts]),
+        np.concatenate([part.temperature_c for part in parts]),
+        rates.pop() if len(rates) == 1 else None,
+        tuple(a for a in AXES if any(a in part.axes for part in parts)),
+        notes,
+    )
+
+
+# --- suffixes and saving -------------------------------------------------------------------------
+
+
+def _suffix(path: Path) -> str:
+    name = path.name.lower()
+    return next((suffix for suffix in FORMATS if name.endswith(suffix)), "")
+
+
+def _format(path: Path) -> _Format:
+    suffix = _suffix(path)
+    if not suffix:
+        raise ConfigError(f"{path}: not the suffix of a recording; known are {' '.join(FORMATS)}")
+    return FORMATS[suffix]
+
+
+def _columns_to_save(
+    path: Path, t_s: Floats, values: Floats, temperature_c: Floats | None, axes: Sequence[str] | None
+) -> dict[str, Floats]:
+    n = len(t_s)
+    if n == 0 or values.shape != (n, len(AXES)):
+        raise RecordingError(f"{path}: {n} times do not fit values of shape {values.shape}; need [n, 6], n ≥ 1")
+    if temperature_c is not None and temperature_c.shape != (n,):
+        raise RecordingError(f"{path}: {n} times do not fit {temperature_c.size} temperatures")
+    if not np.all(np.abs(t_s) < T_LIMIT_S):
+        raise RecordingError(f"{path}: a time is missing or not in seconds")
+    if axes is None:
+        axes = [axis for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()]
+    unknown = [axis for axis in axes if axis not in AXES]
+    if unknown or not axes:
+        what = f"unknown axis {listed(unknown)}" if unknown else "no axis has a value"
+        raise RecordingError(f"{path}: {what}; axes are {' '.join(AXES)}")
+    columns = {"t": t_s} | {axis: values[:, AXES.index(axis)] for axis in axes}
+    if temperature_c is not None and not np.isnan(temperature_c).all():
+        columns["temperature"] = temperature_c
+    return {name: np.asarray(column, dtype=np.float64) for name, column in columns.items()}

@@ -1,0 +1,111 @@
+"""Parquet and Arrow IPC. pyarrow is an optional library: imported when a file asks for it.
+
+An Arrow file is read up to a cut, batch by batch; Parquet cannot be, since its index stands at the end.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from drivers.errors import ConfigError, RecordingError
+from drivers.recording.table import BATCH_ROWS, Table, chosen_columns
+from drivers.sample import Floats
+
+ARROW_MAGIC: Final = b"ARROW1\0\0"
+ARROW_END: Final = b"\xff\xff\xff\xff\0\0\0\0"  # end-of-stream mark of Arrow IPC
+
+
+def _arrow(path: Path) -> Any:
+    try:
+        import pyarrow as pa
+    except ImportError as error:
+        raise ConfigError(f'{path}: {path.suffix} needs pyarrow: pip install "imu-monitor[arrow]"') from error
+    return pa
+
+
+def read_parquet(path: Path) -> Table:
+    """Only the columns that mean something are read; RecordingError when the file is not whole."""
+    pa = _arrow(path)
+    from pyarrow import parquet
+
+    notes: list[str] = []
+    try:
+        with parquet.ParquetFile(path) as file:
+            chosen = chosen_columns(path, file.schema_arrow.names, notes)
+            table = file.read(columns=list(chosen.values()))
+    except (pa.ArrowException, OSError) as error:
+        raise RecordingError(
+            f"{path}: is no whole Parquet file ({_first_line(error)}); its index stands at the end, "
+            "so one that is cut off cannot be read"
+        ) from error
+    return _table(path, table, chosen, notes)
+
+
+def read_ipc(path: Path) -> Table:
+    """Arrow IPC up to a cut. A file is a stream after one magic word, so both are read as streams."""
+    pa = _arrow(path)
+    notes: list[str] = []
+    data = path.read_bytes()
+    is_file = data.startswith(ARROW_MAGIC)
+    try:
+        reader = pa.ipc.open_stream(pa.py_buffer(data).slice(len(ARROW_MAGIC) if is_file else 0))
+    except (pa.ArrowException, OSError) as error:
+        raise RecordingError(f"{path}: is no Arrow IPC file or stream ({_first_line(error)})") from error
+    chosen = chosen_columns(path, reader.schema.names, notes)
+    if not data.endswith(ARROW_MAGIC.rstrip(b"\0") if is_file else ARROW_END):
+        notes.append("The end mark is missing: the file is cut off and was read up to the cut.")
+    batches: list[Any] = []
+    try:
+        while True:
+            batches.append(reader.read_next_batch())
+    except StopIteration:
+        pass  # the regular end
+    except (pa.ArrowException, OSError) as error:
+        notes.append(f"Only {len(batches)} whole batches could be read: {_first_line(error)}.")
+    return _table(path, pa.Table.from_batches(batches, reader.schema), chosen, notes)
+
+
+def _table(path: Path, table: Any, chosen: Mapping[str, str], notes: list[str]) -> Table:
+    columns = {name: _column(path, key, table.column(key)) for name, key in chosen.items()}
+    return Table(columns, None, notes)
+
+
+def _column(path: Path, key: str, column: Any) -> Floats:
+    """One column as float64, null as NaN."""
+    pa = _arrow(path)
+    numeric = (pa.types.is_floating, pa.types.is_integer, pa.types.is_null)
+    if not any(is_type(column.type) for is_type in numeric):
+        unit = "; t is in seconds" if key == "t" else ""
+        raise RecordingError(f"{path}: {key} holds {column.type}, not numbers{unit}")
+    return np.asarray(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().partition("\n")[0].rstrip(".")
+
+
+def write_parquet(path: Path, columns: Mapping[str, Floats]) -> None:
+    """Write with Parquet's default compression."""
+    pa = _arrow(path)
+    from pyarrow import parquet
+
+    parquet.write_table(pa.table(dict(columns)), path)
+
+
+def write_ipc_file(path: Path, columns: Mapping[str, Floats]) -> None:
+    """Write an Arrow file (Feather version 2)."""
+    pa = _arrow(path)
+    _write_ipc(pa.ipc.new_file, path, pa.table(dict(columns)))
+
+
+def write_ipc_stream(path: Path, columns: Mapping[str, Floats]) -> None:
+    """Write an Arrow stream."""
+    pa = _arrow(path)
+    _write_ipc(pa.ipc.new_stream, path, pa.table(dict(columns)))
+
+
+def _write_ipc(new: Any, path: Path, table: Any) -> None:
+    with new(str(path), table.schema) as writer:
+        writer.write_table(table, max_chunksize=BATCH_ROWS)

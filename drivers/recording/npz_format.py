@@ -1,0 +1,143 @@
+""".npz: one array a column, ``fs`` (Hz) may stand for ``t``.
+
+Arrays of Python objects are refused, never unpickled. A zip archive keeps its index at the end, so
+from a cut file the arrays are found again by the header that stands before each.
+"""
+
+import io
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import RecordingError
+from drivers.recording.table import Table, chosen_columns
+from drivers.sample import Floats
+
+LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # PKWARE APPNOTE 4.3.7
+LOCAL_MAGIC: Final = b"PK\3\4"
+
+
+def read_npz(path: Path) -> Table:
+    """Only the arrays that mean something are read, the whole ones and up to a cut."""
+    notes: list[str] = []
+    with path.open("rb") as file:
+        if file.read(4) != LOCAL_MAGIC:
+            raise RecordingError(f"{path}: is no .npz file (a zip archive with one array a column)")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return _npz_table(path, archive, None, notes)
+    except zipfile.BadZipFile:
+        arrays, cut = _recovered(path.read_bytes())
+        if not arrays:
+            raise RecordingError(f"{path}: is damaged or cut off before the end of its first array") from None
+        at = f" inside {cut}" if cut else ""
+        notes.append(f"The file is cut off{at} and was read up to the cut; later columns are missing.")
+        return _npz_table(path, arrays, cut, notes)
+
+
+def _npz_table(path: Path, archive: Mapping[str, Any], cut: str | None, notes: list[str]) -> Table:
+    chosen = chosen_columns(path, list(archive), notes)
+    columns = {name: _npz_column(path, archive, key) for name, key in chosen.items()}
+    short = next((name for name, key in chosen.items() if key == cut), None)
+    if short is not None:
+        column = columns[short]
+        n = max(other.size for other in columns.values())
+        columns[short] = np.concatenate([column, np.full(n - column.size, np.nan)])
+    return Table(columns, _npz_rate(path, archive, notes), notes)
+
+
+def _npz_column(path: Path, archive: Mapping[str, Any], key: str) -> Floats:
+    """One column as float64; an array of objects is refused, since reading it would run code."""
+    array = _npz_array(path, archive, key)
+    if array.dtype.kind not in "fiu":
+        raise RecordingError(f"{path}: {key} holds {array.dtype}, not numbers")
+    if array.ndim != 1:
+        raise RecordingError(f"{path}: {key} has shape {array.shape}; a column has one dimension")
+    return array.astype(np.float64)
+
+
+def _npz_array(path: Path, archive: Mapping[str, Any], key: str) -> NDArray[Any]:
+    try:
+        return np.asarray(archive[key])
+    except zipfile.BadZipFile as error:
+        raise RecordingError(f"{path}: {key} is damaged: {error}") from error
+    except (ValueError, EOFError, MemoryError, RuntimeError, zlib.error) as error:
+        why = "holds Python objects, not numbers" if "bject array" in str(error) else f"is unreadable: {error}"
+        raise RecordingError(f"{path}: {key} {why}") from error
+
+
+def _npz_rate(path: Path, archive: Mapping[str, Any], notes: list[str]) -> float | None:
+    if "fs" not in archive:
+        return None
+    fs = _npz_array(path, archive, "fs")
+    if fs.size == 1 and fs.dtype.kind in "fiu" and np.isfinite(fs).all() and fs.item() > 0:
+        return float(fs.item())
+    notes.append("fs is not one positive number of Hz and was left aside.")
+    return None
+
+
+def _recovered(data: bytes) -> tuple[dict[str, NDArray[Any]], str | None]:
+    """The arrays of a cut .npz by the headers before each (a zip keeps its index at the end).
+
+    Gives them in order, and the name of the one that the cut goes through, if it goes through one.
+    """
+    arrays: dict[str, NDArray[Any]] = {}
+    at = data.find(LOCAL_MAGIC)
+    while 0 <= at <= len(data) - LOCAL_HEADER.size:
+        _, _, flags, method, _, _, _, packed, _, name_size, extra_size = LOCAL_HEADER.unpack_from(data, at)
+        start = at + LOCAL_HEADER.size + name_size
+        key = data[start - name_size : start].decode("utf-8", errors="replace").removesuffix(".npy")
+        extra = data[start : start + extra_size]
+        if packed == 0xFFFFFFFF and extra[:2] == b"\1\0" and len(extra) >= 20:  # ZIP64, APPNOTE 4.5.3
+            packed = int.from_bytes(extra[12:20], "little")
+        raw, end = _unpacked(data[start + extra_size :], method, packed, sized=not flags & 8)
+        array = _array_up_to_cut(raw)
+        if array is not None:
+            arrays[key] = array
+        if end is None:
+            return arrays, key if array is not None else None
+        at = data.find(LOCAL_MAGIC, start + extra_size + end)
+    return arrays, None
+
+
+def _unpacked(data: bytes, method: int, size: int, *, sized: bool) -> tuple[bytes, int | None]:
+    """A member's content and where it ends in ``data``; None where the cut comes before its end."""
+    if method == zipfile.ZIP_STORED and sized:
+        return data[:size], size if size <= len(data) else None
+    if method != zipfile.ZIP_DEFLATED:
+        return b"", None
+    unzip = zlib.decompressobj(-zlib.MAX_WBITS)
+    try:
+        raw = unzip.decompress(data)
+    except zlib.error:
+        return b"", None
+    return raw, len(data) - len(unzip.unused_data) if unzip.eof else None
+
+
+def _array_up_to_cut(raw: bytes) -> NDArray[Any] | None:
+    """The array of .npy bytes, shorter than its header says where the bytes end early."""
+    file = io.BytesIO(raw)
+    try:
+        if np.lib.format.read_magic(file) != (1, 0):
+            return None
+        shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+    except ValueError:
+        return None
+    if dtype.hasobject or dtype.itemsize == 0 or len(shape) > 1:
+        return None
+    count = min(int(np.prod(shape)), (len(raw) - file.tell()) // dtype.itemsize)
+    array = np.frombuffer(raw, dtype, count, file.tell())
+    return array.reshape(shape) if array.size == np.prod(shape) else array
+
+
+def write_npz(path: Path, columns: Mapping[str, Floats]) -> None:
+    """Write compressed."""
+    arrays: dict[str, Any] = dict(columns)
+    with path.open("wb") as file:
+        np.savez_compressed(file, **arrays)

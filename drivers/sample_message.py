@@ -1,0 +1,173 @@
+"""Samples as one message: ``SampleBlock`` <-> the msgpack map of ``<prefix>/<device>/samples``.
+
+The one place that knows this layout: the daemon publishes with ``pack``, the ``samples`` decoder reads
+with ``unpack``, and a replayed recording travels in it. ``docs/samples-format.md`` is its page.
+
+``t`` is the Unix time of the newest sample in seconds, with ``t0`` (first sample) and ``rate`` (Hz) where the
+batch is evenly spaced to half a microsecond; otherwise ``t`` is the time of each row, float64
+little-endian. A float64 of Unix seconds holds 0.24 µs. Keys that this version does not know are left
+aside, as are columns that are no axis. Sizes are bounded and must agree; what does not is a
+``DecodeError``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import DecodeError
+from drivers.sample import AXES, Floats, Ints, SampleBlock, block
+
+SCHEMA: Final = "imu-monitor/samples/1"
+SCHEMAS: Final = (SCHEMA, "imu-monitor/compensated/1")
+"""Schemas whose payload has this layout."""
+TEMPERATURE: Final = "temperature"
+COLUMNS: Final = (*AXES, TEMPERATURE)
+MAX_ROWS: Final = 1_000_000
+MAX_COLUMNS: Final = 64
+EVEN_NS: Final = 500
+"""A row may stand this far from an even grid: twice the resolution of a float64 of Unix seconds."""
+T_LIMIT_S: Final = 9.2e9
+"""int64 nanoseconds end at 9.22e9 s."""
+RATE_LIMITS_HZ: Final = (1e-6, 1e9)
+
+Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 53)]
+
+
+class _Payload(msgspec.Struct, frozen=True, omit_defaults=True):
+    """The map itself."""
+
+    schema: str
+    axes: list[str]
+    data: bytes
+    t: float | bytes
+    samples: Count
+    device: str = ""
+    lost: Count = 0
+    t0: float | None = None
+    rate: float | None = None
+
+
+_ENCODER: Final = msgspec.msgpack.Encoder()
+_DECODER: Final = msgspec.msgpack.Decoder(_Payload)
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """One message: whose samples, how many that device had sent with it, and the samples."""
+
+    device: str
+    samples: int  # received by the publisher since it started, these included
+    block: SampleBlock  # t_ns are Unix times
+
+
+def pack(device: str, samples: int, rows: SampleBlock, offset_ns: int = 0, schema: str = SCHEMA) -> bytes:
+    """The message of these rows; ``samples`` counts since the start, these included.
+
+    ``offset_ns`` is added to ``t_ns`` to make it Unix time. Axes without any value are left out; a block
+    of nothing but NaN keeps all six.
+    """
+    table = np.column_stack((rows.values, rows.temperature_c))
+    measured: NDArray[np.bool_] = ~np.all(np.isnan(table), axis=0)
+    if not measured.any():
+        measured[: len(AXES)] = True
+    t: float | bytes
+    t, t0, rate = _times(rows.t_ns + offset_ns)
+    return _ENCODER.encode(
+        _Payload(
+            schema=schema,
+            device=device,
+            axes=[name for name, there in zip(COLUMNS, measured, strict=True) if there],
+            data=np.ascontiguousarray(table[:, measured], "<f8").tobytes(),
+            t=t,
+            samples=samples,
+            lost=rows.lost,
+            t0=t0,
+            rate=rate,
+        )
+    )
+
+
+def unpack(data: bytes) -> Batch:
+    """The samples of one message. Raises ``DecodeError`` with what is wrong with it."""
+    try:
+        payload = _DECODER.decode(data)
+    except (msgspec.DecodeError, msgspec.ValidationError, UnicodeDecodeError, RecursionError) as error:
+        raise DecodeError(f"no samples message: {error}") from error
+    if payload.schema not in SCHEMAS:
+        raise DecodeError(f'schema "{payload.schema[:64]}" is not {SCHEMA}')
+    table = _table(payload)
+    t_ns = _times_ns(payload, table.shape[0])
+    values = np.full((t_ns.size, len(AXES)), np.nan)
+    temperature_c = np.full(t_ns.size, np.nan)
+    for column, name in zip(table.T, payload.axes, strict=True):
+        if name == TEMPERATURE:
+            temperature_c = column.copy()
+        elif name in AXES:
+            values[:, AXES.index(name)] = column
+    rows = block(t_ns, values, temperature_c, lost=payload.lost)
+    return Batch(payload.device, payload.samples, rows)
+
+
+def seconds_to_ns(seconds: Floats) -> Ints:
+    """Whole nanoseconds; the integer part is kept apart, so nothing is lost beyond the float's own 0.24 µs."""
+    whole = np.floor(seconds)
+    fraction = np.rint((seconds - whole) * 1e9)
+    result: Ints = whole.astype(np.int64) * 1_000_000_000 + fraction.astype(np.int64)
+    return result
+
+
+def _times(unix_ns: Ints) -> tuple[float | bytes, float | None, float | None]:
+    """``t``, ``t0``, ``rate``: the short form where the rows are evenly spaced."""
+    n = unix_ns.size
+    span_ns = int(unix_ns[-1] - unix_ns[0])
+    if n > 1 and span_ns > 0:
+        grid = unix_ns[0] + np.rint(np.arange(n) * (span_ns / (n - 1))).astype(np.int64)
+        if np.abs(unix_ns - grid).max() <= EVEN_NS:
+            return float(unix_ns[-1]) * 1e-9, float(unix_ns[0]) * 1e-9, (n - 1) * 1e9 / span_ns
+    return _ns_to_seconds(unix_ns).astype("<f8").tobytes(), None, None
+
+
+def _ns_to_seconds(t_ns: Ints) -> Floats:
+    whole, rest = np.divmod(t_ns, 1_000_000_000)
+    result: Floats = whole + rest * 1e-9
+    return result
+
+
+def _table(payload: _Payload) -> Floats:
+    """Rows by columns [n, k], as sizes say."""
+    names: Sequence[str] = payload.axes
+    if not 0 < len(names) <= MAX_COLUMNS or len(set(names)) != len(names):
+        raise DecodeError(f"axes: {len(names)} names; need 1 to {MAX_COLUMNS}, each once")
+    n, rest = divmod(len(payload.data), 8 * len(names))
+    if rest or not 0 < n <= MAX_ROWS:
+        raise DecodeError(f"data: {len(payload.data)} bytes are no 1 to {MAX_ROWS} rows of {len(names)} float64")
+    return np.frombuffer(payload.data, "<f8").reshape(n, len(names)).astype(np.float64)
+
+
+def _times_ns(payload: _Payload, n: int) -> Ints:
+    if isinstance(payload.t, bytes):
+        if len(payload.t) != 8 * n:
+            raise DecodeError(f"t: {len(payload.t)} bytes for {n} rows; need one float64 a row")
+        seconds = np.frombuffer(payload.t, "<f8").astype(np.float64)
+        _check_times(seconds)
+        return seconds_to_ns(seconds)
+    t0, rate = payload.t0, payload.rate
+    if t0 is None or rate is None:
+        if n > 1:
+            raise DecodeError("t is one number, so t0 and rate must be there too")
+        t0, rate = payload.t, 1.0
+    if not RATE_LIMITS_HZ[0] <= rate <= RATE_LIMITS_HZ[1]:
+        raise DecodeError(f"rate: {rate:g} Hz is no sample rate")
+    _check_times(np.array([t0, t0 + (n - 1) / rate]))
+    steps: Ints = np.rint(np.arange(n) * (1e9 / rate)).astype(np.int64)
+    first: Ints = seconds_to_ns(np.array([t0]))
+    return first + steps
+
+
+def _check_times(seconds: Floats) -> None:
+    if not np.all(np.abs(seconds) < T_LIMIT_S):
+        raise DecodeError("t: a time is no Unix time in seconds")

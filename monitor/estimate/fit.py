@@ -1,0 +1,395 @@
+"""Allan curve in, coefficients Q N B K R out, six axes at a time.
+
+The curve is linear in θ = (Q², N², B², K², R²). Each axis is fitted by non-negative least squares
+with weights 1/Var(σ²_i) of the model itself, re-weighted a few times (METHODS: edf weights are
+within a few percent of the Cramér–Rao limit). The unconstrained solution û beside it decides what
+a coefficient is worth: its variance were v(t) = c0 + c1 t + c2 t² if the true θ_a were t, from the
+covariances of ``uncertainty``. A term is in when û_a/√c0, the variance taken as if it were absent,
+passes a threshold; its interval is the set of t that û does not contradict; a term that is not in
+has a one-sided bound.
+
+Real sensors end below half the sample rate. White noise through a low-pass looks, beyond the
+filter's memory, like N²/τ − c/τ²: exactly the column of Q with a negative sign. So when the
+shortest τ contradict the fit, Q² may turn negative (it then stands for the band limit and Q is only
+bounded by the first point of the curve); while they still do, the shortest τ is left out.
+
+A fit refuses nothing: an axis with too few τ, or without noise at all, is UNESTIMATED.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.sample import Floats, Ints
+from monitor.compiled import compiled
+from monitor.estimate.coefficients import Coefficients, Status
+from monitor.estimate.uncertainty import NOISES, Table
+from monitor.noise.effect import Source
+from monitor.noise.effects.angle_random_walk import AngleRandomWalk
+from monitor.noise.effects.bias_instability import BiasInstability
+from monitor.noise.effects.quantization_noise import QuantizationNoise
+from monitor.noise.effects.rate_ramp import RateRamp
+from monitor.noise.effects.rate_random_walk import RateRandomWalk
+
+UNIT_SOURCES: Final[tuple[Source, ...]] = (
+    QuantizationNoise(Q=1.0),
+    AngleRandomWalk(N=1.0),
+    BiasInstability(B=1.0),
+    RateRandomWalk(K=1.0),
+    RateRamp(R=1.0),
+)
+"""Rows of the coefficients; their Allan variances are the columns of the fit."""
+
+ENTER_ONCE: Final = 2.33  # σ: one look at one curve, 1 % of absent terms enter
+ENTER_WATCHED: Final = 3.0  # σ: looked at again and again
+LEAVE_WATCHED: Final = 1.5  # σ
+
+MIN_ROWS = NOISES + 1
+"""Fewer τ than this leave a fit no freedom to be contradicted."""
+
+PASSES = 4
+"""Re-weightings; the last changes a coefficient by less than a hundredth of its deviation."""
+
+MISFIT = 4.5
+"""A short τ contradicts the fit when it is this many σ away."""
+
+SHORT_ROWS = 4
+"""How many of the shortest τ in use are asked whether they contradict the fit."""
+
+TWO_SIDED_95 = 1.959963984540054
+ONE_SIDED_95 = 1.6448536269514722
+
+Q, N, B, K, R = range(5)
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """The columns of the fit for one list of cluster sizes."""
+
+    factors: Ints  # [m]
+    rate_hz: float
+    columns: Floats  # [m, 5] Allan variance at τ0 = 1 of coefficients of one
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """One fit of six axes."""
+
+    coefficients: Coefficients
+    fitted: Floats  # [m, 6] unit², Allan variance of the fitted model; NaN where there is none
+    edf: Floats  # [m, 6] equivalent degrees of freedom of the measured curve; NaN as the curve
+    entered: NDArray[np.bool_]  # [5, 6] terms that are in: hand them to the next fit
+    left_out: Ints  # [6] shortest τ that contradicted every fit
+
+
+def design(factors: Ints, rate_hz: float) -> Design:
+    """The columns of the fit, from the effects' own Allan variances."""
+    m = np.asarray(factors, np.float64)
+    columns = np.ascontiguousarray(np.stack([source.avar(m, 1.0) for source in UNIT_SOURCES], axis=1))
+    columns.flags.writeable = False
+    return Design(factors, rate_hz, columns)
+
+
+def fit(
+    design: Design, table: Table, avar: Floats, terms: Ints, before: NDArray[np.bool_] | None = None
+) -> Fit:
+    """Coefficients of six axes from overlapping Allan variances.
+
+    ``avar`` [m, 6] in unit², NaN where the window is too short; ``terms`` [m, 6] second differences
+    behind each; ``table`` from ``uncertainty`` for the window's length. ``before`` is ``entered`` of the
+    fit before when one looks continuously: terms enter at 3 σ and leave at 1.5 σ; without it, one
+    look at 2.33 σ.
+    """
+    m, axes = avar.shape
+    watched = before is not None
+    entered = np.zeros((5, axes), np.bool_) if before is None else before.copy()
+    theta, lo, hi = np.full((3, 5, axes), np.nan)
+    edf, fitted = np.full((2, m, axes), np.nan)
+    status = np.zeros((5, axes), np.int8)
+    left_out = np.zeros(axes, np.int64)
+    thresholds = (ENTER_WATCHED, LEAVE_WATCHED) if watched else (ENTER_ONCE, ENTER_ONCE)
+    _fit_axes(
+        np.ascontiguousarray(avar.T), terms.T.astype(np.float64), table.terms.astype(np.float64),
+        design.columns, table.covariance, thresholds, entered, theta, lo, hi, status, edf, fitted, left_out,
+    )  # fmt: skip
+    to_si = (design.rate_hz ** np.array([-1.0, -0.5, 0.0, 0.5, 1.0]))[:, None]  # √θ at τ0 = 1 to SI
+    value = np.where(status == Status.ESTIMATED, np.sqrt(np.maximum(theta, 0.0)), np.nan)
+    coefficients = Coefficients(value * to_si, lo * to_si, hi * to_si, status)
+    return Fit(coefficients, fitted, edf, entered, left_out)
+
+
+@compiled
+def _fit_axes(  # type: ignore[no-untyped-def]
+    avar, terms, whole, columns, covariance, thresholds, entered, theta, lo, hi, status, edf, fitted, left_out
+):
+    m = whole.size
+    rows = np.empty(m, np.int64)
+    stretch = np.empty(m)
+    for axis in range(avar.shape[0]):
+        count = 0
+        for i in range(m):
+            if avar[axis, i] > 0.0 and terms[axis, i] > 0.0 and whole[i] > 0.0:
+                rows[count] = i
+                stretch[i] = whole[i] / terms[axis, i]
+                count += 1
+        used = rows[:count]
+        if count < MIN_ROWS:
+            entered[:, axis] = False
+            _white_edf(used, columns, covariance, stretch, edf[:, axis])
+            continue
+        left_out[axis] = _fit_axis(
+            avar[axis], used, stretch, columns, covariance, thresholds, entered[:, axis],
+            theta[:, axis], lo[:, axis], hi[:, axis], status[:, axis], edf[:, axis], fitted[:, axis],
+        )  # fmt: skip
+
+
+@compiled
+def _white_edf(rows, columns, covariance, stretch, edf):  # type: ignore[no-untyped-def]
+    """Before there is a fit: the first seconds of a sensor are white noise."""
+    for i in rows:
+        edf[i] = 2.0 * columns[i, N] ** 2 / (covariance[N, N, i, i] * stretch[i])
+
+
+@compiled
+def _fit_axis(  # type: ignore[no-untyped-def]
+    avar, rows, stretch, columns, covariance, thresholds, entered, theta, lo, hi, status, edf, fitted
+):
+    m = avar.size
+    variance = np.empty(m)
+    normal = np.empty((5, 5))
+    right = np.empty(5)
+    free = False
+    first = 0
+    while True:
+        used = rows[first:]
+        for i in used:  # white noise of that level, to begin with
+            variance[i] = avar[i] * avar[i] * covariance[N, N, i, i] / columns[i, N] ** 2
+        for _ in range(PASSES):
+            _normal_equations(avar, used, variance, columns, normal, right)
+            _solve_nonnegative(normal, right, free, theta)
+            _variances(used, theta, columns, covariance, stretch, variance)
+        if not _contradicted(avar, used[:SHORT_ROWS], theta, columns, variance) or used.size <= MIN_ROWS:
+            break
+        if free:
+            first += 1
+        free = True
+    _normal_equations(avar, used, variance, columns, normal, right)
+    _judge(used, variance, stretch, columns, covariance, normal, right, thresholds, entered, theta, lo, hi, status)
+    for i in rows:
+        model = 0.0
+        for a in range(5):
+            model += columns[i, a] * theta[a]
+        fitted[i] = model if model > 0.0 else np.nan
+    _variances(rows, theta, columns, covariance, stretch, variance)
+    for i in rows:
+        model = 0.0
+        for a in range(5):
+            model += columns[i, a] * max(theta[a], 0.0)
+        edf[i] = 2.0 * model * model / variance[i]
+    if free or first > 0:
+        _bound_by_first_point(avar[rows[0]], edf[rows[0]], columns[rows[0], Q], entered, lo, hi, status)
+    return first
+
+
+@compiled
+def _normal_equations(avar, rows, variance, columns, normal, right):  # type: ignore[no-untyped-def]
+    normal[:] = 0.0
+    right[:] = 0.0
+    for i in rows:
+        weight = 1.0 / variance[i]
+        for a in range(5):
+            x = weight * columns[i, a]
+            right[a] += x * avar[i]
+            for b in range(a + 1):
+                normal[a, b] += x * columns[i, b]
+    for a in range(5):
+        for b in range(a):
+            normal[b, a] = normal[a, b]
+
+
+@compiled
+def _variances(rows, theta, columns, covariance, stretch, variance):  # type: ignore[no-untyped-def]
+    """Var σ²_i of the model; a negative Q² stands for a band limit and adds none."""
+    for i in rows:
+        total = 0.0
+        for a in range(NOISES):
+            if theta[a] <= 0.0:
+                continue
+            total += theta[a] * theta[a] * covariance[a, a, i, i]
+            for b in range(a):
+                if theta[b] > 0.0:
+                    total += 2.0 * theta[a] * theta[b] * covariance[a, b, i, i]
+        variance[i] = total * stretch[i]
+
+
+@compiled
+def _solve_nonnegative(normal, right, free, theta):  # type: ignore[no-untyped-def]
+    """The best of all subsets of Q N B K whose solution is not negative (Q may be, if free)."""
+    best = 0.0
+    solution = np.empty(5)
+    theta[:] = 0.0
+    for subset in range(2**NOISES - 1, 0, -1):
+        if not _solve(normal, right, subset, solution):
+            continue
+        gain = 0.0
+        allowed = True
+        for a in range(NOISES):
+            gain += solution[a] * right[a]
+            allowed = allowed and (solution[a] >= 0.0 or (free and a == Q))
+        if allowed and gain > best:
+            best = gain
+            for a in range(5):
+                theta[a] = solution[a]
+            if subset == 2**NOISES - 1:
+                return
+
+
+@compiled
+def _solve(normal, right, subset, solution):  # type: ignore[no-untyped-def]
+    """Cholesky on the columns of a subset, each scaled to one; False when they cannot be told apart."""
+    factor = np.zeros((5, 5))
+    solution[:] = 0.0
+    for a in range(5):
+        if not subset >> a & 1:
+            continue
+        y = right[a] / np.sqrt(normal[a, a])
+        for b in range(a + 1):
+            if not subset >> b & 1:
+                continue
+            x = normal[a, b] / np.sqrt(normal[a, a] * normal[b, b])
+            for c in range(b):
+                x -= factor[a, c] * factor[b, c]
+            if b < a:
+                factor[a, b] = x / factor[b, b]
+            elif x < 1e-12:
+                return False
+            else:
+                factor[a, a] = np.sqrt(x)
+        for c in range(a):
+            y -= factor[a, c] * solution[c]
+        solution[a] = y / factor[a, a]
+    for a in range(4, -1, -1):
+        if not subset >> a & 1:
+            continue
+        x = solution[a]
+        for c in range(a + 1, 5):
+            x -= factor[c, a] * solution[c]
+        solution[a] = x / factor[a, a]
+    for a in range(5):
+        if subset >> a & 1:
+            solution[a] /= np.sqrt(normal[a, a])
+    return True
+
+
+@compiled
+def _contradicted(avar, rows, theta, columns, variance):  # type: ignore[no-untyped-def]
+    """Whether a row lies MISFIT σ off; χ² made normal by its cube root (Wilson & Hilferty 1931)."""
+    for i in rows:
+        model = 0.0
+        for a in range(5):
+            model += columns[i, a] * theta[a]
+        if model <= 0.0:
+            return True
+        spread = variance[i] / (9.0 * model * model)  # 2/(9 edf)
+        if abs((avar[i] / model) ** (1.0 / 3.0) - 1.0 + spread) > MISFIT * np.sqrt(spread):
+            return True
+    return False
+
+
+@compiled
+def _judge(  # type: ignore[no-untyped-def]
+    rows, variance, stretch, columns, covariance, normal, right, thresholds, entered, theta, lo, hi, status
+):
+    """Which terms are in, and the interval of each: see the head of the module."""
+    gain = np.empty(rows.size)
+    unit = np.empty(5)
+    solution = np.empty(5)
+    forms = np.empty((NOISES, NOISES))
+    for a in range(5):
+        subset = (2**NOISES - 1) | (1 << a)
+        unit[:] = 0.0
+        unit[a] = 1.0
+        if not _solve(normal, unit, subset, solution):
+            entered[a] = False
+            continue
+        estimate = 0.0
+        for c in range(5):
+            estimate += solution[c] * right[c]
+        for k in range(rows.size):
+            x = 0.0
+            for c in range(5):
+                x += solution[c] * columns[rows[k], c]
+            gain[k] = x / variance[rows[k]] * np.sqrt(stretch[rows[k]])
+        _quadratic_forms(gain, rows, covariance, theta, a, forms)
+        c0, c1, c2 = 0.0, 0.0, 0.0
+        for b in range(NOISES):
+            for c in range(NOISES):
+                if b == a and c == a:
+                    c2 = forms[b, c]
+                elif b == a or c == a:
+                    c1 += max(theta[b + c - a], 0.0) * forms[b, c]
+                else:
+                    c0 += max(theta[b], 0.0) * max(theta[c], 0.0) * forms[b, c]
+        threshold = thresholds[1] if entered[a] else thresholds[0]
+        entered[a] = a != R and theta[a] > 0.0 and estimate > threshold * np.sqrt(c0)
+        if entered[a]:
+            status[a] = 2
+            value = np.sqrt(theta[a])
+            lo[a] = min(value, _interval_end(estimate, c0, c1, c2, TWO_SIDED_95))
+            hi[a] = max(value, _interval_end(estimate, c0, c1, c2, -TWO_SIDED_95))
+        else:
+            bound = _interval_end(estimate, c0, c1, c2, -ONE_SIDED_95)
+            if bound < np.inf:
+                status[a] = 1
+                lo[a] = 0.0
+                hi[a] = bound
+
+
+@compiled
+def _quadratic_forms(gain, rows, covariance, theta, own, forms):  # type: ignore[no-untyped-def]
+    """g C^bc g for the terms that are there, and for the one that is asked about."""
+    forms[:] = 0.0
+    for b in range(NOISES):
+        for c in range(b + 1):
+            if (theta[b] <= 0.0 and b != own) or (theta[c] <= 0.0 and c != own):
+                continue
+            total = 0.0
+            for k in range(rows.size):
+                part = 0.5 * gain[k] * covariance[b, c, rows[k], rows[k]]
+                for j in range(k):
+                    part += gain[j] * covariance[b, c, rows[k], rows[j]]
+                total += 2.0 * gain[k] * part
+            forms[b, c] = total
+            forms[c, b] = total
+
+
+@compiled
+def _interval_end(estimate, c0, c1, c2, z):  # type: ignore[no-untyped-def]
+    """√t where the estimate lies k √v(t) above t; k is the Pearson-III quantile of probability Φ(z).
+
+    Wilson & Hilferty: k = (2/s)[(1 + s z/6 − s²/36)³ − 1], skewness s = 2 √c2 as of χ² with 2/c2 degrees of
+    freedom. t solves (1 − k²c2) t² − (2û + k²c1) t + û² − k²c0 = 0; the end is clipped at zero.
+    """
+    s = 2.0 * np.sqrt(c2)
+    k = z if s < 1e-6 else 2.0 / s * (max(1.0 + s * z / 6.0 - s * s / 36.0, 0.0) ** 3 - 1.0)
+    a = 1.0 - k * k * c2
+    b = estimate + 0.5 * k * k * c1
+    root = b * b - a * (estimate * estimate - k * k * c0)
+    if root < 0.0:
+        return 0.0 if z > 0.0 else np.inf
+    if a <= 1e-9:
+        return 0.0 if z > 0.0 else np.inf
+    t = (b - np.sqrt(root)) / a if z > 0.0 else (b + np.sqrt(root)) / a
+    return np.sqrt(max(t, 0.0))
+
+
+@compiled
+def _bound_by_first_point(avar, edf, column, entered, lo, hi, status):  # type: ignore[no-untyped-def]
+    """Q is hidden behind the sensor's band limit: it makes no more than the whole of the first point."""
+    entered[Q] = False
+    status[Q] = 1
+    lo[Q] = 0.0
+    spread = 2.0 / (9.0 * max(edf, 1.0))
+    hi[Q] = np.sqrt(avar / column / max(1.0 - spread - ONE_SIDED_95 * np.sqrt(spread), 0.05) ** 3)

@@ -1,0 +1,47 @@
+"""Angle random walk N (velocity random walk on an accelerometer): white noise of the rate."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from drivers.sample import Floats
+from monitor.noise.effect import Source, check_parameters, parameter
+
+
+@dataclass(frozen=True, slots=True)
+class AngleRandomWalk(Source):
+    """IEEE Std 952 eq. C.18–C.19: S(f) = N², σ²(τ) = N²/τ.
+
+    >>> float(AngleRandomWalk(N=1.5e-4).avar(np.array([9.0]), 0.01)[0])
+    2.5e-09
+    """
+
+    N: float = parameter("rad/√s", "m/s/√s")
+
+    name: ClassVar[str] = "angle_random_walk"
+    means: ClassVar[str] = "White noise of the rate: averaging four times as long halves it."
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
+
+    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
+        """N²/τ."""
+        return self.N**2 / tau_s
+
+    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
+        """N² at every frequency."""
+        return np.full_like(f_hz, self.N**2)
+
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_White":
+        """Independent samples of standard deviation N √rate."""
+        return _White(self.N * rate_hz**0.5, rng)
+
+
+class _White:
+    def __init__(self, deviation: float, rng: np.random.Generator) -> None:
+        self._deviation = deviation
+        self._rng = rng
+
+    def draw(self, n: int) -> Floats:
+        return self._deviation * self._rng.standard_normal(n)

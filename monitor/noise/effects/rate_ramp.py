@@ -1,0 +1,49 @@
+"""Rate ramp R: a constant slope."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from drivers.sample import Floats
+from monitor.noise.effect import Source, check_parameters, parameter
+
+
+@dataclass(frozen=True, slots=True)
+class RateRamp(Source):
+    """IEEE Std 952 eq. C.32: σ²(τ) = R²τ²/2. Deterministic, so it has no noise spectrum.
+
+    >>> float(RateRamp(R=2e-6).avar(np.array([1000.0]), 0.01)[0])
+    2e-06
+    """
+
+    R: float = parameter("rad/s²", "m/s³")
+
+    name: ClassVar[str] = "rate_ramp"
+    means: ClassVar[str] = "The bias moves steadily in one direction, as while a sensor warms up."
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
+
+    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
+        """R²τ²/2."""
+        return 0.5 * (self.R * tau_s) ** 2
+
+    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
+        """Zero: a slope taken out of a series leaves nothing."""
+        return np.zeros_like(f_hz)
+
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Slope":
+        """A slope that starts at zero."""
+        return _Slope(self.R / rate_hz)
+
+
+class _Slope:
+    def __init__(self, step: float) -> None:
+        self._step = step
+        self._count = 0
+
+    def draw(self, n: int) -> Floats:
+        k = np.arange(self._count, self._count + n, dtype=np.float64)
+        self._count += n
+        return self._step * k

@@ -1,0 +1,122 @@
+"""The texts of the viewer's panels, as Markdown: is it healthy, and what is its noise now.
+
+In come a ``Health`` or an ``Estimate``, out goes text; numbers stand in the field's units. Pure, so
+that what a person reads can be tested without a viewer.
+"""
+
+from collections.abc import Mapping
+from typing import Final
+
+from monitor.estimate.coefficients import LETTERS
+from monitor.estimate.estimate import Estimate
+from monitor.health import Health
+from monitor.publish.units import (
+    COEFFICIENT_NAMES,
+    COEFFICIENT_UNITS,
+    KIND_NAMES,
+    KINDS,
+    Kind,
+    axes_of,
+    measured_axes,
+    number,
+    reading,
+)
+
+WORDS: Final = {
+    "running": "RUNNING",
+    "waiting": "WAITING for the device",
+    "lost": "LOST: the device is gone, trying again",
+    "ended": "ENDED: the recording is at its end",
+}
+
+
+def health_text(device: str, health: Health, about: str = "") -> str:
+    """The health panel of one device."""
+    lines = [f"# {WORDS.get(health.state, health.state)}"]
+    if health.text:
+        lines.append(f"**{health.text}**")
+    rate = "rate not known yet" if health.rate_hz is None else f"**{health.rate_hz:.2f} Hz**"
+    lines.append(f"**{device}** {about}".rstrip())
+    lines.append(f"{rate}, up {duration(health.uptime_s)}")
+    lines.append(f"| samples | |\n|:--|--:|\n{_counts(health)}")
+    lines.append(_outputs(health.outputs))
+    return "\n\n".join(line for line in lines if line)
+
+
+def overview_text(healths: Mapping[str, Health]) -> str:
+    """One line a device: the panel that a fleet opens on."""
+    rows = [
+        f"| **{name}** | {h.state} | {_rate(h)} | {h.received:,} | {h.lost:,} | {h.bad:,} | {h.text or 'all well'} |"
+        for name, h in healths.items()
+    ]
+    head = "| device | state | rate | received | lost | bad | |\n|:--|:--|--:|--:|--:|--:|:--|"
+    return "\n".join([head, *rows])
+
+
+def noise_text(estimate: Estimate) -> str:
+    """The tables of Q N B K R, one a kind of sensor that the device has."""
+    present = measured_axes(estimate.curve.avar)
+    tables = [_noise_table(estimate, kind) for kind in KINDS if set(axes_of(kind)) & set(present)]
+    if not tables:
+        return "Too few samples yet."
+    seen_s = estimate.curve.n / estimate.rate_hz
+    head = (
+        f"Last **{duration(min(seen_s, estimate.window_s))}** of a window of {duration(estimate.window_s)}; "
+        "95 % intervals; ≤ is a 95 % bound; — too few data yet."
+    )
+    return "\n\n".join([*tables, head])
+
+
+def duration(seconds: float) -> str:
+    """A length of time in the two units that tell most.
+
+    >>> duration(3725.0), duration(0.5), duration(90.0)
+    ('1 h 02 min', '0.50 s', '1 min 30 s')
+    """
+    if seconds < 60:
+        return f"{number(seconds)} s" if seconds < 10 else f"{seconds:.0f} s"
+    whole = round(seconds)
+    days, hours, minutes = whole // 86400, whole // 3600 % 24, whole // 60 % 60
+    if days:
+        return f"{days} d {hours:02d} h"
+    if hours:
+        return f"{hours} h {minutes:02d} min"
+    return f"{minutes} min {whole % 60:02d} s"
+
+
+def _counts(health: Health) -> str:
+    rows = [
+        ("received", f"{health.received:,}"),
+        ("lost", f"{health.lost:,}"),
+        ("bad frames", f"{health.bad:,}"),
+        ("overflowed", f"{health.overflowed:,}"),
+        ("latency, median", _milliseconds(health.latency_p50_s)),
+        ("latency, 99 %", _milliseconds(health.latency_p99_s)),
+        ("memory", f"{health.memory_bytes / 1e6:.0f} MB"),
+    ]
+    return "\n".join(f"| {name} | {value} |" for name, value in rows)
+
+
+def _outputs(outputs: Mapping[str, str]) -> str:
+    return "  \n".join(f"{name}: **{state}**" for name, state in outputs.items())
+
+
+def _rate(health: Health) -> str:
+    return "—" if health.rate_hz is None else f"{health.rate_hz:.2f} Hz"
+
+
+def _milliseconds(seconds: float | None) -> str:
+    return "—" if seconds is None else f"{number(seconds * 1e3)} ms"
+
+
+def _noise_table(estimate: Estimate, kind: Kind) -> str:
+    axes = axes_of(kind)
+    lines = [f"| {KIND_NAMES[kind]} | {' | '.join(axes)} |", "|:--|" + "--:|" * len(axes)]
+    for letter in LETTERS:
+        unit = COEFFICIENT_UNITS[kind][letter].name
+        cells = [reading(estimate.coefficients, letter, axis) for axis in axes]
+        values = " | ".join(f"**{c.value}**" if c.value != "—" else "—" for c in cells)
+        lines.append(f"| **{letter}** {COEFFICIENT_NAMES[kind][letter]}, {unit} | {values} |")
+        if any(c.interval for c in cells):
+            lines.append("| | " + " | ".join(c.interval for c in cells) + " |")
+    return "\n".join(lines)

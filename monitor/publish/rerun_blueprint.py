@@ -1,0 +1,121 @@
+"""What the viewer opens on: is it healthy, what is its noise now, has it changed.
+
+One device fills the window; several get an overview and a tab each. The time panel follows the newest
+sample. Layout only: nothing here knows a number. Importing this module imports Rerun.
+"""
+
+from collections.abc import Sequence
+from typing import Final
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from monitor.publish import colours
+from monitor.publish.rerun_chart import HEIGHT, WIDTH
+from monitor.publish.rerun_scene import TIMELINE
+from monitor.publish.units import (
+    COEFFICIENT_NAMES,
+    COEFFICIENT_UNITS,
+    DEVIATION_UNITS,
+    KIND_NAMES,
+    KINDS,
+    SAMPLE_UNITS,
+    Kind,
+    axes_of,
+)
+
+RAW_SPAN_S: Final = 30.0  # of raw samples in view, up to the cursor
+COURSES: Final = ("N", "B")
+
+
+def blueprint(devices: Sequence[str]) -> rrb.Blueprint:
+    """The layout for these devices."""
+    pages = [_device(d) for d in devices]
+    root = pages[0] if len(pages) == 1 else rrb.Tabs(_overview(devices), *pages, active_tab=0)
+    return rrb.Blueprint(
+        root,
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _device(device: str) -> rrb.Container:
+    left = rrb.Vertical(
+        rrb.TextDocumentView(origin=f"/{device}/status", name="Is it healthy?"),
+        rrb.TextDocumentView(origin=f"/{device}/coefficients", contents="$origin", name="What is its noise now?"),
+        rrb.TextLogView(origin=f"/{device}/events", name="Has it changed? Events"),
+        row_shares=[3.1, 4.6, 1.6],
+    )
+    right = rrb.Vertical(
+        rrb.Horizontal(*(_allan(device, kind) for kind in KINDS)),
+        rrb.Horizontal(*(_course(device, kind, letter) for kind in KINDS for letter in COURSES)),
+        rrb.Horizontal(*(_raw(device, kind) for kind in KINDS), _temperature(device), column_shares=[2, 2, 1]),
+        row_shares=[5, 2.2, 2.2],
+    )
+    return rrb.Horizontal(left, right, column_shares=[3, 7], name=device)
+
+
+def _overview(devices: Sequence[str]) -> rrb.Container:
+    charts = [_allan(d, "gyro", f"{d}: ") for d in devices]
+    return rrb.Vertical(
+        rrb.TextDocumentView(origin="/overview", name="Is it healthy?"),
+        rrb.Grid(*charts),
+        row_shares=[1, 3],
+        name="Overview",
+    )
+
+
+def _allan(device: str, kind: Kind, prefix: str = "") -> rrb.View:
+    paths = [f"+ /{device}/allan/{kind}/**", *(f"+ /{device}/allan/{axis}/**" for axis in axes_of(kind))]
+    bounds = rrb.VisualBounds2D(x_range=[-1.6, WIDTH + 0.6], y_range=[-1.3, HEIGHT + 1.7])
+    return rrb.Spatial2DView(
+        origin=f"/{device}/allan",
+        contents=paths,
+        name=f"{prefix}{KIND_NAMES[kind]}: Allan deviation, {DEVIATION_UNITS[kind].name}",
+        background=rrb.Background(color=colours.BACKGROUND),
+        visual_bounds=bounds,
+    )
+
+
+def _course(device: str, kind: Kind, letter: str) -> rrb.View:
+    unit = COEFFICIENT_UNITS[kind][letter].name
+    return rrb.TimeSeriesView(
+        origin=f"/{device}/coefficients/{letter}",
+        contents=[f"+ $origin/{axis}" for axis in axes_of(kind)],
+        name=f"{letter} {COEFFICIENT_NAMES[kind][letter]}, {unit}",
+        plot_legend=rrb.PlotLegend(visible=False),
+    )
+
+
+def _raw(device: str, kind: Kind) -> rrb.View:
+    return rrb.TimeSeriesView(
+        origin=f"/{device}/samples",
+        contents=[f"+ $origin/{axis}" for axis in axes_of(kind)],
+        name=f"{KIND_NAMES[kind]}: samples, {SAMPLE_UNITS[kind].name}",
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+        time_ranges=_last(RAW_SPAN_S),
+    )
+
+
+def _temperature(device: str) -> rrb.View:
+    return rrb.TimeSeriesView(
+        origin=f"/{device}/temperature",
+        name="Temperature, °C",
+        plot_legend=rrb.PlotLegend(visible=False),
+    )
+
+
+def _last(seconds: float) -> rrb.VisibleTimeRange:
+    return rrb.VisibleTimeRange(
+        TIMELINE,
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-seconds),
+        end=rrb.TimeRangeBoundary.cursor_relative(),
+    )
+
+
+def send(stream: rr.RecordingStream, devices: Sequence[str]) -> None:
+    """Make the layout the active one of the stream's viewer."""
+    stream.send_blueprint(blueprint(devices), make_active=True, make_default=True)

@@ -1,0 +1,132 @@
+"""Geometry of a log-log Allan plot for a viewer that has no logarithmic axes.
+
+In come curves in the field's units; out go points and lines in chart units: a box ``WIDTH`` by
+``HEIGHT``, y pointing down as Rerun's 2D view has it, one unit the same length on both axes. The box
+never moves, so the view's bounds are set once; the decades inside it follow the data. Pure NumPy.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from drivers.sample import Floats
+
+WIDTH: Final = 16.0
+HEIGHT: Final = 10.0
+MIN_DECADES: Final = 2.0
+FILL_STEPS: Final = 96  # vertical strokes that fill a band over the width of its curve
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Which decades of τ and σ the box shows: whole powers of ten."""
+
+    x: tuple[int, int]
+    y: tuple[int, int]
+
+    def place(self, tau: Floats, sigma: Floats) -> Floats:
+        """[n, 2] chart positions of τ (s) and σ (field unit); NaN where σ is not positive."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            log_tau, log_sigma = np.log10(tau), np.log10(np.where(sigma > 0, sigma, np.nan))
+        left, right = self.x
+        bottom, top = self.y
+        across = (log_tau - left) / (right - left) * WIDTH
+        down = (top - log_sigma) / (top - bottom) * HEIGHT
+        return np.column_stack([across, down])
+
+
+def decades(values: Iterable[Floats], least: int = int(MIN_DECADES)) -> tuple[int, int]:
+    """The whole decades that hold all positive finite numbers, at least ``least`` of them.
+
+    >>> decades([np.array([0.02, 300.0])])
+    (-2, 3)
+    """
+    good = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in values])
+    if good.size == 0:
+        return 0, least
+    low = math.floor(math.log10(float(good.min())) + 1e-9)
+    high = math.ceil(math.log10(float(good.max())) - 1e-9)
+    return low, max(high, low + least)
+
+
+def clip(y: Floats) -> Floats:
+    """Heights kept inside the box: an interval may reach far below the plot."""
+    return np.clip(y, 0.0, HEIGHT)
+
+
+def runs(positions: Floats) -> list[Floats]:
+    """The finite stretches of a line, each of two points or more: a NaN breaks it."""
+    good = np.isfinite(positions).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
+    return [positions[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
+
+
+def band(low: Floats, high: Floats) -> Floats:
+    """[FILL_STEPS, 2, 2] vertical strokes side by side that fill the space between two curves."""
+    good = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
+    if int(good.sum()) < 2:
+        return np.empty((0, 2, 2))
+    low, high = low[good], high[good]
+    half = (low[-1, 0] - low[0, 0]) / FILL_STEPS / 2
+    x = np.linspace(low[0, 0] + half, low[-1, 0] - half, FILL_STEPS)
+    bottom, top = (clip(np.interp(x, edge[:, 0], edge[:, 1])) for edge in (low, high))
+    return np.stack([np.column_stack([x, bottom]), np.column_stack([x, top])], axis=1)
+
+
+def whiskers(low: Floats, high: Floats) -> Floats:
+    """[n, 2, 2] one vertical stroke a point, from the lower to the upper end of its interval."""
+    good = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
+    strokes = np.stack([low[good], high[good]], axis=1)
+    strokes[:, :, 1] = clip(strokes[:, :, 1])
+    return strokes
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Lines and tick labels of one scale."""
+
+    frame: list[Floats]
+    major: list[Floats]
+    minor: list[Floats]
+    ticks: list[tuple[float, float, str]]  # x, y, label
+
+
+def grid(scale: Scale) -> Grid:
+    """Decade lines, fainter lines at 2 … 9, and labels under and left of the box."""
+    x_at, x_minor = _lines(scale.x, WIDTH)
+    y_at, y_minor = _lines(scale.y, HEIGHT)
+    flip = HEIGHT
+    ticks = [(x, HEIGHT + 0.25, _tick(p)) for x, p in zip(x_at, range(scale.x[0], scale.x[1] + 1), strict=True)]
+    ticks += [
+        (-0.75, flip - y - 0.25, _tick(p)) for y, p in zip(y_at, range(scale.y[0], scale.y[1] + 1), strict=True)
+    ]
+    return Grid(
+        frame=[np.array([[0, 0], [WIDTH, 0], [WIDTH, HEIGHT], [0, HEIGHT], [0, 0]], float)],
+        major=[_vertical(x) for x in x_at[1:-1]] + [_horizontal(flip - y) for y in y_at[1:-1]],
+        minor=[_vertical(x) for x in x_minor] + [_horizontal(flip - y) for y in y_minor],
+        ticks=ticks,
+    )
+
+
+def _lines(span: tuple[int, int], length: float) -> tuple[list[float], list[float]]:
+    """Where the decades of an axis stand, and where 2 … 9 between them."""
+    per_decade = length / (span[1] - span[0])
+    at = [i * per_decade for i in range(span[1] - span[0] + 1)]
+    between = [a + math.log10(k) * per_decade for a in at[:-1] for k in range(2, 10)]
+    return at, between
+
+
+def _vertical(x: float) -> Floats:
+    return np.array([[x, 0.0], [x, HEIGHT]])
+
+
+def _horizontal(y: float) -> Floats:
+    return np.array([[0.0, y], [WIDTH, y]])
+
+
+def _tick(power: int) -> str:
+    """A power of ten as people read it: 0.01, 1, 1000, and 1e6 beyond."""
+    return f"{10.0**power:g}" if -4 <= power <= 4 else f"1e{power}"

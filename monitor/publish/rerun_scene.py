@@ -1,0 +1,255 @@
+"""What the viewer shows: samples, estimates, events and health as entities of one Rerun stream.
+
+In come results as the service has them (SI), out go batches of columns and drawings under the paths of
+CONTRACTS, on the timeline ``sample_time``. Every call may block in Rerun for as long as a viewer pleases:
+only the viewer's own thread is to call here. Importing this module imports Rerun (half a second).
+
+Numbers are shown in the field's units. ``/<device>/allan/<axis>`` is a drawing, so the same entity also
+carries tau, deviation, lo and hi in SI for whoever reads the recording with a program.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import rerun as rr
+
+from drivers.sample import AXES, Event, Floats
+from monitor.estimate.coefficients import LETTERS, Status
+from monitor.estimate.estimate import Estimate
+from monitor.health import Health
+from monitor.publish import colours
+from monitor.publish.decimate import extremes, means
+from monitor.publish.panels import health_text, noise_text, overview_text
+from monitor.publish.rerun_chart import (
+    FILL_STEPS,
+    HEIGHT,
+    WIDTH,
+    Scale,
+    band,
+    decades,
+    grid,
+    runs,
+    whiskers,
+)
+from monitor.publish.units import (
+    COEFFICIENT_UNITS,
+    DEVIATION_UNITS,
+    KINDS,
+    SAMPLE_UNITS,
+    Kind,
+    axes_of,
+    kind_of,
+)
+
+TIMELINE: Final = "sample_time"
+TEMPERATURES_PER_S: Final = 5.0
+LEVELS: Final = {
+    "link_lost": "ERROR",
+    "samples_lost": "WARN",
+    "noise_changed": "WARN",
+    "bias_stepped": "WARN",
+    "limit_crossed": "WARN",
+    "model_disagrees": "WARN",
+    "temperature_unexplained": "WARN",
+    "clock_jumped": "WARN",
+}
+"""Event kind -> level of the line in the log; all others are INFO."""
+
+
+@dataclass
+class _Device:
+    """What has to be kept of one device between two drawings."""
+
+    about: str
+    scales: dict[Kind, Scale] = field(default_factory=dict)
+
+
+class Scene:
+    """Draws on one stream. Not thread-safe; see the module about blocking."""
+
+    def __init__(self, stream: rr.RecordingStream, devices: Sequence[tuple[str, str]]) -> None:
+        """``devices``: name and a few words about each."""
+        self._stream = stream
+        self._devices = {name: _Device(about) for name, about in devices}
+        self._healths: dict[str, Health] = {}
+
+    def open(self) -> None:
+        """What does not change: names, colours and widths of the lines."""
+        for device in self._devices:
+            for axis in AXES:
+                self._style_axis(device, axis)
+            line = rr.SeriesLines(colors=[colours.TEMPERATURE], widths=[1.5], names=["temperature, °C"])
+            self._stream.log(f"{device}/temperature", line, static=True)
+
+    def samples(self, device: str, wall_s: Floats, values: Floats, temperature_c: Floats) -> None:
+        """Raw samples since the last flush: [n], [n, 6] SI, [n] °C. At most 200 rows/s and axis are drawn."""
+        for i, axis in enumerate(AXES):
+            t, y = extremes(wall_s, values[:, i])
+            self._scalars(f"{device}/samples/{axis}", t, y * SAMPLE_UNITS[kind_of(axis)].factor)
+        self._scalars(f"{device}/temperature", *means(wall_s, temperature_c, TEMPERATURES_PER_S))
+
+    def estimate(self, device: str, wall_s: float, estimate: Estimate) -> None:
+        """The Allan plots and the table of one estimate."""
+        self._at(wall_s)
+        self._stream.log(f"{device}/coefficients", _markdown(noise_text(estimate)))
+        for kind in KINDS:
+            self._allan(device, kind, estimate)
+
+    def courses(self, device: str, wall_s: Floats, estimates: Sequence[Estimate]) -> None:
+        """One point an estimate on the course of every coefficient, with its interval."""
+        at = np.asarray(wall_s)
+        for row, letter in enumerate(LETTERS):
+            for column, axis in enumerate(AXES):
+                values = np.array([_course(e, row, column) for e in estimates])
+                if np.isfinite(values).any():
+                    factor = COEFFICIENT_UNITS[kind_of(axis)][letter].factor
+                    self._scalars(f"{device}/coefficients/{letter}/{axis}", at, values * factor)
+
+    def event(self, device: str, wall_s: float, event: Event) -> None:
+        """One line in the log of the device."""
+        self._at(wall_s)
+        self._stream.log(f"{device}/events", rr.TextLog(event.text, level=LEVELS.get(event.kind, "INFO")))
+
+    def health(self, device: str, wall_s: float, health: Health) -> None:
+        """The health panel of the device, and its row in the overview."""
+        self._at(wall_s)
+        self._healths[device] = health
+        about = self._devices[device].about
+        self._stream.log(f"{device}/status", _markdown(health_text(device, health, about)))
+        if len(self._devices) > 1:
+            self._stream.log("overview", _markdown(overview_text(self._healths)))
+
+    def _style_axis(self, device: str, axis: str) -> None:
+        colour = colours.AXIS_COLOURS[axis]
+        unit = SAMPLE_UNITS[kind_of(axis)].name
+        line = rr.SeriesLines(colors=[colour], widths=[1.0], names=[f"{axis}, {unit}"])
+        self._stream.log(f"{device}/samples/{axis}", line, static=True)
+        dim = colours.mixed(colour, 0.45)
+        for letter in LETTERS:
+            unit = COEFFICIENT_UNITS[kind_of(axis)][letter].name
+            names = [f"{axis}, {unit}", f"{axis} 95 % low", f"{axis} 95 % high"]
+            line = rr.SeriesLines(colors=[colour, dim, dim], widths=[2.0, 0.75, 0.75], names=names)
+            self._stream.log(f"{device}/coefficients/{letter}/{axis}", line, static=True)
+
+    def _scalars(self, path: str, wall_s: Floats, values: Floats) -> None:
+        """``values`` [n] or [n, series] at ``wall_s`` [n] on the timeline."""
+        if wall_s.size:
+            time = rr.TimeColumn(TIMELINE, timestamp=_stamps(wall_s))
+            self._stream.send_columns(path, [time], rr.Scalars.columns(scalars=values))
+
+    def _at(self, wall_s: float) -> None:
+        self._stream.set_time(TIMELINE, timestamp=_stamps(np.array([wall_s]))[0])
+
+    def _allan(self, device: str, kind: Kind, estimate: Estimate) -> None:
+        curves = [_Curve.of(estimate, axis) for axis in axes_of(kind)]
+        curves = [c for c in curves if c is not None]
+        if not curves:
+            return
+        scale = Scale(decades(c.tau for c in curves), decades(part for c in curves for part in c.shown))
+        if self._devices[device].scales.get(kind) != scale:
+            self._devices[device].scales[kind] = scale
+            self._grid(f"{device}/allan/{kind}", kind, scale, [c.axis for c in curves])
+        for curve in curves:
+            self._curve(f"{device}/allan/{curve.axis}", scale, curve)
+
+    def _grid(self, path: str, kind: Kind, scale: Scale, axes: Sequence[str]) -> None:
+        """Frame, decade lines, tick labels and the legend."""
+        lines = grid(scale)
+        for name, strips, colour, order in (
+            ("minor", lines.minor, colours.MINOR, -30.0),
+            ("major", lines.major, colours.MAJOR, -29.0),
+            ("frame", lines.frame, colours.FRAME, -10.0),
+        ):
+            strip = rr.LineStrips2D(strips, colors=[colour], radii=[rr.Radius.ui_points(0.5)], draw_order=order)
+            self._stream.log(f"{path}/{name}", strip)
+        ticks = [(x, y, label) for x, y, label in lines.ticks]
+        unit = DEVIATION_UNITS[kind].name
+        ticks += [(WIDTH / 2, HEIGHT + 0.85, "averaging time τ, s"), (0.0, -0.85, f"σ(τ), {unit}")]
+        self._labels(f"{path}/ticks", ticks, [colours.TEXT])
+        legend = [(WIDTH - 0.9 - 1.4 * i, -0.85, axis) for i, axis in enumerate(reversed(axes))]
+        self._labels(f"{path}/legend", legend, [colours.AXIS_COLOURS[a] for a in reversed(axes)])
+
+    def _labels(self, path: str, labels: list[tuple[float, float, str]], colour: list[colours.Colour]) -> None:
+        points = rr.Points2D(
+            [(x, y) for x, y, _ in labels],
+            labels=[text for _, _, text in labels],
+            colors=colour,
+            radii=[0.0],
+            show_labels=True,
+        )
+        self._stream.log(path, points)
+
+    def _curve(self, path: str, scale: Scale, curve: "_Curve") -> None:
+        """Band, fitted line, intervals and measured points of one axis."""
+        colour = colours.AXIS_COLOURS[curve.axis]
+        low, high = scale.place(curve.tau, curve.lo), scale.place(curve.tau, curve.hi)
+        fill = rr.LineStrips2D(
+            band(low, high),
+            colors=[colours.mixed(colour, 0.22)],
+            radii=[WIDTH / FILL_STEPS / 2],
+            draw_order=-20.0,
+        )
+        self._stream.log(f"{path}/band", fill)
+        thin = rr.Radius.ui_points(0.75)
+        dim = colours.mixed(colour, 0.6)
+        strokes = rr.LineStrips2D(whiskers(low, high), colors=[dim], radii=[thin], draw_order=5.0)
+        self._stream.log(f"{path}/interval", strokes)
+        fitted = runs(scale.place(curve.tau, curve.fitted))
+        fit = rr.LineStrips2D(fitted, colors=[colour], radii=[rr.Radius.ui_points(1.25)], draw_order=10.0)
+        self._stream.log(f"{path}/fit", fit)
+        points = rr.Points2D(
+            scale.place(curve.tau, curve.deviation),
+            colors=[colour],
+            radii=[rr.Radius.ui_points(3.0)],
+            draw_order=20.0,
+        )
+        self._stream.log(path, points, rr.AnyValues(**curve.si))
+
+
+@dataclass(frozen=True)
+class _Curve:
+    """One axis of an Allan curve where it is measured, in the field's unit."""
+
+    axis: str
+    tau: Floats
+    deviation: Floats
+    lo: Floats
+    hi: Floats
+    fitted: Floats
+    si: dict[str, Floats]
+
+    @property
+    def shown(self) -> tuple[Floats, Floats]:
+        """What the plot's height must hold; an interval may leave it."""
+        return self.deviation, self.fitted
+
+    @classmethod
+    def of(cls, estimate: Estimate, axis: str) -> "_Curve | None":
+        """None while the axis has not two points."""
+        curve, i = estimate.curve, AXES.index(axis)
+        rows = np.isfinite(curve.avar[:, i]) & (curve.avar[:, i] > 0)
+        if int(rows.sum()) < 2:
+            return None
+        deviation, fitted = (np.sqrt(a[rows, i]) for a in (curve.avar, estimate.fitted))
+        si = {"tau": curve.tau_s[rows], "deviation": deviation, "lo": curve.lo[rows, i], "hi": curve.hi[rows, i]}
+        f = DEVIATION_UNITS[kind_of(axis)].factor
+        return cls(axis, si["tau"], deviation * f, si["lo"] * f, si["hi"] * f, fitted * f, si)
+
+
+def _course(estimate: Estimate, row: int, column: int) -> tuple[float, float, float]:
+    """value, lo, hi of one coefficient; a bound has no value and starts at 0."""
+    c = estimate.coefficients
+    if c.status[row, column] == Status.UNESTIMATED:
+        return np.nan, np.nan, np.nan
+    return float(c.value[row, column]), float(c.lo[row, column]), float(c.hi[row, column])
+
+
+def _stamps(wall_s: Floats) -> "np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]":
+    """Unix seconds as nanosecond stamps."""
+    return np.round(wall_s * 1e9).astype("datetime64[ns]")
+
+
+def _markdown(text: str) -> rr.TextDocument:
+    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)

@@ -1,0 +1,66 @@
+"""Between a device's reader thread and the worker: one writer, one reader, bounded, the writer never waits.
+
+A full ring overwrites its oldest samples; what was overwritten counts in ``overflowed`` and shows up as ``lost`` of
+the block taken next, so that the gap keeps its length in time. The lock is held for a copy and no longer.
+"""
+
+import threading
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from drivers.sample import SampleBlock, block
+
+
+class RingBuffer:
+    """Holds up to ``capacity`` samples, 80 bytes each."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.overflowed = 0  # samples overwritten since the start
+        self._t_ns = np.zeros(capacity, np.int64)
+        self._values = np.zeros((capacity, 6))
+        self._temperature_c = np.zeros(capacity)
+        self._ticks = np.zeros(capacity, np.int64)
+        self._lost = np.zeros(capacity, np.int64)  # samples missing just before each
+        self._read = self._written = 0  # counted since the start
+        self._lock = threading.Lock()
+
+    def push(self, samples: SampleBlock) -> None:
+        """Add samples; overwrites the oldest when full."""
+        with self._lock:
+            for start in range(0, len(samples), self.capacity):
+                self._write(samples[start : start + self.capacity])
+
+    def take(self) -> list[SampleBlock]:
+        """All samples since the last call, in blocks cut where samples are missing."""
+        with self._lock:
+            n = self._written - self._read
+            if n == 0:
+                return []
+            at = np.arange(self._read, self._written) % self.capacity
+            self._read = self._written
+            taken = block(self._t_ns[at], self._values[at], self._temperature_c[at], self._ticks[at])
+            lost = self._lost[at]
+        edges = [0, *(np.flatnonzero(lost[1:]) + 1).tolist(), n]
+        return [replace(taken[a:b], lost=int(lost[a])) for a, b in pairwise(edges)]
+
+    def _write(self, samples: SampleBlock) -> None:
+        n = len(samples)
+        overwritten = max(0, self._written + n - self._read - self.capacity)
+        if overwritten:
+            gone = np.arange(self._read, self._read + overwritten) % self.capacity
+            missing = overwritten + int(self._lost[gone].sum())
+            self._read += overwritten
+            self.overflowed += overwritten
+        at = np.arange(self._written, self._written + n) % self.capacity
+        self._t_ns[at] = samples.t_ns
+        self._values[at] = samples.values
+        self._temperature_c[at] = samples.temperature_c
+        self._ticks[at] = samples.ticks
+        self._lost[at] = 0
+        self._lost[at[0]] = samples.lost
+        self._written += n
+        if overwritten:
+            self._lost[self._read % self.capacity] += missing

@@ -1,0 +1,363 @@
+"""TOML -> typed settings. Reading opens nothing; everything wrong with a file is found, not only the first thing.
+
+Every key has a default but a device's ``name`` and ``driver``. An unknown key is an error that names the nearest
+known one. Links and decoders bring their own keys: their modules' ``Settings`` are filled from ``[device.driver]``
+and ``[device.driver.decoder_options]``. Relative paths are relative to the configuration file.
+"""
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, TypeVar
+
+import msgspec
+
+import drivers.decoders
+import drivers.links
+from drivers import plugin
+from drivers.decoders.base import Decoder
+from drivers.driver import AxisMap, axis_map
+from drivers.errors import ConfigError
+from drivers.links.base import Link, LinkSettings
+from drivers.sample import AXES
+
+T = TypeVar("T", bound=msgspec.Struct)
+
+CONFIG_FOLDER: Final = Path(__file__).resolve().parent.parent / "config"
+"""The data package beside this one: example configurations, models, DBC files."""
+UNITS_S: Final = {"": 1.0, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+WINDOW_SAMPLES: Final = (100, 10_000_000)
+WINDOW_LONGEST_S: Final = 40 * 86400.0
+DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
+
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+Port = Annotated[int, msgspec.Meta(ge=0, le=65535)]
+
+
+class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One table of the file."""
+
+
+class DeviceTable(_Table, frozen=True, kw_only=True):
+    """``[[device]]``."""
+
+    name: str
+    driver: dict[str, Any]
+    rate: Positive | None = None
+    window: Positive | str = 3600.0
+    tau: Literal["octave", "decade10"] | list[Positive] = "octave"
+    refit: str = "10 Hz"
+    publish: str = "10 Hz"
+    model: Path | None = None
+    axes: dict[str, str] = {}
+
+
+class VirtualTable(LinkSettings, frozen=True, kw_only=True):
+    """Keys of ``link = "virtual"``: a simulated IMU that speaks a real wire format over a pseudo-terminal."""
+
+    model: str = "consumer-mems"
+    """Path of a model file, or the name of one in the shipped ``config/models``."""
+    seed: int = 1
+    speed: Positive = 1.0
+    """Times real time."""
+
+
+class ZenohTable(_Table, frozen=True, kw_only=True):
+    """``[zenoh]``."""
+
+    mode: Literal["peer", "client", "router", "none"] = "peer"
+    listen: list[str] = ["tcp/127.0.0.1:7450"]
+    connect: list[str] = []
+    config: Path | None = None
+    prefix: Annotated[str, msgspec.Meta(pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$")] = "imu"
+
+
+class ViewerTable(_Table, frozen=True, kw_only=True):
+    """``[viewer]``."""
+
+    mode: str = "auto"
+    port: Port = 9876
+    web_port: Port = 9090
+    memory: str = "256MiB"
+
+
+class LogTable(_Table, frozen=True, kw_only=True):
+    """``[log]``."""
+
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    format: Literal["text", "json"] = "text"
+
+
+class _File(_Table, frozen=True, kw_only=True):
+    device: list[dict[str, Any]] = []
+    zenoh: dict[str, Any] = {}
+    viewer: dict[str, Any] = {}
+    log: dict[str, Any] = {}
+
+
+@dataclass(frozen=True, slots=True)
+class Device:
+    """One device, ready to be wired; nothing of it is open."""
+
+    name: str
+    rate_hz: float | None  # None: found from the data
+    window_s: float
+    tau: Literal["octave", "decade10"] | tuple[float, ...]  # s
+    refit_s: float  # 0 = every sample
+    publish_s: float  # 0 = every block
+    link: Link | VirtualTable
+    decoder: Decoder
+    axes: AxisMap
+    silence_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """A whole configuration file."""
+
+    devices: tuple[Device, ...]
+    zenoh: ZenohTable
+    viewer: ViewerTable
+    log: LogTable
+
+
+def load(path: Path) -> Config:
+    """The configuration in a file.
+
+    Raises:
+        ConfigError: one line: the first thing that is wrong, and how many more there are
+    """
+    config, wrong = read(path)
+    if config is None:
+        more = f" (and {len(wrong) - 1} more: imu-monitor check {path})" if len(wrong) > 1 else ""
+        raise ConfigError(wrong[0] + more)
+    return config
+
+
+def read(path: Path) -> tuple[Config | None, list[str]]:
+    """The configuration, or None and all that is wrong with the file, a line each."""
+    try:
+        text = path.read_text("utf-8")
+    except FileNotFoundError:
+        return None, [f"{path}: no such file; imu-monitor check --print-defaults prints one to start from"]
+    except (OSError, UnicodeDecodeError) as error:
+        return None, [f"{path}: cannot be read: {error}"]
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        return None, [f"{path}: not TOML: {error}"]
+    reader = _Reader(path.resolve().parent)
+    config = reader.config(table)
+    return (None if reader.wrong else config), [f"{path}: {line}" for line in reader.wrong]
+
+
+class _Reader:
+    """Fills settings from tables and collects what is wrong."""
+
+    def __init__(self, folder: Path) -> None:
+        self.wrong: list[str] = []
+        self._folder = folder
+
+    def config(self, table: Mapping[str, Any]) -> Config | None:
+        file = self.fill(_File, table, "")
+        if file is None:
+            return None
+        if not file.device:
+            self.wrong.append("device: there is none; add [[device]] with name and driver")
+        devices = [self.device(entry, f"device[{i}]") for i, entry in enumerate(file.device)]
+        names = [entry.get("name") for entry in file.device]
+        for name in sorted({str(n) for n in names if names.count(n) > 1 and n is not None}):
+            self.wrong.append(f'device: {names.count(name)} devices are named "{name}"; names must be unique')
+        zenoh = self.fill(ZenohTable, file.zenoh, "zenoh")
+        viewer = self.fill(ViewerTable, file.viewer, "viewer")
+        log = self.fill(LogTable, file.log, "log")
+        if viewer is not None:
+            self._try("viewer.mode", viewer_mode, viewer.mode)
+        if zenoh is None or viewer is None or log is None:
+            return None
+        return Config(tuple(device for device in devices if device is not None), zenoh, viewer, log)
+
+    def device(self, table: Mapping[str, Any], at: str) -> Device | None:
+        entry = self.fill(DeviceTable, table, at)
+        if entry is None:
+            return None
+        if not DEVICE_NAME.fullmatch(entry.name):
+            self.wrong.append(f'{at}.name: "{entry.name}"; letters, digits, - and _ are possible')
+        at = f"device {entry.name}"
+        window_s = self._try(f"{at}: window", seconds, entry.window)
+        refit_s = self._try(f"{at}: refit", period, entry.refit, "every sample")
+        publish_s = self._try(f"{at}: publish", period, entry.publish, "every block")
+        axes = self._try(f"{at}: axes", _axes, entry.axes)
+        link, decoder = self.driver(entry.driver, f"{at}: driver")
+        if (
+            window_s is None
+            or refit_s is None
+            or publish_s is None
+            or axes is None
+            or link is None
+            or decoder is None
+        ):
+            return None
+        self._try(f"{at}: window", _possible_window, window_s, entry.rate)
+        if entry.model is not None and not entry.model.is_file():
+            self.wrong.append(f"{at}: model: {entry.model}: no such file")
+        tau = entry.tau if isinstance(entry.tau, str) else tuple(entry.tau)
+        silence_s = link.silence if isinstance(link, VirtualTable) else float(entry.driver.get("silence", 3.0))
+        return Device(entry.name, entry.rate, window_s, tau, refit_s, publish_s, link, decoder, axes, silence_s)
+
+    def driver(self, table: Mapping[str, Any], at: str) -> tuple[Link | VirtualTable | None, Decoder | None]:
+        keys = dict(table)
+        link_name = keys.pop("link", None)
+        decoder_name = keys.pop("decoder", "")
+        options = keys.pop("decoder_options", {})
+        known = sorted({*plugin.names(drivers.links, "_link"), "virtual"} - {"loopback"})
+        if link_name not in known:
+            said = "missing" if link_name is None else f'unknown link "{link_name}"'
+            self.wrong.append(f"{at}.link: {said}{plugin.nearest(str(link_name), known)}")
+            return None, None
+        if link_name == "virtual":
+            link: Link | VirtualTable | None = self.fill(VirtualTable, keys, at)
+            carrier, default = "bytes", "xsens_mtdata2"
+        else:
+            module = plugin.load(drivers.links, link_name, "_link")
+            settings = self.fill(module.Settings, keys, at)
+            built: Link | None = None if settings is None else self._try(at, module.build, settings)
+            link, carrier = built, built.carrier if built else ""
+            default = (
+                module.DEFAULT_DECODER if built is None else getattr(built, "default_decoder", module.DEFAULT_DECODER)
+            )
+        decoder = self.decoder(decoder_name or default, options, at)
+        if decoder is not None and carrier and decoder.carrier != carrier:
+            fitting = ", ".join(_decoders_of(carrier))
+            name = decoder_name or default
+            self.wrong.append(
+                f"{at}.decoder: {name} reads {decoder.carrier}, link {link_name} brings {carrier}: {fitting}"
+            )
+        return link, decoder
+
+    def decoder(self, name: str, options: Any, at: str) -> Decoder | None:
+        if not name:
+            self.wrong.append(f"{at}.decoder: missing; known are {', '.join(plugin.names(drivers.decoders))}")
+            return None
+        module = self._try(f"{at}.decoder", plugin.load, drivers.decoders, name)
+        if module is None:
+            return None
+        if not isinstance(options, dict):
+            self.wrong.append(f"{at}.decoder_options: expected a table")
+            return None
+        settings = self.fill(module.Settings, options, f"{at}.decoder_options")
+        decoder: Decoder | None = (
+            None if settings is None else self._try(f"{at}.decoder_options", module.build, settings)
+        )
+        return decoder
+
+    def fill(self, kind: type[T], table: Mapping[str, Any], at: str) -> T | None:
+        """A struct from a table, each key on its own, so that every wrong one is told."""
+        before = len(self.wrong)
+        dot = f"{at}." if at else ""
+        fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
+        values: dict[str, Any] = {}
+        for key, value in table.items():
+            if key not in fields:
+                self.wrong.append(f"{dot}{key}: unknown key{plugin.nearest(key, tuple(fields))}")
+                continue
+            try:
+                values[fields[key].name] = msgspec.convert(value, fields[key].type, dec_hook=self._path)
+            except (msgspec.ValidationError, ValueError) as error:
+                self.wrong.append(f"{dot}{key}: {error}")
+        for key, field in fields.items():
+            if field.required and key not in table:
+                self.wrong.append(f"{dot}{key}: missing")
+        return kind(**values) if len(self.wrong) == before else None
+
+    def _path(self, kind: type, value: Any) -> Any:
+        if kind is Path and isinstance(value, str):
+            return self._folder / Path(value).expanduser()
+        raise ValueError(f"expected a path in quotes, got {value!r}")
+
+    def _try(self, at: str, function: Any, *arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except ConfigError as error:
+            self.wrong.append(f"{at}: {error}")
+            return None
+
+
+def seconds(value: float | str) -> float:
+    """A duration: a number of seconds, or "90s", "30min", "1h", "2d".
+
+    >>> seconds("30min"), seconds(3600), seconds("1.5 h")
+    (1800.0, 3600.0, 5400.0)
+    """
+    if isinstance(value, str):
+        match = re.fullmatch(r"\s*([0-9.]+(?:e[+-]?[0-9]+)?)\s*([a-z]*)\s*", value)
+        try:
+            duration = float(match[1]) * UNITS_S[match[2]] if match else 0.0
+        except (KeyError, ValueError):
+            duration = 0.0
+        if duration <= 0.0:
+            raise ConfigError(f'"{value}" is no duration; write seconds, or "90s", "30min", "1h", "2d"')
+        return duration
+    return float(value)
+
+
+def period(value: str, always: str) -> float:
+    """Seconds between two runs of something: "10 Hz" -> 0.1; the word ``always`` -> 0.
+
+    >>> period("10 Hz", "every sample"), period("every sample", "every sample")
+    (0.1, 0.0)
+    """
+    if value == always:
+        return 0.0
+    match = re.fullmatch(r"\s*([0-9.]+)\s*Hz\s*", value)
+    try:
+        return 1.0 / float(match[1]) if match else _no_rate(value, always)
+    except (ValueError, ZeroDivisionError):
+        return _no_rate(value, always)
+
+
+def viewer_mode(mode: str) -> str:
+    """The viewer's mode; ConfigError for none that there is."""
+    modes = ("auto", "native", "web", "none")
+    if mode in modes or mode.endswith(".rrd"):
+        return mode
+    raise ConfigError(f'"{mode}"; possible are {", ".join(modes)} or a file ending in .rrd')
+
+
+def _no_rate(value: str, always: str) -> float:
+    raise ConfigError(f'"{value}" is no rate; write "10 Hz" or "{always}"')
+
+
+def _possible_window(window_s: float, rate_hz: float | None) -> None:
+    if rate_hz is None:
+        if window_s > WINDOW_LONGEST_S:
+            raise ConfigError(f"{window_s:g} s; at most {WINDOW_LONGEST_S:g} s")
+        return
+    low, high = WINDOW_SAMPLES
+    if not low <= window_s * rate_hz <= high:
+        raise ConfigError(
+            f"{window_s:g} s at {rate_hz:g} Hz are {window_s * rate_hz:.0f} samples; "
+            f"possible are {low} to {high}: {low / rate_hz:g} to {high / rate_hz:g} s"
+        )
+
+
+def _axes(table: dict[str, str]) -> AxisMap:
+    try:
+        return axis_map(table)
+    except KeyError as error:
+        axis, word = error.args
+        raise ConfigError(
+            f'{axis} = "{word}"; both are one of {" ".join(AXES)}, the right one with or without -'
+        ) from None
+
+
+def _decoders_of(carrier: str) -> list[str]:
+    fitting: list[str] = []
+    for name in plugin.names(drivers.decoders):
+        module = plugin.load(drivers.decoders, name)
+        kinds = [member for member in vars(module).values() if isinstance(member, type)]
+        if any(kind.__module__ == module.__name__ and getattr(kind, "carrier", "") == carrier for kind in kinds):
+            fitting.append(name)
+    return fitting
