@@ -15,6 +15,7 @@ Not done here: no sample is dropped, repeated or moved to another place in the o
 
 from dataclasses import dataclass
 from itertools import pairwise
+from math import exp
 from typing import Final
 
 import numpy as np
@@ -273,7 +274,7 @@ class Line:
             self._first_t = t_s
             self._nominal_s = 1.0 / nominal_hz if nominal_hz else None
         dx, dt = index - self._x0, t_s - self._t0
-        keep = np.exp(-max(dt, 0.0) / FORGET_S) if self.count else 0.0
+        keep = exp(-max(dt, 0.0) / FORGET_S) if self.count else 0.0
         # shift the means to the new origin, then update (West 1979)
         self._mx -= dx
         self._mt -= dt

@@ -68,8 +68,8 @@ class ZenohTable(_Table, frozen=True, kw_only=True):
     """``[zenoh]``."""
 
     mode: Literal["peer", "client", "router", "none"] = "peer"
-    listen: list[str] = ["tcp/127.0.0.1:7450"]
-    connect: list[str] = []
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7450",)
+    connect: tuple[str, ...] = ()
     config: Path | None = None
     prefix: Annotated[str, msgspec.Meta(pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$")] = "imu"
 
@@ -218,8 +218,8 @@ class _Reader:
             self.wrong.append(f"{at}.link: {said}{plugin.nearest(str(link_name), known)}")
             return None, None
         if link_name == "virtual":
-            link: Link | VirtualTable | None = self.fill(VirtualTable, keys, at)
-            carrier, default = "bytes", "xsens_mtdata2"
+            link: Link | VirtualTable | None = self._virtual(keys, at)
+            carrier, default = "bytes", "vectornav_binary"
         else:
             module = plugin.load(drivers.links, link_name, "_link")
             settings = self.fill(module.Settings, keys, at)
@@ -236,6 +236,18 @@ class _Reader:
                 f"{at}.decoder: {name} reads {decoder.carrier}, link {link_name} brings {carrier}: {fitting}"
             )
         return link, decoder
+
+    def _virtual(self, keys: Mapping[str, Any], at: str) -> VirtualTable | None:
+        table = self.fill(VirtualTable, keys, at)
+        if table is None:
+            return None
+        shipped = CONFIG_FOLDER / "models" / f"{table.model}.toml"
+        path = shipped if shipped.is_file() else self._folder / table.model
+        if not path.is_file():
+            names = sorted(file.stem for file in shipped.parent.glob("*.toml"))
+            self.wrong.append(f'{at}.model: no model "{table.model}", neither a file nor one of {", ".join(names)}')
+            return None
+        return msgspec.structs.replace(table, model=str(path))
 
     def decoder(self, name: str, options: Any, at: str) -> Decoder | None:
         if not name:

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.sample import NO_TICK, Chunk, Floats, Ints, SampleBlock, block
-from drivers.sample import Arrival as Arrival
-from drivers.sample import Counter as Counter
-from drivers.sample import Given as Given
-from drivers.sample import Timing as Timing
+from drivers.sample import Arrival as Arrival  # noqa: PLC0414 - decoders find it here
+from drivers.sample import Counter as Counter  # noqa: PLC0414 - decoders find it here
+from drivers.sample import Given as Given  # noqa: PLC0414 - decoders find it here
+from drivers.sample import Timing as Timing  # noqa: PLC0414 - decoders find it here
 
 GYRO_LIMIT: Final = 1000.0
 """rad/s; no MEMS gyroscope turns this fast (the widest range sold is 4000 °/s = 70 rad/s)."""
@@ -36,9 +36,18 @@ class Decoder(Protocol):
     """One wire format: bytes <-> SampleBlock."""
 
     carrier: ClassVar[str]  # see drivers.links.base.Carrier
-    timing: Timing
-    bad: int  # frames and samples rejected since the decoder was made
-    hint: str  # why frames are rejected, for the status line; "" while all is well
+
+    @property
+    def timing(self) -> Timing:
+        """What the frames say about time; the same as long as the decoder lives."""
+
+    @property
+    def bad(self) -> int:
+        """Frames and samples rejected since the decoder was made."""
+
+    @property
+    def hint(self) -> str:
+        """Why frames are rejected, for the status line; "" while all is well."""
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
         """Samples completed by these chunks; ``t_ns`` is the arrival of the chunk that completed them."""
@@ -177,9 +186,14 @@ class FrameBuffer:
         self._quiet = QUIET_FRAMES  # good frames since the last rejected one
 
     @property
+    def mute(self) -> bool:
+        """Whether bytes have been coming for a while without one valid frame."""
+        return self._hole >= MUTE_BYTES
+
+    @property
     def hint(self) -> str:
         """Why there are rejected frames, or none at all; "" while all is well."""
-        if self._hole >= MUTE_BYTES:
+        if self.mute:
             return f"{self._hole} bytes without a valid frame: is the baud rate right, and the decoder?"
         if self._quiet < QUIET_FRAMES:
             return "frames fail their check: bytes are lost or damaged on the line"

@@ -17,7 +17,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from drivers.decoders.base import Decoder, DecoderSettings, Given, Rows, Timing
+from drivers.decoders.base import QUIET_FRAMES, Decoder, DecoderSettings, Given, Rows, Timing
 from drivers.errors import DecodeError
 from drivers.sample import NO_TICK, Chunk, SampleBlock
 
@@ -64,6 +64,7 @@ class Ros2ImuDecoder:
         self.timing: Timing = Given()
         self.bad = 0  # messages rejected
         self.hint = ""
+        self._quiet = 0  # messages since the last rejected one
         self._rows = Rows()
         self._counted_apart = 0  # in Rows' tally, but never received
         self._lost = 0  # places empty before the next message
@@ -89,8 +90,10 @@ class Ros2ImuDecoder:
                 messages.append(_cut(chunk.data))
             except DecodeError as error:
                 self.hint = str(error)
+                self._quiet = 0
                 rejected += 1
                 continue
+            self._quiet += 1
             ticks.append(sequence)
             missing.append(self._lost + rejected)
             self._counted_apart += self._lost
@@ -105,6 +108,8 @@ class Ros2ImuDecoder:
             np.array(missing, np.int64),
             rejected,
         )
+        if self._quiet >= QUIET_FRAMES:
+            self.hint = ""
         self.bad = self._rows.bad - self._counted_apart
         return blocks
 

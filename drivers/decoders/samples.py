@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from drivers.decoders.base import Decoder, DecoderSettings, Given, Rows, Timing
+from drivers.decoders.base import QUIET_FRAMES, Decoder, DecoderSettings, Given, Rows, Timing
 from drivers.errors import DecodeError
 from drivers.sample import Chunk, SampleBlock
 from drivers.sample_message import pack, unpack
@@ -30,6 +30,7 @@ class SamplesDecoder:
         self.timing: Timing = Given()
         self.bad = 0  # messages rejected and implausible rows
         self.hint = ""
+        self._quiet = 0  # messages since the last rejected one
         self._rows = Rows()
         self._rejected = 0  # messages
         self._received: int | None = None  # the publisher's count with its last message
@@ -48,9 +49,13 @@ class SamplesDecoder:
         for chunk in chunks:
             try:
                 found += self._message(chunk.data)
+                self._quiet += 1
             except DecodeError as error:
                 self._rejected += 1
                 self.hint = str(error)
+                self._quiet = 0
+        if self._quiet >= QUIET_FRAMES:
+            self.hint = ""
         self.bad = self._rejected + self._rows.bad
         return found
 

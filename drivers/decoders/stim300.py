@@ -27,16 +27,15 @@ from numpy.typing import NDArray
 from drivers.decoders.base import (
     NEED_MORE,
     REJECT,
-    Counter,
+    Decoder,
     DecoderSettings,
     FrameBuffer,
     Rows,
-    Timing,
     one_chunk_each,
     quantize,
 )
 from drivers.errors import ConfigError
-from drivers.sample import Chunk, Floats, Ints, SampleBlock
+from drivers.sample import Chunk, Counter, Floats, Ints, SampleBlock, Timing
 from drivers.units import DEGREE, G0
 
 ACCEL_PART, INCL_PART, TEMPERATURE_PART, AUX_PART = 1, 2, 4, 8
@@ -131,6 +130,8 @@ class Stim300Decoder:
         frames = self._buffer.feed(chunks)
         n = len(frames.data)
         if not n:
+            if self._buffer.mute:  # the sensor may have been set to another datagram
+                self._buffer.sync = self._wanted
             return []
         data = np.frombuffer(b"".join(frames.data), np.uint8).reshape(n, -1)
         parts = IDENTIFIERS[int(data[0, 0])]
@@ -223,7 +224,7 @@ def crc_holds(frame: bytes) -> bool:
 PADDING: Final = (b"", b"\0", b"\0\0", b"\0\0\0")
 
 
-def build(settings: Settings) -> Stim300Decoder:
+def build(settings: Settings) -> Decoder:
     """A decoder with these settings; ConfigError for an unknown identifier or a missing rate."""
     if settings.identifier != "auto" and settings.identifier not in IDENTIFIERS:
         known = ", ".join(f"0x{identifier:02X}" for identifier in sorted(IDENTIFIERS))

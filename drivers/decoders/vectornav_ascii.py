@@ -21,17 +21,16 @@ import numpy as np
 from drivers.decoders.base import (
     NEED_MORE,
     REJECT,
-    Arrival,
+    Decoder,
     DecoderSettings,
     FrameBuffer,
     Rows,
-    Timing,
     Unmeasured,
     invalid,
     one_chunk_each,
     xor,
 )
-from drivers.sample import Chunk, Floats, SampleBlock
+from drivers.sample import Arrival, Chunk, Floats, SampleBlock, Timing
 
 LONGEST: Final = 256
 """Bytes; the longest sentence of the manual is under 200."""
@@ -156,6 +155,6 @@ def match(buffer: bytes, at: int) -> int:
     return REJECT
 
 
-def build(settings: Settings) -> VectornavAsciiDecoder:
+def build(settings: Settings) -> Decoder:
     """A decoder with these settings."""
     return VectornavAsciiDecoder(settings)

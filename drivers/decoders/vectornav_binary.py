@@ -24,17 +24,15 @@ import numpy as np
 from drivers.decoders.base import (
     NEED_MORE,
     REJECT,
-    Arrival,
-    Counter,
+    Decoder,
     DecoderSettings,
     FrameBuffer,
     Frames,
     Rows,
-    Timing,
     invalid,
     one_chunk_each,
 )
-from drivers.sample import NO_TICK, Chunk, SampleBlock
+from drivers.sample import NO_TICK, Arrival, Chunk, Counter, SampleBlock, Timing
 
 FIELD_SIZES: Final = {
     1: (8, 8, 8, 12, 16, 12, 24, 12, 12, 24, 20, 28, 2, 4, 8),
@@ -231,6 +229,6 @@ class VectornavBinaryDecoder:
         return one_chunk_each(frames, samples.t_ns)
 
 
-def build(settings: Settings) -> VectornavBinaryDecoder:
+def build(settings: Settings) -> Decoder:
     """A decoder with these settings."""
     return VectornavBinaryDecoder(settings)

@@ -21,18 +21,17 @@ import numpy as np
 from drivers.decoders.base import (
     NEED_MORE,
     REJECT,
-    Arrival,
+    Decoder,
     DecoderSettings,
     FrameBuffer,
     Frames,
     Rows,
-    Timing,
     Unmeasured,
     one_chunk_each,
     quantize,
 )
 from drivers.errors import ConfigError
-from drivers.sample import Chunk, Floats, Ints, SampleBlock
+from drivers.sample import Arrival, Chunk, Floats, Ints, SampleBlock, Timing
 from drivers.units import DEGREE, G0
 
 ACCEL, RATE = 0x51, 0x52
@@ -207,7 +206,7 @@ def match_bluetooth(buffer: bytes, at: int) -> int:
     return BLUETOOTH_LENGTH if buffer[at : at + 2] in HEADERS and following in HEADERS else REJECT
 
 
-def build(settings: Settings) -> WitmotionDecoder:
+def build(settings: Settings) -> Decoder:
     """A decoder with these settings; ConfigError for a range that is none."""
     for name in ("accelerometer_range", "gyro_range"):
         if not getattr(settings, name) > 0.0:

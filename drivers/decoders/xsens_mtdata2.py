@@ -25,17 +25,15 @@ from numpy.typing import NDArray
 from drivers.decoders.base import (
     NEED_MORE,
     REJECT,
-    Arrival,
-    Counter,
+    Decoder,
     DecoderSettings,
     FrameBuffer,
     Frames,
     Rows,
-    Timing,
     invalid,
     one_chunk_each,
 )
-from drivers.sample import NO_TICK, Chunk, Floats, Ints, SampleBlock
+from drivers.sample import NO_TICK, Arrival, Chunk, Counter, Floats, Ints, SampleBlock, Timing
 
 SYNC: Final = b"\xfa\xff\x36"
 MAX_PAYLOAD: Final = 2048
@@ -273,6 +271,6 @@ def match(buffer: bytes, at: int) -> int:
     return REJECT if sum(buffer[at + 1 : at + length]) & 0xFF else length
 
 
-def build(settings: Settings) -> XsensMtdata2Decoder:
+def build(settings: Settings) -> Decoder:
     """A decoder with these settings."""
     return XsensMtdata2Decoder(settings)

@@ -18,6 +18,7 @@ and remote frames are counted and left aside. Nothing is sent, beyond what an ad
 import contextlib
 import errno
 import logging
+import socket
 import threading
 import time
 from collections.abc import Sequence
@@ -41,6 +42,7 @@ SLICE_S: Final = 0.1
 HOST_STAMPED: Final = ("socketcan", "virtual", "udp_multicast")
 """Interfaces whose time stamps are the host's system clock when the frame came in."""
 OLDEST_S: Final = 1.0
+PROBE_S: Final = 2.0
 BUS_OFF: Final = 0x40
 """CAN_ERR_BUSOFF of linux/can/error.h, in the identifier of a socketcan error frame."""
 ID_MASK: Final = 0x1FFF_FFFF
@@ -95,6 +97,7 @@ class CanLink:
                 return
             s = self._settings
             try:
+                _probe(s)
                 self._bus = can.Bus(
                     channel=s.channel,
                     interface=s.interface,
@@ -166,20 +169,24 @@ class CanLink:
         bus = self._bus
         assert bus is not None
         try:
-            return bus.recv(wait_s)
+            try:
+                return bus.recv(wait_s)
+            except (can.CanOperationError, ValueError) as error:
+                if not isinstance(error, ValueError) and not isinstance(error.__cause__, ValueError):
+                    raise
+                # a text adapter's line that is no frame; slcan keeps a line with bytes beyond ASCII in
+                # its buffer, where it would fail for ever, unless that is flushed
+                self.garbled += 1
+                flush = getattr(bus, "flush", None)
+                if flush is not None:
+                    flush()
+                return None
         except (can.CanError, OSError) as error:
             self._shut_down()
+            reason = error.__cause__ if isinstance(error.__cause__, Exception) else error
             raise LinkLost(
-                f"{self.name}: the bus is gone (interface down or adapter unplugged): {_plain(error)}"
+                f"{self.name}: the bus is gone (interface down or adapter unplugged): {_plain(reason)}"
             ) from error
-        except ValueError:
-            # a text adapter's line that is no frame; slcan keeps it in its buffer, where it would
-            # fail for ever, unless that is flushed
-            self.garbled += 1
-            flush = getattr(bus, "flush", None)
-            if flush is not None:
-                flush()
-            return None
 
     def _chunk(self, message: "can.Message") -> Chunk:
         address = message.arbitration_id | (EXTENDED_ID if message.is_extended_id else 0)
@@ -207,6 +214,13 @@ class CanLink:
         # an unplugged adapter cannot be told to close its channel; it is gone all the same
         with contextlib.suppress(can.CanError, OSError):
             bus.shutdown()
+
+
+def _probe(s: Settings) -> None:
+    """python-can tries a socketcand that is not there for 10 s: ask once whether anybody answers."""
+    if s.interface == "socketcand":
+        host, port = str(s.options.get("host", "127.0.0.1")), int(s.options.get("port", 29536))
+        socket.create_connection((host, port), timeout=PROBE_S).close()
 
 
 def _filter(address: int) -> dict[str, Any]:

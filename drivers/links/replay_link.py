@@ -25,7 +25,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Final, Literal
+from typing import IO, TYPE_CHECKING, Final, Literal, cast
 
 from drivers.errors import ConfigError, LinkEnded, LinkLost, LinkUnavailable, RecordingError
 from drivers.links.base import Carrier, Link, LinkSettings
@@ -48,7 +48,7 @@ STEP_S: Final = 0.02
 CHUNK_BYTES: Final = 4096
 PYTHON_CAN_HEADER: Final = "timestamp,arbitration_id"
 LARGEST_STANDARD_ID: Final = 0x7FF
-DAMAGE: Final = (EOFError, zlib.error, gzip.BadGzipFile, struct.error, binascii.Error)
+DAMAGE: Final = (EOFError, LookupError, zlib.error, gzip.BadGzipFile, struct.error, binascii.Error)
 """What readers raise at a place where a file is cut or damaged, beside ValueError."""
 
 Kind = Literal["recording", "log", "capture"]
@@ -105,12 +105,12 @@ class ReplayLink:
             self.notes = ()
             try:
                 self._source = self._open_source()
-                self._advance()
+                self._next = next(self._source.items, None)
             except OSError as error:
                 self._shut()
                 why = error.strerror or " ".join(str(error).split())
                 raise LinkUnavailable(f"{self._path}: cannot be replayed: {why}") from error
-            except (RecordingError, ConfigError, ValueError) as error:
+            except (*DAMAGE, ValueError, ConfigError, RecordingError) as error:
                 self._shut()
                 raise LinkUnavailable(f"{self._path}: cannot be replayed: {error}") from error
             self._started_s = time.monotonic()
@@ -124,9 +124,9 @@ class ReplayLink:
                 if self._next is None:
                     raise LinkEnded(" ".join((f"{self._path}: the end of the file.", *self.notes)))
                 now = time.monotonic()
-                due = self._started_s + self._next[0] / self._pace
+                due = self._due(self._next)
                 if due <= now:
-                    return self._take((now - self._started_s) * self._pace)
+                    return self._take(now)
                 if now >= deadline:
                     return None
                 self._closing.wait(min(due, deadline) - now)
@@ -138,12 +138,16 @@ class ReplayLink:
         with self._in_use:
             self._shut()
 
-    def _take(self, until_s: float) -> list[Chunk]:
+    def _take(self, now_s: float) -> list[Chunk]:
+        """All that is due by now."""
         chunks: list[Chunk] = []
-        while self._next is not None and self._next[0] <= until_s and len(chunks) < BATCH:
+        while self._next is not None and self._due(self._next) <= now_s and len(chunks) < BATCH:
             chunks.append(self._next[1])
             self._advance()
         return chunks
+
+    def _due(self, item: Timed) -> float:
+        return self._started_s + item[0] / self._pace
 
     def _advance(self) -> None:
         """Fetch the next item; a file that is damaged from here on ends here."""
@@ -204,7 +208,15 @@ def _log(path: Path, channel: str | None) -> _Source:
 
 def _log_frames(messages: "Iterator[can.Message]", channel: str | None) -> Iterator[Chunk]:
     """Data frames of a log that python-can reads."""
-    for message in messages:
+    from can.io.blf import BLFParseError
+
+    while True:
+        try:
+            message = next(messages, None)
+        except BLFParseError as error:
+            raise ValueError(str(error)) from error
+        if message is None:
+            return
         if message.is_error_frame or message.is_remote_frame:
             continue
         if channel is None or str(message.channel) == channel:
@@ -302,8 +314,9 @@ def _header(path: Path) -> str:
 
 
 def _binary(path: Path) -> IO[bytes]:
-    stream: IO[bytes] = gzip.open(path, "rb") if path.suffix.lower() == ".gz" else path.open("rb")  # type: ignore[assignment]
-    return stream
+    if path.suffix.lower() == ".gz":
+        return cast("IO[bytes]", gzip.open(path, "rb"))
+    return path.open("rb")
 
 
 def _text(path: Path) -> IO[str]:

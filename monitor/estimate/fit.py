@@ -78,6 +78,7 @@ class Fit:
     """One fit of six axes."""
 
     coefficients: Coefficients
+    theta: Floats  # [5, 6] Q² N² B² K² R² of the fitted curve, SI; Q² < 0 stands for a band limit
     fitted: Floats  # [m, 6] unit², Allan variance of the fitted model; NaN where there is none
     edf: Floats  # [m, 6] equivalent degrees of freedom of the measured curve; NaN as the curve
     entered: NDArray[np.bool_]  # [5, 6] terms that are in: hand them to the next fit
@@ -114,10 +115,18 @@ def fit(
         np.ascontiguousarray(avar.T), terms.T.astype(np.float64), table.terms.astype(np.float64),
         design.columns, table.covariance, thresholds, entered, theta, lo, hi, status, edf, fitted, left_out,
     )  # fmt: skip
+    own = table.covariance[N, N].diagonal()[:, None] * _ratio(table.terms[:, None], terms)
+    white = 2.0 * design.columns[:, N, None] ** 2 / own
+    edf = np.where(np.isnan(edf) & (avar > 0.0), white, edf)  # before there is a fit, as of white noise
     to_si = (design.rate_hz ** np.array([-1.0, -0.5, 0.0, 0.5, 1.0]))[:, None]  # √θ at τ0 = 1 to SI
     value = np.where(status == Status.ESTIMATED, np.sqrt(np.maximum(theta, 0.0)), np.nan)
     coefficients = Coefficients(value * to_si, lo * to_si, hi * to_si, status)
-    return Fit(coefficients, fitted, edf, entered, left_out)
+    return Fit(coefficients, theta * to_si**2, fitted, edf, entered, left_out)
+
+
+def _ratio(whole: Ints, terms: Ints) -> Floats:
+    """How many terms a window without gaps has for each that is there; NaN where there is none."""
+    return np.where((whole > 0) & (terms > 0), whole / np.maximum(terms, 1), np.nan)
 
 
 @compiled
@@ -137,19 +146,11 @@ def _fit_axes(  # type: ignore[no-untyped-def]
         used = rows[:count]
         if count < MIN_ROWS:
             entered[:, axis] = False
-            _white_edf(used, columns, covariance, stretch, edf[:, axis])
             continue
         left_out[axis] = _fit_axis(
             avar[axis], used, stretch, columns, covariance, thresholds, entered[:, axis],
             theta[:, axis], lo[:, axis], hi[:, axis], status[:, axis], edf[:, axis], fitted[:, axis],
         )  # fmt: skip
-
-
-@compiled
-def _white_edf(rows, columns, covariance, stretch, edf):  # type: ignore[no-untyped-def]
-    """Before there is a fit: the first seconds of a sensor are white noise."""
-    for i in rows:
-        edf[i] = 2.0 * columns[i, N] ** 2 / (covariance[N, N, i, i] * stretch[i])
 
 
 @compiled
@@ -340,7 +341,8 @@ def _judge(  # type: ignore[no-untyped-def]
             lo[a] = min(value, _interval_end(estimate, c0, c1, c2, TWO_SIDED_95))
             hi[a] = max(value, _interval_end(estimate, c0, c1, c2, -TWO_SIDED_95))
         else:
-            bound = _interval_end(estimate, c0, c1, c2, -ONE_SIDED_95)
+            # a bound below what an estimate of zero would give claims more than the curve can know
+            bound = _interval_end(max(estimate, 0.0), c0, c1, c2, -ONE_SIDED_95)
             if bound < np.inf:
                 status[a] = 1
                 lo[a] = 0.0

@@ -20,7 +20,7 @@ AXIS_COLOURS: Final[dict[str, Colour]] = {
 BACKGROUND: Final[Colour] = (13, 16, 17)
 FRAME: Final[Colour] = (92, 98, 104)
 MAJOR: Final[Colour] = (48, 53, 57)
-MINOR: Final[Colour] = (27, 31, 33)
+MINOR: Final[Colour] = (23, 27, 29)
 TEXT: Final[Colour] = (190, 196, 202)
 TEMPERATURE: Final[Colour] = (236, 180, 72)
 

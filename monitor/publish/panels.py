@@ -11,7 +11,6 @@ from monitor.estimate.coefficients import LETTERS
 from monitor.estimate.estimate import Estimate
 from monitor.health import Health
 from monitor.publish.units import (
-    COEFFICIENT_NAMES,
     COEFFICIENT_UNITS,
     KIND_NAMES,
     KINDS,
@@ -32,14 +31,17 @@ WORDS: Final = {
 
 def health_text(device: str, health: Health, about: str = "") -> str:
     """The health panel of one device."""
-    lines = [f"# {WORDS.get(health.state, health.state)}"]
+    lines = [f"## {WORDS.get(health.state, health.state)}"]
     if health.text:
         lines.append(f"**{health.text}**")
-    rate = "rate not known yet" if health.rate_hz is None else f"**{health.rate_hz:.2f} Hz**"
+    rate = "rate not known yet" if health.rate_hz is None else f"{health.rate_hz:.2f} Hz"
     lines.append(f"**{device}** {about}".rstrip())
-    lines.append(f"{rate}, up {duration(health.uptime_s)}")
-    lines.append(f"| samples | |\n|:--|--:|\n{_counts(health)}")
-    lines.append(_outputs(health.outputs))
+    lines.append(f"**{rate}**, up {duration(health.uptime_s)}, {health.memory_bytes / 1e6:.0f} MB of memory")
+    lines.append(f"samples received **{health.received:,}**, lost **{health.lost:,}**, bad **{health.bad:,}**, "
+                 f"overflowed **{health.overflowed:,}**")
+    lines.append(f"latency **{_milliseconds(health.latency_p50_s)}** median, "
+                 f"**{_milliseconds(health.latency_p99_s)}** at 99 %")
+    lines.append(", ".join(f"{name} **{state}**" for name, state in health.outputs.items()))
     return "\n\n".join(line for line in lines if line)
 
 
@@ -60,11 +62,8 @@ def noise_text(estimate: Estimate) -> str:
     if not tables:
         return "Too few samples yet."
     seen_s = estimate.curve.n / estimate.rate_hz
-    head = (
-        f"Last **{duration(min(seen_s, estimate.window_s))}** of a window of {duration(estimate.window_s)}; "
-        "95 % intervals; ≤ is a 95 % bound; — too few data yet."
-    )
-    return "\n\n".join([*tables, head])
+    head = f"Last **{duration(min(seen_s, estimate.window_s))}**, 95 % intervals; ≤ bound; — too few data"
+    return "\n\n".join([head, *tables])
 
 
 def duration(seconds: float) -> str:
@@ -84,23 +83,6 @@ def duration(seconds: float) -> str:
     return f"{minutes} min {whole % 60:02d} s"
 
 
-def _counts(health: Health) -> str:
-    rows = [
-        ("received", f"{health.received:,}"),
-        ("lost", f"{health.lost:,}"),
-        ("bad frames", f"{health.bad:,}"),
-        ("overflowed", f"{health.overflowed:,}"),
-        ("latency, median", _milliseconds(health.latency_p50_s)),
-        ("latency, 99 %", _milliseconds(health.latency_p99_s)),
-        ("memory", f"{health.memory_bytes / 1e6:.0f} MB"),
-    ]
-    return "\n".join(f"| {name} | {value} |" for name, value in rows)
-
-
-def _outputs(outputs: Mapping[str, str]) -> str:
-    return "  \n".join(f"{name}: **{state}**" for name, state in outputs.items())
-
-
 def _rate(health: Health) -> str:
     return "—" if health.rate_hz is None else f"{health.rate_hz:.2f} Hz"
 
@@ -116,7 +98,7 @@ def _noise_table(estimate: Estimate, kind: Kind) -> str:
         unit = COEFFICIENT_UNITS[kind][letter].name
         cells = [reading(estimate.coefficients, letter, axis) for axis in axes]
         values = " | ".join(f"**{c.value}**" if c.value != "—" else "—" for c in cells)
-        lines.append(f"| **{letter}** {COEFFICIENT_NAMES[kind][letter]}, {unit} | {values} |")
+        lines.append(f"| **{letter}** {unit} | {values} |")
         if any(c.interval for c in cells):
             lines.append("| | " + " | ".join(c.interval for c in cells) + " |")
     return "\n".join(lines)

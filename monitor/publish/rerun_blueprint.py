@@ -14,7 +14,6 @@ from monitor.publish import colours
 from monitor.publish.rerun_chart import HEIGHT, WIDTH
 from monitor.publish.rerun_scene import TIMELINE
 from monitor.publish.units import (
-    COEFFICIENT_NAMES,
     COEFFICIENT_UNITS,
     DEVIATION_UNITS,
     KIND_NAMES,
@@ -26,6 +25,7 @@ from monitor.publish.units import (
 
 RAW_SPAN_S: Final = 30.0  # of raw samples in view, up to the cursor
 COURSES: Final = ("N", "B")
+SHORT: Final = {"gyro": "Gyro", "accel": "Accel"}
 
 
 def blueprint(devices: Sequence[str]) -> rrb.Blueprint:
@@ -46,8 +46,8 @@ def _device(device: str) -> rrb.Container:
     left = rrb.Vertical(
         rrb.TextDocumentView(origin=f"/{device}/status", name="Is it healthy?"),
         rrb.TextDocumentView(origin=f"/{device}/coefficients", contents="$origin", name="What is its noise now?"),
-        rrb.TextLogView(origin=f"/{device}/events", name="Has it changed? Events"),
-        row_shares=[3.1, 4.6, 1.6],
+        rrb.TextLogView(origin=f"/{device}/events", name="Has it changed?", columns=_log_columns()),
+        row_shares=[2.35, 6.15, 1.5],
     )
     right = rrb.Vertical(
         rrb.Horizontal(*(_allan(device, kind) for kind in KINDS)),
@@ -85,8 +85,9 @@ def _course(device: str, kind: Kind, letter: str) -> rrb.View:
     return rrb.TimeSeriesView(
         origin=f"/{device}/coefficients/{letter}",
         contents=[f"+ $origin/{axis}" for axis in axes_of(kind)],
-        name=f"{letter} {COEFFICIENT_NAMES[kind][letter]}, {unit}",
+        name=f"{SHORT[kind]} {letter}, {unit}",
         plot_legend=rrb.PlotLegend(visible=False),
+        axis_x=_all_so_far(),
     )
 
 
@@ -96,7 +97,7 @@ def _raw(device: str, kind: Kind) -> rrb.View:
         contents=[f"+ $origin/{axis}" for axis in axes_of(kind)],
         name=f"{KIND_NAMES[kind]}: samples, {SAMPLE_UNITS[kind].name}",
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
-        time_ranges=_last(RAW_SPAN_S),
+        axis_x=_last(RAW_SPAN_S),
     )
 
 
@@ -105,15 +106,22 @@ def _temperature(device: str) -> rrb.View:
         origin=f"/{device}/temperature",
         name="Temperature, °C",
         plot_legend=rrb.PlotLegend(visible=False),
+        axis_x=_all_so_far(),
     )
 
 
-def _last(seconds: float) -> rrb.VisibleTimeRange:
-    return rrb.VisibleTimeRange(
-        TIMELINE,
-        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-seconds),
-        end=rrb.TimeRangeBoundary.cursor_relative(),
-    )
+def _log_columns() -> rrb.TextLogColumns:
+    return rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
+
+
+def _last(seconds: float) -> rrb.TimeAxis:
+    now = rr.TimeRangeBoundary.cursor_relative()
+    return rrb.TimeAxis(view_range=rr.TimeRange(rr.TimeRangeBoundary.cursor_relative(seconds=-seconds), now))
+
+
+def _all_so_far() -> rrb.TimeAxis:
+    now = rr.TimeRangeBoundary.cursor_relative()
+    return rrb.TimeAxis(view_range=rr.TimeRange(rr.TimeRangeBoundary.infinite(), now))
 
 
 def send(stream: rr.RecordingStream, devices: Sequence[str]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from drivers.sample import Floats
 
 WIDTH: Final = 16.0
-HEIGHT: Final = 10.0
+HEIGHT: Final = 11.5
 MIN_DECADES: Final = 2.0
 FILL_STEPS: Final = 96  # vertical strokes that fill a band over the width of its curve
 
@@ -101,7 +101,7 @@ def grid(scale: Scale) -> Grid:
     flip = HEIGHT
     ticks = [(x, HEIGHT + 0.25, _tick(p)) for x, p in zip(x_at, range(scale.x[0], scale.x[1] + 1), strict=True)]
     ticks += [
-        (-0.75, flip - y - 0.25, _tick(p)) for y, p in zip(y_at, range(scale.y[0], scale.y[1] + 1), strict=True)
+        (-0.75, flip - y - 0.35, _tick(p)) for y, p in zip(y_at, range(scale.y[0], scale.y[1] + 1), strict=True)
     ]
     return Grid(
         frame=[np.array([[0, 0], [WIDTH, 0], [WIDTH, HEIGHT], [0, HEIGHT], [0, 0]], float)],

@@ -143,8 +143,7 @@ class Scene:
         self._stream.set_time(TIMELINE, timestamp=_stamps(np.array([wall_s]))[0])
 
     def _allan(self, device: str, kind: Kind, estimate: Estimate) -> None:
-        curves = [_Curve.of(estimate, axis) for axis in axes_of(kind)]
-        curves = [c for c in curves if c is not None]
+        curves = [c for axis in axes_of(kind) if (c := _Curve.of(estimate, axis)) is not None]
         if not curves:
             return
         scale = Scale(decades(c.tau for c in curves), decades(part for c in curves for part in c.shown))
@@ -162,11 +161,11 @@ class Scene:
             ("major", lines.major, colours.MAJOR, -29.0),
             ("frame", lines.frame, colours.FRAME, -10.0),
         ):
-            strip = rr.LineStrips2D(strips, colors=[colour], radii=[rr.Radius.ui_points(0.5)], draw_order=order)
+            strip = rr.LineStrips2D(strips, colors=[colour], radii=rr.Radius.ui_points(0.5), draw_order=order)
             self._stream.log(f"{path}/{name}", strip)
         ticks = [(x, y, label) for x, y, label in lines.ticks]
         unit = DEVIATION_UNITS[kind].name
-        ticks += [(WIDTH / 2, HEIGHT + 0.85, "averaging time τ, s"), (0.0, -0.85, f"σ(τ), {unit}")]
+        ticks += [(WIDTH / 2, HEIGHT + 0.85, "averaging time τ, s"), (1.2, -0.85, f"σ(τ), {unit}")]
         self._labels(f"{path}/ticks", ticks, [colours.TEXT])
         legend = [(WIDTH - 0.9 - 1.4 * i, -0.85, axis) for i, axis in enumerate(reversed(axes))]
         self._labels(f"{path}/legend", legend, [colours.AXIS_COLOURS[a] for a in reversed(axes)])
@@ -186,7 +185,7 @@ class Scene:
         colour = colours.AXIS_COLOURS[curve.axis]
         low, high = scale.place(curve.tau, curve.lo), scale.place(curve.tau, curve.hi)
         fill = rr.LineStrips2D(
-            band(low, high),
+            list(band(low, high)),
             colors=[colours.mixed(colour, 0.22)],
             radii=[WIDTH / FILL_STEPS / 2],
             draw_order=-20.0,
@@ -194,18 +193,18 @@ class Scene:
         self._stream.log(f"{path}/band", fill)
         thin = rr.Radius.ui_points(0.75)
         dim = colours.mixed(colour, 0.6)
-        strokes = rr.LineStrips2D(whiskers(low, high), colors=[dim], radii=[thin], draw_order=5.0)
+        strokes = rr.LineStrips2D(list(whiskers(low, high)), colors=[dim], radii=thin, draw_order=5.0)
         self._stream.log(f"{path}/interval", strokes)
         fitted = runs(scale.place(curve.tau, curve.fitted))
-        fit = rr.LineStrips2D(fitted, colors=[colour], radii=[rr.Radius.ui_points(1.25)], draw_order=10.0)
+        fit = rr.LineStrips2D(fitted, colors=[colour], radii=rr.Radius.ui_points(1.25), draw_order=10.0)
         self._stream.log(f"{path}/fit", fit)
         points = rr.Points2D(
             scale.place(curve.tau, curve.deviation),
             colors=[colour],
-            radii=[rr.Radius.ui_points(3.0)],
+            radii=rr.Radius.ui_points(3.0),
             draw_order=20.0,
         )
-        self._stream.log(path, points, rr.AnyValues(**curve.si))
+        self._stream.log(path, points, rr.AnyValues(drop_untyped_nones=True, **curve.si))
 
 
 @dataclass(frozen=True)
@@ -239,9 +238,9 @@ class _Curve:
 
 
 def _course(estimate: Estimate, row: int, column: int) -> tuple[float, float, float]:
-    """value, lo, hi of one coefficient; a bound has no value and starts at 0."""
+    """value, lo, hi of one estimated coefficient; a bound is a gap, its size would hide what follows."""
     c = estimate.coefficients
-    if c.status[row, column] == Status.UNESTIMATED:
+    if c.status[row, column] != Status.ESTIMATED:
         return np.nan, np.nan, np.nan
     return float(c.value[row, column]), float(c.lo[row, column]), float(c.hi[row, column])
 

@@ -50,7 +50,7 @@ COEFFICIENT_UNITS: Final[dict[Kind, dict[str, Unit]]] = {
         "R": Unit(DEGREE * HOUR * HOUR, "°/h/h"),
     },
     "accel": {
-        "Q": Unit(1e3, "mm/s"),
+        "Q": Unit(1e6, "µm/s"),
         "N": Unit(ROOT_HOUR, "m/s/√h"),
         "B": Unit(MICRO_G, "µg"),
         "K": Unit(MICRO_G * ROOT_HOUR, "µg/√h"),

@@ -1,0 +1,204 @@
+"""Any CAN sensor that a DBC file describes: frames in, samples out, by a map from axes to signals.
+
+``build`` reads the DBC with cantools and checks all of the map; from then on no file is touched and cantools
+is not used: frames of one message are stacked to bytes [n, size] and each signal is cut out of them at
+once (``drivers.decoders.dbc`` is compared with cantools in the tests).
+
+One sample may be spread over several messages. Its frames are joined in order of arrival: a frame whose
+message the open sample already has, or that is later than ``window`` after its first, starts the next
+sample. With ``join = "counter"`` the counter decides: a frame with another count, or, where the counter
+has a message of its own, the arrival of that message, starts the next sample. A sample with a frame
+missing, too short or not ``valid`` is bad, and leaves its place empty; with ``partial = true`` missing frames
+only leave their axes unmeasured. What stands before the first complete sample (joined mid-stream) is not
+counted. A message that brings nothing but temperature may be slower than the rest: the newest is used.
+
+J1939 messages (attribute VFrameFormat, or ``j1939 = true``) are known by their parameter group, whatever
+priority and sender; the first sender heard is the one listened to, unless ``source`` names another. A raw value in
+the top 2/256 of its range is "error" or "not available" there (SAE J1939-71: 0xFE00 to 0xFFFF of 16
+bits) and not measured; ``not_available = true`` applies the rule to other messages too.
+"""
+
+from collections.abc import Sequence
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.decoders.base import QUIET_FRAMES, Decoder, Rows, Timing
+from drivers.decoders.dbc.bits import Bytes
+from drivers.decoders.dbc.database import Database
+from drivers.decoders.dbc.join import COLUMNS, Join, Message, Sample
+from drivers.decoders.dbc.settings import Settings, SignalSettings
+from drivers.sample import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, Ints, SampleBlock
+
+__all__ = ["DbcDecoder", "Settings", "SignalSettings", "build"]
+
+LARGEST_CACHE: Final = 4096
+"""29-bit identifiers looked up so far; noise on a bus must not fill the memory."""
+
+
+class DbcDecoder:
+    """Frames of one device, as its DBC says."""
+
+    carrier: ClassVar[str] = "frames"
+
+    def __init__(self, messages: Sequence[Message], settings: Settings, timing: Timing) -> None:
+        slow = [m for m in messages if m.only_temperature and len(messages) > 1]
+        self._slow = slow[0] if slow else None
+        self._messages = [m for m in messages if m is not self._slow]
+        self._settings = settings
+        self.timing: Timing = timing
+        self.bad = 0
+        self.hint = ""
+        self._rivals = ""  # the hint that two senders are on the bus
+        self._quiet = 0  # good samples since the last rejected one
+        self._rows = Rows()
+        self._join = Join(self._messages, settings)
+        self._known = {m.address: i for i, m in self._numbered() if not m.j1939}
+        self._groups = {_group(m.frame_id): i for i, m in self._numbered() if m.j1939}
+        self._cache: dict[int, int | None] = {}
+        self._source = settings.source
+
+    @property
+    def addresses(self) -> tuple[int, ...]:
+        """What to listen for on the bus; ``ANY_SOURCE`` marks J1939 parameter groups."""
+        return tuple(m.address | (ANY_SOURCE if m.j1939 else 0) for _, m in self._numbered())
+
+    def reset(self) -> None:
+        """Forget an open sample, the newest temperature and the sender listened to."""
+        self._join.reset()
+        self._rows.reset()
+        self._source = self._settings.source
+        self._rivals = ""
+        self._cache.clear()
+
+    def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
+        """Samples that these frames complete; ``t_ns`` is the arrival of the last frame of each."""
+        done: list[Sample] = []
+        for chunk in chunks:
+            which = self._which(chunk.address)
+            if which is None:
+                continue
+            if which < 0:
+                self._note_temperature(chunk.data)
+                continue
+            size = self._messages[which].size
+            if len(chunk.data) < size:
+                message = self._messages[which].name
+                self.hint = f"{message}: frames of {len(chunk.data)} bytes, but its signals need {size}"
+            self._join.put(which, chunk.data[:size] if len(chunk.data) >= size else b"", chunk.t_ns, done)
+        blocks = self._decode(done)
+        self._quiet = self._quiet + len(done) if self._rows.bad == self.bad else 0
+        if self._quiet >= QUIET_FRAMES:
+            self.hint = ""
+        self.hint = self._rivals or self.hint
+        self.bad = self._rows.bad
+        return blocks
+
+    def encode(self, samples: SampleBlock) -> list[Chunk]:
+        """The frames of each sample, message by message; bits of no signal are 0, in J1939 1."""
+        n = len(samples)
+        table = np.column_stack((samples.values, samples.temperature_c))
+        sent: list[tuple[Message, Bytes]] = []
+        # the temperature goes first: it holds for the samples behind it
+        for _, message in sorted(self._numbered()):
+            frames = np.full((n, message.length), 0xFF if message.j1939 else 0, np.uint8)
+            for column in message.columns:
+                column.bits.put(frames, (table[:, column.place] - column.offset) / column.factor)
+            if message.valid is not None:
+                message.valid.put_raw(frames, np.ones(n, np.uint64))
+            if message.counter is not None:
+                message.counter.put_raw(frames, samples.ticks.view(np.uint64) & message.counter.mask)
+            sent.append((message, frames))
+        return [
+            Chunk(frames[row].tobytes(), int(samples.t_ns[row]), message.address)
+            for row in range(n)
+            for message, frames in sent
+            if message is not self._slow or not np.isnan(samples.temperature_c[row])
+        ]
+
+    def _numbered(self) -> list[tuple[int, Message]]:
+        """Messages with their place in a sample; -1 is the one that only brings temperature."""
+        slow = [(-1, self._slow)] if self._slow is not None else []
+        return [*slow, *enumerate(self._messages)]
+
+    def _which(self, address: int) -> int | None:
+        if address in self._known:
+            return self._known[address]
+        if not self._groups or not address & EXTENDED_ID:
+            return None
+        if address not in self._cache:
+            if len(self._cache) >= LARGEST_CACHE:
+                self._cache.clear()
+            self._cache[address] = self._group_of(address)
+        return self._cache[address]
+
+    def _group_of(self, address: int) -> int | None:
+        which = self._groups.get(_group(address))
+        if which is None:
+            return None
+        source = address & 0xFF
+        if self._source is None:
+            self._source = source
+        if source == self._source:
+            return which
+        if self._settings.source is None:
+            self._rivals = (
+                f"senders 0x{self._source:02X} and 0x{source:02X} both send these messages; "
+                f"listening to 0x{self._source:02X}, source = {source} would choose the other"
+            )
+        return None
+
+    def _note_temperature(self, data: bytes) -> None:
+        assert self._slow is not None
+        if len(data) >= self._slow.size:
+            self._join.temperature = data[: self._slow.size]
+
+    def _decode(self, done: Sequence[Sample]) -> list[SampleBlock]:
+        """Samples -> blocks, each signal of all of them at once."""
+        n = len(done)
+        table = np.full((n, len(COLUMNS)), np.nan)
+        ticks = np.full(n, NO_TICK, np.int64)
+        valid = np.ones(n, bool)
+        for which, message in self._numbered():
+            frames, there = _stack(done, which, message.size)
+            for column in message.columns:
+                physical = column.bits.physical(frames) * column.factor + column.offset
+                table[there, column.place] = physical[there]
+            if message.valid is not None:
+                valid &= ~there | (message.valid.raw(frames) == 1)
+            if message.counter is not None:
+                raw: Ints = message.counter.raw(frames).astype(np.int64)
+                ticks[there] = raw[there]
+        # a row without any value is rejected below, and its place stays empty
+        table[~valid] = np.nan
+        if not valid.all():
+            self.hint = f"{self._settings.valid} is not 1: the sensor says that its values do not hold"
+        return self._rows.blocks(
+            np.array([s.t_ns for s in done], np.int64),
+            np.ascontiguousarray(table[:, : len(AXES)]),
+            table[:, len(AXES)].copy(),
+            ticks,
+            np.array([s.bad_before for s in done], np.int64),
+            self._join.take_bad(),
+        )
+
+
+def _stack(done: Sequence[Sample], which: int, size: int) -> tuple[Bytes, NDArray[np.bool_]]:
+    """Frames [n, size] of one message, and where there are any."""
+    frames = [s.temperature if which < 0 else s.frames[which] for s in done]
+    empty = bytes(size)
+    data = np.frombuffer(b"".join(f or empty for f in frames), np.uint8)
+    return data.reshape(len(frames), size), np.array([bool(f) for f in frames], bool)
+
+
+def _group(frame_id: int) -> int:
+    """J1939 parameter group number of a 29-bit identifier (SAE J1939-21 5.1.2)."""
+    group = frame_id >> 8 & 0x3_FFFF
+    return group if group >> 8 & 0xFF >= 240 else group & 0x3_FF00
+
+
+def build(settings: Settings) -> Decoder:
+    """The decoder of these settings; reads the DBC. Raises ``ConfigError`` for all that is wrong with them."""
+    database = Database(settings)
+    return DbcDecoder(database.messages(), settings, database.timing())

@@ -1,0 +1,220 @@
+"""From the settings and a DBC file to the messages and signals that a decoder uses.
+
+The file is read once, with cantools. Every name is looked up, every unit is known, every signal fits in
+its message, or a ``ConfigError`` says in one line which does not and what would be right.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+import drivers
+from drivers import units
+from drivers.decoders.base import Arrival, Counter, Timing
+from drivers.decoders.dbc.bits import Bits
+from drivers.decoders.dbc.join import COLUMNS, Column, Message
+from drivers.decoders.dbc.settings import Settings, SignalSettings
+from drivers.errors import ConfigError
+from drivers.plugin import nearest
+from drivers.sample import AXES
+
+TEMPERATURE: Final = "temperature"
+SHIPPED: Final = Path(drivers.__file__).parent.parent / "config" / "dbc"
+SHIPPED_PREFIX: Final = "shipped:"
+LONGEST_COUNTER: Final = 62
+"""bits; ticks are int64."""
+
+
+class Database:
+    """Looks up each name in the DBC, once."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._path = _locate(settings.file)
+        self._messages: dict[str, Any] = {m.name: m for m in _load(self._path).messages}
+        self._used: dict[str, Message] = {}
+        self._timing: Timing = Arrival()
+        _check(settings)
+        self._look_up()
+
+    def messages(self) -> list[Message]:
+        """The messages that hold what the settings ask for; one that is only a counter comes first."""
+        return sorted(self._used.values(), key=lambda m: not m.only_counter)
+
+    def timing(self) -> Timing:
+        """How the samples get their time."""
+        return self._timing
+
+    def _look_up(self) -> None:
+        s = self._settings
+        for axis, entry in s.signals.items():
+            self._add_axis(axis, _signal_settings(entry))
+        if s.valid:
+            message, signal = self._find("valid", s.valid)
+            self._use(message, signal).valid = self._bits(message, signal)
+        for message, signal in self._counters() if s.counter else ():
+            if signal.is_float or signal.length > LONGEST_COUNTER:
+                raise ConfigError(
+                    f'counter "{s.counter}": a counter is a whole number of at most {LONGEST_COUNTER} bits'
+                )
+            self._use(message, signal).counter = self._bits(message, signal)
+            self._timing = Counter(1 << int(signal.length), s.tick)
+
+    def _counters(self) -> list[tuple[Any, Any]]:
+        name = self._settings.counter
+        if "." in name or self._settings.join == "time":
+            return [self._find("counter", name)]
+        # messages with nothing but temperature need no counter
+        inertial = [m.name for m in self._used.values() if not m.only_temperature]
+        return [self._find("counter", f"{message}.{name}") for message in inertial]
+
+    def _add_axis(self, axis: str, entry: SignalSettings) -> None:
+        if axis not in COLUMNS:
+            raise ConfigError(f'signals: unknown axis "{axis}"{nearest(axis, COLUMNS)}')
+        message, signal = self._find(f"signals.{axis}", entry.signal)
+        factor, offset = self._to_si(axis, entry, signal)
+        column = Column(COLUMNS.index(axis), self._bits(message, signal), factor, offset)
+        self._use(message, signal).columns.append(column)
+
+    def _to_si(self, axis: str, entry: SignalSettings, signal: Any) -> tuple[float, float]:
+        unit = entry.unit or signal.unit or ""
+        try:
+            if axis == TEMPERATURE:
+                factor, offset = units.temperature_scale(unit)
+            else:
+                look_up = units.rate_factor if axis.startswith("g") else units.acceleration_factor
+                factor, offset = look_up(unit), 0.0
+        except ConfigError as error:
+            where = "" if entry.unit else f' (from {self._path.name}); say which it is: unit = "…"'
+            raise ConfigError(f"signals.{axis}: {error}{where}") from error
+        return factor * entry.factor, offset * entry.factor
+
+    def _find(self, key: str, name: str) -> tuple[Any, Any]:
+        """The DBC's message and signal of "Message.Signal"."""
+        message_name, dot, signal_name = name.partition(".")
+        if not dot:
+            raise ConfigError(f'{key} = "{name}": it is "Message.Signal"')
+        message = self._messages.get(message_name)
+        if message is None:
+            known = nearest(message_name, tuple(self._messages))
+            raise ConfigError(f'{key}: {self._path.name} has no message "{message_name}"{known}')
+        signals = {s.name: s for s in message.signals}
+        signal = signals.get(signal_name)
+        if signal is None:
+            known = nearest(signal_name, tuple(signals))
+            raise ConfigError(f'{key}: message {message_name} has no signal "{signal_name}"{known}')
+        if signal.multiplexer_ids:
+            raise ConfigError(f"{key}: {name} is multiplexed; such signals are not supported")
+        return message, signal
+
+    def _use(self, message: Any, signal: Any) -> Message:
+        """The entry of a message among those used, long enough for the signal."""
+        entry = self._used.get(message.name)
+        if entry is None:
+            entry = self._used[message.name] = Message(
+                message.name,
+                message.frame_id,
+                bool(message.is_extended_frame),
+                self._is_j1939(message),
+                0,
+                message.length,
+                [],
+            )
+        bits = self._bits(message, signal)
+        entry.size = max(entry.size, bits.first + bits.span)
+        return entry
+
+    def _is_j1939(self, message: Any) -> bool:
+        s = self._settings
+        return bool(message.protocol == "j1939" if s.j1939 is None else s.j1939)
+
+    def _bits(self, message: Any, signal: Any) -> Bits:
+        s = self._settings
+        big_endian = signal.byte_order == "big_endian"
+        first, last = _ends(signal.start, signal.length, big_endian)
+        if last // 8 >= message.length or signal.length > 64:
+            raise ConfigError(f"{self._path.name}: {signal.name} does not fit in {message.name}")
+        # Motorola counts from the most significant end: the least significant bit is the last one
+        shift = 7 - last % 8 if big_endian else first % 8
+        rule = self._is_j1939(message) if s.not_available is None else s.not_available
+        return Bits(
+            first // 8,
+            last // 8 - first // 8 + 1,
+            shift,
+            signal.length,
+            big_endian,
+            bool(signal.is_signed),
+            bool(signal.is_float),
+            float(signal.scale),
+            float(signal.offset),
+            rule and signal.length >= 8 and not signal.is_signed and not signal.is_float,
+        )
+
+
+def _ends(start: int, length: int, big_endian: bool) -> tuple[int, int]:
+    """First and last bit in order of transmission; a DBC numbers Motorola starts 7 … 0, 15 … 8, …"""
+    first = 8 * (start // 8) + 7 - start % 8 if big_endian else start
+    return first, first + length - 1
+
+
+def _check(settings: Settings) -> None:
+    if not settings.signals:
+        raise ConfigError('signals is empty; it maps axes to signals: gz = "Message.Signal"')
+    if not set(settings.signals) - {TEMPERATURE}:
+        raise ConfigError(f"signals: no axis but temperature; axes are {', '.join(AXES)}")
+    if settings.join == "counter" and not settings.counter:
+        raise ConfigError('join = "counter" needs counter = "Message.Signal"')
+    if settings.tick is not None and not settings.tick > 0.0:
+        raise ConfigError(f"tick = {settings.tick:g}; it is seconds a count, above 0")
+    if not 0.0 <= settings.window < 1e6:
+        raise ConfigError(f"window = {settings.window:g}; it is seconds, 0 or more")
+    if settings.source is not None and not 0 <= settings.source <= 255:
+        raise ConfigError(f"source = {settings.source}; a J1939 source address is 0 to 255")
+
+
+def _signal_settings(entry: str | SignalSettings) -> SignalSettings:
+    if isinstance(entry, SignalSettings):
+        if not (np.isfinite(entry.factor) and entry.factor != 0.0):
+            raise ConfigError(f"signals: factor = {entry.factor:g}; it is a number other than 0")
+        return entry
+    if entry.startswith("-"):
+        return SignalSettings(entry[1:], factor=-1.0)
+    return SignalSettings(entry)
+
+
+def _locate(file: str) -> Path:
+    """The path itself, or that of a shipped database."""
+    path = Path(file).expanduser()
+    name = file.removeprefix(SHIPPED_PREFIX)
+    if name == file and (path.is_file() or len(path.parts) != 1):
+        return path
+    shipped: Mapping[str, Path] = {p.stem: p for p in sorted(SHIPPED.glob("*.dbc"))}
+    stem = name.removesuffix(".dbc")
+    if stem not in shipped:
+        raise ConfigError(f'file = "{file}": no such file, and none shipped{nearest(stem, tuple(shipped))}')
+    return shipped[stem]
+
+
+def _load(path: Path) -> Any:
+    """The database, read leniently: other people's files overlap signals that nobody asks for."""
+    import cantools
+
+    try:
+        if path.suffix.lower() != ".dbc":
+            return cantools.database.load_file(path, strict=False)
+        return cantools.database.load_string(_text(path), "dbc", strict=False)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except (cantools.Error, ValueError, LookupError) as error:
+        raise ConfigError(f"{path}: no CAN database: {' '.join(str(error).split())[:200]}") from error
+
+
+def _text(path: Path) -> str:
+    """DBC editors write the code page of Windows, others UTF-8; degree signs tell them apart."""
+    data = path.read_bytes()
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", errors="replace")

@@ -1,0 +1,41 @@
+"""Keys of the ``dbc`` decoder."""
+
+from typing import Literal
+
+import msgspec
+
+from drivers.decoders.base import DecoderSettings
+
+
+class SignalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One signal in full, where a name alone does not say all."""
+
+    signal: str
+    unit: str = ""
+    """Absent: the DBC's own."""
+    factor: float = 1.0
+    """Applied last: a sign, or a correction."""
+
+
+class Settings(DecoderSettings, frozen=True, kw_only=True):
+    """Keys of a CAN database."""
+
+    file: str
+    """A path, or the name of a shipped one: "j1939_imu", "canmod_gps", "xsens_mti", "bosch_mm7"."""
+    signals: dict[str, str | SignalSettings]
+    """Axis (gx … az, temperature) = "Message.Signal", "-Message.Signal", or a table."""
+    valid: str = ""
+    """A signal that is 1 where the sample holds."""
+    counter: str = ""
+    """"Message.Signal", or with join = "counter" a bare name that every message of a sample has."""
+    tick: float | None = None
+    """Seconds a count; absent: the counter counts samples."""
+    join: Literal["time", "counter"] = "time"
+    window: float = 0.0
+    """Seconds within which the frames of one sample come; 0 = any."""
+    partial: bool = False
+    j1939: bool | None = None
+    source: int | None = None
+    """J1939 source address, 0 to 255."""
+    not_available: bool | None = None
+    """Absent: as the message is J1939 or not."""

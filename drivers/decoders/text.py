@@ -1,0 +1,310 @@
+"""Plain text lines of numbers, as boards of the Arduino class print them.
+
+No standard: ``columns`` says what stands where, and units turn it into SI. A line ends in LF, CR or both.
+With ``delimiter = "auto"`` commas, semicolons and tabs separate fields, and blanks where a line has none of
+them. An empty field, or ``nan``, is not measured. Lines that are empty or begin with the comment prefix are
+passed over; a line with another number of columns, or a field that is no number, is bad. With ``nmea`` a
+line reads ``$fields*CC``, CC the exclusive or between ``$`` and ``*``, and is bad unless that holds.
+
+The first line after the link was opened is most often cut in front, and a cut number is still a number:
+``-0.012`` becomes ``12``. It is left out without being bad, unless a checksum vouches for it or
+``first_line = "keep"``. ``encode`` therefore puts a line end before a block's first line.
+"""
+
+from collections.abc import Sequence
+from typing import ClassVar, Final, Literal
+
+import msgspec
+import numpy as np
+
+from drivers import units
+from drivers.decoders.base import (
+    QUIET_FRAMES,
+    Decoder,
+    DecoderSettings,
+    Rows,
+    one_chunk_each,
+    xor,
+)
+from drivers.errors import ConfigError
+from drivers.plugin import nearest
+from drivers.sample import AXES, NO_TICK, Arrival, Chunk, Counter, Floats, SampleBlock, Timing
+
+LONGEST: Final = 4096
+"""Bytes of a line; more without a line end is noise and is dropped."""
+NOISE: Final = b"\0"
+"""Stands for an overlong line: it is bad, as it is no number."""
+SKIP: Final = "-"
+COLUMNS: Final = (*AXES, "temperature", "t", "counter", SKIP)
+TICK_S: Final = 1e-9
+"""The ``t`` column becomes ticks of 1 ns."""
+DEVICE_WRAP: Final = 1 << 32
+"""Counts after which ``millis()`` and ``micros()`` of small boards start again at 0."""
+NEVER: Final = 1 << 62
+"""Ticks; 146 years of nanoseconds."""
+
+
+class Settings(DecoderSettings, frozen=True):
+    """Keys of ``[device.driver.decoder_options]``."""
+
+    columns: tuple[str, ...]
+    """What stands in each column: gx gy gz ax ay az temperature t counter, or - to skip it."""
+    delimiter: str = "auto"
+    """auto, or the text between two fields; " " is any number of blanks."""
+    gyro_unit: str = "rad/s"
+    """Unit of gx gy gz: rad/s, mrad/s, deg/s, ..."""
+    accel_unit: str = "m/s²"
+    """Unit of ax ay az: m/s², g, mg, ..."""
+    temperature_unit: str = "°C"
+    """Unit of the temperature: °C, K, °F."""
+    scale: dict[str, float] = msgspec.field(default_factory=dict)
+    """Factor of a column before its unit is applied, as gx = 0.0305 for raw counts."""
+    comment: str = "#"
+    """Lines that begin with it are passed over; "" = none."""
+    header: int = 0
+    """Lines to pass over after the link was opened."""
+    first_line: Literal["drop", "keep"] = "drop"
+    """keep: the link always starts at the beginning of a line."""
+    nmea: bool = False
+    """Lines read $fields*CC."""
+    time_unit: Literal["s", "ms", "us", "ns"] = "s"
+    """Unit of the t column, the device's own clock."""
+    counter_modulus: int = 1 << 32
+    """Counts after which the counter column starts again at 0."""
+
+
+class TextDecoder:
+    """Lines of numbers <-> SampleBlock."""
+
+    carrier: ClassVar[str] = "bytes"
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._at = {name: i for i, name in enumerate(settings.columns) if name != SKIP}
+        self._width = len(settings.columns)
+        self._factor, self._offset = _scales(settings)
+        self._tick = round(units.time_factor(settings.time_unit) / TICK_S)
+        self.timing: Timing = _timing(settings, self._tick)
+        self._comment = settings.comment.encode()
+        self._delimiter = settings.delimiter.encode()
+        self._rows = Rows()
+        self._complaint = ""
+        self._quiet = QUIET_FRAMES  # good lines since the last bad one
+        self.reset()
+
+    @property
+    def bad(self) -> int:
+        """Lines that could not be read, and samples that cannot be."""
+        return self._rows.bad
+
+    @property
+    def hint(self) -> str:
+        """What was wrong with the last bad line, while it is not long ago."""
+        return self._complaint if self._quiet < QUIET_FRAMES else ""
+
+    def reset(self) -> None:
+        """Forget half a line; the next line is a first line again."""
+        self._rest = b""
+        self._overlong = False
+        self._joined = False  # whether the end of the first line has come
+        self._seen = 0  # lines since the link was opened
+        self._rows.reset()
+
+    def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
+        """Samples of the lines that these chunks complete."""
+        lines: list[bytes] = []
+        t_ns: list[int] = []
+        for chunk in chunks:
+            new = self._lines(chunk.data)
+            lines += new
+            t_ns += [chunk.t_ns] * len(new)
+        if not lines:
+            return []
+        table, counted = self._table(lines)
+        return self._blocks(table, np.array(t_ns, np.int64)[counted])
+
+    def _lines(self, data: bytes) -> list[bytes]:
+        """Lines completed by these bytes, without their ends and blanks around; none is empty."""
+        *lines, rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
+        if lines and self._overlong:
+            lines[0], self._overlong = NOISE, False
+        lines = [NOISE if len(line) > LONGEST else line.strip() for line in lines]
+        if lines and not self._joined:
+            self._joined = True
+            lines[0] = lines[0] if self._first_is_whole(lines[0]) else b""
+        if len(rest) > LONGEST:
+            rest, self._overlong = b"", True
+            self._complain(f"more than {LONGEST} bytes without a line end: is the baud rate right?")
+        self._rest = rest
+        return [line for line in lines if line]
+
+    def _first_is_whole(self, line: bytes) -> bool:
+        """Whether the first line counts; one that does not is not bad either."""
+        if self._settings.header:
+            return True  # it is passed over with the others
+        if self._settings.nmea:
+            return _checked(line) is not None
+        return self._settings.first_line == "keep" and self._row(line)[0] is not None
+
+    def _table(self, lines: list[bytes]) -> tuple[Floats, list[int]]:
+        """[n, columns] numbers of the lines that count, a bad line infinite; and which lines those are."""
+        bodies: list[bytes | None] = []  # None: fails its check
+        counted: list[int] = []
+        comment, header = self._comment, self._settings.header
+        for i, line in enumerate(lines):
+            if comment and line.startswith(comment):
+                continue
+            self._seen += 1
+            if self._seen <= header:
+                continue
+            bodies.append(_checked(line) if self._settings.nmea else line)
+            counted.append(i)
+        return self._numbers(bodies), counted
+
+    def _numbers(self, bodies: list[bytes | None]) -> Floats:
+        """[n, columns]; all lines at once where they look alike, one by one otherwise."""
+        alike = [self._separated(body) for body in bodies if body is not None]
+        commas = self._width - 1
+        joined = b",".join(alike)
+        if len(alike) == len(bodies) and b"_" not in joined and all(a.count(b",") == commas for a in alike):
+            try:
+                table = np.array(list(map(float, joined.split(b",") if alike else ())))
+            except ValueError:
+                pass  # an empty field, or one that is no number: find out which
+            else:
+                self._quiet += len(bodies)
+                return table.reshape(-1, self._width)
+        rows = []
+        for body in bodies:
+            row, complaint = (None, "a line fails its checksum") if body is None else self._row(body)
+            rows.append(row or [np.inf] * self._width)
+            if complaint:
+                self._complain(complaint)
+            else:
+                self._quiet += 1
+        return np.array(rows).reshape(-1, self._width)
+
+    def _complain(self, complaint: str) -> None:
+        self._complaint, self._quiet = complaint, 0
+
+    def _separated(self, body: bytes) -> bytes:
+        """The line with commas between fields."""
+        if self._delimiter == b"auto":
+            body = body.replace(b";", b",").replace(b"\t", b",")
+            return body if b"," in body else b",".join(body.split())
+        if self._delimiter == b" ":
+            return b",".join(body.split())
+        return body.replace(b",", b"?").replace(self._delimiter, b",") if self._delimiter != b"," else body
+
+    def _row(self, body: bytes) -> tuple[list[float] | None, str]:
+        """The numbers of one line, or None and what is wrong with it."""
+        fields = self._separated(body).split(b",")
+        if len(fields) != self._width:
+            return None, f"a line has {len(fields)} columns, expected are {self._width}: {body[:60]!r}"
+        try:
+            return [_number(field) for field in fields], ""
+        except ValueError:
+            return None, f"a field is no number: {body[:60]!r}"
+
+    def _blocks(self, table: Floats, t_ns: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> list[SampleBlock]:
+        n = len(table)
+        bad = np.isinf(table).any(axis=1)
+        scaled = table * self._factor + self._offset
+        values = np.full((n, 6), np.nan)
+        for axis, name in enumerate(AXES):
+            if name in self._at:
+                values[:, axis] = scaled[:, self._at[name]]
+        temperature_c = scaled[:, self._at["temperature"]] if "temperature" in self._at else np.full(n, np.nan)
+        ticks = np.full(n, NO_TICK, np.int64)
+        if isinstance(self.timing, Counter):
+            counts = scaled[:, self._at["t" if "t" in self._at else "counter"]]
+            bad |= ~(np.abs(counts) < float(NEVER))  # no clock value, or none that can be
+            ticks = np.rint(np.where(bad, 0.0, counts)).astype(np.int64) % self.timing.modulus
+        values[bad] = np.inf
+        return self._rows.blocks(t_ns, values, temperature_c, ticks, np.zeros(n, np.int64))
+
+    def encode(self, samples: SampleBlock) -> list[Chunk]:
+        """A line a sample, in the columns and units set, numbers as exact as they are."""
+        n = len(samples)
+        table = np.zeros((n, self._width))
+        for name, at in self._at.items():
+            if name in AXES:
+                table[:, at] = samples.values[:, AXES.index(name)]
+            elif name == "temperature":
+                table[:, at] = samples.temperature_c
+            else:
+                table[:, at] = samples.ticks
+        table = (table - self._offset) / self._factor
+        between = {"auto": ","}.get(self._settings.delimiter, self._settings.delimiter)
+        whole = {at for name, at in self._at.items() if name == "counter"}
+        bodies = [
+            between.join(f"{x:.0f}" if at in whole else repr(x) for at, x in enumerate(row)).encode()
+            for row in table.tolist()
+        ]
+        if self._settings.nmea:
+            bodies = [b"$%b*%02X" % (body, xor(body)) for body in bodies]
+        lines = [body + b"\r\n" for body in bodies]
+        return one_chunk_each([b"\r\n" + lines[0], *lines[1:]], samples.t_ns)
+
+
+def _number(field: bytes) -> float:
+    field = field.strip()
+    if b"_" in field:  # Python's own notation, nobody's number
+        raise ValueError(field)
+    return float(field) if field else np.nan
+
+
+def _checked(line: bytes) -> bytes | None:
+    """What stands between $ and * if its checksum holds."""
+    start, star = line.rfind(b"$") + 1, line.rfind(b"*")
+    body, stated = line[start:star], line[star + 1 :]
+    try:
+        return body if 0 < start <= star and len(stated) == 2 and int(stated, 16) == xor(body) else None
+    except ValueError:
+        return None
+
+
+def _scales(settings: Settings) -> tuple[Floats, Floats]:
+    """Factor and offset of each column to SI, and of ``t`` to ticks."""
+    factors, offsets = np.ones(len(settings.columns)), np.zeros(len(settings.columns))
+    for i, name in enumerate(settings.columns):
+        factor, offset = 1.0, 0.0
+        if name in AXES[:3]:
+            factor = units.rate_factor(settings.gyro_unit)
+        elif name in AXES[3:]:
+            factor = units.acceleration_factor(settings.accel_unit)
+        elif name == "temperature":
+            factor, offset = units.temperature_scale(settings.temperature_unit)
+        elif name == "t":
+            factor = round(units.time_factor(settings.time_unit) / TICK_S)
+        factors[i], offsets[i] = factor * settings.scale.get(name, 1.0), offset
+    return factors, offsets
+
+
+def _timing(settings: Settings, tick: int) -> Timing:
+    if "t" in settings.columns:
+        wraps = settings.time_unit in ("ms", "us")
+        return Counter(DEVICE_WRAP * tick if wraps else NEVER, TICK_S)
+    return Counter(settings.counter_modulus) if "counter" in settings.columns else Arrival()
+
+
+def build(settings: Settings) -> Decoder:
+    """A decoder with these settings; ConfigError names the key that is wrong."""
+    given = [name for name in settings.columns if name != SKIP]
+    for name in (*given, *settings.scale):
+        if name not in COLUMNS:
+            raise ConfigError(f'unknown column "{name}"{nearest(name, COLUMNS)}')
+    if len(given) != len(set(given)):
+        raise ConfigError("columns: a name stands there twice")
+    if not set(given) & set(AXES):
+        raise ConfigError(f"columns: none of {', '.join(AXES)} is there")
+    if {"t", "counter"} <= set(given):
+        raise ConfigError('columns: give one of t and counter, and "-" for the other')
+    for name, factor in settings.scale.items():
+        if not np.isfinite(factor) or factor == 0.0:
+            raise ConfigError(f"scale of {name}: must be a number other than 0")
+    if not settings.delimiter or not settings.delimiter.isascii() or set(settings.delimiter) & set("\r\n"):
+        raise ConfigError(f"delimiter {settings.delimiter!r}: must be auto, or ASCII text within a line")
+    if not 2 <= settings.counter_modulus <= NEVER:
+        raise ConfigError(f"counter_modulus {settings.counter_modulus}: must be from 2 to 2^62")
+    return TextDecoder(settings)

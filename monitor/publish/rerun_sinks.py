@@ -1,0 +1,258 @@
+"""Where the drawing goes: a viewer window, a page in the browser, or a file.
+
+In come the viewer's settings, out goes an open ``Output``: a Rerun stream, and the child process that
+belongs to it. ``ViewerTrouble`` says in one line what is wrong; the caller tries again later. The viewer's
+program is started directly (its Python wrapper would leave it alive when killed) and told to listen on
+loopback only, with its usage statistics off. Window and page are the same thing to the daemon: a Rerun
+server in a process of its own, so what it holds in memory is not the daemon's. Importing this imports Rerun.
+
+A busy port raises nothing in Rerun, so ports are looked at first: a Rerun server that already listens is
+joined by a window, anything else is trouble; a page moves on to the next free port.
+"""
+
+import contextlib
+import http.client
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import webbrowser
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Final
+from urllib.parse import quote
+
+import rerun as rr
+import rerun_cli  # type: ignore[import-untyped]
+
+from monitor.publish.viewer import ViewerSettings, ViewerTrouble
+
+LOOPBACK: Final = "127.0.0.1"
+APPLICATION: Final = "imu-monitor"
+START_S: Final = 20.0  # for a viewer to listen: the first start of a 300 MB program from a cold disk
+PORTS_TRIED: Final = 20
+PROBE: Final = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadTables"
+
+
+def has_desktop() -> bool:
+    """Whether a window can be opened here at all."""
+    return sys.platform in ("darwin", "win32") or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
+
+
+class Child:
+    """A viewer process, and what it last complained about."""
+
+    def __init__(self, arguments: list[str]) -> None:
+        self._log: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the child
+        quiet = {"RERUN_ANALYTICS": "0", "RERUN_APP_ONLY": "true", "NO_COLOR": "1", "RUST_LOG": "warn"}
+        self._process = subprocess.Popen(
+            [str(viewer_program()), *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=self._log,
+            stderr=self._log,
+            env={**os.environ, **quiet},
+        )
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    def trouble(self) -> str | None:
+        """Why the process is gone; None while it lives."""
+        status = self._process.poll()
+        if status is None:
+            return None
+        return "viewer was closed" if status == 0 else f"viewer ended ({status}): {self._last_words()}"
+
+    def end(self, patience_s: float = 0.5) -> None:
+        """Ask it to go, then make it: a stopped process hears nothing but SIGKILL."""
+        with contextlib.suppress(OSError):
+            self._process.terminate()
+        try:
+            self._process.wait(patience_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait(5.0)
+        self._log.close()
+
+    def kill(self) -> None:
+        """End it from another thread, whatever it is doing."""
+        self._process.kill()
+
+    def _last_words(self) -> str:
+        self._log.seek(0)
+        lines = self._log.read()[-2000:].decode(errors="replace").strip().splitlines()
+        return lines[-1].strip()[:200] if lines else "no message"
+
+
+@dataclass
+class Output:
+    """An open viewer or file."""
+
+    stream: rr.RecordingStream
+    flush_every_s: float
+    url: str = ""  # of the page, or of the Rerun server
+    child: Child | None = None
+    joined_port: int | None = None  # of a viewer that someone else started
+
+    def trouble(self) -> str | None:
+        """Why nobody looks any more; None while all is well."""
+        if self.child is not None:
+            return self.child.trouble()
+        if self.joined_port is not None and not listens(self.joined_port):
+            return f"the viewer on port {self.joined_port} was closed"
+        return None
+
+    def confirm(self, patience_s: float) -> bool:
+        """Whether all that was logged got through within ``patience_s``."""
+        try:
+            self.stream.flush(timeout_sec=patience_s)
+        except RuntimeError:  # Rerun's only way to say "timed out" or "connection lost"
+            return False
+        return True
+
+    def close(self) -> None:
+        """End the viewer that was started here. Frees no stream: that may block, see ``rerun_view``."""
+        if self.child is not None:
+            self.child.end()
+
+
+def viewer_program() -> Path:
+    """The viewer's own program inside the package ``rerun_cli``."""
+    room = Path(rerun_cli.__file__).parent
+    names = ("Rerun.app/Contents/MacOS/Rerun", "rerun.exe", "rerun")
+    found = next((room / name for name in names if (room / name).is_file()), None)
+    if found is None:
+        raise ViewerTrouble(f"rerun-sdk came without its viewer: no program in {room}")
+    return found
+
+
+def listens(port: int) -> bool:
+    """Whether anyone accepts connections on this port of loopback."""
+    with contextlib.suppress(OSError), socket.create_connection((LOOPBACK, port), 0.5):
+        return True
+    return False
+
+
+def is_rerun(port: int) -> bool:
+    """Whether a Rerun server answers there: it knows the service of its own protocol.
+
+    Any other gRPC server says "unimplemented" (status 12), any other server no gRPC at all.
+    """
+    connection = http.client.HTTPConnection(LOOPBACK, port, timeout=1.0)
+    headers = {"content-type": "application/grpc-web+proto", "x-grpc-web": "1"}
+    try:
+        connection.request("POST", PROBE, bytes(5), headers)
+        reply = connection.getresponse()
+        return reply.getheader("grpc-status", "") != "12" and "grpc" in reply.getheader("content-type", "")
+    except (OSError, http.client.HTTPException):
+        return False
+    finally:
+        connection.close()
+
+
+def free_port(wanted: int, taken: int | None = None) -> int:
+    """``wanted``, or the next port after it that nobody holds."""
+    for port in range(wanted, min(wanted + PORTS_TRIED, 65536)):
+        if port != taken and _bindable(port):
+            return port
+    raise ViewerTrouble(f"cannot listen on {wanted} to {wanted + PORTS_TRIED - 1}: all busy")
+
+
+def _bindable(port: int) -> bool:
+    with socket.socket() as probe:
+        if os.name == "posix":
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((LOOPBACK, port))
+        except OSError:
+            return False
+    return True
+
+
+def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[[], bool]) -> Output:
+    """Open what the settings ask for; waits until it listens or ``given_up``. ViewerTrouble says why not."""
+    if settings.mode.endswith(".rrd"):
+        return _open_file(Path(settings.mode), recording_id)
+    if settings.mode == "native" or (settings.mode == "auto" and has_desktop()):
+        return _open_native(settings, recording_id, given_up)
+    return _open_web(settings, recording_id, given_up)
+
+
+def _open_file(path: Path, recording_id: str) -> Output:
+    try:
+        with path.open("wb"):
+            pass
+    except OSError as error:
+        raise ViewerTrouble(f"cannot write {path}: {error.strerror}") from error
+    stream = _stream(recording_id)
+    # A footer would keep a line about every chunk in memory for as long as the daemon runs.
+    stream.set_sinks(rr.FileSink(path, write_footer=False))
+    return Output(stream, flush_every_s=1.0)
+
+
+def _open_native(settings: ViewerSettings, recording_id: str, given_up: Callable[[], bool]) -> Output:
+    port = settings.port
+    if listens(port):
+        if not is_rerun(port):
+            raise ViewerTrouble(f"cannot listen on {port}: busy")
+        return _connected(port, recording_id, joined_port=port)
+    child = Child([
+        *("--bind", LOOPBACK, "--port", str(port)),
+        *("--memory-limit", settings.memory, "--server-memory-limit", "64MiB"),
+        *("--hide-welcome-screen", "--expect-data-soon"),
+    ])  # fmt: skip
+    _wait_for(port, child, given_up)
+    return _connected(port, recording_id, child=child)
+
+
+def _open_web(settings: ViewerSettings, recording_id: str, given_up: Callable[[], bool]) -> Output:
+    port = free_port(settings.port)
+    web_port = free_port(settings.web_port, taken=port)
+    child = Child([
+        *("--serve-web", "--bind", LOOPBACK, "--port", str(port), "--web-viewer-port", str(web_port)),
+        *("--server-memory-limit", settings.memory),
+    ])  # fmt: skip
+    _wait_for(port, child, given_up)
+    output = _connected(port, recording_id, child=child)
+    output.url = f"http://{LOOPBACK}:{web_port}/?url={quote(server_url(port), safe='')}"
+    if has_desktop():
+        webbrowser.open(output.url)
+    return output
+
+
+def server_url(port: int) -> str:
+    """Where a Rerun server on loopback takes and gives recordings."""
+    return f"rerun+http://{LOOPBACK}:{port}/proxy"
+
+
+def _connected(port: int, recording_id: str, child: Child | None = None, joined_port: int | None = None) -> Output:
+    stream = _stream(recording_id)
+    stream.set_sinks(rr.GrpcSink(server_url(port)))
+    return Output(stream, 0.15, server_url(port), child, joined_port)
+
+
+def _stream(recording_id: str) -> rr.RecordingStream:
+    """A stream whose rows stand on ``sample_time`` alone."""
+    stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    return stream
+
+
+def _wait_for(port: int, child: Child, given_up: Callable[[], bool]) -> None:
+    end = time.monotonic() + START_S
+    while time.monotonic() < end and not given_up():
+        trouble = child.trouble()
+        if trouble is not None:
+            child.end()
+            raise ViewerTrouble(trouble)
+        if listens(port):
+            return
+        time.sleep(0.05)
+    child.end()
+    raise ViewerTrouble(f"the viewer did not listen on {port} within {START_S:.0f} s")

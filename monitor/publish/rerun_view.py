@@ -1,0 +1,287 @@
+"""The live view: takes results from the service's loop and draws them in Rerun from a thread of its own.
+
+In come samples, estimates, events and health; every call puts them on a backlog and returns. The thread
+opens the viewer, draws what has come about seven times a second, and once a second asks Rerun whether it
+all got through. A viewer that does not answer (stopped, hung) is ``stalled``: nothing more is drawn until it
+answers, the backlog drops its oldest, and the drops are counted in ``state``. A viewer that is missing,
+cannot start or was closed is said in ``state`` too, and tried again. Nothing here ever raises into the loop.
+
+Traps of Rerun that shape this file: a logging call blocks for ever on a viewer that does not read; so does
+its exit handler (taken off), and so does freeing a stream (so the stream is held by the thread's frame
+alone, and a thread stuck inside Rerun takes it along when the process exits); a first import takes half a
+second (done in the thread, and not at all with mode ``none``).
+"""
+
+import importlib
+import os
+import threading
+import time
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from drivers.sample import Event, Floats
+from monitor.estimate.estimate import Estimate
+from monitor.health import Health
+from monitor.publish.backlog import Backlog
+from monitor.publish.viewer import DeviceInfo, ViewerSettings, ViewerTrouble
+
+if TYPE_CHECKING:
+    from monitor.publish.rerun_scene import Scene
+    from monitor.publish.rerun_sinks import Child, Output
+
+BACKLOG_BYTES: Final = 16_000_000  # about 25 s of 16 devices at 1 kHz, six axes
+CHECK_EVERY_S: Final = 1.0  # whether what was drawn has reached the viewer
+PATIENCE_S: Final = 1.0  # for the viewer to answer that
+STALL_S: Final = 2.0  # inside one call of Rerun before it counts as stalled
+RETRY_S: Final = (2.0, 5.0, 15.0, 30.0)
+DRAWS_PER_S: Final = 8.0  # estimates drawn, shared by all devices; 2 a second for each at most
+EARLY_END_S: Final = 10.0  # a window that ends sooner never worked
+MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
+
+Message = tuple[str, "_Samples | _Estimate | _Event | _Health"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Samples:
+    wall_s: Floats
+    values: Floats
+    temperature_c: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class _Estimate:
+    wall_s: float
+    estimate: Estimate
+
+
+@dataclass(frozen=True, slots=True)
+class _Event:
+    wall_s: float
+    event: Event
+
+
+@dataclass(frozen=True, slots=True)
+class _Health:
+    wall_s: float
+    health: Health
+
+
+class RerunView:
+    """One viewer for all devices. Called by one thread; every call returns at once."""
+
+    def __init__(self, settings: ViewerSettings, devices: Sequence[DeviceInfo]) -> None:
+        """Opens nothing yet."""
+        self._settings = settings
+        self._devices = tuple(devices)
+        self._backlog: Backlog[Message] = Backlog(BACKLOG_BYTES)
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._phase = "off"
+        self._stalled = False
+        self._inside_since: float | None = None  # monotonic s at which the thread went into Rerun
+        self._child: Child | None = None
+        self._url = ""
+        self._recording_id = str(uuid.uuid4())
+
+    @property
+    def state(self) -> str:
+        """``ok``, or in a few words what is wrong: for the status line."""
+        inside = self._inside_since
+        if self._stalled or (inside is not None and time.monotonic() - inside > STALL_S):
+            return f"stalled ({self._backlog.dropped} dropped)"
+        return self._phase
+
+    @property
+    def url(self) -> str:
+        """Where to look: the page, the Rerun server, or "" while there is none."""
+        return self._url
+
+    def start(self) -> None:
+        """Start the thread; trouble shows in ``state`` and is tried again there."""
+        if self._settings.mode == "none" or self._thread is not None:
+            return
+        self._phase = "starting"
+        self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
+        self._thread.start()
+
+    def samples(self, device: str, wall_s: Floats, values: Floats, temperature_c: Floats) -> None:
+        """Samples at Unix times ``wall_s`` [n]: [n, 6] rad/s and m/s², [n] °C; NaN = not measured."""
+        weight = wall_s.nbytes + values.nbytes + temperature_c.nbytes
+        self._put(device, _Samples(wall_s, values, temperature_c), weight)
+
+    def estimate(self, device: str, wall_s: float, estimate: Estimate) -> None:
+        """A refit; of a fast stream of them the viewer draws the newest, twice a second."""
+        self._put(device, _Estimate(wall_s, estimate), estimate.curve.avar.nbytes * 8)
+
+    def event(self, device: str, wall_s: float, event: Event) -> None:
+        """Something happened to a device."""
+        self._put(device, _Event(wall_s, event), 1000)
+
+    def health(self, device: str, wall_s: float, health: Health) -> None:
+        """How a device does, about once a second."""
+        self._put(device, _Health(wall_s, health), 1000)
+
+    def close(self, timeout_s: float = 2.0) -> None:
+        """Draw what is left for at most ``timeout_s``, then end the viewer that was started here."""
+        thread, self._thread = self._thread, None
+        if thread is None:
+            return
+        self._closing.set()
+        self._backlog.wake()
+        thread.join(0.75 * timeout_s)
+        child = self._child
+        if thread.is_alive() and child is not None:
+            child.kill()  # frees the thread from a frozen viewer
+        thread.join(0.25 * timeout_s)
+        self._phase = "closed"
+
+    def _put(self, device: str, message: "_Samples | _Estimate | _Event | _Health", weight: int) -> None:
+        if self._thread is not None:
+            self._backlog.push((device, message), weight)
+
+    # ---- the thread ----
+
+    def _run(self) -> None:
+        """Open, draw, and open again after a while, until closed."""
+        settings, attempt = self._settings, 0
+        while not self._closing.is_set():
+            started = time.monotonic()
+            try:
+                _load_rerun()
+                self._show(settings)
+            except ViewerTrouble as trouble:
+                self._phase = str(trouble)
+            except ImportError as missing:
+                self._phase = MISSING if missing.name in ("rerun", "rerun_cli", "rerun_bindings") else str(missing)
+            except Exception as error:  # noqa: BLE001 - a drawing must not end the view: said, and tried again
+                self._phase = f"{type(error).__name__}: {error}"
+            settings, attempt = self._after(settings, started, attempt)
+
+    def _after(self, settings: ViewerSettings, started: float, attempt: int) -> tuple[ViewerSettings, int]:
+        """Wait before the next try; a window that does not work here gives way to the page."""
+        self._stalled, self._inside_since, self._url = False, None, ""
+        lived_s = time.monotonic() - started
+        if self._closing.is_set():
+            return settings, attempt
+        attempt = 0 if lived_s > 60.0 else attempt + 1
+        if settings.mode == "auto" and lived_s < EARLY_END_S:
+            return replace(settings, mode="web"), attempt
+        self._closing.wait(RETRY_S[min(attempt, len(RETRY_S) - 1)])
+        return settings, attempt
+
+    def _show(self, settings: ViewerSettings) -> None:
+        """One viewer, from opening to its end."""
+        from monitor.publish import rerun_blueprint, rerun_scene, rerun_sinks
+
+        output = rerun_sinks.open_output(settings, self._recording_id, self._closing.is_set)
+        self._child, self._url = output.child, output.url
+        try:
+            names = [(d.name, d.about) for d in self._devices]
+            scene = rerun_scene.Scene(output.stream, names)
+            self._inside_since = time.monotonic()
+            rerun_blueprint.send(output.stream, [d.name for d in self._devices])
+            scene.open()
+            self._phase = "ok"
+            self._draw(output, scene)
+        finally:
+            self._child = None
+            output.close()
+
+    def _draw(self, output: "Output", scene: "Scene") -> None:
+        """Draw what comes until closed or nobody looks any more."""
+        queue = _Pending(2.0 if len(self._devices) <= DRAWS_PER_S / 2 else DRAWS_PER_S / len(self._devices))
+        checked = time.monotonic()
+        while True:
+            closing = self._closing.is_set()
+            queue.add(self._backlog.take(0.0))
+            self._inside_since = time.monotonic()
+            queue.draw(scene, everything=closing)
+            now = time.monotonic()
+            if closing or now - checked > CHECK_EVERY_S:
+                self._confirm(output)
+                checked = time.monotonic()
+            self._inside_since = None
+            if closing:
+                return
+            trouble = output.trouble()
+            if trouble is not None:
+                raise ViewerTrouble(trouble)
+            self._closing.wait(output.flush_every_s)
+
+    def _confirm(self, output: "Output") -> None:
+        """Return when all that was drawn has reached the viewer: bounds what Rerun holds to a second's worth."""
+        while not output.confirm(PATIENCE_S):
+            self._stalled = not self._closing.is_set()
+            trouble = output.trouble()
+            if trouble is not None:
+                raise ViewerTrouble(trouble)
+            if self._closing.is_set():
+                return
+        self._stalled = False
+
+
+@dataclass
+class _Pending:
+    """What has come since the last drawing, device by device."""
+
+    estimates_per_s: float
+    samples: dict[str, list[_Samples]] = field(default_factory=dict)
+    estimates: dict[str, list[_Estimate]] = field(default_factory=dict)
+    healths: dict[str, _Health] = field(default_factory=dict)
+    events: list[tuple[str, _Event]] = field(default_factory=list)
+    drawn: dict[str, float] = field(default_factory=dict)  # device -> monotonic s of its last estimate
+
+    def add(self, messages: Sequence[Message]) -> None:
+        """Sort by device and kind; of healths only the newest counts, of estimates two a second of sample time."""
+        for device, message in messages:
+            match message:
+                case _Samples():
+                    self.samples.setdefault(device, []).append(message)
+                case _Estimate():
+                    self._add_estimate(device, message)
+                case _Event():
+                    self.events.append((device, message))
+                case _Health():
+                    self.healths[device] = message
+
+    def draw(self, scene: "Scene", everything: bool) -> None:
+        """Hand all over to the scene; estimates when they are due, or ``everything``."""
+        for device, parts in self.samples.items():
+            scene.samples(
+                device,
+                np.concatenate([p.wall_s for p in parts]),
+                np.concatenate([p.values for p in parts]),
+                np.concatenate([p.temperature_c for p in parts]),
+            )
+        self.samples.clear()
+        for device, happened in self.events:
+            scene.event(device, happened.wall_s, happened.event)
+        self.events.clear()
+        for device, seen in self.healths.items():
+            scene.health(device, seen.wall_s, seen.health)
+        self.healths.clear()
+        for device in list(self.estimates):
+            if everything or time.monotonic() - self.drawn.get(device, -np.inf) >= 1.0 / self.estimates_per_s:
+                self._draw_estimates(scene, device, self.estimates.pop(device))
+
+    def _add_estimate(self, device: str, message: _Estimate) -> None:
+        kept = self.estimates.setdefault(device, [])
+        if len(kept) > 1 and message.wall_s - kept[-2].wall_s < 0.5:
+            kept.pop()
+        kept.append(message)
+
+    def _draw_estimates(self, scene: "Scene", device: str, kept: Sequence[_Estimate]) -> None:
+        self.drawn[device] = time.monotonic()
+        scene.courses(device, np.array([k.wall_s for k in kept]), [k.estimate for k in kept])
+        scene.estimate(device, kept[-1].wall_s, kept[-1].estimate)
+
+
+def _load_rerun() -> None:
+    """Import Rerun without its exit handler, which waits for ever for a viewer that does not answer."""
+    os.environ.setdefault("RERUN_ANALYTICS", "0")
+    rerun = importlib.import_module("rerun")
+    rerun.unregister_shutdown()

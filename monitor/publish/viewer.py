@@ -1,0 +1,25 @@
+"""What the service says to the viewer's thread: settings, devices, and the one error. Loads no Rerun."""
+
+from dataclasses import dataclass
+
+
+class ViewerTrouble(Exception):  # noqa: N818 - never leaves this room: the thread turns it into its state
+    """The viewer cannot be opened, or is gone: one line for people."""
+
+
+@dataclass(frozen=True, slots=True)
+class ViewerSettings:
+    """Which viewer, and where."""
+
+    mode: str = "auto"  # auto | native | web | none | a path ending in .rrd
+    port: int = 9876  # of the Rerun server, loopback
+    web_port: int = 9090  # of the page, loopback
+    memory: str = "256MiB"  # of what the viewer keeps for looking back; the oldest go first
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceInfo:
+    """A device as the viewer presents it."""
+
+    name: str
+    about: str = ""  # a few words: decoder, link, port

@@ -1,0 +1,243 @@
+"""Results over zenoh: the keys of ``monitor.topics``, presence, commands.
+
+The session is closed unless the configuration says otherwise: a peer without scouting that listens on loopback only.
+If it cannot open (port busy: any free one is taken and said; anything else: tried again), ``state`` says so, and what
+was to be put is dropped: samples go on. zenoh queues what it sends and drops for a subscriber that does not keep up,
+so ``put`` does not wait for anyone.
+
+Commands arrive on a queryable whose queries a thread of this class takes from zenoh's channel (a Python callback that
+is alive at exit would hang the process) and hands to the service by a queue; the service's loop answers them.
+"""
+
+import contextlib
+import json
+import queue
+import re
+import socket
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from monitor import topics
+
+if TYPE_CHECKING:
+    import zenoh
+
+RETRY_S: Final = 2.0
+QUERIES_WAITING: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class ZenohSettings:
+    """How the daemon's own session is opened; see ``[zenoh]``."""
+
+    mode: Literal["peer", "client", "router", "none"] = "peer"
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7450",)
+    connect: tuple[str, ...] = ()
+    config: Path | None = None
+    prefix: str = "imu"
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One query on ``command/<verb>``: to be answered exactly once."""
+
+    device: str
+    verb: str
+    answer: Callable[[bytes], None]
+    refuse: Callable[[str], None]
+
+
+class ZenohOut:
+    """The daemon's session and what it declares for each device."""
+
+    def __init__(self, settings: ZenohSettings, devices: Sequence[str]) -> None:
+        self.settings = settings
+        self.state = "off" if settings.mode == "none" else "not open yet"
+        self.commands: queue.Queue[Command] = queue.Queue(QUERIES_WAITING)
+        self._devices = tuple(devices)
+        self._alive: dict[str, bool] = dict.fromkeys(devices, False)
+        self._session: zenoh.Session | None = None
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._tokens: dict[str, Any] = {}
+        self._threads: list[threading.Thread] = []
+        self._closing = threading.Event()
+
+    def start(self) -> None:
+        """Open in a thread of its own: a router that is not there must not hold up the samples."""
+        if self.settings.mode == "none":
+            return
+        opener = threading.Thread(target=self._open_until_open, name="zenoh open", daemon=True)
+        opener.start()
+        self._threads.append(opener)
+
+    def put(self, topic: topics.Topic, device: str, payload: bytes) -> None:
+        """Send, or drop while there is no session."""
+        import zenoh
+
+        publisher = self._publishers.get(topic.key(self.settings.prefix, device))
+        if publisher is None:
+            return
+        try:
+            publisher.put(payload)
+        except zenoh.ZError as error:
+            self.state = f"cannot send: {_plain(error)}"
+
+    def alive(self, device: str, flowing: bool) -> None:
+        """Show or take away the device's liveliness token."""
+        if self._alive[device] != flowing:
+            self._alive[device] = flowing
+            self._show_alive(device)
+
+    def close(self) -> None:
+        """Take away tokens, close the session, end the threads."""
+        self._closing.set()
+        session, self._session = self._session, None
+        self._publishers = {}
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+        for thread in self._threads:
+            thread.join(timeout=RETRY_S)
+
+    # --- opening
+
+    def _open_until_open(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self._open()
+            except _zenoh_errors() as error:
+                self.state = f"{_plain(error)}; trying again"
+                self._closing.wait(RETRY_S)
+            else:
+                return
+
+    def _open(self) -> None:
+        session, said = self._open_session()
+        if self._closing.is_set():
+            session.close()  # type: ignore[no-untyped-call]
+            return
+        publishers = {}
+        for device in self._devices:
+            for topic in topics.TOPICS:
+                if topic.when in ("batches", "publish", "event", "1 Hz"):
+                    key = topic.key(self.settings.prefix, device)
+                    publishers[key] = self._publisher(session, topic, key)
+            self._declare_commands(session, device)
+        self._session, self._publishers, self.state = session, publishers, said
+        for device in self._devices:
+            self._show_alive(device)
+
+    def _open_session(self) -> tuple["zenoh.Session", str]:
+        """The session; on a busy port with any free one, and what to say of it."""
+        import zenoh
+
+        try:
+            return zenoh.open(self._configuration(self.settings.listen)), "ok"
+        except zenoh.ZError as error:
+            if "in use" not in str(error):
+                raise
+            free = tuple(_free_port(endpoint) for endpoint in self.settings.listen)
+            session = zenoh.open(self._configuration(free))
+            return session, f"ok, but {', '.join(self.settings.listen)} is busy: listening on {', '.join(free)}"
+
+    def _configuration(self, listen: tuple[str, ...]) -> "zenoh.Config":
+        import zenoh
+
+        own = self.settings
+        config = zenoh.Config.from_file(str(own.config)) if own.config else zenoh.Config()
+        if own.config is None:
+            config.insert_json5("scouting/multicast/enabled", "false")
+            config.insert_json5("scouting/gossip/enabled", "false")
+            config.insert_json5("timestamping/enabled", "true")
+        config.insert_json5("mode", json.dumps(own.mode))
+        if own.mode != "client":
+            config.insert_json5("listen/endpoints", json.dumps(listen))
+        if own.connect:
+            config.insert_json5("connect/endpoints", json.dumps(own.connect))
+        return config
+
+    def _publisher(self, session: "zenoh.Session", topic: topics.Topic, key: str) -> "zenoh.Publisher":
+        import zenoh
+
+        # results are few and wanted soon; batches of samples may share a packet
+        return session.declare_publisher(
+            key,
+            encoding=zenoh.Encoding(topic.encoding),
+            congestion_control=zenoh.CongestionControl.DROP,
+            express=topic.when != "batches",
+        )
+
+    # --- presence and commands
+
+    def _show_alive(self, device: str) -> None:
+        session = self._session
+        if session is None:
+            return
+        key = topics.ALIVE.key(self.settings.prefix, device)
+        with contextlib.suppress(*_zenoh_errors()):  # the session is being closed: the token goes with it
+            if self._alive[device] and device not in self._tokens:
+                self._tokens[device] = session.liveliness().declare_token(key)
+            elif not self._alive[device] and device in self._tokens:
+                self._tokens.pop(device).undeclare()
+
+    def _declare_commands(self, session: "zenoh.Session", device: str) -> None:
+        import zenoh
+
+        key = f"{self.settings.prefix}/{device}/command/*"
+        queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(QUERIES_WAITING))
+        taker = threading.Thread(
+            target=self._take_queries, args=(device, queryable), name=f"commands of {device}", daemon=True
+        )
+        taker.start()
+        self._threads.append(taker)
+
+    def _take_queries(self, device: str, queryable: Any) -> None:
+        """Queries until the session is closed."""
+        handler = queryable.handler
+        while not self._closing.is_set():
+            try:
+                query = handler.recv()
+            except _zenoh_errors():
+                return
+            command = Command(device, str(query.key_expr).rsplit("/", 1)[-1], *_answers(query))
+            try:
+                self.commands.put_nowait(command)
+            except queue.Full:
+                command.refuse("busy: too many commands wait")
+
+
+def _answers(query: Any) -> tuple[Callable[[bytes], None], Callable[[str], None]]:
+    """Functions that end a query with a result, or with an error."""
+    import zenoh
+
+    def answer(payload: bytes) -> None:
+        with query:
+            query.reply(query.key_expr, payload, encoding=zenoh.Encoding(topics.JSON))
+
+    def refuse(why: str) -> None:
+        with query:
+            query.reply_err(json.dumps({"error": why}).encode(), encoding=zenoh.Encoding(topics.JSON))
+
+    return answer, refuse
+
+
+def _free_port(endpoint: str) -> str:
+    """The same endpoint on a port that is free now; others than tcp/host:port stay as they are."""
+    match = re.fullmatch(r"tcp/\[?([^\]]+?)\]?:\d+", endpoint)
+    if match is None:
+        return endpoint
+    with socket.create_server((match[1], 0)) as server:
+        return re.sub(r":\d+$", f":{server.getsockname()[1]}", endpoint)
+
+
+def _zenoh_errors() -> tuple[type[Exception], ...]:
+    import zenoh
+
+    return (zenoh.ZError,)
+
+
+def _plain(error: Exception) -> str:
+    """zenoh's reason without the place in its own source code."""
+    return re.sub(r"\s+at \S+\.rs:\d+\.?", "", " ".join(str(error).split()))

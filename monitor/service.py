@@ -1,0 +1,271 @@
+"""The daemon: builds and wires everything, runs the loop, stops in order.
+
+``Service.loop`` is a corridor: take, update, publish, for each device in turn; it decides nothing. It sleeps until a
+reader has pushed samples. An output that cannot start or does not keep up is shown in the status of every device;
+samples go on. Stopping: readers first, then what is in the rings is worked off and published, then the outputs close.
+"""
+
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol
+
+import structlog
+
+from drivers.sample import Event, SampleBlock
+from drivers.sample_message import pack
+from monitor import topics
+from monitor.estimate.estimate import Estimate
+from monitor.health import Health
+from monitor.publish import message
+from monitor.publish.viewer import DeviceInfo, ViewerSettings
+from monitor.publish.zenoh_out import Command, ZenohOut, ZenohSettings
+from monitor.settings import Config, Device, VirtualTable
+from monitor.station import Output, Station
+from monitor.virtual import VirtualImu
+
+if TYPE_CHECKING:
+    from monitor.publish.rerun_view import RerunView
+
+IDLE_S: Final = 0.05
+PACE_S: Final = 0.02
+"""Between two rounds where no device wants every block published."""
+STATUS_S: Final = 1.0
+JOIN_S: Final = 3.0
+
+_log = structlog.get_logger("imu-monitor")
+
+
+class ZenohOutput:
+    """Results as zenoh messages."""
+
+    def __init__(self, zenoh: ZenohOut) -> None:
+        self._zenoh = zenoh
+
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        """One msgpack batch."""
+        self._zenoh.put(topics.SAMPLES, device, pack(device, received, samples, offset_ns))
+
+    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
+        """Curve and coefficients."""
+        self._zenoh.put(topics.ALLAN, device, message.allan(device, unix_s, estimate))
+        self._zenoh.put(topics.COEFFICIENTS, device, message.coefficients(device, unix_s, estimate))
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        """One event."""
+        since_s = None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
+        self._zenoh.put(topics.EVENT, device, message.event(device, unix_s, received, event, since_s))
+
+    def health(self, device: str, unix_s: float, health: Health) -> None:
+        """Status, and presence while samples flow."""
+        self._zenoh.put(topics.STATUS, device, message.status(device, unix_s, health))
+
+
+class ViewerOutput:
+    """Results into the Rerun viewer."""
+
+    def __init__(self, view: "RerunView") -> None:
+        self._view = view
+
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        """Raw samples."""
+        self._view.samples(device, (samples.t_ns + offset_ns) / 1e9, samples.values, samples.temperature_c)
+
+    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
+        """Curve and coefficients."""
+        self._view.estimate(device, unix_s, estimate)
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        """One line of the log."""
+        self._view.event(device, unix_s, event)
+
+    def health(self, device: str, unix_s: float, health: Health) -> None:
+        """The health panel."""
+        self._view.health(device, unix_s, health)
+
+
+class LogOutput:
+    """Events and changes of state as log lines."""
+
+    def __init__(self) -> None:
+        self._said: dict[str, tuple[str, str]] = {}
+
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        """Not logged."""
+
+    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
+        """Not logged."""
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        """One line an event."""
+        _log.info(event.kind, device=device, axis=event.axis, text=event.text)
+
+    def health(self, device: str, unix_s: float, health: Health) -> None:
+        """A line when the state or its sentence has changed."""
+        now = (health.state, health.text)
+        if self._said.get(device) != now:
+            self._said[device] = now
+            say = _log.info if health.state in ("running", "ended") and not health.text else _log.warning
+            say("status", device=device, state=health.state, text=health.text, received=health.received)
+
+
+class Watcher(Protocol):
+    """Someone in this process who looks at the health of the devices, e.g. a table in the terminal."""
+
+    def __call__(self, health: dict[str, Health], latest: dict[str, Estimate | None]) -> None:
+        """Health and newest estimate of every device."""
+
+
+class Service:
+    """Everything between a configuration and its outputs.
+
+    Args:
+        config: what to run
+        watcher: called about once a second
+    """
+
+    def __init__(self, config: Config, watcher: Watcher | None = None) -> None:
+        self.config = config
+        self._watcher = watcher
+        self._wake = threading.Event()
+        self._stop = threading.Event()
+        self.virtual: dict[str, VirtualImu] = {}
+        self.stations = [self._station(device) for device in config.devices]
+        own = config.zenoh
+        self.zenoh = ZenohOut(
+            ZenohSettings(own.mode, own.listen, own.connect, own.config, own.prefix),
+            [station.name for station in self.stations],
+        )
+        self.view = _viewer(config)
+        self.outputs: list[Output] = [LogOutput(), ZenohOutput(self.zenoh)]
+        if self.view is not None:
+            self.outputs.append(ViewerOutput(self.view))
+        every_block = any(device.publish_s == 0.0 for device in config.devices)
+        self._pace_s = 0.0 if every_block else PACE_S
+
+    def stop(self) -> None:
+        """Ask the loop to end; may be called from a signal handler or another thread."""
+        self._stop.set()
+        self._wake.set()
+
+    def run(self, seconds: float | None = None) -> None:
+        """Start, loop until stopped (or for so many seconds, or until all replays have ended), stop in order."""
+        self.zenoh.start()
+        if self.view is not None:
+            self.view.start()
+        for imu in self.virtual.values():
+            imu.start()
+        for station in self.stations:
+            station.start()
+        try:
+            self.loop(None if seconds is None else time.monotonic() + seconds)
+        finally:
+            self._close()
+
+    def loop(self, until_s: float | None) -> None:
+        """Rounds over all devices; status once a second."""
+        status_s = 0.0
+        while not self._stop.is_set():
+            now_s = time.monotonic()
+            for station in self.stations:
+                station.work(self.outputs, now_s)
+                self.zenoh.alive(station.name, station.driver.state == "running")
+            self._answer()
+            if now_s >= status_s:
+                status_s = now_s + STATUS_S
+                self._report()
+            if until_s is not None and now_s >= until_s:
+                return
+            if all(station.ended for station in self.stations):
+                return
+            self._wake.wait(IDLE_S)
+            self._wake.clear()
+            if self._pace_s:
+                self._stop.wait(self._pace_s)
+
+    def states(self) -> dict[str, str]:
+        """Output -> "ok" or what is wrong with it."""
+        states = {"zenoh": self.zenoh.state}
+        if self.view is not None:
+            states["viewer"] = self.view.state
+        return states
+
+    def _station(self, device: Device) -> Station:
+        link = device.link
+        if isinstance(link, VirtualTable):
+            imu = VirtualImu(link, device.decoder)
+            self.virtual[device.name] = imu
+            link = imu.link
+        return Station(device, link, device.decoder, self._wake)
+
+    def _report(self) -> None:
+        states, memory = self.states(), memory_bytes()
+        health = {station.name: station.report(self.outputs, states, memory) for station in self.stations}
+        if self._watcher is not None:
+            self._watcher(health, {station.name: station.latest for station in self.stations})
+
+    def _answer(self) -> None:
+        """Commands that came over zenoh since the last round."""
+        stations = {station.name: station for station in self.stations}
+        while not self.zenoh.commands.empty():
+            command = self.zenoh.commands.get_nowait()
+            self._obey(command, stations[command.device])
+
+    def _obey(self, command: Command, station: Station) -> None:
+        if command.verb != "reset":
+            command.refuse(f'unknown command "{command.verb}"; known are reset')
+            return
+        station.reset()
+        received = station.driver.counts.received
+        command.answer(message.reply(station.name, station.now_unix_s(), received, "the window is empty"))
+        _log.info("reset", device=station.name)
+
+    def _close(self) -> None:
+        try:
+            self._drain()
+        finally:
+            if self.view is not None:
+                self.view.close()
+            self.zenoh.close()
+
+    def _drain(self) -> None:
+        """End the readers, and publish what they still brought."""
+        for station in self.stations:
+            station.stop()
+        for imu in self.virtual.values():
+            imu.stop()
+        for station in self.stations:
+            if not station.join(JOIN_S):
+                _log.warning("reader did not end in time", device=station.name)
+            station.work(self.outputs, time.monotonic(), drain=True)
+            self.zenoh.alive(station.name, False)
+        self._report()
+
+
+def memory_bytes() -> int:
+    """Resident memory of this process."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
+    except OSError:  # no Linux: the peak is the nearest there is
+        import resource
+        import sys
+
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak if sys.platform == "darwin" else peak * 1024
+    import resource
+
+    return pages * resource.getpagesize()
+
+
+def _viewer(config: Config) -> "RerunView | None":
+    if config.viewer.mode == "none":
+        return None
+    from monitor.publish.rerun_view import RerunView
+
+    own = config.viewer
+    devices = [DeviceInfo(device.name, _about(device)) for device in config.devices]
+    return RerunView(ViewerSettings(own.mode, own.port, own.web_port, own.memory), devices)
+
+
+def _about(device: Device) -> str:
+    return "simulated" if isinstance(device.link, VirtualTable) else device.link.name

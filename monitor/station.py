@@ -1,0 +1,235 @@
+"""One device inside the service: its reader thread, ring and estimate, and when what of it is published.
+
+``work`` is one round of the main loop for this device: take, update, publish what is due. Outputs are called in order
+and none of them waits: each has a queue or drops.
+"""
+
+import threading
+import time
+from collections.abc import Sequence
+from typing import Final, Protocol
+
+import numpy as np
+
+from drivers.clock import SampleClock
+from drivers.decoders.base import Decoder
+from drivers.driver import Driver
+from drivers.errors import NotReady
+from drivers.links.base import Link
+from drivers.sample import Event, SampleBlock
+from monitor.estimate.estimate import Estimate
+from monitor.estimate.estimator import Estimator
+from monitor.health import Health
+from monitor.ring import RingBuffer
+from monitor.settings import Device
+from monitor.wall import WallClock
+
+RING_SECONDS: Final = 10.0
+RING_SAMPLES: Final = (16_384, 1_000_000)
+PENDING_BLOCKS: Final = 10_000
+"""Blocks kept while the sample rate is not known yet."""
+SAMPLES_EVERY_S: Final = 0.1
+"""Raw samples travel in batches of at most this long, unless every block is wanted."""
+OFF_NOMINAL: Final = 0.02
+"""A measured rate further than this from the configured one is said."""
+
+
+class Output(Protocol):
+    """Where a station's results go; no call waits for anyone."""
+
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        """A block, and how many samples had come with it; ``offset_ns`` makes its times Unix time."""
+
+    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
+        """One refit."""
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        """Something happened."""
+
+    def health(self, device: str, unix_s: float, health: Health) -> None:
+        """Once a second."""
+
+
+class Station:
+    """One device of the service.
+
+    Args:
+        device: its settings
+        link: what its samples come by
+        wake: set whenever samples have come
+    """
+
+    def __init__(self, device: Device, link: Link, decoder: Decoder, wake: threading.Event) -> None:
+        self.device = device
+        self.name = device.name
+        rate = device.rate_hz or 1000.0
+        low, high = RING_SAMPLES
+        self.ring = RingBuffer(int(min(max(rate * RING_SECONDS, low), high)))
+        self.clock = SampleClock(decoder.timing, device.rate_hz)
+        self.driver = Driver(device.name, link, decoder, self.clock, self._push, device.axes, device.silence_s)
+        self.estimator: Estimator | None = None
+        self.latest: Estimate | None = None
+        self.published = 0  # samples handed to the outputs
+        self._wake = wake
+        self._wall = WallClock(time.monotonic_ns(), time.time_ns())
+        self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
+        self._pending: list[SampleBlock] = []  # not in the estimator yet: the rate is unknown
+        self._batch: list[SampleBlock] = []  # not published yet
+        self._waiting_since_ns = 0
+        self._latencies: list[float] = []
+        self._started_s = time.monotonic()
+        self._next_s = dict.fromkeys(("refit", "publish", "samples"), 0.0)
+        self._advanced = False  # samples since the last refit
+        self._refitted = False  # a refit since the last publication
+        self._newest_ns = 0
+
+    # --- life
+
+    def start(self) -> None:
+        """Start reading."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop reading; what is in the ring stays there to be worked off."""
+        self.driver.stop()
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait for the reader; False when it did not end in time."""
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    @property
+    def ended(self) -> bool:
+        """A replay that has given all it had, and all of it is worked off."""
+        return self.driver.state == "ended" and not self._thread.is_alive() and not self._waiting_since_ns
+
+    # --- one round
+
+    def work(self, outputs: Sequence[Output], now_s: float, drain: bool = False) -> None:
+        """Take what came, advance the estimate, publish what is due; all of it when draining."""
+        since_ns, self._waiting_since_ns = self._waiting_since_ns, 0
+        blocks = self.ring.take()
+        if blocks:
+            self._newest_ns = int(blocks[-1].t_ns[-1])
+            self._batch += blocks
+            self._advance(blocks)
+        for event in self.driver.take_events():
+            for output in outputs:
+                output.event(self.name, self.unix_s(event.t_ns), self.driver.counts.received, event)
+        published = self._publish_samples(outputs, now_s, drain)
+        published |= self._publish_estimate(outputs, now_s, drain)
+        if published and since_ns:
+            self._latencies.append((time.monotonic_ns() - since_ns) / 1e9)
+
+    def reset(self) -> None:
+        """Empty the window."""
+        if self.estimator is not None:
+            self.estimator.reset()
+
+    def report(self, outputs: Sequence[Output], states: dict[str, str], memory_bytes: int) -> Health:
+        """Tell the outputs how the device does, and ease its wall clock."""
+        self._wall.follow(time.monotonic_ns(), time.time_ns())
+        health = self.health(states, memory_bytes)
+        for output in outputs:
+            output.health(self.name, self.now_unix_s(), health)
+        return health
+
+    def health(self, states: dict[str, str], memory_bytes: int) -> Health:
+        """How the device does now."""
+        counts, latencies = self.driver.counts, np.array(self._latencies)
+        self._latencies = []
+        return Health(
+            state=self.driver.state,
+            rate_hz=self.clock.measured_hz,
+            received=counts.received,
+            lost=counts.lost,
+            bad=counts.bad,
+            overflowed=self.ring.overflowed,
+            latency_p50_s=float(np.quantile(latencies, 0.5)) if latencies.size else None,
+            latency_p99_s=float(np.quantile(latencies, 0.99)) if latencies.size else None,
+            memory_bytes=memory_bytes,
+            outputs=dict(states),
+            text=self._text(),
+            uptime_s=time.monotonic() - self._started_s,
+        )
+
+    def unix_s(self, t_ns: int) -> float:
+        """Unix time of a sample time."""
+        return (t_ns + self._offset_ns()) / 1e9
+
+    def now_unix_s(self) -> float:
+        """Unix time of the newest sample, or of now where none has come or none comes."""
+        if self.driver.state == "running" and self._newest_ns:
+            return self.unix_s(self._newest_ns)
+        return self._wall.unix_ns(time.monotonic_ns()) / 1e9
+
+    # --- inside
+
+    def _push(self, samples: SampleBlock) -> None:
+        """Called by the reader's thread."""
+        self.ring.push(samples)
+        if not self._waiting_since_ns:
+            self._waiting_since_ns = time.monotonic_ns()
+        self._wake.set()
+
+    def _offset_ns(self) -> int:
+        return 0 if self.driver.times_are_unix else self._wall.offset_ns
+
+    def _advance(self, blocks: list[SampleBlock]) -> None:
+        if self.estimator is None:
+            self._pending = (self._pending + blocks)[-PENDING_BLOCKS:]
+            rate = self.clock.rate_hz
+            if rate is None:
+                return
+            self.estimator = Estimator(rate, self.device.window_s, self.device.tau)
+            blocks, self._pending = self._pending, []
+        for samples in blocks:
+            self.estimator.update(samples)
+        self._advanced = True
+
+    def _publish_samples(self, outputs: Sequence[Output], now_s: float, drain: bool) -> bool:
+        every_s = min(self.device.publish_s, SAMPLES_EVERY_S)
+        if not self._batch or not (self._due("samples", every_s, now_s) or drain):
+            return False
+        blocks, self._batch = self._batch, []
+        for samples in blocks:
+            self.published += len(samples)
+            for output in outputs:
+                output.samples(self.name, self.published, samples, self._offset_ns())
+        return True
+
+    def _publish_estimate(self, outputs: Sequence[Output], now_s: float, drain: bool) -> bool:
+        if (
+            self.estimator is not None
+            and self._advanced
+            and (self._due("refit", self.device.refit_s, now_s) or drain)
+        ):
+            self._advanced = False
+            try:
+                self.latest = self.estimator.get()
+            except NotReady:
+                return False
+            self._refitted = True
+        if self.latest is None or not self._refitted:
+            return False
+        if not (self._due("publish", self.device.publish_s, now_s) or drain):
+            return False
+        self._refitted = False
+        for output in outputs:
+            output.estimate(self.name, self.unix_s(self.latest.t_ns), self.latest)
+        return True
+
+    def _due(self, what: str, every_s: float, now_s: float) -> bool:
+        if now_s < self._next_s[what]:
+            return False
+        # keep the beat, but do not make up for a pause
+        self._next_s[what] = max(self._next_s[what] + every_s, now_s + 0.5 * every_s)
+        return True
+
+    def _text(self) -> str:
+        nominal, measured = self.device.rate_hz, self.clock.measured_hz
+        if self.driver.text or self.driver.state != "running" or not nominal or not measured:
+            return self.driver.text
+        if abs(measured / nominal - 1.0) > OFF_NOMINAL:
+            return f"samples come at {measured:.4g} Hz, configured are {nominal:g} Hz"
+        return ""

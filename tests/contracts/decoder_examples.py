@@ -1,0 +1,113 @@
+"""How each decoder is tried: settings, and how finely its format can tell numbers apart.
+
+A decoder that is not listed is tried with its default settings and a coarse resolution.
+"""
+
+import importlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from drivers import decoders, plugin
+from drivers.decoders.base import Decoder
+
+DEGREE = math.pi / 180.0
+G = 9.80665
+
+CAN_DATABASE = """VERSION ""
+BS_:
+BU_: IMU
+BO_ 80 Temperature: 2 IMU
+ SG_ temp : 7|16@0- (0.00390625,0) [-128|127] "degC" IMU
+BO_ 50 RateOfTurn: 6 IMU
+ SG_ gyrX : 7|16@0- (0.001953125,0) [-64|64] "rad/s" IMU
+ SG_ gyrY : 23|16@0- (0.001953125,0) [-64|64] "rad/s" IMU
+ SG_ gyrZ : 39|16@0- (0.001953125,0) [-64|64] "rad/s" IMU
+BO_ 52 Acceleration: 6 IMU
+ SG_ accX : 7|16@0- (0.00390625,0) [-128|127] "m/s^2" IMU
+ SG_ accY : 23|16@0- (0.00390625,0) [-128|127] "m/s^2" IMU
+ SG_ accZ : 39|16@0- (0.00390625,0) [-128|127] "m/s^2" IMU
+"""
+CAN_SIGNALS = {
+    **{f"g{axis}": f"RateOfTurn.gyr{axis.upper()}" for axis in "xyz"},
+    **{f"a{axis}": f"Acceleration.acc{axis.upper()}" for axis in "xyz"},
+    "temperature": "Temperature.temp",
+}
+
+
+@dataclass(frozen=True)
+class Example:
+    """One way to set a decoder, and what its format can hold."""
+
+    name: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    gyro_step: float = 1e-3  # rad/s; what one bit or digit means
+    accel_step: float = 1e-2  # m/s²
+    temperature_step: float | None = 0.5  # °C; None = not carried
+    checksum: bool = False  # whether every damaged byte is noticed
+    unchecked_tail: int = 0  # bytes at the end of a frame that its check does not cover
+
+    def __str__(self) -> str:
+        keys = [str(v) for k, v in self.settings.items() if k not in ("columns", "file", "signals")]
+        return "-".join([self.name, *keys])
+
+    def build(self, folder: Path) -> Decoder:
+        """The decoder; a file that its settings name is written to the folder."""
+        settings = dict(self.settings)
+        if self.name == "dbc":
+            (folder / "imu.dbc").write_text(CAN_DATABASE)
+            settings["file"] = str(folder / "imu.dbc")
+        module = importlib.import_module(f"{decoders.__name__}.{self.name}")
+        decoder: Decoder = module.build(msgspec.convert(settings, module.Settings))
+        return decoder
+
+
+FLOAT = 2.0**-22  # relative step of a float32, for numbers up to 4 with a bit to spare
+COLUMNS = ("gx", "gy", "gz", "ax", "ay", "az", "temperature")
+TEXT = Example("text", {"columns": COLUMNS}, 1e-14, 1e-13, 1e-13)
+UNITS = {"gyro_unit": "deg/s", "accel_unit": "mg", "temperature_unit": "K", "delimiter": ";"}
+STIM300 = Example("stim300", {}, DEGREE / 2**14, G / 2**19, 2.0**-8, checksum=True)
+VECTORNAV = Example("vectornav_binary", {}, FLOAT, 8 * FLOAT, 32 * FLOAT, checksum=True)
+XSENS = Example("xsens_mtdata2", {}, FLOAT, 8 * FLOAT, 32 * FLOAT, checksum=True)
+WITMOTION = Example("witmotion", {}, 2000 * DEGREE / 2**15, 16 * G / 2**15, 0.01, checksum=True)
+
+LISTED = (
+    TEXT,
+    Example("text", {"columns": ("counter", *COLUMNS), "nmea": True}, 1e-14, 1e-13, 1e-13, True, 2),
+    Example("text", {"columns": ("t", "-", *COLUMNS), "time_unit": "ms"}, 1e-14, 1e-13, 1e-13),
+    Example("text", {"columns": COLUMNS, **UNITS}, 1e-13, 1e-13, 1e-12),
+    Example("vectornav_ascii", {}, 1e-6, 1e-3, 0.1, checksum=True),
+    Example("vectornav_ascii", {"sentence": "VNYMR"}, 1e-6, 1e-3, None, checksum=True),
+    VECTORNAV,
+    Example("vectornav_binary", {"clock": "arrival"}, FLOAT, 8 * FLOAT, 32 * FLOAT, checksum=True),
+    XSENS,
+    Example("xsens_mtdata2", {"clock": "packet_counter"}, FLOAT, 8 * FLOAT, 32 * FLOAT, checksum=True),
+    Example("xsens_mtdata2", {"format": "fp12.20", "high_rate": True}, 2.0**-20, 2.0**-20, 32 * FLOAT, True),
+    Example("xsens_mtdata2", {"format": "fp16.32"}, 2.0**-32, 2.0**-32, 32 * FLOAT, True),
+    Example("xsens_mtdata2", {"format": "float64"}, 1e-15, 1e-14, 32 * FLOAT, True),
+    STIM300,
+    Example("stim300", {"identifier": 0xAF, "crlf": True}, DEGREE / 2**14, G / 2**19, 2.0**-8, True, 2),
+    Example(
+        "stim300",
+        {"gyro_output": "increment", "accelerometer_output": "increment", "rate": 500.0},
+        500.0 * DEGREE / 2**21,
+        500.0 / 2**22,
+        2.0**-8,
+        True,
+    ),
+    WITMOTION,
+    Example("witmotion", {"temperature": "jy61"}, 2000 * DEGREE / 2**15, 16 * G / 2**15, 1 / 340, True),
+    Example("dbc", {"signals": CAN_SIGNALS}, 2.0**-9, 2.0**-8, 2.0**-8),
+    Example("ros2_imu", {}, 1e-15, 1e-14, None),
+    Example("samples", {}, 1e-15, 1e-14, 1e-14),
+)
+
+NAMES = plugin.names(decoders)
+EXAMPLES = tuple(e for e in LISTED if e.name in NAMES) + tuple(
+    Example(name) for name in NAMES if name not in {e.name for e in LISTED}
+)
+"""At least one for every decoder in the folder."""

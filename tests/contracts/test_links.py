@@ -1,0 +1,280 @@
+"""What every link keeps to, found by listing the folder: a link without a rig here fails the suite."""
+
+import contextlib
+import itertools
+import json
+import os
+import socket
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import msgspec
+import pytest
+
+from drivers import links, plugin
+from drivers.errors import LinkLost, LinkUnavailable
+from drivers.links.base import Link, LinkSettings
+from drivers.links.loopback_link import LoopbackLink
+from drivers.sample import Chunk
+
+UNIQUE = itertools.count()
+DATA = b"12345678"
+
+
+@dataclass
+class Rig:
+    """A link and the world at its other end."""
+
+    link: Link
+    send: Callable[[], None]  # makes DATA arrive
+    lose: Callable[[], None] | None  # the peer goes away; None: see why
+    absent: Link  # a link to a target that is not there
+    why_not_lost: str = ""
+    quiet_s: float = 0.3  # nothing arrives by itself within this time
+
+
+def build(name: str, **keys: Any) -> Link:
+    module = plugin.load(links, name, "_link")
+    link: Link = module.build(msgspec.convert(keys, module.Settings))
+    return link
+
+
+class Pty:
+    """A pseudo terminal: a serial port with a test behind it."""
+
+    def __init__(self) -> None:
+        self.master, slave = os.openpty()
+        tty.setraw(self.master)
+        tty.setraw(slave)
+        self.port = os.ttyname(slave)
+        os.close(slave)
+
+    def write(self, data: bytes) -> None:
+        os.write(self.master, data)
+
+    def close(self) -> None:
+        if self.master >= 0:
+            os.close(self.master)
+        self.master = -1
+
+
+@contextlib.contextmanager
+def serial_rig(tmp_path: Path) -> Iterator[Rig]:
+    pty = Pty()
+    link = build("serial", port=pty.port)
+    absent = build("serial", port=str(tmp_path / "ttyNONE"))
+    yield Rig(link, lambda: pty.write(DATA), pty.close, absent)
+    link.close()
+    pty.close()
+
+
+@contextlib.contextmanager
+def can_virtual_rig(tmp_path: Path) -> Iterator[Rig]:
+    import can
+
+    channel = f"contract-{next(UNIQUE)}"
+    with can.Bus(interface="virtual", channel=channel) as peer:
+        message = can.Message(arbitration_id=9, is_extended_id=False, data=DATA)
+        link = build("can", interface="virtual", channel=channel)
+        absent = build("can", interface="nonesuch", channel=channel)
+        why = "a virtual bus, as a real one, is there whether or not anybody sends"
+        yield Rig(link, lambda: peer.send(message), None, absent, why)
+        link.close()
+
+
+@contextlib.contextmanager
+def can_slcan_rig(tmp_path: Path) -> Iterator[Rig]:
+    pty = Pty()
+    options = {"sleep_after_open": 0.0}
+    link = build("can", interface="slcan", channel=pty.port, options=options)
+    absent = build("can", interface="slcan", channel=str(tmp_path / "ttyNONE"), options=options)
+    line = b"t0098" + DATA.hex().encode() + b"\r"
+    yield Rig(link, lambda: pty.write(line), pty.close, absent)
+    link.close()
+    pty.close()
+
+
+def free_port() -> int:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        port: int = s.getsockname()[1]
+        return port
+
+
+@contextlib.contextmanager
+def router() -> Iterator[tuple[str, Callable[[str, bytes], None]]]:
+    """A zenoh router in this process: its endpoint, and a put."""
+    import zenoh
+
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    config = zenoh.Config()
+    keys = {"mode": "router", "listen/endpoints": [endpoint], "scouting/multicast/enabled": False}
+    for key, value in keys.items():
+        config.insert_json5(key, json.dumps(value))
+    with zenoh.open(config) as session:
+        yield endpoint, lambda key, data: session.put(key, data)
+
+
+@contextlib.contextmanager
+def zenoh_rig(tmp_path: Path) -> Iterator[Rig]:
+    with router() as (endpoint, put):
+        link = build("zenoh", key="contract/**", connect=[endpoint])
+        absent = build("zenoh", key="a/b", mode="client", connect=[f"tcp/127.0.0.1:{free_port()}"])
+        why = "zenoh reconnects by itself: a lost publisher is silence, see LinkSettings.silence"
+        yield Rig(link, lambda: put("contract/a", DATA), None, absent, why)
+        link.close()
+
+
+@contextlib.contextmanager
+def replay_rig(tmp_path: Path) -> Iterator[Rig]:
+    path = tmp_path / "frames.csv"
+    path.write_text(f"t,id_hex,data_hex\n0.0,9,{DATA.hex()}\n1000.0,9,{DATA.hex()}\n")
+    link = build("replay", path=str(path))
+    absent = build("replay", path=str(tmp_path / "none.npz"))
+    yield Rig(link, lambda: None, None, absent, "an open file cannot be lost; its end is LinkEnded")
+    link.close()
+
+
+@contextlib.contextmanager
+def loopback_rig(tmp_path: Path) -> Iterator[Rig]:
+    link, absent = LoopbackLink(), LoopbackLink()
+    absent.absent = True
+    yield Rig(link, lambda: link.write(DATA), link.drop, absent)
+
+
+RIGS: dict[str, Callable[[Path], AbstractContextManager[Rig]]] = {
+    "serial": serial_rig,
+    "can": can_virtual_rig,
+    "can-slcan": can_slcan_rig,
+    "zenoh": zenoh_rig,
+    "replay": replay_rig,
+    "loopback": loopback_rig,
+}
+
+
+@pytest.fixture(params=RIGS)
+def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
+    with RIGS[request.param](tmp_path) as made:
+        yield made
+
+
+@pytest.fixture(params=plugin.names(links, "_link"))
+def module(request: pytest.FixtureRequest) -> ModuleType:
+    return plugin.load(links, request.param, "_link")
+
+
+def receive(rig: Rig) -> list[Chunk]:
+    """Send until something comes: a zenoh session needs a moment to see its router."""
+    for _ in range(100):
+        rig.send()
+        chunks = rig.link.read(0.05)
+        if chunks:
+            return chunks
+    raise AssertionError("nothing came")
+
+
+def test_every_link_has_a_rig() -> None:
+    assert {name.split("-")[0] for name in RIGS} == set(plugin.names(links, "_link"))
+
+
+def test_module_has_settings_build_and_default_decoder(module: ModuleType) -> None:
+    assert issubclass(module.Settings, LinkSettings)
+    assert callable(module.build)
+    assert isinstance(module.DEFAULT_DECODER, str)
+
+
+def test_unknown_keys_are_refused(module: ModuleType) -> None:
+    with pytest.raises(msgspec.ValidationError, match="nonesuch"):
+        msgspec.convert({"nonesuch": 1, "port": "x", "key": "x", "path": "x"}, module.Settings)
+
+
+def test_what_is_sent_is_read(rig: Rig) -> None:
+    rig.link.open()
+    chunks = receive(rig)
+    assert DATA in b"".join(c.data for c in chunks)
+    if rig.link.epoch == "monotonic":
+        assert all(0 <= time.monotonic_ns() - c.t_ns < 5e9 for c in chunks)
+
+
+def test_opens_and_closes_twice_without_harm(rig: Rig) -> None:
+    for _ in range(2):
+        rig.link.open()
+        rig.link.open()
+        assert receive(rig)
+        rig.link.close()
+        rig.link.close()
+
+
+def test_closing_before_opening_is_harmless(rig: Rig) -> None:
+    rig.link.close()
+    rig.link.open()
+    assert receive(rig)
+
+
+def test_read_returns_none_on_timeout(rig: Rig) -> None:
+    rig.link.open()
+    receive(rig)
+    while rig.link.read(0.05):
+        pass
+    start = time.monotonic()
+    assert rig.link.read(rig.quiet_s) is None
+    assert rig.quiet_s * 0.9 <= time.monotonic() - start < rig.quiet_s + 0.5
+
+
+def test_lost_peer_raises_link_lost(rig: Rig) -> None:
+    if rig.lose is None:
+        pytest.skip(rig.why_not_lost)
+    rig.link.open()
+    receive(rig)
+    rig.lose()
+    with pytest.raises(LinkLost) as raised:
+        for _ in range(100):
+            rig.link.read(0.05)
+    assert "\n" not in str(raised.value)
+    rig.link.close()
+
+
+def test_read_after_close_raises_link_lost(rig: Rig) -> None:
+    rig.link.open()
+    rig.link.close()
+    with pytest.raises(LinkLost):
+        rig.link.read(0.1)
+
+
+def test_closing_ends_a_waiting_read(rig: Rig) -> None:
+    rig.link.open()
+    receive(rig)
+    while rig.link.read(0.05):
+        pass
+    ended: list[float] = []
+
+    def wait() -> None:
+        with contextlib.suppress(LinkLost):
+            rig.link.read(30.0)
+        ended.append(time.monotonic())
+
+    reader = threading.Thread(target=wait)
+    reader.start()
+    time.sleep(0.1)
+    assert not ended
+    closed = time.monotonic()
+    rig.link.close()
+    reader.join(5.0)
+    assert ended
+    assert ended[0] - closed < 0.5
+
+
+def test_absent_target_is_link_unavailable(rig: Rig) -> None:
+    for _ in range(2):
+        with pytest.raises(LinkUnavailable) as raised:
+            rig.absent.open()
+        assert str(raised.value)
+        assert "\n" not in str(raised.value)
+    rig.absent.close()

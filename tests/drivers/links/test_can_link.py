@@ -1,0 +1,235 @@
+"""CAN on python-can's virtual bus, on slcan over a pseudo terminal, and on a bus that fails as told."""
+
+import errno
+import itertools
+import os
+import socket
+import time
+import tty
+from collections.abc import Iterator
+from typing import Any
+
+import can
+import msgspec
+import pytest
+
+from drivers.errors import LinkLost, LinkUnavailable
+from drivers.links import can_link
+from drivers.links.can_link import CanLink
+from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk
+
+UNIQUE = itertools.count()
+
+
+def build(**keys: Any) -> CanLink:
+    link = can_link.build(msgspec.convert(keys, can_link.Settings))
+    assert isinstance(link, CanLink)
+    return link
+
+
+@pytest.fixture
+def channel() -> str:
+    return f"can-link-{next(UNIQUE)}"
+
+
+@pytest.fixture
+def peer(channel: str) -> Iterator[can.BusABC]:
+    with can.Bus(interface="virtual", channel=channel) as bus:
+        yield bus
+
+
+def message(identifier: int, extended: bool = False, **keys: Any) -> can.Message:
+    return can.Message(arbitration_id=identifier, is_extended_id=extended, data=b"\1\2\3", **keys)
+
+
+def test_frames_of_one_read_are_all_that_are_there(peer: can.BusABC, channel: str) -> None:
+    link = build(interface="virtual", channel=channel)
+    link.open()
+    for i in range(50):
+        peer.send(message(i, extended=i % 2 == 1))
+    chunks = link.read(1.0)
+    link.close()
+    assert chunks is not None
+    assert [c.address for c in chunks] == [i | (EXTENDED_ID if i % 2 else 0) for i in range(50)]
+    assert {c.data for c in chunks} == {b"\1\2\3"}
+
+
+def test_a_read_is_never_without_end(peer: can.BusABC, channel: str) -> None:
+    link = build(interface="virtual", channel=channel)
+    link.open()
+    for _ in range(can_link.BATCH + 5):
+        peer.send(message(1))
+    sizes = [len(link.read(0.1) or ()) for _ in range(2)]
+    link.close()
+    assert sizes == [can_link.BATCH, 5]
+
+
+def test_a_late_reader_still_gives_the_time_of_arrival(peer: can.BusABC, channel: str) -> None:
+    link = build(interface="virtual", channel=channel)
+    link.open()
+    sent = []
+    for _ in range(3):
+        sent.append(time.monotonic_ns())
+        peer.send(message(1))
+        time.sleep(0.05)
+    time.sleep(0.2)
+    chunks = link.read(1.0) or []
+    link.close()
+    assert [c.t_ns for c in chunks] == pytest.approx(sent, abs=20e6)
+
+
+def test_stamps_that_cannot_be_believed_are_left_aside(channel: str) -> None:
+    with can.Bus(interface="virtual", channel=channel, preserve_timestamps=True) as peer:
+        link = build(interface="virtual", channel=channel)
+        link.open()
+        peer.send(message(1, timestamp=12.5))
+        peer.send(message(1, timestamp=time.time() + 3600.0))
+        chunks = link.read(1.0) or []
+        link.close()
+    now = time.monotonic_ns()
+    assert len(chunks) == 2
+    assert all(0 <= now - c.t_ns < 1e9 for c in chunks)
+
+
+def test_only_what_the_decoder_asks_for(peer: can.BusABC, channel: str) -> None:
+    link = build(interface="virtual", channel=channel)
+    link.accept([0x09, 0x0CF02AFE | EXTENDED_ID | ANY_SOURCE, 0x18EF00FE | EXTENDED_ID | ANY_SOURCE])
+    link.open()
+    kept = [(0x09, False), (0x0CF02A80, True), (0x18F02AE2, True), (0x18EF55AA, True)]
+    others = [(0x0A, False), (0x09, True), (0x0CF02BFE, True), (0x0DF02AFE, True), (0x02A, False)]
+    for identifier, extended in kept + others:
+        peer.send(message(identifier, extended))
+    chunks = link.read(1.0) or []
+    link.close()
+    assert [c.address for c in chunks] == [i | (EXTENDED_ID if e else 0) for i, e in kept]
+
+
+def test_accepting_nothing_in_particular_is_accepting_all(peer: can.BusABC, channel: str) -> None:
+    link = build(interface="virtual", channel=channel)
+    link.accept([])
+    link.open()
+    peer.send(message(0x55))
+    assert link.read(1.0)
+    link.close()
+
+
+def test_error_and_remote_frames_are_left_aside(peer: can.BusABC, channel: str) -> None:
+    link = build(interface="virtual", channel=channel)
+    link.open()
+    peer.send(can.Message(is_error_frame=True, arbitration_id=0x40))
+    peer.send(can.Message(is_remote_frame=True, arbitration_id=5, is_extended_id=False))
+    peer.send(message(7))
+    got: list[Chunk] = []
+    for _ in range(10):
+        got += link.read(0.05) or []
+    link.close()
+    assert [c.address for c in got] == [7]
+    assert link.error_frames == 1
+
+
+class ToldBus:
+    """A bus that gives what it was told to."""
+
+    def __init__(self, *answers: can.Message | Exception) -> None:
+        self.answers = list(answers)
+        self.closed = False
+
+    def recv(self, timeout: float) -> can.Message | None:
+        answer = self.answers.pop(0) if self.answers else None
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def shutdown(self) -> None:
+        self.closed = True
+        raise can.CanOperationError("already unplugged")
+
+
+@pytest.mark.parametrize(
+    ("answer", "says"),
+    [
+        (can.Message(is_error_frame=True, arbitration_id=0x40), "bus off"),
+        (can.CanOperationError("Network is down", 100), "interface down"),
+        (OSError(errno.ENODEV, "No such device"), "unplugged"),
+    ],
+)
+def test_losing_the_bus(monkeypatch: pytest.MonkeyPatch, answer: Any, says: str) -> None:
+    bus = ToldBus(answer)
+    monkeypatch.setattr(can, "Bus", lambda **_: bus)
+    link = build(channel="can0")
+    link.open()
+    with pytest.raises(LinkLost, match=says):
+        link.read(1.0)
+    assert bus.closed
+    with pytest.raises(LinkLost, match="closed"):
+        link.read(0.0)
+
+
+@pytest.mark.parametrize(
+    ("keys", "error", "says"),
+    [
+        ({"interface": "socketscan"}, can.CanInterfaceNotImplementedError("?"), 'did you mean "socketcan"'),
+        ({}, OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol"), "modprobe can_raw"),
+        ({}, OSError(errno.ENODEV, "No such device"), "no such network interface"),
+        ({}, OSError(errno.ENETDOWN, "Network is down"), "ip link set can0 up"),
+        ({}, OSError(errno.EPERM, "Operation not permitted"), "permission"),
+        ({"interface": "kvaser"}, NameError("name 'canGetNumberOfChannels' is not defined"), "not installed"),
+        ({"interface": "slcan"}, TypeError("unexpected keyword"), "refuses these settings"),
+        ({"interface": "pcan"}, can.CanInitializationError("PCAN\nbusy"), "PCAN busy"),
+    ],
+)
+def test_advice(monkeypatch: pytest.MonkeyPatch, keys: dict[str, Any], error: Exception, says: str) -> None:
+    def refuse(**_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(can, "Bus", refuse)
+    with pytest.raises(LinkUnavailable, match=says) as raised:
+        build(channel="can0", **keys).open()
+    assert raised.value.__cause__ is error
+    assert "\n" not in str(raised.value)
+
+
+def test_settings_reach_python_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: dict[str, Any] = {}
+
+    def note(**keys: Any) -> ToldBus:
+        seen.update(keys)
+        return ToldBus()
+
+    monkeypatch.setattr(can, "Bus", note)
+    build(interface="pcan", channel="PCAN_USBBUS1", bitrate=500_000, fd=True, options={"state": 1}).open()
+    expected = {"interface": "pcan", "channel": "PCAN_USBBUS1", "bitrate": 500_000, "fd": True, "state": 1}
+    assert expected.items() <= seen.items()
+
+
+def test_absent_socketcand_is_told_at_once() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    link = build(interface="socketcand", channel="can0", options={"host": "127.0.0.1", "port": port})
+    start = time.monotonic()
+    with pytest.raises(LinkUnavailable):
+        link.open()
+    assert time.monotonic() - start < 5.0
+
+
+def test_an_adapter_that_garbles_a_line_goes_on() -> None:
+    master, slave = os.openpty()
+    tty.setraw(master)
+    tty.setraw(slave)
+    link = build(interface="slcan", channel=os.ttyname(slave), options={"sleep_after_open": 0.0})
+    link.open()
+    os.write(master, b"\xff\xfe\r")
+    for _ in range(5):
+        link.read(0.05)
+    os.write(master, b"t00z2aabb\r")
+    for _ in range(5):
+        link.read(0.05)
+    os.write(master, b"t0092aabb\r")
+    chunks: list[Chunk] = []
+    for _ in range(20):
+        chunks += link.read(0.05) or []
+    link.close()
+    os.close(master)
+    os.close(slave)
+    assert [(c.address, c.data) for c in chunks] == [(9, b"\xaa\xbb")]
+    assert link.garbled == 2

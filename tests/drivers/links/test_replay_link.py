@@ -1,0 +1,246 @@
+"""Replay: every kind of file, its pace, its end, and files that are damaged."""
+
+import gzip
+import time
+from pathlib import Path
+from typing import Any
+
+import can
+import msgspec
+import numpy as np
+import pytest
+
+from drivers.decoders import samples
+from drivers.errors import ConfigError, LinkEnded, LinkUnavailable
+from drivers.links import replay_link
+from drivers.links.base import Link
+from drivers.recording import load_samples
+from drivers.sample import EXTENDED_ID, Chunk, join
+
+FRAMES = [(0x9, False, bytes(range(8))), (0x0CF02AE2, True, b"\x00\x7d\x00\x7d\x00\x7d\x00\x05")] * 20
+
+
+def build(path: Path, speed: str | float = "max", **keys: Any) -> Link:
+    return replay_link.build(
+        msgspec.convert({"path": str(path), "speed": speed, **keys}, replay_link.Settings)
+    )
+
+
+def read_all(link: Link) -> tuple[list[Chunk], str]:
+    """All chunks, and what the link said at its end."""
+    chunks: list[Chunk] = []
+    link.open()
+    try:
+        for _ in range(10_000):
+            chunks += link.read(1.0) or []
+    except LinkEnded as end:
+        return chunks, str(end)
+    finally:
+        link.close()
+    raise AssertionError("no end")
+
+
+def write_recording(path: Path, n: int = 1000, rate_hz: float = 100.0) -> None:
+    rng = np.random.default_rng(1)
+    columns = {a: rng.normal(size=n) for a in ("gx", "gy", "gz", "ax", "ay", "az", "temperature")}
+    np.savez(path, fs=rate_hz, **columns)  # type: ignore[arg-type]
+
+
+# --- recordings ----------------------------------------------------------------------------------
+
+
+def test_a_recording_arrives_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "r.npz"
+    write_recording(path)
+    link = build(path)
+    assert (link.carrier, link.epoch) == ("messages", "unix")
+    chunks, _ = read_all(link)
+    got = join(samples.build(samples.Settings()).feed(chunks))
+    kept = load_samples(path)
+    np.testing.assert_array_equal(got.values, kept.values)
+    np.testing.assert_array_equal(got.temperature_c, kept.temperature_c)
+    np.testing.assert_allclose(got.t_ns, np.arange(1000) * 1e7, atol=500)
+    assert got.lost == 0
+
+
+def test_uneven_times_of_a_recording_are_kept(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    rows = ["t,gz,ax", "1700000000.0,1,2", "1700000000.013,3,", "1700000000.011,5,6", "1700000007.5,7,8"]
+    path.write_text("\n".join(rows) + "\n")
+    chunks, _ = read_all(build(path))
+    got = join(samples.build(samples.Settings()).feed(chunks))
+    assert got.t_ns - 1_700_000_000_000_000_000 == pytest.approx([0, 13e6, 11e6, 7.5e9], abs=500)
+    np.testing.assert_array_equal(got.values[:, 2], [1, 3, 5, 7])
+    np.testing.assert_array_equal(got.values[:, 3], [2, np.nan, 6, 8])
+
+
+def test_rate_of_a_recording_without_times(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    path.write_text("gz\n1\n2\n3\n")
+    with pytest.raises(LinkUnavailable, match="rate"):
+        build(path).open()
+    chunks, _ = read_all(build(path, rate=50.0))
+    got = join(samples.build(samples.Settings()).feed(chunks))
+    assert got.t_ns.tolist() == [0, 20_000_000, 40_000_000]
+
+
+def test_recorded_pace_and_factor(tmp_path: Path) -> None:
+    path = tmp_path / "r.npz"
+    write_recording(path, n=100)
+    for speed, expected_s in (("recorded", 0.99), (4, 0.2475)):
+        start = time.monotonic()
+        chunks, _ = read_all(build(path, speed))
+        assert expected_s <= time.monotonic() - start < expected_s + 0.5
+        # pieces of 20 ms of the reader's time, not one lump
+        assert len(chunks) >= 10
+
+
+def test_each_opening_starts_anew(tmp_path: Path) -> None:
+    path = tmp_path / "r.npz"
+    write_recording(path, n=10)
+    link = build(path)
+    assert read_all(link)[0] == read_all(link)[0]
+
+
+# --- CAN logs ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".asc", ".blf", ".log", ".trc", ".csv", ".log.gz", ".asc.gz"])
+def test_logs_of_python_can(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"drive{suffix}"
+    with can.Logger(path) as logger:
+        for i, (identifier, extended, data) in enumerate(FRAMES):
+            logger.on_message_received(
+                can.Message(
+                    timestamp=1_700_000_000.0 + 0.01 * i,
+                    arbitration_id=identifier,
+                    is_extended_id=extended,
+                    data=data,
+                    channel=1,
+                )
+            )
+    link = build(path)
+    assert (link.carrier, link.epoch) == ("frames", "unix")
+    chunks, _ = read_all(link)
+    assert [(c.address, c.data) for c in chunks] == [
+        (identifier | (EXTENDED_ID if extended else 0), data) for identifier, extended, data in FRAMES
+    ]
+    assert np.diff([c.t_ns for c in chunks]) == pytest.approx(np.full(len(FRAMES) - 1, 1e7), abs=2e5)
+
+
+def write_frames(path: Path) -> None:
+    with gzip.open(path, "wt") as stream:
+        stream.write("t,channel,id_hex,extended,dlc,data_hex\n")
+        for i, (identifier, extended, data) in enumerate(FRAMES):
+            stream.write(
+                f"{0.01 * i:.6f},{1 + i % 2},{identifier:x},{int(extended)},{len(data)},{data.hex()}\n"
+            )
+
+
+def test_frames_as_csv(tmp_path: Path) -> None:
+    path = tmp_path / "frames.csv.gz"
+    write_frames(path)
+    chunks, _ = read_all(build(path))
+    assert [c.data for c in chunks] == [f[2] for f in FRAMES]
+    assert [c.t_ns for c in chunks] == [i * 10_000_000 for i in range(len(FRAMES))]
+    only, _ = read_all(build(path, channel="2"))
+    assert {c.address for c in only} == {0x0CF02AE2 | EXTENDED_ID}
+
+
+def test_frames_as_csv_without_the_optional_columns(tmp_path: Path) -> None:
+    path = tmp_path / "frames.csv"
+    path.write_text("t,bus,id_hex,data_hex\n0.5,0,7ff,00ff\n0.6,0,800,\n")
+    chunks, _ = read_all(build(path))
+    assert [(c.address, c.data) for c in chunks] == [(0x7FF, b"\x00\xff"), (0x800 | EXTENDED_ID, b"")]
+
+
+def test_a_log_cut_off_is_given_up_to_the_cut(tmp_path: Path) -> None:
+    path = tmp_path / "frames.csv.gz"
+    rows = [f"{0.01 * i:.6f},9,{i * 2654435761 % (1 << 32):08x}" for i in range(5000)]
+    packed = gzip.compress(("t,id_hex,data_hex\n" + "\n".join(rows) + "\n").encode())
+    path.write_bytes(packed[: len(packed) // 2])
+    chunks, end = read_all(build(path))
+    assert 100 < len(chunks) < 5000
+    assert "cut off" in end
+    assert [c.data.hex() for c in chunks] == [row[-8:] for row in rows[: len(chunks)]]
+
+
+def test_a_damaged_line_ends_the_log(tmp_path: Path) -> None:
+    path = tmp_path / "frames.csv"
+    path.write_text("t,id_hex,data_hex\n0.1,9,00\n0.2,9,0x\n0.3,9,02\n")
+    chunks, end = read_all(build(path))
+    assert len(chunks) == 1
+    assert "damaged" in end
+
+
+def test_logs_keep_their_pace(tmp_path: Path) -> None:
+    path = tmp_path / "frames.csv.gz"
+    write_frames(path)
+    start = time.monotonic()
+    chunks, _ = read_all(build(path, "recorded"))
+    assert 0.39 <= time.monotonic() - start < 0.9
+    assert len(chunks) == len(FRAMES)
+
+
+# --- captured bytes ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["a.bin", "a.raw", "a.txt", "a.txt.gz"])
+def test_bytes(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    data = np.random.default_rng(2).bytes(20_000)
+    path.write_bytes(gzip.compress(data) if name.endswith(".gz") else data)
+    link = build(path)
+    assert (link.carrier, link.epoch) == ("bytes", "monotonic")
+    chunks, _ = read_all(link)
+    assert b"".join(c.data for c in chunks) == data
+
+
+def test_bytes_at_a_rate(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(bytes(10_000))
+    start = time.monotonic()
+    paced, _ = read_all(build(path, "recorded", bytes_per_second=20_000.0))
+    assert 0.5 <= time.monotonic() - start < 1.0
+    start = time.monotonic()
+    at_once, _ = read_all(build(path, "max", bytes_per_second=20_000.0))
+    assert time.monotonic() - start < 0.4
+    for chunks in (paced, at_once):
+        # the times are those of the line, whatever the pace of reading
+        spacing = np.diff([c.t_ns for c in chunks]) / [len(c.data) for c in chunks[1:]]
+        assert spacing == pytest.approx(np.full(len(chunks) - 1, 1e9 / 20_000), rel=1e-4)
+
+
+# --- what is wrong -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "keys"),
+    [
+        ("a.npx", {}),
+        ("a", {}),
+        ("a.npz", {"speed": "fast"}),
+        ("a.npz", {"speed": 0.0}),
+        ("a.npz", {"speed": -1}),
+        ("a.npz", {"rate": 0.0}),
+        ("a.bin", {"bytes_per_second": -5.0}),
+    ],
+)
+def test_wrong_settings_refuse_to_start(tmp_path: Path, name: str, keys: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError) as raised:
+        build(tmp_path / name, **keys)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.csv", "a.log", "a.blf", "a.bin", "a.txt.gz"])
+def test_a_file_that_is_not_there(tmp_path: Path, name: str) -> None:
+    with pytest.raises(LinkUnavailable, match=r"a\.") as raised:
+        build(tmp_path / name).open()
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.blf", "a.bin.gz"])
+def test_a_file_that_is_something_else(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"this is none of it, " * 20)
+    with pytest.raises(LinkUnavailable):
+        build(tmp_path / name).open()

@@ -1,0 +1,206 @@
+"""Serial ports: pseudo terminals and pyserial's URLs in place of cables."""
+
+import contextlib
+import errno
+import os
+import socket
+import threading
+import time
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import serial
+
+from drivers.errors import ConfigError, LinkLost, LinkUnavailable
+from drivers.links import serial_link
+from drivers.links.base import Link
+
+
+def build(**keys: Any) -> Link:
+    return serial_link.build(msgspec.convert(keys, serial_link.Settings))
+
+
+@pytest.fixture
+def pty() -> Iterator[tuple[int, str]]:
+    master, slave = os.openpty()
+    tty.setraw(master)
+    tty.setraw(slave)
+    yield master, os.ttyname(slave)
+    os.close(slave)
+    with contextlib.suppress(OSError):
+        os.close(master)
+
+
+def read_all(link: Link, n: int) -> bytes:
+    got = b""
+    deadline = time.monotonic() + 5.0
+    while len(got) < n and time.monotonic() < deadline:
+        got += b"".join(c.data for c in link.read(0.2) or ())
+    return got
+
+
+def test_every_byte_comes_once_and_in_order(pty: tuple[int, str]) -> None:
+    master, port = pty
+    link = build(port=port, baudrate=921600)
+    link.open()
+    sent = os.urandom(60_000)
+
+    def write() -> None:
+        for at in range(0, len(sent), 500):
+            os.write(master, sent[at : at + 500])
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    got = read_all(link, len(sent))
+    writer.join()
+    link.close()
+    assert got == sent
+
+
+def test_bytes_do_not_wait_for_the_timeout_of_the_reader(pty: tuple[int, str]) -> None:
+    master, port = pty
+    link = build(port=port)
+    link.open()
+    os.write(master, b"x")
+    start = time.monotonic()
+    assert link.read(10.0)
+    assert time.monotonic() - start < 0.5
+    link.close()
+
+
+def test_a_steady_flow_is_handed_over_at_the_port_timeout(pty: tuple[int, str]) -> None:
+    master, port = pty
+    link = build(port=port, read_timeout=0.02)
+    link.open()
+    stop = threading.Event()
+
+    def flow() -> None:
+        while not stop.wait(0.001):
+            os.write(master, b"abc")
+
+    writer = threading.Thread(target=flow)
+    writer.start()
+    link.read(1.0)
+    start = time.monotonic()
+    for _ in range(10):
+        assert link.read(1.0)
+    each = (time.monotonic() - start) / 10
+    stop.set()
+    writer.join()
+    link.close()
+    assert each < 0.2
+
+
+def test_loop_and_socket_urls() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = build(port=f"socket://127.0.0.1:{server.getsockname()[1]}")
+        link.open()
+        peer, _ = server.accept()
+        peer.sendall(b"over the network")
+        assert read_all(link, 16) == b"over the network"
+        peer.close()
+        with pytest.raises(LinkLost):
+            for _ in range(20):
+                link.read(0.1)
+        link.close()
+    link = build(port="loop://")
+    link.open()
+    assert link.read(0.05) is None
+    link.close()
+
+
+def test_nobody_at_the_network_port() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    with pytest.raises(LinkUnavailable, match=f"127.0.0.1:{port}"):
+        build(port=f"socket://127.0.0.1:{port}").open()
+
+
+def test_port_held_by_another(pty: tuple[int, str]) -> None:
+    holder, second = build(port=pty[1]), build(port=pty[1])
+    holder.open()
+    with pytest.raises(LinkUnavailable, match="held by another program"):
+        second.open()
+    holder.close()
+    second.open()
+    second.close()
+
+
+def test_not_exclusive_lets_others_read(pty: tuple[int, str]) -> None:
+    pair = build(port=pty[1], exclusive=False), build(port=pty[1], exclusive=False)
+    for link in pair:
+        link.open()
+    for link in pair:
+        link.close()
+
+
+def test_a_file_is_no_serial_port(tmp_path: Path) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_text("x")
+    with pytest.raises(LinkUnavailable, match=r"notes\.txt"):
+        build(port=str(path)).open()
+
+
+@pytest.mark.parametrize(
+    ("number", "advice"),
+    [
+        (errno.ENOENT, "no such port"),
+        (errno.EACCES, "group dialout"),
+        (errno.EBUSY, "held by another"),
+        (errno.ENXIO, "no device behind"),
+        (errno.ENOTTY, "not a serial port"),
+        (errno.EMFILE, "cannot be opened"),
+    ],
+)
+def test_advice(monkeypatch: pytest.MonkeyPatch, number: int, advice: str) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise serial.SerialException(number, f"could not open port: {os.strerror(number)}")
+
+    monkeypatch.setattr(serial, "serial_for_url", refuse)
+    with pytest.raises(LinkUnavailable, match=advice) as raised:
+        build(port="/dev/ttyUSB0").open()
+    assert isinstance(raised.value.__cause__, serial.SerialException)
+    assert "/dev/ttyUSB0" in str(raised.value)
+
+
+def test_ports_that_there_are_are_listed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from serial.tools import list_ports, list_ports_common
+
+    there = [list_ports_common.ListPortInfo("/dev/ttyACM7", skip_link_detection=True)]
+    monkeypatch.setattr(list_ports, "comports", lambda: there)
+    with pytest.raises(LinkUnavailable, match="/dev/ttyACM7"):
+        build(port=str(tmp_path / "ttyNONE")).open()
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"port": ""},
+        {"port": "sockets://host:1"},
+        {"port": "x", "baudrate": 0},
+        {"port": "x", "stopbits": 3.0},
+        {"port": "x", "read_timeout": 0.0},
+        {"port": "x", "read_timeout": 5.0},
+    ],
+)
+def test_wrong_settings_refuse_to_start(keys: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError) as raised:
+        build(**keys)
+    assert "\n" not in str(raised.value)
+
+
+def test_unplugging_is_noticed_while_waiting(pty: tuple[int, str]) -> None:
+    master, port = pty
+    link = build(port=port)
+    link.open()
+    threading.Timer(0.1, os.close, (master,)).start()
+    start = time.monotonic()
+    with pytest.raises(LinkLost, match="gone"):
+        link.read(10.0)
+    assert time.monotonic() - start < 2.0
+    with pytest.raises(LinkLost):
+        link.read(0.1)
