@@ -28,6 +28,8 @@ FORGET_S: Final = 30.0
 LEARN_S: Final = 2.0
 LEARN_SAMPLES: Final = 20
 """A rate is known from the data after both."""
+KEEP_LEAST: Final = 0.9
+"""Slow sensors and long blocks: the line rests on ten points or more however far apart they are."""
 CATCH_UP_S: Final = 3.0
 HOLE_PERIODS: Final = 3.0
 HOLE_MIN_S: Final = 0.05
@@ -37,8 +39,9 @@ JUMP_S: Final = 1.0
 LONG_S: Final = 3600.0
 """Given times that go on by more than this at one step are told as an event too."""
 STUCK_SAMPLES: Final = 10
-SNAP: Final = 0.01
-"""A measured rate this near to a rate that sensors are made with is taken to be that rate."""
+SNAP: Final = 0.002
+"""A measured rate this near to a rate that sensors are made with is taken to be that rate; crystals and RC
+oscillators further off are taken at their word."""
 # fmt: off
 MADE_RATES_HZ: Final = np.array([
     1, 2, 4, 5, 8, 10, 12.5, 16, 20, 25, 26, 32, 40, 50, 52, 62.5, 64, 80, 100, 104, 120, 125, 128, 200, 208, 238, 240,
@@ -61,7 +64,6 @@ class SampleClock:
         self._nominal_hz = rate_hz
         self._events: list[Event] = []
         self._line = Line()
-        self._learned_hz: float | None = None
         self._last_t_ns = -(1 << 62)
         self._index = 0.0  # samples since the line's start, missing ones included
         self._arrived_ns = 0  # newest arrival
@@ -73,8 +75,11 @@ class SampleClock:
 
     @property
     def rate_hz(self) -> float | None:
-        """Samples a second: nominal where stated, else found from the data and then kept."""
-        return self._nominal_hz or self._learned_hz
+        """Samples a second: nominal where stated, else found from the data and made better with them; None at first."""
+        if self._nominal_hz or not self._line.settled():
+            return self._nominal_hz
+        measured = self._line.rate_hz()
+        return made_rate(measured) if measured else None
 
     @property
     def measured_hz(self) -> float | None:
@@ -93,20 +98,10 @@ class SampleClock:
     def stamp(self, samples: SampleBlock) -> list[SampleBlock]:
         """The samples with their times, cut where some are missing."""
         if isinstance(self._timing, Given):
-            stamped = self._keep_given(samples)
-        elif isinstance(self._timing, Counter) and (samples.ticks != NO_TICK).all():
-            stamped = self._place(samples, self._counted_gaps(samples, self._timing))
-        else:
-            stamped = self._place(samples, self._arrival_gaps(samples))
-        if self._learned_hz is None:
-            self._learned_hz = self._learn()
-        return stamped
-
-    def _learn(self) -> float | None:
-        if self._line.count < LEARN_SAMPLES or self._line.span_s() < LEARN_S:
-            return None
-        rate = self._line.rate_hz()
-        return None if rate is None else made_rate(rate)
+            return self._keep_given(samples)
+        if isinstance(self._timing, Counter) and (samples.ticks != NO_TICK).all():
+            return self._place(samples, self._counted_gaps(samples, self._timing))
+        return self._place(samples, self._arrival_gaps(samples))
 
     # --- times given by the sender
 
@@ -128,6 +123,7 @@ class SampleClock:
             gap = np.rint(steps / NS / period_s).astype(np.int64) - 1
             gap[(steps <= 0) | (steps / NS < 1.5 * period_s)] = 0
             missing = np.maximum(missing, gap)
+        self._line.add(self._index + int(missing[0]) + 1, float(t[0]) / NS)
         self._index += len(samples) + int(missing.sum())
         self._line.add(self._index, float(t[-1]) / NS)
         return _cut(samples, t, missing)
@@ -265,16 +261,16 @@ class Line:
     def __init__(self) -> None:
         self.count = 0
         self._x0 = self._t0 = 0.0  # newest point
-        self._first_t = 0.0
+        self._first_x = self._first_t = 0.0
         self._w = self._mx = self._mt = self._sxx = self._sxt = 0.0
 
     def add(self, index: float, t_s: float, nominal_hz: float | None = None) -> None:
         """One more (index, arrival) pair; the nominal rate stands in for a slope until there is one."""
         if self.count == 0:
-            self._first_t = t_s
+            self._first_x, self._first_t = index, t_s
             self._nominal_s = 1.0 / nominal_hz if nominal_hz else None
         dx, dt = index - self._x0, t_s - self._t0
-        keep = exp(-max(dt, 0.0) / FORGET_S) if self.count else 0.0
+        keep = max(exp(-max(dt, 0.0) / FORGET_S), KEEP_LEAST) if self.count else 0.0
         # shift the means to the new origin, then update (West 1979)
         self._mx -= dx
         self._mt -= dt
@@ -294,7 +290,7 @@ class Line:
 
     def settled(self) -> bool:
         """Whether the slope rests on enough to tell a hole from jitter."""
-        return self.count >= LEARN_SAMPLES and self.span_s() >= LEARN_S
+        return self._x0 - self._first_x >= LEARN_SAMPLES and self.span_s() >= LEARN_S
 
     def period_s(self) -> float | None:
         """Seconds a sample; None until two pairs have come."""
@@ -329,13 +325,13 @@ class _Step:
 
 
 def made_rate(measured_hz: float) -> float:
-    """The rate that sensors are made with nearest to the measured one, if within SNAP; else the measured one.
+    """The rate that sensors are made with nearest to the measured one, if within SNAP; else the measured, to 5 digits.
 
-    >>> made_rate(99.32), made_rate(97.0)
-    (100.0, 97.0)
+    >>> made_rate(99.97), made_rate(99.32)
+    (100.0, 99.32)
     """
     nearest = float(MADE_RATES_HZ[np.argmin(np.abs(np.log(MADE_RATES_HZ / measured_hz)))])
-    return nearest if abs(measured_hz / nearest - 1.0) < SNAP else measured_hz
+    return nearest if abs(measured_hz / nearest - 1.0) < SNAP else float(f"{measured_hz:.5g}")
 
 
 def _usual(steps: Ints) -> float | None:

@@ -191,14 +191,7 @@ class _Reader:
         publish_s = self._try(f"{at}: publish", period, entry.publish, "every block")
         axes = self._try(f"{at}: axes", _axes, entry.axes)
         link, decoder = self.driver(entry.driver, f"{at}: driver")
-        if (
-            window_s is None
-            or refit_s is None
-            or publish_s is None
-            or axes is None
-            or link is None
-            or decoder is None
-        ):
+        if window_s is None or refit_s is None or publish_s is None or axes is None or link is None or decoder is None:
             return None
         self._try(f"{at}: window", _possible_window, window_s, entry.rate)
         if entry.model is not None and not entry.model.is_file():

@@ -129,6 +129,9 @@ class Station:
     def report(self, outputs: Sequence[Output], states: dict[str, str], memory_bytes: int) -> Health:
         """Tell the outputs how the device does, and ease its wall clock."""
         self._wall.follow(time.monotonic_ns(), time.time_ns())
+        rate = self.clock.rate_hz
+        if self.estimator is not None and rate is not None and rate != self.estimator.rate_hz:
+            self.estimator.relabel(rate)
         health = self.health(states, memory_bytes)
         for output in outputs:
             output.health(self.name, self.now_unix_s(), health)
@@ -199,11 +202,7 @@ class Station:
         return True
 
     def _publish_estimate(self, outputs: Sequence[Output], now_s: float, drain: bool) -> bool:
-        if (
-            self.estimator is not None
-            and self._advanced
-            and (self._due("refit", self.device.refit_s, now_s) or drain)
-        ):
+        if self.estimator is not None and self._advanced and (self._due("refit", self.device.refit_s, now_s) or drain):
             self._advanced = False
             try:
                 self.latest = self.estimator.get()

@@ -34,6 +34,7 @@ LONGEST: Final = 4096
 """Bytes of a line; more without a line end is noise and is dropped."""
 NOISE: Final = b"\0"
 """Stands for an overlong line: it is bad, as it is no number."""
+OVERLONG: Final = f"more than {LONGEST} bytes without a line end: is the baud rate right?"
 SKIP: Final = "-"
 COLUMNS: Final = (*AXES, "temperature", "t", "counter", SKIP)
 TICK_S: Final = 1e-9
@@ -81,6 +82,7 @@ class TextDecoder:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._at = {name: i for i, name in enumerate(settings.columns) if name != SKIP}
+        self._wanted = frozenset(self._at.values())
         self._width = len(settings.columns)
         self._factor, self._offset = _scales(settings)
         self._tick = round(units.time_factor(settings.time_unit) / TICK_S)
@@ -134,7 +136,7 @@ class TextDecoder:
             lines[0] = lines[0] if self._first_is_whole(lines[0]) else b""
         if len(rest) > LONGEST:
             rest, self._overlong = b"", True
-            self._complain(f"more than {LONGEST} bytes without a line end: is the baud rate right?")
+            self._complain(OVERLONG)
         self._rest = rest
         return [line for line in lines if line]
 
@@ -167,13 +169,16 @@ class TextDecoder:
         commas = self._width - 1
         joined = b",".join(alike)
         if len(alike) == len(bodies) and b"_" not in joined and all(a.count(b",") == commas for a in alike):
+            fields = joined.split(b",")
+            table = np.zeros((len(bodies), self._width))
             try:
-                table = np.array(list(map(float, joined.split(b",") if alike else ())))
+                for at in self._at.values() if bodies else ():
+                    table[:, at] = list(map(float, fields[at :: self._width]))
             except ValueError:
                 pass  # an empty field, or one that is no number: find out which
             else:
                 self._quiet += len(bodies)
-                return table.reshape(-1, self._width)
+                return table
         rows = []
         for body in bodies:
             row, complaint = (None, "a line fails its checksum") if body is None else self._row(body)
@@ -198,11 +203,13 @@ class TextDecoder:
 
     def _row(self, body: bytes) -> tuple[list[float] | None, str]:
         """The numbers of one line, or None and what is wrong with it."""
+        if body == NOISE:
+            return None, OVERLONG
         fields = self._separated(body).split(b",")
         if len(fields) != self._width:
             return None, f"a line has {len(fields)} columns, expected are {self._width}: {body[:60]!r}"
         try:
-            return [_number(field) for field in fields], ""
+            return [_number(f) if at in self._wanted else 0.0 for at, f in enumerate(fields)], ""
         except ValueError:
             return None, f"a field is no number: {body[:60]!r}"
 

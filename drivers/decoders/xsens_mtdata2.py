@@ -156,9 +156,7 @@ class XsensMtdata2Decoder:
         kept, bad_after = frames.keep(rows.tolist())
         if rows.size:
             self._clockless = self._clock != 0 and int(ticks[rows[-1]]) == NO_TICK
-        return self._rows.blocks(
-            kept.t_ns, values[rows], temperature_c[rows], ticks[rows], kept.bad_before, bad_after
-        )
+        return self._rows.blocks(kept.t_ns, values[rows], temperature_c[rows], ticks[rows], kept.bad_before, bad_after)
 
     def _read(
         self,

@@ -25,7 +25,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Final, Literal, cast
+from typing import IO, TYPE_CHECKING, BinaryIO, Final, Literal, cast
 
 from drivers.errors import ConfigError, LinkEnded, LinkLost, LinkUnavailable, RecordingError
 from drivers.links.base import Carrier, Link, LinkSettings
@@ -55,6 +55,9 @@ Kind = Literal["recording", "log", "capture"]
 Timed = tuple[float, Chunk]
 """Seconds from the start of the file, and what comes then."""
 CARRIERS: Final[dict[Kind, Carrier]] = {"recording": "messages", "log": "frames", "capture": "bytes"}
+
+DEFAULT_DECODERS: Final[dict[Kind, str]] = {"recording": DEFAULT_DECODER, "log": "dbc", "capture": ""}
+"""Decoder of each kind, where the settings name none; "" = they must."""
 
 
 class Settings(LinkSettings, frozen=True, kw_only=True):
@@ -89,6 +92,7 @@ class ReplayLink:
         self._pace = pace  # file seconds a second; inf = no waiting
         self.carrier: Carrier = CARRIERS[kind]
         self.epoch: Literal["monotonic", "unix"] = "monotonic" if kind == "capture" else "unix"
+        self.default_decoder = DEFAULT_DECODERS[kind]
         self.name = f"replay of {settings.path}"
         self.notes: tuple[str, ...] = ()
         self._source: _Source | None = None
@@ -202,8 +206,21 @@ def _log(path: Path, channel: str | None) -> _Source:
         return _Source(_from_start(_csv_frames(stream, channel)), stream.close)
     import can
 
-    reader = can.LogReader(path)
+    reader = _blf(path) if _plain_suffix(path) == ".blf" else can.LogReader(path)
     return _Source(_from_start(_log_frames(iter(reader), channel)), reader.stop)
+
+
+def _blf(path: Path) -> "can.BLFReader":
+    """python-can's own reader would leave the file open when it is none of its kind."""
+    import can
+    from can.io.blf import BLFParseError
+
+    stream = cast("BinaryIO", _binary(path))
+    try:
+        return can.BLFReader(stream)
+    except (BLFParseError, struct.error) as error:
+        stream.close()
+        raise ValueError(f"no BLF log: {error}") from error
 
 
 def _log_frames(messages: "Iterator[can.Message]", channel: str | None) -> Iterator[Chunk]:

@@ -7,9 +7,11 @@ so an absent publisher shows as silence, not as ``LinkLost``; as a client it nee
 zenoh fills a ring channel that overwrites its oldest when full (a decoder sees that in the sequence
 numbers). A thread of the link's own takes from it and stamps each message, as zenoh's channels cannot be
 waited on with a timeout; no Python callback is registered, since one that lives at exit hangs the
-process. Closing the session ends that thread, and with it a waiting ``read``.
+process. Closing the session ends that thread, and with it a waiting ``read``. A program that ends without
+closing has it closed by ``atexit``: a thread that still waited in zenoh then would abort the process.
 """
 
+import atexit
 import json
 import re
 import threading
@@ -96,6 +98,7 @@ class ZenohLink:
                 target=self._take, args=(subscriber,), name=f"{self.name} taker", daemon=True
             )
             self._taker.start()
+            atexit.register(self.close)
 
     def read(self, timeout_s: float) -> list[Chunk] | None:
         """Messages that came, waiting up to ``timeout_s`` for the first."""
@@ -134,6 +137,7 @@ class ZenohLink:
                 self._changed.notify_all()
 
     def _close_session(self) -> None:
+        atexit.unregister(self.close)
         session, self._session = self._session, None
         taker, self._taker = self._taker, None
         with self._changed:

@@ -35,7 +35,7 @@ def read_parquet(path: Path) -> Table:
         with parquet.ParquetFile(path) as file:
             chosen = chosen_columns(path, file.schema_arrow.names, notes)
             table = file.read(columns=list(chosen.values()))
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise RecordingError(
             f"{path}: is no whole Parquet file ({_first_line(error)}); its index stands at the end, "
             "so one that is cut off cannot be read"
@@ -51,9 +51,10 @@ def read_ipc(path: Path) -> Table:
     is_file = data.startswith(ARROW_MAGIC)
     try:
         reader = pa.ipc.open_stream(pa.py_buffer(data).slice(len(ARROW_MAGIC) if is_file else 0))
-    except (pa.ArrowException, OSError) as error:
+        names = reader.schema.names
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: is no Arrow IPC file or stream ({_first_line(error)})") from error
-    chosen = chosen_columns(path, reader.schema.names, notes)
+    chosen = chosen_columns(path, names, notes)
     if not data.endswith(ARROW_MAGIC.rstrip(b"\0") if is_file else ARROW_END):
         notes.append("The end mark is missing: the file is cut off and was read up to the cut.")
     batches: list[Any] = []

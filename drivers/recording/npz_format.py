@@ -10,9 +10,10 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final, cast
 
 import numpy as np
+from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from drivers.errors import RecordingError
@@ -27,18 +28,26 @@ def read_npz(path: Path) -> Table:
     """Only the arrays that mean something are read, the whole ones and up to a cut."""
     notes: list[str] = []
     with path.open("rb") as file:
-        if file.read(4) != LOCAL_MAGIC:
+        if file.read(len(LOCAL_MAGIC)) != LOCAL_MAGIC:
             raise RecordingError(f"{path}: is no .npz file (a zip archive with one array a column)")
+        file.seek(0)
+        if zipfile.is_zipfile(file):
+            file.seek(0)
+            with _opened(path, file) as archive:
+                return _npz_table(path, archive, None, notes)
+    arrays, cut = _recovered(path.read_bytes())
+    if not arrays:
+        raise RecordingError(f"{path}: is damaged or cut off before its first number")
+    at = f" inside {cut}" if cut else ""
+    notes.append(f"The file is cut off{at} and was read up to the cut; later columns are missing.")
+    return _npz_table(path, arrays, cut, notes)
+
+
+def _opened(path: Path, file: BinaryIO) -> NpzFile:
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            return _npz_table(path, archive, None, notes)
-    except zipfile.BadZipFile:
-        arrays, cut = _recovered(path.read_bytes())
-        if not arrays:
-            raise RecordingError(f"{path}: is damaged or cut off before the end of its first array") from None
-        at = f" inside {cut}" if cut else ""
-        notes.append(f"The file is cut off{at} and was read up to the cut; later columns are missing.")
-        return _npz_table(path, arrays, cut, notes)
+        return cast(NpzFile, np.load(file, allow_pickle=False))
+    except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
+        raise RecordingError(f"{path}: its index of arrays is damaged: {error}") from error
 
 
 def _npz_table(path: Path, archive: Mapping[str, Any], cut: str | None, notes: list[str]) -> Table:

@@ -63,6 +63,12 @@ class Estimator:
         self._window.reset()
         self._entered[:] = False
 
+    def relabel(self, rate_hz: float) -> None:
+        """The rate is known better now: the same clusters of samples, other τ and units."""
+        self.rate_hz = rate_hz
+        self.window_s = self._window.length / rate_hz
+        self._design = design(self._window.factors, rate_hz)
+
     def get(self) -> Estimate:
         """The curve of the window and the coefficients fitted to it.
 

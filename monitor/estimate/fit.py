@@ -93,9 +93,7 @@ def design(factors: Ints, rate_hz: float) -> Design:
     return Design(factors, rate_hz, columns)
 
 
-def fit(
-    design: Design, table: Table, avar: Floats, terms: Ints, before: NDArray[np.bool_] | None = None
-) -> Fit:
+def fit(design: Design, table: Table, avar: Floats, terms: Ints, before: NDArray[np.bool_] | None = None) -> Fit:
     """Coefficients of six axes from overlapping Allan variances.
 
     ``avar`` [m, 6] in unit², NaN where the window is too short; ``terms`` [m, 6] second differences

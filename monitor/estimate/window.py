@@ -160,9 +160,7 @@ def _advance(
 
 
 @compiled
-def _append(
-    sample: Floats, scale: Floats, carry: Floats, phase: Ints, missing: NDArray[np.int32], state: Ints
-) -> None:
+def _append(sample: Floats, scale: Floats, carry: Floats, phase: Ints, missing: NDArray[np.int32], state: Ints) -> None:
     """Write one phase point and the running count of missing samples."""
     before = LANES * state[1]
     now = before + LANES if before + LANES < phase.size else 0
@@ -204,7 +202,7 @@ def _slide(
     old = now - length - 1
     new1, new2 = _place(now - m, places), _place(now - 2 * m, places)
     old0, old1, old2 = _place(old + 2 * m, places), _place(old + m, places), _place(old, places)
-    run = min(rows, places - max(max(now, new1, new2), max(old0, old1, old2)))
+    run = min(rows, places - max(now, new1, new2, old0, old1, old2))
     if run == 1 and whole and leaving:
         _swap(phase, now, new1, new2, old0, old1, old2, sums, i)
         return 1
@@ -241,9 +239,7 @@ def _square(phase: Ints, at0: int, at1: int, at2: int, n: int, out: Floats) -> N
 
 
 @compiled
-def _strike(
-    missing: NDArray[np.int32], at0: int, at2: int, step: int, n: int, squares: Floats, terms: Ints
-) -> None:
+def _strike(missing: NDArray[np.int32], at0: int, at2: int, step: int, n: int, squares: Floats, terms: Ints) -> None:
     """Strike out the terms that touch a missing sample, count the others."""
     for i in range(n):
         if missing[at0 * LANES + i] == missing[at2 * LANES + i]:
@@ -272,9 +268,7 @@ def _exchange(added: Floats, evicted: Floats, n: int, sums: Floats, rest: Floats
 
 
 @compiled
-def _swap(
-    phase: Ints, at0: int, at1: int, at2: int, old0: int, old1: int, old2: int, sums: Floats, i: int
-) -> None:
+def _swap(phase: Ints, at0: int, at1: int, at2: int, old0: int, old1: int, old2: int, sums: Floats, i: int) -> None:
     """The same for a single row, where setting up vector loops would cost more than the work."""
     i0, i1, i2 = np.uintp(at0 * LANES), np.uintp(at1 * LANES), np.uintp(at2 * LANES)
     j0, j1, j2 = np.uintp(old0 * LANES), np.uintp(old1 * LANES), np.uintp(old2 * LANES)

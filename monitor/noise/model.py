@@ -112,8 +112,7 @@ class ModelStream:
 
     def __init__(self, model: NoiseModel, rate_hz: float, seed: int) -> None:
         self._series = {
-            AXES.index(axis): list(_start(axis, sources, rate_hz, seed))
-            for axis, sources in model.sources.items()
+            AXES.index(axis): list(_start(axis, sources, rate_hz, seed)) for axis, sources in model.sources.items()
         }
 
     def draw(self, n: int) -> Floats:

@@ -10,10 +10,12 @@ import numpy as np
 
 from drivers.sample import AXES, Event, Floats
 from monitor import topics
+from monitor.estimate.analysis import Analysis
 from monitor.estimate.coefficients import LETTERS, Coefficients, Status
 from monitor.estimate.estimate import Estimate
 from monitor.health import Health
 
+ANALYZE_SCHEMA: Final = "imu-monitor/analyze/1"
 _ENCODER: Final = msgspec.json.Encoder()
 
 
@@ -25,9 +27,7 @@ def allan(device: str, unix_s: float, estimate: Estimate) -> bytes:
         axis: {"deviation": _list(deviation[:, i]), "lo": _list(curve.lo[:, i]), "hi": _list(curve.hi[:, i])}
         for i, axis in _measured(estimate)
     }
-    return _encode(
-        topics.ALLAN, device, unix_s, estimate.samples, _window(estimate, tau=_list(curve.tau_s), axes=axes)
-    )
+    return _encode(topics.ALLAN, device, unix_s, estimate.samples, _window(estimate, tau=_list(curve.tau_s), axes=axes))
 
 
 def coefficients(device: str, unix_s: float, estimate: Estimate) -> bytes:
@@ -83,6 +83,40 @@ def status(device: str, unix_s: float, health: Health) -> bytes:
 def reply(device: str, unix_s: float, samples: int, text: str) -> bytes:
     """Answer of ``imu/<device>/command/<verb>``."""
     return _encode(topics.RESET, device, unix_s, samples, {"text": text})
+
+
+def analysis(result: Analysis) -> bytes:
+    """``analyze --json``: schema imu-monitor/analyze/1."""
+    estimate = result.estimate
+    curve = estimate.curve
+    deviation, tau = np.sqrt(curve.avar), _list(curve.tau_s)
+    axes = {
+        axis: {
+            "allan": {
+                "tau": tau,
+                "deviation": _list(deviation[:, i]),
+                "lo": _list(curve.lo[:, i]),
+                "hi": _list(curve.hi[:, i]),
+            },
+            "coefficients": coefficient_table(estimate.coefficients, i),
+        }
+        for i, axis in _measured(estimate)
+    }
+    return _ENCODER.encode(
+        {
+            "schema": ANALYZE_SCHEMA,
+            "rate": estimate.rate_hz,
+            "samples": estimate.samples,
+            "seconds": result.seconds,
+            "notes": result.notes,
+            "axes": axes,
+        }
+    )
+
+
+def no_analysis(why: str, samples: int) -> bytes:
+    """``analyze --json`` where the data do not support an answer."""
+    return _ENCODER.encode({"schema": ANALYZE_SCHEMA, "samples": samples, "notes": [why], "axes": {}})
 
 
 def _window(estimate: Estimate, **more: Any) -> dict[str, Any]:

@@ -100,9 +100,7 @@ def grid(scale: Scale) -> Grid:
     y_at, y_minor = _lines(scale.y, HEIGHT)
     flip = HEIGHT
     ticks = [(x, HEIGHT + 0.25, _tick(p)) for x, p in zip(x_at, range(scale.x[0], scale.x[1] + 1), strict=True)]
-    ticks += [
-        (-0.75, flip - y - 0.35, _tick(p)) for y, p in zip(y_at, range(scale.y[0], scale.y[1] + 1), strict=True)
-    ]
+    ticks += [(-0.75, flip - y - 0.35, _tick(p)) for y, p in zip(y_at, range(scale.y[0], scale.y[1] + 1), strict=True)]
     return Grid(
         frame=[np.array([[0, 0], [WIDTH, 0], [WIDTH, HEIGHT], [0, HEIGHT], [0, 0]], float)],
         major=[_vertical(x) for x in x_at[1:-1]] + [_horizontal(flip - y) for y in y_at[1:-1]],

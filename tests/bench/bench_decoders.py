@@ -27,7 +27,7 @@ RUNS = 3
 def made(n: int) -> SampleBlock:
     """A resting sensor with noise, at 1 kHz."""
     rng = np.random.default_rng(1)
-    values = rng.normal(0.0, 0.01, (n, 6)) + [0.0, 0.0, 0.0, 0.0, 0.0, 9.8]
+    values = rng.normal(0.0, 0.01, (n, 6)) + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.8])
     at = np.arange(n)
     return block(at * 1_000_000, values, np.full(n, 25.0), at * 10)
 

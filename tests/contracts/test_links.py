@@ -119,7 +119,7 @@ def router() -> Iterator[tuple[str, Callable[[str, bytes], None]]]:
     for key, value in keys.items():
         config.insert_json5(key, json.dumps(value))
     with zenoh.open(config) as session:
-        yield endpoint, lambda key, data: session.put(key, data)
+        yield endpoint, session.put
 
 
 @contextlib.contextmanager
@@ -180,6 +180,11 @@ def receive(rig: Rig) -> list[Chunk]:
     raise AssertionError("nothing came")
 
 
+def read_on(link: Link) -> None:
+    for _ in range(100):
+        link.read(0.05)
+
+
 def test_every_link_has_a_rig() -> None:
     assert {name.split("-")[0] for name in RIGS} == set(plugin.names(links, "_link"))
 
@@ -235,8 +240,7 @@ def test_lost_peer_raises_link_lost(rig: Rig) -> None:
     receive(rig)
     rig.lose()
     with pytest.raises(LinkLost) as raised:
-        for _ in range(100):
-            rig.link.read(0.05)
+        read_on(rig.link)
     assert "\n" not in str(raised.value)
     rig.link.close()
 

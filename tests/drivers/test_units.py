@@ -38,9 +38,7 @@ def test_times() -> None:
 
 
 def test_both_micro_signs_and_blanks_are_understood() -> None:
-    assert units.acceleration_factor(" \N{GREEK SMALL LETTER MU}g ") == units.acceleration_factor(
-        "\N{MICRO SIGN}g"
-    )
+    assert units.acceleration_factor(" \N{GREEK SMALL LETTER MU}g ") == units.acceleration_factor("\N{MICRO SIGN}g")
 
 
 @pytest.mark.parametrize(

@@ -21,9 +21,7 @@ FRAMES = [(0x9, False, bytes(range(8))), (0x0CF02AE2, True, b"\x00\x7d\x00\x7d\x
 
 
 def build(path: Path, speed: str | float = "max", **keys: Any) -> Link:
-    return replay_link.build(
-        msgspec.convert({"path": str(path), "speed": speed, **keys}, replay_link.Settings)
-    )
+    return replay_link.build(msgspec.convert({"path": str(path), "speed": speed, **keys}, replay_link.Settings))
 
 
 def read_all(link: Link) -> tuple[list[Chunk], str]:
@@ -132,9 +130,7 @@ def write_frames(path: Path) -> None:
     with gzip.open(path, "wt") as stream:
         stream.write("t,channel,id_hex,extended,dlc,data_hex\n")
         for i, (identifier, extended, data) in enumerate(FRAMES):
-            stream.write(
-                f"{0.01 * i:.6f},{1 + i % 2},{identifier:x},{int(extended)},{len(data)},{data.hex()}\n"
-            )
+            stream.write(f"{0.01 * i:.6f},{1 + i % 2},{identifier:x},{int(extended)},{len(data)},{data.hex()}\n")
 
 
 def test_frames_as_csv(tmp_path: Path) -> None:

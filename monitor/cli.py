@@ -1,0 +1,259 @@
+"""The command line: arguments in, one call, printing. Nothing is decided here.
+
+Exit status: 0 done; 1 failed while working; 2 what was asked for is wrong, said in one line on standard error; 3
+finished, but the data do not support an answer. Heavy libraries are imported by the command that needs them.
+"""
+
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
+
+import typer
+from typer.exceptions import TyperException
+
+from drivers.errors import ConfigError, ImuError, NotReady, RecordingError
+
+if TYPE_CHECKING:
+    from monitor.estimate.analysis import Analysis
+    from monitor.estimate.batch import TauGrid
+    from monitor.service import Service
+    from monitor.settings import Config
+
+FAILED: Final = 1
+WRONG: Final = 2
+NO_ANSWER: Final = 3
+
+app = typer.Typer(
+    help="Live noise monitor for MEMS IMUs: windowed Allan variance and Q, N, B, K, R while the sensor runs.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="Configuration file.")]
+Seconds = Annotated[float | None, typer.Option(metavar="S", min=0.1, help="Stop by itself after S seconds.")]
+Viewer = Annotated[
+    str | None, typer.Option(metavar="auto|native|web|none|FILE.rrd", help="Where to show the live view.")
+]
+
+
+@app.command()
+def demo(seconds: Seconds = None, viewer: Viewer = None) -> None:
+    """The whole service on a simulated MEMS IMU that speaks a real wire format over a pseudo-terminal."""
+    from monitor.settings import CONFIG_FOLDER
+
+    _serve(CONFIG_FOLDER / "demo.toml", seconds, viewer)
+
+
+@app.command()
+def run(config: ConfigPath, seconds: Seconds = None, viewer: Viewer = None) -> None:
+    """The daemon: every device in the file, until a signal."""
+    _serve(config, seconds, viewer)
+
+
+@app.command()
+def check(
+    config: Annotated[Path | None, typer.Argument(metavar="CONFIG.toml", help="Configuration file.")] = None,
+    print_defaults: Annotated[
+        bool, typer.Option("--print-defaults", help="Print a whole file with every key and its default.")
+    ] = False,
+) -> None:
+    """Read the file and say all that is wrong with it; opens nothing."""
+    from monitor import settings
+    from monitor.virtual import read_model
+
+    if print_defaults:
+        typer.echo((settings.CONFIG_FOLDER / "defaults.toml").read_text("utf-8"), nl=False)
+        return
+    if config is None:
+        raise ConfigError("CONFIG.toml is missing; --print-defaults prints one to start from")
+    found, wrong = settings.read(config)
+    for device in found.devices if found else ():
+        if isinstance(device.link, settings.VirtualTable):
+            try:
+                read_model(Path(device.link.model))
+            except ConfigError as error:
+                wrong.append(f"{config}: device {device.name}: {error}")
+    for line in wrong:
+        typer.echo(line, err=True)
+    if wrong:
+        raise typer.Exit(WRONG)
+    count = len(found.devices) if found else 0
+    typer.echo(f"{config}: {count} device{'s' if count != 1 else ''}, nothing wrong")
+
+
+@app.command()
+def watch(
+    keyexpr: Annotated[str, typer.Argument(metavar="[KEYEXPR]", help="Which keys to show.")] = "imu/**",
+    connect: Annotated[
+        list[str] | None, typer.Option(metavar="ENDPOINT", help="Daemon or router, e.g. tcp/127.0.0.1:7450.")
+    ] = None,
+    seconds: Seconds = None,
+) -> None:
+    """A live table of any number of daemons, from zenoh alone."""
+    import threading
+
+    from rich.console import Console
+
+    from monitor.publish.terminal import watch as show
+
+    stop = threading.Event()
+    _on_signals(stop.set)
+    show(keyexpr, connect or [], stop, Console(), seconds)
+
+
+@app.command()
+def analyze(
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
+    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate, where the file says none.")] = None,
+    tau: Annotated[
+        str, typer.Option(metavar="octave|decade10|S,S,…", help="Averaging times: a grid, or seconds.")
+    ] = "octave",
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="The curves as a picture.")] = None,
+) -> None:
+    """Allan deviation of a recording, with Q, N, B, K, R and their intervals."""
+    from drivers.recording import iter_blocks, load_samples
+    from monitor.estimate.analysis import analyze as work
+    from monitor.publish import message
+
+    if rate is not None and rate <= 0.0:
+        raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
+    if plot is not None and plot.suffix != ".png":
+        raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
+    grid = _tau(tau)
+    found = load_samples(recording, rate)
+    blocks = list(iter_blocks(found))
+    try:
+        result = work(blocks, found.rate_hz, grid, found.notes)
+    except NotReady as error:
+        if json is not None:
+            _write(json, message.no_analysis(str(error), found.values.shape[0]))
+        raise
+    if json is not None:
+        _write(json, message.analysis(result))
+    if plot is not None:
+        from monitor.publish.plot import allan_plot
+
+        allan_plot(result.estimate, plot, recording.name)
+    if json != Path("-"):
+        _print_analysis(result)
+
+
+def main() -> None:
+    """The program: every error is one line and a status."""
+    try:
+        # without its own error pages, typer hands an Exit's status back
+        sys.exit(app(standalone_mode=False))
+    except TyperException as error:
+        _fail(error.format_message(), WRONG)
+    except (ConfigError, RecordingError) as error:
+        _fail(str(error), WRONG)
+    except NotReady as error:
+        _fail(str(error), NO_ANSWER)
+    except ImuError as error:
+        _fail(str(error), FAILED)
+    except typer.Abort:
+        _fail("interrupted", 128 + signal.SIGINT)
+    except BrokenPipeError:
+        sys.stderr.close()  # whoever read our output has gone; nothing to say and nobody to say it to
+        sys.exit(FAILED)
+    except OSError as error:
+        _fail(str(error), FAILED)
+
+
+def _fail(line: str, status: int) -> NoReturn:
+    print(f"imu-monitor: {line}", file=sys.stderr)  # noqa: T201
+    sys.exit(status)
+
+
+def _serve(path: Path, seconds: float | None, viewer: str | None) -> None:
+    import dataclasses
+
+    import msgspec
+
+    from monitor import settings
+    from monitor.service import Service
+
+    config = settings.load(path)
+    if viewer is not None:
+        mode = settings.viewer_mode(viewer)
+        config = dataclasses.replace(config, viewer=msgspec.structs.replace(config.viewer, mode=mode))
+    _log_as(config)
+    service = Service(config)
+    _on_signals(service.stop)
+    _show_while(service, config, seconds)
+
+
+def _show_while(service: "Service", config: "Config", seconds: float | None) -> None:
+    """Run the service; with its table in the terminal when there is one."""
+    raise NotImplementedError
+
+
+def _log_as(config: "Config") -> None:
+    """Structured lines on standard error."""
+    import logging
+
+    import structlog
+
+    json = config.log.format == "json"
+    structlog.configure(
+        processors=[
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            structlog.processors.JSONRenderer() if json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
+        ],
+        wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, config.log.level.upper())),
+        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        cache_logger_on_first_use=True,
+    )
+
+
+def _on_signals(stop: Callable[[], None]) -> None:
+    """First SIGINT or SIGTERM: stop in order. A second SIGINT ends at once."""
+
+    def first(number: int, _frame: Any) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        stop()
+
+    signal.signal(signal.SIGINT, first)
+    signal.signal(signal.SIGTERM, first)
+
+
+def _tau(text: str) -> "TauGrid":
+    if text in ("octave", "decade10"):
+        return text  # type: ignore[return-value]
+    try:
+        listed = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f'--tau: "{text}"; possible are octave, decade10, or seconds with commas') from None
+    if not all(0.0 < value < float("inf") for value in listed):
+        raise ConfigError(f'--tau: "{text}"; every averaging time must be above 0 s')
+    return listed
+
+
+def _write(path: Path, data: bytes) -> None:
+    if path == Path("-"):
+        sys.stdout.buffer.write(data + b"\n")
+    else:
+        path.write_bytes(data + b"\n")
+
+
+def _print_analysis(result: "Analysis") -> None:
+    from rich.console import Console
+
+    from monitor.publish.terminal import analysis_table
+
+    console = Console()
+    estimate = result.estimate
+    console.print(f"{estimate.curve.n} samples at {estimate.rate_hz:g} Hz, {result.seconds:.6g} s")
+    console.print(analysis_table(estimate))
+    for note in result.notes:
+        console.print(f"note: {note}", markup=False, highlight=False)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""A whole recording at once: the Allan curve, its intervals and the fitted coefficients; the live service's reference.
+
+The recording is first put on a regular grid by the same clock that stamps live samples: what is missing becomes NaN in
+its place, and everything found about the time stamps is said in ``notes``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from drivers.clock import SampleClock, made_rate
+from drivers.errors import NotReady
+from drivers.sample import Floats, Given, Ints, SampleBlock
+from monitor.estimate.batch import TauGrid, cluster_sizes, overlapping
+from monitor.estimate.curve import AllanCurve
+from monitor.estimate.estimate import Estimate
+from monitor.estimate.fit import design, fit
+from monitor.estimate.uncertainty import intervals, table
+
+FEWEST: Final = 50
+"""Samples; below this nothing can be said, and the command exits with status 3."""
+LONGEST_HOLE: Final = 10_000_000
+"""Missing samples kept in place; after a longer pause the recording is said to be in two."""
+
+
+@dataclass(frozen=True, slots=True)
+class Analysis:
+    """What ``imu-monitor analyze`` finds."""
+
+    estimate: Estimate
+    seconds: float
+    notes: tuple[str, ...]
+
+
+def analyze(
+    blocks: Sequence[SampleBlock], rate_hz: float | None, tau: TauGrid = "octave", notes: Sequence[str] = ()
+) -> Analysis:
+    """The analysis of a recording.
+
+    Args:
+        blocks: the recording, with its own times
+        rate_hz: the stated rate; None = found from the times
+        tau: grid or list of averaging times, s
+        notes: what reading the file found
+    Raises:
+        NotReady: fewer than FEWEST samples
+        ConfigError: no τ of the list is possible
+    """
+    values, rate, found = on_grid(blocks, rate_hz)
+    if len(values) < FEWEST:
+        raise NotReady(f"{len(values)} samples; at least {FEWEST} are needed to say anything")
+    factors = cluster_sizes(len(values), rate, tau)
+    avar, terms = overlapping(values, factors)
+    result = fit(design(factors, rate), table(len(values), factors), avar, terms)
+    lo, hi = intervals(avar, result.edf)
+    curve = AllanCurve(factors / rate, factors, avar, terms, result.edf, lo, hi, len(values))
+    seconds = len(values) / rate
+    received = sum(len(samples) for samples in blocks)
+    newest_ns = int(blocks[-1].t_ns[-1])
+    estimate = Estimate(newest_ns, rate, seconds, received, curve, result.fitted, result.coefficients)
+    return Analysis(estimate, seconds, (*notes, *found, *_left_out(result.left_out, curve.tau_s)))
+
+
+def on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Floats, float, list[str]]:
+    """Values [n, 6] at a steady rate, missing samples NaN in their places; the rate; what was found about the times."""
+    clock = SampleClock(Given(), rate_hz)
+    stamped = [one for samples in blocks for one in clock.stamp(samples)]
+    rate = rate_hz or _mean_rate(stamped)
+    notes = [event.text for event in clock.take_events()[:10]]
+    pieces: list[Floats] = []
+    holes = 0
+    for samples in stamped:
+        if samples.lost > LONGEST_HOLE:
+            notes.append(f"a pause of {samples.lost / rate:.6g} s is too long to keep in place; it was closed up")
+        elif samples.lost:
+            holes += 1
+            pieces.append(np.full((samples.lost, 6), np.nan))
+        pieces.append(samples.values)
+    missing = sum(samples.lost for samples in stamped)
+    if holes:
+        notes.append(f"{missing} samples are missing in {holes} places; terms that touch them are left out")
+    return np.concatenate(pieces), rate, notes
+
+
+def _mean_rate(stamped: Sequence[SampleBlock]) -> float:
+    """Samples a second over the whole recording, missing ones included."""
+    n = sum(len(samples) + samples.lost for samples in stamped) - 1 - stamped[0].lost
+    span_s = (int(stamped[-1].t_ns[-1]) - int(stamped[0].t_ns[0])) / 1e9
+    if n < 1 or span_s <= 0.0:
+        raise NotReady("the times of the recording do not go on, so that its rate is unknown; state it with --rate HZ")
+    return made_rate(n / span_s)
+
+
+def _left_out(left_out: Ints, tau_s: Floats) -> list[str]:
+    """Which of the shortest τ contradicted every fit."""
+    most = int(left_out.max())
+    if not most:
+        return []
+    return [
+        f"the fit leaves out τ up to {tau_s[most - 1]:.4g} s: the sensor's bandwidth ends below half the sample rate"
+    ]

@@ -1,0 +1,191 @@
+"""Text lines: columns and units, ends of lines, what is bad and what is not, wrong settings."""
+
+import math
+
+import numpy as np
+import pytest
+
+from drivers.decoders.base import xor
+from drivers.decoders.text import LONGEST, Settings, build
+from drivers.errors import ConfigError
+from drivers.sample import Arrival, Chunk, Counter, SampleBlock, join
+
+SIX = ("gx", "gy", "gz", "ax", "ay", "az")
+LINE = b"1,2,3,4,5,6\n"
+
+
+def blocks_of(data: bytes, **settings: object) -> list[tuple[int, int]]:
+    decoder = build(Settings(**{"columns": SIX, "first_line": "keep", **settings}))
+    return [(len(b), b.lost) for b in decoder.feed([Chunk(data, 77)])]
+
+
+def decoded(data: bytes, **settings: object) -> SampleBlock:
+    decoder = build(Settings(**{"columns": SIX, "first_line": "keep", **settings}))
+    return join(decoder.feed([Chunk(data, 77)]))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"1,2,3,4,5,6",
+        b"1;2;3;4;5;6",
+        b"1\t2\t3\t4\t5\t6",
+        b" 1  2 3 4 5 6 ",
+        b"1, 2, 3, 4, 5, 6",
+        b"1e0,+2,3.,4.0,5,6",
+    ],
+)
+@pytest.mark.parametrize("end", [b"\n", b"\r", b"\r\n", b"\n\n"])
+def test_delimiters_and_line_ends(line: bytes, end: bytes) -> None:
+    got = decoded((line + end) * 3)
+    assert got.values.tolist() == [[1, 2, 3, 4, 5, 6]] * 3
+    assert got.lost == 0
+
+
+def test_a_delimiter_of_its_own() -> None:
+    assert decoded(b"1|2|3|4|5|6\n", delimiter="|").values.tolist() == [[1, 2, 3, 4, 5, 6]]
+    assert decoded(b"1 2   3 4 5 6\n", delimiter=" ").values.tolist() == [[1, 2, 3, 4, 5, 6]]
+    assert blocks_of(LINE + b"1,2|3|4|5|6\n" + LINE, delimiter="|") == []
+
+
+def test_columns_units_and_scale() -> None:
+    got = decoded(
+        b"IMU:,1000,180,77,2,298.15\n",
+        columns=("-", "az", "gz", "-", "gx", "temperature"),
+        gyro_unit="deg/s",
+        accel_unit="mg",
+        temperature_unit="K",
+        scale={"gx": 90.0},
+    )
+    np.testing.assert_allclose(got.values[0, [0, 2, 5]], [math.pi, math.pi, 9.80665])
+    assert np.isnan(got.values[0, [1, 3, 4]]).all()
+    assert got.temperature_c[0] == pytest.approx(25.0)
+
+
+def test_nan_and_empty_are_not_measured() -> None:
+    got = decoded(b"1,nan,,NaN,5, \n" + LINE)
+    np.testing.assert_array_equal(got.values[0], [1, np.nan, np.nan, np.nan, 5, np.nan])
+    assert got.values[1].tolist() == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"1,2,3,4,5",
+        b"1,2,3,4,5,6,7",
+        b"1,2,3,4,5,x",
+        b"1,2,3,4,5,1_0",
+        b"1,2,3,4,5,inf",
+        b"1,2,3,4,5,1e9",
+        b"1,2,3,4,5,\xff\xfe",
+        b"\xc3\x28\x00",
+        b"nan,nan,nan,,,",
+        b"0x10,2,3,4,5,6",
+        b"1 2 3 4 5",
+    ],
+)
+def test_a_line_that_cannot_be_read_is_bad_and_leaves_a_place(line: bytes) -> None:
+    decoder = build(Settings(columns=SIX, first_line="keep"))
+    blocks = decoder.feed([Chunk(LINE * 2 + line + b"\r\n" + LINE * 2, 0)])
+    assert [(len(b), b.lost) for b in blocks] == [(2, 0), (2, 1)]
+    assert all(b.values.tolist() == [[1, 2, 3, 4, 5, 6]] * 2 for b in blocks)
+    assert decoder.bad == 1
+
+
+def test_the_hint_says_what_is_wrong_and_goes_away() -> None:
+    decoder = build(Settings(columns=SIX))
+    decoder.feed([Chunk(b"\n1,2,3\n", 0)])
+    assert "3 columns, expected are 6" in decoder.hint
+    decoder.feed([Chunk(b"1,2,3,4,5,gyro\n", 0)])
+    assert "no number" in decoder.hint
+    decoder.feed([Chunk(LINE * 1000, 0)])
+    assert decoder.hint == ""
+
+
+def test_the_first_line_is_left_out_unless_it_is_known_to_be_whole() -> None:
+    assert blocks_of(LINE * 3, first_line="drop") == [(2, 0)]
+    assert blocks_of(LINE * 3, first_line="keep") == [(3, 0)]
+    assert blocks_of(b"\n" + LINE * 3, first_line="drop") == [(3, 0)]
+    assert blocks_of(b"3,4,5\n" + LINE * 3, first_line="keep") == [(3, 0)]
+    decoder = build(Settings(columns=SIX))
+    decoder.feed([Chunk(b"5,6\n" + LINE, 0)])
+    assert decoder.bad == 0
+    decoder.reset()
+    assert decoder.feed([Chunk(LINE, 0)]) == []
+    assert decoder.bad == 0
+
+
+def test_header_and_comments_are_passed_over() -> None:
+    head = b"# made by a board\r\ngx,gy,gz,ax,ay,az\r\n"
+    assert blocks_of(head + LINE + b"#\n" + LINE, header=1) == [(2, 0)]
+    assert blocks_of(b"\n% note\n" + LINE, comment="%") == [(1, 0)]
+    assert blocks_of(b"\n# note\n" + LINE, comment="") == [(1, 1)]
+
+
+def test_an_overlong_line_is_one_bad_line() -> None:
+    decoder = build(Settings(columns=SIX, first_line="keep"))
+    feeds = [LINE, *[b"7" * 1000] * (3 * LONGEST // 1000), b"\n", LINE]
+    blocks = [b for data in feeds for b in decoder.feed([Chunk(data, 0)])]
+    assert [(len(b), b.lost) for b in blocks] == [(1, 0), (1, 1)]
+    assert "line end" in decoder.hint
+    assert blocks_of(LINE + b"7" * (LONGEST + 1) + b"\n" + LINE) == [(1, 0), (1, 1)]
+
+
+def sentence(body: bytes) -> bytes:
+    return b"$%b*%02X\r\n" % (body, xor(body))
+
+
+def test_nmea_checksum() -> None:
+    good = sentence(b"1,2,3,4,5,6")
+    assert blocks_of(good * 3, nmea=True, first_line="drop") == [(3, 0)]
+    assert blocks_of(good[5:] + good * 2, nmea=True) == [(2, 0)]
+    assert blocks_of(good + good.lower() + b"noise" + good, nmea=True) == [(3, 0)]
+    for wrong in (good.replace(b"3", b"4", 1), b"1,2,3,4,5,6\n", good.replace(b"*", b"+"), b"$*00\n"):
+        assert blocks_of(good + wrong + good, nmea=True) == [(1, 0), (1, 1)]
+
+
+@pytest.mark.parametrize(
+    ("unit", "text", "ticks", "modulus"),
+    [
+        ("s", b"1.25", 1_250_000_000, 2**62),
+        ("ms", b"1234.5", 1_234_500_000, 2**32 * 1_000_000),
+        ("us", b"4294967295", 4_294_967_295_000, 2**32 * 1000),
+        ("ns", b"17", 17, 2**62),
+    ],
+)
+def test_the_devices_own_time(unit: str, text: bytes, ticks: int, modulus: int) -> None:
+    settings = {"columns": ("t", *SIX), "time_unit": unit}
+    assert decoded(text + b"," + LINE, **settings).ticks.tolist() == [ticks]
+    assert build(Settings(**settings)).timing == Counter(modulus, 1e-9)
+
+
+def test_a_counter() -> None:
+    settings = {"columns": (*SIX, "counter"), "counter_modulus": 100}
+    got = decoded(b"1,2,3,4,5,6,99\n1,2,3,4,5,6,0\n", **settings)
+    assert got.ticks.tolist() == [99, 0]
+    assert build(Settings(**settings)).timing == Counter(100)
+    assert build(Settings(columns=SIX)).timing == Arrival()
+    assert blocks_of(b"1,2,3,4,5,6,1\n1,2,3,4,5,6,nan\n1,2,3,4,5,6,3\n", **settings) == [(1, 0), (1, 1)]
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"gyro_unit": "deg/sek"}, ('"deg/sek"', "deg/s")),
+        ({"accel_unit": "furlong"}, ('"furlong"', "m/s²", "mg")),
+        ({"columns": (*SIX, "temperature"), "temperature_unit": "Re"}, ('"Re"', "°C")),
+        ({"columns": ("gx", "temprature")}, ('"temprature"', '"temperature"')),
+        ({"columns": ("gx", "gx")}, ("twice",)),
+        ({"columns": ("-", "temperature")}, ("gx", "az")),
+        ({"columns": ("gx", "t", "counter")}, ("one of t and counter",)),
+        ({"scale": {"gw": 2.0}}, ('"gw"',)),
+        ({"scale": {"gx": 0.0}}, ("gx", "0")),
+        ({"delimiter": ""}, ("delimiter",)),
+        ({"counter_modulus": 1}, ("counter_modulus",)),
+    ],
+)
+def test_wrong_settings_say_what_is_right(settings: dict[str, object], words: tuple[str, ...]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        build(Settings(**{"columns": SIX, **settings}))
+    assert all(word in str(caught.value) for word in words), caught.value
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,118 @@
+"""VectorNav sentences: the manual's and recorded ones, both checksums, and what is passed over."""
+
+import binascii
+
+import numpy as np
+import pytest
+
+from drivers.decoders.base import xor
+from drivers.decoders.vectornav_ascii import Settings, build
+from drivers.sample import Chunk, SampleBlock, join
+
+IMU = (
+    b"$VNIMU,-00.0350,+00.4222,-00.6643,-00.015,+00.019,+09.948,+00.002066,-00.008442,-00.044656,+20.7,+084.322*66\r\n"
+)
+YMR = (
+    b"$VNYMR,+100.949,-007.330,+000.715,-00.0049,-00.2449,+00.5397,"
+    b"-01.258,-00.100,-09.701,-00.000018,+00.001122,-00.000551*69\r\n"
+)
+YMR_2 = (
+    b"$VNYMR,-078.104,+005.642,+023.096,+00.0125,+00.1252,-00.1042,"
+    b"+00.878,-03.762,-08.854,-00.010387,-00.028062,-00.061305*68\r\n"
+)
+REGISTER = b"$VNRRG,08,-114.314,+000.058,-001.773*5F\r\n"
+
+
+def decoded(data: bytes, **settings: object) -> SampleBlock | None:
+    blocks = build(Settings(**settings)).feed([Chunk(data, 77)])
+    return join(blocks) if blocks else None
+
+
+def sentence(body: bytes) -> bytes:
+    return b"$%b*%02X\r\n" % (body, xor(body))
+
+
+def test_imu() -> None:
+    got = decoded(IMU)
+    assert got is not None
+    assert got.values.tolist() == [[0.002066, -0.008442, -0.044656, -0.015, 0.019, 9.948]]
+    assert got.temperature_c.tolist() == [20.7]
+
+
+@pytest.mark.parametrize(
+    ("line", "row"),
+    [
+        (YMR, [-0.000018, 0.001122, -0.000551, -1.258, -0.100, -9.701]),
+        (YMR_2, [-0.010387, -0.028062, -0.061305, 0.878, -3.762, -8.854]),
+    ],
+)
+def test_ymr(line: bytes, row: list[float]) -> None:
+    got = decoded(line)
+    assert got is not None
+    assert got.values.tolist() == [row]
+    assert np.isnan(got.temperature_c).all()
+
+
+def test_auto_stays_with_the_first_of_the_two() -> None:
+    first = decoded(YMR + IMU + YMR_2)
+    assert first is not None
+    assert len(first) == 2
+    chosen = decoded(YMR + IMU + YMR_2, sentence="VNIMU")
+    assert chosen is not None
+    assert chosen.temperature_c.tolist() == [20.7]
+
+
+def test_reset_lets_auto_choose_anew() -> None:
+    decoder = build(Settings())
+    decoder.feed([Chunk(YMR, 0)])
+    assert decoder.feed([Chunk(IMU, 0)]) == []
+    decoder.reset()
+    assert len(decoder.feed([Chunk(IMU, 0)])) == 1
+
+
+def test_other_sentences_are_passed_over() -> None:
+    decoder = build(Settings())
+    blocks = decoder.feed([Chunk(REGISTER + b"$VNRRG,8*4B\r\n" + IMU + REGISTER + IMU, 0)])
+    assert [(len(b), b.lost) for b in blocks] == [(2, 0)]
+    assert decoder.bad == 0
+    decoder.feed([Chunk(REGISTER * 150, 0)])
+    assert "async output" in decoder.hint
+
+
+def test_the_crc_of_four_digits() -> None:
+    body = IMU[1:-5]
+    assert decoded(b"$%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))) is not None
+    assert decoded(b"$%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0) ^ 1)) is None
+
+
+@pytest.mark.parametrize(
+    "end", [b"*XX\r\n", b"*\r\n", b"*6\r\n", b"*066\r\n", b"*67\r\n", b"*66\n", b"\r\n", b"* 6\r\n"]
+)
+def test_any_other_end_is_rejected(end: bytes) -> None:
+    decoder = build(Settings())
+    blocks = decoder.feed([Chunk(IMU + IMU[:-5] + end + IMU, 0)])
+    assert [(len(b), b.lost) for b in blocks] == [(1, 0), (1, 1)]
+    assert decoder.bad == 1
+
+
+def test_what_is_appended_is_not_read() -> None:
+    got = decoded(sentence(IMU[1:-5] + b",T0012345"))
+    assert got is not None
+    assert got.values[0, 5] == 9.948
+
+
+@pytest.mark.parametrize(
+    "body", [b"VNIMU,1,2,3", b"VNIMU," + b",".join([b"x"] * 11), b"VNIMU," + b",".join([b"nan"] * 11)]
+)
+def test_a_right_checksum_around_nonsense_is_bad(body: bytes) -> None:
+    decoder = build(Settings())
+    blocks = decoder.feed([Chunk(IMU + sentence(body) + IMU, 0)])
+    assert [(len(b), b.lost) for b in blocks] == [(1, 0), (1, 1)]
+
+
+def test_encode_prints_as_the_device_does() -> None:
+    got = decoded(IMU)
+    assert got is not None
+    (chunk,) = build(Settings()).encode(got)
+    kept = IMU[IMU.index(b",-00.015") : IMU.index(b",+084")]
+    assert kept in chunk.data

@@ -1,0 +1,148 @@
+"""VectorNav binary: the manual's frames, every place of an axis, and what is rejected."""
+
+import binascii
+import struct
+
+import numpy as np
+import pytest
+
+from drivers.decoders.vectornav_binary import FIELD_SIZES, TICKS, Settings, build, layout
+from drivers.sample import NO_TICK, Arrival, Chunk, Counter, SampleBlock, block, join
+
+EXAMPLE_1 = bytes.fromhex("FA 01 08 00 93 50 2E 42 83 3E F1 3F 48 B5 04 BB 92 88")
+EXAMPLE_2_WRONG = bytes.fromhex("FA 05 08 00 01 00" + "00" * 20 + "A8 3A")
+
+
+def message(masks: dict[int, int], payload: bytes) -> bytes:
+    """Any groups, masks and payload with the right CRC."""
+    groups = sum(1 << (g - 1) for g in masks)
+    body = bytes([groups]) + b"".join(struct.pack("<H", m) for _, m in sorted(masks.items())) + payload
+    return b"\xfa" + body + binascii.crc_hqx(body, 0).to_bytes(2, "big")
+
+
+def decoded(data: bytes, **settings: object) -> SampleBlock | None:
+    decoder = build(Settings(**settings))
+    blocks = decoder.feed([Chunk(data, 77)])
+    return join(blocks) if blocks else None
+
+
+def vector(*numbers: float) -> bytes:
+    return struct.pack(f"<{len(numbers)}f", *numbers)
+
+
+def test_the_manuals_first_example_is_a_message_but_no_sample() -> None:
+    decoder = build(Settings())
+    assert decoder.feed([Chunk(EXAMPLE_1, 0)]) == []
+    form = layout(EXAMPLE_1[1:4], False)
+    assert form is not None
+    assert form.length == len(EXAMPLE_1)
+    assert not form.inertial
+    np.testing.assert_allclose(np.frombuffer(EXAMPLE_1, "<f4", 3, 4), [43.578686, 1.8847202, -0.0020249654], rtol=1e-7)
+    assert decoder.bad == 0
+
+
+def test_the_manuals_second_example_fails_its_crc_and_is_rejected() -> None:
+    decoder = build(Settings())
+    good = message({1: 0x0201}, struct.pack("<Q", 5) + vector(0, 0, -9.8, 0.1, 0.2, 0.3))
+    blocks = decoder.feed([Chunk(good + EXAMPLE_2_WRONG + good, 0)])
+    assert sum(len(b) for b in blocks) == 2
+    assert decoder.bad == 1
+
+
+def test_the_recommended_message() -> None:
+    data = message({1: 0x0201}, struct.pack("<Q", 123_456_789) + vector(0.5, -0.25, -9.75, 0.125, -0.5, 1.0))
+    assert data[:4] == bytes.fromhex("FA 01 01 02")
+    assert len(data) == 38
+    got = decoded(data)
+    assert got is not None
+    assert got.values.tolist() == [[0.125, -0.5, 1.0, 0.5, -0.25, -9.75]]
+    assert got.ticks.tolist() == [123_456_789]
+    assert np.isnan(got.temperature_c).all()
+    assert build(Settings()).timing == Counter(TICKS, 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("masks", "gyro", "accel", "temperature", "time"),
+    [
+        ({1: 1 << 5}, 0, None, None, None),
+        ({1: 1 << 8}, None, 0, None, None),
+        ({1: 1 << 9 | 1 << 10 | 1 << 14}, 12, 0, 36, None),
+        ({1: 1 << 0 | 1 << 5 | 1 << 8}, 8, 20, None, 0),
+        ({3: 1 << 2 | 1 << 3 | 1 << 4}, 12, 0, 24, None),
+        ({3: 1 << 9 | 1 << 10}, 12, 0, None, None),
+        ({1: 1 << 0, 2: 1 << 3, 3: 1 << 0 | 1 << 2 | 1 << 3, 5: 1 << 0}, 8 + 2 + 2 + 12, 12, None, 0),
+        ({2: 1 << 0, 3: 1 << 3}, 8, None, None, 0),
+        ({1: 0x7FFF}, 124, 112, 148, 0),
+    ],
+)
+def test_every_place_of_an_axis(
+    masks: dict[int, int], gyro: int | None, accel: int | None, temperature: int | None, time: int | None
+) -> None:
+    size = sum(n for g, m in masks.items() for bit, n in enumerate(FIELD_SIZES[g]) if m >> bit & 1)
+    payload = bytearray(size)
+    nan = [np.nan] * 3
+    for offset, numbers in ((gyro, (1.0, 2.0, 3.0)), (accel, (4.0, 5.0, 6.0)), (temperature, (25.5,))):
+        if offset is not None:
+            struct.pack_into(f"<{len(numbers)}f", payload, offset, *numbers)
+    if time is not None:
+        struct.pack_into("<Q", payload, time, 9_000)
+    got = decoded(message(masks, bytes(payload)))
+    assert got is not None
+    expected = [*(nan if gyro is None else (1.0, 2.0, 3.0)), *(nan if accel is None else (4.0, 5.0, 6.0))]
+    np.testing.assert_array_equal(got.values[0], expected)
+    np.testing.assert_array_equal(got.temperature_c, [np.nan if temperature is None else 25.5])
+    assert got.ticks.tolist() == [NO_TICK if time is None else 9_000]
+
+
+def test_which_of_both_is_a_setting() -> None:
+    data = message({1: 1 << 5 | 1 << 8 | 1 << 9}, vector(1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4))
+    raw, corrected = decoded(data), decoded(data, compensated=True)
+    assert raw is not None
+    assert corrected is not None
+    assert raw.values.tolist() == [[4, 4, 4, 3, 3, 3]]
+    assert corrected.values.tolist() == [[1, 1, 1, 2, 2, 2]]
+
+
+@pytest.mark.parametrize("masks", [{4: 1}, {6: 3}, {1: 0x8001}, {1: 0}, {3: 0x0800}])
+def test_groups_and_bits_of_unknown_size_are_no_message(masks: dict[int, int]) -> None:
+    assert decoded(message(masks, bytes(30))) is None
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_what_is_no_number_is_bad(wrong: float) -> None:
+    decoder = build(Settings())
+    data = message({1: 1 << 9}, vector(0, wrong, 0, 0, 0, 0))
+    assert decoder.feed([Chunk(data, 0)]) == []
+    assert decoder.bad == 1
+
+
+def test_other_messages_between_cost_nothing() -> None:
+    good = message({1: 0x0201}, struct.pack("<Q", 5) + vector(0, 0, -9.8, 0.1, 0.2, 0.3))
+    decoder = build(Settings())
+    blocks = decoder.feed([Chunk((good + EXAMPLE_1) * 5, 0)])
+    assert [(len(b), b.lost) for b in blocks] == [(5, 0)]
+
+
+def test_without_a_time_the_hint_says_what_to_do() -> None:
+    data = message({1: 1 << 9}, vector(0, 0, -9.8, 0, 0, 0))
+    decoder = build(Settings())
+    decoder.feed([Chunk(data, 0)])
+    assert "TimeStartup" in decoder.hint
+    decoder = build(Settings(clock="arrival"))
+    decoder.feed([Chunk(data, 0)])
+    assert decoder.hint == ""
+    assert decoder.timing == Arrival()
+
+
+def test_time_beyond_62_bits_wraps() -> None:
+    decoder = build(Settings())
+    data = message({1: 0x0201}, struct.pack("<Q", TICKS + 3) + vector(0, 0, -9.8, 0, 0, 0))
+    assert decoder.feed([Chunk(data, 0)])[0].ticks.tolist() == [3]
+
+
+def test_encode_writes_the_recommended_message() -> None:
+    samples = block(np.array([9]), np.zeros((1, 6)), ticks=np.array([7]))
+    (chunk,) = build(Settings()).encode(samples)
+    assert chunk.data[:4] == bytes.fromhex("FA 01 01 02")
+    assert len(chunk.data) == 38
+    assert chunk.t_ns == 9
