@@ -1,12 +1,20 @@
-"""Finds the members of a folder of plug-ins by listing it, and imports one when it is asked for."""
+"""Finds the members of a folder of plug-ins by listing it, imports one when it is asked for, and types its file keys."""
 
 import importlib
 import pkgutil
 from collections.abc import Sequence
 from difflib import get_close_matches
 from types import ModuleType
+from typing import Annotated
+
+import msgspec
 
 from drivers.errors import ConfigError
+
+FilePath = Annotated[str, msgspec.Meta(extra={"file": "exists"})]
+"""A key that names a file which must be there; relative ones are meant beside the configuration file."""
+FileOrName = Annotated[str, msgspec.Meta(extra={"file": "or name"})]
+"""A key that names a file beside the configuration file, or something that is shipped."""
 
 
 def names(package: ModuleType, suffix: str = "") -> tuple[str, ...]:

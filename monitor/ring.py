@@ -27,6 +27,11 @@ class RingBuffer:
         self._read = self._written = 0  # counted since the start
         self._lock = threading.Lock()
 
+    @property
+    def room(self) -> int:
+        """Samples that fit in before the oldest is overwritten."""
+        return self.capacity - (self._written - self._read)
+
     def push(self, samples: SampleBlock) -> None:
         """Add samples; overwrites the oldest when full."""
         with self._lock:

@@ -17,10 +17,10 @@ import msgspec
 import drivers.decoders
 import drivers.links
 from drivers import plugin
-from drivers.decoders.base import Decoder
+from drivers.decoders.base import Addressed, Decoder
 from drivers.driver import AxisMap, axis_map
 from drivers.errors import ConfigError
-from drivers.links.base import Link, LinkSettings
+from drivers.links.base import Filtering, Link, LinkSettings
 from drivers.sample import AXES
 
 T = TypeVar("T", bound=msgspec.Struct)
@@ -228,6 +228,8 @@ class _Reader:
             self.wrong.append(
                 f"{at}.decoder: {name} reads {decoder.carrier}, link {link_name} brings {carrier}: {fitting}"
             )
+        if isinstance(link, Filtering) and isinstance(decoder, Addressed):
+            link.accept(decoder.addresses)
         return link, decoder
 
     def _virtual(self, keys: Mapping[str, Any], at: str) -> VirtualTable | None:
@@ -269,13 +271,25 @@ class _Reader:
                 self.wrong.append(f"{dot}{key}: unknown key{plugin.nearest(key, tuple(fields))}")
                 continue
             try:
-                values[fields[key].name] = msgspec.convert(value, fields[key].type, dec_hook=self._path)
+                converted = msgspec.convert(value, fields[key].type, dec_hook=self._path)
+                values[fields[key].name] = self._beside(converted, fields[key].type)
             except (msgspec.ValidationError, ValueError) as error:
                 self.wrong.append(f"{dot}{key}: {error}")
         for key, field in fields.items():
             if field.required and key not in table:
                 self.wrong.append(f"{dot}{key}: missing")
         return kind(**values) if len(self.wrong) == before else None
+
+    def _beside(self, value: Any, kind: Any) -> Any:
+        """Files are looked for beside the configuration file, see ``drivers.plugin``."""
+        info = msgspec.inspect.type_info(kind)
+        wanted = (info.extra or {}).get("file") if isinstance(info, msgspec.inspect.Metadata) else None
+        if not wanted or not value:
+            return value
+        path = self._folder / Path(value).expanduser()
+        if wanted == "exists" and not path.exists():
+            raise ValueError(f"{path}: no such file")
+        return str(path) if path.exists() else value
 
     def _path(self, kind: type, value: Any) -> Any:
         if kind is Path and isinstance(value, str):

@@ -25,7 +25,8 @@ from monitor.settings import Device
 from monitor.wall import WallClock
 
 RING_SECONDS: Final = 10.0
-RING_SAMPLES: Final = (16_384, 1_000_000)
+RING_SAMPLES: Final = (65_536, 1_000_000)
+PATIENCE_S: Final = 0.002
 PENDING_BLOCKS: Final = 10_000
 """Blocks kept while the sample rate is not known yet."""
 SAMPLES_EVERY_S: Final = 0.1
@@ -71,6 +72,8 @@ class Station:
         self.latest: Estimate | None = None
         self.published = 0  # samples handed to the outputs
         self._wake = wake
+        self._patient = link.epoch == "unix"
+        self._stopping = False
         self._wall = WallClock(time.monotonic_ns(), time.time_ns())
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
         self._pending: list[SampleBlock] = []  # not in the estimator yet: the rate is unknown
@@ -91,6 +94,7 @@ class Station:
 
     def stop(self) -> None:
         """Stop reading; what is in the ring stays there to be worked off."""
+        self._stopping = True
         self.driver.stop()
 
     def join(self, timeout_s: float) -> bool:
@@ -169,7 +173,9 @@ class Station:
     # --- inside
 
     def _push(self, samples: SampleBlock) -> None:
-        """Called by the reader's thread."""
+        """Called by the reader's thread. A sensor is never kept waiting; a recording waits for room."""
+        while self._patient and self.ring.room < len(samples) < self.ring.capacity and not self._stopping:
+            time.sleep(PATIENCE_S)
         self.ring.push(samples)
         if not self._waiting_since_ns:
             self._waiting_since_ns = time.monotonic_ns()

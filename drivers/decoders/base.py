@@ -9,7 +9,7 @@ block that follows it, so that its place in time stays empty.
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final, Protocol
+from typing import ClassVar, Final, Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -57,6 +57,15 @@ class Decoder(Protocol):
 
     def reset(self) -> None:
         """The link was opened anew: forget a half-received frame."""
+
+
+@runtime_checkable
+class Addressed(Protocol):
+    """A decoder that reads only chunks of certain addresses."""
+
+    @property
+    def addresses(self) -> tuple[int, ...]:
+        """Addresses as of ``Chunk.address``."""
 
 
 class Rows:

@@ -2,8 +2,9 @@ r"""VectorNav VN-100/200/300 ASCII sentences ``$VNIMU`` and ``$VNYMR``.
 
 ``$VNxxx,f1,f2,...*CC\r\n``: CC is the exclusive or of the characters between ``$`` and ``*`` in two hex
 digits; four digits are a CRC-16 of polynomial 0x1021 and start 0 over the same. ``*XX`` ("do not check") is
-for the host to send; a device always computes its checksum, so that it is rejected here. Other sentences
-that pass their check are ignored (VN-100 user manual UM001 v2.1, pages 27-43).
+for the host to send; a device always computes its checksum, so that it is rejected here. A line end that
+was made LF on the way is taken too. Other sentences that pass their check are ignored (VN-100 user manual
+UM001 v2.1, pages 27-43).
 
 ``$VNIMU``: magnetic field [Gauss], acceleration [m/s²], rate [rad/s], temperature [°C], pressure [kPa], as
 the sensor measures. ``$VNYMR``: yaw, pitch, roll [°], magnetic field, acceleration, rate, compensated: the
@@ -140,19 +141,13 @@ def match(buffer: bytes, at: int) -> int:
     if not end:
         return NEED_MORE
     star = buffer.rfind(b"*", at, end)
-    if star < 0 or buffer[end - 2 : end] != b"\r\n":
-        return REJECT
-    try:
-        stated = int(buffer[star + 1 : end - 2], 16)
-    except ValueError:
+    if star < 0:
         return REJECT
     body = buffer[at + 1 : star]
-    digits = end - 2 - star - 1
-    if digits == 2:
-        return end - at if xor(body) == stated else REJECT
-    if digits == 4:
-        return end - at if binascii.crc_hqx(body, 0) == stated else REJECT
-    return REJECT
+    stated = buffer[star + 1 : end - 1].removesuffix(b"\r")
+    if len(stated) == 2:
+        return end - at if b"%02X" % xor(body) == stated else REJECT
+    return end - at if b"%04X" % binascii.crc_hqx(body, 0) == stated else REJECT
 
 
 def build(settings: Settings) -> Decoder:

@@ -5,7 +5,8 @@ in ``[device.driver]``), ``build(settings) -> Link`` and ``DEFAULT_DECODER`` (a 
 where the user must choose). Nothing is opened before ``open``.
 """
 
-from typing import Literal, Protocol
+from collections.abc import Sequence
+from typing import Literal, Protocol, runtime_checkable
 
 import msgspec
 
@@ -41,3 +42,11 @@ class Link(Protocol):
 
     def close(self) -> None:
         """Close; ends a waiting ``read``. Closing twice is harmless."""
+
+
+@runtime_checkable
+class Filtering(Protocol):
+    """A link that need not bring everything: told before ``open`` what its decoder wants."""
+
+    def accept(self, addresses: Sequence[int]) -> None:
+        """Bring only chunks of these addresses."""

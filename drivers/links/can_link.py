@@ -1,8 +1,7 @@
 """CAN buses through python-can: one frame a chunk, as many as are there.
 
 Identifiers that the decoder names are filtered in the hardware or the kernel where the interface can,
-in python-can elsewhere. The first frame is waited for, what queued up behind it is drained without
-waiting.
+in python-can elsewhere. The first frame is waited for, what queued up behind it is drained with it.
 
 ``Chunk.t_ns`` is the host's monotonic clock at receipt. A reader that was held up finds many frames
 waiting, which must not all bear the time of its waking: interfaces that stamp a frame with the host's
@@ -18,6 +17,7 @@ and remote frames are counted and left aside. Nothing is sent, beyond what an ad
 import contextlib
 import errno
 import logging
+import math
 import socket
 import threading
 import time
@@ -37,6 +37,11 @@ if TYPE_CHECKING:
 DEFAULT_DECODER: Final = "dbc"
 BATCH: Final = 1000
 """Frames; 65 ms of a fully loaded bus at 1 Mbit/s, so that no read is without end."""
+GAP_S: Final = 0.0005
+"""Wait for a frame behind another. Not 0: python-can, where it filters itself, then gives up at the first
+frame that nobody asked for, though wanted ones may stand behind it."""
+LINGER_S: Final = 0.01
+"""A read gives its frames at the latest so long after the first of them, however many go on coming."""
 SLICE_S: Final = 0.1
 """Longest single wait on the bus: a closed link is noticed within it."""
 HOST_STAMPED: Final = ("socketcan", "virtual", "udp_multicast")
@@ -152,15 +157,19 @@ class CanLink:
     def _drain(self, wait_s: float) -> list[Chunk]:
         """Frames that are there, the first of them waited for."""
         chunks: list[Chunk] = []
+        until = math.inf
         for _ in range(BATCH):
-            message = self._receive(0.0 if chunks else wait_s)
+            message = self._receive(GAP_S if chunks else wait_s)
             if message is None:
                 break
             if message.is_error_frame:
                 self._note_error(message)
             elif not message.is_remote_frame:
                 chunks.append(self._chunk(message))
-            wait_s = 0.0
+            now = time.monotonic()
+            until = min(until, now + LINGER_S)
+            if now >= until:
+                break
         return chunks
 
     def _receive(self, wait_s: float) -> "can.Message | None":

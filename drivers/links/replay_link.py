@@ -29,7 +29,7 @@ from typing import IO, TYPE_CHECKING, BinaryIO, Final, Literal, cast
 
 from drivers.errors import ConfigError, LinkEnded, LinkLost, LinkUnavailable, RecordingError
 from drivers.links.base import Carrier, Link, LinkSettings
-from drivers.plugin import nearest
+from drivers.plugin import FilePath, nearest
 from drivers.recording import FORMATS, Recording, iter_blocks, load_samples
 from drivers.sample import EXTENDED_ID, Chunk
 from drivers.sample_message import pack
@@ -63,7 +63,7 @@ DEFAULT_DECODERS: Final[dict[Kind, str]] = {"recording": DEFAULT_DECODER, "log":
 class Settings(LinkSettings, frozen=True, kw_only=True):
     """Keys of a replay."""
 
-    path: str
+    path: FilePath
     speed: str | float = "recorded"
     """"recorded", "max", or a factor: 10 = ten times as fast."""
     rate: float | None = None

@@ -23,6 +23,7 @@ import msgspec
 
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
+from drivers.plugin import FilePath
 from drivers.sample import Chunk
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ class Settings(LinkSettings, frozen=True, kw_only=True):
     connect: list[str] = msgspec.field(default_factory=list)
     """Endpoints, "tcp/127.0.0.1:7447"."""
     listen: list[str] = msgspec.field(default_factory=list)
-    config: str = ""
+    config: FilePath = ""
     """A zenoh JSON5 file for all else (TLS, access control); the keys above win where they are given."""
 
 

@@ -115,7 +115,7 @@ def _header(path: Path, line: bytes) -> list[str]:
     for separator, word in ((";", "semicolons"), ("\t", "tabs")):
         if separator in text and "," not in text:
             raise RecordingError(f"{path}: columns are separated by {word}; a recording has commas")
-    names = [name.strip(' "') for name in _fields(text)]
+    names = [name.strip(' \t"') for name in _fields(text)]
     if all(_number(name) is not None for name in names):
         raise RecordingError(
             f"{path}: the header line is missing, line 1 is all numbers; it would read like {EXAMPLE_HEADER}"

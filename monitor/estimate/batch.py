@@ -17,14 +17,18 @@ def overlapping(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     """Overlapping Allan variance [m, k] of rates [n, k], and the number of its terms [m, k].
 
     NIST SP 1065 eq. 11 on rates: σ²(m) = Σ (x_{k+2m} - 2x_{k+m} + x_k)² / (2 m² C), with phase x in samples of the
-    rate, so that τ0 does not enter. NaN = missing: terms that touch one are left out.
+    rate, so that τ0 does not enter. What is not finite is missing: terms that touch it are left out.
 
     >>> overlapping(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().tolist()
     [0.5, 0.0]
     """
-    values = values - np.nan_to_num(np.nanmean(values, axis=0)) if values.size else values
-    absent = np.isnan(values)
-    phase = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(np.where(absent, 0.0, values), axis=0)])
+    values = values.astype(np.float64)  # recordings come in float32, whose sums hold no Allan variance
+    absent = ~np.isfinite(values)
+    values[absent] = 0.0
+    # phase of the mean-free rate stays small, and so keeps its digits
+    values -= values.sum(axis=0) / np.maximum((~absent).sum(axis=0), 1)
+    values[absent] = 0.0
+    phase = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     gaps = np.concatenate([np.zeros((1, values.shape[1]), np.int64), np.cumsum(absent, axis=0)])
     avar = np.full((factors.size, values.shape[1]), np.nan)
     terms = np.zeros((factors.size, values.shape[1]), np.int64)

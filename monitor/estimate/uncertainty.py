@@ -17,6 +17,7 @@ sample: τ0 = 1, and θ stands for Q²/τ0², N²/τ0, B², K² τ0, R² τ0².
 """
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from scipy.special import chdtri
@@ -24,16 +25,19 @@ from scipy.special import chdtri
 from drivers.sample import Floats, Ints
 from monitor.compiled import compiled
 
-NOISES = 4
+NOISES: Final = 4
 """Random terms of the table, Q N B K; the ramp R is deterministic and adds no variance of its own."""
 
-LAG_STEP = 0.5
+PAIRS: Final = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
+"""The pairs a ≤ b of noises, in the order of the table's last index."""
+
+LAG_STEP: Final = 0.5
 """Lags are summed in blocks of this share of their distance to the nearest kink of r."""
 
-TAIL = 8.0
+TAIL: Final = 8.0
 """Beyond this many (m_i + m_j) the differences of t² ln t are taken from their series."""
 
-TABLE_STEP = 1.1
+TABLE_STEP: Final = 1.1
 """While a window grows, its table is renewed at this ratio of lengths; terms rescale it between."""
 
 
@@ -44,7 +48,7 @@ class Table:
     n: int  # samples in the window
     factors: Ints  # [m] cluster sizes
     terms: Ints  # [m] second differences in a window without gaps; ≤ 0 where it is too short
-    covariance: Floats  # [4, 4, m, m] C^ab_ij; NaN where the window is too short
+    covariance: Floats  # [m, m, 10] C^ab_ij of the pairs a ≤ b; NaN where the window is too short
 
 
 class Tables:
@@ -69,11 +73,11 @@ def table(n: int, factors: Ints) -> Table:
     White noise, m = 1: neighbours share one sample, edf = 2/3 of the terms.
 
     >>> t = table(30_001, np.array([1, 2]))
-    >>> round(2 * 1.0**2 / t.covariance[1, 1, 0, 0])
+    >>> round(2 * 1.0**2 / t.covariance[0, 0, PAIRS.index((1, 1))])
     20000
     """
     factors = np.ascontiguousarray(factors, np.int64)
-    covariance = np.full((NOISES, NOISES, factors.size, factors.size), np.nan)
+    covariance = np.full((factors.size, factors.size, len(PAIRS)), np.nan)
     _fill(n, factors, covariance)
     terms = n + 1 - 2 * factors
     for array in (terms, covariance):
@@ -92,15 +96,16 @@ def intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Flo
     """
     tail = (1.0 - probability) / 2.0
     safe = np.where(edf > 0.0, edf, np.nan)
-    return (
-        np.sqrt(avar * safe / chdtri(safe, tail)),
-        np.sqrt(avar * safe / chdtri(safe, 1.0 - tail)),
-    )
+    with np.errstate(divide="ignore"):  # a fraction of one degree of freedom bounds nothing from above
+        return (
+            np.sqrt(avar * safe / chdtri(safe, tail)),
+            np.sqrt(avar * safe / chdtri(safe, 1.0 - tail)),
+        )
 
 
 @compiled
 def _fill(n, factors, covariance):  # type: ignore[no-untyped-def]
-    sums = np.empty((NOISES, NOISES))
+    sums = np.empty(10)
     for i in range(factors.size):
         for j in range(i, factors.size):
             small, large = min(factors[i], factors[j]), max(factors[i], factors[j])
@@ -108,19 +113,16 @@ def _fill(n, factors, covariance):  # type: ignore[no-untyped-def]
                 continue
             _sum_lags(n, small, large, sums)
             scale = 0.5 / ((n + 1.0 - 2 * small) * (n + 1.0 - 2 * large))
-            for a in range(NOISES):
-                for b in range(NOISES):
-                    value = scale * sums[min(a, b), max(a, b)]
-                    covariance[a, b, i, j] = value
-                    covariance[a, b, j, i] = value
+            for pair in range(10):
+                covariance[i, j, pair] = scale * sums[pair]
+                covariance[j, i, pair] = scale * sums[pair]
 
 
 @compiled
 def _sum_lags(n, small, large, sums):  # type: ignore[no-untyped-def]
     """Σ w(c) r^a(c) r^b(c) over all lags c of the terms' centres: kinks one by one, between them blocks."""
-    for a in range(NOISES):
-        for b in range(NOISES):
-            sums[a, b] = 0.0
+    for pair in range(10):
+        sums[pair] = 0.0
     end = n + 1 - small - large  # w(end) = 0
     lower = min(small, large - small)
     kinks = (0, lower, large - lower, large, large + small, end)
@@ -168,7 +170,7 @@ def _add(lag, weight, n, small, large, sums):  # type: ignore[no-untyped-def]
     weight *= min(n + 1.0 - 2 * large, n + 1.0 - small - large - lag)
     if lag > TAIL * (small + large):
         r = small * large / (np.pi * lag * lag) * (1.0 + 0.5 * (small * small + large * large) / (lag * lag))
-        sums[2, 2] += weight * r * r
+        sums[7] += weight * r * r
         return
     q, white, flicker, walk = 0.0, 0.0, 0.0, 0.0
     for p in range(-1, 2):
@@ -186,13 +188,13 @@ def _add(lag, weight, n, small, large, sums):  # type: ignore[no-untyped-def]
     white *= scale
     flicker *= scale / (2.0 * np.pi)
     walk *= scale / 12.0
-    sums[0, 0] += weight * q * q
-    sums[0, 1] += weight * q * white
-    sums[0, 2] += weight * q * flicker
-    sums[0, 3] += weight * q * walk
-    sums[1, 1] += weight * white * white
-    sums[1, 2] += weight * white * flicker
-    sums[1, 3] += weight * white * walk
-    sums[2, 2] += weight * flicker * flicker
-    sums[2, 3] += weight * flicker * walk
-    sums[3, 3] += weight * walk * walk
+    sums[0] += weight * q * q
+    sums[1] += weight * q * white
+    sums[2] += weight * q * flicker
+    sums[3] += weight * q * walk
+    sums[4] += weight * white * white
+    sums[5] += weight * white * flicker
+    sums[6] += weight * white * walk
+    sums[7] += weight * flicker * flicker
+    sums[8] += weight * flicker * walk
+    sums[9] += weight * walk * walk

@@ -32,9 +32,11 @@ from monitor.compiled import compiled
 MIN_LENGTH: Final = 100
 """Samples; a shorter window holds no Allan curve worth a name."""
 MAX_LENGTH: Final = 10_000_000
-"""Samples; 64 bytes each are kept."""
+"""Samples; 96 bytes each are kept."""
+AXES: Final = 6
 LANES: Final = 8
 """Columns kept a sample: six axes padded to a vector register."""
+HOLE_ROWS: Final = 4096
 SCALE, CARRY, SUMS = 0, 1, 2
 """Rows of the float workspace."""
 RUN: Final = 64
@@ -93,8 +95,13 @@ class AllanWindow:
         self._state[:] = (0, 0, -(1 << 62))
 
     def update(self, values: Floats) -> None:
-        """Advance by samples [n, 6], one by one; NaN = missing."""
-        _advance(values, self.factors, self._phase, self._missing, self._terms, self._sums, self._state)
+        """Advance by samples [n, 6], one by one; NaN, and what is beyond any phase (1e7 and more), = missing."""
+        # one kind of array only: each layout and access flag would be compiled anew, for seconds
+        rows = np.ascontiguousarray(values, np.float64).view()
+        if rows.ndim != 2 or rows.shape[1] != AXES:
+            raise ValueError(f"samples of shape {rows.shape}; expected is [n, {AXES}]")
+        rows.flags.writeable = False
+        _advance(rows, self.factors, self._phase, self._missing, self._terms, self._sums, self._state)
 
     def skip(self, n: int) -> None:
         """Advance by n missing samples; more than the window holds empty it at once."""
@@ -102,21 +109,21 @@ class AllanWindow:
             self.reset()
             return
         # in pieces, so that a long outage needs no array of its length
-        hole = np.full((min(n, 4096), 6), np.nan)
-        for start in range(0, n, len(hole)):
+        hole = np.full((min(n, HOLE_ROWS), AXES), np.nan)
+        for start in range(0, n, HOLE_ROWS):
             self.update(hole[: n - start])
 
     def avar(self) -> Floats:
         """Allan variance [m, 6] in unit² of the axis; NaN where no term is complete."""
-        sums = (self._sums[SUMS::2] + self._sums[SUMS + 1 :: 2])[:, :6]
-        m = self.factors[:, None] * self._scale[:6]
-        terms = self._terms[:, :6]
+        sums = (self._sums[SUMS::2] + self._sums[SUMS + 1 :: 2])[:, :AXES]
+        m = self.factors[:, None] * self._scale[:AXES]
+        terms = self._terms[:, :AXES]
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(terms > 0, np.maximum(sums, 0.0) / (2.0 * m * m * terms), np.nan)
 
     def terms(self) -> Ints:
         """Number of second differences averaged, [m, 6]."""
-        return self._terms[:, :6].copy()
+        return self._terms[:, :AXES].copy()
 
 
 @compiled

@@ -21,7 +21,7 @@ BACKGROUND: Final[Colour] = (13, 16, 17)
 FRAME: Final[Colour] = (92, 98, 104)
 MAJOR: Final[Colour] = (48, 53, 57)
 MINOR: Final[Colour] = (23, 27, 29)
-TEXT: Final[Colour] = (190, 196, 202)
+TEXT: Final[Colour] = (236, 239, 242)  # read on the label boxes of the dark and of the light theme
 TEMPERATURE: Final[Colour] = (236, 180, 72)
 
 

@@ -35,16 +35,16 @@ def health_text(device: str, health: Health, about: str = "") -> str:
     if health.text:
         lines.append(f"**{health.text}**")
     rate = "rate not known yet" if health.rate_hz is None else f"{health.rate_hz:.2f} Hz"
-    lines.append(f"**{device}** {about}".rstrip())
-    lines.append(f"**{rate}**, up {duration(health.uptime_s)}, {health.memory_bytes / 1e6:.0f} MB of memory")
+    lines.append(f"**{device}** {about}".rstrip() + f", **{rate}**, up {duration(health.uptime_s)}")
     lines.append(
-        f"samples received **{health.received:,}**, lost **{health.lost:,}**, bad **{health.bad:,}**, "
+        f"received **{health.received:,}**, lost **{health.lost:,}**, bad **{health.bad:,}**, "
         f"overflowed **{health.overflowed:,}**"
     )
-    lines.append(
-        f"latency **{_milliseconds(health.latency_p50_s)}** median, **{_milliseconds(health.latency_p99_s)}** at 99 %"
-    )
     lines.append(", ".join(f"{name} **{state}**" for name, state in health.outputs.items()))
+    lines.append(
+        f"latency **{_milliseconds(health.latency_p50_s)}** median, "
+        f"**{_milliseconds(health.latency_p99_s)}** at 99 %, memory **{health.memory_bytes / 1e6:.0f} MB**"
+    )
     return "\n\n".join(line for line in lines if line)
 
 

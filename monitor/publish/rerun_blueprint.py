@@ -25,6 +25,8 @@ from monitor.publish.units import (
 
 RAW_SPAN_S: Final = 30.0  # of raw samples in view, up to the cursor
 COURSES: Final = ("N", "B")
+BOTH_KINDS: Final = 4  # devices at most whose accelerometers are in the overview too
+COLUMNS: Final = 4
 SHORT: Final = {"gyro": "Gyro", "accel": "Accel"}
 
 
@@ -59,11 +61,12 @@ def _device(device: str) -> rrb.Container:
 
 
 def _overview(devices: Sequence[str]) -> rrb.Container:
-    charts = [_allan(d, "gyro", f"{d}: ") for d in devices]
+    kinds = KINDS if len(devices) <= BOTH_KINDS else KINDS[:1]
+    charts = [_allan(d, kind, f"{d}: ") for kind in kinds for d in devices]
     return rrb.Vertical(
         rrb.TextDocumentView(origin="/overview", name="Is it healthy?"),
-        rrb.Grid(*charts),
-        row_shares=[1, 3],
+        rrb.Grid(*charts, grid_columns=min(len(devices), COLUMNS)),
+        row_shares=[1, 4],
         name="Overview",
     )
 

@@ -166,15 +166,23 @@ class Scene:
         ticks = [(x, y, label) for x, y, label in lines.ticks]
         unit = DEVIATION_UNITS[kind].name
         ticks += [(WIDTH / 2, HEIGHT + 0.85, "averaging time τ, s"), (1.2, -0.85, f"σ(τ), {unit}")]
-        self._labels(f"{path}/ticks", ticks, [colours.TEXT])
-        legend = [(WIDTH - 0.9 - 1.4 * i, -0.85, axis) for i, axis in enumerate(reversed(axes))]
-        self._labels(f"{path}/legend", legend, [colours.AXIS_COLOURS[a] for a in reversed(axes)])
+        self._labels(f"{path}/ticks", ticks)
+        self._legend(path, axes)
 
-    def _labels(self, path: str, labels: list[tuple[float, float, str]], colour: list[colours.Colour]) -> None:
+    def _legend(self, path: str, axes: Sequence[str]) -> None:
+        """A stroke of its colour and its name for every axis, above the right end of the box."""
+        ends = [(axis, WIDTH - 2.0 * (len(axes) - 1 - i) - 0.5) for i, axis in enumerate(axes)]
+        strokes = [np.array([[x - 1.15, -0.42], [x - 0.5, -0.42]]) for _, x in ends]
+        tints = [colours.AXIS_COLOURS[axis] for axis in axes]
+        lines = rr.LineStrips2D(strokes, colors=tints, radii=rr.Radius.ui_points(2.0), draw_order=30.0)
+        self._stream.log(f"{path}/legend/strokes", lines)
+        self._labels(f"{path}/legend", [(x, -0.85, axis) for axis, x in ends])
+
+    def _labels(self, path: str, labels: list[tuple[float, float, str]]) -> None:
         points = rr.Points2D(
             [(x, y) for x, y, _ in labels],
             labels=[text for _, _, text in labels],
-            colors=colour,
+            colors=[colours.TEXT],
             radii=[0.0],
             show_labels=True,
         )

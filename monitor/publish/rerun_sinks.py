@@ -34,6 +34,7 @@ LOOPBACK: Final = "127.0.0.1"
 APPLICATION: Final = "imu-monitor"
 START_S: Final = 20.0  # for a viewer to listen: the first start of a 300 MB program from a cold disk
 PORTS_TRIED: Final = 20
+LIVE_FLUSH_S: Final = 0.2  # fluent to the eye; Rerun keeps about 1 kB for every chunk beside its data
 PROBE: Final = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadTables"
 
 
@@ -79,6 +80,10 @@ class Child:
             self._process.wait(5.0)
         self._log.close()
 
+    def signal(self, number: int) -> None:
+        """Send a signal to the process."""
+        self._process.send_signal(number)
+
     def kill(self) -> None:
         """End it from another thread, whatever it is doing."""
         self._process.kill()
@@ -97,23 +102,26 @@ class Output:
     flush_every_s: float
     url: str = ""  # of the page, or of the Rerun server
     child: Child | None = None
-    joined_port: int | None = None  # of a viewer that someone else started
+    port: int | None = None  # of the Rerun server; None for a file
 
     def trouble(self) -> str | None:
         """Why nobody looks any more; None while all is well."""
         if self.child is not None:
             return self.child.trouble()
-        if self.joined_port is not None and not listens(self.joined_port):
-            return f"the viewer on port {self.joined_port} was closed"
+        if self.port is not None and not listens(self.port):
+            return f"the viewer on port {self.port} was closed"
         return None
 
     def confirm(self, patience_s: float) -> bool:
-        """Whether all that was logged got through within ``patience_s``."""
+        """Whether all that was logged got through within ``patience_s``, and the viewer answers.
+
+        Getting through alone says little: sockets take in a stopped viewer's next two megabytes.
+        """
         try:
             self.stream.flush(timeout_sec=patience_s)
         except RuntimeError:  # Rerun's only way to say "timed out" or "connection lost"
             return False
-        return True
+        return self.port is None or ask(self.port, "/imu.monitor/Ping", patience_s) is not None
 
     def close(self) -> None:
         """End the viewer that was started here. Frees no stream: that may block, see ``rerun_view``."""
@@ -143,14 +151,19 @@ def is_rerun(port: int) -> bool:
 
     Any other gRPC server says "unimplemented" (status 12), any other server no gRPC at all.
     """
-    connection = http.client.HTTPConnection(LOOPBACK, port, timeout=1.0)
+    reply = ask(port, PROBE, 1.0)
+    return reply is not None and "grpc" in reply.get("content-type", "") and reply.get("grpc-status") != "12"
+
+
+def ask(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
+    """Headers of the reply to an empty gRPC call; None when nobody answers in time."""
+    connection = http.client.HTTPConnection(LOOPBACK, port, timeout=timeout_s)
     headers = {"content-type": "application/grpc-web+proto", "x-grpc-web": "1"}
     try:
-        connection.request("POST", PROBE, bytes(5), headers)
-        reply = connection.getresponse()
-        return reply.getheader("grpc-status", "") != "12" and "grpc" in reply.getheader("content-type", "")
+        connection.request("POST", path, bytes(5), headers)
+        return {name.lower(): value for name, value in connection.getresponse().getheaders()}
     except (OSError, http.client.HTTPException):
-        return False
+        return None
     finally:
         connection.close()
 
@@ -200,7 +213,9 @@ def _open_native(settings: ViewerSettings, recording_id: str, given_up: Callable
     if listens(port):
         if not is_rerun(port):
             raise ViewerTrouble(f"cannot listen on {port}: busy")
-        return _connected(port, recording_id, joined_port=port)
+        return _connected(port, recording_id)
+    if not has_desktop():
+        raise ViewerTrouble('no desktop here (DISPLAY and WAYLAND_DISPLAY are not set): use viewer mode "web"')
     child = Child([
         *("--bind", LOOPBACK, "--port", str(port)),
         *("--memory-limit", settings.memory, "--server-memory-limit", "64MiB"),
@@ -233,7 +248,7 @@ def server_url(port: int) -> str:
 def _connected(port: int, recording_id: str, child: Child | None = None, joined_port: int | None = None) -> Output:
     stream = _stream(recording_id)
     stream.set_sinks(rr.GrpcSink(server_url(port)))
-    return Output(stream, 0.15, server_url(port), child, joined_port)
+    return Output(stream, LIVE_FLUSH_S, server_url(port), child, port)
 
 
 def _stream(recording_id: str) -> rr.RecordingStream:

@@ -1,7 +1,7 @@
 """The live view: takes results from the service's loop and draws them in Rerun from a thread of its own.
 
 In come samples, estimates, events and health; every call puts them on a backlog and returns. The thread
-opens the viewer, draws what has come about seven times a second, and once a second asks Rerun whether it
+opens the viewer, draws what has come five times a second, and once a second asks Rerun whether it
 all got through. A viewer that does not answer (stopped, hung) is ``stalled``: nothing more is drawn until it
 answers, the backlog drops its oldest, and the drops are counted in ``state``. A viewer that is missing,
 cannot start or was closed is said in ``state`` too, and tried again. Nothing here ever raises into the loop.
@@ -38,7 +38,9 @@ CHECK_EVERY_S: Final = 1.0  # whether what was drawn has reached the viewer
 PATIENCE_S: Final = 1.0  # for the viewer to answer that
 STALL_S: Final = 2.0  # inside one call of Rerun before it counts as stalled
 RETRY_S: Final = (2.0, 5.0, 15.0, 30.0)
-DRAWS_PER_S: Final = 8.0  # estimates drawn, shared by all devices; 2 a second for each at most
+PLOTS_PER_S: Final = 8.0  # Allan plots drawn, shared by all devices; one a second for each at most
+COURSE_EVERY_S: Final = 5.0  # the points of the coefficient courses are sent together
+COURSE_STEP_S: Final = 1.0  # of sample time between two points of a course
 EARLY_END_S: Final = 10.0  # a window that ends sooner never worked
 MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
 
@@ -114,7 +116,7 @@ class RerunView:
         self._put(device, _Samples(wall_s, values, temperature_c), weight)
 
     def estimate(self, device: str, wall_s: float, estimate: Estimate) -> None:
-        """A refit; of a fast stream of them the viewer draws the newest, twice a second."""
+        """A refit; of a fast stream of them the viewer draws the newest, once a second."""
         self._put(device, _Estimate(wall_s, estimate), estimate.curve.avar.nbytes * 8)
 
     def event(self, device: str, wall_s: float, event: Event) -> None:
@@ -193,7 +195,7 @@ class RerunView:
 
     def _draw(self, output: "Output", scene: "Scene") -> None:
         """Draw what comes until closed or nobody looks any more."""
-        queue = _Pending(2.0 if len(self._devices) <= DRAWS_PER_S / 2 else DRAWS_PER_S / len(self._devices))
+        queue = _Pending(plot_every_s=max(1.0, len(self._devices) / PLOTS_PER_S))
         checked = time.monotonic()
         while True:
             closing = self._closing.is_set()
@@ -228,28 +230,30 @@ class RerunView:
 class _Pending:
     """What has come since the last drawing, device by device."""
 
-    estimates_per_s: float
+    plot_every_s: float
     samples: dict[str, list[_Samples]] = field(default_factory=dict)
-    estimates: dict[str, list[_Estimate]] = field(default_factory=dict)
+    newest: dict[str, _Estimate] = field(default_factory=dict)  # for the Allan plots
+    course: dict[str, list[_Estimate]] = field(default_factory=dict)
     healths: dict[str, _Health] = field(default_factory=dict)
     events: list[tuple[str, _Event]] = field(default_factory=list)
-    drawn: dict[str, float] = field(default_factory=dict)  # device -> monotonic s of its last estimate
+    drawn: dict[tuple[str, str], float] = field(default_factory=dict)  # (what, device) -> monotonic s
 
     def add(self, messages: Sequence[Message]) -> None:
-        """Sort by device and kind; of healths only the newest counts, of estimates two a second of sample time."""
+        """Sort by device and kind; of healths and plots only the newest counts."""
         for device, message in messages:
             match message:
                 case _Samples():
                     self.samples.setdefault(device, []).append(message)
                 case _Estimate():
-                    self._add_estimate(device, message)
+                    self.newest[device] = message
+                    self._add_to_course(device, message)
                 case _Event():
                     self.events.append((device, message))
                 case _Health():
                     self.healths[device] = message
 
     def draw(self, scene: "Scene", everything: bool) -> None:
-        """Hand all over to the scene; estimates when they are due, or ``everything``."""
+        """Hand all over to the scene; plots and courses when they are due, or ``everything``."""
         for device, parts in self.samples.items():
             scene.samples(
                 device,
@@ -264,24 +268,40 @@ class _Pending:
         for device, seen in self.healths.items():
             scene.health(device, seen.wall_s, seen.health)
         self.healths.clear()
-        for device in list(self.estimates):
-            if everything or time.monotonic() - self.drawn.get(device, -np.inf) >= 1.0 / self.estimates_per_s:
-                self._draw_estimates(scene, device, self.estimates.pop(device))
+        for device in list(self.newest):
+            if everything or self._due("plot", device, self.plot_every_s):
+                newest = self.newest.pop(device)
+                scene.estimate(device, newest.wall_s, newest.estimate)
+        for device in list(self.course):
+            if everything or self._due("course", device, COURSE_EVERY_S):
+                points = self.course.pop(device)
+                scene.courses(device, np.array([p.wall_s for p in points]), [p.estimate for p in points])
 
-    def _add_estimate(self, device: str, message: _Estimate) -> None:
-        kept = self.estimates.setdefault(device, [])
-        if len(kept) > 1 and message.wall_s - kept[-2].wall_s < 0.5:
-            kept.pop()
-        kept.append(message)
+    def _add_to_course(self, device: str, message: _Estimate) -> None:
+        points = self.course.setdefault(device, [])
+        if len(points) > 1 and message.wall_s - points[-2].wall_s < COURSE_STEP_S:
+            points.pop()
+        points.append(message)
 
-    def _draw_estimates(self, scene: "Scene", device: str, kept: Sequence[_Estimate]) -> None:
-        self.drawn[device] = time.monotonic()
-        scene.courses(device, np.array([k.wall_s for k in kept]), [k.estimate for k in kept])
-        scene.estimate(device, kept[-1].wall_s, kept[-1].estimate)
+    def _due(self, what: str, device: str, every_s: float) -> bool:
+        now = time.monotonic()
+        if now - self.drawn.get((what, device), -np.inf) < every_s:
+            return False
+        self.drawn[what, device] = now
+        return True
 
 
 def _load_rerun() -> None:
-    """Import Rerun without its exit handler, which waits for ever for a viewer that does not answer."""
+    """Import Rerun without its exit handler, which waits for ever for a viewer that does not answer.
+
+    Its own log, read from RUST_LOG at import, would print every closed viewer as an error of the daemon's.
+    """
+    given = os.environ.get("RUST_LOG")
+    os.environ["RUST_LOG"] = given or "off"
     os.environ.setdefault("RERUN_ANALYTICS", "0")
-    rerun = importlib.import_module("rerun")
+    try:
+        rerun = importlib.import_module("rerun")
+    finally:
+        if given is None:
+            del os.environ["RUST_LOG"]
     rerun.unregister_shutdown()

@@ -125,16 +125,16 @@ class Reading:
     unit: str
 
 
-def reading(coefficients: Coefficients, letter: str, axis: str) -> Reading:
+def reading(coefficients: Coefficients, letter: str, axis: str, digits: int = 3) -> Reading:
     """One cell of a table of coefficients, in the field's unit."""
     at = LETTERS.index(letter), AXES.index(axis)
     unit = unit_of(letter, axis)
     value, lo, hi = (float(a[at]) * unit.factor for a in (coefficients.value, coefficients.lo, coefficients.hi))
     match Status(int(coefficients.status[at])):
         case Status.ESTIMATED:
-            return Reading(number(value), f"{number(lo)} … {number(hi)}", unit.name)
+            return Reading(number(value, digits), f"{number(lo, digits)} … {number(hi, digits)}", unit.name)
         case Status.UPPER_BOUND:
-            return Reading(f"≤ {number(hi)}", "", unit.name)
+            return Reading(f"≤ {number(hi, digits)}", "", unit.name)
         case Status.UNESTIMATED:
             return Reading("—", "", unit.name)
 

@@ -55,6 +55,13 @@ class Example:
         keys = [str(v) for k, v in self.settings.items() if k not in ("columns", "file", "signals")]
         return "-".join([self.name, *keys])
 
+    @property
+    def carrier(self) -> str:
+        """What the decoder is fed: bytes, frames or messages."""
+        module = importlib.import_module(f"{decoders.__name__}.{self.name}")
+        carriers = [c.carrier for c in vars(module).values() if "carrier" in getattr(c, "__dict__", {})]
+        return str(next(c for c in carriers if isinstance(c, str)))
+
     def build(self, folder: Path) -> Decoder:
         """The decoder; a file that its settings name is written to the folder."""
         settings = dict(self.settings)

@@ -17,32 +17,20 @@ from tests.contracts.decoder_examples import EXAMPLES, NAMES, Example
 N = 16
 STEP_NS = 10_000_000
 QUICK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-STREAMS = ("bytes",)
-PACKETS = ("frames", "messages")
+STREAMS = [e for e in EXAMPLES if e.carrier == "bytes"]
+CHECKED = [e for e in STREAMS if e.checksum]
+PACKETS = [e for e in EXAMPLES if e.carrier in ("frames", "messages")]
 
-
-@pytest.fixture(params=EXAMPLES, ids=str)
-def example(request: pytest.FixtureRequest) -> Example:
-    return request.param
+every_decoder = pytest.mark.parametrize("example", EXAMPLES, ids=str)
+every_stream = pytest.mark.parametrize("example", STREAMS, ids=str)
+every_checked_stream = pytest.mark.parametrize("example", CHECKED, ids=str)
+every_packet = pytest.mark.parametrize("example", PACKETS, ids=str)
+every_frame = pytest.mark.parametrize("example", [e for e in PACKETS if e.carrier == "frames"], ids=str)
 
 
 @pytest.fixture
 def decoder(example: Example, tmp_path: Path) -> Decoder:
     return example.build(tmp_path)
-
-
-@pytest.fixture
-def stream(decoder: Decoder) -> Decoder:
-    if decoder.carrier not in STREAMS:
-        pytest.skip("speaks of byte streams")
-    return decoder
-
-
-@pytest.fixture
-def packets(decoder: Decoder) -> Decoder:
-    if decoder.carrier not in PACKETS:
-        pytest.skip("speaks of whole frames or messages")
-    return decoder
 
 
 def made(decoder: Decoder, n: int = N, seed: int = 7) -> SampleBlock:
@@ -119,6 +107,7 @@ def test_every_decoder_is_tried() -> None:
 # --- all carriers ------------------------------------------------------------------------------
 
 
+@every_decoder
 def test_encode_then_feed_gives_back_the_samples_to_half_a_bit(example: Example, decoder: Decoder) -> None:
     samples = made(decoder)
     got = join(feed(decoder, [list(decoder.encode(samples))]))
@@ -141,12 +130,14 @@ def test_encode_then_feed_gives_back_the_samples_to_half_a_bit(example: Example,
         assert got.t_ns.tolist() == samples.t_ns.tolist()
 
 
+@every_decoder
 def test_samples_arrive_with_the_chunk_that_completes_them(decoder: Decoder) -> None:
     samples = made(decoder)
     got = join(feed(decoder, [flat(chunks_of(decoder, samples))]))
     assert got.t_ns.tolist() == samples.t_ns.tolist()
 
 
+@every_decoder
 def test_one_call_or_many_make_no_difference(example: Example, decoder: Decoder, tmp_path: Path) -> None:
     parts = chunks_of(decoder, made(decoder))
     at_once = seen(feed(decoder, [flat(parts)]))
@@ -155,19 +146,21 @@ def test_one_call_or_many_make_no_difference(example: Example, decoder: Decoder,
     assert again.bad == decoder.bad == 0
 
 
+@every_decoder
 def test_nothing_fed_gives_nothing(decoder: Decoder) -> None:
     assert decoder.feed([]) == []
     assert decoder.feed([Chunk(b"", 5)]) == []
-    assert decoder.hint == "" or decoder.carrier in PACKETS
+    assert decoder.hint == "" or decoder.carrier != "bytes"
 
 
 # --- byte streams ------------------------------------------------------------------------------
 
 
+@every_stream
 @QUICK
 @given(data=st.data())
-def test_any_cut_gives_the_same(data: st.DataObject, example: Example, stream: Decoder, tmp_path: Path) -> None:
-    parts = chunks_of(stream, made(stream))
+def test_any_cut_gives_the_same(data: st.DataObject, example: Example, decoder: Decoder, tmp_path: Path) -> None:
+    parts = chunks_of(decoder, made(decoder))
     wire = b"".join(bytes_of(parts))
     tail = bytes_of(parts)[-1][: data.draw(st.integers(0, 5), label="tail")]
     cuts = data.draw(st.lists(st.integers(1, len(wire)), max_size=12), label="cuts")
@@ -176,18 +169,20 @@ def test_any_cut_gives_the_same(data: st.DataObject, example: Example, stream: D
     assert seen(feed_bytes(example.build(tmp_path), wire + tail, cuts)) == whole
 
 
-def test_byte_by_byte_gives_the_same(example: Example, stream: Decoder, tmp_path: Path) -> None:
-    wire = b"".join(bytes_of(chunks_of(stream, made(stream))))
-    whole = seen(feed_bytes(stream, wire))
+@every_stream
+def test_byte_by_byte_gives_the_same(example: Example, decoder: Decoder, tmp_path: Path) -> None:
+    wire = b"".join(bytes_of(chunks_of(decoder, made(decoder))))
+    whole = seen(feed_bytes(decoder, wire))
     assert seen(feed_bytes(example.build(tmp_path), wire, list(range(1, len(wire))))) == whole
 
 
+@every_stream
 @QUICK
 @given(data=st.data())
 def test_cuts_do_not_matter_in_a_damaged_stream(
-    data: st.DataObject, example: Example, stream: Decoder, tmp_path: Path
+    data: st.DataObject, example: Example, decoder: Decoder, tmp_path: Path
 ) -> None:
-    frames = bytes_of(chunks_of(stream, made(stream, 40)))
+    frames = bytes_of(chunks_of(decoder, made(decoder, 40)))
     for at in data.draw(st.lists(st.integers(1, 20), max_size=4), label="noise at"):
         frames[at] = data.draw(st.binary(max_size=60), label="noise") + frames[at]
     wire = b"".join(frames)
@@ -208,13 +203,14 @@ def noises(frame: bytes) -> dict[str, bytes]:
     }
 
 
+@every_stream
 @pytest.mark.parametrize("kind", ["random", "long", "half a frame", "starts of frames", "zeros"])
 @pytest.mark.parametrize("place", ["before", "inside", "between", "after"])
 def test_noise_costs_only_the_frame_it_touches(
-    example: Example, stream: Decoder, kind: str, place: str, tmp_path: Path
+    example: Example, decoder: Decoder, kind: str, place: str, tmp_path: Path
 ) -> None:
-    samples = made(stream, 80)
-    frames = bytes_of(chunks_of(stream, samples))
+    samples = made(decoder, 80)
+    frames = bytes_of(chunks_of(decoder, samples))
     expected = clean(example, tmp_path, samples)
     noise, at = noises(frames[7])[kind], 7
     if place == "before":
@@ -230,7 +226,7 @@ def test_noise_costs_only_the_frame_it_touches(
     else:
         frames[-1] += noise
         may_miss = set()
-    got = seen(feed_bytes(stream, b"".join(frames)))[0]
+    got = seen(feed_bytes(decoder, b"".join(frames)))[0]
     whole = [row for i, row in enumerate(expected) if i not in may_miss]
     if example.checksum:
         kept = [row for row in got if row in expected]
@@ -245,11 +241,10 @@ def test_noise_costs_only_the_frame_it_touches(
 MASKS = (0x01, 0x04, 0x80)
 
 
-def test_one_damaged_byte_costs_exactly_its_sample(example: Example, stream: Decoder, tmp_path: Path) -> None:
-    if not example.checksum:
-        pytest.skip("no checksum in this format")
-    samples = made(stream)
-    frames = bytes_of(chunks_of(stream, samples))
+@every_checked_stream
+def test_one_damaged_byte_costs_exactly_its_sample(example: Example, decoder: Decoder, tmp_path: Path) -> None:
+    samples = made(decoder)
+    frames = bytes_of(chunks_of(decoder, samples))
     expected = clean(example, tmp_path, samples)
     k = N // 2
     start = len(frames[k]) - len(frames[k].lstrip(b"\r\n"))  # text begins with a line end
@@ -265,79 +260,81 @@ def test_one_damaged_byte_costs_exactly_its_sample(example: Example, stream: Dec
         assert fresh.hint != ""
 
 
-def test_a_missing_byte_costs_one_sample(example: Example, stream: Decoder, tmp_path: Path) -> None:
-    if not example.checksum:
-        pytest.skip("no checksum in this format")
-    samples = made(stream)
-    frames = bytes_of(chunks_of(stream, samples))
+@every_checked_stream
+def test_a_missing_byte_costs_one_sample(example: Example, decoder: Decoder, tmp_path: Path) -> None:
+    samples = made(decoder)
+    frames = bytes_of(chunks_of(decoder, samples))
     expected = clean(example, tmp_path, samples)
     k = N // 2
     frames[k] = frames[k][:5] + frames[k][6:]
-    assert seen(feed_bytes(stream, b"".join(frames)))[0] == expected[:k] + expected[k + 1 :]
-    assert stream.bad == 1
+    assert seen(feed_bytes(decoder, b"".join(frames)))[0] == expected[:k] + expected[k + 1 :]
+    assert decoder.bad == 1
 
 
-def test_missing_frames_are_counted(example: Example, stream: Decoder) -> None:
-    if not example.checksum:
-        pytest.skip("no checksum in this format")
-    frames = bytes_of(chunks_of(stream, made(stream)))
+@every_checked_stream
+def test_missing_frames_are_counted(example: Example, decoder: Decoder) -> None:
+    frames = bytes_of(chunks_of(decoder, made(decoder)))
     for k in (4, 5, 6):  # line ends stay: a line is as long as it is
         end = frames[k][-2:] if frames[k].endswith(b"\r\n") else b""
         frames[k] = bytes(len(frames[k]) - len(end)) + end
-    got = seen(feed_bytes(stream, b"".join(frames)))
+    got = seen(feed_bytes(decoder, b"".join(frames)))
     assert len(got[0]) == N - 3
     assert got[3] == 3
-    assert stream.bad >= 3  # a sample may be more than one frame
+    assert decoder.bad >= 3  # a sample may be more than one frame
 
 
-def test_reset_forgets_half_a_frame(stream: Decoder) -> None:
-    samples = made(stream)
-    parts = chunks_of(stream, samples)
+@every_stream
+def test_reset_forgets_half_a_frame(decoder: Decoder) -> None:
+    samples = made(decoder)
+    parts = chunks_of(decoder, samples)
     first, rest = flat(parts[:4]), bytes_of(parts[4:])
-    feed(stream, [first])
-    assert feed_bytes(stream, rest[0][: len(rest[0]) // 2]) == []
-    stream.reset()
-    got = seen(feed_bytes(stream, b"".join(rest[1:])))
+    feed(decoder, [first])
+    assert feed_bytes(decoder, rest[0][: len(rest[0]) // 2]) == []
+    decoder.reset()
+    got = seen(feed_bytes(decoder, b"".join(rest[1:])))
     assert len(got[0]) == N - 5
     assert got[3] == 0
-    assert stream.bad == 0
+    assert decoder.bad == 0
 
 
-def test_joined_in_the_middle_of_a_frame(example: Example, stream: Decoder, tmp_path: Path) -> None:
-    samples = made(stream)
-    frames = bytes_of(chunks_of(stream, samples))
+@every_stream
+def test_joined_in_the_middle_of_a_frame(example: Example, decoder: Decoder, tmp_path: Path) -> None:
+    samples = made(decoder)
+    frames = bytes_of(chunks_of(decoder, samples))
     expected = clean(example, tmp_path, samples)
-    got = seen(feed_bytes(stream, b"".join(frames)[len(frames[0]) // 3 :]))
+    got = seen(feed_bytes(decoder, b"".join(frames)[len(frames[0]) // 3 :]))
     assert got[0] == expected[1:]
-    assert got[3] == stream.bad == 0
+    assert got[3] == decoder.bad == 0
 
 
-def test_garbage_raises_nothing_and_fills_no_memory(stream: Decoder) -> None:
+@every_stream
+def test_garbage_raises_nothing_and_fills_no_memory(decoder: Decoder) -> None:
     rng = np.random.default_rng(3)
-    starts = bytes_of(chunks_of(stream, made(stream)))[0][:4]
+    starts = bytes_of(chunks_of(decoder, made(decoder)))[0][:4]
     garbage = rng.integers(0, 256, 50_000, np.uint8).tobytes() + starts * 5000 + b"x" * 30_000
     parts = [garbage[i : i + 1000] for i in range(0, len(garbage), 1000)]
-    feed(stream, [[Chunk(p, 1)] for p in parts])
+    feed(decoder, [[Chunk(p, 1)] for p in parts])
     tracemalloc.start()
     before, _ = tracemalloc.get_traced_memory()
-    feed(stream, [[Chunk(p, 1)] for p in parts])
+    feed(decoder, [[Chunk(p, 1)] for p in parts])
     after, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert after - before < 30_000
-    assert stream.hint != ""
-    lines = b"\r\n" if stream.encode(made(stream, 1))[0].data.endswith(b"\r\n") else b""
-    frames = bytes_of(chunks_of(stream, made(stream, 200)))
-    got = seen(feed_bytes(stream, lines + b"".join(frames)))
+    assert decoder.hint != ""
+    lines = b"\r\n" if decoder.encode(made(decoder, 1))[0].data.endswith(b"\r\n") else b""
+    frames = bytes_of(chunks_of(decoder, made(decoder, 200)))
+    got = seen(feed_bytes(decoder, lines + b"".join(frames)))
     assert len(got[0]) >= 130
 
 
 # --- frames and messages -----------------------------------------------------------------------
 
 
+@every_packet
 @pytest.mark.parametrize("damage", ["cut", "empty", "garbage"])
-def test_a_damaged_chunk_costs_only_its_sample(example: Example, packets: Decoder, damage: str, tmp_path: Path) -> None:
-    samples = made(packets)
-    parts = chunks_of(packets, samples)
+def test_a_damaged_chunk_costs_only_its_sample(example: Example, decoder: Decoder, damage: str, tmp_path: Path) -> None:
+    samples = made(decoder)
+    parts = chunks_of(decoder, samples)
     expected = clean(example, tmp_path, samples)
     k = N // 2
     for at, chunk in enumerate(parts[k]):
@@ -355,21 +352,21 @@ def test_a_damaged_chunk_costs_only_its_sample(example: Example, packets: Decode
         assert fresh.hint != ""
 
 
-def test_chunks_of_others_are_passed_over(packets: Decoder, tmp_path: Path) -> None:
-    if packets.carrier != "frames":
-        pytest.skip("messages come from one publisher")
-    parts = chunks_of(packets, made(packets))
+@every_frame
+def test_chunks_of_others_are_passed_over(decoder: Decoder, tmp_path: Path) -> None:
+    parts = chunks_of(decoder, made(decoder))
     other = Chunk(b"12345678", 1, address=0x7AB)
-    got = seen(feed(packets, [[c for chunk in flat(parts) for c in (other, chunk, other)]]))
+    got = seen(feed(decoder, [[c for chunk in flat(parts) for c in (other, chunk, other)]]))
     assert len(got[0]) == N
-    assert packets.bad == 0
+    assert decoder.bad == 0
 
 
-def test_garbage_chunks_raise_nothing(packets: Decoder) -> None:
+@every_packet
+def test_garbage_chunks_raise_nothing(decoder: Decoder) -> None:
     rng = np.random.default_rng(5)
-    addresses = [c.address for c in packets.encode(made(packets, 1))]
+    addresses = [c.address for c in decoder.encode(made(decoder, 1))]
     for n in rng.integers(0, 400, 2000).tolist():
         data = rng.integers(0, 256, n, np.uint8).tobytes()
-        feed(packets, [[Chunk(data, 1, address=addresses[n % len(addresses)])]])
-    packets.reset()
-    assert len(seen(feed(packets, [flat(chunks_of(packets, made(packets)))]))[0]) >= N - 1
+        feed(decoder, [[Chunk(data, 1, address=addresses[n % len(addresses)])]])
+    decoder.reset()
+    assert len(seen(feed(decoder, [flat(chunks_of(decoder, made(decoder)))]))[0]) >= N - 1

@@ -5,6 +5,7 @@ from typing import Literal
 import msgspec
 
 from drivers.decoders.base import DecoderSettings
+from drivers.plugin import FileOrName
 
 
 class SignalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -20,7 +21,7 @@ class SignalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Settings(DecoderSettings, frozen=True, kw_only=True):
     """Keys of a CAN database."""
 
-    file: str
+    file: FileOrName
     """A path, or the name of a shipped one: "j1939_imu", "canmod_gps", "xsens_mti", "bosch_mm7"."""
     signals: dict[str, str | SignalSettings]
     """Axis (gx … az, temperature) = "Message.Signal", "-Message.Signal", or a table."""

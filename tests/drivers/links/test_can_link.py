@@ -11,12 +11,14 @@ from typing import Any
 
 import can
 import msgspec
+import numpy as np
 import pytest
 
+from drivers.decoders import dbc
 from drivers.errors import LinkLost, LinkUnavailable
 from drivers.links import can_link
 from drivers.links.can_link import CanLink
-from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk
+from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk, join
 
 UNIQUE = itertools.count()
 
@@ -42,14 +44,21 @@ def message(identifier: int, extended: bool = False, **keys: Any) -> can.Message
     return can.Message(arbitration_id=identifier, is_extended_id=extended, data=b"\1\2\3", **keys)
 
 
-def test_frames_of_one_read_are_all_that_are_there(peer: can.BusABC, channel: str) -> None:
+def collect(link: CanLink) -> list[Chunk]:
+    """All that is there: a read on a busy computer may give it in parts."""
+    chunks: list[Chunk] = []
+    while more := link.read(0.2):
+        chunks += more
+    return chunks
+
+
+def test_identifiers_and_data(peer: can.BusABC, channel: str) -> None:
     link = build(interface="virtual", channel=channel)
     link.open()
     for i in range(50):
         peer.send(message(i, extended=i % 2 == 1))
-    chunks = link.read(1.0)
+    chunks = collect(link)
     link.close()
-    assert chunks is not None
     assert [c.address for c in chunks] == [i | (EXTENDED_ID if i % 2 else 0) for i in range(50)]
     assert {c.data for c in chunks} == {b"\1\2\3"}
 
@@ -59,9 +68,12 @@ def test_a_read_is_never_without_end(peer: can.BusABC, channel: str) -> None:
     link.open()
     for _ in range(can_link.BATCH + 5):
         peer.send(message(1))
-    sizes = [len(link.read(0.1) or ()) for _ in range(2)]
+    sizes = []
+    while sum(sizes) < can_link.BATCH + 5:
+        sizes.append(len(link.read(0.1) or ()))
     link.close()
-    assert sizes == [can_link.BATCH, 5]
+    assert max(sizes) <= can_link.BATCH
+    assert sum(sizes) == can_link.BATCH + 5
 
 
 def test_a_late_reader_still_gives_the_time_of_arrival(peer: can.BusABC, channel: str) -> None:
@@ -73,7 +85,7 @@ def test_a_late_reader_still_gives_the_time_of_arrival(peer: can.BusABC, channel
         peer.send(message(1))
         time.sleep(0.05)
     time.sleep(0.2)
-    chunks = link.read(1.0) or []
+    chunks = collect(link)
     link.close()
     assert [c.t_ns for c in chunks] == pytest.approx(sent, abs=20e6)
 
@@ -84,7 +96,7 @@ def test_stamps_that_cannot_be_believed_are_left_aside(channel: str) -> None:
         link.open()
         peer.send(message(1, timestamp=12.5))
         peer.send(message(1, timestamp=time.time() + 3600.0))
-        chunks = link.read(1.0) or []
+        chunks = collect(link)
         link.close()
     now = time.monotonic_ns()
     assert len(chunks) == 2
@@ -99,7 +111,7 @@ def test_only_what_the_decoder_asks_for(peer: can.BusABC, channel: str) -> None:
     others = [(0x0A, False), (0x09, True), (0x0CF02BFE, True), (0x0DF02AFE, True), (0x02A, False)]
     for identifier, extended in kept + others:
         peer.send(message(identifier, extended))
-    chunks = link.read(1.0) or []
+    chunks = collect(link)
     link.close()
     assert [c.address for c in chunks] == [i | (EXTENDED_ID if e else 0) for i, e in kept]
 
@@ -233,3 +245,23 @@ def test_an_adapter_that_garbles_a_line_goes_on() -> None:
     os.close(slave)
     assert [(c.address, c.data) for c in chunks] == [(9, b"\xaa\xbb")]
     assert link.garbled == 2
+
+
+def test_from_the_bus_to_samples(peer: can.BusABC, channel: str) -> None:
+    axes = {"gx": "RollRate", "gy": "PitchRate", "gz": "YawRate"}
+    signals = {axis: f"AngularRateInformation.{name}" for axis, name in axes.items()}
+    decoder = dbc.build(msgspec.convert({"file": "j1939_imu", "signals": signals}, dbc.Settings))
+    assert isinstance(decoder, dbc.DbcDecoder)
+    link = build(interface="virtual", channel=channel)
+    link.accept(decoder.addresses)
+    link.open()
+    for i in range(20):
+        peer.send(message(0x18FEF100, True))  # other traffic of a truck
+        data = (32000 + 128 * i).to_bytes(2, "little") * 3 + b"\0\5"
+        peer.send(can.Message(arbitration_id=0x0CF02A80, is_extended_id=True, data=data))
+    chunks = collect(link)
+    link.close()
+    assert len(chunks) == 20
+    got = join(decoder.feed(chunks))
+    assert np.rad2deg(got.values[:, :3]) == pytest.approx(np.repeat(np.arange(20.0)[:, None], 3, axis=1))
+    assert (np.diff(got.t_ns) >= 0).all()

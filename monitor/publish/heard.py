@@ -1,0 +1,189 @@
+"""What a daemon's messages say of one device: payloads of ``monitor.topics`` -> typed values.
+
+In comes JSON as ``monitor.publish.message`` writes it, from any daemon on the network; out come numbers in SI, or
+``ValueError`` for what is not such a message. Fields that a newer daemon added are ignored. Texts are freed of control
+characters, as they end on a terminal. Pure.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Final, TypeVar
+
+import msgspec
+import numpy as np
+
+from drivers.sample import AXES
+from monitor import topics
+from monitor.estimate.coefficients import LETTERS, Coefficients, Status
+
+STATUSES: Final = {status.name.lower(): status for status in Status}
+QUIET: Final = ("ok", "off")
+"""States of an output that need no word."""
+GONE_S: Final = 2.0
+"""The liveliness token is away and no status (1 Hz) came for so long."""
+SILENT_S: Final = 5.0
+"""The token is there, or was never seen, and nothing came for so long."""
+
+
+class Latency(msgspec.Struct, frozen=True):
+    """Receipt to published, s."""
+
+    p50: float | None = None
+    p99: float | None = None
+
+
+class StatusMessage(msgspec.Struct, frozen=True):
+    """``imu/<device>/status``."""
+
+    schema: str
+    t: float
+    state: str
+    received: int
+    lost: int
+    bad: int
+    rate: float | None = None
+    overflowed: int = 0
+    latency: Latency = Latency()
+    outputs: dict[str, str] = {}
+    text: str = ""
+
+
+class Letter(msgspec.Struct, frozen=True):
+    """One coefficient of one axis."""
+
+    status: str
+    value: float | None = None
+    lo: float | None = None
+    hi: float | None = None
+
+
+class CoefficientsMessage(msgspec.Struct, frozen=True):
+    """``imu/<device>/coefficients``."""
+
+    schema: str
+    samples: int
+    axes: dict[str, dict[str, Letter]]
+    rate: float | None = None
+    window: float | None = None
+
+
+class EventMessage(msgspec.Struct, frozen=True):
+    """``imu/<device>/event``."""
+
+    schema: str
+    t: float
+    kind: str
+    text: str
+
+
+M = TypeVar("M", StatusMessage, CoefficientsMessage, EventMessage)
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """The newest coefficients of a device."""
+
+    coefficients: Coefficients
+    axes: tuple[str, ...]  # those that are measured
+    seen_s: float | None  # how much of the window is full
+
+
+@dataclass(slots=True)
+class Heard:
+    """All that is known of one device; times by the listener's own clock."""
+
+    key: str  # without the topic
+    heard_s: float  # newest message of any kind
+    status: StatusMessage | None = None
+    noise: Noise | None = None
+    there: bool | None = None  # liveliness; None: never told
+
+    def state(self, now_s: float) -> str:
+        """The daemon's word, or what silence means: gone, silent; present while nothing is known yet."""
+        age_s = now_s - self.heard_s
+        ended = self.status is not None and self.status.state == "ended"
+        if age_s > GONE_S and self.there is False and not ended:
+            return "gone"
+        if age_s > SILENT_S and not ended:
+            return "silent"
+        return "present" if self.status is None else clean(self.status.state)
+
+    def rank(self, now_s: float) -> int:
+        """For sorting, worst first: 0 nothing comes, 1 something is wrong or not there yet, 2 runs, 3 has ended."""
+        state, status = self.state(now_s), self.status
+        if state in ("lost", "gone", "silent"):
+            return 0
+        if state == "ended":
+            return 3
+        if status is None or state != "running":
+            return 1
+        well = all(output in QUIET or output.startswith("ok,") for output in status.outputs.values())
+        return 2 if well and not status.text and not status.overflowed else 1
+
+    def trouble(self) -> str:
+        """What is wrong, in words; empty while all is well."""
+        if self.status is None:
+            return ""
+        said = [clean(self.status.text)] if self.status.text else []
+        outputs = self.status.outputs.items()
+        said += [f"{clean(name)}: {clean(state)}" for name, state in outputs if state not in QUIET]
+        if self.status.overflowed:
+            said.append(f"{self.status.overflowed:,} samples overwritten before they were used: too slow here")
+        return "; ".join(said)
+
+
+def split(key: str) -> tuple[str, topics.Topic] | None:
+    """A key -> the device's part and the topic; None for what is no key of ``monitor.topics``.
+
+    >>> split("imu/bench-1/status")
+    ('imu/bench-1', Topic(name='status', encoding='application/json', when='1 Hz'))
+    >>> split("imu/bench-1/gap")
+    """
+    for topic in topics.TOPICS:
+        device = key.removesuffix(f"/{topic.name}")
+        if device != key and device:
+            return device, topic
+    return None
+
+
+def read(kind: type[M], topic: topics.Topic, payload: bytes) -> M:
+    """The message of ``payload``; ValueError when it is none of this topic and schema."""
+    found = msgspec.json.decode(payload, type=kind)  # its errors are ValueErrors
+    if found.schema != topic.schema():
+        raise ValueError(f'schema "{found.schema}" where {topic.schema()} is known')
+    return found
+
+
+def noise(message: CoefficientsMessage) -> Noise:
+    """Coefficients as arrays [5, 6] of SI; ValueError for a status that is not known."""
+    value, lo, hi = (np.full((len(LETTERS), len(AXES)), np.nan) for _ in range(3))
+    status = np.full(value.shape, Status.UNESTIMATED, np.int8)
+    axes = tuple(axis for axis in AXES if axis in message.axes)
+    for axis in axes:
+        for letter, one in message.axes[axis].items():
+            if letter not in LETTERS:
+                continue
+            at = LETTERS.index(letter), AXES.index(axis)
+            value[at], lo[at], hi[at] = (np.nan if x is None else x for x in (one.value, one.lo, one.hi))
+            status[at] = _status(one.status)
+    return Noise(Coefficients(value, lo, hi, status), axes, _seen_s(message))
+
+
+def clean(text: Any) -> str:
+    """One line without control characters (a terminal would obey them).
+
+    >>> clean("link\\x1b[2J lost\\nnow")
+    'link [2J lost now'
+    """
+    return "".join(c if c.isprintable() else " " for c in str(text))
+
+
+def _status(word: str) -> Status:
+    if word not in STATUSES:
+        raise ValueError(f'status "{word}"')
+    return STATUSES[word]
+
+
+def _seen_s(message: CoefficientsMessage) -> float | None:
+    if not message.rate or message.rate < 0 or message.window is None:
+        return message.window
+    return min(message.samples / message.rate, message.window)

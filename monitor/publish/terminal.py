@@ -1,0 +1,396 @@
+"""The live table in the terminal: one row a device, those in trouble first.
+
+In come the payloads of ``monitor.topics``, from zenoh (``watch``) or from the daemon this process is (``run``,
+``demo``); out goes something that rich can print at any width. Of a few layouts the fullest that fits is taken: at 160
+columns a device is one line with three digits, at 100 one line with two, narrower it is three lines, an axis each.
+A state has a word and a sign beside its colour. Numbers stand in the field's units of ``monitor.publish.units``.
+"""
+
+import contextlib
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Final
+
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from monitor import topics
+from monitor.estimate.coefficients import LETTERS
+from monitor.publish import heard, units
+from monitor.publish.heard import Heard
+from monitor.publish.panels import duration
+from monitor.publish.units import Kind
+from monitor.publish.zenoh_in import ENDPOINT, KEYEXPR, ZenohIn
+
+REFRESH_S: Final = 0.5
+PLAIN_S: Final = 1.0
+"""Between two tables where output is no terminal."""
+EVENTS: Final = 5
+TROUBLES: Final = 6
+HEADS: Final = 6
+"""Lines of the screen that are no row: summary, note, heads, and those left empty."""
+SHOWN: Final[tuple[tuple[Kind, str], ...]] = (("gyro", "N"), ("gyro", "B"), ("accel", "N"))
+NONE: Final = "—"
+STATES: Final = {
+    "running": ("●", "green"),
+    "waiting": ("◌", "yellow"),
+    "present": ("○", "yellow"),
+    "lost": ("✖", "bold red"),
+    "gone": ("✖", "bold red"),
+    "silent": ("?", "bold red"),
+    "ended": ("■", "cyan"),
+}
+"""State -> its sign and colour."""
+UNKNOWN: Final = ("?", "yellow")
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How much of a row is shown."""
+
+    digits: int
+    full_counts: bool
+    stacked: bool  # an axis a line
+    gap: int  # blanks between columns
+
+
+LAYOUTS: Final = (Layout(3, True, False, 2), Layout(3, False, False, 1), Layout(2, False, False, 1))
+NARROW: Final = Layout(3, False, True, 1)
+
+
+class Board:
+    """What is known of each device, from the payloads of ``monitor.topics``. Safe between threads.
+
+    Args:
+        clock: seconds on the clock of ``table``'s ``now_s``; for the age of messages
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self.note = ""  # a line above the table, e.g. who cannot be reached
+        self.malformed = 0  # messages that are not what their key says
+        self._clock = clock
+        self._devices: dict[str, Heard] = {}
+        self._events: deque[tuple[str, heard.EventMessage]] = deque(maxlen=EVENTS)
+        self._lock = threading.Lock()
+
+    def take(self, key: str, payload: bytes) -> None:
+        """A message as it was sent; keys of other topics are passed over, malformed payloads counted."""
+        found = heard.split(key)
+        if found is None:
+            return
+        device, topic = found
+        with self._lock:
+            try:
+                self._read(device, topic, payload)
+            except ValueError:
+                self.malformed += 1
+
+    def alive(self, key: str, there: bool) -> None:
+        """The liveliness token at ``key`` appeared or went."""
+        found = heard.split(key)
+        if found is None or found[1] is not topics.ALIVE:
+            return
+        with self._lock:
+            self._device(found[0]).there = there
+
+    def table(self, now_s: float) -> RenderableType:
+        """All of it, at one moment."""
+        with self._lock:
+            devices = sorted(self._devices.values(), key=lambda one: (one.rank(now_s), one.key))
+            parts: list[RenderableType] = [self._summary(devices, now_s)]
+            if devices:
+                parts.append(Fleet(devices, now_s))
+            parts += _apart(_troubles(devices, now_s))
+            if len(devices) == 1 and devices[0].noise is not None:
+                parts += _apart(_detail(devices[0].noise))
+            names = _names(list(self._devices))
+            parts += _apart([_event(names[device], event) for device, event in self._events])
+        return Group(*parts)
+
+    def _read(self, device: str, topic: topics.Topic, payload: bytes) -> None:
+        """ValueError for a malformed one, which then leaves no trace."""
+        if topic is topics.STATUS:
+            status = heard.read(heard.StatusMessage, topic, payload)
+            self._heard(device).status = status
+        elif topic is topics.COEFFICIENTS:
+            noise = heard.noise(heard.read(heard.CoefficientsMessage, topic, payload))
+            self._heard(device).noise = noise
+        elif topic is topics.EVENT:
+            event = heard.read(heard.EventMessage, topic, payload)
+            self._heard(device)
+            self._events.append((device, event))
+
+    def _heard(self, device: str) -> Heard:
+        known = self._device(device)
+        known.heard_s = self._clock()
+        return known
+
+    def _device(self, device: str) -> Heard:
+        return self._devices.setdefault(device, Heard(device, self._clock()))
+
+    def _summary(self, devices: list[Heard], now_s: float) -> Text:
+        line = Text("imu-monitor", style="bold")
+        counts = Counter(one.state(now_s) for one in devices)
+        line.append(f"  {len(devices)} device{'' if len(devices) == 1 else 's'}", style="not bold")
+        for state, count in counts.items():
+            sign, colour = STATES.get(state, UNKNOWN)
+            line.append(f"  {sign} {count} {state}", style=f"not bold {colour}")
+        if self.malformed:
+            line.append(
+                f"  {self.malformed:,} malformed message{'' if self.malformed == 1 else 's'}", style="not bold yellow"
+            )
+        if self.note:
+            line.append(f"\n{self.note}", style="not bold yellow")
+        return line
+
+
+class Fleet:
+    """The table of all devices in the fullest layout that fits, as many rows as the terminal has."""
+
+    def __init__(self, devices: list[Heard], now_s: float) -> None:
+        self._devices = devices
+        self._now_s = now_s
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """The table, and how many did not find room."""
+        layout = next((one for one in LAYOUTS if self._fits(one, console, options)), NARROW)
+        lines_each = 3 if layout.stacked else 1
+        room = len(self._devices)
+        if console.is_terminal:
+            room = max((console.size.height - EVENTS - TROUBLES - HEADS) // lines_each, 3)
+        yield fleet_table(self._devices[:room], self._now_s, layout)
+        if len(self._devices) > room:
+            yield Text(f"… and {len(self._devices) - room} more with less trouble", style="dim")
+
+    def _fits(self, layout: Layout, console: Console, options: ConsoleOptions) -> bool:
+        table = fleet_table(self._devices, self._now_s, layout)
+        return console.measure(table, options=options.update(max_width=10_000)).maximum <= options.max_width
+
+
+def fleet_table(devices: Sequence[Heard], now_s: float, layout: Layout) -> Table:
+    """One row a device."""
+    table = Table(box=None, padding=(0, layout.gap, 0, 0), pad_edge=False, header_style="bold")
+    for head in ("device", "state"):
+        table.add_column(head, no_wrap=True)
+    for head in ("Hz", "received", "lost", "bad"):
+        table.add_column(head, justify="right", no_wrap=True)
+    shown = [pair for pair in SHOWN if any(_measures(one, pair[0]) for one in devices)]
+    noise = [_noise_column(devices, kind, letter, layout) for kind, letter in shown]
+    if layout.stacked and shown:
+        noise.insert(0, (Text(), [Text("x\ny\nz" if one.noise else "", style="bold") for one in devices]))
+    for title, _ in noise:
+        table.add_column(title, justify="right", no_wrap=True)
+    for head in ("p99 ms", "age"):
+        table.add_column(head, justify="right", no_wrap=True)
+    names = _names([one.key for one in devices])
+    for i, one in enumerate(devices):
+        cells = [Text(names[one.key], style="bold"), _state(one.state(now_s)), *_counts(one, layout)]
+        cells += [column[i] for _, column in noise]
+        table.add_row(*cells, _latency(one), Text(_age(now_s - one.heard_s)))
+    return table
+
+
+def watch(
+    keyexpr: str = KEYEXPR,
+    connect: Sequence[str] = (ENDPOINT,),
+    stop: threading.Event | None = None,
+    console: Console | None = None,
+    once_s: float | None = None,
+) -> None:
+    """Show the table until ``stop`` or Ctrl-C; with ``once_s`` listen for so long and print it once.
+
+    Raises:
+        ConfigError: zenoh refuses the key expression or an endpoint
+    """
+    stop, console = stop or threading.Event(), console or Console()
+    board = Board()
+    with contextlib.closing(ZenohIn(keyexpr, connect)) as arriving, contextlib.suppress(KeyboardInterrupt):
+        arriving.start()
+        if once_s is not None:
+            stop.wait(once_s)
+            console.print(_newest(board, arriving))
+        elif console.is_terminal:
+            with Live(console=console, auto_refresh=False) as live:
+                while not stop.wait(REFRESH_S):
+                    live.update(_newest(board, arriving), refresh=True)
+        else:
+            while not stop.wait(PLAIN_S):
+                console.print(_newest(board, arriving))
+
+
+def _newest(board: Board, arriving: ZenohIn) -> RenderableType:
+    """The table with all that has come until now."""
+    for message in arriving.take(0.0):
+        if message.payload is None:
+            board.alive(message.key, message.there)
+        else:
+            board.take(message.key, message.payload)
+    state, dropped = arriving.state, arriving.dropped
+    notes = [state] if state != "ok" else []
+    notes += [f"{dropped:,} messages dropped: too slow here"] if dropped else []
+    board.note = "; ".join(notes)
+    return board.table(time.monotonic())
+
+
+# --- cells
+
+
+def _names(keys: Sequence[str]) -> dict[str, str]:
+    """Key -> what a row is called: the last part, where that tells all devices apart and nothing is lost by it."""
+    prefixes = {key.rpartition("/")[0] for key in keys}
+    short = len(prefixes) == 1
+    return {key: heard.clean(key.rpartition("/")[2] if short else key) for key in keys}
+
+
+def _state(state: str) -> Text:
+    sign, colour = STATES.get(state, UNKNOWN)
+    return Text(f"{sign} {state}", style=colour)
+
+
+def _counts(one: Heard, layout: Layout) -> list[Text]:
+    if one.status is None:
+        return [Text(NONE, style="dim")] * 4
+    rate = NONE if one.status.rate is None else units.number(one.status.rate, 4)
+    write = _full if layout.full_counts else _short
+    lost, bad = (Text(write(count), style="yellow" if count else "dim") for count in (one.status.lost, one.status.bad))
+    return [Text(rate), Text(write(one.status.received)), lost, bad]
+
+
+def _latency(one: Heard) -> Text:
+    p99_s = None if one.status is None else one.status.latency.p99
+    return Text(NONE, style="dim") if p99_s is None else Text(units.number(p99_s * 1e3, 2))
+
+
+def _full(count: int) -> str:
+    return f"{count:,}"
+
+
+def _short(count: int) -> str:
+    """A count in at most five characters.
+
+    >>> _short(9_999), _short(123_456), _short(999_999)
+    ('9999', '123k', '1M')
+    """
+    if count < 10_000:
+        return str(count)
+    count = int(float(f"{count:.2e}"))  # rounded first: 999 999 are 1M
+    power = min((len(str(count)) - 1) // 3, 4)
+    return f"{count / 1000**power:.3g}{'kMGT'[power - 1]}"
+
+
+def _age(age_s: float) -> str:
+    """
+    >>> _age(0.44), _age(75.0), _age(600.0), _age(90_000.0)
+    ('0.4 s', '75 s', '10 min', '25 h')
+    """
+    if age_s < 10:
+        return f"{max(age_s, 0.0):.1f} s"
+    if age_s < 120:
+        return f"{age_s:.0f} s"
+    return f"{age_s / 60:.0f} min" if age_s < 7200 else f"{age_s / 3600:.0f} h"
+
+
+def _measures(one: Heard, kind: Kind) -> bool:
+    return one.noise is not None and bool(set(units.axes_of(kind)) & set(one.noise.axes))
+
+
+def _noise_column(devices: Sequence[Heard], kind: Kind, letter: str, layout: Layout) -> tuple[Text, list[Text]]:
+    """Head and cells of one coefficient on three axes; side by side they stand under each other in every row."""
+    axes = units.axes_of(kind)
+    rows = [[_value(one, letter, axis, layout.digits) for axis in axes] for one in devices]
+    unit = units.COEFFICIENT_UNITS[kind][letter].name
+    if layout.stacked:
+        return Text(f"{letter} {unit}"), [Text("\n".join(row) if any(row) else "") for row in rows]
+    widths = [max(map(len, column)) for column in zip(axes, *rows, strict=True)]
+    lines = [
+        " ".join(value.rjust(width) for value, width in zip(row, widths, strict=True)) for row in [list(axes), *rows]
+    ]
+    return Text(f"{letter} {unit}\n{lines[0]}"), [Text(line) for line in lines[1:]]
+
+
+def _value(one: Heard, letter: str, axis: str, digits: int) -> str:
+    """A coefficient, its bound, a dash where there are too few data, nothing where the axis is not measured."""
+    if one.noise is None or axis not in one.noise.axes:
+        return ""
+    return units.reading(one.noise.coefficients, letter, axis, digits).value.replace("≤ ", "≤")
+
+
+# --- below the table
+
+
+def _apart(lines: Sequence[RenderableType]) -> list[RenderableType]:
+    """A section with an empty line above it, if there is anything in it."""
+    return [Text(), *lines] if lines else []
+
+
+def _troubles(devices: Sequence[Heard], now_s: float) -> list[Text]:
+    """What is wrong in words, a line a device."""
+    names = _names([one.key for one in devices])
+    lines = []
+    for one in devices:
+        if trouble := one.trouble():
+            sign, colour = STATES.get(one.state(now_s), UNKNOWN)
+            sign = "!" if sign == "●" else sign
+            lines.append(Text.assemble((f"{sign} {names[one.key]}  ", colour), trouble))
+    if len(lines) > TROUBLES:
+        lines = [*lines[: TROUBLES - 1], Text(f"… and {len(lines) - TROUBLES + 1} more with trouble", style="dim")]
+    return lines
+
+
+def _event(name: str, event: heard.EventMessage) -> Text:
+    return Text.assemble((f"{_clock_time(event.t)}  ", "dim"), (f"{name}  ", "bold"), heard.clean(event.text))
+
+
+def _clock_time(unix_s: float) -> str:
+    """Local time of the day; a recording's own time may be no date at all."""
+    try:
+        return f"{datetime.fromtimestamp(unix_s).astimezone():%H:%M:%S}"
+    except (ValueError, OverflowError, OSError):
+        return f"{unix_s:g} s"
+
+
+def _detail(noise: heard.Noise) -> list[RenderableType]:
+    """Axis by letter with intervals, a table a kind of sensor."""
+    seen = "" if noise.seen_s is None else f"last {duration(noise.seen_s)}; "
+    parts: list[RenderableType] = [Text(f"{seen}[95 % interval]; ≤ bound; {NONE} too few data yet", style="dim")]
+    for kind in units.KINDS:
+        if set(units.axes_of(kind)) & set(noise.axes):
+            parts.append(Fitting(detail_table(noise, kind, False), detail_table(noise, kind, True)))
+    return parts
+
+
+def detail_table(noise: heard.Noise, kind: Kind, stacked: bool) -> Table:
+    """The five coefficients of the axes of one kind, intervals beside the values or below them."""
+    table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
+    table.add_column(units.KIND_NAMES[kind] if not stacked else kind, no_wrap=True)
+    for letter in LETTERS:
+        table.add_column(f"{letter} {units.COEFFICIENT_UNITS[kind][letter].name}", justify="right", no_wrap=True)
+    for axis in units.axes_of(kind):
+        if axis in noise.axes:
+            cells = [_interval(noise, letter, axis, "\n" if stacked else " ") for letter in LETTERS]
+            table.add_row(Text(axis, style="bold"), *cells)
+    return table
+
+
+def _interval(noise: heard.Noise, letter: str, axis: str, between: str) -> Text:
+    one = units.reading(noise.coefficients, letter, axis)
+    return Text.assemble(one.value, (f"{between}[{one.interval}]", "dim")) if one.interval else Text(one.value)
+
+
+class Fitting:
+    """The wide table where it fits, else the narrow one."""
+
+    def __init__(self, wide: Table, narrow: Table) -> None:
+        self._wide = wide
+        self._narrow = narrow
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """One of the two."""
+        needed = console.measure(self._wide, options=options.update(max_width=10_000)).maximum
+        yield self._wide if needed <= options.max_width else self._narrow

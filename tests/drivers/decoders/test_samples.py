@@ -1,0 +1,77 @@
+"""The samples decoder: what it counts. The message itself is tested in test_sample_message."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.decoders import samples
+from drivers.decoders.base import QUIET_FRAMES
+from drivers.sample import Chunk, Given, block, join
+from drivers.sample_message import pack
+
+
+def message(count: int, n: int = 10, lost: int = 0, bad_rows: tuple[int, ...] = ()) -> Chunk:
+    values = np.arange(6 * n, dtype=np.float64).reshape(n, 6) / 100
+    values[list(bad_rows)] = np.inf
+    return Chunk(pack("d", count, block(np.arange(n) * 10_000_000, values, lost=lost)), 0)
+
+
+def test_times_are_given() -> None:
+    decoder = samples.build(samples.Settings())
+    assert decoder.timing == Given()
+    assert decoder.carrier == "messages"
+
+
+def test_lost_messages_are_counted_by_their_samples() -> None:
+    decoder = samples.build(samples.Settings())
+    blocks = decoder.feed([message(510), message(520), message(550), message(560, lost=3)])
+    assert [b.lost for b in blocks] == [0, 0, 20, 3]
+    assert decoder.bad == 0
+
+
+def test_a_publisher_started_anew_is_no_loss() -> None:
+    decoder = samples.build(samples.Settings())
+    blocks = decoder.feed([message(1000), message(10), message(20), message(40)])
+    assert [b.lost for b in blocks] == [0, 0, 0, 10]
+
+
+def test_a_link_opened_anew_is_no_loss_of_messages() -> None:
+    decoder = samples.build(samples.Settings())
+    decoder.feed([message(10)])
+    decoder.reset()
+    assert [b.lost for b in decoder.feed([message(500)])] == [0]
+
+
+def test_impossible_rows_leave_their_places_empty() -> None:
+    decoder = samples.build(samples.Settings())
+    blocks = decoder.feed([message(10, bad_rows=(0, 4)), message(20, bad_rows=tuple(range(10)), lost=7), message(30)])
+    assert [(len(b), b.lost) for b in blocks] == [(3, 1), (5, 1), (10, 17)]
+    assert decoder.bad == 12
+
+
+def test_a_rejected_message_is_counted_and_explained() -> None:
+    decoder = samples.build(samples.Settings())
+    blocks = decoder.feed([message(10), Chunk(b"no message", 0), message(30)])
+    assert [b.lost for b in blocks] == [0, 10]
+    assert decoder.bad == 1
+    assert "samples message" in decoder.hint
+    for i in range(QUIET_FRAMES):
+        decoder.feed([message(40 + 10 * i)])
+    assert decoder.hint == ""
+
+
+def test_encode_feeds_back() -> None:
+    decoder = samples.build(samples.Settings())
+    sent = block(np.arange(50) ** 2 * 1_000_000, np.random.default_rng(0).normal(size=(50, 6)))
+    chunks = [c for i in range(0, 50, 7) for c in decoder.encode(sent[i : i + 7])]
+    got = join(decoder.feed(chunks))
+    np.testing.assert_array_equal(got.values, sent.values)
+    assert np.abs(got.t_ns - sent.t_ns).max() <= 500
+    assert got.lost == 0
+
+
+@given(st.lists(st.binary(max_size=100), max_size=5))
+def test_noise_raises_nothing(noise: list[bytes]) -> None:
+    decoder = samples.build(samples.Settings())
+    assert decoder.feed([Chunk(data, 0) for data in noise]) == []
+    assert decoder.bad == len(noise)

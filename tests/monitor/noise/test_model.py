@@ -1,0 +1,98 @@
+"""Noise models: text and back, errors in one line, seeds."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import config
+from drivers.errors import ConfigError
+from drivers.sample import AXES
+from monitor.noise.effects import EFFECTS, AngleRandomWalk, Bias, RateRandomWalk
+from monitor.noise.model import NoiseModel
+
+MODELS = sorted(Path(p) for root in config.__path__ for p in Path(root).glob("models/*.toml"))
+
+
+@pytest.mark.parametrize("path", MODELS, ids=lambda p: p.stem)
+def test_shipped_models_are_read_and_written_back(path):
+    model = NoiseModel.from_toml(path.read_text(encoding="utf-8"))
+    assert model.sample_rate_hz
+    assert set(model.sources) == set(AXES)
+    assert NoiseModel.from_toml(model.to_toml()) == model
+
+
+def test_some_model_is_shipped():
+    assert MODELS
+
+
+def test_wildcards_stand_for_a_kind_of_axes_and_add_to_named_ones():
+    model = NoiseModel.from_toml('[gz.bias]\nvalue = 1.0\n["g*".angle_random_walk]\nN = 2e-4')
+    assert model.sources == {
+        "gx": (AngleRandomWalk(N=2e-4),),
+        "gy": (AngleRandomWalk(N=2e-4),),
+        "gz": (Bias(value=1.0), AngleRandomWalk(N=2e-4)),
+    }
+
+
+def test_an_effect_that_occurs_twice_is_an_array_of_tables():
+    text = "[[gx.bias]]\nvalue = 1.0\n[[gx.bias]]\nvalue = 2.0\n"
+    model = NoiseModel.from_toml(text)
+    assert model.sources["gx"] == (Bias(value=1.0), Bias(value=2.0))
+    assert NoiseModel.from_toml(model.to_toml()) == model
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[gq.bias]\nvalue = 1", 'unknown axis "gq"; did you mean "gz"?'),
+        ("[gz.angle_randomwalk]\nN = 1", 'gz: unknown effect "angle_randomwalk"; did you mean "angle_random_walk"?'),
+        ("[gz.bias]\nvalu = 1", 'gz.bias: unknown parameter "valu"; did you mean "value"?'),
+        ("[gz.angle_random_walk]\nN = -1", "gz.angle_random_walk: N must not be negative, is -1"),
+        ('["g*".angle_random_walk]\nN = true', "g*.angle_random_walk: N must be a finite number, is True"),
+        ("[gz.bias]", "gz.bias: value is missing"),
+        ("[gz]\nbias = 3", "gz.bias must be a table with value"),
+        ("gz = 1", "gz must be a table of effects, such as [gz.angle_random_walk]"),
+        ("sample_rate = 0", "sample_rate must be a positive number of Hz, is 0"),
+        ("gz = [", "not TOML: "),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(text, says):
+    with pytest.raises(ConfigError) as error:
+        NoiseModel.from_toml(text)
+    assert str(error.value).startswith(says)
+    assert "\n" not in str(error.value)
+
+
+def test_adding_an_effect_changes_no_other_series():
+    white = NoiseModel({"gz": (AngleRandomWalk(N=1e-4),)})
+    walk = NoiseModel({"gz": (RateRandomWalk(K=1e-5),), "ax": (AngleRandomWalk(N=1e-3),)})
+    both = (walk + white).simulate(500, 100.0, 3)
+    np.testing.assert_allclose(
+        both, white.simulate(500, 100.0, 3) + walk.simulate(500, 100.0, 3), rtol=1e-12, atol=1e-18
+    )
+
+
+def test_axes_and_equal_effects_are_independent():
+    model = NoiseModel(dict.fromkeys(AXES, (AngleRandomWalk(N=1.0),)))
+    correlation = np.corrcoef(model.simulate(20_000, 1.0, 0).T) - np.eye(6)
+    assert np.abs(correlation).max() < 5.0 / np.sqrt(20_000)
+    twice = NoiseModel({"gx": (AngleRandomWalk(N=1.0), AngleRandomWalk(N=1.0))})
+    # independent variances add to 2; the same series twice would give 4. χ² of 20 000: 1 %
+    assert twice.simulate(20_000, 1.0, 0)[:, 0].var() == pytest.approx(2.0, rel=0.05)
+
+
+def test_series_depends_on_seed_not_on_blocks():
+    model = NoiseModel.from_toml(MODELS[0].read_text(encoding="utf-8"))
+    stream = model.stream(100.0, 7)
+    pieces = np.concatenate([stream.draw(n) for n in (1, 0, 9, 490)])
+    np.testing.assert_array_equal(pieces, model.simulate(500, 100.0, 7))
+    assert not np.array_equal(pieces, model.simulate(500, 100.0, 8))
+
+
+def test_avar_and_psd_are_sums_over_an_axis():
+    model = NoiseModel({"gx": tuple(EFFECTS[n](1.0) for n in ("angle_random_walk", "quantization_noise"))})
+    tau = np.array([0.1, 1.0])
+    np.testing.assert_allclose(model.avar("gx", tau, 0.1), 1.0 / tau + 3.0 / tau**2)
+    assert model.avar("gy", tau, 0.1).tolist() == [0.0, 0.0]
+    assert model.psd("gx", np.array([5.0]), 0.1)[0] == pytest.approx(1.0 + 40.0)

@@ -1,0 +1,267 @@
+"""The live view: what reaches a recording, and that no viewer can harm the service."""
+
+import signal
+import socket
+import subprocess
+import sys
+import textwrap
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.sample import AXES, Event
+from monitor.publish import rerun_view
+from monitor.publish.rerun_view import MISSING, RerunView
+from monitor.publish.viewer import DeviceInfo, ViewerSettings
+from tests.monitor.publish import made
+
+pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+
+from monitor.publish import rerun_sinks
+
+DEVICE = [DeviceInfo("bench-1", "stim300 on a test")]
+T0 = 1.76e9
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> bool:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.02)
+    return condition()
+
+
+def free_port() -> int:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return int(s.getsockname()[1])
+
+
+@pytest.fixture
+def server() -> Iterator[rerun_sinks.Child]:
+    """A Rerun server on loopback that someone else started, with ``port`` and ``web_port``."""
+    port, web_port = free_port(), free_port()
+    child = rerun_sinks.Child(
+        ["--serve-web", "--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(web_port)]
+    )
+    child.port = port  # type: ignore[attr-defined]
+    assert wait_for(lambda: rerun_sinks.is_rerun(port))
+    yield child
+    child.kill()
+    child.end()
+
+
+def feed(view: RerunView, i: int) -> float:
+    """A tenth of a second of everything; returns how long the calls took, s."""
+    t = T0 + 0.1 * i
+    samples, estimate, health = made.samples(t, 0.1), made.estimate(t, seconds=60 + i, seed=i), made.health()
+    started = time.perf_counter()
+    view.samples("bench-1", *samples)
+    view.estimate("bench-1", t, estimate)
+    view.health("bench-1", t, health)
+    return time.perf_counter() - started
+
+
+def test_a_recording_holds_what_was_shown(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    view = RerunView(ViewerSettings(mode=str(path)), DEVICE)
+    view.start()
+    assert wait_for(lambda: view.state == "ok"), view.state
+    t, values, temperature_c = made.samples(T0, 1.0)
+    estimate = made.estimate(T0 + 1)
+    view.samples("bench-1", t, values, temperature_c)
+    view.estimate("bench-1", T0 + 1, estimate)
+    view.event("bench-1", T0 + 1, Event("noise_changed", 0, "gz angle random walk rose by 47 %", axis="gz"))
+    view.health("bench-1", T0 + 1, made.health())
+    view.close()
+    assert view.state == "closed"
+
+    rows = read(path)
+    letters = [f"/bench-1/coefficients/{letter}/{axis}" for letter in "QNBK" for axis in AXES]
+    expected = {f"/bench-1/{room}/{axis}" for room in ("samples", "allan") for axis in AXES} | set(letters)
+    assert expected | {"/bench-1/events", "/bench-1/temperature", "/bench-1/status"} <= rows.keys()
+    gz = column(rows["/bench-1/samples/gz"], "Scalars:scalars")
+    assert gz == pytest.approx(np.degrees(values[:, 2]))
+    n = column(rows["/bench-1/coefficients/N/gx"], "Scalars:scalars")
+    c = estimate.coefficients
+    assert n == pytest.approx(np.degrees([c.value[1, 0], c.lo[1, 0], c.hi[1, 0]]) * 60)
+    deviation = column(rows["/bench-1/allan/az"], "deviation")
+    assert deviation == pytest.approx(np.sqrt(estimate.curve.avar[:, 5]))
+    assert "rose by 47 %" in str(rows["/bench-1/events"])
+    assert "RUNNING" in str(rows["/bench-1/status"])
+    times = column(rows["/bench-1/samples/ax"], "sample_time")
+    assert times[[0, -1]] / 1e9 == pytest.approx([T0, T0 + 0.99], abs=1e-6)
+
+
+def read(path: Path) -> dict[str, dict[str, list[object]]]:
+    """Entity -> column -> cells of the recording, the blueprint's not among them."""
+    from rerun.chunk import RrdReader
+
+    rows: dict[str, dict[str, list[object]]] = {}
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="RRD file has no footer")  # on purpose, see rerun_sinks
+        reader = RrdReader(str(path))
+    for chunk in reader.stream():
+        batch = chunk.to_record_batch()
+        for name, cells in zip(batch.schema.names, batch.columns, strict=True):
+            is_time = name == "sample_time"
+            rows.setdefault(chunk.entity_path, {}).setdefault(name, []).extend(
+                cells.cast("int64").to_pylist() if is_time else cells.to_pylist()
+            )
+    return rows
+
+
+def column(cells: dict[str, list[object]], name: str) -> np.ndarray:
+    """All numbers of the one column whose name ends so."""
+    (key,) = [k for k in cells if k == name or k.endswith(name)]
+    return np.array(
+        [x for cell in cells[key] if cell is not None for x in (cell if isinstance(cell, list) else [cell])]
+    )
+
+
+def test_a_frozen_viewer_delays_nobody_and_is_said(server: rerun_sinks.Child) -> None:
+    view = RerunView(ViewerSettings("native", port=server.port), DEVICE)  # type: ignore[attr-defined]
+    view.start()
+    assert wait_for(lambda: view.state == "ok"), view.state
+    server.signal(signal.SIGSTOP)
+    slowest = 0.0
+    for i in range(600):
+        slowest = max(slowest, feed(view, i))
+        if view.state.startswith("stalled"):
+            break
+        time.sleep(0.02)
+    assert view.state.startswith("stalled"), view.state
+    assert slowest < 0.05
+    server.signal(signal.SIGCONT)
+    assert wait_for(lambda: view.state == "ok"), view.state
+    view.close()
+
+
+def test_a_stalled_view_counts_what_it_drops(server: rerun_sinks.Child, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rerun_view, "BACKLOG_BYTES", 100_000)
+    view = RerunView(ViewerSettings("native", port=server.port), DEVICE)  # type: ignore[attr-defined]
+    view.start()
+    assert wait_for(lambda: view.state == "ok"), view.state
+    server.signal(signal.SIGSTOP)
+    assert wait_for(lambda: view.state.startswith("stalled")), view.state
+    for i in range(100):
+        feed(view, i)
+    assert wait_for(lambda: view.state.startswith("stalled") and "(0 dropped)" not in view.state), view.state
+    started = time.monotonic()
+    view.close(1.0)
+    assert time.monotonic() - started < 2.0
+
+
+def test_a_process_with_a_frozen_viewer_exits(server: rerun_sinks.Child) -> None:
+    """Rerun's exit handler and its destructors would wait for the viewer for ever."""
+    program = f"""
+        import os, signal, time
+        import numpy as np
+        from monitor.publish.rerun_view import RerunView
+        from monitor.publish.viewer import DeviceInfo, ViewerSettings
+        view = RerunView(ViewerSettings("native", port={server.port}), [DeviceInfo("d")])
+        view.start()
+        while view.state != "ok":
+            time.sleep(0.02)
+        os.kill({server.pid}, signal.SIGSTOP)
+        t = np.arange(2000) / 100
+        for i in range(400):
+            view.samples("d", t + 20.0 * i, np.random.default_rng(i).standard_normal((2000, 6)), t)
+            time.sleep(0.005)
+        while not view.state.startswith("stalled"):
+            time.sleep(0.05)
+        started = time.monotonic()
+        view.close(1.0)
+        print("closed after", time.monotonic() - started, flush=True)
+    """  # type: ignore[attr-defined]
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program)], timeout=60, capture_output=True, text=True, check=True
+    )
+    assert float(done.stdout.split()[-1]) < 2.0
+
+
+def test_a_viewer_that_dies_is_said_and_joined_again(
+    server: rerun_sinks.Child, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rerun_view, "RETRY_S", (0.1,))
+    monkeypatch.setattr(rerun_sinks, "has_desktop", lambda: False)
+    port = server.port  # type: ignore[attr-defined]
+    view = RerunView(ViewerSettings("native", port=port), DEVICE)
+    view.start()
+    assert wait_for(lambda: view.state == "ok"), view.state
+    server.kill()
+    assert wait_for(lambda: view.state != "ok")
+    assert feed(view, 1) < 0.05
+    again = rerun_sinks.Child(
+        ["--serve-web", "--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(free_port())]
+    )
+    try:
+        assert wait_for(lambda: view.state == "ok"), view.state
+        view.close()
+    finally:
+        again.end()
+
+
+def test_the_page_takes_the_next_free_port_and_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rerun_sinks, "has_desktop", lambda: False)
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", 0))
+        holder.listen()
+        busy = int(holder.getsockname()[1])
+        view = RerunView(ViewerSettings("web", port=busy, web_port=free_port()), DEVICE)
+        view.start()
+        assert wait_for(lambda: view.state == "ok"), view.state
+        assert f"{busy}%2Fproxy" not in view.url
+        assert view.url.startswith("http://127.0.0.1:")
+        port = int(view.url.rsplit("%3A", 1)[1].split("%2F")[0])
+        assert rerun_sinks.is_rerun(port)
+        view.close()
+    assert not rerun_sinks.listens(port)
+
+
+def test_a_port_that_another_program_holds_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", 0))
+        holder.listen()
+        port = int(holder.getsockname()[1])
+        view = RerunView(ViewerSettings("native", port=port), DEVICE)
+        view.start()
+        assert wait_for(lambda: "busy" in view.state), view.state
+        assert view.state == f"cannot listen on {port}: busy"
+        view.close()
+
+
+def test_a_file_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    view = RerunView(ViewerSettings(mode=str(tmp_path / "absent" / "run.rrd")), DEVICE)
+    view.start()
+    assert wait_for(lambda: view.state.startswith("cannot write")), view.state
+    view.close()
+
+
+def test_without_rerun_the_service_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)  # an import then fails as if it were not there
+    view = RerunView(ViewerSettings("web"), DEVICE)
+    view.start()
+    assert wait_for(lambda: view.state == MISSING), view.state
+    assert feed(view, 1) < 0.05
+    view.close()
+
+
+def test_mode_none_imports_and_starts_nothing() -> None:
+    program = """
+        import sys, threading
+        from monitor.publish.rerun_view import RerunView
+        from monitor.publish.viewer import DeviceInfo, ViewerSettings
+        view = RerunView(ViewerSettings("none"), [DeviceInfo("d")])
+        view.start()
+        view.close()
+        assert "rerun" not in sys.modules and threading.active_count() == 1, sys.modules.keys()
+        print(view.state)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "off"

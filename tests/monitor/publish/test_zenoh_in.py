@@ -1,0 +1,213 @@
+"""``watch`` against daemons on loopback: those that are there, come late, go, and come back."""
+
+import contextlib
+import io
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+from rich.console import Console
+
+from drivers.errors import ConfigError
+from monitor import topics
+from monitor.publish import message, terminal
+from monitor.publish.zenoh_in import Message, ZenohIn
+from monitor.publish.zenoh_out import ZenohOut, ZenohSettings
+from tests.monitor.publish import made
+from tests.monitor.publish.zenoh_world import eventually, free_endpoint, router
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
+
+
+@contextlib.contextmanager
+def daemon(endpoint: str, device: str, mode: str = "peer") -> Iterator[ZenohOut]:
+    """A daemon's session that sends status ten times a second, and what no watcher needs beside it."""
+    settings = (
+        ZenohSettings(listen=(endpoint,)) if mode == "peer" else ZenohSettings(mode="client", connect=(endpoint,))
+    )
+    out = ZenohOut(settings, [device])
+    ending = threading.Event()
+
+    def talk() -> None:
+        while not ending.wait(0.1):
+            out.put(topics.STATUS, device, message.status(device, time.time(), made.health()))
+            out.put(topics.COEFFICIENTS, device, message.coefficients(device, time.time(), made.estimate()))
+            out.put(topics.SAMPLES, device, b"raw")
+            out.put(topics.ALLAN, device, b"curve")
+
+    out.start()
+    out.alive(device, True)
+    talker = threading.Thread(target=talk)
+    talker.start()
+    try:
+        yield out
+    finally:
+        ending.set()
+        talker.join()
+        out.close()
+
+
+@contextlib.contextmanager
+def listening(keyexpr: str, *connect: str) -> Iterator[tuple[ZenohIn, list[Message]]]:
+    with contextlib.closing(ZenohIn(keyexpr, connect)) as arriving:
+        arriving.start()
+        yield arriving, []
+
+
+def keys(arriving: ZenohIn, so_far: list[Message]) -> set[str]:
+    so_far += arriving.take(0.1)
+    return {one.key for one in so_far}
+
+
+EVERYTHING = {"imu/a/status", "imu/a/coefficients", "imu/a/alive"}
+
+
+def test_results_and_presence_arrive_but_not_the_bulk(endpoint: str) -> None:
+    with daemon(endpoint, "a"), listening("imu/**", endpoint) as (arriving, got):
+        eventually(lambda: keys(arriving, got) >= EVERYTHING)
+        eventually(lambda: len([keys(arriving, got) for _ in range(5)]))
+        assert keys(arriving, got) == EVERYTHING
+        assert arriving.state == "ok"
+        status = next(one for one in got if one.key == "imu/a/status")
+        assert json.loads(status.payload or b"")["device"] == "a"
+        assert [one for one in got if one.payload is None] == [Message("imu/a/alive", None, True)]
+
+
+@pytest.mark.parametrize(
+    ("keyexpr", "expected"),
+    [
+        ("imu/a", EVERYTHING),
+        ("**", EVERYTHING),
+        ("imu/*", EVERYTHING),
+        ("*/*/*", EVERYTHING),
+        ("imu/*/status", {"imu/a/status"}),
+    ],
+)
+def test_key_expressions(endpoint: str, keyexpr: str, expected: set[str]) -> None:
+    with daemon(endpoint, "a"), listening(keyexpr, endpoint) as (arriving, got):
+        eventually(lambda: keys(arriving, got) >= expected)
+        assert keys(arriving, got) == expected
+
+
+def test_another_device_is_not_heard(endpoint: str) -> None:
+    with daemon(endpoint, "a"), listening("imu/other/**", endpoint) as (arriving, got):
+        eventually(lambda: arriving.state == "ok")
+        time.sleep(0.5)
+        assert keys(arriving, got) == set()
+
+
+def test_daemons_that_come_late_go_and_come_back() -> None:
+    first, second = free_endpoint(), free_endpoint()
+    with listening("imu/**", first, second) as (arriving, got):
+        eventually(lambda: arriving.state == f"nobody at {first}, {second}; trying again")
+        with daemon(second, "b"):
+            eventually(lambda: "imu/b/status" in keys(arriving, got))
+            assert arriving.state.startswith("1 of 2 there")
+            with daemon(first, "a"):
+                eventually(lambda: "imu/a/status" in keys(arriving, got))
+                assert arriving.state == "ok"
+            eventually(lambda: keys(arriving, got) and Message("imu/a/alive", None, False) in got)
+            assert Message("imu/b/alive", None, False) not in got
+            got.clear()
+            with daemon(first, "a"):
+                eventually(lambda: keys(arriving, got) and Message("imu/a/alive", None, True) in got)
+
+
+def test_through_a_router(endpoint: str) -> None:
+    with router(endpoint), daemon(endpoint, "a", mode="client"), listening("imu/**", endpoint) as (arriving, got):
+        eventually(lambda: keys(arriving, got) >= EVERYTHING)
+        assert arriving.state == "ok"
+
+
+def test_closing_at_any_moment_leaves_no_thread(endpoint: str) -> None:
+    before = threading.active_count()
+    for wait_s in (0.0, 0.3, 0.8):
+        arriving = ZenohIn("imu/**", [endpoint])
+        arriving.start()
+        time.sleep(wait_s)
+        started_s = time.monotonic()
+        arriving.close()
+        assert time.monotonic() - started_s < 2.0
+        assert threading.active_count() == before
+    ZenohIn().close()  # never started
+
+
+@pytest.mark.parametrize("keyexpr", ["", "imu//a", "/imu", "imu/**x", "a?b"])
+def test_no_key_expression(keyexpr: str) -> None:
+    with pytest.raises(ConfigError, match="key expression") as raised:
+        ZenohIn(keyexpr)
+    assert ".rs" not in str(raised.value)
+
+
+def test_a_topic_that_is_not_shown() -> None:
+    with pytest.raises(ConfigError, match="nothing to show of it; shown are status, coefficients, event, alive"):
+        ZenohIn("imu/a/samples")
+
+
+def test_no_endpoint() -> None:
+    with pytest.raises(ConfigError, match='connect "localhost:7450": no endpoint'):
+        ZenohIn("imu/**", ["tcp/127.0.0.1:1", "localhost:7450"])
+
+
+# --- watch
+
+
+def test_watch_once(endpoint: str) -> None:
+    console = Console(width=120, file=io.StringIO())
+    with daemon(endpoint, "a"):
+        terminal.watch(connect=[endpoint], console=console, once_s=2.0)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert text.count("imu-monitor  1 device") == 1
+    assert re.search(r"^a +● running +99\.98 +360,000 ", text, re.MULTILINE)
+    assert "[95 % interval]" in text
+
+
+def test_watch_prints_plain_tables_where_there_is_no_terminal(endpoint: str) -> None:
+    console, stop = Console(width=120, file=io.StringIO()), threading.Event()
+    watcher = threading.Thread(target=terminal.watch, args=("imu/**", [endpoint], stop, console))
+    watcher.start()
+    text = eventually(lambda: console.file.getvalue() if console.file.getvalue().count("device") > 2 else "")  # type: ignore[attr-defined]
+    stop.set()
+    watcher.join(5.0)
+    assert not watcher.is_alive()
+    assert f"nobody at {endpoint}; trying again" in text
+    assert "\x1b" not in text
+
+
+def test_watch_on_a_terminal_ends_with_ctrl_c_and_exit_0(endpoint: str) -> None:
+    code = f"""
+        from rich.console import Console
+        from monitor.publish.terminal import watch
+        watch(connect=["{endpoint}"], console=Console(force_terminal=True, width=120))
+    """
+    with daemon(endpoint, "a"):
+        child = subprocess.Popen(
+            [sys.executable, "-c", textwrap.dedent(code)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=os.environ | {"TERM": "xterm-256color"},
+        )
+        assert child.stdout is not None
+        assert child.stderr is not None
+        seen = b""
+        while "● running".encode() not in seen:
+            seen += os.read(child.stdout.fileno(), 65536)
+        child.send_signal(signal.SIGINT)
+        assert child.wait(10.0) == 0
+        rest = child.stdout.read()
+        assert b"\x1b[?25l" in seen  # the cursor was hidden …
+        assert b"\x1b[?25h" in rest  # … and is shown again
+        assert child.stderr.read() == b""
+        child.stdout.close()
+        child.stderr.close()

@@ -1,0 +1,136 @@
+"""What the walks share: a service in this process with its results caught, and ports that nobody uses."""
+
+import os
+import socket
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.sample import Event, SampleBlock, join
+from monitor import settings
+from monitor.estimate.estimate import Estimate
+from monitor.health import Health
+from monitor.service import Service
+from monitor.station import Station
+
+
+class Caught:
+    """An output that keeps everything."""
+
+    def __init__(self) -> None:
+        self.blocks: dict[str, list[SampleBlock]] = {}
+        self.estimates: dict[str, Estimate] = {}
+        self.events: list[tuple[str, Event]] = []
+        self.healths: dict[str, Health] = {}
+
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        self.blocks.setdefault(device, []).append(samples)
+
+    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
+        self.estimates[device] = estimate
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        self.events.append((device, event))
+
+    def health(self, device: str, unix_s: float, health: Health) -> None:
+        self.healths[device] = health
+
+    def values(self, device: str) -> np.ndarray:
+        return join(self.blocks[device]).values
+
+
+class Running:
+    """A service in a thread."""
+
+    def __init__(self, path: Path) -> None:
+        self.service = Service(settings.load(path))
+        self.caught = Caught()
+        self.service.outputs.append(self.caught)
+        self._thread = threading.Thread(target=self.service.run)
+        self._thread.start()
+
+    def station(self, name: str) -> Station:
+        return next(station for station in self.service.stations if station.name == name)
+
+    def stop(self) -> None:
+        self.service.stop()
+        self.join(20.0)
+
+    def join(self, timeout_s: float) -> None:
+        self._thread.join(timeout_s)
+        assert not self._thread.is_alive(), "the service did not stop in time"
+
+
+@contextmanager
+def running(folder: Path, text: str) -> Iterator[Running]:
+    path = folder / "config.toml"
+    path.write_text(text)
+    service = Running(path)
+    try:
+        yield service
+    finally:
+        service.stop()
+
+
+class Cable:
+    """A pseudo-terminal whose name stays the same while it is pulled out and put back."""
+
+    def __init__(self, folder: Path) -> None:
+        self.port = folder / "tty"
+        self.master = -1
+        self.plug()
+
+    def plug(self) -> None:
+        self.master, slave = os.openpty()
+        tty.setraw(self.master)
+        tty.setraw(slave)
+        self.port.unlink(missing_ok=True)
+        self.port.symlink_to(os.ttyname(slave))
+        os.close(slave)
+
+    def pull(self) -> None:
+        self.port.unlink(missing_ok=True)
+        os.close(self.master)
+        self.master = -1
+
+    def write(self, data: bytes) -> None:
+        view = memoryview(data)
+        while view:
+            view = view[os.write(self.master, view) :]
+
+
+def paced(send: Callable[[bytes], None], frames: list[bytes], per_second: float, burst: int = 40) -> float:
+    """Send frames in bursts at that rate; returns the seconds it took."""
+    begun = time.monotonic()
+    for start in range(0, len(frames), burst):
+        early = begun + start / per_second - time.monotonic()
+        if early > 0.0:
+            time.sleep(early)
+        send(b"".join(frames[start : start + burst]))
+    return time.monotonic() - begun
+
+
+def wait_for(condition: Callable[[], bool], timeout_s: float, what: str) -> None:
+    until = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < until, f"waited {timeout_s} s for {what}"
+        time.sleep(0.02)
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port: int = server.getsockname()[1]
+        return port
+
+
+def recordings() -> Path:
+    folder = os.environ.get("IMU_MONITOR_DATA")
+    if not folder:
+        pytest.skip("IMU_MONITOR_DATA is not set: this test reads real recordings")
+    return Path(folder)

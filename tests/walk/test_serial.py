@@ -1,0 +1,50 @@
+"""Real sentences of a VN-100 through a pseudo-terminal, the serial link, the decoder and the whole service."""
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from monitor.estimate.batch import overlapping
+from tests.walk.rig import Cable, paced, recordings, running, wait_for
+
+CONFIG = """
+[[device]]
+name = "vn100"
+rate = 40.0
+window = 800.0
+driver = {{ link = "serial", port = "{port}", decoder = "vectornav_ascii" }}
+[zenoh]
+mode = "none"
+[viewer]
+mode = "none"
+"""
+SPEED = 55.0
+
+
+@pytest.mark.data
+def test_every_sentence_of_a_real_sensor_is_accounted_for(tmp_path: Path) -> None:
+    folder = recordings() / "vn100-serial"
+    with gzip.open(folder / "vnymr-sentences.txt.gz", "rb") as file:
+        lines = [line.rstrip(b"\r\n") + b"\r\n" for line in file]
+    parsed = np.array([line.split(b"*")[0].split(b",")[7:13] for line in lines], float)
+    parsed = parsed[:, [3, 4, 5, 0, 1, 2]]  # the sentence has acceleration before rate
+    cable = Cable(tmp_path)
+    with running(tmp_path, CONFIG.format(port=cable.port)) as run:
+        station = run.station("vn100")
+        wait_for(lambda: "waiting" not in station.driver.text or station.driver.link._port is not None, 10.0, "the port")
+        took = paced(cable.write, lines, 40.0 * SPEED)
+        counts = station.driver.counts
+        wait_for(lambda: counts.received + counts.bad + counts.lost >= len(lines), 10.0, "the last sentence")
+    assert took < len(lines) / 40.0 / 50.0
+    assert (counts.received, counts.bad, counts.lost) == (len(lines), 0, 0)
+    np.testing.assert_array_equal(run.caught.values("vn100"), parsed)
+    curve = run.caught.estimates["vn100"].curve
+    assert curve.n == len(lines)
+    avar, terms = overlapping(parsed, curve.factors)
+    np.testing.assert_array_equal(curve.terms, terms)
+    np.testing.assert_allclose(np.sqrt(curve.avar), np.sqrt(avar), rtol=1e-9)
+    with np.load(folder / "static-12min.npz") as npz:
+        rounded = np.column_stack([npz[axis] for axis in ("gx", "gy", "gz", "ax", "ay", "az")])
+    np.testing.assert_allclose(np.sqrt(curve.avar), np.sqrt(overlapping(rounded, curve.factors)[0]), rtol=1e-5)
