@@ -13,6 +13,7 @@ missing just before it, rejected frames included.
 Not done here: no sample is dropped, repeated or moved to another place in the order.
 """
 
+from collections import deque
 from dataclasses import dataclass
 from itertools import pairwise
 from math import exp
@@ -39,6 +40,12 @@ JUMP_S: Final = 1.0
 LONG_S: Final = 3600.0
 """Given times that go on by more than this at one step are told as an event too."""
 STUCK_SAMPLES: Final = 10
+STEPS_KEPT: Final = 255
+"""The last steps of a counter, or of given times, that tell what is usual."""
+NEAR: Final = 0.25
+"""Steps this near to the usual one, of it, are single ones: a tick is rounded, a device's stamp jitters."""
+LATE: Final = 8.0
+"""A given time is late, and no sample missing, up to so many times the upper quartile of what is usual."""
 SNAP: Final = 0.002
 """A measured rate this near to a rate that sensors are made with is taken to be that rate; crystals and RC
 oscillators further off are taken at their word."""
@@ -64,12 +71,14 @@ class SampleClock:
         self._nominal_hz = rate_hz
         self._events: list[Event] = []
         self._line = Line()
+        self._origin_ns: int | None = None  # seconds count from here: a double of Unix time holds no more than 240 ns
         self._last_t_ns = -(1 << 62)
         self._index = 0.0  # samples since the line's start, missing ones included
         self._arrived_ns = 0  # newest arrival
         self._delay: _Delay | None = None
         self._tick: int | None = None  # last counter value, unwrapped
         self._tick_step = _Step()
+        self._given_steps: deque[float] = deque(maxlen=STEPS_KEPT)  # s
         self._stuck = 0
         self._paused = False
 
@@ -97,98 +106,132 @@ class SampleClock:
 
     def stamp(self, samples: SampleBlock) -> list[SampleBlock]:
         """The samples with their times, cut where some are missing."""
+        if self._origin_ns is None:
+            self._origin_ns = int(samples.t_ns[0])
         if isinstance(self._timing, Given):
             return self._keep_given(samples)
+        if self._paused and self.rate_hz is None:
+            self._line = Line()  # how many are missing is unknown, so that two ends of a pause make no line
         if isinstance(self._timing, Counter) and (samples.ticks != NO_TICK).all():
             return self._place(samples, self._counted_gaps(samples, self._timing))
+        self._tick = None  # samples pass that the counter does not tell
         return self._place(samples, self._arrival_gaps(samples))
+
+    def _seconds(self, t_ns: int) -> float:
+        return (t_ns - (self._origin_ns or 0)) / NS
 
     # --- times given by the sender
 
     def _keep_given(self, samples: SampleBlock) -> list[SampleBlock]:
         t = samples.t_ns
         steps = np.diff(t, prepend=self._last_t_ns if self._line.count else t[0])
+        self._tell_jumps(t, steps)
+        period_s = self._line.period_s() or (1.0 / self._nominal_hz if self._nominal_hz else _usual(steps))
+        missing = np.zeros(len(samples), np.int64)
+        if period_s:
+            missing = self._given_gaps(steps / NS, period_s)
+        missing[0] = max(int(missing[0]), samples.lost)
+        index = self._index + np.cumsum(missing + 1)
+        # a line does not go through a jump
+        jumps = np.flatnonzero((steps < 0) | (steps > LONG_S * NS))
+        at = int(jumps[-1]) if jumps.size else 0
+        if jumps.size:
+            self._line = Line()
+        for row in (at, len(samples) - 1):
+            self._line.add(float(index[row]), self._seconds(int(t[row])))
+        self._index, self._last_t_ns = float(index[-1]), int(t[-1])
+        return _cut(samples, t, missing)
+
+    def _tell_jumps(self, t: Ints, steps: Ints) -> None:
         if (steps < 0).any():
             at = int(np.argmax(steps < 0))
             self._event("clock_jumped", int(t[at]), f"time went back by {-steps[at] / NS:.6g} s")
         if (steps > LONG_S * NS).any():
             at = int(np.argmax(steps))
             self._event("clock_jumped", int(t[at]), f"time went on by {steps[at] / NS:.6g} s at one step")
-        self._last_t_ns = int(t[-1])
-        period_s = self._line.period_s() or (1.0 / self._nominal_hz if self._nominal_hz else _usual(steps))
-        missing = np.zeros(len(samples), np.int64)
-        missing[0] = samples.lost
-        # Host-stamped recordings are late and early by whole periods; a hole is told only where steps are steady.
-        if period_s and _steady(steps, period_s):
-            gap = np.rint(steps / NS / period_s).astype(np.int64) - 1
-            gap[(steps <= 0) | (steps / NS < 1.5 * period_s)] = 0
-            missing = np.maximum(missing, gap)
-        self._line.add(self._index + int(missing[0]) + 1, float(t[0]) / NS)
-        self._index += len(samples) + int(missing.sum())
-        self._line.add(self._index, float(t[-1]) / NS)
-        return _cut(samples, t, missing)
+
+    def _given_gaps(self, steps_s: Floats, period_s: float) -> Ints:
+        """Missing samples before each row [n]: told only where most steps are one period.
+
+        Times that a host stamped are late and early by whole periods, and nothing is missing.
+        """
+        self._given_steps.extend(steps_s[-STEPS_KEPT:].tolist())
+        off = np.abs(np.array(self._given_steps) / period_s - 1.0)
+        if np.median(off) > NEAR:
+            return np.zeros(steps_s.size, np.int64)
+        periods = steps_s / period_s
+        gap = np.rint(periods).astype(np.int64) - 1
+        gap[periods < 1.0 + max(0.5, LATE * float(np.quantile(off, 0.75)))] = 0
+        return gap
 
     # --- missing samples
 
     def _counted_gaps(self, samples: SampleBlock, counter: Counter) -> Ints:
         """Missing samples before each row by the device's counter [n]."""
-        elapsed_s = (int(samples.t_ns[-1]) - self._arrived_ns) / NS
-        previous = self._tick if self._tick is not None else int(samples.ticks[0])
+        arrived_ns = int(samples.t_ns[-1])
+        elapsed_s = (arrived_ns - self._arrived_ns) / NS
         first = self._tick is None
-        raw = np.diff(samples.ticks, prepend=previous % counter.modulus) % counter.modulus
-        steps = raw.astype(np.int64)
-        if not first:
-            steps[0] = self._with_turns(int(steps[0]), counter, elapsed_s)
-        self._tick = previous + int(steps.sum())
-        moving = steps[1:] if first else steps
-        self._watch_stuck(samples, moving)
-        self._tick_step.see(moving)
+        previous = int(samples.ticks[0]) if self._tick is None else self._tick
+        steps = np.diff(samples.ticks, prepend=previous % counter.modulus) % counter.modulus
+        self._tick_step.see(steps)
         size = self._ticks_a_sample(counter)
-        if size is None:
-            missing = np.zeros(len(samples), np.int64)
-        else:
-            missing = np.maximum(np.rint(steps / size).astype(np.int64) - 1, 0)
-        if first:
-            missing[0] = 0
-        elif self._ran_ahead(int(steps.max()), size, int(samples.t_ns[-1])):
+        if not first:
+            steps[0] += counter.modulus * self._hidden_turns(steps, size, counter, arrived_ns)
+        self._tick = previous + int(steps.sum())
+        waited = self._watch_stuck(samples, steps[1:] if first else steps)
+        missing = np.zeros(len(samples), np.int64)
+        if size is not None:
+            missing = np.maximum(np.rint(steps / size).astype(np.int64) - 1 - waited, 0)
+        if first or steps.sum() == 0:  # a counter that stands still says nothing
+            missing[0] = samples.lost
+        elif self._ran_ahead(int(steps.max()), size, arrived_ns):
             text = f"counter moved by {steps.max()} ticks within {elapsed_s:.3f} s"
             self._event("clock_jumped", int(samples.t_ns[0]), text)
-            missing[np.argmax(steps)] = self._missing_in(elapsed_s, len(samples))
-        if steps.sum() == 0:  # a counter that stands still says nothing
-            missing[0] = samples.lost
+            missing[np.argmax(steps)] = self._missing_in(elapsed_s, len(samples) + int(missing.sum() - missing.max()))
         self._paused = False
         return missing
 
-    def _with_turns(self, step: int, counter: Counter, elapsed_s: float) -> int:
-        """Adds whole turns of a short counter that a pause of the host's length must have hidden."""
-        size = self._ticks_a_sample(counter)
+    def _hidden_turns(self, steps: Ints, size: float | None, counter: Counter, arrived_ns: int) -> int:
+        """Whole turns of a short counter, hidden in a pause of the link or in a delay that was never made good."""
         rate = self._line.rate_hz() or self._nominal_hz
-        if size is None or rate is None or not self._paused:
-            return step
-        return step + max(0, round((elapsed_s * rate * size - step) / counter.modulus)) * counter.modulus
+        if size is None or rate is None:
+            return 0
+        turn = counter.modulus / size  # samples
+        counted = int(np.rint(steps / size).sum())
+        if self._paused:
+            self._delay = None
+            elapsed_s = (arrived_ns - self._arrived_ns) / NS
+            return max(0, round((elapsed_s * rate - counted) / turn))
+        return round(self._never_caught_up(arrived_ns, counted, turn / 2.0) / turn)
 
     def _ticks_a_sample(self, counter: Counter) -> float | None:
-        if counter.tick_s is not None and self._nominal_hz is not None:
-            nominal = 1.0 / (self._nominal_hz * counter.tick_s)
-            seen = self._tick_step.usual()
-            # a device set to another rate than the file says is believed
-            return nominal if seen is None or abs(seen - nominal) < 0.5 * nominal else float(seen)
         seen = self._tick_step.usual()
-        return None if seen is None else float(seen)
+        if counter.tick_s is None or self._nominal_hz is None:
+            return seen
+        nominal = 1.0 / (self._nominal_hz * counter.tick_s)
+        # a device set to another rate than the file says is believed
+        return nominal if seen is None or abs(seen - nominal) < 0.5 * nominal else seen
 
-    def _watch_stuck(self, samples: SampleBlock, steps: Ints) -> None:
+    def _watch_stuck(self, samples: SampleBlock, steps: Ints) -> Ints:
+        """Samples [n] that came with the counter standing still, at the row where it goes on."""
         before = self._stuck
         moved = np.flatnonzero(steps)
         self._stuck = before + len(steps) if moved.size == 0 else len(steps) - 1 - int(moved[-1])
         if before < STUCK_SAMPLES <= self._stuck:
             self._event("clock_jumped", int(samples.t_ns[-1]), f"counter stands still at {samples.ticks[-1]}")
+        waited = np.zeros(len(samples), np.int64)
+        if moved.size:
+            at = moved + len(samples) - len(steps)
+            waited[at] = np.diff(moved, prepend=-1 - before) - 1
+        return np.where(waited >= STUCK_SAMPLES, waited, 0)
 
     def _ran_ahead(self, step: int, size: float | None, arrived_ns: int) -> bool:
         period_s = self._line.period_s()
         if size is None or period_s is None:
             return False
         # samples may wait in buffers before the host sees them, but none arrives before it was taken
-        return step / size * period_s > arrived_ns / NS - self._line.at(self._index) + JUMP_S
+        waited_s = max(self._seconds(arrived_ns) - self._line.at(self._index), 0.0)
+        return step / size * period_s > waited_s + JUMP_S
 
     def _arrival_gaps(self, samples: SampleBlock) -> Ints:
         """Missing samples before each row [n]: rejected frames, a pause of the link, a delay never caught up."""
@@ -200,22 +243,27 @@ class SampleClock:
             missing[0] = max(samples.lost, self._missing_in(elapsed_s, len(samples)))
             self._paused, self._delay = False, None
             return missing
-        missing[0] += self._never_caught_up(arrived_ns, len(samples))
+        missing[0] += self._never_caught_up(arrived_ns, len(samples) + samples.lost)
         return missing
 
     def _missing_in(self, elapsed_s: float, arrived: int) -> int:
         rate = self._line.rate_hz() or self._nominal_hz
         return max(0, round(elapsed_s * rate) - arrived) if rate and self._arrived_ns else 0
 
-    def _never_caught_up(self, arrived_ns: int, arrived: int) -> int:
-        """Samples missing by a sudden delay that CATCH_UP_S ago began and was not made good since."""
+    def _never_caught_up(self, arrived_ns: int, counted: int, least: float = HOLE_PERIODS) -> int:
+        """Samples missing by a sudden delay that CATCH_UP_S ago began and was not made good since.
+
+        Args:
+            counted: samples that have come or are known to be missing since the last call
+            least: fewer missing samples than this are none
+        """
         period_s = self._line.period_s()
         if period_s is None or not self._line.settled():
             return 0
-        least_s = max(HOLE_PERIODS * period_s, HOLE_MIN_S)
-        behind_s = arrived_ns / NS - self._line.at(self._index + arrived)
+        least_s = max(least * period_s, HOLE_MIN_S)
+        behind_s = self._seconds(arrived_ns) - self._line.at(self._index + counted)
         if self._delay is None:
-            pause_s = (arrived_ns - self._arrived_ns) / NS - arrived * period_s
+            pause_s = (arrived_ns - self._arrived_ns) / NS - counted * period_s
             if pause_s > least_s and behind_s > least_s:
                 self._delay = _Delay(arrived_ns, behind_s)
             return 0
@@ -226,7 +274,9 @@ class SampleClock:
         if arrived_ns - self._delay.since_ns < CATCH_UP_S * NS:
             return 0
         hole = round(self._delay.least_s / period_s)
-        self._delay = None
+        rest_s = behind_s - hole * period_s
+        # another delay may have begun meanwhile
+        self._delay = _Delay(arrived_ns, rest_s) if rest_s > least_s else None
         return hole
 
     # --- times on the line
@@ -235,11 +285,14 @@ class SampleClock:
         index = self._index + np.cumsum(missing + 1)
         self._index = float(index[-1])
         self._arrived_ns = int(samples.t_ns[-1])
-        # within a chunk the last sample waited least
-        self._line.add(self._index, self._arrived_ns / NS, self._nominal_hz)
-        period_s = self._line.period_s() or 0.0
-        newest_s = self._line.at(self._index)
-        t_ns = np.rint((newest_s - (self._index - index) * period_s) * NS).astype(np.int64)
+        arrived_s = self._seconds(self._arrived_ns)
+        if self._delay is None:  # what may be a hole must not bend the line
+            # within a chunk the last sample waited least
+            self._line.add(self._index, arrived_s, self._nominal_hz)
+        period_s = self._line.period_s() or 1.0 / NS  # the first samples of an unknown rate: in order at least
+        # no sample is newer than its arrival, but for the scatter of the line
+        newest_s = min(self._line.at(self._index), arrived_s + JUMP_S)
+        t_ns = np.rint((newest_s - (self._index - index) * period_s) * NS).astype(np.int64) + (self._origin_ns or 0)
         if t_ns[0] <= self._last_t_ns:  # the line was corrected backwards: never out of order
             t_ns = np.maximum(t_ns, self._last_t_ns + np.arange(1, len(samples) + 1))
         self._last_t_ns = int(t_ns[-1])
@@ -310,18 +363,35 @@ class Line:
 
 
 class _Step:
-    """The usual step of a counter: the most frequent one seen so far, of few kinds kept."""
+    """The usual step of a counter: the mean of all steps near the median of the last ones."""
 
     def __init__(self) -> None:
-        self._seen: dict[int, int] = {}
+        self._recent: deque[int] = deque(maxlen=STEPS_KEPT)
+        self._sum = self._count = 0
 
     def see(self, steps: Ints) -> None:
-        for step, times in zip(*np.unique(steps[steps > 0], return_counts=True), strict=True):
-            if int(step) in self._seen or len(self._seen) < 64:
-                self._seen[int(step)] = self._seen.get(int(step), 0) + int(times)
+        """Learn from the steps that moved."""
+        moved = steps[steps > 0]
+        self._recent.extend(moved[-STEPS_KEPT:].tolist())
+        near = self._near(moved)
+        self._add(near)
+        if near.size < moved.size:
+            recent = np.array(self._recent)
+            if 2 * self._near(recent).size < recent.size:  # most are others: begin anew
+                self._sum = self._count = 0
+                self._add(recent[np.abs(recent / np.median(recent) - 1.0) < NEAR])
 
-    def usual(self) -> int | None:
-        return max(self._seen, key=lambda step: (self._seen[step], -step)) if self._seen else None
+    def usual(self) -> float | None:
+        """Ticks a sample; None until the counter has moved."""
+        return self._sum / self._count if self._count else None
+
+    def _add(self, steps: Ints) -> None:
+        self._sum += int(steps.sum())
+        self._count += int(steps.size)
+
+    def _near(self, steps: Ints) -> Ints:
+        usual = self.usual()
+        return steps[:0] if usual is None else steps[np.abs(steps / usual - 1.0) < NEAR]
 
 
 def made_rate(measured_hz: float) -> float:
@@ -338,12 +408,6 @@ def _usual(steps: Ints) -> float | None:
     """Median step in s; None where there is none."""
     forward = steps[steps > 0]
     return float(np.median(forward)) / NS if forward.size else None
-
-
-def _steady(steps: Ints, period_s: float) -> bool:
-    """Whether most steps are one period, so that a longer one is a hole and not a late host."""
-    inner: Floats = np.abs(steps[1:] / NS / period_s - 1.0)
-    return bool(inner.size == 0 or np.median(inner) < 0.25)
 
 
 def _cut(samples: SampleBlock, t_ns: Ints, missing: Ints) -> list[SampleBlock]:

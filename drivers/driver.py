@@ -136,9 +136,11 @@ class Driver:
             self._watch_undecoded(sum(len(chunk.data) for chunk in chunks))
             return
         for one in samples:
+            rejected = one.lost
             for stamped in self.clock.stamp(one):
-                self._count(stamped, rejected=one.lost)
+                self._count(stamped, rejected)
                 self._push(self._axes.apply(stamped))
+                rejected = 0  # they stood before the first row
         self.counts.bad = self.decoder.bad
         self._events.extend(self.clock.take_events())
         if self.state != "running":

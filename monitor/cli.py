@@ -18,7 +18,6 @@ from drivers.errors import ConfigError, ImuError, NotReady, RecordingError
 if TYPE_CHECKING:
     from monitor.estimate.analysis import Analysis
     from monitor.estimate.batch import TauGrid
-    from monitor.service import Service
     from monitor.settings import Config
 
 FAILED: Final = 1
@@ -99,10 +98,11 @@ def watch(
     from rich.console import Console
 
     from monitor.publish.terminal import watch as show
+    from monitor.publish.zenoh_in import ENDPOINT
 
     stop = threading.Event()
     _on_signals(stop.set)
-    show(keyexpr, connect or [], stop, Console(), seconds)
+    show(keyexpr, connect or [ENDPOINT], stop, Console(), seconds)
 
 
 @app.command()
@@ -176,21 +176,35 @@ def _serve(path: Path, seconds: float | None, viewer: str | None) -> None:
     import msgspec
 
     from monitor import settings
-    from monitor.service import Service
 
     config = settings.load(path)
     if viewer is not None:
         mode = settings.viewer_mode(viewer)
         config = dataclasses.replace(config, viewer=msgspec.structs.replace(config.viewer, mode=mode))
     _log_as(config)
-    service = Service(config)
+    _serve_config(config, seconds)
+
+
+def _serve_config(config: "Config", seconds: float | None) -> None:
+    """Run the service: a table where there is a terminal, else log lines; the last table once more at the end."""
+    import time
+    from contextlib import nullcontext
+
+    from rich.console import Console
+    from rich.live import Live
+
+    from monitor.outputs import LogOutput, TableOutput
+    from monitor.publish.terminal import Board
+    from monitor.service import Service
+
+    console, board = Console(), Board()
+    live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
+    service = Service(config, [TableOutput(board, live)] if live else [TableOutput(board), LogOutput()])
     _on_signals(service.stop)
-    _show_while(service, config, seconds)
-
-
-def _show_while(service: "Service", config: "Config", seconds: float | None) -> None:
-    """Run the service; with its table in the terminal when there is one."""
-    raise NotImplementedError
+    with live or nullcontext():
+        service.run(seconds)
+    if live is not None or seconds is not None:
+        console.print(board.table(time.monotonic()))
 
 
 def _log_as(config: "Config") -> None:
@@ -252,7 +266,7 @@ def _print_analysis(result: "Analysis") -> None:
     console.print(f"{estimate.curve.n} samples at {estimate.rate_hz:g} Hz, {result.seconds:.6g} s")
     console.print(analysis_table(estimate))
     for note in result.notes:
-        console.print(f"note: {note}", markup=False, highlight=False)
+        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -7,16 +7,13 @@ samples go on. Stopping: readers first, then what is in the rings is worked off 
 
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from drivers.sample import Event, SampleBlock
-from drivers.sample_message import pack
-from monitor import topics
-from monitor.estimate.estimate import Estimate
-from monitor.health import Health
+from monitor.outputs import ViewerOutput, ZenohOutput
 from monitor.publish import message
 from monitor.publish.viewer import DeviceInfo, ViewerSettings
 from monitor.publish.zenoh_out import Command, ZenohOut, ZenohSettings
@@ -36,97 +33,16 @@ JOIN_S: Final = 3.0
 _log = structlog.get_logger("imu-monitor")
 
 
-class ZenohOutput:
-    """Results as zenoh messages."""
-
-    def __init__(self, zenoh: ZenohOut) -> None:
-        self._zenoh = zenoh
-
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
-        """One msgpack batch."""
-        self._zenoh.put(topics.SAMPLES, device, pack(device, received, samples, offset_ns))
-
-    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """Curve and coefficients."""
-        self._zenoh.put(topics.ALLAN, device, message.allan(device, unix_s, estimate))
-        self._zenoh.put(topics.COEFFICIENTS, device, message.coefficients(device, unix_s, estimate))
-
-    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """One event."""
-        since_s = None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
-        self._zenoh.put(topics.EVENT, device, message.event(device, unix_s, received, event, since_s))
-
-    def health(self, device: str, unix_s: float, health: Health) -> None:
-        """Status, and presence while samples flow."""
-        self._zenoh.put(topics.STATUS, device, message.status(device, unix_s, health))
-
-
-class ViewerOutput:
-    """Results into the Rerun viewer."""
-
-    def __init__(self, view: "RerunView") -> None:
-        self._view = view
-
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
-        """Raw samples."""
-        self._view.samples(device, (samples.t_ns + offset_ns) / 1e9, samples.values, samples.temperature_c)
-
-    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """Curve and coefficients."""
-        self._view.estimate(device, unix_s, estimate)
-
-    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """One line of the log."""
-        self._view.event(device, unix_s, event)
-
-    def health(self, device: str, unix_s: float, health: Health) -> None:
-        """The health panel."""
-        self._view.health(device, unix_s, health)
-
-
-class LogOutput:
-    """Events and changes of state as log lines."""
-
-    def __init__(self) -> None:
-        self._said: dict[str, tuple[str, str]] = {}
-
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
-        """Not logged."""
-
-    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """Not logged."""
-
-    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """One line an event."""
-        _log.info(event.kind, device=device, axis=event.axis, text=event.text)
-
-    def health(self, device: str, unix_s: float, health: Health) -> None:
-        """A line when the state or its sentence has changed."""
-        now = (health.state, health.text)
-        if self._said.get(device) != now:
-            self._said[device] = now
-            say = _log.info if health.state in ("running", "ended") and not health.text else _log.warning
-            say("status", device=device, state=health.state, text=health.text, received=health.received)
-
-
-class Watcher(Protocol):
-    """Someone in this process who looks at the health of the devices, e.g. a table in the terminal."""
-
-    def __call__(self, health: dict[str, Health], latest: dict[str, Estimate | None]) -> None:
-        """Health and newest estimate of every device."""
-
-
 class Service:
     """Everything between a configuration and its outputs.
 
     Args:
         config: what to run
-        watcher: called about once a second
+        more: further outputs, e.g. the table in the terminal
     """
 
-    def __init__(self, config: Config, watcher: Watcher | None = None) -> None:
+    def __init__(self, config: Config, more: Sequence[Output] = ()) -> None:
         self.config = config
-        self._watcher = watcher
         self._wake = threading.Event()
         self._stop = threading.Event()
         self.virtual: dict[str, VirtualImu] = {}
@@ -137,7 +53,7 @@ class Service:
             [station.name for station in self.stations],
         )
         self.view = _viewer(config)
-        self.outputs: list[Output] = [LogOutput(), ZenohOutput(self.zenoh)]
+        self.outputs: list[Output] = [ZenohOutput(self.zenoh), *more]
         if self.view is not None:
             self.outputs.append(ViewerOutput(self.view))
         every_block = any(device.publish_s == 0.0 for device in config.devices)
@@ -200,9 +116,8 @@ class Service:
 
     def _report(self) -> None:
         states, memory = self.states(), memory_bytes()
-        health = {station.name: station.report(self.outputs, states, memory) for station in self.stations}
-        if self._watcher is not None:
-            self._watcher(health, {station.name: station.latest for station in self.stations})
+        for station in self.stations:
+            station.report(self.outputs, states, memory)
 
     def _answer(self) -> None:
         """Commands that came over zenoh since the last round."""

@@ -228,8 +228,7 @@ class _Reader:
             self.wrong.append(
                 f"{at}.decoder: {name} reads {decoder.carrier}, link {link_name} brings {carrier}: {fitting}"
             )
-        if isinstance(link, Filtering) and isinstance(decoder, Addressed):
-            link.accept(decoder.addresses)
+        _narrow(link, decoder)
         return link, decoder
 
     def _virtual(self, keys: Mapping[str, Any], at: str) -> VirtualTable | None:
@@ -370,6 +369,12 @@ def _axes(table: dict[str, str]) -> AxisMap:
         raise ConfigError(
             f'{axis} = "{word}"; both are one of {" ".join(AXES)}, the right one with or without -'
         ) from None
+
+
+def _narrow(link: object, decoder: object) -> None:
+    """A link that can leave things out brings only what its decoder reads."""
+    if isinstance(link, Filtering) and isinstance(decoder, Addressed):
+        link.accept(decoder.addresses)
 
 
 def _decoders_of(carrier: str) -> list[str]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from drivers.clock import SampleClock, made_rate
 from drivers.errors import NotReady
-from drivers.sample import Floats, Given, Ints, SampleBlock
+from drivers.sample import AXES, Floats, Given, Ints, SampleBlock
 from monitor.estimate.batch import TauGrid, cluster_sizes, overlapping
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Estimate
@@ -94,10 +94,10 @@ def _mean_rate(stamped: Sequence[SampleBlock]) -> float:
 
 
 def _left_out(left_out: Ints, tau_s: Floats) -> list[str]:
-    """Which of the shortest τ contradicted every fit."""
-    most = int(left_out.max())
-    if not most:
-        return []
+    """On which axes the shortest τ contradict every sum of the five terms."""
     return [
-        f"the fit leaves out τ up to {tau_s[most - 1]:.4g} s: the sensor's bandwidth ends below half the sample rate"
+        f"{axis}: the fit leaves out τ up to {tau_s[count - 1]:.3g} s, which no sum of the five terms follows: "
+        "the sensor's bandwidth or a vibration shows there"
+        for axis, count in zip(AXES, left_out.tolist(), strict=True)
+        if count
     ]

@@ -73,7 +73,7 @@ def duration(seconds: float) -> str:
     """A length of time in the two units that tell most.
 
     >>> duration(3725.0), duration(0.5), duration(90.0)
-    ('1 h 02 min', '0.50 s', '1 min 30 s')
+    ('1 h 02 min', '0.500 s', '1 min 30 s')
     """
     if seconds < 60:
         return f"{number(seconds)} s" if seconds < 10 else f"{seconds:.0f} s"

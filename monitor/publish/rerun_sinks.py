@@ -13,6 +13,7 @@ joined by a window, anything else is trouble; a page moves on to the next free p
 import contextlib
 import http.client
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -28,12 +29,14 @@ from urllib.parse import quote
 import rerun as rr
 import rerun_cli  # type: ignore[import-untyped]
 
-from monitor.publish.viewer import ViewerSettings, ViewerTrouble
+from monitor.publish.viewer import ViewerClosed, ViewerSettings, ViewerTrouble
 
 LOOPBACK: Final = "127.0.0.1"
 APPLICATION: Final = "imu-monitor"
 START_S: Final = 20.0  # for a viewer to listen: the first start of a 300 MB program from a cold disk
 PORTS_TRIED: Final = 20
+CLOSED: Final = "viewer was closed: start `rerun` to look again"
+PROGRAM_MIB: Final = 256  # an empty viewer window holds 125 to 170 MB
 LIVE_FLUSH_S: Final = 0.2  # fluent to the eye; Rerun keeps about 1 kB for every chunk beside its data
 PROBE: Final = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadTables"
 
@@ -65,9 +68,11 @@ class Child:
     def trouble(self) -> str | None:
         """Why the process is gone; None while it lives."""
         status = self._process.poll()
-        if status is None:
-            return None
-        return "viewer was closed" if status == 0 else f"viewer ended ({status}): {self._last_words()}"
+        return None if status is None else f"viewer ended ({status}): {self._last_words()}"
+
+    def left(self) -> bool:
+        """Whether it went as a program goes whose window is closed."""
+        return self._process.poll() == 0
 
     def end(self, patience_s: float = 0.5) -> None:
         """Ask it to go, then make it: a stopped process hears nothing but SIGKILL."""
@@ -104,13 +109,15 @@ class Output:
     child: Child | None = None
     port: int | None = None  # of the Rerun server; None for a file
 
-    def trouble(self) -> str | None:
-        """Why nobody looks any more; None while all is well."""
-        if self.child is not None:
-            return self.child.trouble()
-        if self.port is not None and not listens(self.port):
-            return f"the viewer on port {self.port} was closed"
-        return None
+    def check(self) -> None:
+        """ViewerTrouble when nobody looks any more, ViewerClosed when that was someone's wish."""
+        if self.child is not None and self.child.left():
+            raise ViewerClosed(CLOSED)
+        trouble = self.child.trouble() if self.child is not None else None
+        if trouble is None and self.port is not None and not listens(self.port):
+            trouble = f"the viewer on port {self.port} was closed"
+        if trouble is not None:
+            raise ViewerTrouble(trouble)
 
     def confirm(self, patience_s: float) -> bool:
         """Whether all that was logged got through within ``patience_s``, and the viewer answers.
@@ -191,7 +198,7 @@ def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[
     """Open what the settings ask for; waits until it listens or ``given_up``. ViewerTrouble says why not."""
     if settings.mode.endswith(".rrd"):
         return _open_file(Path(settings.mode), recording_id)
-    if settings.mode == "native" or (settings.mode == "auto" and has_desktop()):
+    if settings.mode in ("native", "join") or (settings.mode == "auto" and has_desktop()):
         return _open_native(settings, recording_id, given_up)
     return _open_web(settings, recording_id, given_up)
 
@@ -214,11 +221,13 @@ def _open_native(settings: ViewerSettings, recording_id: str, given_up: Callable
         if not is_rerun(port):
             raise ViewerTrouble(f"cannot listen on {port}: busy")
         return _connected(port, recording_id)
+    if settings.mode == "join":
+        raise ViewerClosed(CLOSED)
     if not has_desktop():
         raise ViewerTrouble('no desktop here (DISPLAY and WAYLAND_DISPLAY are not set): use viewer mode "web"')
     child = Child([
         *("--bind", LOOPBACK, "--port", str(port)),
-        *("--memory-limit", settings.memory, "--server-memory-limit", "64MiB"),
+        *("--memory-limit", with_program(settings.memory), "--server-memory-limit", "64MiB"),
         *("--hide-welcome-screen", "--expect-data-soon"),
     ])  # fmt: skip
     _wait_for(port, child, given_up)
@@ -238,6 +247,19 @@ def _open_web(settings: ViewerSettings, recording_id: str, given_up: Callable[[]
     if has_desktop():
         webbrowser.open(output.url)
     return output
+
+
+def with_program(memory: str) -> str:
+    """What a window is allowed in all, so that ``memory`` is left for data; a share of the machine is as given.
+
+    >>> with_program("256MiB"), with_program("1GiB"), with_program("25%")
+    ('512MiB', '1280MiB', '25%')
+    """
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(MiB|GiB)", memory.strip())
+    if found is None:
+        return memory
+    mebibytes = float(found[1]) * {"MiB": 1, "GiB": 1024}[found[2]]
+    return f"{mebibytes + PROGRAM_MIB:.0f}MiB"
 
 
 def server_url(port: int) -> str:

@@ -27,7 +27,7 @@ from drivers.sample import Event, Floats
 from monitor.estimate.estimate import Estimate
 from monitor.health import Health
 from monitor.publish.backlog import Backlog
-from monitor.publish.viewer import DeviceInfo, ViewerSettings, ViewerTrouble
+from monitor.publish.viewer import DeviceInfo, ViewerClosed, ViewerSettings, ViewerTrouble
 
 if TYPE_CHECKING:
     from monitor.publish.rerun_scene import Scene
@@ -155,6 +155,9 @@ class RerunView:
             try:
                 _load_rerun()
                 self._show(settings)
+            except ViewerClosed as closed:
+                settings = replace(settings, mode="join")
+                self._phase = str(closed)
             except ViewerTrouble as trouble:
                 self._phase = str(trouble)
             except ImportError as missing:
@@ -169,7 +172,7 @@ class RerunView:
         lived_s = time.monotonic() - started
         if self._closing.is_set():
             return settings, attempt
-        attempt = 0 if lived_s > 60.0 else attempt + 1
+        attempt = 0 if lived_s > 60.0 or settings.mode == "join" else attempt + 1
         if settings.mode == "auto" and lived_s < EARLY_END_S:
             return replace(settings, mode="web"), attempt
         self._closing.wait(RETRY_S[min(attempt, len(RETRY_S) - 1)])
@@ -209,18 +212,14 @@ class RerunView:
             self._inside_since = None
             if closing:
                 return
-            trouble = output.trouble()
-            if trouble is not None:
-                raise ViewerTrouble(trouble)
+            output.check()
             self._closing.wait(output.flush_every_s)
 
     def _confirm(self, output: "Output") -> None:
         """Return when all that was drawn has reached the viewer: bounds what Rerun holds to a second's worth."""
         while not output.confirm(PATIENCE_S):
             self._stalled = not self._closing.is_set()
-            trouble = output.trouble()
-            if trouble is not None:
-                raise ViewerTrouble(trouble)
+            output.check()
             if self._closing.is_set():
                 return
         self._stalled = False

@@ -15,13 +15,16 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Final
 
+import numpy as np
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from drivers.sample import AXES
 from monitor import topics
 from monitor.estimate.coefficients import LETTERS
+from monitor.estimate.estimate import Estimate
 from monitor.publish import heard, units
 from monitor.publish.heard import Heard
 from monitor.publish.panels import duration
@@ -353,6 +356,12 @@ def _clock_time(unix_s: float) -> str:
         return f"{datetime.fromtimestamp(unix_s).astimezone():%H:%M:%S}"
     except (ValueError, OverflowError, OSError):
         return f"{unix_s:g} s"
+
+
+def analysis_table(estimate: Estimate) -> RenderableType:
+    """Coefficients of every measured axis with their intervals, for ``analyze``."""
+    axes = tuple(axis for i, axis in enumerate(AXES) if not np.isnan(estimate.curve.avar[:, i]).all())
+    return Group(*_detail(heard.Noise(estimate.coefficients, axes, None)))
 
 
 def _detail(noise: heard.Noise) -> list[RenderableType]:

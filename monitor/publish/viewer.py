@@ -7,11 +7,15 @@ class ViewerTrouble(Exception):  # noqa: N818 - never leaves this room: the thre
     """The viewer cannot be opened, or is gone: one line for people."""
 
 
+class ViewerClosed(ViewerTrouble):
+    """Someone closed the window: it is not to be opened again unasked."""
+
+
 @dataclass(frozen=True, slots=True)
 class ViewerSettings:
     """Which viewer, and where."""
 
-    mode: str = "auto"  # auto | native | web | none | a path ending in .rrd
+    mode: str = "auto"  # auto | native | web | none | a path ending in .rrd; join: only a viewer that is open
     port: int = 9876  # of the Rerun server, loopback
     web_port: int = 9090  # of the page, loopback
     memory: str = "256MiB"  # of what the viewer keeps for looking back; the oldest go first

@@ -67,7 +67,7 @@ def cramer_rao(sources: tuple[Source, ...], n: int) -> Floats:
 
     I_ab = Σ_k S_a S_b / S² over the n/2 positive frequencies, in the variances; half of it in deviations.
     """
-    f = np.arange(1, n // 2) * (RATE_HZ / n)
+    f = np.arange(1, n // 2, dtype=np.float64) * (RATE_HZ / n)
     spectra = np.stack([source.psd(f, 1.0 / RATE_HZ) for source in sources])
     shares = spectra / spectra.sum(0)
     return np.asarray(0.5 * np.sqrt(np.diag(np.linalg.inv(shares @ shares.T))))
@@ -95,7 +95,7 @@ def deviations(looked: list[Look], sources: tuple[Source, ...], n: int) -> None:
     inside = []
     for look in looked:
         lo, hi = intervals(look.avar, look.fit.edf)
-        inside.append((lo.T**2 <= truth) & (truth <= hi.T**2))
+        inside.append((truth >= lo.T**2) & (truth <= hi.T**2))
     share = np.concatenate(inside)
     print("  deviations, m ≤ n/8:", _share(share[:, factors <= n // 8].ravel()))
     print("  by τ:", " ".join(f"{s:.3f}" for s in share.mean(0)))

@@ -207,6 +207,30 @@ def test_a_viewer_that_dies_is_said_and_joined_again(
         again.end()
 
 
+def test_a_window_that_was_closed_is_not_opened_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The window is played by a server that leaves with status 0 as soon as someone has looked at it."""
+    monkeypatch.setattr(rerun_view, "RETRY_S", (0.05,))
+    monkeypatch.setattr(rerun_sinks, "has_desktop", lambda: True)
+    starts = tmp_path / "starts"
+    program = tmp_path / "window"
+    program.write_text(f"""#!{sys.executable}
+import socket, sys
+open({str(starts)!r}, "a").write("started\\n")
+port = int(sys.argv[sys.argv.index("--port") + 1])
+with socket.create_server(("127.0.0.1", port)) as server:
+    server.accept()
+""")
+    program.chmod(0o755)
+    monkeypatch.setattr(rerun_sinks, "viewer_program", lambda: program)
+    view = RerunView(ViewerSettings("native", port=free_port()), DEVICE)
+    view.start()
+    assert wait_for(lambda: view.state == rerun_sinks.CLOSED), view.state
+    time.sleep(0.5)  # ten more tries
+    assert view.state == rerun_sinks.CLOSED
+    assert starts.read_text() == "started\n"
+    view.close()
+
+
 def test_the_page_takes_the_next_free_port_and_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rerun_sinks, "has_desktop", lambda: False)
     with socket.socket() as holder:

@@ -1,0 +1,125 @@
+"""Adapters: what a station says, as zenoh messages, in the viewer, as log lines, in the terminal. None waits."""
+
+import time
+from typing import TYPE_CHECKING, Final
+
+import structlog
+
+from drivers.sample import Event, SampleBlock
+from drivers.sample_message import pack
+from monitor import topics
+from monitor.estimate.estimate import Estimate
+from monitor.health import Health
+from monitor.publish import message
+from monitor.publish.terminal import Board
+from monitor.publish.zenoh_out import ZenohOut
+
+if TYPE_CHECKING:
+    from rich.live import Live
+
+    from monitor.publish.rerun_view import RerunView
+
+PREFIX: Final = "imu"
+_log = structlog.get_logger("imu-monitor")
+
+
+class ZenohOutput:
+    """Results as zenoh messages."""
+
+    def __init__(self, zenoh: ZenohOut) -> None:
+        self._zenoh = zenoh
+
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        """One msgpack batch."""
+        self._zenoh.put(topics.SAMPLES, device, pack(device, received, samples, offset_ns))
+
+    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
+        """Curve and coefficients."""
+        self._zenoh.put(topics.ALLAN, device, message.allan(device, unix_s, estimate))
+        self._zenoh.put(topics.COEFFICIENTS, device, message.coefficients(device, unix_s, estimate))
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        """One event."""
+        since_s = None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
+        self._zenoh.put(topics.EVENT, device, message.event(device, unix_s, received, event, since_s))
+
+    def health(self, device: str, unix_s: float, health: Health) -> None:
+        """Status, and presence while samples flow."""
+        self._zenoh.put(topics.STATUS, device, message.status(device, unix_s, health))
+
+
+class ViewerOutput:
+    """Results into the Rerun viewer."""
+
+    def __init__(self, view: "RerunView") -> None:
+        self._view = view
+
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        """Raw samples."""
+        self._view.samples(device, (samples.t_ns + offset_ns) / 1e9, samples.values, samples.temperature_c)
+
+    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
+        """Curve and coefficients."""
+        self._view.estimate(device, unix_s, estimate)
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        """One line of the log."""
+        self._view.event(device, unix_s, event)
+
+    def health(self, device: str, unix_s: float, health: Health) -> None:
+        """The health panel."""
+        self._view.health(device, unix_s, health)
+
+
+class LogOutput:
+    """Events and changes of state as log lines."""
+
+    def __init__(self) -> None:
+        self._said: dict[str, tuple[str, str]] = {}
+
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        """Not logged."""
+
+    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
+        """Not logged."""
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        """One line an event."""
+        _log.info(event.kind, device=device, axis=event.axis, text=event.text)
+
+    def health(self, device: str, unix_s: float, health: Health) -> None:
+        """A line when the state or its sentence has changed."""
+        now = (health.state, health.text)
+        if self._said.get(device) != now:
+            self._said[device] = now
+            say = _log.info if health.state in ("running", "ended") and not health.text else _log.warning
+            say("status", device=device, state=health.state, text=health.text, received=health.received)
+
+
+class TableOutput:
+    """Results as the table in the terminal, drawn once a second: the one that ``watch`` shows of other processes."""
+
+    def __init__(self, board: Board, live: "Live | None" = None) -> None:
+        self.board = board
+        self._live = live
+        self._latest: dict[str, tuple[float, Estimate]] = {}
+
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        """Not shown."""
+
+    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
+        """Kept until the table is drawn."""
+        self._latest[device] = (unix_s, estimate)
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        """One of the last lines."""
+        self.board.take(topics.EVENT.key(PREFIX, device), message.event(device, unix_s, received, event, None))
+
+    def health(self, device: str, unix_s: float, health: Health) -> None:
+        """One row."""
+        self.board.take(topics.STATUS.key(PREFIX, device), message.status(device, unix_s, health))
+        if device in self._latest:
+            at_s, estimate = self._latest.pop(device)
+            self.board.take(topics.COEFFICIENTS.key(PREFIX, device), message.coefficients(device, at_s, estimate))
+        if self._live is not None:
+            self._live.update(self.board.table(time.monotonic()), refresh=True)
