@@ -44,6 +44,8 @@ STEPS_KEPT: Final = 255
 """The last steps of a counter, or of given times, that tell what is usual."""
 NEAR: Final = 0.25
 """Steps this near to the usual one, of it, are single ones: a tick is rounded, a device's stamp jitters."""
+SURELY_MISSING: Final = 4.0
+"""Periods: a longer given step is a gap though it is not one of whole periods."""
 LATE: Final = 8.0
 """A given time is late, and no sample missing, up to so many times the upper quartile of what is usual."""
 SNAP: Final = 0.002
@@ -78,6 +80,7 @@ class SampleClock:
         self._delay: _Delay | None = None
         self._tick: int | None = None  # last counter value, unwrapped
         self._tick_step = _Step()
+        self._went_back = False
         self._given_steps: deque[float] = deque(maxlen=STEPS_KEPT)  # s
         self._stuck = 0
         self._paused = False
@@ -133,7 +136,7 @@ class SampleClock:
         missing[0] = max(int(missing[0]), samples.lost)
         index = self._index + np.cumsum(missing + 1)
         # a line does not go through a jump
-        jumps = np.flatnonzero((steps < 0) | (steps > LONG_S * NS))
+        jumps = np.flatnonzero((steps < -JUMP_S * NS) | (steps > LONG_S * NS))
         at = int(jumps[-1]) if jumps.size else 0
         if jumps.size:
             self._line = Line()
@@ -143,9 +146,11 @@ class SampleClock:
         return _cut(samples, t, missing)
 
     def _tell_jumps(self, t: Ints, steps: Ints) -> None:
-        if (steps < 0).any():
-            at = int(np.argmax(steps < 0))
+        back = steps < (-JUMP_S * NS if self._went_back else 0.0)  # what jitters back and forth is told once
+        if back.any():
+            at = int(np.argmax(back))
             self._event("clock_jumped", int(t[at]), f"time went back by {-steps[at] / NS:.6g} s")
+            self._went_back = True
         if (steps > LONG_S * NS).any():
             at = int(np.argmax(steps))
             self._event("clock_jumped", int(t[at]), f"time went on by {steps[at] / NS:.6g} s at one step")
@@ -153,15 +158,21 @@ class SampleClock:
     def _given_gaps(self, steps_s: Floats, period_s: float) -> Ints:
         """Missing samples before each row [n]: told only where most steps are one period.
 
-        Times that a host stamped are late and early by whole periods, and nothing is missing.
+        Times that a host stamped are late and early by whole periods, and nothing is missing. So a short gap must
+        be one of whole periods, longer than what is usual, and no neighbour may make good for it.
         """
+        before = np.concatenate([[self._given_steps[-1] if self._given_steps else period_s], steps_s[:-1]])
+        after = np.concatenate([steps_s[1:], [period_s]])
         self._given_steps.extend(steps_s[-STEPS_KEPT:].tolist())
         off = np.abs(np.array(self._given_steps) / period_s - 1.0)
         if np.median(off) > NEAR:
             return np.zeros(steps_s.size, np.int64)
         periods = steps_s / period_s
         gap = np.rint(periods).astype(np.int64) - 1
-        gap[periods < 1.0 + max(0.5, LATE * float(np.quantile(off, 0.75)))] = 0
+        late = (periods < SURELY_MISSING) & (np.abs(periods - np.rint(periods)) > NEAR)
+        late |= periods < 1.0 + max(0.5, LATE * float(np.quantile(off, 0.75)))
+        late |= steps_s + np.minimum(before, after) < 2.5 * period_s
+        gap[late] = 0
         return gap
 
     # --- missing samples
@@ -184,7 +195,7 @@ class SampleClock:
             missing = np.maximum(np.rint(steps / size).astype(np.int64) - 1 - waited, 0)
         if first or steps.sum() == 0:  # a counter that stands still says nothing
             missing[0] = samples.lost
-        elif self._ran_ahead(int(steps.max()), size, arrived_ns):
+        elif self._ran_ahead(int(missing.max()), int(steps.max()), counter, arrived_ns):
             text = f"counter moved by {steps.max()} ticks within {elapsed_s:.3f} s"
             self._event("clock_jumped", int(samples.t_ns[0]), text)
             missing[np.argmax(steps)] = self._missing_in(elapsed_s, len(samples) + int(missing.sum() - missing.max()))
@@ -193,8 +204,10 @@ class SampleClock:
 
     def _hidden_turns(self, steps: Ints, size: float | None, counter: Counter, arrived_ns: int) -> int:
         """Whole turns of a short counter, hidden in a pause of the link or in a delay that was never made good."""
-        rate = self._line.rate_hz() or self._nominal_hz
-        if size is None or rate is None:
+        if size is None:
+            return 0
+        rate = self._line.rate_hz() or (1.0 / (size * counter.tick_s) if counter.tick_s else None)
+        if rate is None:
             return 0
         turn = counter.modulus / size  # samples
         counted = int(np.rint(steps / size).sum())
@@ -225,13 +238,18 @@ class SampleClock:
             waited[at] = np.diff(moved, prepend=-1 - before) - 1
         return np.where(waited >= STUCK_SAMPLES, waited, 0)
 
-    def _ran_ahead(self, step: int, size: float | None, arrived_ns: int) -> bool:
+    def _ran_ahead(self, missing: int, step: int, counter: Counter, arrived_ns: int) -> bool:
+        """Whether so many samples cannot be missing, as the time for them has not passed on the host."""
         period_s = self._line.period_s()
-        if size is None or period_s is None:
-            return False
+        if period_s is not None:
+            lasted_s = missing * period_s
+        elif counter.tick_s is not None:
+            lasted_s = step * counter.tick_s
+        else:  # half a turn on is more likely a step back
+            return 2 * step > counter.modulus
         # samples may wait in buffers before the host sees them, but none arrives before it was taken
-        waited_s = max(self._seconds(arrived_ns) - self._line.at(self._index), 0.0)
-        return step / size * period_s > waited_s + JUMP_S
+        known_s = self._line.at(self._index) if self._line.count else self._seconds(self._arrived_ns)
+        return lasted_s > max(self._seconds(arrived_ns) - known_s, 0.0) + JUMP_S
 
     def _arrival_gaps(self, samples: SampleBlock) -> Ints:
         """Missing samples before each row [n]: rejected frames, a pause of the link, a delay never caught up."""
@@ -405,9 +423,12 @@ def made_rate(measured_hz: float) -> float:
 
 
 def _usual(steps: Ints) -> float | None:
-    """Median step in s; None where there is none."""
-    forward = steps[steps > 0]
-    return float(np.median(forward)) / NS if forward.size else None
+    """Period in s, where it is not known yet: the middle of steady steps, the mean of others; None where there is none."""
+    forward = steps[steps > 0] / NS
+    if not forward.size:
+        return None
+    low, middle, high = np.quantile(forward, [0.25, 0.5, 0.75])
+    return float(middle if high - low < 2.0 * NEAR * middle else forward.mean())
 
 
 def _cut(samples: SampleBlock, t_ns: Ints, missing: Ints) -> list[SampleBlock]:

@@ -26,7 +26,6 @@ NO_ANSWER: Final = 3
 
 app = typer.Typer(
     help="Live noise monitor for MEMS IMUs: windowed Allan variance and Q, N, B, K, R while the sensor runs.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -179,7 +178,10 @@ def _serve(path: Path, seconds: float | None, viewer: str | None) -> None:
 
     config = settings.load(path)
     if viewer is not None:
-        mode = settings.viewer_mode(viewer)
+        try:
+            mode = settings.viewer_mode(viewer)
+        except ConfigError as error:
+            raise ConfigError(f"--viewer: {error}") from None
         config = dataclasses.replace(config, viewer=msgspec.structs.replace(config.viewer, mode=mode))
     _log_as(config)
     _serve_config(config, seconds)
@@ -252,8 +254,11 @@ def _tau(text: str) -> "TauGrid":
 def _write(path: Path, data: bytes) -> None:
     if path == Path("-"):
         sys.stdout.buffer.write(data + b"\n")
-    else:
+        return
+    try:
         path.write_bytes(data + b"\n")
+    except OSError as error:
+        raise ConfigError(f"--json: {path}: cannot be written: {error.strerror}") from error
 
 
 def _print_analysis(result: "Analysis") -> None:

@@ -31,6 +31,8 @@ UNITS_S: Final = {"": 1.0, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 
 WINDOW_SAMPLES: Final = (100, 10_000_000)
 WINDOW_LONGEST_S: Final = 40 * 86400.0
 DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
+ENDPOINT: Final = re.compile(r"[a-z]+/.+")
+MEMORY: Final = re.compile(r"[0-9]+(\.[0-9]+)?\s*([kMGT]?i?B|%)")
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Port = Annotated[int, msgspec.Meta(ge=0, le=65535)]
@@ -59,7 +61,7 @@ class VirtualTable(LinkSettings, frozen=True, kw_only=True):
 
     model: str = "consumer-mems"
     """Path of a model file, or the name of one in the shipped ``config/models``."""
-    seed: int = 1
+    seed: Annotated[int, msgspec.Meta(ge=0)] = 1
     speed: Positive = 1.0
     """Times real time."""
 
@@ -175,9 +177,24 @@ class _Reader:
         log = self.fill(LogTable, file.log, "log")
         if viewer is not None:
             self._try("viewer.mode", viewer_mode, viewer.mode)
+            if not MEMORY.fullmatch(viewer.memory):
+                self.wrong.append(f'viewer.memory: "{viewer.memory}" is no size; write "256MiB", "1GB" or "25%"')
+        if zenoh is not None:
+            self._reachable(zenoh)
         if zenoh is None or viewer is None or log is None:
             return None
         return Config(tuple(device for device in devices if device is not None), zenoh, viewer, log)
+
+    def _reachable(self, zenoh: ZenohTable) -> None:
+        """Whether the session could ever open."""
+        for key, endpoints in (("listen", zenoh.listen), ("connect", zenoh.connect)):
+            for endpoint in endpoints:
+                if not ENDPOINT.fullmatch(endpoint):
+                    self.wrong.append(f'zenoh.{key}: "{endpoint}" is no endpoint; write "tcp/127.0.0.1:7450"')
+        if zenoh.config is not None and zenoh.mode != "none" and not zenoh.config.is_file():
+            self.wrong.append(f"zenoh.config: {zenoh.config}: no such file")
+        if zenoh.mode == "client" and not zenoh.connect and zenoh.config is None:
+            self.wrong.append('zenoh.connect: empty, but a client needs a router, e.g. ["tcp/127.0.0.1:7447"]')
 
     def device(self, table: Mapping[str, Any], at: str) -> Device | None:
         entry = self.fill(DeviceTable, table, at)
@@ -197,6 +214,7 @@ class _Reader:
         if entry.model is not None and not entry.model.is_file():
             self.wrong.append(f"{at}: model: {entry.model}: no such file")
         tau = entry.tau if isinstance(entry.tau, str) else tuple(entry.tau)
+        self._try(f"{at}: tau", _possible_tau, tau, window_s, entry.rate)
         silence_s = link.silence if isinstance(link, VirtualTable) else float(entry.driver.get("silence", 3.0))
         return Device(entry.name, entry.rate, window_s, tau, refit_s, publish_s, link, decoder, axes, silence_s)
 
@@ -243,7 +261,10 @@ class _Reader:
             return None
         return msgspec.structs.replace(table, model=str(path))
 
-    def decoder(self, name: str, options: Any, at: str) -> Decoder | None:
+    def decoder(self, name: Any, options: Any, at: str) -> Decoder | None:
+        if not isinstance(name, str):
+            self.wrong.append(f"{at}.decoder: expected a name in quotes, got {name!r}")
+            return None
         if not name:
             self.wrong.append(f"{at}.decoder: missing; known are {', '.join(plugin.names(drivers.decoders))}")
             return None
@@ -359,6 +380,17 @@ def _possible_window(window_s: float, rate_hz: float | None) -> None:
             f"{window_s:g} s at {rate_hz:g} Hz are {window_s * rate_hz:.0f} samples; "
             f"possible are {low} to {high}: {low / rate_hz:g} to {high / rate_hz:g} s"
         )
+
+
+def _possible_tau(tau: str | tuple[float, ...], window_s: float, rate_hz: float | None) -> None:
+    """At least one τ of a list lies between one sample and half the window."""
+    if isinstance(tau, str):
+        return
+    shortest_s = 1.0 / rate_hz if rate_hz else 0.0
+    # a τ is rounded to whole samples
+    if not any(0.5 * shortest_s < one <= 0.5 * window_s for one in tau):
+        low = f"{shortest_s:g} s, one sample," if rate_hz else "one sample"
+        raise ConfigError(f"none of {list(tau)} s lies between {low} and {window_s / 2:g} s, half the window")
 
 
 def _axes(table: dict[str, str]) -> AxisMap:

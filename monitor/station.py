@@ -14,7 +14,7 @@ import numpy as np
 from drivers.clock import SampleClock
 from drivers.decoders.base import Decoder
 from drivers.driver import Driver
-from drivers.errors import NotReady
+from drivers.errors import ConfigError, NotReady
 from drivers.links.base import Link
 from drivers.sample import Event, SampleBlock
 from monitor.estimate.estimate import Estimate
@@ -81,6 +81,7 @@ class Station:
         self._waiting_since_ns = 0
         self._latencies: list[float] = []
         self._started_s = time.monotonic()
+        self._no_estimate = ""  # why there can be none
         self._next_s = dict.fromkeys(("refit", "publish", "samples"), 0.0)
         self._advanced = False  # samples since the last refit
         self._refitted = False  # a refit since the last publication
@@ -185,13 +186,19 @@ class Station:
         return 0 if self.driver.times_are_unix else self._wall.offset_ns
 
     def _advance(self, blocks: list[SampleBlock]) -> None:
+        if self._no_estimate:
+            return
         if self.estimator is None:
             self._pending = (self._pending + blocks)[-PENDING_BLOCKS:]
             rate = self.clock.rate_hz
             if rate is None:
                 return
-            self.estimator = Estimator(rate, self.device.window_s, self.device.tau)
             blocks, self._pending = self._pending, []
+            try:
+                self.estimator = Estimator(rate, self.device.window_s, self.device.tau)
+            except ConfigError as error:  # a list of τ that does not fit the rate found; samples go on
+                self._no_estimate = f"no estimate: {error}"
+                return
         for samples in blocks:
             self.estimator.update(samples)
         self._advanced = True
@@ -233,8 +240,10 @@ class Station:
 
     def _text(self) -> str:
         nominal, measured = self.device.rate_hz, self.clock.measured_hz
-        if self.driver.text or self.driver.state != "running" or not nominal or not measured:
+        if self.driver.text or self.driver.state != "running":
             return self.driver.text
+        if self._no_estimate or not nominal or not measured:
+            return self._no_estimate
         if abs(measured / nominal - 1.0) > OFF_NOMINAL:
             return f"samples come at {measured:.4g} Hz, configured are {nominal:g} Hz"
         return ""

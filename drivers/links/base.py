@@ -6,7 +6,7 @@ where the user must choose). Nothing is opened before ``open``.
 """
 
 from collections.abc import Sequence
-from typing import Literal, Protocol, runtime_checkable
+from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import msgspec
 
@@ -19,7 +19,7 @@ Carrier = Literal["bytes", "frames", "messages"]
 class LinkSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Keys that every link understands."""
 
-    silence: float = 3.0
+    silence: Annotated[float, msgspec.Meta(ge=0.0)] = 3.0
     """Seconds without a byte after which the link is opened anew; 0 = never."""
 
 

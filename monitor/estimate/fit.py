@@ -16,7 +16,8 @@ both are bounded. Without a slope, R is only bounded, and a ramp does pass as K.
 Real sensors end below half the sample rate. White noise through a low-pass looks, beyond the
 filter's memory, like N²/τ − c/τ²: exactly the column of Q with a negative sign. So when the
 shortest τ contradict the fit, Q² may turn negative (it then stands for the band limit and Q is only
-bounded by the first point of the curve); while they still do, the shortest τ is left out.
+bounded by the first point of the curve); while they still do, the shortest τ is left out. If no
+filter explains it, as with a line or motion, nothing is left out, and the misfit is there to see.
 
 A fit refuses nothing: an axis with too few τ, or without noise at all, is UNESTIMATED.
 """
@@ -46,6 +47,9 @@ UNIT_SOURCES: Final[tuple[Source, ...]] = (
     RateRamp(R=1.0),
 )
 """Rows of the coefficients; their Allan variances are the columns of the fit."""
+
+TO_SI: Final = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+"""Powers of the sample rate that bring Q N B K R from τ0 = 1 to SI."""
 
 ENTER_ONCE: Final = 2.33  # σ: one look at one curve, 1 % of absent terms enter
 ENTER_WATCHED: Final = 3.0  # σ: looked at again and again
@@ -77,7 +81,6 @@ def design(factors: Ints, rate_hz: float) -> Design:
     """The columns of the fit, from the effects' own Allan variances."""
     m = np.asarray(factors, np.float64)
     columns = np.ascontiguousarray(np.stack([source.avar(m, 1.0) for source in UNIT_SOURCES], axis=1))
-    columns.flags.writeable = False
     return Design(factors, rate_hz, columns)
 
 
@@ -107,23 +110,28 @@ def fit(
     edf, fitted = np.full((2, axes, m), np.nan)
     status = np.zeros((axes, 5), np.int8)
     left_out = np.zeros(axes, np.int64)
+    measured = np.ascontiguousarray(avar.T)
+    level, flat, slope_variance = measured, design.columns, np.zeros(NOISES)
     slope = np.full(axes, np.nan) if slope is None else slope / design.rate_hz
-    slope_variance = _slope_variance(table.n)
-    # the curve without s²τ²/2, and the columns without what their own noise puts into s² on average
-    level = np.ascontiguousarray(avar.T) - np.nan_to_num(slope)[:, None] ** 2 * design.columns[:, R]
-    flat = design.columns.copy()
-    flat[:, :NOISES] -= slope_variance * design.columns[:, R, None]
+    if not np.isnan(slope).all():
+        # the curve without s²τ²/2, and the columns without what their own noise puts into s² on average
+        slope_variance = _slope_variance(table.n)
+        level = measured - np.nan_to_num(slope)[:, None] ** 2 * design.columns[:, R]
+        flat = design.columns.copy()
+        flat[:, :NOISES] -= slope_variance * design.columns[:, R, None]
     fit_axes(
-        np.ascontiguousarray(avar.T), level, terms.T.astype(np.float64), table.terms.astype(np.float64),
+        measured, level, terms.T.astype(np.float64), table.terms.astype(np.float64),
         design.columns, flat, table.covariance, slope, slope_variance,
         (ENTER_ONCE, ENTER_ONCE) if before is None else (ENTER_WATCHED, LEAVE_WATCHED),
         entered, theta, lo, hi, status, edf, fitted, left_out,
     )  # fmt: skip
-    to_si = design.rate_hz ** np.array([-1.0, -0.5, 0.0, 0.5, 1.0])  # √θ at τ0 = 1 to SI
+    to_si = design.rate_hz**TO_SI
     value = np.where(status == Status.ESTIMATED, np.sqrt(np.maximum(theta, 0.0)), np.nan)
     coefficients = Coefficients((value * to_si).T, (lo * to_si).T, (hi * to_si).T, status.T)
-    edf = np.where(np.isnan(edf.T) & (avar > 0.0), _white_edf(design, table, terms), edf.T)
-    return Fit(coefficients, (theta * to_si**2).T, fitted.T, edf, entered.T, left_out)
+    missing = np.isnan(edf.T) & (avar > 0.0)
+    if missing.any():
+        edf = np.where(missing, _white_edf(design, table, terms), edf.T).T
+    return Fit(coefficients, (theta * to_si**2).T, fitted.T, edf.T, entered.T, left_out)
 
 
 def slope_of_thirds(phase: Floats, seconds: float) -> Floats:

@@ -28,6 +28,9 @@ MISFIT_AGAIN: Final = 2.5
 SHORT_ROWS: Final = 4
 """How many of the shortest τ in use are asked whether they contradict the fit."""
 
+FILTER_MEMORY: Final = 16
+"""Clusters of more samples are not left out: a filter that reaches so far would be no noise of the sensor."""
+
 TWO_SIDED_95: Final = 1.959963984540054
 ONE_SIDED_95: Final = 1.6448536269514722
 
@@ -115,9 +118,10 @@ def _judge_ramp(slope, slope_variance, thresholds, entered, theta, lo, hi, statu
 def _fit_terms(  # type: ignore[no-untyped-def]
     avar, level, rows, stretch, columns, covariance, variance, normal, right, theta
 ):
-    """Re-weighted Q N B K; how many of the shortest τ had to be left out, and whether Q² was set free."""
+    """Re-weighted Q N B K; how many of the shortest τ were left out, and whether Q² was set free."""
     first = 0
     free = False
+    asking = True
     while True:
         used = rows[first:]
         for i in used:  # white noise of that level, to begin with
@@ -127,11 +131,14 @@ def _fit_terms(  # type: ignore[no-untyped-def]
             _solve_nonnegative(normal, right, free, theta)
             _variances(used, theta, covariance, stretch, variance)
         limit = MISFIT_AGAIN if free else MISFIT
-        if used.size <= MIN_ROWS or not _contradicted(level, used[:SHORT_ROWS], theta, columns, variance, limit):
+        if not asking or not _contradicted(level, used[:SHORT_ROWS], theta, columns, variance, limit):
             break
-        if free:
+        if not free:
+            free = True
+        elif used.size > MIN_ROWS and columns[used[0], N] * FILTER_MEMORY >= 1.0:
             first += 1
-        free = True
+        else:  # no filter: a line, motion, or what else the five terms do not know
+            first, free, asking = 0, False, False
     _normal_equations(level, used, variance, columns, normal, right)
     return first, free
 

@@ -13,7 +13,7 @@ from monitor.noise.effect import Source, check_parameters, parameter
 class AngleRandomWalk(Source):
     """IEEE Std 952 eq. C.18–C.19: S(f) = N², σ²(τ) = N²/τ.
 
-    >>> float(AngleRandomWalk(N=1.5e-4).avar(np.array([9.0]), 0.01)[0])
+    >>> print(f"{AngleRandomWalk(N=1.5e-4).avar(np.array([9.0]), 0.01)[0]:.6g}")
     2.5e-09
     """
 

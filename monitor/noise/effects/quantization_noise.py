@@ -13,7 +13,7 @@ from monitor.noise.effect import Source, check_parameters, parameter
 class QuantizationNoise(Source):
     """IEEE Std 952 eq. C.14–C.15: σ²(τ) = 3Q²/τ², S(f) = 4Q²/τ0 sin²(πfτ0).
 
-    >>> float(QuantizationNoise(Q=2e-6).avar(np.array([0.1]), 0.01)[0])
+    >>> print(f"{QuantizationNoise(Q=2e-6).avar(np.array([0.1]), 0.01)[0]:.6g}")
     1.2e-09
     """
 

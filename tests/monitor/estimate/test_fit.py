@@ -225,3 +225,12 @@ def test_the_fitted_curve_is_drawn_through_the_measured_one():
     # the longest has 15 degrees of freedom: the mean of RECORDS scatters by 3 %
     np.testing.assert_allclose(np.mean(ratio, axis=(0, 2))[factors <= N // 8], 1.0, atol=0.1)
     np.testing.assert_allclose(np.mean(ratio, axis=(0, 2))[factors <= N // 128], 1.0, atol=0.02)
+
+
+def test_a_line_is_no_filter_and_nothing_is_left_out_for_it():
+    values = NoiseModel(dict.fromkeys(AXES, MIX)).simulate(N, RATE_HZ, 3)
+    line = 5e-4 * np.sin(2.0 * np.pi * 0.565 * np.arange(N) / RATE_HZ)
+    result = fit_values(values + line[:, None])
+    assert (result.left_out == 0).all()
+    # the shortest τ, which the line does not reach, still tell N
+    np.testing.assert_allclose(result.coefficients.value[1], 1.5e-4, rtol=0.12)

@@ -1,0 +1,399 @@
+"""Sample times and missing samples from counters, arrivals and given times, in scenarios where the truth is known."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.clock import FORGET_S, Line, SampleClock, made_rate
+from drivers.sample import Arrival, Counter, Given, block
+
+NS = 1e9
+T0 = 1e5  # s, where the host's clock stands
+
+
+def burst(t, every_s=0.016):
+    """Arrival at the next poll of a USB adapter."""
+    return np.ceil(t / every_s) * every_s
+
+
+def jitter(t, most_s=0.010, seed=0):
+    return np.maximum.accumulate(t + np.random.default_rng(seed).uniform(0.0, most_s, t.size))
+
+
+def feed(clock, arrived_s, ticks=None, lost=None):
+    """Blocks of the samples that arrived together."""
+    edges = [0, *(np.flatnonzero(np.diff(arrived_s)) + 1).tolist(), len(arrived_s)]
+    out = []
+    for a, b in zip(edges, edges[1:], strict=False):
+        t_ns = np.rint(arrived_s[a:b] * NS).astype(np.int64)
+        counted = None if ticks is None else np.array(ticks[a:b], np.int64)
+        out += clock.stamp(block(t_ns, np.zeros((b - a, 6)), None, counted, 0 if lost is None else int(lost[a])))
+    assert sum(len(one) for one in out) == len(arrived_s)
+    assert (np.diff(times(out)) > 0).all()
+    return out
+
+
+def times(out):
+    return np.concatenate([one.t_ns for one in out])
+
+
+def lost(out):
+    return sum(one.lost for one in out)
+
+
+def kinds(clock):
+    return [event.kind for event in clock.take_events()]
+
+
+# --- counters
+
+STIM300 = (256, 1 / 2000)
+SAMPLES_16 = (65536, None)
+XSENS = (1 << 32, 1e-4)
+VECTORNAV = (1 << 62, 1e-9)
+COUNTERS = [(STIM300, 500.0), (STIM300, 262.0), (SAMPLES_16, 100.0), ((256, None), 100.0), (XSENS, 400.0), (VECTORNAV, 40.0)]
+
+
+def ticks_of(index, kind, rate):
+    modulus, tick_s = kind
+    counted = index if tick_s is None else np.rint(index / rate / tick_s).astype(np.int64)
+    return (counted + modulus - 1000 % modulus) % modulus  # so that it wraps
+
+
+@pytest.mark.parametrize("nominal", [True, False])
+@pytest.mark.parametrize(("kind", "rate"), COUNTERS)
+class TestCounter:
+    @pytest.mark.parametrize("holes", [[], [(5, 3)], [(300, 1), (400, 10), (402, 1)], [(900, 300)]])
+    @pytest.mark.parametrize("arrive", [burst, jitter])
+    def test_missing_samples_are_exact(self, kind, rate, nominal, holes, arrive):
+        index = np.arange(int(32 * rate))
+        kept = np.ones(index.size, bool)
+        for at, n in holes:
+            # a short counter needs the settled line to see a whole turn
+            first = at if n < 256 else int(20 * rate)
+            kept[first : first + n] = False
+        clock = SampleClock(Counter(*kind), rate if nominal else None)
+        out = feed(clock, arrive(T0 + index / rate)[kept], ticks_of(index, kind, rate)[kept])
+        assert lost(out) == (~kept).sum()
+        assert clock.rate_hz == pytest.approx(rate, rel=1e-3)
+        assert kinds(clock) == []
+
+    def test_duplicates_lose_nothing(self, kind, rate, nominal):
+        index = np.arange(int(10 * rate))
+        twice = np.sort(np.concatenate([index, index[200:203]]))
+        clock = SampleClock(Counter(*kind), rate if nominal else None)
+        assert lost(feed(clock, burst(T0 + index / rate)[twice], ticks_of(index, kind, rate)[twice])) == 0
+        assert kinds(clock) == []
+
+    def test_a_counter_that_sticks_is_told_once(self, kind, rate, nominal):
+        index = np.arange(int(20 * rate))
+        ticks = ticks_of(index, kind, rate)
+        ticks[300:] = ticks[300]
+        clock = SampleClock(Counter(*kind), rate if nominal else None)
+        assert lost(feed(clock, burst(T0 + index / rate), ticks)) == 0
+        assert kinds(clock) == ["clock_jumped"]
+
+    def test_what_came_while_it_stood_still_is_not_missing(self, kind, rate, nominal):
+        index = np.arange(int(20 * rate))
+        ticks = ticks_of(index, kind, rate)
+        ticks[300:350] = ticks[300]
+        clock = SampleClock(Counter(*kind), rate if nominal else None)
+        assert lost(feed(clock, burst(T0 + index / rate), ticks)) <= 1
+        assert kinds(clock) == ["clock_jumped"]
+
+    def test_a_cable_out_for_five_seconds(self, kind, rate, nominal):
+        index, at, n = np.arange(int(40 * rate)), int(20 * rate), int(5 * rate)
+        ticks, arrived = ticks_of(index, kind, rate), jitter(T0 + index / rate)
+        clock = SampleClock(Counter(*kind), rate if nominal else None)
+        out = feed(clock, arrived[:at], ticks[:at])
+        clock.pause()
+        later = feed(clock, arrived[at + n :], ticks[at + n :])
+        assert lost(out + later) == n
+        assert times(out)[-1] < times(later)[0]
+        assert kinds(clock) == []
+
+    @pytest.mark.parametrize("at_s", [1.0, 20.0])
+    def test_a_cable_out_and_the_device_begins_anew(self, kind, rate, nominal, at_s):
+        index, at, n = np.arange(int(40 * rate)), int(at_s * rate), int(5 * rate)
+        ticks, arrived = ticks_of(index + 7000, kind, rate), jitter(T0 + index / rate)
+        fresh = ticks_of(index, kind, rate) if kind[0] == 256 else np.rint(index / rate / kind[1] if kind[1] else index)
+        clock = SampleClock(Counter(*kind), rate if nominal else None)
+        out = feed(clock, arrived[:at], ticks[:at])
+        clock.pause()
+        out += feed(clock, arrived[at + n :], fresh[: index.size - at - n])
+        turn = kind[0] / (rate and 1) * (kind[1] or 1 / rate) * rate  # samples
+        if nominal or at_s > 5.0:
+            # by arrival; what a short counter shows stands, and may be off by half a turn
+            assert lost(out) == pytest.approx(n, abs=turn / 2 + 5 if kind[0] == 256 else 5)
+        else:  # nothing is known of the rate: nothing is invented
+            assert lost(out) <= n + turn
+        assert kinds(clock) == ([] if kind[0] == 256 else ["clock_jumped"])
+
+    def test_a_late_scheduler_loses_nothing(self, kind, rate, nominal):
+        index = np.arange(int(40 * rate))
+        arrived = burst(T0 + index / rate)
+        asleep = np.flatnonzero((arrived > T0 + 20) & (arrived < T0 + 21))
+        arrived[asleep] = T0 + 21 + np.arange(asleep.size) // 60 * 3e-4
+        clock = SampleClock(Counter(*kind), rate if nominal else None)
+        out = feed(clock, np.maximum.accumulate(arrived), ticks_of(index, kind, rate))
+        assert lost(out) == 0
+        assert kinds(clock) == []
+
+
+@pytest.mark.parametrize(("kind", "rate"), COUNTERS)
+def test_a_replay_fifty_times_as_fast_as_configured(kind, rate):
+    index = np.arange(int(300 * rate))
+    clock = SampleClock(Counter(*kind), rate)
+    out = feed(clock, burst(T0 + index / rate / 50, 0.01), ticks_of(index, kind, rate))
+    assert lost(out) == 0
+    assert kinds(clock) == []
+    assert times(out)[-1] / NS == pytest.approx(T0 + 6.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("kind", "rate"), [c for c in COUNTERS if c[0][0] > 256])
+def test_a_device_that_starts_anew_unseen(kind, rate):
+    index, at = np.arange(int(40 * rate)), int(20 * rate)
+    ticks = ticks_of(index + 7000, kind, rate)
+    ticks[at:] = np.rint(np.arange(index.size - at) / rate / kind[1] if kind[1] else np.arange(index.size - at))
+    arrived = jitter(T0 + index / rate + 0.7 * (index >= at))
+    clock = SampleClock(Counter(*kind), rate)
+    assert lost(feed(clock, arrived, ticks)) == pytest.approx(0.7 * rate, abs=0.011 * rate + 1)
+    assert kinds(clock) == ["clock_jumped"]
+
+
+def test_samples_without_their_counter_go_by_arrival_and_leave_no_false_gap():
+    index = np.arange(4000)
+    ticks = index.copy()
+    ticks[1000:1200] = -1
+    clock = SampleClock(Counter(65536), 100.0)
+    assert lost(feed(clock, burst(T0 + index / 100), ticks)) == 0
+    assert kinds(clock) == []
+
+
+def test_time_stamps_of_the_device_may_jitter():
+    """Each step is another: what is usual is their middle, not the one that happened to come first."""
+    rng = np.random.default_rng(0)
+    index = np.arange(4000)
+    ticks = np.rint((index / 400 + rng.uniform(-2e-4, 2e-4, index.size)) * 1e9).astype(np.int64) + 10**9
+    kept = np.ones(index.size, bool)
+    kept[[1, 2, 700, 2000, 2001]] = False
+    clock = SampleClock(Counter(*VECTORNAV), None)
+    assert lost(feed(clock, burst(T0 + index / 400)[kept], ticks[kept])) == 5
+
+
+def test_a_device_set_to_another_rate_is_believed():
+    index = np.arange(8000)
+    ticks = np.where(index < 4000, 4 * index, 16000 + 8 * (index - 4000)) % 256
+    taken = np.where(index < 4000, index / 500, 8 + (index - 4000) / 250)
+    clock = SampleClock(Counter(*STIM300), None)
+    # until half of the last steps are the new ones, each counts as one missing
+    assert lost(feed(clock, burst(T0 + taken), ticks)) < 200
+
+
+# --- arrival alone
+
+
+@pytest.mark.parametrize("rate", [20.0, 99.32, 100.0, 1000.0, 4000.0])
+@pytest.mark.parametrize("arrive", [burst, jitter])
+@pytest.mark.parametrize("nominal", [True, False])
+def test_arrival_jitter_does_not_become_jitter_of_the_samples(rate, arrive, nominal):
+    taken = T0 + np.arange(int(45 * rate)) / rate
+    clock = SampleClock(Arrival(), rate if nominal else None)
+    out = feed(clock, arrive(taken))
+    assert lost(out) == 0
+    assert kinds(clock) == []
+    settled = times(out)[int(FORGET_S * rate) :] / NS
+    # an arrival's own share in the line is up to 4 of the arrivals in 30 s; a burst is off by up to 8 ms, jitter by 5
+    most = 4 * (0.008 if arrive is burst else 0.005) / (FORGET_S * rate)
+    assert np.abs(np.diff(settled) - 1 / rate).max() < max(1.5 * most, 5e-6)
+    if arrive is jitter and rate >= 99.0:
+        assert np.abs(np.diff(settled) - 1 / rate).max() < 10e-6
+    assert np.ptp(settled - taken[int(FORGET_S * rate) :]) < 3e-3
+    assert clock.rate_hz == pytest.approx(rate, rel=2e-5 if rate > 50 else 2e-4)
+    assert clock.measured_hz == pytest.approx(rate, rel=2e-4)
+
+
+@pytest.mark.parametrize("rate", [20.0, 99.32, 100.0])
+@pytest.mark.parametrize("arrive", [burst, jitter])
+@pytest.mark.parametrize("nominal", [True, False])
+class TestArrival:
+    def clock(self, rate, nominal):
+        return SampleClock(Arrival(), rate if nominal else None)
+
+    @pytest.mark.parametrize("asleep_s", [0.2, 1.0, 2.5])
+    def test_a_late_scheduler_loses_nothing(self, rate, arrive, nominal, asleep_s):
+        arrived = arrive(T0 + np.arange(int(40 * rate)) / rate)
+        asleep = np.flatnonzero((arrived > T0 + 20) & (arrived < T0 + 20 + asleep_s))
+        arrived[asleep] = T0 + 20 + asleep_s + np.arange(asleep.size) // 20 * 3e-4
+        clock = self.clock(rate, nominal)
+        out = feed(clock, np.maximum.accumulate(arrived))
+        assert lost(out) == 0
+        assert np.diff(times(out)[int(10 * rate) :]).max() < 1.1 * NS / rate + 2e6
+
+    @pytest.mark.parametrize("hole_s", [[0.2], [0.5], [2.0], [0.5, 0.3]])
+    def test_holes_are_found(self, rate, arrive, nominal, hole_s):
+        index = np.arange(int(60 * rate))
+        kept = np.ones(index.size, bool)
+        for i, length in enumerate(hole_s):
+            at = int((20 + 1.5 * i) * rate)
+            kept[at : at + round(length * rate)] = False
+        clock = self.clock(rate, nominal)
+        out = feed(clock, arrive(T0 + index / rate)[kept])
+        assert lost(out) == pytest.approx((~kept).sum(), abs=2)
+        assert kinds(clock) == []
+
+    def test_rejected_frames_are_missing_and_nothing_else(self, rate, arrive, nominal):
+        index = np.arange(int(40 * rate))
+        bad = np.zeros(index.size, int)
+        kept = np.ones(index.size, bool)
+        for at in range(100, index.size, 97):
+            kept[at : at + 2] = False
+            bad[at + 2] = 2
+        clock = self.clock(rate, nominal)
+        assert lost(feed(clock, arrive(T0 + index / rate)[kept])) == 0  # nobody told, too short to be seen
+        clock = self.clock(rate, nominal)
+        arrived = T0 + index / rate  # one by one, so that each block may carry its loss
+        assert lost(feed(clock, arrived[kept], lost=bad[kept])) == bad.sum()
+
+    @pytest.mark.parametrize("at_s", [1.0, 20.0])
+    def test_a_cable_out_for_five_seconds(self, rate, arrive, nominal, at_s):
+        arrived = arrive(T0 + np.arange(int(60 * rate)) / rate)
+        at, n = int(at_s * rate), int(5 * rate)
+        clock = self.clock(rate, nominal)
+        out = feed(clock, arrived[:at])
+        clock.pause()
+        out += feed(clock, arrived[at + n :])
+        if nominal or at_s > 5.0:
+            assert lost(out) == pytest.approx(n, abs=2)
+        assert clock.rate_hz == pytest.approx(rate, rel=1e-3)
+
+
+@pytest.mark.parametrize("rate", [20.0, 100.0, 2000.0])
+def test_a_fast_replay_by_arrival(rate):
+    clock = SampleClock(Arrival(), rate)
+    out = feed(clock, burst(T0 + np.arange(int(300 * rate)) / rate / 50, 0.01))
+    assert lost(out) == 0
+    assert times(out)[-1] / NS == pytest.approx(T0 + 6.0, abs=0.1)
+
+
+def test_a_crystal_that_drifts_is_followed_for_half_an_hour():
+    index = np.arange(1800 * 100)
+    taken = T0 + np.cumsum((1.0 + 50e-6 * np.sin(2 * np.pi * index / index.size)) / 100.0)
+    clock = SampleClock(Arrival(), 100.0)
+    out = feed(clock, burst(taken))
+    assert lost(out) == 0
+    off = times(out)[6000:] / NS - taken[6000:]
+    assert np.ptp(off) < 5e-3  # the mean of the wait for the poll drifts by a quarter of it; the line lags 30 s
+
+
+def test_unix_time_keeps_its_nanoseconds():
+    """Frames of a log: a double of Unix time holds no more than 240 ns."""
+    t_ns = 1_700_000_000_123_456_789 + np.arange(2000) * 1_000_000
+    clock = SampleClock(Arrival(), 1000.0)
+    out = [one for t in t_ns for one in clock.stamp(block(np.array([t]), np.zeros((1, 6))))]
+    assert np.abs(times(out) - t_ns).max() <= 5
+
+
+def test_the_first_samples_of_an_unknown_rate_are_in_order():
+    clock = SampleClock(Arrival(), None)
+    out = clock.stamp(block(np.full(50, 10**9), np.zeros((50, 6))))
+    assert clock.rate_hz is None
+    assert (np.diff(times(out)) > 0).all()
+
+
+# --- given times
+
+
+@pytest.mark.parametrize("rows", [1, 20, 4096])
+@pytest.mark.parametrize("nominal", [True, False])
+@pytest.mark.parametrize("scatter", ["exact", "ms", "normal", "uniform", "bursts"])
+def test_given_times_are_kept_and_holes_told_where_they_can_be(rows, nominal, scatter):
+    rng = np.random.default_rng(3)
+    index = np.arange(6000)
+    kept = ~((index > 2000) & (index <= 2050) | (index == 3000))
+    exact = 1.7e9 + index / 100
+    t = {
+        "exact": exact,
+        "ms": np.round(exact, 3),
+        "normal": exact + 0.0015 * rng.standard_normal(index.size),
+        "uniform": np.sort(exact + rng.uniform(-0.005, 0.005, index.size)),
+        "bursts": np.sort(burst(exact, 0.043) + rng.uniform(0.0, 0.002, index.size)),
+    }[scatter][kept]
+    t_ns = np.rint(t * NS).astype(np.int64)
+    clock = SampleClock(Given(), 100.0 if nominal else None)
+    out = []
+    for at in range(0, len(t_ns), rows):
+        out += clock.stamp(block(t_ns[at : at + rows].copy(), np.zeros((len(t_ns[at : at + rows]), 6))))
+    assert np.array_equal(times(out), t_ns)
+    if scatter in ("exact", "ms", "normal"):
+        assert lost(out) in ((51,) if scatter != "normal" else (49, 50, 51, 52))
+        assert clock.rate_hz == pytest.approx(100.0, rel=5e-3)
+    else:  # late and early by whole periods: nothing is invented
+        assert lost(out) <= 1
+    assert kinds(clock) == []
+
+
+def test_given_times_that_jump_are_told_and_the_rate_survives():
+    t = np.concatenate([np.arange(1000) / 100, 5.0 + np.arange(1000) / 100, 9000.0 + np.arange(1000) / 100])
+    clock = SampleClock(Given(), None)
+    out = []
+    for at in range(0, 3000, 100):
+        out += clock.stamp(block(np.rint(t[at : at + 100] * NS).astype(np.int64), np.zeros((100, 6))))
+    texts = [event.text for event in clock.take_events()]
+    assert [text.split(" by ")[0] for text in texts] == ["time went back", "time went on"]
+    assert clock.rate_hz == 100.0
+    assert lost(out) == round((9000.0 - 14.99) * 100) - 1
+
+
+def test_times_that_stand_still_or_jitter_back_lose_nothing():
+    t = np.arange(2000) / 100
+    t[500:503] = t[500]
+    t[700:1500:2] -= 0.012
+    clock = SampleClock(Given(), 100.0)
+    out = clock.stamp(block(np.rint(t * NS).astype(np.int64), np.zeros((2000, 6))))
+    assert lost(out) <= 2
+    assert kinds(clock) == ["clock_jumped"]
+
+
+def test_loss_told_by_the_sender_is_kept():
+    clock = SampleClock(Given(), 100.0)
+    first = block(np.arange(100) * 10**7, np.zeros((100, 6)))
+    second = block(np.arange(107, 207) * 10**7, np.zeros((100, 6)), lost=7)
+    assert lost(clock.stamp(first) + clock.stamp(second)) == 7
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "most"), [("mpu6050-hosttime/static-11min", 0), ("phone/gyro-a", 0), ("can-car/drive-a", 60)]
+)
+def test_recordings_with_host_times_have_no_invented_holes(name, most):
+    if "IMU_MONITOR_DATA" not in os.environ:
+        pytest.skip("IMU_MONITOR_DATA does not point to the recordings")
+    t = np.load(Path(os.environ["IMU_MONITOR_DATA"]) / f"{name}.npz")["t"]
+    t_ns = np.rint(t * NS).astype(np.int64)
+    for nominal in (None, (len(t) - 1) / (t[-1] - t[0])):
+        clock = SampleClock(Given(), nominal)
+        out = []
+        for at in range(0, len(t), 500):
+            out += clock.stamp(block(t_ns[at : at + 500].copy(), np.zeros((len(t_ns[at : at + 500]), 6))))
+        assert lost(out) <= most
+
+
+# --- parts
+
+
+def test_the_line_of_exact_points_is_exact():
+    line = Line()
+    for i in range(100):
+        line.add(7.0 * i, 3.0 + 0.07 * i)
+    assert line.rate_hz() == pytest.approx(100.0, rel=1e-12)
+    assert line.at(7000.0) == pytest.approx(73.0, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("measured", "made"), [(99.97, 100.0), (100.19, 100.0), (100.3, 100.3), (262.1, 262.0), (1e6, 1e6), (0.5, 0.5)]
+)
+def test_rates_that_sensors_are_made_with(measured, made):
+    assert made_rate(measured) == made

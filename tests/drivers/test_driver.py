@@ -1,0 +1,312 @@
+"""One device's reader over the in-memory link: it goes on whatever happens, ends at once, and counts every sample."""
+
+import os
+import threading
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from drivers.clock import SampleClock
+from drivers.decoders import stim300, text, vectornav_binary
+from drivers.driver import UNDECODED_BYTES, AxisMap, Driver, axis_map
+from drivers.links.loopback_link import LoopbackLink
+from drivers.sample import NO_TICK, Chunk, block
+
+RATE = 100.0
+
+
+def samples(first, n, rate=RATE, tick_s=1e-9, modulus=1 << 62):
+    index = np.arange(first, first + n)
+    values = np.tile([0.1, -0.2, 0.3, 1.0, 2.0, 9.81], (n, 1)) + 1e-3 * index[:, None]
+    ticks = np.rint(index / rate / tick_s).astype(np.int64) % modulus
+    return block(np.zeros(n, np.int64), values, None, ticks)
+
+
+class Rig:
+    """A driver with its pushed blocks; a decoder of the same kind encodes."""
+
+    def __init__(self, decoder=None, rate=RATE, axes=None, silence_s=0.0):
+        self.decoder = decoder or vectornav_binary.build(vectornav_binary.Settings())
+        self.encoder = vectornav_binary.build(vectornav_binary.Settings())
+        self.link = LoopbackLink()
+        self.pushed = []
+        clock = SampleClock(self.decoder.timing, rate)
+        self.driver = Driver("bench", self.link, self.decoder, clock, self.pushed.append, axes, silence_s)
+        self.thread = threading.Thread(target=self.driver.run, daemon=True)
+        self.sent = 0
+
+    def send(self, n):
+        for chunk in self.encoder.encode(samples(self.sent, n)):
+            self.link.write(chunk.data)
+        self.sent += n
+
+    def wait(self, condition, seconds=5.0):
+        until = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < until, f"{self.driver.state}: {self.driver.text}, {self.driver.counts}"
+            time.sleep(0.002)
+
+    def received(self, n):
+        self.wait(lambda: self.driver.counts.received == n)
+
+    def kinds(self):
+        return [event.kind for event in self.driver.take_events()]
+
+
+@contextmanager
+def running(*args, **kwargs):
+    rig = Rig(*args, **kwargs)
+    rig.thread.start()
+    try:
+        yield rig
+    finally:
+        begun = time.monotonic()
+        rig.driver.stop()
+        rig.thread.join(5.0)
+        assert not rig.thread.is_alive()
+        assert time.monotonic() - begun < 0.5
+
+
+def test_samples_come_through():
+    with running() as rig:
+        assert rig.driver.state == "waiting"
+        assert rig.driver.text == "waiting for loopback"
+        rig.send(50)
+        rig.received(50)
+        rig.wait(lambda: rig.driver.state == "running")
+        assert rig.driver.text == ""
+    values = np.concatenate([one.values for one in rig.pushed])
+    assert values == pytest.approx(samples(0, 50).values, rel=1e-6)
+    assert (rig.driver.counts.bad, rig.driver.counts.lost) == (0, 0)
+    assert rig.kinds() == []
+
+
+def test_a_link_that_is_absent_is_tried_again_with_growing_pauses():
+    rig = Rig()
+    tries = []
+    honest = rig.link.open
+
+    def opened():
+        tries.append(time.monotonic())
+        honest()
+
+    rig.link.open = opened
+    rig.link.absent = True
+    rig.thread.start()
+    rig.wait(lambda: len(tries) >= 4)
+    assert rig.driver.state == "waiting"
+    assert "nobody is at the other end" in rig.driver.text
+    assert rig.driver.text.endswith("trying again")
+    pauses = np.diff(tries[:4])
+    assert (pauses > [0.09, 0.18, 0.38]).all()
+    rig.link.absent = False
+    rig.send(5)
+    rig.received(5)
+    rig.driver.stop()
+    rig.thread.join(1.0)
+    assert rig.kinds() == []  # it never was there, so it is not back
+
+
+def test_a_lost_link_is_told_and_told_when_it_is_back():
+    with running() as rig:
+        rig.send(20)
+        rig.received(20)
+        rig.link.absent = True
+        rig.link.drop()
+        rig.wait(lambda: rig.driver.state == "lost")
+        rig.sent += 30  # the device goes on measuring
+        time.sleep(0.3)  # as long as these take
+        rig.link.absent = False
+        rig.send(20)
+        rig.received(40)
+        rig.wait(lambda: rig.driver.state == "running")
+    assert rig.kinds() == ["link_lost", "samples_lost", "link_back"]
+    assert rig.driver.counts.lost == 30
+
+
+def test_silence_opens_the_link_anew():
+    with running(silence_s=0.3) as rig:
+        rig.send(1)
+        rig.received(1)
+        rig.wait(lambda: rig.driver.state == "lost", 2.0)
+        assert "silent for" in rig.driver.text
+        rig.send(1)
+        rig.wait(lambda: rig.driver.state == "running", 3.0)
+    assert {"link_lost", "link_back"} <= set(rig.kinds())
+
+
+def test_a_replay_s_end_ends_the_reader():
+    rig = Rig()
+    rig.send(10)
+    rig.link.end()
+    rig.thread.start()
+    rig.thread.join(5.0)
+    assert not rig.thread.is_alive()
+    assert rig.driver.state == "ended"
+    assert "end of what was written" in rig.driver.text
+    assert rig.driver.counts.received == 10
+
+
+@pytest.mark.parametrize("where", ["absent", "waiting", "running", "lost", "flooded", "before it began"])
+def test_it_ends_within_half_a_second_from_anywhere(where):
+    rig = Rig(silence_s=0.0)
+    if where == "before it began":
+        rig.driver.stop()
+    rig.link.absent = where == "absent"
+    rig.thread.start()
+    if where in ("running", "lost"):
+        rig.send(3)
+        rig.received(3)
+    if where == "lost":
+        rig.link.absent = True
+        rig.link.drop()
+        rig.wait(lambda: rig.driver.state == "lost")
+    if where == "flooded":
+        for _ in range(20):
+            rig.send(500)
+    if where == "absent":
+        time.sleep(0.8)  # so that it is in one of the longer pauses
+    begun = time.monotonic()
+    rig.driver.stop()
+    rig.thread.join(3.0)
+    assert not rig.thread.is_alive()
+    assert time.monotonic() - begun < 0.5
+
+
+def test_stopping_just_when_the_link_opens_still_ends():
+    """A stop between the look at the flag and ``open`` must not leave an open link read for ever."""
+    for _ in range(200):
+        rig = Rig()
+        rig.thread.start()
+        rig.driver.stop()
+        rig.thread.join(1.0)
+        assert not rig.thread.is_alive()
+
+
+def test_bytes_without_a_sample_say_so():
+    with running() as rig:
+        for _ in range(30):
+            rig.link.write(bytes(range(1, 200)))
+        rig.wait(lambda: f"{rig.link.name}: " in rig.driver.text)
+        assert "baud rate" in rig.driver.text
+        assert rig.driver.state == "waiting"
+        rig.send(5)
+        rig.wait(lambda: rig.driver.state == "running")
+        assert rig.driver.text == ""
+    assert UNDECODED_BYTES < 30 * 199
+
+
+def test_fifty_lost_links_leave_nothing_behind():
+    with running() as rig:
+        rig.send(1)
+        rig.received(1)
+        threads, files = threading.active_count(), len(os.listdir("/proc/self/fd")) if os.path.isdir("/proc/self/fd") else 0
+        for i in range(50):
+            rig.link.drop()
+            rig.wait(lambda: rig.driver.state == "lost")
+            rig.sent += 1
+            rig.send(1)
+            rig.wait(lambda n=i + 2: rig.driver.counts.received == n and rig.driver.state == "running")
+        assert threading.active_count() == threads
+        assert not files or len(os.listdir("/proc/self/fd")) <= files
+        kinds = rig.kinds()
+        assert kinds.count("link_lost") == kinds.count("link_back") == 50
+    assert rig.driver.counts.lost == 50
+
+
+def damaged(frames, broken, absent):
+    """The stream with a byte flipped in some frames and others left out."""
+    out = []
+    for i, frame in enumerate(frames):
+        if i in absent:
+            continue
+        out.append(bytes([*frame[:9], frame[9] ^ 0x55, *frame[10:]]) if i in broken else frame)
+    return b"".join(out)
+
+
+@pytest.mark.parametrize("name", ["vectornav_binary", "stim300"])
+@pytest.mark.parametrize("pieces", [1, 7, 1000])
+def test_received_bad_and_lost_are_all_that_was_sent(name, pieces):
+    module = {"vectornav_binary": vectornav_binary, "stim300": stim300}[name]
+    decoder, encoder = module.build(module.Settings()), module.build(module.Settings())
+    kind = decoder.timing
+    n = 2000
+    rng = np.random.default_rng(4)
+    broken = set(rng.choice(np.arange(20, n - 5), 60, replace=False).tolist())
+    absent = set(rng.choice(np.arange(20, n - 5), 80, replace=False).tolist()) - broken
+    frames = [c.data for c in encoder.encode(samples(0, n, 500.0, kind.tick_s, kind.modulus))]
+    data = damaged(frames, broken, absent)
+    rig = Rig(decoder, 500.0)
+    rig.thread.start()
+    for at in range(0, len(data), max(1, len(data) // pieces)):
+        rig.link.write(data[at : at + max(1, len(data) // pieces)])
+    rig.link.end()
+    rig.thread.join(10.0)
+    counts = rig.driver.counts
+    assert rig.driver.state == "ended"
+    assert counts.received == n - len(broken) - len(absent)
+    assert counts.received + counts.bad + counts.lost == n
+    assert counts.bad == len(broken)
+    assert sum(len(one) + one.lost for one in rig.pushed) == n
+
+
+def test_loss_counts_once_beside_rejected_frames_in_one_read():
+    """One read with a rejected frame before its first gap, and a second gap behind."""
+    rig = Rig()
+    frames = [c.data for c in rig.encoder.encode(samples(0, 60))]
+    rig.link.open()
+    rig.link.write(b"".join(frames[:20]))
+    rig.driver.step()
+    rig.link.write(damaged(frames, {20}, {30, 31, 32})[20 * len(frames[0]) :])
+    rig.driver.step()
+    counts = rig.driver.counts
+    assert (counts.received, counts.bad, counts.lost) == (56, 1, 3)
+
+
+def test_times_follow_what_the_link_brings():
+    rig = Rig()
+    rig.link.epoch = "unix"
+    assert Driver("a", rig.link, rig.decoder, rig.driver.clock, rig.pushed.append).times_are_unix
+    assert not rig.driver.times_are_unix
+
+
+# --- axes
+
+
+def test_axes_are_mapped_with_their_signs():
+    axes = axis_map({"gy": "gz", "gz": "-gy", "ay": "+az", "az": "-ay"})
+    with running(axes=axes) as rig:
+        rig.send(1)
+        rig.received(1)
+    assert rig.pushed[0].values[0] == pytest.approx([0.1, 0.3, 0.2, 1.0, 9.81, -2.0], rel=1e-6)
+
+
+def test_axis_map_keeps_all_else():
+    first = block(np.arange(3), np.arange(18.0).reshape(3, 6), np.ones(3), np.arange(3), 4)
+    mapped = axis_map({"gx": "-gx"}).apply(first)
+    assert (mapped.lost, mapped.ticks.tolist(), mapped.temperature_c.tolist()) == (4, [0, 1, 2], [1.0] * 3)
+    assert mapped.values[:, 0].tolist() == [-0.0, -6.0, -12.0]
+    assert np.array_equal(mapped.values[:, 1:], first.values[:, 1:])
+    assert AxisMap().apply(first) is first
+    assert axis_map({}) == AxisMap()
+
+
+@pytest.mark.parametrize("table", [{"gq": "gx"}, {"gx": "mx"}, {"gx": "--gy"}, {"gx": ""}, {"gx": "-"}])
+def test_axes_that_are_none_are_refused(table):
+    with pytest.raises(KeyError):
+        axis_map(table)
+
+
+def test_an_arrival_timed_device_counts_its_rejected_lines():
+    decoder = text.build(text.Settings(columns=["gx", "gy", "gz", "ax", "ay", "az"], gyro_unit="rad/s", accel_unit="m/s2"))
+    rig = Rig(decoder)
+    lines = [b"0.1 0.2 0.3 1 2 9.8\n"] * 50
+    lines[20] = b"0.1 0.2 x.3 1 2 9.8\n"
+    rig.link.write(Chunk(b"".join(lines), 10**9))
+    rig.link.end()
+    rig.driver.run()
+    counts = rig.driver.counts
+    assert (counts.received, counts.bad, counts.lost) == (49, 1, 0)
+    assert (rig.pushed[0].ticks == NO_TICK).all()

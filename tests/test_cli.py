@@ -1,0 +1,522 @@
+"""The program as its users meet it: exit status, one line for what is wrong, JSON, signals, pipes, open sockets."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import allantools
+import numpy as np
+import psutil
+import pytest
+
+from drivers.recording import save_samples
+from drivers.sample import AXES
+from monitor.cli import main
+from monitor.settings import CONFIG_FOLDER
+from monitor.virtual import read_model
+
+PROGRAM = [sys.executable, "-m", "monitor.cli"]
+COMMANDS = ("demo", "run", "check", "watch", "analyze")
+RATE_HZ = 100.0
+DEVICE = '[[device]]\nname = "bench-1"\n'
+VIRTUAL = DEVICE + 'driver = { link = "virtual" }\n'
+CAN = DEVICE + 'driver = {{ link = "can", channel = "can0", decoder = "dbc", decoder_options = {} }}\n'
+QUIET = '[zenoh]\nmode = "none"\n[viewer]\nmode = "none"\n'
+
+
+class Said:
+    """What one run of the program left behind."""
+
+    def __init__(self, status: int, out: str, err: str) -> None:
+        self.status, self.out, self.err = status, out, err
+
+    def only_line(self) -> str:
+        """The one line on standard error; standard output is empty."""
+        assert self.out == ""
+        assert self.err.endswith("\n")
+        assert self.err.count("\n") == 1, self.err
+        assert "Traceback" not in self.err
+        return self.err
+
+
+Call = Callable[..., Said]
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path) -> Call:
+    """The program in this process, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: str) -> Said:
+        monkeypatch.setattr(sys, "argv", ["imu-monitor", *arguments])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main()
+        out, err = capfd.readouterr()
+        return Said(int(ended.value.code or 0), out, err)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three minutes of the shipped model."""
+    path = tmp_path_factory.mktemp("recording") / "static.csv"
+    values = read_model(CONFIG_FOLDER / "models" / "consumer-mems.toml").stream(RATE_HZ, 7).draw(18_000)
+    save_samples(path, np.arange(len(values)) / RATE_HZ, values)
+    return path
+
+
+def program(*arguments: str, **more: Any) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run([*PROGRAM, *arguments], capture_output=True, text=True, timeout=60, check=False, **more)
+
+
+# --- configuration files ---------------------------------------------------------------------------
+
+WRONG_FILES = {
+    "unknown key": (VIRTUAL + "windw = 10.0\n", 'windw: unknown key; did you mean "window"?'),
+    "unknown table": (VIRTUAL + '[zeno]\nmode = "peer"\n', 'zeno: unknown key; did you mean "zenoh"?'),
+    "wrong type": (VIRTUAL + 'rate = "fast"\n', "device[0].rate: Expected `float | null`, got `str`"),
+    "infinite rate": (VIRTUAL + "rate = inf\n", "inf Hz"),
+    "one name twice": (VIRTUAL + VIRTUAL, '2 devices are named "bench-1"; names must be unique'),
+    "name with a slash": (VIRTUAL.replace("bench-1", "a/b"), '"a/b"; letters, digits, - and _ are possible'),
+    "no name": ('[[device]]\ndriver = { link = "virtual" }\n', "device[0].name: missing"),
+    "no driver": (DEVICE, "device[0].driver: missing"),
+    "no device": ("", "there is none; add [[device]]"),
+    "not TOML": ("[[device\nname =", "not TOML: "),
+    "not text": (b"\xff\xfe\x00", "cannot be read: "),
+    "unknown protocol": (DEVICE + 'driver = { link = "virtual", decoder = "stim30" }\n', 'did you mean "stim300"?'),
+    "protocol by number": (DEVICE + 'driver = { link = "virtual", decoder = 3 }\n', "driver.decoder: expected a name"),
+    "unknown link": (DEVICE + 'driver = { link = "seral" }\n', 'unknown link "seral"; did you mean "serial"?'),
+    "no link": (DEVICE + "driver = {}\n", "driver.link: missing; known are can, replay, serial, virtual, zenoh"),
+    "no protocol": (DEVICE + 'driver = { link = "serial", port = "/dev/x" }\n', "driver.decoder: missing; known are"),
+    "no port": (DEVICE + 'driver = { link = "serial", decoder = "stim300" }\n', "driver.port: missing"),
+    "protocol that does not fit": (
+        DEVICE + 'driver = { link = "virtual", decoder = "ros2_imu" }\n',
+        "ros2_imu reads messages, link virtual brings bytes",
+    ),
+    "negative silence": (DEVICE + 'driver = { link = "virtual", silence = -1.0 }\n', "driver.silence: Expected"),
+    "negative seed": (DEVICE + 'driver = { link = "virtual", seed = -1 }\n', "driver.seed: Expected"),
+    "unknown model": (DEVICE + 'driver = { link = "virtual", model = "x" }\n', "one of consumer-mems"),
+    "DBC without the signal": (
+        CAN.format('{ file = "canmod_gps", signals = { gx = "ImuData.Nope" } }'),
+        'signals.gx: message ImuData has no signal "Nope"; known are ',
+    ),
+    "DBC without the message": (
+        CAN.format('{ file = "canmod_gps", signals = { gx = "ImuDat.AngularRateX" } }'),
+        'has no message "ImuDat"; did you mean "ImuData"?',
+    ),
+    "no such DBC": (
+        CAN.format('{ file = "canmod_gp", signals = { gx = "ImuData.AngularRateX" } }'),
+        'did you mean "canmod_gps"?',
+    ),
+    "bad unit": (VIRTUAL + 'window = "3 parsec"\n', '"3 parsec" is no duration; write seconds, or "90s"'),
+    "window too short": (VIRTUAL + "rate = 100.0\nwindow = 0.1\n", "are 10 samples; possible are 100 to 10000000"),
+    "window too long": (VIRTUAL + 'rate = 100.0\nwindow = "2d"\n', "are 17280000 samples; possible are 100 to"),
+    "window too long at any rate": (VIRTUAL + 'window = "1e9 s"\n', "1e+09 s; at most 3.456e+06 s"),
+    "unknown grid of tau": (VIRTUAL + 'tau = "octav"\n', "device[0].tau: "),
+    "negative tau": (VIRTUAL + "tau = [-1.0]\n", "device[0].tau: "),
+    "empty tau": (VIRTUAL + "tau = []\n", "tau: none of [] s lies between one sample and 1800 s, half the window"),
+    "tau beyond the window": (VIRTUAL + "window = 10.0\ntau = [1000.0]\n", "tau: none of [1000.0] s lies between"),
+    "tau below a sample": (VIRTUAL + "rate = 100.0\ntau = [0.001]\n", "tau: none of [0.001] s lies between"),
+    "bad rate of fits": (VIRTUAL + 'refit = "10 hz"\n', '"10 hz" is no rate; write "10 Hz" or "every sample"'),
+    "no rate of fits": (VIRTUAL + 'refit = "0 Hz"\n', '"0 Hz" is no rate; write "10 Hz" or "every sample"'),
+    "unknown axis": (VIRTUAL + 'axes = { gz = "-gw" }\n', 'gz = "-gw"; both are one of gx gy gz ax ay az'),
+    "bad viewer": (VIRTUAL + '[viewer]\nmode = "nativ"\n', 'viewer.mode: "nativ"; possible are auto, native, web, none'),
+    "bad port": (VIRTUAL + "[viewer]\nport = 99999\n", "viewer.port: Expected `int` <= 65535"),
+    "bad size": (VIRTUAL + '[viewer]\nmemory = "lots"\n', 'viewer.memory: "lots" is no size; write "256MiB"'),
+    "bad endpoint": (VIRTUAL + '[zenoh]\nlisten = ["7450"]\n', 'zenoh.listen: "7450" is no endpoint; write "tcp/'),
+    "no zenoh file": (VIRTUAL + '[zenoh]\nconfig = "x.json5"\n', "x.json5: no such file"),
+    "client of nobody": (VIRTUAL + '[zenoh]\nmode = "client"\n', "zenoh.connect: empty, but a client needs a router"),
+    "bad log level": (VIRTUAL + '[log]\nlevel = "loud"\n', "log.level: "),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_FILES)
+def test_a_wrong_file_refuses_to_start_in_one_line(call: Call, case: str) -> None:
+    text, words = WRONG_FILES[case]
+    Path("c.toml").write_bytes(text if isinstance(text, bytes) else text.encode())
+    for command in ("run", "check"):
+        said = call(command, "c.toml")
+        assert said.status == 2
+        line = said.only_line()
+        assert "c.toml: " in line
+        assert words in line
+
+
+def test_check_tells_all_that_is_wrong_and_run_the_first(call: Call) -> None:
+    text = '[[device]]\nname = "a"\nwindw = 1.0\ndriver = { link = "virtual" }\n[viewer]\nmode = "x"\n[log]\nlevel = 3\n'
+    Path("c.toml").write_text(text)
+    said = call("check", "c.toml")
+    assert said.status == 2
+    assert said.out == ""
+    assert [line.split(": ")[:2] for line in said.err.splitlines()] == [
+        ["c.toml", key] for key in ("device[0].windw", "log.level", "viewer.mode")
+    ]
+    line = call("run", "c.toml").only_line()
+    assert "windw" in line
+    assert "(and 2 more: imu-monitor check c.toml)" in line
+
+
+def test_check_reads_the_model_of_a_simulated_device_too(call: Call) -> None:
+    Path("model.toml").write_text("sample_rate = 100.0\n[gz.angle_random_walk]\nM = 1.0\n")
+    Path("c.toml").write_text(DEVICE + 'driver = { link = "virtual", model = "model.toml" }\n' + QUIET)
+    for command in ("check", "run"):
+        said = call(command, "c.toml")
+        assert said.status == 2
+        assert "model.toml" in said.only_line()
+
+
+@pytest.mark.parametrize("path", sorted(CONFIG_FOLDER.glob("*.toml")), ids=lambda path: path.stem)
+def test_check_accepts_every_shipped_file(call: Call, path: Path) -> None:
+    if path.stem in ("can", "replay"):  # their own files are the user's
+        pytest.skip(f"{path.name} names files that only its reader has")
+    said = call("check", str(path))
+    assert (said.status, said.err) == (0, "")
+    assert "nothing wrong" in said.out
+
+
+def test_check_accepts_the_defaults_that_it_prints(call: Call) -> None:
+    printed = call("check", "--print-defaults")
+    assert (printed.status, printed.err) == (0, "")
+    Path("defaults.toml").write_text(printed.out)
+    said = call("check", "defaults.toml")
+    assert (said.status, said.out, said.err) == (0, "defaults.toml: 1 device, nothing wrong\n", "")
+
+
+# --- arguments -------------------------------------------------------------------------------------
+
+WRONG_ARGUMENTS = {
+    "no command": ((), "Missing command"),
+    "unknown command": (("analyse",), "No such command 'analyse'"),
+    "unknown option": (("analyze", "x.csv", "--nope"), "No such option: --nope"),
+    "missing argument": (("analyze",), "Missing argument 'RECORDING'"),
+    "missing configuration": (("run",), "Missing argument 'CONFIG.toml'"),
+    "nothing to check": (("check",), "--print-defaults"),
+    "missing file": (("run", "nowhere.toml"), "nowhere.toml: no such file"),
+    "folder for a file": (("run", "."), ".: cannot be read"),
+    "bad viewer": (("demo", "--viewer", "nativ"), '--viewer: "nativ"; possible are auto, native, web, none'),
+    "bad seconds": (("demo", "--seconds", "soon"), "Invalid value for '--seconds'"),
+    "no seconds": (("demo", "--seconds", "0"), "Invalid value for '--seconds'"),
+    "bad endpoint": (("watch", "--connect", "7450"), 'connect "7450": no endpoint; write e.g. tcp/127.0.0.1:7450'),
+    "bad key": (("watch", "##", "--connect", "tcp/127.0.0.1:9"), 'key expression "##"'),
+    "bad rate": (("analyze", "x.csv", "--rate", "-1"), "--rate: -1 Hz; it must be above 0"),
+    "no rate": (("analyze", "x.csv", "--rate", "nan"), "--rate"),
+    "bad tau": (("analyze", "x.csv", "--tau", "octav"), '--tau: "octav"; possible are octave, decade10, or seconds'),
+    "negative tau": (("analyze", "x.csv", "--tau", "1,-2"), "every averaging time must be above 0 s"),
+    "bad picture": (("analyze", "x.csv", "--plot", "x.pdf"), "a name ending in .png is needed"),
+    "no recording": (("analyze", "nowhere.csv"), "nowhere.csv: cannot be read: No such file or directory"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_ARGUMENTS)
+def test_a_wrong_argument_is_one_line(call: Call, case: str) -> None:
+    arguments, words = WRONG_ARGUMENTS[case]
+    said = call(*arguments)
+    assert said.status == 2
+    assert words in said.only_line()
+
+
+def test_help_of_every_command_is_quick() -> None:
+    """None of the heavy libraries is loaded for it."""
+    source = f"""
+import sys
+from monitor.cli import main
+for command in ([], *([name] for name in {COMMANDS!r})):
+    sys.argv = ["imu-monitor", *command, "--help"]
+    try:
+        main()
+    except SystemExit as ended:
+        print("status", ended.code)
+print("heavy", sorted({{"numpy", "scipy", "numba", "rerun", "zenoh", "can", "matplotlib", "pyarrow"}} & sys.modules.keys()))
+"""
+    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.count("status 0\n") == 1 + len(COMMANDS)
+    assert done.stdout.count("--help") >= 1 + len(COMMANDS)
+    assert done.stdout.endswith("heavy []\n")
+
+
+# --- analyze ---------------------------------------------------------------------------------------
+
+
+def test_json_on_standard_output_is_all_there_is(call: Call, recording: Path) -> None:
+    said = call("analyze", str(recording), "--json", "-")
+    assert (said.status, said.err) == (0, "")
+    result = json.loads(said.out)
+    assert {"schema", "rate", "samples", "seconds", "notes", "axes"} <= result.keys()
+    assert result["schema"] == "imu-monitor/analyze/1"
+    assert (result["rate"], result["samples"], result["seconds"], result["notes"]) == (RATE_HZ, 18_000, 180.0, [])
+    assert list(result["axes"]) == list(AXES)
+    for table in result["axes"].values():
+        assert {"allan", "coefficients"} <= table.keys()
+        assert {"tau", "deviation", "lo", "hi"} == table["allan"].keys()
+        assert len({len(column) for column in table["allan"].values()}) == 1
+        assert list(table["coefficients"]) == list("QNBKR")
+        for one in table["coefficients"].values():
+            assert one.keys() == {"value", "lo", "hi", "status"}
+            assert one["status"] in ("estimated", "upper_bound", "unestimated")
+            assert (one["value"] is None) == (one["status"] != "estimated")
+        allan = {name: np.array(column) for name, column in table["allan"].items()}
+        assert (allan["lo"] < allan["deviation"]).all()
+        assert (allan["deviation"] < allan["hi"]).all()
+        assert table["coefficients"]["N"]["status"] == "estimated"
+
+
+@pytest.mark.parametrize("grid", ["octave", "decade10", "0.01,0.05,0.5,5,50"])
+def test_deviations_are_those_of_allantools(call: Call, recording: Path, grid: str) -> None:
+    said = call("analyze", str(recording), "--json", "x.json", "--tau", grid)
+    assert said.status == 0
+    result = json.loads(Path("x.json").read_bytes())
+    columns = np.loadtxt(recording, delimiter=",", skiprows=1).T[1:]
+    for axis, column in zip(AXES, columns, strict=True):
+        allan = result["axes"][axis]["allan"]
+        tau, deviation, _, _ = allantools.oadev(column, rate=RATE_HZ, data_type="freq", taus=allan["tau"])
+        np.testing.assert_allclose(allan["tau"], tau, rtol=1e-12)
+        np.testing.assert_allclose(allan["deviation"], deviation, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("x.csv", b"", "x.csv: the file is empty"),
+        ("x.csv", b"t,gx\n", "x.csv: has a header line but no whole line of samples"),
+        ("x.csv", b"gx\n" + b"0.1\n" * 100, "x.csv: has neither t nor fs, so its rate is not known; give it with --rate"),
+        ("x.csv", b"t,speed\n" + b"0.1,1\n" * 100, "x.csv: no axis among its columns"),
+        ("x.csv", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + bytes(range(256)) * 9, "x.csv: no axis among its columns"),
+        ("x.npz", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + bytes(range(256)) * 9, "x.npz: is no .npz file"),
+        ("x.csv.gz", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + bytes(range(256)) * 9, "x.csv.gz: "),
+        ("x.png", b"\x89PNG\r\n\x1a\n", "x.png: not the suffix of a recording; known are .csv"),
+    ],
+)
+def test_what_is_no_recording_is_said_in_one_line(call: Call, name: str, content: bytes, words: str) -> None:
+    Path(name).write_bytes(content)
+    said = call("analyze", name, "--json", "x.json")
+    assert said.status == 2
+    assert words in said.only_line()
+    assert not Path("x.json").exists()
+
+
+def test_a_folder_without_recordings(call: Call) -> None:
+    said = call("analyze", ".")
+    assert said.status == 2
+    assert "no recordings in this folder" in said.only_line()
+
+
+def test_a_rate_makes_a_recording_without_times_readable(call: Call) -> None:
+    Path("x.csv").write_text("gx\n" + "0.1\n0.2\n0.4\n" * 40)
+    said = call("analyze", "x.csv", "--rate", "50", "--json", "-")
+    assert said.status == 0
+    assert json.loads(said.out)["seconds"] == 120 / 50
+
+
+def test_a_file_cut_off_in_the_middle_is_read_up_to_the_cut(call: Call, recording: Path) -> None:
+    whole = recording.read_bytes()
+    at = whole.index(b"\n", len(whole) // 2) + 20  # inside a line
+    Path("cut.csv").write_bytes(whole[:at])
+    said = call("analyze", "cut.csv", "--json", "-")
+    assert said.status == 0
+    result = json.loads(said.out)
+    assert result["samples"] == whole[:at].count(b"\n") - 1
+    assert any("cut off" in note for note in result["notes"])
+    shown = call("analyze", "cut.csv")
+    assert shown.status == 0
+    assert "cut off" in shown.out
+
+
+@pytest.mark.parametrize("target", ["-", "why.json"])
+def test_too_short_a_recording_is_an_answer_too(call: Call, target: str) -> None:
+    Path("x.csv").write_text("t,gx\n" + "".join(f"{i / 100},{i % 3}\n" for i in range(20)))
+    said = call("analyze", "x.csv", "--json", target)
+    assert said.status == 3
+    assert said.err.count("\n") == 1
+    assert "20 samples; at least 50 are needed" in said.err
+    result = json.loads(said.out if target == "-" else Path(target).read_bytes())
+    assert result["schema"] == "imu-monitor/analyze/1"
+    assert (result["samples"], result["axes"]) == (20, {})
+    assert "at least 50 are needed" in result["notes"][0]
+
+
+@pytest.mark.parametrize("option", ["--json", "--plot"])
+def test_a_result_that_cannot_be_written_is_one_line(call: Call, recording: Path, option: str) -> None:
+    Path("file").touch()
+    for target in ("nowhere/x.png", "file/x.png"):
+        said = call("analyze", str(recording), option, target)
+        assert said.status == 2
+        assert target in said.only_line()
+
+
+# --- as a process ----------------------------------------------------------------------------------
+
+
+def test_a_wrong_file_ends_a_real_process(tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text(VIRTUAL + "windw = 1.0\n")
+    done = program("run", "c.toml", cwd=tmp_path, env={**os.environ, "PYTHONPATH": os.getcwd()})
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.splitlines() == [
+        'imu-monitor: c.toml: device[0].windw: unknown key; did you mean "window"?',
+    ]
+
+
+@pytest.mark.parametrize("arguments", [("check", "--print-defaults"), ("analyze", "RECORDING", "--json", "-"), ("--help",)])
+def test_a_reader_that_has_gone_is_no_crash(recording: Path, arguments: tuple[str, ...]) -> None:
+    """As in ``imu-monitor … | head -1``."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "wb") as closed:
+        command = [*PROGRAM, *(str(recording) if word == "RECORDING" else word for word in arguments)]
+        done = subprocess.run(command, stdout=closed, stderr=subprocess.PIPE, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (1, b"")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+@pytest.mark.parametrize("arguments", [("RECORDING", "--json", "-"), ("RECORDING",)])
+def test_a_full_disk_behind_standard_output_is_one_line(recording: Path, arguments: tuple[str, ...]) -> None:
+    with open("/dev/full", "wb") as full:
+        command = [*PROGRAM, "analyze", *(str(recording) if word == "RECORDING" else word for word in arguments)]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "No space left" in done.stderr
+
+
+class Daemon:
+    """The program running in a process of its own, with what it has said so far."""
+
+    def __init__(self, command: list[str]) -> None:
+        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        self.lines: list[str] = []
+
+    def hears(self, word: str) -> None:
+        """Wait for a line with that word on standard error."""
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self.lines.append(line)
+            if word in line:
+                return
+        raise AssertionError(f"it ended without {word}: {''.join(self.lines)}")
+
+    def status_after(self, number: int, within_s: float) -> int:
+        self.process.send_signal(number)
+        begun_s = time.monotonic()
+        status = self.process.wait(30.0)
+        assert time.monotonic() - begun_s < within_s
+        return status
+
+    def rest(self) -> str:
+        assert self.process.stderr is not None
+        return self.process.stderr.read()
+
+
+@contextmanager
+def daemon(command: list[str]) -> Iterator[Daemon]:
+    one = Daemon(command)
+    try:
+        yield one
+    finally:
+        one.process.kill()
+        one.process.wait(10.0)
+        assert one.process.stderr is not None
+        one.process.stderr.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("command", ["demo", "run"])
+def test_a_signal_stops_in_order(tmp_path: Path, command: str, number: int) -> None:
+    if command == "run":
+        (tmp_path / "c.toml").write_text(VIRTUAL + QUIET)
+        arguments = ["run", str(tmp_path / "c.toml")]
+    else:
+        arguments = ["demo", "--viewer", "none"]
+    before = set(Path(os.environ.get("TMPDIR", "/tmp")).glob("imu-monitor-*"))
+    with daemon([*PROGRAM, *arguments]) as one:
+        one.hears("state=running")
+        assert one.status_after(number, 3.0) == 0
+        assert "Traceback" not in one.rest()
+    port = next(match[1] for line in one.lines if (match := re.search(r"waiting for (\S+)/tty", line)))
+    assert Path(port) not in before
+    assert not Path(port).exists()  # the simulated port is taken away again
+
+
+def test_a_second_interrupt_ends_at_once() -> None:
+    source = """
+import sys, time
+import monitor.service
+from monitor.cli import main
+def stuck(self):
+    print("draining", file=sys.stderr, flush=True)
+    time.sleep(60.0)
+monitor.service.Service._drain = stuck
+sys.argv = ["imu-monitor", "demo", "--viewer", "none"]
+main()
+"""
+    with daemon([sys.executable, "-c", source]) as one:
+        one.hears("state=running")
+        one.process.send_signal(signal.SIGINT)
+        one.hears("draining")
+        assert one.status_after(signal.SIGINT, 3.0) == -signal.SIGINT
+
+
+def test_the_demo_really_receives_samples() -> None:
+    begun_s = time.monotonic()
+    done = program("demo", "--seconds", "5", "--viewer", "none")
+    assert done.returncode == 0, done.stderr
+    assert 5.0 <= time.monotonic() - begun_s < 30.0
+    assert "1 running" in done.stdout
+    row = next(line for line in done.stdout.splitlines() if re.match(r"demo\s", line))
+    received, lost, bad = map(int, re.findall(r"running\s+[\d.]+\s+(\d+)\s+(\d+)\s+(\d+)", row)[0])
+    assert 400 <= received <= 550
+    assert (lost, bad) == (0, 0)
+    assert "Traceback" not in done.stderr
+
+
+# --- sockets ---------------------------------------------------------------------------------------
+
+
+def bound(process: psutil.Process) -> list[tuple[str, int]]:
+    """Addresses on which the process and its children take packets or connections."""
+    found = []
+    for one in (process, *process.children(recursive=True)):
+        for socket in one.net_connections("inet"):
+            if socket.status == psutil.CONN_LISTEN or (socket.type == 2 and socket.laddr):
+                found.append((socket.laddr.ip, socket.laddr.port))
+    return found
+
+
+@pytest.mark.parametrize(("viewer", "least"), [("none", 1), ("web", 3)])
+def test_defaults_listen_on_loopback_only(viewer: str, least: int) -> None:
+    """zenoh's port; with the page also Rerun's server and the page itself."""
+    if viewer == "web":
+        pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    with daemon([*PROGRAM, "demo", "--viewer", viewer]) as one:
+        one.hears("state=running")
+        process = psutil.Process(one.process.pid)
+        until_s = time.monotonic() + 40.0
+        while len(bound(process)) < least and time.monotonic() < until_s:
+            time.sleep(0.1)
+        addresses = bound(process)
+        assert len(addresses) >= least, addresses
+        assert {address for address, _ in addresses} <= {"127.0.0.1", "::1"}
+        assert one.status_after(signal.SIGTERM, 5.0) == 0
+
+
+def test_watching_listens_nowhere() -> None:
+    with daemon([*PROGRAM, "watch", "--seconds", "3"]) as one:
+        process = psutil.Process(one.process.pid)
+        opened = False
+        while one.process.poll() is None:
+            try:
+                opened = opened or any("zenoh" in Path(file.path).name for file in process.memory_maps())
+                assert bound(process) == []
+            except psutil.NoSuchProcess:
+                break
+            time.sleep(0.1)
+        assert opened
+        assert one.process.wait(20.0) == 0
