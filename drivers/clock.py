@@ -129,7 +129,7 @@ class SampleClock:
         t = samples.t_ns
         steps = np.diff(t, prepend=self._last_t_ns if self._line.count else t[0])
         self._tell_jumps(t, steps)
-        period_s = self._line.period_s() or (1.0 / self._nominal_hz if self._nominal_hz else _usual(steps))
+        period_s = self._given_period_s(steps)
         missing = np.zeros(len(samples), np.int64)
         if period_s:
             missing = self._given_gaps(steps / NS, period_s)
@@ -144,6 +144,14 @@ class SampleClock:
             self._line.add(float(index[row]), self._seconds(int(t[row])))
         self._index, self._last_t_ns = float(index[-1]), int(t[-1])
         return _cut(samples, t, missing)
+
+    def _given_period_s(self, steps: Ints) -> float | None:
+        """What a gap is measured by; None as long as all that came may be one burst of a late sender."""
+        if self._line.settled():
+            return self._line.period_s()
+        if self._nominal_hz:
+            return 1.0 / self._nominal_hz
+        return _usual(steps) if steps.sum() > LEARN_S * NS else None
 
     def _tell_jumps(self, t: Ints, steps: Ints) -> None:
         back = steps < (-JUMP_S * NS if self._went_back else 0.0)  # what jitters back and forth is told once

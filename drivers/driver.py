@@ -103,6 +103,14 @@ class Driver:
 
     def run(self) -> None:
         """Read until stopped; to be called in the device's own thread."""
+        try:
+            self._run()
+        except Exception as error:
+            # a bug: the thread dies loudly, and the status does not go on saying that all is well
+            self.state, self.text = "lost", f"reading ended by a fault of the program: {error!r}"
+            raise
+
+    def _run(self) -> None:
         pause_s = FIRST_PAUSE_S
         while not self._stop.is_set():
             received = self.counts.received

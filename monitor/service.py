@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
+from monitor.estimate.estimator import warm_up
 from monitor.outputs import ViewerOutput, ZenohOutput
 from monitor.publish import message
 from monitor.publish.viewer import DeviceInfo, ViewerSettings
 from monitor.publish.zenoh_out import Command, ZenohOut, ZenohSettings
 from monitor.settings import Config, Device, VirtualTable
-from monitor.station import Output, Station
+from monitor.station import Output, Ready, Station
 from monitor.virtual import VirtualImu
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ class Service:
     def __init__(self, config: Config, more: Sequence[Output] = ()) -> None:
         self.config = config
         self._wake = threading.Event()
+        self._ready = Ready()
         self._stop = threading.Event()
         self.virtual: dict[str, VirtualImu] = {}
         self.stations = [self._station(device) for device in config.devices]
@@ -66,6 +68,7 @@ class Service:
 
     def run(self, seconds: float | None = None) -> None:
         """Start, loop until stopped (or for so many seconds, or until all replays have ended), stop in order."""
+        threading.Thread(target=self._warm_up, name="warm-up", daemon=True).start()
         self.zenoh.start()
         if self.view is not None:
             self.view.start()
@@ -106,13 +109,19 @@ class Service:
             states["viewer"] = self.view.state
         return states
 
+    def _warm_up(self) -> None:
+        """Beside the loop, so that a first start's compilation holds up neither samples nor status."""
+        for kernel in warm_up():
+            (self._ready.window if kernel == "window" else self._ready.fit).set()
+            self._wake.set()
+
     def _station(self, device: Device) -> Station:
         link = device.link
         if isinstance(link, VirtualTable):
             imu = VirtualImu(link, device.decoder)
             self.virtual[device.name] = imu
             link = imu.link
-        return Station(device, link, device.decoder, self._wake)
+        return Station(device, link, device.decoder, self._wake, self._ready)
 
     def _report(self) -> None:
         states, memory = self.states(), memory_bytes()
@@ -145,6 +154,7 @@ class Service:
 
     def _drain(self) -> None:
         """End the readers, and publish what they still brought."""
+        self._ready.fit.wait()
         for station in self.stations:
             station.stop()
         for imu in self.virtual.values():

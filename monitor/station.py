@@ -7,6 +7,7 @@ and none of them waits: each has a queue or drops.
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 import numpy as np
@@ -28,11 +29,19 @@ RING_SECONDS: Final = 10.0
 RING_SAMPLES: Final = (65_536, 1_000_000)
 PATIENCE_S: Final = 0.002
 PENDING_BLOCKS: Final = 10_000
-"""Blocks kept while the sample rate is not known yet."""
+"""Blocks kept while the sample rate is not known yet, or the kernels are being compiled."""
 SAMPLES_EVERY_S: Final = 0.1
 """Raw samples travel in batches of at most this long, unless every block is wanted."""
 OFF_NOMINAL: Final = 0.02
 """A measured rate further than this from the configured one is said."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """Which kernels are compiled."""
+
+    window: threading.Event = field(default_factory=threading.Event)
+    fit: threading.Event = field(default_factory=threading.Event)
 
 
 class Output(Protocol):
@@ -58,9 +67,10 @@ class Station:
         device: its settings
         link: what its samples come by
         wake: set whenever samples have come
+        ready: which of the estimator's kernels are compiled; samples wait in order until they are
     """
 
-    def __init__(self, device: Device, link: Link, decoder: Decoder, wake: threading.Event) -> None:
+    def __init__(self, device: Device, link: Link, decoder: Decoder, wake: threading.Event, ready: Ready) -> None:
         self.device = device
         self.name = device.name
         rate = device.rate_hz or 1000.0
@@ -72,6 +82,7 @@ class Station:
         self.latest: Estimate | None = None
         self.published = 0  # samples handed to the outputs
         self._wake = wake
+        self._ready = ready
         self._patient = link.epoch == "unix"
         self._stopping = False
         self._wall = WallClock(time.monotonic_ns(), time.time_ns())
@@ -191,7 +202,7 @@ class Station:
         if self.estimator is None:
             self._pending = (self._pending + blocks)[-PENDING_BLOCKS:]
             rate = self.clock.rate_hz
-            if rate is None:
+            if rate is None or not self._ready.window.is_set():
                 return
             blocks, self._pending = self._pending, []
             try:
@@ -218,7 +229,7 @@ class Station:
         if self.estimator is not None and self._advanced and (self._due("refit", self.device.refit_s, now_s) or drain):
             self._advanced = False
             try:
-                self.latest = self.estimator.get()
+                self.latest = self.estimator.get(fitted=self._ready.fit.is_set())
             except NotReady:
                 return False
             self._refitted = True
@@ -239,6 +250,8 @@ class Station:
         return True
 
     def _text(self) -> str:
+        if not self._ready.fit.is_set() and self.driver.state == "running":
+            return "first start: compiling the estimator; no coefficients yet, no sample is lost"
         nominal, measured = self.device.rate_hz, self.clock.measured_hz
         if self.driver.text or self.driver.state != "running":
             return self.driver.text

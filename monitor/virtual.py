@@ -104,6 +104,8 @@ class VirtualImu:
     # --- the sensor's own life
 
     def _run(self) -> None:
+        # a sensor's clock runs from its first sample: what the simulator compiles comes before it
+        self.model.stream(1.0 / self._tick_s, 0).draw(1)
         begun_s, made = time.monotonic(), 0
         while not self._stop.wait(STEP_S):
             due = int((time.monotonic() - begun_s) * self.rate_hz)

@@ -13,7 +13,7 @@ import numpy as np
 from drivers.clock import SampleClock, made_rate
 from drivers.errors import NotReady
 from drivers.sample import AXES, Floats, Given, Ints, SampleBlock
-from monitor.estimate.batch import TauGrid, cluster_sizes, overlapping
+from monitor.estimate.batch import TauGrid, cluster_sizes, overlapping, slope
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.fit import design, fit
@@ -53,7 +53,7 @@ def analyze(
         raise NotReady(f"{len(values)} samples; at least {FEWEST} are needed to say anything")
     factors = cluster_sizes(len(values), rate, tau)
     avar, terms = overlapping(values, factors)
-    result = fit(design(factors, rate), table(len(values), factors), avar, terms)
+    result = fit(design(factors, rate), table(len(values), factors), avar, terms, slope=slope(values) * rate)
     lo, hi = intervals(avar, result.edf)
     curve = AllanCurve(factors / rate, factors, avar, terms, result.edf, lo, hi, len(values))
     seconds = len(values) / rate

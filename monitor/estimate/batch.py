@@ -43,6 +43,20 @@ def overlapping(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     return avar, terms
 
 
+def slope(values: Floats) -> Floats:
+    """Slope of the rate [k] over a recording [n, k], unit a sample, from its first and last third; NaN as there.
+
+    >>> slope(0.5 * np.arange(9.0)[:, None]).tolist()
+    [0.5]
+    """
+    third = len(values) // 3
+    if third == 0:
+        return np.full(values.shape[1], np.nan)
+    newest = values[len(values) - 3 * third :]
+    result: Floats = (newest[2 * third :].mean(axis=0) - newest[:third].mean(axis=0)) / (2.0 * third)
+    return np.where(np.isnan(newest).any(axis=0), np.nan, result)
+
+
 def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints:
     """Cluster sizes m for a window of that many samples: τ = m/rate.
 

@@ -5,17 +5,18 @@ refits. The rate enters only as the label of the τ axis and the units of the co
 samples.
 """
 
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import NotReady
-from drivers.sample import SampleBlock
+from drivers.sample import Floats, Ints, SampleBlock, block
 from monitor.estimate.batch import TauGrid, cluster_sizes
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Estimate
-from monitor.estimate.fit import design, fit
+from monitor.estimate.fit import Fit, design, fit, nothing_fitted
 from monitor.estimate.uncertainty import Tables, intervals
 from monitor.estimate.window import MAX_LENGTH, MIN_LENGTH, AllanWindow
 
@@ -69,8 +70,8 @@ class Estimator:
         self.window_s = self._window.length / rate_hz
         self._design = design(self._window.factors, rate_hz)
 
-    def get(self) -> Estimate:
-        """The curve of the window and the coefficients fitted to it.
+    def get(self, fitted: bool = True) -> Estimate:
+        """The curve of the window and the coefficients fitted to it; without ``fitted``, deviations alone.
 
         Raises:
             NotReady: fewer than FEWEST samples in the window
@@ -78,8 +79,7 @@ class Estimator:
         if self._window.n < FEWEST:
             raise NotReady(f"{self._window.n} of at least {FEWEST} samples")
         avar, terms = self._window.avar(), self._window.terms()
-        result = fit(self._design, self._tables.at(self._window.n), avar, terms, self._entered)
-        self._entered = result.entered
+        result = self._fit(avar, terms) if fitted else nothing_fitted(avar)
         lo, hi = intervals(avar, result.edf)
         curve = AllanCurve(
             self._window.factors / self.rate_hz, self._window.factors, avar, terms, result.edf, lo, hi, self._window.n
@@ -87,3 +87,21 @@ class Estimator:
         return Estimate(
             self._newest_ns, self.rate_hz, self.window_s, self._samples, curve, result.fitted, result.coefficients
         )
+
+    def _fit(self, avar: Floats, terms: Ints) -> Fit:
+        slope = self._window.slope() * self.rate_hz
+        result = fit(self._design, self._tables.at(self._window.n), avar, terms, self._entered, slope)
+        self._entered = result.entered
+        return result
+
+
+def warm_up() -> Iterator[str]:
+    """Have the kernels compiled, or loaded from the disk cache; yields "window" and "fit" as each is ready.
+
+    Seconds at the very first start on a machine, milliseconds later.
+    """
+    estimator = Estimator(100.0, 1.0)
+    estimator.update(block(np.arange(100, dtype=np.int64), np.zeros((100, 6))))
+    yield "window"
+    estimator.get()
+    yield "fit"

@@ -134,6 +134,20 @@ def fit(
     return Fit(coefficients, (theta * to_si**2).T, fitted.T, edf.T, entered.T, left_out)
 
 
+def nothing_fitted(avar: Floats) -> Fit:
+    """What is said of a curve [m, 6] that has not been fitted: nothing."""
+    nothing = np.full((5, avar.shape[1]), np.nan)
+    status = np.full((5, avar.shape[1]), Status.UNESTIMATED, np.int8)
+    return Fit(
+        Coefficients(nothing, nothing, nothing, status),
+        theta=nothing,
+        fitted=np.full_like(avar, np.nan),
+        edf=np.full_like(avar, np.nan),
+        entered=np.zeros((5, avar.shape[1]), np.bool_),
+        left_out=np.zeros(avar.shape[1], np.int64),
+    )
+
+
 def slope_of_thirds(phase: Floats, seconds: float) -> Floats:
     """Slope of the rate over a window from its integral at the start, one third, two thirds and the end.
 

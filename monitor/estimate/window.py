@@ -20,7 +20,7 @@ The rounding is white phase noise of variance 2^-2s/12 and changes σ²(m) by ab
 σ being the noise of a sample: for an hour at 100 Hz (s = 38, 36) and σ = 1e-4, 1e-10.
 """
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,10 +37,15 @@ AXES: Final = 6
 LANES: Final = 8
 """Columns kept a sample: six axes padded to a vector register."""
 HOLE_ROWS: Final = 4096
-SCALE, CARRY, SUMS = 0, 1, 2
-"""Rows of the float workspace."""
+TOTAL, NEWEST, STRUCK, WIDTH = 0, 1, 2, 3
+"""Of the state: samples since reset, place of the newest phase point, newest sample that was missing on any axis;
+and LANES, from where the compiler cannot know it: it would make eight scalar lines of a vector loop."""
 RUN: Final = 64
 """Samples whose phase is written before the τ take their terms."""
+STAGE: Final = 512
+"""Samples handed to the kernel at a time."""
+LINE: Final = 8
+"""Numbers of eight bytes in a cache line: a row of phase fills one, and must not lie across two."""
 FULL_SCALE: Final = (70.0,) * 3 + (400.0,) * 3 + (1.0,) * 2
 """rad/s and m/s²: the mean over τ may reach these at the longest τ (4000 °/s, 40 g), more at shorter ones."""
 
@@ -65,43 +70,53 @@ class AllanWindow:
             raise ConfigError(f"cluster sizes {factors.tolist()} must ascend within 1 and {length // 2}")
         self.length = length
         self.factors = factors.astype(np.int64)
+        self._taus = int(factors.size)
         # |second difference| ≤ 2 m · full scale must stay below 2^63
         bits = 62 - np.ceil(np.log2(2.0 * float(factors[-1]) * np.array(FULL_SCALE)))
         self._scale = np.exp2(np.minimum(bits, 48.0))
-        self._phase = np.zeros((length + 1 + RUN) * LANES, np.int64)
-        self._missing = np.zeros((length + 1 + RUN) * LANES, np.int32)
-        self._terms = np.zeros((factors.size, LANES), np.int64)
-        # scale, rounding not yet in phase, then a sum and the rest of its roundings for each τ
-        self._sums = np.zeros((2 + 2 * factors.size, LANES))
-        # samples since reset, place of the newest phase point, newest sample that was missing on any axis
-        self._state = np.zeros(3, np.int64)
+        # few arrays for all, as the interpreter takes 50 ns to hand one to the kernel; see _cut_ints, _cut_floats
+        taus, places = self._taus, length + 1 + RUN
+        self._ints = _aligned(LANES + -(-taus // LINE) * LINE + taus * LANES + places * LANES, np.int64)
+        self._floats = _aligned((2 + 2 * RUN + 2 * taus + STAGE) * LANES, np.float64)
+        self._missing = np.zeros(places * LANES, np.int32)
+        self._state, _, terms, self._phase = _cut_ints(self._ints, taus)
+        self._scaling, _, sums, rest, stage = _cut_floats(self._floats, taus)
+        self._terms, self._sums, self._rest = (part.reshape(taus, LANES) for part in (terms, sums, rest))
+        self._stage = stage[: STAGE * AXES].reshape(STAGE, AXES)
         self.reset()
 
     @property
     def n(self) -> int:
         """Samples in the window now, missing ones included."""
-        return min(int(self._state[0]), self.length)
+        return min(int(self._state[TOTAL]), self.length)
 
     @property
     def total(self) -> int:
         """Samples since the last reset, missing ones included."""
-        return int(self._state[0])
+        return int(self._state[TOTAL])
 
     def reset(self) -> None:
         """Forget all samples."""
-        for array in (self._phase, self._missing, self._terms, self._sums):
+        for array in (self._ints, self._floats, self._missing):
             array[:] = 0
-        self._sums[SCALE] = self._scale
-        self._state[:] = (0, 0, -(1 << 62))
+        _cut_ints(self._ints, self._taus)[1][:] = self.factors
+        self._scaling[:LANES] = self._scale
+        self._state[:4] = (0, 0, -(1 << 62), LANES)
 
     def update(self, values: Floats) -> None:
         """Advance by samples [n, 6], one by one; NaN, and what is beyond any phase (1e7 and more), = missing."""
-        # one kind of array only: each layout and access flag would be compiled anew, for seconds
-        rows = np.ascontiguousarray(values, np.float64).view()
-        if rows.ndim != 2 or rows.shape[1] != AXES:
-            raise ValueError(f"samples of shape {rows.shape}; expected is [n, {AXES}]")
-        rows.flags.writeable = False
-        _advance(rows, self.factors, self._phase, self._missing, self._terms, self._sums, self._state)
+        rows = np.asarray(values)
+        shape = rows.shape
+        if len(shape) != 2 or shape[1] != AXES:
+            raise ValueError(f"samples of shape {shape}; expected is [n, {AXES}]")
+        n = shape[0]
+        if n > STAGE:
+            for start in range(0, n, STAGE):
+                self.update(rows[start : start + STAGE])
+            return
+        # copied: each layout and access flag of an array would be compiled anew, for seconds
+        self._stage[:n] = rows
+        _advance(self._ints, self._floats, self._missing, self._taus, n)
 
     def skip(self, n: int) -> None:
         """Advance by n missing samples; more than the window holds empty it at once."""
@@ -115,45 +130,85 @@ class AllanWindow:
 
     def avar(self) -> Floats:
         """Allan variance [m, 6] in unit² of the axis; NaN where no term is complete."""
-        sums = (self._sums[SUMS::2] + self._sums[SUMS + 1 :: 2])[:, :AXES]
+        sums = (self._sums + self._rest)[:, :AXES]
         m = self.factors[:, None] * self._scale[:AXES]
         terms = self._terms[:, :AXES]
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(terms > 0, np.maximum(sums, 0.0) / (2.0 * m * m * terms), np.nan)
+
+    def slope(self) -> Floats:
+        """Slope of the rate over the window [6], unit of the axis a sample; NaN where a sample is missing.
+
+        Mean of the last third less that of the first, over two thirds of the window (``fit.slope_of_thirds``).
+        """
+        third = self.n // 3
+        if third == 0:
+            return np.full(AXES, np.nan)
+        places = self._phase.size // LANES
+        at = (int(self._state[NEWEST]) - third * np.arange(4)) % places * LANES
+        phase = self._phase[at[:, None] + np.arange(AXES)]
+        bent = (phase[0] - phase[1] - phase[2] + phase[3]) / self._scale[:AXES]
+        missing = self._missing[at[:, None] + np.arange(AXES)]
+        return np.where(missing[0] == missing[3], bent / (2.0 * third * third), np.nan)
 
     def terms(self) -> Ints:
         """Number of second differences averaged, [m, 6]."""
         return self._terms[:, :AXES].copy()
 
 
+def _aligned(size: int, dtype: type[np.generic]) -> NDArray[Any]:
+    """So many zeros that begin with a cache line."""
+    space = np.zeros(size + LINE, dtype)
+    start = -(space.ctypes.data // space.itemsize) % LINE
+    return space[start : start + size]
+
+
 @compiled
-def _advance(
-    values: Floats,
-    factors: Ints,
-    phase: Ints,
-    missing: NDArray[np.int32],
-    terms: Ints,
-    sums: Floats,
-    state: Ints,
-) -> None:
-    """Advance sample by sample; see the module's head for the arithmetic.
+def _cut_ints(ints: Ints, taus: int) -> tuple[Ints, Ints, Ints, Ints]:
+    """State, factors [m], terms [m · LANES], phase [places · LANES]."""
+    terms = LANES + (taus + LINE - 1) // LINE * LINE
+    phase = terms + taus * LANES
+    return ints[:LANES], ints[LANES : LANES + taus], ints[terms:phase], ints[phase:]
+
+
+@compiled
+def _cut_floats(floats: Floats, taus: int) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Parts of the workspace.
+
+    Scale and rounding not yet in phase [2 · LANES], two scratches for a run, sums and what their roundings left
+    [m · LANES], and the stage [STAGE · AXES and more].
+    """
+    scratch, sums = 2 * LANES, (2 + 2 * RUN) * LANES
+    rest, stage = sums + taus * LANES, sums + 2 * taus * LANES
+    return floats[:scratch], floats[scratch:sums], floats[sums:rest], floats[rest:stage], floats[stage:]
+
+
+@compiled
+def _advance(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, n: int) -> None:
+    """Advance by the first n staged samples; see the module's head for the arithmetic.
 
     Phase is written for a run of up to RUN samples, then each τ takes its terms one by one along that run: few
     streams through memory at a time, which the processor fetches ahead, where a walk over all τ would need a hundred.
     """
+    state, factors, terms, phase = _cut_ints(ints, taus)
+    scaling, scratch, sums, rest, stage = _cut_floats(floats, taus)
     places = phase.size // LANES
     length = places - 1 - RUN
-    scratch = np.empty((2, RUN * LANES))
     done = 0
-    while done < values.shape[0]:
-        run = min(RUN, values.shape[0] - done)
-        first = state[1] + 1 if state[1] + 1 < places else 0
+    while done < n:
+        run = min(RUN, n - done)
+        first = state[NEWEST] + 1 if state[NEWEST] + 1 < places else 0
         for row in range(done, done + run):
-            _append(values[row], sums[SCALE], sums[CARRY], phase, missing, state)
-        count = state[0] - run  # samples before this run
-        whole = count - state[2] > length
-        for i in range(factors.size):
+            _append(stage[row * AXES : (row + 1) * AXES], scaling, phase, missing, state)
+        done += run
+        count = state[TOTAL] - run  # samples before this run
+        whole = count - state[STRUCK] > length
+        if run == 1 and whole and count >= length and taus <= RUN:
+            _swap(first, factors, length, phase, scratch, sums, rest)
+            continue
+        for i in range(taus):
             row = max(0, 2 * factors[i] - 1 - count)  # the first whose term is complete
+            own = slice(i * LANES, (i + 1) * LANES)
             while row < run:
                 # as far as no stream comes to the ring's end, and the window is full throughout or not at all
                 now = first + row if first + row < places else first + row - places
@@ -161,29 +216,28 @@ def _advance(
                 end = run if leaving else min(run, length - count)
                 row += _slide(
                     now, end - row, factors[i], length, leaving, whole,
-                    phase, missing, scratch, terms, sums, i,
+                    phase, missing, scratch, terms[own], sums[own], rest[own], state[WIDTH],
                 )  # fmt: skip
-        done += run
 
 
 @compiled
-def _append(sample: Floats, scale: Floats, carry: Floats, phase: Ints, missing: NDArray[np.int32], state: Ints) -> None:
+def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.int32], state: Ints) -> None:
     """Write one phase point and the running count of missing samples."""
-    before = LANES * state[1]
+    before = LANES * state[NEWEST]
     now = before + LANES if before + LANES < phase.size else 0
-    state[0] += 1
-    state[1] = now // LANES
+    state[TOTAL] += 1
+    state[NEWEST] = now // LANES
     for lane in range(sample.size):
-        y = sample[lane] * scale[lane] + carry[lane]
+        y = sample[lane] * scaling[lane] + scaling[LANES + lane]
         if abs(y) < 4.0e18:  # false for NaN too
             step = np.rint(y)
-            carry[lane] = y - step
+            scaling[LANES + lane] = y - step
             phase[now + lane] = phase[before + lane] + np.int64(step)
             missing[now + lane] = missing[before + lane]
         else:
             phase[now + lane] = phase[before + lane]
             missing[now + lane] = missing[before + lane] + 1
-            state[2] = state[0]
+            state[STRUCK] = state[TOTAL]
 
 
 @compiled
@@ -199,7 +253,8 @@ def _slide(
     scratch: Floats,
     terms: Ints,
     sums: Floats,
-    i: int,
+    rest: Floats,
+    lanes: int,
 ) -> int:
     """Add the terms that end at up to ``rows`` phase points from ``now`` on, evict as many when ``leaving``.
 
@@ -210,23 +265,20 @@ def _slide(
     new1, new2 = _place(now - m, places), _place(now - 2 * m, places)
     old0, old1, old2 = _place(old + 2 * m, places), _place(old + m, places), _place(old, places)
     run = min(rows, places - max(now, new1, new2, old0, old1, old2))
-    if run == 1 and whole and leaving:
-        _swap(phase, now, new1, new2, old0, old1, old2, sums, i)
-        return 1
     n = run * LANES
-    added, evicted = scratch[0], scratch[1]
+    added, evicted = scratch[: RUN * LANES], scratch[RUN * LANES :]
     _square(phase, now, new1, new2, n, added)
     if leaving:
         _square(phase, old0, old1, old2, n, evicted)
     else:
         evicted[:n] = 0.0
     if not whole:
-        _strike(missing, now, new2, 1, n, added, terms[i])
+        _strike(missing, now, new2, 1, n, added, terms)
         if leaving:
-            _strike(missing, old0, old2, -1, n, evicted, terms[i])
+            _strike(missing, old0, old2, -1, n, evicted, terms)
     elif not leaving:
-        terms[i] += run
-    _exchange(added, evicted, n, sums[SUMS + 2 * i], sums[SUMS + 2 * i + 1], LANES)
+        terms += run
+    _exchange(added, evicted, n, sums, rest, lanes)
     return run
 
 
@@ -259,11 +311,11 @@ def _strike(missing: NDArray[np.int32], at0: int, at2: int, step: int, n: int, s
 def _exchange(added: Floats, evicted: Floats, n: int, sums: Floats, rest: Floats, lanes: int) -> None:
     """sums + rest += added - evicted, row by row, each rounding kept in rest.
 
-    TwoSum: Knuth, TAOCP vol. 2, 4.2.2, theorem B. ``lanes`` is an argument so that the compiler makes one vector
-    loop of it instead of eight scalar lines.
+    TwoSum: Knuth, TAOCP vol. 2, 4.2.2, theorem B. An index that could be negative, or a known number of
+    ``lanes``, would make scalar lines of the inner loop: three times the cost.
     """
-    for row in range(0, n, lanes):
-        for lane in range(lanes):
+    for row in range(np.uintp(0), np.uintp(n), np.uintp(lanes)):
+        for lane in range(np.uintp(lanes)):
             s = sums[lane]
             t = s + added[row + lane]
             z = t - s
@@ -275,20 +327,25 @@ def _exchange(added: Floats, evicted: Floats, n: int, sums: Floats, rest: Floats
 
 
 @compiled
-def _swap(phase: Ints, at0: int, at1: int, at2: int, old0: int, old1: int, old2: int, sums: Floats, i: int) -> None:
-    """The same for a single row, where setting up vector loops would cost more than the work."""
-    i0, i1, i2 = np.uintp(at0 * LANES), np.uintp(at1 * LANES), np.uintp(at2 * LANES)
-    j0, j1, j2 = np.uintp(old0 * LANES), np.uintp(old1 * LANES), np.uintp(old2 * LANES)
-    at = SUMS + 2 * i
-    for lane in range(np.uintp(LANES)):
-        d = float(phase[i0 + lane] - 2 * phase[i1 + lane] + phase[i2 + lane])
-        e = float(phase[j0 + lane] - 2 * phase[j1 + lane] + phase[j2 + lane])
-        added, evicted = d * d, e * e
-        s = sums[at, lane]
-        t = s + added
-        z = t - s
-        first = (s - (t - z)) + (added - z)
-        u = t - evicted
-        z = u - t
-        sums[at, lane] = u
-        sums[at + 1, lane] += first + ((t - (u - z)) - (evicted + z))
+def _swap(now: int, factors: Ints, length: int, phase: Ints, scratch: Floats, sums: Floats, rest: Floats) -> None:
+    """The same for a single sample of a full window without gaps: all τ in one go.
+
+    Setting up vector loops for each τ would cost more than the work; so the differences are gathered one by one, and
+    one loop exchanges them all.
+    """
+    places = phase.size // LANES
+    added, evicted = scratch[: RUN * LANES], scratch[RUN * LANES :]
+    old = now - length - 1
+    at0, old2 = np.uintp(now * LANES), np.uintp(_place(old, places) * LANES)
+    for i in range(factors.size):
+        m = factors[i]
+        at1, at2 = np.uintp(_place(now - m, places) * LANES), np.uintp(_place(now - 2 * m, places) * LANES)
+        old0, old1 = np.uintp(_place(old + 2 * m, places) * LANES), np.uintp(_place(old + m, places) * LANES)
+        out = np.uintp(i * LANES)
+        for lane in range(np.uintp(AXES)):
+            d = float(phase[at0 + lane] - 2 * phase[at1 + lane] + phase[at2 + lane])
+            e = float(phase[old0 + lane] - 2 * phase[old1 + lane] + phase[old2 + lane])
+            added[out + lane] = d * d
+            evicted[out + lane] = e * e
+    n = factors.size * LANES
+    _exchange(added, evicted, n, sums, rest, n)

@@ -11,6 +11,7 @@ joined by a window, anything else is trouble; a page moves on to the next free p
 """
 
 import contextlib
+import ctypes
 import http.client
 import os
 import re
@@ -131,9 +132,11 @@ class Output:
         return self.port is None or ask(self.port, "/imu.monitor/Ping", patience_s) is not None
 
     def close(self) -> None:
-        """End the viewer that was started here. Frees no stream: that may block, see ``rerun_view``."""
+        """End the viewer that was started here; a file is complete afterwards."""
         if self.child is not None:
             self.child.end()
+        if self.port is None:
+            self.stream.disconnect()
 
 
 def viewer_program() -> Path:
@@ -274,8 +277,14 @@ def _connected(port: int, recording_id: str, child: Child | None = None, joined_
 
 
 def _stream(recording_id: str) -> rr.RecordingStream:
-    """A stream whose rows stand on ``sample_time`` alone."""
+    """A stream whose rows stand on ``sample_time`` alone, and that is never freed.
+
+    Freeing one waits for its viewer, with a lock held that every other stream of the process needs: a viewer
+    that is gone at the wrong moment would take the next one along, and keep the process from exiting. One
+    reference more than anyone holds costs a few kilobytes for each viewer that was opened.
+    """
     stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(stream))
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     return stream

@@ -7,9 +7,8 @@ answers, the backlog drops its oldest, and the drops are counted in ``state``. A
 cannot start or was closed is said in ``state`` too, and tried again. Nothing here ever raises into the loop.
 
 Traps of Rerun that shape this file: a logging call blocks for ever on a viewer that does not read; so does
-its exit handler (taken off), and so does freeing a stream (so the stream is held by the thread's frame
-alone, and a thread stuck inside Rerun takes it along when the process exits); a first import takes half a
-second (done in the thread, and not at all with mode ``none``).
+its exit handler (taken off), and so does freeing a stream (never done, see ``rerun_sinks``); a first import
+takes half a second (done in the thread, and not at all with mode ``none``).
 """
 
 import importlib

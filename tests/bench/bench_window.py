@@ -31,6 +31,7 @@ AXES: Final = 6
 BLOCK: Final = 100
 CHUNK: Final = 10
 """Samples that 10 ms of a serial port hold at 1 kHz."""
+A_CALL: Final = {"blocks": BLOCK, "chunks": CHUNK, "singles": 1}
 NOISE: Final = 1e-4
 FIRST_USE: Final = """
 import time
@@ -108,7 +109,7 @@ def window_costs(rounds: int) -> None:
     took = alternate(works, rounds)
     shown = table(
         f"a window of L samples, six axes, {TAUS} τ; median (best) of {rounds} rounds",
-        "samples a call", "L", "a call's sample", "ns a τ and axis", "times faster than allantools, a sample and axis",
+        "samples a call", "L", "a sample", "ns a τ·axis", "allantools over this, a sample·axis",
     )  # fmt: skip
     medians: dict[tuple[str, int], float] = {}
     for how, count in (("blocks", len(many)), ("chunks", len(many)), ("singles", len(singles))):
@@ -117,7 +118,7 @@ def window_costs(rounds: int) -> None:
             theirs = took[f"{length} peer"][0] / len(few)
             medians[how, length] = median
             shown.add_row(
-                f"{dict(blocks=BLOCK, chunks=CHUNK, singles=1)[how]}",
+                f"{A_CALL[how]}",
                 f"{length:,}",
                 f"{median * 1e6:.3f} ({best * 1e6:.3f}) µs",
                 f"{median * 1e9 / AXES / TAUS:.2f} ({best * 1e9 / AXES / TAUS:.2f})",

@@ -206,7 +206,8 @@ def test_arrival_jitter_does_not_become_jitter_of_the_samples(rate, arrive, nomi
     assert kinds(clock) == []
     settled = times(out)[int(FORGET_S * rate) :] / NS
     # an arrival's own share in the line is up to 4 of the arrivals in 30 s; a burst is off by up to 8 ms, jitter by 5
-    most = 4 * (0.008 if arrive is burst else 0.005) / (FORGET_S * rate)
+    arrivals = FORGET_S * (min(rate, 1 / 0.016) if arrive is burst else rate)
+    most = 4 * (0.008 if arrive is burst else 0.005) / arrivals
     assert np.abs(np.diff(settled) - 1 / rate).max() < max(1.5 * most, 5e-6)
     if arrive is jitter and rate >= 99.0:
         assert np.abs(np.diff(settled) - 1 / rate).max() < 10e-6
@@ -366,7 +367,7 @@ def test_loss_told_by_the_sender_is_kept():
 
 @pytest.mark.data
 @pytest.mark.parametrize(
-    ("name", "most"), [("mpu6050-hosttime/static-11min", 0), ("phone/gyro-a", 0), ("can-car/drive-a", 60)]
+    ("name", "most"), [("mpu6050-hosttime/static-11min", 0), ("phone/gyro-a", 0), ("car-phone-can/minute", 0), ("can-car/drive-a", 120)]
 )
 def test_recordings_with_host_times_have_no_invented_holes(name, most):
     if "IMU_MONITOR_DATA" not in os.environ:
@@ -378,7 +379,7 @@ def test_recordings_with_host_times_have_no_invented_holes(name, most):
         out = []
         for at in range(0, len(t), 500):
             out += clock.stamp(block(t_ns[at : at + 500].copy(), np.zeros((len(t_ns[at : at + 500]), 6))))
-        assert lost(out) <= most
+        assert lost(out) <= most  # the car's device itself leaves out a slot now and then
 
 
 # --- parts

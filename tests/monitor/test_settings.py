@@ -1,0 +1,280 @@
+"""Everything wrong with a file is told, each with its key and what would be right; what is shipped is right."""
+
+import tomllib
+from pathlib import Path
+
+import msgspec
+import pytest
+
+import drivers.decoders
+import drivers.links
+from drivers import plugin
+from drivers.decoders.vectornav_ascii import VectornavAsciiDecoder
+from drivers.driver import AxisMap
+from drivers.errors import ConfigError
+from drivers.links import serial_link
+from monitor.settings import (
+    CONFIG_FOLDER,
+    DeviceTable,
+    LogTable,
+    ViewerTable,
+    VirtualTable,
+    ZenohTable,
+    load,
+    period,
+    read,
+    seconds,
+    viewer_mode,
+)
+
+DRIVER = 'driver = { link = "serial", port = "/dev/null", decoder = "vectornav_ascii" }'
+
+
+def wrong(tmp_path, text):
+    path = tmp_path / "my.toml"
+    path.write_text(text, "utf-8")
+    config, lines = read(path)
+    assert (config is None) == bool(lines)
+    assert all(line.startswith(f"{path}: ") and "\n" not in line for line in lines)
+    return [line.removeprefix(f"{path}: ") for line in lines]
+
+
+def device(extra="", name="a", driver=DRIVER):
+    return f'[[device]]\nname = "{name}"\n{extra}\n{driver}\n'
+
+
+def test_a_device_needs_its_name_and_driver_only(tmp_path):
+    path = tmp_path / "my.toml"
+    path.write_text(device())
+    (one,) = load(path).devices
+    assert (one.name, one.rate_hz, one.window_s, one.tau) == ("a", None, 3600.0, "octave")
+    assert (one.refit_s, one.publish_s, one.silence_s) == (0.1, 0.1, 3.0)
+    assert one.axes == AxisMap()
+    assert isinstance(one.decoder, VectornavAsciiDecoder)
+
+
+CASES = {
+    "unknown key": (device("windw = 60.0"), ['device[0].windw: unknown key; did you mean "window"?']),
+    "unknown table": ("[zenho]\n" + device(), ['zenho: unknown key; did you mean "zenoh"?']),
+    "unknown key of zenoh": (device() + '[zenoh]\nlisten_to = ["x"]', ['zenoh.listen_to: unknown key; did you mean "listen"?']),
+    "unknown key of the link": (
+        device(driver='driver = { link = "serial", port = "x", baud = 1, decoder = "stim300" }'),
+        ['device a: driver.baud: unknown key; did you mean "baudrate"?'],
+    ),
+    "unknown key of the decoder": (
+        device(driver='driver = { link = "serial", port = "x", decoder = "stim300", decoder_options = { range = "5g" } }'),
+        ["device a: driver.decoder_options.range: unknown key"],
+    ),
+    "wrong type": (device('rate = "fast"'), ["device[0].rate: Expected `float"]),
+    "rate not above 0": (device("rate = 0"), ["device[0].rate: Expected `float` > 0"]),
+    "rate not a number": (device("rate = nan"), ["device[0].rate: "]),
+    "rate without end": (device("rate = inf"), ["inf Hz are inf samples"]),
+    "name missing": (f"[[device]]\n{DRIVER}", ["device[0].name: missing"]),
+    "driver missing": ('[[device]]\nname = "a"', ["device[0].driver: missing"]),
+    "no device": ("", ["device: there is none"]),
+    "two of one name": (device() + device(), ['2 devices are named "a"; names must be unique']),
+    "impossible name": (device(name="a/b"), ['device[0].name: "a/b"; letters']),
+    "no link": (device(driver='driver = { port = "x" }'), ["device a: driver.link: missing; known are"]),
+    "unknown link": (device(driver='driver = { link = "seral" }'), ['unknown link "seral"; did you mean "serial"?']),
+    "loopback is no link of a file": (device(driver='driver = { link = "loopback" }'), ['unknown link "loopback"']),
+    "a link that is no word": (device(driver="driver = { link = 3 }"), ["driver.link: "]),
+    "unknown protocol": (
+        device(driver='driver = { link = "serial", port = "x", decoder = "stim30" }'),
+        ['device a: driver.decoder: unknown name "stim30"; did you mean "stim300"?'],
+    ),
+    "protocol missing": (device(driver='driver = { link = "serial", port = "x" }'), ["driver.decoder: missing; known are"]),
+    "a protocol that is no word": (device(driver='driver = { link = "serial", port = "x", decoder = 3 }'), ["driver.decoder: "]),
+    "decoder that does not fit": (
+        device(driver='driver = { link = "serial", port = "x", decoder = "ros2_imu" }'),
+        ["device a: driver.decoder: ros2_imu reads messages, link serial brings bytes: "],
+    ),
+    "options that are no table": (
+        device(driver='driver = { link = "serial", port = "x", decoder = "text", decoder_options = 3 }'),
+        ["driver.decoder_options: expected a table"],
+    ),
+    "bad unit": (
+        device(
+            driver='driver = { link = "serial", port = "x", decoder = "text", '
+            'decoder_options = { columns = ["gx"], gyro_unit = "deg/h2" } }'
+        ),
+        ["device a: driver.decoder_options: "],
+    ),
+    "port missing": (device(driver='driver = { link = "serial", decoder = "stim300" }'), ["device a: driver.port: missing"]),
+    "window that is no duration": (device('window = "1 week"'), ['device a: window: "1 week" is no duration']),
+    "window too short": (device("rate = 100\nwindow = 0.5"), ["50 samples; possible are 100 to 10000000: 1 to 100000 s"]),
+    "window too long": (device('rate = 1000\nwindow = "1d"'), ["86400000 samples"]),
+    "window of nan": (device("window = nan"), ["window"]),
+    "window without end": (device("window = inf"), ["window"]),
+    "unknown tau": (device('tau = "octaves"'), ["device[0].tau: "]),
+    "tau not above 0": (device("tau = [1.0, -1.0]"), ["device[0].tau: "]),
+    "impossible tau": (device("rate = 100\nwindow = 60\ntau = [100.0]"), ["device a: tau: none of [100.0] s lies"]),
+    "no tau at all": (device("rate = 100\ntau = []"), ["device a: tau: "]),
+    "refit": (device('refit = "often"'), ['device a: refit: "often" is no rate; write "10 Hz" or "every sample"']),
+    "publish": (device('publish = "0 Hz"'), ['device a: publish: "0 Hz" is no rate; write "10 Hz" or "every block"']),
+    "axes": (device("axes = { gx = \"up\" }"), ['device a: axes: gx = "up"; both are one of gx gy gz ax ay az']),
+    "a model that is not there": (device('model = "models/none.toml"'), ["models/none.toml: no such file"]),
+    "silence below 0": (
+        device(driver='driver = { link = "serial", port = "x", decoder = "stim300", silence = "3" }'),
+        ["device a: driver.silence: Expected `float`"],
+    ),
+    "unknown virtual model": (device(driver='driver = { link = "virtual", model = "none" }'), ['no model "none"']),
+    "replay of what cannot be": (device(driver='driver = { link = "replay", path = "a.jpg" }'), ["a.jpg: no such file"]),
+    "viewer": (device() + '[viewer]\nmode = "window"', ['viewer.mode: "window"; possible are auto']),
+    "viewer's port": (device() + "[viewer]\nport = 70000", ["viewer.port: Expected `int` <= 65535"]),
+    "viewer's memory": (device() + "[viewer]\nmemory = 3", ["viewer.memory: Expected `str`"]),
+    "zenoh's mode": (device() + '[zenoh]\nmode = "pear"', ["zenoh.mode: Invalid enum value 'pear'"]),
+    "zenoh's prefix": (device() + '[zenoh]\nprefix = "a/*"', ["zenoh.prefix: "]),
+    "log": (device() + '[log]\nlevel = "loud"', ["log.level: Invalid enum value 'loud'"]),
+    "a device that is no table": ("device = 3", ["device: Expected `array`"]),
+    "not TOML": ("[[device]\n", ["not TOML: "]),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_is_wrong_is_said(tmp_path, case):
+    text, expected = CASES[case]
+    lines = wrong(tmp_path, text)
+    assert len(lines) == len(expected)
+    for line, part in zip(lines, expected, strict=True):
+        assert part in line
+
+
+def test_a_signal_that_the_dbc_does_not_have(tmp_path):
+    dbc = sorted((CONFIG_FOLDER / "dbc").glob("*.dbc"))[0]
+    (line,) = wrong(
+        tmp_path,
+        device(
+            driver=f'driver = {{ link = "can", channel = "vcan0", decoder = "dbc", '
+            f'decoder_options = {{ file = "{dbc}", signals = {{ gz = "NoSuchSignal" }} }} }}'
+        ),
+    )
+    assert line.startswith("device a: driver.decoder_options: ")
+    assert "NoSuchSignal" in line
+
+
+def test_a_file_that_is_no_recording(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(b"")
+    (line,) = wrong(tmp_path, device(driver='driver = { link = "replay", path = "a.jpg" }'))
+    assert "nothing to replay by its suffix" in line
+
+
+def test_all_that_is_wrong_is_told_at_once(tmp_path):
+    text = (
+        device("rate = -1\nwindw = 3")
+        + device('window = "soon"\nrefit = "x"\naxes = { gx = "q" }', "b", 'driver = { link = "serial", bautrate = 1 }')
+        + '[log]\nlevel = "x"\n[viewer]\nmode = "y"\n'
+    )
+    lines = wrong(tmp_path, text)
+    for part in ("rate", "windw", "window", "refit", "axes", "bautrate", "port: missing", "decoder: missing", "log", "viewer"):
+        assert any(part in line for line in lines), part
+    with pytest.raises(ConfigError, match=rf"\(and {len(lines) - 1} more: imu-monitor check .*my.toml\)$"):
+        load(tmp_path / "my.toml")
+
+
+@pytest.mark.parametrize("what", ["missing", "folder", "binary"])
+def test_a_file_that_cannot_be_read(tmp_path, what):
+    path = tmp_path / "my.toml"
+    if what == "folder":
+        path.mkdir()
+    elif what == "binary":
+        path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="no such file" if what == "missing" else "cannot be read"):
+        load(path)
+
+
+def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
+    folder = tmp_path / "etc"
+    folder.mkdir()
+    monkeypatch.chdir(tmp_path)
+    (folder / "my.csv").write_text("t,gx\n0,1\n")
+    (folder / "z.json5").write_text("{}")
+    path = folder / "my.toml"
+    path.write_text(device(driver='driver = { link = "replay", path = "my.csv" }') + '[zenoh]\nconfig = "z.json5"')
+    config = load(path)
+    assert config.zenoh.config == folder / "z.json5"
+    link = config.devices[0].link
+    link.open()
+    link.close()
+
+
+# --- what is shipped
+
+
+@pytest.mark.parametrize("path", sorted(CONFIG_FOLDER.glob("*.toml")), ids=lambda path: path.name)
+def test_examples_are_right(path):
+    config, lines = read(path)
+    assert [line for line in lines if "no such file" not in line] == []
+    assert config is not None or lines
+
+
+def test_the_printed_defaults_are_the_defaults():
+    table = tomllib.loads((CONFIG_FOLDER / "defaults.toml").read_text("utf-8"))
+    text = (CONFIG_FOLDER / "defaults.toml").read_text("utf-8")
+    driver = table["device"][0]["driver"]
+    for kind, keys in (
+        (DeviceTable, table["device"][0]),
+        (serial_link.Settings, driver),
+        (ZenohTable, table["zenoh"]),
+        (ViewerTable, table["viewer"]),
+        (LogTable, table["log"]),
+    ):
+        for field in msgspec.structs.fields(kind):
+            default = field.default if field.default is not msgspec.NODEFAULT else None
+            if field.encode_name in keys:
+                value = keys[field.encode_name]
+                if default is not None:
+                    assert (tuple(value) if isinstance(default, tuple) else value) == default, field.name
+            else:  # no default: told as a comment
+                assert f"\n# {field.encode_name} = " in text, field.name
+    config, lines = read(CONFIG_FOLDER / "defaults.toml")
+    assert lines == []
+    assert config is not None
+    assert config.devices[0].axes == AxisMap()
+
+
+def test_every_link_can_be_named():
+    known = {*plugin.names(drivers.links, "_link")} - {"loopback"}
+    for name in known:
+        module = plugin.load(drivers.links, name, "_link")
+        assert module.DEFAULT_DECODER in ("", *plugin.names(drivers.decoders))
+
+
+# --- words
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("90s", 90.0), ("30min", 1800.0), ("1h", 3600.0), ("2d", 172800.0), (" 1.5 h ", 5400.0), ("250ms", 0.25), ("60", 60.0), ("1e3s", 1000.0), (7, 7.0)],
+)
+def test_durations(text, value):
+    assert seconds(text) == pytest.approx(value)
+
+
+@pytest.mark.parametrize("text", ["", "h", "1w", "-1h", "0s", "1.2.3s", "1 h 3 min", "1H", "nan"])
+def test_words_that_are_no_durations(text):
+    with pytest.raises(ConfigError, match="no duration"):
+        seconds(text)
+
+
+@pytest.mark.parametrize(("text", "value"), [("10 Hz", 0.1), ("0.5Hz", 2.0), ("always", 0.0)])
+def test_rates(text, value):
+    assert period(text, "always") == value
+
+
+@pytest.mark.parametrize("text", ["", "10", "10hz", "0 Hz", "-1 Hz", "1.1.1 Hz"])
+def test_words_that_are_no_rates(text):
+    with pytest.raises(ConfigError, match="no rate"):
+        period(text, "always")
+
+
+def test_viewer_modes():
+    assert [viewer_mode(mode) for mode in ("auto", "native", "web", "none", "a.rrd")] == ["auto", "native", "web", "none", "a.rrd"]
+
+
+def test_virtual_model_may_be_a_file_beside_the_configuration(tmp_path):
+    (tmp_path / "mine.toml").write_text((CONFIG_FOLDER / "models" / "consumer-mems.toml").read_text())
+    path = tmp_path / "my.toml"
+    path.write_text(device(driver='driver = { link = "virtual", model = "mine.toml", seed = 3 }'))
+    link = load(path).devices[0].link
+    assert isinstance(link, VirtualTable)
+    assert Path(link.model) == tmp_path / "mine.toml"

@@ -1,0 +1,215 @@
+"""The pages say what is so: commands, keys, settings, links, names of functions, and the programs printed in them."""
+
+import ast
+import re
+import selectors
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import IO
+from urllib.parse import quote
+
+import numpy as np
+import pytest
+import typer
+
+import drivers.decoders
+from drivers import plugin
+from drivers.recording import FORMATS
+from drivers.sample import block
+from drivers.sample_message import pack
+from monitor import settings, topics
+from monitor.cli import app
+from monitor.publish import message
+from monitor.publish.rerun_sinks import server_url
+from monitor.publish.zenoh_out import ZenohOut, ZenohSettings
+from tests.monitor.publish.made import estimate
+from tests.monitor.publish.zenoh_world import eventually, free_endpoint
+
+ROOT = Path(__file__).resolve().parent.parent
+README = ROOT / "README.md"
+PAGES = sorted([README, ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
+COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+PRINTED_BY = "tcp/127.0.0.1:7450"
+
+
+def title(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def fences(page: Path, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)
+
+
+def code(page: Path) -> list[str]:
+    """All that is set as code: fenced blocks, and spans between backticks in the rest."""
+    text = page.read_text("utf-8")
+    fenced = re.findall(r"^```\w*\n(.*?)^```", text, re.M | re.S)
+    return fenced + re.findall(r"`([^`]+)`", re.sub(r"^```.*?^```", "", text, flags=re.M | re.S))
+
+
+def section(page: Path, heading: str) -> str:
+    parts = re.split(r"^## ", page.read_text("utf-8"), flags=re.M)
+    return next(part for part in parts if part.startswith(heading + "\n"))
+
+
+def first_cells(text: str) -> list[str]:
+    """The code in the first column of the section's tables."""
+    return re.findall(r"^\| `([^`]+)` \|", text, re.M)
+
+
+# --- settings and commands
+
+
+@pytest.mark.parametrize("toml", [t for page in PAGES for t in fences(page, "toml") if "[[device]]" in t])
+def test_every_configuration_is_one(toml: str, tmp_path: Path) -> None:
+    (tmp_path / "recording.csv").write_text("t,gz\n0.00,0.1\n0.01,0.2\n")
+    (tmp_path / "page.toml").write_text(toml)
+    assert settings.read(tmp_path / "page.toml")[1] == []
+
+
+def test_the_configurations_show_every_link() -> None:
+    shown = {found for toml in fences(README, "toml") for found in re.findall(r'link = "(\w+)"', toml)}
+    assert shown == {"serial", "can", "zenoh", "replay"}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=title)
+def test_every_command_is_one(page: Path) -> None:
+    for text in code(page):
+        for line in text.splitlines():
+            for word, rest in re.findall(r"\bimu-monitor ([a-z]\w*)(.*)", line):
+                assert word in COMMANDS, line
+                known = {option for parameter in COMMANDS[word].params for option in parameter.opts}
+                assert set(re.findall(r"--[a-z-]+", rest)) <= known, line
+
+
+def test_the_table_has_every_command_and_its_options() -> None:
+    rows = re.findall(r"^\| `imu-monitor (\w+)[^`]*` \|(.*)", section(README, "Commands"), re.M)
+    assert [name for name, _ in rows] == list(COMMANDS)
+    everywhere = {"--help", "--seconds", "--viewer"}
+    for name, row in rows:
+        own = {option for parameter in COMMANDS[name].params for option in parameter.opts if option.startswith("--")}
+        assert own - everywhere == set(re.findall(r"--[a-z-]+", row)), name
+
+
+def test_the_viewers_address_is_the_one_it_listens_on() -> None:
+    own = settings.ViewerTable()
+    page = f"http://127.0.0.1:{own.web_port}/?url={quote(server_url(own.port), safe='')}"
+    assert f"`{page}`" in README.read_text("utf-8")
+    assert f"-L {own.web_port}:127.0.0.1:{own.web_port} -L {own.port}:127.0.0.1:{own.port}" in README.read_text("utf-8")
+
+
+# --- tables
+
+
+def test_the_keys_are_those_that_are_published() -> None:
+    rows = re.findall(r"^\| `(imu/[^`]+)` \| (\S*) ?\|", section(README, "zenoh"), re.M)
+    encodings = {topics.JSON: "JSON", topics.MSGPACK: "msgpack", "": ""}
+    published = [(topic.key("imu", "<device>"), encodings[topic.encoding]) for topic in topics.TOPICS]
+    assert sorted(rows) == sorted(published)
+
+
+def test_the_protocols_are_those_that_are_decoded() -> None:
+    assert sorted(first_cells(section(README, "Protocols"))) == sorted(plugin.names(drivers.decoders))
+
+
+def test_every_kind_of_recording_is_named() -> None:
+    named = re.findall(r"\.[a-z.]+", next(t for t in fences(README, "toml") if "recording.csv" in t))
+    assert set(FORMATS) <= set(named)
+
+
+# --- links, pictures, files, names
+
+
+@pytest.mark.parametrize("page", PAGES, ids=title)
+def test_every_link_leads_somewhere(page: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.M | re.S)
+    for alt, target in re.findall(r"!?\[([^\]]+)\]\(([^)]+)\)", text):
+        assert alt
+        if not re.match(r"https?://", target):
+            assert (page.parent / target.partition("#")[0]).exists(), target
+    assert "![](" not in text, "a picture without words for those who cannot see it"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=title)
+def test_every_file_named_is_there(page: Path) -> None:
+    for text in code(page):
+        for path in re.findall(r"\b((?:monitor|drivers|config|tests|docs)/[\w./-]*\w)", text):
+            assert (ROOT / path).exists(), path
+
+
+def defined() -> set[str]:
+    """What the sources define: ``module``, ``name``, ``Class.method``, ``module.function``."""
+    names: set[str] = set()
+    for path in [*ROOT.glob("drivers/**/*.py"), *ROOT.glob("monitor/**/*.py")]:
+        names.add(path.stem)
+        for node in ast.parse(path.read_text("utf-8")).body:
+            if not isinstance(node, ast.FunctionDef | ast.ClassDef):
+                continue
+            names |= {node.name, f"{path.stem}.{node.name}"}
+            if isinstance(node, ast.ClassDef):
+                names |= {f"{node.name}.{item.name}" for item in node.body if isinstance(item, ast.FunctionDef)}
+    return names
+
+
+@pytest.mark.parametrize(
+    ("page", "heading"),
+    [
+        (README, "One sample through the code"),
+        (ROOT / "docs" / "architecture.md", "Walk 1: one sample from the wire to the plot"),
+        (ROOT / "docs" / "architecture.md", "Walk 2: a link that goes away and comes back"),
+    ],
+    ids=["readme", "walk 1", "walk 2"],
+)
+def test_every_name_on_a_walk_is_defined(page: Path, heading: str) -> None:
+    said = re.findall(r"`([A-Z]\w+\.\w+|[a-z]\w+\.[a-z]\w+|[A-Z][a-z]\w+|[a-z]+)`", section(page, heading))
+    assert len(said) > 8
+    assert set(said) <= defined()
+
+
+# --- programs
+
+
+def first_line(stdout: IO[str], publish: "list[tuple[topics.Topic, bytes]]", zenoh: ZenohOut) -> str:
+    """What a program prints first, while results are published ten times a second."""
+    with selectors.DefaultSelector() as selector:
+        selector.register(stdout, selectors.EVENT_READ)
+        until_s = time.monotonic() + 30.0
+        while time.monotonic() < until_s:
+            for topic, payload in publish:
+                zenoh.put(topic, "bench-1", payload)
+            if selector.select(0.1):
+                return stdout.readline()
+    raise AssertionError("it printed nothing")
+
+
+@pytest.mark.parametrize(
+    ("page", "word"),
+    [(README, "estimated"), (ROOT / "docs" / "samples-format.md", "9.81")],
+    ids=["coefficients", "samples"],
+)
+def test_a_subscriber_as_printed_prints_what_is_published(page: Path, word: str) -> None:
+    endpoint = free_endpoint()
+    [program] = [text for text in fences(page, "python") if "declare_subscriber" in text]
+    assert PRINTED_BY in program
+    rows = block(np.arange(2) * 10_000_000, np.tile([0.1, 0.2, 0.3, 0.0, 0.0, 9.81], (2, 1)))
+    results = [
+        (topics.COEFFICIENTS, message.coefficients("bench-1", 1.76e9, estimate())),
+        (topics.SAMPLES, pack("bench-1", 2, rows)),
+    ]
+    zenoh = ZenohOut(ZenohSettings(listen=(endpoint,)), ["bench-1"])
+    zenoh.start()
+    try:
+        eventually(lambda: zenoh.state == "ok")
+        command = [sys.executable, "-u", "-c", program.replace(PRINTED_BY, endpoint)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            try:
+                assert process.stdout is not None
+                line = first_line(process.stdout, results, zenoh)
+            finally:
+                process.kill()
+    finally:
+        zenoh.close()
+    assert line.startswith("bench-1 ")
+    assert word in line

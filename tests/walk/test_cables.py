@@ -1,0 +1,83 @@
+"""Fifty times unplugged and put back: nothing grows, and every sample is received, rejected or known to be missing."""
+
+import gc
+import threading
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from drivers import driver
+from drivers.sample import join
+from tests.walk.rig import Running, running, wait_for
+
+WARM_UP, CYCLES = 10, 50
+NOISE_BYTES = 3_000_000
+"""Memory that comes and goes by itself: samples kept by this test, pages of the ring and the window touched first."""
+PERIOD_NS = 10_000_000
+CONFIG = """
+[[device]]
+name = "loose"
+rate = 100.0
+driver = { link = "virtual" }
+[[device]]
+name = "firm"
+rate = 100.0
+driver = { link = "virtual", seed = 2 }
+[zenoh]
+mode = "none"
+[viewer]
+mode = "none"
+"""
+
+
+def pull_and_put_back(run: Running, times: int) -> None:
+    """Each time a few samples are sent into the air, and some come after it."""
+    imu, station = run.service.virtual["loose"], run.station("loose")
+    for _ in range(times):
+        imu.unplug()
+        wait_for(lambda: station.driver.state == "lost", 10.0, "the loss")
+        before = imu.dropped
+        wait_for(lambda: imu.dropped >= before + 3, 10.0, "samples that find no cable")
+        received = station.driver.counts.received
+        imu.plug()
+        wait_for(lambda: station.driver.counts.received >= received + 3, 10.0, "samples after the pause")
+        assert station.driver.state == "running"
+
+
+def measured() -> tuple[int, int, int]:
+    """Threads, open files, resident bytes."""
+    gc.collect()
+    process = psutil.Process()
+    return threading.active_count(), process.num_fds(), process.memory_info().rss
+
+
+def test_fifty_pulled_cables_leave_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(driver, "FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(driver, "LONGEST_PAUSE_S", 0.05)
+    with running(tmp_path, CONFIG) as run:
+        for station in run.service.stations:
+            counts = station.driver.counts
+            wait_for(lambda counts=counts: counts.received >= 10, 20.0, "the first samples")  # type: ignore[misc]
+        pull_and_put_back(run, WARM_UP)
+        threads, files, memory = measured()
+        pull_and_put_back(run, CYCLES)
+        # the estimate is the service's last chance to be in the middle of something
+        wait_for(lambda: measured()[:2] == (threads, files), 5.0, "as many threads and files as before")
+        assert measured()[2] - memory < NOISE_BYTES
+    kinds = [event.kind for device, event in run.caught.events if device == "loose"]
+    assert (kinds.count("link_lost"), kinds.count("link_back")) == (WARM_UP + CYCLES, WARM_UP + CYCLES)
+    assert [device for device, event in run.caught.events if event.kind.startswith("link")].count("firm") == 0
+    for station in run.service.stations:
+        counts, blocks = station.driver.counts, run.caught.blocks[station.name]
+        # TimeStartup tells which sample each one was
+        number = join(blocks).ticks // PERIOD_NS
+        assert counts.received == number.size == sum(map(len, blocks))
+        assert counts.received + counts.bad + counts.lost == number[-1] - number[0] + 1
+        missing = np.concatenate([np.r_[one.lost, np.zeros(len(one) - 1, int)] for one in blocks])
+        np.testing.assert_array_equal(missing[1:], np.diff(number) - 1)
+        assert station.ring.overflowed == 0
+    loose, firm = (run.station(name).driver.counts for name in ("loose", "firm"))
+    assert loose.lost >= 3 * (WARM_UP + CYCLES)
+    assert (firm.lost, firm.bad) == (0, 0)
