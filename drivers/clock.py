@@ -7,7 +7,8 @@ host's scheduler does not become jitter of the samples.
 
 Missing samples are known from a counter exactly; without one from rejected frames (the decoder says so), from
 the pause while a link was closed, and from a sudden delay: one that is caught up within CATCH_UP_S was a late
-scheduler, one that stays is a hole. ``lost`` of each block that goes out counts all samples
+scheduler, one that stays is a hole. The same delay tells the whole turns that a short counter hides. A counter that
+ran further than the host's clock allows began anew: then arrival decides. ``lost`` of each block that goes out counts all samples
 missing just before it, rejected frames included.
 
 Not done here: no sample is dropped, repeated or moved to another place in the order.
@@ -172,10 +173,12 @@ class SampleClock:
         before = np.concatenate([[self._given_steps[-1] if self._given_steps else period_s], steps_s[:-1]])
         after = np.concatenate([steps_s[1:], [period_s]])
         self._given_steps.extend(steps_s[-STEPS_KEPT:].tolist())
+        periods = steps_s / period_s
+        if (periods < 1.5).all():
+            return np.zeros(steps_s.size, np.int64)
         off = np.abs(np.array(self._given_steps) / period_s - 1.0)
         if np.median(off) > NEAR:
             return np.zeros(steps_s.size, np.int64)
-        periods = steps_s / period_s
         gap = np.rint(periods).astype(np.int64) - 1
         late = (periods < SURELY_MISSING) & (np.abs(periods - np.rint(periods)) > NEAR)
         late |= periods < 1.0 + max(0.5, LATE * float(np.quantile(off, 0.75)))
@@ -431,11 +434,11 @@ def made_rate(measured_hz: float) -> float:
 
 
 def _usual(steps: Ints) -> float | None:
-    """Period in s, where it is not known yet: the middle of steady steps, the mean of others; None where there is none."""
+    """Period in s, while it is not known: the middle of steady steps, the mean of others; None where there is none."""
     forward = steps[steps > 0] / NS
     if not forward.size:
         return None
-    low, middle, high = np.quantile(forward, [0.25, 0.5, 0.75])
+    low, middle, high = np.quantile(forward, [0.1, 0.5, 0.9])
     return float(middle if high - low < 2.0 * NEAR * middle else forward.mean())
 
 

@@ -25,6 +25,8 @@ FIRST_PAUSE_S: Final = 0.1
 LONGEST_PAUSE_S: Final = 5.0
 UNDECODED_BYTES: Final = 2000
 """So many bytes without one sample: probably the wrong baud rate or decoder, and said so."""
+MUTE_S: Final = 3.0
+"""A running device whose bytes hold no sample for so long, and for ten sample periods, is lost."""
 EVENTS_KEPT: Final = 1000
 
 State = Literal["waiting", "running", "lost", "ended"]
@@ -90,6 +92,7 @@ class Driver:
         self._stop = threading.Event()
         self._undecoded = 0
         self._heard_s = 0.0
+        self._sampled_s = 0.0
         self._newest_t_ns = 0
 
     def take_events(self) -> list[Event]:
@@ -143,6 +146,7 @@ class Driver:
         if not samples:
             self._watch_undecoded(sum(len(chunk.data) for chunk in chunks))
             return
+        self._sampled_s, self._undecoded = self._heard_s, 0
         for one in samples:
             rejected = one.lost
             for stamped in self.clock.stamp(one):
@@ -168,17 +172,22 @@ class Driver:
 
     def _watch_undecoded(self, size: int) -> None:
         self.counts.bad = self.decoder.bad
-        if self.state == "running":
-            return
         self._undecoded += size
-        if self._undecoded >= UNDECODED_BYTES:
-            why = self.decoder.hint or "wrong baud rate, or another protocol than the configured one"
-            self.text = f"{self.link.name}: {self._undecoded} bytes and no sample in them; {why}"
+        mute_s = self._heard_s - self._sampled_s
+        patience_s = max(MUTE_S, 10.0 / (self.clock.rate_hz or 10.0))
+        if self._undecoded < UNDECODED_BYTES or (self.state == "running" and mute_s < patience_s):
+            return
+        why = self.decoder.hint or "wrong baud rate, or another protocol than the configured one"
+        self.text = f"{self.link.name}: {self._undecoded} bytes and no sample in them; {why}"
+        if self.state == "running":
+            self._event("link_lost", self.text)
+            self.state = "lost"
+            self.clock.pause()
 
     def _back(self) -> None:
         if self.state == "lost":
             self._event("link_back", f"{self.link.name} is back")
-        self.state, self.text, self._undecoded = "running", "", 0
+        self.state, self.text = "running", ""
 
     def _gone(self, error: LinkError) -> None:
         if self.state == "running":

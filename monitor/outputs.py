@@ -1,6 +1,7 @@
 """Adapters: what a station says, as zenoh messages, in the viewer, as log lines, in the terminal. None waits."""
 
 import time
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Final
 
 import structlog
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from monitor.publish.rerun_view import RerunView
 
 PREFIX: Final = "imu"
+OPENING_S: Final = 10.0
+"""To read a long recording before its first sample; what cannot be opened by then is shown."""
 _log = structlog.get_logger("imu-monitor")
 
 
@@ -51,8 +54,10 @@ class ZenohOutput:
 class ViewerOutput:
     """Results into the Rerun viewer."""
 
-    def __init__(self, view: "RerunView") -> None:
+    def __init__(self, view: "RerunView", recorded: Collection[str] = ()) -> None:
+        """``recorded``: devices whose times are not the host's."""
         self._view = view
+        self._recorded = recorded
 
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         """Raw samples."""
@@ -67,7 +72,9 @@ class ViewerOutput:
         self._view.event(device, unix_s, event)
 
     def health(self, device: str, unix_s: float, health: Health) -> None:
-        """The health panel."""
+        """The health panel. A line at today's date would put all that a recording of last year holds out of sight."""
+        if device in self._recorded and not health.received and health.uptime_s < OPENING_S:
+            return
         self._view.health(device, unix_s, health)
 
 
@@ -103,6 +110,10 @@ class TableOutput:
         self.board = board
         self._live = live
         self._latest: dict[str, tuple[float, Estimate]] = {}
+
+    def viewer_at(self, url: str) -> None:
+        """The line above the table: where the viewer's page is, "" = nowhere."""
+        self.board.note = f"viewer: {url}" if url else ""
 
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         """Not shown."""

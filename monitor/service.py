@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from monitor.estimate.estimator import warm_up
-from monitor.outputs import ViewerOutput, ZenohOutput
+from monitor.outputs import TableOutput, ViewerOutput, ZenohOutput
 from monitor.publish import message
 from monitor.publish.viewer import DeviceInfo, ViewerSettings
 from monitor.publish.zenoh_out import Command, ZenohOut, ZenohSettings
@@ -55,9 +55,11 @@ class Service:
             [station.name for station in self.stations],
         )
         self.view = _viewer(config)
+        self._page = ""  # where the viewer's page is, as it was said last
         self.outputs: list[Output] = [ZenohOutput(self.zenoh), *more]
         if self.view is not None:
-            self.outputs.append(ViewerOutput(self.view))
+            recorded = {station.name for station in self.stations if station.driver.times_are_unix}
+            self.outputs.append(ViewerOutput(self.view, recorded))
         every_block = any(device.publish_s == 0.0 for device in config.devices)
         self._pace_s = 0.0 if every_block else PACE_S
 
@@ -125,8 +127,22 @@ class Service:
 
     def _report(self) -> None:
         states, memory = self.states(), memory_bytes()
+        self._tell_page()
         for station in self.stations:
             station.report(self.outputs, states, memory)
+
+    def _tell_page(self) -> None:
+        """Say where the viewer's page is, once for each place; a window needs no address."""
+        url = self.view.url if self.view is not None else ""
+        page = url if url.startswith("http://") else ""
+        if page == self._page:
+            return
+        self._page = page
+        if page:
+            _log.info("viewer", url=page)
+        for output in self.outputs:
+            if isinstance(output, TableOutput):
+                output.viewer_at(page)
 
     def _answer(self) -> None:
         """Commands that came over zenoh since the last round."""

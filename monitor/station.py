@@ -90,6 +90,7 @@ class Station:
         self._pending: list[SampleBlock] = []  # not in the estimator yet: the rate is unknown
         self._batch: list[SampleBlock] = []  # not published yet
         self._waiting_since_ns = 0
+        self._unpublished_since_ns = 0  # of the oldest sample that was taken and not published yet
         self._latencies: list[float] = []
         self._started_s = time.monotonic()
         self._no_estimate = ""  # why there can be none
@@ -123,7 +124,8 @@ class Station:
 
     def work(self, outputs: Sequence[Output], now_s: float, drain: bool = False) -> None:
         """Take what came, advance the estimate, publish what is due; all of it when draining."""
-        since_ns, self._waiting_since_ns = self._waiting_since_ns, 0
+        came_ns, self._waiting_since_ns = self._waiting_since_ns, 0
+        self._unpublished_since_ns = self._unpublished_since_ns or came_ns
         blocks = self.ring.take()
         if blocks:
             self._newest_ns = int(blocks[-1].t_ns[-1])
@@ -134,8 +136,9 @@ class Station:
                 output.event(self.name, self.unix_s(event.t_ns), self.driver.counts.received, event)
         published = self._publish_samples(outputs, now_s, drain)
         published |= self._publish_estimate(outputs, now_s, drain)
-        if published and since_ns:
-            self._latencies.append((time.monotonic_ns() - since_ns) / 1e9)
+        if published and self._unpublished_since_ns:
+            self._latencies.append((time.monotonic_ns() - self._unpublished_since_ns) / 1e9)
+            self._unpublished_since_ns = 0
 
     def reset(self) -> None:
         """Empty the window."""
@@ -177,8 +180,8 @@ class Station:
         return (t_ns + self._offset_ns()) / 1e9
 
     def now_unix_s(self) -> float:
-        """Unix time of the newest sample, or of now where none has come or none comes."""
-        if self.driver.state == "running" and self._newest_ns:
+        """Unix time of the newest sample, or of now while a device waits or is lost."""
+        if self.driver.state in ("running", "ended") and self._newest_ns:
             return self.unix_s(self._newest_ns)
         return self._wall.unix_ns(time.monotonic_ns()) / 1e9
 

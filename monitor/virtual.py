@@ -112,6 +112,7 @@ class VirtualImu:
             late = due - made - int(BEHIND_S * self.rate_hz)
             if late > 0:  # the machine slept: the sensor ran on meanwhile
                 made += late
+                self.dropped += late
             if due > made:
                 self._send(made, due - made)
                 made = due
@@ -120,22 +121,21 @@ class VirtualImu:
         index = np.arange(first, first + n)
         values = self._stream.draw(n)
         samples = block(np.zeros(n, np.int64), values, self._temperature(index), self._ticks(index))
-        data = b"".join(chunk.data for chunk in self._decoder.encode(samples))
-        if self._write(data):
-            self.sent += n
-        else:
-            self.dropped += n
+        frames = [chunk.data for chunk in self._decoder.encode(samples)]
+        written = self._write(b"".join(frames))
+        whole = int(np.searchsorted(np.cumsum([len(frame) for frame in frames]), written, "right"))
+        self.sent += whole
+        self.dropped += n - whole
 
-    def _write(self, data: bytes) -> bool:
-        """Whether all of it went out; what has begun is finished as long as anyone reads."""
+    def _write(self, data: bytes) -> int:
+        """Bytes that went out; what has begun is finished as long as anyone reads."""
+        view = memoryview(data)
         with self._plugging, contextlib.suppress(BlockingIOError):
-            view = memoryview(data)
             while view and self._master is not None:
                 if not select.select([], [self._master], [], STEP_S)[1]:
-                    return False
+                    break
                 view = view[os.write(self._master, view) :]
-            return not view
-        return False
+        return len(data) - len(view)
 
     def _temperature(self, index: Ints) -> Floats:
         result: Floats = ROOM_C + WARM_UP_C * -np.expm1(-index * self._tick_s / WARM_UP_S)

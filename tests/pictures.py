@@ -1,9 +1,11 @@
 """Makes every picture of the viewer and of the plots that the documentation shows: ``python -m tests.pictures``.
 
-Everything goes the way it goes in use: results are handed to ``RerunView``, which draws them in a native
-viewer without a screen (software Vulkan) and in the web viewer inside a real Chromium, driven by its DevTools
-protocol. Needs the packages chromium, mesa-vulkan-drivers and libvulkan1 (Debian's names); network traffic stays
-on loopback. The device is made by hand from the five-term formula, the same at every run.
+Nothing is drawn by hand. A little over an hour of the shipped model ``consumer-mems``, with the temperature of a
+sensor that warms up, is written to a recording; ``Service`` replays it sixty times as fast into a native viewer
+without a screen (software Vulkan), then into the page inside a real Chromium, driven by its DevTools protocol;
+``imu-monitor analyze`` makes the plot of its first hour. The fleet are simulated devices in real time; one cable is
+pulled and put back, another is pulled for good. Needs the packages chromium, mesa-vulkan-drivers and
+libvulkan1 (Debian's names); network traffic stays on loopback.
 
     python -m tests.pictures [--out docs/pictures] [--only native fleet web plot]
 """
@@ -16,7 +18,9 @@ import secrets
 import shutil
 import socket
 import subprocess
+import sys
 import tempfile
+import threading
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -26,22 +30,50 @@ from typing import Any
 
 import numpy as np
 
-from drivers.sample import Event
-from monitor.publish import plot, rerun_sinks
-from monitor.publish.rerun_view import RerunView
-from monitor.publish.viewer import DeviceInfo, ViewerSettings
-from tests.monitor.publish import made
+from drivers.recording import save_samples
+from monitor import settings
+from monitor.publish import rerun_sinks
+from monitor.service import Service
+from monitor.virtual import ROOM_C, WARM_UP_C, WARM_UP_S, read_model
 
 SIZE = (1600, 1000)
-T0 = 1_763_704_800.0  # Unix s: a round hour
-LENGTH_S = 3600.0
-SETTLE_S = 8.0  # for a software renderer to paint what has arrived
+MODEL = settings.CONFIG_FOLDER / "models" / "consumer-mems.toml"
+T0 = 1_763_705_400.0  # Unix s of the first sample: 2025-11-21 06:10 UTC
+HOUR_S = 3600.0
+SPARE_S = 1800.0  # of the recording beyond the hour, so that it still runs while the picture is taken
+GAP_S = (1403.0, 1404.5)  # since T0: what the recording lost
+SPEED = 60.0
+SETTLE_S = 6.0  # for a software renderer to paint what has arrived
+PAGE_S = 15.0  # the same for WebAssembly on a software renderer
+PULLED_S, PLUGGED_S, PULLED_AGAIN_S, LOOKED_S = 40.0, 44.0, 85.0, 89.0  # since the fleet's start
 CHROMIUM_FLAGS = (
     *("--headless=new", "--no-sandbox", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync", "--disable-default-apps"),
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
     *("--hide-scrollbars", f"--window-size={SIZE[0]},{SIZE[1] + 143}"),
 )
+REPLAY = """
+[[device]]
+name = "bench-1"
+rate = 100.0
+driver = {{ link = "replay", path = "{recording}", speed = {speed} }}
+"""
+FLEET = """
+[[device]]
+name = "nose"
+rate = 100.0
+driver = { link = "virtual", seed = 1 }
+
+[[device]]
+name = "tail"
+rate = 100.0
+driver = { link = "virtual", seed = 2, decoder = "xsens_mtdata2" }
+
+[[device]]
+name = "wing"
+rate = 100.0
+driver = { link = "virtual", seed = 3, decoder = "stim300" }
+"""
 
 
 def main() -> None:
@@ -51,53 +83,113 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", choices=PICTURES, default=list(PICTURES))
     asked = parser.parse_args()
     asked.out.mkdir(parents=True, exist_ok=True)
-    for name in asked.only:
-        path = PICTURES[name](asked.out.resolve())
-        print(f"{path} ({path.stat().st_size / 1e3:.0f} kB)")
+    with tempfile.TemporaryDirectory() as folder:
+        for name in asked.only:
+            path = PICTURES[name](asked.out.resolve(), Path(folder))
+            print(f"{path} ({path.stat().st_size / 1e3:.0f} kB)")
 
 
-def native(out: Path) -> Path:
+def native(out: Path, folder: Path) -> Path:
     """One device in the native viewer."""
-    return _native(out / "viewer.png", [DeviceInfo("bench-1", "stim300 on /dev/ttyUSB0")])
+    path = out / "viewer.png"
+    with window() as (port, shoot), serving(folder, replay(folder), "native", port) as service:
+        until(lambda: replayed(service, HOUR_S), 300.0)
+        time.sleep(SETTLE_S)
+        shoot(path)
+    return path
 
 
-def fleet(out: Path) -> Path:
+def fleet(out: Path, folder: Path) -> Path:
     """Three devices: the overview."""
-    return _native(out / "viewer-fleet.png", [DeviceInfo(name) for name in ("bench-1", "bench-2", "wing")])
+    path = out / "viewer-fleet.png"
+    with window() as (port, shoot), serving(folder, FLEET, "native", port) as service:
+        tail, wing = service.virtual["tail"], service.virtual["wing"]
+        until(lambda: all(station.latest is not None for station in service.stations), 120.0)
+        begun_s = time.monotonic()
+        for at_s, act in (
+            (PULLED_S, tail.unplug),
+            (PLUGGED_S, tail.plug),
+            (PULLED_AGAIN_S, wing.unplug),
+            (LOOKED_S, lambda: shoot(path)),
+        ):
+            time.sleep(max(begun_s + at_s - time.monotonic(), 0.0))
+            act()
+    return path
 
 
-def web(out: Path) -> Path:
+def web(out: Path, folder: Path) -> Path:
     """One device on the page, in Chromium."""
-    port, web_port = free_port(), free_port()
-    view = RerunView(ViewerSettings("web", port, web_port), [DeviceInfo("bench-1", "stim300 on /dev/ttyUSB0")])
-    view.start()
-    try:
-        until(lambda: view.state == "ok", 30.0)
-        feed(view, ["bench-1"])
-        with browser() as page:
-            dark = [{"name": "prefers-color-scheme", "value": "dark"}]
-            page.call("Emulation.setEmulatedMedia", features=dark)
-            page.call("Page.navigate", url=view.url + "&renderer=webgl&hide_welcome_screen=1")
-            time.sleep(45.0)  # WebAssembly of 40 MB on a software renderer
-            shot = page.call("Page.captureScreenshot", format="png")
-    finally:
-        view.close()
+    with serving(folder, replay(folder), "web", free_port()) as service, browser() as page:
+        view = service.view
+        assert view is not None
+        until(lambda: view.url.startswith("http://"), 30.0)
+        dark = [{"name": "prefers-color-scheme", "value": "dark"}]
+        page.call("Emulation.setEmulatedMedia", features=dark)
+        page.call("Page.navigate", url=view.url + "&renderer=webgl&hide_welcome_screen=1")
+        until(lambda: replayed(service, HOUR_S), 300.0)
+        time.sleep(PAGE_S)
+        shot = page.call("Page.captureScreenshot", format="png")
     path = out / "viewer-web.png"
     path.write_bytes(base64.b64decode(shot["data"]))
     return path
 
 
-def allan(out: Path) -> Path:
+def allan(out: Path, folder: Path) -> Path:
     """The plot that ``analyze --plot`` writes."""
     path = out / "allan-plot.png"
-    plot.allan_plot(made.estimate(T0, seconds=LENGTH_S, seed=7), path, title="bench-1, 1 h at 100 Hz")
+    arguments = ["analyze", str(recording(folder, HOUR_S)), "--plot", str(path)]
+    subprocess.run([sys.executable, "-m", "monitor.cli", *arguments], check=True)
     return path
 
 
-PICTURES: dict[str, Callable[[Path], Path]] = {"native": native, "fleet": fleet, "web": web, "plot": allan}
+PICTURES: dict[str, Callable[[Path, Path], Path]] = {"native": native, "fleet": fleet, "web": web, "plot": allan}
 
 
-def _native(path: Path, devices: list[DeviceInfo]) -> Path:
+def recording(folder: Path, seconds: float) -> Path:
+    """So much of the simulated device, with a gap; the same at every run."""
+    path = folder / f"consumer-mems-{seconds:.0f}s.npz"
+    if not path.exists():
+        model = read_model(MODEL)
+        rate_hz = model.sample_rate_hz
+        assert rate_hz is not None
+        since_s = np.arange(round(seconds * rate_hz)) / rate_hz
+        values = model.stream(rate_hz, 1).draw(since_s.size)
+        temperature_c = ROOM_C - WARM_UP_C * np.expm1(-since_s / WARM_UP_S)
+        kept = (since_s < GAP_S[0]) | (since_s >= GAP_S[1])
+        save_samples(path, T0 + since_s[kept], values[kept], temperature_c[kept])
+    return path
+
+
+def replay(folder: Path) -> str:
+    """The configuration of one device that replays it."""
+    return REPLAY.format(recording=recording(folder, HOUR_S + SPARE_S), speed=SPEED)
+
+
+def replayed(service: Service, seconds: float) -> bool:
+    """Whether so much of the recording is in the estimate."""
+    latest = service.stations[0].latest
+    return latest is not None and latest.t_ns >= (T0 + seconds) * 1e9
+
+
+@contextmanager
+def serving(folder: Path, devices: str, mode: str, port: int) -> Iterator[Service]:
+    """The service with these devices, showing them in the viewer at ``port``."""
+    viewer = f'[viewer]\nmode = "{mode}"\nport = {port}\nweb_port = {free_port()}\n'
+    path = folder / "pictures.toml"
+    path.write_text(f'{devices}\n[zenoh]\nlisten = ["tcp/127.0.0.1:{free_port()}"]\n\n{viewer}')
+    service = Service(settings.load(path))
+    thread = threading.Thread(target=service.run)
+    thread.start()
+    try:
+        yield service
+    finally:
+        service.stop()
+        thread.join(30.0)
+
+
+@contextmanager
+def window() -> Iterator[tuple[int, Callable[[Path], None]]]:
+    """A native viewer without a screen: its port, and what takes its picture."""
     from rerun.experimental import ViewerClient
 
     port = free_port()
@@ -105,37 +197,11 @@ def _native(path: Path, devices: list[DeviceInfo]) -> Path:
     child = rerun_sinks.Child([
         *("--bind", "127.0.0.1", "--port", str(port), "--headless", "--window-size", size, "--hide-welcome-screen")
     ])  # fmt: skip
-    view = RerunView(ViewerSettings("native", port), devices)
     try:
         until(lambda: rerun_sinks.listens(port), 30.0)
-        view.start()
-        until(lambda: view.state == "ok", 30.0)
-        feed(view, [d.name for d in devices])
-        time.sleep(SETTLE_S)
-        ViewerClient(rerun_sinks.server_url(port)).save_screenshot(str(path))
+        yield port, lambda path: ViewerClient(rerun_sinks.server_url(port)).save_screenshot(str(path))
     finally:
-        view.close()
         child.end()
-    return path
-
-
-def feed(view: RerunView, devices: list[str]) -> None:
-    """An hour of each device, as fast as it goes: courses, temperature, the last minute's samples, events."""
-    for k, device in enumerate(devices):
-        now = T0 + LENGTH_S
-        scale = 1.0 + 0.35 * k
-        for i in range(30, int(LENGTH_S) + 1, 30):
-            view.estimate(
-                device, T0 + i, made.estimate(T0 + i, seconds=float(i), scale=scale, seed=7 if i == 3600 else i)
-            )
-        t = T0 + np.arange(0.0, LENGTH_S, 5.0)
-        view.samples(device, t, np.full((t.size, 6), np.nan), 31.0 + 1.5 * (1 - np.exp(-(t - T0) / 900.0)))
-        raw_t, raw, _ = made.samples(now - 60.0, 60.0, seed=k)
-        view.samples(device, raw_t, raw, np.full(raw_t.size, np.nan))
-        view.event(device, T0 + 4.0, Event("link_back", 0, "link back after 3.2 s"))
-        change = "gz angle random walk rose by 12 %"
-        view.event(device, T0 + 1815.0, Event("noise_changed", 0, change, axis="gz"))
-        view.health(device, now, made.health(uptime_s=LENGTH_S))
 
 
 def until(true: Callable[[], bool], seconds: float) -> None:

@@ -130,7 +130,10 @@ WRONG_FILES = {
     "bad rate of fits": (VIRTUAL + 'refit = "10 hz"\n', '"10 hz" is no rate; write "10 Hz" or "every sample"'),
     "no rate of fits": (VIRTUAL + 'refit = "0 Hz"\n', '"0 Hz" is no rate; write "10 Hz" or "every sample"'),
     "unknown axis": (VIRTUAL + 'axes = { gz = "-gw" }\n', 'gz = "-gw"; both are one of gx gy gz ax ay az'),
-    "bad viewer": (VIRTUAL + '[viewer]\nmode = "nativ"\n', 'viewer.mode: "nativ"; possible are auto, native, web, none'),
+    "bad viewer": (
+        VIRTUAL + '[viewer]\nmode = "nativ"\n',
+        'viewer.mode: "nativ"; possible are auto, native, web, none',
+    ),
     "bad port": (VIRTUAL + "[viewer]\nport = 99999\n", "viewer.port: Expected `int` <= 65535"),
     "bad size": (VIRTUAL + '[viewer]\nmemory = "lots"\n', 'viewer.memory: "lots" is no size; write "256MiB"'),
     "bad endpoint": (VIRTUAL + '[zenoh]\nlisten = ["7450"]\n', 'zenoh.listen: "7450" is no endpoint; write "tcp/'),
@@ -153,7 +156,9 @@ def test_a_wrong_file_refuses_to_start_in_one_line(call: Call, case: str) -> Non
 
 
 def test_check_tells_all_that_is_wrong_and_run_the_first(call: Call) -> None:
-    text = '[[device]]\nname = "a"\nwindw = 1.0\ndriver = { link = "virtual" }\n[viewer]\nmode = "x"\n[log]\nlevel = 3\n'
+    text = (
+        '[[device]]\nname = "a"\nwindw = 1.0\ndriver = { link = "virtual" }\n[viewer]\nmode = "x"\n[log]\nlevel = 3\n'
+    )
     Path("c.toml").write_text(text)
     said = call("check", "c.toml")
     assert said.status == 2
@@ -236,7 +241,8 @@ for command in ([], *([name] for name in {COMMANDS!r})):
         main()
     except SystemExit as ended:
         print("status", ended.code)
-print("heavy", sorted({{"numpy", "scipy", "numba", "rerun", "zenoh", "can", "matplotlib", "pyarrow"}} & sys.modules.keys()))
+heavy = {{"numpy", "scipy", "numba", "rerun", "zenoh", "can", "matplotlib", "pyarrow"}}
+print("heavy", sorted(heavy & sys.modules.keys()))
 """
     done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.count("status 0\n") == 1 + len(COMMANDS)
@@ -288,7 +294,11 @@ def test_deviations_are_those_of_allantools(call: Call, recording: Path, grid: s
     [
         ("x.csv", b"", "x.csv: the file is empty"),
         ("x.csv", b"t,gx\n", "x.csv: has a header line but no whole line of samples"),
-        ("x.csv", b"gx\n" + b"0.1\n" * 100, "x.csv: has neither t nor fs, so its rate is not known; give it with --rate"),
+        (
+            "x.csv",
+            b"gx\n" + b"0.1\n" * 100,
+            "x.csv: has neither t nor fs, so its rate is not known; give it with --rate",
+        ),
         ("x.csv", b"t,speed\n" + b"0.1,1\n" * 100, "x.csv: no axis among its columns"),
         ("x.csv", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + bytes(range(256)) * 9, "x.csv: no axis among its columns"),
         ("x.npz", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + bytes(range(256)) * 9, "x.npz: is no .npz file"),
@@ -365,7 +375,9 @@ def test_a_wrong_file_ends_a_real_process(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize("arguments", [("check", "--print-defaults"), ("analyze", "RECORDING", "--json", "-"), ("--help",)])
+@pytest.mark.parametrize(
+    "arguments", [("check", "--print-defaults"), ("analyze", "RECORDING", "--json", "-"), ("--help",)]
+)
 def test_a_reader_that_has_gone_is_no_crash(recording: Path, arguments: tuple[str, ...]) -> None:
     """As in ``imu-monitor … | head -1``."""
     reading, writing = os.pipe()
@@ -478,6 +490,14 @@ def test_the_demo_really_receives_samples() -> None:
 # --- sockets ---------------------------------------------------------------------------------------
 
 
+def all_bound(process: psutil.Process, least: int) -> list[tuple[str, int]]:
+    """The same, once there are so many."""
+    until_s = time.monotonic() + 40.0
+    while len(bound(process)) < least and time.monotonic() < until_s:
+        time.sleep(0.1)
+    return bound(process)
+
+
 def bound(process: psutil.Process) -> list[tuple[str, int]]:
     """Addresses on which the process and its children take packets or connections."""
     found = []
@@ -495,14 +515,21 @@ def test_defaults_listen_on_loopback_only(viewer: str, least: int) -> None:
         pytest.importorskip("rerun", reason="rerun-sdk is not installed")
     with daemon([*PROGRAM, "demo", "--viewer", viewer]) as one:
         one.hears("state=running")
-        process = psutil.Process(one.process.pid)
-        until_s = time.monotonic() + 40.0
-        while len(bound(process)) < least and time.monotonic() < until_s:
-            time.sleep(0.1)
-        addresses = bound(process)
+        addresses = all_bound(psutil.Process(one.process.pid), least)
         assert len(addresses) >= least, addresses
         assert {address for address, _ in addresses} <= {"127.0.0.1", "::1"}
         assert one.status_after(signal.SIGTERM, 5.0) == 0
+
+
+def test_a_zenoh_file_opens_nothing_by_what_it_leaves_out(tmp_path: Path) -> None:
+    """One that is there for TLS only must not turn scouting on."""
+    (tmp_path / "zenoh.json5").write_text("{ /* nothing of scouting */ transport: {} }")
+    (tmp_path / "c.toml").write_text(VIRTUAL + '[zenoh]\nconfig = "zenoh.json5"\n[viewer]\nmode = "none"\n')
+    with daemon([*PROGRAM, "run", str(tmp_path / "c.toml")]) as one:
+        one.hears("state=running")
+        addresses = all_bound(psutil.Process(one.process.pid), 1)
+        assert len(addresses) == 1
+        assert addresses[0][0] == "127.0.0.1"
 
 
 def test_watching_listens_nowhere() -> None:

@@ -135,7 +135,7 @@ def test_every_link_leads_somewhere(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=title)
 def test_every_file_named_is_there(page: Path) -> None:
     for text in code(page):
-        for path in re.findall(r"\b((?:monitor|drivers|config|tests|docs)/[\w./-]*\w)", text):
+        for path in re.findall(r"(?<![\w/-])((?:monitor|drivers|config|tests|docs)/[\w./-]*\w)", text):
             assert (ROOT / path).exists(), path
 
 

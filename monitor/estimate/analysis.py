@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.clock import SampleClock, made_rate
+from drivers.clock import JUMP_S, LONG_S, NS, SampleClock, made_rate
 from drivers.errors import NotReady
 from drivers.sample import AXES, Floats, Given, Ints, SampleBlock
 from monitor.estimate.batch import TauGrid, cluster_sizes, overlapping, slope
@@ -21,8 +21,8 @@ from monitor.estimate.uncertainty import intervals, table
 
 FEWEST: Final = 50
 """Samples; below this nothing can be said, and the command exits with status 3."""
-LONGEST_HOLE: Final = 10_000_000
-"""Missing samples kept in place; after a longer pause the recording is said to be in two."""
+LONGEST_HOLE: Final = 1_000_000
+"""Missing samples kept in place, 48 bytes each; one stands for a longer pause, and keeps terms from reaching across."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,8 @@ def on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Float
     holes = 0
     for samples in stamped:
         if samples.lost > LONGEST_HOLE:
-            notes.append(f"a pause of {samples.lost / rate:.6g} s is too long to keep in place; it was closed up")
+            notes.append(f"a pause of {samples.lost / rate:.6g} s is too long to keep in place; no term reaches across")
+            pieces.append(np.full((1, 6), np.nan))
         elif samples.lost:
             holes += 1
             pieces.append(np.full((samples.lost, 6), np.nan))
@@ -85,9 +86,13 @@ def on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Float
 
 
 def _mean_rate(stamped: Sequence[SampleBlock]) -> float:
-    """Samples a second over the whole recording, missing ones included."""
-    n = sum(len(samples) + samples.lost for samples in stamped) - 1 - stamped[0].lost
-    span_s = (int(stamped[-1].t_ns[-1]) - int(stamped[0].t_ns[0])) / 1e9
+    """Samples a second over the whole recording, missing ones included, where its times do not jump."""
+    steps = np.diff(np.concatenate([samples.t_ns for samples in stamped])) / NS
+    samples_each = np.ones(steps.size + 1, np.int64)
+    starts = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])
+    samples_each[starts] += [samples.lost for samples in stamped]
+    steady = (steps > -JUMP_S) & (steps < LONG_S)
+    n, span_s = int(samples_each[1:][steady].sum()), float(steps[steady].sum())
     if n < 1 or span_s <= 0.0:
         raise NotReady("the times of the recording do not go on, so that its rate is unknown; state it with --rate HZ")
     return made_rate(n / span_s)

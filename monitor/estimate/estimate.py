@@ -16,5 +16,5 @@ class Estimate:
     window_s: float  # the window's full length
     samples: int  # received since start
     curve: AllanCurve
-    fitted: Floats  # [m, 6] Allan variance of the fitted model at curve.tau_s; NaN where none
+    fitted: Floats  # [m, 6] Allan variance of the fitted model at curve.tau_s; NaN where none, or left out of the fit
     coefficients: Coefficients

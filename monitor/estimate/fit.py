@@ -71,7 +71,7 @@ class Fit:
 
     coefficients: Coefficients
     theta: Floats  # [5, 6] Q² N² B² K² R² of the fitted curve, SI; Q² < 0 stands for a band limit
-    fitted: Floats  # [m, 6] unit², Allan variance of the fitted model; NaN where there is none
+    fitted: Floats  # [m, 6] unit², Allan variance of the fitted model; NaN where there is none or left_out
     edf: Floats  # [m, 6] equivalent degrees of freedom of the measured curve; NaN as the curve
     entered: NDArray[np.bool_]  # [5, 6] terms that are in: hand them to the next fit
     left_out: Ints  # [6] shortest τ that contradicted every fit

@@ -80,12 +80,13 @@ def _fit_axis(  # type: ignore[no-untyped-def]
     if straight:
         noise = _judge_ramp(slope, slope_variance, thresholds, entered, theta, lo, hi, status)
     _variances(rows, theta, covariance, stretch, variance)
-    for i in rows:
+    for k in range(rows.size):
+        i = rows[k]
         model, positive = 0.0, 0.0
         for a in range(5):
             model += columns[i, a] * theta[a]
             positive += columns[i, a] * max(theta[a], 0.0)
-        fitted[i] = model if model > 0.0 else np.nan
+        fitted[i] = model if k >= first and model > 0.0 else np.nan
         # a ramp multiplies the noise of the mean second difference: 4 R² (m²/2)² Var(slope)
         variance[i] += 4.0 * theta[R] * columns[i, R] ** 2 * noise
         edf[i] = 2.0 * positive * positive / variance[i]

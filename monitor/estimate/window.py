@@ -81,7 +81,8 @@ class AllanWindow:
         self._missing = np.zeros(places * LANES, np.int32)
         self._state, _, terms, self._phase = _cut_ints(self._ints, taus)
         self._scaling, _, sums, rest, stage = _cut_floats(self._floats, taus)
-        self._terms, self._sums, self._rest = (part.reshape(taus, LANES) for part in (terms, sums, rest))
+        self._terms = terms.reshape(taus, LANES)
+        self._sums, self._rest = sums.reshape(taus, LANES), rest.reshape(taus, LANES)
         self._stage = stage[: STAGE * AXES].reshape(STAGE, AXES)
         self.reset()
 
@@ -133,8 +134,10 @@ class AllanWindow:
         sums = (self._sums + self._rest)[:, :AXES]
         m = self.factors[:, None] * self._scale[:AXES]
         terms = self._terms[:, :AXES]
+        # a constant axis shows second differences of up to one unit, the rounding of its phase: no noise at all
+        sums = np.where(sums <= terms, 0.0, sums)
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.where(terms > 0, np.maximum(sums, 0.0) / (2.0 * m * m * terms), np.nan)
+            return np.where(terms > 0, sums / (2.0 * m * m * terms), np.nan)
 
     def slope(self) -> Floats:
         """Slope of the rate over the window [6], unit of the axis a sample; NaN where a sample is missing.

@@ -9,6 +9,7 @@ from typing import Final
 
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.blueprint.encodings import TimelineColumn
 
 from monitor.publish import colours
 from monitor.publish.rerun_chart import HEIGHT, WIDTH
@@ -24,6 +25,7 @@ from monitor.publish.units import (
 )
 
 RAW_SPAN_S: Final = 30.0  # of raw samples in view, up to the cursor
+LABEL_SHARE: Final = 0.08  # of a plot's width: half a tick's label
 COURSES: Final = ("N", "B")
 BOTH_KINDS: Final = 4  # devices at most whose accelerometers are in the overview too
 COLUMNS: Final = 4
@@ -48,7 +50,7 @@ def _device(device: str) -> rrb.Container:
     left = rrb.Vertical(
         rrb.TextDocumentView(origin=f"/{device}/status", name="Is it healthy?"),
         rrb.TextDocumentView(origin=f"/{device}/coefficients", contents="$origin", name="What is its noise now?"),
-        rrb.TextLogView(origin=f"/{device}/events", name="Has it changed?", columns=_log_columns()),
+        rrb.TextLogView(origin=f"/{device}/events", name="Has it changed?", columns=_log_columns("LogLevel")),
         row_shares=[2.35, 6.15, 1.5],
     )
     right = rrb.Vertical(
@@ -64,7 +66,15 @@ def _overview(devices: Sequence[str]) -> rrb.Container:
     kinds = KINDS if len(devices) <= BOTH_KINDS else KINDS[:1]
     charts = [_allan(d, kind, f"{d}: ") for kind in kinds for d in devices]
     return rrb.Vertical(
-        rrb.TextDocumentView(origin="/overview", name="Is it healthy?"),
+        rrb.Horizontal(
+            rrb.TextDocumentView(origin="/overview", name="Is it healthy?"),
+            rrb.TextLogView(
+                origin="/",
+                contents=[f"+ /{d}/events" for d in devices],
+                name="Has it changed?",
+                columns=_log_columns("EntityPath", "LogLevel"),
+            ),
+        ),
         rrb.Grid(*charts, grid_columns=min(len(devices), COLUMNS)),
         row_shares=[1, 4],
         name="Overview",
@@ -113,13 +123,16 @@ def _temperature(device: str) -> rrb.View:
     )
 
 
-def _log_columns() -> rrb.TextLogColumns:
-    return rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
+def _log_columns(*columns: str) -> rrb.TextLogColumns:
+    """The time of the day stands in the text: a column for it would be cut off to the date."""
+    hidden = TimelineColumn(timeline=TIMELINE, visible=False)
+    return rrb.TextLogColumns(timeline_columns=[hidden], text_log_columns=[*columns, "Body"])
 
 
 def _last(seconds: float) -> rrb.TimeAxis:
-    now = rr.TimeRangeBoundary.cursor_relative()
-    return rrb.TimeAxis(view_range=rr.TimeRange(rr.TimeRangeBoundary.cursor_relative(seconds=-seconds), now))
+    """The last of it, and room on the right for the label of a tick that stands at the cursor."""
+    first, last = (rr.TimeRangeBoundary.cursor_relative(seconds=s) for s in (-seconds, LABEL_SHARE * seconds))
+    return rrb.TimeAxis(view_range=rr.TimeRange(first, last))
 
 
 def _all_so_far() -> rrb.TimeAxis:

@@ -110,7 +110,8 @@ class Scene:
     def event(self, device: str, wall_s: float, event: Event) -> None:
         """One line in the log of the device."""
         self._at(wall_s)
-        self._stream.log(f"{device}/events", rr.TextLog(event.text, level=LEVELS.get(event.kind, "INFO")))
+        body = f"{_clock_time(wall_s)}  {event.text}"
+        self._stream.log(f"{device}/events", rr.TextLog(body, level=LEVELS.get(event.kind, "INFO")))
 
     def health(self, device: str, wall_s: float, health: Health) -> None:
         """The health panel of the device, and its row in the overview."""
@@ -256,6 +257,15 @@ def _course(estimate: Estimate, row: int, column: int) -> tuple[float, float, fl
 def _stamps(wall_s: Floats) -> "np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]":
     """Unix seconds as nanosecond stamps."""
     return np.round(wall_s * 1e9).astype("datetime64[ns]")
+
+
+def _clock_time(wall_s: float) -> str:
+    """Time of the day in UTC, as the viewer's own time axes have it; its column of dates is too narrow to show one.
+
+    >>> _clock_time(1.76e9)
+    '08:53:20'
+    """
+    return str(np.datetime_as_string(_stamps(np.array([wall_s]))[0], "s")[-8:])
 
 
 def _markdown(text: str) -> rr.TextDocument:

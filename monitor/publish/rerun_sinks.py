@@ -15,6 +15,7 @@ import ctypes
 import http.client
 import os
 import re
+import shutil
 import socket
 import subprocess
 import sys
@@ -54,7 +55,7 @@ class Child:
         self._log: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the child
         quiet = {"RERUN_ANALYTICS": "0", "RERUN_APP_ONLY": "true", "NO_COLOR": "1", "RUST_LOG": "warn"}
         self._process = subprocess.Popen(
-            [str(viewer_program()), *arguments],
+            [*_leash(), str(viewer_program()), *arguments],
             stdin=subprocess.DEVNULL,
             stdout=self._log,
             stderr=self._log,
@@ -147,6 +148,15 @@ def viewer_program() -> Path:
     if found is None:
         raise ViewerTrouble(f"rerun-sdk came without its viewer: no program in {room}")
     return found
+
+
+def _leash() -> list[str]:
+    """What makes a program end when the thread that started it does, however that comes: Linux alone has it.
+
+    ``setpriv`` (util-linux) sets it and then becomes the program; without it a killed daemon leaves its viewer.
+    """
+    setpriv = shutil.which("setpriv") if sys.platform == "linux" else None
+    return [] if setpriv is None else [setpriv, "--pdeathsig", "TERM", "--"]
 
 
 def listens(port: int) -> bool:

@@ -27,6 +27,12 @@ if TYPE_CHECKING:
 
 RETRY_S: Final = 2.0
 QUERIES_WAITING: Final = 64
+CLOSED: Final = {
+    "scouting/multicast/enabled": "false",
+    "scouting/gossip/enabled": "false",
+    "timestamping/enabled": "true",
+}
+"""JSON of what a session is unless told otherwise; zenoh's own defaults scout."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +61,8 @@ class ZenohOut:
 
     def __init__(self, settings: ZenohSettings, devices: Sequence[str]) -> None:
         self.settings = settings
-        self.state = "off" if settings.mode == "none" else "not open yet"
+        self._said = "off" if settings.mode == "none" else "not open yet"
+        self._unsent = ""  # why the newest message did not go out
         self.commands: queue.Queue[Command] = queue.Queue(QUERIES_WAITING)
         self._devices = tuple(devices)
         self._alive: dict[str, bool] = dict.fromkeys(devices, False)
@@ -64,6 +71,17 @@ class ZenohOut:
         self._tokens: dict[str, Any] = {}
         self._threads: list[threading.Thread] = []
         self._closing = threading.Event()
+
+    @property
+    def state(self) -> str:
+        """``ok``, or what is wrong: for the status."""
+        session = self._session
+        if self._unsent or session is None or not self.settings.connect:
+            return self._unsent or self._said
+        with contextlib.suppress(*_zenoh_errors()):  # the session is being closed
+            if not session.info.routers_zid() and not session.info.peers_zid():
+                return f"nobody at {', '.join(self.settings.connect)}; trying again"
+        return self._said
 
     def start(self) -> None:
         """Open in a thread of its own: a router that is not there must not hold up the samples."""
@@ -83,7 +101,9 @@ class ZenohOut:
         try:
             publisher.put(payload)
         except zenoh.ZError as error:
-            self.state = f"cannot send: {_plain(error)}"
+            self._unsent = f"cannot send: {_plain(error)}"
+        else:
+            self._unsent = ""
 
     def alive(self, device: str, flowing: bool) -> None:
         """Show or take away the device's liveliness token."""
@@ -104,11 +124,12 @@ class ZenohOut:
     # --- opening
 
     def _open_until_open(self) -> None:
+        errors: tuple[type[Exception], ...] = (*_zenoh_errors(), OSError)
         while not self._closing.is_set():
             try:
                 self._open()
-            except _zenoh_errors() as error:
-                self.state = f"{_plain(error)}; trying again"
+            except errors as error:
+                self._said = f"{_plain(error)}; trying again"
                 self._closing.wait(RETRY_S)
             else:
                 return
@@ -125,7 +146,7 @@ class ZenohOut:
                     key = topic.key(self.settings.prefix, device)
                     publishers[key] = self._publisher(session, topic, key)
             self._declare_commands(session, device)
-        self._session, self._publishers, self.state = session, publishers, said
+        self._session, self._publishers, self._said = session, publishers, said
         for device in self._devices:
             self._show_alive(device)
 
@@ -147,10 +168,9 @@ class ZenohOut:
 
         own = self.settings
         config = zenoh.Config.from_file(str(own.config)) if own.config else zenoh.Config()
-        if own.config is None:
-            config.insert_json5("scouting/multicast/enabled", "false")
-            config.insert_json5("scouting/gossip/enabled", "false")
-            config.insert_json5("timestamping/enabled", "true")
+        for key, value in CLOSED.items():
+            if config.get_json(key) == "null":  # the file, if there is one, says nothing of it
+                config.insert_json5(key, value)
         config.insert_json5("mode", json.dumps(own.mode))
         if own.mode != "client":
             config.insert_json5("listen/endpoints", json.dumps(listen))
@@ -228,7 +248,8 @@ def _free_port(endpoint: str) -> str:
     match = re.fullmatch(r"tcp/\[?([^\]]+?)\]?:\d+", endpoint)
     if match is None:
         return endpoint
-    with socket.create_server((match[1], 0)) as server:
+    family = socket.AF_INET6 if ":" in match[1] else socket.AF_INET
+    with socket.create_server((match[1], 0), family=family) as server:
         return re.sub(r":\d+$", f":{server.getsockname()[1]}", endpoint)
 
 

@@ -1,6 +1,7 @@
 """Sample times and missing samples from counters, arrivals and given times, in scenarios where the truth is known."""
 
 import os
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ def feed(clock, arrived_s, ticks=None, lost=None):
     """Blocks of the samples that arrived together."""
     edges = [0, *(np.flatnonzero(np.diff(arrived_s)) + 1).tolist(), len(arrived_s)]
     out = []
-    for a, b in zip(edges, edges[1:], strict=False):
+    for a, b in pairwise(edges):
         t_ns = np.rint(arrived_s[a:b] * NS).astype(np.int64)
         counted = None if ticks is None else np.array(ticks[a:b], np.int64)
         out += clock.stamp(block(t_ns, np.zeros((b - a, 6)), None, counted, 0 if lost is None else int(lost[a])))
@@ -53,7 +54,14 @@ STIM300 = (256, 1 / 2000)
 SAMPLES_16 = (65536, None)
 XSENS = (1 << 32, 1e-4)
 VECTORNAV = (1 << 62, 1e-9)
-COUNTERS = [(STIM300, 500.0), (STIM300, 262.0), (SAMPLES_16, 100.0), ((256, None), 100.0), (XSENS, 400.0), (VECTORNAV, 40.0)]
+COUNTERS = [
+    (STIM300, 125.0),
+    (STIM300, 262.0),
+    (SAMPLES_16, 100.0),
+    ((256, None), 100.0),
+    (XSENS, 100.0),
+    (VECTORNAV, 40.0),
+]
 
 
 def ticks_of(index, kind, rate):
@@ -68,11 +76,11 @@ class TestCounter:
     @pytest.mark.parametrize("holes", [[], [(5, 3)], [(300, 1), (400, 10), (402, 1)], [(900, 300)]])
     @pytest.mark.parametrize("arrive", [burst, jitter])
     def test_missing_samples_are_exact(self, kind, rate, nominal, holes, arrive):
-        index = np.arange(int(32 * rate))
+        index = np.arange(int(24 * rate))
         kept = np.ones(index.size, bool)
         for at, n in holes:
             # a short counter needs the settled line to see a whole turn
-            first = at if n < 256 else int(20 * rate)
+            first = at if n < 256 else int(12 * rate)
             kept[first : first + n] = False
         clock = SampleClock(Counter(*kind), rate if nominal else None)
         out = feed(clock, arrive(T0 + index / rate)[kept], ticks_of(index, kind, rate)[kept])
@@ -88,7 +96,7 @@ class TestCounter:
         assert kinds(clock) == []
 
     def test_a_counter_that_sticks_is_told_once(self, kind, rate, nominal):
-        index = np.arange(int(20 * rate))
+        index = np.arange(int(12 * rate))
         ticks = ticks_of(index, kind, rate)
         ticks[300:] = ticks[300]
         clock = SampleClock(Counter(*kind), rate if nominal else None)
@@ -96,7 +104,7 @@ class TestCounter:
         assert kinds(clock) == ["clock_jumped"]
 
     def test_what_came_while_it_stood_still_is_not_missing(self, kind, rate, nominal):
-        index = np.arange(int(20 * rate))
+        index = np.arange(int(12 * rate))
         ticks = ticks_of(index, kind, rate)
         ticks[300:350] = ticks[300]
         clock = SampleClock(Counter(*kind), rate if nominal else None)
@@ -104,7 +112,7 @@ class TestCounter:
         assert kinds(clock) == ["clock_jumped"]
 
     def test_a_cable_out_for_five_seconds(self, kind, rate, nominal):
-        index, at, n = np.arange(int(40 * rate)), int(20 * rate), int(5 * rate)
+        index, at, n = np.arange(int(28 * rate)), int(12 * rate), int(5 * rate)
         ticks, arrived = ticks_of(index, kind, rate), jitter(T0 + index / rate)
         clock = SampleClock(Counter(*kind), rate if nominal else None)
         out = feed(clock, arrived[:at], ticks[:at])
@@ -114,9 +122,9 @@ class TestCounter:
         assert times(out)[-1] < times(later)[0]
         assert kinds(clock) == []
 
-    @pytest.mark.parametrize("at_s", [1.0, 20.0])
+    @pytest.mark.parametrize("at_s", [1.0, 12.0])
     def test_a_cable_out_and_the_device_begins_anew(self, kind, rate, nominal, at_s):
-        index, at, n = np.arange(int(40 * rate)), int(at_s * rate), int(5 * rate)
+        index, at, n = np.arange(int(28 * rate)), int(at_s * rate), int(5 * rate)
         ticks, arrived = ticks_of(index + 7000, kind, rate), jitter(T0 + index / rate)
         fresh = ticks_of(index, kind, rate) if kind[0] == 256 else np.rint(index / rate / kind[1] if kind[1] else index)
         clock = SampleClock(Counter(*kind), rate if nominal else None)
@@ -132,10 +140,10 @@ class TestCounter:
         assert kinds(clock) == ([] if kind[0] == 256 else ["clock_jumped"])
 
     def test_a_late_scheduler_loses_nothing(self, kind, rate, nominal):
-        index = np.arange(int(40 * rate))
+        index = np.arange(int(28 * rate))
         arrived = burst(T0 + index / rate)
-        asleep = np.flatnonzero((arrived > T0 + 20) & (arrived < T0 + 21))
-        arrived[asleep] = T0 + 21 + np.arange(asleep.size) // 60 * 3e-4
+        asleep = np.flatnonzero((arrived > T0 + 12) & (arrived < T0 + 13))
+        arrived[asleep] = T0 + 13 + np.arange(asleep.size) // 60 * 3e-4
         clock = SampleClock(Counter(*kind), rate if nominal else None)
         out = feed(clock, np.maximum.accumulate(arrived), ticks_of(index, kind, rate))
         assert lost(out) == 0
@@ -144,17 +152,17 @@ class TestCounter:
 
 @pytest.mark.parametrize(("kind", "rate"), COUNTERS)
 def test_a_replay_fifty_times_as_fast_as_configured(kind, rate):
-    index = np.arange(int(300 * rate))
+    index = np.arange(int(200 * rate))
     clock = SampleClock(Counter(*kind), rate)
     out = feed(clock, burst(T0 + index / rate / 50, 0.01), ticks_of(index, kind, rate))
     assert lost(out) == 0
     assert kinds(clock) == []
-    assert times(out)[-1] / NS == pytest.approx(T0 + 6.0, abs=0.1)
+    assert times(out)[-1] / NS == pytest.approx(T0 + 4.0, abs=0.1)
 
 
 @pytest.mark.parametrize(("kind", "rate"), [c for c in COUNTERS if c[0][0] > 256])
 def test_a_device_that_starts_anew_unseen(kind, rate):
-    index, at = np.arange(int(40 * rate)), int(20 * rate)
+    index, at = np.arange(int(28 * rate)), int(12 * rate)
     ticks = ticks_of(index + 7000, kind, rate)
     ticks[at:] = np.rint(np.arange(index.size - at) / rate / kind[1] if kind[1] else np.arange(index.size - at))
     arrived = jitter(T0 + index / rate + 0.7 * (index >= at))
@@ -195,7 +203,7 @@ def test_a_device_set_to_another_rate_is_believed():
 # --- arrival alone
 
 
-@pytest.mark.parametrize("rate", [20.0, 99.32, 100.0, 1000.0, 4000.0])
+@pytest.mark.parametrize("rate", [20.0, 99.32, 100.0, 2000.0])
 @pytest.mark.parametrize("arrive", [burst, jitter])
 @pytest.mark.parametrize("nominal", [True, False])
 def test_arrival_jitter_does_not_become_jitter_of_the_samples(rate, arrive, nominal):
@@ -225,9 +233,9 @@ class TestArrival:
 
     @pytest.mark.parametrize("asleep_s", [0.2, 1.0, 2.5])
     def test_a_late_scheduler_loses_nothing(self, rate, arrive, nominal, asleep_s):
-        arrived = arrive(T0 + np.arange(int(40 * rate)) / rate)
-        asleep = np.flatnonzero((arrived > T0 + 20) & (arrived < T0 + 20 + asleep_s))
-        arrived[asleep] = T0 + 20 + asleep_s + np.arange(asleep.size) // 20 * 3e-4
+        arrived = arrive(T0 + np.arange(int(28 * rate)) / rate)
+        asleep = np.flatnonzero((arrived > T0 + 12) & (arrived < T0 + 12 + asleep_s))
+        arrived[asleep] = T0 + 12 + asleep_s + np.arange(asleep.size) // 20 * 3e-4
         clock = self.clock(rate, nominal)
         out = feed(clock, np.maximum.accumulate(arrived))
         assert lost(out) == 0
@@ -235,10 +243,10 @@ class TestArrival:
 
     @pytest.mark.parametrize("hole_s", [[0.2], [0.5], [2.0], [0.5, 0.3]])
     def test_holes_are_found(self, rate, arrive, nominal, hole_s):
-        index = np.arange(int(60 * rate))
+        index = np.arange(int(30 * rate))
         kept = np.ones(index.size, bool)
         for i, length in enumerate(hole_s):
-            at = int((20 + 1.5 * i) * rate)
+            at = int((12 + 1.5 * i) * rate)
             kept[at : at + round(length * rate)] = False
         clock = self.clock(rate, nominal)
         out = feed(clock, arrive(T0 + index / rate)[kept])
@@ -246,7 +254,7 @@ class TestArrival:
         assert kinds(clock) == []
 
     def test_rejected_frames_are_missing_and_nothing_else(self, rate, arrive, nominal):
-        index = np.arange(int(40 * rate))
+        index = np.arange(int(28 * rate))
         bad = np.zeros(index.size, int)
         kept = np.ones(index.size, bool)
         for at in range(100, index.size, 97):
@@ -258,9 +266,9 @@ class TestArrival:
         arrived = T0 + index / rate  # one by one, so that each block may carry its loss
         assert lost(feed(clock, arrived[kept], lost=bad[kept])) == bad.sum()
 
-    @pytest.mark.parametrize("at_s", [1.0, 20.0])
+    @pytest.mark.parametrize("at_s", [1.0, 12.0])
     def test_a_cable_out_for_five_seconds(self, rate, arrive, nominal, at_s):
-        arrived = arrive(T0 + np.arange(int(60 * rate)) / rate)
+        arrived = arrive(T0 + np.arange(int(30 * rate)) / rate)
         at, n = int(at_s * rate), int(5 * rate)
         clock = self.clock(rate, nominal)
         out = feed(clock, arrived[:at])
@@ -271,16 +279,16 @@ class TestArrival:
         assert clock.rate_hz == pytest.approx(rate, rel=1e-3)
 
 
-@pytest.mark.parametrize("rate", [20.0, 100.0, 2000.0])
+@pytest.mark.parametrize("rate", [20.0, 100.0, 400.0])
 def test_a_fast_replay_by_arrival(rate):
     clock = SampleClock(Arrival(), rate)
-    out = feed(clock, burst(T0 + np.arange(int(300 * rate)) / rate / 50, 0.01))
+    out = feed(clock, burst(T0 + np.arange(int(200 * rate)) / rate / 50, 0.01))
     assert lost(out) == 0
-    assert times(out)[-1] / NS == pytest.approx(T0 + 6.0, abs=0.1)
+    assert times(out)[-1] / NS == pytest.approx(T0 + 4.0, abs=0.1)
 
 
-def test_a_crystal_that_drifts_is_followed_for_half_an_hour():
-    index = np.arange(1800 * 100)
+def test_a_crystal_that_drifts_is_followed_as_it_warms_up():
+    index = np.arange(900 * 100)
     taken = T0 + np.cumsum((1.0 + 50e-6 * np.sin(2 * np.pi * index / index.size)) / 100.0)
     clock = SampleClock(Arrival(), 100.0)
     out = feed(clock, burst(taken))
@@ -312,8 +320,8 @@ def test_the_first_samples_of_an_unknown_rate_are_in_order():
 @pytest.mark.parametrize("scatter", ["exact", "ms", "normal", "uniform", "bursts"])
 def test_given_times_are_kept_and_holes_told_where_they_can_be(rows, nominal, scatter):
     rng = np.random.default_rng(3)
-    index = np.arange(6000)
-    kept = ~((index > 2000) & (index <= 2050) | (index == 3000))
+    index = np.arange(3000)
+    kept = ~((index > 1000) & (index <= 1050) | (index == 2000))
     exact = 1.7e9 + index / 100
     t = {
         "exact": exact,
@@ -367,7 +375,8 @@ def test_loss_told_by_the_sender_is_kept():
 
 @pytest.mark.data
 @pytest.mark.parametrize(
-    ("name", "most"), [("mpu6050-hosttime/static-11min", 0), ("phone/gyro-a", 0), ("car-phone-can/minute", 0), ("can-car/drive-a", 120)]
+    ("name", "most"),
+    [("mpu6050-hosttime/static-11min", 0), ("phone/gyro-a", 0), ("car-phone-can/minute", 0), ("can-car/drive-a", 120)],
 )
 def test_recordings_with_host_times_have_no_invented_holes(name, most):
     if "IMU_MONITOR_DATA" not in os.environ:

@@ -202,7 +202,10 @@ def test_fifty_lost_links_leave_nothing_behind():
     with running() as rig:
         rig.send(1)
         rig.received(1)
-        threads, files = threading.active_count(), len(os.listdir("/proc/self/fd")) if os.path.isdir("/proc/self/fd") else 0
+        threads, files = (
+            threading.active_count(),
+            len(os.listdir("/proc/self/fd")) if os.path.isdir("/proc/self/fd") else 0,
+        )
         for i in range(50):
             rig.link.drop()
             rig.wait(lambda: rig.driver.state == "lost")
@@ -314,7 +317,9 @@ def test_axes_that_are_none_are_refused(table):
 
 
 def test_an_arrival_timed_device_counts_its_rejected_lines():
-    decoder = text.build(text.Settings(columns=["gx", "gy", "gz", "ax", "ay", "az"], gyro_unit="rad/s", accel_unit="m/s2"))
+    decoder = text.build(
+        text.Settings(columns=["gx", "gy", "gz", "ax", "ay", "az"], gyro_unit="rad/s", accel_unit="m/s2")
+    )
     rig = Rig(decoder)
     lines = [b"0.1 0.2 0.3 1 2 9.8\n"] * 50
     lines[20] = b"0.1 0.2 x.3 1 2 9.8\n"

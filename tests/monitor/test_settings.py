@@ -56,13 +56,18 @@ def test_a_device_needs_its_name_and_driver_only(tmp_path):
 CASES = {
     "unknown key": (device("windw = 60.0"), ['device[0].windw: unknown key; did you mean "window"?']),
     "unknown table": ("[zenho]\n" + device(), ['zenho: unknown key; did you mean "zenoh"?']),
-    "unknown key of zenoh": (device() + '[zenoh]\nlisten_to = ["x"]', ['zenoh.listen_to: unknown key; did you mean "listen"?']),
+    "unknown key of zenoh": (
+        device() + '[zenoh]\nlisten_to = ["x"]',
+        ['zenoh.listen_to: unknown key; did you mean "listen"?'],
+    ),
     "unknown key of the link": (
         device(driver='driver = { link = "serial", port = "x", baud = 1, decoder = "stim300" }'),
         ['device a: driver.baud: unknown key; did you mean "baudrate"?'],
     ),
     "unknown key of the decoder": (
-        device(driver='driver = { link = "serial", port = "x", decoder = "stim300", decoder_options = { range = "5g" } }'),
+        device(
+            driver='driver = { link = "serial", port = "x", decoder = "stim300", decoder_options = { range = "5g" } }'
+        ),
         ["device a: driver.decoder_options.range: unknown key"],
     ),
     "wrong type": (device('rate = "fast"'), ["device[0].rate: Expected `float"]),
@@ -82,8 +87,14 @@ CASES = {
         device(driver='driver = { link = "serial", port = "x", decoder = "stim30" }'),
         ['device a: driver.decoder: unknown name "stim30"; did you mean "stim300"?'],
     ),
-    "protocol missing": (device(driver='driver = { link = "serial", port = "x" }'), ["driver.decoder: missing; known are"]),
-    "a protocol that is no word": (device(driver='driver = { link = "serial", port = "x", decoder = 3 }'), ["driver.decoder: "]),
+    "protocol missing": (
+        device(driver='driver = { link = "serial", port = "x" }'),
+        ["driver.decoder: missing; known are"],
+    ),
+    "a protocol that is no word": (
+        device(driver='driver = { link = "serial", port = "x", decoder = 3 }'),
+        ["driver.decoder: "],
+    ),
     "decoder that does not fit": (
         device(driver='driver = { link = "serial", port = "x", decoder = "ros2_imu" }'),
         ["device a: driver.decoder: ros2_imu reads messages, link serial brings bytes: "],
@@ -99,9 +110,15 @@ CASES = {
         ),
         ["device a: driver.decoder_options: "],
     ),
-    "port missing": (device(driver='driver = { link = "serial", decoder = "stim300" }'), ["device a: driver.port: missing"]),
+    "port missing": (
+        device(driver='driver = { link = "serial", decoder = "stim300" }'),
+        ["device a: driver.port: missing"],
+    ),
     "window that is no duration": (device('window = "1 week"'), ['device a: window: "1 week" is no duration']),
-    "window too short": (device("rate = 100\nwindow = 0.5"), ["50 samples; possible are 100 to 10000000: 1 to 100000 s"]),
+    "window too short": (
+        device("rate = 100\nwindow = 0.5"),
+        ["50 samples; possible are 100 to 10000000: 1 to 100000 s"],
+    ),
     "window too long": (device('rate = 1000\nwindow = "1d"'), ["86400000 samples"]),
     "window of nan": (device("window = nan"), ["window"]),
     "window without end": (device("window = inf"), ["window"]),
@@ -111,14 +128,17 @@ CASES = {
     "no tau at all": (device("rate = 100\ntau = []"), ["device a: tau: "]),
     "refit": (device('refit = "often"'), ['device a: refit: "often" is no rate; write "10 Hz" or "every sample"']),
     "publish": (device('publish = "0 Hz"'), ['device a: publish: "0 Hz" is no rate; write "10 Hz" or "every block"']),
-    "axes": (device("axes = { gx = \"up\" }"), ['device a: axes: gx = "up"; both are one of gx gy gz ax ay az']),
+    "axes": (device('axes = { gx = "up" }'), ['device a: axes: gx = "up"; both are one of gx gy gz ax ay az']),
     "a model that is not there": (device('model = "models/none.toml"'), ["models/none.toml: no such file"]),
     "silence below 0": (
         device(driver='driver = { link = "serial", port = "x", decoder = "stim300", silence = "3" }'),
         ["device a: driver.silence: Expected `float`"],
     ),
     "unknown virtual model": (device(driver='driver = { link = "virtual", model = "none" }'), ['no model "none"']),
-    "replay of what cannot be": (device(driver='driver = { link = "replay", path = "a.jpg" }'), ["a.jpg: no such file"]),
+    "replay of what cannot be": (
+        device(driver='driver = { link = "replay", path = "a.jpg" }'),
+        ["a.jpg: no such file"],
+    ),
     "viewer": (device() + '[viewer]\nmode = "window"', ['viewer.mode: "window"; possible are auto']),
     "viewer's port": (device() + "[viewer]\nport = 70000", ["viewer.port: Expected `int` <= 65535"]),
     "viewer's memory": (device() + "[viewer]\nmemory = 3", ["viewer.memory: Expected `str`"]),
@@ -165,7 +185,18 @@ def test_all_that_is_wrong_is_told_at_once(tmp_path):
         + '[log]\nlevel = "x"\n[viewer]\nmode = "y"\n'
     )
     lines = wrong(tmp_path, text)
-    for part in ("rate", "windw", "window", "refit", "axes", "bautrate", "port: missing", "decoder: missing", "log", "viewer"):
+    for part in (
+        "rate",
+        "windw",
+        "window",
+        "refit",
+        "axes",
+        "bautrate",
+        "port: missing",
+        "decoder: missing",
+        "log",
+        "viewer",
+    ):
         assert any(part in line for line in lines), part
     with pytest.raises(ConfigError, match=rf"\(and {len(lines) - 1} more: imu-monitor check .*my.toml\)$"):
         load(tmp_path / "my.toml")
@@ -244,7 +275,17 @@ def test_every_link_can_be_named():
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [("90s", 90.0), ("30min", 1800.0), ("1h", 3600.0), ("2d", 172800.0), (" 1.5 h ", 5400.0), ("250ms", 0.25), ("60", 60.0), ("1e3s", 1000.0), (7, 7.0)],
+    [
+        ("90s", 90.0),
+        ("30min", 1800.0),
+        ("1h", 3600.0),
+        ("2d", 172800.0),
+        (" 1.5 h ", 5400.0),
+        ("250ms", 0.25),
+        ("60", 60.0),
+        ("1e3s", 1000.0),
+        (7, 7.0),
+    ],
 )
 def test_durations(text, value):
     assert seconds(text) == pytest.approx(value)
@@ -268,7 +309,13 @@ def test_words_that_are_no_rates(text):
 
 
 def test_viewer_modes():
-    assert [viewer_mode(mode) for mode in ("auto", "native", "web", "none", "a.rrd")] == ["auto", "native", "web", "none", "a.rrd"]
+    assert [viewer_mode(mode) for mode in ("auto", "native", "web", "none", "a.rrd")] == [
+        "auto",
+        "native",
+        "web",
+        "none",
+        "a.rrd",
+    ]
 
 
 def test_virtual_model_may_be_a_file_beside_the_configuration(tmp_path):

@@ -30,8 +30,7 @@ def nist_1000():
 
 
 def columns(path: Path, *names: str):
-    stream = gzip.open(path, "rt") if path.suffix == ".gz" else path.open()
-    with stream:
+    with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as stream:
         rows = list(csv.DictReader(stream))
     return [np.array([float(row[name]) for row in rows]) for name in names]
 
@@ -124,7 +123,9 @@ def test_oscillator_of_stable32(reference):
 @pytest.mark.data
 def test_adis16405_of_the_avar_package(reference):
     with (reference / "avar-package-allan-tables.csv").open() as stream:
-        rows = [r for r in csv.DictReader(stream) if r["key"] == "adis" and r["type"] == "Gyroscope" and r["axis"] == "X"]
+        rows = [
+            r for r in csv.DictReader(stream) if r["key"] == "adis" and r["type"] == "Gyroscope" and r["axis"] == "X"
+        ]
     gx = np.load(reference.parent / "adis16405" / "run1.npz")["gx"].astype(float)
     factors = [2 ** (i + 1) for i in range(len(rows))]
     listed = np.array([float(r["adev"]) for r in rows])

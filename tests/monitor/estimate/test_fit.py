@@ -161,6 +161,9 @@ def test_the_sensors_own_filter_does_not_pull_the_coefficients(cutoff_hz):
     np.testing.assert_allclose(result.coefficients.value[2], 2e-4, rtol=0.25)
     assert (result.coefficients.status[0] == Status.UPPER_BOUND).all()
     assert (result.left_out >= 1).all()
+    drawn = np.arange(len(result.fitted))[:, None] >= result.left_out
+    np.testing.assert_array_equal(np.isfinite(result.fitted), drawn)
+    assert np.isfinite(result.edf).all()
     assert (fit_values(wide).left_out == 0).all()
 
 

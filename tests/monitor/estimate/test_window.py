@@ -1,5 +1,7 @@
 """The sliding window equals the whole-recording curve of its last samples, at every position, whatever came before."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -79,7 +81,7 @@ def test_blocks_of_any_cut_equal_one_by_one(cuts, values, length):
     whole, cut, single = (AllanWindow(length, factors) for _ in range(3))
     whole.update(values)
     edges = [0, *sorted(cuts), len(values)]
-    for a, b in zip(edges, edges[1:], strict=False):
+    for a, b in pairwise(edges):
         cut.update(values[a:b])
     for row in values:
         single.update(row[None])
@@ -216,7 +218,7 @@ def test_full_scale_square_wave_at_the_longest_tau_does_not_overflow():
 @pytest.mark.parametrize("height", [1e-4 * 1e6, 400.0, 2000.0])
 @pytest.mark.parametrize("held", [1, 5, 400, 3000])
 def test_what_a_transient_added_is_taken_out_again(height, held):
-    """Held longer than the longest τ and beyond full scale too: then σ² at long τ is wrong while it is in the window."""
+    """Held longer than the longest τ, and beyond full scale: then σ² at long τ is wrong while it is in there."""
     length = 1000
     values = made(9000, seed=11)
     values[2000 : 2000 + held] += height

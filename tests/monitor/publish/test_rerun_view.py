@@ -1,5 +1,6 @@
 """The live view: what reaches a recording, and that no viewer can harm the service."""
 
+import shutil
 import signal
 import socket
 import subprocess
@@ -92,7 +93,7 @@ def test_a_recording_holds_what_was_shown(tmp_path: Path) -> None:
     assert n == pytest.approx(np.degrees([c.value[1, 0], c.lo[1, 0], c.hi[1, 0]]) * 60)
     deviation = column(rows["/bench-1/allan/az"], "deviation")
     assert deviation == pytest.approx(np.sqrt(estimate.curve.avar[:, 5]))
-    assert "rose by 47 %" in str(rows["/bench-1/events"])
+    assert "08:53:21  gz angle random walk rose by 47 %" in str(rows["/bench-1/events"])
     assert "RUNNING" in str(rows["/bench-1/status"])
     times = column(rows["/bench-1/samples/ax"], "sample_time")
     assert times[[0, -1]] / 1e9 == pytest.approx([T0, T0 + 0.99], abs=1e-6)
@@ -246,6 +247,24 @@ def test_the_page_takes_the_next_free_port_and_leaves_nothing_behind(monkeypatch
         assert rerun_sinks.is_rerun(port)
         view.close()
     assert not rerun_sinks.listens(port)
+
+
+@pytest.mark.skipif(shutil.which("setpriv") is None, reason="a program ends with its parent where there is setpriv")
+def test_a_killed_daemon_takes_its_viewer_along() -> None:
+    port, web_port = free_port(), free_port()
+    program = f"""
+        import time
+        from monitor.publish.rerun_view import RerunView
+        from monitor.publish.viewer import DeviceInfo, ViewerSettings
+        RerunView(ViewerSettings("web", {port}, {web_port}), [DeviceInfo("d")]).start()
+        time.sleep(60.0)
+    """
+    with subprocess.Popen([sys.executable, "-c", textwrap.dedent(program)]) as daemon:
+        try:
+            assert wait_for(lambda: rerun_sinks.is_rerun(port))
+        finally:
+            daemon.kill()
+    assert wait_for(lambda: not rerun_sinks.listens(port), 5.0)
 
 
 def test_a_port_that_another_program_holds_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,130 @@
+"""A whole recording: its grid in time, its rate, and what is said about both."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.errors import ConfigError, NotReady
+from drivers.sample import block
+from monitor.estimate.analysis import FEWEST, LONGEST_HOLE, analyze, on_grid
+from monitor.estimate.batch import overlapping
+from monitor.estimate.coefficients import Status
+
+
+def white(n, seed=0):
+    return 1e-3 * np.random.default_rng(seed).standard_normal((n, 6)) + 9.81
+
+
+def recording(t_s, values=None, rows=1000):
+    t_ns = np.rint(np.asarray(t_s) * 1e9).astype(np.int64)
+    values = white(len(t_ns)) if values is None else values
+    edges = range(0, len(t_ns), rows)
+    return [block(t_ns[a : a + rows].copy(), values[a : a + rows].copy()) for a in edges]
+
+
+@pytest.mark.parametrize("rate", [100.0, None])
+@pytest.mark.parametrize("rows", [17, 1000, 10**6])
+def test_a_steady_recording(rate, rows):
+    values = white(6000)
+    found = analyze(recording(np.arange(6000) / 100, values, rows), rate)
+    assert found.notes == ()
+    assert found.seconds == 60.0
+    estimate = found.estimate
+    assert (estimate.rate_hz, estimate.samples, estimate.window_s) == (100.0, 6000, 60.0)
+    assert estimate.curve.avar == pytest.approx(overlapping(values, estimate.curve.factors)[0])
+    assert (estimate.coefficients.status[1] == Status.ESTIMATED).all()
+    assert estimate.coefficients.value[1] == pytest.approx(1e-4, rel=0.1)
+
+
+@pytest.mark.parametrize("rate", [100.0, None])
+@pytest.mark.parametrize("rows", [17, 1000, 10**6])
+def test_holes_stay_in_their_places(rate, rows):
+    index = np.arange(8000)
+    kept = ~((index >= 3000) & (index < 3123) | (index == 5000))
+    values = white(8000)
+    grid, found, notes = on_grid(recording(index[kept] / 100, values[kept], rows), rate)
+    assert found == 100.0
+    assert notes == ["124 samples are missing in 2 places; terms that touch them are left out"]
+    expected = np.where(kept[:, None], values, np.nan)
+    assert np.array_equal(grid, expected, equal_nan=True)
+
+
+def test_a_very_long_pause_costs_no_memory_and_no_term_reaches_across():
+    t = np.concatenate([np.arange(3000) / 100, 30.0 + 2 * LONGEST_HOLE / 100 + np.arange(3000) / 100])
+    values = white(6000)
+    values[3000:] += 1.0  # a step that would show in every term across
+    found = analyze(recording(t, values), 100.0)
+    assert any("too long to keep in place" in note for note in found.notes)
+    assert found.estimate.curve.n == 6001
+    assert np.nanmax(found.estimate.curve.avar) < 2e-6
+
+
+@pytest.mark.parametrize("jump_s", [-40.0, 5 * 3600.0])
+def test_a_jump_of_the_times_does_not_spoil_the_rate(jump_s):
+    t = np.concatenate([np.arange(5000) / 100, 50.0 + jump_s + np.arange(5000) / 100])
+    found = analyze(recording(t), None)
+    assert found.estimate.rate_hz == 100.0
+    assert any("time went" in note for note in found.notes)
+
+
+def test_times_that_jitter_are_no_holes():
+    t = np.arange(8000) / 100 + 0.001 * np.random.default_rng(1).standard_normal(8000)
+    found = analyze(recording(t), None)
+    assert (found.estimate.rate_hz, found.estimate.curve.n) == (100.0, 8000)
+
+
+@pytest.mark.parametrize("n", [1, 2, FEWEST - 1])
+def test_too_short_is_an_answer(n):
+    with pytest.raises(NotReady):
+        analyze(recording(np.arange(n) / 100), None)
+    with pytest.raises(NotReady, match="at least 50"):
+        analyze(recording(np.arange(n) / 100), 100.0)
+
+
+def test_times_that_stand_still_ask_for_the_rate():
+    with pytest.raises(NotReady, match="--rate"):
+        analyze(recording(np.zeros(500)), None)
+
+
+def test_a_list_of_tau():
+    blocks = recording(np.arange(6000) / 100)
+    assert analyze(blocks, 100.0, (0.1, 1.0)).estimate.curve.tau_s.tolist() == [0.1, 1.0]
+    with pytest.raises(ConfigError):
+        analyze(blocks, 100.0, (100.0,))
+
+
+def test_an_absent_axis_is_unestimated_and_warns_nobody():
+    values = white(6000)
+    values[:, 3:] = np.nan
+    found = analyze(recording(np.arange(6000) / 100, values), None, notes=["of the file"])
+    assert found.notes == ("of the file",)
+    assert (found.estimate.coefficients.status[:, 3:] == Status.UNESTIMATED).all()
+    assert (found.estimate.coefficients.status[1, :3] == Status.ESTIMATED).all()
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "rate"),
+    [
+        ("mpu6050-hosttime/static-11min.npz", 99.32),
+        ("mpu6050-arduino/static-7min.npz", 100.0),
+        ("px4-bench/bench-69s.npz", 250.0),
+        ("vn100-serial/static-12min.npz", 40.0),
+        ("phone/gyro-a.npz", 5.0),
+        ("autopilot-3imu/imu1.npz", 50.0),
+    ],
+)
+def test_recordings_of_real_sensors(name, rate):
+    if "IMU_MONITOR_DATA" not in os.environ:
+        pytest.skip("IMU_MONITOR_DATA does not point to the recordings")
+    from drivers.recording import iter_blocks, load_samples
+
+    loaded = load_samples(Path(os.environ["IMU_MONITOR_DATA"]) / name)
+    blocks = list(iter_blocks(loaded))
+    found = analyze(blocks, None, notes=loaded.notes)
+    assert found.estimate.rate_hz == pytest.approx(rate, rel=0.01)
+    received = sum(len(one) for one in blocks)
+    assert received <= found.estimate.curve.n <= 1.02 * received
+    assert (found.estimate.coefficients.status[1, :3] != Status.UNESTIMATED).all()

@@ -1,0 +1,140 @@
+"""The live estimate: what was missing keeps its place, one by one equals blocks, and the rate is a label only."""
+
+import numpy as np
+import pytest
+
+from drivers.errors import ConfigError, NotReady
+from drivers.sample import block
+from monitor.estimate.batch import overlapping
+from monitor.estimate.coefficients import Status
+from monitor.estimate.estimator import FEWEST, Estimator
+
+RATE = 100.0
+
+
+def made(first, n, lost=0, seed=0):
+    values = 1e-3 * np.random.default_rng([seed, first]).standard_normal((n, 6)) + 9.81
+    return block(np.arange(first, first + n) * 10_000_000, values, lost=lost)
+
+
+def test_the_last_estimate_covers_all_samples():
+    estimator = Estimator(RATE, 20.0)
+    blocks = [made(at, 100) for at in range(0, 3000, 100)]
+    for one in blocks:
+        estimator.update(one)
+    found = estimator.get()
+    assert (found.samples, found.t_ns, found.window_s, found.rate_hz) == (3000, 29_990_000_000, 20.0, RATE)
+    values = np.concatenate([one.values for one in blocks])[-2000:]
+    assert found.curve.n == 2000
+    assert found.curve.avar == pytest.approx(overlapping(values, found.curve.factors)[0], rel=1e-8)
+    assert np.array_equal(found.curve.tau_s, found.curve.factors / RATE)
+    assert (found.curve.lo < np.sqrt(found.curve.avar)).all()
+    assert (found.curve.hi > np.sqrt(found.curve.avar)).all()
+    # white noise of 1e-3 at 100 Hz: N = 1e-4
+    assert (found.coefficients.status[1] == Status.ESTIMATED).all()
+    assert found.coefficients.value[1] == pytest.approx(1e-4, rel=0.15)
+
+
+def test_missing_samples_keep_their_place():
+    estimator = Estimator(RATE, 20.0)
+    estimator.update(made(0, 500))
+    estimator.update(made(537, 400, lost=37))
+    values = np.concatenate([made(0, 500).values, np.full((37, 6), np.nan), made(537, 400).values])
+    found = estimator.get().curve
+    expected, terms = overlapping(values, found.factors)
+    assert np.array_equal(found.terms, terms)
+    assert found.avar[terms > 0] == pytest.approx(expected[terms > 0], rel=1e-8)
+    assert found.n == 937
+
+
+@pytest.mark.parametrize("lost", [1999, 2000, 2001, 10**11])
+def test_more_missing_than_the_window_holds(lost):
+    estimator = Estimator(RATE, 20.0)
+    estimator.update(made(0, 3000))
+    estimator.update(made(5000, 300, lost=lost))
+    found = estimator.get()
+    first = 0 if lost > 1700 else 1
+    expected, terms = overlapping(made(5000, 300).values, found.curve.factors)
+    assert first == 0
+    assert np.array_equal(found.curve.terms, terms)
+    assert found.curve.avar[terms > 0] == pytest.approx(expected[terms > 0], rel=1e-8)
+    assert found.samples == 3300
+
+
+def test_one_by_one_is_as_blocks():
+    whole, single = Estimator(RATE, 5.0), Estimator(RATE, 5.0)
+    samples = made(0, 1200)
+    whole.update(samples)
+    for i in range(1200):
+        single.update(samples[i : i + 1])
+    a, b = whole.get(), single.get()
+    assert np.array_equal(a.coefficients.status, b.coefficients.status)
+    np.testing.assert_allclose(a.coefficients.value, b.coefficients.value, rtol=1e-9)
+    np.testing.assert_allclose(a.coefficients.hi, b.coefficients.hi, rtol=1e-9)
+
+
+def test_too_few_samples_are_no_answer():
+    estimator = Estimator(RATE, 20.0)
+    with pytest.raises(NotReady, match="0 of at least 8"):
+        estimator.get()
+    estimator.update(made(0, FEWEST - 1))
+    with pytest.raises(NotReady):
+        estimator.get()
+    estimator.update(made(FEWEST - 1, 1))
+    found = estimator.get()
+    assert (found.coefficients.status != Status.ESTIMATED).all() or np.isfinite(found.coefficients.value).any()
+
+
+def test_reset_empties_the_window_and_goes_on_counting():
+    estimator, fresh = Estimator(RATE, 20.0), Estimator(RATE, 20.0)
+    estimator.update(made(0, 3000))
+    estimator.get()
+    estimator.reset()
+    with pytest.raises(NotReady):
+        estimator.get()
+    for one in (estimator, fresh):
+        one.update(made(3000, 400))
+    assert np.array_equal(estimator.get().curve.avar, fresh.get().curve.avar, equal_nan=True)
+    assert (estimator.samples, fresh.samples) == (3400, 400)
+
+
+def test_another_rate_is_another_label():
+    one, other = Estimator(RATE, 20.0), Estimator(2 * RATE, 10.0)
+    for estimator in (one, other):
+        estimator.update(made(0, 2500))
+    one.relabel(2 * RATE)
+    a, b = one.get(), other.get()
+    assert (a.rate_hz, a.window_s) == (b.rate_hz, b.window_s) == (200.0, 10.0)
+    assert np.array_equal(a.curve.tau_s, b.curve.tau_s)
+    np.testing.assert_allclose(a.coefficients.value, b.coefficients.value, rtol=1e-12)
+
+
+def test_an_axis_that_is_not_measured_is_unestimated():
+    estimator = Estimator(RATE, 20.0)
+    samples = made(0, 3000)
+    values = samples.values.copy()
+    values[:, 2] = np.nan
+    estimator.update(block(samples.t_ns.copy(), values))
+    found = estimator.get()
+    assert (found.coefficients.status[:, 2] == Status.UNESTIMATED).all()
+    assert np.isnan(found.coefficients.value[:, 2]).all()
+    assert found.coefficients.status[1, 1] == Status.ESTIMATED
+
+
+def test_a_constant_axis_is_unestimated():
+    estimator = Estimator(RATE, 20.0)
+    estimator.update(block(np.arange(2500) * 10**7, np.full((2500, 6), 9.81)))
+    assert (estimator.get().coefficients.status == Status.UNESTIMATED).all()
+
+
+def test_a_tau_that_cannot_be_is_refused():
+    with pytest.raises(ConfigError, match="half the window"):
+        Estimator(RATE, 20.0, (30.0,))
+
+
+def test_deviations_alone_before_the_fit_is_compiled():
+    estimator = Estimator(RATE, 20.0)
+    estimator.update(made(0, 2500))
+    bare = estimator.get(fitted=False)
+    assert np.array_equal(bare.curve.avar, estimator.get().curve.avar)
+    assert (bare.coefficients.status == Status.UNESTIMATED).all()

@@ -1,0 +1,249 @@
+"""One device inside the service: when what is published, and that nothing is left out of the last estimate."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from drivers.decoders import text, vectornav_binary
+from drivers.driver import AxisMap
+from drivers.links.loopback_link import LoopbackLink
+from drivers.sample import block
+from monitor.settings import Device
+from monitor.station import Ready, Station
+
+RATE = 100.0
+
+
+class Caught:
+    """An output that keeps everything."""
+
+    def __init__(self):
+        self.blocks, self.counts, self.estimates, self.events, self.healths = [], [], [], [], []
+
+    def samples(self, device, received, samples, offset_ns):
+        self.blocks.append(samples)
+        self.counts.append(received)
+
+    def estimate(self, device, unix_s, estimate):
+        self.estimates.append((unix_s, estimate))
+
+    def event(self, device, unix_s, received, event):
+        self.events.append((unix_s, event))
+
+    def health(self, device, unix_s, health):
+        self.healths.append(health)
+
+
+class Rig:
+    def __init__(self, rate=RATE, window_s=20.0, refit_s=0.1, publish_s=0.1, tau="octave", decoder=None):
+        decoder = decoder or vectornav_binary.build(vectornav_binary.Settings())
+        self.link = LoopbackLink()
+        device = Device("bench", rate, window_s, tau, refit_s, publish_s, self.link, decoder, AxisMap(), 0.0)
+        self.wake = threading.Event()
+        self.ready = Ready()
+        self.ready.window.set()
+        self.ready.fit.set()
+        self.station = Station(device, self.link, decoder, self.wake, self.ready)
+        self.caught = Caught()
+        self.sent = 0
+        self.link.open()
+
+    def bring(self, n, lost=0):
+        """As the reader would push them; the times are the host's."""
+        self.sent += lost
+        index = np.arange(self.sent, self.sent + n)
+        self.sent += n
+        values = 1e-3 * np.random.default_rng(self.sent).standard_normal((n, 6))
+        samples = block(index * 10_000_000, values, None, index, lost)
+        self.station.driver.counts.received += n
+        self.station._push(samples)
+
+    def work(self, now_s, drain=False):
+        self.station.work([self.caught], now_s, drain)
+
+
+def test_drained_everything_is_out_and_the_estimate_covers_it():
+    rig = Rig(refit_s=10.0, publish_s=10.0)
+    rig.work(1000.0)
+    for i in range(30):
+        rig.bring(50)
+        rig.work(1000.0 + 0.1 * i)
+    rig.bring(7)
+    rig.work(1003.0, drain=True)
+    assert sum(len(one) for one in rig.caught.blocks) == 1507 == rig.caught.counts[-1]
+    assert np.array_equal(np.concatenate([one.t_ns for one in rig.caught.blocks]), np.arange(1507) * 10_000_000)
+    _, last = rig.caught.estimates[-1]
+    assert (last.samples, last.curve.n, last.t_ns) == (1507, 1507, 15_060_000_000)
+
+
+def test_refits_and_publications_keep_their_beat():
+    rig = Rig(refit_s=0.5, publish_s=2.0)
+    for i in range(1000):
+        rig.bring(1)
+        rig.work(1000.0 + 0.01 * i)
+    assert 4 <= len(rig.caught.estimates) <= 6
+    # raw samples go on in short batches
+    assert 80 <= len(rig.caught.blocks) <= 110 or sum(map(len, rig.caught.blocks)) >= 985
+
+
+def test_every_sample_and_every_block():
+    rig = Rig(refit_s=0.0, publish_s=0.0)
+    rig.bring(20)
+    rig.work(1000.0)
+    for i in range(30):
+        rig.bring(1)
+        rig.work(1000.001 + 0.0001 * i)
+    assert len(rig.caught.estimates) == 31
+    assert [estimate.samples for _, estimate in rig.caught.estimates] == list(range(20, 51))
+    assert len(rig.caught.blocks) == 31
+
+
+def test_a_pause_is_not_made_up_for():
+    rig = Rig(refit_s=0.1, publish_s=0.1)
+    rig.bring(50)
+    rig.work(1000.0)
+    for i in range(20):
+        rig.bring(1)
+        rig.work(2000.0 + 0.001 * i)
+    assert len(rig.caught.estimates) == 2
+
+
+def test_nothing_new_is_not_published_again():
+    rig = Rig(refit_s=0.0, publish_s=0.0)
+    rig.bring(20)
+    for i in range(5):
+        rig.work(1000.0 + i)
+    assert (len(rig.caught.estimates), len(rig.caught.blocks)) == (1, 1)
+
+
+def test_samples_wait_for_a_rate_and_none_is_left_out():
+    lines = text.Settings(columns=("gx", "gy", "gz", "ax", "ay", "az"))
+    rig = Rig(rate=None, decoder=text.build(lines))
+    rig.bring(300)
+    rig.work(1000.0, drain=True)
+    assert rig.caught.estimates == []
+    assert sum(map(len, rig.caught.blocks)) == 300
+    for i in range(400):  # the clock learns from what the reader stamps
+        t_ns = np.array([10**12 + i * 10_000_000])
+        rig.station.clock.stamp(block(t_ns, np.zeros((1, 6))))
+    rig.bring(100)
+    rig.work(1001.0, drain=True)
+    (_, found) = rig.caught.estimates[-1]
+    assert (found.samples, found.curve.n, found.rate_hz) == (400, 400, 100.0)
+
+
+def test_a_rate_known_better_is_the_new_label():
+    lines = text.Settings(columns=("gx", "gy", "gz", "ax", "ay", "az"))
+    rig = Rig(rate=None, decoder=text.build(lines))
+    t_ns = 10**12
+    for _ in range(300):
+        t_ns += 10_300_000
+        rig.station.clock.stamp(block(np.array([t_ns]), np.zeros((1, 6))))
+    rig.bring(500)
+    rig.work(1000.0, drain=True)
+    before = rig.caught.estimates[-1][1]
+    for _ in range(60_000):
+        t_ns += 10_000_000
+        rig.station.clock.stamp(block(np.array([t_ns]), np.zeros((1, 6))))
+    rig.station.report([rig.caught], {}, 0)
+    rig.bring(1)
+    rig.work(1001.0, drain=True)
+    after = rig.caught.estimates[-1][1]
+    assert before.rate_hz == pytest.approx(97.087, rel=1e-4)
+    assert after.rate_hz == 100.0
+    assert np.array_equal(after.curve.factors, before.curve.factors)
+    assert after.curve.n == 501
+
+
+def test_reset_empties_the_window():
+    rig = Rig()
+    rig.station.reset()
+    rig.bring(500)
+    rig.work(1000.0, drain=True)
+    rig.station.reset()
+    rig.bring(30)
+    rig.work(1001.0, drain=True)
+    assert rig.caught.estimates[-1][1].curve.n == 30
+    assert rig.caught.estimates[-1][1].samples == 530
+
+
+def test_missing_samples_keep_their_place_and_more_than_the_window_empty_it():
+    rig = Rig(window_s=5.0)
+    rig.bring(300)
+    rig.bring(50, lost=20)
+    rig.work(1000.0, drain=True)
+    assert rig.caught.estimates[-1][1].curve.n == 370
+    rig.bring(40, lost=10_000)
+    rig.work(1001.0, drain=True)
+    assert rig.caught.estimates[-1][1].curve.n == 40
+
+
+def test_a_tau_that_does_not_fit_the_rate_found_is_said_and_samples_go_on():
+    rig = Rig(rate=1000.0, window_s=0.1, tau=(5.0,))
+    rig.bring(300)
+    rig.work(1000.0, drain=True)
+    assert sum(map(len, rig.caught.blocks)) == 300
+    assert rig.caught.estimates == []
+    rig.station.driver.state, rig.station.driver.text = "running", ""
+    assert "tau: none of [5.0] s" in rig.station.health({}, 0).text
+
+
+def test_latency_counts_from_the_oldest_unpublished_sample():
+    rig = Rig(refit_s=10.0, publish_s=10.0)
+    rig.bring(10)
+    rig.work(1000.0)  # goes out at once
+    rig.station.health({}, 0)
+    rig.bring(1)
+    rig.work(1000.01)  # taken, but its batch waits
+    time.sleep(0.05)
+    rig.bring(1)
+    rig.work(1000.2)
+    health = rig.station.health({}, 0)
+    assert health.latency_p50_s >= 0.05
+    assert rig.station.health({}, 0).latency_p50_s is None
+
+
+def test_overflow_is_counted_and_travels_as_loss():
+    rig = Rig()
+    capacity = rig.station.ring.capacity
+    rig.bring(capacity)
+    rig.bring(100)
+    rig.work(1000.0, drain=True)
+    assert rig.station.health({}, 0).overflowed == 100
+    assert rig.caught.blocks[0].lost == 100
+    assert sum(map(len, rig.caught.blocks)) == capacity
+
+
+def test_through_the_reader_s_thread_to_the_end_of_a_replay():
+    rig = Rig()
+    encoder = vectornav_binary.build(vectornav_binary.Settings())
+    index = np.arange(400)
+    made = block(index, np.random.default_rng(0).standard_normal((400, 6)), None, index * 10_000_000)
+    for chunk in encoder.encode(made):
+        rig.link.write(chunk.data)
+    rig.link.end()
+    rig.station.start()
+    until = time.monotonic() + 5.0
+    while not rig.station.ended:
+        rig.work(time.monotonic())
+        assert time.monotonic() < until
+    rig.station.stop()
+    assert rig.station.join(1.0)
+    rig.work(time.monotonic(), drain=True)
+    assert sum(map(len, rig.caught.blocks)) == 400
+    assert rig.caught.estimates[-1][1].samples == 400
+    assert rig.station.report([rig.caught], {"zenoh": "ok"}, 7).received == 400
+    assert (rig.caught.healths[-1].state, rig.caught.healths[-1].memory_bytes) == ("ended", 7)
+    assert rig.wake.is_set()
+    # Unix time of samples stamped by the monotonic clock
+    assert rig.caught.estimates[-1][0] == pytest.approx(time.time(), abs=30.0)
+
+
+def test_a_rate_off_the_configured_one_is_said():
+    rig = Rig(rate=100.0)
+    for i in range(400):
+        rig.station.clock.stamp(block(np.array([10**12 + i * 20_000_000]), np.zeros((1, 6))))
+    rig.station.driver.state, rig.station.driver.text = "running", ""
+    assert rig.station.health({}, 0).text == "samples come at 50 Hz, configured are 100 Hz"

@@ -1,0 +1,124 @@
+"""The simulated sensor through an ordinary serial link: every sample it made is received or known to be missing."""
+
+import os
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from drivers.clock import SampleClock
+from drivers.decoders import stim300, vectornav_binary, xsens_mtdata2
+from drivers.driver import Driver
+from drivers.errors import ConfigError
+from monitor.settings import CONFIG_FOLDER, VirtualTable
+from monitor.virtual import VirtualImu
+
+pytest.importorskip("tty", reason="pseudo-terminals need a POSIX system")
+
+MODEL = str(CONFIG_FOLDER / "models" / "consumer-mems.toml")
+
+
+class Rig:
+    def __init__(self, module=vectornav_binary, speed=1.0):
+        decoder = module.build(module.Settings())
+        self.imu = VirtualImu(VirtualTable(model=MODEL, seed=3, speed=speed), decoder)
+        self.blocks = []
+        self.driver = Driver(
+            "v", self.imu.link, decoder, SampleClock(decoder.timing, self.imu.rate_hz), self.blocks.append
+        )
+        self.thread = threading.Thread(target=self.driver.run, daemon=True)
+
+    def __enter__(self):
+        self.imu.start()
+        self.thread.start()
+        return self
+
+    def __exit__(self, *exc):
+        self.imu.stop()
+        self.driver.stop()
+        self.thread.join(5.0)
+        assert not self.thread.is_alive()
+
+    def wait(self, condition, seconds=8.0):
+        until = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < until, (self.driver.state, self.driver.text, self.driver.counts)
+            time.sleep(0.005)
+
+    def kinds(self):
+        return [event.kind for event in self.driver.take_events()]
+
+
+@pytest.mark.parametrize("module", [vectornav_binary, stim300, xsens_mtdata2], ids=lambda m: m.__name__)
+def test_what_it_sends_is_received(module):
+    with Rig(module) as rig:
+        rig.wait(lambda: rig.driver.counts.received >= 100)
+    counts = rig.driver.counts
+    made = rig.imu.sent + rig.imu.dropped
+    # what stood in the terminal before the port was opened, and after it was closed, nobody counted
+    assert 0 <= made - counts.received - counts.lost - counts.bad <= 60
+    assert (counts.lost, counts.bad) == (0, 0)
+    values = np.concatenate([one.values for one in rig.blocks])
+    assert np.isfinite(values).all()
+    # white noise of the model: N √rate, and Q
+    assert 0.5e-3 < values[:, 0].std() < 5e-3
+
+
+def test_a_pulled_cable_and_back():
+    with Rig() as rig:
+        rig.wait(lambda: rig.driver.counts.received >= 50)
+        rig.imu.unplug()
+        rig.wait(lambda: rig.driver.state == "lost")
+        assert not rig.imu.port.exists()
+        before = rig.driver.counts.received
+        time.sleep(0.5)
+        assert rig.driver.counts.received == before
+        rig.imu.plug()
+        rig.wait(lambda: rig.driver.state == "running")
+        rig.wait(lambda: rig.driver.counts.received >= before + 50)
+        kinds = rig.kinds()
+    counts = rig.driver.counts
+    assert kinds.count("link_lost") == kinds.count("link_back") == 1
+    assert "samples_lost" in kinds
+    assert counts.lost >= 40  # half a second at 100 Hz, told by the sensor's counter
+    assert 0 <= rig.imu.sent + rig.imu.dropped - counts.received - counts.lost - counts.bad <= 60
+
+
+def test_nobody_reads_and_the_sensor_goes_on():
+    rig = Rig(speed=20.0)
+    rig.imu.start()
+    try:
+        rig.wait(lambda: rig.imu.dropped > 200)
+    finally:
+        rig.imu.stop()
+    assert rig.imu.sent > 0
+    assert not rig.imu.port.parent.exists()
+
+
+def test_plugging_twice_and_pulling_twice_is_harmless_and_leaves_nothing_open():
+    rig = Rig()
+    files = os.listdir("/dev/fd")
+    for _ in range(20):
+        rig.imu.plug()
+        rig.imu.plug()
+        rig.imu.unplug()
+        rig.imu.unplug()
+    assert len(os.listdir("/dev/fd")) == len(files)
+    rig.imu.stop()
+
+
+def test_same_seed_same_noise():
+    a, b = Rig().imu, Rig().imu
+    try:
+        assert np.array_equal(a._stream.draw(50), b._stream.draw(50))
+    finally:
+        a.stop()
+        b.stop()
+
+
+def test_a_model_that_cannot_be_read(tmp_path):
+    (tmp_path / "bad.toml").write_text("[gz.no_such_effect]\nx = 1\n")
+    decoder = vectornav_binary.build(vectornav_binary.Settings())
+    with pytest.raises(ConfigError):
+        VirtualImu(VirtualTable(model=str(tmp_path / "bad.toml")), decoder)
