@@ -8,8 +8,8 @@ host's scheduler does not become jitter of the samples.
 Missing samples are known from a counter exactly; without one from rejected frames (the decoder says so), from
 the pause while a link was closed, and from a sudden delay: one that is caught up within CATCH_UP_S was a late
 scheduler, one that stays is a hole. The same delay tells the whole turns that a short counter hides. A counter that
-ran further than the host's clock allows began anew: then arrival decides. ``lost`` of each block that goes out counts all samples
-missing just before it, rejected frames included.
+ran further than the host's clock allows began anew: then arrival decides. ``lost`` of each block that goes out counts
+all samples missing just before it, rejected frames included.
 
 Not done here: no sample is dropped, repeated or moved to another place in the order.
 """
@@ -17,21 +17,14 @@ Not done here: no sample is dropped, repeated or moved to another place in the o
 from collections import deque
 from dataclasses import dataclass
 from itertools import pairwise
-from math import exp
 from typing import Final
 
 import numpy as np
 
+from drivers.line import LEARN_S, Line, made_rate
 from drivers.sample import NO_TICK, Counter, Event, Floats, Given, Ints, SampleBlock, Timing, block
 
 NS: Final = 1e9
-FORGET_S: Final = 30.0
-"""Time constant of the fitted line: long against arrival jitter, short against a crystal's warm-up."""
-LEARN_S: Final = 2.0
-LEARN_SAMPLES: Final = 20
-"""A rate is known from the data after both."""
-KEEP_LEAST: Final = 0.9
-"""Slow sensors and long blocks: the line rests on ten points or more however far apart they are."""
 CATCH_UP_S: Final = 3.0
 HOLE_PERIODS: Final = 3.0
 HOLE_MIN_S: Final = 0.05
@@ -49,16 +42,6 @@ SURELY_MISSING: Final = 4.0
 """Periods: a longer given step is a gap though it is not one of whole periods."""
 LATE: Final = 8.0
 """A given time is late, and no sample missing, up to so many times the upper quartile of what is usual."""
-SNAP: Final = 0.002
-"""A measured rate this near to a rate that sensors are made with is taken to be that rate; crystals and RC
-oscillators further off are taken at their word."""
-# fmt: off
-MADE_RATES_HZ: Final = np.array([
-    1, 2, 4, 5, 8, 10, 12.5, 16, 20, 25, 26, 32, 40, 50, 52, 62.5, 64, 80, 100, 104, 120, 125, 128, 200, 208, 238, 240,
-    250, 256, 262, 400, 416, 476, 480, 500, 512, 800, 833, 952, 1000, 1024, 1600, 1660, 2000, 3200, 3330, 4000, 6400,
-    6660, 8000, 16000, 32000,
-])
-# fmt: on
 
 
 class SampleClock:
@@ -337,60 +320,6 @@ class _Delay:
     least_s: float  # the least any arrival since was behind the line
 
 
-class Line:
-    """Least squares of time on index with exponential forgetting; sums are kept about the newest point."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._x0 = self._t0 = 0.0  # newest point
-        self._first_x = self._first_t = 0.0
-        self._w = self._mx = self._mt = self._sxx = self._sxt = 0.0
-
-    def add(self, index: float, t_s: float, nominal_hz: float | None = None) -> None:
-        """One more (index, arrival) pair; the nominal rate stands in for a slope until there is one."""
-        if self.count == 0:
-            self._first_x, self._first_t = index, t_s
-            self._nominal_s = 1.0 / nominal_hz if nominal_hz else None
-        dx, dt = index - self._x0, t_s - self._t0
-        keep = max(exp(-max(dt, 0.0) / FORGET_S), KEEP_LEAST) if self.count else 0.0
-        # shift the means to the new origin, then update (West 1979)
-        self._mx -= dx
-        self._mt -= dt
-        self._x0, self._t0 = index, t_s
-        self._w, self._sxx, self._sxt = self._w * keep + 1.0, self._sxx * keep, self._sxt * keep
-        gain = 1.0 / self._w
-        ex, et = -self._mx, -self._mt
-        self._mx += gain * ex
-        self._mt += gain * et
-        self._sxx += (1.0 - gain) * ex * ex
-        self._sxt += (1.0 - gain) * ex * et
-        self.count += 1
-
-    def span_s(self) -> float:
-        """Seconds from the first pair to the newest."""
-        return self._t0 - self._first_t
-
-    def settled(self) -> bool:
-        """Whether the slope rests on enough to tell a hole from jitter."""
-        return self._x0 - self._first_x >= LEARN_SAMPLES and self.span_s() >= LEARN_S
-
-    def period_s(self) -> float | None:
-        """Seconds a sample; None until two pairs have come."""
-        if self.count >= 2 and self._sxt > 0.0 and (self.settled() or self._nominal_s is None):
-            return self._sxt / self._sxx
-        return self._nominal_s if self.count else None
-
-    def rate_hz(self) -> float | None:
-        """Samples a second; None until known."""
-        period = self.period_s()
-        return 1.0 / period if period else None
-
-    def at(self, index: float) -> float:
-        """The line's time at an index, s."""
-        period = self.period_s() or 0.0
-        return self._t0 + self._mt + (index - self._x0 - self._mx) * period
-
-
 class _Step:
     """The usual step of a counter: the mean of all steps near the median of the last ones."""
 
@@ -421,16 +350,6 @@ class _Step:
     def _near(self, steps: Ints) -> Ints:
         usual = self.usual()
         return steps[:0] if usual is None else steps[np.abs(steps / usual - 1.0) < NEAR]
-
-
-def made_rate(measured_hz: float) -> float:
-    """The rate that sensors are made with nearest to the measured one, if within SNAP; else the measured, to 5 digits.
-
-    >>> made_rate(99.97), made_rate(99.32)
-    (100.0, 99.32)
-    """
-    nearest = float(MADE_RATES_HZ[np.argmin(np.abs(np.log(MADE_RATES_HZ / measured_hz)))])
-    return nearest if abs(measured_hz / nearest - 1.0) < SNAP else float(f"{measured_hz:.5g}")
 
 
 def _usual(steps: Ints) -> float | None:

@@ -1,4 +1,4 @@
-"""Finds the members of a folder of plug-ins by listing it, imports one when it is asked for, and types its file keys."""
+"""Finds the members of a folder of plug-ins by listing it, imports one when asked for, and types its file keys."""
 
 import importlib
 import pkgutil

@@ -4,11 +4,13 @@ Exit status: 0 done; 1 failed while working; 2 what was asked for is wrong, said
 finished, but the data do not support an answer. Heavy libraries are imported by the command that needs them.
 """
 
+import contextlib
+import io
 import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, TextIO, cast
 
 import typer
 from typer.exceptions import TyperException
@@ -165,7 +167,8 @@ def main() -> None:
 
 
 def _fail(line: str, status: int) -> NoReturn:
-    print(f"imu-monitor: {line}", file=sys.stderr)  # noqa: T201
+    with contextlib.suppress(OSError):  # nobody to say it to: the status stays
+        print(f"imu-monitor: {line}", file=sys.stderr)  # noqa: T201
     sys.exit(status)
 
 
@@ -209,6 +212,19 @@ def _serve_config(config: "Config", seconds: float | None) -> None:
         console.print(board.table(time.monotonic()))
 
 
+class _Lines(io.TextIOBase):
+    """Standard error as the log's place: a line that cannot be written (disk full, reader gone) is dropped."""
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            sys.stderr.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            sys.stderr.flush()
+
+
 def _log_as(config: "Config") -> None:
     """Structured lines on standard error."""
     import logging
@@ -223,7 +239,7 @@ def _log_as(config: "Config") -> None:
             structlog.processors.JSONRenderer() if json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
         ],
         wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, config.log.level.upper())),
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        logger_factory=structlog.PrintLoggerFactory(cast("TextIO", _Lines())),
         cache_logger_on_first_use=True,
     )
 

@@ -10,8 +10,9 @@ from typing import Final
 
 import numpy as np
 
-from drivers.clock import JUMP_S, LONG_S, NS, SampleClock, made_rate
+from drivers.clock import JUMP_S, LONG_S, NS, SampleClock
 from drivers.errors import NotReady
+from drivers.line import made_rate
 from drivers.sample import AXES, Floats, Given, Ints, SampleBlock
 from monitor.estimate.batch import TauGrid, cluster_sizes, overlapping, slope
 from monitor.estimate.curve import AllanCurve

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 
-class ViewerTrouble(Exception):  # noqa: N818 - never leaves this room: the thread turns it into its state
+class ViewerTrouble(Exception):
     """The viewer cannot be opened, or is gone: one line for people."""
 
 

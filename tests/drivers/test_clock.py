@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.clock import FORGET_S, Line, SampleClock, made_rate
+from drivers.clock import SampleClock
+from drivers.line import FORGET_S, Line, made_rate
 from drivers.sample import Arrival, Counter, Given, block
 
 NS = 1e9

@@ -161,7 +161,7 @@ def test_the_example_of_the_page_reads_what_is_published() -> None:
     program = program.replace("print(", "break_after(")
     printed = io.StringIO()
 
-    class Done(Exception):  # noqa: N818
+    class Done(Exception):
         pass
 
     def break_after(*words: object) -> None:

@@ -1,4 +1,4 @@
-"""A process of its own that publishes a recording over zenoh: python -m tests.walk.publisher FILE.npz KEY ENDPOINT RATE."""
+"""A process that publishes a recording over zenoh: python -m tests.walk.publisher FILE.npz KEY ENDPOINT RATE."""
 
 import sys
 import time

@@ -65,8 +65,17 @@ def test_a_log_file_gives_the_recorded_samples(tmp_path: Path, name: str, kind: 
     with can.Logger(str(tmp_path / f"drive{kind}")) as log:
         for message in messages:
             log.on_message_received(message)
-    config = f'[[device]]\nname = "imu"\nrate = 100.0\nwindow = 700.0\n[device.driver]\nlink = "replay"\nspeed = "max"\n'
-    with running(tmp_path, config + f'path = "drive{kind}"\ndecoder = "dbc"\n' + OPTIONS) as run:
+    config = f"""[[device]]
+name = "imu"
+rate = 100.0
+window = 700.0
+[device.driver]
+link = "replay"
+path = "drive{kind}"
+speed = "max"
+decoder = "dbc"
+"""
+    with running(tmp_path, config + OPTIONS) as run:
         run.join(60.0)  # a replay that has ended ends the service
         counts = run.station("imu").driver.counts
     sent = imu_frames(messages)

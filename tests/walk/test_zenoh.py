@@ -33,7 +33,8 @@ def test_a_recording_from_another_process_gives_the_authors_table(tmp_path: Path
     folder = recordings()
     path = folder / "adis16405" / "run1.npz"
     with (folder / "reference" / "avar-package-allan-tables.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if (row["key"], row["type"], row["axis"]) == ("adis", "Gyroscope", "X")]
+        wanted = ("adis", "Gyroscope", "X")
+        rows = [row for row in csv.DictReader(file) if (row["key"], row["type"], row["axis"]) == wanted]
     table = {round(float(row["tau_as_listed_s"]) * 100): np.radians(float(row["adev"])) for row in rows}
     config = f"""[[device]]
 name = "run1"

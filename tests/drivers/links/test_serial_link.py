@@ -61,6 +61,21 @@ def test_every_byte_comes_once_and_in_order(pty: tuple[int, str]) -> None:
     assert got == sent
 
 
+def test_a_flow_faster_than_the_buffer_is_not_held_up(pty: tuple[int, str]) -> None:
+    """A wait of the port's time-out after every buffer would take 10 s."""
+    master, port = pty
+    link = build(port=port, read_timeout=0.1)
+    link.open()
+    sent = os.urandom(400_000)
+    parts = [sent[at : at + 500] for at in range(0, len(sent), 500)]
+    writer = threading.Thread(target=lambda: [os.write(master, part) for part in parts], daemon=True)
+    writer.start()
+    got = read_all(link, len(sent))
+    assert got == sent
+    writer.join()
+    link.close()
+
+
 def test_bytes_do_not_wait_for_the_timeout_of_the_reader(pty: tuple[int, str]) -> None:
     master, port = pty
     link = build(port=port)
