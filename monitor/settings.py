@@ -183,6 +183,9 @@ class _Reader:
             self._reachable(zenoh)
         if zenoh is None or viewer is None or log is None:
             return None
+        if viewer.mode.endswith(".rrd"):
+            path = self._folder / Path(viewer.mode).expanduser()
+            viewer = msgspec.structs.replace(viewer, mode=str(path))
         return Config(tuple(device for device in devices if device is not None), zenoh, viewer, log)
 
     def _reachable(self, zenoh: ZenohTable) -> None:

@@ -28,8 +28,6 @@ from monitor.wall import WallClock
 RING_SECONDS: Final = 10.0
 RING_SAMPLES: Final = (65_536, 1_000_000)
 PATIENCE_S: Final = 0.002
-PENDING_BLOCKS: Final = 10_000
-"""Blocks kept while the sample rate is not known yet, or the kernels are being compiled."""
 SAMPLES_EVERY_S: Final = 0.1
 """Raw samples travel in batches of at most this long, unless every block is wanted."""
 OFF_NOMINAL: Final = 0.02
@@ -87,7 +85,6 @@ class Station:
         self._stopping = False
         self._wall = WallClock(time.monotonic_ns(), time.time_ns())
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
-        self._pending: list[SampleBlock] = []  # not in the estimator yet: the rate is unknown
         self._batch: list[SampleBlock] = []  # not published yet
         self._waiting_since_ns = 0
         self._unpublished_since_ns = 0  # of the oldest sample that was taken and not published yet
@@ -118,15 +115,15 @@ class Station:
     @property
     def ended(self) -> bool:
         """A replay that has given all it had, and all of it is worked off."""
-        return self.driver.state == "ended" and not self._thread.is_alive() and not self._waiting_since_ns
+        if self.driver.state != "ended" or self._thread.is_alive() or not self._ready.fit.is_set():
+            return False
+        return not self._waiting_since_ns or self.clock.rate_hz is None
 
     # --- one round
 
     def work(self, outputs: Sequence[Output], now_s: float, drain: bool = False) -> None:
         """Take what came, advance the estimate, publish what is due; all of it when draining."""
-        came_ns, self._waiting_since_ns = self._waiting_since_ns, 0
-        self._unpublished_since_ns = self._unpublished_since_ns or came_ns
-        blocks = self.ring.take()
+        blocks = self._take() if drain or self._can_take() else []
         if blocks:
             self._newest_ns = int(blocks[-1].t_ns[-1])
             self._batch += blocks
@@ -199,15 +196,24 @@ class Station:
     def _offset_ns(self) -> int:
         return 0 if self.driver.times_are_unix else self._wall.offset_ns
 
+    def _can_take(self) -> bool:
+        """Until the rate is known and the kernels are compiled, samples wait in the ring."""
+        if self.estimator is not None or self._no_estimate:
+            return True
+        if self.clock.rate_hz is None:  # times from which no rate can be told must not stop the samples
+            return self.ring.room < self.ring.capacity // 2
+        return self._ready.window.is_set()
+
+    def _take(self) -> list[SampleBlock]:
+        came_ns, self._waiting_since_ns = self._waiting_since_ns, 0
+        self._unpublished_since_ns = self._unpublished_since_ns or came_ns
+        return self.ring.take()
+
     def _advance(self, blocks: list[SampleBlock]) -> None:
-        if self._no_estimate:
-            return
+        rate = self.clock.rate_hz
         if self.estimator is None:
-            self._pending = (self._pending + blocks)[-PENDING_BLOCKS:]
-            rate = self.clock.rate_hz
-            if rate is None or not self._ready.window.is_set():
+            if rate is None or self._no_estimate:
                 return
-            blocks, self._pending = self._pending, []
             try:
                 self.estimator = Estimator(rate, self.device.window_s, self.device.tau)
             except ConfigError as error:  # a list of τ that does not fit the rate found; samples go on
@@ -230,9 +236,10 @@ class Station:
 
     def _publish_estimate(self, outputs: Sequence[Output], now_s: float, drain: bool) -> bool:
         if self.estimator is not None and self._advanced and (self._due("refit", self.device.refit_s, now_s) or drain):
-            self._advanced = False
+            fitted = self._ready.fit.is_set()
+            self._advanced = not fitted  # a curve alone is fitted as soon as that can be
             try:
-                self.latest = self.estimator.get(fitted=self._ready.fit.is_set())
+                self.latest = self.estimator.get(fitted=fitted)
             except NotReady:
                 return False
             self._refitted = True

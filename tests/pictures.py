@@ -1,10 +1,10 @@
 """Makes every picture of the viewer and of the plots that the documentation shows: ``python -m tests.pictures``.
 
-Nothing is drawn by hand. A little over an hour of the shipped model ``consumer-mems``, with the temperature of a
-sensor that warms up, is written to a recording; ``Service`` replays it sixty times as fast into a native viewer
-without a screen (software Vulkan), then into the page inside a real Chromium, driven by its DevTools protocol;
-``imu-monitor analyze`` makes the plot of its first hour. The fleet are simulated devices in real time; one cable is
-pulled and put back, another is pulled for good. Needs the packages chromium, mesa-vulkan-drivers and
+Nothing is drawn by hand. The shipped model ``consumer-mems``, with the temperature of a sensor that warms up, is
+simulated into a recording; ``Service`` replays an hour of it sixty times as fast into a native viewer without a
+screen (software Vulkan), then into the page inside a real Chromium, driven by its DevTools protocol, and is stopped
+as by a signal; ``imu-monitor analyze`` makes the plot of the same hour. The fleet are simulated devices in real time;
+one cable is pulled and put back, another is pulled for good. Needs the packages chromium, mesa-vulkan-drivers and
 libvulkan1 (Debian's names); network traffic stays on loopback.
 
     python -m tests.pictures [--out docs/pictures] [--only native fleet web plot]
@@ -27,6 +27,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -40,12 +41,12 @@ SIZE = (1600, 1000)
 MODEL = settings.CONFIG_FOLDER / "models" / "consumer-mems.toml"
 T0 = 1_763_705_400.0  # Unix s of the first sample: 2025-11-21 06:10 UTC
 HOUR_S = 3600.0
-SPARE_S = 1800.0  # of the recording beyond the hour, so that it still runs while the picture is taken
+SPARE_S = 900.0  # of the recording beyond the hour, so that it still runs when the service is stopped
 GAP_S = (1403.0, 1404.5)  # since T0: what the recording lost
 SPEED = 60.0
 SETTLE_S = 6.0  # for a software renderer to paint what has arrived
 PAGE_S = 15.0  # the same for WebAssembly on a software renderer
-PULLED_S, PLUGGED_S, PULLED_AGAIN_S, LOOKED_S = 40.0, 44.0, 85.0, 89.0  # since the fleet's start
+PULLED_S, PLUGGED_S, PULLED_AGAIN_S, LOOKED_S = 30.0, 34.0, 70.0, 74.0  # since the fleet's start
 CHROMIUM_FLAGS = (
     *("--headless=new", "--no-sandbox", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync", "--disable-default-apps"),
@@ -92,8 +93,9 @@ def main() -> None:
 def native(out: Path, folder: Path) -> Path:
     """One device in the native viewer."""
     path = out / "viewer.png"
-    with window() as (port, shoot), serving(folder, replay(folder), "native", port) as service:
-        until(lambda: replayed(service, HOUR_S), 300.0)
+    with window() as (port, shoot):
+        with serving(folder, replay(folder), port) as service:
+            until(lambda: replayed(service, HOUR_S), 300.0)
         time.sleep(SETTLE_S)
         shoot(path)
     return path
@@ -102,7 +104,7 @@ def native(out: Path, folder: Path) -> Path:
 def fleet(out: Path, folder: Path) -> Path:
     """Three devices: the overview."""
     path = out / "viewer-fleet.png"
-    with window() as (port, shoot), serving(folder, FLEET, "native", port) as service:
+    with window() as (port, shoot), serving(folder, FLEET, port) as service:
         tail, wing = service.virtual["tail"], service.virtual["wing"]
         until(lambda: all(station.latest is not None for station in service.stations), 120.0)
         begun_s = time.monotonic()
@@ -119,14 +121,12 @@ def fleet(out: Path, folder: Path) -> Path:
 
 def web(out: Path, folder: Path) -> Path:
     """One device on the page, in Chromium."""
-    with serving(folder, replay(folder), "web", free_port()) as service, browser() as page:
-        view = service.view
-        assert view is not None
-        until(lambda: view.url.startswith("http://"), 30.0)
+    with page_server() as (port, url), browser() as page:
         dark = [{"name": "prefers-color-scheme", "value": "dark"}]
         page.call("Emulation.setEmulatedMedia", features=dark)
-        page.call("Page.navigate", url=view.url + "&renderer=webgl&hide_welcome_screen=1")
-        until(lambda: replayed(service, HOUR_S), 300.0)
+        page.call("Page.navigate", url=url + "&renderer=webgl&hide_welcome_screen=1")
+        with serving(folder, replay(folder), port) as service:
+            until(lambda: replayed(service, HOUR_S), 300.0)
         time.sleep(PAGE_S)
         shot = page.call("Page.captureScreenshot", format="png")
     path = out / "viewer-web.png"
@@ -147,7 +147,7 @@ PICTURES: dict[str, Callable[[Path, Path], Path]] = {"native": native, "fleet": 
 
 def recording(folder: Path, seconds: float) -> Path:
     """So much of the simulated device, with a gap; the same at every run."""
-    path = folder / f"consumer-mems-{seconds:.0f}s.npz"
+    path = folder / f"bench-1_{seconds / 3600:g}h.npz"
     if not path.exists():
         model = read_model(MODEL)
         rate_hz = model.sample_rate_hz
@@ -172,9 +172,9 @@ def replayed(service: Service, seconds: float) -> bool:
 
 
 @contextmanager
-def serving(folder: Path, devices: str, mode: str, port: int) -> Iterator[Service]:
-    """The service with these devices, showing them in the viewer at ``port``."""
-    viewer = f'[viewer]\nmode = "{mode}"\nport = {port}\nweb_port = {free_port()}\n'
+def serving(folder: Path, devices: str, port: int) -> Iterator[Service]:
+    """The service with these devices, showing them in the viewer that is open at ``port``; stopped at the end."""
+    viewer = f'[viewer]\nmode = "native"\nport = {port}\n'
     path = folder / "pictures.toml"
     path.write_text(f'{devices}\n[zenoh]\nlisten = ["tcp/127.0.0.1:{free_port()}"]\n\n{viewer}')
     service = Service(settings.load(path))
@@ -200,6 +200,20 @@ def window() -> Iterator[tuple[int, Callable[[Path], None]]]:
     try:
         until(lambda: rerun_sinks.listens(port), 30.0)
         yield port, lambda path: ViewerClient(rerun_sinks.server_url(port)).save_screenshot(str(path))
+    finally:
+        child.end()
+
+
+@contextmanager
+def page_server() -> Iterator[tuple[int, str]]:
+    """What serves the page, as mode "web" starts it, but for it to stay when the service stops: its port, the page."""
+    port, web_port = free_port(), free_port()
+    child = rerun_sinks.Child([
+        *("--serve-web", "--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(web_port))
+    ])  # fmt: skip
+    try:
+        until(lambda: rerun_sinks.listens(port) and rerun_sinks.listens(web_port), 30.0)
+        yield port, f"http://127.0.0.1:{web_port}/?url={quote(rerun_sinks.server_url(port), safe='')}"
     finally:
         child.end()
 

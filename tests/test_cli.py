@@ -22,7 +22,7 @@ import pytest
 from drivers.recording import save_samples
 from drivers.sample import AXES
 from monitor.cli import main
-from monitor.settings import CONFIG_FOLDER
+from monitor.settings import CONFIG_FOLDER, load
 from monitor.virtual import read_model
 
 PROGRAM = [sys.executable, "-m", "monitor.cli"]
@@ -171,6 +171,12 @@ def test_check_tells_all_that_is_wrong_and_run_the_first(call: Call) -> None:
     line = call("run", "c.toml").only_line()
     assert "windw" in line
     assert "(and 2 more: imu-monitor check c.toml)" in line
+
+
+def test_a_file_for_the_view_is_beside_the_configuration(tmp_path: Path) -> None:
+    """As every relative path in it."""
+    (tmp_path / "c.toml").write_text(VIRTUAL + '[viewer]\nmode = "live.rrd"\n')
+    assert load(tmp_path / "c.toml").viewer.mode == str(tmp_path / "live.rrd")
 
 
 def test_check_reads_the_model_of_a_simulated_device_too(call: Call) -> None:

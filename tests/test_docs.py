@@ -6,6 +6,7 @@ import selectors
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 from typing import IO
 from urllib.parse import quote
@@ -29,6 +30,7 @@ from tests.monitor.publish.zenoh_world import eventually, free_endpoint
 
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
+ARCHITECTURE = ROOT / "docs" / "architecture.md"
 PAGES = sorted([README, ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 PRINTED_BY = "tcp/127.0.0.1:7450"
@@ -139,6 +141,22 @@ def test_every_file_named_is_there(page: Path) -> None:
             assert (ROOT / path).exists(), path
 
 
+def test_the_floors_are_those_that_are_held() -> None:
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]["contracts"]
+    held = [floor for contract in contracts if contract["type"] == "layers" for floor in contract["layers"]]
+    drawn = next(block for block in fences(ARCHITECTURE, "") if "monitor.cli" in block).splitlines()
+    assert [line for line in drawn if not line.startswith("---")] == held
+
+
+def test_every_room_is_on_the_plan() -> None:
+    plan = section(ARCHITECTURE, "Rooms")
+    seams = {"links", "decoders", "effects", "recording", "dbc"}  # folders whose members come and go
+    for package in ("drivers", "monitor"):
+        for path in (ROOT / package).rglob("*.py"):
+            if path.stem != "__init__" and not seams & set(path.parts):
+                assert re.search(rf"\b{path.name}\b", plan), path.relative_to(ROOT)
+
+
 def defined() -> set[str]:
     """What the sources define: ``module``, ``name``, ``Class.method``, ``module.function``."""
     names: set[str] = set()
@@ -157,8 +175,8 @@ def defined() -> set[str]:
     ("page", "heading"),
     [
         (README, "One sample through the code"),
-        (ROOT / "docs" / "architecture.md", "Walk 1: one sample from the wire to the plot"),
-        (ROOT / "docs" / "architecture.md", "Walk 2: a link that goes away and comes back"),
+        (ARCHITECTURE, "Walk 1: one sample from the wire to the plot"),
+        (ARCHITECTURE, "Walk 2: a link that goes away and comes back"),
     ],
     ids=["readme", "walk 1", "walk 2"],
 )

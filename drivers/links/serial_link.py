@@ -1,8 +1,8 @@
 """Serial ports, local or networked: any URL that pyserial knows.
 
-Bytes come out as they arrived, cut anywhere. One thread waits for the first byte, lets others join it for
-a short time (``read_timeout``, 10 ms), and takes all that are there: that costs a tenth of waking up for
-every frame, and no byte waits longer than that. URL handlers without a file number wake up at every
+Bytes come out as they arrived, cut anywhere. One thread waits for the first byte, lets others join it until
+a short time (``read_timeout``, 10 ms) has passed, and takes all that are there: that costs a tenth of waking up
+for every frame, and no byte waits longer than that. URL handlers without a file number wake up at every
 arrival instead, within the same time. ``close`` only raises a flag and ends the pending read; the port
 itself is closed once the reader has left it, as a file number closed under a waiting reader may by then
 belong to another file.
@@ -124,10 +124,11 @@ class SerialLink:
             if not _has_file_number(port):
                 data: bytes = port.read(READ_SIZE)
                 return data
+            until_s = time.monotonic() + self._settings.read_timeout
             data = port.read(1)
             if data:
                 if not self._plenty:
-                    self._closing.wait(self._settings.read_timeout)
+                    self._closing.wait(max(0.0, until_s - time.monotonic()))
                 with contextlib.suppress(BlockingIOError):  # nothing has joined it
                     data += os.read(port.fileno(), READ_SIZE)
             self._plenty = len(data) > READ_SIZE // 2

@@ -35,12 +35,13 @@ def health_text(device: str, health: Health, about: str = "") -> str:
     if health.text:
         lines.append(f"**{health.text}**")
     rate = "rate not known yet" if health.rate_hz is None else f"{health.rate_hz:.2f} Hz"
-    lines.append(f"**{device}** {about}".rstrip() + f", **{rate}**, up {duration(health.uptime_s)}")
+    lines.append(f"**{device}** {about}".rstrip() + f", **{rate}**")
     lines.append(
         f"received **{health.received:,}**, lost **{health.lost:,}**, bad **{health.bad:,}**, "
         f"overflowed **{health.overflowed:,}**"
     )
-    lines.append(", ".join(f"{name} **{state}**" for name, state in health.outputs.items()))
+    outputs = "".join(f", {name} **{state}**" for name, state in health.outputs.items())
+    lines.append(f"up **{duration(health.uptime_s)}**{outputs}")
     lines.append(
         f"latency **{_milliseconds(health.latency_p50_s)}** median, "
         f"**{_milliseconds(health.latency_p99_s)}** at 99 %, memory **{health.memory_bytes / 1e6:.0f} MB**"

@@ -85,7 +85,16 @@ def _curves(axes: "Axes", estimate: Estimate, kind: Kind) -> None:
     axes.grid(which="minor", color="#ececec", linewidth=0.5)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, ncols=5, loc="upper right", handlelength=1.6, columnspacing=1.2)
+    # above the box: curves and intervals may fill every corner of it
+    axes.legend(
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        borderaxespad=0.2,
+        frameon=False,
+        ncols=5,
+        handlelength=1.6,
+        columnspacing=1.2,
+    )
 
 
 def _table(axes: "Axes", estimate: Estimate, kind: Kind) -> None:

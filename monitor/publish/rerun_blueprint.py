@@ -50,8 +50,8 @@ def _device(device: str) -> rrb.Container:
     left = rrb.Vertical(
         rrb.TextDocumentView(origin=f"/{device}/status", name="Is it healthy?"),
         rrb.TextDocumentView(origin=f"/{device}/coefficients", contents="$origin", name="What is its noise now?"),
-        rrb.TextLogView(origin=f"/{device}/events", name="Has it changed?", columns=_log_columns("LogLevel")),
-        row_shares=[2.35, 6.15, 1.5],
+        rrb.TextLogView(origin=f"/{device}/events", name="Has it changed?", columns=_log_columns()),
+        row_shares=[2.35, 6.3, 1.35],
     )
     right = rrb.Vertical(
         rrb.Horizontal(*(_allan(device, kind) for kind in KINDS)),
@@ -67,13 +67,9 @@ def _overview(devices: Sequence[str]) -> rrb.Container:
     charts = [_allan(d, kind, f"{d}: ") for kind in kinds for d in devices]
     return rrb.Vertical(
         rrb.Horizontal(
-            rrb.TextDocumentView(origin="/overview", name="Is it healthy?"),
-            rrb.TextLogView(
-                origin="/",
-                contents=[f"+ /{d}/events" for d in devices],
-                name="Has it changed?",
-                columns=_log_columns("EntityPath", "LogLevel"),
-            ),
+            rrb.TextDocumentView(origin="/overview", contents="$origin", name="Is it healthy?"),
+            rrb.TextLogView(origin="/overview/events", name="Has it changed?", columns=_log_columns()),
+            column_shares=[11, 9],
         ),
         rrb.Grid(*charts, grid_columns=min(len(devices), COLUMNS)),
         row_shares=[1, 4],
@@ -123,10 +119,10 @@ def _temperature(device: str) -> rrb.View:
     )
 
 
-def _log_columns(*columns: str) -> rrb.TextLogColumns:
+def _log_columns() -> rrb.TextLogColumns:
     """The time of the day stands in the text: a column for it would be cut off to the date."""
     hidden = TimelineColumn(timeline=TIMELINE, visible=False)
-    return rrb.TextLogColumns(timeline_columns=[hidden], text_log_columns=[*columns, "Body"])
+    return rrb.TextLogColumns(timeline_columns=[hidden], text_log_columns=["LogLevel", "Body"])
 
 
 def _last(seconds: float) -> rrb.TimeAxis:

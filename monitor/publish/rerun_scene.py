@@ -45,6 +45,7 @@ from monitor.publish.units import (
 
 TIMELINE: Final = "sample_time"
 TEMPERATURES_PER_S: Final = 5.0
+NARROW: Final = 1.5  # ends of an interval further than this factor from their value are not on the course
 LEVELS: Final = {
     "link_lost": "ERROR",
     "samples_lost": "WARN",
@@ -108,10 +109,12 @@ class Scene:
                     self._scalars(f"{device}/coefficients/{letter}/{axis}", at, values * factor)
 
     def event(self, device: str, wall_s: float, event: Event) -> None:
-        """One line in the log of the device."""
+        """One line in the log of the device, and in that of the overview."""
         self._at(wall_s)
-        body = f"{_clock_time(wall_s)}  {event.text}"
-        self._stream.log(f"{device}/events", rr.TextLog(body, level=LEVELS.get(event.kind, "INFO")))
+        level, at = LEVELS.get(event.kind, "INFO"), _clock_time(wall_s)
+        self._stream.log(f"{device}/events", rr.TextLog(f"{at}  {event.text}", level=level))
+        if len(self._devices) > 1:
+            self._stream.log("overview/events", rr.TextLog(f"{at}  {device}: {event.text}", level=level))
 
     def health(self, device: str, wall_s: float, health: Health) -> None:
         """The health panel of the device, and its row in the overview."""
@@ -247,11 +250,15 @@ class _Curve:
 
 
 def _course(estimate: Estimate, row: int, column: int) -> tuple[float, float, float]:
-    """value, lo, hi of one estimated coefficient; a bound is a gap, its size would hide what follows."""
+    """value, lo, hi of one estimated coefficient; a gap where their size would hide all that follows.
+
+    That are bounds, and the intervals of a device's first seconds.
+    """
     c = estimate.coefficients
     if c.status[row, column] != Status.ESTIMATED:
         return np.nan, np.nan, np.nan
-    return float(c.value[row, column]), float(c.lo[row, column]), float(c.hi[row, column])
+    value, lo, hi = (float(part[row, column]) for part in (c.value, c.lo, c.hi))
+    return (value, lo, hi) if lo * NARROW > value and hi < value * NARROW else (value, np.nan, np.nan)
 
 
 def _stamps(wall_s: Floats) -> "np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]":

@@ -37,14 +37,15 @@ class Caught:
 
 
 class Rig:
-    def __init__(self, rate=RATE, window_s=20.0, refit_s=0.1, publish_s=0.1, tau="octave", decoder=None):
+    def __init__(self, rate=RATE, window_s=20.0, refit_s=0.1, publish_s=0.1, tau="octave", decoder=None, ready=None):
         decoder = decoder or vectornav_binary.build(vectornav_binary.Settings())
         self.link = LoopbackLink()
         device = Device("bench", rate, window_s, tau, refit_s, publish_s, self.link, decoder, AxisMap(), 0.0)
         self.wake = threading.Event()
-        self.ready = Ready()
-        self.ready.window.set()
-        self.ready.fit.set()
+        self.ready = ready or Ready()
+        if ready is None:
+            self.ready.window.set()
+            self.ready.fit.set()
         self.station = Station(device, self.link, decoder, self.wake, self.ready)
         self.caught = Caught()
         self.sent = 0
@@ -122,14 +123,15 @@ def test_samples_wait_for_a_rate_and_none_is_left_out():
     lines = text.Settings(columns=("gx", "gy", "gz", "ax", "ay", "az"))
     rig = Rig(rate=None, decoder=text.build(lines))
     rig.bring(300)
-    rig.work(1000.0, drain=True)
+    rig.work(1000.0)
     assert rig.caught.estimates == []
-    assert sum(map(len, rig.caught.blocks)) == 300
+    assert rig.caught.blocks == []
     for i in range(400):  # the clock learns from what the reader stamps
         t_ns = np.array([10**12 + i * 10_000_000])
         rig.station.clock.stamp(block(t_ns, np.zeros((1, 6))))
     rig.bring(100)
-    rig.work(1001.0, drain=True)
+    rig.work(1001.0)
+    assert sum(map(len, rig.caught.blocks)) == 400
     (_, found) = rig.caught.estimates[-1]
     assert (found.samples, found.curve.n, found.rate_hz) == (400, 400, 100.0)
 
@@ -247,3 +249,28 @@ def test_a_rate_off_the_configured_one_is_said():
         rig.station.clock.stamp(block(np.array([10**12 + i * 20_000_000]), np.zeros((1, 6))))
     rig.station.driver.state, rig.station.driver.text = "running", ""
     assert rig.station.health({}, 0).text == "samples come at 50 Hz, configured are 100 Hz"
+
+
+def test_a_replay_has_ended_when_its_samples_are_fitted():
+    rig = Rig(ready=Ready())
+    rig.bring(300)
+    rig.work(1000.0)
+    rig.station.driver.state = "ended"
+    assert not rig.station.ended
+    rig.ready.window.set()
+    rig.work(1001.0)
+    assert rig.caught.estimates[-1][1].coefficients.status.max() == 0  # the curve alone
+    assert not rig.station.ended
+    rig.ready.fit.set()
+    rig.work(1002.0)
+    assert rig.caught.estimates[-1][1].coefficients.status.max() > 0
+    assert rig.station.ended
+
+
+def test_samples_whose_rate_cannot_be_told_go_on():
+    lines = text.Settings(columns=("gx", "gy", "gz", "ax", "ay", "az"))
+    rig = Rig(rate=None, decoder=text.build(lines))
+    rig.bring(40_000)
+    rig.work(1000.0)
+    assert sum(map(len, rig.caught.blocks)) == 40_000
+    assert rig.caught.estimates == []

@@ -13,8 +13,8 @@ from drivers.sample import join
 from tests.walk.rig import Running, running, wait_for
 
 WARM_UP, CYCLES = 10, 50
-NOISE_BYTES = 3_000_000
-"""Memory that comes and goes by itself: samples kept by this test, pages of the ring and the window touched first."""
+NOISE_BYTES = 2_000_000
+"""40 kB a cycle. About 0.6 MB come by themselves: samples kept by this test, pages of ring and window touched first."""
 PERIOD_NS = 10_000_000
 CONFIG = """
 [[device]]

@@ -117,14 +117,7 @@ def test_a_frozen_viewer(tmp_path: Path) -> None:
         goes_on(run)
         child.send_signal(signal.SIGCONT)
         output_says(run, "viewer", lambda text: text == "ok")
-
-
-@needs_rerun
-def test_a_viewer_that_is_frozen_for_good_does_not_hold_up_the_end(tmp_path: Path) -> None:
-    with healthy(tmp_path, viewer("web")) as run:
-        output_says(run, "viewer", lambda text: text == "ok")
-        child = viewer_child(run)
-        child.send_signal(signal.SIGSTOP)
+        child.send_signal(signal.SIGSTOP)  # now for good: it must not hold up the end
         output_says(run, "viewer", lambda text: text.startswith("stalled"))
         goes_on(run)
         run.service.stop()
@@ -296,7 +289,7 @@ def test_a_router_that_is_not_there_yet(tmp_path: Path, mode: str) -> None:
             output_says(run, "zenoh", lambda text: text == f"nobody at {endpoint}; trying again")
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "[::1]", "localhost"])
+@pytest.mark.parametrize("host", ["127.0.0.1", "[::1]"])
 def test_a_busy_zenoh_port(tmp_path: Path, host: str) -> None:
     family = socket.AF_INET6 if host == "[::1]" else socket.AF_INET
     try:
