@@ -213,7 +213,7 @@ def axis_map(table: dict[str, str]) -> AxisMap:
     source, sign = list(range(6)), [1.0] * 6
     for axis, word in table.items():
         bare = word.lstrip("+-")
-        if axis not in AXES or bare not in AXES or len(word) - len(bare) > 1:
+        if axis not in AXES or bare not in AXES or axis[0] != bare[0] or len(word) - len(bare) > 1:
             raise KeyError(axis, word)
         source[AXES.index(axis)] = AXES.index(bare)
         sign[AXES.index(axis)] = -1.0 if word.startswith("-") else 1.0

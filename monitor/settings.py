@@ -69,8 +69,9 @@ class VirtualTable(LinkSettings, frozen=True, kw_only=True):
 class ZenohTable(_Table, frozen=True, kw_only=True):
     """``[zenoh]``."""
 
-    mode: Literal["peer", "client", "router", "none"] = "peer"
-    listen: tuple[str, ...] = ("tcp/127.0.0.1:7450",)
+    mode: Literal["peer", "client", "router", "none"] | None = "peer"
+    listen: tuple[str, ...] | None = ("tcp/127.0.0.1:7450",)
+    """These two are None where a zenoh file is named and they are not given beside it: then the file's hold."""
     connect: tuple[str, ...] = ()
     config: Path | None = None
     prefix: Annotated[str, msgspec.Meta(pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$")] = "imu"
@@ -172,7 +173,8 @@ class _Reader:
         names = [entry.get("name") for entry in file.device]
         for name in sorted({str(n) for n in names if names.count(n) > 1 and n is not None}):
             self.wrong.append(f'device: {names.count(name)} devices are named "{name}"; names must be unique')
-        zenoh = self.fill(ZenohTable, file.zenoh, "zenoh")
+        unsaid = dict.fromkeys({"mode", "listen"} - file.zenoh.keys()) if "config" in file.zenoh else {}
+        zenoh = self.fill(ZenohTable, {**unsaid, **file.zenoh}, "zenoh")
         viewer = self.fill(ViewerTable, file.viewer, "viewer")
         log = self.fill(LogTable, file.log, "log")
         if viewer is not None:
@@ -190,7 +192,7 @@ class _Reader:
 
     def _reachable(self, zenoh: ZenohTable) -> None:
         """Whether the session could ever open."""
-        for key, endpoints in (("listen", zenoh.listen), ("connect", zenoh.connect)):
+        for key, endpoints in (("listen", zenoh.listen or ()), ("connect", zenoh.connect)):
             for endpoint in endpoints:
                 if not ENDPOINT.fullmatch(endpoint):
                     self.wrong.append(f'zenoh.{key}: "{endpoint}" is no endpoint; write "tcp/127.0.0.1:7450"')
@@ -402,7 +404,7 @@ def _axes(table: dict[str, str]) -> AxisMap:
     except KeyError as error:
         axis, word = error.args
         raise ConfigError(
-            f'{axis} = "{word}"; both are one of {" ".join(AXES)}, the right one with or without -'
+            f'{axis} = "{word}"; both are one of {" ".join(AXES)} and of one kind, the right one with or without -'
         ) from None
 
 

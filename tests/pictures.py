@@ -45,7 +45,7 @@ SPARE_S = 900.0  # of the recording beyond the hour, so that it still runs when 
 GAP_S = (1403.0, 1404.5)  # since T0: what the recording lost
 SPEED = 60.0
 SETTLE_S = 6.0  # for a software renderer to paint what has arrived
-PAGE_S = 15.0  # the same for WebAssembly on a software renderer
+STILL_S = 5.0  # a page that has not changed for so long has caught up with what was sent
 PULLED_S, PLUGGED_S, PULLED_AGAIN_S, LOOKED_S = 30.0, 34.0, 70.0, 74.0  # since the fleet's start
 CHROMIUM_FLAGS = (
     *("--headless=new", "--no-sandbox", "--no-first-run", "--disable-background-networking"),
@@ -127,10 +127,9 @@ def web(out: Path, folder: Path) -> Path:
         page.call("Page.navigate", url=url + "&renderer=webgl&hide_welcome_screen=1")
         with serving(folder, replay(folder), port) as service:
             until(lambda: replayed(service, HOUR_S), 300.0)
-        time.sleep(PAGE_S)
-        shot = page.call("Page.captureScreenshot", format="png")
+        picture = still(page)
     path = out / "viewer-web.png"
-    path.write_bytes(base64.b64decode(shot["data"]))
+    path.write_bytes(picture)
     return path
 
 
@@ -283,6 +282,18 @@ class Page:
             whole += self._in.read(size)
             if first & 0x80:
                 return whole
+
+
+def still(page: Page) -> bytes:
+    """Its picture once it has caught up: on a software renderer it may be half a minute behind."""
+    before = b""
+    for _ in range(24):
+        picture = base64.b64decode(page.call("Page.captureScreenshot", format="png")["data"])
+        if picture == before:
+            return picture
+        before = picture
+        time.sleep(STILL_S)
+    raise TimeoutError(f"the page still changes after {24 * STILL_S:.0f} s")
 
 
 @contextmanager

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import msgspec
 
-from drivers.errors import LinkLost, LinkUnavailable
+from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.plugin import nearest
 from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk
@@ -271,5 +271,15 @@ def _plain(error: Exception) -> str:
 
 
 def build(settings: Settings) -> Link:
-    """The link of these settings; opens nothing, and does not load python-can."""
+    """The link of these settings; opens nothing.
+
+    Raises ``ConfigError`` for an interface that python-can does not know.
+    """
+    from can.interfaces import VALID_INTERFACES
+
+    if settings.interface not in VALID_INTERFACES:
+        known = tuple(sorted(VALID_INTERFACES))
+        raise ConfigError(
+            f'interface "{settings.interface}": python-can has none such{nearest(settings.interface, known)}'
+        )
     return CanLink(settings)

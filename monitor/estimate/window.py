@@ -32,7 +32,7 @@ from monitor.compiled import compiled
 MIN_LENGTH: Final = 100
 """Samples; a shorter window holds no Allan curve worth a name."""
 MAX_LENGTH: Final = 10_000_000
-"""Samples; 96 bytes each are kept."""
+"""Samples; 64 bytes each are kept, 96 once any has been missing."""
 AXES: Final = 6
 LANES: Final = 8
 """Columns kept a sample: six axes padded to a vector register."""
@@ -236,11 +236,13 @@ def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.in
             step = np.rint(y)
             scaling[LANES + lane] = y - step
             phase[now + lane] = phase[before + lane] + np.int64(step)
-            missing[now + lane] = missing[before + lane]
+            count = missing[before + lane]
         else:
             phase[now + lane] = phase[before + lane]
-            missing[now + lane] = missing[before + lane] + 1
+            count = missing[before + lane] + 1
             state[STRUCK] = state[TOTAL]
+        if missing[now + lane] != count:  # not written while it stays 0, so that the system need not give the memory
+            missing[now + lane] = count
 
 
 @compiled

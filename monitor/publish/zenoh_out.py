@@ -35,14 +35,17 @@ CLOSED: Final = {
 """JSON of what a session is unless told otherwise; zenoh's own defaults scout."""
 
 
+LISTEN: Final = ("tcp/127.0.0.1:7450",)
+
+
 @dataclass(frozen=True, slots=True)
 class ZenohSettings:
     """How the daemon's own session is opened; see ``[zenoh]``."""
 
-    mode: Literal["peer", "client", "router", "none"] = "peer"
-    listen: tuple[str, ...] = ("tcp/127.0.0.1:7450",)
+    mode: Literal["peer", "client", "router", "none"] | None = "peer"
+    listen: tuple[str, ...] | None = LISTEN
     connect: tuple[str, ...] = ()
-    config: Path | None = None
+    config: Path | None = None  # a zenoh file; mode and listen of None are its own
     prefix: str = "imu"
 
 
@@ -69,6 +72,7 @@ class ZenohOut:
         self._session: zenoh.Session | None = None
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._tokens: dict[str, Any] = {}
+        self._showing = threading.Lock()  # the opener and the loop both show who is alive
         self._threads: list[threading.Thread] = []
         self._closing = threading.Event()
 
@@ -154,25 +158,29 @@ class ZenohOut:
         """The session; on a busy port with any free one, and what to say of it."""
         import zenoh
 
+        listen = self.settings.listen
         try:
-            return zenoh.open(self._configuration(self.settings.listen)), "ok"
+            return zenoh.open(self._configuration(listen)), "ok"
         except zenoh.ZError as error:
-            if "in use" not in str(error):
+            if "in use" not in str(error) or listen is None:
                 raise
-            free = tuple(_free_port(endpoint) for endpoint in self.settings.listen)
+            free = tuple(_free_port(endpoint) for endpoint in listen)
             session = zenoh.open(self._configuration(free))
-            return session, f"ok, but {', '.join(self.settings.listen)} is busy: listening on {', '.join(free)}"
+            return session, f"ok, but {', '.join(listen)} is busy: listening on {', '.join(free)}"
 
-    def _configuration(self, listen: tuple[str, ...]) -> "zenoh.Config":
+    def _configuration(self, listen: tuple[str, ...] | None) -> "zenoh.Config":
+        """Our keys, over the file's where there is one, over those of a closed session."""
         import zenoh
 
-        own = self.settings
+        own, unsaid = self.settings, zenoh.Config()
         config = zenoh.Config.from_file(str(own.config)) if own.config else zenoh.Config()
-        for key, value in CLOSED.items():
-            if config.get_json(key) == "null":  # the file, if there is one, says nothing of it
+        closed = {**CLOSED, "mode": '"peer"', "listen/endpoints": json.dumps(LISTEN)}
+        for key, value in closed.items():
+            if config.get_json(key) == unsaid.get_json(key):
                 config.insert_json5(key, value)
-        config.insert_json5("mode", json.dumps(own.mode))
-        if own.mode != "client":
+        if own.mode is not None:
+            config.insert_json5("mode", json.dumps(own.mode))
+        if listen is not None and own.mode != "client":
             config.insert_json5("listen/endpoints", json.dumps(listen))
         if own.connect:
             config.insert_json5("connect/endpoints", json.dumps(own.connect))
@@ -196,7 +204,8 @@ class ZenohOut:
         if session is None:
             return
         key = topics.ALIVE.key(self.settings.prefix, device)
-        with contextlib.suppress(*_zenoh_errors()):  # the session is being closed: the token goes with it
+        # an error here is the session being closed: the token goes with it
+        with self._showing, contextlib.suppress(*_zenoh_errors()):
             if self._alive[device] and device not in self._tokens:
                 self._tokens[device] = session.liveliness().declare_token(key)
             elif not self._alive[device] and device in self._tokens:
