@@ -279,7 +279,5 @@ def build(settings: Settings) -> Link:
 
     if settings.interface not in VALID_INTERFACES:
         known = tuple(sorted(VALID_INTERFACES))
-        raise ConfigError(
-            f'interface "{settings.interface}": python-can has none such{nearest(settings.interface, known)}'
-        )
+        raise ConfigError(f'no interface "{settings.interface}" in python-can{nearest(settings.interface, known)}')
     return CanLink(settings)

@@ -82,7 +82,8 @@ def on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Float
         pieces.append(samples.values)
     missing = sum(samples.lost for samples in stamped)
     if holes:
-        notes.append(f"{missing} samples are missing in {holes} places; terms that touch them are left out")
+        places = "1 place" if holes == 1 else f"{holes} places"
+        notes.append(f"{missing} samples are missing in {places}; terms that touch them are left out")
     return np.concatenate(pieces), rate, notes
 
 
