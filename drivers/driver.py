@@ -16,7 +16,7 @@ import numpy as np
 
 from drivers.clock import SampleClock
 from drivers.decoders.base import Decoder
-from drivers.errors import LinkEnded, LinkError, LinkLost
+from drivers.errors import ConfigError, LinkEnded, LinkError, LinkLost
 from drivers.links.base import Link
 from drivers.sample import AXES, Event, Given, SampleBlock, block
 
@@ -91,6 +91,7 @@ class Driver:
         self._events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         self._stop = threading.Event()
         self._undecoded = 0
+        self._placed = 0  # rejected frames whose places have been told as lost
         self._heard_s = 0.0
         self._sampled_s = 0.0
         self._newest_t_ns = 0
@@ -148,7 +149,9 @@ class Driver:
             return
         self._sampled_s, self._undecoded = self._heard_s, 0
         for one in samples:
-            rejected = one.lost
+            # a decoder's hole is of rejected frames, or of messages that a sender counted and nobody received
+            rejected = min(one.lost, self.decoder.bad - self._placed)
+            self._placed += rejected
             for stamped in self.clock.stamp(one):
                 self._count(stamped, rejected)
                 self._push(self._axes.apply(stamped))
@@ -196,6 +199,7 @@ class Driver:
         self.text = f"{error}; trying again"
         self.link.close()
         self.decoder.reset()
+        self._placed = self.decoder.bad
         self.clock.pause()
 
     def _event(self, kind: str, text: str) -> None:
@@ -208,13 +212,15 @@ def axis_map(table: dict[str, str]) -> AxisMap:
     """The map of ``[device.axes]``, e.g. ``{"gz": "-gy"}``: output axis <- signed measured axis.
 
     Raises:
-        KeyError: an axis that is none of AXES, as ``KeyError(key, word)``
+        ConfigError: an axis that is none of AXES, or of the other kind
     """
     source, sign = list(range(6)), [1.0] * 6
     for axis, word in table.items():
         bare = word.lstrip("+-")
         if axis not in AXES or bare not in AXES or axis[0] != bare[0] or len(word) - len(bare) > 1:
-            raise KeyError(axis, word)
+            raise ConfigError(
+                f'{axis} = "{word}"; both are one of {" ".join(AXES)} and of one kind, the right one with or without -'
+            )
         source[AXES.index(axis)] = AXES.index(bare)
         sign[AXES.index(axis)] = -1.0 if word.startswith("-") else 1.0
     return AxisMap(tuple(source), tuple(sign))

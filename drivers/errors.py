@@ -1,4 +1,4 @@
-"""The error tree of the project. Each class also is the matching builtin.
+"""The error tree of the project. A class is the matching builtin too, where there is one.
 
     ImuError
       ConfigError(ValueError)        only while starting; the service refuses to start

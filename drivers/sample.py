@@ -6,6 +6,7 @@ nanoseconds, or Unix time where the source brings its own times; ``ticks`` is th
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -101,7 +102,10 @@ Timing = Arrival | Counter | Given
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something happened to a device: what, when, how large, how sure. Kinds as in CONTRACTS."""
+    """Something happened to a device: what, when, how large, how sure.
+
+    Kinds so far: ``link_lost``, ``link_back``, ``samples_lost``, ``clock_jumped``.
+    """
 
     kind: str
     t_ns: int
@@ -113,7 +117,7 @@ class Event:
 
 
 def join(blocks: Sequence[SampleBlock]) -> SampleBlock:
-    """One block of several, for looking at: ``lost`` of all is summed at the front."""
+    """One block of several; ``lost`` of all is summed at the front."""
     return block(
         np.concatenate([b.t_ns for b in blocks]),
         np.concatenate([b.values for b in blocks]),
@@ -121,3 +125,9 @@ def join(blocks: Sequence[SampleBlock]) -> SampleBlock:
         np.concatenate([b.ticks for b in blocks]),
         sum(b.lost for b in blocks),
     )
+
+
+def unbroken(blocks: Sequence[SampleBlock]) -> list[SampleBlock]:
+    """The same samples in as few blocks as can be: a new one only where samples are missing."""
+    edges = [*(i for i, one in enumerate(blocks) if i == 0 or one.lost), len(blocks)]
+    return [blocks[a] if b - a == 1 else join(blocks[a:b]) for a, b in pairwise(edges)]

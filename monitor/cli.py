@@ -99,7 +99,7 @@ def watch(
     from rich.console import Console
 
     from monitor.publish.terminal import watch as show
-    from monitor.publish.zenoh_in import ENDPOINT
+    from monitor.topics import ENDPOINT
 
     stop = threading.Event()
     _on_signals(stop.set)
@@ -246,10 +246,12 @@ def _log_as(config: "Config") -> None:
 
 def _on_signals(stop: Callable[[], None]) -> None:
     """First SIGINT or SIGTERM: stop in order. A second SIGINT ends at once."""
+    import threading
 
     def first(number: int, _frame: Any) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-        stop()
+        # in a thread of its own: the main one may hold the lock of the very event that stop sets
+        threading.Thread(target=stop, name="stop", daemon=True).start()
 
     signal.signal(signal.SIGINT, first)
     signal.signal(signal.SIGTERM, first)

@@ -1,5 +1,9 @@
-"""One decorator for every kernel: compiled by Numba at first call, cached on disk, without the GIL."""
+"""One decorator for every kernel: compiled by Numba at first call, cached on disk, without the GIL.
 
+Where nothing can be kept on disk (a read-only system, a user without a home) it is compiled at every start.
+"""
+
+import contextlib
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar, cast
 
@@ -11,4 +15,7 @@ R = TypeVar("R")
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """Compile in nopython mode. No fast-math: compensated sums must keep their order."""
-    return cast("Callable[P, R]", numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    kernel = numba.njit(nogil=True, error_model="numpy")(function)
+    with contextlib.suppress(RuntimeError):  # no folder for it
+        kernel.enable_caching()
+    return cast("Callable[P, R]", kernel)

@@ -47,7 +47,7 @@ class ZenohOutput:
         self._zenoh.put(topics.EVENT, device, message.event(device, unix_s, received, event, since_s))
 
     def health(self, device: str, unix_s: float, health: Health) -> None:
-        """Status, and presence while samples flow."""
+        """Status."""
         self._zenoh.put(topics.STATUS, device, message.status(device, unix_s, health))
 
 

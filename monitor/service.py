@@ -17,7 +17,7 @@ from monitor.estimate.estimator import warm_up
 from monitor.outputs import TableOutput, ViewerOutput, ZenohOutput
 from monitor.publish import message
 from monitor.publish.viewer import DeviceInfo, ViewerSettings
-from monitor.publish.zenoh_out import Command, ZenohOut, ZenohSettings
+from monitor.publish.zenoh_out import Command, ZenohOut
 from monitor.settings import Config, Device, VirtualTable
 from monitor.station import Output, Ready, Station
 from monitor.virtual import VirtualImu
@@ -49,11 +49,7 @@ class Service:
         self._stop = threading.Event()
         self.virtual: dict[str, VirtualImu] = {}
         self.stations = [self._station(device) for device in config.devices]
-        own = config.zenoh
-        self.zenoh = ZenohOut(
-            ZenohSettings(own.mode, own.listen, own.connect, own.config, own.prefix),
-            [station.name for station in self.stations],
-        )
+        self.zenoh = ZenohOut(config.zenoh, [station.name for station in self.stations])
         self.view = _viewer(config)
         self._page = ""  # where the viewer's page is, as it was said last
         self.outputs: list[Output] = [ZenohOutput(self.zenoh), *more]
@@ -64,13 +60,20 @@ class Service:
         self._pace_s = 0.0 if every_block else PACE_S
 
     def stop(self) -> None:
-        """Ask the loop to end; may be called from a signal handler or another thread."""
+        """Ask the loop to end; may be called from another thread."""
         self._stop.set()
         self._wake.set()
 
     def run(self, seconds: float | None = None) -> None:
         """Start, loop until stopped (or for so many seconds, or until all replays have ended), stop in order."""
         threading.Thread(target=self._warm_up, name="warm-up", daemon=True).start()
+        try:
+            self._start()
+            self.loop(None if seconds is None else time.monotonic() + seconds)
+        finally:
+            self._close()
+
+    def _start(self) -> None:
         self.zenoh.start()
         if self.view is not None:
             self.view.start()
@@ -78,10 +81,6 @@ class Service:
             imu.start()
         for station in self.stations:
             station.start()
-        try:
-            self.loop(None if seconds is None else time.monotonic() + seconds)
-        finally:
-            self._close()
 
     def loop(self, until_s: float | None) -> None:
         """Rounds over all devices; status once a second."""
@@ -113,8 +112,16 @@ class Service:
 
     def _warm_up(self) -> None:
         """Beside the loop, so that a first start's compilation holds up neither samples nor status."""
-        for kernel in warm_up():
-            (self._ready.window if kernel == "window" else self._ready.fit).set()
+        try:
+            for kernel in warm_up():
+                (self._ready.window if kernel == "window" else self._ready.fit).set()
+                self._wake.set()
+        except OSError as error:
+            _log.warning("compiled kernels cannot be kept, the next start will be slow again", error=str(error))
+        finally:
+            # what has failed is compiled by the loop, or ends it; without this it would wait for ever
+            self._ready.window.set()
+            self._ready.fit.set()
             self._wake.set()
 
     def _station(self, device: Device) -> Station:
@@ -176,7 +183,10 @@ class Service:
         for imu in self.virtual.values():
             imu.stop()
         for station in self.stations:
-            if not station.join(JOIN_S):
+            until_s = time.monotonic() + JOIN_S
+            while not (ended := station.join(PACE_S)) and time.monotonic() < until_s:
+                station.work(self.outputs, time.monotonic())  # a replay waits for room
+            if not ended:
                 _log.warning("reader did not end in time", device=station.name)
             station.work(self.outputs, time.monotonic(), drain=True)
             self.zenoh.alive(station.name, False)

@@ -21,7 +21,7 @@ from drivers.decoders.base import Addressed, Decoder
 from drivers.driver import AxisMap, axis_map
 from drivers.errors import ConfigError
 from drivers.links.base import Filtering, Link, LinkSettings
-from drivers.sample import AXES
+from monitor.topics import ENDPOINT
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -31,7 +31,7 @@ UNITS_S: Final = {"": 1.0, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 
 WINDOW_SAMPLES: Final = (100, 10_000_000)
 WINDOW_LONGEST_S: Final = 40 * 86400.0
 DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
-ENDPOINT: Final = re.compile(r"[a-z]+/.+")
+IS_ENDPOINT: Final = re.compile(r"[a-z]+/.+")
 MEMORY: Final = re.compile(r"[0-9]+(\.[0-9]+)?\s*([kMGT]?i?B|%)")
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
@@ -62,7 +62,7 @@ class VirtualTable(LinkSettings, frozen=True, kw_only=True):
     model: str = "consumer-mems"
     """Path of a model file, or the name of one in the shipped ``config/models``."""
     seed: Annotated[int, msgspec.Meta(ge=0)] = 1
-    speed: Positive = 1.0
+    speed: Annotated[float, msgspec.Meta(gt=0.0, le=10_000.0)] = 1.0
     """Times real time."""
 
 
@@ -70,7 +70,7 @@ class ZenohTable(_Table, frozen=True, kw_only=True):
     """``[zenoh]``."""
 
     mode: Literal["peer", "client", "router", "none"] | None = "peer"
-    listen: tuple[str, ...] | None = ("tcp/127.0.0.1:7450",)
+    listen: tuple[str, ...] | None = (ENDPOINT,)
     """These two are None where a zenoh file is named and they are not given beside it: then the file's hold."""
     connect: tuple[str, ...] = ()
     config: Path | None = None
@@ -194,8 +194,8 @@ class _Reader:
         """Whether the session could ever open."""
         for key, endpoints in (("listen", zenoh.listen or ()), ("connect", zenoh.connect)):
             for endpoint in endpoints:
-                if not ENDPOINT.fullmatch(endpoint):
-                    self.wrong.append(f'zenoh.{key}: "{endpoint}" is no endpoint; write "tcp/127.0.0.1:7450"')
+                if not IS_ENDPOINT.fullmatch(endpoint):
+                    self.wrong.append(f'zenoh.{key}: "{endpoint}" is no endpoint; write "{ENDPOINT}"')
         if zenoh.config is not None and zenoh.mode != "none" and not zenoh.config.is_file():
             self.wrong.append(f"zenoh.config: {zenoh.config}: no such file")
         if zenoh.mode == "client" and not zenoh.connect and zenoh.config is None:
@@ -211,7 +211,7 @@ class _Reader:
         window_s = self._try(f"{at}: window", seconds, entry.window)
         refit_s = self._try(f"{at}: refit", period, entry.refit, "every sample")
         publish_s = self._try(f"{at}: publish", period, entry.publish, "every block")
-        axes = self._try(f"{at}: axes", _axes, entry.axes)
+        axes = self._try(f"{at}: axes", axis_map, entry.axes)
         link, decoder = self.driver(entry.driver, f"{at}: driver")
         if window_s is None or refit_s is None or publish_s is None or axes is None or link is None or decoder is None:
             return None
@@ -220,7 +220,7 @@ class _Reader:
             self.wrong.append(f"{at}: model: {entry.model}: no such file")
         tau = entry.tau if isinstance(entry.tau, str) else tuple(entry.tau)
         self._try(f"{at}: tau", _possible_tau, tau, window_s, entry.rate)
-        silence_s = link.silence if isinstance(link, VirtualTable) else float(entry.driver.get("silence", 3.0))
+        silence_s = float(entry.driver.get("silence", LinkSettings().silence))
         return Device(entry.name, entry.rate, window_s, tau, refit_s, publish_s, link, decoder, axes, silence_s)
 
     def driver(self, table: Mapping[str, Any], at: str) -> tuple[Link | VirtualTable | None, Decoder | None]:
@@ -396,16 +396,6 @@ def _possible_tau(tau: str | tuple[float, ...], window_s: float, rate_hz: float 
     if not any(0.5 * shortest_s < one <= 0.5 * window_s for one in tau):
         low = f"{shortest_s:g} s, one sample," if rate_hz else "one sample"
         raise ConfigError(f"none of {list(tau)} s lies between {low} and {window_s / 2:g} s, half the window")
-
-
-def _axes(table: dict[str, str]) -> AxisMap:
-    try:
-        return axis_map(table)
-    except KeyError as error:
-        axis, word = error.args
-        raise ConfigError(
-            f'{axis} = "{word}"; both are one of {" ".join(AXES)} and of one kind, the right one with or without -'
-        ) from None
 
 
 def _narrow(link: object, decoder: object) -> None:

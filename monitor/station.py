@@ -17,7 +17,7 @@ from drivers.decoders.base import Decoder
 from drivers.driver import Driver
 from drivers.errors import ConfigError, NotReady
 from drivers.links.base import Link
-from drivers.sample import Event, SampleBlock
+from drivers.sample import Event, SampleBlock, unbroken
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.estimator import Estimator
 from monitor.health import Health
@@ -82,7 +82,6 @@ class Station:
         self._wake = wake
         self._ready = ready
         self._patient = link.epoch == "unix"
-        self._stopping = False
         self._wall = WallClock(time.monotonic_ns(), time.time_ns())
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
         self._batch: list[SampleBlock] = []  # not published yet
@@ -104,12 +103,12 @@ class Station:
 
     def stop(self) -> None:
         """Stop reading; what is in the ring stays there to be worked off."""
-        self._stopping = True
         self.driver.stop()
 
     def join(self, timeout_s: float) -> bool:
         """Wait for the reader; False when it did not end in time."""
-        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
     @property
@@ -186,7 +185,7 @@ class Station:
 
     def _push(self, samples: SampleBlock) -> None:
         """Called by the reader's thread. A sensor is never kept waiting; a recording waits for room."""
-        while self._patient and self.ring.room < len(samples) < self.ring.capacity and not self._stopping:
+        while self._patient and self.ring.room < len(samples) < self.ring.capacity:
             time.sleep(PATIENCE_S)
         self.ring.push(samples)
         if not self._waiting_since_ns:
@@ -212,7 +211,7 @@ class Station:
     def _advance(self, blocks: list[SampleBlock]) -> None:
         rate = self.clock.rate_hz
         if self.estimator is None:
-            if rate is None or self._no_estimate:
+            if rate is None or self._no_estimate or not self._ready.window.is_set():
                 return
             try:
                 self.estimator = Estimator(rate, self.device.window_s, self.device.tau)
@@ -228,7 +227,7 @@ class Station:
         if not self._batch or not (self._due("samples", every_s, now_s) or drain):
             return False
         blocks, self._batch = self._batch, []
-        for samples in blocks:
+        for samples in unbroken(blocks):
             self.published += len(samples)
             for output in outputs:
                 output.samples(self.name, self.published, samples, self._offset_ns())

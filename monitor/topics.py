@@ -6,6 +6,8 @@ Keys are ``<prefix>/<device>/<name>``; the prefix is ``imu`` unless ``[zenoh] pr
 from dataclasses import dataclass
 from typing import Final, Literal
 
+ENDPOINT: Final = "tcp/127.0.0.1:7450"
+"""Where a daemon listens unless it is told otherwise: not 7447, where ROS 2's router listens."""
 JSON: Final = "application/json"
 MSGPACK: Final = "application/msgpack"
 

@@ -24,7 +24,8 @@ from monitor import settings, topics
 from monitor.cli import app
 from monitor.publish import message
 from monitor.publish.rerun_sinks import server_url
-from monitor.publish.zenoh_out import ZenohOut, ZenohSettings
+from monitor.publish.zenoh_out import ZenohOut
+from monitor.settings import ZenohTable
 from tests.monitor.publish.made import estimate
 from tests.monitor.publish.zenoh_world import eventually, free_endpoint
 
@@ -216,7 +217,7 @@ def test_a_subscriber_as_printed_prints_what_is_published(page: Path, word: str)
         (topics.COEFFICIENTS, message.coefficients("bench-1", 1.76e9, estimate())),
         (topics.SAMPLES, pack("bench-1", 2, rows)),
     ]
-    zenoh = ZenohOut(ZenohSettings(listen=(endpoint,)), ["bench-1"])
+    zenoh = ZenohOut(ZenohTable(listen=(endpoint,)), ["bench-1"])
     zenoh.start()
     try:
         eventually(lambda: zenoh.state == "ok")

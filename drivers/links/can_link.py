@@ -247,9 +247,6 @@ def _why_not_open(s: Settings, error: Exception) -> str:
     import can
 
     name = f"CAN {s.interface} {s.channel}"
-    known = sorted(can.VALID_INTERFACES)
-    if s.interface not in known:
-        return f'{name}: unknown interface "{s.interface}"{nearest(s.interface, known)}'
     number = getattr(error, "errno", None)
     if number == errno.EAFNOSUPPORT:
         return f"{name}: this kernel has no CAN (AF_CAN); sudo modprobe can_raw, or use slcan"

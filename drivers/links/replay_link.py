@@ -41,7 +41,8 @@ DEFAULT_DECODER: Final = "samples"
 CAN_LOGS: Final = (".asc", ".blf", ".log", ".trc")
 CAPTURES: Final = (".bin", ".raw", ".txt")
 BATCH: Final = 1000
-"""Chunks a read gives at most, so that none is without end."""
+BATCH_BYTES: Final = 1_000_000
+"""What a read gives at most, and a chunk more: so that none is without end, and none holds hours of a recording."""
 ROWS_AT_ONCE: Final = 4096
 STEP_S: Final = 0.02
 """Paced recordings and bytes come in pieces of this length, as from a device with a small buffer."""
@@ -145,8 +146,10 @@ class ReplayLink:
     def _take(self, now_s: float) -> list[Chunk]:
         """All that is due by now."""
         chunks: list[Chunk] = []
-        while self._next is not None and self._due(self._next) <= now_s and len(chunks) < BATCH:
+        size = 0
+        while self._next is not None and self._due(self._next) <= now_s and len(chunks) < BATCH and size < BATCH_BYTES:
             chunks.append(self._next[1])
+            size += len(self._next[1].data)
             self._advance()
         return chunks
 

@@ -12,8 +12,6 @@ closing has it closed by ``atexit``: a thread that still waited in zenoh then wo
 """
 
 import atexit
-import json
-import re
 import threading
 import time
 from collections import deque
@@ -25,6 +23,7 @@ from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.plugin import FilePath
 from drivers.sample import Chunk
+from drivers.zenoh_session import configuration, plain
 
 if TYPE_CHECKING:
     import zenoh
@@ -32,15 +31,6 @@ if TYPE_CHECKING:
 DEFAULT_DECODER: Final = "samples"
 RING_SIZE: Final = 4096
 """Messages; four seconds at 1 kHz."""
-
-
-CLOSED: Final[dict[str, Any]] = {
-    "mode": "peer",
-    "scouting/multicast/enabled": False,
-    "scouting/gossip/enabled": False,
-    "listen/endpoints": [],
-}
-"""What a session is unless told otherwise; zenoh's own defaults scout and listen everywhere."""
 
 
 class Settings(LinkSettings, frozen=True, kw_only=True):
@@ -92,7 +82,7 @@ class ZenohLink:
                 subscriber: Any = session.declare_subscriber(self._settings.key, channel)
             except zenoh.ZError as error:
                 self._close_session()
-                raise LinkUnavailable(f"{self.name}: cannot subscribe: {_plain(error)}") from error
+                raise LinkUnavailable(f"{self.name}: cannot subscribe: {plain(error)}") from error
             self._waiting.clear()
             self._running = True
             self._taker = threading.Thread(
@@ -156,7 +146,7 @@ class ZenohLink:
             help_ = f'no router at {", ".join(s.connect) or "(connect is empty)"}; start it, or use mode = "peer"'
         else:
             help_ = "check the endpoints of listen and connect"
-        return f"{self.name}: {help_}: {_plain(error)}"
+        return f"{self.name}: {help_}: {plain(error)}"
 
 
 def _chunk(sample: Any, t_ns: int) -> Chunk:
@@ -165,28 +155,12 @@ def _chunk(sample: Any, t_ns: int) -> Chunk:
 
 
 def _configuration(settings: Settings) -> "zenoh.Config":
-    """zenoh's configuration: our keys, over the file's, over those of a closed session."""
-    import zenoh
-
-    defaults = zenoh.Config()
-    config = zenoh.Config.from_file(settings.config) if settings.config else zenoh.Config()
-    for key, value in CLOSED.items():
-        if config.get_json(key) == defaults.get_json(key):
-            config.insert_json5(key, json.dumps(value))
     own = {
         "mode": settings.mode,
-        "connect/endpoints": settings.connect,
-        "listen/endpoints": settings.listen,
+        "connect/endpoints": settings.connect or None,
+        "listen/endpoints": settings.listen or None,
     }
-    for key, value in own.items():
-        if value:
-            config.insert_json5(key, json.dumps(value))
-    return config
-
-
-def _plain(error: Exception) -> str:
-    """zenoh's reason without the place in its own source code."""
-    return re.sub(r" at \S+\.rs:\d+\.?", "", " ".join(str(error).split()))
+    return configuration(own, settings.config)
 
 
 def build(settings: Settings) -> Link:
@@ -199,9 +173,9 @@ def build(settings: Settings) -> Link:
     try:
         zenoh.KeyExpr(settings.key)
     except zenoh.ZError as error:
-        raise ConfigError(f'key "{settings.key}": {_plain(error)}') from error
+        raise ConfigError(f'key "{settings.key}": {plain(error)}') from error
     try:
         _configuration(settings)
     except zenoh.ZError as error:
-        raise ConfigError(f"zenoh settings: {_plain(error)}") from error
+        raise ConfigError(f"zenoh settings: {plain(error)}") from error
     return ZenohLink(settings)

@@ -18,6 +18,7 @@ from monitor.estimate.batch import TauGrid, cluster_sizes, overlapping, slope
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.fit import design, fit
+from monitor.estimate.fit_kernel import MIN_ROWS
 from monitor.estimate.uncertainty import intervals, table
 
 FEWEST: Final = 50
@@ -61,7 +62,9 @@ def analyze(
     received = sum(len(samples) for samples in blocks)
     newest_ns = int(blocks[-1].t_ns[-1])
     estimate = Estimate(newest_ns, rate, seconds, received, curve, result.fitted, result.coefficients)
-    return Analysis(estimate, seconds, (*notes, *found, *_left_out(result.left_out, curve.tau_s)))
+    few = [f"{factors.size} averaging times are too few to fit five terms; at least {MIN_ROWS} are needed"]
+    said = few if factors.size < MIN_ROWS else _left_out(result.left_out, curve.tau_s)
+    return Analysis(estimate, seconds, (*notes, *found, *said))
 
 
 def on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Floats, float, list[str]]:
@@ -71,16 +74,16 @@ def on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Float
     rate = rate_hz or _mean_rate(stamped)
     notes = [event.text for event in clock.take_events()[:10]]
     pieces: list[Floats] = []
-    holes = 0
+    holes = missing = 0
     for samples in stamped:
         if samples.lost > LONGEST_HOLE:
             notes.append(f"a pause of {samples.lost / rate:.6g} s is too long to keep in place; no term reaches across")
             pieces.append(np.full((1, 6), np.nan))
         elif samples.lost:
             holes += 1
+            missing += samples.lost
             pieces.append(np.full((samples.lost, 6), np.nan))
         pieces.append(samples.values)
-    missing = sum(samples.lost for samples in stamped)
     if holes:
         places = "1 place" if holes == 1 else f"{holes} places"
         notes.append(f"{missing} samples are missing in {places}; terms that touch them are left out")

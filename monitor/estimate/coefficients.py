@@ -22,7 +22,7 @@ class Status(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Coefficients:
-    """Rows Q N B K R, columns gx … az, in the SI units of CONTRACTS."""
+    """Rows Q N B K R, columns gx … az, in SI: rad, m, s."""
 
     value: Floats  # [5, 6]
     lo: Floats  # [5, 6]

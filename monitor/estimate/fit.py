@@ -1,7 +1,7 @@
 """Allan curve in, coefficients Q N B K R out, six axes at a time.
 
 The curve is linear in θ = (Q², N², B², K², R²). Each axis is fitted by non-negative least squares
-with weights 1/Var(σ²_i) of the model itself, re-weighted a few times (METHODS: edf weights are
+with weights 1/Var(σ²_i) of the model itself, re-weighted a few times (such weights come
 within a few percent of the Cramér–Rao limit). The unconstrained solution û beside it decides what
 a coefficient is worth: its variance were v(t) = c0 + c1 t + c2 t² if the true θ_a were t, from the
 covariances of ``uncertainty``. A term is in when û_a/√c0, the variance taken as if it were absent,

@@ -2,7 +2,8 @@
 
 Comes in: samples, missing ones included as NaN, in their places. Goes out: sums of squared second
 differences S_m and their counts C_m for every cluster size m and axis, from which
-σ²(m) = S_m / (2 m² C_m) (rate form; METHODS 1, `papers/000_…` eq. 12-15). Cost per sample: one added and one
+σ²(m) = S_m / (2 m² C_m) (rate form; "Dynamic extraction of random
+drift error coefficients of MEMS gyroscopes", eq. 12-15). Cost per sample: one added and one
 evicted term a τ and axis, whatever the window's length.
 
 Why it stays exact for years:
@@ -97,12 +98,12 @@ class AllanWindow:
         return int(self._state[TOTAL])
 
     def reset(self) -> None:
-        """Forget all samples."""
-        for array in (self._ints, self._floats, self._missing):
-            array[:] = 0
+        """Forget all samples; phase and the count of missing ones only matter by their differences, and stay."""
+        self._terms[:] = 0
+        self._floats[:] = 0
         _cut_ints(self._ints, self._taus)[1][:] = self.factors
         self._scaling[:LANES] = self._scale
-        self._state[:4] = (0, 0, -(1 << 62), LANES)
+        self._state[[TOTAL, STRUCK, WIDTH]] = (0, -(1 << 62), LANES)
 
     def update(self, values: Floats) -> None:
         """Advance by samples [n, 6], one by one; NaN, and what is beyond any phase (1e7 and more), = missing."""

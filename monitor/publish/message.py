@@ -1,4 +1,4 @@
-"""Results -> bytes: the JSON of CONTRACTS, each payload with schema, device, time and sample count.
+"""Results -> bytes: JSON, each payload with schema, device, time and sample count.
 
 NaN becomes null, as JSON has no word for it. ``t`` is the Unix time of the newest sample in s.
 """
@@ -12,6 +12,7 @@ from drivers.sample import AXES, Event, Floats
 from monitor import topics
 from monitor.estimate.analysis import Analysis
 from monitor.estimate.coefficients import LETTERS, Coefficients, Status
+from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Estimate
 from monitor.health import Health
 
@@ -21,18 +22,14 @@ _ENCODER: Final = msgspec.json.Encoder()
 
 def allan(device: str, unix_s: float, estimate: Estimate) -> bytes:
     """``imu/<device>/allan``: deviation and its 95 % interval at each τ, axes that are measured."""
-    curve = estimate.curve
-    deviation = np.sqrt(curve.avar)
-    axes = {
-        axis: {"deviation": _list(deviation[:, i]), "lo": _list(curve.lo[:, i]), "hi": _list(curve.hi[:, i])}
-        for i, axis in _measured(estimate)
-    }
-    return _encode(topics.ALLAN, device, unix_s, estimate.samples, _window(estimate, tau=_list(curve.tau_s), axes=axes))
+    tau = _list(estimate.curve.tau_s)
+    axes = {axis: _curve(estimate.curve, i) for i, axis in measured_axes(estimate)}
+    return _encode(topics.ALLAN, device, unix_s, estimate.samples, _window(estimate, tau=tau, axes=axes))
 
 
 def coefficients(device: str, unix_s: float, estimate: Estimate) -> bytes:
     """``imu/<device>/coefficients``: Q N B K R of each measured axis with interval and status."""
-    axes = {axis: coefficient_table(estimate.coefficients, i) for i, axis in _measured(estimate)}
+    axes = {axis: coefficient_table(estimate.coefficients, i) for i, axis in measured_axes(estimate)}
     return _encode(topics.COEFFICIENTS, device, unix_s, estimate.samples, _window(estimate, axes=axes))
 
 
@@ -88,19 +85,13 @@ def reply(device: str, unix_s: float, samples: int, text: str) -> bytes:
 def analysis(result: Analysis) -> bytes:
     """``analyze --json``: schema imu-monitor/analyze/1."""
     estimate = result.estimate
-    curve = estimate.curve
-    deviation, tau = np.sqrt(curve.avar), _list(curve.tau_s)
+    tau = _list(estimate.curve.tau_s)
     axes = {
         axis: {
-            "allan": {
-                "tau": tau,
-                "deviation": _list(deviation[:, i]),
-                "lo": _list(curve.lo[:, i]),
-                "hi": _list(curve.hi[:, i]),
-            },
+            "allan": {"tau": tau, **_curve(estimate.curve, i)},
             "coefficients": coefficient_table(estimate.coefficients, i),
         }
-        for i, axis in _measured(estimate)
+        for i, axis in measured_axes(estimate)
     }
     return _ENCODER.encode(
         {
@@ -127,9 +118,15 @@ def _encode(topic: topics.Topic, device: str, unix_s: float, samples: int, paylo
     return _ENCODER.encode({"schema": topic.schema(), "device": device, "t": unix_s, "samples": samples, **payload})
 
 
-def _measured(estimate: Estimate) -> list[tuple[int, str]]:
+def measured_axes(estimate: Estimate) -> list[tuple[int, str]]:
+    """Column and name of each axis that has a curve."""
     avar = estimate.curve.avar
     return [(i, axis) for i, axis in enumerate(AXES) if not np.isnan(avar[:, i]).all()]
+
+
+def _curve(curve: AllanCurve, axis: int) -> dict[str, list[float]]:
+    columns = {"deviation": np.sqrt(curve.avar), "lo": curve.lo, "hi": curve.hi}
+    return {name: _list(column[:, axis]) for name, column in columns.items()}
 
 
 def _number(value: np.float64) -> float | None:

@@ -15,21 +15,20 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Final
 
-import numpy as np
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from drivers.sample import AXES
 from monitor import topics
 from monitor.estimate.coefficients import LETTERS
 from monitor.estimate.estimate import Estimate
 from monitor.publish import heard, units
 from monitor.publish.heard import Heard
+from monitor.publish.message import measured_axes
 from monitor.publish.panels import duration
 from monitor.publish.units import Kind
-from monitor.publish.zenoh_in import ENDPOINT, KEYEXPR, ZenohIn
+from monitor.publish.zenoh_in import KEYEXPR, ZenohIn
 
 REFRESH_S: Final = 0.5
 PLAIN_S: Final = 1.0
@@ -201,7 +200,7 @@ def fleet_table(devices: Sequence[Heard], now_s: float, layout: Layout) -> Table
 
 def watch(
     keyexpr: str = KEYEXPR,
-    connect: Sequence[str] = (ENDPOINT,),
+    connect: Sequence[str] = (topics.ENDPOINT,),
     stop: threading.Event | None = None,
     console: Console | None = None,
     once_s: float | None = None,
@@ -360,7 +359,7 @@ def _clock_time(unix_s: float) -> str:
 
 def analysis_table(estimate: Estimate) -> RenderableType:
     """Coefficients of every measured axis with their intervals, for ``analyze``."""
-    axes = tuple(axis for i, axis in enumerate(AXES) if not np.isnan(estimate.curve.avar[:, i]).all())
+    axes = tuple(axis for _, axis in measured_axes(estimate))
     return Group(*_detail(heard.Noise(estimate.coefficients, axes, None)))
 
 

@@ -1,6 +1,6 @@
 """From SI to the units people know, written once: viewer, terminal and plots take them from here.
 
-In comes a number in the SI units of CONTRACTS (rad, m, s); out goes the same number in the field's
+In comes a number in SI units (rad, m, s); out goes the same number in the field's
 unit, or a short text with the unit beside it. Nothing here computes with field units, and nothing
 elsewhere converts. Factors follow from 1 rad = 180/π °, 1 h = 3600 s (√h = 60 √s) and
 1 g = 9.80665 m/s² (standard gravity, CGPM 1901).

@@ -10,14 +10,13 @@ backlog (a Python callback that is alive at exit would hang the process). ``take
 within a topic; nothing here reads a payload.
 """
 
-import json
-import re
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.errors import ConfigError
+from drivers.zenoh_session import configuration, plain
 from monitor import topics
 from monitor.publish.backlog import Backlog
 
@@ -25,8 +24,6 @@ if TYPE_CHECKING:
     import zenoh
 
 KEYEXPR: Final = "imu/**"
-ENDPOINT: Final = "tcp/127.0.0.1:7450"
-"""Where a daemon listens unless it is told otherwise."""
 TOPICS: Final = (topics.STATUS, topics.COEFFICIENTS, topics.EVENT)
 RING_MESSAGES: Final = 4096
 BACKLOG_BYTES: Final = 16_000_000
@@ -55,7 +52,7 @@ class ZenohIn:
         ConfigError: zenoh refuses the key expression or an endpoint
     """
 
-    def __init__(self, keyexpr: str = KEYEXPR, connect: Sequence[str] = (ENDPOINT,)) -> None:
+    def __init__(self, keyexpr: str = KEYEXPR, connect: Sequence[str] = (topics.ENDPOINT,)) -> None:
         self._keys = {topic: narrowed(keyexpr, topic) for topic in (*TOPICS, topics.ALIVE)}
         self._connect = tuple(connect)
         self._config = _configuration(self._connect)
@@ -110,7 +107,7 @@ class ZenohIn:
                 self._session = session
                 self._subscribe(session)
             except zenoh.ZError as error:
-                self._said = f"{_plain(error)}; trying again"
+                self._said = f"{plain(error)}; trying again"
                 self._end()
                 self._closing.wait(RETRY_S)
             else:
@@ -180,7 +177,7 @@ def _check_keys(keyexpr: str, keys: list[str]) -> None:
         for key in keys:
             zenoh.KeyExpr(key)
     except zenoh.ZError as error:
-        raise ConfigError(f'key expression "{keyexpr}": {_plain(error)}') from error
+        raise ConfigError(f'key expression "{keyexpr}": {plain(error)}') from error
     if not keys:
         shown = ", ".join(topic.name for topic in (*TOPICS, topics.ALIVE))
         raise ConfigError(f'key expression "{keyexpr}": nothing to show of it; shown are {shown}')
@@ -189,24 +186,9 @@ def _check_keys(keyexpr: str, keys: list[str]) -> None:
 def _configuration(connect: tuple[str, ...]) -> "zenoh.Config":
     import zenoh
 
-    config = zenoh.Config()
-    keys = {
-        "mode": "peer",
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "listen/endpoints": [],
-    }
-    for key, value in keys.items():
-        config.insert_json5(key, json.dumps(value))
     for endpoint in connect:
         try:
-            config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+            configuration({"connect/endpoints": [endpoint]})
         except zenoh.ZError as error:
-            raise ConfigError(f'connect "{endpoint}": no endpoint; write e.g. {ENDPOINT}') from error
-    config.insert_json5("connect/endpoints", json.dumps(connect))
-    return config
-
-
-def _plain(error: Exception) -> str:
-    """zenoh's reason without the place in its own source code."""
-    return re.sub(r"\s+at \S+\.rs:\d+\.?", "", " ".join(str(error).split()))
+            raise ConfigError(f'connect "{endpoint}": no endpoint; write e.g. {topics.ENDPOINT}') from error
+    return configuration({"connect/endpoints": connect})

@@ -17,36 +17,17 @@ import socket
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
+from drivers.zenoh_session import CLOSED, configuration, plain
 from monitor import topics
+from monitor.settings import ZenohTable
 
 if TYPE_CHECKING:
     import zenoh
 
 RETRY_S: Final = 2.0
 QUERIES_WAITING: Final = 64
-CLOSED: Final = {
-    "scouting/multicast/enabled": "false",
-    "scouting/gossip/enabled": "false",
-    "timestamping/enabled": "true",
-}
-"""JSON of what a session is unless told otherwise; zenoh's own defaults scout."""
-
-
-LISTEN: Final = ("tcp/127.0.0.1:7450",)
-
-
-@dataclass(frozen=True, slots=True)
-class ZenohSettings:
-    """How the daemon's own session is opened; see ``[zenoh]``."""
-
-    mode: Literal["peer", "client", "router", "none"] | None = "peer"
-    listen: tuple[str, ...] | None = LISTEN
-    connect: tuple[str, ...] = ()
-    config: Path | None = None  # a zenoh file; mode and listen of None are its own
-    prefix: str = "imu"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +43,7 @@ class Command:
 class ZenohOut:
     """The daemon's session and what it declares for each device."""
 
-    def __init__(self, settings: ZenohSettings, devices: Sequence[str]) -> None:
+    def __init__(self, settings: ZenohTable, devices: Sequence[str]) -> None:
         self.settings = settings
         self._said = "off" if settings.mode == "none" else "not open yet"
         self._unsent = ""  # why the newest message did not go out
@@ -73,7 +54,8 @@ class ZenohOut:
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._tokens: dict[str, Any] = {}
         self._showing = threading.Lock()  # the opener and the loop both show who is alive
-        self._threads: list[threading.Thread] = []
+        self._opener = threading.Thread(target=self._open_until_open, name="zenoh open", daemon=True)
+        self._takers: list[threading.Thread] = []
         self._closing = threading.Event()
 
     @property
@@ -91,9 +73,7 @@ class ZenohOut:
         """Open in a thread of its own: a router that is not there must not hold up the samples."""
         if self.settings.mode == "none":
             return
-        opener = threading.Thread(target=self._open_until_open, name="zenoh open", daemon=True)
-        opener.start()
-        self._threads.append(opener)
+        self._opener.start()
 
     def put(self, topic: topics.Topic, device: str, payload: bytes) -> None:
         """Send, or drop while there is no session."""
@@ -105,7 +85,7 @@ class ZenohOut:
         try:
             publisher.put(payload)
         except zenoh.ZError as error:
-            self._unsent = f"cannot send: {_plain(error)}"
+            self._unsent = f"cannot send: {plain(error)}"
         else:
             self._unsent = ""
 
@@ -116,14 +96,11 @@ class ZenohOut:
             self._show_alive(device)
 
     def close(self) -> None:
-        """Take away tokens, close the session, end the threads."""
+        """Close the session, which takes away tokens, and end the threads."""
         self._closing.set()
-        session, self._session = self._session, None
-        self._publishers = {}
-        if session is not None:
-            session.close()  # type: ignore[no-untyped-call]
-        for thread in self._threads:
-            thread.join(timeout=RETRY_S)
+        if self._opener.is_alive():
+            self._opener.join(RETRY_S)
+        self._end()
 
     # --- opening
 
@@ -133,16 +110,29 @@ class ZenohOut:
             try:
                 self._open()
             except errors as error:
-                self._said = f"{_plain(error)}; trying again"
+                self._said = f"{plain(error)}; trying again"
+                self._end()
                 self._closing.wait(RETRY_S)
             else:
+                if self._closing.is_set():  # it took longer than close waits
+                    self._end()
                 return
+
+    def _end(self) -> None:
+        """Close the session, which ends the threads that take from it."""
+        session, self._session = self._session, None
+        self._publishers = {}
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+        with self._showing:
+            self._tokens = {}  # they went with the session
+        takers, self._takers = self._takers, []
+        for taker in takers:
+            taker.join(RETRY_S)
 
     def _open(self) -> None:
         session, said = self._open_session()
-        if self._closing.is_set():
-            session.close()  # type: ignore[no-untyped-call]
-            return
+        self._session = session
         publishers = {}
         for device in self._devices:
             for topic in topics.TOPICS:
@@ -150,7 +140,7 @@ class ZenohOut:
                     key = topic.key(self.settings.prefix, device)
                     publishers[key] = self._publisher(session, topic, key)
             self._declare_commands(session, device)
-        self._session, self._publishers, self._said = session, publishers, said
+        self._publishers, self._said = publishers, said
         for device in self._devices:
             self._show_alive(device)
 
@@ -170,21 +160,14 @@ class ZenohOut:
 
     def _configuration(self, listen: tuple[str, ...] | None) -> "zenoh.Config":
         """Our keys, over the file's where there is one, over those of a closed session."""
-        import zenoh
-
-        own, unsaid = self.settings, zenoh.Config()
-        config = zenoh.Config.from_file(str(own.config)) if own.config else zenoh.Config()
-        closed = {**CLOSED, "mode": '"peer"', "listen/endpoints": json.dumps(LISTEN)}
-        for key, value in closed.items():
-            if config.get_json(key) == unsaid.get_json(key):
-                config.insert_json5(key, value)
-        if own.mode is not None:
-            config.insert_json5("mode", json.dumps(own.mode))
-        if listen is not None and own.mode != "client":
-            config.insert_json5("listen/endpoints", json.dumps(listen))
-        if own.connect:
-            config.insert_json5("connect/endpoints", json.dumps(own.connect))
-        return config
+        own = self.settings
+        keys = {
+            "mode": own.mode,
+            "listen/endpoints": None if own.mode == "client" else listen,
+            "connect/endpoints": own.connect or None,
+        }
+        unsaid = {**CLOSED, "listen/endpoints": [topics.ENDPOINT], "timestamping/enabled": True}
+        return configuration(keys, own.config, unsaid)
 
     def _publisher(self, session: "zenoh.Session", topic: topics.Topic, key: str) -> "zenoh.Publisher":
         import zenoh
@@ -220,7 +203,7 @@ class ZenohOut:
             target=self._take_queries, args=(device, queryable), name=f"commands of {device}", daemon=True
         )
         taker.start()
-        self._threads.append(taker)
+        self._takers.append(taker)
 
     def _take_queries(self, device: str, queryable: Any) -> None:
         """Queries until the session is closed."""
@@ -230,20 +213,22 @@ class ZenohOut:
                 query = handler.recv()
             except _zenoh_errors():
                 return
-            command = Command(device, str(query.key_expr).rsplit("/", 1)[-1], *_answers(query))
+            verb = str(query.key_expr).rsplit("/", 1)[-1]
+            key = f"{self.settings.prefix}/{device}/command/{verb}"  # the query's own may stand for many devices
+            command = Command(device, verb, *_answers(query, key))
             try:
                 self.commands.put_nowait(command)
             except queue.Full:
                 command.refuse("busy: too many commands wait")
 
 
-def _answers(query: Any) -> tuple[Callable[[bytes], None], Callable[[str], None]]:
+def _answers(query: Any, key: str) -> tuple[Callable[[bytes], None], Callable[[str], None]]:
     """Functions that end a query with a result, or with an error."""
     import zenoh
 
     def answer(payload: bytes) -> None:
         with query:
-            query.reply(query.key_expr, payload, encoding=zenoh.Encoding(topics.JSON))
+            query.reply(key, payload, encoding=zenoh.Encoding(topics.JSON))
 
     def refuse(why: str) -> None:
         with query:
@@ -266,8 +251,3 @@ def _zenoh_errors() -> tuple[type[Exception], ...]:
     import zenoh
 
     return (zenoh.ZError,)
-
-
-def _plain(error: Exception) -> str:
-    """zenoh's reason without the place in its own source code."""
-    return re.sub(r"\s+at \S+\.rs:\d+\.?", "", " ".join(str(error).split()))

@@ -4,7 +4,7 @@
 
 Another process writes VectorNav binary frames at 1 kHz to one pseudo-terminal a device; the daemon reads them by its
 serial link, with window and publishing as they are by default but for a window of ten minutes (a
-window holds 96 bytes a sample, an hour of 16 devices at 1 kHz 5.5 GB); this process subscribes to all it
+window holds 64 bytes a sample, an hour of 16 devices at 1 kHz 3.7 GB); this process subscribes to all it
 publishes. Processor time is taken from 5 s after the first sample to the last one. What is sent must be received, bad
 or lost.
 """

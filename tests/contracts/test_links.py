@@ -83,7 +83,7 @@ def can_virtual_rig(tmp_path: Path) -> Iterator[Rig]:
     with can.Bus(interface="virtual", channel=channel) as peer:
         message = can.Message(arbitration_id=9, is_extended_id=False, data=DATA)
         link = build("can", interface="virtual", channel=channel)
-        absent = build("can", interface="nonesuch", channel=channel)
+        absent = build("can", interface="socketcan", channel="nonesuch0")
         why = "a virtual bus, as a real one, is there whether or not anybody sends"
         yield Rig(link, lambda: peer.send(message), None, absent, why)
         link.close()

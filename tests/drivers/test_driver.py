@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from drivers.clock import SampleClock
+from drivers.decoders import samples as samples_decoder
 from drivers.decoders import stim300, text, vectornav_binary
 from drivers.driver import UNDECODED_BYTES, AxisMap, Driver, axis_map
+from drivers.errors import ConfigError
 from drivers.links.loopback_link import LoopbackLink
 from drivers.sample import NO_TICK, Chunk, block
+from drivers.sample_message import pack
 
 RATE = 100.0
 
@@ -268,6 +271,22 @@ def test_loss_counts_once_beside_rejected_frames_in_one_read():
     assert (counts.received, counts.bad, counts.lost) == (56, 1, 3)
 
 
+def test_messages_that_never_came_are_lost_and_rejected_ones_are_bad():
+    """The sender's count tells both: here of 10 messages of 10 samples."""
+    decoder = samples_decoder.build(samples_decoder.Settings())
+    rig = Rig(decoder)
+    t_ns = 1_700_000_000 * 10**9 + 10_000_000 * np.arange(100)
+    messages = [pack("a", n, block(t_ns[n - 10 : n], np.ones((10, 6)))) for n in range(10, 101, 10)]
+    messages[3] = messages[3][:40]
+    del messages[6:8]
+    for message in messages:
+        rig.link.write(message)
+    rig.link.end()
+    rig.driver.run()
+    counts = rig.driver.counts
+    assert (counts.received, counts.bad, counts.lost) == (70, 1, 29)  # a message that cannot be read counts as one
+
+
 def test_times_follow_what_the_link_brings():
     rig = Rig()
     rig.link.epoch = "unix"
@@ -312,7 +331,7 @@ def test_axis_map_keeps_all_else():
 
 @pytest.mark.parametrize("table", [{"gq": "gx"}, {"gx": "mx"}, {"gx": "--gy"}, {"gx": ""}, {"gx": "-"}])
 def test_axes_that_are_none_are_refused(table):
-    with pytest.raises(KeyError):
+    with pytest.raises(ConfigError, match="both are one of gx gy gz ax ay az and of one kind"):
         axis_map(table)
 
 

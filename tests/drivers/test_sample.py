@@ -1,9 +1,11 @@
 """Sample blocks: read-only, absent is NaN, and loss stays where it happened."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from drivers.sample import AXES, NO_TICK, block, join
+from drivers.sample import AXES, NO_TICK, block, join, unbroken
 
 
 def a_block(n=5, start=0, lost=0):
@@ -60,3 +62,13 @@ def test_join_sums_the_loss():
     joined = join([a_block(2, lost=1), a_block(3, start=2, lost=4)])
     assert joined.lost == 5
     assert joined.t_ns.tolist() == [0, 1, 2, 3, 4]
+
+
+def test_unbroken_joins_what_nothing_is_missing_between():
+    t_ns = np.arange(10, dtype=np.int64)
+    whole = block(t_ns, np.arange(60.0).reshape(10, 6))
+    pieces = [whole[:2], replace(whole[2:3], lost=4), whole[3:7], replace(whole[7:], lost=1)]
+    found = unbroken(pieces)
+    assert [(len(one), one.lost) for one in found] == [(2, 0), (5, 4), (3, 1)]
+    np.testing.assert_array_equal(np.concatenate([one.values for one in found]), whole.values)
+    assert unbroken([]) == []

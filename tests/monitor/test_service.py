@@ -2,12 +2,16 @@
 
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 from structlog.testing import capture_logs
 
+from drivers.recording import save_samples
+from monitor import service as service_module
 from monitor import settings
 from monitor.outputs import TableOutput
 from monitor.publish.terminal import Board
@@ -66,3 +70,36 @@ def test_a_recording_of_long_ago_leaves_nothing_at_todays_date(tmp_path: Path) -
     assert "ENDED" in str(cells["/d/status"])
     times_s = [t / 1e9 for entity in cells.values() for t in entity.get("sample_time", []) if isinstance(t, int)]
     assert RECORDED_S <= min(times_s) <= max(times_s) <= RECORDED_S + 1.0
+
+
+def test_kernels_that_cannot_be_kept_hold_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full_disk() -> Iterator[str]:
+        yield "window"
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(service_module, "warm_up", full_disk)
+    save_samples(tmp_path / "short.npz", np.arange(500) / 100.0, np.random.default_rng(1).standard_normal((500, 6)))
+    service = Service(config(tmp_path, 'link = "replay", path = "short.npz", speed = "max"', 'mode = "none"'))
+    with capture_logs() as logs:
+        service.run(20.0)
+    latest = service.stations[0].latest
+    assert latest is not None
+    assert latest.samples == 500
+    assert np.isfinite(latest.fitted[:, 2]).any()
+    assert ["No space left" in str(line.get("error")) for line in logs].count(True) == 1
+
+
+def test_a_replay_that_is_stopped_loses_nothing_it_has_counted(tmp_path: Path) -> None:
+    n = 1_000_000  # many times what the ring holds
+    save_samples(tmp_path / "long.npz", np.arange(n) / 100.0, np.random.default_rng(1).standard_normal((n, 6)))
+    service = Service(config(tmp_path, 'link = "replay", path = "long.npz", speed = "max"', 'mode = "none"'))
+    (station,) = service.stations
+    thread = threading.Thread(target=service.run)
+    thread.start()
+    assert wait_for(lambda: station.published > 0)
+    service.stop()
+    thread.join(20.0)
+    assert not thread.is_alive()
+    assert station.driver.state != "ended"
+    assert station.ring.overflowed == 0
+    assert station.published == station.driver.counts.received < n

@@ -13,8 +13,10 @@ from drivers.decoders.vectornav_ascii import VectornavAsciiDecoder
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
 from drivers.links import serial_link
+from monitor.estimate.window import MAX_LENGTH, MIN_LENGTH
 from monitor.settings import (
     CONFIG_FOLDER,
+    WINDOW_SAMPLES,
     DeviceTable,
     LogTable,
     ViewerTable,
@@ -133,6 +135,10 @@ CASES = {
     "silence below 0": (
         device(driver='driver = { link = "serial", port = "x", decoder = "stim300", silence = "3" }'),
         ["device a: driver.silence: Expected `float`"],
+    ),
+    "a virtual speed without end": (
+        device(driver='driver = { link = "virtual", speed = inf }'),
+        ["device a: driver.speed: Expected `float` <= 10000.0"],
     ),
     "unknown virtual model": (device(driver='driver = { link = "virtual", model = "none" }'), ['no model "none"']),
     "replay of what cannot be": (
@@ -325,3 +331,7 @@ def test_virtual_model_may_be_a_file_beside_the_configuration(tmp_path):
     link = load(path).devices[0].link
     assert isinstance(link, VirtualTable)
     assert Path(link.model) == tmp_path / "mine.toml"
+
+
+def test_windows_that_are_accepted_are_those_that_the_estimator_can_hold():
+    assert WINDOW_SAMPLES == (MIN_LENGTH, MAX_LENGTH)

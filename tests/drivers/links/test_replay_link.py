@@ -61,6 +61,18 @@ def test_a_recording_arrives_as_it_is(tmp_path: Path) -> None:
     assert got.lost == 0
 
 
+def test_no_read_brings_hours_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "r.npz"
+    write_recording(path, 200_000)
+    link = build(path)
+    link.open()
+    sizes = []
+    while sum(sizes) < 8_000_000:
+        sizes.append(sum(len(chunk.data) for chunk in link.read(1.0) or []))
+    link.close()
+    assert max(sizes) < 1_300_000  # 56 bytes a sample, 4096 samples a message
+
+
 def test_uneven_times_of_a_recording_are_kept(tmp_path: Path) -> None:
     path = tmp_path / "r.csv"
     rows = ["t,gz,ax", "1700000000.0,1,2", "1700000000.013,3,", "1700000000.011,5,6", "1700000007.5,7,8"]

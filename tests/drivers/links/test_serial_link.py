@@ -148,6 +148,8 @@ def test_not_exclusive_lets_others_read(pty: tuple[int, str]) -> None:
     pair = build(port=pty[1], exclusive=False), build(port=pty[1], exclusive=False)
     for link in pair:
         link.open()
+    os.write(pty[0], b"abc")
+    assert b"c" in b"".join(chunk.data for link in pair for chunk in link.read(0.3) or ())
     for link in pair:
         link.close()
 

@@ -51,6 +51,13 @@ def test_holes_stay_in_their_places(rate, rows):
     assert np.array_equal(grid, expected, equal_nan=True)
 
 
+def test_a_very_long_pause_is_not_counted_among_the_short_holes():
+    index = np.concatenate([np.arange(3000), 3000 + 2 * LONGEST_HOLE + np.arange(3000)])
+    index = np.delete(index, [1000, 1001, 1002])
+    _, _, notes = on_grid(recording(index / 100, white(5997)), 100.0)
+    assert "3 samples are missing in 1 place; terms that touch them are left out" in notes
+
+
 def test_a_very_long_pause_costs_no_memory_and_no_term_reaches_across():
     t = np.concatenate([np.arange(3000) / 100, 30.0 + 2 * LONGEST_HOLE / 100 + np.arange(3000) / 100])
     values = white(6000)
@@ -128,3 +135,9 @@ def test_recordings_of_real_sensors(name, rate):
     received = sum(len(one) for one in blocks)
     assert received <= found.estimate.curve.n <= 1.02 * received
     assert (found.estimate.coefficients.status[1, :3] != Status.UNESTIMATED).all()
+
+
+def test_too_few_averaging_times_for_a_fit_are_said():
+    found = analyze(recording(np.arange(6000) / 100), 100.0, (0.1, 1.0, 10.0))
+    assert found.notes == ("3 averaging times are too few to fit five terms; at least 5 are needed",)
+    assert (found.estimate.coefficients.status == Status.UNESTIMATED).all()

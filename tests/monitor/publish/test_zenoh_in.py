@@ -20,7 +20,8 @@ from drivers.errors import ConfigError
 from monitor import topics
 from monitor.publish import message, terminal
 from monitor.publish.zenoh_in import Message, ZenohIn
-from monitor.publish.zenoh_out import ZenohOut, ZenohSettings
+from monitor.publish.zenoh_out import ZenohOut
+from monitor.settings import ZenohTable
 from tests.monitor.publish import made
 from tests.monitor.publish.zenoh_world import eventually, free_endpoint, router
 
@@ -33,9 +34,7 @@ def endpoint() -> str:
 @contextlib.contextmanager
 def daemon(endpoint: str, device: str, mode: str = "peer") -> Iterator[ZenohOut]:
     """A daemon's session that sends status ten times a second, and what no watcher needs beside it."""
-    settings = (
-        ZenohSettings(listen=(endpoint,)) if mode == "peer" else ZenohSettings(mode="client", connect=(endpoint,))
-    )
+    settings = ZenohTable(listen=(endpoint,)) if mode == "peer" else ZenohTable(mode="client", connect=(endpoint,))
     out = ZenohOut(settings, [device])
     ending = threading.Event()
 

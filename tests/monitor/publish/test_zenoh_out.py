@@ -17,7 +17,8 @@ import pytest
 import zenoh
 
 from monitor import topics
-from monitor.publish.zenoh_out import Command, ZenohOut, ZenohSettings
+from monitor.publish.zenoh_out import Command, ZenohOut
+from monitor.settings import ZenohTable
 from tests.monitor.publish.zenoh_world import eventually, free_endpoint, router, session
 
 DEVICES = ("bench-1", "bench-2")
@@ -31,7 +32,7 @@ def endpoint() -> str:
 
 @contextlib.contextmanager
 def started(**settings: Any) -> Iterator[ZenohOut]:
-    out = ZenohOut(ZenohSettings(**settings), DEVICES)
+    out = ZenohOut(ZenohTable(**settings), DEVICES)
     out.start()
     try:
         yield out
@@ -148,6 +149,15 @@ def test_a_command_is_answered(endpoint: str) -> None:
         assert str(reply.ok.encoding) == topics.JSON
 
 
+def test_a_command_to_all_devices_is_answered_by_each(endpoint: str) -> None:
+    with through_a_router(endpoint) as (out, client):
+        threads = [answering(out), answering(out)]
+        found = [json.loads(bytes(reply.ok.payload))["of"] for reply in replies(client, "imu/*/command/reset")]
+        for thread in threads:
+            thread.join()
+        assert sorted(found) == sorted(DEVICES)
+
+
 def test_a_verb_that_is_not_known_is_refused(endpoint: str) -> None:
     with through_a_router(endpoint) as (out, client):
         thread = answering(out)
@@ -225,7 +235,7 @@ def test_a_router_that_comes_later(endpoint: str) -> None:
 
 
 def test_closing_while_it_waits_for_a_router(endpoint: str) -> None:
-    out = ZenohOut(ZenohSettings(mode="client", connect=(endpoint,)), DEVICES)
+    out = ZenohOut(ZenohTable(mode="client", connect=(endpoint,)), DEVICES)
     out.start()
     eventually(lambda: out.state != "not open yet")
     started_s = time.monotonic()
@@ -263,8 +273,9 @@ def test_no_session_at_all() -> None:
 def test_a_process_that_forgets_to_close_still_ends(endpoint: str) -> None:
     code = f"""
         import time
-        from monitor.publish.zenoh_out import ZenohOut, ZenohSettings
-        out = ZenohOut(ZenohSettings(listen=("{endpoint}",)), ["a"])
+        from monitor.publish.zenoh_out import ZenohOut
+        from monitor.settings import ZenohTable
+        out = ZenohOut(ZenohTable(listen=("{endpoint}",)), ["a"])
         out.start()
         while out.state != "ok":
             time.sleep(0.02)
