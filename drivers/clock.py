@@ -80,7 +80,7 @@ class SampleClock:
     @property
     def measured_hz(self) -> float | None:
         """Samples a second by the host's clock, without rounding; None until known."""
-        return self._line.rate_hz()
+        return self._line.rate_hz() if self._line.settled() else None
 
     def take_events(self) -> list[Event]:
         """What the clock found since the last call."""

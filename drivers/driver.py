@@ -28,6 +28,7 @@ UNDECODED_BYTES: Final = 2000
 MUTE_S: Final = 3.0
 """A running device whose bytes hold no sample for so long, and for ten sample periods, is lost."""
 EVENTS_KEPT: Final = 1000
+TELL_EVERY_S: Final = 1.0
 
 State = Literal["waiting", "running", "lost", "ended"]
 
@@ -95,6 +96,8 @@ class Driver:
         self._heard_s = 0.0
         self._sampled_s = 0.0
         self._newest_t_ns = 0
+        self._untold = self._holes = 0  # samples missing, and in how many places, since that was told
+        self._told_s = -TELL_EVERY_S
 
     def take_events(self) -> list[Event]:
         """Events since the last call, oldest first."""
@@ -139,6 +142,7 @@ class Driver:
     def step(self) -> None:
         """One read and all that follows from it."""
         chunks = self.link.read(READ_TIMEOUT_S)
+        self._tell_lost()
         if chunks is None:
             self._watch_silence()
             return
@@ -157,6 +161,7 @@ class Driver:
                 self._push(self._axes.apply(stamped))
                 rejected = 0  # they stood before the first row
         self.counts.bad = self.decoder.bad
+        self._tell_lost()
         self._events.extend(self.clock.take_events())
         if self.state != "running":
             self._back()
@@ -166,7 +171,17 @@ class Driver:
         self._newest_t_ns = int(stamped.t_ns[-1])
         if stamped.lost:
             self.counts.lost += max(0, stamped.lost - rejected)
-            self._event("samples_lost", f"{stamped.lost} samples missing")
+            self._untold += stamped.lost
+            self._holes += 1
+
+    def _tell_lost(self) -> None:
+        """One event a second at most: a bad line must not drown all else."""
+        if not self._untold or time.monotonic() - self._told_s < TELL_EVERY_S:
+            return
+        places = "" if self._holes == 1 else f" in {self._holes} places"
+        self._event("samples_lost", f"{self._untold} samples missing{places}")
+        self._untold = self._holes = 0
+        self._told_s = time.monotonic()
 
     def _watch_silence(self) -> None:
         silent_s = time.monotonic() - self._heard_s

@@ -158,7 +158,7 @@ class Station:
         self._latencies = []
         return Health(
             state=self.driver.state,
-            rate_hz=self.clock.measured_hz,
+            rate_hz=self.clock.measured_hz if self.driver.state == "running" else None,
             received=counts.received,
             lost=counts.lost,
             bad=counts.bad,

@@ -64,6 +64,7 @@ class CoefficientsMessage(msgspec.Struct, frozen=True):
     axes: dict[str, dict[str, Letter]]
     rate: float | None = None
     window: float | None = None
+    filled: float | None = None
 
 
 class EventMessage(msgspec.Struct, frozen=True):
@@ -165,7 +166,7 @@ def noise(message: CoefficientsMessage) -> Noise:
             at = LETTERS.index(letter), AXES.index(axis)
             value[at], lo[at], hi[at] = (np.nan if x is None else x for x in (one.value, one.lo, one.hi))
             status[at] = _status(one.status)
-    return Noise(Coefficients(value, lo, hi, status), axes, _seen_s(message))
+    return Noise(Coefficients(value, lo, hi, status), axes, message.filled)
 
 
 def clean(text: Any) -> str:
@@ -181,9 +182,3 @@ def _status(word: str) -> Status:
     if word not in STATUSES:
         raise ValueError(f'status "{word}"')
     return STATUSES[word]
-
-
-def _seen_s(message: CoefficientsMessage) -> float | None:
-    if not message.rate or message.rate < 0 or message.window is None:
-        return message.window
-    return min(message.samples / message.rate, message.window)

@@ -111,7 +111,8 @@ def no_analysis(why: str, samples: int) -> bytes:
 
 
 def _window(estimate: Estimate, **more: Any) -> dict[str, Any]:
-    return {"rate": estimate.rate_hz, "window": estimate.window_s, **more}
+    filled_s = estimate.curve.n / estimate.rate_hz
+    return {"rate": estimate.rate_hz, "window": estimate.window_s, "filled": filled_s, **more}
 
 
 def _encode(topic: topics.Topic, device: str, unix_s: float, samples: int, payload: dict[str, Any]) -> bytes:

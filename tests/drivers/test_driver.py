@@ -4,10 +4,12 @@ import os
 import threading
 import time
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from drivers import driver as driver_module
 from drivers.clock import SampleClock
 from drivers.decoders import samples as samples_decoder
 from drivers.decoders import stim300, text, vectornav_binary
@@ -348,3 +350,18 @@ def test_an_arrival_timed_device_counts_its_rejected_lines():
     counts = rig.driver.counts
     assert (counts.received, counts.bad, counts.lost) == (48, 1, 0)  # the first line may be half a line
     assert (rig.pushed[0].ticks == NO_TICK).all()
+
+
+def test_many_holes_are_told_once_a_second(monkeypatch):
+    now_s = [1000.0]
+    monkeypatch.setattr(driver_module, "time", SimpleNamespace(monotonic=lambda: now_s[0], monotonic_ns=lambda: 0))
+    rig = Rig()
+    driver = rig.driver
+    for lost in (3, 2, 2):
+        driver._count(block(np.zeros(1, np.int64), np.zeros((1, 6)), lost=lost), 0)
+        driver._tell_lost()
+    now_s[0] += 1.0
+    driver._tell_lost()
+    driver._tell_lost()
+    assert [event.text for event in driver.take_events()] == ["3 samples missing", "4 samples missing in 2 places"]
+    assert driver.counts.lost == 7
