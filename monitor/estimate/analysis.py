@@ -23,6 +23,8 @@ from monitor.estimate.uncertainty import intervals, table
 
 FEWEST: Final = 50
 """Samples; below this nothing can be said, and the command exits with status 3."""
+OFF_RATE: Final = 0.02
+"""A stated rate further than this from what the times say is told."""
 LONGEST_HOLE: Final = 1_000_000
 """Missing samples kept in place, 48 bytes each; one stands for a longer pause, and keeps terms from reaching across."""
 
@@ -72,7 +74,7 @@ def on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Float
     clock = SampleClock(Given(), rate_hz)
     stamped = [one for samples in blocks for one in clock.stamp(samples)]
     rate = rate_hz or _mean_rate(stamped)
-    notes = [event.text for event in clock.take_events()[:10]]
+    notes = [event.text for event in clock.take_events()[:10]] + _said_otherwise(stamped, rate)
     pieces: list[Floats] = []
     holes = missing = 0
     for samples in stamped:
@@ -88,6 +90,15 @@ def on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Float
         places = "1 place" if holes == 1 else f"{holes} places"
         notes.append(f"{missing} samples are missing in {places}; terms that touch them are left out")
     return np.concatenate(pieces), rate, notes
+
+
+def _said_otherwise(stamped: Sequence[SampleBlock], rate_hz: float) -> list[str]:
+    """Where the steps of the times are steady, but not those of the rate."""
+    steps_s = np.diff(np.concatenate([samples.t_ns for samples in stamped])) / NS
+    low, middle, high = np.quantile(steps_s, [0.1, 0.5, 0.9]) if steps_s.size else (0.0, 0.0, 0.0)
+    if middle <= 0.0 or high - low > OFF_RATE * middle or abs(middle * rate_hz - 1.0) < OFF_RATE:
+        return []
+    return [f"the rate used is {rate_hz:g} Hz, but the times step by {middle:.6g} s, {1.0 / middle:.6g} Hz"]
 
 
 def _mean_rate(stamped: Sequence[SampleBlock]) -> float:

@@ -141,3 +141,8 @@ def test_too_few_averaging_times_for_a_fit_are_said():
     found = analyze(recording(np.arange(6000) / 100), 100.0, (0.1, 1.0, 10.0))
     assert found.notes == ("3 averaging times are too few to fit five terms; at least 5 are needed",)
     assert (found.estimate.coefficients.status == Status.UNESTIMATED).all()
+
+
+def test_times_that_contradict_the_stated_rate_are_said():
+    found = analyze(recording(np.arange(6000) / 50), 100.0)
+    assert "the rate used is 100 Hz, but the times step by 0.02 s, 50 Hz" in found.notes
