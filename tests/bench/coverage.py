@@ -2,7 +2,7 @@
 
     python tests/bench/coverage.py --records 300 --seconds 2700
 
-For the mix of METHODS (Q 2e-6, N 1.5e-4, B 4e-5, K 1.5e-6 at 100 Hz) it prints how often the 95 %
+For the mix of a MEMS gyro (Q 2e-6, N 1.5e-4, B 4e-5, K 1.5e-6 at 100 Hz) it prints how often the 95 %
 intervals of deviations and of coefficients hold the truth, the rms error of the fit over the
 Cramér–Rao limit of the spectrum (Whittle), and how often a term that was left out of the simulation
 enters all the same. Counting errors of a share p over n looks are √(p(1 − p)/n).

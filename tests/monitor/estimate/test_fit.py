@@ -97,7 +97,7 @@ def test_every_number_has_a_status():
 def test_intervals_hold_the_truth_as_often_as_they_say(row):
     looked, _ = fits(MIX)
     held = (gather(looked, "lo")[row] <= TRUTH[row]) & (TRUTH[row] <= gather(looked, "hi")[row])
-    # 95 % two-sided, up to 98 or down to 92 as METHODS measured; one in 1000 counts falls outside
+    # 95 % two-sided, up to 98 or down to 92 for one τ or letter; one in 1000 counts falls outside
     assert held.sum() >= binom.ppf(0.0005, RECORDS, 0.92), LETTERS[row]
 
 

@@ -13,7 +13,7 @@ SPREAD = np.array([1.0, 1.35, 0.8])  # x y z differ, as they do
 
 
 def terms(tau_s: np.ndarray) -> np.ndarray:
-    """[m, 5] of the equation in CONTRACTS: the factors of Q² N² B² K² R²."""
+    """[m, 5] of the five-term equation (IEEE Std 952): the factors of Q² N² B² K² R²."""
     one = np.ones_like(tau_s)
     return np.column_stack([3 / tau_s**2, 1 / tau_s, 2 * np.log(2) / np.pi * one, tau_s / 3, tau_s**2 / 2])
 

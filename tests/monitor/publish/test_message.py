@@ -1,4 +1,4 @@
-"""The JSON on the wire, key by key as CONTRACTS shows it."""
+"""The JSON on the wire, key by key as the README's table of keys says."""
 
 import json
 from typing import Any
