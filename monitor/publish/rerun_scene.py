@@ -1,7 +1,7 @@
 """What the viewer shows: samples, estimates, events and health as entities of one Rerun stream.
 
-In come results as the service has them (SI), out go batches of columns and drawings under the paths of
-docs/viewer.md, on the timeline ``sample_time``. Every call may block in Rerun for as long as a viewer pleases:
+In come results as the service has them (SI), out go batches of columns and drawings under the paths that
+the README lists, on the timeline ``sample_time``. Every call may block in Rerun for as long as a viewer pleases:
 only the viewer's own thread is to call here. Importing this module imports Rerun (half a second).
 
 Numbers are shown in the field's units. ``/<device>/allan/<axis>`` is a drawing, so the same entity also
