@@ -111,9 +111,10 @@ def slcan(message: can.Message) -> bytes:
 
 
 @pytest.mark.data
-def test_a_serial_can_adapter_gives_the_recorded_samples(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["can-boat/moored-5min", "can-car/drive-a"])
+def test_a_serial_can_adapter_gives_the_recorded_samples(tmp_path: Path, name: str) -> None:
     folder = recordings()
-    messages = frames(folder / "can-boat/moored-5min-frames.csv.gz")[:20_000]
+    messages = frames(folder / f"{name}-frames.csv.gz")
     cable = Cable(tmp_path)
     adapter = SlcanAdapter(cable)
     adapter.start()
@@ -135,5 +136,6 @@ decoder = "dbc"
         sent = len(imu_frames(messages))
         wait_for(lambda: counts.received + counts.bad >= sent, 10.0, "the last frame")
     assert (counts.received, counts.bad, counts.lost) == (sent, 0, 0)
-    want = expected(folder / "can-boat/moored-5min.npz")[:sent]
+    want = expected(folder / f"{name}.npz")
+    assert len(want) == sent
     assert (np.abs(run.caught.values("imu") - want) <= HALF_BIT).all()
