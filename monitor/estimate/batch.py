@@ -1,46 +1,76 @@
-"""Allan variance of a whole recording at once, by cumulative sums: the reference for the window.
+"""Allan variance of a whole recording at once, in floating point: the reference for the window.
 
-Shares no arithmetic with ``window``: phase is a float64 of the mean-free rate, sums are NumPy's.
+Shares no arithmetic with ``window``, which works in integers. Three things keep the digits, with 9.81 m/s² under 1e-4
+of noise or not, and for 10⁷ samples and more:
+
+- A term never reaches across a missing sample, so each unbroken run is a recording of its own. Its mean is taken off
+  first: exact where the noise is small beside it (Sterbenz), and second differences do not see which constant it was.
+- Phase is the running sum of what is left, with the roundings of all its steps summed beside it and put back
+  (Ogita, Rump & Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26(6), 2005): right to its last digit.
+- Squares are added in LANES separate sums, and these by NumPy in pairs.
+
+Against sums in whole numbers without any rounding σ² is right to 1e-15 for stationary noise, and to 1e-12 under a
+random walk. What remains is the last digit of phase, large where the mean is not steady: 1e-10 with a rate that ramps
+through 20 000 times its noise.
+
+One float64 a sample and axis is held beside the samples. The kernel runs without the GIL, an axis a call: who has
+threads maps the axes over them, ``overlapping(values, factors, each=pool.map)``.
+
+A run is walked in blocks, all τ to each: for τ shorter than a block phase comes from memory once for all of them, and
+of a longer octave's three places two were touched by the octave before. A τ at a time, memory would bound it.
 """
 
-from typing import Literal
+from collections.abc import Callable, Iterable
+from typing import Final, Literal
 
 import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.sample import Floats, Ints
+from monitor.compiled import compiled
 
 TauGrid = Literal["octave", "decade10"] | tuple[float, ...]
 
+Column = tuple[Floats, Ints]
+"""Allan variance [m] of one axis, and the number of its terms [m]."""
 
-def overlapping(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
+EachAxis = Callable[[Callable[[Floats], Column], Iterable[Floats]], Iterable[Column]]
+"""What ``map`` does, and an executor's ``map`` in threads."""
+
+BLOCK: Final = 16_384
+"""Phase points of a block: three of them fill a third of a second-level cache of 1 MB."""
+LANES: Final = 512
+"""Separate sums of squares a τ: a row long enough for the set-up of a vector loop, and in the first-level cache."""
+
+
+def overlapping(values: Floats, factors: Ints, each: EachAxis = map) -> tuple[Floats, Ints]:
     """Overlapping Allan variance [m, k] of rates [n, k], and the number of its terms [m, k].
 
     NIST SP 1065 eq. 11 on rates: σ²(m) = Σ (x_{k+2m} - 2x_{k+m} + x_k)² / (2 m² C), with phase x in samples of the
     rate, so that τ0 does not enter. What is not finite is missing: terms that touch it are left out.
 
+    Args:
+        values: rates [n, k] of any floating type; left alone
+        factors: cluster sizes m ≥ 1
+        each: maps the axes; of an executor, they are done side by side
+
     >>> overlapping(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().tolist()
     [0.5, 0.0]
     """
-    values = values.astype(np.float64)  # recordings come in float32, whose sums hold no Allan variance
-    absent = ~np.isfinite(values)
-    values[absent] = 0.0
-    # phase of the mean-free rate stays small, and so keeps its digits
-    values -= values.sum(axis=0) / np.maximum((~absent).sum(axis=0), 1)
-    values[absent] = 0.0
-    phase = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    gaps = np.concatenate([np.zeros((1, values.shape[1]), np.int64), np.cumsum(absent, axis=0)])
-    avar = np.full((factors.size, values.shape[1]), np.nan)
-    terms = np.zeros((factors.size, values.shape[1]), np.int64)
-    for i, m in enumerate(factors):
-        if 2 * m >= len(phase):
-            break
-        d = phase[2 * m :] - 2 * phase[m:-m] + phase[: -2 * m]
-        whole = gaps[2 * m :] == gaps[: -2 * m]
-        terms[i] = whole.sum(axis=0)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            avar[i] = np.where(whole, d * d, 0.0).sum(axis=0) / (2.0 * m * m * terms[i])
-    return avar, terms
+    columns = list(each(lambda column: overlapping_axis(column, factors), values.T))
+    return np.stack([avar for avar, _ in columns], axis=1), np.stack([terms for _, terms in columns], axis=1)
+
+
+def overlapping_axis(rate: Floats, factors: Ints) -> Column:
+    """``overlapping`` of one axis [n]: variance and terms, [m] each."""
+    phase = np.empty(len(rate) + 1)
+    phase[0] = 0.0
+    phase[1:] = rate  # a copy in float64, whatever came: float32 sums hold no Allan variance
+    m = np.ascontiguousarray(factors, np.int64)
+    lanes, terms = np.zeros((m.size, LANES)), np.zeros(m.size, np.int64)
+    _add_runs(phase, m, lanes, terms)
+    with np.errstate(invalid="ignore"):  # 0/0 where no term is whole
+        return lanes.sum(axis=1) / (2.0 * m * m * terms), terms
 
 
 def slope(values: Floats) -> Floats:
@@ -52,9 +82,32 @@ def slope(values: Floats) -> Floats:
     third = len(values) // 3
     if third == 0:
         return np.full(values.shape[1], np.nan)
-    newest = values[len(values) - 3 * third :]
-    result: Floats = (newest[2 * third :].mean(axis=0) - newest[:third].mean(axis=0)) / (2.0 * third)
-    return np.where(np.isnan(newest).any(axis=0), np.nan, result)
+    newest = values[len(values) - 3 * third :].reshape(3, third, -1)
+    with np.errstate(invalid="ignore"):  # what is not finite is missing, and makes its sum so
+        sums: Floats = np.ones(third) @ newest  # five times as fast as a sum along rows of six
+        result: Floats = (sums[2] - sums[0]) / (2.0 * third * third)
+    return np.where(np.isfinite(sums).all(axis=0), result, np.nan)
+
+
+def slopes(values: Floats, factors: Ints) -> Floats:
+    """Slope of the rate [m, k] as each τ sees it, unit a sample: mean second difference of phase over m².
+
+    NaN for an axis with a missing sample, and where no term is whole.
+
+    >>> slopes(0.5 * np.arange(90.0)[:, None], np.array([1, 8])).round(12).ravel().tolist()
+    [0.5, 0.5]
+    """
+    n = len(values)
+    phase = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values - values.mean(axis=0), axis=0)])
+    sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(phase, axis=0)])
+    result = np.full((factors.size, values.shape[1]), np.nan)
+    for i, m in enumerate(factors.tolist()):
+        terms = n + 1 - 2 * m
+        if terms > 0:
+            # the sum of all second differences telescopes to four blocks of phase at the ends
+            blocks = sums[n + 1] - 2 * sums[n + 1 - m] + sums[terms] - sums[2 * m] + 2 * sums[m] - sums[0]
+            result[i] = blocks / (terms * float(m) ** 2)
+    return result
 
 
 def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints:
@@ -81,3 +134,52 @@ def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints
             f"and half the window ({samples / 2 / rate_hz:g} s)"
         )
     return possible
+
+
+@compiled
+def _add_runs(phase: Floats, factors: Ints, lanes: Floats, terms: Ints) -> None:
+    """Add all terms of rates ``phase[1:]``, which become phase in place, each run from 0 in the slot before it."""
+    before = 0
+    while before + 1 < phase.size:
+        last = _integrate(phase, before)
+        for begin in range(before, last + 1, BLOCK):
+            end = min(begin + BLOCK, last + 1)
+            for i in range(factors.size):
+                first = max(begin, before + 2 * factors[i])
+                if first < end:
+                    terms[i] += end - first
+                    _add_squares(phase, first, end, factors[i], lanes[i])
+        before = last + 1
+
+
+@compiled
+def _integrate(phase: Floats, before: int) -> int:
+    """Turn the run of finite rates behind a slot into phase; returns its last slot, ``before`` where there is none."""
+    total, last = 0.0, before
+    while last + 1 < phase.size and np.isfinite(phase[last + 1]):
+        last += 1
+        total += phase[last]
+    mean = total / max(last - before, 1)
+    total, rest = 0.0, 0.0
+    phase[before] = 0.0
+    for i in range(before + 1, last + 1):
+        step = phase[i] - mean
+        longer = total + step
+        back = longer - total
+        rest += (total - (longer - back)) + (step - back)
+        total = longer
+        phase[i] = total + rest
+    return last
+
+
+@compiled
+def _add_squares(phase: Floats, first: int, end: int, m: int, lanes: Floats) -> None:
+    """Squared second differences that end at first … end - 1, to the lanes in turn.
+
+    An index that could be negative would make a scalar loop of the inner one.
+    """
+    for row in range(first, end, LANES):
+        at0, at1, at2 = np.uintp(row), np.uintp(row - m), np.uintp(row - 2 * m)
+        for lane in range(np.uintp(min(LANES, end - row))):
+            d = (phase[at0 + lane] - phase[at1 + lane]) - (phase[at1 + lane] - phase[at2 + lane])
+            lanes[lane] += d * d

@@ -1,10 +1,21 @@
-"""All that one refit produces."""
+"""All that one look at the estimate gives."""
 
 from dataclasses import dataclass
 
-from drivers.sample import Floats
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.sample import Floats, Ints
 from monitor.estimate.coefficients import Coefficients
 from monitor.estimate.curve import AllanCurve
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """The coefficients after each of n consecutive samples."""
+
+    t_ns: Ints  # [n]
+    value: Floats  # [n, 5, 6] Q N B K R in SI; NaN where not estimated
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,3 +29,6 @@ class Estimate:
     curve: AllanCurve
     fitted: Floats  # [m, 6] Allan variance of the fitted model at curve.tau_s; NaN where none, or left out of the fit
     coefficients: Coefficients
+    k_or_r: NDArray[np.bool_]  # [6] the window drifts, and does not tell whether by random walk or by a ramp
+    recent: AllanCurve | None = None  # the same τ, each over a span of its own, see window.quick_spans
+    course: Course | None = None  # since the look before, where a fit at every sample is wanted

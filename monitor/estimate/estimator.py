@@ -1,8 +1,12 @@
 """Blocks in, Estimate out: the window, its uncertainty and the fit of one device.
 
-``update`` advances the window sample by sample, missing ones in their places; ``get`` is a look at the result and
-refits. The rate enters only as the label of the τ axis and the units of the coefficients: a cluster is a number of
-samples.
+``update`` advances the window sample by sample, missing ones in their places; ``get`` is a look at the result, with
+the best fit there is (all covariances). Between looks, where it is wanted, the coefficients follow every sample by
+the gains of ``refit``. The rate enters only as the label of the τ axis and the units of the coefficients: a cluster
+is a number of samples.
+
+Beside the fixed window of the fit, each τ has a shorter span of its own for the eye (``recent``): it shows a change of
+N within half a minute.
 """
 
 from collections.abc import Iterator
@@ -15,13 +19,16 @@ from drivers.errors import NotReady
 from drivers.sample import Floats, Ints, SampleBlock, block
 from monitor.estimate.batch import TauGrid, cluster_sizes
 from monitor.estimate.curve import AllanCurve
-from monitor.estimate.estimate import Estimate
+from monitor.estimate.estimate import Course, Estimate
 from monitor.estimate.fit import Fit, design, fit, nothing_fitted
-from monitor.estimate.uncertainty import Tables, intervals
-from monitor.estimate.window import MAX_LENGTH, MIN_LENGTH, AllanWindow
+from monitor.estimate.refit import Refit
+from monitor.estimate.uncertainty import Spans, Tables, intervals
+from monitor.estimate.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_spans
 
 FEWEST: Final = 8
 """Samples before the first answer: three τ with a few terms each."""
+COURSE_SAMPLES: Final = 16_384
+"""Of the course of coefficients, the newest kept until someone looks."""
 
 
 class Estimator:
@@ -31,18 +38,28 @@ class Estimator:
         rate_hz: nominal samples a second
         window_s: length of the sliding window
         tau: grid of averaging times, or a list of them in s
+        every_sample: have the coefficients follow every sample, not only each look
     Raises:
         ConfigError: the window or the list of τ is impossible at this rate
     """
 
-    def __init__(self, rate_hz: float, window_s: float, tau: TauGrid = "octave") -> None:
+    def __init__(self, rate_hz: float, window_s: float, tau: TauGrid = "octave", every_sample: bool = False) -> None:
         self.rate_hz = rate_hz
         length = min(max(round(window_s * rate_hz), MIN_LENGTH), MAX_LENGTH)
         self.window_s = length / rate_hz
-        self._window = AllanWindow(length, cluster_sizes(length, rate_hz, tau))
-        self._design = design(self._window.factors, rate_hz)
-        self._tables = Tables(self._window.factors, length)
+        factors = cluster_sizes(length, rate_hz, tau)
+        spans = quick_spans(factors, rate_hz, length)
+        self._m = factors.size
+        # the rows of the fit, then those for the eye
+        rows, lengths = np.tile(factors, 2), np.concatenate([np.full(self._m, length), spans])
+        self._window = AllanWindow(length, rows, lengths)
+        self._factors = factors
+        self._design = design(factors, rate_hz)
+        self._tables = Tables(factors, length)
+        self._spans = Spans(factors, spans, self._design.columns)
         self._entered: NDArray[np.bool_] = np.zeros((5, 6), np.bool_)
+        self._refit = Refit(self._window, self._m, self._tables) if every_sample else None
+        self._course: list[Course] = []
         self._samples = 0
         self._newest_ns = 0
 
@@ -51,24 +68,38 @@ class Estimator:
         """Samples received since the start, resets notwithstanding."""
         return self._samples
 
+    @property
+    def filled(self) -> int:
+        """Samples in the window now, missing ones included."""
+        return self._window.n
+
     def update(self, samples: SampleBlock) -> None:
         """Advance by the samples missing before the block, then by the block."""
         if samples.lost:
             self._window.skip(samples.lost)
-        self._window.update(samples.values)
+        if self._refit is None:
+            self._window.update(samples.values)
+        else:
+            course = Course(samples.t_ns, self._refit.update(self._design, samples.values))
+            self._course = _newest([*self._course, course], COURSE_SAMPLES)
         self._samples += len(samples)
         self._newest_ns = int(samples.t_ns[-1])
 
     def reset(self) -> None:
         """Empty the window."""
         self._window.reset()
-        self._entered[:] = False
+        self._begin_anew()
+
+    def restart(self, samples: int) -> None:
+        """Forget all but the newest samples, missing ones included: the noise was another before them."""
+        self._window.keep(min(samples, self._window.n))
+        self._begin_anew()
 
     def relabel(self, rate_hz: float) -> None:
         """The rate is known better now: the same clusters of samples, other τ and units."""
         self.rate_hz = rate_hz
         self.window_s = self._window.length / rate_hz
-        self._design = design(self._window.factors, rate_hz)
+        self._design = design(self._factors, rate_hz)
 
     def get(self, fitted: bool = True) -> Estimate:
         """The curve of the window and the coefficients fitted to it; without ``fitted``, deviations alone.
@@ -76,23 +107,50 @@ class Estimator:
         Raises:
             NotReady: fewer than FEWEST samples in the window
         """
-        if self._window.n < FEWEST:
-            raise NotReady(f"{self._window.n} of at least {FEWEST} samples")
+        n = self._window.n
+        if n < FEWEST:
+            raise NotReady(f"{n} of at least {FEWEST} samples")
         avar, terms = self._window.avar(), self._window.terms()
-        result = self._fit(avar, terms) if fitted else nothing_fitted(avar)
-        lo, hi = intervals(avar, result.edf)
-        curve = AllanCurve(
-            self._window.factors / self.rate_hz, self._window.factors, avar, terms, result.edf, lo, hi, self._window.n
-        )
+        own, recent = slice(0, self._m), slice(self._m, None)
+        result = self._fit(avar[own], terms[own]) if fitted else nothing_fitted(avar[own])
+        curve = self._curve(avar[own], terms[own], result.edf, n)
+        quick_edf = self._spans.edf(result.theta, self.rate_hz, terms[recent])
+        quick = self._curve(avar[recent], terms[recent], quick_edf, n)
+        course, self._course = self._course, []
         return Estimate(
-            self._newest_ns, self.rate_hz, self.window_s, self._samples, curve, result.fitted, result.coefficients
-        )
+            self._newest_ns, self.rate_hz, self.window_s, self._samples, curve, result.fitted, result.coefficients,
+            result.k_or_r, quick, _joined(course),
+        )  # fmt: skip
+
+    def _begin_anew(self) -> None:
+        self._entered = np.zeros((5, 6), np.bool_)
+        if self._refit is not None:
+            self._refit.reset()
 
     def _fit(self, avar: Floats, terms: Ints) -> Fit:
-        slope = self._window.slope() * self.rate_hz
-        result = fit(self._design, self._tables.at(self._window.n), avar, terms, self._entered, slope)
+        slope, slopes = self._window.slope() * self.rate_hz, self._window.slopes()[: self._m] * self.rate_hz
+        before = self._entered if self._refit is None else self._refit.entered
+        result = fit(self._design, self._tables.at(self._window.n), avar, terms, before, slope, slopes)
         self._entered = result.entered
         return result
+
+    def _curve(self, avar: Floats, terms: Ints, edf: Floats, n: int) -> AllanCurve:
+        lo, hi = intervals(avar, edf)
+        return AllanCurve(self._factors / self.rate_hz, self._factors, avar, terms, edf, lo, hi, n)
+
+
+def _newest(course: list[Course], samples: int) -> list[Course]:
+    """The last parts that hold so many samples between them."""
+    count = sum(part.t_ns.size for part in course)
+    while len(course) > 1 and count - course[0].t_ns.size >= samples:
+        count -= course.pop(0).t_ns.size
+    return course
+
+
+def _joined(course: list[Course]) -> Course | None:
+    if not course:
+        return None
+    return Course(np.concatenate([part.t_ns for part in course]), np.concatenate([part.value for part in course]))
 
 
 def warm_up() -> Iterator[str]:

@@ -8,8 +8,8 @@ covariances of ``uncertainty``. A term is in when û_a/√c0, the variance taken
 passes a threshold; its interval is the set of t that û does not contradict; a term that is not in
 has a one-sided bound, never tighter than an estimate of zero would give.
 
-A ramp cannot be told from random walk by the curve alone. Given the window's slope s, the curve is
-fitted without s²τ²/2, so that K is unbiased whether or not there is a ramp, and R is in when s is
+A ramp cannot be told from random walk by the curve alone. Given the window's slope s, the fit is to the curve
+that the samples have without that line, so that K is unbiased whether or not there is a ramp, and R is in when s is
 more than noise makes with K at the upper end of its interval. Else K or R may be its cause, and
 both are bounded. Without a slope, R is only bounded, and a ramp does pass as K.
 
@@ -30,8 +30,10 @@ from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
 from monitor.estimate.coefficients import Coefficients, Status
-from monitor.estimate.fit_kernel import WHITE, N, R, fit_axes
+from monitor.estimate.fit_kernel import WHITE, fit_axes
+from monitor.estimate.least_squares import N, R
 from monitor.estimate.uncertainty import NOISES, Table
+from monitor.estimate.verdict import Gains, Known, answer, gains
 from monitor.noise.effect import Source
 from monitor.noise.effects.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.bias_instability import BiasInstability
@@ -54,6 +56,8 @@ TO_SI: Final = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 ENTER_ONCE: Final = 2.33  # σ: one look at one curve, 1 % of absent terms enter
 ENTER_WATCHED: Final = 3.0  # σ: looked at again and again
 LEAVE_WATCHED: Final = 1.5  # σ
+THRESHOLDS_ONCE: Final = (ENTER_ONCE, ENTER_ONCE)
+THRESHOLDS_WATCHED: Final = (ENTER_WATCHED, LEAVE_WATCHED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +79,9 @@ class Fit:
     edf: Floats  # [m, 6] equivalent degrees of freedom of the measured curve; NaN as the curve
     entered: NDArray[np.bool_]  # [5, 6] terms that are in: hand them to the next fit
     left_out: Ints  # [6] shortest τ that contradicted every fit
+    misfit: Floats  # [6] variance of the curve about the fit over that of noise of the five terms; 1 where it agrees
+    k_or_r: NDArray[np.bool_]  # [6] the window drifts, by random walk or by a ramp: which of them, it does not tell
+    gains: Gains | None  # the fit as a linear map of the curve; None where nothing was fitted
 
 
 def design(factors: Ints, rate_hz: float) -> Design:
@@ -84,6 +91,14 @@ def design(factors: Ints, rate_hz: float) -> Design:
     return Design(factors, rate_hz, columns)
 
 
+def known(design: Design, table: Table) -> Known:
+    """What every fit at this length of the window shares."""
+    slope_variance = _slope_variance(table.n)
+    flat = design.columns.copy()
+    flat[:, :NOISES] -= slope_variance * design.columns[:, R, None]
+    return Known(design.columns, flat, table.covariance, table.terms.astype(np.float64), slope_variance)
+
+
 def fit(
     design: Design,
     table: Table,
@@ -91,6 +106,8 @@ def fit(
     terms: Ints,
     before: NDArray[np.bool_] | None = None,
     slope: Floats | None = None,
+    slopes: Floats | None = None,
+    full: bool = True,
 ) -> Fit:
     """Coefficients of six axes from overlapping Allan variances.
 
@@ -103,35 +120,36 @@ def fit(
             1.5 σ; without it, one look at 2.33 σ
         slope: [6] unit/s, ``slope_of_thirds`` of the same window, NaN = not measured; without it a ramp is
             never estimated, only bounded
+        slopes: [m, 6] unit/s, the mean second difference of phase over τ² at each τ, of the same window; without it a
+            strong ramp's products with the noise pull K
+        full: weigh by the covariances of all τ, else by their variances alone
     """
     m, axes = avar.shape
-    entered = np.zeros((axes, 5), np.bool_) if before is None else np.array(before.T, order="C")
-    theta, lo, hi = np.full((3, axes, 5), np.nan)
-    edf, fitted = np.full((2, axes, m), np.nan)
-    status = np.zeros((axes, 5), np.int8)
-    left_out = np.zeros(axes, np.int64)
-    measured = np.ascontiguousarray(avar.T)
-    level, flat, slope_variance = measured, design.columns, np.zeros(NOISES)
-    slope = np.full(axes, np.nan) if slope is None else slope / design.rate_hz
-    if not np.isnan(slope).all():
-        # the curve without s²τ²/2, and the columns without what their own noise puts into s² on average
-        slope_variance = _slope_variance(table.n)
-        level = measured - np.nan_to_num(slope)[:, None] ** 2 * design.columns[:, R]
-        flat = design.columns.copy()
-        flat[:, :NOISES] -= slope_variance * design.columns[:, R, None]
+    found = answer(axes, m, np.zeros((axes, 5), np.bool_) if before is None else np.array(before.T, order="C"))
+    frozen = gains(axes, m)
+    straight = np.full(axes, np.nan) if slope is None else slope / design.rate_hz
     fit_axes(
-        measured, level, terms.T.astype(np.float64), table.terms.astype(np.float64),
-        design.columns, flat, table.covariance, slope, slope_variance,
-        (ENTER_ONCE, ENTER_ONCE) if before is None else (ENTER_WATCHED, LEAVE_WATCHED),
-        entered, theta, lo, hi, status, edf, fitted, left_out,
-    )  # fmt: skip
+        known(design, table),
+        np.ascontiguousarray(avar.T),
+        np.ascontiguousarray(terms.T, np.float64),
+        straight,
+        np.tile(straight[:, None], m) if slopes is None else np.ascontiguousarray(slopes.T) / design.rate_hz,
+        THRESHOLDS_ONCE if before is None else THRESHOLDS_WATCHED,
+        full,
+        found,
+        frozen,
+    )
     to_si = design.rate_hz**TO_SI
-    value = np.where(status == Status.ESTIMATED, np.sqrt(np.maximum(theta, 0.0)), np.nan)
-    coefficients = Coefficients((value * to_si).T, (lo * to_si).T, (hi * to_si).T, status.T)
-    missing = np.isnan(edf.T) & (avar > 0.0)
+    value = np.where(found.status == Status.ESTIMATED, np.sqrt(np.maximum(found.theta, 0.0)), np.nan)
+    coefficients = Coefficients((value * to_si).T, (found.lo * to_si).T, (found.hi * to_si).T, found.status.T)
+    edf = found.edf.T
+    missing = np.isnan(edf) & (avar > 0.0)
     if missing.any():
-        edf = np.where(missing, _white_edf(design, table, terms), edf.T).T
-    return Fit(coefficients, (theta * to_si**2).T, fitted.T, edf.T, entered.T, left_out)
+        edf = np.where(missing, _white_edf(design, table, terms), edf)
+    return Fit(
+        coefficients, (found.theta * to_si**2).T, found.fitted.T, edf, found.entered.T, found.left_out,
+        found.misfit, frozen.either, frozen,
+    )  # fmt: skip
 
 
 def nothing_fitted(avar: Floats) -> Fit:
@@ -145,6 +163,9 @@ def nothing_fitted(avar: Floats) -> Fit:
         edf=np.full_like(avar, np.nan),
         entered=np.zeros((5, avar.shape[1]), np.bool_),
         left_out=np.zeros(avar.shape[1], np.int64),
+        misfit=np.ones(avar.shape[1]),
+        k_or_r=np.zeros(avar.shape[1], np.bool_),
+        gains=None,
     )
 
 

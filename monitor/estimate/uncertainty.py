@@ -16,6 +16,7 @@ since the exact sum takes milliseconds, they are not used. Everything here is in
 sample: τ0 = 1, and θ stands for Q²/τ0², N²/τ0, B², K² τ0, R² τ0².
 """
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -36,6 +37,8 @@ LAG_STEP: Final = 0.5
 
 TAIL: Final = 8.0
 """Beyond this many (m_i + m_j) the differences of t² ln t are taken from their series."""
+
+FOR_EVER: Final = 1 << 62
 
 TABLE_STEP: Final = 1.1
 """While a window grows, its table is renewed at this ratio of lengths; terms rescale it between."""
@@ -66,6 +69,13 @@ class Tables:
             known = self._table = table(n, self._factors)
         return known
 
+    def lasts(self, n: int) -> int:
+        """For how many samples, the one of n included, ``at(n)`` stays the table to use; for ever in a full window."""
+        known = self.at(n)
+        if n >= self._capacity:
+            return FOR_EVER
+        return min(self._capacity, math.ceil(TABLE_STEP * known.n)) - n
+
 
 def table(n: int, factors: Ints) -> Table:
     """Covariances of overlapping Allan variances of ``n`` samples at these cluster sizes.
@@ -83,6 +93,30 @@ def table(n: int, factors: Ints) -> Table:
     for array in (terms, covariance):
         array.flags.writeable = False
     return Table(n, factors, terms, covariance)
+
+
+class Spans:
+    """Degrees of freedom of a curve whose τ look back over different spans."""
+
+    def __init__(self, factors: Ints, spans: Ints, columns: Floats) -> None:
+        """``columns`` [m, 4 or more]: Allan variance of Q N B K of one at τ0 = 1."""
+        tables = [table(int(span), np.array([m])) for m, span in zip(factors, spans, strict=True)]
+        self._covariance = np.array([one.covariance[0, 0] for one in tables])  # [m, 10]
+        self._columns = columns[:, :NOISES]
+        self._terms = np.array([one.terms[0] for one in tables])
+
+    def edf(self, theta: Floats, rate_hz: float, terms: Ints) -> Floats:
+        """Degrees of freedom [m, k] of terms [m, k] under noise of the shape of ``theta`` [5, k], SI.
+
+        Where nothing was fitted, of white noise.
+        """
+        shape = np.maximum(theta[:NOISES], 0.0) * (rate_hz ** np.array([2.0, 1.0, 0.0, -1.0]))[:, None]
+        shape = np.where(np.isnan(shape).any(axis=0) | (shape.sum(axis=0) == 0.0), np.eye(NOISES)[1][:, None], shape)
+        level = self._columns @ shape
+        pairs = np.array([shape[a] * shape[b] * (1.0 if a == b else 2.0) for a, b in PAIRS])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            whole = 2.0 * level**2 / (self._covariance @ pairs)
+            return np.where(terms > 0, whole * terms / self._terms[:, None], np.nan)
 
 
 def intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Floats, Floats]:

@@ -8,9 +8,10 @@ import pytest
 
 from drivers.errors import ConfigError, NotReady
 from drivers.sample import block
-from monitor.estimate.analysis import FEWEST, LONGEST_HOLE, analyze, on_grid
+from monitor.estimate.analysis import FEWEST, analyze
 from monitor.estimate.batch import overlapping
 from monitor.estimate.coefficients import Status
+from monitor.estimate.grid import LONGEST_HOLE, on_grid
 
 
 def white(n, seed=0):

@@ -3,6 +3,8 @@
 import csv
 import gzip
 import os
+from concurrent.futures import ThreadPoolExecutor
+from fractions import Fraction
 from pathlib import Path
 
 import allantools
@@ -10,7 +12,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConfigError
-from monitor.estimate.batch import cluster_sizes, overlapping
+from monitor.estimate.batch import BLOCK, LANES, cluster_sizes, overlapping, overlapping_axis, slope
 
 
 @pytest.fixture
@@ -75,6 +77,96 @@ def test_missing_samples_strike_out_the_terms_that_touch_them():
         assert terms.tolist() == [[len(squares), 0]]
         assert avar[0, 0] == pytest.approx(0.5 * np.mean(squares), rel=1e-12)
         assert np.isnan(avar[0, 1])
+
+
+def exact(y, factors):
+    """Without any rounding: each double is a whole number of the finest unit among them, and Python's ints have no end.
+
+    Of a run that is not finite everywhere, the terms that touch no missing sample.
+    """
+    parts = [Fraction(float(v)) if np.isfinite(v) else None for v in y]
+    unit = max(part.denominator for part in parts if part is not None)
+    phase, gaps = [0], [0]
+    for part in parts:
+        phase.append(phase[-1] + (0 if part is None else part.numerator * (unit // part.denominator)))
+        gaps.append(gaps[-1] + (part is None))
+    found = []
+    for m in map(int, factors):
+        whole = [k for k in range(2 * m, len(phase)) if gaps[k] == gaps[k - 2 * m]]
+        total = sum((phase[k] - 2 * phase[k - m] + phase[k - 2 * m]) ** 2 for k in whole)
+        found.append(float(Fraction(total, 2 * m * m * unit * unit * len(whole))))
+    return found
+
+
+def wandering(rng, n):
+    return 1e-4 * rng.standard_normal(n) + 1e-6 * np.cumsum(rng.standard_normal(n))
+
+
+@pytest.mark.parametrize(
+    ("added", "within"),
+    [
+        (lambda n: 0.0, 1e-14),
+        (lambda n: 9.81, 1e-14),
+        (lambda n: -1e4, 1e-14),
+        (lambda n: 9.81 + 100.0 * (np.arange(n) == n // 2), 1e-14),
+        (lambda n: np.linspace(8.81, 10.81, n), 1e-10),  # 20 000 times the noise
+    ],
+    ids=["nothing", "gravity", "a large mean", "a knock", "a steep ramp"],
+)
+def test_equals_a_sum_without_rounding(added, within):
+    n = 12_000
+    y = wandering(np.random.default_rng(3), n) + added(n)
+    factors = np.array([1, 2, 3, 7, 64, 1000, 3000, 6000])
+    avar, terms = overlapping_axis(y, factors)
+    assert avar == pytest.approx(exact(y, factors), rel=within)
+    assert terms.tolist() == (n + 1 - 2 * factors).tolist()
+
+
+def test_gaps_in_a_long_record_leave_the_sum_exact():
+    n = BLOCK + 3 * LANES + 17  # more than one block, and a row begun
+    rng = np.random.default_rng(4)
+    y = 9.81 + wandering(rng, n)
+    y[rng.integers(0, n, 5)] = np.nan
+    y[[0, n - 1, BLOCK - 1, BLOCK, BLOCK + 1]] = [np.inf, -np.inf, np.nan, np.nan, np.nan]
+    factors = np.array([1, 5, 100, 700])
+    avar, terms = overlapping_axis(y, factors)
+    assert avar == pytest.approx(exact(y, factors), rel=1e-14)
+    assert (terms > 0).all()
+
+
+@pytest.mark.parametrize("n", [BLOCK - 1, BLOCK, 2 * BLOCK, 2 * BLOCK + 1, 3 * BLOCK + LANES - 1])
+def test_blocks_and_rows_join_without_seam(n):
+    y = np.random.default_rng(n).standard_normal(n)
+    factors = np.array([1, LANES - 1, LANES, BLOCK // 4, BLOCK // 2 - 1, BLOCK // 2, n // 2])
+    expected = allantools.oadev(y, rate=1.0, data_type="freq", taus=factors)[1]
+    found, terms = overlapping_axis(y, factors)
+    assert np.sqrt(found)[: len(expected)] == pytest.approx(expected, rel=1e-12)
+    assert terms.tolist() == (n + 1 - 2 * factors).tolist()
+
+
+def test_single_precision_is_summed_in_double():
+    y = (9.81 + 1e-3 * np.random.default_rng(5).standard_normal((30_000, 2))).astype(np.float32)
+    factors = 2 ** np.arange(12)
+    assert overlapping(y, factors)[0] == pytest.approx(overlapping(y.astype(np.float64), factors)[0], rel=1e-15)
+    assert slope(y) == pytest.approx(slope(y.astype(np.float64)), rel=1e-12)
+
+
+def test_axes_in_threads_are_the_same_axes():
+    y = np.random.default_rng(6).standard_normal((5000, 6))
+    y[77, 2] = np.nan
+    with ThreadPoolExecutor(3) as pool:
+        avar, terms = overlapping(y, np.array([1, 10, 100]), each=pool.map)
+    assert avar.tolist() == overlapping(y, np.array([1, 10, 100]))[0].tolist()
+    assert terms[0].tolist() == [4999, 4999, 4997, 4999, 4999, 4999]
+
+
+def test_slope_is_that_of_the_thirds_and_absent_where_a_sample_is():
+    y = np.random.default_rng(7).standard_normal((1001, 3)) + 0.01 * np.arange(1001.0)[:, None]
+    y[500, 1], y[600, 2], y[601, 2] = np.nan, np.inf, -np.inf
+    found = slope(y)
+    assert found[0] == pytest.approx((y[668:, 0].mean() - y[2:335, 0].mean()) / 666.0, rel=1e-12)
+    assert np.isnan(found[1:]).all()
+    assert np.isnan(slope(y[:2])).all()
 
 
 def test_too_long_clusters_have_no_answer():

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from drivers.errors import ConfigError
-from monitor.estimate import window as window_module
 from monitor.estimate.batch import cluster_sizes, overlapping
-from monitor.estimate.window import FULL_SCALE, MAX_LENGTH, MIN_LENGTH, AllanWindow
+from monitor.estimate.window import FULL_SCALE, MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_spans
+from monitor.estimate.window_kernel import STAGE, advance
 
 FACTORS = np.array([1, 2, 3, 7, 16, 25, 50])
 LENGTH = 100
@@ -26,13 +26,22 @@ def expected(values, length=LENGTH, factors=FACTORS):
     return overlapping(values[-length:], factors)
 
 
+def expected_of_spans(window, values):
+    """Row by row, each over its own span."""
+    rows = [expected(values, span, np.array([m])) for m, span in zip(window.factors, window.spans, strict=True)]
+    return np.concatenate([avar for avar, _ in rows]), np.concatenate([terms for _, terms in rows])
+
+
 def check(window, values, rel=1e-9, largest=0.0):
     """The window against the batch of the last samples of ``values``.
 
     Where few terms remain, and those small, the unit of the integer phase shows: one each side of a second difference.
     ``largest``: deviation ever held, of which the sums keep 2^-53.
     """
-    avar, terms = expected(values, window.length, window.factors)
+    if (window.spans == window.length).all():
+        avar, terms = expected(values, window.length, window.factors)
+    else:
+        avar, terms = expected_of_spans(window, values)
     assert np.array_equal(window.terms(), terms)
     found = window.avar()
     assert np.array_equal(np.isnan(found), np.isnan(avar))
@@ -191,6 +200,155 @@ def test_impossible_windows_are_refused(length, factors):
         AllanWindow(length, np.array(factors, np.int64))
 
 
+# --- forgetting all but the newest
+
+
+def broken(n, seed=0):
+    """Noise with single samples, an axis and a stretch of all axes missing."""
+    values = made(n, seed)
+    values[np.random.default_rng(seed + 1).choice(n, n // 60, replace=False)] = np.nan
+    values[n // 2 : n // 2 + 9, 3] = np.nan
+    values[n // 3 : n // 3 + 5] = np.nan
+    return values
+
+
+@pytest.mark.parametrize("samples", [10, 99, 100, 150, 700])
+@pytest.mark.parametrize("make", [made, broken])
+@pytest.mark.parametrize("spans", [None, [10, 30, 6, 50, 100, 63, 100]])
+def test_keeping_the_newest_is_a_fresh_window_given_those(samples, make, spans):
+    spans = None if spans is None else np.array(spans)
+    values = np.rint(make(samples + 250) * 2.0**36) * 2.0**-36  # so that no unit of phase is left to round
+    for n in sorted({0, 1, 5, 63, 64, 65, 99, 100, samples} & set(range(min(samples, LENGTH) + 1))):
+        window, fresh = (AllanWindow(LENGTH, FACTORS, spans) for _ in range(2))
+        window.update(values[:samples])
+        window.keep(n)
+        fresh.update(values[samples - n : samples])
+        for start in (samples, samples + 1, samples + 40, samples + 130, samples + 250):
+            new = values[samples - n : start]
+            check(window, new)
+            assert (window.n, window.total) == (fresh.n, fresh.total)
+            np.testing.assert_allclose(window.avar(), fresh.avar(), rtol=1e-13)
+            assert np.array_equal(window.slope(), fresh.slope(), equal_nan=True)
+            end = {samples: 1, samples + 1: 40, samples + 40: 130}.get(start, 250)
+            for one in (window, fresh):
+                one.update(values[start : samples + end])
+
+
+def test_what_is_forgotten_leaves_nothing_behind():
+    values = made(3000)
+    values[2500:2900] += 100.0
+    window = AllanWindow(1000, cluster_sizes(1000, 1.0))
+    window.update(values)
+    window.keep(100)
+    check(window, values[-100:])
+
+
+@pytest.mark.parametrize("n", [-1, 61, 10**9])
+def test_more_than_is_held_cannot_be_kept(n):
+    window = AllanWindow(LENGTH, FACTORS)
+    window.update(made(60))
+    with pytest.raises(ValueError, match="of 60 samples"):
+        window.keep(n)
+
+
+# --- a span for each row
+
+
+SPANNED = np.array([1, 1, 2, 7, 7, 3, 50, 16])
+SPANS = np.array([2, 300, 5, 14, 100, 163, 300, 299])
+
+
+def test_every_row_equals_the_batch_of_its_own_span_at_every_position():
+    values = broken(900)
+    window = AllanWindow(300, SPANNED, SPANS)
+    for i in range(len(values)):
+        window.update(values[i : i + 1])
+        check(window, values[: i + 1])
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    cuts=st.lists(st.integers(0, 700), max_size=12),
+    shares=st.lists(st.floats(0.0, 1.0), min_size=8, max_size=8),
+    holes=st.lists(st.tuples(st.integers(0, 690), st.integers(1, 80), st.integers(0, 6)), max_size=4),
+)
+def test_rows_of_any_span_and_blocks_of_any_cut(cuts, shares, holes):
+    values = made(700, seed=len(cuts))
+    for at, n, axis in holes:
+        values[at : at + n, slice(None) if axis == 6 else axis] = np.nan
+    spans = 2 * SPANNED + np.floor(np.array(shares) * (200 - 2 * SPANNED)).astype(np.int64)
+    cut, single = (AllanWindow(200, SPANNED, spans) for _ in range(2))
+    for a, b in pairwise([0, *sorted(cuts), len(values)]):
+        cut.update(values[a:b])
+    for row in values:
+        single.update(row[None])
+    assert np.array_equal(cut.terms(), single.terms())
+    np.testing.assert_allclose(cut.avar(), single.avar(), rtol=1e-13)
+    check(cut, values)
+
+
+def test_full_length_spans_are_the_plain_window():
+    values = broken(900)
+    plain, spanned = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS, np.full(FACTORS.size, LENGTH))
+    for window in (plain, spanned):
+        window.update(values)
+    assert_same(plain, spanned)
+
+
+def test_slope_and_length_are_those_of_the_whole_window():
+    values = made(900)
+    plain, spanned = AllanWindow(300, np.array([1, 2])), AllanWindow(300, np.array([1, 2]), np.array([10, 20]))
+    for window in (plain, spanned):
+        window.update(values)
+    assert spanned.n == 300
+    assert np.array_equal(plain.slope(), spanned.slope())
+
+
+def test_a_transient_leaves_each_row_after_its_own_span():
+    values = made(900)
+    values[600:603] += 1e6 * 1e-4
+    window = AllanWindow(300, np.array([1, 1]), np.array([20, 300]))
+    window.update(values[:623])
+    check(window, values[:623])
+    short, long = window.avar()[:, 0]
+    assert short < 1e-7 < 1.0 < long
+
+
+@pytest.mark.parametrize(
+    ("factors", "spans"),
+    [([1, 2], [10]), ([4], [7]), ([1], [101]), ([1], [0]), ([0], [10]), ([51], [102]), ([1, 2], [[10, 10]])],
+)
+def test_impossible_spans_are_refused(factors, spans):
+    with pytest.raises(ConfigError):
+        AllanWindow(100, np.array(factors), np.array(spans))
+
+
+@pytest.mark.parametrize(("length", "rate_hz"), [(100, 1.0), (100, 100.0), (360_000, 100.0), (3_600_000, 1000.0)])
+def test_quick_spans_fit_any_window(length, rate_hz):
+    factors = np.unique([*cluster_sizes(length, rate_hz), length // 2])
+    window = AllanWindow(length, factors, quick_spans(factors, rate_hz, length))
+    assert ((window.spans >= 16 * factors) | (window.spans == length)).all()
+    assert (window.spans >= min(10 * rate_hz, length)).all()
+
+
+# --- the kernel, called from other compiled code
+
+
+def test_staged_samples_can_be_taken_one_at_a_time():
+    values = broken(STAGE)
+    window, plain = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS)
+    for row in values:
+        plain.update(row[None])
+    window._stage[:] = values
+    for row in range(STAGE):
+        advance(window._ints, window._floats, window._missing, window._taus, row, 1)
+    assert_same(window, plain)
+    window._stage[:] = values[::-1]
+    advance(window._ints, window._floats, window._missing, window._taus, 100, 300)
+    plain.update(values[::-1][100:400])
+    assert_same(window, plain)
+
+
 # --- long runs, large values
 
 
@@ -313,9 +471,10 @@ def test_any_array_is_taken_by_the_one_compiled_version(how):
         same.flags.writeable = False
     window, plain = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS)
     plain.update(values)
+    versions = advance.signatures
     window.update(same)
     assert_same(window, plain)
-    assert len(window_module._advance.signatures) == 1
+    assert advance.signatures == versions
     assert how == "list" or same is not values
 
 

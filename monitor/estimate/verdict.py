@@ -1,0 +1,326 @@
+"""What a solution is worth, compiled: which terms are in, their intervals, and how long the solution may stand.
+
+The unconstrained solution û beside the fit has the variance v(t) = c0 + c1 t + c2 t² if the true θ_a were t, from the
+covariances of ``uncertainty``; all that is said here of a term rests on that, see the head of ``fit``.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.sample import Floats, Ints
+from monitor.compiled import compiled
+from monitor.estimate.least_squares import K, Q, R, normal_equations, solve, weigh
+from monitor.estimate.uncertainty import NOISES
+
+MOVED: Final = 0.4
+"""Gains are made anew when a θ has moved by this share, a coefficient by a fifth, and by more than its own scatter."""
+
+TWO_SIDED_95: Final = 1.959963984540054
+ONE_SIDED_95: Final = 1.6448536269514722
+
+JUST_SEEN: Final = 3.0
+"""σ of an absent term, at which it would be seen."""
+
+NUMBERS: Final = 2 * NOISES
+"""Of Gains: θ of Q N B K (of one that is zero, how it would pull), then û of Q N B K, the solution without bounds."""
+
+
+class Known(NamedTuple):
+    """What holds for all axes at one length of the window."""
+
+    columns: Floats  # [m, 5] Allan variance of coefficients of one
+    flat: Floats  # [m, 5] the same without what their own noise puts into slope² τ²/2 on average
+    covariance: Floats  # [m, m, 10] of ``uncertainty.Table``
+    whole: Floats  # [m] terms in a window without gaps
+    slope_variance: Floats  # [4] of the slope of thirds, for θ of one
+
+
+class Answer(NamedTuple):
+    """One fit, a row an axis."""
+
+    entered: NDArray[np.bool_]  # [axes, 5] which terms are in; also read, as what was in before
+    theta: Floats  # [axes, 5] also read by a warm start
+    lo: Floats  # [axes, 5]
+    hi: Floats  # [axes, 5]
+    status: NDArray[np.int8]  # [axes, 5]
+    edf: Floats  # [axes, m]
+    fitted: Floats  # [axes, m]
+    left_out: Ints  # [axes]
+    misfit: Floats  # [axes] variance about the fit over that of noise of the five terms; one where chance explains it
+
+
+class Gains(NamedTuple):
+    """The linear map from curve to coefficients, and how far it holds; a row an axis."""
+
+    rows: Floats  # [axes, m, NUMBERS]
+    ramp: Floats  # [axes, NUMBERS] the same for a curve of τ²/2: what slope² takes away
+    twist: Floats  # [axes, NUMBERS] and what the slope itself does, as the τ see other slopes than the window
+    low: Floats  # [axes, NUMBERS + 1] the numbers, and last the slope's size, must stay between these
+    high: Floats  # [axes, NUMBERS + 1]
+    used: Ints  # [axes, 2] first τ used, and the one after the last; equal: there is no solution
+    straight: NDArray[np.bool_]  # [axes] they stand for a curve from which slope² τ²/2 is taken
+    either: NDArray[np.bool_]  # [axes] the slope is more than noise without K makes: K or R
+
+
+def answer(axes: int, m: int, entered: NDArray[np.bool_]) -> Answer:
+    """Room for the answer of m τ."""
+    theta, lo, hi = np.full((3, axes, 5), np.nan)
+    edf, fitted = np.full((2, axes, m), np.nan)
+    return Answer(
+        entered, theta, lo, hi, np.zeros((axes, 5), np.int8), edf, fitted, np.zeros(axes, np.int64), np.ones(axes)
+    )
+
+
+def gains(axes: int, m: int) -> Gains:
+    """Room for the gains of m τ; they do not hold yet."""
+    return Gains(
+        np.zeros((axes, m, NUMBERS)),
+        np.zeros((axes, NUMBERS)),
+        np.zeros((axes, NUMBERS)),
+        np.full((axes, NUMBERS + 1), np.inf),
+        np.full((axes, NUMBERS + 1), -np.inf),
+        np.zeros((axes, 2), np.int64),
+        np.zeros(axes, np.bool_),
+        np.zeros(axes, np.bool_),
+    )
+
+
+@compiled
+def judge(  # type: ignore[no-untyped-def]
+    level, rows, stretch, covariance, weighted, normal, thresholds, straight, misfit,
+    entered, theta, lo, hi, status, numbers,
+):  # fmt: skip
+    """Which terms are in, and the interval of each: see the head of ``fit``.
+
+    Returns the variance of each û if its term were absent; ``numbers`` [m, NUMBERS] takes the rows of û.
+    """
+    terms = NOISES if straight else 5
+    gain, estimate = np.zeros((5, rows.size)), np.zeros(5)
+    numbers[:] = 0.0
+    for a in range(terms):
+        if not _row_of(a, rows, weighted, normal, stretch, gain[a]):
+            entered[a] = False
+            continue
+        estimate[a] = _estimate(gain[a], level, rows, stretch)
+        if a < NOISES:
+            for k in range(rows.size):
+                numbers[rows[k], NOISES + a] = gain[a, k] / stretch[rows[k]]
+    forms = _variance_forms(np.arange(terms), gain, rows, theta, covariance)
+    for a in range(terms):
+        c0, c1, c2 = misfit * forms[a, 0], misfit * forms[a, 1], forms[a, 2]
+        if c0 <= 0.0 and c2 <= 0.0:  # there was no solution
+            continue
+        skewness = 2.0 * np.sqrt(forms[a, 2])
+        threshold = thresholds[1] if entered[a] else thresholds[0]
+        entered[a] = a != R and theta[a] > 0.0 and estimate[a] > threshold * np.sqrt(c0)
+        if entered[a]:
+            status[a] = 2
+            value = np.sqrt(theta[a])
+            lo[a] = min(value, _interval_end(estimate[a], c0, c1, c2, skewness, TWO_SIDED_95))
+            hi[a] = max(value, _interval_end(estimate[a], c0, c1, c2, skewness, -TWO_SIDED_95))
+        else:
+            # a bound below what an estimate of zero would give claims more than the curve can know
+            status[a] = 1
+            lo[a] = 0.0
+            hi[a] = _interval_end(max(estimate[a], 0.0), c0, c1, c2, skewness, -ONE_SIDED_95)
+    return misfit * forms[:NOISES, 0]
+
+
+@compiled
+def sharpen(  # type: ignore[no-untyped-def]
+    level, rows, stretch, columns, covariance, full, misfit, c0, theta, hi, status, numbers
+):
+    """Bounds of the terms that are not in, each by the weights that suit a term just as large as could be seen.
+
+    Weights for an absent term look where none of it is: on the few long τ that K would fill, say, they leave so little
+    that its own scatter drowns it, and the bound is far off or infinite.
+    """
+    supposed, scratch, weights = theta.copy(), np.empty(level.size), np.empty((level.size, 5))
+    normal, right, gain = np.empty((5, 5)), np.empty(5), np.empty((1, rows.size))
+    for a in range(NOISES):
+        if status[a] != 1 or c0[a] <= 0.0:
+            continue
+        estimate = 0.0
+        for i in rows:
+            estimate += numbers[i, NOISES + a] * level[i]
+        supposed[:] = theta
+        supposed[a] = max(estimate, 0.0) + JUST_SEEN * np.sqrt(c0[a])
+        weigh(rows, supposed, covariance, stretch, columns, full, scratch, weights)
+        normal_equations(level, rows, columns, weights, normal, right)
+        if _row_of(a, rows, weights, normal, stretch, gain[0]):
+            c = _variance_forms(np.array([a]), gain, rows, theta, covariance)[0]
+            estimate = max(_estimate(gain[0], level, rows, stretch), 0.0)
+            skewness = 2.0 * np.sqrt(c[2])
+            hi[a] = _interval_end(estimate, misfit * c[0], misfit * c[1], c[2], skewness, -ONE_SIDED_95)
+
+
+@compiled
+def _estimate(gain, level, rows, stretch):  # type: ignore[no-untyped-def]
+    """û of one row."""
+    estimate = 0.0
+    for k in range(rows.size):
+        estimate += gain[k] / stretch[rows[k]] * level[rows[k]]
+    return estimate
+
+
+@compiled
+def _row_of(a, rows, weighted, normal, stretch, gain):  # type: ignore[no-untyped-def]
+    """The row of the linear map from curve to û_a, each τ as if it had all terms; False where there is none."""
+    unit, solution = np.zeros(5), np.empty(5)
+    unit[a] = 1.0
+    if not solve(normal, unit, (2**NOISES - 1) | (1 << a), solution):
+        return False
+    for k in range(rows.size):
+        x = 0.0
+        for c in range(5):
+            x += solution[c] * weighted[rows[k], c]
+        gain[k] = x * stretch[rows[k]]
+    return True
+
+
+@compiled
+def _variance_forms(terms, gain, rows, theta, covariance):  # type: ignore[no-untyped-def]
+    """c0 c1 c2 [terms, 3] of each û = g σ²: its variance if its own θ were t is c0 + c1 t + c2 t².
+
+    One walk over the pairs of τ for all terms; of those the ramp, which has no noise, only has c0.
+    """
+    q, n, b, k = max(theta[0], 0.0), theta[1], theta[2], theta[3]
+    forms, bent, own = np.zeros((terms.size, 3)), np.zeros(5), np.zeros(5)
+    for i in range(rows.size):
+        for j in range(i + 1):
+            c = covariance[rows[i], rows[j]]
+            own[0], own[1], own[2], own[3] = c[0], c[4], c[7], c[9]
+            bent[0] = n * c[1] + b * c[2] + k * c[3]
+            bent[1] = q * c[1] + b * c[5] + k * c[6]
+            bent[2] = q * c[2] + n * c[5] + k * c[8]
+            bent[3] = q * c[3] + n * c[6] + b * c[8]
+            others = n * (n * c[4] + b * c[5] + k * c[6]) + b * (n * c[5] + b * c[7] + k * c[8])
+            others += k * (n * c[6] + b * c[8] + k * c[9])  # without Q
+            twice = 1.0 if i == j else 2.0
+            for index in range(terms.size):
+                a = terms[index]
+                weight = twice * gain[index, i] * gain[index, j]
+                if a == Q:
+                    absent = others
+                elif a == R:
+                    absent = others + q * (2.0 * bent[0] + q * own[0])
+                else:
+                    absent = others + q * (2.0 * bent[0] + q * own[0]) - theta[a] * (2.0 * bent[a] + theta[a] * own[a])
+                forms[index, 0] += weight * absent
+                forms[index, 1] += weight * 2.0 * bent[a]
+                forms[index, 2] += weight * own[a]
+    for a in range(forms.shape[0]):
+        forms[a, 0] = max(forms[a, 0], 0.0)
+    return forms
+
+
+@compiled
+def judge_ramp(slope, slope_variance, thresholds, entered, theta, lo, hi, status):  # type: ignore[no-untyped-def]
+    """R is in when the slope is more than noise makes even with K at the upper end of its interval.
+
+    Returns the variance of the slope under the fitted noise, and under that with most K.
+    """
+    noise = 0.0
+    for a in range(NOISES):
+        noise += max(theta[a], 0.0) * slope_variance[a]
+    most = noise
+    if status[K] > 0:
+        most += (hi[K] ** 2 - theta[K]) * slope_variance[K]
+    entered[R] = status[K] > 0 and abs(slope) > thresholds[1 if entered[R] else 0] * np.sqrt(most)
+    theta[R] = slope * slope if entered[R] else max(slope * slope - noise, 0.0)
+    status[R] = 2 if entered[R] else 1
+    lo[R] = max(abs(slope) - TWO_SIDED_95 * np.sqrt(most), 0.0) if entered[R] else 0.0
+    hi[R] = abs(slope) + (TWO_SIDED_95 if entered[R] else ONE_SIDED_95) * np.sqrt(most)
+    return noise, most
+
+
+@compiled
+def _interval_end(estimate, c0, c1, c2, skewness, z):  # type: ignore[no-untyped-def]
+    """√t where the estimate lies k √v(t) above t; k is the Pearson-III quantile of probability Φ(z).
+
+    Wilson & Hilferty: k = (2/s)[(1 + s z/6 − s²/36)³ − 1], skewness s = 2 √c2 of the estimate alone, as of χ² with
+    2/c2 degrees of freedom. t solves (1 − k²c2) t² − (2û + k²c1) t + û² − k²c0 = 0; the end is clipped at zero.
+    """
+    s = skewness
+    k = z if s < 1e-6 else 2.0 / s * (max(1.0 + s * z / 6.0 - s * s / 36.0, 0.0) ** 3 - 1.0)
+    a = 1.0 - k * k * c2
+    b = estimate + 0.5 * k * k * c1
+    root = b * b - a * (estimate * estimate - k * k * c0)
+    if root < 0.0 or a <= 1e-9:
+        return 0.0 if z > 0.0 else np.inf
+    t = (b - np.sqrt(root)) / a if z > 0.0 else (b + np.sqrt(root)) / a
+    return np.sqrt(max(t, 0.0))
+
+
+@compiled
+def bound_by_first_point(avar, edf, column, entered, lo, hi, status):  # type: ignore[no-untyped-def]
+    """Q is hidden behind the sensor's band limit: it makes no more than the whole of the first point."""
+    entered[Q] = False
+    status[Q] = 1
+    lo[Q] = 0.0
+    spread = 2.0 / (9.0 * max(edf, 1.0))
+    hi[Q] = np.sqrt(avar / column / max(1.0 - spread - ONE_SIDED_95 * np.sqrt(spread), 0.05) ** 3)
+
+
+@compiled
+def freeze(  # type: ignore[no-untyped-def]
+    axis, rows, weighted, normal, right, free, thresholds, c0, most, columns, slope, slopes, answer, gains
+):
+    """Keep the solution as a linear map, with the limits of its use.
+
+    ``gains.rows`` holds û of Q N B K already; here come θ on the terms that are not zero, and for one that is, the
+    pull that would let it grow.
+    """
+    m = columns.shape[0]
+    if rows[-1] - rows[0] != rows.size - 1:
+        return  # a τ between others without a term: only a gap nearly as long as the window makes that
+    out, low, high = gains.rows[axis], gains.low[axis], gains.high[axis]
+    theta, entered, status = answer.theta[axis], answer.entered[axis], answer.status[axis]
+    subset = 0
+    for a in range(NOISES):
+        if theta[a] != 0.0:
+            subset |= 1 << a
+    unit, solution = np.empty(5), np.empty(5)
+    for a in range(NOISES):
+        for i in range(m):
+            out[i, a] = 0.0
+        if subset >> a & 1:
+            unit[:] = 0.0
+            unit[a] = 1.0
+            if not solve(normal, unit, subset, solution):
+                return
+            for i in rows:
+                for c in range(NOISES):
+                    out[i, a] += solution[c] * weighted[i, c]
+            reach = max(MOVED * abs(theta[a]), np.sqrt(c0[a]))
+            low[a] = theta[a] - reach if free and a == Q else max(theta[a] - reach, 0.0)
+            high[a] = theta[a] + reach
+        else:
+            low[a], high[a] = -np.inf, 1e-9 * abs(right[a])
+    for a in range(NOISES):
+        if not subset >> a & 1:
+            for i in rows:
+                out[i, a] = weighted[i, a]
+                for b in range(NOISES):
+                    if subset >> b & 1:
+                        out[i, a] -= normal[a, b] * out[i, b]
+        # of û: where the term would enter or leave
+        low[NOISES + a], high[NOISES + a] = -np.inf, np.inf
+        if entered[a]:
+            low[NOISES + a] = thresholds[1] * np.sqrt(c0[a])
+        elif theta[a] > 0.0:
+            high[NOISES + a] = thresholds[0] * np.sqrt(c0[a])
+    low[NUMBERS], high[NUMBERS] = 0.0, np.inf
+    if entered[R]:
+        low[NUMBERS] = thresholds[1] * np.sqrt(most)
+    elif status[K] > 0 and most == most:
+        high[NUMBERS] = thresholds[0] * np.sqrt(most)
+    for r in range(NUMBERS):
+        gains.ramp[axis, r] = gains.twist[axis, r] = 0.0
+        if gains.straight[axis]:
+            for i in rows:
+                gains.ramp[axis, r] += out[i, r] * columns[i, R]
+                gains.twist[axis, r] += out[i, r] * columns[i, R] * 2.0 * (slopes[axis, i] - slope)
+    gains.used[axis, 0], gains.used[axis, 1] = rows[0], rows[-1] + 1
