@@ -93,10 +93,10 @@ def design(factors: Ints, rate_hz: float) -> Design:
 
 def known(design: Design, table: Table) -> Known:
     """What every fit at this length of the window shares."""
-    slope_variance = _slope_variance(table.n)
     flat = design.columns.copy()
-    flat[:, :NOISES] -= slope_variance * design.columns[:, R, None]
-    return Known(design.columns, flat, table.covariance, table.terms.astype(np.float64), slope_variance)
+    # what taking away the line costs each noise on average, see the level in ``fit_axis``
+    flat[:, :NOISES] -= (2.0 * table.bend - table.slope) * design.columns[:, R, None]
+    return Known(design.columns, flat, table.covariance, table.terms.astype(np.float64), table.slope)
 
 
 def fit(
@@ -181,16 +181,6 @@ def slope_of_thirds(phase: Floats, seconds: float) -> Floats:
     [0.1]
     """
     return np.asarray((phase[3] - phase[2] - phase[1] + phase[0]) / (2.0 / 9.0 * seconds**2))
-
-
-def _slope_variance(n: int) -> Floats:
-    """Variance of ``slope_of_thirds`` for Q² N² B² K² of one, τ0 = 1, from the autocovariances of phase.
-
-    With τ = n/3 the sums over the four points are 4, 2τ, (9 ln 3 − 8 ln 2) τ²/π and 5τ³/3, over (2τ²)².
-    """
-    tau = n / 3.0
-    flicker = (9.0 * np.log(3.0) - 8.0 * np.log(2.0)) / np.pi
-    return np.array([4.0, 2.0 * tau, flicker * tau**2, 5.0 / 3.0 * tau**3]) / (4.0 * tau**4)
 
 
 def _white_edf(design: Design, table: Table, terms: Ints) -> Floats:

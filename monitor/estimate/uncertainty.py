@@ -52,6 +52,8 @@ class Table:
     factors: Ints  # [m] cluster sizes
     terms: Ints  # [m] second differences in a window without gaps; ≤ 0 where it is too short
     covariance: Floats  # [m, m, 10] C^ab_ij of the pairs a ≤ b; NaN where the window is too short
+    slope: Floats  # [4] variance of the slope of thirds, for θ of one
+    bend: Floats  # [m, 4] its covariance with the slope that each τ sees (``window_kernel.mean_bend``)
 
 
 class Tables:
@@ -90,9 +92,40 @@ def table(n: int, factors: Ints) -> Table:
     covariance = np.full((factors.size, factors.size, len(PAIRS)), np.nan)
     _fill(n, factors, covariance)
     terms = n + 1 - 2 * factors
-    for array in (terms, covariance):
+    slope, bend = _slope_variance(n), np.array([_bend_covariance(n, m) for m in factors.tolist()])
+    for array in (terms, covariance, slope, bend):
         array.flags.writeable = False
-    return Table(n, factors, terms, covariance)
+    return Table(n, factors, terms, covariance, slope, bend)
+
+
+def _slope_variance(n: int) -> Floats:
+    """Variance of ``fit.slope_of_thirds`` for Q² N² B² K² of one, τ0 = 1, from the autocovariances of phase.
+
+    With τ = n/3 the sums over the four points are 4, 2τ, (9 ln 3 − 8 ln 2) τ²/π and 5τ³/3, over (2τ²)².
+    """
+    tau = n / 3.0
+    flicker = (9.0 * np.log(3.0) - 8.0 * np.log(2.0)) / np.pi
+    return np.array([4.0, 2.0 * tau, flicker * tau**2, 5.0 / 3.0 * tau**3]) / (4.0 * tau**4)
+
+
+def _bend_covariance(n: int, m: int) -> Floats:
+    """Covariance of the slope of thirds and of the mean second difference over m², for Q² N² B² K² of one, τ0 = 1.
+
+    Both are sums over a few points of phase, so it is a sum of the generalised autocovariances over the lags between
+    them; of the blocks of m points behind a mean second difference some sixty stand for all.
+    """
+    if n < 3 or n + 1 <= 2 * m:
+        return np.full(NOISES, np.nan)
+    k = np.arange(0, m, max(1, m // 64))
+    block = np.concatenate([n - k, n - m - k, 2 * m - 1 - k, m - 1 - k])
+    sign = np.repeat([1.0, -1.0, -1.0, 1.0], k.size)
+    third = n // 3
+    lag = np.abs(np.subtract.outer(n - third * np.arange(4), block)).astype(np.float64)
+    weight = np.outer([1.0, -1.0, -1.0, 1.0], sign)
+    weight *= m / k.size / ((n + 1.0 - 2 * m) * m**2) / (2.0 * third**2)
+    flicker = lag**2 * np.log(np.maximum(lag, 1.0)) / (2.0 * np.pi)
+    parts = (lag == 0.0, -lag / 2.0, flicker, (lag**2 - 1.0) * lag / 12.0)
+    return np.array([float((weight * part).sum()) for part in parts])
 
 
 class Spans:

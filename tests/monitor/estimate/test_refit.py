@@ -39,7 +39,8 @@ def fresh(window, before):
     """A fit from nothing to the curve of a window; diagonal weights, as at every sample."""
     tables = Tables(FACTORS, LENGTH)
     slope = window.slope() * RATE_HZ
-    return fit(DESIGN, tables.at(window.n), window.avar(), window.terms(), before, slope, full=False)
+    slopes = window.slopes() * RATE_HZ
+    return fit(DESIGN, tables.at(window.n), window.avar(), window.terms(), before, slope, slopes, full=False)
 
 
 @pytest.mark.parametrize("seconds", [40, 150, 390, 600])
