@@ -11,7 +11,12 @@ scheduler, one that stays is a hole. The same delay tells the whole turns that a
 ran further than the host's clock allows began anew: then arrival decides. ``lost`` of each block that goes out counts
 all samples missing just before it, rejected frames included.
 
-Not done here: no sample is dropped, repeated or moved to another place in the order.
+A row that repeats another, with the same counter or given time and the same values, is kept out and told; with other
+values it stays, and that is told. Rows of one block whose given times are a steady sequence in another order are put in
+order; one that comes after its place was passed on as missing is kept out and told (``drivers.order``). Events of one
+kind are at most one a second of sample time.
+
+Not done here: no value is changed, and where times are too rough to tell, every row stays in the order it came.
 """
 
 from collections import deque
@@ -22,9 +27,9 @@ from typing import Final
 import numpy as np
 
 from drivers.line import LEARN_S, Line, made_rate
+from drivers.order import BACK, NEAR, NS, Repeats, Telling, steady_order
 from drivers.sample import NO_TICK, Counter, Event, Floats, Given, Ints, SampleBlock, Timing, block
 
-NS: Final = 1e9
 CATCH_UP_S: Final = 3.0
 HOLE_PERIODS: Final = 3.0
 HOLE_MIN_S: Final = 0.05
@@ -36,8 +41,6 @@ LONG_S: Final = 3600.0
 STUCK_SAMPLES: Final = 10
 STEPS_KEPT: Final = 255
 """The last steps of a counter, or of given times, that tell what is usual."""
-NEAR: Final = 0.25
-"""Steps this near to the usual one, of it, are single ones: a tick is rounded, a device's stamp jitters."""
 SURELY_MISSING: Final = 4.0
 """Periods: a longer given step is a gap though it is not one of whole periods."""
 LATE: Final = 8.0
@@ -55,7 +58,14 @@ class SampleClock:
     def __init__(self, timing: Timing, rate_hz: float | None) -> None:
         self._timing = timing
         self._nominal_hz = rate_hz
-        self._events: list[Event] = []
+        self.repeated = 0
+        """Rows kept out, as they had come before."""
+        self.late = 0
+        """Rows kept out, as their places had been passed on as missing."""
+        self._telling = Telling()
+        self._repeats = Repeats(ordered=isinstance(timing, Given))
+        self._holes: deque[int] = deque(maxlen=BACK)  # given times that samples told as missing would have
+        self._owed = 0  # missing samples told with a row that was kept out
         self._line = Line()
         self._origin_ns: int | None = None  # seconds count from here: a double of Unix time holds no more than 240 ns
         self._last_t_ns = -(1 << 62)
@@ -82,10 +92,9 @@ class SampleClock:
         """Samples a second by the host's clock, without rounding; None until known."""
         return self._line.rate_hz() if self._line.settled() else None
 
-    def take_events(self) -> list[Event]:
-        """What the clock found since the last call."""
-        events, self._events = self._events, []
-        return events
+    def take_events(self, ended: bool = False) -> list[Event]:
+        """What the clock found since the last call; all of it if no more samples will come."""
+        return self._telling.take(ended)
 
     def pause(self) -> None:
         """The link was closed: what the next sample's arrival shows to be missing is a hole."""
@@ -95,6 +104,11 @@ class SampleClock:
         """The samples with their times, cut where some are missing."""
         if self._origin_ns is None:
             self._origin_ns = int(samples.t_ns[0])
+        self._telling.tell_due(int(samples.t_ns[-1]))
+        kept = self._in_order(self._without_repeats(samples))
+        return self._stamp(kept) if kept is not None else []
+
+    def _stamp(self, samples: SampleBlock) -> list[SampleBlock]:
         if isinstance(self._timing, Given):
             return self._keep_given(samples)
         if self._paused and self.rate_hz is None:
@@ -106,6 +120,70 @@ class SampleClock:
 
     def _seconds(self, t_ns: int) -> float:
         return (t_ns - (self._origin_ns or 0)) / NS
+
+    # --- rows that came twice, or late
+
+    def _without_repeats(self, samples: SampleBlock) -> SampleBlock | None:
+        given = isinstance(self._timing, Given)
+        if not given and (not isinstance(self._timing, Counter) or (samples.ticks == NO_TICK).any()):
+            return samples
+        keys, word = (samples.t_ns, "time") if given else (samples.ticks, "count")
+        repeats, shared = self._repeats.find(keys, samples.values)
+        t_ns = int(samples.t_ns[-1])
+        if shared:
+            text = f"{{n}} rows have the {word} of another row and other values; all are kept"
+            self._event("samples_repeated", t_ns, text, shared)
+        if repeats is None:
+            return samples
+        n = int(repeats.sum())
+        self.repeated += n
+        self._event("samples_repeated", t_ns, f"{{n}} rows repeat others, {word} and values; left out", n)
+        return self._rows(samples, np.flatnonzero(~repeats))
+
+    def _in_order(self, samples: SampleBlock | None) -> SampleBlock | None:
+        """Given times in their order, as far as the rows came together; a row whose place has passed is kept out."""
+        if samples is None or not isinstance(self._timing, Given):
+            return samples
+        t = samples.t_ns
+        if not self._line.count or (t[0] >= self._last_t_ns and (len(t) == 1 or (np.diff(t) >= 0).all())):
+            return samples
+        period_s = self._given_period_s(np.diff(t))
+        if not period_s:
+            return samples
+        if self._holes:
+            samples = self._without_late(samples, period_s)
+            if samples is None:
+                return None
+            t = samples.t_ns
+        steps = np.diff(t)
+        order = None if (steps < -JUMP_S * NS).any() else steady_order(t, period_s)
+        if order is None:
+            return samples
+        n = int((steps < 0).sum())
+        self._event("clock_jumped", int(t[-1]), "rows that came out of order: {n}; put in order", n)
+        return self._rows(samples, order)
+
+    def _without_late(self, samples: SampleBlock, period_s: float) -> SampleBlock | None:
+        holes = np.array(self._holes)
+        far = np.abs(samples.t_ns[:, None] - holes)
+        late = (samples.t_ns < self._last_t_ns) & (far.min(axis=1) < NEAR * period_s * NS)
+        if not late.any():
+            return samples
+        filled = set(far[late].argmin(axis=1).tolist())
+        self._holes = deque((t for i, t in enumerate(self._holes) if i not in filled), maxlen=BACK)
+        n = int(late.sum())
+        self.late += n
+        text = "{n} samples came after later ones, their places passed on as missing; left out"
+        self._event("clock_jumped", int(samples.t_ns[-1]), text, n)
+        return self._rows(samples, np.flatnonzero(~late))
+
+    def _rows(self, samples: SampleBlock, rows: Ints) -> SampleBlock | None:
+        """These rows in this order; what was missing before a row that is gone is missing before the next."""
+        if not rows.size:
+            self._owed += samples.lost
+            return None
+        lost, self._owed = samples.lost + self._owed, 0
+        return block(samples.t_ns[rows], samples.values[rows], samples.temperature_c[rows], samples.ticks[rows], lost)
 
     # --- times given by the sender
 
@@ -127,6 +205,10 @@ class SampleClock:
         for row in (at, len(samples) - 1):
             self._line.add(float(index[row]), self._seconds(int(t[row])))
         self._index, self._last_t_ns = float(index[-1]), int(t[-1])
+        if period_s:
+            for row in np.flatnonzero((missing > 0) & (missing <= BACK)).tolist():
+                places = np.arange(1, missing[row] + 1) * (period_s * NS)
+                self._holes.extend((t[row] - np.rint(places)).astype(np.int64).tolist())
         return _cut(samples, t, missing)
 
     def _given_period_s(self, steps: Ints) -> float | None:
@@ -310,8 +392,8 @@ class SampleClock:
         self._last_t_ns = int(t_ns[-1])
         return _cut(samples, t_ns, missing)
 
-    def _event(self, kind: str, t_ns: int, text: str) -> None:
-        self._events.append(Event(kind, t_ns, text))
+    def _event(self, kind: str, t_ns: int, text: str, n: int = 0) -> None:
+        self._telling.tell(kind, t_ns, text, n)
 
 
 @dataclass(frozen=True, slots=True)

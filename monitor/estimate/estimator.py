@@ -20,7 +20,7 @@ from drivers.sample import Floats, Ints, SampleBlock, block
 from monitor.estimate.batch import TauGrid, cluster_sizes
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Course, Estimate
-from monitor.estimate.fit import Fit, design, fit, nothing_fitted
+from monitor.estimate.fit import Fit, design, fit, joined, nothing_fitted
 from monitor.estimate.refit import Refit
 from monitor.estimate.uncertainty import Spans, Tables, intervals
 from monitor.estimate.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_spans
@@ -55,9 +55,11 @@ class Estimator:
         self._window = AllanWindow(length, rows, lengths)
         self._factors = factors
         self._design = design(factors, rate_hz)
-        self._tables = Tables(factors, length)
+        self._tables = self._new_tables()
+        self._restarted: dict[int, Tables] = {}  # of axes, by their number
         self._spans = Spans(factors, spans, self._design.columns)
         self._entered: NDArray[np.bool_] = np.zeros((5, 6), np.bool_)
+        self._lengths = np.zeros(6, np.int64)  # samples of each axis since its last restart, at most the window
         self._refit = Refit(self._window, self._m, self._tables) if every_sample else None
         self._course: list[Course] = []
         self._samples = 0
@@ -77,10 +79,13 @@ class Estimator:
         """Advance by the samples missing before the block, then by the block."""
         if samples.lost:
             self._window.skip(samples.lost)
+            self._lengths += samples.lost
+        np.minimum(self._lengths, self._window.n, out=self._lengths)
         if self._refit is None:
             self._window.update(samples.values)
+            self._lengths += len(samples)
         else:
-            course = Course(samples.t_ns, self._refit.update(self._design, samples.values))
+            course = Course(samples.t_ns, self._refit.update(self._design, samples.values, self._lengths))
             self._course = _newest([*self._course, course], COURSE_SAMPLES)
         self._samples += len(samples)
         self._newest_ns = int(samples.t_ns[-1])
@@ -88,12 +93,18 @@ class Estimator:
     def reset(self) -> None:
         """Empty the window."""
         self._window.reset()
-        self._begin_anew()
+        self._lengths[:] = 0
+        self._entered[:] = False
+        if self._refit is not None:
+            self._refit.reset()
 
-    def restart(self, samples: int) -> None:
-        """Forget all but the newest samples, missing ones included: the noise was another before them."""
-        self._window.keep(min(samples, self._window.n))
-        self._begin_anew()
+    def restart(self, axis: int, samples: int) -> None:
+        """Of one axis, forget all but the newest samples: its noise was another before them."""
+        self._window.forget(axis, samples)
+        self._lengths[axis] = min(samples, self._lengths[axis])
+        self._entered[:, axis] = False
+        if self._refit is not None:
+            self._refit.restart(axis)
 
     def relabel(self, rate_hz: float) -> None:
         """The rate is known better now: the same clusters of samples, other τ and units."""
@@ -122,17 +133,32 @@ class Estimator:
             result.k_or_r, quick, _joined(course),
         )  # fmt: skip
 
-    def _begin_anew(self) -> None:
-        self._entered = np.zeros((5, 6), np.bool_)
-        if self._refit is not None:
-            self._refit.reset()
-
     def _fit(self, avar: Floats, terms: Ints) -> Fit:
-        slope, slopes = self._window.slope() * self.rate_hz, self._window.slopes()[: self._m] * self.rate_hz
+        """Fit the axes that fill the window together, each restarted one by the covariances of its own length."""
+        lengths = np.minimum(self._lengths, self._window.n)
+        slope, slopes = self._window.slope(lengths), self._window.slopes(lengths)[: self._m]
         before = self._entered if self._refit is None else self._refit.entered
-        result = fit(self._design, self._tables.at(self._window.n), avar, terms, before, slope, slopes)
+        shorter = [axis for axis in range(len(lengths)) if lengths[axis] < self._window.n]
+        groups = [np.flatnonzero(lengths == self._window.n), *(np.array([axis]) for axis in shorter)]
+        groups = [axes for axes in groups if axes.size]
+        fits = []
+        for axes in groups:
+            n = int(lengths[axes[0]])
+            tables = (
+                self._tables if n == self._window.n else self._restarted.setdefault(int(axes[0]), self._new_tables())
+            )
+            fits.append(
+                fit(
+                    self._design, tables.at(n), avar[:, axes], terms[:, axes], before[:, axes],
+                    slope[axes] * self.rate_hz, slopes[:, axes] * self.rate_hz,
+                )
+            )  # fmt: skip
+        result = fits[0] if len(fits) == 1 else joined(fits, np.concatenate(groups))
         self._entered = result.entered
         return result
+
+    def _new_tables(self) -> Tables:
+        return Tables(self._factors, self._window.length)
 
     def _curve(self, avar: Floats, terms: Ints, edf: Floats, n: int) -> AllanCurve:
         lo, hi = intervals(avar, edf)

@@ -22,8 +22,9 @@ filter explains it, as with a line or motion, nothing is left out, and the misfi
 A fit refuses nothing: an axis with too few τ, or without noise at all, is UNESTIMATED.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,6 +151,19 @@ def fit(
         coefficients, (found.theta * to_si**2).T, found.fitted.T, edf, found.entered.T, found.left_out,
         found.misfit, frozen.either, frozen,
     )  # fmt: skip
+
+
+def joined(fits: Sequence[Fit], axes: Ints) -> Fit:
+    """Fits of some axes each, as one of all: column ``axes[k]`` of the result is the k-th of theirs."""
+    order = np.argsort(axes)
+
+    def side_by_side(field: str, of: str = "") -> NDArray[Any]:
+        parts = [getattr(getattr(one, of) if of else one, field) for one in fits]
+        return np.concatenate(parts, axis=-1)[..., order]
+
+    coefficients = Coefficients(*(side_by_side(field, "coefficients") for field in ("value", "lo", "hi", "status")))
+    names = ("theta", "fitted", "edf", "entered", "left_out", "misfit", "k_or_r")
+    return Fit(coefficients, **{name: side_by_side(name) for name in names}, gains=None)
 
 
 def nothing_fitted(avar: Floats) -> Fit:

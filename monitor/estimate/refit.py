@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import Floats
+from drivers.sample import Floats, Ints
 from monitor.compiled import compiled
 from monitor.estimate.fit import THRESHOLDS_WATCHED, TO_SI, Design, known
 from monitor.estimate.fit_kernel import fit_axis
@@ -33,7 +33,7 @@ from monitor.estimate.window_kernel import (
     cut_floats,
     cut_ints,
     mean_bend,
-    place,
+    thirds,
 )
 
 REFRESH: Final = 4
@@ -66,19 +66,28 @@ class Refit:
         self._gains: Gains = gains(AXES, self._rows)
         self._n = 0
 
+    def restart(self, axis: int) -> None:
+        """One axis begins anew."""
+        self._answer.entered[axis] = False
+        self._answer.theta[axis] = np.nan
+        self._gains.used[axis] = 0
+
     @property
     def entered(self) -> NDArray[np.bool_]:
         """Which terms are in [5, 6]."""
         return self._answer.entered.T
 
-    def update(self, design: Design, values: Floats) -> Floats:
-        """Advance by samples [n, 6]; the coefficients [n, 5, 6] in SI after each, NaN where not estimated."""
+    def update(self, design: Design, values: Floats, lengths: Ints) -> Floats:
+        """Advance by samples [n, 6]; the coefficients [n, 5, 6] in SI after each, NaN where not estimated.
+
+        ``lengths`` [6], samples of each axis that the window holds, are advanced too.
+        """
         course = np.empty((len(values), 5, AXES))
         for start in range(0, len(values), STAGE):
-            self._advance(design, values[start : start + STAGE], course[start : start + STAGE])
+            self._advance(design, values[start : start + STAGE], lengths, course[start : start + STAGE])
         return course
 
-    def _advance(self, design: Design, values: Floats, course: Floats) -> None:
+    def _advance(self, design: Design, values: Floats, lengths: Ints, course: Floats) -> None:
         self._window.stage(values)
         done = 0
         while done < len(values):
@@ -89,7 +98,7 @@ class Refit:
                 self._n = table.n
             until = min(len(values) - done, self._tables.lasts(n))
             _follow(
-                self._window.parts(), done, until, known(design, table), THRESHOLDS_WATCHED,
+                self._window.parts(), done, until, lengths, known(design, table), THRESHOLDS_WATCHED,
                 design.rate_hz**TO_SI,
                 self._answer, self._gains, self._ages, self._curve, self._terms, self._slopes, course,
             )  # fmt: skip
@@ -98,13 +107,13 @@ class Refit:
 
 @compiled
 def _follow(  # type: ignore[no-untyped-def]
-    parts, start, n, known, thresholds, to_si, answer, gains, ages, curve, terms, slopes, course
+    parts, start, n, lengths, known, thresholds, to_si, answer, gains, ages, curve, terms, slopes, course
 ):
     """Advance by n staged samples from row ``start``, and fit after each into that row of ``course``."""
     ints, floats, missing, taus, window = parts
     state, factors, _, counts, phase = cut_ints(ints, taus)
     scaling, _, sums, rest, _ = cut_floats(floats, taus)
-    places, m = phase.size // LANES, known.whole.size
+    m = known.whole.size
     numbers, slope, held = np.empty((AXES, NUMBERS)), np.empty(AXES), np.empty(AXES, np.bool_)
     units, inverse = np.empty((AXES, m)), np.empty((AXES, m))
     for axis in range(AXES):
@@ -115,7 +124,8 @@ def _follow(  # type: ignore[no-untyped-def]
         advance(ints, floats, missing, taus, row, 1)
         filled = min(state[TOTAL], window)
         for axis in range(AXES):
-            slope[axis] = _slope(phase, missing, state[NEWEST], filled // 3, places, axis) / scaling[axis]
+            lengths[axis] = min(lengths[axis] + 1, filled)
+            slope[axis] = thirds(phase, missing, state[NEWEST], lengths[axis], axis) / scaling[axis]
         _apply(
             units, inverse, terms, counts, sums, rest, slope,
             gains.rows, gains.ramp, gains.twist, gains.low, gains.high, gains.used, gains.straight, numbers, held,
@@ -135,7 +145,9 @@ def _follow(  # type: ignore[no-untyped-def]
                     inverse[axis, i] = 1.0 / (units[axis, i] * counts[at])
                     # as AllanWindow.avar: a constant axis has no noise
                     curve[axis, i] = total * inverse[axis, i] if total > counts[at] else 0.0
-                    slopes[axis, i] = mean_bend(phase, missing, state[NEWEST], filled, factors[i], axis) / scaling[axis]
+                    slopes[axis, i] = (
+                        mean_bend(phase, missing, state[NEWEST], lengths[axis], factors[i], axis) / scaling[axis]
+                    )
                 fit_axis(axis, known, curve, terms, slope[axis], slopes, thresholds, False, True, answer, gains)
                 ages[axis] = 0
             for a in range(5):
@@ -174,15 +186,3 @@ def _apply(  # type: ignore[no-untyped-def]
             held[axis] = held[axis] and low[axis, NUMBERS] <= abs(s) <= high[axis, NUMBERS]
         for r in range(NUMBERS):  # false for NaN too
             held[axis] = held[axis] and low[axis, r] <= numbers[axis, r] <= high[axis, r]
-
-
-@compiled
-def _slope(phase, missing, newest, third, places, axis):  # type: ignore[no-untyped-def]
-    """As ``AllanWindow.slope``, of one axis and in units of its integers; NaN where a sample is missing."""
-    if third == 0:
-        return np.nan
-    at0, at1 = newest * LANES + axis, place(newest - third, places) * LANES + axis
-    at2, at3 = place(newest - 2 * third, places) * LANES + axis, place(newest - 3 * third, places) * LANES + axis
-    if missing[at0] != missing[at3]:
-        return np.nan
-    return float(phase[at0] - phase[at1] - phase[at2] + phase[at3]) / (2.0 * third * third)

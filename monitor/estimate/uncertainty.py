@@ -18,6 +18,7 @@ sample: τ0 = 1, and θ stands for Q²/τ0², N²/τ0, B², K² τ0, R² τ0².
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -25,6 +26,9 @@ from scipy.special import chdtri
 
 from drivers.sample import Floats, Ints
 from monitor.compiled import compiled
+from monitor.noise.effects.bias_instability import BiasInstability
+
+Q, N, B, K, R = range(5)
 
 NOISES: Final = 4
 """Random terms of the table, Q N B K; the ramp R is deterministic and adds no variance of its own."""
@@ -91,11 +95,21 @@ def table(n: int, factors: Ints) -> Table:
     factors = np.ascontiguousarray(factors, np.int64)
     covariance = np.full((factors.size, factors.size, len(PAIRS)), np.nan)
     _fill(n, factors, covariance)
+    # t² ln t is continuous 1/f; sampled, there is none above half the rate: less at the shortest τ
+    share = np.array([_sampled_flicker(m) for m in factors.tolist()])
+    for pair, (a, b) in enumerate(PAIRS):
+        covariance[:, :, pair] *= np.outer(share, share) ** ((a == B) + (b == B))
     terms = n + 1 - 2 * factors
     slope, bend = _slope_variance(n), np.array([_bend_covariance(n, m) for m in factors.tolist()])
     for array in (terms, covariance, slope, bend):
         array.flags.writeable = False
     return Table(n, factors, terms, covariance, slope, bend)
+
+
+@cache
+def _sampled_flicker(m: int) -> float:
+    """Deviation of sampled 1/f noise over that of continuous, one but at the shortest τ."""
+    return float(np.sqrt(BiasInstability(B=1.0).avar(np.array([float(m)]), 1.0)[0] / (2.0 * np.log(2.0) / np.pi)))
 
 
 def _slope_variance(n: int) -> Floats:

@@ -18,7 +18,9 @@ MOVED: Final = 0.4
 """Gains are made anew when a θ has moved by this share, a coefficient by a fifth, and by more than its own scatter."""
 
 TWO_SIDED_95: Final = 1.959963984540054
-ONE_SIDED_95: Final = 1.6448536269514722
+BOUND: Final = TWO_SIDED_95
+"""Of an upper bound: 97.5 % for one look, and still 95 % of what is said where terms that come out large are estimated
+instead and their intervals miss too."""
 
 JUST_SEEN: Final = 3.0
 """σ of an absent term, at which it would be seen."""
@@ -124,7 +126,7 @@ def judge(  # type: ignore[no-untyped-def]
             # a bound below what an estimate of zero would give claims more than the curve can know
             status[a] = 1
             lo[a] = 0.0
-            hi[a] = _interval_end(max(estimate[a], 0.0), c0, c1, c2, skewness, -ONE_SIDED_95)
+            hi[a] = _interval_end(max(estimate[a], 0.0), c0, c1, c2, skewness, -BOUND)
     return misfit * forms[:NOISES, 0]
 
 
@@ -153,7 +155,7 @@ def sharpen(  # type: ignore[no-untyped-def]
             c = _variance_forms(np.array([a]), gain, rows, theta, covariance)[0]
             estimate = max(_estimate(gain[0], level, rows, stretch), 0.0)
             skewness = 2.0 * np.sqrt(c[2])
-            hi[a] = _interval_end(estimate, misfit * c[0], misfit * c[1], c[2], skewness, -ONE_SIDED_95)
+            hi[a] = _interval_end(estimate, misfit * c[0], misfit * c[1], c[2], skewness, -BOUND)
 
 
 @compiled
@@ -232,7 +234,7 @@ def judge_ramp(slope, slope_variance, thresholds, entered, theta, lo, hi, status
     theta[R] = slope * slope if entered[R] else max(slope * slope - noise, 0.0)
     status[R] = 2 if entered[R] else 1
     lo[R] = max(abs(slope) - TWO_SIDED_95 * np.sqrt(most), 0.0) if entered[R] else 0.0
-    hi[R] = abs(slope) + (TWO_SIDED_95 if entered[R] else ONE_SIDED_95) * np.sqrt(most)
+    hi[R] = abs(slope) + (TWO_SIDED_95 if entered[R] else BOUND) * np.sqrt(most)
     return noise, most
 
 
@@ -261,7 +263,7 @@ def bound_by_first_point(avar, edf, column, entered, lo, hi, status):  # type: i
     status[Q] = 1
     lo[Q] = 0.0
     spread = 2.0 / (9.0 * max(edf, 1.0))
-    hi[Q] = np.sqrt(avar / column / max(1.0 - spread - ONE_SIDED_95 * np.sqrt(spread), 0.05) ** 3)
+    hi[Q] = np.sqrt(avar / column / max(1.0 - spread - BOUND * np.sqrt(spread), 0.05) ** 3)
 
 
 @compiled

@@ -46,7 +46,9 @@ from monitor.estimate.window_kernel import (
     bends,
     cut_floats,
     cut_ints,
+    forget,
     take_again,
+    thirds,
 )
 
 MIN_LENGTH: Final = 100
@@ -194,6 +196,14 @@ class AllanWindow:
         self._state[STRUCK] -= forgotten
         take_again(self._ints, self._floats, self._missing, self._taus)
 
+    def forget(self, axis: int, n: int) -> None:
+        """Of one axis, forget all but the newest n samples: those before are missing from now on.
+
+        Costs a walk over the window, and what n samples cost.
+        """
+        if n < self.n:
+            forget(self._ints, self._floats, self._missing, self._taus, axis, n)
+
     def avar(self) -> Floats:
         """Allan variance [m, 6] in unit² of the axis; NaN where no term is complete."""
         sums = (self._sums + self._rest)[:, :AXES]
@@ -204,28 +214,25 @@ class AllanWindow:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(terms > 0, sums / (2.0 * m * m * terms), np.nan)
 
-    def slope(self) -> Floats:
-        """Slope of the rate over the window [6], unit of the axis a sample; NaN where a sample is missing.
+    def slope(self, lengths: Ints | None = None) -> Floats:
+        """Slope of the rate over the newest ``lengths`` [6] samples, by default all; NaN where one is missing.
 
-        Mean of the last third less that of the first, over two thirds of the window (``fit.slope_of_thirds``).
+        [6], unit of the axis a sample: mean of the last third less that of the first, over two thirds of the
+        window (``fit.slope_of_thirds``).
         """
-        third = self.n // 3
-        if third == 0:
-            return np.full(AXES, np.nan)
-        places = self._phase.size // LANES
-        at = (int(self._state[NEWEST]) - third * np.arange(4)) % places * LANES
-        phase = self._phase[at[:, None] + np.arange(AXES)]
-        bent = (phase[0] - phase[1] - phase[2] + phase[3]) / self._scale[:AXES]
-        missing = self._missing[at[:, None] + np.arange(AXES)]
-        return np.where(missing[0] == missing[3], bent / (2.0 * third * third), np.nan)
+        newest = int(self._state[NEWEST])
+        lengths = np.full(AXES, self.n) if lengths is None else lengths
+        result = np.array([thirds(self._phase, self._missing, newest, n, axis) for axis, n in enumerate(lengths)])
+        return result / self._scale[:AXES]
 
-    def slopes(self) -> Floats:
+    def slopes(self, lengths: Ints | None = None) -> Floats:
         """Slope of the rate [m, 6] as each τ sees it: its mean second difference of phase over m²; unit a sample.
 
-        NaN where a sample is missing. Not of spans, but of the whole window.
+        NaN where a sample is missing. Not of spans, but of the newest ``lengths`` [6] samples; of all by default.
         """
         result = np.empty((self._taus, AXES))
-        bends(self._phase, self._missing, int(self._state[NEWEST]), self.n, self.factors, result)
+        lengths = np.full(AXES, self.n) if lengths is None else lengths
+        bends(self._phase, self._missing, int(self._state[NEWEST]), lengths, self.factors, result)
         return result / self._scale[:AXES]
 
     def terms(self) -> Ints:

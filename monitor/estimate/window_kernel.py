@@ -264,11 +264,52 @@ def _swap(now: int, factors: Ints, spans: Ints, phase: Ints, scratch: Floats, su
 
 
 @compiled
-def bends(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, factors: Ints, out: Floats) -> None:
+def forget(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, axis: int, n: int) -> None:
+    """Of one axis, all but the newest n samples become missing, and the sums are made anew from those n."""
+    state, factors, spans, terms, phase = cut_ints(ints, taus)
+    _, _, sums, rest, _ = cut_floats(floats, taus)
+    places = phase.size // LANES
+    # a count that differs from point to point: no term can begin and end with the same
+    oldest = place(state[NEWEST] - n, places) * LANES + axis
+    for back in range(1, min(state[TOTAL], places - 1 - RUN) - n + 1):
+        missing[place(state[NEWEST] - n - back, places) * LANES + axis] = missing[oldest] - back
+    state[STRUCK] = max(state[STRUCK], state[TOTAL] - n)
+    for i in range(taus):
+        m, own = factors[i], i * LANES + axis
+        total, left, count = 0.0, 0.0, 0
+        for back in range(min(n, spans[i]) - 2 * m, -1, -1):
+            at = state[NEWEST] - back
+            at0, at1 = place(at, places) * LANES + axis, place(at - m, places) * LANES + axis
+            at2 = place(at - 2 * m, places) * LANES + axis
+            if missing[at0] == missing[at2]:
+                d = float(phase[at0] - 2 * phase[at1] + phase[at2])
+                s = total + d * d
+                z = s - total
+                left += (total - (s - z)) + (d * d - z)
+                total = s
+                count += 1
+        sums[own], rest[own], terms[own] = total, left, count
+
+
+@compiled
+def thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> float:
+    """Slope of the last n samples by their thirds, in units of the integers; NaN where a sample is missing."""
+    third, places = n // 3, phase.size // LANES
+    if third == 0:
+        return np.nan
+    at0, at1 = newest * LANES + axis, place(newest - third, places) * LANES + axis
+    at2, at3 = place(newest - 2 * third, places) * LANES + axis, place(newest - 3 * third, places) * LANES + axis
+    if missing[at0] != missing[at3]:
+        return np.nan
+    return float(phase[at0] - phase[at1] - phase[at2] + phase[at3]) / (2.0 * third * third)
+
+
+@compiled
+def bends(phase: Ints, missing: NDArray[np.int32], newest: int, lengths: Ints, factors: Ints, out: Floats) -> None:
     """``mean_bend`` of all τ and axes [m, AXES]."""
     for i in range(factors.size):
         for axis in range(AXES):
-            out[i, axis] = mean_bend(phase, missing, newest, n, factors[i], axis)
+            out[i, axis] = mean_bend(phase, missing, newest, lengths[axis], factors[i], axis)
 
 
 @compiled

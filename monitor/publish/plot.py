@@ -1,10 +1,11 @@
-"""The Allan plot of one analysis as a picture, for ``imu-monitor analyze --plot FILE.png``.
+"""One analysis as one picture, for ``imu-monitor analyze --plot FILE.png``.
 
-In comes an ``Estimate``, out goes a file: gyroscopes and accelerometers side by side, log-log, in the field's
-units, with the measured deviation and its 95 % intervals, the fitted curve and a table of the coefficients below.
-matplotlib is imported when a plot is asked for, and draws without a screen. Axes differ by colour and by marker.
+In comes an ``Estimate``, out goes a file: gyroscopes and accelerometers side by side, the Allan plot with the letters,
+a table of the coefficients below, and, where dynamic curves were made, those below that in the same file.
+matplotlib is imported when a plot is asked for, and draws without a screen.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -12,13 +13,15 @@ import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES
-from monitor.estimate.coefficients import LETTERS
+from monitor.estimate.coefficients import LETTERS, Status
+from monitor.estimate.dynamic import Dynamic
 from monitor.estimate.estimate import Estimate
+from monitor.publish.allan_figure import COLOURS, GREY, READING, Beside, allan_panel
+from monitor.publish.dynamic_figure import dynamic_panels, height_inches
+from monitor.publish.panels import duration
 from monitor.publish.units import (
     COEFFICIENT_NAMES,
     COEFFICIENT_UNITS,
-    DEVIATION_UNITS,
-    KIND_NAMES,
     KINDS,
     Kind,
     axes_of,
@@ -28,80 +31,94 @@ from monitor.publish.units import (
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import SubFigure
 
-INCHES: Final = (7.2, 7.0)  # of one panel with its table
+INCHES: Final = (7.2, 7.6)  # of one Allan panel with its table
 DPI: Final = 150
 MISSING: Final = 'matplotlib is not installed: pip install "imu-monitor[plot]"'
-COLOURS: Final = ("#D55E00", "#009E73", "#0072B2")  # x y z: vermilion, bluish green, blue (Okabe & Ito)
-MARKERS: Final = ("o", "s", "^")
-GREY: Final = "#6b6b6b"
+EXPLAINED: Final = (
+    "small print: 95 % interval;  ≤ one-sided 95 % bound;  — too few data;  K or R: the data do not tell which"
+)
 
 
-def allan_plot(estimate: Estimate, path: Path, title: str = "") -> None:
+def allan_plot(
+    estimate: Estimate,
+    path: Path,
+    title: str = "",
+    others: Sequence[Beside] = (),
+    dynamic: Dynamic | None = None,
+    changes_s: Sequence[float] = (),
+) -> None:
     """Write the picture; the ending of ``path`` says the format.
 
-    ConfigError when matplotlib is missing or the folder cannot be written.
+    Args:
+        estimate: of the whole recording
+        path: file to write
+        title: above all
+        others: other deviations, such as total and Hadamard
+        dynamic: dynamic curves of the same recording, drawn below
+        changes_s: marks on their time axis, seconds since the first sample
+    Raises:
+        ConfigError: matplotlib is missing or the file cannot be written
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ConfigError(MISSING) from error
-    present = measured_axes(estimate.curve.avar)
-    kinds = [kind for kind in KINDS if set(axes_of(kind)) & set(present)] or list(KINDS)
-    figure = Figure(figsize=(INCHES[0] * len(kinds), INCHES[1]), dpi=DPI, layout="constrained")
+    kinds = kinds_of(estimate)
+    below = max((height_inches(dynamic, kind) for kind in kinds), default=0.0) if dynamic is not None else 0.0
+    figure = Figure(figsize=(INCHES[0] * len(kinds), INCHES[1] + below), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(2, len(kinds), height_ratios=[3.4, 1.7])
+    rows = [INCHES[1]] if dynamic is None else [INCHES[1], below]
+    parts = figure.subfigures(len(rows), len(kinds), squeeze=False, height_ratios=rows)
     for column, kind in enumerate(kinds):
-        _curves(figure.add_subplot(grid[0, column]), estimate, kind)
-        _table(figure.add_subplot(grid[1, column]), estimate, kind)
-    if title:
-        figure.suptitle(title, fontsize=13, fontweight="bold")
+        _static(parts[0, column], estimate, kind, others)
+        if dynamic is not None:
+            dynamic_panels(parts[1, column], dynamic, kind, changes_s)
+    figure.suptitle("\n".join([*([title] if title else []), summary(estimate)]), fontsize=12)
     try:
         figure.savefig(path)
     except (OSError, ValueError) as error:
         raise ConfigError(f"cannot write the plot {path}: {error}") from error
 
 
-def _curves(axes: "Axes", estimate: Estimate, kind: Kind) -> None:
-    """One log-log panel."""
-    unit = DEVIATION_UNITS[kind]
-    tau_s = estimate.curve.tau_s
-    for axis, colour, marker in zip(axes_of(kind), COLOURS, MARKERS, strict=True):
-        i = AXES.index(axis)
-        rows = np.isfinite(estimate.curve.avar[:, i]) & (estimate.curve.avar[:, i] > 0)
-        if not rows.any():
-            continue
-        measured, fitted = (np.sqrt(a[:, i]) * unit.factor for a in (estimate.curve.avar, estimate.fitted))
-        lo, hi = (a[rows, i] * unit.factor for a in (estimate.curve.lo, estimate.curve.hi))
-        axes.fill_between(tau_s[rows], lo, hi, color=colour, alpha=0.18, linewidth=0)
-        axes.plot(tau_s, fitted, "--", color=colour, linewidth=1.3)
-        axes.plot(tau_s[rows], measured[rows], marker, color=colour, markersize=4.5, label=axis)
-    axes.plot([], [], "--", color=GREY, linewidth=1.3, label="fit")
-    axes.fill_between([], [], [], color=GREY, alpha=0.25, label="95 %")
-    axes.set(xscale="log", yscale="log", xlabel="averaging time τ, s", ylabel=f"Allan deviation σ(τ), {unit.name}")
-    axes.set_title(KIND_NAMES[kind], loc="left", fontsize=12)
-    axes.grid(which="major", color="#d0d0d0", linewidth=0.8)
-    axes.grid(which="minor", color="#ececec", linewidth=0.5)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    # above the box: curves and intervals may fill every corner of it
-    axes.legend(
-        loc="lower right",
-        bbox_to_anchor=(1.0, 1.0),
-        borderaxespad=0.2,
-        frameon=False,
-        ncols=5,
-        handlelength=1.6,
-        columnspacing=1.2,
+def kinds_of(estimate: Estimate) -> list[Kind]:
+    """The kinds that are measured; both where nothing is."""
+    present = set(measured_axes(estimate.curve.avar))
+    return [kind for kind in KINDS if set(axes_of(kind)) & present] or list(KINDS)
+
+
+def summary(estimate: Estimate) -> str:
+    """How much was recorded, in a line: samples, rate, duration, and what is missing."""
+    missing = estimate.curve.n - estimate.samples
+    gaps = f", {missing:,} missing" if missing > 0 else ""
+    seconds = duration(estimate.curve.n / estimate.rate_hz)
+    return f"{estimate.samples:,} samples at {estimate.rate_hz:.6g} Hz, {seconds}{gaps}"
+
+
+def k_or_r(estimate: Estimate, letter: str, axis: str) -> bool:
+    """Whether this is one of two terms of which the data show one, without telling which."""
+    i, drifts = AXES.index(axis), letter in ("K", "R")
+    return (
+        drifts
+        and bool(estimate.k_or_r[i])
+        and estimate.coefficients.status[LETTERS.index(letter), i] == Status.UPPER_BOUND
     )
+
+
+def _static(part: "SubFigure", estimate: Estimate, kind: Kind, others: Sequence[Beside]) -> None:
+    """Allan plot and table of one kind."""
+    curves, table = part.subplots(2, 1, height_ratios=[3.6, 1.75])
+    allan_panel(curves, estimate, kind, others)
+    _table(table, estimate, kind)
 
 
 def _table(axes: "Axes", estimate: Estimate, kind: Kind) -> None:
     """The coefficients of one kind: value, and its interval in small print."""
     axes.axis("off")
     columns = (0.0, 0.46, 0.65, 0.84)
-    rows = np.linspace(0.95, 0.06, len(LETTERS) + 1)
+    rows = np.linspace(0.97, 0.16, len(LETTERS) + 1)
     for axis, x, colour in zip(axes_of(kind), columns[1:], COLOURS, strict=True):
         axes.text(x, rows[0], axis, color=colour, fontweight="bold", va="center")
     for letter, y in zip(LETTERS, rows[1:], strict=True):
@@ -110,5 +127,8 @@ def _table(axes: "Axes", estimate: Estimate, kind: Kind) -> None:
         for axis, x in zip(axes_of(kind), columns[1:], strict=True):
             cell = reading(estimate.coefficients, letter, axis)
             axes.text(x, y + 0.02, cell.value, va="center", fontsize=9.5)
-            axes.text(x, y - 0.055, cell.interval, va="center", fontsize=6.5, color=GREY)
-    axes.set(xlim=(0, 1), ylim=(0, 1))
+            small = "K or R" if k_or_r(estimate, letter, axis) else cell.interval
+            axes.text(x, y - 0.05, small, va="center", fontsize=6.5, color=GREY)
+    axes.text(columns[0], 0.045, EXPLAINED, va="center", fontsize=7.5, color=GREY)
+    axes.text(columns[0], -0.02, READING, va="center", fontsize=7.5, color=GREY)
+    axes.set(xlim=(0, 1), ylim=(-0.04, 1))

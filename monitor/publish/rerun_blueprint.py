@@ -1,7 +1,8 @@
 """What the viewer opens on: is it healthy, what is its noise now, has it changed.
 
-One device fills the window; several get an overview and a tab each. The time panel follows the newest
-sample. Layout only: nothing here knows a number. Importing this module imports Rerun.
+One device fills the window; several get an overview and a tab each. A second tab of a device shows its noise over
+time. The time panel follows the newest sample. Layout only: nothing here knows a number. Importing this module imports
+Rerun.
 """
 
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TimelineColumn
 
-from monitor.publish import colours
+from monitor.publish import colours, rerun_dynamic
 from monitor.publish.rerun_chart import HEIGHT, WIDTH
 from monitor.publish.rerun_scene import TIMELINE
 from monitor.publish.units import (
@@ -27,6 +28,8 @@ from monitor.publish.units import (
 RAW_SPAN_S: Final = 30.0  # of raw samples in view, up to the cursor
 LABEL_SHARE: Final = 0.08  # of a plot's width: half a tick's label
 COURSES: Final = ("N", "B")
+DYNAMIC_COURSES: Final = ("N", "B", "K")
+TAUS: Final = 17  # an hour's octaves at 100 Hz: a surface of other τ is a little higher or lower
 BOTH_KINDS: Final = 4  # devices at most whose accelerometers are in the overview too
 COLUMNS: Final = 4
 SHORT: Final = {"gyro": "Gyro", "accel": "Accel"}
@@ -59,7 +62,32 @@ def _device(device: str) -> rrb.Container:
         rrb.Horizontal(*(_raw(device, kind) for kind in KINDS), _temperature(device), column_shares=[2, 2, 1]),
         row_shares=[5, 2.2, 2.2],
     )
-    return rrb.Horizontal(left, right, column_shares=[3, 7], name=device)
+    now = rrb.Horizontal(left, right, column_shares=[3, 7], name="Now")
+    return rrb.Tabs(now, _dynamic(device), active_tab=0, name=device)
+
+
+def _dynamic(device: str) -> rrb.Container:
+    """Surfaces of all axes, and below them the courses of the coefficients that change."""
+    columns = [
+        rrb.Vertical(
+            *(_surface(device, axis) for axis in axes_of(kind)),
+            rrb.Horizontal(*(_course(device, kind, letter) for letter in DYNAMIC_COURSES)),
+            row_shares=[3, 3, 3, 2.6],
+        )
+        for kind in KINDS
+    ]
+    return rrb.Horizontal(*columns, name="Dynamic")
+
+
+def _surface(device: str, axis: str) -> rrb.View:
+    x, y = rerun_dynamic.bounds(TAUS)
+    return rrb.Spatial2DView(
+        origin=f"/{device}/dynamic/{axis}",
+        contents="$origin/**",
+        name=f"{axis}: Allan deviation over time, against its median",
+        background=rrb.Background(color=colours.BACKGROUND),
+        visual_bounds=rrb.VisualBounds2D(x_range=list(x), y_range=list(y)),
+    )
 
 
 def _overview(devices: Sequence[str]) -> rrb.Container:
@@ -93,7 +121,7 @@ def _course(device: str, kind: Kind, letter: str) -> rrb.View:
     unit = COEFFICIENT_UNITS[kind][letter].name
     return rrb.TimeSeriesView(
         origin=f"/{device}/coefficients/{letter}",
-        contents=[f"+ $origin/{axis}" for axis in axes_of(kind)],
+        contents=[f"+ $origin/{axis}/**" for axis in axes_of(kind)],
         name=f"{SHORT[kind]} {letter}, {unit}",
         plot_legend=rrb.PlotLegend(visible=False),
         axis_x=_all_so_far(),

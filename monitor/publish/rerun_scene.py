@@ -19,7 +19,7 @@ from drivers.sample import AXES, Event, Floats
 from monitor.estimate.coefficients import LETTERS, Status
 from monitor.estimate.estimate import Estimate
 from monitor.health import Health
-from monitor.publish import colours
+from monitor.publish import colours, rerun_dynamic
 from monitor.publish.decimate import extremes, means
 from monitor.publish.panels import health_text, noise_text, overview_text
 from monitor.publish.rerun_chart import (
@@ -33,6 +33,7 @@ from monitor.publish.rerun_chart import (
     runs,
     whiskers,
 )
+from monitor.publish.surface import Surface
 from monitor.publish.units import (
     COEFFICIENT_UNITS,
     DEVIATION_UNITS,
@@ -65,6 +66,7 @@ class _Device:
 
     about: str
     scales: dict[Kind, Scale] = field(default_factory=dict)
+    surface: Surface = field(default_factory=Surface)
 
 
 class Scene:
@@ -92,11 +94,14 @@ class Scene:
         self._scalars(f"{device}/temperature", *means(wall_s, temperature_c, TEMPERATURES_PER_S))
 
     def estimate(self, device: str, wall_s: float, estimate: Estimate) -> None:
-        """The Allan plots and the table of one estimate."""
+        """The Allan plots and the table of one estimate, and the surface over time whenever it has grown."""
         self._at(wall_s)
         self._stream.log(f"{device}/coefficients", _markdown(noise_text(estimate)))
         for kind in KINDS:
             self._allan(device, kind, estimate)
+        surface = self._devices[device].surface
+        if surface.add(wall_s, estimate):
+            rerun_dynamic.draw(self._stream, device, surface)
 
     def courses(self, device: str, wall_s: Floats, estimates: Sequence[Estimate]) -> None:
         """One point an estimate on the course of every coefficient, with its interval."""
@@ -115,6 +120,7 @@ class Scene:
         self._stream.log(f"{device}/events", rr.TextLog(f"{at}  {event.text}", level=level))
         if len(self._devices) > 1:
             self._stream.log("overview/events", rr.TextLog(f"{at}  {device}: {event.text}", level=level))
+        self._mark(device, wall_s, event)
 
     def health(self, device: str, wall_s: float, health: Health) -> None:
         """The health panel of the device, and its row in the overview."""
@@ -136,6 +142,18 @@ class Scene:
             names = [f"{axis}, {unit}", f"{axis} 95 % low", f"{axis} 95 % high"]
             line = rr.SeriesLines(colors=[colour, dim, dim], widths=[2.0, 0.75, 0.75], names=names)
             self._stream.log(f"{device}/coefficients/{letter}/{axis}", line, static=True)
+            mark = rr.SeriesPoints(colors=[colour], markers=["diamond"], marker_sizes=[7.0], names=[f"{axis} changed"])
+            self._stream.log(f"{device}/coefficients/{letter}/{axis}/changed", mark, static=True)
+
+    def _mark(self, device: str, wall_s: float, event: Event) -> None:
+        """A change of a coefficient, on its course: a diamond at the size that it has now."""
+        if event.axis is None:
+            return
+        for letter, sizes in event.what.items():
+            if letter in LETTERS and "after" in sizes:
+                unit = COEFFICIENT_UNITS[kind_of(event.axis)][letter]
+                path = f"{device}/coefficients/{letter}/{event.axis}/changed"
+                self._scalars(path, np.array([wall_s]), np.array([sizes["after"]]) * unit.factor)
 
     def _scalars(self, path: str, wall_s: Floats, values: Floats) -> None:
         """``values`` [n] or [n, series] at ``wall_s`` [n] on the timeline."""

@@ -1,141 +1,180 @@
 """Do the intervals hold what they promise? Simulates records of known noise and counts.
 
-    python tests/bench/coverage.py --records 300 --seconds 2700
+    python -m tests.bench.coverage --json coverage.jsonl                   # all cells of 45 min and 3 h, 20 minutes
+    python -m tests.bench.coverage --json coverage.jsonl --records 120     # fewer; more can be added later
+    python -m tests.bench.coverage --json coverage.jsonl --records 0 --page docs/statistics.md      # only tables
 
-For the mix of a MEMS gyro (Q 2e-6, N 1.5e-4, B 4e-5, K 1.5e-6 at 100 Hz) it prints how often the 95 %
-intervals of deviations and of coefficients hold the truth, the rms error of the fit over the
-Cramér–Rao limit of the spectrum (Whittle), and how often a term that was left out of the simulation
-enters all the same. Counting errors of a share p over n looks are √(p(1 − p)/n).
+Counted for each cell (a noise and a length of record at 100 Hz), in percent with the 95 % interval of Wilson:
+
+- how often the two-sided 95 % interval of a deviation holds the true one, at all τ up to an eighth of the record
+  together. Neighbouring τ of a record err together, so its interval is that of as many independent looks as the
+  scatter between records shows;
+- for each term that is there: how often what is said of it is true, be it a two-sided 95 % interval or a one-sided 95 %
+  bound; how often it is estimated; and the shares of true intervals and of true bounds by themselves. A term enters
+  when its estimate comes out large, so the few intervals of a term that is seldom in are those of lucky records,
+  and the few bounds of one that is nearly always in those of unlucky ones: where a kind of answer is given
+  in less than half of the records, its share is shown but not judged;
+- for each term that is absent: how often it is estimated all the same.
+
+Each record goes through ``analyze``, and is looked at once. One process, one thread; a run can be broken off and
+taken up again.
 """
 
-import argparse
-from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from drivers.sample import AXES, Floats
-from monitor.estimate.batch import cluster_sizes, overlapping
-from monitor.estimate.coefficients import LETTERS, Status
-from monitor.estimate.fit import Fit, design, fit, slope_of_thirds
-from monitor.estimate.uncertainty import intervals, table
-from monitor.noise.effect import Source
-from monitor.noise.effects.angle_random_walk import AngleRandomWalk
-from monitor.noise.effects.bias_instability import BiasInstability
-from monitor.noise.effects.quantization_noise import QuantizationNoise
-from monitor.noise.effects.rate_ramp import RateRamp
-from monitor.noise.effects.rate_random_walk import RateRandomWalk
-from monitor.noise.model import NoiseModel
+from drivers.sample import Ints, block
+from monitor.estimate.analysis import analyze
+from monitor.estimate.coefficients import LETTERS, Coefficients, Status
+from tests.bench.records import (
+    HOURS_3,
+    MIN_45,
+    MIX,
+    RATE_HZ,
+    Chunk,
+    Noise,
+    length,
+    markdown,
+    merged,
+    program,
+    sixes,
+    true_avar,
+    wilson,
+)
 
-RATE_HZ = 100.0
-MIX: dict[str, Source] = {
-    "Q": QuantizationNoise(Q=2e-6),
-    "N": AngleRandomWalk(N=1.5e-4),
-    "B": BiasInstability(B=4e-5),
-    "K": RateRandomWalk(K=1.5e-6),
+CELLS: Final = {
+    "white": Noise(N=MIX.N),
+    "flicker": Noise(B=MIX.B),
+    "random walk": Noise(K=MIX.K),
+    "mix": MIX,
+    "mix without Q": Noise(N=MIX.N, B=MIX.B, K=MIX.K),
+    "mix without B": Noise(Q=MIX.Q, N=MIX.N, K=MIX.K),
+    "mix without K": Noise(Q=MIX.Q, N=MIX.N, B=MIX.B),
+    "mix with K × 10": Noise(MIX.Q, MIX.N, MIX.B, 10.0 * MIX.K),
+    "mix, ramp 2e-7": Noise(MIX.Q, MIX.N, MIX.B, MIX.K, R=2e-7),
+    "mix, ramp 1e-6": Noise(MIX.Q, MIX.N, MIX.B, MIX.K, R=1e-6),
 }
+TWO_SIDED: Final = (0.93, 0.97)
+ONE_SIDED: Final = (0.94, 1.0)
+FALSE: Final = (0.0, 0.05)
+SAID: Final = (0.93, 1.0)
+ANY: Final = (0.0, 1.0)
+COUNTED: Final = ("estimated", "held", "bounded", "bound_held")
 
 
-@dataclass(frozen=True, slots=True)
-class Look:
-    """One record of six equal axes, fitted."""
-
-    avar: Floats  # [m, 6]
-    fit: Fit
+BoolMatrix = NDArray[np.bool_]
 
 
-def looks(sources: tuple[Source, ...], n: int, records: int, seed: int) -> Iterator[Look]:
-    """Fits of simulated records, six at a time."""
-    factors = cluster_sizes(n, RATE_HZ)
-    columns, covariances = design(factors, RATE_HZ), table(n, factors)
-    model = NoiseModel(dict.fromkeys(AXES, sources))
-    for k in range(-(-records // len(AXES))):
-        values = model.simulate(n, RATE_HZ, seed + k)
-        avar, terms = overlapping(values, factors)
-        thirds = np.cumsum(values, axis=0)[[0, n // 3, 2 * n // 3, n - 1]] / RATE_HZ
-        slope = slope_of_thirds(thirds, n / RATE_HZ)
-        yield Look(avar, fit(columns, covariances, avar, terms, slope=slope))
+def count(cell: str, seconds: int, seed: int, chunk: int) -> Chunk:
+    """Simulate, analyze and count one chunk."""
+    noise = CELLS[cell]
+    n = round(seconds * RATE_HZ)
+    t_ns = np.arange(n) * round(1e9 / RATE_HZ)
+    by_tau: list[BoolMatrix] = []
+    letters = np.zeros((len(LETTERS), len(COUNTED)), np.int64)
+    for values in sixes(noise, cell, seconds, seed, chunk):
+        found = analyze([block(t_ns, values)], RATE_HZ).estimate
+        truth = np.sqrt(true_avar(noise, found.curve.factors))[:, None]
+        by_tau.append((found.curve.lo <= truth) & (truth <= found.curve.hi))
+        letters += _counted(found.coefficients, noise)
+    inside, m = np.concatenate(by_tau, axis=1), found.curve.factors
+    shares = inside[m <= n // 8].mean(axis=0)
+    return {
+        "m": m.tolist(),
+        "deviations": inside.sum(axis=1).tolist(),
+        "shares": [shares.sum(), (shares**2).sum()],
+        "letters": {c: dict(zip(COUNTED, row, strict=True)) for c, row in zip(LETTERS, letters.tolist(), strict=True)},
+    }
 
 
-def true_values(sources: tuple[Source, ...]) -> Floats:
-    """Q N B K R of a list of sources; zero where there is none."""
-    return np.array([next((getattr(s, c) for s in sources if hasattr(s, c)), 0.0) for c in LETTERS])
+def _counted(given: Coefficients, noise: Noise) -> Ints:
+    """[5, 4] of COUNTED in six axes."""
+    truth = np.array([getattr(noise, letter) for letter in LETTERS])[:, None]
+    held = (given.lo <= truth) & (truth <= given.hi)
+    estimated, bounded = given.status == Status.ESTIMATED, given.status == Status.UPPER_BOUND
+    return np.stack([flags.sum(axis=1) for flags in (estimated, estimated & held, bounded, bounded & held)], axis=1)
 
 
-def cramer_rao(sources: tuple[Source, ...], n: int) -> Floats:
-    """Least relative standard deviation of the coefficients of ``sources``, from Whittle's information.
+def tables(chunks: list[Chunk]) -> str:
+    """Markdown of all that was counted."""
+    groups = merged(chunks)
+    parts = [
+        "Deviations, two-sided 95 % intervals, τ up to an eighth of the record:",
+        markdown(
+            ("record", "noise", "records", "holds, %", "worst and best τ, %"), [_deviations(*g) for g in groups.items()]
+        ),
+        "Terms that are there:",
+        markdown(
+            ("record", "noise", "term", "what is said holds, %", "estimated, %", "interval holds, %", "bound holds, %"),
+            [row for group in groups.items() for row in _present(*group)],
+        ),
+        "Terms that are absent, and enter all the same, %:",
+        markdown(("record", "noise", *LETTERS), [_absent(*group) for group in groups.items()]),
+        f"Bold: all of the figure's interval lies outside {_percent(*TWO_SIDED)} % (intervals), "
+        f"{_percent(*ONE_SIDED)} % (bounds), {_percent(*SAID)} % (what is said), {_percent(*FALSE)} % (absent terms).",
+    ]
+    return "\n\n".join(parts)
 
-    I_ab = Σ_k S_a S_b / S² over the n/2 positive frequencies, in the variances; half of it in deviations.
-    """
-    f = np.arange(1, n // 2, dtype=np.float64) * (RATE_HZ / n)
-    spectra = np.stack([source.psd(f, 1.0 / RATE_HZ) for source in sources])
-    shares = spectra / spectra.sum(0)
-    return np.asarray(0.5 * np.sqrt(np.diag(np.linalg.inv(shares @ shares.T))))
+
+def _deviations(key: tuple[int, str], group: list[Chunk]) -> tuple[str, ...]:
+    seconds, cell = key
+    records = sum(chunk["records"] for chunk in group)
+    total, square = np.sum([chunk["shares"] for chunk in group], axis=0)
+    share = total / records
+    scatter = (square / records - share**2) / records  # variance of the mean share
+    looks = share * (1.0 - share) / scatter
+    m = np.array(group[0]["m"])
+    by_tau = np.sum([chunk["deviations"] for chunk in group], axis=0)[m <= seconds * RATE_HZ / 8] / records
+    worst = f"{100 * by_tau.min():.1f}, {100 * by_tau.max():.1f}"
+    return length(seconds), cell, str(records), _share(share * looks, looks, TWO_SIDED), worst
 
 
-def held(looked: list[Look], truth: Floats) -> None:
-    """Print coverage and power of the coefficients."""
-    for row, letter in enumerate(LETTERS):
-        status = np.concatenate([look.fit.coefficients.status[row] for look in looked])
-        lo = np.concatenate([look.fit.coefficients.lo[row] for look in looked])
-        hi = np.concatenate([look.fit.coefficients.hi[row] for look in looked])
-        within = (lo <= truth[row]) & (truth[row] <= hi)
-        estimated, bounded = status == Status.ESTIMATED, status == Status.UPPER_BOUND
-        print(
-            f"  {letter}: in {estimated.mean():6.1%}, holds when in {_share(within[estimated])}, "
-            f"bound holds {_share(within[bounded])}, both {_share(within[status != Status.UNESTIMATED])}, "
-            f"median bound {np.median(hi[bounded]) if bounded.any() else np.nan:.2g}"
+def _present(key: tuple[int, str], group: list[Chunk]) -> list[tuple[str, ...]]:
+    seconds, cell = key
+    records = sum(chunk["records"] for chunk in group)
+    rows: list[tuple[str, ...]] = []
+    for letter in CELLS[cell].present():
+        counts = [sum(chunk["letters"][letter][name] for chunk in group) for name in COUNTED]
+        estimated, held, bounded, bound_held = counts
+        rows.append(
+            (
+                length(seconds),
+                cell,
+                letter,
+                _share(held + bound_held, estimated + bounded, SAID),
+                _share(estimated, records),
+                _share(held, estimated, TWO_SIDED if 2 * estimated >= records else ANY),
+                _share(bound_held, bounded, ONE_SIDED if 2 * bounded >= records else ANY),
+            )
         )
+    return rows
 
 
-def deviations(looked: list[Look], sources: tuple[Source, ...], n: int) -> None:
-    """Print coverage of the intervals of the deviations, one by one and for m ≤ n/8."""
-    factors = cluster_sizes(n, RATE_HZ)
-    truth = sum(source.avar(factors / RATE_HZ, 1.0 / RATE_HZ) for source in sources)
-    inside = []
-    for look in looked:
-        lo, hi = intervals(look.avar, look.fit.edf)
-        inside.append((truth >= lo.T**2) & (truth <= hi.T**2))
-    share = np.concatenate(inside)
-    print("  deviations, m ≤ n/8:", _share(share[:, factors <= n // 8].ravel()))
-    print("  by τ:", " ".join(f"{s:.3f}" for s in share.mean(0)))
+def _absent(key: tuple[int, str], group: list[Chunk]) -> tuple[str, ...]:
+    seconds, cell = key
+    records = sum(chunk["records"] for chunk in group)
+    there = CELLS[cell].present()
+    entered = [
+        "–" if c in there else _share(sum(chunk["letters"][c]["estimated"] for chunk in group), records, FALSE)
+        for c in LETTERS
+    ]
+    return length(seconds), cell, *entered
 
 
-def errors(looked: list[Look], sources: tuple[Source, ...], n: int) -> None:
-    """Print rms relative error of √θ over the Cramér–Rao limit, whether or not a term is in."""
-    theta = np.concatenate([look.fit.theta.T for look in looked])
-    limit = cramer_rao(sources, n)
-    for k, (letter, source) in enumerate(zip("QNBK", sources, strict=False)):
-        relative = np.sqrt(np.maximum(theta[:, k], 0.0)) / getattr(source, letter) - 1.0
-        print(f"  {letter}: rms {np.sqrt(np.mean(relative**2)):.4f}, limit {limit[k]:.4f}, "
-              f"ratio {np.sqrt(np.mean(relative**2)) / limit[k]:.2f}, mean {relative.mean():+.4f}")  # fmt: skip
+def _share(held: float, looks: float, target: tuple[float, float] = ANY) -> str:
+    """A share with its interval, bold where the interval does not meet the target."""
+    if not looks:
+        return "–"
+    lo, hi = wilson(held, looks)
+    text = f"{100 * held / looks:.1f} [{100 * lo:.1f}, {100 * hi:.1f}]"
+    return text if lo <= target[1] and hi >= target[0] else f"**{text}**"
 
 
-def _share(flags: np.ndarray) -> str:
-    return f"{flags.mean():.3f} of {flags.size}" if flags.size else "–"
-
-
-def main() -> None:
-    """Run all counts for one length of record."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--records", type=int, default=300)
-    parser.add_argument("--seconds", type=float, default=2700.0)
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    n = int(given.seconds * RATE_HZ)
-    cases = {"whole mix": tuple(MIX.values())}
-    cases |= {f"without {c}": tuple(s for k, s in MIX.items() if k != c) for c in "QBK"}
-    cases["K × 10"] = (*(MIX[c] for c in "QNB"), RateRandomWalk(K=1.5e-5))
-    for ramp in (2e-7, 1e-6):
-        cases[f"with a ramp of {ramp}"] = (*MIX.values(), RateRamp(R=ramp))
-    for title, sources in cases.items():
-        print(title)
-        looked = list(looks(sources, n, given.records, given.seed))
-        held(looked, true_values(sources))
-        deviations(looked, sources, n)
-        if len(sources) == 4:
-            errors(looked, sources, n)
+def _percent(lo: float, hi: float) -> str:
+    return f"{100 * lo:.0f}–{100 * hi:.0f}"
 
 
 if __name__ == "__main__":
-    main()
+    program("coverage", __doc__ or "", CELLS, (MIN_45, HOURS_3), count, tables)

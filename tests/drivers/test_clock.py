@@ -24,15 +24,21 @@ def jitter(t, most_s=0.010, seed=0):
     return np.maximum.accumulate(t + np.random.default_rng(seed).uniform(0.0, most_s, t.size))
 
 
-def feed(clock, arrived_s, ticks=None, lost=None):
-    """Blocks of the samples that arrived together."""
+def varied(n):
+    """Values of n rows, none like another."""
+    return np.tile(np.arange(float(n))[:, None], 6)
+
+
+def feed(clock, arrived_s, ticks=None, lost=None, values=None):
+    """Blocks of the samples that arrived together; no sample may be kept out unless ``values`` are given."""
+    values = varied(len(arrived_s)) if values is None else values
     edges = [0, *(np.flatnonzero(np.diff(arrived_s)) + 1).tolist(), len(arrived_s)]
     out = []
     for a, b in pairwise(edges):
         t_ns = np.rint(arrived_s[a:b] * NS).astype(np.int64)
         counted = None if ticks is None else np.array(ticks[a:b], np.int64)
-        out += clock.stamp(block(t_ns, np.zeros((b - a, 6)), None, counted, 0 if lost is None else int(lost[a])))
-    assert sum(len(one) for one in out) == len(arrived_s)
+        out += clock.stamp(block(t_ns, values[a:b].copy(), None, counted, 0 if lost is None else int(lost[a])))
+    assert sum(len(one) for one in out) + clock.repeated == len(arrived_s)
     assert (np.diff(times(out)) > 0).all()
     return out
 
@@ -89,12 +95,24 @@ class TestCounter:
         assert clock.rate_hz == pytest.approx(rate, rel=1e-3)
         assert kinds(clock) == []
 
-    def test_duplicates_lose_nothing(self, kind, rate, nominal):
+    def test_duplicates_lose_nothing_and_are_kept_out(self, kind, rate, nominal):
+        index = np.arange(int(10 * rate))
+        twice = np.sort(np.concatenate([index, index[200:203]]))
+        clock = SampleClock(Counter(*kind), rate if nominal else None)
+        values = varied(index.size)[twice]
+        out = feed(clock, burst(T0 + index / rate)[twice], ticks_of(index, kind, rate)[twice], values=values)
+        assert lost(out) == 0
+        assert clock.repeated == 3
+        assert np.array_equal(np.concatenate([one.values for one in out]), varied(index.size))
+        assert set(kinds(clock)) == {"samples_repeated"}
+
+    def test_the_same_count_with_other_values_is_kept(self, kind, rate, nominal):
         index = np.arange(int(10 * rate))
         twice = np.sort(np.concatenate([index, index[200:203]]))
         clock = SampleClock(Counter(*kind), rate if nominal else None)
         assert lost(feed(clock, burst(T0 + index / rate)[twice], ticks_of(index, kind, rate)[twice])) == 0
-        assert kinds(clock) == []
+        assert clock.repeated == 0
+        assert "other values" in clock.take_events()[0].text
 
     def test_a_counter_that_sticks_is_told_once(self, kind, rate, nominal):
         index = np.arange(int(12 * rate))
@@ -102,7 +120,7 @@ class TestCounter:
         ticks[300:] = ticks[300]
         clock = SampleClock(Counter(*kind), rate if nominal else None)
         assert lost(feed(clock, burst(T0 + index / rate), ticks)) == 0
-        assert kinds(clock) == ["clock_jumped"]
+        assert [kind for kind in kinds(clock) if kind != "samples_repeated"] == ["clock_jumped"]
 
     def test_what_came_while_it_stood_still_is_not_missing(self, kind, rate, nominal):
         index = np.arange(int(12 * rate))
@@ -110,7 +128,7 @@ class TestCounter:
         ticks[300:350] = ticks[300]
         clock = SampleClock(Counter(*kind), rate if nominal else None)
         assert lost(feed(clock, burst(T0 + index / rate), ticks)) <= 1
-        assert kinds(clock) == ["clock_jumped"]
+        assert [kind for kind in kinds(clock) if kind != "samples_repeated"] == ["clock_jumped"]
 
     def test_a_cable_out_for_five_seconds(self, kind, rate, nominal):
         index, at, n = np.arange(int(28 * rate)), int(12 * rate), int(5 * rate)
@@ -335,14 +353,15 @@ def test_given_times_are_kept_and_holes_told_where_they_can_be(rows, nominal, sc
     clock = SampleClock(Given(), 100.0 if nominal else None)
     out = []
     for at in range(0, len(t_ns), rows):
-        out += clock.stamp(block(t_ns[at : at + rows].copy(), np.zeros((len(t_ns[at : at + rows]), 6))))
+        out += clock.stamp(block(t_ns[at : at + rows].copy(), varied(len(t_ns))[at : at + rows].copy()))
     assert np.array_equal(times(out), t_ns)
     if scatter in ("exact", "ms", "normal"):
         assert lost(out) in ((51,) if scatter != "normal" else (49, 50, 51, 52))
         assert clock.rate_hz == pytest.approx(100.0, rel=5e-3)
     else:  # late and early by whole periods: nothing is invented
         assert lost(out) <= 1
-    assert kinds(clock) == []
+    shared = len(np.unique(t_ns)) < len(t_ns)  # Unix time as a double
+    assert set(kinds(clock)) <= ({"samples_repeated"} if shared else set())
 
 
 def test_given_times_that_jump_are_told_and_the_rate_survives():
@@ -362,9 +381,10 @@ def test_times_that_stand_still_or_jitter_back_lose_nothing():
     t[500:503] = t[500]
     t[700:1500:2] -= 0.012
     clock = SampleClock(Given(), 100.0)
-    out = clock.stamp(block(np.rint(t * NS).astype(np.int64), np.zeros((2000, 6))))
+    out = clock.stamp(block(np.rint(t * NS).astype(np.int64), varied(2000)))
     assert lost(out) <= 2
-    assert kinds(clock) == ["clock_jumped"]
+    assert sum(len(one) for one in out) == 2000
+    assert sorted(kinds(clock)) == ["clock_jumped", "samples_repeated"]
 
 
 def test_loss_told_by_the_sender_is_kept():
@@ -372,6 +392,108 @@ def test_loss_told_by_the_sender_is_kept():
     first = block(np.arange(100) * 10**7, np.zeros((100, 6)))
     second = block(np.arange(107, 207) * 10**7, np.zeros((100, 6)), lost=7)
     assert lost(clock.stamp(first) + clock.stamp(second)) == 7
+
+
+def stamp_given(clock, t_s, values, rows):
+    t_ns = np.rint(np.asarray(t_s) * NS).astype(np.int64)
+    return [
+        one
+        for at in range(0, len(t_ns), rows)
+        for one in clock.stamp(block(t_ns[at : at + rows].copy(), values[at : at + rows].copy()))
+    ]
+
+
+@pytest.mark.parametrize("rows", [1, 7, 4096])
+@pytest.mark.parametrize("again", [[880, 881, 900], list(range(400, 440))])
+def test_rows_that_are_sent_twice_are_kept_out_once(rows, again):
+    """One by one, or a whole batch again."""
+    sent = np.insert(np.arange(1000), max(again) + 1, again)
+    clock = SampleClock(Given(), 100.0)
+    out = stamp_given(clock, 50.0 + sent / 100, varied(1000)[sent], rows)
+    assert np.array_equal(np.concatenate([one.values for one in out])[:, 0], np.arange(1000))
+    assert clock.repeated == len(again)
+    assert lost(out) == 0
+    texts = [event.text for event in clock.take_events(ended=True)]
+    assert sum(int(text.split()[0]) for text in texts) == len(again)
+    assert all(text.endswith("left out") for text in texts)
+
+
+def test_a_recording_in_which_every_row_stands_twice():
+    sent = np.repeat(np.arange(3000), 2)
+    clock = SampleClock(Given(), None)
+    out = stamp_given(clock, sent / 100, varied(3000)[sent], 1000)
+    assert np.array_equal(np.concatenate([one.values for one in out])[:, 0], np.arange(3000))
+    assert clock.rate_hz == 100.0
+
+
+@pytest.mark.parametrize("rows", [1, 50, 4096])
+def test_times_too_coarse_to_tell_rows_apart_make_no_repeats(rows):
+    """Five rows in each second, of few levels: equal rows at one time are no repeats."""
+    values = np.repeat(np.random.default_rng(0).integers(0, 2, (3000, 1)).astype(float), 6, axis=1)
+    values[:6, 0] = np.arange(6)
+    clock = SampleClock(Given(), 5.0)
+    out = stamp_given(clock, np.arange(3000) // 5, values, rows)
+    assert sum(len(one) for one in out) == 3000
+    assert (clock.repeated, lost(out), kinds(clock)) == (0, 0, [])
+
+
+@pytest.mark.parametrize("late_by", [1, 3])
+def test_rows_out_of_order_are_put_in_order_where_they_came_together(late_by):
+    sent = np.arange(2000)
+    for at in (300, 1000, 1500):
+        sent = np.insert(np.delete(sent, at), at + late_by, at)
+    clock = SampleClock(Given(), 100.0)
+    out = stamp_given(clock, 7.0 + sent[:200] / 100, varied(2000)[sent[:200]], 200)
+    out += stamp_given(clock, 7.0 + sent[200:] / 100, varied(2000)[sent[200:]], 4096)
+    assert np.array_equal(np.concatenate([one.values for one in out])[:, 0], np.arange(2000))
+    assert lost(out) == 0
+    assert "out of order: 3" in clock.take_events()[0].text
+
+
+@pytest.mark.parametrize("late_by", [1, 3])
+def test_rows_that_come_after_their_place_has_passed_are_left_out(late_by):
+    sent = np.arange(2000)
+    for at in (300, 1000, 1500):
+        sent = np.insert(np.delete(sent, at), at + late_by, at)
+    clock = SampleClock(Given(), 100.0)
+    out = stamp_given(clock, 7.0 + sent / 100, varied(2000)[sent], 1)
+    kept = np.concatenate([one.values for one in out])[:, 0]
+    assert np.array_equal(kept, np.delete(np.arange(2000), [300, 1000, 1500]))
+    assert (clock.late, lost(out)) == (3, 3)
+    assert {event.kind for event in clock.take_events()} == {"clock_jumped"}
+
+
+@pytest.mark.parametrize("rows", [1, 100])
+def test_a_clock_that_is_set_back_a_little_leaves_no_sample_out(rows):
+    t = np.arange(3000) / 100 + 20.0
+    t[1500:] -= 0.503
+    clock = SampleClock(Given(), 100.0)
+    assert sum(len(one) for one in stamp_given(clock, t, varied(3000), rows)) == 3000
+    assert any(event.text == "time went back by 0.493 s" for event in clock.take_events())
+
+
+def test_events_of_a_kind_are_at_most_one_a_second():
+    sent = np.sort(np.concatenate([np.arange(6000), np.arange(100, 6000, 10)]))
+    clock = SampleClock(Given(), 100.0)
+    stamp_given(clock, sent / 100, varied(6000)[sent], 1)
+    told = clock.take_events(ended=True)
+    assert 50 <= len(told) <= 61
+    assert sum(int(event.text.split()[0]) for event in told) == clock.repeated == 590
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    "name", ["mpu6050-hosttime/static-11min", "phone/gyro-a", "px4-bench/bench-69s", "robot-arm/mpu9150"]
+)
+def test_recordings_of_real_sensors_hold_no_repeats(name):
+    if "IMU_MONITOR_DATA" not in os.environ:
+        pytest.skip("IMU_MONITOR_DATA does not point to the recordings")
+    data = np.load(Path(os.environ["IMU_MONITOR_DATA"]) / f"{name}.npz")
+    values = np.stack([data[axis] for axis in ("gx", "gy", "gz") * 2], axis=1).astype(np.float64)
+    clock = SampleClock(Given(), None)
+    out = stamp_given(clock, data["t"], values, 500)
+    assert sum(len(one) for one in out) == len(values)
+    assert (clock.repeated, clock.late) == (0, 0)
 
 
 @pytest.mark.data

@@ -138,3 +138,58 @@ def test_deviations_alone_before_the_fit_is_compiled():
     bare = estimator.get(fitted=False)
     assert np.array_equal(bare.curve.avar, estimator.get().curve.avar)
     assert (bare.coefficients.status == Status.UNESTIMATED).all()
+
+
+def test_an_axis_restarts_alone():
+    estimator, fresh = Estimator(RATE, 100.0), Estimator(RATE, 100.0)
+    for at in range(0, 20_000, 500):
+        estimator.update(made(at, 500))
+    before = estimator.get()
+    estimator.restart(2, 4_000)
+    for at in range(16_000, 20_000, 500):
+        fresh.update(made(at, 500))
+    after, own = estimator.get(), fresh.get()
+    others = [0, 1, 3, 4, 5]
+    for field in ("value", "lo", "hi", "status"):
+        whole, now = (getattr(one.coefficients, field) for one in (before, after))
+        np.testing.assert_allclose(now[:, others], whole[:, others], rtol=1e-9)
+        np.testing.assert_allclose(now[:, 2], getattr(own.coefficients, field)[:, 2], rtol=1e-6)
+    np.testing.assert_allclose(after.curve.avar[:9, 2], own.curve.avar[:9, 2], rtol=1e-8)
+
+
+@pytest.mark.parametrize("every_sample", [False, True])
+def test_a_restarted_axis_is_at_its_new_noise_at_once(every_sample):
+    estimator = Estimator(RATE, 200.0, every_sample=every_sample)
+    for at in range(0, 40_000, 500):
+        one = made(at, 500)
+        loud = np.where(np.arange(6) == 1, 3.0, 1.0) if at >= 30_000 else 1.0
+        estimator.update(block(one.t_ns, (one.values - 9.81) * loud + 9.81))
+        if at + 500 == 32_000:
+            estimator.restart(1, 2_000)
+    n = estimator.get().coefficients.value[1]
+    assert n[1] == pytest.approx(3e-4, rel=0.05)
+    assert n[[0, 2]] == pytest.approx(1e-4, rel=0.05)
+
+
+def test_the_course_has_a_row_a_sample():
+    estimator = Estimator(RATE, 100.0, every_sample=True)
+    estimator.update(made(0, 700))
+    estimator.update(made(707, 300, lost=7))
+    found = estimator.get()
+    assert found.course is not None
+    assert found.course.t_ns.tolist() == [*made(0, 700).t_ns.tolist(), *made(707, 300).t_ns.tolist()]
+    assert found.course.value[-1, 1] == pytest.approx(found.coefficients.value[1], rel=0.06)
+    assert estimator.get().course is None
+
+
+def test_recent_deviations_follow_a_change_at_once():
+    estimator = Estimator(RATE, 600.0)
+    for at in range(0, 60_000, 500):
+        one = made(at, 500)
+        estimator.update(block(one.t_ns, (one.values - 9.81) * (2.0 if at >= 58_000 else 1.0)))
+    found = estimator.get()
+    assert found.recent is not None
+    assert np.sqrt(found.recent.avar[0]) == pytest.approx(2e-3, rel=0.1)
+    assert np.sqrt(found.curve.avar[0]) == pytest.approx(np.sqrt(1 + 3 * 2000 / 60_000) * 1e-3, rel=0.05)
+    truth = 2e-3 / np.sqrt(found.recent.factors[:8, None])
+    assert ((found.recent.lo[:8] < truth) & (truth < found.recent.hi[:8])).mean() > 0.85

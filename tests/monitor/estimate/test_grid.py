@@ -56,7 +56,7 @@ def test_rows_out_of_order_are_put_in_order():
     sent = np.insert(np.delete(np.arange(6000), 2500), 2502, 2500)
     grid, _, notes = on_grid(recording(sent / 100, values[sent]), None)
     assert np.array_equal(grid, values)
-    assert notes == ["samples came out of order at 1 places; put in order"]
+    assert notes == ["rows that came out of order: 1; put in order"]
 
 
 def test_more_than_ten_notes_are_counted():

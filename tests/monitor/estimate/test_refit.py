@@ -27,9 +27,9 @@ def follow(values, blocks=(1000,)):
     """The course of the coefficients of values [n, 6], and the window they end with."""
     window = AllanWindow(LENGTH, FACTORS)
     refit = Refit(window, FACTORS.size, Tables(FACTORS, LENGTH))
-    courses, at, k = [], 0, 0
+    courses, at, k, lengths = [], 0, 0, np.zeros(6, np.int64)
     while at < len(values):
-        courses.append(refit.update(DESIGN, values[at : at + blocks[k % len(blocks)]]))
+        courses.append(refit.update(DESIGN, values[at : at + blocks[k % len(blocks)]], lengths))
         at += blocks[k % len(blocks)]
         k += 1
     return np.concatenate(courses), window, refit

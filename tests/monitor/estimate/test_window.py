@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from drivers.errors import ConfigError
-from monitor.estimate.batch import cluster_sizes, overlapping
+from monitor.estimate.batch import cluster_sizes, overlapping, slope, slopes
 from monitor.estimate.window import FULL_SCALE, MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_spans
 from monitor.estimate.window_kernel import STAGE, advance
 
@@ -488,3 +488,37 @@ def test_updating_leaves_the_caller_s_array_writable():
 def test_a_wrong_shape_is_refused(shape):
     with pytest.raises(ValueError, match=r"\[n, 6\]"):
         AllanWindow(LENGTH, FACTORS).update(np.zeros(shape))
+
+
+# --- one axis begins anew
+
+
+@pytest.mark.parametrize("kept", [0, 1, 5, 90, LENGTH - 1])
+def test_forgetting_one_axis_makes_its_older_samples_missing(kept):
+    values = made(3 * LENGTH)
+    values[LENGTH : LENGTH + 7, 2] = np.nan
+    window, expected = AllanWindow(LENGTH, FACTORS), values[: 2 * LENGTH].copy()
+    window.update(expected)
+    window.forget(1, kept)
+    expected[: len(expected) - kept, 1] = np.nan
+    for n in (0, 3, 40, LENGTH):
+        window.update(values[len(expected) : len(expected) + n])
+        expected = np.concatenate([expected, values[len(expected) : len(expected) + n]])
+        avar, terms = overlapping(expected[-LENGTH:], FACTORS)
+        assert np.array_equal(window.terms(), terms)
+        assert window.avar()[terms > 0] == pytest.approx(avar[terms > 0], rel=1e-9)
+
+
+def test_the_slope_of_an_axis_that_began_anew_is_that_of_its_own_samples():
+    values = made(LENGTH) + 1e-3 * np.arange(LENGTH)[:, None]
+    window = AllanWindow(LENGTH, FACTORS)
+    window.update(values)
+    window.forget(4, 60)
+    lengths = np.full(6, LENGTH)
+    lengths[4] = 60
+    assert np.isnan(window.slope()[4])
+    assert window.slope(lengths)[4] == pytest.approx(slope(values[-60:])[4], rel=1e-6)
+    assert window.slope(lengths)[[0, 5]] == pytest.approx(slope(values)[[0, 5]], rel=1e-6)
+    expected = slopes(values[-60:], FACTORS)[:, 4]
+    there = np.isfinite(expected)
+    assert window.slopes(lengths)[there, 4] == pytest.approx(expected[there], rel=1e-6)

@@ -55,6 +55,7 @@ def estimate(
         ),
         fitted=terms(tau_s) @ used**2,
         coefficients=coefficients,
+        k_or_r=np.zeros(6, np.bool_),
     )
 
 
