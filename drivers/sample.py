@@ -104,7 +104,8 @@ Timing = Arrival | Counter | Given
 class Event:
     """Something happened to a device: what, when, how large, how sure.
 
-    Kinds so far: ``link_lost``, ``link_back``, ``samples_lost``, ``clock_jumped``.
+    Kinds so far: ``link_lost``, ``link_back``, ``samples_lost``, ``samples_repeated``, ``clock_jumped``, ``moved``,
+    ``noise_changed``, ``bias_stepped``, ``outlier_burst``.
     """
 
     kind: str

@@ -20,3 +20,7 @@ class Health:
     outputs: Mapping[str, str]  # output -> "ok" or what is wrong with it
     text: str  # one sentence for people; empty while all is well
     uptime_s: float
+    repeated: int = 0  # samples that came twice, left out
+    late: int = 0  # samples that came when their place had passed as missing, left out
+    moving: bool = False  # the device is moved just now
+    moved: int = 0  # samples of moving stretches

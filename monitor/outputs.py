@@ -10,6 +10,8 @@ from drivers.sample import Event, SampleBlock
 from drivers.sample_message import pack
 from monitor import topics
 from monitor.estimate.estimate import Estimate
+from monitor.estimate.hadamard import HadamardCurve
+from monitor.estimate.total import TotalCurve
 from monitor.health import Health
 from monitor.publish import message
 from monitor.publish.terminal import Board
@@ -41,6 +43,10 @@ class ZenohOutput:
         self._zenoh.put(topics.ALLAN, device, message.allan(device, unix_s, estimate))
         self._zenoh.put(topics.COEFFICIENTS, device, message.coefficients(device, unix_s, estimate))
 
+    def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
+        """Total and Hadamard deviations."""
+        self._zenoh.put(topics.TOTAL, device, message.total(device, unix_s, received, total, hadamard))
+
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """One event."""
         since_s = None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
@@ -67,6 +73,9 @@ class ViewerOutput:
         """Curve and coefficients."""
         self._view.estimate(device, unix_s, estimate)
 
+    def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
+        """Not shown."""
+
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """One line of the log."""
         self._view.event(device, unix_s, event)
@@ -89,6 +98,9 @@ class LogOutput:
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         """Not logged."""
+
+    def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
+        """Not said."""
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """One line an event."""
@@ -121,6 +133,9 @@ class TableOutput:
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         """Kept until the table is drawn."""
         self._latest[device] = (unix_s, estimate)
+
+    def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
+        """Not shown."""
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """One of the last lines."""

@@ -52,6 +52,10 @@ class DeviceTable(_Table, frozen=True, kw_only=True):
     tau: Literal["octave", "decade10"] | list[Positive] = "octave"
     refit: str = "10 Hz"
     publish: str = "10 Hz"
+    motion: Literal["tell", "leave out"] = "tell"
+    alarms_per_day: Annotated[float, msgspec.Meta(ge=0.0)] = 0.033
+    """False alarms of changed noise to bear; 0 = do not look."""
+    restart: bool = True
     model: Path | None = None
     axes: dict[str, str] = {}
 
@@ -114,6 +118,9 @@ class Device:
     decoder: Decoder
     axes: AxisMap
     silence_s: float
+    leave_out_motion: bool = False
+    alarms_per_day: float = 0.033  # 0 = changes are not looked for
+    restart: bool = True  # the estimate of an axis begins anew where its noise has changed
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +228,10 @@ class _Reader:
         tau = entry.tau if isinstance(entry.tau, str) else tuple(entry.tau)
         self._try(f"{at}: tau", _possible_tau, tau, window_s, entry.rate)
         silence_s = float(entry.driver.get("silence", LinkSettings().silence))
-        return Device(entry.name, entry.rate, window_s, tau, refit_s, publish_s, link, decoder, axes, silence_s)
+        return Device(
+            entry.name, entry.rate, window_s, tau, refit_s, publish_s, link, decoder, axes, silence_s,
+            entry.motion == "leave out", entry.alarms_per_day, entry.restart,
+        )  # fmt: skip
 
     def driver(self, table: Mapping[str, Any], at: str) -> tuple[Link | VirtualTable | None, Decoder | None]:
         keys = dict(table)

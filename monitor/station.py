@@ -20,6 +20,9 @@ from drivers.links.base import Link
 from drivers.sample import Event, SampleBlock, unbroken
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.estimator import Estimator
+from monitor.estimate.hadamard import HadamardCurve
+from monitor.estimate.total import TotalCurve
+from monitor.estimate.watch import Watch
 from monitor.health import Health
 from monitor.ring import RingBuffer
 from monitor.settings import Device
@@ -30,6 +33,9 @@ RING_SAMPLES: Final = (65_536, 1_000_000)
 PATIENCE_S: Final = 0.002
 SAMPLES_EVERY_S: Final = 0.1
 """Raw samples travel in batches of at most this long, unless every block is wanted."""
+TOTAL_EVERY_S: Final = 0.1
+TOTAL_SHARE: Final = 0.02
+"""Of a processor, that total and Hadamard deviations may take for a device."""
 OFF_NOMINAL: Final = 0.02
 """A measured rate further than this from the configured one is said."""
 
@@ -50,6 +56,9 @@ class Output(Protocol):
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         """One refit."""
+
+    def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
+        """Total and Hadamard deviations, renewed in rounds."""
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Something happened."""
@@ -77,6 +86,7 @@ class Station:
         self.clock = SampleClock(decoder.timing, device.rate_hz)
         self.driver = Driver(device.name, link, decoder, self.clock, self._push, device.axes, device.silence_s)
         self.estimator: Estimator | None = None
+        self.watch: Watch | None = None
         self.latest: Estimate | None = None
         self.published = 0  # samples handed to the outputs
         self._wake = wake
@@ -90,7 +100,7 @@ class Station:
         self._latencies: list[float] = []
         self._started_s = time.monotonic()
         self._no_estimate = ""  # why there can be none
-        self._next_s = dict.fromkeys(("refit", "publish", "samples"), 0.0)
+        self._next_s = dict.fromkeys(("refit", "publish", "samples", "total"), 0.0)
         self._advanced = False  # samples since the last refit
         self._refitted = False  # a refit since the last publication
         self._newest_ns = 0
@@ -127,11 +137,14 @@ class Station:
             self._newest_ns = int(blocks[-1].t_ns[-1])
             self._batch += blocks
             self._advance(blocks)
-        for event in self.driver.take_events():
+        if drain:
+            self._estimate(self.watch.flush() if self.watch is not None else [])
+        for event in self.driver.take_events() + (self.watch.take_events() if self.watch is not None else []):
             for output in outputs:
                 output.event(self.name, self.unix_s(event.t_ns), self.driver.counts.received, event)
         published = self._publish_samples(outputs, now_s, drain)
         published |= self._publish_estimate(outputs, now_s, drain)
+        self._publish_total(outputs, now_s)
         if published and self._unpublished_since_ns:
             self._latencies.append((time.monotonic_ns() - self._unpublished_since_ns) / 1e9)
             self._unpublished_since_ns = 0
@@ -147,6 +160,8 @@ class Station:
         rate = self.clock.rate_hz
         if self.estimator is not None and rate is not None and rate != self.estimator.rate_hz:
             self.estimator.relabel(rate)
+            if self.watch is not None:
+                self.watch.relabel(rate)
         health = self.health(states, memory_bytes)
         for output in outputs:
             output.health(self.name, self.now_unix_s(), health)
@@ -169,6 +184,10 @@ class Station:
             outputs=dict(states),
             text=self._text(),
             uptime_s=time.monotonic() - self._started_s,
+            repeated=self.clock.repeated,
+            late=self.clock.late,
+            moving=self.watch is not None and self.watch.moving,
+            moved=self.watch.moved_samples if self.watch is not None else 0,
         )
 
     def unix_s(self, t_ns: int) -> float:
@@ -214,13 +233,25 @@ class Station:
             if rate is None or self._no_estimate or not self._ready.window.is_set():
                 return
             try:
-                self.estimator = Estimator(rate, self.device.window_s, self.device.tau)
+                every_sample = self.device.refit_s == 0.0
+                self.estimator = Estimator(rate, self.device.window_s, self.device.tau, every_sample)
+                self.watch = Watch(rate, self.device.leave_out_motion, self.device.alarms_per_day)
             except ConfigError as error:  # a list of τ that does not fit the rate found; samples go on
                 self._no_estimate = f"no estimate: {error}"
                 return
         for samples in blocks:
+            self._estimate(self.watch.update(samples) if self.watch is not None else [samples])
+
+    def _estimate(self, blocks: list[SampleBlock]) -> None:
+        """Advance the estimate, and let axes begin anew whose noise was found changed."""
+        if self.estimator is None or self.watch is None:
+            return
+        for samples in blocks:
             self.estimator.update(samples)
-        self._advanced = True
+            self._advanced = True
+        for restart in self.watch.take_restarts():
+            if self.device.restart:
+                self.estimator.restart(restart.axis, restart.samples)
 
     def _publish_samples(self, outputs: Sequence[Output], now_s: float, drain: bool) -> bool:
         every_s = min(self.device.publish_s, SAMPLES_EVERY_S)
@@ -250,6 +281,17 @@ class Station:
         for output in outputs:
             output.estimate(self.name, self.unix_s(self.latest.t_ns), self.latest)
         return True
+
+    def _publish_total(self, outputs: Sequence[Output], now_s: float) -> None:
+        """One step of the slow statistics, as often as they may take their share of the time."""
+        if self.estimator is None or not self._ready.fit.is_set() or now_s < self._next_s["total"]:
+            return
+        begun_s = time.perf_counter()
+        found = self.estimator.step()
+        self._next_s["total"] = now_s + max(TOTAL_EVERY_S, (time.perf_counter() - begun_s) / TOTAL_SHARE)
+        if found is not None:
+            for output in outputs:
+                output.total(self.name, self.unix_s(self._newest_ns), self.driver.counts.received, *found)
 
     def _due(self, what: str, every_s: float, now_s: float) -> bool:
         if now_s < self._next_s[what]:

@@ -18,7 +18,7 @@ class Topic:
 
     name: str
     encoding: str
-    when: Literal["batches", "publish", "event", "1 Hz", "presence", "query"]
+    when: Literal["batches", "publish", "rounds", "event", "1 Hz", "presence", "query"]
 
     def key(self, prefix: str, device: str) -> str:
         """The key expression of this topic for one device."""
@@ -32,9 +32,10 @@ class Topic:
 SAMPLES: Final = Topic("samples", MSGPACK, "batches")
 ALLAN: Final = Topic("allan", JSON, "publish")
 COEFFICIENTS: Final = Topic("coefficients", JSON, "publish")
+TOTAL: Final = Topic("total", JSON, "rounds")
 EVENT: Final = Topic("event", JSON, "event")
 STATUS: Final = Topic("status", JSON, "1 Hz")
 ALIVE: Final = Topic("alive", "", "presence")
 RESET: Final = Topic("command/reset", JSON, "query")
 
-TOPICS: Final = (SAMPLES, ALLAN, COEFFICIENTS, EVENT, STATUS, ALIVE, RESET)
+TOPICS: Final = (SAMPLES, ALLAN, COEFFICIENTS, TOTAL, EVENT, STATUS, ALIVE, RESET)

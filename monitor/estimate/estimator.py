@@ -21,8 +21,12 @@ from monitor.estimate.batch import TauGrid, cluster_sizes
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Course, Estimate
 from monitor.estimate.fit import Fit, design, fit, joined, nothing_fitted
+from monitor.estimate.hadamard import HadamardCurve
 from monitor.estimate.refit import Refit
+from monitor.estimate.slow import SlowStatistics
+from monitor.estimate.total import TotalCurve
 from monitor.estimate.uncertainty import Spans, Tables, intervals
+from monitor.estimate.watch import Watch
 from monitor.estimate.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_spans
 
 FEWEST: Final = 8
@@ -62,6 +66,8 @@ class Estimator:
         self._lengths = np.zeros(6, np.int64)  # samples of each axis since its last restart, at most the window
         self._refit = Refit(self._window, self._m, self._tables) if every_sample else None
         self._course: list[Course] = []
+        self._slow = SlowStatistics(self._window)
+        self._theta = np.full((5, 6), np.nan)  # of the newest fit
         self._samples = 0
         self._newest_ns = 0
 
@@ -133,6 +139,12 @@ class Estimator:
             result.k_or_r, quick, _joined(course),
         )  # fmt: skip
 
+    def step(self) -> tuple[TotalCurve, HadamardCurve] | None:
+        """One step towards total and Hadamard deviations of the window, see ``slow``; the curves after the last one."""
+        rounds = self._slow.rounds
+        self._slow.step()
+        return self._slow.get(self.rate_hz, self._theta) if self._slow.rounds > rounds else None
+
     def _fit(self, avar: Floats, terms: Ints) -> Fit:
         """Fit the axes that fill the window together, each restarted one by the covariances of its own length."""
         lengths = np.minimum(self._lengths, self._window.n)
@@ -154,7 +166,7 @@ class Estimator:
                 )
             )  # fmt: skip
         result = fits[0] if len(fits) == 1 else joined(fits, np.concatenate(groups))
-        self._entered = result.entered
+        self._entered, self._theta = result.entered, result.theta
         return result
 
     def _new_tables(self) -> Tables:
@@ -184,8 +196,12 @@ def warm_up() -> Iterator[str]:
 
     Seconds at the very first start on a machine, milliseconds later.
     """
-    estimator = Estimator(100.0, 1.0)
-    estimator.update(block(np.arange(100, dtype=np.int64), np.zeros((100, 6))))
+    estimator, samples = Estimator(100.0, 1.0), block(np.arange(100, dtype=np.int64), np.zeros((100, 6)))
+    estimator.update(samples)
     yield "window"
     estimator.get()
+    Estimator(100.0, 1.0, every_sample=True).update(samples)
+    watch = Watch(100.0)
+    watch.update(samples)
+    estimator.restart(0, 10)
     yield "fit"

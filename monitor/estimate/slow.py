@@ -71,6 +71,7 @@ class SlowStatistics:
                 raise ConfigError(f"cluster sizes {factors.tolist()} must lie within 1 and {limit}")
         self._factors = [[int(m) for m in factors] for factors in given]
         self._moments: list[dict[int, Moments]] = [{}, {}]
+        self.rounds = 0  # complete ones
         self._seen = 0
         self._round = self._steps()
         self._last: tuple[list[_Sum], list[_Sum]] | None = None
@@ -119,6 +120,7 @@ class SlowStatistics:
                 sums[HADAMARD].append(self._hadamard(m))
                 if m == hadamards[-1]:
                     self._last = sums
+                    self.rounds += 1
                 yield
 
     def _total(self, m: int) -> _Sum:

@@ -3,6 +3,7 @@
 NaN becomes null, as JSON has no word for it. ``t`` is the Unix time of the newest sample in s.
 """
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import msgspec
@@ -11,9 +12,14 @@ import numpy as np
 from drivers.sample import AXES, Event, Floats
 from monitor import topics
 from monitor.estimate.analysis import Analysis
+from monitor.estimate.change import Change
 from monitor.estimate.coefficients import LETTERS, Coefficients, Status
 from monitor.estimate.curve import AllanCurve
+from monitor.estimate.dynamic import Dynamic
 from monitor.estimate.estimate import Estimate
+from monitor.estimate.hadamard import HadamardCurve
+from monitor.estimate.rest import Motion
+from monitor.estimate.total import TotalCurve
 from monitor.health import Health
 
 ANALYZE_SCHEMA: Final = "imu-monitor/analyze/1"
@@ -21,9 +27,15 @@ _ENCODER: Final = msgspec.json.Encoder()
 
 
 def allan(device: str, unix_s: float, estimate: Estimate) -> bytes:
-    """``imu/<device>/allan``: deviation and its 95 % interval at each τ, axes that are measured."""
+    """``imu/<device>/allan``: deviation and its 95 % interval at each τ, axes that are measured.
+
+    ``recent``: the same over a span of its own for each τ, max(10 s, 16 τ).
+    """
     tau = _list(estimate.curve.tau_s)
-    axes = {axis: _curve(estimate.curve, i) for i, axis in measured_axes(estimate)}
+    axes: dict[str, dict[str, Any]] = {axis: _curve(estimate.curve, i) for i, axis in measured_axes(estimate)}
+    if estimate.recent is not None:
+        for i, axis in measured_axes(estimate):
+            axes[axis]["recent"] = _curve(estimate.recent, i)
     return _encode(topics.ALLAN, device, unix_s, estimate.samples, _window(estimate, tau=tau, axes=axes))
 
 
@@ -33,14 +45,39 @@ def coefficients(device: str, unix_s: float, estimate: Estimate) -> bytes:
     return _encode(topics.COEFFICIENTS, device, unix_s, estimate.samples, _window(estimate, axes=axes))
 
 
-def coefficient_table(all_axes: Coefficients, axis: int) -> dict[str, dict[str, Any]]:
-    """One axis of the coefficients, a table a letter; also what ``analyze --json`` writes."""
+def total(device: str, unix_s: float, samples: int, total: TotalCurve, hadamard: HadamardCurve) -> bytes:
+    """``imu/<device>/total``: total and Hadamard deviation, each with its own τ; axes that are measured."""
+    curves = {
+        "total": (total.tau_s, np.sqrt(total.tvar), total.lo, total.hi),
+        "hadamard": (hadamard.tau_s, np.sqrt(hadamard.hvar), hadamard.lo, hadamard.hi),
+    }
+    payload = {
+        name: {
+            "tau": _list(tau_s),
+            "axes": {
+                axis: {"deviation": _list(deviation[:, i]), "lo": _list(lo[:, i]), "hi": _list(hi[:, i])}
+                for i, axis in enumerate(AXES)
+                if np.isfinite(deviation[:, i]).any()
+            },
+        }
+        for name, (tau_s, deviation, lo, hi) in curves.items()
+    }
+    return _encode(topics.TOTAL, device, unix_s, samples, payload)
+
+
+def coefficient_table(all_axes: Coefficients, axis: int, k_or_r: bool = False) -> dict[str, dict[str, Any]]:
+    """One axis of the coefficients, a table a letter; also what ``analyze --json`` writes.
+
+    ``k_or_r``: one of these two is there, and which is not known: each has the other's letter in ``or``.
+    """
+    other = {"K": "R", "R": "K"} if k_or_r else {}
     return {
         letter: {
             "value": _number(all_axes.value[row, axis]),
             "lo": _number(all_axes.lo[row, axis]),
             "hi": _number(all_axes.hi[row, axis]),
             "status": Status(int(all_axes.status[row, axis])).name.lower(),
+            **({"or": other[letter]} if letter in other else {}),
         }
         for row, letter in enumerate(LETTERS)
     }
@@ -72,6 +109,10 @@ def status(device: str, unix_s: float, health: Health) -> bytes:
         "memory": health.memory_bytes,
         "outputs": health.outputs,
         "uptime": health.uptime_s,
+        "repeated": health.repeated,
+        "late": health.late,
+        "moving": health.moving,
+        "moved": health.moved,
         "text": health.text,
     }
     return _encode(topics.STATUS, device, unix_s, health.received, payload)
@@ -82,27 +123,38 @@ def reply(device: str, unix_s: float, samples: int, text: str) -> bytes:
     return _encode(topics.RESET, device, unix_s, samples, {"text": text})
 
 
-def analysis(result: Analysis) -> bytes:
-    """``analyze --json``: schema imu-monitor/analyze/1."""
+def analysis(
+    result: Analysis,
+    total: TotalCurve | None = None,
+    hadamard: HadamardCurve | None = None,
+    dynamic: Dynamic | None = None,
+) -> bytes:
+    """``analyze --json``: schema imu-monitor/analyze/1, with those of the other curves that were made."""
     estimate = result.estimate
+    rate_hz = estimate.rate_hz
     tau = _list(estimate.curve.tau_s)
-    axes = {
-        axis: {
+    axes: dict[str, dict[str, Any]] = {}
+    for i, axis in measured_axes(estimate):
+        axes[axis] = {
             "allan": {"tau": tau, **_curve(estimate.curve, i)},
-            "coefficients": coefficient_table(estimate.coefficients, i),
+            **({"total": _beside(total.tau_s, total.tvar, total.lo, total.hi, i)} if total else {}),
+            **({"hadamard": _beside(hadamard.tau_s, hadamard.hvar, hadamard.lo, hadamard.hi, i)} if hadamard else {}),
+            "coefficients": coefficient_table(estimate.coefficients, i, bool(estimate.k_or_r[i])),
+            "bandwidth": _number(result.bandwidth_hz[i]),
         }
-        for i, axis in measured_axes(estimate)
+    payload = {
+        "schema": ANALYZE_SCHEMA,
+        "rate": rate_hz,
+        "samples": estimate.samples,
+        "seconds": result.seconds,
+        "notes": result.notes,
+        "axes": axes,
+        "motions": [_motion(motion, rate_hz) for motion in result.motions],
+        "changes": [_change(change, rate_hz) for change in result.changes],
     }
-    return _ENCODER.encode(
-        {
-            "schema": ANALYZE_SCHEMA,
-            "rate": estimate.rate_hz,
-            "samples": estimate.samples,
-            "seconds": result.seconds,
-            "notes": result.notes,
-            "axes": axes,
-        }
-    )
+    if dynamic is not None:
+        payload["dynamic"] = _dynamic(dynamic, measured_axes(estimate))
+    return _ENCODER.encode(payload)
 
 
 def no_analysis(why: str, samples: int) -> bytes:
@@ -128,6 +180,64 @@ def measured_axes(estimate: Estimate) -> list[tuple[int, str]]:
 def _curve(curve: AllanCurve, axis: int) -> dict[str, list[float]]:
     columns = {"deviation": np.sqrt(curve.avar), "lo": curve.lo, "hi": curve.hi}
     return {name: _list(column[:, axis]) for name, column in columns.items()}
+
+
+def _beside(tau_s: Floats, variance: Floats, lo: Floats, hi: Floats, axis: int) -> dict[str, list[float]]:
+    """Another deviation of one axis."""
+    columns = {"deviation": np.sqrt(variance), "lo": lo, "hi": hi}
+    return {"tau": _list(tau_s), **{name: _list(column[:, axis]) for name, column in columns.items()}}
+
+
+def _motion(motion: Motion, rate_hz: float) -> dict[str, Any]:
+    return {
+        "kind": motion.kind,
+        "axis": motion.axis,
+        "t": motion.since / rate_hz,
+        "seconds": motion.seconds,
+        "peak": motion.peak,
+        "text": motion.text,
+    }
+
+
+def _change(change: Change, rate_hz: float) -> dict[str, Any]:
+    what = {
+        name: {"from": first, "to": second} if name == "band" else {"before": first, "after": second}
+        for name, (first, second) in change.what.items()
+    }
+    return {
+        "kind": change.kind,
+        "axis": AXES[change.axis],
+        "t": change.since / rate_hz,
+        "sigma": change.sigma,
+        "what": what,
+        "text": change.text,
+    }
+
+
+def _dynamic(dynamic: Dynamic, axes: Sequence[tuple[int, str]]) -> dict[str, Any]:
+    """Lists by time step; of deviations, in each a list by τ."""
+    return {
+        "window": dynamic.window_s,
+        "t": _list(dynamic.t_s),
+        "tau": _list(dynamic.tau_s),
+        "axes": {
+            axis: {
+                "deviation": _list(dynamic.deviation[:, :, i]),
+                "lo": _list(dynamic.lo[:, :, i]),
+                "hi": _list(dynamic.hi[:, :, i]),
+                "coefficients": {
+                    letter: {
+                        "value": _list(dynamic.value[:, row, i]),
+                        "lo": _list(dynamic.value_lo[:, row, i]),
+                        "hi": _list(dynamic.value_hi[:, row, i]),
+                        "status": [Status(one).name.lower() for one in dynamic.status[:, row, i].tolist()],
+                    }
+                    for row, letter in enumerate(LETTERS)
+                },
+            }
+            for i, axis in axes
+        },
+    }
 
 
 def _number(value: np.float64) -> float | None:

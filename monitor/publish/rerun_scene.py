@@ -46,6 +46,8 @@ from monitor.publish.units import (
 
 TIMELINE: Final = "sample_time"
 TEMPERATURES_PER_S: Final = 5.0
+BETWEEN: Final = 20
+"""Points on the course of a coefficient from one estimate to the next, where it follows every sample."""
 NARROW: Final = 1.5  # ends of an interval further than this factor from their value are not on the course
 LEVELS: Final = {
     "link_lost": "ERROR",
@@ -104,11 +106,18 @@ class Scene:
             rerun_dynamic.draw(self._stream, device, surface)
 
     def courses(self, device: str, wall_s: Floats, estimates: Sequence[Estimate]) -> None:
-        """One point an estimate on the course of every coefficient, with its interval."""
-        at = np.asarray(wall_s)
+        """The course of every coefficient: a point an estimate, with its interval, and the samples between."""
+        looks = [_between(at_s, estimate) for at_s, estimate in zip(np.asarray(wall_s), estimates, strict=True)]
+        at = np.concatenate([times for times, _ in looks])
         for row, letter in enumerate(LETTERS):
             for column, axis in enumerate(AXES):
-                values = np.array([_course(e, row, column) for e in estimates])
+                parts = []
+                for estimate, (_, value) in zip(estimates, looks, strict=True):
+                    between = np.full((len(value), 3), np.nan)
+                    between[:, 0] = value[:, row, column]
+                    between[-1] = _course(estimate, row, column)
+                    parts.append(between)
+                values = np.concatenate(parts)
                 if np.isfinite(values).any():
                     factor = COEFFICIENT_UNITS[kind_of(axis)][letter].factor
                     self._scalars(f"{device}/coefficients/{letter}/{axis}", at, values * factor)
@@ -265,6 +274,19 @@ class _Curve:
         si = {"tau": curve.tau_s[rows], "deviation": deviation, "lo": curve.lo[rows, i], "hi": curve.hi[rows, i]}
         f = DEVIATION_UNITS[kind_of(axis)].factor
         return cls(axis, si["tau"], deviation * f, si["lo"] * f, si["hi"] * f, fitted * f, si)
+
+
+def _between(wall_s: float, estimate: Estimate) -> tuple[Floats, Floats]:
+    """Times and coefficients [n, 5, 6] since the estimate before, where they follow every sample; the last is its own.
+
+    Thinned to BETWEEN points: the eye sees no more, and a viewer bears no more.
+    """
+    if estimate.course is None:
+        return np.array([wall_s]), np.full((1, 5, 6), np.nan)
+    step = -(-estimate.course.t_ns.size // BETWEEN)
+    rows = slice((estimate.course.t_ns.size - 1) % step, None, step)
+    before_s = (estimate.course.t_ns[-1] - estimate.course.t_ns[rows]) / 1e9
+    return wall_s - before_s, estimate.course.value[rows].copy()
 
 
 def _course(estimate: Estimate, row: int, column: int) -> tuple[float, float, float]:

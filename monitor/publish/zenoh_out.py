@@ -136,7 +136,7 @@ class ZenohOut:
         publishers = {}
         for device in self._devices:
             for topic in topics.TOPICS:
-                if topic.when in ("batches", "publish", "event", "1 Hz"):
+                if topic.when not in ("presence", "query"):
                     key = topic.key(self.settings.prefix, device)
                     publishers[key] = self._publisher(session, topic, key)
             self._declare_commands(session, device)

@@ -20,7 +20,7 @@ class Caught:
     """An output that keeps everything."""
 
     def __init__(self):
-        self.blocks, self.counts, self.estimates, self.events, self.healths = [], [], [], [], []
+        self.blocks, self.counts, self.estimates, self.events, self.healths, self.totals = [], [], [], [], [], []
 
     def samples(self, device, received, samples, offset_ns):
         self.blocks.append(samples)
@@ -28,6 +28,9 @@ class Caught:
 
     def estimate(self, device, unix_s, estimate):
         self.estimates.append((unix_s, estimate))
+
+    def total(self, device, unix_s, received, total, hadamard):
+        self.totals.append((received, total, hadamard))
 
     def event(self, device, unix_s, received, event):
         self.events.append((unix_s, event))

@@ -15,6 +15,8 @@ import pytest
 from drivers.sample import Event, SampleBlock, join
 from monitor import settings
 from monitor.estimate.estimate import Estimate
+from monitor.estimate.hadamard import HadamardCurve
+from monitor.estimate.total import TotalCurve
 from monitor.health import Health
 from monitor.service import Service
 from monitor.station import Station
@@ -26,6 +28,7 @@ class Caught:
     def __init__(self) -> None:
         self.blocks: dict[str, list[SampleBlock]] = {}
         self.estimates: dict[str, Estimate] = {}
+        self.totals: dict[str, tuple[TotalCurve, HadamardCurve]] = {}
         self.events: list[tuple[str, Event]] = []
         self.healths: dict[str, Health] = {}
 
@@ -34,6 +37,9 @@ class Caught:
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         self.estimates[device] = estimate
+
+    def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
+        self.totals[device] = (total, hadamard)
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         self.events.append((device, event))

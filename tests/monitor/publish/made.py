@@ -5,6 +5,8 @@ import numpy as np
 from monitor.estimate.coefficients import Coefficients, Status
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Estimate
+from monitor.estimate.hadamard import HadamardCurve, hadamard_curve
+from monitor.estimate.total import TotalCurve, total_curve
 from monitor.health import Health
 
 GYRO = np.array([2.0e-6, 1.5e-4, 4.0e-5, 1.5e-6, 0.0])  # Q N B K R in SI
@@ -73,6 +75,14 @@ def fitted(truth: np.ndarray, seconds: float, rng: np.random.Generator) -> Coeff
     if seconds < 1500:
         status[4], lo[4], hi[4] = Status.UNESTIMATED, np.nan, np.nan
     return Coefficients(value=value, lo=lo, hi=hi, status=status)
+
+
+def slow_curves() -> tuple[TotalCurve, HadamardCurve]:
+    """Total and Hadamard deviations of ten seconds of white noise."""
+    values = 1e-3 * np.random.default_rng(3).standard_normal((1000, 6))
+    theta = np.zeros((5, 6))
+    theta[1] = 1e-8
+    return total_curve(values, 100.0, theta), hadamard_curve(values, 100.0, theta)
 
 
 def health(**changed: object) -> Health:

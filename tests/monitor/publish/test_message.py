@@ -34,6 +34,7 @@ def gyro_z_only() -> Any:
 ALL = {
     topics.ALLAN: message.allan("bench-1", UNIX_S, made.estimate()),
     topics.COEFFICIENTS: message.coefficients("bench-1", UNIX_S, made.estimate()),
+    topics.TOTAL: message.total("bench-1", UNIX_S, 360_000, *made.slow_curves()),
     topics.EVENT: message.event("bench-1", UNIX_S, 360_000, Event("link_back", 0, "back"), None),
     topics.STATUS: message.status("bench-1", UNIX_S, made.health()),
     topics.RESET: message.reply("bench-1", UNIX_S, 360_000, "the window is empty"),
@@ -68,6 +69,18 @@ def test_coefficients() -> None:
         "status": "estimated",
     }
     assert found["axes"]["gz"]["R"] == {"value": None, "lo": 0.0, "hi": 3e-9, "status": "upper_bound"}
+
+
+def test_total_and_hadamard_have_their_own_tau() -> None:
+    total, hadamard = made.slow_curves()
+    found = parsed(ALL[topics.TOTAL])
+    assert found["total"]["tau"] == total.tau_s.tolist()
+    assert found["hadamard"]["tau"] == hadamard.tau_s.tolist()
+    assert list(found["total"]["axes"]) == list(AXES)
+    gz = found["total"]["axes"]["gz"]
+    assert gz["deviation"] == np.sqrt(total.tvar[:, 2]).tolist()
+    assert gz["lo"][0] == total.lo[0, 2]
+    assert gz["hi"][-1] is None  # beyond half the window there is no interval
 
 
 def test_too_few_data_are_null_and_say_so() -> None:
@@ -128,6 +141,10 @@ def test_status() -> None:
         "memory": 182_000_000,
         "outputs": {"zenoh": "ok", "viewer": "stalled"},
         "uptime": 3600.0,
+        "repeated": 0,
+        "late": 0,
+        "moving": False,
+        "moved": 0,
         "text": "…",
     }
 

@@ -1,0 +1,141 @@
+"""What an analysis found, in sentences for people: of the fit, of motion, of changes. And the sensor's own bandwidth.
+
+Each function returns notes, none where there is nothing to say; a recording full of events gets MOST of a kind and a
+count. Times are seconds since the first sample. Numbers are looked up in results, nothing is estimated here but the
+bandwidth, which is the fit's negative Q² by another name.
+"""
+
+import math
+from collections.abc import Sequence
+from itertools import groupby
+from typing import Final
+
+import numpy as np
+
+from drivers.sample import AXES, Floats
+from monitor.estimate.change import Change
+from monitor.estimate.coefficients import Status
+from monitor.estimate.curve import AllanCurve
+from monitor.estimate.fit import Fit
+from monitor.estimate.least_squares import K, N, Q
+from monitor.estimate.rest import Motion
+
+MOST: Final = 10
+"""Notes of one kind."""
+ALIKE: Final = 0.25
+"""Share by which a variance may differ from that of a low-pass and still be told as one."""
+NEAR_WORST: Final = 0.5
+"""Averaging times that depart by this share of the worst, and to the same side, are told with it."""
+
+
+def bandwidth_hz(curve: AllanCurve, fit: Fit, rate_hz: float) -> Floats:
+    """Cutoff (−3 dB) [6] of the first-order low-pass that bends the first points as they are bent; NaN where none does.
+
+    White noise N behind a first-order low-pass of time constant T, taken every τ0, is an autoregression of step φ =
+    e^(−τ0/T); its integral has the variance V(t) = N²(t − c(1 − φ^(t/τ0))), c = τ0/sinh(τ0/T). Its Allan variance,
+    (4 V(τ) − V(2τ))/2τ², is N²/τ − 3cN²/2τ² beyond the filter's memory: the column of Q (IEEE Std 952) with Q² =
+    −cN²/2. So c = −2Q²/N², T = τ0/asinh(τ0/c), f = 1/(2πT); for T ≫ τ0 that is −N²/(4πQ²).
+
+    The shortest τ, within the filter's memory, may be left out of the fit; where they are no better than ALIKE to such
+    a filter, it is a vibration or motion rather, and there is no answer.
+    """
+    found = np.full(len(AXES), np.nan)
+    for i in np.flatnonzero((fit.theta[Q] < 0.0) & (fit.theta[N] > 0.0)).tolist():
+        white, left_out = float(fit.theta[N, i]), fit.left_out[i]
+        shift_s = -2.0 * float(fit.theta[Q, i]) / white
+        cutoff = cutoff_hz(shift_s, rate_hz)
+        tau_s = curve.tau_s[:left_out]
+        faded = np.exp(-2.0 * np.pi * cutoff * tau_s)
+        alone = white / tau_s - white * shift_s * (4.0 * (1.0 - faded) - (1.0 - faded**2)) / (2.0 * tau_s**2)
+        if (np.abs(curve.avar[:left_out, i] / alone - 1.0) < ALIKE).all():
+            found[i] = cutoff
+    return found
+
+
+def cutoff_hz(shift_s: float, rate_hz: float) -> float:
+    """Cutoff of the low-pass that shifts the variance of the integral by ``shift_s``, c of ``bandwidth_hz``.
+
+    >>> round(cutoff_hz(2e-3, 1e6), 2), round(cutoff_hz(2e-3, 100.0), 2)
+    (79.58, 36.8)
+    """
+    return math.asinh(1.0 / (rate_hz * shift_s)) * rate_hz / (2.0 * math.pi)
+
+
+def of_fit(curve: AllanCurve, fit: Fit, bandwidth_hz: Floats) -> list[str]:
+    """Where the five terms are not the whole story, axis by axis."""
+    notes = []
+    for i, axis in enumerate(AXES):
+        if fit.left_out[i]:
+            notes.append(
+                f"{axis}: the fit leaves out τ up to {curve.tau_s[fit.left_out[i] - 1]:.3g} s, which no sum of the "
+                "five terms follows: the sensor's bandwidth or a vibration shows there"
+            )
+        if np.isfinite(bandwidth_hz[i]):
+            notes.append(
+                f"{axis}: the sensor's own bandwidth shows in the shortest τ: as of a first-order low-pass at "
+                f"{bandwidth_hz[i]:.3g} Hz"
+            )
+        if fit.misfit[i] > 1.0:
+            notes.append(_misfit(axis, curve.tau_s, *_departure(curve, fit, i), float(fit.misfit[i])))
+        if fit.k_or_r[i]:
+            notes.append(_k_or_r(axis, fit.coefficients.status[K, i] == Status.ESTIMATED))
+    return notes
+
+
+def of_motions(motions: Sequence[Motion], rate_hz: float, struck: bool) -> list[str]:
+    """That the sensor moved, how often, and what was done about it."""
+    if not motions:
+        return []
+    times = "once" if len(motions) == 1 else f"{len(motions)} times"
+    seconds = sum(motion.seconds for motion in motions)
+    done = "struck out" if struck else "left in; --rest strikes it out"
+    notes = [f"the sensor moved {times}, {seconds:.3g} s in all: {done}"]
+    notes += [f"at {motion.since / rate_hz:.1f} s: {motion.text}" for motion in motions[:MOST]]
+    return notes + _more(len(motions), "motions")
+
+
+def of_changes(changes: Sequence[Change], rate_hz: float) -> list[str]:
+    """What changed, and what that means for a curve of all of it."""
+    if not changes:
+        return []
+    notes = [f"at {change.since / rate_hz:.1f} s: {change.text} ({change.sigma:.1f} σ)" for change in changes[:MOST]]
+    notes += _more(len(changes), "changes")
+    if any(change.kind != "outlier_burst" for change in changes):
+        notes.append("one curve of the whole recording mixes before and after; --window S shows them apart")
+    return notes
+
+
+def _more(count: int, what: str) -> list[str]:
+    return [f"and {count - MOST} more {what}"] if count > MOST else []
+
+
+def _departure(curve: AllanCurve, fit: Fit, axis: int) -> tuple[int, int]:
+    """First and last τ of the run in which the curve of one axis stands off most, in σ of its own scatter."""
+    model, edf = fit.fitted[:, axis], fit.edf[:, axis]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        off = np.nan_to_num((np.cbrt(curve.avar[:, axis] / model) - 1.0) * np.sqrt(4.5 * edf))
+    worst = int(np.abs(off).argmax())
+    near = off * np.sign(off[worst]) >= NEAR_WORST * abs(off[worst])
+    for belongs, run in groupby(range(off.size), key=near.__getitem__):
+        rows = list(run)
+        if belongs and rows[0] <= worst <= rows[-1]:
+            return rows[0], rows[-1]
+    return worst, worst
+
+
+def _misfit(axis: str, tau_s: Floats, first: int, last: int, misfit: float) -> str:
+    where = f"τ = {tau_s[first]:.3g} s" if first == last else f"τ from {tau_s[first]:.3g} to {tau_s[last]:.3g} s"
+    return (
+        f"{axis}: the curve departs from every sum of the five terms (scatter {misfit**0.5:.2g} times wider), most at "
+        f"{where}: a line, vibration, motion or temperature; intervals are widened accordingly"
+    )
+
+
+def _k_or_r(axis: str, seen: bool) -> str:
+    """A rise that may be either: ``seen`` where no slope was to be had, else where it drifts and is too short."""
+    if seen:
+        return f"{axis}: K or R: samples are missing, so that no slope tells a ramp from rate random walk"
+    return (
+        f"{axis}: K or R: the record drifts by more than Q, N and B make, and is too short to tell a ramp from "
+        "rate random walk"
+    )

@@ -1,0 +1,118 @@
+"""Watches over the samples of one device on their way to the estimate: is it at rest, has its noise changed?
+
+Comes in: blocks in order. Goes out: the blocks for the estimate, those of moving stretches struck out where that is
+wanted; and what was found, as events with the times of the samples. A change of noise names the axis whose estimate is
+to begin anew, and with how many samples. The detector of changes never sees a moving stretch.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+from drivers.sample import AXES, Event, SampleBlock
+from monitor.estimate.change import Change, ChangeDetector
+from monitor.estimate.rest import Motion, Rest
+
+OTHER_RATE: Final = 0.02
+"""A rate known better by less than this share is the same to blocks of a quarter of a second."""
+
+
+@dataclass(frozen=True, slots=True)
+class Restart:
+    """The estimate of one axis is to begin anew."""
+
+    axis: int
+    samples: int  # the newest that belong to the new noise, missing ones included
+
+
+class Watch:
+    """Motion and changes of one device.
+
+    Args:
+        rate_hz: samples a second
+        leave_out: hand on moving stretches as missing; else all samples pass at once, as they are
+        alarms_per_day: false alarms of changes to bear; 0 = do not look for changes
+    """
+
+    def __init__(self, rate_hz: float, leave_out: bool = False, alarms_per_day: float = 1.0 / 30.0) -> None:
+        self._rate_hz = rate_hz
+        self._leave_out = leave_out
+        self._alarms_per_day = alarms_per_day
+        self._came = 0  # samples since the start, missing ones included
+        self._newest_ns = 0
+        self._moved_before = 0
+        self._events: list[Event] = []
+        self._restarts: list[Restart] = []
+        self._begin()
+
+    @property
+    def moving(self) -> bool:
+        """Whether the device is moved just now."""
+        return self._rest.moving
+
+    @property
+    def moved_samples(self) -> int:
+        """Samples of moving stretches so far."""
+        return self._moved_before + self._rest.moved_samples
+
+    def relabel(self, rate_hz: float) -> None:
+        """The rate is known better; if it is another one, what was learned was of other times."""
+        if abs(rate_hz / self._rate_hz - 1.0) > OTHER_RATE:
+            self._moved_before += self._rest.moved_samples
+            self._rate_hz = rate_hz
+            self._begin()
+
+    def update(self, samples: SampleBlock) -> list[SampleBlock]:
+        """The blocks that are to be estimated now."""
+        self._came += samples.lost + len(samples)
+        self._newest_ns = int(samples.t_ns[-1])
+        still = self._rest.update(samples)
+        self._look(still)
+        return still if self._leave_out else [samples]
+
+    def flush(self) -> list[SampleBlock]:
+        """What was held back, when no more will come."""
+        still = self._rest.flush()
+        self._look(still)
+        return still if self._leave_out else []
+
+    def take_events(self) -> list[Event]:
+        """What was found since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def take_restarts(self) -> list[Restart]:
+        """Which axes are to begin anew, since the last call."""
+        restarts, self._restarts = self._restarts, []
+        return restarts
+
+    def _begin(self) -> None:
+        self._began = self._came
+        self._rest = Rest(self._rate_hz)
+        self._changes = ChangeDetector(self._rate_hz, self._alarms_per_day) if self._alarms_per_day > 0.0 else None
+
+    def _look(self, still: list[SampleBlock]) -> None:
+        self._events += [self._moved(motion) for motion in self._rest.take()]
+        if self._changes is None:
+            return
+        for samples in still:
+            if samples.lost:
+                self._changes.skip(samples.lost)
+            self._changes.update(samples.values)
+        for change in self._changes.take():
+            self._events.append(self._changed(change))
+            if change.kind == "noise_changed":
+                handed_on = self._changes.samples if self._leave_out else self._came - self._began
+                self._restarts.append(Restart(change.axis, handed_on - change.since))
+
+    def _moved(self, motion: Motion) -> Event:
+        what = {"moved": {"seconds": motion.seconds, "peak": motion.peak}}
+        return Event("moved", self._t_ns(motion.until), motion.text, motion.axis, what, self._t_ns(motion.since))
+
+    def _changed(self, change: Change) -> Event:
+        what = {name: {"before": before, "after": after} for name, (before, after) in change.what.items()}
+        found_ns, since_ns = self._t_ns(change.found), self._t_ns(change.since)
+        return Event(change.kind, found_ns, change.text, AXES[change.axis], what, since_ns, change.sigma)
+
+    def _t_ns(self, index: int) -> int:
+        """Time of a sample by its number since the watch began, of the newest at the latest."""
+        return self._newest_ns - round(max(self._came - self._began - 1 - index, 0) / self._rate_hz * 1e9)
