@@ -33,6 +33,8 @@ RING_SAMPLES: Final = (65_536, 1_000_000)
 PATIENCE_S: Final = 0.002
 SAMPLES_EVERY_S: Final = 0.1
 """Raw samples travel in batches of at most this long, unless every block is wanted."""
+PIECE: Final = 512
+"""Samples estimated before it is asked whether the noise has changed: a fast replay brings thousands at once."""
 TOTAL_EVERY_S: Final = 0.1
 TOTAL_SHARE: Final = 0.02
 """Of a processor, that total and Hadamard deviations may take for a device."""
@@ -240,7 +242,9 @@ class Station:
                 self._no_estimate = f"no estimate: {error}"
                 return
         for samples in blocks:
-            self._estimate(self.watch.update(samples) if self.watch is not None else [samples])
+            for start in range(0, len(samples), PIECE):
+                piece = samples[start : start + PIECE]
+                self._estimate(self.watch.update(piece) if self.watch is not None else [piece])
 
     def _estimate(self, blocks: list[SampleBlock]) -> None:
         """Advance the estimate, and let axes begin anew whose noise was found changed."""

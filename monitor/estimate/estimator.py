@@ -31,7 +31,7 @@ from monitor.estimate.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_s
 
 FEWEST: Final = 8
 """Samples before the first answer: three τ with a few terms each."""
-COURSE_SAMPLES: Final = 16_384
+COURSE_SAMPLES: Final = 65_536
 """Of the course of coefficients, the newest kept until someone looks."""
 
 

@@ -54,9 +54,9 @@ class Caught:
 class Running:
     """A service in a thread."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, caught: Caught) -> None:
         self.service = Service(settings.load(path))
-        self.caught = Caught()
+        self.caught = caught
         self.service.outputs.append(self.caught)
         self._thread = threading.Thread(target=self.service.run)
         self._thread.start()
@@ -74,10 +74,10 @@ class Running:
 
 
 @contextmanager
-def running(folder: Path, text: str) -> Iterator[Running]:
+def running(folder: Path, text: str, caught: Caught | None = None) -> Iterator[Running]:
     path = folder / "config.toml"
     path.write_text(text)
-    service = Running(path)
+    service = Running(path, caught or Caught())
     try:
         yield service
     finally:
