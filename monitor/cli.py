@@ -8,7 +8,7 @@ import contextlib
 import io
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, TextIO, cast
 
@@ -20,6 +20,8 @@ from drivers.errors import ConfigError, ImuError, NotReady, RecordingError
 if TYPE_CHECKING:
     from monitor.estimate.analysis import Analysis
     from monitor.estimate.batch import TauGrid
+    from monitor.export import Noise
+    from monitor.offline import Tell
     from monitor.settings import Config
 
 FAILED: Final = 1
@@ -113,35 +115,71 @@ def analyze(
     tau: Annotated[
         str, typer.Option(metavar="octave|decade10|S,S,…", help="Averaging times: a grid, or seconds.")
     ] = "octave",
+    window: Annotated[
+        str | None, typer.Option(metavar="S", help="Curves over time too, in a window of S seconds; also 5min, 1h.")
+    ] = None,
+    rest: Annotated[bool, typer.Option("--rest", help="Strike out stretches in which the sensor moved.")] = False,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
-    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="The curves as a picture.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE.png|.html", help="The curves as a picture, or all of it as a page.")
+    ] = None,
 ) -> None:
-    """Allan deviation of a recording, with Q, N, B, K, R and their intervals."""
-    from drivers.recording import iter_blocks, load_samples
-    from monitor.estimate.analysis import analyze as work
+    """Allan deviation of a recording, with Q, N, B, K, R and their intervals; motion and changes in it."""
+    from monitor import offline
     from monitor.publish import message
 
-    if rate is not None and rate <= 0.0:
+    if rate is not None and not 0.0 < rate < float("inf"):
         raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
-    if plot is not None and plot.suffix != ".png":
-        raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
-    grid = _tau(tau)
-    found = load_samples(recording, rate)
-    blocks = list(iter_blocks(found))
+    if plot is not None and plot.suffix not in (".png", ".html"):
+        raise ConfigError(f"--plot: {plot}: a name ending in .png or .html is needed")
+    wanted = offline.Request(recording, rate, _tau(tau), _duration("--window", window), rest, bool(json or plot))
     try:
-        result = work(blocks, found.rate_hz, grid, found.notes)
-    except NotReady as error:
+        with _progress() as tell:
+            results = offline.make(wanted, tell)
+    except offline.TooShort as error:
         if json is not None:
-            _write(json, message.no_analysis(str(error), found.values.shape[0]))
+            _write("--json", json, message.no_analysis(str(error), error.samples) + b"\n")
         raise
     if json is not None:
-        _write(json, message.analysis(result))
+        payload = message.analysis(results.analysis, results.total, results.hadamard, results.dynamic)
+        _write("--json", json, payload + b"\n")
     if plot is not None:
-        from monitor.publish.plot import allan_plot
-
-        allan_plot(result.estimate, plot, recording.name)
+        offline.draw(results, plot, recording.name)
     if json != Path("-"):
-        _print_analysis(result)
+        _print_analysis(results.analysis)
+    if results.lacking:
+        raise NotReady(results.lacking)
+
+
+@app.command()
+def export(
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="MODEL.toml|RESULT.json", help="Model, or JSON of analyze; - = standard input."),
+    ],
+    form: Annotated[str, typer.Option("--format", metavar="kalibr|gyroparams|kalman", help="For which tool.")],
+    inflation: Annotated[float, typer.Option(metavar="F", help="Factor on N, B and K, 1 or more.")] = 1.0,
+    dt: Annotated[
+        float | None, typer.Option(metavar="S", help="kalman: time step; the samples' own unless given.")
+    ] = None,
+    correlation_time: Annotated[
+        float | None, typer.Option(metavar="S", help="kalman: of the process that stands for B.")
+    ] = None,
+    rostopic: Annotated[str | None, typer.Option(metavar="T", help="kalibr: topic of the IMU; /imu0.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where to write; else standard output.")] = None,
+) -> None:
+    """Noise parameters for other tools: Kalibr's imu.yaml, MATLAB's gyroparams, a Kalman filter's F and Q."""
+    from monitor import export as exports
+
+    options = {"dt_s": dt, "correlation_time_s": correlation_time, "rostopic": rostopic}
+    belong = {"dt_s": "kalman", "correlation_time_s": "kalman", "rostopic": "kalibr"}
+    given = {name: value for name, value in options.items() if value is not None}
+    for name in given:
+        if form in exports.FORMATS and form != belong[name]:
+            option = name.removesuffix("_s").replace("_", "-")
+            raise ConfigError(f"--{option}: belongs to --format {belong[name]}, not {form}")
+    text = exports.export(_noise(source), form, inflation, **given)
+    _write("--out", out or Path("-"), text.encode())
 
 
 def main() -> None:
@@ -269,14 +307,55 @@ def _tau(text: str) -> "TauGrid":
     return listed
 
 
-def _write(path: Path, data: bytes) -> None:
+def _duration(option: str, text: str | None) -> float | None:
+    from monitor.settings import seconds
+
+    try:
+        return None if text is None else seconds(text)
+    except ConfigError as error:
+        raise ConfigError(f"{option}: {error}") from None
+
+
+def _noise(source: Path) -> "Noise":
+    """What is known of each axis; JSON begins with a brace, as no model does."""
+    from monitor.export import from_analysis, from_model
+    from monitor.noise.model import NoiseModel
+
+    try:
+        text = sys.stdin.buffer.read() if source == Path("-") else source.read_bytes()
+        if text.lstrip().startswith(b"{"):
+            return from_analysis(text, source.name)
+        return from_model(NoiseModel.from_toml(text.decode()), source.name)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{source}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from error
+
+
+def _write(option: str, path: Path, data: bytes) -> None:
     if path == Path("-"):
-        sys.stdout.buffer.write(data + b"\n")
+        sys.stdout.buffer.write(data)
+        sys.stdout.buffer.flush()
         return
     try:
-        path.write_bytes(data + b"\n")
+        path.write_bytes(data)
     except OSError as error:
-        raise ConfigError(f"--json: {path}: cannot be written: {error.strerror}") from error
+        raise ConfigError(f"{option}: {path}: cannot be written: {error.strerror}") from error
+
+
+@contextlib.contextmanager
+def _progress() -> "Iterator[Tell]":
+    """A bar on a terminal, nothing where output is piped."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    if not (console.is_terminal and sys.stdout.isatty()):
+        yield lambda _what, _share: None
+        return
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda what, share: bar.update(task, description=what, total=share and 1.0, completed=share or 0.0)
 
 
 def _print_analysis(result: "Analysis") -> None:

@@ -1,25 +1,35 @@
 """A whole recording at once: the Allan curve, its intervals and the fitted coefficients; the live service's reference.
 
 The recording is first put on a regular grid by the same clock that stamps live samples: what is missing becomes NaN in
-its place, and everything found about the time stamps is said in ``notes``.
+its place, and everything found about the time stamps is said in ``notes``. ``analyze`` makes the curve and the fit;
+``events_of`` asks of the same samples whether the sensor moved and whether its noise changed, which takes longer than
+the curve and is a step of its own. Moving stretches are struck out of the curve only on demand, as a rest that was
+wrongly called motion would be lost; of the search for changes they are always kept out.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
+import numpy as np
+
 from drivers.errors import NotReady
-from drivers.sample import AXES, Floats, Ints, SampleBlock
-from monitor.estimate.batch import TauGrid, cluster_sizes, overlapping, slope, slopes
+from drivers.sample import Floats, Ints, SampleBlock
+from monitor.estimate import findings
+from monitor.estimate.batch import EachAxis, TauGrid, cluster_sizes, overlapping, slope, slopes
+from monitor.estimate.change import Change, ChangeDetector
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Estimate
-from monitor.estimate.fit import design, fit
+from monitor.estimate.fit import Fit, design, fit
 from monitor.estimate.fit_kernel import MIN_ROWS
 from monitor.estimate.grid import on_grid
+from monitor.estimate.rest import Motion, find
 from monitor.estimate.uncertainty import intervals, table
 
 FEWEST: Final = 50
 """Samples; below this nothing can be said, and the command exits with status 3."""
+CHUNK: Final = 65_536
+"""Rows given to the detector of changes at a time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,10 +39,21 @@ class Analysis:
     estimate: Estimate
     seconds: float
     notes: tuple[str, ...]
+    values: Floats  # [n, 6] on the grid, SI; NaN = missing, or moving and struck out
+    fit: Fit
+    bandwidth_hz: Floats  # [6] the sensor's own, where the curve shows one; else NaN
+    motions: tuple[Motion, ...] = ()
+    changes: tuple[Change, ...] = ()
+    struck: bool = False  # moving stretches are missing in ``values``
 
 
 def analyze(
-    blocks: Sequence[SampleBlock], rate_hz: float | None, tau: TauGrid = "octave", notes: Sequence[str] = ()
+    blocks: Sequence[SampleBlock],
+    rate_hz: float | None,
+    tau: TauGrid = "octave",
+    notes: Iterable[str] = (),
+    each: EachAxis = map,
+    rest: bool = False,
 ) -> Analysis:
     """The analysis of a recording.
 
@@ -41,39 +62,75 @@ def analyze(
         rate_hz: the stated rate; None = found from the times
         tau: grid or list of averaging times, s
         notes: what reading the file found
+        each: maps the axes; of an executor, they are done side by side
+        rest: strike out stretches in which the sensor moved
     Raises:
-        NotReady: fewer than FEWEST samples
+        NotReady: fewer than FEWEST samples, or fewer at rest
         ConfigError: no τ of the list is possible
     """
     values, rate, found = on_grid(blocks, rate_hz)
     if len(values) < FEWEST:
         raise NotReady(f"{len(values)} samples; at least {FEWEST} are needed to say anything")
-    factors = cluster_sizes(len(values), rate, tau)
-    avar, terms = overlapping(values, factors)
-    result = fit(
-        design(factors, rate),
-        table(len(values), factors),
+    motions: tuple[Motion, ...] = ()
+    if rest:
+        values, motions = _at_rest(values, rate)
+        found = [*found, *findings.of_motions(motions, rate, struck=True)]
+    curve, fitted = _fitted(values, rate, cluster_sizes(len(values), rate, tau), each)
+    estimate = Estimate(
+        int(blocks[-1].t_ns[-1]), rate, curve.n / rate, sum(len(samples) for samples in blocks),
+        curve, fitted.fitted, fitted.coefficients, fitted.k_or_r,
+    )  # fmt: skip
+    bandwidth_hz = findings.bandwidth_hz(curve, fitted, rate)
+    few = [f"{len(curve.tau_s)} averaging times are too few to fit five terms; at least {MIN_ROWS} are needed"]
+    said = few if len(curve.tau_s) < MIN_ROWS else findings.of_fit(curve, fitted, bandwidth_hz)
+    return Analysis(
+        estimate, estimate.window_s, (*notes, *found, *said), values, fitted, bandwidth_hz, motions, struck=rest
+    )
+
+
+def events_of(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analysis:
+    """The same analysis with what happened in the recording: motion, and changes of noise and bias, told in its notes.
+
+    Args:
+        result: of ``analyze``
+        alarms_per_day: false alarms of the detector of changes to bear, of all axes together
+    """
+    rate = result.estimate.rate_hz
+    moving = np.zeros(len(result.values), np.bool_)
+    motions, notes = result.motions, list(result.notes)
+    if not result.struck:
+        moving, listed = find(result.values, rate)
+        motions = tuple(listed)
+        notes += findings.of_motions(motions, rate, struck=False)
+    detector = ChangeDetector(rate, alarms_per_day)
+    for begin in range(0, len(result.values), CHUNK):
+        rows, struck = result.values[begin : begin + CHUNK], moving[begin : begin + CHUNK]
+        detector.update(np.where(struck[:, None], np.nan, rows) if struck.any() else rows)
+    changes = tuple(sorted(detector.take(), key=lambda change: change.since))
+    notes += findings.of_changes(changes, rate)
+    return replace(result, notes=tuple(notes), motions=motions, changes=changes)
+
+
+def _at_rest(values: Floats, rate_hz: float) -> tuple[Floats, tuple[Motion, ...]]:
+    """The samples with moving stretches missing, and the stretches."""
+    moving, motions = find(values, rate_hz)
+    left = len(values) - int(moving.sum())
+    if left < FEWEST:
+        raise NotReady(f"{left} samples at rest; at least {FEWEST} are needed to say anything")
+    return np.where(moving[:, None], np.nan, values) if moving.any() else values, tuple(motions)
+
+
+def _fitted(values: Floats, rate_hz: float, factors: Ints, each: EachAxis) -> tuple[AllanCurve, Fit]:
+    """The curve with its intervals, and the fit to it."""
+    n = len(values)
+    avar, terms = overlapping(values, factors, each)
+    found = fit(
+        design(factors, rate_hz),
+        table(n, factors),
         avar,
         terms,
-        slope=slope(values) * rate,
-        slopes=slopes(values, factors) * rate,
+        slope=slope(values) * rate_hz,
+        slopes=slopes(values, factors) * rate_hz,
     )
-    lo, hi = intervals(avar, result.edf)
-    curve = AllanCurve(factors / rate, factors, avar, terms, result.edf, lo, hi, len(values))
-    seconds = len(values) / rate
-    received = sum(len(samples) for samples in blocks)
-    newest_ns = int(blocks[-1].t_ns[-1])
-    estimate = Estimate(newest_ns, rate, seconds, received, curve, result.fitted, result.coefficients, result.k_or_r)
-    few = [f"{factors.size} averaging times are too few to fit five terms; at least {MIN_ROWS} are needed"]
-    said = few if factors.size < MIN_ROWS else _left_out(result.left_out, curve.tau_s)
-    return Analysis(estimate, seconds, (*notes, *found, *said))
-
-
-def _left_out(left_out: Ints, tau_s: Floats) -> list[str]:
-    """On which axes the shortest τ contradict every sum of the five terms."""
-    return [
-        f"{axis}: the fit leaves out τ up to {tau_s[count - 1]:.3g} s, which no sum of the five terms follows: "
-        "the sensor's bandwidth or a vibration shows there"
-        for axis, count in zip(AXES, left_out.tolist(), strict=True)
-        if count
-    ]
+    lo, hi = intervals(avar, found.edf)
+    return AllanCurve(factors / rate_hz, factors, avar, terms, found.edf, lo, hi, n), found

@@ -22,7 +22,9 @@ from monitor.estimate.rest import Motion
 
 MOST: Final = 10
 """Notes of one kind."""
-ALIKE: Final = 0.25
+CLEAR: Final = 3.0
+"""σ from which on an averaging time is said to depart."""
+ALIKE: Final = 0.1
 """Share by which a variance may differ from that of a low-pass and still be told as one."""
 NEAR_WORST: Final = 0.5
 """Averaging times that depart by this share of the worst, and to the same side, are told with it."""
@@ -110,10 +112,16 @@ def _more(count: int, what: str) -> list[str]:
 
 
 def _departure(curve: AllanCurve, fit: Fit, axis: int) -> tuple[int, int]:
-    """First and last τ of the run in which the curve of one axis stands off most, in σ of its own scatter."""
+    """First and last τ of the run in which the curve of one axis stands off by the largest factor.
+
+    Not by the most σ: the fit is pulled, and the shortest τ are known so well that they are many σ off wherever the
+    cause is. But only where it is more than chance.
+    """
     model, edf = fit.fitted[:, axis], fit.edf[:, axis]
     with np.errstate(invalid="ignore", divide="ignore"):
-        off = np.nan_to_num((np.cbrt(curve.avar[:, axis] / model) - 1.0) * np.sqrt(4.5 * edf))
+        ratio = curve.avar[:, axis] / model
+        sigma = (np.cbrt(ratio) - 1.0) * np.sqrt(4.5 * edf)  # Wilson & Hilferty 1931
+        off = np.where(np.abs(sigma) > CLEAR, np.log(ratio), 0.0)
     worst = int(np.abs(off).argmax())
     near = off * np.sign(off[worst]) >= NEAR_WORST * abs(off[worst])
     for belongs, run in groupby(range(off.size), key=near.__getitem__):

@@ -39,6 +39,7 @@ HEADS: Final = 6
 """Lines of the screen that are no row: summary, note, heads, and those left empty."""
 SHOWN: Final[tuple[tuple[Kind, str], ...]] = (("gyro", "N"), ("gyro", "B"), ("accel", "N"))
 NONE: Final = "—"
+K_OR_R: Final = "K or R"
 STATES: Final = {
     "running": ("●", "green"),
     "waiting": ("◌", "yellow"),
@@ -360,20 +361,22 @@ def _clock_time(unix_s: float) -> str:
 def analysis_table(estimate: Estimate) -> RenderableType:
     """Coefficients of every measured axis with their intervals, for ``analyze``."""
     axes = tuple(axis for _, axis in measured_axes(estimate))
-    return Group(*_detail(heard.Noise(estimate.coefficients, axes, None)))
+    either = tuple(axis for i, axis in measured_axes(estimate) if estimate.k_or_r[i])
+    return Group(*_detail(heard.Noise(estimate.coefficients, axes, None), either))
 
 
-def _detail(noise: heard.Noise) -> list[RenderableType]:
-    """Axis by letter with intervals, a table a kind of sensor."""
+def _detail(noise: heard.Noise, either: Sequence[str] = ()) -> list[RenderableType]:
+    """Axis by letter with intervals, a table a kind of sensor; ``either``: axes whose drift is K or R."""
     seen = "" if noise.seen_s is None else f"last {duration(noise.seen_s)}; "
-    parts: list[RenderableType] = [Text(f"{seen}[95 % interval]; ≤ bound; {NONE} too few data yet", style="dim")]
+    known = f"; {K_OR_R}: one of them, the data do not tell which" if either else ""
+    parts: list[RenderableType] = [Text(f"{seen}[95 % interval]; ≤ bound; {NONE} too few data yet{known}", style="dim")]
     for kind in units.KINDS:
         if set(units.axes_of(kind)) & set(noise.axes):
-            parts.append(Fitting(detail_table(noise, kind, False), detail_table(noise, kind, True)))
+            parts.append(Fitting(detail_table(noise, kind, False, either), detail_table(noise, kind, True, either)))
     return parts
 
 
-def detail_table(noise: heard.Noise, kind: Kind, stacked: bool) -> Table:
+def detail_table(noise: heard.Noise, kind: Kind, stacked: bool, either: Sequence[str] = ()) -> Table:
     """The five coefficients of the axes of one kind, intervals beside the values or below them."""
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
     table.add_column(units.KIND_NAMES[kind] if not stacked else kind, no_wrap=True)
@@ -381,14 +384,18 @@ def detail_table(noise: heard.Noise, kind: Kind, stacked: bool) -> Table:
         table.add_column(f"{letter} {units.COEFFICIENT_UNITS[kind][letter].name}", justify="right", no_wrap=True)
     for axis in units.axes_of(kind):
         if axis in noise.axes:
-            cells = [_interval(noise, letter, axis, "\n" if stacked else " ") for letter in LETTERS]
+            between = "\n" if stacked else " "
+            cells = [_interval(noise, letter, axis, between, axis in either) for letter in LETTERS]
             table.add_row(Text(axis, style="bold"), *cells)
     return table
 
 
-def _interval(noise: heard.Noise, letter: str, axis: str, between: str) -> Text:
+def _interval(noise: heard.Noise, letter: str, axis: str, between: str, either: bool) -> Text:
     one = units.reading(noise.coefficients, letter, axis)
-    return Text.assemble(one.value, (f"{between}[{one.interval}]", "dim")) if one.interval else Text(one.value)
+    small = f"[{one.interval}]" if one.interval else ""
+    if either and letter in ("K", "R"):
+        small = f"{small} {K_OR_R}".strip()
+    return Text.assemble(one.value, (f"{between}{small}", "dim")) if small else Text(one.value)
 
 
 class Fitting:

