@@ -36,7 +36,7 @@ SAMPLES_EVERY_S: Final = 0.1
 PIECE: Final = 512
 """Samples estimated before it is asked whether the noise has changed: a fast replay brings thousands at once."""
 TOTAL_EVERY_S: Final = 0.1
-TOTAL_SHARE: Final = 0.02
+TOTAL_SHARE: Final = 0.005
 """Of a processor, that total and Hadamard deviations may take for a device."""
 OFF_NOMINAL: Final = 0.02
 """A measured rate further than this from the configured one is said."""

@@ -99,7 +99,7 @@ class Estimator:
     def reset(self) -> None:
         """Empty the window."""
         self._window.reset()
-        self._lengths[:] = 0
+        self._lengths[:], self._theta[:] = 0, np.nan
         self._entered[:] = False
         if self._refit is not None:
             self._refit.reset()
@@ -108,7 +108,7 @@ class Estimator:
         """Of one axis, forget all but the newest samples: its noise was another before them."""
         self._window.forget(axis, samples)
         self._lengths[axis] = min(samples, self._lengths[axis])
-        self._entered[:, axis] = False
+        self._entered[:, axis], self._theta[:, axis] = False, np.nan
         if self._refit is not None:
             self._refit.restart(axis)
 
@@ -162,7 +162,7 @@ class Estimator:
             fits.append(
                 fit(
                     self._design, tables.at(n), avar[:, axes], terms[:, axes], before[:, axes],
-                    slope[axes] * self.rate_hz, slopes[:, axes] * self.rate_hz,
+                    slope[axes] * self.rate_hz, slopes[:, axes] * self.rate_hz, start=self._theta[:, axes],
                 )
             )  # fmt: skip
         result = fits[0] if len(fits) == 1 else joined(fits, np.concatenate(groups))

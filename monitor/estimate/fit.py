@@ -109,6 +109,7 @@ def fit(
     slope: Floats | None = None,
     slopes: Floats | None = None,
     full: bool = True,
+    start: Floats | None = None,
 ) -> Fit:
     """Coefficients of six axes from overlapping Allan variances.
 
@@ -124,10 +125,13 @@ def fit(
         slopes: [m, 6] unit/s, the mean second difference of phase over τ² at each τ, of the same window; without it a
             strong ramp's products with the noise pull K
         full: weigh by the covariances of all τ, else by their variances alone
+        start: [5, 6] ``theta`` of a fit a moment ago, to begin with its weights: a third of the work
     """
     m, axes = avar.shape
     found = answer(axes, m, np.zeros((axes, 5), np.bool_) if before is None else np.array(before.T, order="C"))
     frozen = gains(axes, m)
+    if start is not None:
+        found.theta[:] = start.T / design.rate_hz ** (2.0 * TO_SI)
     straight = np.full(axes, np.nan) if slope is None else slope / design.rate_hz
     fit_axes(
         known(design, table),
@@ -137,6 +141,7 @@ def fit(
         np.tile(straight[:, None], m) if slopes is None else np.ascontiguousarray(slopes.T) / design.rate_hz,
         THRESHOLDS_ONCE if before is None else THRESHOLDS_WATCHED,
         full,
+        start is not None,
         found,
         frozen,
     )

@@ -44,10 +44,12 @@ WHITE: Final = PAIRS.index((N, N))
 
 
 @compiled
-def fit_axes(known, avar, terms, slope, slopes, thresholds, full, answer, gains):  # type: ignore[no-untyped-def]
-    """Fit all axes from nothing: ``avar``, ``terms`` and ``slopes`` [axes, m], ``slope`` [axes] or NaN."""
+def fit_axes(  # type: ignore[no-untyped-def]
+    known, avar, terms, slope, slopes, thresholds, full, warm, answer, gains
+):
+    """Fit all axes: ``avar``, ``terms`` and ``slopes`` [axes, m], ``slope`` [axes] or NaN."""
     for axis in range(avar.shape[0]):
-        fit_axis(axis, known, avar, terms, slope[axis], slopes, thresholds, full, False, answer, gains)
+        fit_axis(axis, known, avar, terms, slope[axis], slopes, thresholds, full, warm, answer, gains)
 
 
 @compiled
@@ -91,7 +93,7 @@ def fit_axis(  # type: ignore[no-untyped-def]
         entered, theta, lo, hi, status, gains.rows[axis],
     )  # fmt: skip
     sharpen(
-        level, rows[first:], stretch, flat, known.covariance, full, misfit, c0,
+        level, rows[first:], stretch, flat, known.covariance, misfit, c0,
         theta, hi, status, gains.rows[axis],
     )  # fmt: skip
     for a in range(5):

@@ -132,7 +132,7 @@ def judge(  # type: ignore[no-untyped-def]
 
 @compiled
 def sharpen(  # type: ignore[no-untyped-def]
-    level, rows, stretch, columns, covariance, full, misfit, c0, theta, hi, status, numbers
+    level, rows, stretch, columns, covariance, misfit, c0, theta, hi, status, numbers
 ):
     """Bounds of the terms that are not in, each by the weights that suit a term just as large as could be seen.
 
@@ -149,7 +149,7 @@ def sharpen(  # type: ignore[no-untyped-def]
             estimate += numbers[i, NOISES + a] * level[i]
         supposed[:] = theta
         supposed[a] = max(estimate, 0.0) + JUST_SEEN * np.sqrt(c0[a])
-        weigh(rows, supposed, covariance, stretch, columns, full, scratch, weights)
+        weigh(rows, supposed, covariance, stretch, columns, False, scratch, weights)
         normal_equations(level, rows, columns, weights, normal, right)
         if _row_of(a, rows, weights, normal, stretch, gain[0]):
             c = _variance_forms(np.array([a]), gain, rows, theta, covariance)[0]
