@@ -152,8 +152,8 @@ def test_an_axis_restarts_alone():
     others = [0, 1, 3, 4, 5]
     for field in ("value", "lo", "hi", "status"):
         whole, now = (getattr(one.coefficients, field) for one in (before, after))
-        np.testing.assert_allclose(now[:, others], whole[:, others], rtol=1e-4)  # begun from other weights
-        np.testing.assert_allclose(now[:, 2], getattr(own.coefficients, field)[:, 2], rtol=1e-4)
+        np.testing.assert_allclose(now[:, others], whole[:, others], rtol=5e-3)  # begun from other weights
+        np.testing.assert_allclose(now[:, 2], getattr(own.coefficients, field)[:, 2], rtol=5e-3)
     np.testing.assert_allclose(after.curve.avar[:9, 2], own.curve.avar[:9, 2], rtol=1e-8)
 
 

@@ -12,6 +12,7 @@ from drivers.errors import ConfigError
 from monitor.estimate.batch import cluster_sizes, overlapping, slope, slopes
 from monitor.estimate.window import FULL_SCALE, MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_spans
 from monitor.estimate.window_kernel import STAGE, advance
+from tests.bench import long_run
 
 FACTORS = np.array([1, 2, 3, 7, 16, 25, 50])
 LENGTH = 100
@@ -522,3 +523,11 @@ def test_the_slope_of_an_axis_that_began_anew_is_that_of_its_own_samples():
     expected = slopes(values[-60:], FACTORS)[:, 4]
     there = np.isfinite(expected)
     assert window.slopes(lengths)[there, 4] == pytest.approx(expected[there], rel=1e-6)
+
+
+# --- for ever
+
+
+def test_ten_million_samples_with_gaps_and_a_transient_leave_no_trace():
+    """The same program runs 10⁹; see docs/benchmarks.md."""
+    assert long_run.run(10, lambda line: None) < 1e-9
