@@ -26,12 +26,15 @@ from monitor.settings import CONFIG_FOLDER, load
 from monitor.virtual import read_model
 
 PROGRAM = [sys.executable, "-m", "monitor.cli"]
-COMMANDS = ("demo", "run", "check", "watch", "analyze")
+COMMANDS = ("demo", "run", "check", "watch", "analyze", "export")
 RATE_HZ = 100.0
 DEVICE = '[[device]]\nname = "bench-1"\n'
 VIRTUAL = DEVICE + 'driver = { link = "virtual" }\n'
 CAN = DEVICE + 'driver = {{ link = "can", channel = "can0", decoder = "dbc", decoder_options = {} }}\n'
 QUIET = '[zenoh]\nmode = "none"\n[viewer]\nmode = "none"\n'
+
+
+MODEL = str(CONFIG_FOLDER / "models" / "consumer-mems.toml")
 
 
 class Said:
@@ -225,7 +228,35 @@ WRONG_ARGUMENTS = {
     "no rate": (("analyze", "x.csv", "--rate", "nan"), "--rate"),
     "bad tau": (("analyze", "x.csv", "--tau", "octav"), '--tau: "octav"; possible are octave, decade10, or seconds'),
     "negative tau": (("analyze", "x.csv", "--tau", "1,-2"), "every averaging time must be above 0 s"),
-    "bad picture": (("analyze", "x.csv", "--plot", "x.pdf"), "a name ending in .png is needed"),
+    "bad picture": (("analyze", "x.csv", "--plot", "x.pdf"), "--plot: x.pdf: a name ending in .png or .html is needed"),
+    "bad window": (
+        ("analyze", "x.csv", "--window", "soon"),
+        '--window: "soon" is no duration; write seconds, or "90s"',
+    ),
+    "no window": (("analyze", "x.csv", "--window", "0"), '--window: "0" is no duration'),
+    "infinite rate": (("analyze", "x.csv", "--rate", "inf"), "--rate: inf Hz; it must be above 0"),
+    "no format": (("export", "x.toml"), "Missing option '--format'"),
+    "unknown format": (("export", MODEL, "--format", "gtsam"), 'unknown format "gtsam"; possible are kalibr,'),
+    "no source": (("export", "x.toml", "--format", "kalibr"), "x.toml: cannot be read: No such file or directory"),
+    "folder for a source": (("export", ".", "--format", "kalibr"), ".: cannot be read: Is a directory"),
+    "deflation": (("export", MODEL, "--format", "kalibr", "--inflation", "0.5"), "inflation 0.5; it must be 1 or more"),
+    "other's option": (
+        ("export", MODEL, "--format", "kalibr", "--dt", "0.01"),
+        "--dt: belongs to --format kalman, not kalibr",
+    ),
+    "other's time": (
+        ("export", MODEL, "--format", "gyroparams", "--correlation-time", "9"),
+        "--correlation-time: belongs to --format kalman, not gyroparams",
+    ),
+    "other's topic": (
+        ("export", MODEL, "--format", "kalman", "--rostopic", "/imu"),
+        "--rostopic: belongs to --format kalibr, not kalman",
+    ),
+    "no time step": (("export", MODEL, "--format", "kalman", "--dt", "0"), "kalman needs a time step above 0 s"),
+    "nowhere to write": (
+        ("export", MODEL, "--format", "kalibr", "--out", "nowhere/x.yaml"),
+        "--out: nowhere/x.yaml: cannot be written",
+    ),
     "no recording": (("analyze", "nowhere.csv"), "nowhere.csv: cannot be read: No such file or directory"),
 }
 
@@ -267,15 +298,20 @@ def test_json_on_standard_output_is_all_there_is(call: Call, recording: Path) ->
     result = json.loads(said.out)
     assert {"schema", "rate", "samples", "seconds", "notes", "axes"} <= result.keys()
     assert result["schema"] == "imu-monitor/analyze/1"
-    assert (result["rate"], result["samples"], result["seconds"], result["notes"]) == (RATE_HZ, 18_000, 180.0, [])
+    assert (result["rate"], result["samples"], result["seconds"]) == (RATE_HZ, 18_000, 180.0)
+    assert all("K or R" in note for note in result["notes"])
     assert list(result["axes"]) == list(AXES)
+    assert (result["motions"], result["changes"]) == ([], [])
+    assert "dynamic" not in result
     for table in result["axes"].values():
-        assert {"allan", "coefficients"} <= table.keys()
-        assert {"tau", "deviation", "lo", "hi"} == table["allan"].keys()
-        assert len({len(column) for column in table["allan"].values()}) == 1
+        assert table.keys() == {"allan", "total", "hadamard", "coefficients", "bandwidth"}
+        for name in ("allan", "total", "hadamard"):
+            assert table[name].keys() == {"tau", "deviation", "lo", "hi"}
+            assert len({len(column) for column in table[name].values()}) == 1
+        assert table["total"]["tau"][-1] > 90.0  # beyond half the recording
         assert list(table["coefficients"]) == list("QNBKR")
         for one in table["coefficients"].values():
-            assert one.keys() == {"value", "lo", "hi", "status"}
+            assert one.keys() - {"or"} == {"value", "lo", "hi", "status"}
             assert one["status"] in ("estimated", "upper_bound", "unestimated")
             assert (one["value"] is None) == (one["status"] != "estimated")
         allan = {name: np.array(column) for name, column in table["allan"].items()}
@@ -371,7 +407,176 @@ def test_a_result_that_cannot_be_written_is_one_line(call: Call, recording: Path
         assert target in said.only_line()
 
 
+def test_total_and_hadamard_deviations_are_those_of_allantools(call: Call, recording: Path) -> None:
+    """Hadamard's as they are; total is corrected for its bias, which is small at a thirtieth of the recording."""
+    assert call("analyze", str(recording), "--json", "x.json", "--tau", "0.05,0.1,0.5,1,2,5").status == 0
+    result = json.loads(Path("x.json").read_bytes())
+    columns = np.loadtxt(recording, delimiter=",", skiprows=1).T[1:]
+    for axis, column in zip(AXES, columns, strict=True):
+        table = result["axes"][axis]
+        _, hadamard, _, _ = allantools.ohdev(column, rate=RATE_HZ, data_type="freq", taus=table["total"]["tau"])
+        np.testing.assert_allclose(table["hadamard"]["deviation"], hadamard, rtol=1e-9)
+        _, total, _, _ = allantools.totdev(column, rate=RATE_HZ, data_type="freq", taus=table["total"]["tau"])
+        np.testing.assert_allclose(table["total"]["deviation"], total, rtol=0.01)
+
+
+@pytest.mark.parametrize("window", ["60", "1min"])
+def test_a_window_gives_curves_over_time(call: Call, recording: Path, window: str) -> None:
+    said = call("analyze", str(recording), "--window", window, "--json", "-")
+    assert (said.status, said.err) == (0, "")
+    found = json.loads(said.out)["dynamic"]
+    assert found["window"] == 60.0
+    assert (found["t"][0], found["t"][-1], len(found["t"])) == (60.0, 180.0, 41)
+    n = found["axes"]["gx"]["coefficients"]["N"]
+    whole = json.loads(said.out)["axes"]["gx"]["coefficients"]["N"]["value"]
+    assert n["value"] == pytest.approx([whole] * 41, rel=0.1)
+
+
+def test_a_window_longer_than_the_recording_is_an_answer_too(call: Call, recording: Path) -> None:
+    said = call("analyze", str(recording), "--window", "1h", "--json", "x.json")
+    assert said.status == 3
+    assert said.err == "imu-monitor: no dynamic curves: 180 s are recorded, less than the window of 3600 s\n"
+    assert "N °/√h" in said.out
+    result = json.loads(Path("x.json").read_bytes())
+    assert result["axes"]["gx"]["coefficients"]["N"]["status"] == "estimated"
+    assert "dynamic" not in result
+    assert "no dynamic curves: 180 s are recorded, less than the window of 3600 s" in result["notes"]
+
+
+def test_a_window_of_too_few_samples_is_wrong(call: Call, recording: Path) -> None:
+    said = call("analyze", str(recording), "--window", "0.1")
+    assert said.status == 2
+    assert "window of 0.1 s: 10 samples at 100 Hz; possible are 1 to" in said.only_line()
+
+
+@pytest.mark.parametrize("name", ["x.png", "x.html"])
+def test_a_plot_is_what_its_name_says(call: Call, recording: Path, name: str) -> None:
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("jinja2")
+    said = call("analyze", str(recording), "--plot", name)
+    assert said.status == 0
+    assert "N °/√h" in said.out
+    start = Path(name).read_bytes()[:15]
+    assert start.startswith(b"\x89PNG" if name == "x.png" else b"<!DOCTYPE html>")
+
+
+def test_motion_is_told_and_struck_out_on_demand(call: Call, recording: Path) -> None:
+    columns = np.loadtxt(recording, delimiter=",", skiprows=1)
+    columns[9000:9300, 1] += np.sin(np.arange(300) / 20)
+    save_samples(Path("moved.csv"), columns[:, 0], columns[:, 1:])
+    left, struck = (json.loads(call("analyze", "moved.csv", *more, "--json", "-").out) for more in ((), ("--rest",)))
+    [motion] = left["motions"]
+    assert (motion["axis"], struck["motions"]) == ("gx", [motion])
+    assert motion["t"] == pytest.approx(89.75, abs=0.3)
+    assert "the sensor moved once, 3 s in all: left in; --rest strikes it out" in left["notes"]
+    assert "the sensor moved once, 3 s in all: struck out" in struck["notes"]
+    n = [one["axes"]["gx"]["coefficients"]["N"]["value"] for one in (left, struck)]
+    whole = json.loads(call("analyze", str(recording), "--json", "-").out)["axes"]["gx"]["coefficients"]["N"]["value"]
+    assert n[1] == pytest.approx(whole, rel=0.03)
+    assert n[0] is None or n[0] > 1.5 * whole
+
+
+# --- export ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("kalibr", "--rostopic", "/imu7"), ["rostopic: /imu7", "gyroscope_noise_density: 1.500000e-04"]),
+        (
+            ("kalibr", "--inflation", "2"),
+            ["gyroscope_noise_density: 3.000000e-04", "N, B and K are 2 times"],
+        ),
+        (("gyroparams",), ["gyroparams(", "accelparams("]),
+        (("kalman",), ["dt = 0.01 ", "[gz]", "psd_white = 2.250000e-08"]),
+        (("kalman", "--dt", "0.5", "--correlation-time", "60"), ["dt = 0.5 ", "correlation_time = 6.000000e+01"]),
+    ],
+)
+def test_a_model_is_exported(call: Call, arguments: tuple[str, ...], words: list[str]) -> None:
+    said = call("export", MODEL, "--format", *arguments)
+    assert (said.status, said.err) == (0, "")
+    assert "source: consumer-mems.toml" in said.out
+    for word in words:
+        assert word in said.out
+    assert call("export", MODEL, "--format", *arguments, "--out", "x").out == ""
+    assert Path("x").read_text() == said.out
+
+
+def test_what_analyze_wrote_is_exported(call: Call, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert call("analyze", str(recording), "--json", "x.json").status == 0
+    found = json.loads(Path("x.json").read_bytes())["axes"]
+    said = call("export", "x.json", "--format", "kalibr")
+    assert (said.status, said.err) == (0, "")
+    worst = max(found[axis]["coefficients"]["N"]["value"] for axis in ("gx", "gy", "gz"))
+    assert f"gyroscope_noise_density: {worst:.6e}" in said.out
+    with Path("x.json").open() as piped:
+        monkeypatch.setattr(sys, "stdin", piped)
+        assert call("export", "-", "--format", "kalibr").out == said.out.replace("source: x.json", "source: -")
+
+
+def test_too_short_a_recording_exports_nothing(call: Call) -> None:
+    Path("x.csv").write_text("t,gx\n" + "".join(f"{i / 100},{i % 3}\n" for i in range(20)))
+    assert call("analyze", "x.csv", "--json", "x.json").status == 3
+    said = call("export", "x.json", "--format", "kalibr")
+    assert said.status == 3
+    assert "nothing to export: no axis has any of Q, N, B, K, R: a longer recording is needed" in said.only_line()
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "nothing to export"),
+        (b"[gz", "x: not TOML: "),
+        (b"\xff\xfe", "x: cannot be read: "),
+        (b"{", "x: not the JSON of an analysis: "),
+        (b'{"schema": "imu-monitor/status/1", "axes": {}}', 'x: schema "imu-monitor/status/1"; an export needs'),
+    ],
+)
+def test_what_cannot_be_exported_is_said_in_one_line(call: Call, content: bytes, words: str) -> None:
+    Path("x").write_bytes(content)
+    said = call("export", "x", "--format", "kalibr")
+    assert said.status == 2
+    assert words in said.only_line()
+
+
 # --- as a process ----------------------------------------------------------------------------------
+
+
+def test_a_bar_shows_on_a_terminal_and_is_gone_at_the_end(recording: Path) -> None:
+    pty = pytest.importorskip("pty", reason="there are no pseudo-terminals here")
+    master, terminal = pty.openpty()
+    command = [*PROGRAM, "analyze", str(recording), "--window", "20"]
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "120"}
+    with subprocess.Popen(command, stdin=terminal, stdout=terminal, stderr=terminal, env=environment) as process:
+        os.close(terminal)
+        shown = b""
+        with contextlib.suppress(OSError):  # Linux ends a pseudo-terminal so
+            while part := os.read(master, 65_536):
+                shown += part
+        assert process.wait(60.0) == 0
+    os.close(master)
+    assert b"dynamic curves" in shown
+    assert shown.rindex(b"\x1b[2K") < shown.index(b"Gyroscopes")  # erased before the table
+
+
+def test_an_interrupt_ends_an_analysis_in_one_line(tmp_path: Path) -> None:
+    values = np.random.default_rng(1).standard_normal((1_000_000, 6))
+    np.savez(tmp_path / "long.npz", fs=100.0, **dict(zip(AXES, values.T, strict=True)))
+    source = """
+import sys
+import monitor.offline as offline
+from monitor.cli import main
+def told(values, rate_hz, window_s, tau, progress):
+    print("working", file=sys.stderr, flush=True)
+    from monitor.estimate.dynamic import dynamic
+    return dynamic(values, rate_hz, window_s, tau, progress=progress)
+offline.dynamic = told
+main()
+"""
+    with daemon([sys.executable, "-c", source, "analyze", str(tmp_path / "long.npz"), "--window", "1000"]) as one:
+        one.hears("working")
+        assert one.status_after(signal.SIGINT, 10.0) == 128 + signal.SIGINT
+        assert one.rest() == ""
 
 
 def test_a_wrong_file_ends_a_real_process(tmp_path: Path) -> None:

@@ -112,17 +112,17 @@ def _more(count: int, what: str) -> list[str]:
 
 
 def _departure(curve: AllanCurve, fit: Fit, axis: int) -> tuple[int, int]:
-    """First and last τ of the run in which the curve of one axis stands off by the largest factor.
+    """First and last τ of the run in which the curve of one axis stands above the fit by the largest factor.
 
-    Not by the most σ: the fit is pulled, and the shortest τ are known so well that they are many σ off wherever the
-    cause is. But only where it is more than chance.
+    What no term makes adds to the curve, but the fit is pulled towards it and leaves most σ elsewhere: below itself,
+    and at the shortest τ, which are known best. Only what is more than chance counts.
     """
     model, edf = fit.fitted[:, axis], fit.edf[:, axis]
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = curve.avar[:, axis] / model
         sigma = (np.cbrt(ratio) - 1.0) * np.sqrt(4.5 * edf)  # Wilson & Hilferty 1931
         off = np.where(np.abs(sigma) > CLEAR, np.log(ratio), 0.0)
-    worst = int(np.abs(off).argmax())
+    worst = int(off.argmax()) if (off > 0.0).any() else int(off.argmin())
     near = off * np.sign(off[worst]) >= NEAR_WORST * abs(off[worst])
     for belongs, run in groupby(range(off.size), key=near.__getitem__):
         rows = list(run)

@@ -368,7 +368,7 @@ def analysis_table(estimate: Estimate) -> RenderableType:
 def _detail(noise: heard.Noise, either: Sequence[str] = ()) -> list[RenderableType]:
     """Axis by letter with intervals, a table a kind of sensor; ``either``: axes whose drift is K or R."""
     seen = "" if noise.seen_s is None else f"last {duration(noise.seen_s)}; "
-    known = f"; {K_OR_R}: one of them, the data do not tell which" if either else ""
+    known = f"; {K_OR_R}: one of them" if either else ""
     parts: list[RenderableType] = [Text(f"{seen}[95 % interval]; ≤ bound; {NONE} too few data yet{known}", style="dim")]
     for kind in units.KINDS:
         if set(units.axes_of(kind)) & set(noise.axes):
