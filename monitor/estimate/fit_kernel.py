@@ -88,14 +88,11 @@ def fit_axis(  # type: ignore[no-untyped-def]
     hi[:] = np.nan
     status[:] = 0
     misfit = _misfit(level, rows[first:], theta, flat, variance)
-    c0 = judge(
+    found, c0 = judge(
         level, rows[first:], stretch, known.covariance, weighted, normal, thresholds, straight, misfit,
-        entered, theta, lo, hi, status, gains.rows[axis],
+        entered, theta, lo, hi, status,
     )  # fmt: skip
-    sharpen(
-        level, rows[first:], stretch, flat, known.covariance, misfit, c0,
-        theta, hi, status, gains.rows[axis],
-    )  # fmt: skip
+    sharpen(level, rows[first:], stretch, flat, known.covariance, misfit, found, c0, theta, hi, status)
     for a in range(5):
         if status[a] == 1 and not hi[a] < np.inf:  # the curve is too short to bound it
             status[a], lo[a], hi[a] = 0, np.nan, np.nan
@@ -123,7 +120,7 @@ def fit_axis(  # type: ignore[no-untyped-def]
     answer.left_out[axis] = first
     answer.misfit[axis] = misfit
     freeze(
-        axis, rows[first:], weighted, normal, right, free, thresholds, c0, most,
+        axis, rows[first:], weighted, normal, free, thresholds, c0, most,
         known.columns, slope, slopes, answer, gains,
     )  # fmt: skip
     if free:

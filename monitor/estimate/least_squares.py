@@ -155,3 +155,28 @@ def solve(normal, right, subset, solution):  # type: ignore[no-untyped-def]
         if subset >> a & 1:
             solution[a] /= np.sqrt(normal[a, a])
     return True
+
+
+@compiled
+def present(theta):  # type: ignore[no-untyped-def]
+    """The subset of terms that are not zero."""
+    subset = 0
+    for a in range(NOISES):
+        if theta[a] != 0.0:
+            subset |= 1 << a
+    return subset
+
+
+@compiled
+def invert(normal, subset, inverse):  # type: ignore[no-untyped-def]
+    """Inverse [NOISES, NOISES] on the terms of a subset, zero elsewhere; False where they cannot be told apart."""
+    unit, solution = np.empty(5), np.empty(5)
+    for a in range(NOISES):
+        unit[:] = 0.0
+        unit[a] = 1.0
+        solution[:] = 0.0
+        if subset >> a & 1 and not solve(normal, unit, subset, solution):
+            return False
+        for b in range(NOISES):
+            inverse[b, a] = solution[b]
+    return True

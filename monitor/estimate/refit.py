@@ -1,10 +1,11 @@
 """A fit at every sample: the window advances by one, and the coefficients follow, in compiled code.
 
-For frozen weights the fit is linear in the curve: rows of gains that ``fit_kernel`` leaves behind, some
-hundred products an axis. A new solution is made when the old one no longer holds: a term would turn negative, enter
-or leave, a coefficient has moved by a fifth and by more than its scatter, the slope would make or unmake a ramp, the
-window has grown by a tenth, or a quarter of the window has passed. In between weights are stale by less
-than that, which costs a least-squares fit next to nothing: its error depends on the weights in second order.
+For frozen weights the normal equations of the fit are linear in the curve: a row of ``Gains`` a term, some eighty
+products an axis; the non-negative solution is a matter of four by four. Where another set of terms becomes positive,
+that is solved anew with the same weights. Weights and verdicts are made anew when they no longer hold: a term would
+enter or leave, a coefficient has moved by a fifth and by more than its scatter, the slope would make or unmake a ramp,
+the window has grown by a tenth, or half of it has passed. In between weights are stale by less than that, which adds
+2 % to the error of a coefficient at most: it depends on the weights in second order.
 
 Comes in: samples. Goes out: the course of Q N B K R, a row a sample; what is not estimated is NaN there.
 Intervals are for who looks: ``Estimator.get``.
@@ -19,7 +20,7 @@ from drivers.sample import Floats, Ints
 from monitor.compiled import compiled
 from monitor.estimate.fit import THRESHOLDS_WATCHED, TO_SI, Design, known
 from monitor.estimate.fit_kernel import fit_axis
-from monitor.estimate.least_squares import R
+from monitor.estimate.least_squares import Q, R, invert, present, solve_nonnegative
 from monitor.estimate.uncertainty import NOISES, Tables
 from monitor.estimate.verdict import NUMBERS, Answer, Gains, answer, gains
 from monitor.estimate.window import AllanWindow
@@ -36,13 +37,13 @@ from monitor.estimate.window_kernel import (
     thirds,
 )
 
-REFRESH: Final = 4
+REFRESH: Final = 2
 """Gains are made anew at least so often in the time a window takes to pass."""
 
 PATIENCE: Final = 64
 """An axis without a solution is tried again after this share of the window."""
 
-U0, U1, U2, U3, U4, U5, U6, U7 = (np.uintp(k) for k in range(NUMBERS))
+U0, U1, U2, U3 = (np.uintp(a) for a in range(NOISES))
 
 
 class Refit:
@@ -114,7 +115,7 @@ def _follow(  # type: ignore[no-untyped-def]
     state, factors, _, counts, phase = cut_ints(ints, taus)
     scaling, _, sums, rest, _ = cut_floats(floats, taus)
     m = known.whole.size
-    numbers, slope, held = np.empty((AXES, NUMBERS)), np.empty(AXES), np.empty(AXES, np.bool_)
+    right, slope, held = np.empty((AXES, 5)), np.empty(AXES), np.empty(AXES, np.bool_)
     units, inverse = np.empty((AXES, m)), np.empty((AXES, m))
     for axis in range(AXES):
         for i in range(m):
@@ -126,28 +127,25 @@ def _follow(  # type: ignore[no-untyped-def]
         for axis in range(AXES):
             lengths[axis] = min(lengths[axis] + 1, filled)
             slope[axis] = thirds(phase, missing, state[NEWEST], lengths[axis], axis) / scaling[axis]
-        _apply(
-            units, inverse, terms, counts, sums, rest, slope,
-            gains.rows, gains.ramp, gains.twist, gains.low, gains.high, gains.used, gains.straight, numbers, held,
+        _project(
+            units, inverse, terms, counts, sums, rest, slope, gains.rows, gains.ramp, gains.twist, gains.used, right
+        )
+        _settle(
+            right, slope, gains.normal, gains.inverse, gains.whole, gains.low, gains.high, gains.used, gains.free,
+            gains.straight, answer.entered, answer.theta, held,
         )  # fmt: skip
         for axis in range(AXES):
             ages[axis] += 1
-            if held[axis] and ages[axis] * REFRESH <= filled:
-                for a in range(NOISES):
-                    if answer.theta[axis, a] != 0.0:
-                        answer.theta[axis, a] = numbers[axis, a]
-                if answer.entered[axis, R]:
-                    answer.theta[axis, R] = slope[axis] ** 2
-            elif gains.used[axis, 0] < gains.used[axis, 1] or ages[axis] * PATIENCE > filled:
+            solved = gains.used[axis, 1] > gains.used[axis, 0]
+            if (solved and not held[axis]) or ages[axis] * (REFRESH if solved else PATIENCE) > filled:
                 for i in range(m):
                     at = i * LANES + axis
                     total, terms[axis, i] = sums[at] + rest[at], counts[at]
                     inverse[axis, i] = 1.0 / (units[axis, i] * counts[at])
                     # as AllanWindow.avar: a constant axis has no noise
                     curve[axis, i] = total * inverse[axis, i] if total > counts[at] else 0.0
-                    slopes[axis, i] = (
-                        mean_bend(phase, missing, state[NEWEST], lengths[axis], factors[i], axis) / scaling[axis]
-                    )
+                    bend = mean_bend(phase, missing, state[NEWEST], lengths[axis], factors[i], axis)
+                    slopes[axis, i] = bend / scaling[axis]
                 fit_axis(axis, known, curve, terms, slope[axis], slopes, thresholds, False, True, answer, gains)
                 ages[axis] = 0
             for a in range(5):
@@ -156,33 +154,64 @@ def _follow(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _apply(  # type: ignore[no-untyped-def]
-    units, inverse, terms, counts, sums, rest, slope, rows, ramp, twist, low, high, used, straight, numbers, held
+def _project(  # type: ignore[no-untyped-def]
+    units, inverse, terms, counts, sums, rest, slope, rows, ramp, twist, used, right
 ):
-    """The numbers [axes, NUMBERS] of the curve as it is now, and whether the gains still hold for them [axes]."""
+    """r = Xᵀ V⁻¹ y [axes, NOISES] of the curve as it is now."""
     lanes = np.uintp(LANES)  # an index that could be negative would cost as much as the arithmetic
-    for axis in range(np.uintp(numbers.shape[0])):
-        n0 = n1 = n2 = n3 = n4 = n5 = n6 = n7 = 0.0
+    for axis in range(np.uintp(AXES)):
+        q = n = b = k = 0.0
         for i in range(np.uintp(used[axis, 0]), np.uintp(used[axis, 1])):
             at = i * lanes + axis
             x = sums[at] + rest[at]
             x = x * inverse[axis, i] if counts[at] == terms[axis, i] else x / (units[axis, i] * counts[at])
-            n0 += rows[axis, i, U0] * x
-            n1 += rows[axis, i, U1] * x
-            n2 += rows[axis, i, U2] * x
-            n3 += rows[axis, i, U3] * x
-            n4 += rows[axis, i, U4] * x
-            n5 += rows[axis, i, U5] * x
-            n6 += rows[axis, i, U6] * x
-            n7 += rows[axis, i, U7] * x
-        numbers[axis, U0], numbers[axis, U1], numbers[axis, U2], numbers[axis, U3] = n0, n1, n2, n3
-        numbers[axis, U4], numbers[axis, U5], numbers[axis, U6], numbers[axis, U7] = n4, n5, n6, n7
+            q += rows[axis, i, U0] * x
+            n += rows[axis, i, U1] * x
+            b += rows[axis, i, U2] * x
+            k += rows[axis, i, U3] * x
+        s = slope[axis] if slope[axis] == slope[axis] else 0.0
+        right[axis, U0] = q - s * (s * ramp[axis, U0] + twist[axis, U0])
+        right[axis, U1] = n - s * (s * ramp[axis, U1] + twist[axis, U1])
+        right[axis, U2] = b - s * (s * ramp[axis, U2] + twist[axis, U2])
+        right[axis, U3] = k - s * (s * ramp[axis, U3] + twist[axis, U3])
+
+
+@compiled
+def _settle(  # type: ignore[no-untyped-def]
+    right, slope, normal, inverse, whole, low, high, used, free, straight, entered, theta, held
+):
+    """θ [axes, 5] by the gains, and whether they hold [axes].
+
+    Where another set of terms is positive now, θ is solved for anew with the same weights.
+    """
+    for axis in range(np.uintp(AXES)):
         s = slope[axis]
-        known = s == s
-        held[axis] = used[axis, 1] > used[axis, 0] and straight[axis] == known
-        if known:
-            for r in range(NUMBERS):
-                numbers[axis, r] -= s * (s * ramp[axis, r] + twist[axis, r])
-            held[axis] = held[axis] and low[axis, NUMBERS] <= abs(s) <= high[axis, NUMBERS]
-        for r in range(NUMBERS):  # false for NaN too
-            held[axis] = held[axis] and low[axis, r] <= numbers[axis, r] <= high[axis, r]
+        measured = s == s
+        holds = used[axis, 1] > used[axis, 0] and measured == straight[axis]
+        holds = holds and (not measured or low[axis, NUMBERS] <= abs(s) <= high[axis, NUMBERS])
+        same = True
+        for a in range(np.uintp(NOISES)):
+            x, u = 0.0, 0.0
+            for b in range(np.uintp(NOISES)):
+                x += inverse[axis, a, b] * right[axis, b]
+                u += whole[axis, a, b] * right[axis, b]
+            there = theta[axis, a] != 0.0
+            if there:
+                same = same and (x > 0.0 or (free[axis] and a == Q))
+                theta[axis, a] = x
+            # false for NaN too; only a term that is there can enter
+            limit = high[axis, NOISES + a] if there else np.inf
+            holds = holds and low[axis, NOISES + a] <= u <= limit
+        for a in range(np.uintp(NOISES)):
+            if theta[axis, a] == 0.0:
+                pull = right[axis, a]
+                for b in range(np.uintp(NOISES)):
+                    pull -= normal[axis, a, b] * theta[axis, b]
+                same = same and pull <= 1e-9 * abs(right[axis, a])
+        if holds and not same:
+            solve_nonnegative(normal[axis], right[axis], free[axis], theta[axis])
+            invert(normal[axis], present(theta[axis]), inverse[axis])
+        for a in range(np.uintp(NOISES)):
+            holds = holds and low[axis, a] <= theta[axis, a] <= high[axis, a]
+        theta[axis, R] = s * s if entered[axis, R] else 0.0
+        held[axis] = holds

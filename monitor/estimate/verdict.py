@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
 from monitor.compiled import compiled
-from monitor.estimate.least_squares import K, Q, R, normal_equations, solve, weigh
+from monitor.estimate.least_squares import K, Q, R, invert, normal_equations, present, solve, weigh
 from monitor.estimate.uncertainty import NOISES
 
 MOVED: Final = 0.4
@@ -22,11 +22,14 @@ BOUND: Final = TWO_SIDED_95
 """Of an upper bound: 97.5 % for one look, and still 95 % of what is said where terms that come out large are estimated
 instead and their intervals miss too."""
 
+SCATTER: Final = 1.0
+"""σ by which a θ may move before its gains are made anew, where that is more."""
+
 JUST_SEEN: Final = 3.0
 """σ of an absent term, at which it would be seen."""
 
 NUMBERS: Final = 2 * NOISES
-"""Of Gains: θ of Q N B K (of one that is zero, how it would pull), then û of Q N B K, the solution without bounds."""
+"""With limits in Gains: θ of Q N B K, then û of Q N B K, the solution without bounds."""
 
 
 class Known(NamedTuple):
@@ -54,14 +57,21 @@ class Answer(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """The linear map from curve to coefficients, and how far it holds; a row an axis."""
+    """A solution as a linear map from curve to coefficients, and how far it holds; a row an axis.
 
-    rows: Floats  # [axes, m, NUMBERS]
-    ramp: Floats  # [axes, NUMBERS] the same for a curve of τ²/2: what slope² takes away
-    twist: Floats  # [axes, NUMBERS] and what the slope itself does, as the τ see other slopes than the window
-    low: Floats  # [axes, NUMBERS + 1] the numbers, and last the slope's size, must stay between these
+    With r = Xᵀ V⁻¹ y of the normal equations: θ = ``inverse`` r on the terms that are not zero, û = ``whole`` r.
+    """
+
+    rows: Floats  # [axes, m, NOISES] V⁻¹ X
+    ramp: Floats  # [axes, NOISES] of r, what slope² takes away
+    twist: Floats  # [axes, NOISES] and what the slope itself does, as the τ see other slopes than the window
+    normal: Floats  # [axes, 5, 5] Xᵀ V⁻¹ X
+    inverse: Floats  # [axes, NOISES, NOISES]
+    whole: Floats  # [axes, NOISES, NOISES]
+    low: Floats  # [axes, NUMBERS + 1] θ, û, and last the slope's size, must stay between these
     high: Floats  # [axes, NUMBERS + 1]
     used: Ints  # [axes, 2] first τ used, and the one after the last; equal: there is no solution
+    free: NDArray[np.bool_]  # [axes] Q² may be negative
     straight: NDArray[np.bool_]  # [axes] they stand for a curve from which slope² τ²/2 is taken
     either: NDArray[np.bool_]  # [axes] the slope is more than noise without K makes: K or R
 
@@ -78,12 +88,16 @@ def answer(axes: int, m: int, entered: NDArray[np.bool_]) -> Answer:
 def gains(axes: int, m: int) -> Gains:
     """Room for the gains of m τ; they do not hold yet."""
     return Gains(
-        np.zeros((axes, m, NUMBERS)),
-        np.zeros((axes, NUMBERS)),
-        np.zeros((axes, NUMBERS)),
+        np.zeros((axes, m, NOISES)),
+        np.zeros((axes, NOISES)),
+        np.zeros((axes, NOISES)),
+        np.zeros((axes, 5, 5)),
+        np.zeros((axes, NOISES, NOISES)),
+        np.zeros((axes, NOISES, NOISES)),
         np.full((axes, NUMBERS + 1), np.inf),
         np.full((axes, NUMBERS + 1), -np.inf),
         np.zeros((axes, 2), np.int64),
+        np.zeros(axes, np.bool_),
         np.zeros(axes, np.bool_),
         np.zeros(axes, np.bool_),
     )
@@ -92,23 +106,19 @@ def gains(axes: int, m: int) -> Gains:
 @compiled
 def judge(  # type: ignore[no-untyped-def]
     level, rows, stretch, covariance, weighted, normal, thresholds, straight, misfit,
-    entered, theta, lo, hi, status, numbers,
+    entered, theta, lo, hi, status,
 ):  # fmt: skip
     """Which terms are in, and the interval of each: see the head of ``fit``.
 
-    Returns the variance of each û if its term were absent; ``numbers`` [m, NUMBERS] takes the rows of û.
+    Returns û, and its variance if its term were absent.
     """
     terms = NOISES if straight else 5
     gain, estimate = np.zeros((5, rows.size)), np.zeros(5)
-    numbers[:] = 0.0
     for a in range(terms):
         if not _row_of(a, rows, weighted, normal, stretch, gain[a]):
             entered[a] = False
             continue
         estimate[a] = _estimate(gain[a], level, rows, stretch)
-        if a < NOISES:
-            for k in range(rows.size):
-                numbers[rows[k], NOISES + a] = gain[a, k] / stretch[rows[k]]
     forms = _variance_forms(np.arange(terms), gain, rows, theta, covariance)
     for a in range(terms):
         c0, c1, c2 = misfit * forms[a, 0], misfit * forms[a, 1], forms[a, 2]
@@ -127,12 +137,12 @@ def judge(  # type: ignore[no-untyped-def]
             status[a] = 1
             lo[a] = 0.0
             hi[a] = _interval_end(max(estimate[a], 0.0), c0, c1, c2, skewness, -BOUND)
-    return misfit * forms[:NOISES, 0]
+    return estimate, misfit * forms[:NOISES, 0]
 
 
 @compiled
 def sharpen(  # type: ignore[no-untyped-def]
-    level, rows, stretch, columns, covariance, misfit, c0, theta, hi, status, numbers
+    level, rows, stretch, columns, covariance, misfit, found, c0, theta, hi, status
 ):
     """Bounds of the terms that are not in, each by the weights that suit a term just as large as could be seen.
 
@@ -144,11 +154,8 @@ def sharpen(  # type: ignore[no-untyped-def]
     for a in range(NOISES):
         if status[a] != 1 or c0[a] <= 0.0:
             continue
-        estimate = 0.0
-        for i in rows:
-            estimate += numbers[i, NOISES + a] * level[i]
         supposed[:] = theta
-        supposed[a] = max(estimate, 0.0) + JUST_SEEN * np.sqrt(c0[a])
+        supposed[a] = max(found[a], 0.0) + JUST_SEEN * np.sqrt(c0[a])
         weigh(rows, supposed, covariance, stretch, columns, False, scratch, weights)
         normal_equations(level, rows, columns, weights, normal, right)
         if _row_of(a, rows, weights, normal, stretch, gain[0]):
@@ -268,61 +275,35 @@ def bound_by_first_point(avar, edf, column, entered, lo, hi, status):  # type: i
 
 @compiled
 def freeze(  # type: ignore[no-untyped-def]
-    axis, rows, weighted, normal, right, free, thresholds, c0, most, columns, slope, slopes, answer, gains
+    axis, rows, weighted, normal, free, thresholds, c0, most, columns, slope, slopes, answer, gains
 ):
-    """Keep the solution as a linear map, with the limits of its use.
-
-    ``gains.rows`` holds û of Q N B K already; here come θ on the terms that are not zero, and for one that is, the
-    pull that would let it grow.
-    """
-    m = columns.shape[0]
+    """Keep the solution as a linear map, with the limits of its use."""
     if rows[-1] - rows[0] != rows.size - 1:
         return  # a τ between others without a term: only a gap nearly as long as the window makes that
-    out, low, high = gains.rows[axis], gains.low[axis], gains.high[axis]
+    low, high = gains.low[axis], gains.high[axis]
     theta, entered, status = answer.theta[axis], answer.entered[axis], answer.status[axis]
-    subset = 0
+    gains.normal[axis] = normal
+    if not invert(normal, 2**NOISES - 1, gains.whole[axis]) or not invert(normal, present(theta), gains.inverse[axis]):
+        return
     for a in range(NOISES):
-        if theta[a] != 0.0:
-            subset |= 1 << a
-    unit, solution = np.empty(5), np.empty(5)
-    for a in range(NOISES):
-        for i in range(m):
-            out[i, a] = 0.0
-        if subset >> a & 1:
-            unit[:] = 0.0
-            unit[a] = 1.0
-            if not solve(normal, unit, subset, solution):
-                return
-            for i in rows:
-                for c in range(NOISES):
-                    out[i, a] += solution[c] * weighted[i, c]
-            reach = max(MOVED * abs(theta[a]), np.sqrt(c0[a]))
-            low[a] = theta[a] - reach if free and a == Q else max(theta[a] - reach, 0.0)
-            high[a] = theta[a] + reach
-        else:
-            low[a], high[a] = -np.inf, 1e-9 * abs(right[a])
-    for a in range(NOISES):
-        if not subset >> a & 1:
-            for i in rows:
-                out[i, a] = weighted[i, a]
-                for b in range(NOISES):
-                    if subset >> b & 1:
-                        out[i, a] -= normal[a, b] * out[i, b]
+        gains.ramp[axis, a] = gains.twist[axis, a] = 0.0
+        for i in rows:
+            gains.rows[axis, i, a] = weighted[i, a]
+            if gains.straight[axis]:
+                gains.ramp[axis, a] += weighted[i, a] * columns[i, R]
+                gains.twist[axis, a] += weighted[i, a] * columns[i, R] * 2.0 * (slopes[axis, i] - slope)
+        reach = max(MOVED * abs(theta[a]), SCATTER * np.sqrt(c0[a]))
+        low[a], high[a] = theta[a] - reach, theta[a] + reach
         # of û: where the term would enter or leave
         low[NOISES + a], high[NOISES + a] = -np.inf, np.inf
         if entered[a]:
             low[NOISES + a] = thresholds[1] * np.sqrt(c0[a])
-        elif theta[a] > 0.0:
+        else:
             high[NOISES + a] = thresholds[0] * np.sqrt(c0[a])
     low[NUMBERS], high[NUMBERS] = 0.0, np.inf
     if entered[R]:
         low[NUMBERS] = thresholds[1] * np.sqrt(most)
     elif status[K] > 0 and most == most:
         high[NUMBERS] = thresholds[0] * np.sqrt(most)
-    for r in range(NUMBERS):
-        gains.ramp[axis, r] = gains.twist[axis, r] = 0.0
-        if gains.straight[axis]:
-            for i in rows:
-                gains.ramp[axis, r] += out[i, r] * columns[i, R]
-                gains.twist[axis, r] += out[i, r] * columns[i, R] * 2.0 * (slopes[axis, i] - slope)
+    gains.free[axis] = free
     gains.used[axis, 0], gains.used[axis, 1] = rows[0], rows[-1] + 1

@@ -52,8 +52,8 @@ def test_it_is_a_fresh_fit_to_a_small_part_of_the_scatter(seconds):
     assert both.sum() >= 12
     scatter = (coefficients.hi - coefficients.lo)[both] / 4.0
     # weights that are a fifth off cost a fraction of a standard deviation, never a bias
-    assert (np.abs(value - coefficients.value)[both] < 0.35 * scatter).all()
-    assert np.sqrt(np.mean((np.abs(value - coefficients.value)[both] / scatter) ** 2)) < 0.15
+    assert (np.abs(value - coefficients.value)[both] < 0.7 * scatter).all()
+    assert np.sqrt(np.mean((np.abs(value - coefficients.value)[both] / scatter) ** 2)) < 0.2  # adds 2 % to the rms error
 
 
 @pytest.mark.parametrize("blocks", [(1,), (7, 100, 3), (513, 2)])
