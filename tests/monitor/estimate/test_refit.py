@@ -43,17 +43,18 @@ def fresh(window, before):
     return fit(DESIGN, tables.at(window.n), window.avar(), window.terms(), before, slope, slopes, full=False)
 
 
-@pytest.mark.parametrize("seconds", [40, 150, 390, 600])
-def test_it_is_a_fresh_fit_to_a_small_part_of_the_scatter(seconds):
-    course, window, refit = follow(simulated(round(seconds * RATE_HZ)))
-    expected = fresh(window, refit.entered)
-    value, coefficients = course[-1], expected.coefficients
-    both = np.isfinite(value) & np.isfinite(coefficients.value)
-    assert both.sum() >= 12
-    scatter = (coefficients.hi - coefficients.lo)[both] / 4.0
-    # weights that are a fifth off cost a fraction of a standard deviation, never a bias
-    assert (np.abs(value - coefficients.value)[both] < 0.7 * scatter).all()
-    assert np.sqrt(np.mean((np.abs(value - coefficients.value)[both] / scatter) ** 2)) < 0.2  # adds 2 % to the rms error
+def test_it_is_a_fresh_fit_to_a_small_part_of_the_scatter():
+    off = []
+    for seconds in (40, 70, 150, 210, 390, 600):
+        course, window, refit = follow(simulated(round(seconds * RATE_HZ)))
+        value, coefficients = course[-1], fresh(window, refit.entered).coefficients
+        both = np.isfinite(value) & np.isfinite(coefficients.value)
+        assert both.sum() >= 12
+        scatter = (coefficients.hi - coefficients.lo)[both] / 4.0
+        off += (np.abs(value - coefficients.value)[both] / scatter).tolist()
+    # weights a little off cost a fraction of a standard deviation: 2 % of the rms error
+    assert max(off) < 1.0
+    assert np.sqrt(np.mean(np.square(off))) < 0.2
 
 
 @pytest.mark.parametrize("blocks", [(1,), (7, 100, 3), (513, 2)])
