@@ -3,11 +3,12 @@
 Nothing is drawn by hand. The shipped model ``consumer-mems``, with the temperature of a sensor that warms up, is
 simulated into a recording; ``Service`` replays an hour of it sixty times as fast into a native viewer without a
 screen (software Vulkan), then into the page inside a real Chromium, driven by its DevTools protocol, and is stopped
-as by a signal; ``imu-monitor analyze`` makes the plot of the same hour. The fleet are simulated devices in real time;
-one cable is pulled and put back, another is pulled for good. Needs the packages chromium, mesa-vulkan-drivers and
-libvulkan1 (Debian's names); network traffic stays on loopback.
+as by a signal; ``imu-monitor analyze`` makes the plot of the same hour. Curves over time, in the viewer, the picture
+and the page, are those of the same hour with a gyroscope that becomes noisier. The fleet are simulated devices in real
+time; one cable is pulled and put back, another is pulled for good. Needs the packages chromium, mesa-vulkan-drivers
+and libvulkan1 (Debian's names); network traffic stays on loopback.
 
-    python -m tests.pictures [--out docs/pictures] [--only native fleet web plot]
+    python -m tests.pictures [--out docs/pictures] [--only native surfaces fleet web plot dynamic report]
 """
 
 import argparse
@@ -43,6 +44,9 @@ T0 = 1_763_705_400.0  # Unix s of the first sample: 2025-11-21 06:10 UTC
 HOUR_S = 3600.0
 SPARE_S = 900.0  # of the recording beyond the hour, so that it still runs when the service is stopped
 GAP_S = (1403.0, 1404.5)  # since T0: what the recording lost
+CHANGED_S = 2400.0  # since T0: when gz becomes noisier
+MORE_N = 1.7e-4  # rad/√s: so much white noise is added
+WINDOW = "5min"
 SPEED = 60.0
 SETTLE_S = 6.0  # for a software renderer to paint what has arrived
 STILL_S = 5.0  # a page that has not changed for so long has caught up with what was sent
@@ -101,6 +105,26 @@ def native(out: Path, folder: Path) -> Path:
     return path
 
 
+def surfaces(out: Path, folder: Path) -> Path:
+    """The same viewer's tab with the curves over time, of a device that has changed."""
+    from rerun.experimental import ViewerClient
+
+    path = out / "viewer-dynamic.png"
+    with window() as (port, shoot):
+        with serving(folder, replay(folder, changed=True), port) as service:
+            until(lambda: replayed(service, HOUR_S), 300.0)
+        viewer = ViewerClient(rerun_sinks.server_url(port))
+        layout = viewer.get_blueprint().blueprint
+        for part in layout.values():
+            tabs = part.get("ContainerBlueprint", {})
+            if "active_tab" in tabs:
+                tabs["active_tab"] = tabs["contents"][1]
+        viewer.set_blueprint(layout, of="recording")
+        time.sleep(SETTLE_S)
+        shoot(path)
+    return path
+
+
 def fleet(out: Path, folder: Path) -> Path:
     """Three devices: the overview."""
     path = out / "viewer-fleet.png"
@@ -135,33 +159,67 @@ def web(out: Path, folder: Path) -> Path:
 
 def allan(out: Path, folder: Path) -> Path:
     """The plot that ``analyze --plot`` writes."""
-    path = out / "allan-plot.png"
-    arguments = ["analyze", str(recording(folder, HOUR_S)), "--plot", str(path)]
-    subprocess.run([sys.executable, "-m", "monitor.cli", *arguments], check=True)
+    return analyzed(recording(folder, HOUR_S), out / "allan-plot.png")
+
+
+def dynamic(out: Path, folder: Path) -> Path:
+    """The same with the curves over time."""
+    return analyzed(recording(folder, HOUR_S, changed=True), out / "dynamic-plot.png", "--window", WINDOW)
+
+
+def report(out: Path, folder: Path) -> Path:
+    """The page that ``analyze --plot`` writes, in Chromium."""
+    page = analyzed(recording(folder, HOUR_S, changed=True), folder / "report.html", "--window", WINDOW)
+    path = out / "report.png"
+    with browser() as tab:
+        tab.call("Page.navigate", url=page.as_uri())
+        time.sleep(SETTLE_S)
+        size = tab.call("Page.getLayoutMetrics")["cssContentSize"]
+        whole = {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1}
+        shot = tab.call("Page.captureScreenshot", format="png", clip=whole, captureBeyondViewport=True)
+    path.write_bytes(base64.b64decode(shot["data"]))
     return path
 
 
-PICTURES: dict[str, Callable[[Path, Path], Path]] = {"native": native, "fleet": fleet, "web": web, "plot": allan}
+def analyzed(source: Path, plot: Path, *more: str) -> Path:
+    """What ``imu-monitor analyze --plot`` makes of a recording."""
+    arguments = ["analyze", str(source), "--plot", str(plot), *more]
+    subprocess.run([sys.executable, "-m", "monitor.cli", *arguments], check=True)
+    return plot
 
 
-def recording(folder: Path, seconds: float) -> Path:
-    """So much of the simulated device, with a gap; the same at every run."""
-    path = folder / f"bench-1_{seconds / 3600:g}h.npz"
+PICTURES: dict[str, Callable[[Path, Path], Path]] = {
+    "native": native,
+    "surfaces": surfaces,
+    "fleet": fleet,
+    "web": web,
+    "plot": allan,
+    "dynamic": dynamic,
+    "report": report,
+}
+
+
+def recording(folder: Path, seconds: float, changed: bool = False) -> Path:
+    """So much of the simulated device, with a gap; the same at every run. ``changed``: gz becomes noisier."""
+    path = folder / f"bench-1_{seconds / 3600:g}h{'_changed' if changed else ''}.npz"
     if not path.exists():
         model = read_model(MODEL)
         rate_hz = model.sample_rate_hz
         assert rate_hz is not None
         since_s = np.arange(round(seconds * rate_hz)) / rate_hz
         values = model.stream(rate_hz, 1).draw(since_s.size)
+        if changed:
+            after = since_s >= CHANGED_S
+            values[after, 2] += MORE_N * rate_hz**0.5 * np.random.default_rng(1).standard_normal(after.sum())
         temperature_c = ROOM_C - WARM_UP_C * np.expm1(-since_s / WARM_UP_S)
         kept = (since_s < GAP_S[0]) | (since_s >= GAP_S[1])
         save_samples(path, T0 + since_s[kept], values[kept], temperature_c[kept])
     return path
 
 
-def replay(folder: Path) -> str:
+def replay(folder: Path, changed: bool = False) -> str:
     """The configuration of one device that replays it."""
-    return REPLAY.format(recording=recording(folder, HOUR_S + SPARE_S), speed=SPEED)
+    return REPLAY.format(recording=recording(folder, HOUR_S + SPARE_S, changed), speed=SPEED)
 
 
 def replayed(service: Service, seconds: float) -> bool:

@@ -64,24 +64,18 @@ def cutoff_hz(shift_s: float, rate_hz: float) -> float:
 
 
 def of_fit(curve: AllanCurve, fit: Fit, bandwidth_hz: Floats) -> list[str]:
-    """Where the five terms are not the whole story, axis by axis."""
-    notes = []
+    """Where the five terms are not the whole story; axes of which the same is said share a note."""
+    axes: dict[str, list[str]] = {}
     for i, axis in enumerate(AXES):
         if fit.left_out[i]:
-            notes.append(
-                f"{axis}: the fit leaves out τ up to {curve.tau_s[fit.left_out[i] - 1]:.3g} s, which no sum of the "
-                "five terms follows: the sensor's bandwidth or a vibration shows there"
-            )
+            _add(axes, axis, _left_out(float(curve.tau_s[fit.left_out[i] - 1])))
         if np.isfinite(bandwidth_hz[i]):
-            notes.append(
-                f"{axis}: the sensor's own bandwidth shows in the shortest τ: as of a first-order low-pass at "
-                f"{bandwidth_hz[i]:.3g} Hz"
-            )
+            _add(axes, axis, _bandwidth(float(bandwidth_hz[i])))
         if fit.misfit[i] > 1.0:
-            notes.append(_misfit(axis, curve.tau_s, *_departure(curve, fit, i), float(fit.misfit[i])))
+            _add(axes, axis, _misfit(curve.tau_s, *_departure(curve, fit, i), float(fit.misfit[i])))
         if fit.k_or_r[i]:
-            notes.append(_k_or_r(axis, fit.coefficients.status[K, i] == Status.ESTIMATED))
-    return notes
+            _add(axes, axis, _k_or_r(fit.coefficients.status[K, i] == Status.ESTIMATED))
+    return [f"{', '.join(those)}: {text}" for text, those in axes.items()]
 
 
 def of_motions(motions: Sequence[Motion], rate_hz: float, struck: bool) -> list[str]:
@@ -131,19 +125,33 @@ def _departure(curve: AllanCurve, fit: Fit, axis: int) -> tuple[int, int]:
     return worst, worst
 
 
-def _misfit(axis: str, tau_s: Floats, first: int, last: int, misfit: float) -> str:
-    where = f"τ = {tau_s[first]:.3g} s" if first == last else f"τ from {tau_s[first]:.3g} to {tau_s[last]:.3g} s"
+def _add(axes: dict[str, list[str]], axis: str, text: str) -> None:
+    axes.setdefault(text, []).append(axis)
+
+
+def _left_out(tau_s: float) -> str:
     return (
-        f"{axis}: the curve departs from every sum of the five terms (scatter {misfit**0.5:.2g} times wider), most at "
-        f"{where}: a line, vibration, motion or temperature; intervals are widened accordingly"
+        f"the fit leaves out τ up to {tau_s:.3g} s, which no sum of the five terms follows: the sensor's bandwidth or "
+        "a vibration shows there"
     )
 
 
-def _k_or_r(axis: str, seen: bool) -> str:
+def _bandwidth(cutoff: float) -> str:
+    return f"the sensor's own bandwidth shows in the shortest τ: as of a first-order low-pass at {cutoff:.3g} Hz"
+
+
+def _misfit(tau_s: Floats, first: int, last: int, misfit: float) -> str:
+    where = f"τ = {tau_s[first]:.3g} s" if first == last else f"τ from {tau_s[first]:.3g} to {tau_s[last]:.3g} s"
+    return (
+        f"the curve departs from every sum of the five terms (scatter {misfit**0.5:.2g} times wider), most at {where}: "
+        "a line, vibration, motion or temperature; intervals are widened accordingly"
+    )
+
+
+def _k_or_r(seen: bool) -> str:
     """A rise that may be either: ``seen`` where no slope was to be had, else where it drifts and is too short."""
     if seen:
-        return f"{axis}: K or R: samples are missing, so that no slope tells a ramp from rate random walk"
+        return "K or R: samples are missing, so that no slope tells a ramp from rate random walk"
     return (
-        f"{axis}: K or R: the record drifts by more than Q, N and B make, and is too short to tell a ramp from "
-        "rate random walk"
+        "K or R: the record drifts by more than Q, N and B make, and is too short to tell a ramp from rate random walk"
     )

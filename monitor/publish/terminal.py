@@ -392,10 +392,10 @@ def detail_table(noise: heard.Noise, kind: Kind, stacked: bool, either: Sequence
 
 def _interval(noise: heard.Noise, letter: str, axis: str, between: str, either: bool) -> Text:
     one = units.reading(noise.coefficients, letter, axis)
-    small = f"[{one.interval}]" if one.interval else ""
+    small = [f"[{one.interval}]"] if one.interval else []
     if either and letter in ("K", "R"):
-        small = f"{small} {K_OR_R}".strip()
-    return Text.assemble(one.value, (f"{between}{small}", "dim")) if small else Text(one.value)
+        small.append(K_OR_R)
+    return Text.assemble(one.value, *((between + part, "dim") for part in small))
 
 
 class Fitting:

@@ -221,7 +221,7 @@ def test_motions_and_changes_are_told_with_their_times() -> None:
         "t": 250.0,
         "sigma": 9.1,
         "what": {"N": {"before": 1.5e-4, "after": 2.2e-4}},
-        "text": "gz N rose by 47 %",
+        "text": "gz angle random walk rose by 47 %",
     }
     assert found["changes"][1]["what"] == {"band": {"from": 10.0, "to": 20.0}, "rms": {"before": 1e-3, "after": 2e-3}}
 

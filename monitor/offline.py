@@ -1,0 +1,133 @@
+"""One recording from its file to all results that are wanted: ``analyze`` with the threads that pure rooms do without.
+
+What is always made: curve, fit, motion and changes. Total and Hadamard deviations take four times as long as the Allan
+curve and are made for who draws or writes them, dynamic curves where a window is given. Axes of the curve are done side
+by side, and so are what does not need each other; kernels run without the GIL. Dynamic curves run in the caller's
+thread, so that Ctrl-C ends them at once.
+"""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from drivers.errors import NotReady
+from drivers.recording import iter_blocks, load_samples
+from drivers.sample import Ints
+from monitor.estimate.analysis import Analysis, analyze, events_of
+from monitor.estimate.batch import TauGrid
+from monitor.estimate.dynamic import Dynamic, dynamic
+from monitor.estimate.hadamard import HadamardCurve, hadamard_curve
+from monitor.estimate.total import TotalCurve, total_curve
+from monitor.publish.allan_figure import besides
+
+Tell = Callable[[str, float | None], None]
+"""Told what is being done, and the share that is done where that is known."""
+
+
+class TooShort(NotReady):
+    """Too few samples for any answer."""
+
+    def __init__(self, why: str, samples: int) -> None:
+        super().__init__(why)
+        self.samples = samples
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What is wanted of which recording."""
+
+    recording: Path
+    rate_hz: float | None = None
+    tau: TauGrid = "octave"
+    window_s: float | None = None  # of dynamic curves
+    rest: bool = False  # strike out motion
+    others: bool = False  # total and Hadamard deviations too
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """All that was made of it."""
+
+    analysis: Analysis
+    total: TotalCurve | None = None
+    hadamard: HadamardCurve | None = None
+    dynamic: Dynamic | None = None
+    lacking: str = ""  # why there are no dynamic curves, where they were wanted
+
+
+def make(request: Request, tell: Tell = lambda _what, _share: None) -> Results:
+    """Read and analyse.
+
+    Raises:
+        RecordingError, ConfigError: no recording; or a τ, rate or window that it does not allow
+        TooShort: too few samples for any answer
+    """
+    tell("reading", None)
+    found = load_samples(request.recording, request.rate_hz)
+    blocks = list(iter_blocks(found))
+    pool = ThreadPoolExecutor(os.cpu_count())
+    try:
+        tell("curve and fit", None)
+        try:
+            result = analyze(blocks, found.rate_hz, request.tau, found.notes, pool.map, request.rest)
+        except NotReady as error:
+            raise TooShort(str(error), len(found)) from error
+        tell("motion and changes" + (", total and Hadamard deviations" if request.others else ""), None)
+        events = pool.submit(events_of, result)
+        others = pool.submit(_others, result, request.tau) if request.others else None
+        courses, lacking = _courses(result, request, tell)
+        total, hadamard = others.result() if others else (None, None)
+        found_all = events.result()
+        if lacking:
+            found_all = replace(found_all, notes=(*found_all.notes, lacking))
+        return Results(found_all, total, hadamard, courses, lacking)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def draw(results: Results, path: Path, title: str) -> None:
+    """The picture, or the page if the name ends in .html.
+
+    Raises:
+        ConfigError: what draws is not installed, or the file cannot be written
+    """
+    result = results.analysis
+    beside = besides(results.total, results.hadamard)
+    changes_s = [change.since / result.estimate.rate_hz for change in result.changes]
+    if path.suffix == ".html":
+        from monitor.publish.report import html_report
+
+        html_report(result, path, title, beside, results.dynamic, changes_s)
+    else:
+        from monitor.publish.plot import allan_plot
+
+        allan_plot(result.estimate, path, title, beside, results.dynamic, changes_s)
+
+
+def _courses(result: Analysis, request: Request, tell: Tell) -> tuple[Dynamic | None, str]:
+    """Dynamic curves if they are wanted, or why they cannot be made."""
+    if request.window_s is None:
+        return None, ""
+    rate_hz = result.estimate.rate_hz
+    try:
+        shown = dynamic(
+            result.values, rate_hz, request.window_s, request.tau, progress=lambda share: tell("dynamic curves", share)
+        )
+    except NotReady as error:
+        return None, f"no dynamic curves: {error}"
+    return shown, ""
+
+
+def _others(result: Analysis, tau: TauGrid) -> tuple[TotalCurve, HadamardCurve | None]:
+    """Total and Hadamard deviations: octaves, or the τ that were listed as far as they are possible."""
+    values, rate_hz, theta = result.values, result.estimate.rate_hz, result.fit.theta
+    listed = None if isinstance(tau, str) else result.estimate.curve.factors
+    short: Ints | None = None if listed is None else listed[3 * listed <= len(values)]
+    total = total_curve(values, rate_hz, theta, listed)
+    if short is not None and not np.size(short):
+        return total, None
+    return total, hadamard_curve(values, rate_hz, theta, short)
