@@ -37,6 +37,8 @@ Column = tuple[Floats, Ints]
 EachAxis = Callable[[Callable[[Floats], Column], Iterable[Floats]], Iterable[Column]]
 """What ``map`` does, and an executor's ``map`` in threads."""
 
+PRESENT: Final = 0.98
+"""Share of the samples that must be there for a slope."""
 BLOCK: Final = 16_384
 """Phase points of a block: three of them fill a third of a second-level cache of 1 MB."""
 LANES: Final = 512
@@ -74,7 +76,9 @@ def overlapping_axis(rate: Floats, factors: Ints) -> Column:
 
 
 def slope(values: Floats) -> Floats:
-    """Slope of the rate [k] over a recording [n, k], unit a sample, from its first and last third; NaN as there.
+    """Slope of the rate [k] over a recording [n, k], unit a sample, from its first and last third.
+
+    NaN where more than a fiftieth of the samples is missing.
 
     >>> slope(0.5 * np.arange(9.0)[:, None]).tolist()
     [0.5]
@@ -82,30 +86,56 @@ def slope(values: Floats) -> Floats:
     third = len(values) // 3
     if third == 0:
         return np.full(values.shape[1], np.nan)
-    newest = values[len(values) - 3 * third :].reshape(3, third, -1)
-    with np.errstate(invalid="ignore"):  # what is not finite is missing, and makes its sum so
-        sums: Floats = np.ones(third) @ newest  # five times as fast as a sum along rows of six
-        result: Floats = (sums[2] - sums[0]) / (2.0 * third * third)
-    return np.where(np.isfinite(sums).all(axis=0), result, np.nan)
+    newest = values[len(values) - 3 * third :]
+    late, early = _present_mean(newest[2 * third :]), _present_mean(newest[:third])
+    few = np.isfinite(newest).mean(axis=0) < PRESENT
+    return np.where(few, np.nan, (late - early) / (2.0 * third))
 
 
-def slopes(values: Floats, factors: Ints) -> Floats:
+def slopes(values: Floats, factors: Ints, each: EachAxis = map) -> Floats:
     """Slope of the rate [m, k] as each τ sees it, unit a sample: mean second difference of phase over m².
 
-    NaN for an axis with a missing sample, and where no term is whole.
+    NaN where no term is whole, and for an axis of which more than a fiftieth is missing; fewer count as its mean.
 
     >>> slopes(0.5 * np.arange(90.0)[:, None], np.array([1, 8])).round(12).ravel().tolist()
     [0.5, 0.5]
     """
-    n = len(values)
-    phase = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values - values.mean(axis=0), axis=0)])
-    sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(phase, axis=0)])
-    result = np.full((factors.size, values.shape[1]), np.nan)
-    for i, m in enumerate(factors.tolist()):
+    m = np.ascontiguousarray(factors, np.int64)
+    return np.stack([bent for bent, _ in each(lambda column: (_bends(column, m), m), values.T)], axis=1)
+
+
+def _present_mean(values: Floats) -> Floats:
+    """Mean [k] of what is there in [n, k]; NaN where too little is."""
+    there = np.isfinite(values)
+    count = there.sum(axis=0)
+    mean = (np.ones(len(values)) @ np.where(there, values, 0.0)) / np.maximum(count, 1)
+    return np.where(count < PRESENT * len(values), np.nan, mean)
+
+
+def _bends(rate: Floats, factors: Ints) -> Floats:
+    there = np.isfinite(rate)
+    if there.mean() < PRESENT:
+        return np.full(factors.size, np.nan)
+    mean = float(rate[there].mean(dtype=np.float64))
+    return _end_blocks(np.ascontiguousarray(np.where(there, rate, mean), np.float64), mean, factors)
+
+
+@compiled
+def _end_blocks(rate: Floats, mean: float, factors: Ints) -> Floats:
+    """The sum of all second differences telescopes to four blocks of phase at the ends; over their number and m²."""
+    n = rate.size
+    sums = np.empty(n + 2)  # of phase, itself the sum of the mean-free rate
+    sums[0] = sums[1] = 0.0
+    phase = 0.0
+    for i in range(n):
+        phase += rate[i] - mean
+        sums[i + 2] = sums[i + 1] + phase
+    result = np.full(factors.size, np.nan)
+    for i in range(factors.size):
+        m = factors[i]
         terms = n + 1 - 2 * m
         if terms > 0:
-            # the sum of all second differences telescopes to four blocks of phase at the ends
-            blocks = sums[n + 1] - 2 * sums[n + 1 - m] + sums[terms] - sums[2 * m] + 2 * sums[m] - sums[0]
+            blocks = sums[n + 1] - 2.0 * sums[n + 1 - m] + sums[terms] - sums[2 * m] + 2.0 * sums[m] - sums[0]
             result[i] = blocks / (terms * float(m) ** 2)
     return result
 

@@ -9,7 +9,8 @@ Beside the fixed window of the fit, each τ has a shorter span of its own for th
 N within half a minute.
 """
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Collection, Iterator
 from typing import Final
 
 import numpy as np
@@ -25,7 +26,7 @@ from monitor.estimate.hadamard import HadamardCurve
 from monitor.estimate.refit import Refit
 from monitor.estimate.slow import SlowStatistics
 from monitor.estimate.total import TotalCurve
-from monitor.estimate.uncertainty import Spans, Tables, intervals
+from monitor.estimate.uncertainty import AxisTables, Spans, intervals
 from monitor.estimate.watch import Watch
 from monitor.estimate.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_spans
 
@@ -59,13 +60,13 @@ class Estimator:
         self._window = AllanWindow(length, rows, lengths)
         self._factors = factors
         self._design = design(factors, rate_hz)
-        self._tables = self._new_tables()
-        self._restarted: dict[int, Tables] = {}  # of axes, by their number
+        self._tables = AxisTables(factors, length)
         self._spans = Spans(factors, spans, self._design.columns)
         self._entered: NDArray[np.bool_] = np.zeros((5, 6), np.bool_)
         self._lengths = np.zeros(6, np.int64)  # samples of each axis since its last restart, at most the window
         self._refit = Refit(self._window, self._m, self._tables) if every_sample else None
-        self._course: list[Course] = []
+        self._course: deque[Course] = deque()
+        self._followed = 0  # samples in it
         self._slow = SlowStatistics(self._window)
         self._theta = np.full((5, 6), np.nan)  # of the newest fit
         self._samples = 0
@@ -83,7 +84,9 @@ class Estimator:
 
     def update(self, samples: SampleBlock) -> None:
         """Advance by the samples missing before the block, then by the block."""
-        if samples.lost:
+        if samples.lost > self._window.length:
+            self.reset()
+        elif samples.lost:
             self._window.skip(samples.lost)
             self._lengths += samples.lost
         np.minimum(self._lengths, self._window.n, out=self._lengths)
@@ -91,8 +94,10 @@ class Estimator:
             self._window.update(samples.values)
             self._lengths += len(samples)
         else:
-            course = Course(samples.t_ns, self._refit.update(self._design, samples.values, self._lengths))
-            self._course = _newest([*self._course, course], COURSE_SAMPLES)
+            self._course.append(Course(samples.t_ns, self._refit.update(self._design, samples.values, self._lengths)))
+            self._followed += len(samples)
+            while self._followed - len(self._course[0].t_ns) >= COURSE_SAMPLES:
+                self._followed -= len(self._course.popleft().t_ns)
         self._samples += len(samples)
         self._newest_ns = int(samples.t_ns[-1])
 
@@ -133,10 +138,12 @@ class Estimator:
         curve = self._curve(avar[own], terms[own], result.edf, n)
         quick_edf = self._spans.edf(result.theta, self.rate_hz, terms[recent])
         quick = self._curve(avar[recent], terms[recent], quick_edf, n)
-        course, self._course = self._course, []
+        course = _joined(self._course)
+        self._course.clear()
+        self._followed = 0
         return Estimate(
             self._newest_ns, self.rate_hz, self.window_s, self._samples, curve, result.fitted, result.coefficients,
-            result.k_or_r, quick, _joined(course),
+            result.k_or_r, quick, course,
         )  # fmt: skip
 
     def step(self) -> tuple[TotalCurve, HadamardCurve] | None:
@@ -156,12 +163,10 @@ class Estimator:
         fits = []
         for axes in groups:
             n = int(lengths[axes[0]])
-            tables = (
-                self._tables if n == self._window.n else self._restarted.setdefault(int(axes[0]), self._new_tables())
-            )
+            table = self._tables.of(int(axes[0]), n, self._window.n).at(n)
             fits.append(
                 fit(
-                    self._design, tables.at(n), avar[:, axes], terms[:, axes], before[:, axes],
+                    self._design, table, avar[:, axes], terms[:, axes], before[:, axes],
                     slope[axes] * self.rate_hz, slopes[:, axes] * self.rate_hz, start=self._theta[:, axes],
                 )
             )  # fmt: skip
@@ -169,23 +174,12 @@ class Estimator:
         self._entered, self._theta = result.entered, result.theta
         return result
 
-    def _new_tables(self) -> Tables:
-        return Tables(self._factors, self._window.length)
-
     def _curve(self, avar: Floats, terms: Ints, edf: Floats, n: int) -> AllanCurve:
         lo, hi = intervals(avar, edf)
         return AllanCurve(self._factors / self.rate_hz, self._factors, avar, terms, edf, lo, hi, n)
 
 
-def _newest(course: list[Course], samples: int) -> list[Course]:
-    """The last parts that hold so many samples between them."""
-    count = sum(part.t_ns.size for part in course)
-    while len(course) > 1 and count - course[0].t_ns.size >= samples:
-        count -= course.pop(0).t_ns.size
-    return course
-
-
-def _joined(course: list[Course]) -> Course | None:
+def _joined(course: Collection[Course]) -> Course | None:
     if not course:
         return None
     return Course(np.concatenate([part.t_ns for part in course]), np.concatenate([part.value for part in course]))
@@ -194,14 +188,14 @@ def _joined(course: list[Course]) -> Course | None:
 def warm_up() -> Iterator[str]:
     """Have the kernels compiled, or loaded from the disk cache; yields "window" and "fit" as each is ready.
 
-    Seconds at the very first start on a machine, milliseconds later.
+    "window" is all that samples pass on their way, "fit" what a look needs, and a fit at every sample. Half a minute
+    each at the very first start on a machine, milliseconds later.
     """
     estimator, samples = Estimator(100.0, 1.0), block(np.arange(100, dtype=np.int64), np.zeros((100, 6)))
     estimator.update(samples)
+    estimator.restart(0, 10)
+    Watch(100.0).update(samples)
     yield "window"
     estimator.get()
     Estimator(100.0, 1.0, every_sample=True).update(samples)
-    watch = Watch(100.0)
-    watch.update(samples)
-    estimator.restart(0, 10)
     yield "fit"

@@ -21,8 +21,8 @@ from monitor.compiled import compiled
 from monitor.estimate.fit import THRESHOLDS_WATCHED, TO_SI, Design, known
 from monitor.estimate.fit_kernel import fit_axis
 from monitor.estimate.least_squares import Q, R, invert, present, solve_nonnegative
-from monitor.estimate.uncertainty import NOISES, Tables
-from monitor.estimate.verdict import NUMBERS, Answer, Gains, answer, gains
+from monitor.estimate.uncertainty import FOR_EVER, NOISES, AxisTables, Table
+from monitor.estimate.verdict import NUMBERS, Answer, Gains, Known, answer, gains
 from monitor.estimate.window import AllanWindow
 from monitor.estimate.window_kernel import (
     AXES,
@@ -41,7 +41,8 @@ REFRESH: Final = 2
 """Gains are made anew at least so often in the time a window takes to pass."""
 
 PATIENCE: Final = 64
-"""An axis without a solution is tried again after this share of the window."""
+"""An axis is tried again after this share of the window while it has no solution, or one that the five terms alone do
+not explain: gains cannot tell when a band limit, a line or a transient is gone."""
 
 U0, U1, U2, U3 = (np.uintp(a) for a in range(NOISES))
 
@@ -52,10 +53,10 @@ class Refit:
     Args:
         window: advanced from here only
         rows: how many of its rows, from the first, are fitted
-        tables: covariances of those rows
+        tables: covariances of those rows, for each axis those of its own length
     """
 
-    def __init__(self, window: AllanWindow, rows: int, tables: Tables) -> None:
+    def __init__(self, window: AllanWindow, rows: int, tables: AxisTables) -> None:
         self._window, self._rows, self._tables = window, rows, tables
         self._curve, self._terms, self._slopes = np.zeros((3, AXES, rows))
         self._ages = np.zeros(AXES, np.int64)
@@ -65,13 +66,14 @@ class Refit:
         """Begin anew, with no term in."""
         self._answer: Answer = answer(AXES, self._rows, np.zeros((AXES, 5), np.bool_))
         self._gains: Gains = gains(AXES, self._rows)
-        self._n = 0
+        self._used: list[Table | None] = [None] * AXES  # whose ``Known`` those are
+        self._known: list[Known] = []
 
     def restart(self, axis: int) -> None:
-        """One axis begins anew."""
-        self._answer.entered[axis] = False
+        """One axis begins anew, and is fitted at the next sample."""
+        self._answer.entered[axis], self._answer.status[axis] = False, 0
         self._answer.theta[axis] = np.nan
-        self._gains.used[axis] = 0
+        self._fit_anew(axis)
 
     @property
     def entered(self) -> NDArray[np.bool_]:
@@ -92,29 +94,44 @@ class Refit:
         self._window.stage(values)
         done = 0
         while done < len(values):
-            n = min(self._window.n + 1, self._window.length)
-            table = self._tables.at(n)
-            if table.n != self._n:
-                self._gains.used[:] = 0
-                self._n = table.n
-            until = min(len(values) - done, self._tables.lasts(n))
+            until = min(len(values) - done, self._lookup(design, lengths))
             _follow(
-                self._window.parts(), done, until, lengths, known(design, table), THRESHOLDS_WATCHED,
+                self._window.parts(), done, until, lengths, tuple(self._known), THRESHOLDS_WATCHED,
                 design.rate_hz**TO_SI,
                 self._answer, self._gains, self._ages, self._curve, self._terms, self._slopes, course,
             )  # fmt: skip
             done += until
 
+    def _lookup(self, design: Design, lengths: Ints) -> int:
+        """Find the table of every axis; for how many samples these last."""
+        filled = min(self._window.n + 1, self._window.length)
+        lasts = FOR_EVER
+        for axis in range(AXES):
+            n = min(int(lengths[axis]) + 1, filled)
+            tables = self._tables.of(axis, n, filled)
+            table = tables.at(n)
+            if table is not self._used[axis]:
+                self._used[axis] = table
+                self._fit_anew(axis)
+                self._known[axis : axis + 1] = [known(design, table)]
+            lasts = min(lasts, tables.lasts(n))
+        return lasts
+
+    def _fit_anew(self, axis: int) -> None:
+        """At the next sample."""
+        self._gains.used[axis] = 0
+        self._ages[axis] = self._window.length
+
 
 @compiled
 def _follow(  # type: ignore[no-untyped-def]
-    parts, start, n, lengths, known, thresholds, to_si, answer, gains, ages, curve, terms, slopes, course
+    parts, start, n, lengths, knowns, thresholds, to_si, answer, gains, ages, curve, terms, slopes, course
 ):
     """Advance by n staged samples from row ``start``, and fit after each into that row of ``course``."""
     ints, floats, missing, taus, window = parts
     state, factors, _, counts, phase = cut_ints(ints, taus)
     scaling, _, sums, rest, _ = cut_floats(floats, taus)
-    m = known.whole.size
+    m = knowns[0].whole.size
     right, slope, held = np.empty((AXES, 5)), np.empty(AXES), np.empty(AXES, np.bool_)
     units, inverse = np.empty((AXES, m)), np.empty((AXES, m))
     for axis in range(AXES):
@@ -137,7 +154,8 @@ def _follow(  # type: ignore[no-untyped-def]
         for axis in range(AXES):
             ages[axis] += 1
             solved = gains.used[axis, 1] > gains.used[axis, 0]
-            if (solved and not held[axis]) or ages[axis] * (REFRESH if solved else PATIENCE) > filled:
+            explained = solved and not gains.free[axis] and answer.misfit[axis] == 1.0
+            if (solved and not held[axis]) or ages[axis] * (REFRESH if explained else PATIENCE) > lengths[axis]:
                 for i in range(m):
                     at = i * LANES + axis
                     total, terms[axis, i] = sums[at] + rest[at], counts[at]
@@ -146,7 +164,7 @@ def _follow(  # type: ignore[no-untyped-def]
                     curve[axis, i] = total * inverse[axis, i] if total > counts[at] else 0.0
                     bend = mean_bend(phase, missing, state[NEWEST], lengths[axis], factors[i], axis)
                     slopes[axis, i] = bend / scaling[axis]
-                fit_axis(axis, known, curve, terms, slope[axis], slopes, thresholds, False, True, answer, gains)
+                fit_axis(axis, knowns[axis], curve, terms, slope[axis], slopes, thresholds, False, True, answer, gains)
                 ages[axis] = 0
             for a in range(5):
                 estimated = answer.status[axis, a] == 2
@@ -182,13 +200,15 @@ def _settle(  # type: ignore[no-untyped-def]
 ):
     """θ [axes, 5] by the gains, and whether they hold [axes].
 
-    Where another set of terms is positive now, θ is solved for anew with the same weights.
+    Where another set of terms is positive now, θ is solved for anew with the same weights. Without gains it stays.
     """
     for axis in range(np.uintp(AXES)):
+        if used[axis, 1] <= used[axis, 0]:
+            held[axis] = False
+            continue
         s = slope[axis]
         measured = s == s
-        holds = used[axis, 1] > used[axis, 0] and measured == straight[axis]
-        holds = holds and (not measured or low[axis, NUMBERS] <= abs(s) <= high[axis, NUMBERS])
+        holds = measured == straight[axis] and (not measured or low[axis, NUMBERS] <= abs(s) <= high[axis, NUMBERS])
         same = True
         for a in range(np.uintp(NOISES)):
             x, u = 0.0, 0.0
@@ -197,8 +217,9 @@ def _settle(  # type: ignore[no-untyped-def]
                 u += whole[axis, a, b] * right[axis, b]
             there = theta[axis, a] != 0.0
             if there:
-                same = same and (x > 0.0 or (free[axis] and a == Q))
-                theta[axis, a] = x
+                allowed = x > 0.0 or (free[axis] and a == Q)
+                same = same and allowed
+                theta[axis, a] = x if allowed else 0.0  # a new fit begins with the weights of these
             # false for NaN too; only a term that is there can enter
             limit = high[axis, NOISES + a] if there else np.inf
             holds = holds and low[axis, NOISES + a] <= u <= limit

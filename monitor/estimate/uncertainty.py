@@ -24,7 +24,7 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtri
 
-from drivers.sample import Floats, Ints
+from drivers.sample import AXES, Floats, Ints
 from monitor.compiled import compiled
 from monitor.noise.effects.bias_instability import BiasInstability
 
@@ -83,6 +83,18 @@ class Tables:
         return min(self._capacity, math.ceil(TABLE_STEP * known.n)) - n
 
 
+class AxisTables:
+    """The tables of six axes: those that reach back over all of the window share one, one that began anew has its own."""
+
+    def __init__(self, factors: Ints, capacity: int) -> None:
+        self._shared = Tables(factors, capacity)
+        self._own = [Tables(factors, capacity) for _ in AXES]
+
+    def of(self, axis: int, n: int, filled: int) -> Tables:
+        """For an axis with the newest ``n`` of the ``filled`` samples that the window holds."""
+        return self._shared if n == filled else self._own[axis]
+
+
 def table(n: int, factors: Ints) -> Table:
     """Covariances of overlapping Allan variances of ``n`` samples at these cluster sizes.
 
@@ -117,6 +129,8 @@ def _slope_variance(n: int) -> Floats:
 
     With τ = n/3 the sums over the four points are 4, 2τ, (9 ln 3 − 8 ln 2) τ²/π and 5τ³/3, over (2τ²)².
     """
+    if n < 3:
+        return np.full(NOISES, np.nan)
     tau = n / 3.0
     flicker = (9.0 * np.log(3.0) - 8.0 * np.log(2.0)) / np.pi
     return np.array([4.0, 2.0 * tau, flicker * tau**2, 5.0 / 3.0 * tau**3]) / (4.0 * tau**4)
@@ -177,7 +191,7 @@ def intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Flo
     """
     tail = (1.0 - probability) / 2.0
     safe = np.where(edf > 0.0, edf, np.nan)
-    with np.errstate(divide="ignore"):  # a fraction of one degree of freedom bounds nothing from above
+    with np.errstate(divide="ignore", over="ignore"):  # a fraction of one degree of freedom bounds nothing from above
         return (
             np.sqrt(avar * safe / chdtri(safe, tail)),
             np.sqrt(avar * safe / chdtri(safe, 1.0 - tail)),

@@ -126,12 +126,18 @@ def judge(  # type: ignore[no-untyped-def]
             continue
         skewness = 2.0 * np.sqrt(forms[a, 2])
         threshold = thresholds[1] if entered[a] else thresholds[0]
-        entered[a] = a != R and theta[a] > 0.0 and estimate[a] > threshold * np.sqrt(c0)
+        low = _interval_end(estimate[a], c0, c1, c2, skewness, TWO_SIDED_95)
+        # what was out stays out while its interval reaches to zero
+        seen = entered[a] or low > 0.0
+        entered[a] = seen and a != R and theta[a] > 0.0 and estimate[a] > threshold * np.sqrt(c0)
         if entered[a]:
             status[a] = 2
+            high = _interval_end(estimate[a], c0, c1, c2, skewness, -TWO_SIDED_95)
             value = np.sqrt(theta[a])
-            lo[a] = min(value, _interval_end(estimate[a], c0, c1, c2, skewness, TWO_SIDED_95))
-            hi[a] = max(value, _interval_end(estimate[a], c0, c1, c2, skewness, -TWO_SIDED_95))
+            if not low < value < high:  # others were held at zero, and this one is not û: the interval of what it is
+                low = min(low, _interval_end(theta[a], c0, c1, c2, skewness, TWO_SIDED_95))
+                high = max(high, _interval_end(theta[a], c0, c1, c2, skewness, -TWO_SIDED_95))
+            lo[a], hi[a] = low, high
         else:
             # a bound below what an estimate of zero would give claims more than the curve can know
             status[a] = 1

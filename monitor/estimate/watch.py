@@ -42,6 +42,7 @@ class Watch:
         self._moved_before = 0
         self._events: list[Event] = []
         self._restarts: list[Restart] = []
+        self._final: list[SampleBlock] = []  # held back at the rate before, to go out with the next
         self._begin()
 
     @property
@@ -57,6 +58,7 @@ class Watch:
     def relabel(self, rate_hz: float) -> None:
         """The rate is known better; if it is another one, what was learned was of other times."""
         if abs(rate_hz / self._rate_hz - 1.0) > OTHER_RATE:
+            self._final = self.flush()
             self._moved_before += self._rest.moved_samples
             self._rate_hz = rate_hz
             self._begin()
@@ -67,13 +69,13 @@ class Watch:
         self._newest_ns = int(samples.t_ns[-1])
         still = self._rest.update(samples)
         self._look(still)
-        return still if self._leave_out else [samples]
+        return self._let_go(still) if self._leave_out else [samples]
 
     def flush(self) -> list[SampleBlock]:
         """What was held back, when no more will come."""
         still = self._rest.flush()
         self._look(still)
-        return still if self._leave_out else []
+        return self._let_go(still) if self._leave_out else []
 
     def take_events(self) -> list[Event]:
         """What was found since the last call."""
@@ -89,6 +91,10 @@ class Watch:
         self._began = self._came
         self._rest = Rest(self._rate_hz)
         self._changes = ChangeDetector(self._rate_hz, self._alarms_per_day) if self._alarms_per_day > 0.0 else None
+
+    def _let_go(self, still: list[SampleBlock]) -> list[SampleBlock]:
+        earlier, self._final = self._final, []
+        return earlier + still
 
     def _look(self, still: list[SampleBlock]) -> None:
         self._events += [self._moved(motion) for motion in self._rest.take()]

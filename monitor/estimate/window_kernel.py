@@ -23,6 +23,11 @@ STAGE: Final = 512
 """Samples handed to the kernel at a time."""
 LINE: Final = 8
 """Numbers of eight bytes in a cache line: a row of phase fills one, and must not lie across two."""
+PRESENT: Final = 0.98
+"""Share of the samples that must be there for a slope: gaps shift the middle of what is left, by less than this."""
+LEVEL: Final = 64
+"""Samples whose mean is the level: full scale in the finest phase still fits 64 bits."""
+NEVER: Final = 1 << 62
 BEND_POINTS: Final = 64
 """Of a block of phase, that stand for its sum to a percent of its scatter."""
 
@@ -292,16 +297,33 @@ def forget(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, ax
 
 
 @compiled
+def level(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> int:
+    """Mean of the newest samples of an axis, in its integers: near enough to its mean that differences fit in 64 bits.
+
+    NEVER where none of them is there.
+    """
+    places = phase.size // LANES
+    last, first = newest * LANES + axis, place(newest - min(n, LEVEL), places) * LANES + axis
+    present = min(n, LEVEL) - (missing[last] - missing[first])
+    return (phase[last] - phase[first]) // present if present > 0 else NEVER
+
+
+@compiled
 def thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> float:
-    """Slope of the last n samples by their thirds, in units of the integers; NaN where a sample is missing."""
+    """Slope of the last n samples by their thirds, in units of the integers; NaN where too many are missing."""
     third, places = n // 3, phase.size // LANES
-    if third == 0:
+    middle = level(phase, missing, newest, n, axis)
+    if third == 0 or middle == NEVER:
         return np.nan
     at0, at1 = newest * LANES + axis, place(newest - third, places) * LANES + axis
     at2, at3 = place(newest - 2 * third, places) * LANES + axis, place(newest - 3 * third, places) * LANES + axis
-    if missing[at0] != missing[at3]:
+    late, early = third - (missing[at0] - missing[at1]), third - (missing[at2] - missing[at3])
+    if min(late, early) < PRESENT * third or 3 * third - (missing[at0] - missing[at3]) < PRESENT * 3 * third:
         return np.nan
-    return float(phase[at0] - phase[at1] - phase[at2] + phase[at3]) / (2.0 * third * third)
+    # phase wraps, and so does the level times a count: their difference is small, and is taken before it is a number
+    rise = float(phase[at0] - phase[at1] - middle * late) / late
+    rise -= float(phase[at2] - phase[at3] - middle * early) / early
+    return float(rise / (2.0 * third))
 
 
 @compiled
@@ -314,14 +336,16 @@ def bends(phase: Ints, missing: NDArray[np.int32], newest: int, lengths: Ints, f
 
 @compiled
 def mean_bend(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, m: int, axis: int) -> float:
-    """Mean second difference of phase over clusters of m in the last n samples, over m²; NaN where one is missing.
+    """Mean second difference of phase over clusters of m in the last n samples, over m²; NaN where too few are there.
 
     The sum of all second differences telescopes to those of four blocks of m points at the ends. Of a
-    long block BEND_POINTS points are taken: phase is so smooth that they stand for all.
+    long block BEND_POINTS points are taken: phase is so smooth that they stand for all. A missing sample counts as one
+    of the level.
     """
     places = phase.size // LANES
     last, first = newest * LANES + axis, place(newest - n, places) * LANES + axis
-    if n < 2 * m or missing[last] != missing[first]:
+    middle = level(phase, missing, newest, n, axis)
+    if n < 2 * m or middle == NEVER or n - (missing[last] - missing[first]) < PRESENT * n:
         return np.nan
     stride = max(1, m // BEND_POINTS)
     total = 0.0
@@ -329,7 +353,8 @@ def mean_bend(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, m: i
         at0, at1 = place(newest - k, places) * LANES + axis, place(newest - m - k, places) * LANES + axis
         at2 = place(newest - n + 2 * m - 1 - k, places) * LANES + axis
         at3 = place(newest - n + m - 1 - k, places) * LANES + axis
-        total += float(phase[at0] - phase[at1] - phase[at2] + phase[at3])
+        absent = missing[at0] - missing[at1] - missing[at2] + missing[at3]
+        total += float(phase[at0] - phase[at1] - phase[at2] + phase[at3] + middle * absent)
     points = (m + stride - 1) // stride
     # the blocks are n + 1 − 2m apart, so many differences have their mean
     return total / points * m / (n + 1.0 - 2 * m) / (float(m) * m)

@@ -160,12 +160,14 @@ def test_axes_in_threads_are_the_same_axes():
     assert terms[0].tolist() == [4999, 4999, 4997, 4999, 4999, 4999]
 
 
-def test_slope_is_that_of_the_thirds_and_absent_where_a_sample_is():
+def test_slope_is_that_of_what_is_there_in_the_thirds_and_absent_where_too_little_is():
     y = np.random.default_rng(7).standard_normal((1001, 3)) + 0.01 * np.arange(1001.0)[:, None]
     y[500, 1], y[600, 2], y[601, 2] = np.nan, np.inf, -np.inf
     found = slope(y)
     assert found[0] == pytest.approx((y[668:, 0].mean() - y[2:335, 0].mean()) / 666.0, rel=1e-12)
-    assert np.isnan(found[1:]).all()
+    assert found[1:] == pytest.approx((y[668:, 1:].mean(axis=0) - y[2:335, 1:].mean(axis=0)) / 666.0, rel=1e-12)
+    y[700:720, 1] = np.nan
+    assert np.isnan(slope(y)).tolist() == [False, True, False]
     assert np.isnan(slope(y[:2])).all()
 
 

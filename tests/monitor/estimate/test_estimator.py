@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConfigError, NotReady
-from drivers.sample import block
+from drivers.sample import AXES, block
 from monitor.estimate.batch import overlapping
 from monitor.estimate.coefficients import Status
-from monitor.estimate.estimator import FEWEST, Estimator
+from monitor.estimate.estimator import COURSE_SAMPLES, FEWEST, Estimator
+from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
+from monitor.noise.model import NoiseModel
 
 RATE = 100.0
 
@@ -53,9 +55,7 @@ def test_more_missing_than_the_window_holds(lost):
     estimator.update(made(0, 3000))
     estimator.update(made(5000, 300, lost=lost))
     found = estimator.get()
-    first = 0 if lost > 1700 else 1
     expected, terms = overlapping(made(5000, 300).values, found.curve.factors)
-    assert first == 0
     assert np.array_equal(found.curve.terms, terms)
     assert found.curve.avar[terms > 0] == pytest.approx(expected[terms > 0], rel=1e-8)
     assert found.samples == 3300
@@ -169,6 +169,65 @@ def test_a_restarted_axis_is_at_its_new_noise_at_once(every_sample):
     n = estimator.get().coefficients.value[1]
     assert n[1] == pytest.approx(3e-4, rel=0.05)
     assert n[[0, 2]] == pytest.approx(1e-4, rel=0.05)
+
+
+@pytest.mark.parametrize("every_sample", [False, True])
+@pytest.mark.parametrize("kept", [0, 1, 2, 3, 7])
+def test_an_axis_restarts_with_next_to_nothing(kept, every_sample):
+    estimator = Estimator(RATE, 20.0, every_sample=every_sample)
+    estimator.update(made(0, 3000))
+    estimator.restart(2, kept)
+    estimator.restart(2, kept)
+    found = estimator.get()
+    assert (found.coefficients.status[:, 2] == Status.UNESTIMATED).all()
+    assert found.coefficients.status[1, 3] == Status.ESTIMATED
+    estimator.update(made(3000, 1000))
+    assert estimator.get().coefficients.value[1, 2] == pytest.approx(1e-4, rel=0.2)
+
+
+def test_the_course_of_a_restarted_axis_is_that_of_a_young_window():
+    mix = (QuantizationNoise(Q=5e-6), AngleRandomWalk(N=1.5e-4), BiasInstability(B=1e-4), RateRandomWalk(K=3e-5))
+    differences, ramps = [], 0
+    for seed in range(2):
+        values = NoiseModel(dict.fromkeys(AXES, mix)).simulate(60_000, RATE, seed)
+        old, young = (Estimator(RATE, 300.0, every_sample=True) for _ in range(2))
+
+        def feed(estimators, first, last, values=values):
+            for at in range(first, last, 2000):
+                for estimator in estimators:
+                    estimator.update(block(np.arange(at, at + 2000) * 10_000_000, values[at : at + 2000].copy()))
+
+        feed([old], 0, 32_000)
+        old.get()
+        for axis in range(6):
+            old.restart(axis, 2000)
+        feed([young], 30_000, 32_000)
+        young.get()
+        feed([old, young], 32_000, 60_000)
+        one, other = old.get().course, young.get().course
+        assert np.isfinite(one.value[:, 1]).all()  # from the first sample on
+        differences.append((one.value[:, 1] / other.value[:, 1] - 1.0).ravel())
+        ramps += np.isfinite(one.value[:, 4]).sum()
+    assert ramps == 0
+    assert np.sqrt(np.nanmean(np.concatenate(differences) ** 2)) < 2e-3
+
+
+def test_an_outage_longer_than_the_window_forgets_what_was_seen_before():
+    estimator = Estimator(RATE, 20.0, every_sample=True)
+    estimator.update(made(0, 3000))
+    assert np.isfinite(estimator.get().course.value[-1, 1]).all()
+    estimator.update(made(10_000, 5, lost=7000))
+    assert not estimator._refit.entered.any()
+
+
+def test_the_course_is_bounded_until_someone_looks():
+    estimator = Estimator(RATE, 5.0, every_sample=True)
+    for at in range(0, 70_000, 700):
+        estimator.update(made(at, 700))
+    t_ns = estimator.get().course.t_ns
+    assert COURSE_SAMPLES <= t_ns.size < COURSE_SAMPLES + 700
+    assert t_ns[-1] == 69_999 * 10_000_000
+    assert (np.diff(t_ns) == 10_000_000).all()
 
 
 def test_the_course_has_a_row_a_sample():

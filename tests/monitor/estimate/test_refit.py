@@ -7,7 +7,7 @@ from drivers.sample import AXES
 from monitor.estimate.batch import cluster_sizes
 from monitor.estimate.fit import design, fit
 from monitor.estimate.refit import Refit
-from monitor.estimate.uncertainty import Tables
+from monitor.estimate.uncertainty import AxisTables, Tables
 from monitor.estimate.window import AllanWindow
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
 from monitor.noise.model import NoiseModel
@@ -26,7 +26,7 @@ def simulated(n, *more, seed=0):
 def follow(values, blocks=(1000,)):
     """The course of the coefficients of values [n, 6], and the window they end with."""
     window = AllanWindow(LENGTH, FACTORS)
-    refit = Refit(window, FACTORS.size, Tables(FACTORS, LENGTH))
+    refit = Refit(window, FACTORS.size, AxisTables(FACTORS, LENGTH))
     courses, at, k, lengths = [], 0, 0, np.zeros(6, np.int64)
     while at < len(values):
         courses.append(refit.update(DESIGN, values[at : at + blocks[k % len(blocks)]], lengths))

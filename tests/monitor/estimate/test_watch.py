@@ -97,3 +97,20 @@ def test_a_rate_that_is_another_begins_to_learn_anew_and_keeps_its_counts():
     assert watch.moved_samples == moved
     feed(watch, noise(1000, 5))
     assert watch.moved_samples == moved
+
+
+@pytest.mark.parametrize("at", [2_600, 7_900, 9_050])
+def test_at_another_rate_nothing_that_was_held_back_is_lost(at):
+    """Also in the middle of a motion, which is told."""
+    values = noise(12_000)
+    values[7_700:8_000, 0] += 0.5 * np.sin(np.arange(300) / 15.0)
+    watch, passed = Watch(RATE_HZ, leave_out=True), []
+    for first in range(0, len(values), 130):
+        part = values[first : first + 130]
+        passed += watch.update(block(STEP_NS * np.arange(first, first + len(part)), part))
+        if first <= at < first + 130:
+            watch.relabel(1.05 * RATE_HZ)
+    passed += watch.flush()
+    assert np.array_equal(np.concatenate([one.t_ns for one in passed]), STEP_NS * np.arange(12_000))
+    assert {event.kind for event in watch.take_events()} == {"moved"}
+    assert watch.moved_samples == np.isnan(np.concatenate([one.values for one in passed])[:, 0]).sum() > 150

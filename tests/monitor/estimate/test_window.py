@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
 from drivers.errors import ConfigError
 from monitor.estimate.batch import cluster_sizes, overlapping, slope, slopes
@@ -491,6 +492,73 @@ def test_a_wrong_shape_is_refused(shape):
         AllanWindow(LENGTH, FACTORS).update(np.zeros(shape))
 
 
+# --- any order of calls
+
+
+class Calls(RuleBasedStateMachine):
+    """A window of several spans, beside the samples that it should hold: those of each axis, missing ones as NaN."""
+
+    def __init__(self):
+        super().__init__()
+        length = LENGTH + 30
+        self.window = AllanWindow(length, np.array([1, 3, 1, 20, 65, 20]), np.array([length, 99, 40, length, length, 77]))
+        self.held = np.empty((0, 6))
+        self.given = 0
+
+    @rule(n=st.integers(0, 200), holes=st.lists(st.tuples(st.integers(0, 199), st.integers(0, 5)), max_size=4))
+    def update(self, n, holes):
+        rows = made(n, self.given)
+        self.given += 1
+        for row, axis in holes:
+            if row < n:
+                rows[row, axis] = np.nan
+        self.window.update(rows)
+        self.held = np.concatenate([self.held, rows])[-self.window.length :]
+
+    @rule(n=st.integers(1, 3))
+    def update_one_by_one(self, n):
+        for _ in range(n):
+            self.update(1, [])
+
+    @rule(n=st.integers(0, LENGTH + 33))
+    def skip(self, n):
+        self.window.skip(n)
+        empty = n > self.window.length
+        self.held = np.concatenate([self.held[:0] if empty else self.held, np.full((0 if empty else n, 6), np.nan)])
+        self.held = self.held[-self.window.length :]
+
+    @rule(axis=st.integers(0, 5), n=st.integers(0, LENGTH + 33))
+    def forget(self, axis, n):
+        self.window.forget(axis, n)
+        self.held[: max(len(self.held) - n, 0), axis] = np.nan
+
+    @rule(share=st.floats(0.0, 1.0))
+    def keep(self, share):
+        n = round(share * len(self.held))
+        self.window.keep(n)
+        self.held = self.held[len(self.held) - n :]
+
+    @rule()
+    def reset(self):
+        self.window.reset()
+        self.held = self.held[:0]
+
+    @invariant()
+    def is_the_batch(self):
+        assert self.window.n == len(self.held)
+        check(self.window, self.held)
+        if len(self.held) >= 3:
+            np.testing.assert_allclose(self.window.slope(), slope(self.held), rtol=1e-6, atol=1e-12)
+            seen, true = self.window.slopes(), slopes(self.held, self.window.factors)
+            assert np.array_equal(np.isnan(seen), np.isnan(true))
+            whole = np.isfinite(self.held).all(axis=0)  # with a gap, each puts another mean in its place
+            np.testing.assert_allclose(seen[:, whole], true[:, whole], rtol=1e-5, atol=1e-12)
+
+
+def test_any_order_of_calls_leaves_the_batch_of_what_is_held():
+    run_state_machine_as_test(Calls, settings=settings(max_examples=60, stateful_step_count=20, deadline=None))
+
+
 # --- one axis begins anew
 
 
@@ -531,3 +599,25 @@ def test_the_slope_of_an_axis_that_began_anew_is_that_of_its_own_samples():
 def test_ten_million_samples_with_gaps_and_a_transient_leave_no_trace():
     """The same program runs 10⁹; see docs/benchmarks.md."""
     assert long_run.run(10, lambda line: None) < 1e-9
+
+
+@pytest.mark.parametrize("gap", [(10, 3), (480, 5), (900, 6)])
+def test_a_small_gap_leaves_the_slope(gap):
+    n, (at, missing) = 1000, gap
+    factors = np.array([1, 4, 16, 64, 250])
+    values = 9.81 + 1e-2 * np.random.default_rng(7).standard_normal((n, 6)) + 1e-3 * np.arange(n)[:, None]
+    whole, window = AllanWindow(n, factors), AllanWindow(n, factors)
+    whole.update(values)
+    values[at : at + missing] = np.nan
+    window.update(values)
+    np.testing.assert_allclose(window.slope(), slope(values), rtol=1e-9)
+    np.testing.assert_allclose(window.slope(), whole.slope(), rtol=0.01)
+    # a missing sample stands for the level, here up to the whole ramp away
+    np.testing.assert_allclose(window.slopes()[2:], whole.slopes()[2:], rtol=0.05)
+    np.testing.assert_allclose(slopes(values, factors)[2:], whole.slopes()[2:], rtol=0.05)
+    values[:100] = np.nan
+    window.update(values)
+    assert np.isnan(window.slope()).all()
+    assert np.isnan(slope(values)).all()
+    assert np.isnan(window.slopes()).all()
+    assert np.isnan(slopes(values, factors)).all()
