@@ -16,11 +16,12 @@ import numpy as np
 from drivers.errors import NotReady
 from drivers.sample import Floats, Ints, SampleBlock
 from monitor.estimate import findings
+from monitor.estimate.bandwidth import LowPass, contradicted, sought, with_bandwidth
 from monitor.estimate.batch import EachAxis, TauGrid, cluster_sizes, overlapping, slope, slopes
 from monitor.estimate.change import Change, ChangeDetector
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Estimate
-from monitor.estimate.fit import Fit, design, fit
+from monitor.estimate.fit import Fit, Looks, design, fit
 from monitor.estimate.fit_kernel import MIN_ROWS
 from monitor.estimate.grid import on_grid
 from monitor.estimate.rest import Motion, find
@@ -75,14 +76,14 @@ def analyze(
     if rest:
         values, motions = _at_rest(values, rate)
         found = [*found, *findings.of_motions(motions, rate, struck=True)]
-    curve, fitted = _fitted(values, rate, cluster_sizes(len(values), rate, tau), each)
+    curve, fitted, filters = _fitted(values, rate, cluster_sizes(len(values), rate, tau), each)
     estimate = Estimate(
         int(blocks[-1].t_ns[-1]), rate, curve.n / rate, sum(len(samples) for samples in blocks),
         curve, fitted.fitted, fitted.coefficients, fitted.k_or_r,
     )  # fmt: skip
-    bandwidth_hz = findings.bandwidth_hz(curve, fitted, rate)
+    bandwidth_hz = np.array([np.nan if one is None else one.cutoff * rate for one in filters])
     few = [f"{len(curve.tau_s)} averaging times are too few to fit five terms; at least {MIN_ROWS} are needed"]
-    said = few if len(curve.tau_s) < MIN_ROWS else findings.of_fit(curve, fitted, bandwidth_hz)
+    said = few if len(curve.tau_s) < MIN_ROWS else findings.of_fit(curve, fitted, filters, rate)
     return Analysis(
         estimate, estimate.window_s, (*notes, *found, *said), values, fitted, bandwidth_hz, motions, struck=rest
     )
@@ -120,17 +121,19 @@ def _at_rest(values: Floats, rate_hz: float) -> tuple[Floats, tuple[Motion, ...]
     return np.where(moving[:, None], np.nan, values) if moving.any() else values, tuple(motions)
 
 
-def _fitted(values: Floats, rate_hz: float, factors: Ints, each: EachAxis) -> tuple[AllanCurve, Fit]:
-    """The curve with its intervals, and the fit to it."""
+def _fitted(
+    values: Floats, rate_hz: float, factors: Ints, each: EachAxis
+) -> tuple[AllanCurve, Fit, list[LowPass | None]]:
+    """The curve with its intervals, the fit to it, and the sensor's own low-pass on axes that show one."""
     n = len(values)
     avar, terms = overlapping(values, factors, each)
-    found = fit(
-        design(factors, rate_hz),
-        table(n, factors),
-        avar,
-        terms,
-        slope=slope(values) * rate_hz,
-        slopes=slopes(values, factors) * rate_hz,
-    )
+    columns, covariances = design(factors, rate_hz), table(n, factors)
+    looks = Looks(avar, terms, slope(values) * rate_hz, slopes(values, factors, each) * rate_hz)
+    found = fit(columns, covariances, avar, terms, slope=looks.slope, slopes=looks.slopes)
+    filters = [
+        sought(columns, covariances, looks.axis(axis)) if contradicted(found, axis) else None
+        for axis in range(values.shape[1])
+    ]
+    found, filters = with_bandwidth(columns, covariances, looks, found, filters)
     lo, hi = intervals(avar, found.edf)
-    return AllanCurve(factors / rate_hz, factors, avar, terms, found.edf, lo, hi, n), found
+    return AllanCurve(factors / rate_hz, factors, avar, terms, found.edf, lo, hi, n), found, filters

@@ -18,15 +18,16 @@ from numpy.typing import NDArray
 
 from drivers.errors import NotReady
 from drivers.sample import Floats, Ints, SampleBlock, block
+from monitor.estimate.bandwidth import LowPass, contradicted, sought, with_bandwidth
 from monitor.estimate.batch import TauGrid, cluster_sizes
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Course, Estimate
-from monitor.estimate.fit import Fit, design, fit, joined, nothing_fitted
+from monitor.estimate.fit import Fit, Looks, design, fit, joined, nothing_fitted
 from monitor.estimate.hadamard import HadamardCurve
 from monitor.estimate.refit import Refit
 from monitor.estimate.slow import SlowStatistics
 from monitor.estimate.total import TotalCurve
-from monitor.estimate.uncertainty import AxisTables, Spans, intervals
+from monitor.estimate.uncertainty import AxisTables, Spans, Table, intervals
 from monitor.estimate.watch import Watch
 from monitor.estimate.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_spans
 
@@ -69,6 +70,9 @@ class Estimator:
         self._followed = 0  # samples in it
         self._slow = SlowStatistics(self._window)
         self._theta = np.full((5, 6), np.nan)  # of the newest fit
+        self._odd: list[tuple[Table, Looks] | None] = [None] * 6  # curves that contradict their fit
+        self._filters: list[LowPass | None] = [None] * 6
+        self._turn = 0
         self._samples = 0
         self._newest_ns = 0
 
@@ -147,9 +151,13 @@ class Estimator:
         )  # fmt: skip
 
     def step(self) -> tuple[TotalCurve, HadamardCurve] | None:
-        """One step towards total and Hadamard deviations of the window, see ``slow``; the curves after the last one."""
+        """One step of what takes long: total and Hadamard deviations, see ``slow``, and the sensor's own low-pass.
+
+        Returns the two curves when a round of them is complete.
+        """
         rounds = self._slow.rounds
         self._slow.step()
+        self._seek_bandwidth()
         return self._slow.get(self.rate_hz, self._theta) if self._slow.rounds > rounds else None
 
     def _fit(self, avar: Floats, terms: Ints) -> Fit:
@@ -164,15 +172,30 @@ class Estimator:
         for axes in groups:
             n = int(lengths[axes[0]])
             table = self._tables.of(int(axes[0]), n, self._window.n).at(n)
-            fits.append(
-                fit(
-                    self._design, table, avar[:, axes], terms[:, axes], before[:, axes],
-                    slope[axes] * self.rate_hz, slopes[:, axes] * self.rate_hz, start=self._theta[:, axes],
-                )
+            looks = Looks(
+                avar[:, axes], terms[:, axes], slope[axes] * self.rate_hz, slopes[:, axes] * self.rate_hz,
+                before[:, axes],
             )  # fmt: skip
+            one = fit(
+                self._design, table, looks.avar, looks.terms, looks.before, looks.slope, looks.slopes,
+                start=self._theta[:, axes],
+            )  # fmt: skip
+            self._theta[:, axes] = one.theta
+            for column, axis in enumerate(axes.tolist()):
+                self._odd[axis] = (table, looks.axis(column)) if contradicted(one, column) else None
+            fits.append(with_bandwidth(self._design, table, looks, one, [self._filters[axis] for axis in axes])[0])
         result = fits[0] if len(fits) == 1 else joined(fits, np.concatenate(groups))
-        self._entered, self._theta = result.entered, result.theta
+        self._entered = result.entered
         return result
+
+    def _seek_bandwidth(self) -> None:
+        """Look for the low-pass of the next axis in turn whose shortest τ contradict the fit."""
+        for _ in range(len(self._odd)):
+            self._turn = (self._turn + 1) % len(self._odd)
+            odd = self._odd[self._turn]
+            self._filters[self._turn] = None if odd is None else sought(self._design, *odd)
+            if odd is not None:
+                return
 
     def _curve(self, avar: Floats, terms: Ints, edf: Floats, n: int) -> AllanCurve:
         lo, hi = intervals(avar, edf)

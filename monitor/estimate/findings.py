@@ -1,11 +1,9 @@
-"""What an analysis found, in sentences for people: of the fit, of motion, of changes. And the sensor's own bandwidth.
+"""What an analysis found, in sentences for people: of the fit, of motion, of changes.
 
 Each function returns notes, none where there is nothing to say; a recording full of events gets MOST of a kind and a
-count. Times are seconds since the first sample. Numbers are looked up in results, nothing is estimated here but the
-bandwidth, which is the fit's negative Q² by another name.
+count. Times are seconds since the first sample. Numbers are looked up in results, nothing is estimated here.
 """
 
-import math
 from collections.abc import Sequence
 from itertools import groupby
 from typing import Final
@@ -13,64 +11,31 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import AXES, Floats
+from monitor.estimate.bandwidth import LowPass
 from monitor.estimate.change import Change
 from monitor.estimate.coefficients import Status
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.fit import Fit
-from monitor.estimate.least_squares import K, N, Q
+from monitor.estimate.least_squares import K
 from monitor.estimate.rest import Motion
 
 MOST: Final = 10
 """Notes of one kind."""
 CLEAR: Final = 3.0
 """σ from which on an averaging time is said to depart."""
-ALIKE: Final = 0.1
-"""Share by which a variance may differ from that of a low-pass and still be told as one."""
 NEAR_WORST: Final = 0.5
 """Averaging times that depart by this share of the worst, and to the same side, are told with it."""
 
 
-def bandwidth_hz(curve: AllanCurve, fit: Fit, rate_hz: float) -> Floats:
-    """Cutoff (−3 dB) [6] of the first-order low-pass that bends the first points as they are bent; NaN where none does.
-
-    White noise N behind a first-order low-pass of time constant T, taken every τ0, is an autoregression of step φ =
-    e^(−τ0/T); its integral has the variance V(t) = N²(t − c(1 − φ^(t/τ0))), c = τ0/sinh(τ0/T). Its Allan variance,
-    (4 V(τ) − V(2τ))/2τ², is N²/τ − 3cN²/2τ² beyond the filter's memory: the column of Q (IEEE Std 952) with Q² =
-    −cN²/2. So c = −2Q²/N², T = τ0/asinh(τ0/c), f = 1/(2πT); for T ≫ τ0 that is −N²/(4πQ²).
-
-    The shortest τ, within the filter's memory, may be left out of the fit; where they are no better than ALIKE to such
-    a filter, it is a vibration or motion rather, and there is no answer.
-    """
-    found = np.full(len(AXES), np.nan)
-    for i in np.flatnonzero((fit.theta[Q] < 0.0) & (fit.theta[N] > 0.0)).tolist():
-        white, left_out = float(fit.theta[N, i]), fit.left_out[i]
-        shift_s = -2.0 * float(fit.theta[Q, i]) / white
-        cutoff = cutoff_hz(shift_s, rate_hz)
-        tau_s = curve.tau_s[:left_out]
-        faded = np.exp(-2.0 * np.pi * cutoff * tau_s)
-        alone = white / tau_s - white * shift_s * (4.0 * (1.0 - faded) - (1.0 - faded**2)) / (2.0 * tau_s**2)
-        if (np.abs(curve.avar[:left_out, i] / alone - 1.0) < ALIKE).all():
-            found[i] = cutoff
-    return found
-
-
-def cutoff_hz(shift_s: float, rate_hz: float) -> float:
-    """Cutoff of the low-pass that shifts the variance of the integral by ``shift_s``, c of ``bandwidth_hz``.
-
-    >>> round(cutoff_hz(2e-3, 1e6), 2), round(cutoff_hz(2e-3, 100.0), 2)
-    (79.58, 36.8)
-    """
-    return math.asinh(1.0 / (rate_hz * shift_s)) * rate_hz / (2.0 * math.pi)
-
-
-def of_fit(curve: AllanCurve, fit: Fit, bandwidth_hz: Floats) -> list[str]:
+def of_fit(curve: AllanCurve, fit: Fit, filters: Sequence[LowPass | None], rate_hz: float) -> list[str]:
     """Where the five terms are not the whole story; axes of which the same is said share a note."""
     axes: dict[str, list[str]] = {}
     for i, axis in enumerate(AXES):
         if fit.left_out[i]:
             _add(axes, axis, _left_out(float(curve.tau_s[fit.left_out[i] - 1])))
-        if np.isfinite(bandwidth_hz[i]):
-            _add(axes, axis, _bandwidth(float(bandwidth_hz[i])))
+        low_pass = filters[i]
+        if low_pass is not None:
+            _add(axes, axis, _bandwidth(low_pass, rate_hz))
         if fit.misfit[i] > 1.0:
             _add(axes, axis, _misfit(curve.tau_s, *_departure(curve, fit, i), float(fit.misfit[i])))
         if fit.k_or_r[i]:
@@ -136,8 +101,11 @@ def _left_out(tau_s: float) -> str:
     )
 
 
-def _bandwidth(cutoff: float) -> str:
-    return f"the sensor's own bandwidth shows in the shortest τ: as of a first-order low-pass at {cutoff:.3g} Hz"
+def _bandwidth(low_pass: LowPass, rate_hz: float) -> str:
+    return (
+        f"the sensor's own bandwidth shows in the shortest τ: as of a low-pass of order {low_pass.order} at "
+        f"{low_pass.cutoff * rate_hz:.3g} Hz; N is the noise inside it"
+    )
 
 
 def _misfit(tau_s: Floats, first: int, last: int, misfit: float) -> str:

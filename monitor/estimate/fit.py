@@ -1,8 +1,8 @@
 """Allan curve in, coefficients Q N B K R out, six axes at a time.
 
-The curve is linear in θ = (Q², N², B², K², R²). Each axis is fitted by non-negative least squares
-with weights 1/Var(σ²_i) of the model itself, re-weighted a few times (such weights come
-within a few percent of the Cramér–Rao limit). The unconstrained solution û beside it decides what
+The curve is linear in θ = (Q², N², B², K², R²). Each axis is fitted by non-negative least squares, weighted by the
+covariance of the τ under the model itself, or by its diagonal alone where time is short, and re-weighted a few times
+(such weights come within a few percent of the Cramér–Rao limit). The unconstrained solution û beside it decides what
 a coefficient is worth: its variance were v(t) = c0 + c1 t + c2 t² if the true θ_a were t, from the
 covariances of ``uncertainty``. A term is in when û_a/√c0, the variance taken as if it were absent,
 passes a threshold; its interval is the set of t that û does not contradict; a term that is not in
@@ -23,7 +23,7 @@ A fit refuses nothing: an axis with too few τ, or without noise at all, is UNES
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -57,6 +57,8 @@ TO_SI: Final = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 ENTER_ONCE: Final = 2.33  # σ: one look at one curve, 1 % of absent terms enter
 ENTER_WATCHED: Final = 3.0  # σ: looked at again and again
 LEAVE_WATCHED: Final = 1.5  # σ
+FIELDS: Final = ("theta", "fitted", "edf", "entered", "left_out", "scatter", "misfit", "k_or_r")
+"""Of a Fit, what is by the axis, beside the coefficients."""
 THRESHOLDS_ONCE: Final = (ENTER_ONCE, ENTER_ONCE)
 THRESHOLDS_WATCHED: Final = (ENTER_WATCHED, LEAVE_WATCHED)
 
@@ -80,7 +82,8 @@ class Fit:
     edf: Floats  # [m, 6] equivalent degrees of freedom of the measured curve; NaN as the curve
     entered: NDArray[np.bool_]  # [5, 6] terms that are in: hand them to the next fit
     left_out: Ints  # [6] shortest τ that contradicted every fit
-    misfit: Floats  # [6] variance of the curve about the fit over that of noise of the five terms; 1 where it agrees
+    scatter: Floats  # [6] variance of the curve about the fit over that of noise of the five terms
+    misfit: Floats  # [6] the same where it is more than chance makes, else 1
     k_or_r: NDArray[np.bool_]  # [6] the window drifts, by random walk or by a ramp: which of them, it does not tell
     gains: Gains | None  # the fit as a linear map of the curve; None where nothing was fitted
 
@@ -92,12 +95,31 @@ def design(factors: Ints, rate_hz: float) -> Design:
     return Design(factors, rate_hz, columns)
 
 
-def known(design: Design, table: Table) -> Known:
+def known(design: Design, table: Table, blind: Floats | None = None, ask: bool = True) -> Known:
     """What every fit at this length of the window shares."""
     flat = design.columns.copy()
     # what taking away the line costs each noise on average, see the level in ``fit_axis``
     flat[:, :NOISES] -= (2.0 * table.bend - table.slope) * design.columns[:, R, None]
-    return Known(design.columns, flat, table.covariance, table.terms.astype(np.float64), table.slope)
+    blind = np.zeros(design.factors.size) if blind is None else blind
+    whole = table.terms.astype(np.float64)
+    return Known(design.columns, flat, table.covariance, whole, table.slope, blind, ask)
+
+
+@dataclass(frozen=True, slots=True)
+class Looks:
+    """What is fitted: the curve of some axes, and the slopes of the same window."""
+
+    avar: Floats  # [m, k] unit²; NaN where the window is too short
+    terms: Ints  # [m, k] second differences behind each
+    slope: Floats  # [k] unit/s, ``slope_of_thirds``; NaN = not measured: then a ramp is only bounded
+    slopes: Floats  # [m, k] unit/s, the mean second difference of phase over τ² at each τ
+    before: NDArray[np.bool_] | None = None  # [5, k] ``entered`` of the fit before, of who looks again and again
+
+    def axis(self, column: int) -> "Looks":
+        """One axis."""
+        one = slice(column, column + 1)
+        before = None if self.before is None else self.before[:, one]
+        return Looks(self.avar[:, one], self.terms[:, one], self.slope[one], self.slopes[:, one], before)
 
 
 def fit(
@@ -128,17 +150,30 @@ def fit(
         start: [5, 6] ``theta`` of a fit a moment ago, to begin with its weights: a third of the work
     """
     m, axes = avar.shape
+    slope = np.full(axes, np.nan) if slope is None else slope
+    looks = Looks(avar, terms, slope, np.tile(slope, (m, 1)) if slopes is None else slopes, before)
+    return _fit(design, table, looks, known(design, table), full, start)
+
+
+def fit_columns(design: Design, table: Table, looks: Looks, full: bool = False, blind: Floats | None = None) -> Fit:
+    """The same with the columns as they are: no τ is left out, and the fit does not look along ``blind`` [m]."""
+    in_samples = np.zeros(design.factors.size) if blind is None else blind
+    return _fit(design, table, looks, known(design, table, in_samples, ask=False), full)
+
+
+def _fit(design: Design, table: Table, looks: Looks, shared: Known, full: bool, start: Floats | None = None) -> Fit:
+    avar, terms, before = looks.avar, looks.terms, looks.before
+    m, axes = avar.shape
     found = answer(axes, m, np.zeros((axes, 5), np.bool_) if before is None else np.array(before.T, order="C"))
     frozen = gains(axes, m)
     if start is not None:
         found.theta[:] = start.T / design.rate_hz ** (2.0 * TO_SI)
-    straight = np.full(axes, np.nan) if slope is None else slope / design.rate_hz
     fit_axes(
-        known(design, table),
+        shared,
         np.ascontiguousarray(avar.T),
         np.ascontiguousarray(terms.T, np.float64),
-        straight,
-        np.tile(straight[:, None], m) if slopes is None else np.ascontiguousarray(slopes.T) / design.rate_hz,
+        looks.slope / design.rate_hz,
+        np.ascontiguousarray(looks.slopes.T) / design.rate_hz,
         THRESHOLDS_ONCE if before is None else THRESHOLDS_WATCHED,
         full,
         start is not None,
@@ -154,8 +189,22 @@ def fit(
         edf = np.where(missing, _white_edf(design, table, terms), edf)
     return Fit(
         coefficients, (found.theta * to_si**2).T, found.fitted.T, edf, found.entered.T, found.left_out,
-        found.misfit, frozen.either, frozen,
+        found.scatter, found.misfit, frozen.either, frozen,
     )  # fmt: skip
+
+
+def replaced(whole: Fit, axis: int, one: Fit) -> Fit:
+    """A fit with one axis of it from another fit, of that axis alone."""
+
+    def put(into: NDArray[Any], part: NDArray[Any]) -> NDArray[Any]:
+        result = into.copy()
+        result[..., axis] = part[..., 0]
+        return result
+
+    names = ("value", "lo", "hi", "status")
+    coefficients = [put(getattr(whole.coefficients, name), getattr(one.coefficients, name)) for name in names]
+    fields: dict[str, Any] = {name: put(getattr(whole, name), getattr(one, name)) for name in FIELDS}
+    return replace(whole, coefficients=Coefficients(*coefficients), **fields)
 
 
 def joined(fits: Sequence[Fit], axes: Ints) -> Fit:
@@ -167,8 +216,7 @@ def joined(fits: Sequence[Fit], axes: Ints) -> Fit:
         return np.concatenate(parts, axis=-1)[..., order]
 
     coefficients = Coefficients(*(side_by_side(field, "coefficients") for field in ("value", "lo", "hi", "status")))
-    names = ("theta", "fitted", "edf", "entered", "left_out", "misfit", "k_or_r")
-    return Fit(coefficients, **{name: side_by_side(name) for name in names}, gains=None)
+    return Fit(coefficients, **{name: side_by_side(name) for name in FIELDS}, gains=None)
 
 
 def nothing_fitted(avar: Floats) -> Fit:
@@ -182,6 +230,7 @@ def nothing_fitted(avar: Floats) -> Fit:
         edf=np.full_like(avar, np.nan),
         entered=np.zeros((5, avar.shape[1]), np.bool_),
         left_out=np.zeros(avar.shape[1], np.int64),
+        scatter=np.full(avar.shape[1], np.nan),
         misfit=np.ones(avar.shape[1]),
         k_or_r=np.zeros(avar.shape[1], np.bool_),
         gains=None,

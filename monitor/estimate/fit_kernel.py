@@ -82,12 +82,13 @@ def fit_axis(  # type: ignore[no-untyped-def]
     lo, hi = answer.lo[axis], answer.hi[axis]
     variance, weighted, normal, right = np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5)
     first, free = _fit_terms(
-        curve, level, rows, stretch, flat, known.covariance, full, warm, variance, weighted, normal, right, theta
+        curve, level, rows, stretch, flat, known, full, warm, variance, weighted, normal, right, theta
     )
     lo[:] = np.nan
     hi[:] = np.nan
     status[:] = 0
-    misfit = _misfit(level, rows[first:], theta, flat, variance)
+    scatter, limit = _misfit(level, rows[first:], theta, flat, variance)
+    misfit = scatter if scatter > limit else 1.0
     found, c0 = judge(
         level, rows[first:], stretch, known.covariance, weighted, normal, thresholds, straight, misfit,
         entered, theta, lo, hi, status,
@@ -118,7 +119,7 @@ def fit_axis(  # type: ignore[no-untyped-def]
         variance[i] += 4.0 * theta[R] * known.columns[i, R] ** 2 * noise
         answer.edf[axis, i] = 2.0 * positive * positive / variance[i]
     answer.left_out[axis] = first
-    answer.misfit[axis] = misfit
+    answer.misfit[axis], answer.scatter[axis] = misfit, scatter
     freeze(
         axis, rows[first:], weighted, normal, free, thresholds, c0, most,
         known.columns, slope, slopes, answer, gains,
@@ -130,16 +131,16 @@ def fit_axis(  # type: ignore[no-untyped-def]
 
 @compiled
 def _fit_terms(  # type: ignore[no-untyped-def]
-    avar, level, rows, stretch, columns, covariance, full, warm, variance, weighted, normal, right, theta
+    avar, level, rows, stretch, columns, known, full, warm, variance, weighted, normal, right, theta
 ):
     """Re-weighted Q N B K; how many of the shortest τ were left out, and whether Q² was set free."""
     first, free = 0, False
-    asking = True
+    asking, covariance = known.ask, known.covariance
     warm = warm and theta[N] > 0.0
     while True:
         used = rows[first:]
         if warm:
-            weigh(used, theta, covariance, stretch, columns, full, variance, weighted)
+            weigh(used, theta, covariance, stretch, columns, known.blind, full, variance, weighted)
         else:
             for i in used:  # white noise of that level, to begin with
                 variance[i] = avar[i] * avar[i] * covariance[i, i, WHITE] / columns[i, N] ** 2
@@ -148,7 +149,7 @@ def _fit_terms(  # type: ignore[no-untyped-def]
         for _ in range(WARM_PASSES if warm else PASSES):
             normal_equations(level, used, columns, weighted, normal, right)
             solve_nonnegative(normal, right, free, theta)
-            weigh(used, theta, covariance, stretch, columns, full, variance, weighted)
+            weigh(used, theta, covariance, stretch, columns, known.blind, full, variance, weighted)
         limit = MISFIT_AGAIN if free else MISFIT
         if not asking or not _contradicted(level, used[:SHORT_ROWS], theta, columns, variance, limit):
             break
@@ -167,7 +168,7 @@ def _fit_terms(  # type: ignore[no-untyped-def]
 def _misfit(level, rows, theta, columns, variance):  # type: ignore[no-untyped-def]
     """How many times wider the curve scatters about the fit, in variance, than noise of the five terms would.
 
-    One unless it is far more than chance makes of so many τ: then intervals are as much wider (Birge 1932).
+    And the limit beyond which chance does not make that of so many τ: then intervals are as much wider (Birge 1932).
     """
     total, freedom = 0.0, rows.size
     for a in range(NOISES):
@@ -181,8 +182,7 @@ def _misfit(level, rows, theta, columns, variance):  # type: ignore[no-untyped-d
             spread = variance[i] / (9.0 * model * model)
             total += ((max(level[i], 0.0) / model) ** (1.0 / 3.0) - 1.0 + spread) ** 2 / spread
     freedom = max(freedom, 1)
-    ratio = total / freedom
-    return ratio if ratio > 1.0 + MISFIT_OF_ALL * np.sqrt(2.0 / freedom) else 1.0
+    return total / freedom, 1.0 + MISFIT_OF_ALL * np.sqrt(2.0 / freedom)
 
 
 @compiled

@@ -37,14 +37,15 @@ def variances(rows, theta, covariance, stretch, variance):  # type: ignore[no-un
 
 
 @compiled
-def whiten(rows, theta, covariance, stretch, columns, variance, weighted):  # type: ignore[no-untyped-def]
+def whiten(rows, theta, covariance, stretch, columns, blind, variance, weighted):  # type: ignore[no-untyped-def]
     """V⁻¹ columns by Cholesky of the correlations; False where they are no positive definite matrix."""
     m = rows.size
     factor = np.empty((m, m))
     for k in range(m):
         for j in range(k + 1):
             i, h = rows[k], rows[j]
-            x = variance_form(theta, covariance[i, h]) * stretch[i] * stretch[h] / np.sqrt(variance[i] * variance[h])
+            x = variance_form(theta, covariance[i, h]) * stretch[i] * stretch[h] + blind[i] * blind[h]
+            x /= np.sqrt(variance[i] * variance[h])
             for c in range(j):
                 x -= factor[k, c] * factor[j, c]
             if j < k:
@@ -70,10 +71,10 @@ def whiten(rows, theta, covariance, stretch, columns, variance, weighted):  # ty
 
 
 @compiled
-def weigh(rows, theta, covariance, stretch, columns, full, variance, weighted):  # type: ignore[no-untyped-def]
-    """``weighted`` = V⁻¹ columns with the model's own covariance V of the τ, or its diagonal."""
+def weigh(rows, theta, covariance, stretch, columns, blind, full, variance, weighted):  # type: ignore[no-untyped-def]
+    """``weighted`` = V⁻¹ columns with the model's own covariance V of the τ, and ``blind`` blindᵀ, or its diagonal."""
     variances(rows, theta, covariance, stretch, variance)
-    if full and whiten(rows, theta, covariance, stretch, columns, variance, weighted):
+    if full and whiten(rows, theta, covariance, stretch, columns, blind, variance, weighted):
         return
     for i in rows:
         for a in range(5):

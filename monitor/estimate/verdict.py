@@ -40,6 +40,8 @@ class Known(NamedTuple):
     covariance: Floats  # [m, m, 10] of ``uncertainty.Table``
     whole: Floats  # [m] terms in a window without gaps
     slope_variance: Floats  # [4] of the slope of thirds, for θ of one
+    blind: Floats  # [m] a direction of the curve that the fit does not look along, larger than any noise; zero = none
+    ask: bool  # leave out short τ that contradict the fit
 
 
 class Answer(NamedTuple):
@@ -54,6 +56,7 @@ class Answer(NamedTuple):
     fitted: Floats  # [axes, m]
     left_out: Ints  # [axes]
     misfit: Floats  # [axes] variance about the fit over that of noise of the five terms; one where chance explains it
+    scatter: Floats  # [axes] the same, whether or not
 
 
 class Gains(NamedTuple):
@@ -80,9 +83,8 @@ def answer(axes: int, m: int, entered: NDArray[np.bool_]) -> Answer:
     """Room for the answer of m τ."""
     theta, lo, hi = np.full((3, axes, 5), np.nan)
     edf, fitted = np.full((2, axes, m), np.nan)
-    return Answer(
-        entered, theta, lo, hi, np.zeros((axes, 5), np.int8), edf, fitted, np.zeros(axes, np.int64), np.ones(axes)
-    )
+    status, left_out = np.zeros((axes, 5), np.int8), np.zeros(axes, np.int64)
+    return Answer(entered, theta, lo, hi, status, edf, fitted, left_out, np.ones(axes), np.full(axes, np.inf))
 
 
 def gains(axes: int, m: int) -> Gains:
@@ -162,7 +164,7 @@ def sharpen(  # type: ignore[no-untyped-def]
             continue
         supposed[:] = theta
         supposed[a] = max(found[a], 0.0) + JUST_SEEN * np.sqrt(c0[a])
-        weigh(rows, supposed, covariance, stretch, columns, False, scratch, weights)
+        weigh(rows, supposed, covariance, stretch, columns, scratch, False, scratch, weights)
         normal_equations(level, rows, columns, weights, normal, right)
         if _row_of(a, rows, weights, normal, stretch, gain[0]):
             c = _variance_forms(np.array([a]), gain, rows, theta, covariance)[0]

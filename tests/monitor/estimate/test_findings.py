@@ -25,25 +25,11 @@ def white(n, seed=1):
     return 1e-3 * np.random.default_rng(seed).standard_normal((n, 6))
 
 
-@pytest.mark.parametrize("cutoff_hz", [33.0, 40.0])
-def test_the_cutoff_of_a_first_order_filter_is_found(cutoff_hz):
-    """An autoregression is white noise behind such a filter, as sampled."""
-    step = np.exp(-2.0 * np.pi * cutoff_hz / RATE_HZ)
-    found = analyzed(lfilter([1.0 - step], [1.0, -step], white(400_000), axis=0))
-    there = np.isfinite(found.bandwidth_hz)
-    assert there.sum() >= 3
-    assert found.bandwidth_hz[there] == pytest.approx(cutoff_hz, rel=0.1)
+def test_the_sensor_s_own_bandwidth_is_told():
+    found = analyzed(lfilter(*butter(2, 30.0, fs=RATE_HZ), white(400_000), axis=0))
     said = [note for note in found.notes if "the sensor's own bandwidth" in note]
-    axis = int(np.flatnonzero(there)[0])
-    assert said[0].endswith(f"as of a first-order low-pass at {found.bandwidth_hz[axis]:.3g} Hz")
-
-
-def test_what_is_no_filter_of_first_order_has_no_cutoff():
-    steep = lfilter(*butter(3, 20.0, fs=RATE_HZ), white(400_000), axis=0)
-    assert np.isnan(analyzed(steep).bandwidth_hz).all()
-    assert np.isnan(analyzed(white(400_000)).bandwidth_hz).all()
-    line = white(400_000) + 5e-3 * np.sin(2.0 * np.pi * 20.3 * np.arange(400_000) / RATE_HZ)[:, None]
-    assert np.isnan(analyzed(line).bandwidth_hz).all()
+    assert said
+    assert "as of a low-pass of order 2 at " in said[0]
 
 
 def test_a_line_is_told_with_the_averaging_times_that_it_spoils():
@@ -72,7 +58,7 @@ def test_a_drift_in_a_short_record_is_k_or_r():
 def test_with_samples_missing_no_slope_tells_them_apart():
     rng = np.random.default_rng(4)
     values = white(100_000) + np.cumsum(3e-5 * rng.standard_normal((100_000, 6)), axis=0)
-    values[500] = np.nan
+    values[500:4000] = np.nan
     found = analyzed(values)
     [note] = [one for one in found.notes if "K or R" in one]  # one for all axes that have it
     axes = ", ".join(np.array(AXES)[found.fit.k_or_r])
