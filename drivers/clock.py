@@ -189,8 +189,14 @@ class SampleClock:
 
     def _keep_given(self, samples: SampleBlock) -> list[SampleBlock]:
         t = samples.t_ns
-        steps = np.diff(t, prepend=self._last_t_ns if self._line.count else t[0])
-        self._tell_jumps(t, steps)
+        steps = np.empty(len(samples), np.int64)
+        steps[0] = t[0] - self._last_t_ns if self._line.count else 0
+        np.subtract(t[1:], t[:-1], out=steps[1:])
+        shortest, longest = int(steps.min()), int(steps.max())
+        jumps = np.zeros(0, np.int64)
+        if shortest < 0 or longest > LONG_S * NS:
+            self._tell_jumps(t, steps)
+            jumps = np.flatnonzero((steps < -JUMP_S * NS) | (steps > LONG_S * NS))
         period_s = self._given_period_s(steps)
         missing = np.zeros(len(samples), np.int64)
         if period_s:
@@ -198,14 +204,13 @@ class SampleClock:
         missing[0] = max(int(missing[0]), samples.lost)
         index = self._index + np.cumsum(missing + 1)
         # a line does not go through a jump
-        jumps = np.flatnonzero((steps < -JUMP_S * NS) | (steps > LONG_S * NS))
         at = int(jumps[-1]) if jumps.size else 0
         if jumps.size:
             self._line = Line()
         for row in (at, len(samples) - 1):
             self._line.add(float(index[row]), self._seconds(int(t[row])))
         self._index, self._last_t_ns = float(index[-1]), int(t[-1])
-        if period_s:
+        if period_s and missing.any():
             for row in np.flatnonzero((missing > 0) & (missing <= BACK)).tolist():
                 places = np.arange(1, missing[row] + 1) * (period_s * NS)
                 self._holes.extend((t[row] - np.rint(places)).astype(np.int64).tolist())
@@ -235,12 +240,13 @@ class SampleClock:
         Times that a host stamped are late and early by whole periods, and nothing is missing. So a short gap must
         be one of whole periods, longer than what is usual, and no neighbour may make good for it.
         """
-        before = np.concatenate([[self._given_steps[-1] if self._given_steps else period_s], steps_s[:-1]])
-        after = np.concatenate([steps_s[1:], [period_s]])
+        last_s = self._given_steps[-1] if self._given_steps else period_s
         self._given_steps.extend(steps_s[-STEPS_KEPT:].tolist())
         periods = steps_s / period_s
-        if (periods < 1.5).all():
+        if periods.max() < 1.5:
             return np.zeros(steps_s.size, np.int64)
+        before = np.concatenate([[last_s], steps_s[:-1]])
+        after = np.concatenate([steps_s[1:], [period_s]])
         off = np.abs(np.array(self._given_steps) / period_s - 1.0)
         if np.median(off) > NEAR:
             return np.zeros(steps_s.size, np.int64)

@@ -222,7 +222,11 @@ class Station:
             return True
         if self.clock.rate_hz is None:  # times from which no rate can be told must not stop the samples
             return self.ring.room < self.ring.capacity // 2
-        return self._ready.window.is_set()
+        return self._compiled()
+
+    def _compiled(self) -> bool:
+        """Whether samples can be taken at once: to compile what they need in this loop would hold up all devices."""
+        return (self._ready.window if self.device.refit_s else self._ready.fit).is_set()
 
     def _take(self) -> list[SampleBlock]:
         came_ns, self._waiting_since_ns = self._waiting_since_ns, 0
@@ -232,7 +236,7 @@ class Station:
     def _advance(self, blocks: list[SampleBlock]) -> None:
         rate = self.clock.rate_hz
         if self.estimator is None:
-            if rate is None or self._no_estimate or not self._ready.window.is_set():
+            if rate is None or self._no_estimate or not self._compiled():
                 return
             try:
                 every_sample = self.device.refit_s == 0.0
@@ -269,7 +273,9 @@ class Station:
         return True
 
     def _publish_estimate(self, outputs: Sequence[Output], now_s: float, drain: bool) -> bool:
-        if self.estimator is not None and self._advanced and (self._due("refit", self.device.refit_s, now_s) or drain):
+        # at every sample the course follows by itself: a look before that is published would take its samples away
+        every_s = self.device.refit_s or self.device.publish_s
+        if self.estimator is not None and self._advanced and (self._due("refit", every_s, now_s) or drain):
             fitted = self._ready.fit.is_set()
             self._advanced = not fitted  # a curve alone is fitted as soon as that can be
             try:

@@ -2,8 +2,8 @@
 
 The recording is first put on a regular grid by the same clock that stamps live samples: what is missing becomes NaN in
 its place, and everything found about the time stamps is said in ``notes``. ``analyze`` makes the curve and the fit;
-``events_of`` asks of the same samples whether the sensor moved and whether its noise changed, which takes longer than
-the curve and is a step of its own. Moving stretches are struck out of the curve only on demand, as a rest that was
+``events_of`` asks of the same samples whether the sensor moved, whether its noise changed, and what of it is a line or
+an outlier, which takes longer than the curve and is a step of its own. Moving stretches are struck out of the curve only on demand, as a rest that was
 wrongly called motion would be lost; of the search for changes they are always kept out.
 """
 
@@ -20,6 +20,7 @@ from monitor.estimate.bandwidth import LowPass, contradicted, sought, with_bandw
 from monitor.estimate.batch import EachAxis, TauGrid, cluster_sizes, overlapping, slope, slopes
 from monitor.estimate.change import Change, ChangeDetector
 from monitor.estimate.curve import AllanCurve
+from monitor.estimate.departures import lines, outliers
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.fit import Fit, Looks, design, fit
 from monitor.estimate.fit_kernel import MIN_ROWS
@@ -90,7 +91,7 @@ def analyze(
 
 
 def events_of(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analysis:
-    """The same analysis with what happened in the recording: motion, and changes of noise and bias, told in its notes.
+    """The same analysis with what happened in the recording: motion, changes, lines, outliers, told in its notes.
 
     Args:
         result: of ``analyze``
@@ -109,6 +110,9 @@ def events_of(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analysis:
         detector.update(np.where(struck[:, None], np.nan, rows) if struck.any() else rows)
     changes = tuple(sorted(detector.take(), key=lambda change: change.since))
     notes += findings.of_changes(changes, rate)
+    notes += findings.of_departures(
+        lines(result.values, moving, rate, result.estimate.curve), outliers(result.values, moving)
+    )
     return replace(result, notes=tuple(notes), motions=motions, changes=changes)
 
 

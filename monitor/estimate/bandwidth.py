@@ -7,7 +7,8 @@ order are those with the least misfit. The cutoff is not known better than the d
 out of the fit, so that no interval is too narrow by it. If no such filter explains the curve, the answer of ``fit``
 stands: the shortest τ left out.
 
-Every filter has a flat bottom, so N is the level of the white noise inside the band.
+Every filter has a flat bottom, so N is the level of the white noise inside the band. Q cannot be told from what the
+filter is not quite, and is only bounded.
 """
 
 from collections.abc import Sequence
@@ -19,8 +20,9 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from drivers.sample import Floats, Ints
+from monitor.estimate.coefficients import Coefficients, Status
 from monitor.estimate.fit import Design, Fit, Looks, fit_columns, replaced
-from monitor.estimate.least_squares import N
+from monitor.estimate.least_squares import N, Q
 from monitor.estimate.uncertainty import Table
 
 Kind = Literal["digital", "sampled"]
@@ -105,8 +107,16 @@ def with_bandwidth(
             better = _fitted(design, table, looks.axis(axis), low_pass)
             if better.scatter[0] < AGREES:
                 found = replaced(found, axis, better)
+                _bound(found.coefficients, axis)
                 used[axis] = low_pass
     return found, used
+
+
+def _bound(coefficients: Coefficients, axis: int) -> None:
+    """Q makes up for what the filter is not quite: no more than a bound."""
+    if coefficients.status[Q, axis] == Status.ESTIMATED:
+        coefficients.value[Q, axis], coefficients.lo[Q, axis] = np.nan, 0.0
+        coefficients.status[Q, axis] = Status.UPPER_BOUND
 
 
 def contradicted(found: Fit, axis: int) -> bool:

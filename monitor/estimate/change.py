@@ -60,6 +60,7 @@ from monitor.estimate.change_kernel import (
     set_due,
 )
 from monitor.estimate.change_size import Octaves, named
+from monitor.estimate.words import amount
 
 LONGEST_S: Final = 300.0
 """The longest clusters; longer ones would learn for days, and show temperature rather than noise."""
@@ -78,16 +79,17 @@ HOLE_ROWS: Final = 4096
 MANY: Final = 4.0
 """Times the clipped variance from which on clipping bends the size, and all squares are taken as they are."""
 
+STEEP: Final = "quantization noise or vibration near Nyquist"
+"""Octaves do not tell them apart (``change_size``)."""
 NOISE_NAMES: Final = {
-    "g": {"Q": "quantization noise", "N": "angle random walk", "B": "bias instability", "K": "rate random walk"},
+    "g": {"Q": STEEP, "N": "angle random walk", "B": "bias instability", "K": "rate random walk"},
     "a": {
-        "Q": "quantization noise",
+        "Q": STEEP,
         "N": "velocity random walk",
         "B": "bias instability",
         "K": "acceleration random walk",
     },
 }
-UNITS: Final = {"g": "rad/s", "a": "m/s²"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +103,13 @@ class Change:
     sigma: float  # how sure
     what: Mapping[str, tuple[float, float]]  # before, after in SI: letters; or band (Hz, from, to) and rms; bias; count
     text: str
+
+    def sides(self) -> dict[str, dict[str, float]]:
+        """``what`` as it leaves the process: ``before`` and ``after``, of a band ``from`` and ``to``."""
+        return {
+            name: {"from": first, "to": second} if name == "band" else {"before": first, "after": second}
+            for name, (first, second) in self.what.items()
+        }
 
 
 class ChangeDetector:
@@ -259,7 +268,7 @@ class ChangeDetector:
         # an outlier a in one sample gives one z² = a²/2
         scale = sqrt(2.0 * max(after[0, UNIT_RAW] - after[0, UNIT_S], 0.0) / max(count, 1.0))
         what = {"count": (0.0, float(count)), "scale": (sqrt(variance), scale)}
-        text = f"{AXES[axis]} {count:.0f} outliers of about {scale:.2g} {UNITS[AXES[axis][0]]} within " + (
+        text = f"{AXES[axis]} {count:.0f} outliers of about {amount(AXES[axis], scale)} within " + (
             f"{(now - alarm[START]) / self.rate_hz:.1f} s"
         )
         sigma = sqrt(2.0 * alarm[EVIDENCE])
@@ -273,7 +282,7 @@ class ChangeDetector:
 
     def _stepped(self, axis: int, alarm: Floats) -> None:
         before, after = (float(x) for x in self._state.step[axis, [BEFORE, AFTER]])
-        text = f"{AXES[axis]} bias stepped by {after - before:+.2g} {UNITS[AXES[axis][0]]}"
+        text = f"{AXES[axis]} bias stepped by {amount(AXES[axis], after - before, sign=True)}"
         sigma = sqrt(2.0 * alarm[EVIDENCE])
         what = {"bias": (before, after)}
         self._found.append(Change("bias_stepped", axis, int(alarm[START]), int(alarm[FOUND]), sigma, what, text))

@@ -8,6 +8,9 @@ rather a filter or a line than two changes. A set that leaves misfit is refused:
 the change, and it is a band of frequencies that changed: where a Haar difference of clusters τ responds most,
 f = 0.371/τ, half an octave to both sides. The standard's letters are no law of a sensor, so a misfit counts only
 beyond SHAPE of the variance.
+
+Q stands for a vibration near Nyquist too: a line at a third of the sample rate makes A² sin⁴(πfτ)/(πfτ)², where sin⁴ is
+9/16 at every octave, so exactly Q's 1/τ². No statistic of octaves tells them apart, and the words for Q name both.
 """
 
 from dataclasses import dataclass

@@ -15,14 +15,20 @@ from monitor.estimate.bandwidth import LowPass
 from monitor.estimate.change import Change
 from monitor.estimate.coefficients import Status
 from monitor.estimate.curve import AllanCurve
+from monitor.estimate.departures import FAR, Line
 from monitor.estimate.fit import Fit
 from monitor.estimate.least_squares import K
 from monitor.estimate.rest import Motion
+from monitor.estimate.words import amount
 
 MOST: Final = 10
 """Notes of one kind."""
 CLEAR: Final = 3.0
 """σ from which on an averaging time is said to depart."""
+SAME: Final = 0.01
+"""Of a frequency: lines that differ by less are one, on several axes."""
+FAR_SHARE: Final = 0.001
+"""A smaller share of outliers is not told."""
 NEAR_WORST: Final = 0.5
 """Averaging times that depart by this share of the worst, and to the same side, are told with it."""
 
@@ -63,6 +69,26 @@ def of_changes(changes: Sequence[Change], rate_hz: float) -> list[str]:
     notes += _more(len(changes), "changes")
     if any(change.kind != "outlier_burst" for change in changes):
         notes.append("one curve of the whole recording mixes before and after; --window S shows them apart")
+    return notes
+
+
+def of_departures(found: Sequence[Line], far: Floats) -> list[str]:
+    """Lines of the spectrum, those of several axes at one frequency together; and outliers, by axis [6] their share."""
+    notes = []
+    left = sorted(found, key=lambda one: -one.share)
+    while left and len(notes) < MOST:
+        at_hz, what = left[0].frequency_hz, "a resonance about" if left[0].wide else "a line at"
+        here = [one for one in left if abs(one.frequency_hz / at_hz - 1.0) < SAME]
+        left = [one for one in left if one not in here]
+        sizes = [f"{AXES[one.axis]} {amount(AXES[one.axis], one.amplitude)}" for one in here]
+        notes.append(f"{what} {at_hz:.4g} Hz: {', '.join(sizes)}")
+    notes += _more(MOST + len(left), "lines")
+    for i in np.flatnonzero(far > FAR_SHARE).tolist():
+        percent = 100.0 * far[i]
+        notes.append(
+            f"{AXES[i]}: {percent:.2g} % of the samples lie beyond {FAR:g} σ of the others: the noise is not Gaussian; "
+            "intervals assume that it is"
+        )
     return notes
 
 

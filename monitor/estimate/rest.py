@@ -14,7 +14,6 @@ Not found: rotation at a constant rate below 2 °/s, and motion that hides in th
 
 from collections import deque
 from dataclasses import dataclass
-from math import degrees
 from typing import Final, Literal
 
 import numpy as np
@@ -33,6 +32,7 @@ from monitor.estimate.rest_kernel import (
     finish,
     state,
 )
+from monitor.estimate.words import amount
 
 BLOCK_S: Final = 0.25
 FEWEST: Final = 8
@@ -165,7 +165,7 @@ def _motion(episode: Floats, size: int, rate_hz: float) -> Motion:
     moving = last - first + 1
     seconds = moving * size / rate_hz
     kind: Kind = "handling/orientation" if episode[CHANGED] else "knock" if moving <= KNOCK_BLOCKS else "motion"
-    size_text = f"{axis} up to {degrees(peak):.2g} °/s" if axis[0] == "g" else f"{axis} up to {peak:.2g} m/s²"
+    size_text = f"{axis} up to {amount(axis, peak)}"
     verb = {"knock": "knocked", "motion": "moved", "handling/orientation": "handled, and left in another orientation,"}
     text = f"{verb[kind]} for {seconds:.1f} s: {size_text}"
     if kind == "knock":

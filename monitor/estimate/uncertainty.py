@@ -84,7 +84,7 @@ class Tables:
 
 
 class AxisTables:
-    """The tables of six axes: those that reach back over all of the window share one, one that began anew has its own."""
+    """The tables of six axes: all that reach back over the whole window share one, each that began anew has its own."""
 
     def __init__(self, factors: Ints, capacity: int) -> None:
         self._shared = Tables(factors, capacity)

@@ -14,6 +14,8 @@ from monitor.estimate.rest import Motion, Rest
 
 OTHER_RATE: Final = 0.02
 """A rate known better by less than this share is the same to blocks of a quarter of a second."""
+LONGEST_HOLE: Final = 10_000_000
+"""Samples missing at once, over which the detector of changes still passes, in 1.6 s; after more it learns anew."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +92,11 @@ class Watch:
     def _begin(self) -> None:
         self._began = self._came
         self._rest = Rest(self._rate_hz)
-        self._changes = ChangeDetector(self._rate_hz, self._alarms_per_day) if self._alarms_per_day > 0.0 else None
+        self._first = 0  # of the samples since then, the first that the detector of changes has seen
+        self._changes = self._detector() if self._alarms_per_day > 0.0 else None
+
+    def _detector(self) -> ChangeDetector:
+        return ChangeDetector(self._rate_hz, self._alarms_per_day)
 
     def _let_go(self, still: list[SampleBlock]) -> list[SampleBlock]:
         earlier, self._final = self._final, []
@@ -101,13 +107,20 @@ class Watch:
         if self._changes is None:
             return
         for samples in still:
-            if samples.lost:
+            if samples.lost > LONGEST_HOLE:
+                self._take(self._changes)
+                self._changes, self._first = self._detector(), self._first + self._changes.samples + samples.lost
+            elif samples.lost:
                 self._changes.skip(samples.lost)
             self._changes.update(samples.values)
-        for change in self._changes.take():
+        self._take(self._changes)
+
+    def _take(self, changes: ChangeDetector) -> None:
+        """Tell what was found, and let axes begin anew."""
+        for change in changes.take():
             self._events.append(self._changed(change))
             if change.kind == "noise_changed":
-                handed_on = self._changes.samples if self._leave_out else self._came - self._began
+                handed_on = changes.samples if self._leave_out else self._came - self._began - self._first
                 self._restarts.append(Restart(change.axis, handed_on - change.since))
 
     def _moved(self, motion: Motion) -> Event:
@@ -116,7 +129,7 @@ class Watch:
 
     def _changed(self, change: Change) -> Event:
         what = {name: {"before": before, "after": after} for name, (before, after) in change.what.items()}
-        found_ns, since_ns = self._t_ns(change.found), self._t_ns(change.since)
+        found_ns, since_ns = self._t_ns(self._first + change.found), self._t_ns(self._first + change.since)
         return Event(change.kind, found_ns, change.text, AXES[change.axis], what, since_ns, change.sigma)
 
     def _t_ns(self, index: int) -> int:

@@ -200,16 +200,12 @@ def _motion(motion: Motion, rate_hz: float) -> dict[str, Any]:
 
 
 def _change(change: Change, rate_hz: float) -> dict[str, Any]:
-    what = {
-        name: {"from": first, "to": second} if name == "band" else {"before": first, "after": second}
-        for name, (first, second) in change.what.items()
-    }
     return {
         "kind": change.kind,
         "axis": AXES[change.axis],
         "t": change.since / rate_hz,
         "sigma": change.sigma,
-        "what": what,
+        "what": change.sides(),
         "text": change.text,
     }
 

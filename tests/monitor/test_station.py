@@ -105,6 +105,29 @@ def test_every_sample_and_every_block():
     assert len(rig.caught.blocks) == 31
 
 
+def test_no_sample_is_missing_from_the_courses_that_are_published():
+    rig = Rig(refit_s=0.0, publish_s=0.5)
+    for i in range(200):
+        rig.bring(5)
+        rig.work(1000.0 + 0.05 * i)
+    rig.work(1010.0, drain=True)
+    assert 18 <= len(rig.caught.estimates) <= 22
+    t_ns = np.concatenate([estimate.course.t_ns for _, estimate in rig.caught.estimates])
+    assert np.array_equal(t_ns, np.arange(1000) * 10_000_000)
+
+
+def test_a_fit_at_every_sample_waits_for_its_kernels():
+    ready = Ready()
+    ready.window.set()
+    rig = Rig(refit_s=0.0, publish_s=0.0, ready=ready)
+    rig.bring(300)
+    rig.work(1000.0)
+    assert (rig.caught.blocks, rig.caught.estimates) == ([], [])
+    ready.fit.set()
+    rig.work(1000.1)
+    assert rig.caught.estimates[-1][1].course.t_ns.size == 300
+
+
 def test_a_pause_is_not_made_up_for():
     rig = Rig(refit_s=0.1, publish_s=0.1)
     rig.bring(50)

@@ -8,7 +8,8 @@ import pytest
 
 from drivers.errors import NotReady
 from drivers.sample import block
-from monitor.estimate.grid import LONGEST_HOLE, NOTES, on_grid, stale_share
+from monitor.estimate.grid import LONGEST_HOLE, NOTES, on_grid
+from monitor.estimate.stale import stale_share
 
 
 def white(n, seed=0):

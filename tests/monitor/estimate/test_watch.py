@@ -114,3 +114,23 @@ def test_at_another_rate_nothing_that_was_held_back_is_lost(at):
     assert np.array_equal(np.concatenate([one.t_ns for one in passed]), STEP_NS * np.arange(12_000))
     assert {event.kind for event in watch.take_events()} == {"moved"}
     assert watch.moved_samples == np.isnan(np.concatenate([one.values for one in passed])[:, 0]).sum() > 150
+
+
+@pytest.mark.parametrize("leave_out", [False, True])
+def test_after_an_outage_of_years_changes_are_learned_anew_with_their_times(leave_out):
+    lost = 10**10
+    values = noise(30_000)
+    values[20_000:, 3] *= 2.0
+    watch = Watch(RATE_HZ, leave_out)
+    feed(watch, noise(5_000, 9))
+    t_ns = FIRST_NS + STEP_NS * (5_000 + lost + np.arange(len(values)))
+    handed_on = watch.update(block(t_ns[:250], values[:250], lost=lost))
+    for at in range(250, len(values), 250):
+        handed_on += watch.update(block(t_ns[at : at + 250], values[at : at + 250]))
+        if restarts := watch.take_restarts():
+            break
+    (event,) = watch.take_events()
+    assert (event.kind, event.axis, restarts[0].axis) == ("noise_changed", "ax", 3)
+    assert (event.since_ns - t_ns[20_000]) / 1e9 == pytest.approx(0.0, abs=1.0)
+    newest_ns = handed_on[-1].t_ns[-1]
+    assert newest_ns - restarts[0].samples * STEP_NS == pytest.approx(event.since_ns, abs=2 * STEP_NS)
