@@ -16,13 +16,14 @@ import numpy as np
 
 from drivers.errors import NotReady
 from drivers.recording import iter_blocks, load_samples
-from drivers.sample import Ints
+from drivers.sample import AXES, Ints
 from monitor.estimate.analysis import Analysis, analyze, events_of
 from monitor.estimate.batch import TauGrid
 from monitor.estimate.dynamic import Dynamic, dynamic
 from monitor.estimate.hadamard import HadamardCurve, hadamard_curve
 from monitor.estimate.total import TotalCurve, total_curve
 from monitor.publish.allan_figure import besides
+from monitor.publish.dynamic_figure import Mark
 
 Tell = Callable[[str, float | None], None]
 """Told what is being done, and the share that is done where that is known."""
@@ -97,15 +98,15 @@ def draw(results: Results, path: Path, title: str) -> None:
     """
     result = results.analysis
     beside = besides(results.total, results.hadamard)
-    changes_s = [change.since / result.estimate.rate_hz for change in result.changes]
+    marks = [Mark(change.since / result.estimate.rate_hz, AXES[change.axis]) for change in result.changes]
     if path.suffix == ".html":
         from monitor.publish.report import html_report
 
-        html_report(result, path, title, beside, results.dynamic, changes_s)
+        html_report(result, path, title, beside, results.dynamic, marks)
     else:
         from monitor.publish.plot import allan_plot
 
-        allan_plot(result.estimate, path, title, beside, results.dynamic, changes_s)
+        allan_plot(result.estimate, path, title, beside, results.dynamic, marks)
 
 
 def _courses(result: Analysis, request: Request, tell: Tell) -> tuple[Dynamic | None, str]:
@@ -124,7 +125,7 @@ def _courses(result: Analysis, request: Request, tell: Tell) -> tuple[Dynamic | 
 
 def _others(result: Analysis, tau: TauGrid) -> tuple[TotalCurve, HadamardCurve | None]:
     """Total and Hadamard deviations: octaves, or the τ that were listed as far as they are possible."""
-    values, rate_hz, theta = result.values, result.estimate.rate_hz, result.fit.theta
+    values, rate_hz, theta = result.values, result.estimate.rate_hz, np.where(result.fit.entered, result.fit.theta, 0.0)
     listed = None if isinstance(tau, str) else result.estimate.curve.factors
     short: Ints | None = None if listed is None else listed[3 * listed <= len(values)]
     total = total_curve(values, rate_hz, theta, listed)

@@ -3,8 +3,9 @@
 The recording is first put on a regular grid by the same clock that stamps live samples: what is missing becomes NaN in
 its place, and everything found about the time stamps is said in ``notes``. ``analyze`` makes the curve and the fit;
 ``events_of`` asks of the same samples whether the sensor moved, whether its noise changed, and what of it is a line or
-an outlier, which takes longer than the curve and is a step of its own. Moving stretches are struck out of the curve only on demand, as a rest that was
-wrongly called motion would be lost; of the search for changes they are always kept out.
+an outlier, which takes longer than the curve and is a step of its own. Moving stretches are struck out of the curve
+only on demand, as a rest that was wrongly called motion would be lost; of what ``events_of`` asks they are always kept
+out.
 """
 
 from collections.abc import Iterable, Sequence

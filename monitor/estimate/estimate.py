@@ -1,5 +1,6 @@
 """All that one look at the estimate gives."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,13 @@ class Course:
 
     t_ns: Ints  # [n]
     value: Floats  # [n, 5, 6] Q N B K R in SI; NaN where not estimated
+
+
+def joined(courses: Collection[Course]) -> Course | None:
+    """Courses one after another as one; None of none."""
+    if not courses:
+        return None
+    return Course(np.concatenate([part.t_ns for part in courses]), np.concatenate([part.value for part in courses]))
 
 
 @dataclass(frozen=True, slots=True)

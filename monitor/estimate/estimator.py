@@ -10,7 +10,7 @@ N within half a minute.
 """
 
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -22,6 +22,7 @@ from monitor.estimate.bandwidth import LowPass, contradicted, sought, with_bandw
 from monitor.estimate.batch import TauGrid, cluster_sizes
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Course, Estimate
+from monitor.estimate.estimate import joined as joined_courses
 from monitor.estimate.fit import Fit, Looks, design, fit, joined, nothing_fitted
 from monitor.estimate.hadamard import HadamardCurve
 from monitor.estimate.refit import Refit
@@ -142,7 +143,7 @@ class Estimator:
         curve = self._curve(avar[own], terms[own], result.edf, n)
         quick_edf = self._spans.edf(result.theta, self.rate_hz, terms[recent])
         quick = self._curve(avar[recent], terms[recent], quick_edf, n)
-        course = _joined(self._course)
+        course = joined_courses(self._course)
         self._course.clear()
         self._followed = 0
         return Estimate(
@@ -158,7 +159,11 @@ class Estimator:
         rounds = self._slow.rounds
         self._slow.step()
         self._seek_bandwidth()
-        return self._slow.get(self.rate_hz, self._theta) if self._slow.rounds > rounds else None
+        return (
+            self._slow.get(self.rate_hz, np.where(self._entered, self._theta, 0.0))
+            if self._slow.rounds > rounds
+            else None
+        )
 
     def _fit(self, avar: Floats, terms: Ints) -> Fit:
         """Fit the axes that fill the window together, each restarted one by the covariances of its own length."""
@@ -200,12 +205,6 @@ class Estimator:
     def _curve(self, avar: Floats, terms: Ints, edf: Floats, n: int) -> AllanCurve:
         lo, hi = intervals(avar, edf)
         return AllanCurve(self._factors / self.rate_hz, self._factors, avar, terms, edf, lo, hi, n)
-
-
-def _joined(course: Collection[Course]) -> Course | None:
-    if not course:
-        return None
-    return Course(np.concatenate([part.t_ns for part in course]), np.concatenate([part.value for part in course]))
 
 
 def warm_up() -> Iterator[str]:

@@ -74,7 +74,7 @@ def of_changes(changes: Sequence[Change], rate_hz: float) -> list[str]:
 
 def of_departures(found: Sequence[Line], far: Floats) -> list[str]:
     """Lines of the spectrum, those of several axes at one frequency together; and outliers, by axis [6] their share."""
-    notes = []
+    notes: list[str] = []
     left = sorted(found, key=lambda one: -one.share)
     while left and len(notes) < MOST:
         at_hz, what = left[0].frequency_hz, "a resonance about" if left[0].wide else "a line at"
@@ -83,11 +83,11 @@ def of_departures(found: Sequence[Line], far: Floats) -> list[str]:
         sizes = [f"{AXES[one.axis]} {amount(AXES[one.axis], one.amplitude)}" for one in here]
         notes.append(f"{what} {at_hz:.4g} Hz: {', '.join(sizes)}")
     notes += _more(MOST + len(left), "lines")
-    for i in np.flatnonzero(far > FAR_SHARE).tolist():
-        percent = 100.0 * far[i]
+    shares = [f"{AXES[i]} {100.0 * far[i]:.2g} %" for i in np.flatnonzero(far > FAR_SHARE).tolist()]
+    if shares:
         notes.append(
-            f"{AXES[i]}: {percent:.2g} % of the samples lie beyond {FAR:g} σ of the others: the noise is not Gaussian; "
-            "intervals assume that it is"
+            f"outliers beyond {FAR:g} σ of the other samples: {', '.join(shares)} of all; the noise is not Gaussian, "
+            "and intervals assume that it is"
         )
     return notes
 

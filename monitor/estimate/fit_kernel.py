@@ -37,7 +37,7 @@ MISFIT_OF_ALL: Final = 6.0
 SHORT_ROWS: Final = 4
 """How many of the shortest τ in use are asked whether they contradict the fit."""
 
-FILTER_MEMORY: Final = 64
+FILTER_MEMORY: Final = 16
 """Clusters of more samples are not left out: a filter that reaches so far would be no noise of the sensor."""
 
 WHITE: Final = PAIRS.index((N, N))

@@ -147,7 +147,7 @@ def _said_stale(values: Floats) -> list[str]:
 
 
 def _said_of_steps(stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints, rate_hz: float) -> list[str]:
-    """Where times step unevenly; and where they say another rate, by their steps if these are steady, else their mean."""
+    """Where times step unevenly; where they say another rate, by their steps if steady, else by their mean."""
     steps = np.diff(t_ns)
     if not steps.size:
         return []
@@ -160,7 +160,7 @@ def _said_of_steps(stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints, rate_
     if max(1.0 / rate_hz - low, high - 1.0 / rate_hz) > UNEVEN / rate_hz:
         worst_s = float(steps[steps < LONG_S * NS].max()) / NS
         uneven = [
-            f"times step unevenly: by {middle:.3g} s in the median, {high:.3g} s at 90 %, {worst_s:.3g} s at worst; the "
+            f"times step unevenly: by {middle:.3g} s in the median, {high:.3g} s at 90 %, {worst_s:.3g} s at worst; "
             "samples are taken to be even"
         ]
     try:

@@ -7,11 +7,12 @@ that is estimated its own line, thin, and a ring where the coefficient is read o
 letter. Axes differ by colour and by marker. Only functions that draw import matplotlib.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.sample import AXES, Floats
 from monitor.estimate.coefficients import LETTERS, Status
@@ -52,6 +53,11 @@ class Beside:
     hi: Floats
     only_beyond: bool = False  # only where τ is longer than the longest of the Allan deviation
 
+    def rows(self, axis: int, longest_s: float) -> NDArray[np.bool_]:
+        """Its points [k] that are drawn, of an axis whose Allan deviation ends at ``longest_s``."""
+        there = np.isfinite(self.deviation[:, axis]) & (self.deviation[:, axis] > 0)
+        return np.asarray(there & (self.tau_s > longest_s) if self.only_beyond else there)
+
 
 def besides(total: TotalCurve | None = None, hadamard: HadamardCurve | None = None) -> list[Beside]:
     """Total deviation from where the Allan deviation ends, and Hadamard deviation throughout: those that are given."""
@@ -79,6 +85,7 @@ def allan_panel(axes: "Axes", estimate: Estimate, kind: Kind, others: Sequence[B
     tau_s, lowest_s = estimate.curve.tau_s, _lowest_s(estimate, kind)
     shown: list[Floats] = []
     rings: list[_Ring] = []
+    drawn: set[str] = set()
     for axis, colour, marker in zip(axes_of(kind), COLOURS, MARKERS, strict=True):
         i = AXES.index(axis)
         rows = np.isfinite(estimate.curve.avar[:, i]) & (estimate.curve.avar[:, i] > 0)
@@ -96,10 +103,11 @@ def allan_panel(axes: "Axes", estimate: Estimate, kind: Kind, others: Sequence[B
             np.clip(hi, None, measured[rows] * BEYOND),
         ]
         shown += _beside(axes, others, i, colour, marker, factor, float(tau_s[rows][-1]))
+        drawn |= {other.name for other in others if other.rows(i, float(tau_s[rows][-1])).any()}
         rings += _rings(estimate, i, factor, colour, lowest_s, float(measured[rows].min()))
     _limits(axes, shown, rings)
     _letters(axes, rings)
-    _furnish(axes, kind, others)
+    _furnish(axes, kind, others, drawn)
 
 
 def _beside(
@@ -108,14 +116,15 @@ def _beside(
     """Other deviations of one axis: a thin line with open markers. Returns what the height must hold."""
     shown = []
     for number, other in enumerate(others):
-        rows = np.isfinite(other.deviation[:, i]) & (other.deviation[:, i] > 0)
+        marks = other.rows(i, longest_s)
+        if not marks.any():
+            continue
         # the line begins at the last point of the Allan deviation, so that it is seen what it goes on from
-        line = rows & (other.tau_s >= longest_s) if other.only_beyond else rows
+        line = marks | (other.tau_s == longest_s) if other.only_beyond else marks
         y = other.deviation[:, i] * factor
         axes.plot(other.tau_s[line], y[line], STYLES[number % 3], color=colour, linewidth=0.9, alpha=0.8, zorder=2)
         shown.append(y[line])
         if other.only_beyond:  # elsewhere its marks would cover those of the Allan deviation
-            marks = rows & (other.tau_s > longest_s)
             ends = np.abs([y - other.lo[:, i] * factor, other.hi[:, i] * factor - y])[:, marks]
             axes.plot(other.tau_s[marks], y[marks], marker, mfc="white", mec=colour, mew=0.9, markersize=4.5, zorder=4)
             axes.errorbar(other.tau_s[marks], y[marks], ends, fmt="none", ecolor=colour, elinewidth=0.7, alpha=0.6)
@@ -198,11 +207,13 @@ def _heaps(axes: "Axes", rings: Sequence[_Ring]) -> list[list[_Ring]]:
     return heaps
 
 
-def _furnish(axes: "Axes", kind: Kind, others: Sequence[Beside]) -> None:
-    """Labels, grid and legend."""
+def _furnish(axes: "Axes", kind: Kind, others: Sequence[Beside], drawn: Collection[str]) -> None:
+    """Labels, grid and legend; of other deviations those are named that are drawn."""
     axes.plot([], [], "--", color=GREY, linewidth=1.3, label="fit")
     axes.fill_between([], [], [], color=GREY, alpha=0.25, label="95 %")
     for number, other in enumerate(others):
+        if other.name not in drawn:
+            continue
         marker = "o" if other.only_beyond else ""
         axes.plot([], [], STYLES[number % 3], marker=marker, mfc="white", color=GREY, linewidth=0.9, label=other.name)
     axes.set(xlabel="averaging time τ, s", ylabel=f"Allan deviation σ(τ), {DEVIATION_UNITS[kind].name}")
@@ -215,7 +226,7 @@ def _furnish(axes: "Axes", kind: Kind, others: Sequence[Beside]) -> None:
         bbox_to_anchor=(1.0, 1.0),
         borderaxespad=0.2,
         frameon=False,
-        ncols=5 + len(others),
+        ncols=5 + len(drawn),
         handlelength=1.6,
         handletextpad=0.5,
         columnspacing=1.1,

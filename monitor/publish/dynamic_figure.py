@@ -4,7 +4,8 @@ In comes a ``Dynamic``; out go two groups of panels with one common time axis, t
 every τ against time, coloured by the deviation over its own median over time, so that all τ stand in one scale: red is
 more than usual, blue less. Cells whose 95 % interval holds that median are pale: that colour alone says nothing. Of the
 coefficients those are drawn that are estimated for a while on some axis, with their intervals as bands; a line is
-interrupted where there is no estimate. Change times are vertical marks through all panels.
+interrupted where there is no estimate. A change is a vertical mark through the surface of its axis and, in the colour
+of the axis, through the courses; those too near to each other to be named apart share a word.
 """
 
 from collections.abc import Sequence
@@ -30,9 +31,18 @@ LINE_INCHES: Final = 1.6
 SPARE_INCHES: Final = 1.2  # title, colour bar, time axis
 SHARE: Final = 0.05  # of the time steps: a letter estimated on fewer has no panel
 PALE: Final = 0.3
+APART: Final = 0.13  # of the width: words nearer than this would touch
 RATIOS: Final = (1.25, 1.5, 2.0, 3.0, 5.0, 10.0)  # ends of the colour scale; the first that holds most of the cells
 WIDE: Final = 3.0  # log scale where a coefficient varies by more than this factor
 UNITS_S: Final = (("s", 1.0, 600.0), ("min", 60.0, 10_800.0), ("h", 3600.0, 259_200.0), ("d", 86_400.0, np.inf))
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A change of one axis."""
+
+    t_s: float  # since the first sample
+    axis: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +92,8 @@ def relative(dynamic: Dynamic) -> Floats:
         return dynamic.deviation / _median(dynamic)
 
 
-def dynamic_panels(figure: "Figure | SubFigure", dynamic: Dynamic, kind: Kind, changes_s: Sequence[float] = ()) -> None:
-    """Fill a figure with the panels of one kind; ``changes_s`` in seconds since the first sample."""
+def dynamic_panels(figure: "Figure | SubFigure", dynamic: Dynamic, kind: Kind, marks: Sequence[Mark] = ()) -> None:
+    """Fill a figure with the panels of one kind; ``marks``: of all kinds, its own are drawn."""
     axes, shown = axes_shown(dynamic, kind), letters(dynamic, kind)
     ratios = [SURFACE_INCHES] * len(axes) + [LINE_INCHES] * len(shown)
     panels = figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
@@ -96,20 +106,47 @@ def dynamic_panels(figure: "Figure | SubFigure", dynamic: Dynamic, kind: Kind, c
         _course(panel, dynamic, kind, letter, dynamic.t_s / clock.seconds)
     for panel in panels:
         panel.set_xlim(edges[0], edges[-1])
-        for change_s in changes_s:
-            panel.axvline(change_s / clock.seconds, color=DARK, linewidth=1.1, linestyle=(0, (4, 2)))
-    for change_s in changes_s:
-        if edges[0] <= change_s / clock.seconds <= edges[-1]:
-            place = (change_s / clock.seconds, 1.0)
-            panels[0].annotate(
-                "change", place, (0, 2), xycoords=("data", "axes fraction"), textcoords="offset points",
-                ha="center", va="bottom", fontsize=8, color=DARK,
-            )  # fmt: skip
+    own = [mark for mark in marks if mark.axis in axes and edges[0] <= mark.t_s / clock.seconds <= edges[-1]]
+    _mark(list(panels), axes, own, clock)
     panels[0].set_title(KIND_NAMES[kind], loc="left", fontsize=12, pad=14)
     panels[-1].set_xlabel(f"time at the end of the window of {dynamic.window_s:.4g} s, {clock.name}")
     figure.align_ylabels(list(panels))
     if mesh is not None:
         _bar(figure, mesh, list(panels[: len(axes)]), ratio)
+
+
+def _mark(panels: "Sequence[Axes]", axes: Sequence[str], marks: Sequence[Mark], clock: Clock) -> None:
+    """Vertical lines, and above the first panel what they are."""
+    for mark in marks:
+        at, colour = mark.t_s / clock.seconds, COLOURS[AXES.index(mark.axis) % 3]
+        panels[axes.index(mark.axis)].axvline(at, color=DARK, linewidth=1.1, linestyle=(0, (4, 2)))
+        for panel in panels[len(axes) :]:
+            panel.axvline(at, color=colour, linewidth=1.1, linestyle=(0, (4, 2)))
+    left, right = panels[0].get_xlim()
+    for near in _near([mark.t_s / clock.seconds for mark in marks], APART * (right - left)):
+        panels[0].annotate(
+            "change" if len(near) == 1 else f"{len(near)} changes", (sum(near) / len(near), 1.0), (0, 2),
+            xycoords=("data", "axes fraction"), textcoords="offset points",
+            ha="center", va="bottom", fontsize=8, color=DARK,
+        )  # fmt: skip
+
+
+def _near(times: Sequence[float], apart: float) -> list[list[float]]:
+    """Times in heaps whose middles lie so far apart.
+
+    >>> _near([1.0, 9.0, 1.5, 2.0], 2.0)
+    [[1.0, 1.5, 2.0], [9.0]]
+    """
+    heaps = [[time] for time in sorted(times)]
+    at = 1
+    while at < len(heaps):
+        before, this = heaps[at - 1], heaps[at]
+        if sum(this) / len(this) - sum(before) / len(before) < apart:
+            heaps[at - 1 : at + 1] = [before + this]
+            at = max(at - 1, 1)  # the heap's middle has moved
+        else:
+            at += 1
+    return heaps
 
 
 def _surface(panel: "Axes", dynamic: Dynamic, axis: str, edges: Floats, ratio: float) -> "QuadMesh":

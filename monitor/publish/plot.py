@@ -17,7 +17,7 @@ from monitor.estimate.coefficients import LETTERS, Status
 from monitor.estimate.dynamic import Dynamic
 from monitor.estimate.estimate import Estimate
 from monitor.publish.allan_figure import COLOURS, GREY, READING, Beside, allan_panel
-from monitor.publish.dynamic_figure import dynamic_panels, height_inches
+from monitor.publish.dynamic_figure import Mark, dynamic_panels, height_inches
 from monitor.publish.panels import duration
 from monitor.publish.units import (
     COEFFICIENT_NAMES,
@@ -47,7 +47,7 @@ def allan_plot(
     title: str = "",
     others: Sequence[Beside] = (),
     dynamic: Dynamic | None = None,
-    changes_s: Sequence[float] = (),
+    marks: Sequence[Mark] = (),
 ) -> None:
     """Write the picture; the ending of ``path`` says the format.
 
@@ -57,7 +57,7 @@ def allan_plot(
         title: above all
         others: other deviations, such as total and Hadamard
         dynamic: dynamic curves of the same recording, drawn below
-        changes_s: marks on their time axis, seconds since the first sample
+        marks: changes, on their time axis
     Raises:
         ConfigError: matplotlib is missing or the file cannot be written
     """
@@ -75,7 +75,7 @@ def allan_plot(
     for column, kind in enumerate(kinds):
         _static(parts[0, column], estimate, kind, others)
         if dynamic is not None:
-            dynamic_panels(parts[1, column], dynamic, kind, changes_s)
+            dynamic_panels(parts[1, column], dynamic, kind, marks)
     figure.suptitle("\n".join([*([title] if title else []), summary(estimate)]), fontsize=12)
     try:
         figure.savefig(path)

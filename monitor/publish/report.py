@@ -21,7 +21,7 @@ from monitor.estimate.dynamic import Dynamic
 from monitor.estimate.estimate import Estimate
 from monitor.publish import plot
 from monitor.publish.allan_figure import COLOURS, READING, Beside, allan_panel
-from monitor.publish.dynamic_figure import dynamic_panels, height_inches
+from monitor.publish.dynamic_figure import Mark, dynamic_panels, height_inches
 from monitor.publish.panels import duration
 from monitor.publish.units import (
     COEFFICIENT_NAMES,
@@ -85,14 +85,14 @@ def html_report(
     title: str = "",
     others: Sequence[Beside] = (),
     dynamic: Dynamic | None = None,
-    changes_s: Sequence[float] = (),
+    marks: Sequence[Mark] = (),
 ) -> None:
     """Write the page; arguments as for ``plot.allan_plot``.
 
     Raises:
         ConfigError: matplotlib or Jinja2 is missing, or the file cannot be written
     """
-    page = html(analysis, title, others, dynamic, changes_s)
+    page = html(analysis, title, others, dynamic, marks)
     try:
         path.write_text(page, "utf-8")
     except OSError as error:
@@ -104,7 +104,7 @@ def html(
     title: str = "",
     others: Sequence[Beside] = (),
     dynamic: Dynamic | None = None,
-    changes_s: Sequence[float] = (),
+    marks: Sequence[Mark] = (),
 ) -> str:
     """The page as text."""
     try:
@@ -124,7 +124,7 @@ def html(
         title=title or "Recording",
         facts=facts(analysis),
         notes=analysis.notes,
-        parts=[_part(estimate, kind, others, dynamic, changes_s) for kind in plot.kinds_of(estimate)],
+        parts=[_part(estimate, kind, others, dynamic, marks) for kind in plot.kinds_of(estimate)],
         reading=READING,
         window="" if dynamic is None else duration(dynamic.window_s),
     )
@@ -162,17 +162,17 @@ def _cell(estimate: Estimate, letter: str, axis: str) -> Cell:
 
 
 def _part(
-    estimate: Estimate, kind: Kind, others: Sequence[Beside], dynamic: Dynamic | None, changes_s: Sequence[float]
+    estimate: Estimate, kind: Kind, others: Sequence[Beside], dynamic: Dynamic | None, marks: Sequence[Mark]
 ) -> Part:
     import matplotlib
 
     # a path remembers the threshold from when it was made
     with matplotlib.rc_context({"path.simplify_threshold": SIMPLER_PX}):
-        return _drawn(estimate, kind, others, dynamic, changes_s)
+        return _drawn(estimate, kind, others, dynamic, marks)
 
 
 def _drawn(
-    estimate: Estimate, kind: Kind, others: Sequence[Beside], dynamic: Dynamic | None, changes_s: Sequence[float]
+    estimate: Estimate, kind: Kind, others: Sequence[Beside], dynamic: Dynamic | None, marks: Sequence[Mark]
 ) -> Part:
     from matplotlib.figure import Figure
 
@@ -181,7 +181,7 @@ def _drawn(
     surface = ""
     if dynamic is not None:
         figure = Figure(figsize=(WIDE_INCHES, height_inches(dynamic, kind)), layout="constrained")
-        dynamic_panels(figure, dynamic, kind, changes_s)
+        dynamic_panels(figure, dynamic, kind, marks)
         surface = _svg(figure, f"{kind}-dynamic")
     tints = tuple(zip(axes_of(kind), COLOURS, strict=True))
     return Part(KIND_NAMES[kind], tints, table(estimate, kind), _svg(curves, f"{kind}-allan"), surface)

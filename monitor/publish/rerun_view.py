@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from drivers.sample import Event, Floats
-from monitor.estimate.estimate import Estimate
+from monitor.estimate.estimate import Estimate, joined
 from monitor.health import Health
 from monitor.publish.backlog import Backlog
 from monitor.publish.viewer import DeviceInfo, ViewerClosed, ViewerSettings, ViewerTrouble
@@ -278,7 +278,9 @@ class _Pending:
     def _add_to_course(self, device: str, message: _Estimate) -> None:
         points = self.course.setdefault(device, [])
         if len(points) > 1 and message.wall_s - points[-2].wall_s < COURSE_STEP_S:
-            points.pop()
+            # the samples between the points stay on the course
+            course = joined([part for part in (points.pop().estimate.course, message.estimate.course) if part])
+            message = _Estimate(message.wall_s, replace(message.estimate, course=course))
         points.append(message)
 
     def _due(self, what: str, device: str, every_s: float) -> bool:

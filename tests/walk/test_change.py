@@ -1,4 +1,4 @@
-"""The experiment of "Dynamic extraction of random drift error coefficients of MEMS gyroscopes", through the whole service.
+"""The experiment of "Dynamic extraction of random drift error coefficients of MEMS gyroscopes", as a service.
 
 600 s at 100 Hz in a window of 100 s, fitted at every sample. At 250 s, on all six axes, N goes from 1.5e-4 to 3e-4,
 B from 4e-5 to 3e-4, K from 1.5e-6 to 1e-4 and R from 0 to 1e-4; Q stays at 2e-5 (SI units of the axis). An Allan

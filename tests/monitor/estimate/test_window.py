@@ -501,7 +501,9 @@ class Calls(RuleBasedStateMachine):
     def __init__(self):
         super().__init__()
         length = LENGTH + 30
-        self.window = AllanWindow(length, np.array([1, 3, 1, 20, 65, 20]), np.array([length, 99, 40, length, length, 77]))
+        self.window = AllanWindow(
+            length, np.array([1, 3, 1, 20, 65, 20]), np.array([length, 99, 40, length, length, 77])
+        )
         self.held = np.empty((0, 6))
         self.given = 0
 

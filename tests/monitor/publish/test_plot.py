@@ -12,6 +12,7 @@ from monitor.estimate.coefficients import Status
 from monitor.estimate.dynamic import Dynamic, dynamic
 from monitor.publish import allan_figure, dynamic_figure, plot
 from monitor.publish.allan_figure import Beside
+from monitor.publish.dynamic_figure import Mark
 from tests.monitor.publish import made
 
 
@@ -150,7 +151,7 @@ def test_dynamic_curves_stand_below_in_the_same_picture(tmp_path: Path, changing
     path = tmp_path / "plot.png"
     estimate = made.estimate()
     estimate.curve.avar[:, 3:] = np.nan
-    plot.allan_plot(estimate, path, "bench-1", dynamic=changing, changes_s=[300.0])
+    plot.allan_plot(estimate, path, "bench-1", dynamic=changing, marks=[Mark(300.0, "gz")])
     image = pixels(path)
     below = dynamic_figure.height_inches(changing, "gyro") * plot.DPI
     assert image.shape[0] == pytest.approx(plot.INCHES[1] * plot.DPI + below, abs=2)

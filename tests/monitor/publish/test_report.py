@@ -16,6 +16,7 @@ from monitor.estimate.dynamic import Dynamic, dynamic
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from monitor.noise.model import NoiseModel
 from monitor.publish import report
+from monitor.publish.dynamic_figure import Mark
 from tests.monitor.publish import made
 
 pytest.importorskip("matplotlib")
@@ -113,7 +114,7 @@ def test_the_facts_of_the_recording_are_on_the_page() -> None:
 
 def test_the_page_is_complete_in_itself_and_below_a_megabyte(tmp_path: Path, long: Dynamic) -> None:
     path = tmp_path / "report.html"
-    report.html_report(analysis(), path, "a <b> & c", dynamic=long, changes_s=[1500.0])
+    report.html_report(analysis(), path, "a <b> & c", dynamic=long, marks=[Mark(1500.0, "gz")])
     text = path.read_text("utf-8")
     assert path.stat().st_size < 1_000_000
     page = Page(text)
