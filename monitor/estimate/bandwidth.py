@@ -11,7 +11,7 @@ Every filter has a flat bottom, so N is the level of the white noise inside the 
 filter is not quite, and is only bounded.
 """
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final, Literal
@@ -35,6 +35,8 @@ BINS: Final = 1 << 13
 """Of the spectrum from zero to half the sample rate: a filter forgets within so many samples."""
 REFINED: Final = 3
 """Families, of those nearest on the grid, whose cutoff is sought to the end."""
+PIECE: Final = 8
+"""Cutoffs tried in one piece of a search."""
 ALIASES: Final = 8
 AGREES: Final = 2.0
 """Variance about the fit over that of noise, up to which a filter explains a curve."""
@@ -126,12 +128,26 @@ def contradicted(found: Fit, axis: int) -> bool:
 
 def sought(design: Design, table: Table, looks: Looks) -> LowPass | None:
     """The low-pass with the least misfit for the one axis of ``looks``; None where none explains its curve."""
+    search = searching(design, table, looks)
+    while True:
+        try:
+            next(search)
+        except StopIteration as end:
+            found: LowPass | None = end.value
+            return found
+
+
+def searching(design: Design, table: Table, looks: Looks) -> Generator[None, None, LowPass | None]:
+    """``sought`` in pieces of a few milliseconds, for who must not be kept waiting."""
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
-
-    def misfit(low_pass: LowPass) -> float:
-        return float(fit_columns(_with(design, _column(low_pass, factors)), table, looks).scatter[0])
-
-    grids = [[misfit(LowPass(kind, order, float(cutoff))) for cutoff in CUTOFFS] for kind, order in FAMILIES]
+    grids: list[list[float]] = []
+    for kind, order in FAMILIES:
+        grids.append([])
+        for number, cutoff in enumerate(CUTOFFS):
+            column = _column(LowPass(kind, order, float(cutoff)), factors)
+            grids[-1].append(float(fit_columns(_with(design, column), table, looks).scatter[0]))
+            if number % PIECE == PIECE - 1:
+                yield
     found = []
     for family in np.argsort([min(grid) for grid in grids])[:REFINED]:
         kind, order = FAMILIES[family]
@@ -144,6 +160,7 @@ def sought(design: Design, table: Table, looks: Looks) -> LowPass | None:
 
         best = minimize_scalar(of, bounds=(float(ends[0]), float(ends[1])), method="bounded", options={"xatol": 1e-4})
         found.append((float(best.fun), LowPass(kind, order, float(np.exp(best.x)))))
+        yield
     least, low_pass = min(found, key=lambda one: one[0])
     return low_pass if least < AGREES else None
 

@@ -10,7 +10,7 @@ N within half a minute.
 """
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from typing import Final
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import NotReady
 from drivers.sample import Floats, Ints, SampleBlock, block
-from monitor.estimate.bandwidth import LowPass, contradicted, sought, with_bandwidth
+from monitor.estimate.bandwidth import LowPass, contradicted, searching, with_bandwidth
 from monitor.estimate.batch import TauGrid, cluster_sizes
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Course, Estimate
@@ -73,7 +73,8 @@ class Estimator:
         self._theta = np.full((5, 6), np.nan)  # of the newest fit
         self._odd: list[tuple[Table, Looks] | None] = [None] * 6  # curves that contradict their fit
         self._filters: list[LowPass | None] = [None] * 6
-        self._turn = 0
+        self._turn = 0  # the axis whose filter is sought
+        self._search: Generator[None, None, LowPass | None] | None = None
         self._samples = 0
         self._newest_ns = 0
 
@@ -194,13 +195,21 @@ class Estimator:
         return result
 
     def _seek_bandwidth(self) -> None:
-        """Look for the low-pass of the next axis in turn whose shortest τ contradict the fit."""
+        """A piece of the search for the low-pass of one axis; then of the next whose shortest τ contradict the fit."""
+        if self._search is not None:
+            try:
+                next(self._search)
+            except StopIteration as end:
+                self._filters[self._turn] = end.value
+                self._search = None
+            return
         for _ in range(len(self._odd)):
             self._turn = (self._turn + 1) % len(self._odd)
             odd = self._odd[self._turn]
-            self._filters[self._turn] = None if odd is None else sought(self._design, *odd)
             if odd is not None:
+                self._search = searching(self._design, *odd)
                 return
+            self._filters[self._turn] = None
 
     def _curve(self, avar: Floats, terms: Ints, edf: Floats, n: int) -> AllanCurve:
         lo, hi = intervals(avar, edf)

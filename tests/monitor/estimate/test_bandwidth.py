@@ -74,7 +74,7 @@ def test_the_live_estimate_finds_it_too():
     estimator = Estimator(RATE_HZ, 1200.0)
     estimator.update(block(np.arange(len(values)) * 10_000_000, values))
     before = estimator.get()
-    for _ in range(6):
+    for _ in range(6 * 65):  # pieces of six searches
         estimator.step()
     after = estimator.get()
     assert np.isnan(before.fitted[0]).any() or (before.fitted[0] != after.fitted[0]).any()
