@@ -186,7 +186,7 @@ def small(path: Path) -> Path:
     from PIL import Image
 
     with Image.open(path) as picture:
-        few = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+        few = picture.convert("RGB").quantize(256, kmeans=1, dither=Image.Dither.NONE)
     few.save(path, optimize=True)
     return path
 

@@ -133,7 +133,7 @@ def _fitted(
     n = len(values)
     avar, terms = overlapping(values, factors, each)
     columns, covariances = design(factors, rate_hz), table(n, factors)
-    looks = Looks(avar, terms, slope(values) * rate_hz, slopes(values, factors, each) * rate_hz)
+    looks = Looks(avar, terms, slope(values) * rate_hz, slopes(values, factors) * rate_hz)
     found = fit(columns, covariances, avar, terms, slope=looks.slope, slopes=looks.slopes)
     filters = [
         sought(columns, covariances, looks.axis(axis)) if contradicted(found, axis) else None

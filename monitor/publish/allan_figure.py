@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 COLOURS: Final = ("#D55E00", "#009E73", "#0072B2")  # x y z: vermilion, bluish green, blue (Okabe & Ito)
 MARKERS: Final = ("o", "s", "^")
-SIZES: Final = (7.0, 4.6, 2.6)  # of markers, pt: axes that are alike stay visible inside each other
-RING_SIZES: Final = (11.5, 8.0, 4.5)
+SIZES: Final = (8.2, 5.0, 3.8)  # of markers, pt: axes that are alike stay visible inside each other
+RING_SIZES: Final = (12.0, 8.5, 5.0)
 DASHES: Final = ((0, (4, 8)), (4, (4, 8)), (8, (4, 8)))  # of fits that coincide, each fills the gaps of the others
 GREY: Final = "#6b6b6b"
 DARK: Final = "#222222"
@@ -104,7 +104,17 @@ def allan_panel(axes: "Axes", estimate: Estimate, kind: Kind, others: Sequence[B
         axes.fill_between(tau_s[rows], lo, hi, color=colour, alpha=0.16, linewidth=0)
         axes.plot(tau_s, fitted, linestyle=DASHES[number], color=colour, linewidth=1.5, zorder=3)
         size = SIZES[number]
-        axes.plot(tau_s[rows], measured[rows], marker, color=colour, markersize=size, mew=0, label=axis, zorder=4)
+        axes.plot(
+            tau_s[rows],
+            measured[rows],
+            marker,
+            color=colour,
+            markersize=size,
+            mec="white",
+            mew=0.4,
+            label=axis,
+            zorder=4,
+        )
         shown += [
             measured[rows],
             fitted,

@@ -119,22 +119,20 @@ def dynamic_panels(figure: "Figure | SubFigure", dynamic: Dynamic, kind: Kind, m
 
 def _mark(panels: "Sequence[Axes]", axes: Sequence[str], marks: Sequence[Mark], clock: Clock) -> None:
     """Vertical lines, and in the surface of their axis what they are."""
-    from matplotlib.patheffects import withStroke
-
     left, right = panels[0].get_xlim()
+    apart = APART * (right - left)
     for panel, axis in zip(panels, axes, strict=False):
         times = [mark.t_s / clock.seconds for mark in marks if mark.axis == axis]
         for at in times:
             panel.axvline(at, color=DARK, linewidth=1.1, linestyle=DASHED)
             for course in panels[len(axes) :]:
                 course.axvline(at, color=COLOURS[AXES.index(axis) % 3], linewidth=1.1, linestyle=DASHED)
-        for near in _near(times, APART * (right - left)):
-            before = near[0] > right - APART * (right - left)  # else the word would leave the panel
+        for near in _near(np.clip(times, left + apart / 2.0, right - apart / 2.0).tolist(), apart):
             panel.annotate(
-                "change" if len(near) == 1 else f"{len(near)} changes", (near[0] if before else near[-1], 1.0),
-                (-4 if before else 4, -3), xycoords=("data", "axes fraction"), textcoords="offset points",
-                ha="right" if before else "left", va="top", fontsize=8, color=DARK,
-                path_effects=[withStroke(linewidth=2.5, foreground="white")],
+                "change" if len(near) == 1 else f"{len(near)} changes", (sum(near) / len(near), 1.0), (0, -4),
+                xycoords=("data", "axes fraction"), textcoords="offset points",
+                ha="center", va="top", fontsize=8, color=DARK,
+                bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.9},
             )  # fmt: skip
 
 
@@ -217,8 +215,8 @@ def _course(panel: "Axes", dynamic: Dynamic, kind: Kind, letter: str, t: Floats)
         plain_ticks(panel)
     else:
         room = 0.25 * (high - low) + 0.02 * high
-        most = np.nanquantile(ends, [1.0 - BANDS, BANDS])
-        panel.set_ylim(max(min(low - room, most[0]), 0.0), max(high + room, most[1]))
+        lowest, highest = np.nanquantile(ends, [1.0 - BANDS, BANDS]).tolist()
+        panel.set_ylim(max(min(low - room, lowest), 0.0), max(high + room, highest))
     panel.set_ylabel(f"{letter}, {unit.name}")
     panel.set_title(COEFFICIENT_NAMES[kind][letter], loc="left", fontsize=9, color=GREY, pad=3)
     quiet(panel)

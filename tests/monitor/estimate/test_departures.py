@@ -167,7 +167,7 @@ def low_passed(rng, n):
     ids=["white", "flicker", "quantization", "random walk", "low-passed", "its steps", "coarse", "held"],
 )
 def test_noise_has_no_lines(noise):
-    """In one of a hundred at most; measured over thousands, it is one of a thousand."""
+    """In one of a hundred at most; none was seen in a thousand of each."""
     records = [noise(np.random.default_rng(seed), FEWEST) for seed in range(200)]
     assert sum(bool(found(record)) for record in records) <= 2
 
@@ -192,7 +192,7 @@ def test_gaussian_noise_has_none_however_coarse(step, missing):
     values = white(60_000) + 9.81
     values = np.round(values / step) * step if step else values
     values[np.random.default_rng(1).random(60_000) < missing] = np.nan
-    assert shares(values).max() < 1e-5
+    assert shares(values).max() < 3e-5
 
 
 def test_too_short_for_a_block_is_no_answer():

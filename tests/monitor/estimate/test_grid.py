@@ -9,7 +9,6 @@ import pytest
 from drivers.errors import NotReady
 from drivers.sample import block
 from monitor.estimate.grid import LONGEST_HOLE, NOTES, on_grid
-from monitor.estimate.stale import stale_share
 
 
 def white(n, seed=0):
@@ -94,25 +93,9 @@ def test_stale_rows_are_told_and_kept(fraction, step):
         values[row] = values[row - 1]
     grid, _, notes = on_grid(recording(np.arange(20000) / 100, values), None)
     assert np.array_equal(grid, values)
-    assert stale_share(values) == pytest.approx(fraction, rel=0.1)
     (note,) = notes
     assert note.endswith("the sensor updates slower than it is read; they are kept")
     assert float(note.split()[0]) == pytest.approx(100 * fraction, rel=0.1)
-
-
-@pytest.mark.parametrize("step", [1e-3, 3e-3, 1e-2])
-def test_coarse_resolution_is_not_stale(step):
-    values = np.round(white(30000) / step) * step
-    assert stale_share(values) < 0.01
-
-
-def test_what_cannot_be_told_is_not_said():
-    assert stale_share(np.ones((1000, 6))) == 0.0
-    one = np.full((1000, 6), np.nan)
-    one[:, 0] = np.repeat(np.arange(500.0), 2)
-    assert stale_share(one) == 0.0
-    assert stale_share(np.full((10, 6), np.nan)) == 0.0
-    assert stale_share(np.empty((0, 6))) == 0.0
 
 
 def test_times_that_stand_still_ask_for_the_rate():

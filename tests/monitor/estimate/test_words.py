@@ -39,6 +39,6 @@ def test_a_difference_has_its_sign(axis):
 @pytest.mark.parametrize("si", [1e-30, 1e30, math.inf, -math.inf, math.nan])
 def test_no_number_breaks_a_sentence(axis, si):
     number, unit = amount(axis, si).split()
-    assert float(number) == pytest.approx(float(number)) if math.isfinite(si) else not math.isfinite(float(number))
+    assert math.isfinite(float(number)) == math.isfinite(si)
     assert "e" not in number.lower()
     assert unit in ("°/s", "mg", "m/s²")
