@@ -17,7 +17,7 @@ import numpy as np
 from drivers.errors import NotReady
 from drivers.sample import Floats, Ints, SampleBlock
 from monitor.estimate import findings
-from monitor.estimate.bandwidth import LowPass, contradicted, sought, with_bandwidth
+from monitor.estimate.bandwidth import LowPass, contradicted, power, sought, with_bandwidth
 from monitor.estimate.batch import EachAxis, TauGrid, cluster_sizes, overlapping, slope, slopes
 from monitor.estimate.change import Change, ChangeDetector
 from monitor.estimate.curve import AllanCurve
@@ -136,7 +136,7 @@ def _fitted(
     looks = Looks(avar, terms, slope(values) * rate_hz, slopes(values, factors) * rate_hz)
     found = fit(columns, covariances, avar, terms, slope=looks.slope, slopes=looks.slopes)
     filters = [
-        sought(columns, covariances, looks.axis(axis)) if contradicted(found, axis) else None
+        sought(columns, covariances, looks.axis(axis), power(values[:, axis])) if contradicted(found, axis) else None
         for axis in range(values.shape[1])
     ]
     found, filters = with_bandwidth(columns, covariances, looks, found, filters)

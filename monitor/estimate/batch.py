@@ -87,8 +87,10 @@ def slope(values: Floats) -> Floats:
     if third == 0:
         return np.full(values.shape[1], np.nan)
     newest = np.ascontiguousarray(values[len(values) - 3 * third :], np.float64)
-    early, _, late = (_present_mean(newest[part * third : (part + 1) * third]) for part in range(3))
-    return (late - early) / (2.0 * third)
+    parts = [_mean(newest[part * third : (part + 1) * third]) for part in range(3)]
+    counts = np.stack([count for count, _ in parts])
+    whole = (counts.sum(axis=0) >= PRESENT * 3 * third) & (counts[::2] >= PRESENT * third).all(axis=0)
+    return np.where(whole, (parts[2][1] - parts[0][1]) / (2.0 * third), np.nan)
 
 
 def slopes(values: Floats, factors: Ints) -> Floats:
@@ -105,10 +107,12 @@ def slopes(values: Floats, factors: Ints) -> Floats:
     terms = len(rates) + 1 - 2 * m
     ends = np.stack([np.zeros_like(m), m, 2 * m, terms, terms + m, terms + 2 * m])
     places, at = np.unique(ends, return_inverse=True)
-    first, second, third, fourth, fifth, sixth = _sums_of_phase(rates, _present_mean(rates), places)[at.reshape(6, -1)]
+    mean = _present_mean(rates)
+    first, second, third, fourth, fifth, sixth = _sums_of_phase(rates, mean, places)[at.reshape(6, -1)]
     blocks = (sixth - 2.0 * fifth + fourth) - (third - 2.0 * second + first)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where((terms > 0)[:, None], blocks / (terms * m.astype(np.float64) ** 2)[:, None], np.nan)
+        bent = blocks / (terms * m.astype(np.float64) ** 2)[:, None]
+        return np.where((terms > 0)[:, None] & ~np.isnan(mean), bent, np.nan)
 
 
 def _present_mean(values: Floats) -> Floats:

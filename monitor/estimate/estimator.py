@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import NotReady
 from drivers.sample import Floats, Ints, SampleBlock, block
-from monitor.estimate.bandwidth import LowPass, contradicted, searching, with_bandwidth
+from monitor.estimate.bandwidth import LowPass, contradicted, power, searching, with_bandwidth
 from monitor.estimate.batch import TauGrid, cluster_sizes
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Course, Estimate
@@ -34,6 +34,8 @@ from monitor.estimate.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_s
 
 FEWEST: Final = 8
 """Samples before the first answer: three τ with a few terms each."""
+POWER_ROWS: Final = 65_536
+"""The newest samples, whose spectrum is asked whether it shows a filter."""
 COURSE_SAMPLES: Final = 65_536
 """Of the course of coefficients, the newest kept until someone looks."""
 
@@ -207,7 +209,7 @@ class Estimator:
             self._turn = (self._turn + 1) % len(self._odd)
             odd = self._odd[self._turn]
             if odd is not None:
-                self._search = searching(self._design, *odd)
+                self._search = searching(self._design, *odd, power(self._window.newest(self._turn, POWER_ROWS)))
                 return
             self._filters[self._turn] = None
 

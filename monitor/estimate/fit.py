@@ -99,6 +99,7 @@ def known(design: Design, table: Table, blind: Floats | None = None, ask: bool =
     flat = design.columns.copy()
     # what taking away the line costs each noise on average, see the level in ``fit_axis``
     flat[:, :NOISES] -= (2.0 * table.bend - table.slope) * design.columns[:, R, None]
+    flat[:, ~design.columns.any(axis=0)] = 0.0  # not asked for
     blind = np.zeros(design.factors.size) if blind is None else blind
     whole = table.terms.astype(np.float64)
     return Known(design.columns, flat, table.covariance, whole, table.slope, blind, ask)

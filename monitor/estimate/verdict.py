@@ -25,6 +25,12 @@ instead and their intervals miss too."""
 SCATTER: Final = 1.0
 """σ by which a θ may move before its gains are made anew, where that is more."""
 
+SURELY: Final = 3.3
+"""σ by which a curve is below a term that it does not have; of 20 τ none is so far by chance in 99 of 100."""
+
+LEAST_SHRUNK: Final = 0.05
+"""Below this (under two degrees of freedom) a measured variance is no bound."""
+
 JUST_SEEN: Final = 3.0
 """σ of an absent term, at which it would be seen."""
 
@@ -129,17 +135,16 @@ def judge(  # type: ignore[no-untyped-def]
         skewness = 2.0 * np.sqrt(forms[a, 2])
         threshold = thresholds[1] if entered[a] else thresholds[0]
         low = _interval_end(estimate[a], c0, c1, c2, skewness, TWO_SIDED_95)
+        high = _interval_end(estimate[a], c0, c1, c2, skewness, -TWO_SIDED_95)
+        if theta[a] > 0.0 and not low < np.sqrt(theta[a]) < high:
+            # others were held at zero, and this one is not û: the interval of what it is
+            low = min(low, _interval_end(theta[a], c0, c1, c2, skewness, TWO_SIDED_95))
+            high = max(high, _interval_end(theta[a], c0, c1, c2, skewness, -TWO_SIDED_95))
         # what was out stays out while its interval reaches to zero
         seen = entered[a] or low > 0.0
         entered[a] = seen and a != R and theta[a] > 0.0 and estimate[a] > threshold * np.sqrt(c0)
         if entered[a]:
-            status[a] = 2
-            high = _interval_end(estimate[a], c0, c1, c2, skewness, -TWO_SIDED_95)
-            value = np.sqrt(theta[a])
-            if not low < value < high:  # others were held at zero, and this one is not û: the interval of what it is
-                low = min(low, _interval_end(theta[a], c0, c1, c2, skewness, TWO_SIDED_95))
-                high = max(high, _interval_end(theta[a], c0, c1, c2, skewness, -TWO_SIDED_95))
-            lo[a], hi[a] = low, high
+            status[a], lo[a], hi[a] = 2, low, high
         else:
             # a bound below what an estimate of zero would give claims more than the curve can know
             status[a] = 1
@@ -272,13 +277,36 @@ def _interval_end(estimate, c0, c1, c2, skewness, z):  # type: ignore[no-untyped
 
 
 @compiled
+def cap(curve, edf, rows, columns, entered, theta, lo, hi, status):  # type: ignore[no-untyped-def]
+    """Where the five terms are no description of the curve: none may be more than the whole of it at any τ."""
+    for a in range(5):
+        most = np.inf
+        for i in rows:
+            if columns[i, a] > 0.0:
+                most = min(most, highest(curve[i], edf[i], SURELY) / columns[i, a])
+        most = np.sqrt(most)
+        if status[a] == 0 or hi[a] <= most:
+            continue
+        hi[a] = most
+        if status[a] == 2 and not lo[a] < np.sqrt(theta[a]) < most:
+            entered[a], status[a], lo[a] = False, 1, 0.0
+
+
+@compiled
+def highest(avar, edf, z):  # type: ignore[no-untyped-def]
+    """What the truth may be above a measured variance, at z σ (Wilson & Hilferty); infinite with too little freedom."""
+    spread = 2.0 / (9.0 * max(edf, 1.0))
+    shrunk = 1.0 - spread - z * np.sqrt(spread)
+    return avar / shrunk**3 if shrunk > LEAST_SHRUNK else np.inf
+
+
+@compiled
 def bound_by_first_point(avar, edf, column, entered, lo, hi, status):  # type: ignore[no-untyped-def]
     """Q is hidden behind the sensor's band limit: it makes no more than the whole of the first point."""
     entered[Q] = False
     status[Q] = 1
     lo[Q] = 0.0
-    spread = 2.0 / (9.0 * max(edf, 1.0))
-    hi[Q] = np.sqrt(avar / column / max(1.0 - spread - BOUND * np.sqrt(spread), 0.05) ** 3)
+    hi[Q] = np.sqrt(highest(avar, edf, BOUND) / column)
 
 
 @compiled

@@ -224,6 +224,13 @@ class AllanWindow:
         """Number of second differences averaged, [m, 6]."""
         return self._terms[:, :AXES].copy()
 
+    def newest(self, axis: int, n: int) -> Floats:
+        """Up to n of the newest samples of one axis, from its phase; NaN = missing."""
+        places = self._phase.size // LANES
+        at = (int(self._state[NEWEST]) - np.arange(min(n, self.n), -1, -1)) % places
+        phase, missing = self._phase[at * LANES + axis], self._missing[at * LANES + axis]
+        return np.where(np.diff(missing) > 0, np.nan, np.diff(phase) / self._scale[axis])
+
     def ring(self) -> tuple[Ints, NDArray[np.int32], int, Floats]:
         """A look at phase without a copy, good until the next update.
 
