@@ -21,11 +21,11 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from drivers.sample import Floats, Ints
+from monitor.estimate.bounds import BOUND, highest
 from monitor.estimate.coefficients import Status
 from monitor.estimate.fit import Design, Fit, Looks, fit_columns, replaced
 from monitor.estimate.least_squares import N, Q
 from monitor.estimate.uncertainty import Table
-from monitor.estimate.verdict import BOUND, highest
 
 Kind = Literal["digital", "sampled"]
 FAMILIES: Final[tuple[tuple[Kind, int], ...]] = tuple(

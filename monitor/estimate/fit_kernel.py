@@ -12,9 +12,10 @@ from typing import Final
 import numpy as np
 
 from monitor.compiled import compiled
+from monitor.estimate.bounds import bound_by_first_point, cap
 from monitor.estimate.least_squares import K, N, Q, R, normal_equations, solve_nonnegative, variances, weigh
 from monitor.estimate.uncertainty import NOISES, PAIRS
-from monitor.estimate.verdict import bound_by_first_point, cap, freeze, judge, judge_ramp, sharpen
+from monitor.estimate.verdict import freeze, judge, judge_ramp, sharpen
 
 MIN_ROWS: Final = NOISES + 1
 """Fewer τ than this leave a fit no freedom to be contradicted."""
