@@ -111,9 +111,11 @@ def events_of(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analysis:
         detector.update(np.where(struck[:, None], np.nan, rows) if struck.any() else rows)
     changes = tuple(sorted(detector.take(), key=lambda change: change.since))
     notes += findings.of_changes(changes, rate)
-    notes += findings.of_departures(
-        lines(result.values, moving, rate, result.estimate.curve), outliers(result.values, moving)
+    found = lines(result.values, moving, rate, result.estimate.curve)
+    notes = findings.explained(
+        notes, result.estimate.curve, result.fit, found, moved=bool(motions) and not result.struck
     )
+    notes += findings.of_departures(found, outliers(result.values, moving))
     return replace(result, notes=tuple(notes), motions=motions, changes=changes)
 
 

@@ -9,8 +9,9 @@ so that the longest costs no more than a second of it; stretches with more than 
   power is what stands above the sides of its feet. Told is what adds MATTERS or more of the Allan variance at some τ:
   a line of amplitude A makes A² sin⁴(πfτ) / (m sin(πf/rate))² (the sine of IEEE Std 952, annex C, averaged over m
   samples rather than without pause), and a resonance is taken for a line of the same power.
-- **Outliers** lie beyond FAR σ of their stretch, by the distance from the median of BLOCK samples around; σ is by the
-  median distance, which one sample in ten moves by an eighth. A step of the resolution is the least σ.
+- **Outliers** lie beyond FAR σ of their stretch, by the distance from the median of BLOCK samples around, and half as
+  far from that of the NEXT to both sides, as no slope or curve within the block does; σ is by the median distance,
+  which one sample in ten moves by an eighth. A step of the resolution is the least σ.
 
 Not found: lines below FIRST bins of a stretch, and what lasts only for a moment.
 """
@@ -57,6 +58,8 @@ LINES: Final = 3
 FAR: Final = 5.0
 BLOCK: Final = 63
 """Odd, so that the median is a sample and distances from it are whole steps of the resolution."""
+NEXT: Final = 3
+"""To each side: up to three outliers in a row are told."""
 GAUSSIAN: Final = 1.4826
 """σ over the median distance, of Gaussian noise."""
 
@@ -121,6 +124,12 @@ def outliers(values: Floats, moving: Mask) -> Floats:
         if far:
             shares[axis] = np.mean(far)
     return shares
+
+
+def added(line: Line, curve: AllanCurve) -> Floats:
+    """Share [m] of its axis' Allan variance that a line makes at each τ."""
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        return _added(line.axis, line.frequency_hz * curve.tau_s[0] / curve.factors[0], line.amplitude, curve)
 
 
 def _stretches(column: Floats, moving: Mask, rows: int, most: int) -> Iterator[Floats]:
@@ -205,20 +214,32 @@ def _runs(marks: Mask) -> list[tuple[int, int]]:
 
 def _line(axis: int, peak: _Peak, bin_hz: float, rate_hz: float, curve: AllanCurve) -> Line:
     """What a peak adds to the Allan curve."""
-    frequency = peak.middle * bin_hz
-    turns = np.pi * frequency / rate_hz  # of half a sample
-    made = 2.0 * peak.power * (np.sin(curve.factors * turns) ** 2 / (curve.factors * np.sin(turns))) ** 2
-    shares = made / curve.avar[:, axis]
-    return Line(axis, frequency, (2.0 * peak.power) ** 0.5, float(np.nanmax(shares, initial=0.0)), peak.wide)
+    frequency, amplitude = peak.middle * bin_hz, (2.0 * peak.power) ** 0.5
+    shares = _added(axis, frequency / rate_hz, amplitude, curve)
+    return Line(axis, frequency, amplitude, float(np.nanmax(shares, initial=0.0)), peak.wide)
+
+
+def _added(axis: int, turns: float, amplitude: float, curve: AllanCurve) -> Floats:
+    """Share [m] of a curve that a line makes, of so many turns a sample."""
+    half = np.pi * turns
+    made = (amplitude * np.sin(curve.factors * half) ** 2 / np.sin(half)) ** 2 / curve.factors
+    return np.asarray(made / (curve.factors * curve.avar[:, axis]))
 
 
 def _far(part: Floats) -> float:
     """Share of a stretch, of what is there of it, that lies far from the rest."""
-    blocks = part[: part.size // BLOCK * BLOCK].reshape(-1, BLOCK)
-    away = np.abs(blocks - np.median(blocks, axis=1, keepdims=True))
     steps = np.abs(np.diff(part))
     step = float(steps[steps > 0.0].min(initial=np.inf))
-    return float((away > FAR * max(GAUSSIAN * _median(away, step), step)).mean()) if np.isfinite(step) else 0.0
+    part = part[: part.size // BLOCK * BLOCK]
+    if not part.size or not np.isfinite(step):
+        return 0.0
+    blocks = part.reshape(-1, BLOCK)
+    away = np.abs(blocks - np.median(blocks, axis=1, keepdims=True))
+    least = FAR * max(GAUSSIAN * _median(away, step), step)
+    rows = np.flatnonzero(away > least)
+    around = np.clip(rows[:, None] + np.arange(-NEXT, NEXT + 1), 0, part.size - 1)
+    alone = np.abs(part[rows] - np.median(part[around], axis=1)) > least / 2.0
+    return float(alone.sum()) / part.size
 
 
 def _median(away: Floats, step: float) -> float:

@@ -219,16 +219,19 @@ class Estimator:
 
 
 def warm_up() -> Iterator[str]:
-    """Have the kernels compiled, or loaded from the disk cache; yields "window" and "fit" as each is ready.
+    """Have the kernels compiled, or loaded from the disk cache; yields "window", "fit" and "all" as each is ready.
 
-    "window" is all that samples pass on their way, "fit" what a look needs, and a fit at every sample. Half a minute
-    each at the very first start on a machine, milliseconds later.
+    "window" gives a curve, "fit" its coefficients; the rest are those of motion and change, of total and Hadamard
+    deviations, and of a fit at every sample. Some seconds each at the very first start on a machine, milliseconds later.
     """
     estimator, samples = Estimator(100.0, 1.0), block(np.arange(100, dtype=np.int64), np.zeros((100, 6)))
     estimator.update(samples)
-    estimator.restart(0, 10)
-    Watch(100.0).update(samples)
     yield "window"
     estimator.get()
-    Estimator(100.0, 1.0, every_sample=True).update(samples)
     yield "fit"
+    Watch(100.0).update(samples)
+    estimator.restart(0, 10)
+    while estimator.step() is None:  # a round of the slow statistics
+        pass
+    Estimator(100.0, 1.0, every_sample=True).update(samples)
+    yield "all"

@@ -2,8 +2,9 @@
 
 The clock calls a step of two periods a hole, as the next sample has to be placed at once. A whole recording knows
 better, hole by hole, what only came late. Rows that repeat others, time and values, are kept out. Rows that repeat the
-one before while time goes on stay, as they are what the sensor's register held. A stated rate is believed, and so are
-the times: where they differ it is said. Everything found is said in notes, at most NOTES of one sort.
+one before while time goes on stay, as they are what the sensor's register held. A stated rate is believed, also where
+the times say another. Everything found is said in notes, at most NOTES of one sort; so is a resolution of the values as
+coarse as their noise.
 """
 
 from collections.abc import Sequence
@@ -15,12 +16,16 @@ from drivers.clock import JUMP_S, LONG_S, SampleClock
 from drivers.errors import NotReady
 from drivers.line import made_rate
 from drivers.order import NS
-from drivers.sample import Floats, Given, Ints, SampleBlock
+from drivers.sample import AXES, Floats, Given, Ints, SampleBlock
 from monitor.estimate.late import truly_missing
+from monitor.estimate.resolution import Steps, coarse
 from monitor.estimate.stale import stale_share
+from monitor.estimate.words import amount, plain
 
 OFF_RATE: Final = 0.002
 """A stated rate further than this from what the times say is told, where they say it that well."""
+FAR_RATE: Final = 0.02
+"""Further than this it is told in any case."""
 STEADY: Final = 0.02
 """Steps that differ by less are alike."""
 NOTES: Final = 10
@@ -53,7 +58,7 @@ def on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Float
     values = _placed(stamped, lost)
     notes = told[:NOTES] + ([f"and {len(told) - NOTES} more notes on the times"] if len(told) > NOTES else [])
     notes += _said_of_steps(stamped, t_ns, lost, rate) + _said_late(late)
-    notes += _said_stale(values) + _said_missing(lost, rate)
+    notes += _said_stale(values) + _said_coarse(coarse(values)) + _said_missing(lost, rate)
     return values, rate, notes
 
 
@@ -124,7 +129,9 @@ def _said_late(late: int) -> list[str]:
     if not late:
         return []
     times = "once" if late == 1 else f"{late} times"
-    return [f"a sample came late by a period or more {times}; later ones made good for it, so that none is missing there"]
+    return [
+        f"a sample came late by a period or more {times}; later ones made good for it, so that none is missing there"
+    ]
 
 
 def _said_stale(values: Floats) -> list[str]:
@@ -133,6 +140,23 @@ def _said_stale(values: Floats) -> list[str]:
         return []
     percent = 100.0 * share
     return [f"{percent:.2g} % of rows repeat the one before: the sensor updates slower than it is read; they are kept"]
+
+
+def _said_coarse(found: Sequence[Steps]) -> list[str]:
+    """By kind of sensor and size of the steps."""
+    alike: dict[str, list[Steps]] = {}
+    for one in found:
+        alike.setdefault(amount(AXES[one.axis], one.step), []).append(one)
+    notes = []
+    for size, those in alike.items():
+        axes = ", ".join(AXES[one.axis] for one in those)
+        low, high = (plain(f(one.step / one.noise for one in those)) for f in (min, max))
+        times = low if low == high else f"{low} to {high}"
+        notes.append(
+            f"values come in steps of {size} ({axes}), {times} times the noise from sample to sample: quantization "
+            "shapes the shortest τ"
+        )
+    return notes
 
 
 def _said_of_steps(stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints, rate_hz: float) -> list[str]:
@@ -145,14 +169,18 @@ def _said_of_steps(stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints, rate_
         return [f"the rate used is {rate_hz:g} Hz; the times do not go on and say none"]
     uneven = _said_uneven(steps, rate_hz)
     mean_hz, known = _rate(*going)
-    if abs(mean_hz / rate_hz - 1.0) < max(OFF_RATE, SURE * known):
+    if abs(mean_hz / rate_hz - 1.0) < min(max(OFF_RATE, SURE * known), FAR_RATE):
         return uneven
+    if steps.max() - steps.min() <= STEADY * steps.min():
+        step_s = float(steps.mean()) / NS
+        return [f"the rate used is {rate_hz:g} Hz, but the times step by {step_s:.6g} s, {1.0 / step_s:.6g} Hz"]
     return [*uneven, f"the rate used is {rate_hz:g} Hz, but by the times {mean_hz:.5g} samples came a second"]
 
 
 def _said_uneven(steps: Ints, rate_hz: float) -> list[str]:
     low, middle, high = (np.quantile(steps, [0.1, 0.5, 0.9]) / NS).tolist()
-    if high - low <= STEADY * middle or max(1.0 / rate_hz - low, high - 1.0 / rate_hz) <= UNEVEN / rate_hz:
+    alike = middle > 0.0 and high - low <= STEADY * middle
+    if alike or max(1.0 / rate_hz - low, high - 1.0 / rate_hz) <= UNEVEN / rate_hz:
         return []
     unit_s = _unit_s(steps)
     if unit_s > UNEVEN / rate_hz:

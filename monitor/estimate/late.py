@@ -22,7 +22,7 @@ AROUND: Final = 60
 """Rows to each side: bus adapters were seen to send twenty late at once, and most have to be on time."""
 FEWEST: Final = 2.0 / 3.0
 """Periods: times that wander shift by half a period without any loss."""
-CATCH_UP: Final = 1000
+CATCH_UP: Final = 10_000
 """Rows that a late sender is granted at most to catch up."""
 WANDERS: Final = 0.01
 """Of the rate, at most, within reach: a level that falls by less is nothing that was caught up."""
@@ -57,7 +57,7 @@ def truly_missing(t_ns: Ints, rows: Ints, claimed: Ints, breaks: Ints) -> Ints:
 
 
 def _period_ns(t_ns: Ints, edges: Ints) -> float:
-    """Median over stretches that cross no edge; NaN where there are none."""
+    """Median over stretches that cross no edge; over all steps where these are too few."""
     part = np.zeros(t_ns.size, np.int64)
     part[edges] = 1
     part = np.cumsum(part)

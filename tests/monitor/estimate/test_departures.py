@@ -7,7 +7,7 @@ from scipy.signal import butter, lfilter
 from monitor.estimate import departures
 from monitor.estimate.batch import overlapping
 from monitor.estimate.curve import AllanCurve
-from monitor.estimate.departures import BLOCK, LACKING, LEAST, MATTERS, ROWS, lines, outliers
+from monitor.estimate.departures import BLOCK, LACKING, LEAST, MATTERS, ROWS, added, lines, outliers
 
 RATE_HZ = 100.0
 FEWEST = departures.FEWEST_ROWS * LEAST
@@ -193,6 +193,34 @@ def test_gaussian_noise_has_none_however_coarse(step, missing):
     values = np.round(values / step) * step if step else values
     values[np.random.default_rng(1).random(60_000) < missing] = np.nan
     assert shares(values).max() < 3e-5
+
+
+@pytest.mark.parametrize("rows", [40, 400])
+@pytest.mark.parametrize("height", [0.05, 1.0])
+def test_a_warm_up_has_no_outliers(rows, height):
+    """Samples a few times a minute: the curve falls within one block."""
+    values = np.concatenate([white(179, seed) for seed in range(20)])
+    values += height * np.exp(-(np.arange(len(values)) % 179) / rows)[:, None]
+    parts = values.reshape(20, 179, 6)
+    assert max(shares(part).max() for part in parts) == 0.0
+
+
+@pytest.mark.parametrize("row", [1, 2, 3])
+def test_outliers_in_a_row_are_told_up_to_three(row):
+    values = white(63_000)
+    for begin in range(50, 63_000, 630):
+        values[begin : begin + row, 2] += 0.05
+    assert shares(values)[2] == pytest.approx(row / 630, rel=0.1)
+
+
+@pytest.mark.parametrize("hz", [0.31, 5.0, 17.3])
+def test_what_a_line_adds_at_each_averaging_time(hz):
+    without, values = curve_of(white(60_000)), with_line(60_000, 5e-4, hz)
+    [line] = found(values)
+    more = 1.0 - without.avar[:, 1] / curve_of(values).avar[:, 1]
+    told = added(line, curve_of(values))
+    assert told[:9] == pytest.approx(more[:9], abs=0.03)
+    assert told.max() == pytest.approx(line.share)
 
 
 def test_too_short_for_a_block_is_no_answer():
