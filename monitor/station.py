@@ -249,7 +249,7 @@ class Station:
                 self._no_estimate = f"no estimate: {error}"
                 return
         if self.watch is None and self._ready.all.is_set():
-            self.watch = Watch(rate, self.device.leave_out_motion, self.device.alarms_per_day)
+            self.watch = Watch(self.estimator.rate_hz, self.device.leave_out_motion, self.device.alarms_per_day)
         for samples in blocks:
             for start in range(0, len(samples), PIECE):
                 piece = samples[start : start + PIECE]

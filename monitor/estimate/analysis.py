@@ -112,9 +112,8 @@ def events_of(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analysis:
     changes = tuple(sorted(detector.take(), key=lambda change: change.since))
     notes += findings.of_changes(changes, rate)
     found = lines(result.values, moving, rate, result.estimate.curve)
-    notes = findings.explained(
-        notes, result.estimate.curve, result.fit, found, moved=bool(motions) and not result.struck
-    )
+    moved = bool(motions) and not result.struck
+    notes = findings.explained(notes, result.estimate.curve, result.fit, found, moved)
     notes += findings.of_departures(found, outliers(result.values, moving))
     return replace(result, notes=tuple(notes), motions=motions, changes=changes)
 

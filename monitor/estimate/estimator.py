@@ -222,7 +222,7 @@ def warm_up() -> Iterator[str]:
     """Have the kernels compiled, or loaded from the disk cache; yields "window", "fit" and "all" as each is ready.
 
     "window" gives a curve, "fit" its coefficients; the rest are those of motion and change, of total and Hadamard
-    deviations, and of a fit at every sample. Some seconds each at the very first start on a machine, milliseconds later.
+    deviations, and of a fit at every sample. Many seconds at the very first start on a machine, milliseconds later.
     """
     estimator, samples = Estimator(100.0, 1.0), block(np.arange(100, dtype=np.int64), np.zeros((100, 6)))
     estimator.update(samples)
