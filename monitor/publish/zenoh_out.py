@@ -9,6 +9,7 @@ Commands arrive on a queryable whose queries a thread of this class takes from z
 is alive at exit would hang the process) and hands to the service by a queue; the service's loop answers them.
 """
 
+import atexit
 import contextlib
 import json
 import queue
@@ -73,6 +74,8 @@ class ZenohOut:
         """Open in a thread of its own: a router that is not there must not hold up the samples."""
         if self.settings.mode == "none":
             return
+        # a thread that still takes from zenoh while the interpreter ends would abort the process
+        atexit.register(self.close)
         self._opener.start()
 
     def put(self, topic: topics.Topic, device: str, payload: bytes) -> None:
@@ -97,6 +100,7 @@ class ZenohOut:
 
     def close(self) -> None:
         """Close the session, which takes away tokens, and end the threads."""
+        atexit.unregister(self.close)
         self._closing.set()
         if self._opener.is_alive():
             self._opener.join(RETRY_S)
