@@ -21,6 +21,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from drivers.sample import Floats, Ints
+from monitor.estimate.batch import PRESENT
 from monitor.estimate.bounds import BOUND, highest
 from monitor.estimate.coefficients import Status
 from monitor.estimate.fit import Design, Fit, Looks, fit_columns, replaced
@@ -105,17 +106,19 @@ def _moments(kind: Kind, order: int, cutoff: float) -> tuple[Floats, Floats]:
 
 
 def power(rates: Floats) -> Floats:
-    """Spectrum [POWER_BINS + 1] of one axis [n], in no unit: the mean of stretches spread over it; missing = its mean.
+    """Spectrum [POWER_BINS + 1] of one axis [n], in no unit: the mean of stretches spread over it that lack little.
 
-    Empty where the samples are too few.
+    Empty where there are too few.
     """
     rows = 2 * POWER_BINS
     begins = np.unique(np.linspace(0, len(rates) - rows, MOST_STRETCHES).astype(np.int64))
     if begins[0] < 0 or len(rates) < FEWEST_STRETCHES * rows:
         return np.empty(0)
     parts = np.stack([rates[begin : begin + rows] for begin in begins])
-    with np.errstate(invalid="ignore"):
-        parts = parts - np.nanmean(parts, axis=1, keepdims=True)
+    parts = parts[np.isfinite(parts).mean(axis=1) >= PRESENT]
+    if len(parts) < FEWEST_STRETCHES:
+        return np.empty(0)
+    parts = parts - np.nanmean(parts, axis=1, keepdims=True)
     turned = np.fft.rfft(np.nan_to_num(parts) * np.hanning(rows), axis=1)
     return np.asarray((turned.real**2 + turned.imag**2).mean(axis=0))
 
@@ -157,8 +160,8 @@ def _bound(design: Design, found: Fit, looks: Looks) -> None:
     """Q of the one axis, which no fit beside a filter can tell: no more than the whole of the first point."""
     c, first = found.coefficients, int(np.argmax(looks.avar[:, 0] > 0.0))
     most = highest(looks.avar[first, 0], found.edf[first, 0], BOUND) / design.columns[first, Q]
-    c.status[Q], c.value[Q], c.lo[Q] = Status.UPPER_BOUND, np.nan, 0.0
-    c.hi[Q] = most**0.5 / design.rate_hz
+    if np.isfinite(most):
+        c.status[Q], c.lo[Q], c.hi[Q] = Status.UPPER_BOUND, 0.0, most**0.5 / design.rate_hz
 
 
 def contradicted(found: Fit, axis: int) -> bool:

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from monitor.compiled import compiled
-from monitor.estimate.least_squares import Q
+from monitor.estimate.least_squares import N, Q
 
 TWO_SIDED_95: Final = 1.959963984540054
 BOUND: Final = TWO_SIDED_95
@@ -38,12 +38,17 @@ def interval_end(estimate, c0, c1, c2, skewness, z):  # type: ignore[no-untyped-
 
 
 @compiled
-def cap(curve, edf, rows, columns, entered, theta, lo, hi, status):  # type: ignore[no-untyped-def]
-    """Where the five terms are no description of the curve: none may be more than the whole of it at any τ."""
+def cap(  # type: ignore[no-untyped-def]
+    curve, edf, rows, columns, memory, entered, theta, lo, hi, status
+):
+    """Where the five terms are no description of the curve: none may be more than the whole of it at any τ.
+
+    N only beyond ``memory`` samples: within, the sensor's own filter may have taken white noise away.
+    """
     for a in range(5):
         most = np.inf
         for i in rows:
-            if columns[i, a] > 0.0:
+            if columns[i, a] > 0.0 and (a != N or columns[i, N] * memory < 1.0):
                 most = min(most, highest(curve[i], edf[i], SURELY) / columns[i, a])
         most = np.sqrt(most)
         if status[a] == 0 or hi[a] <= most:

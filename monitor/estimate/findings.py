@@ -39,6 +39,10 @@ IS_Q: Final = 0.2
 SHORTEST: Final = 3
 """Averaging times that tell Q."""
 BAND: Final = "the sensor's bandwidth or a vibration shows there"
+LOW: Final = (
+    "the shortest averaging times lie below white noise, as behind a filter; N is the level of the longer ones, and Q "
+    "no more than a bound"
+)
 MOVED: Final = "the sensor moved, which may be why; --rest strikes it out"
 UNKNOWN: Final = "vibration, motion or temperature may be why"
 ORDERS: Final = ("", "first", "second", "third", "fourth")
@@ -53,6 +57,8 @@ def of_fit(curve: AllanCurve, fit: Fit, filters: Sequence[LowPass | None], rate_
         low_pass = filters[i]
         if low_pass is not None:
             _add(axes, axis, _bandwidth(low_pass, rate_hz))
+        elif fit.theta[Q, i] < 0.0 and not fit.left_out[i]:
+            _add(axes, axis, LOW)
         if fit.k_or_r[i]:
             _add(axes, axis, _k_or_r(fit.coefficients.status[K, i] == Status.ESTIMATED))
     return [f"{', '.join(those)}: {text}" for text, those in axes.items()] + of_misfit(curve, fit)

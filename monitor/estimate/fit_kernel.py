@@ -132,7 +132,7 @@ def fit_axis(  # type: ignore[no-untyped-def]
         known.columns, slope, slopes, answer, gains,
     )  # fmt: skip
     if misfit > 1.0:
-        cap(curve, answer.edf[axis], rows[first:], known.columns, entered, theta, lo, hi, status)
+        cap(curve, answer.edf[axis], rows[first:], known.columns, FILTER_MEMORY, entered, theta, lo, hi, status)
     if free:
         i = rows[0]
         bound_by_first_point(curve[i], answer.edf[axis, i], known.columns[i, Q], entered, lo, hi, status)

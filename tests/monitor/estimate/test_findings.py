@@ -68,7 +68,7 @@ def departing(misfit=(1.0,) * 6, at=(2,) * 6, left_out=(0,) * 6, q=()):
     curve = SimpleNamespace(factors=factors, tau_s=factors / RATE_HZ, avar=avar)
     fit = SimpleNamespace(
         fitted=fitted, edf=np.full((8, 6), 1e3), misfit=np.array(misfit), left_out=np.array(left_out),
-        k_or_r=np.zeros(6, bool), coefficients=SimpleNamespace(status=status),
+        theta=np.ones((5, 6)), k_or_r=np.zeros(6, bool), coefficients=SimpleNamespace(status=status),
     )  # fmt: skip
     return curve, fit
 
@@ -181,3 +181,13 @@ def test_a_departure_ends_where_the_curve_comes_back():
     curve = SimpleNamespace(avar=measured)
     fit = SimpleNamespace(fitted=np.ones((6, 1)), edf=np.array([9e4, 100.0, 100.0, 100.0, 1.0, 10.0])[:, None])
     assert findings._departure(curve, fit, 0) == (1, 2)  # the first is only many σ off, the fifth by chance
+
+
+def test_a_filter_that_is_not_known_is_told_too():
+    # a moving average of two: no Butterworth
+    white = 1e-3 * np.random.default_rng(8).standard_normal((200_001, 6))
+    values = 0.85 * white[1:] + 0.15 * white[:-1]
+    found = analyze([block(np.arange(len(values)) * 10_000_000, values)], RATE_HZ)
+    assert (found.fit.theta[0] < 0.0).any()
+    assert np.isnan(found.bandwidth_hz[found.fit.theta[0] < 0.0]).all()
+    assert any("lie below white noise" in note for note in found.notes)
