@@ -12,7 +12,6 @@ from typing import Final
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 from PIL import Image  # rerun-sdk brings it
 
 from drivers.sample import AXES, Floats
@@ -51,12 +50,11 @@ def draw(stream: rr.RecordingStream, device: str, surface: Surface) -> None:
 
 
 def picture(relative: Floats) -> bytes:
-    """A PNG of ln of the deviation over its median [columns, m]: COLUMNS pixels wide, longest τ on top."""
+    """A PNG of ln of the deviation over its median [columns, m], stretched to COLUMNS pixels; longest τ on top."""
     share = np.clip(np.nan_to_num(relative) / np.log(ENDS), -1.0, 1.0)
     shade = np.where(np.isfinite(relative), np.rint(SHADES * (1.0 + share)), NOTHING).astype(np.uint8)
-    canvas: NDArray[np.uint8] = np.full((relative.shape[1], COLUMNS), NOTHING, np.uint8)
-    canvas[:, : len(relative)] = shade.T[::-1]
-    image = Image.fromarray(np.repeat(canvas, _rows(relative.shape[1]), axis=0), "P")
+    wide = shade[np.arange(COLUMNS) * len(relative) // COLUMNS]
+    image = Image.fromarray(np.repeat(wide.T[::-1], _rows(relative.shape[1]), axis=0), "P")
     image.putpalette([part for colour in PALETTE for part in colour])
     data = io.BytesIO()
     image.save(data, "PNG")
@@ -89,8 +87,7 @@ def _tau_labels(tau_s: Floats, height: int) -> list[tuple[float, float, str]]:
 
 def _time_labels(surface: Surface, height: int) -> list[tuple[float, float, str]]:
     """The time of the day in UTC at the oldest and the newest column."""
-    ends = surface.ends_s
-    at = [(12.0, ends[0])] + ([(len(ends) - 1.0, ends[-1])] if len(ends) > COLUMNS // 6 else [])
+    at = ((12.0, surface.ends_s[0]), (COLUMNS - 1.0, surface.ends_s[-1]))
     return [(x, height + 6.0, _clock_time(t)) for x, t in at]
 
 
