@@ -18,7 +18,6 @@ from functools import lru_cache
 from typing import Final, Literal
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from drivers.sample import Floats, Ints
 from monitor.estimate.batch import PRESENT
@@ -185,6 +184,8 @@ def sought(design: Design, table: Table, looks: Looks, power: Floats) -> LowPass
 
 def searching(design: Design, table: Table, looks: Looks, power: Floats) -> Generator[None, None, LowPass | None]:
     """``sought`` in pieces of a few milliseconds, for who must not be kept waiting."""
+    from scipy.optimize import minimize_scalar  # 25 MB that only such a sensor needs
+
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
     grids: list[list[float]] = []
     for kind, order in FAMILIES:
