@@ -1,16 +1,27 @@
 """One decorator for every kernel: compiled by Numba at first call, cached on disk, without the GIL.
 
 Where nothing can be kept on disk (a read-only system, a user without a home) it is compiled at every start.
+
+Before it takes cached code Numba asks only whether the kernel's own file has changed; but what the kernel calls from
+other files, and their constants, are compiled into it. So here the stamp of the cache covers all that a file imports.
 """
 
 import contextlib
+import inspect
+import re
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar, cast
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Final, ParamSpec, TypeVar, cast
 
 import numba
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+ROOT: Final = Path(__file__).parents[1]
+IMPORTS: Final = re.compile(r"^from (monitor[\w.]*) import", re.MULTILINE)
 
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
@@ -18,4 +29,20 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     kernel = numba.njit(nogil=True, error_model="numpy")(function)
     with contextlib.suppress(RuntimeError):  # no folder for it
         kernel.enable_caching()
+        kept = cast("Any", kernel)._cache._cache_file  # noqa: SLF001
+        kept._source_stamp = (kept._source_stamp, stamp(Path(inspect.getfile(function))))  # noqa: SLF001
     return cast("Callable[P, R]", kernel)
+
+
+@cache
+def stamp(path: Path, root: Path = ROOT) -> str:
+    """Of a file and all that it imports of this package under ``root``, one by the other."""
+    texts: dict[Path, bytes] = {}
+    left = [path]
+    while left:
+        one = left.pop()
+        if one not in texts and one.is_file():
+            texts[one] = one.read_bytes()
+            names = IMPORTS.findall(texts[one].decode())
+            left += [root / f"{name.replace('.', '/')}.py" for name in names]
+    return sha256(b"\0".join(texts[one] for one in sorted(texts))).hexdigest()

@@ -20,14 +20,19 @@ LEAST_SHRUNK: Final = 0.05
 
 
 @compiled
-def interval_end(estimate, c0, c1, c2, skewness, z):  # type: ignore[no-untyped-def]
-    """√t where the estimate lies k √v(t) above t; k is the Pearson-III quantile of probability Φ(z).
-
-    Wilson & Hilferty: k = (2/s)[(1 + s z/6 − s²/36)³ − 1], skewness s = 2 √c2 of the estimate alone, as of χ² with
-    2/c2 degrees of freedom. t solves (1 − k²c2) t² − (2û + k²c1) t + û² − k²c0 = 0; the end is clipped at zero.
-    """
+def quantile(z, skewness):  # type: ignore[no-untyped-def]
+    """Of probability Φ(z), Pearson III of variance one, as χ² with 8/skewness² degrees (Wilson & Hilferty 1931)."""
     s = skewness
-    k = z if s < 1e-6 else 2.0 / s * (max(1.0 + s * z / 6.0 - s * s / 36.0, 0.0) ** 3 - 1.0)
+    return z if s < 1e-6 else 2.0 / s * (max(1.0 + s * z / 6.0 - s * s / 36.0, 0.0) ** 3 - 1.0)
+
+
+@compiled
+def interval_end(estimate, c0, c1, c2, skewness, z):  # type: ignore[no-untyped-def]
+    """√t where the estimate lies k √v(t) above t, k the quantile of Φ(z) with the skewness 2 √c2 of the estimate alone.
+
+    t solves (1 − k²c2) t² − (2û + k²c1) t + û² − k²c0 = 0; the end is clipped at zero.
+    """
+    k = quantile(z, skewness)
     a = 1.0 - k * k * c2
     b = estimate + 0.5 * k * k * c1
     root = b * b - a * (estimate * estimate - k * k * c0)

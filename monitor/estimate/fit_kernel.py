@@ -96,7 +96,7 @@ def fit_axis(  # type: ignore[no-untyped-def]
         )
         scatter, limit = _misfit(level, rows[first:], theta, flat, variance)
     misfit = scatter if scatter > limit else 1.0
-    found, c0 = judge(
+    found, c0, enters = judge(
         level, rows[first:], stretch, known.covariance, weighted, normal, thresholds, straight, misfit,
         entered, theta, lo, hi, status,
     )  # fmt: skip
@@ -128,7 +128,7 @@ def fit_axis(  # type: ignore[no-untyped-def]
     answer.left_out[axis] = first
     answer.misfit[axis], answer.scatter[axis] = misfit, scatter
     freeze(
-        axis, rows[first:], weighted, normal, free, thresholds, c0, most,
+        axis, rows[first:], weighted, normal, free, thresholds, found, c0, enters, most,
         known.columns, slope, slopes, answer, gains,
     )  # fmt: skip
     if misfit > 1.0:

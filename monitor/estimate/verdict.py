@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
 from monitor.compiled import compiled
-from monitor.estimate.bounds import BOUND, TWO_SIDED_95, interval_end
+from monitor.estimate.bounds import BOUND, TWO_SIDED_95, interval_end, quantile
 from monitor.estimate.least_squares import K, Q, R, invert, normal_equations, present, solve, weigh
 from monitor.estimate.uncertainty import NOISES
 
@@ -108,10 +108,10 @@ def judge(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Which terms are in, and the interval of each: see the head of ``fit``.
 
-    Returns û, and its variance if its term were absent.
+    Returns û, its variance if its term were absent, and from where on a term that is out comes in.
     """
     terms = NOISES if straight else 5
-    gain, estimate = np.zeros((5, rows.size)), np.zeros(5)
+    gain, estimate, enters = np.zeros((5, rows.size)), np.zeros(5), np.full(NOISES, np.inf)
     for a in range(terms):
         if not _row_of(a, rows, weighted, normal, stretch, gain[a]):
             entered[a] = False
@@ -123,6 +123,8 @@ def judge(  # type: ignore[no-untyped-def]
         if c0 <= 0.0 and c2 <= 0.0:  # there was no solution
             continue
         skewness = 2.0 * np.sqrt(forms[a, 2])
+        if a != R:
+            enters[a] = max(thresholds[0], quantile(TWO_SIDED_95, skewness)) * np.sqrt(c0)
         threshold = thresholds[1] if entered[a] else thresholds[0]
         low = interval_end(estimate[a], c0, c1, c2, skewness, TWO_SIDED_95)
         high = interval_end(estimate[a], c0, c1, c2, skewness, -TWO_SIDED_95)
@@ -140,7 +142,7 @@ def judge(  # type: ignore[no-untyped-def]
             status[a] = 1
             lo[a] = 0.0
             hi[a] = interval_end(max(estimate[a], 0.0), c0, c1, c2, skewness, -BOUND)
-    return estimate, misfit * forms[:NOISES, 0]
+    return estimate, misfit * forms[:NOISES, 0], enters
 
 
 @compiled
@@ -250,7 +252,7 @@ def judge_ramp(slope, slope_variance, thresholds, entered, theta, lo, hi, status
 
 @compiled
 def freeze(  # type: ignore[no-untyped-def]
-    axis, rows, weighted, normal, free, thresholds, c0, most, columns, slope, slopes, answer, gains
+    axis, rows, weighted, normal, free, thresholds, found, c0, enters, most, columns, slope, slopes, answer, gains
 ):
     """Keep the solution as a linear map, with the limits of its use."""
     if rows[-1] - rows[0] != rows.size - 1:
@@ -274,7 +276,7 @@ def freeze(  # type: ignore[no-untyped-def]
         if entered[a]:
             low[NOISES + a] = thresholds[1] * np.sqrt(c0[a])
         else:
-            high[NOISES + a] = thresholds[0] * np.sqrt(c0[a])
+            high[NOISES + a] = max(enters[a], found[a] + SCATTER * np.sqrt(c0[a]))
     low[NUMBERS], high[NUMBERS] = 0.0, np.inf
     if entered[R]:
         low[NUMBERS] = thresholds[1] * np.sqrt(most)
