@@ -121,3 +121,21 @@ def test_samples_that_are_missing_keep_their_place():
     course, window, refit = follow(values)
     expected = fresh(window, refit.entered).coefficients.value[1]
     assert course[-1, 1] == pytest.approx(expected, rel=5e-3)
+
+
+def test_a_term_on_the_verge_costs_no_fit_at_every_sample():
+    # K is seen at 3 σ and more of none, and its interval still reaches to zero: it stays out
+    rng, length = np.random.default_rng(1), 10_000
+    sizes = np.unique(np.rint(np.geomspace(1, length // 4, 22)).astype(np.int64))
+    estimator = Estimator(1.0, float(length), tuple(sizes.astype(float).tolist()), every_sample=True)
+    walk = np.cumsum(1e-4 * np.sqrt(3.0) * 30.0 / length * rng.standard_normal((2 * length + 1000, 6)), axis=0)
+    values = walk + 1e-4 * rng.standard_normal(walk.shape)
+    estimator.update(block(np.arange(2 * length), values[: 2 * length]))
+    refit, anew = estimator._refit, np.zeros(6, int)
+    verge = 0
+    for i in range(2 * length, len(values)):
+        estimator.update(block(np.array([i]), values[i : i + 1]))
+        anew += refit._ages == 0
+        verge += int((refit._answer.status[:, 3] == 1).sum())
+    assert verge > 1000
+    assert anew.max() < 20
