@@ -4,6 +4,7 @@ import gzip
 import os
 import pickle
 import sys
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import ConfigError, ImuError, RecordingError
-from drivers.recording import FORMATS, Recording, is_recording, iter_blocks, load_samples, save_samples
+from drivers.recording import FORMATS, Recording, is_recording, iter_blocks, load_samples, save_samples, writing
 from drivers.recording.csv_format import READ_BYTES
 from drivers.sample import AXES, join
 
@@ -117,6 +118,63 @@ class TestRoundTrip:
         assert is_recording(path.with_name(path.name.upper()))
         assert not is_recording(path.with_name("notes.txt"))
         assert not is_recording(path.with_name(path.name + ".part"))
+
+
+def appended(path, t, values, temperature, cuts):
+    with writing(path, AXES, temperature=True) as append:
+        for rows in map(slice, (0, *cuts), (*cuts, len(t))):
+            append(t[rows], values[rows], temperature[rows])
+
+
+class TestPieceByPiece:
+    @pytest.mark.parametrize("cuts", [(1,), (100, 101, 4000), (65_536,), (70_000, 140_000)])
+    def test_any_cut_is_the_same_recording(self, path, cuts):
+        t, values, temperature = samples(150_000 if max(cuts) > 65_000 else 5000)
+        appended(path, t, values, temperature, cuts)
+        recording = load_samples(path)
+        assert recording.t_s.tobytes() == t.tobytes()
+        assert np.array_equal(recording.values, values)
+        assert np.array_equal(recording.temperature_c, temperature)
+        assert recording.notes == ()
+
+    def test_columns_that_were_not_asked_for_are_absent(self, path):
+        t, values, _ = samples()
+        with writing(path, ["gz"], temperature=False) as append:
+            append(t, values)
+        assert load_samples(path).axes == ("gz",)
+
+    @pytest.mark.parametrize("ended", [KeyboardInterrupt, OSError, SystemExit])
+    def test_a_run_that_is_broken_off_leaves_nothing(self, path, ended):
+        t, values, temperature = samples()
+        with pytest.raises(ended), writing(path, AXES, temperature=True) as append:
+            append(t, values, temperature)
+            raise ended
+        assert list(path.parent.iterdir()) == []
+
+    def test_a_run_that_is_broken_off_leaves_what_was_there(self, path):
+        save_samples(path, *samples())
+        before = path.read_bytes()
+        with pytest.raises(KeyboardInterrupt), writing(path, AXES, temperature=True) as append:
+            append(*samples(9))
+            raise KeyboardInterrupt
+        assert list(path.parent.iterdir()) == [path]
+        assert path.read_bytes() == before
+
+    def test_memory_does_not_grow_with_the_rows(self, path):
+        """What Python and NumPy hold; Arrow's own buffers are those of one piece."""
+        t, values, temperature = samples(20_000)
+
+        def peak(times):
+            tracemalloc.start()
+            with writing(path, AXES, temperature=True) as append:
+                for _ in range(times):
+                    append(t, values, temperature)
+            high = tracemalloc.get_traced_memory()[1]
+            tracemalloc.stop()
+            return high
+
+        few, many = peak(2), peak(12)
+        assert many < few + 1_000_000  # ten times 1.3 MB went through
 
 
 class TestSaveRefuses:
