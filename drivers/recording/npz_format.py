@@ -26,7 +26,7 @@ from drivers.sample import Floats
 LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # PKWARE APPNOTE 4.3.7
 LOCAL_MAGIC: Final = b"PK\3\4"
 ITEM: Final = np.dtype("<f8")
-COPY_BYTES: Final = 1 << 20
+COPY_BYTES: Final = 1 << 18
 
 
 def read_npz(path: Path) -> Table:

@@ -127,9 +127,9 @@ def appended(path, t, values, temperature, cuts):
 
 
 class TestPieceByPiece:
-    @pytest.mark.parametrize("cuts", [(1,), (100, 101, 4000), (65_536,), (70_000, 140_000)])
+    @pytest.mark.parametrize("cuts", [(1,), (100, 101, 1900), (65_537,)])
     def test_any_cut_is_the_same_recording(self, path, cuts):
-        t, values, temperature = samples(150_000 if max(cuts) > 65_000 else 5000)
+        t, values, temperature = samples(max(cuts) + 100)
         appended(path, t, values, temperature, cuts)
         recording = load_samples(path)
         assert recording.t_s.tobytes() == t.tobytes()
@@ -146,7 +146,7 @@ class TestPieceByPiece:
     @pytest.mark.parametrize("ended", [KeyboardInterrupt, OSError, SystemExit])
     def test_a_run_that_is_broken_off_leaves_nothing(self, path, ended):
         t, values, temperature = samples()
-        with pytest.raises(ended), writing(path, AXES, temperature=True) as append:
+        with pytest.raises(ended), writing(path, AXES, temperature=True) as append:  # noqa: PT012
             append(t, values, temperature)
             raise ended
         assert list(path.parent.iterdir()) == []
@@ -154,7 +154,7 @@ class TestPieceByPiece:
     def test_a_run_that_is_broken_off_leaves_what_was_there(self, path):
         save_samples(path, *samples())
         before = path.read_bytes()
-        with pytest.raises(KeyboardInterrupt), writing(path, AXES, temperature=True) as append:
+        with pytest.raises(KeyboardInterrupt), writing(path, AXES, temperature=True) as append:  # noqa: PT012
             append(*samples(9))
             raise KeyboardInterrupt
         assert list(path.parent.iterdir()) == [path]
@@ -162,7 +162,7 @@ class TestPieceByPiece:
 
     def test_memory_does_not_grow_with_the_rows(self, path):
         """What Python and NumPy hold; Arrow's own buffers are those of one piece."""
-        t, values, temperature = samples(20_000)
+        t, values, temperature = samples(5_000)
 
         def peak(times):
             tracemalloc.start()
@@ -173,8 +173,8 @@ class TestPieceByPiece:
             tracemalloc.stop()
             return high
 
-        few, many = peak(2), peak(12)
-        assert many < few + 1_000_000  # ten times 1.3 MB went through
+        few, many = peak(2), peak(14)
+        assert many < few + 1_000_000  # twelve times 320 kB more went through
 
 
 class TestSaveRefuses:
