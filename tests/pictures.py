@@ -34,9 +34,10 @@ import numpy as np
 
 from drivers.recording import save_samples
 from monitor import settings
+from monitor.catalogue import read_model
 from monitor.publish import rerun_sinks
 from monitor.service import Service
-from monitor.virtual import ROOM_C, WARM_UP_C, WARM_UP_S, read_model
+from monitor.virtual import ROOM_C, WARM_UP_C, WARM_UP_S
 
 SIZE = (1600, 1000)
 MODEL = settings.CONFIG_FOLDER / "models" / "consumer-mems.toml"

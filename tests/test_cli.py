@@ -21,9 +21,9 @@ import pytest
 
 from drivers.recording import save_samples
 from drivers.sample import AXES
+from monitor.catalogue import read_model
 from monitor.cli import main
 from monitor.settings import CONFIG_FOLDER, load
-from monitor.virtual import read_model
 
 PROGRAM = [sys.executable, "-m", "monitor.cli"]
 COMMANDS = ("demo", "run", "check", "watch", "analyze", "export")
