@@ -105,12 +105,12 @@ WRONG_FILES = {
     "no protocol": (DEVICE + 'driver = { link = "serial", port = "/dev/x" }\n', "driver.decoder: missing; known are"),
     "no port": (DEVICE + 'driver = { link = "serial", decoder = "stim300" }\n', "driver.port: missing"),
     "protocol that does not fit": (
-        DEVICE + 'driver = { link = "virtual", decoder = "ros2_imu" }\n',
-        "ros2_imu reads messages, link virtual brings bytes",
+        DEVICE + 'driver = { link = "serial", port = "x", decoder = "ros2_imu" }\n',
+        "ros2_imu reads messages, link serial brings bytes",
     ),
     "negative silence": (DEVICE + 'driver = { link = "virtual", silence = -1.0 }\n', "driver.silence: Expected"),
     "negative seed": (DEVICE + 'driver = { link = "virtual", seed = -1 }\n', "driver.seed: Expected"),
-    "unknown model": (DEVICE + 'driver = { link = "virtual", model = "x" }\n', "one of consumer-mems"),
+    "unknown model": (DEVICE + 'driver = { link = "virtual", model = "x" }\n', 'no model "x", neither a file nor one of those shipped'),
     "DBC without the signal": (
         CAN.format('{ file = "canmod_gps", signals = { gx = "ImuData.Nope" } }'),
         'signals.gx: message ImuData has no signal "Nope"; known are ',
