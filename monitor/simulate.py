@@ -43,6 +43,7 @@ class Request:
     rate_hz: float | None = None  # the model's own unless given
     temperature_from: Path | None = None  # a recording whose temperature is taken instead of the model's
     truth: bool = False
+    name: str = "the model"  # for messages
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,9 +102,13 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
         raise ConfigError(f"{request.seconds:g} s at {rate_hz:g} Hz hold no sample")
     axes = tuple(axis for axis in AXES if axis in request.model.effects)
     if not axes:
-        raise ConfigError(f"the model names no axis; axes are {' '.join(AXES)}")
+        raise ConfigError(f"{request.name}: names no axis; axes are {' '.join(AXES)}")
     tell("preparing", None)
-    stream = request.model.stream(rate_hz, request.seed, _temperature(request, rate_hz, n))
+    temperature_c = _temperature(request, rate_hz, n)
+    try:
+        stream = request.model.stream(rate_hz, request.seed, temperature_c)
+    except ConfigError as error:
+        raise ConfigError(f"{request.name}: {error}") from error
     first = stream.draw_all(min(n, ROWS))
     temperature = not bool(np.isnan(first.temperature_c).all())
     truth = request.out.with_name(request.out.name + ".truth.json") if request.truth else None
@@ -125,14 +130,15 @@ def _write(result: Result, stream: ModelStream, first: Drawn, tell: Tell) -> Non
             written += len(block.values)
             tell("simulating", written / result.samples)
             if written == result.samples:
-                return
+                break
             block = stream.draw_all(min(ROWS, result.samples - written))
+        tell("finishing the file", None)  # an archive is packed only now
 
 
 def _rate_hz(request: Request) -> float:
     rate_hz = request.rate_hz or request.model.sample_rate_hz
     if rate_hz is None:
-        raise ConfigError("the model has no sample_rate; give one with --rate HZ")
+        raise ConfigError(f"{request.name}: has no sample_rate; give one with --rate HZ")
     return rate_hz
 
 

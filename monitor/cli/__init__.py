@@ -187,7 +187,7 @@ def simulate(
     if rate is not None and not 0.0 < rate < float("inf"):
         raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
     noise = load(model, Path.cwd())
-    request = simulation.Request(noise, out, length_s, seed, rate, temperature_from, truth)
+    request = simulation.Request(noise, out, length_s, seed, rate, temperature_from, truth, model)
     serving.end_on_sigterm()
     with output.progress() as tell:
         result = simulation.make(request, tell)
