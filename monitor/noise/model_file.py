@@ -1,8 +1,8 @@
 """Model files: TOML to effects and back, and a table for people.
 
 A model file has ``sample_rate`` (Hz), optionally ``[temperature]``, and one table an axis, in it one table an effect,
-or an array of tables where an effect occurs twice; ``g*`` and ``a*`` stand for all axes of a kind. What is wrong in it is
-a ConfigError of one line that names the place and the nearest known word. Parameters that are absent stay absent.
+or an array of tables where an effect occurs twice; ``g*`` and ``a*`` stand for all axes of a kind. What is wrong in it
+is a ConfigError of one line that names the place and the nearest known word. Parameters that are absent stay absent.
 """
 
 import contextlib

@@ -25,8 +25,8 @@ Curve = Callable[[Floats], Floats]
 
 PER_DECADE: Final = 400
 """Points of the grid in frequency."""
-BELOW: Final = 1e-3
-"""The grid begins at this over the longest τ: what lies below adds less than a thousandth of a thousandth."""
+BELOW: Final = 1e-5
+"""The grid begins at this over the longest τ: of a random walk, 3·10⁻⁵ of σ² lies below."""
 SMOOTH: Final = 0.1
 """Of 1/τ: up to here the kernel is smooth on the grid."""
 
