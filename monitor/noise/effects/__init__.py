@@ -62,3 +62,33 @@ _ALL: Final[tuple[type[Effect], ...]] = (
     *ORDER,
 )
 EFFECTS: Final[dict[str, type[Effect]]] = {effect.name: effect for effect in _ALL}
+
+__all__ = [
+    "EFFECTS",
+    "ORDER",
+    "AngleRandomWalk",
+    "BandwidthLimit",
+    "Bias",
+    "BiasInstability",
+    "BiasStep",
+    "CrossAxis",
+    "ExponentiallyCorrelated",
+    "GSensitivity",
+    "Narrowband",
+    "NoiseStep",
+    "Outliers",
+    "PoissonSteps",
+    "QuantizationNoise",
+    "RandomTelegraph",
+    "RateRamp",
+    "RateRandomWalk",
+    "Resolution",
+    "SampleHold",
+    "SampleRateError",
+    "Saturation",
+    "ScaleFactor",
+    "Sinusoidal",
+    "TemperatureBias",
+    "TemperatureLag",
+    "TurnOnTransient",
+]
