@@ -117,7 +117,7 @@ def unknown(tau0_s: float) -> Spectrum:
 
 
 def allan_of_line(f_hz: float, mean_square: float, tau_s: Floats, tau0_s: float) -> Floats:
-    """Of A sin(2πft), A² = 2·mean square: A² sin⁴(πfτ)/(m² sin²(πfτ0)), the sampled form of IEEE Std 952 eq. C.38."""
+    """Sinusoidal noise of IEEE Std 952 annex C, as sampled: A² sin⁴(πfτ)/(m² sin²(πfτ0)), A² = 2·mean square."""
     m = tau_s / tau0_s
     ratio = np.sin(np.pi * f_hz * tau_s) ** 2 / (m * np.sin(np.pi * f_hz * tau0_s))
     return np.asarray(2.0 * mean_square * ratio**2)

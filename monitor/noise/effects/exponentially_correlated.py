@@ -13,7 +13,7 @@ from monitor.noise.effect import Block, Series, Source, parameter
 
 @dataclass(frozen=True, slots=True)
 class ExponentiallyCorrelated(Source):
-    """IEEE Std 952 eq. C.34–C.37, as sampled: autocovariance σ²φ^|n|, φ = exp(−τ0/T_c).
+    """Markov noise of IEEE Std 952 annex C, as sampled: autocovariance σ²φ^|n|, φ = exp(−τ0/T_c).
 
     σ²(τ) = σ²(1 − φ²)[n − 3φ − nφ² + 4φ^(n+1) − φ^(2n+1)] / [n²(1 − φ)²(1 − φ²)] with n = τ/τ0,
     S(f) = σ²τ0(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²).

@@ -17,7 +17,7 @@ RENEWED: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class Sinusoidal(Source):
-    """A sin(2πft + φ), of IEEE Std 952 eq. C.38, as sampled: σ²(τ) = A² sin⁴(πfτ)/(m² sin²(πfτ0)), m = τ/τ0.
+    """A sin(2πft + φ), IEEE Std 952 annex C, as sampled: σ²(τ) = A² sin⁴(πfτ)/(m² sin²(πfτ0)), m = τ/τ0.
 
     The textbook A² sin⁴(πfτ)/(πfτ)² is its limit for τ0 → 0. Its spectrum is a line of A²/4 at ±f and has no density.
     A phase that is absent is drawn from the seed.
