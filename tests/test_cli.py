@@ -194,6 +194,15 @@ def test_check_reads_the_model_of_a_simulated_device_too(call: Call) -> None:
         assert "model.toml" in said.only_line()
 
 
+def test_check_reads_the_effects_of_a_simulated_device_too(call: Call) -> None:
+    driver = '{ link = "virtual", effect = ["gz.sinusoidal:amplitude=1,frequency=60"] }'
+    Path("c.toml").write_text(f"{DEVICE}driver = {driver}\n{QUIET}")
+    for command in ("check", "run"):
+        said = call(command, "c.toml")
+        assert said.status == 2
+        assert 'effect "gz.sinusoidal:amplitude=1,frequency=60": ' in said.only_line()
+
+
 @pytest.mark.parametrize("name", sorted(path.name for path in CONFIG_FOLDER.glob("*.toml")))
 def test_check_accepts_every_shipped_file(call: Call, recording: Path, name: str) -> None:
     shutil.copy(CONFIG_FOLDER / name, name)
