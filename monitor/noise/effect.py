@@ -43,7 +43,14 @@ class Series(ABC):
 
     @abstractmethod
     def add(self, values: Floats, block: Block) -> None:
-        """Add the next ``values.size`` samples, in the unit of the axis."""
+        """Add the next ``values.size`` samples (at least one), in the unit of the axis."""
+
+    def draw(self, n: int, first: int = 0) -> Floats:
+        """The next ``n`` samples by themselves, the first of them the stream's sample ``first``; no temperature."""
+        values = np.zeros(n)
+        if n:
+            self.add(values, Block(first, np.full(n, np.nan), np.empty(n)))
+        return values
 
     def truth(self) -> dict[str, Any]:
         """What was drawn from the seed so far and the parameters do not say; nothing for plain noise."""

@@ -138,6 +138,16 @@ def test_any_cut_into_blocks_gives_the_same_series(name, cuts):
     np.testing.assert_array_equal(np.concatenate([piece.temperature_c for piece in pieces]), whole.temperature_c)
 
 
+@pytest.mark.parametrize(
+    "name", [n for n in NAMES if issubclass(EFFECTS[n], Source) and not EFFECTS[n].uses_temperature]
+)
+def test_a_source_by_itself_gives_what_the_stream_adds(name):
+    started = effect(name).start(RATE_HZ, np.random.default_rng(5))
+    pieces = [started.draw(size, first) for size, first in ((1, 0), (0, 1), (900, 1), (99, 901))]
+    whole = effect(name).start(RATE_HZ, np.random.default_rng(5)).draw(1000)
+    np.testing.assert_array_equal(np.concatenate(pieces), whole)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_same_seed_same_series_other_seed_another(name):
     np.testing.assert_array_equal(series(name, 1, 200), series(name, 1, 200))

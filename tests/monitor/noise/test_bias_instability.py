@@ -7,15 +7,8 @@ import allantools
 import numpy as np
 import pytest
 
-from monitor.noise.effect import Block, Series
 from monitor.noise.effects import bias_instability
 from monitor.noise.effects.bias_instability import BiasInstability
-
-
-def drawn(series: Series, n: int) -> np.ndarray:
-    values = np.zeros(n)
-    series.add(values, Block(0, np.full(n, np.nan), np.empty(n)))
-    return values
 
 
 def response(frequency: np.ndarray) -> np.ndarray:
@@ -35,7 +28,7 @@ def test_first_sample_is_as_noisy_as_later_ones():
     def deviation_after(skip: int) -> float:
         rng = np.random.default_rng(2)
         series = [bias_instability._Flicker(1.0, rng) for _ in range(3000)]
-        return float(np.std([drawn(one, skip + 1)[-1] for one in series]))
+        return float(np.std([one.draw(skip + 1)[-1] for one in series]))
 
     # two standard deviations of 3000 values each: 1.8 % of their ratio
     assert deviation_after(0) == pytest.approx(deviation_after(2000), rel=0.08)
