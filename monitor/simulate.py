@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from drivers.errors import ConfigError
-from drivers.recording import load_samples, writing
+from drivers.recording import Recording, load_samples, writing
 from drivers.recording.saving import whole
 from drivers.sample import AXES, Floats
 from monitor.noise.model import NoiseModel
@@ -146,15 +146,25 @@ def _temperature(request: Request, rate_hz: float, n: int) -> Floats | None:
     """[≤ n] °C of the recording at the samples' times, straight lines between its own; None: the model's."""
     if request.temperature_from is None:
         return None
-    found = load_samples(request.temperature_from, rate_hz)
+    found = _recorded(request.temperature_from, request.rate_hz)
     known = np.isfinite(found.temperature_c)
     if not known.any():
         raise ConfigError(f"{request.temperature_from}: has no temperature; the column is temperature, in °C")
-    t_s = np.arange(len(found)) / rate_hz if found.t_s is None else found.t_s - found.t_s[0]
+    t_s = np.arange(len(found)) / (found.rate_hz or rate_hz) if found.t_s is None else found.t_s - found.t_s[0]
     t_s, temperature_c = t_s[known], found.temperature_c[known]
     order = np.argsort(t_s, kind="stable")
     length = min(n, int(t_s.max() * rate_hz) + 1)
     return np.interp(np.arange(length) / rate_hz, t_s[order], temperature_c[order])
+
+
+def _recorded(path: Path, rate_hz: float | None) -> Recording:
+    """At its own rate; where it states none, its rows are as far apart as the samples that ``--rate`` asks for."""
+    try:
+        return load_samples(path)
+    except ConfigError:
+        if rate_hz is None:
+            raise
+        return load_samples(path, rate_hz)
 
 
 def _truth(result: Result, model: NoiseModel, stream: ModelStream) -> bytes:

@@ -289,6 +289,7 @@ WRONG_ARGUMENTS = {
     "nothing to write": (("simulate", "consumer-mems", "--seconds", "1"), "Missing option '--out'"),
     "unknown form": (simulating("consumer-mems", "--out", "x.mat"), "x.mat: not the suffix of a recording"),
     "nowhere to write it": (simulating("consumer-mems", "--out", "nowhere/x.csv"), "there is no folder nowhere"),
+    "nowhere to say it": (simulating("consumer-mems", "--json", "nowhere/x.json"), "--json: nowhere/x.json: cannot be"),
     "folder to write": (simulating("consumer-mems", "--out", ".csv/../.csv"), "cannot be written"),
     "no temperature": (
         simulating("consumer-mems", "--temperature-from", "nowhere.csv"),

@@ -186,6 +186,7 @@ def simulate(
     length_s = options.duration("--seconds", seconds)
     if rate is not None and not 0.0 < rate < float("inf"):
         raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
+    output.check_place("--json", json)
     noise = load(model, Path.cwd())
     request = simulation.Request(noise, out, length_s, seed, rate, temperature_from, truth, model)
     serving.end_on_sigterm()

@@ -15,6 +15,12 @@ Tell = Callable[[str, float | None], None]
 """Told what is being done, and the share that is done where that is known."""
 
 
+def check_place(option: str, path: Path | None) -> None:
+    """ConfigError before the work where ``write`` could not but fail after it."""
+    if path is not None and path != Path("-") and not path.parent.is_dir():
+        raise ConfigError(f"{option}: {path}: cannot be written: there is no folder {path.parent}")
+
+
 def write(option: str, path: Path, data: bytes) -> None:
     """To a file, or to standard output for ``-``."""
     if path == Path("-"):

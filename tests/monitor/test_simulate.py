@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -97,6 +98,21 @@ def test_the_temperature_of_a_recording_is_taken(tmp_path: Path) -> None:
     since_s = np.arange(1500) / 50.0
     assert recording.temperature_c == pytest.approx(20.0 + np.minimum(since_s, 19.5))  # then held
     assert recording.values[:, 3] == pytest.approx(1e-2 * (recording.temperature_c - 25.0))
+
+
+def test_the_recording_keeps_its_own_rate(tmp_path: Path) -> None:
+    np.savez(tmp_path / "oven.npz", fs=1.0, gx=np.zeros(11), temperature=np.arange(11.0))
+    make(Request(WARM, tmp_path / "x.npz", 8.0, seed=1, rate_hz=20.0, temperature_from=tmp_path / "oven.npz"))
+    assert load_samples(tmp_path / "x.npz").temperature_c == pytest.approx(np.arange(160) / 20.0)
+
+
+def test_a_recording_without_times_has_the_rate_asked_for(tmp_path: Path) -> None:
+    (tmp_path / "oven.csv").write_text("gx,temperature\n" + "".join(f"0,{i}\n" for i in range(200)))
+    wanted = Request(WARM, tmp_path / "x.npz", 8.0, seed=1, temperature_from=tmp_path / "oven.csv")
+    with pytest.raises(ConfigError, match="give it with --rate HZ"):
+        make(wanted)
+    make(replace(wanted, rate_hz=20.0))
+    assert load_samples(tmp_path / "x.npz").temperature_c == pytest.approx(np.arange(160.0))
 
 
 def test_a_recording_without_temperature_is_said(tmp_path: Path) -> None:
