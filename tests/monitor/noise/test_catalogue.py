@@ -12,10 +12,12 @@ from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
 
 SENSORS = sorted(
-    path
-    for root in config.__path__
-    for path in Path(root).glob("models/*.toml")
-    if path.stem != "consumer-mems"  # a class of sensors, not one
+    {  # once each: a namespace package may name one folder several times
+        path.resolve()
+        for root in config.__path__
+        for path in Path(root).glob("models/*.toml")
+        if path.stem != "consumer-mems"  # a class of sensors, not one
+    }
 )
 DEGREE, HOUR_S, G = np.pi / 180.0, 3600.0, 9.80665
 ONE_SIDED = 1.0 / np.sqrt(2.0)  # of a density's root, to two-sided
@@ -23,6 +25,7 @@ FLOOR = 1.0 / np.sqrt(2.0 * np.log(2.0) / np.pi)  # B of the lowest point of the
 SHEET_UNITS = {
     "°/s/√Hz": DEGREE * ONE_SIDED,
     "mdps/√Hz": 1e-3 * DEGREE * ONE_SIDED,
+    "°/h/√Hz": DEGREE / HOUR_S * ONE_SIDED,
     "µg/√Hz": 1e-6 * G * ONE_SIDED,
     "mg/√Hz": 1e-3 * G * ONE_SIDED,
     "°/√h": DEGREE / HOUR_S**0.5,
@@ -73,7 +76,8 @@ def test_every_value_is_the_sheets_own(path):
 def test_names_its_document(path):
     head = " ".join(line.lstrip("# ") for line in path.read_text("utf-8").splitlines() if line.startswith("#"))
     assert re.search(r"[Dd]ata ?[Ss]heet|Product Specification|user manual", head)
-    assert ("one-sided" in head) == ("√Hz" in path.read_text("utf-8"))
+    assert re.search(r"revision (\w|\.)+", head), "which revision, or that it is not known"
+    assert "noise density (per √Hz) is one-sided, so N is that over √2" in head
     assert ("floor of the Allan curve" in head) == ("bias_instability" in path.read_text("utf-8"))
 
 
