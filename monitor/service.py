@@ -114,14 +114,14 @@ class Service:
         """Beside the loop, so that a first start's compilation holds up neither samples nor status."""
         try:
             for kernel in warm_up():
-                (self._ready.window if kernel == "window" else self._ready.fit).set()
+                getattr(self._ready, kernel).set()
                 self._wake.set()
         except OSError as error:
             _log.warning("compiled kernels cannot be kept, the next start will be slow again", error=str(error))
         finally:
             # what has failed is compiled by the loop, or ends it; without this it would wait for ever
-            self._ready.window.set()
-            self._ready.fit.set()
+            for kernels in (self._ready.window, self._ready.fit, self._ready.all):
+                kernels.set()
             self._wake.set()
 
     def _station(self, device: Device) -> Station:
@@ -177,7 +177,7 @@ class Service:
 
     def _drain(self) -> None:
         """End the readers, and publish what they still brought."""
-        self._ready.fit.wait()
+        self._ready.all.wait()
         for station in self.stations:
             station.stop()
         for imu in self.virtual.values():

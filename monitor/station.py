@@ -17,6 +17,7 @@ from drivers.decoders.base import Decoder
 from drivers.driver import Driver
 from drivers.errors import ConfigError, NotReady
 from drivers.links.base import Link
+from drivers.links.replay_link import ReplayLink
 from drivers.sample import Event, SampleBlock, unbroken
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.estimator import Estimator
@@ -44,10 +45,11 @@ OFF_NOMINAL: Final = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Ready:
-    """Which kernels are compiled."""
+    """Which kernels are compiled, see ``estimator.warm_up``."""
 
     window: threading.Event = field(default_factory=threading.Event)
     fit: threading.Event = field(default_factory=threading.Event)
+    all: threading.Event = field(default_factory=threading.Event)
 
 
 class Output(Protocol):
@@ -93,6 +95,8 @@ class Station:
         self.published = 0  # samples handed to the outputs
         self._wake = wake
         self._ready = ready
+        # a recording is over before its changes could be looked for
+        self._waits_for_all = device.refit_s == 0.0 or device.leave_out_motion or isinstance(link, ReplayLink)
         self._patient = link.epoch == "unix"
         self._wall = WallClock(time.monotonic_ns(), time.time_ns())
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
@@ -126,7 +130,7 @@ class Station:
     @property
     def ended(self) -> bool:
         """A replay that has given all it had, and all of it is worked off."""
-        if self.driver.state != "ended" or self._thread.is_alive() or not self._ready.fit.is_set():
+        if self.driver.state != "ended" or self._thread.is_alive() or not self._ready.all.is_set():
             return False
         return not self._waiting_since_ns or self.clock.rate_hz is None
 
@@ -226,7 +230,7 @@ class Station:
 
     def _compiled(self) -> bool:
         """Whether samples can be taken at once: to compile what they need in this loop would hold up all devices."""
-        return (self._ready.window if self.device.refit_s else self._ready.fit).is_set()
+        return (self._ready.all if self._waits_for_all else self._ready.window).is_set()
 
     def _take(self) -> list[SampleBlock]:
         came_ns, self._waiting_since_ns = self._waiting_since_ns, 0
@@ -241,10 +245,11 @@ class Station:
             try:
                 every_sample = self.device.refit_s == 0.0
                 self.estimator = Estimator(rate, self.device.window_s, self.device.tau, every_sample)
-                self.watch = Watch(rate, self.device.leave_out_motion, self.device.alarms_per_day)
             except ConfigError as error:  # a list of τ that does not fit the rate found; samples go on
                 self._no_estimate = f"no estimate: {error}"
                 return
+        if self.watch is None and self._ready.all.is_set():
+            self.watch = Watch(self.estimator.rate_hz, self.device.leave_out_motion, self.device.alarms_per_day)
         for samples in blocks:
             for start in range(0, len(samples), PIECE):
                 piece = samples[start : start + PIECE]
@@ -252,12 +257,12 @@ class Station:
 
     def _estimate(self, blocks: list[SampleBlock]) -> None:
         """Advance the estimate, and let axes begin anew whose noise was found changed."""
-        if self.estimator is None or self.watch is None:
+        if self.estimator is None:
             return
         for samples in blocks:
             self.estimator.update(samples)
             self._advanced = True
-        for restart in self.watch.take_restarts():
+        for restart in self.watch.take_restarts() if self.watch is not None else ():
             if self.device.restart:
                 self.estimator.restart(restart.axis, restart.samples)
 
@@ -294,7 +299,7 @@ class Station:
 
     def _publish_total(self, outputs: Sequence[Output], now_s: float) -> None:
         """One step of the slow statistics, as often as they may take their share of the time."""
-        if self.estimator is None or not self._ready.fit.is_set() or now_s < self._next_s["total"]:
+        if self.estimator is None or not self._ready.all.is_set() or now_s < self._next_s["total"]:
             return
         begun_s = time.perf_counter()
         found = self.estimator.step()

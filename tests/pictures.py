@@ -160,12 +160,12 @@ def web(out: Path, folder: Path) -> Path:
 
 def allan(out: Path, folder: Path) -> Path:
     """The plot that ``analyze --plot`` writes."""
-    return analyzed(recording(folder, HOUR_S), out / "allan-plot.png")
+    return small(analyzed(recording(folder, HOUR_S), out / "allan-plot.png"))
 
 
 def dynamic(out: Path, folder: Path) -> Path:
     """The same with the curves over time."""
-    return analyzed(recording(folder, HOUR_S, changed=True), out / "dynamic-plot.png", "--window", WINDOW)
+    return small(analyzed(recording(folder, HOUR_S, changed=True), out / "dynamic-plot.png", "--window", WINDOW))
 
 
 def report(out: Path, folder: Path) -> Path:
@@ -179,6 +179,16 @@ def report(out: Path, folder: Path) -> Path:
         whole = {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1}
         shot = tab.call("Page.captureScreenshot", format="png", clip=whole, captureBeyondViewport=True)
     path.write_bytes(base64.b64decode(shot["data"]))
+    return small(path)
+
+
+def small(path: Path) -> Path:
+    """The same picture in so many colours as a byte can tell, for the documentation: a third of its size."""
+    from PIL import Image
+
+    with Image.open(path) as picture:
+        few = picture.convert("RGB").quantize(256, kmeans=1, dither=Image.Dither.NONE)
+    few.save(path, optimize=True)
     return path
 
 

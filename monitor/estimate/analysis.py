@@ -17,7 +17,7 @@ import numpy as np
 from drivers.errors import NotReady
 from drivers.sample import Floats, Ints, SampleBlock
 from monitor.estimate import findings
-from monitor.estimate.bandwidth import LowPass, contradicted, sought, with_bandwidth
+from monitor.estimate.bandwidth import LowPass, contradicted, power, sought, with_bandwidth
 from monitor.estimate.batch import EachAxis, TauGrid, cluster_sizes, overlapping, slope, slopes
 from monitor.estimate.change import Change, ChangeDetector
 from monitor.estimate.curve import AllanCurve
@@ -111,9 +111,10 @@ def events_of(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analysis:
         detector.update(np.where(struck[:, None], np.nan, rows) if struck.any() else rows)
     changes = tuple(sorted(detector.take(), key=lambda change: change.since))
     notes += findings.of_changes(changes, rate)
-    notes += findings.of_departures(
-        lines(result.values, moving, rate, result.estimate.curve), outliers(result.values, moving)
-    )
+    found = lines(result.values, moving, rate, result.estimate.curve)
+    moved = bool(motions) and not result.struck
+    notes = findings.explained(notes, result.estimate.curve, result.fit, found, moved)
+    notes += findings.of_departures(found, outliers(result.values, moving))
     return replace(result, notes=tuple(notes), motions=motions, changes=changes)
 
 
@@ -133,10 +134,10 @@ def _fitted(
     n = len(values)
     avar, terms = overlapping(values, factors, each)
     columns, covariances = design(factors, rate_hz), table(n, factors)
-    looks = Looks(avar, terms, slope(values) * rate_hz, slopes(values, factors, each) * rate_hz)
+    looks = Looks(avar, terms, slope(values) * rate_hz, slopes(values, factors) * rate_hz)
     found = fit(columns, covariances, avar, terms, slope=looks.slope, slopes=looks.slopes)
     filters = [
-        sought(columns, covariances, looks.axis(axis)) if contradicted(found, axis) else None
+        sought(columns, covariances, looks.axis(axis), power(values[:, axis])) if contradicted(found, axis) else None
         for axis in range(values.shape[1])
     ]
     found, filters = with_bandwidth(columns, covariances, looks, found, filters)

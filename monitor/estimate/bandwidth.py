@@ -7,11 +7,12 @@ order are those with the least misfit. The cutoff is not known better than the d
 out of the fit, so that no interval is too narrow by it. If no such filter explains the curve, the answer of ``fit``
 stands: the shortest τ left out.
 
-Every filter has a flat bottom, so N is the level of the white noise inside the band. Q cannot be told from what the
-filter is not quite, and is only bounded.
+Every filter has a flat bottom, so N is the level of the white noise inside the band. Q is left out and only bounded:
+beside it almost any filter explains almost any curve. A filter must also be seen in the spectrum: where that does not
+fall beyond the cutoff, something else bent the curve.
 """
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final, Literal
@@ -20,7 +21,8 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from drivers.sample import Floats, Ints
-from monitor.estimate.coefficients import Coefficients, Status
+from monitor.estimate.bounds import BOUND, highest
+from monitor.estimate.coefficients import Status
 from monitor.estimate.fit import Design, Fit, Looks, fit_columns, replaced
 from monitor.estimate.least_squares import N, Q
 from monitor.estimate.uncertainty import Table
@@ -35,9 +37,19 @@ BINS: Final = 1 << 13
 """Of the spectrum from zero to half the sample rate: a filter forgets within so many samples."""
 REFINED: Final = 3
 """Families, of those nearest on the grid, whose cutoff is sought to the end."""
+PIECE: Final = 8
+"""Cutoffs tried in one piece of a search."""
 ALIASES: Final = 8
 AGREES: Final = 2.0
 """Variance about the fit over that of noise, up to which a filter explains a curve."""
+POWER_BINS: Final = 1024
+MOST_STRETCHES: Final = 64
+FEWEST_STRETCHES: Final = 4
+BEYOND: Final = 1.2
+"""Cutoffs, from which on a spectrum is asked whether it falls."""
+FALLS: Final = 2.0
+RESIDUE: Final = 0.05
+"""A spectrum may lie so many times above the filter's, and by this share of its own bottom."""
 STEP: Final = 1.01
 """Of a cutoff, for the derivative by it."""
 WIDE: Final = 3.0
@@ -69,8 +81,9 @@ class LowPass:
         return np.asarray(m * level[k] - first[k])
 
 
-def _spectrum(kind: Kind, order: int, cutoff: float) -> Floats:
-    f = np.arange(BINS + 1) / (2.0 * BINS)
+def _spectrum(kind: Kind, order: int, cutoff: float, bins: int = BINS) -> Floats:
+    """Squared response [bins + 1] from zero to half the sample rate."""
+    f = np.arange(bins + 1) / (2.0 * bins)
     if kind == "digital":
         with np.errstate(over="ignore"):
             return np.asarray(1.0 / (1.0 + (np.tan(np.pi * f) / np.tan(np.pi * cutoff)) ** (2 * order)))
@@ -91,6 +104,34 @@ def _moments(kind: Kind, order: int, cutoff: float) -> tuple[Floats, Floats]:
     return level / level[-1], first / level[-1]
 
 
+def power(rates: Floats) -> Floats:
+    """Spectrum [POWER_BINS + 1] of one axis [n], in no unit: the mean of stretches spread over it; missing = its mean.
+
+    Empty where the samples are too few.
+    """
+    rows = 2 * POWER_BINS
+    begins = np.unique(np.linspace(0, len(rates) - rows, MOST_STRETCHES).astype(np.int64))
+    if begins[0] < 0 or len(rates) < FEWEST_STRETCHES * rows:
+        return np.empty(0)
+    parts = np.stack([rates[begin : begin + rows] for begin in begins])
+    with np.errstate(invalid="ignore"):
+        parts = parts - np.nanmean(parts, axis=1, keepdims=True)
+    turned = np.fft.rfft(np.nan_to_num(parts) * np.hanning(rows), axis=1)
+    return np.asarray((turned.real**2 + turned.imag**2).mean(axis=0))
+
+
+def seen(low_pass: LowPass, power: Floats) -> bool:
+    """Whether a spectrum falls beyond the cutoff as it would behind the filter; medians, so that no line matters."""
+    f = np.arange(power.size) / (2.0 * max(power.size - 1, 1))
+    below = (f >= low_pass.cutoff / 4.0) & (f <= low_pass.cutoff / 2.0) & (f >= 3.0 / (2.0 * POWER_BINS))
+    beyond = f >= min(BEYOND * low_pass.cutoff, 0.49)
+    if not below.any():
+        return False
+    filtered = _spectrum(low_pass.kind, low_pass.order, low_pass.cutoff, POWER_BINS)
+    expected = np.median(filtered[beyond]) / np.median(filtered[below])
+    return bool(np.median(power[beyond]) <= (FALLS * expected + RESIDUE) * np.median(power[below]))
+
+
 def with_bandwidth(
     design: Design, table: Table, looks: Looks, found: Fit, filters: Sequence[LowPass | None]
 ) -> tuple[Fit, list[LowPass | None]]:
@@ -106,17 +147,18 @@ def with_bandwidth(
         if low_pass is not None and contradicted(found, axis):
             better = _fitted(design, table, looks.axis(axis), low_pass)
             if better.scatter[0] < AGREES:
+                _bound(design, better, looks.axis(axis))
                 found = replaced(found, axis, better)
-                _bound(found.coefficients, axis)
                 used[axis] = low_pass
     return found, used
 
 
-def _bound(coefficients: Coefficients, axis: int) -> None:
-    """Q makes up for what the filter is not quite: no more than a bound."""
-    if coefficients.status[Q, axis] == Status.ESTIMATED:
-        coefficients.value[Q, axis], coefficients.lo[Q, axis] = np.nan, 0.0
-        coefficients.status[Q, axis] = Status.UPPER_BOUND
+def _bound(design: Design, found: Fit, looks: Looks) -> None:
+    """Q of the one axis, which no fit beside a filter can tell: no more than the whole of the first point."""
+    c, first = found.coefficients, int(np.argmax(looks.avar[:, 0] > 0.0))
+    most = highest(looks.avar[first, 0], found.edf[first, 0], BOUND) / design.columns[first, Q]
+    c.status[Q], c.value[Q], c.lo[Q] = Status.UPPER_BOUND, np.nan, 0.0
+    c.hi[Q] = most**0.5 / design.rate_hz
 
 
 def contradicted(found: Fit, axis: int) -> bool:
@@ -124,14 +166,31 @@ def contradicted(found: Fit, axis: int) -> bool:
     return bool(found.left_out[axis] > 0 or found.theta[0, axis] < 0.0 or found.misfit[axis] > 1.0)
 
 
-def sought(design: Design, table: Table, looks: Looks) -> LowPass | None:
-    """The low-pass with the least misfit for the one axis of ``looks``; None where none explains its curve."""
+def sought(design: Design, table: Table, looks: Looks, power: Floats) -> LowPass | None:
+    """The low-pass with the least misfit for the one axis of ``looks``; None where none explains its curve.
+
+    ``power``: its spectrum, of ``power``.
+    """
+    search = searching(design, table, looks, power)
+    while True:
+        try:
+            next(search)
+        except StopIteration as end:
+            found: LowPass | None = end.value
+            return found
+
+
+def searching(design: Design, table: Table, looks: Looks, power: Floats) -> Generator[None, None, LowPass | None]:
+    """``sought`` in pieces of a few milliseconds, for who must not be kept waiting."""
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
-
-    def misfit(low_pass: LowPass) -> float:
-        return float(fit_columns(_with(design, _column(low_pass, factors)), table, looks).scatter[0])
-
-    grids = [[misfit(LowPass(kind, order, float(cutoff))) for cutoff in CUTOFFS] for kind, order in FAMILIES]
+    grids: list[list[float]] = []
+    for kind, order in FAMILIES:
+        grids.append([])
+        for number, cutoff in enumerate(CUTOFFS):
+            column = _column(LowPass(kind, order, float(cutoff)), factors)
+            grids[-1].append(float(fit_columns(_with(design, column), table, looks).scatter[0]))
+            if number % PIECE == PIECE - 1:
+                yield
     found = []
     for family in np.argsort([min(grid) for grid in grids])[:REFINED]:
         kind, order = FAMILIES[family]
@@ -144,13 +203,14 @@ def sought(design: Design, table: Table, looks: Looks) -> LowPass | None:
 
         best = minimize_scalar(of, bounds=(float(ends[0]), float(ends[1])), method="bounded", options={"xatol": 1e-4})
         found.append((float(best.fun), LowPass(kind, order, float(np.exp(best.x)))))
+        yield
     least, low_pass = min(found, key=lambda one: one[0])
-    return low_pass if least < AGREES else None
+    return low_pass if least < AGREES and seen(low_pass, power) else None
 
 
 def _with(design: Design, column: Floats) -> Design:
     columns = design.columns.copy()
-    columns[:, N] = column
+    columns[:, N], columns[:, Q] = column, 0.0
     return replace(design, columns=columns)
 
 

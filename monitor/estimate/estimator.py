@@ -10,7 +10,7 @@ N within half a minute.
 """
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from typing import Final
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import NotReady
 from drivers.sample import Floats, Ints, SampleBlock, block
-from monitor.estimate.bandwidth import LowPass, contradicted, sought, with_bandwidth
+from monitor.estimate.bandwidth import LowPass, contradicted, power, searching, with_bandwidth
 from monitor.estimate.batch import TauGrid, cluster_sizes
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Course, Estimate
@@ -34,6 +34,8 @@ from monitor.estimate.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_s
 
 FEWEST: Final = 8
 """Samples before the first answer: three τ with a few terms each."""
+POWER_ROWS: Final = 65_536
+"""The newest samples, whose spectrum is asked whether it shows a filter."""
 COURSE_SAMPLES: Final = 65_536
 """Of the course of coefficients, the newest kept until someone looks."""
 
@@ -73,7 +75,8 @@ class Estimator:
         self._theta = np.full((5, 6), np.nan)  # of the newest fit
         self._odd: list[tuple[Table, Looks] | None] = [None] * 6  # curves that contradict their fit
         self._filters: list[LowPass | None] = [None] * 6
-        self._turn = 0
+        self._turn = 0  # the axis whose filter is sought
+        self._search: Generator[None, None, LowPass | None] | None = None
         self._samples = 0
         self._newest_ns = 0
 
@@ -194,13 +197,21 @@ class Estimator:
         return result
 
     def _seek_bandwidth(self) -> None:
-        """Look for the low-pass of the next axis in turn whose shortest τ contradict the fit."""
+        """A piece of the search for the low-pass of one axis; then of the next whose shortest τ contradict the fit."""
+        if self._search is not None:
+            try:
+                next(self._search)
+            except StopIteration as end:
+                self._filters[self._turn] = end.value
+                self._search = None
+            return
         for _ in range(len(self._odd)):
             self._turn = (self._turn + 1) % len(self._odd)
             odd = self._odd[self._turn]
-            self._filters[self._turn] = None if odd is None else sought(self._design, *odd)
             if odd is not None:
+                self._search = searching(self._design, *odd, power(self._window.newest(self._turn, POWER_ROWS)))
                 return
+            self._filters[self._turn] = None
 
     def _curve(self, avar: Floats, terms: Ints, edf: Floats, n: int) -> AllanCurve:
         lo, hi = intervals(avar, edf)
@@ -208,16 +219,19 @@ class Estimator:
 
 
 def warm_up() -> Iterator[str]:
-    """Have the kernels compiled, or loaded from the disk cache; yields "window" and "fit" as each is ready.
+    """Have the kernels compiled, or loaded from the disk cache; yields "window", "fit" and "all" as each is ready.
 
-    "window" is all that samples pass on their way, "fit" what a look needs, and a fit at every sample. Half a minute
-    each at the very first start on a machine, milliseconds later.
+    "window" gives a curve, "fit" its coefficients; the rest are those of motion and change, of total and Hadamard
+    deviations, and of a fit at every sample. Many seconds at the very first start on a machine, milliseconds later.
     """
     estimator, samples = Estimator(100.0, 1.0), block(np.arange(100, dtype=np.int64), np.zeros((100, 6)))
     estimator.update(samples)
-    estimator.restart(0, 10)
-    Watch(100.0).update(samples)
     yield "window"
     estimator.get()
-    Estimator(100.0, 1.0, every_sample=True).update(samples)
     yield "fit"
+    Watch(100.0).update(samples)
+    estimator.restart(0, 10)
+    while estimator.step() is None:  # a round of the slow statistics
+        pass
+    Estimator(100.0, 1.0, every_sample=True).update(samples)
+    yield "all"

@@ -34,7 +34,7 @@ from monitor.estimate.coefficients import Coefficients, Status
 from monitor.estimate.fit_kernel import WHITE, fit_axes
 from monitor.estimate.least_squares import N, R
 from monitor.estimate.uncertainty import NOISES, Table
-from monitor.estimate.verdict import Gains, Known, answer, gains
+from monitor.estimate.verdict import Known, answer, gains
 from monitor.noise.effect import Source
 from monitor.noise.effects.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.bias_instability import BiasInstability
@@ -85,7 +85,6 @@ class Fit:
     scatter: Floats  # [6] variance of the curve about the fit over that of noise of the five terms
     misfit: Floats  # [6] the same where it is more than chance makes, else 1
     k_or_r: NDArray[np.bool_]  # [6] the window drifts, by random walk or by a ramp: which of them, it does not tell
-    gains: Gains | None  # the fit as a linear map of the curve; None where nothing was fitted
 
 
 def design(factors: Ints, rate_hz: float) -> Design:
@@ -100,6 +99,7 @@ def known(design: Design, table: Table, blind: Floats | None = None, ask: bool =
     flat = design.columns.copy()
     # what taking away the line costs each noise on average, see the level in ``fit_axis``
     flat[:, :NOISES] -= (2.0 * table.bend - table.slope) * design.columns[:, R, None]
+    flat[:, ~design.columns.any(axis=0)] = 0.0  # not asked for
     blind = np.zeros(design.factors.size) if blind is None else blind
     whole = table.terms.astype(np.float64)
     return Known(design.columns, flat, table.covariance, whole, table.slope, blind, ask)
@@ -189,7 +189,7 @@ def _fit(design: Design, table: Table, looks: Looks, shared: Known, full: bool, 
         edf = np.where(missing, _white_edf(design, table, terms), edf)
     return Fit(
         coefficients, (found.theta * to_si**2).T, found.fitted.T, edf, found.entered.T, found.left_out,
-        found.scatter, found.misfit, frozen.either, frozen,
+        found.scatter, found.misfit, frozen.either,
     )  # fmt: skip
 
 
@@ -216,7 +216,7 @@ def joined(fits: Sequence[Fit], axes: Ints) -> Fit:
         return np.concatenate(parts, axis=-1)[..., order]
 
     coefficients = Coefficients(*(side_by_side(field, "coefficients") for field in ("value", "lo", "hi", "status")))
-    return Fit(coefficients, **{name: side_by_side(name) for name in FIELDS}, gains=None)
+    return Fit(coefficients, **{name: side_by_side(name) for name in FIELDS})
 
 
 def nothing_fitted(avar: Floats) -> Fit:
@@ -233,7 +233,6 @@ def nothing_fitted(avar: Floats) -> Fit:
         scatter=np.full(avar.shape[1], np.nan),
         misfit=np.ones(avar.shape[1]),
         k_or_r=np.zeros(avar.shape[1], np.bool_),
-        gains=None,
     )
 
 

@@ -12,9 +12,10 @@ from typing import Final
 import numpy as np
 
 from monitor.compiled import compiled
+from monitor.estimate.bounds import bound_by_first_point, cap
 from monitor.estimate.least_squares import K, N, Q, R, normal_equations, solve_nonnegative, variances, weigh
 from monitor.estimate.uncertainty import NOISES, PAIRS
-from monitor.estimate.verdict import bound_by_first_point, freeze, judge, judge_ramp, sharpen
+from monitor.estimate.verdict import freeze, judge, judge_ramp, sharpen
 
 MIN_ROWS: Final = NOISES + 1
 """Fewer τ than this leave a fit no freedom to be contradicted."""
@@ -88,6 +89,12 @@ def fit_axis(  # type: ignore[no-untyped-def]
     hi[:] = np.nan
     status[:] = 0
     scatter, limit = _misfit(level, rows[first:], theta, flat, variance)
+    if full and scatter > limit:
+        # covariances of noises that are not those of the curve draw a fit away from all of its points
+        first, free = _fit_terms(
+            curve, level, rows, stretch, flat, known, False, warm, variance, weighted, normal, right, theta
+        )
+        scatter, limit = _misfit(level, rows[first:], theta, flat, variance)
     misfit = scatter if scatter > limit else 1.0
     found, c0 = judge(
         level, rows[first:], stretch, known.covariance, weighted, normal, thresholds, straight, misfit,
@@ -124,6 +131,8 @@ def fit_axis(  # type: ignore[no-untyped-def]
         axis, rows[first:], weighted, normal, free, thresholds, c0, most,
         known.columns, slope, slopes, answer, gains,
     )  # fmt: skip
+    if misfit > 1.0:
+        cap(curve, answer.edf[axis], rows[first:], known.columns, entered, theta, lo, hi, status)
     if free:
         i = rows[0]
         bound_by_first_point(curve[i], answer.edf[axis, i], known.columns[i, Q], entered, lo, hi, status)

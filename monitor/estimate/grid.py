@@ -1,9 +1,10 @@
 """A recording on a regular grid: by the same clock that stamps live samples, what is missing is NaN in its place.
 
 The clock calls a step of two periods a hole, as the next sample has to be placed at once. A whole recording knows
-better: where samples before and after lie on one line only if none is missing, it came late, and that is all. Rows that
-repeat others, time and values, are kept out. Rows that repeat the one before while time goes on stay, as they are what
-the sensor's register held. Everything found is said in notes, at most NOTES of one sort.
+better, hole by hole, what only came late. Rows that repeat others, time and values, are kept out. Rows that repeat the
+one before while time goes on stay, as they are what the sensor's register held. A stated rate is believed, also where
+the times say another. Everything found is said in notes, at most NOTES of one sort; so is a resolution of the values as
+coarse as their noise.
 """
 
 from collections.abc import Sequence
@@ -15,21 +16,30 @@ from drivers.clock import JUMP_S, LONG_S, SampleClock
 from drivers.errors import NotReady
 from drivers.line import made_rate
 from drivers.order import NS
-from drivers.sample import Floats, Given, Ints, SampleBlock
+from drivers.sample import AXES, Floats, Given, Ints, SampleBlock
+from monitor.estimate.late import truly_missing
+from monitor.estimate.resolution import Steps, coarse
 from monitor.estimate.stale import stale_share
+from monitor.estimate.words import amount, plain
 
-OFF_RATE: Final = 0.02
-"""A stated rate further than this from what the times say is told."""
+OFF_RATE: Final = 0.002
+"""A stated rate further than this from what the times say is told, where they say it that well."""
+FAR_RATE: Final = 0.02
+"""Further than this it is told in any case."""
+STEADY: Final = 0.02
+"""Steps that differ by less are alike."""
 NOTES: Final = 10
 """Of the clock; what is beyond is counted."""
 STALE: Final = 0.01
 """A share below this is not told."""
 LONGEST_HOLE: Final = 1_000_000
 """Missing samples kept in place, 48 bytes each; one stands for a longer pause, and keeps terms from reaching across."""
-AROUND: Final = 500
-"""Rows to both sides of a hole that say whether anything is missing: long enough for a late sender to catch up."""
-ASKED: Final = 200
-"""Holes that are asked at most, spread over the recording."""
+STRETCHES: Final = 8
+"""Of a recording, whose rates tell how well the mean of all is known."""
+SURE: Final = 5.0
+"""Standard errors of eight stretches."""
+UNIT: Final = 0.05
+"""Of a unit of times: what is nearer to a whole number of it is one."""
 UNEVEN: Final = 0.5
 """Of a period: steps of which a fifth is further off than this are told."""
 
@@ -48,40 +58,24 @@ def on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Float
     values = _placed(stamped, lost)
     notes = told[:NOTES] + ([f"and {len(told) - NOTES} more notes on the times"] if len(told) > NOTES else [])
     notes += _said_of_steps(stamped, t_ns, lost, rate) + _said_late(late)
-    notes += _said_stale(values) + _said_missing(lost, rate)
+    notes += _said_stale(values) + _said_coarse(coarse(values)) + _said_missing(lost, rate)
     return values, rate, notes
 
 
 def _without_late(stamped: Sequence[SampleBlock], t_ns: Ints) -> tuple[Ints, int]:
-    """Samples missing before each block, and how many holes were none, as all that is missing only came late.
-
-    Around a true hole times lie on a line against the index that counts what is missing; around a late sample, against
-    the one that does not. Most of the holes decide for all: one alone may be unclear.
-    """
+    """Samples missing before each block, and how many holes were none, as all that is missing only came late."""
     lost = np.array([samples.lost for samples in stamped], np.int64)
     short = (lost > 0) & (lost <= LONGEST_HOLE)
-    holes = np.flatnonzero(short)
-    if not holes.size:
-        return lost, 0
     rows = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])
-    asked = rows[holes[:: -(-holes.size // ASKED)]]
-    missing = np.zeros(t_ns.size, np.int64)
-    missing[rows] = lost
-    late = 0
-    for row in asked.tolist():
-        around = slice(max(row - AROUND, 0), row + AROUND)
-        t_s = (t_ns[around] - t_ns[row]) / NS
-        index = np.arange(t_s.size, dtype=np.float64)
-        late += _scatter(index, t_s) < _scatter(index + np.cumsum(missing[around]), t_s)
-    if 2 * late <= asked.size:
+    short &= rows > 0  # nothing is known of what was before the first
+    if not short.any():
         return lost, 0
-    return np.where(short, 0, lost), int(holes.size)
-
-
-def _scatter(index: Floats, t_s: Floats) -> float:
-    """Sum of squares about the line of least squares."""
-    x, y = index - index.mean(), t_s - t_s.mean()
-    return float(y @ y - (x @ y) ** 2 / (x @ x))
+    steps = np.diff(t_ns)
+    jumps = np.flatnonzero((steps < -JUMP_S * NS) | (steps > LONG_S * NS)) + 1
+    breaks = np.concatenate([rows[lost > LONGEST_HOLE], jumps])
+    missing = lost.copy()
+    missing[short] = truly_missing(t_ns, rows[short], lost[short], breaks)
+    return missing, int((short & (missing == 0)).sum())
 
 
 def _placed(stamped: Sequence[SampleBlock], lost: Ints) -> Floats:
@@ -135,7 +129,9 @@ def _said_late(late: int) -> list[str]:
     if not late:
         return []
     times = "once" if late == 1 else f"{late} times"
-    return [f"a sample came late by a period or more {times}, but later ones made good for it: none is missing"]
+    return [
+        f"a sample came late by a period or more {times}; later ones made good for it, so that none is missing there"
+    ]
 
 
 def _said_stale(values: Floats) -> list[str]:
@@ -146,49 +142,90 @@ def _said_stale(values: Floats) -> list[str]:
     return [f"{percent:.2g} % of rows repeat the one before: the sensor updates slower than it is read; they are kept"]
 
 
+def _said_coarse(found: Sequence[Steps]) -> list[str]:
+    """By kind of sensor and size of the steps."""
+    alike: dict[str, list[Steps]] = {}
+    for one in found:
+        alike.setdefault(amount(AXES[one.axis], one.step), []).append(one)
+    notes = []
+    for size, those in alike.items():
+        axes = ", ".join(AXES[one.axis] for one in those)
+        low, high = (plain(f(one.step / one.noise for one in those)) for f in (min, max))
+        times = low if low == high else f"{low} to {high}"
+        notes.append(
+            f"values come in steps of {size} ({axes}), {times} times the noise from sample to sample: quantization "
+            "shapes the shortest τ"
+        )
+    return notes
+
+
 def _said_of_steps(stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints, rate_hz: float) -> list[str]:
-    """Where times step unevenly; where they say another rate, by their steps if steady, else by their mean."""
+    """Where times step unevenly; where they say another rate."""
     steps = np.diff(t_ns)
     if not steps.size:
         return []
-    low, middle, high = _spread(steps)
-    if middle > 0.0 and high - low <= OFF_RATE * middle:
-        if abs(middle * rate_hz - 1.0) < OFF_RATE:
-            return []
-        return [f"the rate used is {rate_hz:g} Hz, but the times step by {middle:.6g} s, {1.0 / middle:.6g} Hz"]
-    uneven = []
-    if max(1.0 / rate_hz - low, high - 1.0 / rate_hz) > UNEVEN / rate_hz:
-        worst_s = float(steps[steps < LONG_S * NS].max()) / NS
-        uneven = [
-            f"times step unevenly: by {middle:.3g} s in the median, {high:.3g} s at 90 %, {worst_s:.3g} s at worst; "
-            "samples are taken to be even"
-        ]
-    try:
-        mean_hz = _mean_rate(stamped, t_ns, lost)
-    except NotReady:
+    going = _going(stamped, t_ns, lost)
+    if going is None:
         return [f"the rate used is {rate_hz:g} Hz; the times do not go on and say none"]
-    if abs(mean_hz / rate_hz - 1.0) < OFF_RATE:
+    uneven = _said_uneven(steps, rate_hz)
+    mean_hz, known = _rate(*going)
+    if abs(mean_hz / rate_hz - 1.0) < min(max(OFF_RATE, SURE * known), FAR_RATE):
         return uneven
+    if steps.max() - steps.min() <= STEADY * steps.min():
+        step_s = float(steps.mean()) / NS
+        return [f"the rate used is {rate_hz:g} Hz, but the times step by {step_s:.6g} s, {1.0 / step_s:.6g} Hz"]
     return [*uneven, f"the rate used is {rate_hz:g} Hz, but by the times {mean_hz:.5g} samples came a second"]
 
 
-def _spread(steps: Ints) -> tuple[float, float, float]:
-    """Tenth, middle and ninetieth hundredth of the steps, s; where all are near alike, ends and mean stand for them."""
-    low, high = int(steps.min()), int(steps.max())
-    if high - low <= OFF_RATE * low:
-        return low / NS, float(steps.mean()) / NS, high / NS
-    tenth, middle, ninetieth = (np.quantile(steps, [0.1, 0.5, 0.9]) / NS).tolist()
-    return tenth, middle, ninetieth
+def _said_uneven(steps: Ints, rate_hz: float) -> list[str]:
+    low, middle, high = (np.quantile(steps, [0.1, 0.5, 0.9]) / NS).tolist()
+    alike = middle > 0.0 and high - low <= STEADY * middle
+    if alike or max(1.0 / rate_hz - low, high - 1.0 / rate_hz) <= UNEVEN / rate_hz:
+        return []
+    unit_s = _unit_s(steps)
+    if unit_s > UNEVEN / rate_hz:
+        return [f"times have a resolution of {unit_s:.3g} s; samples are taken to be even"]
+    worst_s = float(steps[steps < LONG_S * NS].max()) / NS
+    return [
+        f"times step unevenly: by {middle:.3g} s in the median, {high:.3g} s at 90 %, {worst_s:.3g} s at worst; "
+        "samples are taken to be even"
+    ]
 
 
-def _mean_rate(stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints) -> float:
-    """Samples a second over the whole recording, missing ones included, where its times do not jump."""
-    steps = np.diff(t_ns) / NS
+def _unit_s(steps: Ints) -> float:
+    """The unit that all steps are none or some of; 0 where there is none."""
+    on = steps[steps > 0]
+    if not on.size:
+        return 0.0
+    unit = float(on[on < 1.5 * on.min()].mean())  # a third of a second is not a whole number of nanoseconds
+    whole = np.abs(steps / unit - np.rint(steps / unit)) < UNIT
+    return unit / NS if whole.all() else 0.0
+
+
+def _going(stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints) -> tuple[Floats, Floats] | None:
+    """Samples that came by each row, missing ones included, and s that passed, where times do not jump."""
+    steps_s = np.diff(t_ns) / NS
     samples_each = np.ones(t_ns.size, np.int64)
     starts = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])
     samples_each[starts] += lost
-    steady = (steps > -JUMP_S) & (steps < LONG_S)
-    n, span_s = int(samples_each[1:][steady].sum()), float(steps[steady].sum())
-    if n < 1 or span_s <= 0.0:
+    steady = (steps_s > -JUMP_S) & (steps_s < LONG_S)
+    came, passed_s = np.cumsum(samples_each[1:][steady]).astype(np.float64), np.cumsum(steps_s[steady])
+    return (came, passed_s) if came.size and passed_s[-1] > 0.0 else None
+
+
+def _rate(came: Floats, passed_s: Floats) -> tuple[float, float]:
+    """Samples a second over all, and its relative standard error by the scatter of stretches; 1 where there are few."""
+    mean_hz = float(came[-1] / passed_s[-1])
+    if came.size < 2 * STRETCHES:
+        return mean_hz, 1.0
+    at = np.linspace(0, came.size - 1, STRETCHES + 1).astype(np.int64)
+    periods = np.diff(passed_s[at]) / np.diff(came[at])
+    return mean_hz, float(periods.std(ddof=1)) / STRETCHES**0.5 * mean_hz
+
+
+def _mean_rate(stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints) -> float:
+    """The rate of a recording of which none is stated."""
+    going = _going(stamped, t_ns, lost)
+    if going is None:
         raise NotReady("the times of the recording do not go on, so that its rate is unknown; state it with --rate HZ")
-    return made_rate(n / span_s)
+    return made_rate(_rate(*going)[0])

@@ -83,7 +83,7 @@ def weigh(rows, theta, covariance, stretch, columns, blind, full, variance, weig
 
 @compiled
 def normal_equations(level, rows, columns, weighted, normal, right):  # type: ignore[no-untyped-def]
-    """Xᵀ V⁻¹ X and Xᵀ V⁻¹ y."""
+    """Xᵀ V⁻¹ X and Xᵀ V⁻¹ y; a column of zeros is a term that is not asked for, and comes out as zero."""
     normal[:] = 0.0
     right[:] = 0.0
     for i in rows:
@@ -92,6 +92,8 @@ def normal_equations(level, rows, columns, weighted, normal, right):  # type: ig
             for b in range(a + 1):
                 normal[a, b] += weighted[i, a] * columns[i, b]
     for a in range(5):
+        if normal[a, a] == 0.0:
+            normal[a, a], right[a] = 1.0, -1.0
         for b in range(a):
             normal[b, a] = normal[a, b]
 

@@ -72,7 +72,7 @@ class SlowStatistics:
         self._factors = [[int(m) for m in factors] for factors in given]
         self._moments: list[dict[int, Moments]] = [{}, {}]
         self.rounds = 0  # complete ones
-        self._seen = 0
+        self._seen = window.resets
         self._round = self._steps()
         self._last: tuple[list[_Sum], list[_Sum]] | None = None
 
@@ -81,10 +81,10 @@ class SlowStatistics:
 
         A window that was emptied ends the round, and what was handed over before is no longer.
         """
-        if self._window.total < self._seen:
+        if self._window.resets != self._seen:
             self._last = None
             self._round = self._steps()
-        self._seen = self._window.total
+        self._seen = self._window.resets
         next(self._round)
 
     def get(self, rate_hz: float, theta: Floats) -> tuple[TotalCurve, HadamardCurve] | None:

@@ -70,8 +70,8 @@ def _count(values: Floats, there: NDArray[np.bool_], begins: Ints, asked: Ints, 
 def _held(each: Floats, all_of_them: Floats) -> Floats:
     """The shares s [k] that solve all_of_them = s + (1 - s) Π (each - s)/(1 - s), each [k, axes], by halving."""
     explained = each.prod(axis=1)
-    # within its counting error; or an axis that never moves tells nothing
-    none = (all_of_them <= explained + 3.0 * np.sqrt(explained / ROWS)) | (each.max(axis=1) == 1.0)
+    # within its counting error; an axis that never moves, each = 1, says nothing for or against
+    none = all_of_them <= explained + 3.0 * np.sqrt(explained / ROWS)
     each, all_of_them = each[~none], all_of_them[~none]
     low, high = np.zeros(len(each)), np.minimum(each.min(axis=1), all_of_them)
     for _ in range(HALVINGS):

@@ -11,16 +11,12 @@ from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
 from monitor.compiled import compiled
+from monitor.estimate.bounds import BOUND, TWO_SIDED_95, interval_end
 from monitor.estimate.least_squares import K, Q, R, invert, normal_equations, present, solve, weigh
 from monitor.estimate.uncertainty import NOISES
 
 MOVED: Final = 0.4
 """Gains are made anew when a θ has moved by this share, a coefficient by a fifth, and by more than its own scatter."""
-
-TWO_SIDED_95: Final = 1.959963984540054
-BOUND: Final = TWO_SIDED_95
-"""Of an upper bound: 97.5 % for one look, and still 95 % of what is said where terms that come out large are estimated
-instead and their intervals miss too."""
 
 SCATTER: Final = 1.0
 """σ by which a θ may move before its gains are made anew, where that is more."""
@@ -128,23 +124,22 @@ def judge(  # type: ignore[no-untyped-def]
             continue
         skewness = 2.0 * np.sqrt(forms[a, 2])
         threshold = thresholds[1] if entered[a] else thresholds[0]
-        low = _interval_end(estimate[a], c0, c1, c2, skewness, TWO_SIDED_95)
+        low = interval_end(estimate[a], c0, c1, c2, skewness, TWO_SIDED_95)
+        high = interval_end(estimate[a], c0, c1, c2, skewness, -TWO_SIDED_95)
+        if theta[a] > 0.0 and not low < np.sqrt(theta[a]) < high:
+            # others were held at zero, and this one is not û: the interval of what it is
+            low = min(low, interval_end(theta[a], c0, c1, c2, skewness, TWO_SIDED_95))
+            high = max(high, interval_end(theta[a], c0, c1, c2, skewness, -TWO_SIDED_95))
         # what was out stays out while its interval reaches to zero
         seen = entered[a] or low > 0.0
         entered[a] = seen and a != R and theta[a] > 0.0 and estimate[a] > threshold * np.sqrt(c0)
         if entered[a]:
-            status[a] = 2
-            high = _interval_end(estimate[a], c0, c1, c2, skewness, -TWO_SIDED_95)
-            value = np.sqrt(theta[a])
-            if not low < value < high:  # others were held at zero, and this one is not û: the interval of what it is
-                low = min(low, _interval_end(theta[a], c0, c1, c2, skewness, TWO_SIDED_95))
-                high = max(high, _interval_end(theta[a], c0, c1, c2, skewness, -TWO_SIDED_95))
-            lo[a], hi[a] = low, high
+            status[a], lo[a], hi[a] = 2, low, high
         else:
             # a bound below what an estimate of zero would give claims more than the curve can know
             status[a] = 1
             lo[a] = 0.0
-            hi[a] = _interval_end(max(estimate[a], 0.0), c0, c1, c2, skewness, -BOUND)
+            hi[a] = interval_end(max(estimate[a], 0.0), c0, c1, c2, skewness, -BOUND)
     return estimate, misfit * forms[:NOISES, 0]
 
 
@@ -170,7 +165,7 @@ def sharpen(  # type: ignore[no-untyped-def]
             c = _variance_forms(np.array([a]), gain, rows, theta, covariance)[0]
             estimate = max(_estimate(gain[0], level, rows, stretch), 0.0)
             skewness = 2.0 * np.sqrt(c[2])
-            hi[a] = _interval_end(estimate, misfit * c[0], misfit * c[1], c[2], skewness, -BOUND)
+            hi[a] = interval_end(estimate, misfit * c[0], misfit * c[1], c[2], skewness, -BOUND)
 
 
 @compiled
@@ -251,34 +246,6 @@ def judge_ramp(slope, slope_variance, thresholds, entered, theta, lo, hi, status
     lo[R] = max(abs(slope) - TWO_SIDED_95 * np.sqrt(most), 0.0) if entered[R] else 0.0
     hi[R] = abs(slope) + (TWO_SIDED_95 if entered[R] else BOUND) * np.sqrt(most)
     return noise, most
-
-
-@compiled
-def _interval_end(estimate, c0, c1, c2, skewness, z):  # type: ignore[no-untyped-def]
-    """√t where the estimate lies k √v(t) above t; k is the Pearson-III quantile of probability Φ(z).
-
-    Wilson & Hilferty: k = (2/s)[(1 + s z/6 − s²/36)³ − 1], skewness s = 2 √c2 of the estimate alone, as of χ² with
-    2/c2 degrees of freedom. t solves (1 − k²c2) t² − (2û + k²c1) t + û² − k²c0 = 0; the end is clipped at zero.
-    """
-    s = skewness
-    k = z if s < 1e-6 else 2.0 / s * (max(1.0 + s * z / 6.0 - s * s / 36.0, 0.0) ** 3 - 1.0)
-    a = 1.0 - k * k * c2
-    b = estimate + 0.5 * k * k * c1
-    root = b * b - a * (estimate * estimate - k * k * c0)
-    if root < 0.0 or a <= 1e-9:
-        return 0.0 if z > 0.0 else np.inf
-    t = (b - np.sqrt(root)) / a if z > 0.0 else (b + np.sqrt(root)) / a
-    return np.sqrt(max(t, 0.0))
-
-
-@compiled
-def bound_by_first_point(avar, edf, column, entered, lo, hi, status):  # type: ignore[no-untyped-def]
-    """Q is hidden behind the sensor's band limit: it makes no more than the whole of the first point."""
-    entered[Q] = False
-    status[Q] = 1
-    lo[Q] = 0.0
-    spread = 2.0 / (9.0 * max(edf, 1.0))
-    hi[Q] = np.sqrt(avar / column / max(1.0 - spread - BOUND * np.sqrt(spread), 0.05) ** 3)
 
 
 @compiled

@@ -47,7 +47,6 @@ from monitor.estimate.window_kernel import (
     cut_floats,
     cut_ints,
     forget,
-    take_again,
     thirds,
 )
 
@@ -128,6 +127,7 @@ class AllanWindow:
         self._terms = terms.reshape(taus, LANES)
         self._sums, self._rest = sums.reshape(taus, LANES), rest.reshape(taus, LANES)
         self._stage = stage[: STAGE * AXES].reshape(STAGE, AXES)
+        self.resets = -1  # how many times it was emptied
         self.reset()
 
     @property
@@ -142,6 +142,7 @@ class AllanWindow:
 
     def reset(self) -> None:
         """Forget all samples; phase and the count of missing ones only matter by their differences, and stay."""
+        self.resets += 1
         self._terms[:] = 0
         self._floats[:] = 0
         self._scaling[:LANES] = self._scale
@@ -179,22 +180,6 @@ class AllanWindow:
         hole = np.full((min(n, HOLE_ROWS), AXES), np.nan)
         for start in range(0, n, HOLE_ROWS):
             self.update(hole[: n - start])
-
-    def keep(self, n: int) -> None:
-        """Forget all but the newest n samples, missing ones included: a reset, and those n again.
-
-        Costs what n samples cost.
-
-        Raises:
-            ValueError: the window does not hold so many
-        """
-        if not 0 <= n <= self.n:
-            raise ValueError(f"keep {n} of {self.n} samples")
-        forgotten = self.total - n
-        self._terms[:], self._sums[:], self._rest[:] = 0, 0.0, 0.0
-        self._state[TOTAL] = n
-        self._state[STRUCK] -= forgotten
-        take_again(self._ints, self._floats, self._missing, self._taus)
 
     def forget(self, axis: int, n: int) -> None:
         """Of one axis, forget all but the newest n samples: those before are missing from now on.
@@ -238,6 +223,13 @@ class AllanWindow:
     def terms(self) -> Ints:
         """Number of second differences averaged, [m, 6]."""
         return self._terms[:, :AXES].copy()
+
+    def newest(self, axis: int, n: int) -> Floats:
+        """Up to n of the newest samples of one axis, from its phase; NaN = missing."""
+        places = self._phase.size // LANES
+        at = (int(self._state[NEWEST]) - np.arange(min(n, self.n), -1, -1)) % places
+        phase, missing = self._phase[at * LANES + axis], self._missing[at * LANES + axis]
+        return np.where(np.diff(missing) > 0, np.nan, np.diff(phase) / self._scale[axis])
 
     def ring(self) -> tuple[Ints, NDArray[np.int32], int, Floats]:
         """A look at phase without a copy, good until the next update.

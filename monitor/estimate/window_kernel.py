@@ -91,19 +91,6 @@ def advance(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, s
 
 
 @compiled
-def take_again(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int) -> None:
-    """Take the terms of the newest samples, as many as the state says there are, from the ring into empty sums."""
-    state, factors, spans, terms, phase = cut_ints(ints, taus)
-    _, scratch, sums, rest, _ = cut_floats(floats, taus)
-    places = phase.size // LANES
-    n = state[TOTAL]
-    for done in range(0, n, RUN):
-        first, run = place(state[NEWEST] + 1 - n + done, places), min(RUN, n - done)
-        whole = state[STRUCK] <= 0
-        _take(first, run, done, whole, factors, spans, phase, missing, scratch, terms, sums, rest, state[WIDTH])
-
-
-@compiled
 def _take(
     first: int,
     run: int,

@@ -19,12 +19,12 @@ def amount(axis: str, si: float, sign: bool = False) -> str:
     ('160 °/s', '-3.3 mg', '27 m/s²', '0.000057 °/s')
     """
     if axis.startswith("g"):
-        return f"{_plain(degrees(si), sign)} °/s"
+        return f"{plain(degrees(si), sign)} °/s"
     if abs(si) < 1000.0 * MILLI_G:
-        return f"{_plain(si / MILLI_G, sign)} mg"
-    return f"{_plain(si, sign)} m/s²"
+        return f"{plain(si / MILLI_G, sign)} mg"
+    return f"{plain(si, sign)} m/s²"
 
 
-def _plain(value: float, sign: bool) -> str:
-    """Two significant digits."""
+def plain(value: float, sign: bool = False) -> str:
+    """Two significant digits, no exponent."""
     return np.format_float_positional(float(f"{value:.1e}"), trim="-", sign=sign)

@@ -4,7 +4,8 @@ In come an ``Estimate`` and, if there are any, other deviations of the same reco
 Measured points with their 95 % band, the fitted curve dashed, and the letters in the way of the field: for each term
 that is estimated its own line, thin, and a ring where the coefficient is read on it (IEEE Std 952): Q at τ = √3 s, N at
 1 s, K at 3 s, R at √2 s, and B, as 0.664 B, where the curve is lowest. Rings that would cover each other share a
-letter. Axes differ by colour and by marker. Only functions that draw import matplotlib.
+letter. Axes differ by colour and by marker, and none covers another: markers and rings of the second and third are
+smaller, and the dashes of each fit lie in the gaps of the others. Only functions that draw import matplotlib.
 """
 
 from collections.abc import Collection, Sequence
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 
 COLOURS: Final = ("#D55E00", "#009E73", "#0072B2")  # x y z: vermilion, bluish green, blue (Okabe & Ito)
 MARKERS: Final = ("o", "s", "^")
+SIZES: Final = (8.2, 5.0, 3.8)  # of markers, pt: axes that are alike stay visible inside each other
+RING_SIZES: Final = (12.0, 8.5, 5.0)
+DASHES: Final = ((0, (4, 8)), (4, (4, 8)), (8, (4, 8)))  # of fits that coincide, each fills the gaps of the others
 GREY: Final = "#6b6b6b"
 DARK: Final = "#222222"
 READ_AT_S: Final = {"Q": 3.0**0.5, "N": 1.0, "K": 3.0, "R": 2.0**0.5}  # where the term's deviation is its coefficient
@@ -76,7 +80,11 @@ class _Ring:
     letter: str
     tau_s: float
     sigma: float  # field unit
-    colour: str
+    number: int  # of its axis, x y z
+
+    @property
+    def colour(self) -> str:
+        return COLOURS[self.number]
 
 
 def allan_panel(axes: "Axes", estimate: Estimate, kind: Kind, others: Sequence[Beside] = ()) -> None:
@@ -86,7 +94,7 @@ def allan_panel(axes: "Axes", estimate: Estimate, kind: Kind, others: Sequence[B
     shown: list[Floats] = []
     rings: list[_Ring] = []
     drawn: set[str] = set()
-    for axis, colour, marker in zip(axes_of(kind), COLOURS, MARKERS, strict=True):
+    for number, (axis, colour, marker) in enumerate(zip(axes_of(kind), COLOURS, MARKERS, strict=True)):
         i = AXES.index(axis)
         rows = np.isfinite(estimate.curve.avar[:, i]) & (estimate.curve.avar[:, i] > 0)
         if not rows.any():
@@ -94,8 +102,19 @@ def allan_panel(axes: "Axes", estimate: Estimate, kind: Kind, others: Sequence[B
         measured, fitted = (np.sqrt(a[:, i]) * factor for a in (estimate.curve.avar, estimate.fitted))
         lo, hi = (a[rows, i] * factor for a in (estimate.curve.lo, estimate.curve.hi))
         axes.fill_between(tau_s[rows], lo, hi, color=colour, alpha=0.16, linewidth=0)
-        axes.plot(tau_s, fitted, "--", color=colour, linewidth=1.3, zorder=3)
-        axes.plot(tau_s[rows], measured[rows], marker, color=colour, markersize=4.5, label=axis, zorder=4)
+        axes.plot(tau_s, fitted, linestyle=DASHES[number], color=colour, linewidth=1.5, zorder=3)
+        size = SIZES[number]
+        axes.plot(
+            tau_s[rows],
+            measured[rows],
+            marker,
+            color=colour,
+            markersize=size,
+            mec="white",
+            mew=0.4,
+            label=axis,
+            zorder=4,
+        )
         shown += [
             measured[rows],
             fitted,
@@ -104,7 +123,7 @@ def allan_panel(axes: "Axes", estimate: Estimate, kind: Kind, others: Sequence[B
         ]
         shown += _beside(axes, others, i, colour, marker, factor, float(tau_s[rows][-1]))
         drawn |= {other.name for other in others if other.rows(i, float(tau_s[rows][-1])).any()}
-        rings += _rings(estimate, i, factor, colour, lowest_s, float(measured[rows].min()))
+        rings += _rings(estimate, i, factor, lowest_s, float(measured[rows].min()))
     _limits(axes, shown, rings)
     _letters(axes, rings)
     _furnish(axes, kind, others, drawn)
@@ -143,13 +162,11 @@ def _lowest_s(estimate: Estimate, kind: Kind) -> float:
     return float(estimate.curve.tau_s[rows][np.argmin(level)])
 
 
-def _rings(estimate: Estimate, i: int, factor: float, colour: str, lowest_s: float, floor: float) -> list[_Ring]:
+def _rings(estimate: Estimate, i: int, factor: float, lowest_s: float, floor: float) -> list[_Ring]:
     """Where the estimated coefficients of one axis are read."""
     known = estimate.coefficients
     rings = [
-        _Ring(
-            letter, READ_AT_S.get(letter, lowest_s), float(value) * (FLOOR if letter == "B" else 1.0) * factor, colour
-        )
+        _Ring(letter, READ_AT_S.get(letter, lowest_s), float(value) * (FLOOR if letter == "B" else 1.0) * factor, i % 3)
         for letter, value, status in zip(LETTERS, known.value[:, i], known.status[:, i], strict=True)
         if status == Status.ESTIMATED
     ]
@@ -176,12 +193,13 @@ def _letters(axes: "Axes", rings: Sequence[_Ring]) -> None:
     for ring in rings:
         line = ring.sigma * (ends_s / ring.tau_s) ** SLOPES[ring.letter]
         axes.plot(ends_s, line, "-", color=ring.colour, linewidth=0.7, alpha=0.4, zorder=1)
-        axes.plot(ring.tau_s, ring.sigma, "o", mfc="none", mec=ring.colour, mew=1.4, markersize=8.0, zorder=5)
+        size = RING_SIZES[ring.number]
+        axes.plot(ring.tau_s, ring.sigma, "o", mfc="none", mec=ring.colour, mew=1.4, markersize=size, zorder=5)
     for heap in _heaps(axes, rings):
         axes.annotate(
             heap[0].letter,
             (heap[0].tau_s, float(np.exp(np.mean([np.log(ring.sigma) for ring in heap])))),
-            (8, 0),
+            (9, 0),
             textcoords="offset points",
             ha="left",
             va="center",

@@ -4,8 +4,8 @@ In comes a ``Dynamic``; out go two groups of panels with one common time axis, t
 every τ against time, coloured by the deviation over its own median over time, so that all τ stand in one scale: red is
 more than usual, blue less. Cells whose 95 % interval holds that median are pale: that colour alone says nothing. Of the
 coefficients those are drawn that are estimated for a while on some axis, with their intervals as bands; a line is
-interrupted where there is no estimate. A change is a vertical mark through the surface of its axis and, in the colour
-of the axis, through the courses; those too near to each other to be named apart share a word.
+interrupted where there is no estimate. A change is a vertical mark, with a word, through the surface of its axis and,
+in the colour of the axis, through the courses; those too near to each other to be named apart share a word.
 """
 
 from collections.abc import Sequence
@@ -31,8 +31,10 @@ LINE_INCHES: Final = 1.6
 SPARE_INCHES: Final = 1.2  # title, colour bar, time axis
 SHARE: Final = 0.05  # of the time steps: a letter estimated on fewer has no panel
 PALE: Final = 0.3
+DASHED: Final = (0, (4, 2))
 APART: Final = 0.13  # of the width: words nearer than this would touch
 RATIOS: Final = (1.25, 1.5, 2.0, 3.0, 5.0, 10.0)  # ends of the colour scale; the first that holds most of the cells
+BANDS: Final = 0.9  # of the bands' ends a panel holds so many; the widest would flatten the courses
 WIDE: Final = 3.0  # log scale where a coefficient varies by more than this factor
 UNITS_S: Final = (("s", 1.0, 600.0), ("min", 60.0, 10_800.0), ("h", 3600.0, 259_200.0), ("d", 86_400.0, np.inf))
 
@@ -108,7 +110,7 @@ def dynamic_panels(figure: "Figure | SubFigure", dynamic: Dynamic, kind: Kind, m
         panel.set_xlim(edges[0], edges[-1])
     own = [mark for mark in marks if mark.axis in axes and edges[0] <= mark.t_s / clock.seconds <= edges[-1]]
     _mark(list(panels), axes, own, clock)
-    panels[0].set_title(KIND_NAMES[kind], loc="left", fontsize=12, pad=14)
+    panels[0].set_title(KIND_NAMES[kind], loc="left", fontsize=12)
     panels[-1].set_xlabel(f"time at the end of the window of {dynamic.window_s:.4g} s, {clock.name}")
     figure.align_ylabels(list(panels))
     if mesh is not None:
@@ -116,19 +118,22 @@ def dynamic_panels(figure: "Figure | SubFigure", dynamic: Dynamic, kind: Kind, m
 
 
 def _mark(panels: "Sequence[Axes]", axes: Sequence[str], marks: Sequence[Mark], clock: Clock) -> None:
-    """Vertical lines, and above the first panel what they are."""
-    for mark in marks:
-        at, colour = mark.t_s / clock.seconds, COLOURS[AXES.index(mark.axis) % 3]
-        panels[axes.index(mark.axis)].axvline(at, color=DARK, linewidth=1.1, linestyle=(0, (4, 2)))
-        for panel in panels[len(axes) :]:
-            panel.axvline(at, color=colour, linewidth=1.1, linestyle=(0, (4, 2)))
+    """Vertical lines, and in the surface of their axis what they are."""
     left, right = panels[0].get_xlim()
-    for near in _near([mark.t_s / clock.seconds for mark in marks], APART * (right - left)):
-        panels[0].annotate(
-            "change" if len(near) == 1 else f"{len(near)} changes", (sum(near) / len(near), 1.0), (0, 2),
-            xycoords=("data", "axes fraction"), textcoords="offset points",
-            ha="center", va="bottom", fontsize=8, color=DARK,
-        )  # fmt: skip
+    apart = APART * (right - left)
+    for panel, axis in zip(panels, axes, strict=False):
+        times = [mark.t_s / clock.seconds for mark in marks if mark.axis == axis]
+        for at in times:
+            panel.axvline(at, color=DARK, linewidth=1.1, linestyle=DASHED)
+            for course in panels[len(axes) :]:
+                course.axvline(at, color=COLOURS[AXES.index(axis) % 3], linewidth=1.1, linestyle=DASHED)
+        for near in _near(np.clip(times, left + apart / 2.0, right - apart / 2.0).tolist(), apart):
+            panel.annotate(
+                "change" if len(near) == 1 else f"{len(near)} changes", (sum(near) / len(near), 1.0), (0, -4),
+                xycoords=("data", "axes fraction"), textcoords="offset points",
+                ha="center", va="top", fontsize=8, color=DARK,
+                bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.9},
+            )  # fmt: skip
 
 
 def _near(times: Sequence[float], apart: float) -> list[list[float]]:
@@ -188,7 +193,7 @@ def _bar(figure: "Figure | SubFigure", mesh: "QuadMesh", panels: "list[Axes]", r
 def _course(panel: "Axes", dynamic: Dynamic, kind: Kind, letter: str, t: Floats) -> None:
     """One coefficient of three axes over time."""
     row, unit = LETTERS.index(letter), COEFFICIENT_UNITS[kind][letter]
-    held = []
+    held, ends = [], []
     for axis, colour in zip(axes_of(kind), COLOURS, strict=True):
         i = AXES.index(axis)
         estimated = dynamic.status[:, row, i] == Status.ESTIMATED
@@ -202,15 +207,16 @@ def _course(panel: "Axes", dynamic: Dynamic, kind: Kind, letter: str, t: Floats)
         alone = _alone(estimated)
         panel.plot(t[alone], value[alone], ".", color=colour, markersize=3.5)
         held.append(value)
-    values = np.concatenate(held)
-    low, high = np.nanmin(values), np.nanmax(values)
+        ends.append((lo, hi))
+    low, high = np.nanmin(held), np.nanmax(held)
     if low > 0 and high > WIDE * low:
         panel.set_yscale("log")
         panel.set_ylim(low / 1.5, high * 1.5)
         plain_ticks(panel)
     else:
         room = 0.25 * (high - low) + 0.02 * high
-        panel.set_ylim(max(low - room, 0.0), high + room)
+        lowest, highest = np.nanquantile(ends, [1.0 - BANDS, BANDS]).tolist()
+        panel.set_ylim(max(min(low - room, lowest), 0.0), max(high + room, highest))
     panel.set_ylabel(f"{letter}, {unit.name}")
     panel.set_title(COEFFICIENT_NAMES[kind][letter], loc="left", fontsize=9, color=GREY, pad=3)
     quiet(panel)

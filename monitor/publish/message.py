@@ -41,7 +41,10 @@ def allan(device: str, unix_s: float, estimate: Estimate) -> bytes:
 
 def coefficients(device: str, unix_s: float, estimate: Estimate) -> bytes:
     """``imu/<device>/coefficients``: Q N B K R of each measured axis with interval and status."""
-    axes = {axis: coefficient_table(estimate.coefficients, i) for i, axis in measured_axes(estimate)}
+    axes = {
+        axis: coefficient_table(estimate.coefficients, i, bool(estimate.k_or_r[i]))
+        for i, axis in measured_axes(estimate)
+    }
     return _encode(topics.COEFFICIENTS, device, unix_s, estimate.samples, _window(estimate, axes=axes))
 
 

@@ -118,7 +118,7 @@ def _table(axes: "Axes", estimate: Estimate, kind: Kind) -> None:
     """The coefficients of one kind: value, and its interval in small print."""
     axes.axis("off")
     columns = (0.0, 0.46, 0.65, 0.84)
-    rows = np.linspace(0.97, 0.16, len(LETTERS) + 1)
+    rows = np.linspace(0.97, 0.19, len(LETTERS) + 1)
     for axis, x, colour in zip(axes_of(kind), columns[1:], COLOURS, strict=True):
         axes.text(x, rows[0], axis, color=colour, fontweight="bold", va="center")
     for letter, y in zip(LETTERS, rows[1:], strict=True):
@@ -129,6 +129,6 @@ def _table(axes: "Axes", estimate: Estimate, kind: Kind) -> None:
             axes.text(x, y + 0.02, cell.value, va="center", fontsize=9.5)
             small = "K or R" if k_or_r(estimate, letter, axis) else cell.interval
             axes.text(x, y - 0.05, small, va="center", fontsize=6.5, color=GREY)
-    axes.text(columns[0], 0.045, EXPLAINED, va="center", fontsize=7.5, color=GREY)
-    axes.text(columns[0], -0.02, READING, va="center", fontsize=7.5, color=GREY)
-    axes.set(xlim=(0, 1), ylim=(-0.04, 1))
+    axes.text(columns[0], 0.03, EXPLAINED, va="center", fontsize=7.5, color=GREY)
+    axes.text(columns[0], -0.04, READING, va="center", fontsize=7.5, color=GREY)
+    axes.set(xlim=(0, 1), ylim=(-0.06, 1))

@@ -251,9 +251,10 @@ def restarted(values: Floats, factors: Ints, before: int, ends: Sequence[int]) -
     """The rectangle, all before the change forgotten at the first look after it."""
     window = AllanWindow(LENGTH, factors)
     for look, (start, end) in enumerate(zip([0, *ends], ends, strict=False)):
-        window.update(values[start:end])
         if look == 1:
-            window.keep(end - before)
+            window.reset()
+            start = before
+        window.update(values[start:end])
         yield fitted(RESTARTED, factors, window.avar(), window.n)
 
 

@@ -49,6 +49,7 @@ class Rig:
         if ready is None:
             self.ready.window.set()
             self.ready.fit.set()
+            self.ready.all.set()
         self.station = Station(device, self.link, decoder, self.wake, self.ready)
         self.caught = Caught()
         self.sent = 0
@@ -124,6 +125,9 @@ def test_a_fit_at_every_sample_waits_for_its_kernels():
     rig.work(1000.0)
     assert (rig.caught.blocks, rig.caught.estimates) == ([], [])
     ready.fit.set()
+    rig.work(1000.05)
+    assert rig.caught.estimates == []
+    ready.all.set()
     rig.work(1000.1)
     assert rig.caught.estimates[-1][1].course.t_ns.size == 300
 
@@ -291,7 +295,12 @@ def test_a_replay_has_ended_when_its_samples_are_fitted():
     rig.ready.fit.set()
     rig.work(1002.0)
     assert rig.caught.estimates[-1][1].coefficients.status.max() > 0
+    assert rig.station.watch is None
+    rig.ready.all.set()
     assert rig.station.ended
+    rig.bring(10)
+    rig.work(1003.0)
+    assert rig.station.watch is not None
 
 
 def test_samples_whose_rate_cannot_be_told_go_on():

@@ -14,6 +14,7 @@ CONFIG = """
 name = "vn100"
 rate = 40.0
 window = 800.0
+restart = false  # the whole recording is compared, and its vibration changes
 driver = {{ link = "serial", port = "{port}", decoder = "vectornav_ascii" }}
 [zenoh]
 mode = "none"

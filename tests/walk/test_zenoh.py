@@ -40,6 +40,7 @@ def test_a_recording_from_another_process_gives_the_authors_table(tmp_path: Path
 name = "run1"
 rate = 100.0
 window = 10000.0
+restart = false  # the whole recording is compared
 driver = {{ link = "zenoh", key = "lab/run1", mode = "client", connect = ["{router}"], silence = 30.0 }}
 [zenoh]
 mode = "none"

@@ -6,7 +6,7 @@ from scipy.signal import butter, sosfilt
 
 from drivers.sample import block
 from monitor.estimate.analysis import analyze
-from monitor.estimate.bandwidth import LowPass
+from monitor.estimate.bandwidth import LowPass, power, seen
 from monitor.estimate.batch import overlapping
 from monitor.estimate.estimator import Estimator
 
@@ -74,7 +74,7 @@ def test_the_live_estimate_finds_it_too():
     estimator = Estimator(RATE_HZ, 1200.0)
     estimator.update(block(np.arange(len(values)) * 10_000_000, values))
     before = estimator.get()
-    for _ in range(6):
+    for _ in range(6 * 65):  # pieces of six searches
         estimator.step()
     after = estimator.get()
     assert np.isnan(before.fitted[0]).any() or (before.fitted[0] != after.fitted[0]).any()
@@ -82,3 +82,25 @@ def test_the_live_estimate_finds_it_too():
     assert ((c.lo[1] <= N) & (c.hi[1] >= N)).sum() >= 5
     assert np.isfinite(after.fitted).all()
     np.testing.assert_allclose(after.fitted[0], after.curve.avar[0], rtol=0.03)
+
+
+def test_what_does_not_fall_beyond_the_cutoff_is_no_filter():
+    # a strong wide resonance: the shortest τ lie low as behind a low-pass, and the spectrum does not end
+    rng = np.random.default_rng(3)
+    values = N * np.sqrt(RATE_HZ) * rng.standard_normal((200_000, 6))
+    sections = butter(2, [3.0, 5.0], "bandpass", fs=RATE_HZ, output="sos")
+    values += 20.0 * N * np.sqrt(RATE_HZ) * sosfilt(sections, rng.standard_normal((200_000, 6)), axis=0)
+    found = analyze([block(np.arange(len(values)) * 10_000_000, values)], RATE_HZ)
+    assert (found.fit.misfit > 1.0).all() or (found.fit.left_out > 0).all()
+    assert np.isnan(found.bandwidth_hz).all()
+
+
+def test_a_spectrum_is_asked_by_medians():
+    spectrum = power(filtered(2, 20.0, 100_000)[:, 0])
+    assert seen(LowPass("digital", 2, 0.2), spectrum)
+    assert not seen(LowPass("digital", 2, 0.05), spectrum)
+    assert not seen(LowPass("digital", 2, 0.001), spectrum)  # lower than any of its bins
+    spectrum[700:703] *= 1e6  # a line beyond the cutoff
+    assert seen(LowPass("digital", 2, 0.2), spectrum)
+    assert power(np.zeros(100)).size == 0
+    assert not seen(LowPass("digital", 2, 0.2), power(np.zeros(100)))

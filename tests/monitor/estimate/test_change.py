@@ -200,7 +200,7 @@ def test_a_step_is_told_once_with_its_height():
     before, after = change.what["bias"]
     assert after - before == pytest.approx(4 * SIGMA, rel=0.25)
     assert abs(change.since - 50_011) <= 40
-    assert change.text.startswith("gz bias stepped by +0.00")
+    assert change.text.startswith("gz bias stepped by +0.2")
 
 
 def test_a_step_on_the_border_of_all_blocks_is_found_too():

@@ -1,16 +1,18 @@
-"""Sentences about a fit and about events; and the bandwidth of sensors whose filter is known."""
+"""Sentences about a fit, what explains it, and events."""
 
 import re
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.signal import butter, lfilter
 
 from drivers.sample import AXES, block
 from monitor.estimate import findings
 from monitor.estimate.analysis import analyze
+from monitor.estimate.bandwidth import LowPass
 from monitor.estimate.change import Change
+from monitor.estimate.coefficients import Status
+from monitor.estimate.departures import Line, lines
 from monitor.estimate.rest import Motion
 
 RATE_HZ = 100.0
@@ -25,11 +27,14 @@ def white(n, seed=1):
     return 1e-3 * np.random.default_rng(seed).standard_normal((n, 6))
 
 
-def test_the_sensor_s_own_bandwidth_is_told():
-    found = analyzed(lfilter(*butter(2, 30.0, fs=RATE_HZ), white(400_000), axis=0))
-    said = [note for note in found.notes if "the sensor's own bandwidth" in note]
-    assert said
-    assert "as of a low-pass of order 2 at " in said[0]
+def test_the_sensor_s_own_bandwidth_is_told_once_for_axes_alike():
+    axes = [None if i == 2 else LowPass("digital", 1, 0.249 + 0.001 * i) for i in range(6)]
+    curve, fit = departing()
+    [note] = findings.of_fit(curve, fit, axes, RATE_HZ)
+    assert note == (
+        "gx, gy, ax, ay, az: white noise ends below half the sample rate, as behind a first-order low-pass at about "
+        "25 Hz; N is the level below it"
+    )
 
 
 def test_a_line_is_told_with_the_averaging_times_that_it_spoils():
@@ -42,6 +47,82 @@ def test_a_line_is_told_with_the_averaging_times_that_it_spoils():
     assert float(times) == pytest.approx(found.fit.misfit[1] ** 0.5, rel=0.1)
     assert where == "0.64"  # a line's deviation peaks at 0.37 of its period, 2 s: sin⁴(πfτ)/(πfτ)²
     assert found.fit.misfit[0] == 1.0
+    curve = found.estimate.curve
+    told = lines(values, np.zeros(len(values), bool), RATE_HZ, curve)
+    known = findings.explained(["first", *found.notes], curve, found.fit, told)
+    assert known[0] == "first"
+    [known] = [one for one in known if "departs" in one]
+    assert known == note.replace("vibration, motion or temperature may be why", "the line at 0.4999 Hz shows there")
+    assert findings.of_departures(told, np.zeros(6)) == ["a line at 0.4999 Hz: gy 0.11 °/s"]
+
+
+def departing(misfit=(1.0,) * 6, at=(2,) * 6, left_out=(0,) * 6, q=()):
+    """A white curve of eight τ; axes of a misfit depart at one of them; ``q``: axes that have a Q."""
+    factors = 2 ** np.arange(8)
+    fitted = np.repeat(1.0 / factors[:, None], 6, axis=1)
+    avar = fitted.copy()
+    for axis in range(6):
+        avar[at[axis], axis] *= 4.0 if misfit[axis] > 1.0 else 1.0
+    status = np.full((5, 6), Status.UPPER_BOUND)
+    status[0, list(q)] = Status.ESTIMATED
+    curve = SimpleNamespace(factors=factors, tau_s=factors / RATE_HZ, avar=avar)
+    fit = SimpleNamespace(
+        fitted=fitted, edf=np.full((8, 6), 1e3), misfit=np.array(misfit), left_out=np.array(left_out),
+        k_or_r=np.zeros(6, bool), coefficients=SimpleNamespace(status=status),
+    )  # fmt: skip
+    return curve, fit
+
+
+def line(axis, hz, amplitude=1.0, wide=False):
+    return Line(axis, hz, amplitude, 0.5, wide)
+
+
+def test_axes_that_depart_alike_share_a_note():
+    curve, fit = departing((9.0, 36.0, 1.0, 16.0, 4.0, 1.0), at=(2, 2, 2, 2, 6, 2))
+    text = "vibration, motion or temperature may be why; intervals are widened accordingly"
+    assert findings.of_misfit(curve, fit) == [
+        "gx, gy, ax: the curve departs from every sum of the five terms (scatter 3 to 6 times wider), most at "
+        f"τ = 0.04 s: {text}",
+        f"ay: the curve departs from every sum of the five terms (scatter 2 times wider), most at τ = 0.64 s: {text}",
+    ]
+
+
+def test_motion_left_in_is_one_note_that_points_to_rest():
+    curve, fit = departing((4.0, 4.0, 4.0, 9.0, 9.0, 9.0), at=(0, 1, 3, 5, 6, 7))
+    notes = findings.explained(findings.of_misfit(curve, fit), curve, fit, [line(0, 9.0)], moved=True)
+    assert notes == [
+        "gx, gy, gz, ax, ay, az: the curve departs from every sum of the five terms (scatter 2 to 3 times wider): the "
+        "sensor moved, which may be why; --rest strikes it out; intervals are widened accordingly"
+    ]
+    assert findings.explained(["other"], *departing(), [], moved=True) == ["other"]
+
+
+def test_a_line_is_blamed_only_where_it_shows():
+    """At τ = 0.04 s a line of 9 Hz is strongest; one of 0.05 Hz does not reach there, nor one of another axis."""
+    curve, fit = departing((4.0,) * 3 + (1.0,) * 3)
+    found = [line(0, 9.0), line(1, 9.03), line(2, 0.05, 0.1), line(3, 9.0)]
+    notes = findings.of_misfit(curve, fit, found)
+    assert [note.split(":")[0] for note in notes] == ["gx, gy", "gz"]
+    assert "the line at 9 Hz shows there" in notes[0]
+    assert "may be why" in notes[1]
+
+
+def test_what_is_left_out_is_one_note_with_the_line_that_is_told():
+    curve, fit = departing(left_out=(4, 3, 0, 0, 0, 1))
+    assert findings.of_misfit(curve, fit, [line(0, 9.0, wide=True), line(1, 9.0)]) == [
+        "gx, gy: the fit leaves out τ up to 0.08, 0.04 s, which no sum of the five terms follows: the resonance about "
+        "9 Hz shows there",
+        "az: the fit leaves out τ up to 0.01 s, which no sum of the five terms follows: the sensor's bandwidth or a "
+        "vibration shows there",
+    ]
+
+
+@pytest.mark.parametrize(("amplitude", "hz", "told"), [(1.0, 30.0, True), (0.2, 30.0, False), (1.0, 0.5, False)])
+def test_quantization_noise_that_may_be_a_line(amplitude, hz, told):
+    curve, fit = departing(q=(0, 2, 4))
+    found = [line(axis, hz, amplitude) for axis in (0, 1, 2)]
+    expected = [f"gx, gz: quantization noise may be the line at {hz:g} Hz"] if told else []
+    assert findings.explained([], curve, fit, found) == expected
 
 
 def test_a_drift_in_a_short_record_is_k_or_r():

@@ -237,3 +237,24 @@ def test_a_line_is_no_filter_and_nothing_is_left_out_for_it():
     assert (result.left_out == 0).all()
     # the shortest τ, which the line does not reach, still tell N
     np.testing.assert_allclose(result.coefficients.value[1], 1.5e-4, rtol=0.12)
+
+
+def test_where_the_terms_are_no_description_none_is_more_than_the_curve():
+    # a strong line at 0.5 Hz over white noise: nothing may be claimed above the curve's own limits
+    t = np.arange(400_000) / 100.0
+    values = 1e-3 * np.random.default_rng(5).standard_normal((t.size, 6)) + 0.05 * np.sin(np.pi * t)[:, None]
+    factors = cluster_sizes(t.size, 100.0)
+    avar, terms = overlapping(values, factors)
+    columns = design(factors, 100.0)
+    found = fit(columns, table(t.size, factors), avar, terms)
+    assert (found.misfit > 1.0).all()
+    c = found.coefficients
+    for axis in range(6):
+        for letter, power in zip(range(5), (-2, -1, 0, 1, 2), strict=True):
+            if c.status[letter, axis] == Status.UNESTIMATED:
+                continue
+            shape = columns.columns[:, letter] * 100.0 ** (-power)  # of σ², for a coefficient of one in SI
+            most = np.sqrt((2.5 * avar[:, axis] / shape)[:12].min())  # τ with many degrees of freedom
+            assert c.hi[letter, axis] <= most * 1.01
+            if c.status[letter, axis] == Status.ESTIMATED:
+                assert 0.0 < c.lo[letter, axis] < c.value[letter, axis] < c.hi[letter, axis]

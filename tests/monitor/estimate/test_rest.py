@@ -133,7 +133,7 @@ def test_a_knock_rings_and_an_outlier_does_not():
     mask, (knock,) = find(values, RATE)
     assert (knock.kind, knock.axis) == ("knock", "az")
     assert knock.since <= 4000 < knock.until
-    assert knock.text == "knocked: az up to 4 m/s²"
+    assert knock.text == "knocked: az up to 410 mg"
     assert mask.sum() <= (2 + 1 + AFTER) * block_size(RATE)
 
 

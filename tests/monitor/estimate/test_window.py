@@ -214,45 +214,6 @@ def broken(n, seed=0):
     return values
 
 
-@pytest.mark.parametrize("samples", [10, 99, 100, 150, 700])
-@pytest.mark.parametrize("make", [made, broken])
-@pytest.mark.parametrize("spans", [None, [10, 30, 6, 50, 100, 63, 100]])
-def test_keeping_the_newest_is_a_fresh_window_given_those(samples, make, spans):
-    spans = None if spans is None else np.array(spans)
-    values = np.rint(make(samples + 250) * 2.0**36) * 2.0**-36  # so that no unit of phase is left to round
-    for n in sorted({0, 1, 5, 63, 64, 65, 99, 100, samples} & set(range(min(samples, LENGTH) + 1))):
-        window, fresh = (AllanWindow(LENGTH, FACTORS, spans) for _ in range(2))
-        window.update(values[:samples])
-        window.keep(n)
-        fresh.update(values[samples - n : samples])
-        for start in (samples, samples + 1, samples + 40, samples + 130, samples + 250):
-            new = values[samples - n : start]
-            check(window, new)
-            assert (window.n, window.total) == (fresh.n, fresh.total)
-            np.testing.assert_allclose(window.avar(), fresh.avar(), rtol=1e-13)
-            assert np.array_equal(window.slope(), fresh.slope(), equal_nan=True)
-            end = {samples: 1, samples + 1: 40, samples + 40: 130}.get(start, 250)
-            for one in (window, fresh):
-                one.update(values[start : samples + end])
-
-
-def test_what_is_forgotten_leaves_nothing_behind():
-    values = made(3000)
-    values[2500:2900] += 100.0
-    window = AllanWindow(1000, cluster_sizes(1000, 1.0))
-    window.update(values)
-    window.keep(100)
-    check(window, values[-100:])
-
-
-@pytest.mark.parametrize("n", [-1, 61, 10**9])
-def test_more_than_is_held_cannot_be_kept(n):
-    window = AllanWindow(LENGTH, FACTORS)
-    window.update(made(60))
-    with pytest.raises(ValueError, match="of 60 samples"):
-        window.keep(n)
-
-
 # --- a span for each row
 
 
@@ -533,12 +494,6 @@ class Calls(RuleBasedStateMachine):
     def forget(self, axis, n):
         self.window.forget(axis, n)
         self.held[: max(len(self.held) - n, 0), axis] = np.nan
-
-    @rule(share=st.floats(0.0, 1.0))
-    def keep(self, share):
-        n = round(share * len(self.held))
-        self.window.keep(n)
-        self.held = self.held[len(self.held) - n :]
 
     @rule()
     def reset(self):
