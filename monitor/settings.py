@@ -385,11 +385,12 @@ def model_path(name: str, folder: Path) -> Path:
     Raises:
         ConfigError: neither, with the nearest name
     """
-    shipped = CONFIG_FOLDER / "models" / f"{name}.toml"
+    models = CONFIG_FOLDER / "models"
+    shipped = models / f"{name}.toml"
     path = shipped if shipped.is_file() else folder / Path(name).expanduser()
     if path.is_file():
         return path
-    names = sorted(file.stem for file in shipped.parent.glob("*.toml"))
+    names = sorted(file.stem for file in models.glob("*.toml"))
     raise ConfigError(f'no model "{name}", neither a file nor one of those shipped{plugin.nearest(name, names)}')
 
 

@@ -343,6 +343,20 @@ WRONG_MODELS = {
         "gz.sinusoidal: frequency must be below 50",
     ),
     "no source axis": ("[gz.g_sensitivity]\ncoefficient = 1.0\n", "gz.g_sensitivity: source is missing"),
+    "source without effects": (
+        '[gz.g_sensitivity]\nsource = "ax"\ncoefficient = 1.0\n',
+        "gz.g_sensitivity: the model has no effect on its source ax",
+    ),
+    "two clocks": (
+        "[gx.sample_rate_error]\nratio = 1.01\n[gz.sample_rate_error]\nratio = 1.02\n",
+        "sample_rate_error: a recording has one clock",
+    ),
+    "no temperature": (
+        "[gz.temperature_bias]\ncoefficient = 1.0\nreference = 25.0\n",
+        "gz.temperature_bias: no temperature",
+    ),
+    "unknown key": ("sample_rat = 100.0\n", 'unknown key "sample_rat"; did you mean "sample_rate"?'),
+    "unknown table": ("[temprature]\nmean = 25.0\n", 'unknown axis "temprature"; did you mean "temperature"?'),
     "no axis": ("", "names no axis"),
     "no TOML": ("[gz", "not TOML"),
 }
@@ -358,6 +372,22 @@ def test_a_wrong_model_is_one_line_and_nothing_is_written(call: Call, case: str)
     assert "m.toml: " in line
     assert words in line
     assert [path.name for path in Path().iterdir()] == ["m.toml"]
+
+
+@pytest.mark.parametrize("option", ["--json", "--temperature-from"])
+def test_what_is_written_is_no_other_file_of_the_command(call: Call, option: str) -> None:
+    Path("x.csv").write_text("t,gz\n")
+    same = f"../{Path.cwd().name}/x.csv"
+    said = call("simulate", "consumer-mems", "--seconds", "1", "--out", "x.csv", option, same)
+    assert said.status == 2
+    assert f"{option}: " in said.only_line()
+    assert Path("x.csv").read_text() == "t,gz\n"
+
+
+def test_a_path_to_no_model_names_those_that_there_are(call: Call) -> None:
+    said = call("simulate", "no/where.toml", "--seconds", "1", "--out", "x.csv")
+    assert said.status == 2
+    assert "known are adis16405, " in said.only_line()
 
 
 def test_a_model_without_a_rate_asks_for_one(call: Call) -> None:

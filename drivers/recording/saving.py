@@ -82,13 +82,17 @@ def whole(path: Path) -> Iterator[Path]:
     """A name to write to, renamed to ``path`` at the end and removed after any exception.
 
     Raises:
-        ConfigError: there is no such folder, no permission, or a folder of that name
+        ConfigError: there is no such folder, a folder of that name, or no permission and whatever else forbids it
     """
     if not path.parent.is_dir():
         raise ConfigError(f"{path}: cannot be written: there is no folder {path.parent}")
     if path.is_dir():  # said before the work rather than after it
         raise ConfigError(f"{path}: cannot be written: it is a folder")
     part = path.with_name(path.name + PART)
+    try:
+        part.touch()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
     try:
         yield part
         os.replace(part, path)

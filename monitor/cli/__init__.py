@@ -187,6 +187,9 @@ def simulate(
     if rate is not None and not 0.0 < rate < float("inf"):
         raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
     output.check_place("--json", json)
+    for option, path in (("--json", json), ("--temperature-from", temperature_from)):
+        if path is not None and path.resolve() == out.resolve():
+            raise ConfigError(f"{option}: {path} is what --out writes; another name is needed")
     noise = load(model, Path.cwd())
     request = simulation.Request(noise, out, length_s, seed, rate, temperature_from, truth, model)
     serving.end_on_sigterm()

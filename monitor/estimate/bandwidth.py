@@ -107,13 +107,16 @@ def _moments(kind: Kind, order: int, cutoff: float) -> tuple[Floats, Floats]:
 def power(rates: Floats) -> Floats:
     """Spectrum [POWER_BINS + 1] of one axis [n], in no unit: the mean of stretches spread over it; missing = its mean.
 
-    Empty where the samples are too few.
+    Stretches of which nothing is there are left out. Empty where the samples are too few.
     """
     rows = 2 * POWER_BINS
     begins = np.unique(np.linspace(0, len(rates) - rows, MOST_STRETCHES).astype(np.int64))
     if begins[0] < 0 or len(rates) < FEWEST_STRETCHES * rows:
         return np.empty(0)
     parts = np.stack([rates[begin : begin + rows] for begin in begins])
+    parts = parts[np.isfinite(parts).any(axis=1)]
+    if not parts.size:
+        return np.empty(0)
     with np.errstate(invalid="ignore"):
         parts = parts - np.nanmean(parts, axis=1, keepdims=True)
     turned = np.fft.rfft(np.nan_to_num(parts) * np.hanning(rows), axis=1)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 WILDCARDS: Final = {"g*": AXES[:3], "a*": AXES[3:]}
 KNOWN: Final = (*AXES, *WILDCARDS)
+KEYS: Final = ("sample_rate", "temperature")
 
 Placed = tuple[tuple[str, ...], tuple[Effect, ...]]  # axes, their effects
 
@@ -114,7 +115,8 @@ def _assignments(table: Any) -> Iterator[str]:
 
 def _effects(axis: str, effects: Any) -> Iterator[Effect]:
     if axis not in KNOWN:
-        raise ConfigError(f'unknown axis "{axis}"{nearest(axis, KNOWN)}')
+        what = "axis" if isinstance(effects, dict) else "key"
+        raise ConfigError(f'unknown {what} "{axis}"{nearest(axis, (*KNOWN, *KEYS))}')
     if not isinstance(effects, dict):
         raise ConfigError(f"{axis} must be a table of effects, such as [{axis}.angle_random_walk]")
     for name, given in effects.items():

@@ -192,6 +192,12 @@ class TestSaveRefuses:
             save_samples(path, *samples())
         assert list(path.parent.iterdir()) == [path]
 
+    def test_what_the_system_refuses_is_said_before_the_work(self, tmp_path):
+        path = tmp_path / f"{'x' * 248}.csv"  # a name that cannot grow by .part
+        with pytest.raises(ConfigError, match=r"x\.csv: cannot be written: .*too long"):
+            save_samples(path, *samples())
+        assert list(tmp_path.iterdir()) == []
+
     def test_arrays_that_do_not_fit(self, tmp_path):
         t, values, temperature = samples()
         for wrong in ((t[1:], values), (t, values[:, :3]), (t[:0], values[:0]), (t, values, temperature[1:])):
