@@ -98,6 +98,9 @@ def whole(path: Path) -> Iterator[Path]:
         os.replace(part, path)
     except (IsADirectoryError, PermissionError) as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
+    except OSError as error:  # a full disk does not say of which file
+        error.filename = error.filename or str(path)
+        raise
     finally:
         part.unlink(missing_ok=True)
 

@@ -1,5 +1,6 @@
 """Recordings: every format round trip, what is missing or cut, and files that are none."""
 
+import errno
 import gzip
 import os
 import pickle
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.recording import FORMATS, Recording, is_recording, iter_blocks, load_samples, save_samples, writing
 from drivers.recording.csv_format import READ_BYTES
+from drivers.recording.saving import whole
 from drivers.sample import AXES, join
 
 SUFFIXES = tuple(FORMATS)
@@ -196,6 +198,16 @@ class TestSaveRefuses:
         path = tmp_path / f"{'x' * 248}.csv"  # a name that cannot grow by .part
         with pytest.raises(ConfigError, match=r"x\.csv: cannot be written: .*too long"):
             save_samples(path, *samples())
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_full_disk_names_the_file_and_leaves_nothing(self, tmp_path):
+        def fill():
+            with whole(tmp_path / "x.csv") as part:
+                part.write_text("t,gz\n")
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        with pytest.raises(OSError, match=r"No space left on device: .*x\.csv"):
+            fill()
         assert list(tmp_path.iterdir()) == []
 
     def test_arrays_that_do_not_fit(self, tmp_path):
