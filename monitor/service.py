@@ -127,7 +127,7 @@ class Service:
     def _station(self, device: Device) -> Station:
         link = device.link
         if isinstance(link, VirtualTable):
-            imu = VirtualImu(link, device.decoder)
+            imu = VirtualImu(link, device.decoder, device.name)
             self.virtual[device.name] = imu
             link = imu.link
         return Station(device, link, device.decoder, self._wake, self._ready)

@@ -36,6 +36,7 @@ MEMORY: Final = re.compile(r"[0-9]+(\.[0-9]+)?\s*([kMGT]?i?B|%)")
 
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Port = Annotated[int, msgspec.Meta(ge=0, le=65535)]
+Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 
 
 class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -60,14 +61,44 @@ class DeviceTable(_Table, frozen=True, kw_only=True):
     axes: dict[str, str] = {}
 
 
+class FaultsTable(_Table, frozen=True, kw_only=True):
+    """``[device.driver.faults]``: what goes wrong on the way from a simulated sensor, all of it drawn from its seed."""
+
+    lost: Share = 0.0
+    """Share of samples that are never sent; their count goes on."""
+    repeated: Share = 0.0
+    """Share of samples that are sent twice."""
+    flipped: Share = 0.0
+    """Share of samples one bit of which is flipped."""
+    cut: Share = 0.0
+    """Share of samples whose frame ends before it is whole."""
+    jitter: Annotated[float, msgspec.Meta(ge=0.0, le=0.5)] = 0.0
+    """s: each burst is held back by a random time of up to so much."""
+    unplugged: Share = 0.0
+    """Chance at each sample that the cable is pulled before it."""
+    unplugged_for: Annotated[float, msgspec.Meta(gt=0.0)] = 2.0
+    """s of the sensor's time until it is put back."""
+    clock: Annotated[float, msgspec.Meta(ge=0.5, le=2.0)] = 1.0
+    """True rate over the rate that the sensor's clock and settings claim."""
+
+
 class VirtualTable(LinkSettings, frozen=True, kw_only=True):
-    """Keys of ``link = "virtual"``: a simulated IMU that speaks a real wire format over a pseudo-terminal."""
+    """Keys of ``link = "virtual"``: a simulated IMU that speaks a real wire format over a real link.
+
+    The decoder says which: a stream of bytes over a pseudo-terminal, CAN frames over a bus of python-can in this
+    process, messages over zenoh on loopback.
+    """
 
     model: str = "consumer-mems"
     """Path of a model file, or the name of one in the shipped ``config/models``."""
     seed: Annotated[int, msgspec.Meta(ge=0)] = 1
     speed: Annotated[float, msgspec.Meta(gt=0.0, le=10_000.0)] = 1.0
     """Times real time."""
+    effect: tuple[str, ...] = ()
+    """Effects that the sensor takes on while it runs: "gz.sinusoidal:amplitude=1e-3,frequency=17"."""
+    effect_at: Annotated[float, msgspec.Meta(ge=0.0)] = 90.0
+    """s of the sensor's time; by then changes are looked for."""
+    faults: FaultsTable = FaultsTable()
 
 
 class ZenohTable(_Table, frozen=True, kw_only=True):
@@ -245,7 +276,7 @@ class _Reader:
             return None, None
         if link_name == "virtual":
             link: Link | VirtualTable | None = self._virtual(keys, at)
-            carrier, default = "bytes", "vectornav_binary"
+            carrier, default = "", "vectornav_binary"
         else:
             module = plugin.load(drivers.links, link_name, "_link")
             settings = self.fill(module.Settings, keys, at)
@@ -265,16 +296,25 @@ class _Reader:
         return link, decoder
 
     def _virtual(self, keys: Mapping[str, Any], at: str) -> VirtualTable | None:
-        table = self.fill(VirtualTable, keys, at)
-        if table is None:
+        named = dict(keys)
+        faults = self._faults(named.pop("faults", {}), f"{at}.faults")
+        table = self.fill(VirtualTable, named, at)
+        path = None if table is None else self._try(f"{at}.model", model_path, table.model, self._folder)
+        if table is None or faults is None or path is None:
             return None
-        shipped = CONFIG_FOLDER / "models" / f"{table.model}.toml"
-        path = shipped if shipped.is_file() else self._folder / table.model
-        if not path.is_file():
-            names = sorted(file.stem for file in shipped.parent.glob("*.toml"))
-            self.wrong.append(f'{at}.model: no model "{table.model}", neither a file nor one of {", ".join(names)}')
+        return msgspec.structs.replace(table, model=str(path), faults=faults)
+
+    def _faults(self, keys: Any, at: str) -> FaultsTable | None:
+        if not isinstance(keys, dict):
+            self.wrong.append(f"{at}: expected a table")
             return None
-        return msgspec.structs.replace(table, model=str(path))
+        table = self.fill(FaultsTable, keys, at)
+        if table is not None and table.lost + table.repeated + table.flipped + table.cut > 1.0:
+            self.wrong.append(
+                f"{at}: lost, repeated, flipped and cut are shares of all samples: their sum is at most 1"
+            )
+            return None
+        return table
 
     def decoder(self, name: Any, options: Any, at: str) -> Decoder | None:
         if not isinstance(name, str):
@@ -337,6 +377,21 @@ class _Reader:
         except ConfigError as error:
             self.wrong.append(f"{at}: {error}")
             return None
+
+
+def model_path(name: str, folder: Path) -> Path:
+    """The shipped model of that name, or the file of that path; relative ones begin at ``folder``.
+
+    Raises:
+        ConfigError: neither, with the nearest name
+    """
+    models = CONFIG_FOLDER / "models"
+    shipped = models / f"{name}.toml"
+    path = shipped if shipped.is_file() else folder / Path(name).expanduser()
+    if path.is_file():
+        return path
+    names = sorted(file.stem for file in models.glob("*.toml"))
+    raise ConfigError(f'no model "{name}", neither a file nor one of those shipped{plugin.nearest(name, names)}')
 
 
 def seconds(value: float | str) -> float:

@@ -5,10 +5,10 @@ simulated into a recording; ``Service`` replays an hour of it sixty times as fas
 screen (software Vulkan), then into the page inside a real Chromium, driven by its DevTools protocol, and is stopped
 as by a signal; ``imu-monitor analyze`` makes the plot of the same hour. Curves over time, in the viewer, the picture
 and the page, are those of the same hour with a gyroscope that becomes noisier. The fleet are simulated devices in real
-time; one cable is pulled and put back, another is pulled for good. Needs the packages chromium, mesa-vulkan-drivers
-and libvulkan1 (Debian's names); network traffic stays on loopback.
+time; one cable is pulled and put back, another is pulled for good. ``demo --effect`` runs in real time too. Needs the
+packages chromium, mesa-vulkan-drivers and libvulkan1 (Debian's names); network traffic stays on loopback.
 
-    python -m tests.pictures [--out docs/pictures] [--only native surfaces fleet web plot dynamic report]
+    python -m tests.pictures [--out docs/pictures] [--only native surfaces fleet effect web plot dynamic report]
 """
 
 import argparse
@@ -26,17 +26,21 @@ import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import msgspec
 import numpy as np
 
 from drivers.recording import save_samples
 from monitor import settings
+from monitor.catalogue import read_model
+from monitor.demo import demo
 from monitor.publish import rerun_sinks
 from monitor.service import Service
-from monitor.virtual import ROOM_C, WARM_UP_C, WARM_UP_S, read_model
+from monitor.virtual import ROOM_C, WARM_UP_C, WARM_UP_S
 
 SIZE = (1600, 1000)
 MODEL = settings.CONFIG_FOLDER / "models" / "consumer-mems.toml"
@@ -51,6 +55,8 @@ SPEED = 60.0
 SETTLE_S = 6.0  # for a software renderer to paint what has arrived
 STILL_S = 5.0  # a page that has not changed for so long has caught up with what was sent
 PULLED_S, PLUGGED_S, PULLED_AGAIN_S, LOOKED_S = 30.0, 34.0, 70.0, 74.0  # since the fleet's start
+VIBRATION = "gz.sinusoidal:amplitude=4e-3,frequency=17"
+SHOWN_S = 45.0  # after the vibration began
 CHROMIUM_FLAGS = (
     *("--headless=new", "--no-sandbox", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync", "--disable-default-apps"),
@@ -143,6 +149,23 @@ def fleet(out: Path, folder: Path) -> Path:
     return path
 
 
+def effect(out: Path, _: Path) -> Path:
+    """The demo, whose sensor has begun to vibrate."""
+    path = out / "demo-effect.png"
+    config = demo(effects=[VIBRATION])
+    zenoh = msgspec.structs.replace(config.zenoh, mode="none")
+    with window() as (port, shoot):
+        viewer = msgspec.structs.replace(config.viewer, mode="native", port=port)
+        with running(replace(config, zenoh=zenoh, viewer=viewer)) as service:
+            (sensor,) = [device.link for device in config.devices]
+            assert isinstance(sensor, settings.VirtualTable)
+            begun_s = time.monotonic()
+            until(lambda: service.stations[0].latest is not None, 60.0)
+            time.sleep(begun_s + sensor.effect_at + SHOWN_S - time.monotonic())
+            shoot(path)
+    return small(path)
+
+
 def web(out: Path, folder: Path) -> Path:
     """One device on the page, in Chromium."""
     with page_server() as (port, url), browser() as page:
@@ -202,6 +225,7 @@ PICTURES: dict[str, Callable[[Path, Path], Path]] = {
     "native": native,
     "surfaces": surfaces,
     "fleet": fleet,
+    "effect": effect,
     "web": web,
     "plot": allan,
     "dynamic": dynamic,
@@ -244,7 +268,14 @@ def serving(folder: Path, devices: str, port: int) -> Iterator[Service]:
     viewer = f'[viewer]\nmode = "native"\nport = {port}\n'
     path = folder / "pictures.toml"
     path.write_text(f'{devices}\n[zenoh]\nlisten = ["tcp/127.0.0.1:{free_port()}"]\n\n{viewer}')
-    service = Service(settings.load(path))
+    with running(settings.load(path)) as service:
+        yield service
+
+
+@contextmanager
+def running(config: settings.Config) -> Iterator[Service]:
+    """The service in a thread of its own; stopped at the end."""
+    service = Service(config)
     thread = threading.Thread(target=service.run)
     thread.start()
     try:

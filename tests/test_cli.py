@@ -21,12 +21,12 @@ import pytest
 
 from drivers.recording import save_samples
 from drivers.sample import AXES
+from monitor.catalogue import read_model
 from monitor.cli import main
 from monitor.settings import CONFIG_FOLDER, load
-from monitor.virtual import read_model
 
 PROGRAM = [sys.executable, "-m", "monitor.cli"]
-COMMANDS = ("demo", "run", "check", "watch", "analyze", "export")
+COMMANDS = ("demo", "run", "check", "watch", "analyze", "simulate", "export")
 RATE_HZ = 100.0
 DEVICE = '[[device]]\nname = "bench-1"\n'
 VIRTUAL = DEVICE + 'driver = { link = "virtual" }\n'
@@ -105,12 +105,15 @@ WRONG_FILES = {
     "no protocol": (DEVICE + 'driver = { link = "serial", port = "/dev/x" }\n', "driver.decoder: missing; known are"),
     "no port": (DEVICE + 'driver = { link = "serial", decoder = "stim300" }\n', "driver.port: missing"),
     "protocol that does not fit": (
-        DEVICE + 'driver = { link = "virtual", decoder = "ros2_imu" }\n',
-        "ros2_imu reads messages, link virtual brings bytes",
+        DEVICE + 'driver = { link = "serial", port = "x", decoder = "ros2_imu" }\n',
+        "ros2_imu reads messages, link serial brings bytes",
     ),
     "negative silence": (DEVICE + 'driver = { link = "virtual", silence = -1.0 }\n', "driver.silence: Expected"),
     "negative seed": (DEVICE + 'driver = { link = "virtual", seed = -1 }\n', "driver.seed: Expected"),
-    "unknown model": (DEVICE + 'driver = { link = "virtual", model = "x" }\n', "one of consumer-mems"),
+    "unknown model": (
+        DEVICE + 'driver = { link = "virtual", model = "x" }\n',
+        'no model "x", neither a file nor one of those shipped',
+    ),
     "DBC without the signal": (
         CAN.format('{ file = "canmod_gps", signals = { gx = "ImuData.Nope" } }'),
         'signals.gx: message ImuData has no signal "Nope"; known are ',
@@ -191,6 +194,15 @@ def test_check_reads_the_model_of_a_simulated_device_too(call: Call) -> None:
         assert "model.toml" in said.only_line()
 
 
+def test_check_reads_the_effects_of_a_simulated_device_too(call: Call) -> None:
+    driver = '{ link = "virtual", effect = ["gz.sinusoidal:amplitude=1,frequency=60"] }'
+    Path("c.toml").write_text(f"{DEVICE}driver = {driver}\n{QUIET}")
+    for command in ("check", "run"):
+        said = call(command, "c.toml")
+        assert said.status == 2
+        assert 'effect "gz.sinusoidal:amplitude=1,frequency=60": ' in said.only_line()
+
+
 @pytest.mark.parametrize("name", sorted(path.name for path in CONFIG_FOLDER.glob("*.toml")))
 def test_check_accepts_every_shipped_file(call: Call, recording: Path, name: str) -> None:
     shutil.copy(CONFIG_FOLDER / name, name)
@@ -209,6 +221,12 @@ def test_check_accepts_the_defaults_that_it_prints(call: Call) -> None:
 
 
 # --- arguments -------------------------------------------------------------------------------------
+
+
+def simulating(*arguments: str) -> tuple[str, ...]:
+    """Of an option given twice the last counts."""
+    return ("simulate", "--seconds", "1", "--out", "x.csv", *arguments)
+
 
 WRONG_ARGUMENTS = {
     "no command": ((), "Missing command"),
@@ -257,6 +275,26 @@ WRONG_ARGUMENTS = {
         ("export", MODEL, "--format", "kalibr", "--out", "nowhere/x.yaml"),
         "--out: nowhere/x.yaml: cannot be written",
     ),
+    "no sensor": (("demo", "--sensor", "consumer-mem"), '--sensor: no model "consumer-mem"'),
+    "no such effect": (("demo", "--effect", "gz.sinusodal:amplitude=1"), 'did you mean "sinusoidal"?'),
+    "no effect": (("demo", "--effect", "vibration"), '--effect: "vibration" is no effect; write axis.effect:'),
+    "effect too fast": (("demo", "--effect", "gz.sinusoidal:amplitude=1,frequency=60"), "below 50 Hz"),
+    "bad time of an effect": (("demo", "--effect-at", "soon"), '--effect-at: "soon" is no duration'),
+    "no model": (simulating("nothing.toml"), 'no model "nothing.toml", neither a file nor one of those shipped'),
+    "nearest model": (simulating("consumer-mem"), 'did you mean "consumer-mems"?'),
+    "no length": (simulating("consumer-mems", "--seconds", "0"), '--seconds: "0" is no duration'),
+    "length in words": (simulating("consumer-mems", "--seconds", "soon"), '--seconds: "soon" is no duration'),
+    "no rate of samples": (simulating("consumer-mems", "--rate", "0"), "--rate: 0 Hz; it must be above 0"),
+    "negative seed": (simulating("consumer-mems", "--seed", "-1"), "Invalid value for '--seed'"),
+    "nothing to write": (("simulate", "consumer-mems", "--seconds", "1"), "Missing option '--out'"),
+    "unknown form": (simulating("consumer-mems", "--out", "x.mat"), "x.mat: not the suffix of a recording"),
+    "nowhere to write it": (simulating("consumer-mems", "--out", "nowhere/x.csv"), "there is no folder nowhere"),
+    "nowhere to say it": (simulating("consumer-mems", "--json", "nowhere/x.json"), "--json: nowhere/x.json: cannot be"),
+    "folder to write": (simulating("consumer-mems", "--out", ".csv/../.csv"), "cannot be written"),
+    "no temperature": (
+        simulating("consumer-mems", "--temperature-from", "nowhere.csv"),
+        "nowhere.csv: cannot be read: No such file or directory",
+    ),
     "no recording": (("analyze", "nowhere.csv"), "nowhere.csv: cannot be read: No such file or directory"),
 }
 
@@ -267,6 +305,7 @@ def test_a_wrong_argument_is_one_line(call: Call, case: str) -> None:
     said = call(*arguments)
     assert said.status == 2
     assert words in said.only_line()
+    assert not list(Path().iterdir())
 
 
 def test_help_of_every_command_is_quick() -> None:
@@ -287,6 +326,132 @@ print("heavy", sorted(heavy & sys.modules.keys()))
     assert done.stdout.count("status 0\n") == 1 + len(COMMANDS)
     assert done.stdout.count("--help") >= 1 + len(COMMANDS)
     assert done.stdout.endswith("heavy []\n")
+
+
+# --- simulate --------------------------------------------------------------------------------------
+
+WRONG_MODELS = {
+    "unknown effect": (
+        "[gz.sinusodal]\namplitude = 1.0\n",
+        'gz: unknown effect "sinusodal"; did you mean "sinusoidal"?',
+    ),
+    "unknown axis": ("[gw.bias]\nvalue = 1.0\n", 'unknown axis "gw"'),
+    "missing parameter": ("[gz.sinusoidal]\namplitude = 1.0\n", "gz.sinusoidal: frequency is missing"),
+    "negative parameter": ("[gz.angle_random_walk]\nN = -1.0\n", "gz.angle_random_walk: N must"),
+    "above Nyquist": (
+        "[gz.sinusoidal]\namplitude = 1.0\nfrequency = 99.0\n",
+        "gz.sinusoidal: frequency must be below 50",
+    ),
+    "no source axis": ("[gz.g_sensitivity]\ncoefficient = 1.0\n", "gz.g_sensitivity: source is missing"),
+    "source without effects": (
+        '[gz.g_sensitivity]\nsource = "ax"\ncoefficient = 1.0\n',
+        "gz.g_sensitivity: the model has no effect on its source ax",
+    ),
+    "two clocks": (
+        "[gx.sample_rate_error]\nratio = 1.01\n[gz.sample_rate_error]\nratio = 1.02\n",
+        "sample_rate_error: a recording has one clock",
+    ),
+    "no temperature": (
+        "[gz.temperature_bias]\ncoefficient = 1.0\nreference = 25.0\n",
+        "gz.temperature_bias: no temperature",
+    ),
+    "unknown key": ("sample_rat = 100.0\n", 'unknown key "sample_rat"; did you mean "sample_rate"?'),
+    "unknown table": ("[temprature]\nmean = 25.0\n", 'unknown axis "temprature"; did you mean "temperature"?'),
+    "no axis": ("", "names no axis"),
+    "no TOML": ("[gz", "not TOML"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_MODELS)
+def test_a_wrong_model_is_one_line_and_nothing_is_written(call: Call, case: str) -> None:
+    text, words = WRONG_MODELS[case]
+    Path("m.toml").write_text("sample_rate = 100.0\n" + text)
+    said = call("simulate", "m.toml", "--seconds", "1", "--out", "x.csv", "--truth", "--json", "x.json")
+    assert said.status == 2
+    line = said.only_line()
+    assert "m.toml: " in line
+    assert words in line
+    assert [path.name for path in Path().iterdir()] == ["m.toml"]
+
+
+@pytest.mark.parametrize("option", ["--json", "--temperature-from"])
+def test_what_is_written_is_no_other_file_of_the_command(call: Call, option: str) -> None:
+    Path("x.csv").write_text("t,gz\n")
+    same = f"../{Path.cwd().name}/x.csv"
+    said = call("simulate", "consumer-mems", "--seconds", "1", "--out", "x.csv", option, same)
+    assert said.status == 2
+    assert f"{option}: " in said.only_line()
+    assert Path("x.csv").read_text() == "t,gz\n"
+
+
+def test_a_path_to_no_model_names_those_that_there_are(call: Call) -> None:
+    said = call("simulate", "no/where.toml", "--seconds", "1", "--out", "x.csv")
+    assert said.status == 2
+    assert "known are adis16405, " in said.only_line()
+
+
+def test_a_model_without_a_rate_asks_for_one(call: Call) -> None:
+    Path("m.toml").write_text("[gz.angle_random_walk]\nN = 1e-3\n")
+    said = call("simulate", "m.toml", "--seconds", "1min", "--out", "x.csv")
+    assert said.status == 2
+    assert "m.toml: has no sample_rate; give one with --rate HZ" in said.only_line()
+    said = call(
+        "simulate", "m.toml", "--seconds", "1min", "--out", "x.csv", "--rate", "20", "--seed", "5", "--json", "-"
+    )
+    assert (said.status, said.err) == (0, "")
+    assert json.loads(said.out) == {
+        "schema": "imu-monitor/simulate/1",
+        "out": "x.csv",
+        "samples": 1200,
+        "rate": 20.0,
+        "seconds": 60.0,
+        "seed": 5,
+        "axes": ["gz"],
+        "temperature": False,
+        "truth": None,
+    }
+    assert len(Path("x.csv").read_text().splitlines()) == 1201
+
+
+def test_what_was_simulated_is_analyzed(call: Call) -> None:
+    said = call("simulate", "consumer-mems", "--seconds", "3min", "--out", "x.parquet", "--truth")
+    assert (said.status, said.err) == (0, "")
+    assert said.out == (
+        "x.parquet: 18000 samples at 100 Hz, 180 s, seed 1: gx gy gz ax ay az; truth in x.parquet.truth.json\n"
+    )
+    said = call("analyze", "x.parquet", "--json", "-")
+    assert said.status == 0
+    noise = json.loads(said.out)["axes"]["gz"]["coefficients"]["N"]
+    assert noise["lo"] <= 1.5e-4 <= noise["hi"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+def test_a_simulation_that_is_broken_off_leaves_nothing(tmp_path: Path, number: int, suffix: str) -> None:
+    arguments = ["simulate", "consumer-mems", "--seconds", "40d", "--out", f"x{suffix}", "--truth"]
+    process = subprocess.Popen([*PROGRAM, *arguments], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    try:
+        until = time.monotonic() + 30.0
+        while not growing(process.pid, tmp_path):
+            assert time.monotonic() < until
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.send_signal(number)
+        _, err = process.communicate(timeout=20.0)
+    finally:
+        process.kill()
+    assert process.returncode == 128 + number
+    assert err in ("imu-monitor: interrupted\n", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def growing(pid: int, folder: Path) -> bool:
+    """Whether the process holds a file in that folder, named or not, into which it has written."""
+    for opened in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(OSError):
+            if os.readlink(opened).startswith(str(folder)) and opened.stat().st_size > 100_000:
+                return True
+    return False
 
 
 # --- analyze ---------------------------------------------------------------------------------------

@@ -21,7 +21,9 @@ from drivers.recording import FORMATS
 from drivers.sample import block
 from drivers.sample_message import pack
 from monitor import settings, topics
+from monitor.catalogue import read_model
 from monitor.cli import app
+from monitor.noise.model import NoiseModel
 from monitor.publish import message
 from monitor.publish.rerun_sinks import server_url
 from monitor.publish.zenoh_out import ZenohOut
@@ -32,6 +34,7 @@ from tests.monitor.publish.zenoh_world import eventually, free_endpoint
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
 ARCHITECTURE = ROOT / "docs" / "architecture.md"
+SIMULATOR = ROOT / "docs" / "simulator.md"
 PAGES = sorted([README, ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 PRINTED_BY = "tcp/127.0.0.1:7450"
@@ -70,6 +73,19 @@ def test_every_configuration_is_one(toml: str, tmp_path: Path) -> None:
     (tmp_path / "recording.csv").write_text("t,gz\n0.00,0.1\n0.01,0.2\n")
     (tmp_path / "page.toml").write_text(toml)
     assert settings.read(tmp_path / "page.toml")[1] == []
+
+
+@pytest.mark.parametrize("toml", [t for page in PAGES for t in fences(page, "toml") if "angle_random_walk]" in t])
+def test_every_model_is_one_that_can_be_simulated(toml: str) -> None:
+    model = NoiseModel.from_toml(toml)
+    assert model.sample_rate_hz is not None
+    model.stream(model.sample_rate_hz, 1).draw(10)
+
+
+def test_the_catalogue_is_that_of_the_folder() -> None:
+    rows = re.findall(r"^\| `([^`]+)` \|.*\| ([\d.]+) \|$", section(SIMULATOR, "The catalogue"), re.M)
+    models = [(path.stem, read_model(path)) for path in sorted((ROOT / "config" / "models").glob("*.toml"))]
+    assert rows == [(name, f"{model.sample_rate_hz:g}") for name, model in models]
 
 
 def test_the_configurations_show_every_link() -> None:

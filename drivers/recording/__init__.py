@@ -14,48 +14,21 @@ Time stamps are passed on as stored, with their jitter, gaps and steps back. Not
 sorted or filled here, no unit is guessed, and nothing is ever unpickled.
 """
 
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import ConfigError, RecordingError
-from drivers.recording.arrow_format import (
-    read_ipc,
-    read_parquet,
-    write_ipc_file,
-    write_ipc_stream,
-    write_parquet,
-)
-from drivers.recording.csv_format import read_csv, write_csv, write_csv_gz
-from drivers.recording.npz_format import read_npz, write_npz
-from drivers.recording.table import EXAMPLE_HEADER, Table, listed
+from drivers.recording.formats import FORMATS, T_LIMIT_S, format_of, is_recording
+from drivers.recording.saving import save_samples, writing
+from drivers.recording.table import EXAMPLE_HEADER, Table
 from drivers.sample import AXES, Floats, SampleBlock, block
 
-T_LIMIT_S: Final = 9.2e9  # int64 nanoseconds end at 9.22e9 s; beyond it t is not in seconds
-
-
-@dataclass(frozen=True, slots=True)
-class _Format:
-    read: Callable[[Path], Table]
-    write: Callable[[Path, Mapping[str, Floats]], None]
-
-
-FORMATS: Final[Mapping[str, _Format]] = {
-    ".csv": _Format(read_csv, write_csv),
-    ".csv.gz": _Format(read_csv, write_csv_gz),
-    ".npz": _Format(read_npz, write_npz),
-    ".parquet": _Format(read_parquet, write_parquet),
-    ".arrow": _Format(read_ipc, write_ipc_file),
-    ".feather": _Format(read_ipc, write_ipc_file),
-    ".arrows": _Format(read_ipc, write_ipc_stream),
-}
-"""Suffixes of recordings, how each is read and written."""
+__all__ = ["FORMATS", "Recording", "is_recording", "iter_blocks", "load_samples", "save_samples", "writing"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,46 +72,13 @@ def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]
         yield block(_times_ns(recording, part), recording.values[part], recording.temperature_c[part])
 
 
-def save_samples(
-    path: Path,
-    t_s: Floats,
-    values: Floats,
-    temperature_c: Floats | None = None,
-    axes: Sequence[str] | None = None,
-) -> None:
-    """Write a recording in the format of the path's suffix; float64 comes back bit for bit.
-
-    ``t_s`` [n] s, ``values`` [n, 6] in AXES order, ``temperature_c`` [n] °C. ``axes`` names the columns
-    to write; by default those with at least one value. The file appears whole or not at all.
-
-    Raises ConfigError for a suffix or place that cannot be written, RecordingError for unfit arrays.
-    """
-    columns = _columns_to_save(path, t_s, values, temperature_c, axes)
-    write = _format(path).write
-    if not path.parent.is_dir():
-        raise ConfigError(f"{path}: cannot be written: there is no folder {path.parent}")
-    part = path.with_name(path.name + ".part")
-    try:
-        write(part, columns)
-        os.replace(part, path)
-    except (IsADirectoryError, PermissionError) as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        part.unlink(missing_ok=True)
-
-
-def is_recording(path: Path) -> bool:
-    """Whether the path's suffix is that of a recording; the file itself is not looked at."""
-    return _suffix(path) in FORMATS
-
-
 # --- from columns to a recording -----------------------------------------------------------------
 
 
 def _load_file(path: Path, rate_hz: float | None) -> Recording:
     if path.stat().st_size == 0:
         raise RecordingError(f"{path}: the file is empty; a recording has columns {EXAMPLE_HEADER}")
-    return _assemble(path, _format(path).read(path), rate_hz)
+    return _assemble(path, format_of(path).read(path), rate_hz)
 
 
 def _assemble(path: Path, table: Table, rate_hz: float | None) -> Recording:
@@ -274,40 +214,3 @@ def _joined(path: Path, parts: Sequence[Recording], notes: list[str]) -> Recordi
         tuple(a for a in AXES if any(a in part.axes for part in parts)),
         notes,
     )
-
-
-# --- suffixes and saving -------------------------------------------------------------------------
-
-
-def _suffix(path: Path) -> str:
-    name = path.name.lower()
-    return next((suffix for suffix in FORMATS if name.endswith(suffix)), "")
-
-
-def _format(path: Path) -> _Format:
-    suffix = _suffix(path)
-    if not suffix:
-        raise ConfigError(f"{path}: not the suffix of a recording; known are {' '.join(FORMATS)}")
-    return FORMATS[suffix]
-
-
-def _columns_to_save(
-    path: Path, t_s: Floats, values: Floats, temperature_c: Floats | None, axes: Sequence[str] | None
-) -> dict[str, Floats]:
-    n = len(t_s)
-    if n == 0 or values.shape != (n, len(AXES)):
-        raise RecordingError(f"{path}: {n} times do not fit values of shape {values.shape}; need [n, 6], n ≥ 1")
-    if temperature_c is not None and temperature_c.shape != (n,):
-        raise RecordingError(f"{path}: {n} times do not fit {temperature_c.size} temperatures")
-    if not np.all(np.abs(t_s) < T_LIMIT_S):
-        raise RecordingError(f"{path}: a time is missing or not in seconds")
-    if axes is None:
-        axes = [axis for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()]
-    unknown = [axis for axis in axes if axis not in AXES]
-    if unknown or not axes:
-        what = f"unknown axis {listed(unknown)}" if unknown else "no axis has a value"
-        raise RecordingError(f"{path}: {what}; axes are {' '.join(AXES)}")
-    columns = {"t": t_s} | {axis: values[:, AXES.index(axis)] for axis in axes}
-    if temperature_c is not None and not np.isnan(temperature_c).all():
-        columns["temperature"] = temperature_c
-    return {name: np.asarray(column, dtype=np.float64) for name, column in columns.items()}

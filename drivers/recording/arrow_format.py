@@ -3,14 +3,15 @@
 An Arrow file is read up to a cut, batch by batch; Parquet cannot be, since its index stands at the end.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from drivers.errors import ConfigError, RecordingError
-from drivers.recording.table import BATCH_ROWS, Table, chosen_columns
+from drivers.recording.table import BATCH_ROWS, PART, Append, Table, chosen_columns
 from drivers.sample import Floats
 
 ARROW_MAGIC: Final = b"ARROW1\0\0"
@@ -21,7 +22,8 @@ def _arrow(path: Path) -> Any:
     try:
         import pyarrow as pa
     except ImportError as error:
-        raise ConfigError(f'{path}: {path.suffix} needs pyarrow: pip install "imu-monitor[arrow]"') from error
+        whole = Path(str(path).removesuffix(PART))
+        raise ConfigError(f'{whole}: {whole.suffix} needs pyarrow: pip install "imu-monitor[arrow]"') from error
     return pa
 
 
@@ -87,26 +89,34 @@ def _first_line(error: Exception) -> str:
     return str(error).strip().partition("\n")[0].rstrip(".")
 
 
-def write_parquet(path: Path, columns: Mapping[str, Floats]) -> None:
-    """Write with Parquet's default compression."""
+@contextmanager
+def parquet_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
+    """Write with Parquet's default compression; what is appended at once is one row group."""
     pa = _arrow(path)
     from pyarrow import parquet
 
-    parquet.write_table(pa.table(dict(columns)), path)
+    schema = _schema(pa, names)
+    with parquet.ParquetWriter(path, schema) as file:
+        yield lambda columns: file.write_table(pa.table(dict(columns), schema))
 
 
-def write_ipc_file(path: Path, columns: Mapping[str, Floats]) -> None:
+def ipc_file_writer(path: Path, names: Sequence[str]) -> AbstractContextManager[Append]:
     """Write an Arrow file (Feather version 2)."""
-    pa = _arrow(path)
-    _write_ipc(pa.ipc.new_file, path, pa.table(dict(columns)))
+    return _ipc_writer(_arrow(path).ipc.new_file, path, names)
 
 
-def write_ipc_stream(path: Path, columns: Mapping[str, Floats]) -> None:
+def ipc_stream_writer(path: Path, names: Sequence[str]) -> AbstractContextManager[Append]:
     """Write an Arrow stream."""
+    return _ipc_writer(_arrow(path).ipc.new_stream, path, names)
+
+
+@contextmanager
+def _ipc_writer(new: Any, path: Path, names: Sequence[str]) -> Iterator[Append]:
     pa = _arrow(path)
-    _write_ipc(pa.ipc.new_stream, path, pa.table(dict(columns)))
+    schema = _schema(pa, names)
+    with new(str(path), schema) as file:
+        yield lambda columns: file.write_table(pa.table(dict(columns), schema), max_chunksize=BATCH_ROWS)
 
 
-def _write_ipc(new: Any, path: Path, table: Any) -> None:
-    with new(str(path), table.schema) as writer:
-        writer.write_table(table, max_chunksize=BATCH_ROWS)
+def _schema(pa: Any, names: Sequence[str]) -> Any:
+    return pa.schema([(name, pa.float64()) for name in names])

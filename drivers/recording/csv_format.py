@@ -9,7 +9,8 @@ import csv
 import gzip
 import io
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import BinaryIO, Final, TextIO
 import numpy as np
 
 from drivers.errors import RecordingError
-from drivers.recording.table import BATCH_ROWS, EXAMPLE_HEADER, Table, chosen_columns
+from drivers.recording.table import BATCH_ROWS, EXAMPLE_HEADER, Append, Columns, Table, chosen_columns
 from drivers.sample import Floats
 
 READ_BYTES: Final = 1 << 22
@@ -199,25 +200,31 @@ def _number(field: str) -> float | None:
         return None
 
 
-def write_csv(path: Path, columns: Mapping[str, Floats]) -> None:
+@contextmanager
+def csv_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
     """One header line, then one line a sample; missing is ``nan``."""
     with path.open("w", encoding="ascii", newline="") as file:
-        _write_lines(file, columns)
+        yield _lines_to(file, names)
 
 
-def write_csv_gz(path: Path, columns: Mapping[str, Floats]) -> None:
+@contextmanager
+def csv_gz_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
     """The same, compressed; equal columns give equal bytes, so no time stamp goes into the gzip header."""
     with (
         path.open("wb") as raw,
         gzip.GzipFile("", "wb", GZIP_LEVEL, raw, mtime=0) as packed,
         io.TextIOWrapper(packed, "ascii", newline="") as file,
     ):
-        _write_lines(file, columns)
+        yield _lines_to(file, names)
 
 
-def _write_lines(file: TextIO, columns: Mapping[str, Floats]) -> None:
+def _lines_to(file: TextIO, names: Sequence[str]) -> Append:
     """repr() is the shortest text that reads back as the same float64."""
-    file.write(",".join(columns) + "\n")
-    for start in range(0, next(iter(columns.values())).size, BATCH_ROWS):
-        fields = [map(repr, column[start : start + BATCH_ROWS].tolist()) for column in columns.values()]
-        file.writelines(",".join(row) + "\n" for row in zip(*fields, strict=True))
+    file.write(",".join(names) + "\n")
+
+    def append(columns: Columns) -> None:
+        for start in range(0, columns[names[0]].size, BATCH_ROWS):
+            fields = [map(repr, columns[name][start : start + BATCH_ROWS].tolist()) for name in names]
+            file.writelines(",".join(row) + "\n" for row in zip(*fields, strict=True))
+
+    return append

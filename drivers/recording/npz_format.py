@@ -5,23 +5,28 @@ from a cut file the arrays are found again by the header that stands before each
 """
 
 import io
+import shutil
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, Final, cast
+from tempfile import TemporaryFile
+from typing import IO, Any, BinaryIO, Final, cast
 
 import numpy as np
 from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from drivers.errors import RecordingError
-from drivers.recording.table import Table, chosen_columns
+from drivers.recording.table import Append, Columns, Table, chosen_columns
 from drivers.sample import Floats
 
 LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # PKWARE APPNOTE 4.3.7
 LOCAL_MAGIC: Final = b"PK\3\4"
+ITEM: Final = np.dtype("<f8")
+COPY_BYTES: Final = 1 << 18
 
 
 def read_npz(path: Path) -> Table:
@@ -145,8 +150,32 @@ def _array_up_to_cut(raw: bytes) -> NDArray[Any] | None:
     return array.reshape(shape) if array.size == np.prod(shape) else array
 
 
-def write_npz(path: Path, columns: Mapping[str, Floats]) -> None:
-    """Write compressed."""
-    arrays: dict[str, Any] = dict(columns)
-    with path.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+@contextmanager
+def npz_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
+    """Write compressed. An archive holds one array after the other, so columns gather in files without a name.
+
+    Those need the room of the numbers unpacked (8 bytes each) in the folder of ``path`` while it is written.
+    """
+    with ExitStack() as stack:
+        gathered = {name: stack.enter_context(TemporaryFile(dir=path.parent)) for name in names}
+
+        def append(columns: Columns) -> None:
+            for name, file in gathered.items():
+                file.write(np.ascontiguousarray(columns[name]).data)
+
+        yield append
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, file in gathered.items():
+                _put_array(archive, name, file)
+
+
+def _put_array(archive: zipfile.ZipFile, name: str, numbers: IO[bytes]) -> None:
+    """A member as ``numpy.savez_compressed`` makes it, without the array in memory."""
+    shape = (numbers.tell() // ITEM.itemsize,)
+    numbers.seek(0)
+    member = zipfile.ZipInfo(f"{name}.npy")  # dated 1980: equal columns give equal bytes
+    member.compress_type = zipfile.ZIP_DEFLATED
+    with archive.open(member, "w", force_zip64=True) as file:
+        header = {"descr": ITEM.str, "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(cast(Any, file), header)
+        shutil.copyfileobj(numbers, file, COPY_BYTES)

@@ -1,6 +1,7 @@
-"""What a reader of one format gives: known columns by name, the file's own rate, notes."""
+"""What a reader of one format gives (known columns by name, the file's own rate, notes), and what a writer takes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -16,6 +17,18 @@ ALIASES: Final = {"temp": "temperature"}
 EXAMPLE_HEADER: Final = "t,gx,gy,gz,ax,ay,az"
 
 BATCH_ROWS: Final = 1 << 16  # rows written at a time; a cut Arrow file loses at most so many
+
+PART: Final = ".part"
+"""End of a file's name while it is being written."""
+
+Columns = Mapping[str, Floats]
+"""Columns as float64 [n], all equally long, under their names in COLUMNS."""
+
+Append = Callable[[Columns], None]
+"""Takes the next rows of a file that is being written."""
+
+Writer = Callable[[Path, Sequence[str]], AbstractContextManager[Append]]
+"""Begins a file with columns of these names; it is whole once the context has been left."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -59,9 +59,9 @@ def from_model(model: NoiseModel, source: str = "noise model") -> Noise:
     letters = {effect: letter for letter, effect in EFFECT_OF.items()}
     axes: dict[str, dict[str, Term]] = {}
     left_out = []
-    for axis, sources in model.sources.items():
+    for axis, effects in model.effects.items():
         sizes: dict[str, float] = {}
-        for one in sources:
+        for one in effects:
             letter = letters.get(one.name)
             if letter is None:
                 left_out.append(f"{axis}.{one.name}")

@@ -6,6 +6,10 @@ from typing import Final
 
 RUNS: Final = (
     ("bench_window", "--rounds", "7"),
+    ("bench_batch", "--samples", "300000", "--rounds", "3"),
+    ("bench_paper", "--budget", "0.05", "--rounds", "1", "--windows", "10000"),
+    ("bench_memory", "--rate", "200", "--window", "600"),
+    ("bench_simulate", "--rounds", "3", "--memory", "2e6"),
     ("bench_decoders",),
     ("bench_imports", "--rounds", "3"),
     ("bench_latency", "--seconds", "10"),

@@ -1,6 +1,6 @@
 """Table 1 of "Dynamic extraction of random drift error coefficients of MEMS gyroscopes", and what a fit a sample costs.
 
-    python -m tests.bench.bench_paper [--budget 60] [--rounds 7]
+    python -m tests.bench.bench_paper [--budget 60] [--rounds 7] [--windows 10000 360000]
 
 The job of the table: white noise, a window of 202 samples, and at each sample the window's Allan variance and a fit
 of five coefficients. The paper compares a *general* method, which computes the variance of each window anew, and a
@@ -243,14 +243,14 @@ def each_sample(length: int, taus: int, rounds: int) -> tuple[str, ...]:
     )
 
 
-def fits(rounds: int) -> None:
+def fits(windows: Sequence[int], rounds: int) -> None:
     """Cost of a fit at every sample, of each window and number of τ."""
     load = Load()
     shown = table(
         f"six axes, a hundred samples a call, full windows; median of {rounds} rounds, a sample", "window", "τ",
         "kernel, and a τ·axis", "Estimator.update", "fitted at each", "more, an axis", "fit from nothing, an axis",
     )  # fmt: skip
-    for length in WINDOWS:
+    for length in windows:
         for taus in (20, 40):
             shown.add_row(f"{length:,}", *each_sample(length, taus, rounds))
     console.print(shown)
@@ -263,12 +263,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--budget", type=float, default=60.0, metavar="S", help="of a method and length; beyond, ~")
     parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument(
+        "--windows", type=int, nargs="+", default=WINDOWS, metavar="N", help="samples, of the last table"
+    )
     given = parser.parse_args()
     console.print(about())
     Fitted(cluster_sizes(L, 1.0))(LENGTHS[0])  # compiled by now
     paper(cluster_sizes(L, 1.0), given.budget)
     paper(np.arange(1, L // 2), given.budget)
-    fits(given.rounds)
+    fits(given.windows, given.rounds)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
 """Recordings: every format round trip, what is missing or cut, and files that are none."""
 
+import errno
 import gzip
 import os
 import pickle
 import sys
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import ConfigError, ImuError, RecordingError
-from drivers.recording import FORMATS, Recording, is_recording, iter_blocks, load_samples, save_samples
+from drivers.recording import FORMATS, Recording, is_recording, iter_blocks, load_samples, save_samples, writing
 from drivers.recording.csv_format import READ_BYTES
+from drivers.recording.saving import whole
 from drivers.sample import AXES, join
 
 SUFFIXES = tuple(FORMATS)
@@ -119,6 +122,63 @@ class TestRoundTrip:
         assert not is_recording(path.with_name(path.name + ".part"))
 
 
+def appended(path, t, values, temperature, cuts):
+    with writing(path, AXES, temperature=True) as append:
+        for rows in map(slice, (0, *cuts), (*cuts, len(t))):
+            append(t[rows], values[rows], temperature[rows])
+
+
+class TestPieceByPiece:
+    @pytest.mark.parametrize("cuts", [(1,), (100, 101, 1900), (65_537,)])
+    def test_any_cut_is_the_same_recording(self, path, cuts):
+        t, values, temperature = samples(max(cuts) + 100)
+        appended(path, t, values, temperature, cuts)
+        recording = load_samples(path)
+        assert recording.t_s.tobytes() == t.tobytes()
+        assert np.array_equal(recording.values, values)
+        assert np.array_equal(recording.temperature_c, temperature)
+        assert recording.notes == ()
+
+    def test_columns_that_were_not_asked_for_are_absent(self, path):
+        t, values, _ = samples()
+        with writing(path, ["gz"], temperature=False) as append:
+            append(t, values)
+        assert load_samples(path).axes == ("gz",)
+
+    @pytest.mark.parametrize("ended", [KeyboardInterrupt, OSError, SystemExit])
+    def test_a_run_that_is_broken_off_leaves_nothing(self, path, ended):
+        t, values, temperature = samples()
+        with pytest.raises(ended), writing(path, AXES, temperature=True) as append:  # noqa: PT012
+            append(t, values, temperature)
+            raise ended
+        assert list(path.parent.iterdir()) == []
+
+    def test_a_run_that_is_broken_off_leaves_what_was_there(self, path):
+        save_samples(path, *samples())
+        before = path.read_bytes()
+        with pytest.raises(KeyboardInterrupt), writing(path, AXES, temperature=True) as append:  # noqa: PT012
+            append(*samples(9))
+            raise KeyboardInterrupt
+        assert list(path.parent.iterdir()) == [path]
+        assert path.read_bytes() == before
+
+    def test_memory_does_not_grow_with_the_rows(self, path):
+        """What Python and NumPy hold; Arrow's own buffers are those of one piece."""
+        t, values, temperature = samples(5_000)
+
+        def peak(times):
+            tracemalloc.start()
+            with writing(path, AXES, temperature=True) as append:
+                for _ in range(times):
+                    append(t, values, temperature)
+            high = tracemalloc.get_traced_memory()[1]
+            tracemalloc.stop()
+            return high
+
+        few, many = peak(2), peak(14)
+        assert many < few + 1_000_000  # twelve times 320 kB more went through
+
+
 class TestSaveRefuses:
     def test_unknown_suffix(self, tmp_path):
         with pytest.raises(ConfigError, match=r"x\.mat: not the suffix of a recording; known are \.csv"):
@@ -133,6 +193,22 @@ class TestSaveRefuses:
         with pytest.raises(ConfigError, match="cannot be written"):
             save_samples(path, *samples())
         assert list(path.parent.iterdir()) == [path]
+
+    def test_what_the_system_refuses_is_said_before_the_work(self, tmp_path):
+        path = tmp_path / f"{'x' * 248}.csv"  # a name that cannot grow by .part
+        with pytest.raises(ConfigError, match=r"x\.csv: cannot be written: .*too long"):
+            save_samples(path, *samples())
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_full_disk_names_the_file_and_leaves_nothing(self, tmp_path):
+        def fill():
+            with whole(tmp_path / "x.csv") as part:
+                part.write_text("t,gz\n")
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        with pytest.raises(OSError, match=r"No space left on device: .*x\.csv"):
+            fill()
+        assert list(tmp_path.iterdir()) == []
 
     def test_arrays_that_do_not_fit(self, tmp_path):
         t, values, temperature = samples()

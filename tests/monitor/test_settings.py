@@ -141,6 +141,22 @@ CASES = {
         ["device a: driver.speed: Expected `float` <= 10000.0"],
     ),
     "unknown virtual model": (device(driver='driver = { link = "virtual", model = "none" }'), ['no model "none"']),
+    "unknown fault": (
+        device(driver='driver = { link = "virtual", faults = { lots = 1 } }'),
+        ['device a: driver.faults.lots: unknown key; did you mean "lost"?'],
+    ),
+    "more than all samples": (
+        device(driver='driver = { link = "virtual", faults = { lost = 1.5 } }'),
+        ["device a: driver.faults.lost: Expected `float` <= 1.0"],
+    ),
+    "more faults than samples": (
+        device(driver='driver = { link = "virtual", faults = { lost = 0.6, cut = 0.6 } }'),
+        ["device a: driver.faults: lost, repeated, flipped and cut are shares of all samples: their sum is at most 1"],
+    ),
+    "faults in a word": (
+        device(driver='driver = { link = "virtual", faults = "some" }'),
+        ["device a: driver.faults: expected a table"],
+    ),
     "replay of what cannot be": (
         device(driver='driver = { link = "replay", path = "a.jpg" }'),
         ["a.jpg: no such file"],
@@ -331,6 +347,18 @@ def test_virtual_model_may_be_a_file_beside_the_configuration(tmp_path):
     link = load(path).devices[0].link
     assert isinstance(link, VirtualTable)
     assert Path(link.model) == tmp_path / "mine.toml"
+
+
+@pytest.mark.parametrize(
+    ("decoder", "carrier"), [("vectornav_ascii", "bytes"), ("ros2_imu", "messages"), ("samples", "messages")]
+)
+def test_a_virtual_device_speaks_any_wire_format(tmp_path, decoder, carrier):
+    path = tmp_path / "my.toml"
+    path.write_text(device(driver=f'driver = {{ link = "virtual", decoder = "{decoder}", faults = {{ lost = 0.1 }} }}'))
+    found = load(path).devices[0]
+    assert found.decoder.carrier == carrier
+    assert isinstance(found.link, VirtualTable)
+    assert (found.link.faults.lost, found.link.faults.clock) == (0.1, 1.0)
 
 
 def test_windows_that_are_accepted_are_those_that_the_estimator_can_hold():

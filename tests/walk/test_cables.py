@@ -40,8 +40,8 @@ def pull_and_put_back(run: Running) -> None:
     imu, station = run.service.virtual["loose"], run.station("loose")
     imu.unplug()
     wait_for(lambda: station.driver.state == "lost", 10.0, "the loss")
-    before = imu.dropped
-    wait_for(lambda: imu.dropped >= before + 3, 10.0, "samples that find no cable")
+    before = imu.truth.dropped
+    wait_for(lambda: imu.truth.dropped >= before + 3, 10.0, "samples that find no cable")
     received = station.driver.counts.received
     imu.plug()
     wait_for(lambda: station.driver.counts.received >= received + 3, 10.0, "samples after the pause")

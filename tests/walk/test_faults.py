@@ -63,7 +63,7 @@ def healthy(folder: Path, text: str) -> Iterator[Running]:
     number = join(run.caught.blocks["healthy"]).ticks // PERIOD_NS  # TimeStartup: the place of each in what was sent
     assert counts.received == number.size == number[-1] - number[0] + 1
     assert (counts.lost, counts.bad, run.station("healthy").ring.overflowed) == (0, 0, 0)
-    assert run.service.virtual["healthy"].dropped == 0
+    assert run.service.virtual["healthy"].truth.dropped == 0
 
 
 def goes_on(run: Running) -> None:

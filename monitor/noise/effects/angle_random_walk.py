@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Source, check_parameters, parameter
+from monitor.noise.effect import Block, Series, Source, parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,9 +22,6 @@ class AngleRandomWalk(Source):
     name: ClassVar[str] = "angle_random_walk"
     means: ClassVar[str] = "White noise of the rate: averaging four times as long halves it."
 
-    def __post_init__(self) -> None:
-        check_parameters(self)
-
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """N²/τ."""
         return self.N**2 / tau_s
@@ -38,10 +35,12 @@ class AngleRandomWalk(Source):
         return _White(self.N * rate_hz**0.5, rng)
 
 
-class _White:
+class _White(Series):
     def __init__(self, deviation: float, rng: np.random.Generator) -> None:
         self._deviation = deviation
         self._rng = rng
 
-    def draw(self, n: int) -> Floats:
-        return self._deviation * self._rng.standard_normal(n)
+    def add(self, values: Floats, block: Block) -> None:
+        white = self._rng.standard_normal(out=block.scratch)
+        white *= self._deviation
+        values += white

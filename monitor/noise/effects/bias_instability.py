@@ -15,7 +15,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.compiled import compiled
-from monitor.noise.effect import Source, check_parameters, parameter
+from monitor.noise.effect import Block, Series, Source, parameter
 
 # fmt: off
 ONE_MINUS_POLE: Final = np.array([
@@ -51,9 +51,6 @@ class BiasInstability(Source):
     name: ClassVar[str] = "bias_instability"
     means: ClassVar[str] = "Slow flicker of the bias: the floor that no averaging gets below."
 
-    def __post_init__(self) -> None:
-        check_parameters(self)
-
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """(2 ln 2/π) B²; over few samples, where the spectrum ends at 1/(2 τ0), that of the samples."""
         m = np.atleast_1d(np.asarray(tau_s / tau0_s, np.float64))
@@ -79,7 +76,7 @@ def _sampled(m: Floats) -> Floats:
     return integral
 
 
-class _Flicker:
+class _Flicker(Series):
     """y = direct·w + Σ residue·s, s ← pole·s + w: the partial fractions of the filter."""
 
     def __init__(self, B: float, rng: np.random.Generator) -> None:
@@ -92,10 +89,9 @@ class _Flicker:
         overlap = ONE_MINUS_POLE[:, None] + ONE_MINUS_POLE - ONE_MINUS_POLE[:, None] * ONE_MINUS_POLE
         self._states = np.linalg.cholesky(1.0 / overlap) @ rng.standard_normal(ONE_MINUS_POLE.size)
 
-    def draw(self, n: int) -> Floats:
-        out = self._rng.standard_normal(n)
-        _colour(out, self._states, self._poles, self._residues, self._direct)
-        return out
+    def add(self, values: Floats, block: Block) -> None:
+        white = self._rng.standard_normal(out=block.scratch)
+        _colour(values, white, self._states, self._poles, self._residues, self._direct)
 
 
 def _residues() -> Floats:
@@ -108,12 +104,11 @@ def _residues() -> Floats:
 
 
 @compiled
-def _colour(series, states, poles, residues, direct):  # type: ignore[no-untyped-def]
-    """White noise in, 1/f noise out, in place; ``states`` is carried on."""
-    for k in range(series.size):
-        white = series[k]
-        value = direct * white
+def _colour(values, white, states, poles, residues, direct):  # type: ignore[no-untyped-def]
+    """White noise in, 1/f noise added; ``states`` is carried on."""
+    for k in range(values.size):
+        value = direct * white[k]
         for i in range(states.size):
-            states[i] = poles[i] * states[i] + white
+            states[i] = poles[i] * states[i] + white[k]
             value += residues[i] * states[i]
-        series[k] = value
+        values[k] += value

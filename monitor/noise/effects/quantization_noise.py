@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Source, check_parameters, parameter
+from monitor.noise.effect import Block, Series, Source, parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,9 +24,6 @@ class QuantizationNoise(Source):
         "The angle is rounded anew at every reading: strong between neighbouring samples, gone over seconds."
     )
 
-    def __post_init__(self) -> None:
-        check_parameters(self)
-
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """3Q²/τ²."""
         return 3.0 * self.Q**2 / tau_s**2
@@ -40,16 +37,16 @@ class QuantizationNoise(Source):
         return _Differences(self.Q, rate_hz, rng)
 
 
-class _Differences:
+class _Differences(Series):
     def __init__(self, Q: float, rate_hz: float, rng: np.random.Generator) -> None:
         self._rng = rng
-        self._Q = Q
-        self._rate_hz = rate_hz
-        self._angle = Q * float(rng.standard_normal())
+        self._scale = Q * rate_hz
+        self._angle = self._scale * float(rng.standard_normal())  # over the sample time
 
-    def draw(self, n: int) -> Floats:
-        angles = np.empty(n + 1)
-        angles[0] = self._angle
-        angles[1:] = self._Q * self._rng.standard_normal(n)
+    def add(self, values: Floats, block: Block) -> None:
+        angles = self._rng.standard_normal(out=block.scratch)
+        angles *= self._scale
+        values += angles
+        values[0] -= self._angle
+        values[1:] -= angles[:-1]
         self._angle = float(angles[-1])
-        return np.diff(angles) * self._rate_hz

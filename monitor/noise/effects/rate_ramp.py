@@ -1,12 +1,13 @@
 """Rate ramp R: a constant slope."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Source, check_parameters, parameter
+from monitor.noise.effect import Block, Series, Source, parameter
+from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,9 +23,6 @@ class RateRamp(Source):
     name: ClassVar[str] = "rate_ramp"
     means: ClassVar[str] = "The bias moves steadily in one direction, as while a sensor warms up."
 
-    def __post_init__(self) -> None:
-        check_parameters(self)
-
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """R²τ²/2."""
         return 0.5 * (self.R * tau_s) ** 2
@@ -33,17 +31,20 @@ class RateRamp(Source):
         """Zero: a slope taken out of a series leaves nothing."""
         return np.zeros_like(f_hz)
 
+    def spectrum(self, tau0_s: float) -> Spectrum:
+        """A slope and nothing else."""
+        return replace(Source.spectrum(self, tau0_s), slope=self.R)
+
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Slope":
         """A slope that starts at zero."""
         return _Slope(self.R / rate_hz)
 
 
-class _Slope:
+class _Slope(Series):
     def __init__(self, step: float) -> None:
         self._step = step
         self._count = 0
 
-    def draw(self, n: int) -> Floats:
-        k = np.arange(self._count, self._count + n, dtype=np.float64)
-        self._count += n
-        return self._step * k
+    def add(self, values: Floats, block: Block) -> None:
+        values += self._step * np.arange(self._count, self._count + values.size, dtype=np.float64)
+        self._count += values.size

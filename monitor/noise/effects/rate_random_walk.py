@@ -6,7 +6,8 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Source, check_parameters, parameter
+from monitor.compiled import compiled
+from monitor.noise.effect import Block, Series, Source, parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,9 +26,6 @@ class RateRandomWalk(Source):
     name: ClassVar[str] = "rate_random_walk"
     means: ClassVar[str] = "The bias itself takes random steps and never returns: worse the longer one averages."
 
-    def __post_init__(self) -> None:
-        check_parameters(self)
-
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """K²τ/3 (1 + τ0²/(2τ²))."""
         return self.K**2 / 3.0 * (tau_s + 0.5 * tau0_s**2 / tau_s)
@@ -41,17 +39,21 @@ class RateRandomWalk(Source):
         return _Walk(self.K / rate_hz**0.5, rng)
 
 
-class _Walk:
+class _Walk(Series):
     def __init__(self, step: float, rng: np.random.Generator) -> None:
         self._step = step
         self._rng = rng
         self._place = 0.0
 
-    def draw(self, n: int) -> Floats:
-        if n == 0:
-            return np.empty(0)
-        steps = self._step * self._rng.standard_normal(n)
-        steps[0] += self._place  # the running sum adds in the same order whatever the blocks
-        places: Floats = np.cumsum(steps)
-        self._place = float(places[-1])
-        return places
+    def add(self, values: Floats, block: Block) -> None:
+        steps = self._rng.standard_normal(out=block.scratch)
+        self._place = _walk(values, steps, self._step, self._place)
+
+
+@compiled
+def _walk(values, steps, step, place):  # type: ignore[no-untyped-def]
+    """Add the running sum; the order of its additions does not depend on the blocks."""
+    for k in range(values.size):
+        place += step * steps[k]
+        values[k] += place
+    return place

@@ -104,3 +104,10 @@ def test_a_spectrum_is_asked_by_medians():
     assert seen(LowPass("digital", 2, 0.2), spectrum)
     assert power(np.zeros(100)).size == 0
     assert not seen(LowPass("digital", 2, 0.2), power(np.zeros(100)))
+
+
+def test_a_spectrum_is_that_of_the_samples_there_are():
+    there = filtered(2, 20.0, 100_000)[:, 0]
+    absent = np.full(100_000, np.nan)
+    assert np.median(power(np.concatenate([absent, there])) / power(there)) == pytest.approx(1.0, rel=0.2)
+    assert power(absent).size == 0

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from drivers.sample import AXES
+from drivers.sample import AXES, block
 from monitor.estimate.batch import cluster_sizes
+from monitor.estimate.estimator import Estimator
 from monitor.estimate.fit import design, fit
 from monitor.estimate.refit import Refit
 from monitor.estimate.uncertainty import AxisTables, Tables

@@ -8,8 +8,9 @@ import pytest
 import config
 from drivers.errors import ConfigError
 from drivers.sample import AXES
-from monitor.noise.effects import EFFECTS, AngleRandomWalk, Bias, RateRandomWalk
+from monitor.noise.effects import EFFECTS, AngleRandomWalk, Bias, GSensitivity, RateRandomWalk
 from monitor.noise.model import NoiseModel
+from monitor.noise.temperature import Temperature
 
 MODELS = sorted(Path(p) for root in config.__path__ for p in Path(root).glob("models/*.toml"))
 
@@ -18,7 +19,7 @@ MODELS = sorted(Path(p) for root in config.__path__ for p in Path(root).glob("mo
 def test_shipped_models_are_read_and_written_back(path):
     model = NoiseModel.from_toml(path.read_text(encoding="utf-8"))
     assert model.sample_rate_hz
-    assert set(model.sources) == set(AXES)
+    assert set(model.effects) == set(AXES)
     assert NoiseModel.from_toml(model.to_toml()) == model
 
 
@@ -28,7 +29,7 @@ def test_some_model_is_shipped():
 
 def test_wildcards_stand_for_a_kind_of_axes_and_add_to_named_ones():
     model = NoiseModel.from_toml('[gz.bias]\nvalue = 1.0\n["g*".angle_random_walk]\nN = 2e-4')
-    assert model.sources == {
+    assert model.effects == {
         "gx": (AngleRandomWalk(N=2e-4),),
         "gy": (AngleRandomWalk(N=2e-4),),
         "gz": (Bias(value=1.0), AngleRandomWalk(N=2e-4)),
@@ -38,7 +39,7 @@ def test_wildcards_stand_for_a_kind_of_axes_and_add_to_named_ones():
 def test_an_effect_that_occurs_twice_is_an_array_of_tables():
     text = "[[gx.bias]]\nvalue = 1.0\n[[gx.bias]]\nvalue = 2.0\n"
     model = NoiseModel.from_toml(text)
-    assert model.sources["gx"] == (Bias(value=1.0), Bias(value=2.0))
+    assert model.effects["gx"] == (Bias(value=1.0), Bias(value=2.0))
     assert NoiseModel.from_toml(model.to_toml()) == model
 
 
@@ -55,6 +56,52 @@ def test_an_effect_that_occurs_twice_is_an_array_of_tables():
         ("gz = 1", "gz must be a table of effects, such as [gz.angle_random_walk]"),
         ("sample_rate = 0", "sample_rate must be a positive number of Hz, is 0"),
         ("gz = [", "not TOML: "),
+        ("[gz.sinusoidal]\namplitude = 1\nfrequency = 0", "gz.sinusoidal: frequency must be above zero, is 0"),
+        (
+            "sample_rate = 100\n[gz.sinusoidal]\namplitude = 1\nfrequency = 50",
+            "gz.sinusoidal: frequency must be below 50 Hz, half the sample rate, is 50",
+        ),
+        (
+            "sample_rate = 100\n[gz.bandwidth_limit]\ncutoff = 60\norder = 2",
+            "gz.bandwidth_limit: cutoff must be below 50 Hz, half the sample rate, is 60",
+        ),
+        (
+            '[gz.g_sensitivity]\nsource = "aq"\ncoefficient = 1',
+            "gz.g_sensitivity: source must be one of gx, gy, gz, ax, ay, az, is 'aq'; did you mean \"a",
+        ),
+        (
+            '[gz.g_sensitivity]\nsource = "gx"\ncoefficient = 1',
+            "gz.g_sensitivity: source must be an accelerometer, is 'gx'",
+        ),
+        (
+            '[ax.g_sensitivity]\nsource = "az"\ncoefficient = 1',
+            "ax.g_sensitivity: belongs on a gyroscope, not on ax",
+        ),
+        (
+            '[gz.cross_axis]\nsource = "az"\ncoefficient = 1',
+            "gz.cross_axis: source must be a gyroscope as gz is, is 'az'",
+        ),
+        (
+            '["a*".cross_axis]\nsource = "az"\ncoefficient = 1',
+            "az.cross_axis: source must be another axis than az itself",
+        ),
+        (
+            'sample_rate = 100\n[gz.cross_axis]\nsource = "gx"\ncoefficient = 1',
+            "gz.cross_axis: the model has no effect on its source gx",
+        ),
+        (
+            "sample_rate = 100\n[gz.noise_step]\ntime = 1\nratio = 2",
+            "gz.noise_step: gz has no angle_random_walk to multiply",
+        ),
+        (
+            "[gz.sample_rate_error]\nratio = 1.01\n[ax.sample_rate_error]\nratio = 0.99",
+            "sample_rate_error: a recording has one clock, but ratio is 0.99 and 1.01",
+        ),
+        ("[temperature]\nswing = 3", "temperature: mean is missing"),
+        ("[temperature]\nmean = 3\nswin = 3", 'temperature: unknown parameter "swin"; did you mean "swing"?'),
+        ("[temperature]\nmean = 3\nwander = 3", "temperature: wander needs a wander_time"),
+        ("[temperature]\nmean = 3\nswing = 3\nperiod = 0", "temperature: period must be above zero, is 0"),
+        ("temperature = 25", "temperature must be a table with mean, swing, period, wander, wander_time"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(text, says):
@@ -62,6 +109,37 @@ def test_what_is_wrong_is_said_in_one_line(text, says):
         NoiseModel.from_toml(text)
     assert str(error.value).startswith(says)
     assert "\n" not in str(error.value)
+
+
+def test_temperature_is_needed_by_the_stream_and_not_by_the_file():
+    model = NoiseModel.from_toml("sample_rate = 100\n[gz.temperature_bias]\ncoefficient = 1\nreference = 20")
+    with pytest.raises(ConfigError, match=r"^gz.temperature_bias: no temperature: .* no \[temperature\]"):
+        model.stream(100.0, 0)
+    assert model.simulate(2, 100.0, 0, np.array([21.0, 22.0]))[:, 2].tolist() == [1.0, 2.0]
+
+
+def test_sum_keeps_the_first_rate_and_temperature():
+    one = NoiseModel({}, 100.0, Temperature(mean=20.0))
+    assert one + NoiseModel({}, 50.0, Temperature(mean=30.0)) == one
+    assert NoiseModel() + one == one
+    with pytest.raises(TypeError):
+        one + 1
+
+
+def test_print_is_a_table_with_units():
+    model = NoiseModel(
+        {"gz": (AngleRandomWalk(N=1.5e-4), GSensitivity(source="az", coefficient=2e-5)), "az": (Bias(value=9.8),)},
+        100.0,
+        Temperature(mean=25.0, swing=3.0, period=86400.0),
+    )
+    assert str(model).splitlines() == [
+        "sample rate 100 Hz",
+        "temperature mean = 25 °C, swing = 3 °C, period = 86400 s",
+        "axis  effect             parameters",
+        "gz    angle_random_walk  N = 0.00015 rad/√s",
+        "gz    g_sensitivity      source = az, coefficient = 2e-05 rad/s per m/s²",
+        "az    bias               value = 9.8 m/s²",
+    ]
 
 
 def test_adding_an_effect_changes_no_other_series():

@@ -5,24 +5,16 @@ finished, but the data do not support an answer. Heavy libraries are imported by
 """
 
 import contextlib
-import io
 import signal
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, TextIO, cast
+from typing import Annotated, Final, NoReturn
 
 import typer
 from typer.exceptions import TyperException
 
 from drivers.errors import ConfigError, ImuError, NotReady, RecordingError
-
-if TYPE_CHECKING:
-    from monitor.estimate.analysis import Analysis
-    from monitor.estimate.batch import TauGrid
-    from monitor.export import Noise
-    from monitor.offline import Tell
-    from monitor.settings import Config
+from monitor.cli import options, output, serving
 
 FAILED: Final = 1
 WRONG: Final = 2
@@ -43,17 +35,35 @@ Viewer = Annotated[
 
 
 @app.command()
-def demo(seconds: Seconds = None, viewer: Viewer = None) -> None:
+def demo(
+    sensor: Annotated[
+        str | None, typer.Option(metavar="NAME|MODEL.toml", help="A sensor of the catalogue, or a model file.")
+    ] = None,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="AXIS.EFFECT:P=V,…",
+            help="An effect that the sensor takes on, e.g. gz.sinusoidal:amplitude=3e-3,frequency=17; repeatable.",
+        ),
+    ] = None,
+    effect_at: Annotated[
+        str | None, typer.Option(metavar="S", help="When, after the start; 90 s, by then changes are looked for.")
+    ] = None,
+    seconds: Seconds = None,
+    viewer: Viewer = None,
+) -> None:
     """The whole service on a simulated MEMS IMU that speaks a real wire format over a pseudo-terminal."""
-    from monitor.settings import CONFIG_FOLDER
+    from monitor.demo import demo as configuration
 
-    _serve(CONFIG_FOLDER / "demo.toml", seconds, viewer)
+    serving.serve(configuration(sensor, effect or (), options.duration("--effect-at", effect_at)), seconds, viewer)
 
 
 @app.command()
 def run(config: ConfigPath, seconds: Seconds = None, viewer: Viewer = None) -> None:
     """The daemon: every device in the file, until a signal."""
-    _serve(config, seconds, viewer)
+    from monitor import settings
+
+    serving.serve(settings.load(config), seconds, viewer)
 
 
 @app.command()
@@ -65,7 +75,7 @@ def check(
 ) -> None:
     """Read the file and say all that is wrong with it; opens nothing."""
     from monitor import settings
-    from monitor.virtual import read_model
+    from monitor.virtual import Sensor
 
     if print_defaults:
         typer.echo((settings.CONFIG_FOLDER / "defaults.toml").read_text("utf-8"), nl=False)
@@ -76,7 +86,7 @@ def check(
     for device in found.devices if found else ():
         if isinstance(device.link, settings.VirtualTable):
             try:
-                read_model(Path(device.link.model))
+                Sensor(device.link, device.decoder, device.name)
             except ConfigError as error:
                 wrong.append(f"{config}: device {device.name}: {error}")
     for line in wrong:
@@ -104,7 +114,7 @@ def watch(
     from monitor.topics import ENDPOINT
 
     stop = threading.Event()
-    _on_signals(stop.set)
+    serving.on_signals(stop.set)
     show(keyexpr, connect or [ENDPOINT], stop, Console(), seconds)
 
 
@@ -132,23 +142,63 @@ def analyze(
         raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
     if plot is not None and plot.suffix not in (".png", ".html"):
         raise ConfigError(f"--plot: {plot}: a name ending in .png or .html is needed")
-    wanted = offline.Request(recording, rate, _tau(tau), _duration("--window", window), rest, bool(json or plot))
+    window_s = options.duration("--window", window)
+    wanted = offline.Request(recording, rate, options.tau(tau), window_s, rest, bool(json or plot))
     try:
-        with _progress() as tell:
+        with output.progress() as tell:
             results = offline.make(wanted, tell)
     except offline.TooShort as error:
         if json is not None:
-            _write("--json", json, message.no_analysis(str(error), error.samples) + b"\n")
+            output.write("--json", json, message.no_analysis(str(error), error.samples) + b"\n")
         raise
     if json is not None:
         payload = message.analysis(results.analysis, results.total, results.hadamard, results.dynamic)
-        _write("--json", json, payload + b"\n")
+        output.write("--json", json, payload + b"\n")
     if plot is not None:
         offline.draw(results, plot, recording.name)
     if json != Path("-"):
-        _print_analysis(results.analysis)
+        output.print_analysis(results.analysis)
     if results.lacking:
         raise NotReady(results.lacking)
+
+
+@app.command()
+def simulate(
+    model: Annotated[str, typer.Argument(metavar="MODEL.toml|NAME", help="Model file, or one of the catalogue.")],
+    seconds: Annotated[str, typer.Option(metavar="S", help="Length in seconds; also 30min, 1h, 2d.")],
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="What to write: .csv, .csv.gz, .npz, .parquet, .arrow, .feather.")
+    ],
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Same seed, same recording.")] = 1,
+    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate; the model's own unless given.")] = None,
+    temperature_from: Annotated[
+        Path | None, typer.Option(metavar="RECORDING", help="Take the temperature of this recording.")
+    ] = None,
+    truth: Annotated[
+        bool, typer.Option("--truth", help="Write FILE.truth.json too: the model, and what was drawn from the seed.")
+    ] = False,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
+) -> None:
+    """A recording from a model, of any length; it appears whole or not at all."""
+    from monitor import simulate as simulation
+    from monitor.catalogue import load
+
+    length_s = options.duration("--seconds", seconds)
+    if rate is not None and not 0.0 < rate < float("inf"):
+        raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
+    output.check_place("--json", json)
+    for option, path in (("--json", json), ("--temperature-from", temperature_from)):
+        if path is not None and path.resolve() == out.resolve():
+            raise ConfigError(f"{option}: {path} is what --out writes; another name is needed")
+    noise = load(model, Path.cwd())
+    request = simulation.Request(noise, out, length_s, seed, rate, temperature_from, truth, model)
+    serving.end_on_sigterm()
+    with output.progress() as tell:
+        result = simulation.make(request, tell)
+    if json is not None:
+        output.write("--json", json, result.to_json() + b"\n")
+    if json != Path("-"):
+        typer.echo(result.text())
 
 
 @app.command()
@@ -171,15 +221,15 @@ def export(
     """Noise parameters for other tools: Kalibr's imu.yaml, MATLAB's gyroparams, a Kalman filter's F and Q."""
     from monitor import export as exports
 
-    options = {"dt_s": dt, "correlation_time_s": correlation_time, "rostopic": rostopic}
+    keys = {"dt_s": dt, "correlation_time_s": correlation_time, "rostopic": rostopic}
     belong = {"dt_s": "kalman", "correlation_time_s": "kalman", "rostopic": "kalibr"}
-    given = {name: value for name, value in options.items() if value is not None}
+    given = {name: value for name, value in keys.items() if value is not None}
     for name in given:
         if form in exports.FORMATS and form != belong[name]:
             option = name.removesuffix("_s").replace("_", "-")
             raise ConfigError(f"--{option}: belongs to --format {belong[name]}, not {form}")
-    text = exports.export(_noise(source), form, inflation, **given)
-    _write("--out", out or Path("-"), text.encode())
+    text = exports.export(options.noise(source), form, inflation, **given)
+    output.write("--out", out or Path("-"), text.encode())
 
 
 def main() -> None:
@@ -208,168 +258,3 @@ def _fail(line: str, status: int) -> NoReturn:
     with contextlib.suppress(OSError):  # nobody to say it to: the status stays
         print(f"imu-monitor: {line}", file=sys.stderr)  # noqa: T201
     sys.exit(status)
-
-
-def _serve(path: Path, seconds: float | None, viewer: str | None) -> None:
-    import dataclasses
-
-    import msgspec
-
-    from monitor import settings
-
-    config = settings.load(path)
-    if viewer is not None:
-        try:
-            mode = settings.viewer_mode(viewer)
-        except ConfigError as error:
-            raise ConfigError(f"--viewer: {error}") from None
-        config = dataclasses.replace(config, viewer=msgspec.structs.replace(config.viewer, mode=mode))
-    _log_as(config)
-    _serve_config(config, seconds)
-
-
-def _serve_config(config: "Config", seconds: float | None) -> None:
-    """Run the service: a table where there is a terminal, else log lines; the last table once more at the end."""
-    import time
-    from contextlib import nullcontext
-
-    from rich.console import Console
-    from rich.live import Live
-
-    from monitor.outputs import LogOutput, TableOutput
-    from monitor.publish.terminal import Board
-    from monitor.service import Service
-
-    console, board = Console(), Board()
-    live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
-    service = Service(config, [TableOutput(board, live)] if live else [TableOutput(board), LogOutput()])
-    _on_signals(service.stop)
-    with live or nullcontext():
-        service.run(seconds)
-    if live is not None or seconds is not None:
-        console.print(board.table(time.monotonic()))
-
-
-class _Lines(io.TextIOBase):
-    """Standard error as the log's place: a line that cannot be written (disk full, reader gone) is dropped."""
-
-    def write(self, text: str) -> int:
-        with contextlib.suppress(OSError):
-            sys.stderr.write(text)
-        return len(text)
-
-    def flush(self) -> None:
-        with contextlib.suppress(OSError):
-            sys.stderr.flush()
-
-
-def _log_as(config: "Config") -> None:
-    """Structured lines on standard error."""
-    import logging
-
-    import structlog
-
-    json = config.log.format == "json"
-    structlog.configure(
-        processors=[
-            structlog.processors.add_log_level,
-            structlog.processors.TimeStamper(fmt="iso", utc=True),
-            structlog.processors.JSONRenderer() if json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
-        ],
-        wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, config.log.level.upper())),
-        logger_factory=structlog.PrintLoggerFactory(cast("TextIO", _Lines())),
-        cache_logger_on_first_use=True,
-    )
-
-
-def _on_signals(stop: Callable[[], None]) -> None:
-    """First SIGINT or SIGTERM: stop in order. A second SIGINT ends at once."""
-    import threading
-
-    def first(number: int, _frame: Any) -> None:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        # in a thread of its own: the main one may hold the lock of the very event that stop sets
-        threading.Thread(target=stop, name="stop", daemon=True).start()
-
-    signal.signal(signal.SIGINT, first)
-    signal.signal(signal.SIGTERM, first)
-
-
-def _tau(text: str) -> "TauGrid":
-    if text in ("octave", "decade10"):
-        return text  # type: ignore[return-value]
-    try:
-        listed = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        raise ConfigError(f'--tau: "{text}"; possible are octave, decade10, or seconds with commas') from None
-    if not all(0.0 < value < float("inf") for value in listed):
-        raise ConfigError(f'--tau: "{text}"; every averaging time must be above 0 s')
-    return listed
-
-
-def _duration(option: str, text: str | None) -> float | None:
-    from monitor.settings import seconds
-
-    try:
-        return None if text is None else seconds(text)
-    except ConfigError as error:
-        raise ConfigError(f"{option}: {error}") from None
-
-
-def _noise(source: Path) -> "Noise":
-    """What is known of each axis; JSON begins with a brace, as no model does."""
-    from monitor.export import from_analysis, from_model
-    from monitor.noise.model import NoiseModel
-
-    try:
-        text = sys.stdin.buffer.read() if source == Path("-") else source.read_bytes()
-        if text.lstrip().startswith(b"{"):
-            return from_analysis(text, source.name)
-        return from_model(NoiseModel.from_toml(text.decode()), source.name)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{source}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    except ConfigError as error:
-        raise ConfigError(f"{source}: {error}") from error
-
-
-def _write(option: str, path: Path, data: bytes) -> None:
-    if path == Path("-"):
-        sys.stdout.buffer.write(data)
-        sys.stdout.buffer.flush()
-        return
-    try:
-        path.write_bytes(data)
-    except OSError as error:
-        raise ConfigError(f"{option}: {path}: cannot be written: {error.strerror}") from error
-
-
-@contextlib.contextmanager
-def _progress() -> "Iterator[Tell]":
-    """A bar on a terminal, nothing where output is piped."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    if not (console.is_terminal and sys.stdout.isatty()):
-        yield lambda _what, _share: None
-        return
-    with Progress(console=console, transient=True) as bar:
-        task = bar.add_task("", total=None)
-        yield lambda what, share: bar.update(task, description=what, total=share and 1.0, completed=share or 0.0)
-
-
-def _print_analysis(result: "Analysis") -> None:
-    from rich.console import Console
-
-    from monitor.publish.terminal import analysis_table
-
-    console = Console()
-    estimate = result.estimate
-    console.print(f"{estimate.curve.n} samples at {estimate.rate_hz:g} Hz, {result.seconds:.6g} s")
-    console.print(analysis_table(estimate))
-    for note in result.notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,58 @@
+"""The formats of recordings by suffix: how each is read and written."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from drivers.errors import ConfigError
+from drivers.recording.arrow_format import (
+    ipc_file_writer,
+    ipc_stream_writer,
+    parquet_writer,
+    read_ipc,
+    read_parquet,
+)
+from drivers.recording.csv_format import csv_gz_writer, csv_writer, read_csv
+from drivers.recording.npz_format import npz_writer, read_npz
+from drivers.recording.table import Table, Writer
+
+T_LIMIT_S: Final = 9.2e9  # int64 nanoseconds end at 9.22e9 s; beyond it t is not in seconds
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """One format."""
+
+    read: Callable[[Path], Table]
+    writer: Writer
+
+
+FORMATS: Final[Mapping[str, Format]] = {
+    ".csv": Format(read_csv, csv_writer),
+    ".csv.gz": Format(read_csv, csv_gz_writer),
+    ".npz": Format(read_npz, npz_writer),
+    ".parquet": Format(read_parquet, parquet_writer),
+    ".arrow": Format(read_ipc, ipc_file_writer),
+    ".feather": Format(read_ipc, ipc_file_writer),
+    ".arrows": Format(read_ipc, ipc_stream_writer),
+}
+"""Suffixes of recordings, how each is read and written."""
+
+
+def format_of(path: Path) -> Format:
+    """The format of the path's suffix; ConfigError for one that is none."""
+    suffix = _suffix(path)
+    if not suffix:
+        raise ConfigError(f"{path}: not the suffix of a recording; known are {' '.join(FORMATS)}")
+    return FORMATS[suffix]
+
+
+def is_recording(path: Path) -> bool:
+    """Whether the path's suffix is that of a recording; the file itself is not looked at."""
+    return _suffix(path) in FORMATS
+
+
+def _suffix(path: Path) -> str:
+    name = path.name.lower()
+    return next((suffix for suffix in FORMATS if name.endswith(suffix)), "")

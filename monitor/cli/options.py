@@ -1,0 +1,56 @@
+"""Arguments that are more than a word or a number; ConfigError names the option."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, overload
+
+from drivers.errors import ConfigError
+
+if TYPE_CHECKING:
+    from monitor.estimate.batch import TauGrid
+    from monitor.export import Noise
+
+
+def tau(text: str) -> "TauGrid":
+    """A grid by name, or a list of seconds."""
+    if text in ("octave", "decade10"):
+        return text  # type: ignore[return-value]
+    try:
+        listed = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f'--tau: "{text}"; possible are octave, decade10, or seconds with commas') from None
+    if not all(0.0 < value < float("inf") for value in listed):
+        raise ConfigError(f'--tau: "{text}"; every averaging time must be above 0 s')
+    return listed
+
+
+@overload
+def duration(option: str, text: str) -> float: ...
+@overload
+def duration(option: str, text: None) -> None: ...
+@overload
+def duration(option: str, text: str | None) -> float | None: ...
+def duration(option: str, text: str | None) -> float | None:
+    """Seconds, from a number of them or "30min", "1h"."""
+    from monitor.settings import seconds
+
+    try:
+        return None if text is None else seconds(text)
+    except ConfigError as error:
+        raise ConfigError(f"{option}: {error}") from None
+
+
+def noise(source: Path) -> "Noise":
+    """What is known of each axis; JSON begins with a brace, as no model does."""
+    from monitor.export import from_analysis, from_model
+    from monitor.noise.model import NoiseModel
+
+    try:
+        text = sys.stdin.buffer.read() if source == Path("-") else source.read_bytes()
+        if text.lstrip().startswith(b"{"):
+            return from_analysis(text, source.name)
+        return from_model(NoiseModel.from_toml(text.decode()), source.name)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{source}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from error

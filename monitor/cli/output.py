@@ -1,0 +1,62 @@
+"""What commands print and write: results, and progress on a terminal."""
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drivers.errors import ConfigError
+
+if TYPE_CHECKING:
+    from monitor.estimate.analysis import Analysis
+
+Tell = Callable[[str, float | None], None]
+"""Told what is being done, and the share that is done where that is known."""
+
+
+def check_place(option: str, path: Path | None) -> None:
+    """ConfigError before the work where ``write`` could not but fail after it."""
+    if path is not None and path != Path("-") and not path.parent.is_dir():
+        raise ConfigError(f"{option}: {path}: cannot be written: there is no folder {path.parent}")
+
+
+def write(option: str, path: Path, data: bytes) -> None:
+    """To a file, or to standard output for ``-``."""
+    if path == Path("-"):
+        sys.stdout.buffer.write(data)
+        sys.stdout.buffer.flush()
+        return
+    try:
+        path.write_bytes(data)
+    except OSError as error:
+        raise ConfigError(f"{option}: {path}: cannot be written: {error.strerror}") from error
+
+
+@contextlib.contextmanager
+def progress() -> Iterator[Tell]:
+    """A bar on a terminal, nothing where output is piped."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    if not (console.is_terminal and sys.stdout.isatty()):
+        yield lambda _what, _share: None
+        return
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda what, share: bar.update(task, description=what, total=share and 1.0, completed=share or 0.0)
+
+
+def print_analysis(result: "Analysis") -> None:
+    """Samples, coefficients and notes."""
+    from rich.console import Console
+
+    from monitor.publish.terminal import analysis_table
+
+    console = Console()
+    estimate = result.estimate
+    console.print(f"{estimate.curve.n} samples at {estimate.rate_hz:g} Hz, {result.seconds:.6g} s")
+    console.print(analysis_table(estimate))
+    for note in result.notes:
+        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)

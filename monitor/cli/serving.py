@@ -1,0 +1,110 @@
+"""The service in a terminal: its table or log lines, its log, and the signals that end it."""
+
+import contextlib
+import io
+import signal
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO, cast
+
+from drivers.errors import ConfigError
+
+if TYPE_CHECKING:
+    from monitor.settings import Config
+
+
+def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
+    """Run the service: a table where there is a terminal, else log lines; the last table once more at the end.
+
+    ``viewer`` goes before the configuration's.
+    """
+    import time
+    from contextlib import nullcontext
+
+    from rich.console import Console
+    from rich.live import Live
+
+    from monitor.outputs import LogOutput, TableOutput
+    from monitor.publish.terminal import Board
+    from monitor.service import Service
+
+    config = _with_viewer(config, viewer)
+    _log_as(config)
+    console, board = Console(), Board()
+    live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
+    service = Service(config, [TableOutput(board, live)] if live else [TableOutput(board), LogOutput()])
+    on_signals(service.stop)
+    with live or nullcontext():
+        service.run(seconds)
+    if live is not None or seconds is not None:
+        console.print(board.table(time.monotonic()))
+
+
+def _with_viewer(config: "Config", viewer: str | None) -> "Config":
+    import dataclasses
+
+    import msgspec
+
+    from monitor import settings
+
+    if viewer is None:
+        return config
+    try:
+        mode = settings.viewer_mode(viewer)
+    except ConfigError as error:
+        raise ConfigError(f"--viewer: {error}") from None
+    return dataclasses.replace(config, viewer=msgspec.structs.replace(config.viewer, mode=mode))
+
+
+class _Lines(io.TextIOBase):
+    """Standard error as the log's place: a line that cannot be written (disk full, reader gone) is dropped."""
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            sys.stderr.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            sys.stderr.flush()
+
+
+def _log_as(config: "Config") -> None:
+    """Structured lines on standard error."""
+    import logging
+
+    import structlog
+
+    json = config.log.format == "json"
+    structlog.configure(
+        processors=[
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            structlog.processors.JSONRenderer() if json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
+        ],
+        wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, config.log.level.upper())),
+        logger_factory=structlog.PrintLoggerFactory(cast("TextIO", _Lines())),
+        cache_logger_on_first_use=True,
+    )
+
+
+def on_signals(stop: Callable[[], None]) -> None:
+    """First SIGINT or SIGTERM: stop in order. A second SIGINT ends at once."""
+    import threading
+
+    def first(number: int, _frame: Any) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        # in a thread of its own: the main one may hold the lock of the very event that stop sets
+        threading.Thread(target=stop, name="stop", daemon=True).start()
+
+    signal.signal(signal.SIGINT, first)
+    signal.signal(signal.SIGTERM, first)
+
+
+def end_on_sigterm() -> None:
+    """SIGTERM ends work as Ctrl-C does: what is half written is removed."""
+
+    def ended(_number: int, _frame: Any) -> NoReturn:
+        sys.exit(128 + signal.SIGTERM)
+
+    signal.signal(signal.SIGTERM, ended)

@@ -1,0 +1,62 @@
+"""The sensor's own low-pass."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from scipy.signal import butter, sosfilt, sosfilt_zi
+
+from drivers.sample import Floats
+from monitor.noise.effect import Running, Transform, below_nyquist, parameter
+from monitor.noise.spectrum import Spectrum
+
+
+@dataclass(frozen=True, slots=True)
+class BandwidthLimit(Transform):
+    """Butterworth low-pass, digital by the bilinear transform: |H|² = 1/(1 + (tan(πfτ0)/tan(πf_cτ0))^(2n)).
+
+    Butterworth, "On the theory of filter amplifiers", 1930. The Allan variance behind it is an integral over the
+    spectrum. The filter begins settled at its first sample, so that gravity is no transient.
+
+    >>> from monitor.noise.spectrum import white
+    >>> half = BandwidthLimit(cutoff=10.0, order=2).reshape(white(1.0, 0.01)).density(np.array([10.0]))
+    >>> print(f"{half[0]:.6g}")
+    0.005
+    """
+
+    cutoff: float = parameter("Hz", "Hz", positive=True)
+    order: int = parameter("1", "1", positive=True, whole=True, most=8)
+
+    name: ClassVar[str] = "bandwidth_limit"
+    means: ClassVar[str] = "The sensor's own filter lets slow motion through and damps what is fast, noise too."
+
+    def check_rate(self, rate_hz: float) -> None:
+        """Its cutoff must be below half the sample rate."""
+        below_nyquist(self, "cutoff", rate_hz)
+
+    def reshape(self, spectrum: Spectrum) -> Spectrum:
+        """Times |H|²."""
+        tau0_s = spectrum.tau0_s
+        corner = np.tan(np.pi * self.cutoff * tau0_s)
+
+        def gain(f_hz: Floats) -> Floats:
+            # at half the sample rate the tangent is 1e16: over to infinity, and the gain is zero
+            with np.errstate(over="ignore"):
+                return np.asarray(1.0 / (1.0 + (np.tan(np.pi * f_hz * tau0_s) / corner) ** (2 * int(self.order))))
+
+        return spectrum.filtered(gain)
+
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_LowPass":
+        """Settled at the first sample."""
+        return _LowPass(butter(int(self.order), self.cutoff, fs=rate_hz, output="sos"))
+
+
+class _LowPass(Running):
+    def __init__(self, sections: Any) -> None:
+        self._sections = sections
+        self._state: Any = None
+
+    def apply(self, values: Floats) -> None:
+        if self._state is None:
+            self._state = sosfilt_zi(self._sections) * values[0]
+        values[:], self._state = sosfilt(self._sections, values, zi=self._state)

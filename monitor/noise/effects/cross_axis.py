@@ -1,0 +1,31 @@
+"""One axis that leaks into another of its kind."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from drivers.errors import ConfigError
+from monitor.noise.effect import GYROS, Leak, parameter, source_axis
+
+
+@dataclass(frozen=True, slots=True)
+class CrossAxis(Leak):
+    """y += c·x, with x as the axis ``source`` measures it by itself (IEEE Std 1293: cross-axis sensitivity).
+
+    >>> CrossAxis(source="gx", coefficient=0.02).check_axis("gx")
+    Traceback (most recent call last):
+    drivers.errors.ConfigError: cross_axis: source must be another axis than gx itself
+    """
+
+    source: str = source_axis()
+    coefficient: float = parameter("1", "1", signed=True)
+
+    name: ClassVar[str] = "cross_axis"
+    means: ClassVar[str] = "The axis is not square to its neighbour and reads a little of it."
+
+    def check_axis(self, axis: str) -> None:
+        """From another axis of the same kind."""
+        if self.source == axis:
+            raise ConfigError(f"{self.name}: source must be another axis than {axis} itself")
+        if (self.source in GYROS) != (axis in GYROS):
+            kind = "a gyroscope" if axis in GYROS else "an accelerometer"
+            raise ConfigError(f"{self.name}: source must be {kind} as {axis} is, is {self.source!r}")

@@ -1,0 +1,65 @@
+"""Exponentially correlated noise: first-order Gauss–Markov."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from drivers.sample import Floats
+from monitor.compiled import compiled
+from monitor.noise import correlated
+from monitor.noise.effect import Block, Series, Source, parameter
+
+
+@dataclass(frozen=True, slots=True)
+class ExponentiallyCorrelated(Source):
+    """Markov noise of IEEE Std 952 annex C, as sampled: autocovariance σ²φ^|n|, φ = exp(−τ0/T_c).
+
+    σ²(τ) = σ²(1 − φ²)[n − 3φ − nφ² + 4φ^(n+1) − φ^(2n+1)] / [n²(1 − φ)²(1 − φ²)] with n = τ/τ0,
+    S(f) = σ²τ0(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²).
+
+    >>> noise = ExponentiallyCorrelated(sigma=1.0, correlation_time=10.0)
+    >>> print(f"{noise.avar(np.array([18.9]), 1e-3)[0]:.3f}")
+    0.381
+    """
+
+    sigma: float = parameter("rad/s", "m/s²")
+    correlation_time: float = parameter("s", "s", positive=True)
+
+    name: ClassVar[str] = "exponentially_correlated"
+    means: ClassVar[str] = "The bias wanders and comes back, and forgets where it was after a correlation time."
+
+    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
+        """The closed form above."""
+        return correlated.avar(self.sigma, 1.0 / self.correlation_time, tau_s, tau0_s)
+
+    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
+        """The closed form above."""
+        return correlated.psd(self.sigma, 1.0 / self.correlation_time, f_hz, tau0_s)
+
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_GaussMarkov":
+        """A stationary series."""
+        return _GaussMarkov(self.sigma, 1.0 / (self.correlation_time * rate_hz), rng)
+
+
+class _GaussMarkov(Series):
+    """x ← φx + σ√(1 − φ²) w."""
+
+    def __init__(self, sigma: float, step: float, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._phi = float(np.exp(-step))
+        self._drive = sigma * float(np.sqrt(-np.expm1(-2.0 * step)))
+        self._state = sigma * float(rng.standard_normal())
+
+    def add(self, values: Floats, block: Block) -> None:
+        white = self._rng.standard_normal(out=block.scratch)
+        self._state = _follow(values, white, self._phi, self._drive, self._state)
+
+
+@compiled
+def _follow(values, white, phi, drive, state):  # type: ignore[no-untyped-def]
+    """Add the process; its state is given back."""
+    for k in range(values.size):
+        values[k] += state
+        state = phi * state + drive * white[k]
+    return state

@@ -1,0 +1,30 @@
+"""Acceleration that leaks into a gyroscope."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from drivers.errors import ConfigError
+from monitor.noise.effect import ACCELEROMETERS, GYROS, Leak, parameter, source_axis
+
+
+@dataclass(frozen=True, slots=True)
+class GSensitivity(Leak):
+    """ω += c·a, with a as the accelerometer ``source`` measures it by itself (IEEE Std 952: g-sensitive drift).
+
+    >>> GSensitivity(source="az", coefficient=1e-5).check_axis("ax")
+    Traceback (most recent call last):
+    drivers.errors.ConfigError: g_sensitivity: belongs on a gyroscope, not on ax
+    """
+
+    source: str = source_axis()
+    coefficient: float = parameter("rad/s per m/s²", "1", signed=True)
+
+    name: ClassVar[str] = "g_sensitivity"
+    means: ClassVar[str] = "The gyroscope feels acceleration: gravity and vibration shift its reading."
+
+    def check_axis(self, axis: str) -> None:
+        """On a gyroscope, from an accelerometer."""
+        if axis not in GYROS:
+            raise ConfigError(f"{self.name}: belongs on a gyroscope, not on {axis}")
+        if self.source not in ACCELEROMETERS:
+            raise ConfigError(f"{self.name}: source must be an accelerometer, is {self.source!r}")

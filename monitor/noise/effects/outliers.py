@@ -1,0 +1,56 @@
+"""Outliers: single samples that are wrong."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from drivers.sample import Floats
+from monitor.noise.effect import Block, Series, Source, parameter
+from monitor.noise.events import Events
+
+
+@dataclass(frozen=True, slots=True)
+class Outliers(Source):
+    """A share p of the samples, each by itself, has a Gaussian error of deviation s added: Tukey's contaminated noise.
+
+    Independent samples of variance ps²: S(f) = ps²τ0, σ²(τ) = ps²τ0/τ.
+
+    >>> print(f"{Outliers(fraction=1e-4, scale=0.1).avar(np.array([1.0]), 0.01)[0]:.6g}")
+    1e-08
+    """
+
+    fraction: float = parameter("1", "1", most=1.0)
+    scale: float = parameter("rad/s", "m/s²")
+
+    name: ClassVar[str] = "outliers"
+    means: ClassVar[str] = "Single samples are far off, the next ones are right again."
+
+    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
+        """ps²τ0/τ."""
+        return self.fraction * self.scale**2 * tau0_s / tau_s
+
+    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
+        """ps²τ0."""
+        return np.full_like(f_hz, self.fraction * self.scale**2 * tau0_s)
+
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Isolated":
+        """Gaps between outliers are geometric: what a toss at every sample gives."""
+        return _Isolated(self.fraction, self.scale, rate_hz, rng)
+
+
+class _Isolated(Series):
+    def __init__(self, fraction: float, scale: float, rate_hz: float, rng: np.random.Generator) -> None:
+        def gaps(n: int) -> Floats:
+            if fraction == 0.0:
+                return np.full(n, np.inf)
+            return rng.geometric(fraction, n).astype(np.float64)
+
+        self._events = Events(gaps, lambda n: scale * rng.standard_normal(n), rate_hz, before=-1.0)
+
+    def add(self, values: Floats, block: Block) -> None:
+        when, errors = self._events.take(block.first, values.size)
+        values[when] += errors
+
+    def truth(self) -> dict[str, Any]:
+        return self._events.truth("errors")

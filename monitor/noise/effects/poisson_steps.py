@@ -1,0 +1,63 @@
+"""Jumps at random times."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, ClassVar
+
+import numpy as np
+
+from drivers.sample import Floats
+from monitor.noise.effect import Block, Series, Source, parameter
+from monitor.noise.effects.rate_random_walk import RateRandomWalk
+from monitor.noise.events import Events
+
+
+@dataclass(frozen=True, slots=True)
+class PoissonSteps(Source):
+    """Gaussian jumps, λ a second on average: a compound Poisson process (Cox & Miller, Theory of Stochastic Processes).
+
+    Its increments are independent, so its second moments are those of rate random walk with K² = λh².
+
+    >>> jumps = PoissonSteps(rate=0.01, height=1e-4)
+    >>> print(f"{jumps.avar(np.array([300.0]), 0.01)[0]:.6g}")
+    1e-08
+    """
+
+    rate: float = parameter("1/s", "1/s")
+    height: float = parameter("rad/s", "m/s²")
+
+    name: ClassVar[str] = "poisson_steps"
+    means: ClassVar[str] = "Now and then the bias jumps to a new place and stays there."
+
+    @property
+    def _walk(self) -> RateRandomWalk:
+        return RateRandomWalk(K=self.rate**0.5 * self.height)
+
+    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
+        """That of rate random walk, K² = λh²."""
+        return self._walk.avar(tau_s, tau0_s)
+
+    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
+        """That of rate random walk, K² = λh²."""
+        return self._walk.psd(f_hz, tau0_s)
+
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Jumps":
+        """Starts at zero."""
+        return _Jumps(self.rate / rate_hz, self.height, rate_hz, rng)
+
+
+class _Jumps(Series):
+    def __init__(self, rate: float, height: float, rate_hz: float, rng: np.random.Generator) -> None:
+        gap = 1.0 / rate if rate > 0.0 else np.inf
+        self._events = Events(lambda n: rng.exponential(gap, n), lambda n: height * rng.standard_normal(n), rate_hz)
+        self._place = 0.0
+
+    def add(self, values: Floats, block: Block) -> None:
+        when, heights = self._events.take(block.first, values.size)
+        edges = [0, *when.tolist(), values.size]
+        for jump, (begin, end) in zip([0.0, *heights.tolist()], pairwise(edges), strict=True):
+            self._place += jump
+            values[begin:end] += self._place
+
+    def truth(self) -> dict[str, Any]:
+        return self._events.truth("heights")

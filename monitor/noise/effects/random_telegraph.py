@@ -1,0 +1,61 @@
+"""Random telegraph noise: popcorn."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, ClassVar
+
+import numpy as np
+
+from drivers.sample import Floats
+from monitor.noise import correlated
+from monitor.noise.effect import Block, Series, Source, parameter
+from monitor.noise.events import Events
+
+
+@dataclass(frozen=True, slots=True)
+class RandomTelegraph(Source):
+    """Two levels ±a/2, left after times that are exponentially distributed with mean T: flips at the rate λ = 1/T.
+
+    Autocovariance (a²/4) exp(−2λ|t|) (Machlup, "Noise in semiconductors: spectrum of a two-parameter random signal",
+    1954): second moments are those of exponentially correlated noise with σ = a/2 and T_c = T/2.
+
+    >>> popcorn = RandomTelegraph(amplitude=2.0, dwell_time=20.0)
+    >>> print(f"{popcorn.avar(np.array([18.9]), 1e-3)[0]:.3f}")
+    0.381
+    """
+
+    amplitude: float = parameter("rad/s", "m/s²")
+    dwell_time: float = parameter("s", "s", positive=True)
+
+    name: ClassVar[str] = "random_telegraph"
+    means: ClassVar[str] = "The bias jumps between two levels at random times, like popcorn."
+
+    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
+        """That of exponentially correlated noise, σ = a/2, T_c = T/2."""
+        return correlated.avar(0.5 * self.amplitude, 2.0 / self.dwell_time, tau_s, tau0_s)
+
+    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
+        """That of exponentially correlated noise, σ = a/2, T_c = T/2."""
+        return correlated.psd(0.5 * self.amplitude, 2.0 / self.dwell_time, f_hz, tau0_s)
+
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_TwoLevels":
+        """A stationary series: either level first, and the rest of a dwell, which is as long as a whole one."""
+        return _TwoLevels(0.5 * self.amplitude, self.dwell_time * rate_hz, rate_hz, rng)
+
+
+class _TwoLevels(Series):
+    def __init__(self, level: float, dwell: float, rate_hz: float, rng: np.random.Generator) -> None:
+        self._level = level if rng.random() < 0.5 else -level
+        self._first_level = self._level
+        self._flips = Events(lambda n: rng.exponential(dwell, n), np.zeros, rate_hz)
+
+    def add(self, values: Floats, block: Block) -> None:
+        when, _ = self._flips.take(block.first, values.size)
+        edges = [0, *when.tolist(), values.size]
+        for begin, end in pairwise(edges):
+            values[begin:end] += self._level
+            self._level = -self._level
+        self._level = -self._level  # no flip at the end of a block
+
+    def truth(self) -> dict[str, Any]:
+        return {"first_level": self._first_level, **self._flips.truth()}

@@ -1,0 +1,52 @@
+"""The least significant bit."""
+
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+
+from drivers.sample import Floats
+from monitor.noise.effect import Running, Transform, parameter
+from monitor.noise.spectrum import Spectrum, unknown, white
+
+WIDE: Final = 0.6
+"""Allan deviation at τ0, in steps, above which rounding is white: its harmonics are below exp(−2π²·0.6²) = 8·10⁻⁴."""
+
+
+@dataclass(frozen=True, slots=True)
+class Resolution(Transform):
+    """y = x rounded to whole steps.
+
+    Where neighbouring samples differ by more than a step, rounding adds independent errors of variance step²/12
+    (Widrow & Kollár, Quantization Noise, 2008): S(f) + step²τ0/12, σ²(τ) + step²τ0/(12τ). That holds where the Allan
+    deviation at τ0 is at least 0.6 steps. Below, the output depends on where between two steps the rate lies: NaN.
+
+    >>> one = white(1.0, 0.01)
+    >>> [round(float(Resolution(step=x).reshape(one).allan(np.array([1.0]))[0]), 6) for x in (1.2, 3.0)]
+    [0.0112, nan]
+    """
+
+    step: float = parameter("rad/s", "m/s²", positive=True)
+
+    name: ClassVar[str] = "resolution"
+    means: ClassVar[str] = "The output moves in steps of one least significant bit."
+
+    def reshape(self, spectrum: Spectrum) -> Spectrum:
+        """Plus white noise of variance step²/12, where that holds."""
+        tau0_s = spectrum.tau0_s
+        deviation = float(spectrum.allan(np.array([tau0_s]))[0]) ** 0.5
+        return spectrum + white(self.step**2 / 12.0, tau0_s) if deviation >= WIDE * self.step else unknown(tau0_s)
+
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Rounding":
+        """A rounding."""
+        return _Rounding(self.step)
+
+
+class _Rounding(Running):
+    def __init__(self, step: float) -> None:
+        self._step = step
+
+    def apply(self, values: Floats) -> None:
+        values /= self._step
+        np.rint(values, out=values)
+        values *= self._step

@@ -1,0 +1,83 @@
+"""Samples that repeat the one before."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from drivers.sample import Floats
+from monitor.compiled import compiled
+from monitor.noise.effect import Running, Transform, parameter
+from monitor.noise.spectrum import Spectrum
+
+
+@dataclass(frozen=True, slots=True)
+class SampleHold(Transform):
+    """A share h of the samples, tossed for each by itself, repeats the sample before.
+
+    With the age of the value that is read being geometric, what is read is on average the input through
+    G = (1 − h)/(1 − h/z), and the rest is noise that decays as hⁿ: with V the mean square of (1 − |G|²) S,
+    S_out(f) = |G|² S + V τ0 (1 − h²)/|1 − h/z|². Exact for any input of stationary increments. The Allan variance is an
+    integral over that spectrum.
+
+    >>> from monitor.noise.spectrum import white
+    >>> held = SampleHold(fraction=0.5).reshape(white(1.0, 0.01))
+    >>> print(f"{held.allan(np.array([0.01]))[0]:.3f}")  # r(0) − r(1) of white noise held: 1 − h
+    0.500
+    """
+
+    fraction: float = parameter("1", "1", most=0.999)
+
+    name: ClassVar[str] = "sample_hold"
+    means: ClassVar[str] = "Some samples are not new: the value before is sent once more."
+
+    def reshape(self, spectrum: Spectrum) -> Spectrum:
+        """As the class says."""
+        h, tau0_s = self.fraction, spectrum.tau0_s
+
+        def squared(f_hz: Floats) -> Floats:
+            return np.asarray((1.0 - h) ** 2 + 4.0 * h * np.sin(np.pi * f_hz * tau0_s) ** 2)  # |1 − h/z|²
+
+        def gain(f_hz: Floats) -> Floats:
+            return (1.0 - h) ** 2 / squared(f_hz)
+
+        lowest = 1e-7 / tau0_s
+        # 1 − |G|², without cancellation at low f
+        lost = (
+            spectrum.mean_square(lowest, lambda f: 4.0 * h * np.sin(np.pi * f * tau0_s) ** 2 / squared(f))
+            + spectrum.slope**2 * tau0_s**2 * h / (1.0 - h) ** 2
+        )
+        rest = Spectrum(lambda f: lost * tau0_s * (1.0 - h**2) / squared(f), None, tau0_s)
+        return spectrum.filtered(gain, around=((0.0, (1.0 - h) / (2.0 * np.pi * tau0_s)),)) + rest
+
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Holding":
+        """The first sample is always new."""
+        return _Holding(self.fraction, rng)
+
+
+class _Holding(Running):
+    def __init__(self, fraction: float, rng: np.random.Generator) -> None:
+        self._fraction = fraction
+        self._rng = rng
+        self._last = np.nan
+        self._held = 0
+
+    def apply(self, values: Floats) -> None:
+        tosses = self._rng.random(values.size)
+        self._last, held = _hold(values, tosses, self._fraction, self._last)
+        self._held += held
+
+    def truth(self) -> dict[str, Any]:
+        return {"count": self._held}
+
+
+@compiled
+def _hold(values, tosses, fraction, last):  # type: ignore[no-untyped-def]
+    held = 0
+    for k in range(values.size):
+        if tosses[k] < fraction and not np.isnan(last):
+            values[k] = last
+            held += 1
+        else:
+            last = values[k]
+    return last, held

@@ -1,0 +1,43 @@
+"""A scale factor that is wrong."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from drivers.sample import Floats
+from monitor.noise.effect import Running, Transform, parameter
+from monitor.noise.spectrum import Spectrum
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleFactor(Transform):
+    """y = f·x: σ²(τ) and S(f) of the axis times f² (IEEE Std 952, scale factor).
+
+    >>> from monitor.noise.spectrum import white
+    >>> float(ScaleFactor(factor=2.0).reshape(white(1.0, 0.01)).allan(np.array([0.01]))[0])
+    4.0
+    """
+
+    factor: float = parameter("1", "1")
+
+    name: ClassVar[str] = "scale_factor"
+    means: ClassVar[str] = (
+        "Everything the axis reads is too large or too small by one factor, as after a slip of units."
+    )
+
+    def reshape(self, spectrum: Spectrum) -> Spectrum:
+        """Times f²."""
+        return spectrum.scaled(self.factor)
+
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Scaling":
+        """A multiplication."""
+        return _Scaling(self.factor)
+
+
+class _Scaling(Running):
+    def __init__(self, factor: float) -> None:
+        self._factor = factor
+
+    def apply(self, values: Floats) -> None:
+        values *= self._factor

@@ -1,0 +1,84 @@
+"""A sinusoid: a motor, the mains, a fan."""
+
+from dataclasses import dataclass, replace
+from math import cos, floor, pi, sin
+from typing import Any, ClassVar, Final
+
+import numpy as np
+
+from drivers.sample import Floats
+from monitor.compiled import compiled
+from monitor.noise.effect import Block, Series, Source, below_nyquist, parameter
+from monitor.noise.spectrum import Spectrum, allan_of_line
+
+RENEWED: Final = 64
+"""The rotation that makes the sinusoid begins anew at every so many samples: rounding does not add up."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sinusoidal(Source):
+    """A sin(2πft + φ), IEEE Std 952 annex C, as sampled: σ²(τ) = A² sin⁴(πfτ)/(m² sin²(πfτ0)), m = τ/τ0.
+
+    The textbook A² sin⁴(πfτ)/(πfτ)² is its limit for τ0 → 0. Its spectrum is a line of A²/4 at ±f and has no density.
+    A phase that is absent is drawn from the seed.
+
+    >>> line = Sinusoidal(amplitude=1.0, frequency=25.0)
+    >>> [round(float(x), 6) for x in line.avar(np.array([0.01, 0.02, 0.04]), 0.01)]
+    [0.5, 0.5, 0.0]
+    """
+
+    amplitude: float = parameter("rad/s", "m/s²")
+    frequency: float = parameter("Hz", "Hz", positive=True)
+    phase: float | None = parameter("rad", "rad", signed=True, optional=True)
+
+    name: ClassVar[str] = "sinusoidal"
+    means: ClassVar[str] = "A steady oscillation at one frequency: a line in the spectrum, waves in the Allan curve."
+
+    def check_rate(self, rate_hz: float) -> None:
+        """Its frequency must be below half the sample rate."""
+        below_nyquist(self, "frequency", rate_hz)
+
+    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
+        """A² sin⁴(πfτ)/(m² sin²(πfτ0))."""
+        return allan_of_line(self.frequency, 0.5 * self.amplitude**2, tau_s, tau0_s)
+
+    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
+        """Zero: a line has power, but no density."""
+        return np.zeros_like(f_hz)
+
+    def spectrum(self, tau0_s: float) -> Spectrum:
+        """One line."""
+        return replace(Source.spectrum(self, tau0_s), lines=((self.frequency, 0.5 * self.amplitude**2),))
+
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Line":
+        """A sinusoid that counts its time from the stream's first sample."""
+        drawn = self.phase is None
+        phase = float(rng.uniform(0.0, 2.0 * pi)) if self.phase is None else self.phase
+        return _Line(self.amplitude, self.frequency / rate_hz, phase, drawn)
+
+
+class _Line(Series):
+    def __init__(self, amplitude: float, step: float, phase: float, drawn: bool) -> None:
+        self._amplitude, self._step, self._phase, self._drawn = amplitude, step, phase, drawn
+
+    def add(self, values: Floats, block: Block) -> None:
+        _turn(values, block.first, self._amplitude, self._step, self._phase)
+
+    def truth(self) -> dict[str, Any]:
+        return {"phase": self._phase} if self._drawn else {}
+
+
+@compiled
+def _turn(values, first, amplitude, step, phase):  # type: ignore[no-untyped-def]
+    """Add A sin(2π·step·k + phase) for k = first, …; ``step`` is in cycles a sample."""
+    c, s = cos(2.0 * pi * step), sin(2.0 * pi * step)
+    k = first - first % RENEWED
+    while k < first + values.size:
+        cycles = step * k
+        angle = 2.0 * pi * (cycles - floor(cycles)) + phase
+        x, y = amplitude * cos(angle), amplitude * sin(angle)
+        for i in range(k, min(k + RENEWED, first + values.size)):
+            if i >= first:
+                values[i - first] += y
+            x, y = c * x - s * y, s * x + c * y
+        k += RENEWED

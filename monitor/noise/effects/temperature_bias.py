@@ -1,0 +1,49 @@
+"""A bias that follows temperature at once."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from drivers.sample import Floats
+from monitor.noise.effect import Block, Series, Source, parameter
+
+
+@dataclass(frozen=True, slots=True)
+class TemperatureBias(Source):
+    """b = c (T − T_r) + q (T − T_r)²: the polynomial of IEEE Std 952's error model, to second order.
+
+    Its Allan variance and spectrum are those of the temperature, which is not the effect's to know: NaN.
+
+    >>> bool(np.isnan(TemperatureBias(coefficient=1e-4, reference=25.0).psd(np.array([1.0]), 0.01)[0]))
+    True
+    """
+
+    coefficient: float = parameter("rad/s/°C", "m/s²/°C", signed=True)
+    reference: float = parameter("°C", "°C", signed=True)
+    quadratic: float | None = parameter("rad/s/°C²", "m/s²/°C²", signed=True, optional=True)
+
+    name: ClassVar[str] = "temperature_bias"
+    means: ClassVar[str] = "The bias moves with the temperature of the sensor, without delay."
+    uses_temperature: ClassVar[bool] = True
+
+    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
+        """NaN: it depends on the temperature."""
+        return np.full_like(tau_s, np.nan)
+
+    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
+        """NaN: it depends on the temperature."""
+        return np.full_like(f_hz, np.nan)
+
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Following":
+        """A function of each sample's temperature."""
+        return _Following(self.coefficient, self.quadratic or 0.0, self.reference)
+
+
+class _Following(Series):
+    def __init__(self, linear: float, quadratic: float, reference_c: float) -> None:
+        self._linear, self._quadratic, self._reference_c = linear, quadratic, reference_c
+
+    def add(self, values: Floats, block: Block) -> None:
+        warmer = block.temperature_c - self._reference_c
+        values += (self._linear + self._quadratic * warmer) * warmer

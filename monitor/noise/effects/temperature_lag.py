@@ -1,0 +1,63 @@
+"""A bias that follows temperature with a delay."""
+
+from dataclasses import dataclass
+from math import expm1
+from typing import ClassVar
+
+import numpy as np
+
+from drivers.sample import Floats
+from monitor.compiled import compiled
+from monitor.noise.effect import Block, Series, Source, parameter
+
+
+@dataclass(frozen=True, slots=True)
+class TemperatureLag(Source):
+    """b = c (T_l − T_r), where T_l follows the measured T by dT_l/dt = (T − T_l)/τ: Newton's law of cooling.
+
+    The part that causes the bias is taken to have settled at the first temperature when the series begins. Between
+    samples the temperature is held. Allan variance and spectrum depend on the temperature: NaN.
+
+    >>> lag = TemperatureLag(coefficient=1e-4, reference=25.0, time_constant=60.0)
+    >>> bool(np.isnan(lag.avar(np.array([1.0]), 0.01)[0]))
+    True
+    """
+
+    coefficient: float = parameter("rad/s/°C", "m/s²/°C", signed=True)
+    reference: float = parameter("°C", "°C", signed=True)
+    time_constant: float = parameter("s", "s", positive=True)
+
+    name: ClassVar[str] = "temperature_lag"
+    means: ClassVar[str] = "The bias follows the temperature of the sensor, but later: heat takes its time."
+    uses_temperature: ClassVar[bool] = True
+
+    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
+        """NaN: it depends on the temperature."""
+        return np.full_like(tau_s, np.nan)
+
+    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
+        """NaN: it depends on the temperature."""
+        return np.full_like(f_hz, np.nan)
+
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Lagging":
+        """Settled at the first temperature."""
+        return _Lagging(self.coefficient, self.reference, -expm1(-1.0 / (self.time_constant * rate_hz)))
+
+
+class _Lagging(Series):
+    def __init__(self, coefficient: float, reference_c: float, share: float) -> None:
+        self._coefficient, self._reference_c, self._share = coefficient, reference_c, share
+        self._inside_c: float | None = None
+
+    def add(self, values: Floats, block: Block) -> None:
+        inside = float(block.temperature_c[0]) if self._inside_c is None else self._inside_c
+        self._inside_c = _lag(values, block.temperature_c, inside, self._coefficient, self._reference_c, self._share)
+
+
+@compiled
+def _lag(values, temperature, inside, coefficient, reference, share):  # type: ignore[no-untyped-def]
+    """Add the bias of the temperature inside, which is given back."""
+    for k in range(values.size):
+        values[k] += coefficient * (inside - reference)
+        inside += share * (temperature[k] - inside)
+    return inside

@@ -1,0 +1,56 @@
+"""A transient after switching on."""
+
+from dataclasses import dataclass
+from math import exp
+from typing import ClassVar
+
+import numpy as np
+
+from drivers.sample import Floats
+from monitor.compiled import compiled
+from monitor.noise.effect import Block, Series, Source, parameter
+
+
+@dataclass(frozen=True, slots=True)
+class TurnOnTransient(Source):
+    """A exp(−t/τ) from the first sample on: the warm-up term of IEEE Std 952's drift model.
+
+    It happens once, so its Allan variance and spectrum depend on the length of the recording: NaN.
+
+    >>> bool(np.isnan(TurnOnTransient(amplitude=1e-3, time_constant=60.0).avar(np.array([1.0]), 0.01)[0]))
+    True
+    """
+
+    amplitude: float = parameter("rad/s", "m/s²", signed=True)
+    time_constant: float = parameter("s", "s", positive=True)
+
+    name: ClassVar[str] = "turn_on_transient"
+    means: ClassVar[str] = "After switching on the bias runs in, quickly at first, then ever more slowly."
+
+    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
+        """NaN: it depends on the length of the recording."""
+        return np.full_like(tau_s, np.nan)
+
+    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
+        """NaN: it depends on the length of the recording."""
+        return np.full_like(f_hz, np.nan)
+
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Decay":
+        """Begins at its first sample, also where it is added to a running stream."""
+        return _Decay(self.amplitude, 1.0 / (self.time_constant * rate_hz))
+
+
+class _Decay(Series):
+    def __init__(self, amplitude: float, step: float) -> None:
+        self._amplitude, self._step = amplitude, step
+        self._count = 0
+
+    def add(self, values: Floats, block: Block) -> None:
+        _decay(values, self._count, self._amplitude, self._step)
+        self._count += values.size
+
+
+@compiled
+def _decay(values, first, amplitude, step):  # type: ignore[no-untyped-def]
+    for k in range(values.size):
+        values[k] += amplitude * exp(-step * (first + k))

@@ -1,0 +1,112 @@
+"""The temperature of a simulated sensor: a steady swing, as of day and night, plus a slow wander.
+
+T(t) = mean + swing sin(2πt/period) + first-order Gauss–Markov noise of deviation ``wander`` and correlation time
+``wander_time``. Where a recording has its own temperature, that stands instead.
+"""
+
+from dataclasses import dataclass, fields
+from math import isfinite
+from typing import Final
+
+import numpy as np
+
+from drivers.errors import ConfigError
+from drivers.plugin import nearest
+from drivers.sample import Floats
+from monitor.noise.effect import Block, Series
+from monitor.noise.effects.exponentially_correlated import ExponentiallyCorrelated
+from monitor.noise.effects.sinusoidal import Sinusoidal
+
+UNITS: Final = {"mean": "°C", "swing": "°C", "period": "s", "wander": "°C", "wander_time": "s"}
+
+
+@dataclass(frozen=True, slots=True)
+class Temperature:
+    """What a model file's ``[temperature]`` says; a swing needs its period, a wander its time.
+
+    >>> Temperature(mean=25.0, swing=3.0)
+    Traceback (most recent call last):
+    drivers.errors.ConfigError: temperature: swing needs a period
+    """
+
+    mean: float
+    swing: float | None = None
+    period: float | None = None
+    wander: float | None = None
+    wander_time: float | None = None
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if value is None and f.name != "mean":
+                continue
+            if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+                raise ConfigError(f"temperature: {f.name} must be a finite number, is {value!r}")
+            if f.name in ("swing", "wander") and value < 0.0:
+                raise ConfigError(f"temperature: {f.name} must not be negative, is {value!r}")
+            if f.name in ("period", "wander_time") and value <= 0.0:
+                raise ConfigError(f"temperature: {f.name} must be above zero, is {value!r}")
+        if (self.swing is None) != (self.period is None):
+            raise ConfigError(
+                "temperature: " + ("swing needs a period" if self.swing is not None else "period needs a swing")
+            )
+        if (self.wander is None) != (self.wander_time is None):
+            needs = "wander needs a wander_time" if self.wander is not None else "wander_time needs a wander"
+            raise ConfigError(f"temperature: {needs}")
+
+    @classmethod
+    def from_table(cls, table: object) -> "Temperature":
+        """From a parsed ``[temperature]``; ConfigError when it is no such table."""
+        if not isinstance(table, dict):
+            raise ConfigError(f"temperature must be a table with {', '.join(UNITS)}")
+        for name in table:
+            if name not in UNITS:
+                raise ConfigError(f'temperature: unknown parameter "{name}"{nearest(name, tuple(UNITS))}')
+        if "mean" not in table:
+            raise ConfigError("temperature: mean is missing")
+        return cls(**table)
+
+    def start(self, rate_hz: float, rng: np.random.Generator) -> Series:
+        """Begin a series in °C."""
+        parts: list[Series] = []
+        if self.swing is not None and self.period is not None:
+            swing = Sinusoidal(amplitude=self.swing, frequency=1.0 / self.period, phase=0.0)
+            swing.check_rate(rate_hz)
+            parts.append(swing.start(rate_hz, rng))
+        if self.wander is not None and self.wander_time is not None:
+            wander = ExponentiallyCorrelated(sigma=self.wander, correlation_time=self.wander_time)
+            parts.append(wander.start(rate_hz, rng))
+        return _Generated(self.mean, parts)
+
+
+class Recorded(Series):
+    """A recording's temperature, held at its last value beyond its end; values that are missing are those before.
+
+    Args:
+        temperature_c: [n] °C
+    Raises:
+        ConfigError: no value at all
+    """
+
+    def __init__(self, temperature_c: Floats) -> None:
+        given = np.asarray(temperature_c, np.float64).ravel()
+        known = np.flatnonzero(np.isfinite(given))
+        if known.size == 0:
+            raise ConfigError("the recording has no temperature")
+        before = np.searchsorted(known, np.arange(given.size), "right") - 1
+        self._values = given[known[np.maximum(before, 0)]]
+
+    def add(self, values: Floats, block: Block) -> None:
+        """Add the temperature."""
+        index = np.arange(block.first, block.first + values.size)
+        values += self._values[np.minimum(index, self._values.size - 1)]
+
+
+class _Generated(Series):
+    def __init__(self, mean: float, parts: list[Series]) -> None:
+        self._mean, self._parts = mean, parts
+
+    def add(self, values: Floats, block: Block) -> None:
+        values += self._mean
+        for part in self._parts:
+            part.add(values, block)

@@ -1,0 +1,47 @@
+"""docs/effects.md says what the code says: names, order, sentences, parameters, units, what is NaN."""
+
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from monitor.noise.effect import Transform
+from monitor.noise.effects import EFFECTS, ORDER
+from monitor.noise.temperature import UNITS
+from tests.contracts.effect_examples import AXIS, model
+
+PAGE = Path(__file__).parents[3] / "docs" / "effects.md"
+SECTIONS = dict(
+    re.findall(r"^## `\[?(\w+)\]?`(?: →)?\n(.*?)(?=^## |\Z)", PAGE.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+)
+
+
+def test_every_effect_is_there_and_transforms_are_marked_in_their_order():
+    assert list(SECTIONS) == [*EFFECTS, "temperature"]
+    marked = re.findall(r"^## `(\w+)` →$", PAGE.read_text("utf-8"), flags=re.MULTILINE)
+    assert marked == [kind.name for kind in ORDER]
+    assert {name for name, kind in EFFECTS.items() if issubclass(kind, Transform)} == set(marked)
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_section_is_that_of_the_code(name):
+    section = SECTIONS[name]
+    assert section.strip().startswith(EFFECTS[name].means)
+    rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", section, flags=re.MULTILINE))
+    assert list(rows) == [f.name for f in fields(EFFECTS[name])]
+    for f in fields(EFFECTS[name]):
+        assert rows[f.name] == " / ".join(dict.fromkeys(f.metadata["units"]))
+        assert ("may be absent" in section) == any(g.metadata.get("optional", False) for g in fields(EFFECTS[name]))
+    assert all(re.search(rf"^{what}: .+\.$", section, flags=re.MULTILINE) for what in (r"σ²\(τ\)", r"S\(f\)", "Source"))
+
+
+@pytest.mark.parametrize("name", sorted(set(EFFECTS) - {"saturation", "resolution"}))  # those depend on their numbers
+def test_page_says_nan_where_the_code_does(name):
+    value = model(name).avar(AXIS, np.array([1.0]), 0.02)[0]
+    assert ("σ²(τ): NaN" in SECTIONS[name]) == bool(np.isnan(value))
+
+
+def test_temperature_is_there():
+    assert dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", SECTIONS["temperature"], flags=re.MULTILINE)) == UNITS

@@ -1,0 +1,263 @@
+"""The stream as a whole: leaks, order of transforms, effects added while it runs, truth, temperature, memory."""
+
+import json
+import tracemalloc
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from drivers.errors import ConfigError
+from drivers.sample import AXES
+from monitor.noise.effects import (
+    ORDER,
+    AngleRandomWalk,
+    BandwidthLimit,
+    Bias,
+    BiasInstability,
+    BiasStep,
+    CrossAxis,
+    ExponentiallyCorrelated,
+    GSensitivity,
+    Narrowband,
+    NoiseStep,
+    Outliers,
+    PoissonSteps,
+    QuantizationNoise,
+    RandomTelegraph,
+    RateRamp,
+    RateRandomWalk,
+    Resolution,
+    SampleHold,
+    SampleRateError,
+    Saturation,
+    ScaleFactor,
+    Sinusoidal,
+    TemperatureBias,
+    TemperatureLag,
+    TurnOnTransient,
+)
+from monitor.noise.model import NoiseModel
+from monitor.noise.temperature import Temperature
+
+RATE_HZ = 100.0
+
+
+def test_transforms_act_in_their_order_wherever_they_stand():
+    assert [kind.name for kind in ORDER] == [
+        "scale_factor", "bandwidth_limit", "sample_rate_error", "saturation", "resolution", "sample_hold",
+    ]  # fmt: skip
+    axis = (Resolution(step=0.4), Saturation(limit=1.0), Bias(value=0.7), ScaleFactor(factor=2.0))
+    # 0.7 · 2 = 1.4, clipped to 1.0, rounded to 0.8; any other order gives another number
+    assert NoiseModel({"gx": axis}).simulate(3, RATE_HZ, 0)[:, 0].tolist() == [0.8, 0.8, 0.8]
+
+
+def test_axes_leak_what_they_read_by_themselves():
+    both = NoiseModel(
+        {
+            "gx": (AngleRandomWalk(N=1.0), CrossAxis(source="gy", coefficient=0.5), Saturation(limit=9.0)),
+            "gy": (AngleRandomWalk(N=1.0), CrossAxis(source="gx", coefficient=0.25), Resolution(step=3.0)),
+        }
+    )
+    alone = NoiseModel(
+        {
+            "gx": (AngleRandomWalk(N=1.0), Saturation(limit=9.0)),
+            "gy": (AngleRandomWalk(N=1.0), Resolution(step=3.0)),
+        }
+    )
+    bare = NoiseModel({"gx": (AngleRandomWalk(N=1.0),), "gy": (AngleRandomWalk(N=1.0),)}).simulate(5000, RATE_HZ, 2)
+    read, mixed = alone.simulate(5000, RATE_HZ, 2), both.simulate(5000, RATE_HZ, 2)
+    np.testing.assert_allclose(mixed[:, 0], np.clip(bare[:, 0] + 0.5 * read[:, 1], -9.0, 9.0))
+    np.testing.assert_allclose(mixed[:, 1], 3.0 * np.rint((bare[:, 1] + 0.25 * read[:, 0]) / 3.0))
+
+
+def test_held_samples_are_the_same_ones_with_and_without_a_leak():
+    axis = (AngleRandomWalk(N=1.0), SampleHold(fraction=0.5))
+    model = NoiseModel({"gx": axis, "gy": (Bias(value=0.0),)})
+    leaking = model + NoiseModel({"gx": (CrossAxis(source="gy", coefficient=1.0),)})
+    np.testing.assert_array_equal(model.simulate(5000, RATE_HZ, 2), leaking.simulate(5000, RATE_HZ, 2))
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        AngleRandomWalk(N=1.0),
+        Sinusoidal(amplitude=1.0, frequency=7.0, phase=0.3),
+        BiasStep(time=30.0, height=2.0),
+        NoiseStep(time=30.0, ratio=3.0),
+        ScaleFactor(factor=2.0),
+        Resolution(step=0.5),
+        CrossAxis(source="gx", coefficient=0.5),
+        GSensitivity(source="az", coefficient=0.5),
+    ],
+    ids=lambda effect: effect.name,
+)
+def test_an_effect_added_before_the_first_sample_is_as_one_of_the_model(effect):
+    model = NoiseModel({axis: (AngleRandomWalk(N=0.5), Saturation(limit=4.0)) for axis in AXES})
+    running = model.stream(RATE_HZ, 1)
+    running.add("gz", effect)
+    whole = (model + NoiseModel({"gz": (effect,)})).simulate(5000, RATE_HZ, 1)
+    np.testing.assert_array_equal(running.draw(5000), whole)
+
+
+def test_what_is_added_acts_from_the_next_sample_on():
+    model = NoiseModel({"gz": (AngleRandomWalk(N=0.5), BandwidthLimit(cutoff=20.0, order=2)), "gx": (Bias(value=1.0),)})
+    plain = model.simulate(6000, RATE_HZ, 1)
+    running = model.stream(RATE_HZ, 1)
+    np.testing.assert_array_equal(running.draw(3000), plain[:3000])
+    running.add("gx", Bias(value=2.0))
+    running.add("gx", BiasStep(time=40.0, height=8.0))
+    running.add("gx", RateRamp(R=1.0))
+    running.add("gz", CrossAxis(source="gx", coefficient=1e-12))
+    later = running.draw(3000)
+    np.testing.assert_allclose(later[:, 2], plain[3000:, 2], atol=1e-9)  # the filter was not begun anew
+    k = np.arange(3000)
+    np.testing.assert_allclose(later[:, 0], 3.0 + 8.0 * (k >= 1000) + k / RATE_HZ)
+
+
+def test_what_cannot_be_added_is_said_and_changes_nothing():
+    model = NoiseModel({"gz": (Bias(value=1.0),)})
+    running = model.stream(RATE_HZ, 1)
+    for axis, effect, says in (
+        ("gq", Bias(value=1.0), 'unknown axis "gq"'),
+        ("gz", Sinusoidal(amplitude=1.0, frequency=60.0), "gz.sinusoidal: frequency must be below 50 Hz"),
+        ("gz", SampleRateError(ratio=2.0), "gz.sample_rate_error: the clock of a stream that runs cannot change"),
+        ("gz", NoiseStep(time=1.0, ratio=2.0), "gz.noise_step: gz has no angle_random_walk"),
+        ("gz", CrossAxis(source="gx", coefficient=2.0), "gz.cross_axis: the model has no effect on its source gx"),
+        ("gz", TemperatureBias(coefficient=1.0, reference=2.0), "gz.temperature_bias: no temperature"),
+    ):
+        with pytest.raises(ConfigError, match=f"^{says}"):
+            running.add(axis, effect)
+    np.testing.assert_array_equal(running.draw(10), model.simulate(10, RATE_HZ, 1))
+
+
+def test_truth_tells_what_the_seed_decided():
+    model = NoiseModel(
+        {
+            "gz": (
+                Sinusoidal(amplitude=1.0, frequency=5.0),
+                Sinusoidal(amplitude=1.0, frequency=6.0, phase=1.0),
+                Sinusoidal(amplitude=1.0, frequency=7.0),
+            ),
+            "gx": (PoissonSteps(rate=2.0, height=3.0),),
+            "gy": (RandomTelegraph(amplitude=2.0, dwell_time=0.7),),
+            "ax": (Outliers(fraction=0.02, scale=5.0),),
+            "ay": (SampleHold(fraction=0.1), RateRamp(R=1.0)),
+            "az": (BiasInstability(B=1.0),),
+        }
+    )
+    stream = model.stream(RATE_HZ, 8)
+    assert stream.truth()["gx"]["poisson_steps"][0]["count"] == 0
+    values = stream.draw(10_000)
+    truth = json.loads(json.dumps(stream.truth()))
+    assert set(truth) == {"gx", "gy", "gz", "ax", "ay"}
+
+    one, other = (line["phase"] for line in truth["gz"]["sinusoidal"])  # a stated phase is in the model
+    t = np.arange(10_000) / RATE_HZ
+    lines = [np.sin(2.0 * np.pi * f * t + phase) for f, phase in ((5.0, one), (6.0, 1.0), (7.0, other))]
+    np.testing.assert_allclose(values[:, 2], sum(lines), atol=1e-9)
+
+    jumps = truth["gx"]["poisson_steps"][0]
+    assert jumps["count"] == len(jumps["times"]) == len(jumps["heights"])
+    built = sum(h * (t >= at) for at, h in zip(jumps["times"], jumps["heights"], strict=True))
+    np.testing.assert_allclose(values[:, 0], built)
+
+    flips = truth["gy"]["random_telegraph"][0]
+    assert flips["count"] == len(flips["times"])
+    sign = (-1.0) ** np.searchsorted(flips["times"], t, "right")
+    np.testing.assert_allclose(values[:, 1], flips["first_level"] * sign)
+
+    wrong = truth["ax"]["outliers"][0]
+    assert wrong["count"] == np.count_nonzero(values[:, 3])
+    np.testing.assert_allclose(np.flatnonzero(values[:, 3]) / RATE_HZ, wrong["times"])
+    assert truth["ay"]["sample_hold"][0]["count"] == np.count_nonzero(np.diff(values[:, 4]) == 0.0)
+
+
+def test_truth_lists_no_more_than_a_stated_number():
+    stream = NoiseModel({"gx": (Outliers(fraction=0.5, scale=1.0),)}).stream(RATE_HZ, 0)
+    stream.draw(5000)
+    told = stream.truth()["gx"]["outliers"][0]
+    assert told["count"] > 2000
+    assert len(told["times"]) == len(told["errors"]) == 1000
+
+
+def test_dwells_are_exponential_and_either_level_comes_first():
+    model = NoiseModel({"gx": (RandomTelegraph(amplitude=2.0, dwell_time=0.5),)})
+    stream = model.stream(1000.0, 3)
+    stream.draw(400_000)
+    dwells = np.diff(stream.truth()["gx"]["random_telegraph"][0]["times"])
+    assert kstest(dwells, "expon", args=(0.0, 0.5)).pvalue > 0.001
+    firsts = [model.simulate(1, 1000.0, seed)[0, 0] for seed in range(200)]
+    assert 70 < np.count_nonzero(np.array(firsts) > 0.0) < 130  # 4.2 deviations of a fair coin
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        ExponentiallyCorrelated(sigma=2.0, correlation_time=50.0),
+        Narrowband(sigma=2.0, frequency=3.0, bandwidth=0.01),
+        RandomTelegraph(amplitude=4.0, dwell_time=100.0),
+    ],
+    ids=lambda source: source.name,
+)
+def test_starts_stationary(source):
+    # 3000 first samples: their variance is known to 2.6 %, four of that
+    first = [NoiseModel({"gx": (source,)}).simulate(1, RATE_HZ, seed)[0, 0] for seed in range(3000)]
+    assert np.mean(np.square(first)) == pytest.approx(4.0, rel=0.1)
+
+
+def test_generated_temperature_is_what_the_table_says():
+    warm = Temperature(mean=25.0, swing=3.0, period=40.0)
+    drawn = NoiseModel({}, RATE_HZ, warm).stream(RATE_HZ, 1).draw_all(5000)
+    np.testing.assert_allclose(
+        drawn.temperature_c, 25.0 + 3.0 * np.sin(2.0 * np.pi * np.arange(5000) / RATE_HZ / 40.0), atol=1e-9
+    )
+    wander = Temperature(mean=0.0, wander=2.0, wander_time=0.05)
+    c = NoiseModel({}, RATE_HZ, wander).stream(RATE_HZ, 1).draw_all(200_000).temperature_c
+    assert c.var() == pytest.approx(4.0, rel=0.05)
+    assert np.mean(c[5:] * c[:-5]) == pytest.approx(4.0 * np.exp(-1.0), rel=0.08)
+    assert np.isnan(NoiseModel().stream(RATE_HZ, 1).draw_all(3).temperature_c).all()
+
+
+def test_recorded_temperature_stands_instead_and_is_held():
+    model = NoiseModel({"gx": (TemperatureBias(coefficient=1.0, reference=0.0),)}, None, Temperature(mean=99.0))
+    drawn = model.stream(RATE_HZ, 1, np.array([np.nan, 20.0, np.nan, 22.0, np.nan])).draw_all(7)
+    assert drawn.temperature_c.tolist() == [20.0, 20.0, 20.0, 22.0, 22.0, 22.0, 22.0]
+    assert drawn.values[:, 0].tolist() == drawn.temperature_c.tolist()
+    with pytest.raises(ConfigError, match="no temperature"):
+        model.stream(RATE_HZ, 1, np.array([np.nan]))
+
+
+def test_true_time_runs_at_the_true_rate():
+    axis = (
+        BiasStep(time=10.0, height=1.0),
+        Sinusoidal(amplitude=1.0, frequency=3.0, phase=0.0),
+        TurnOnTransient(amplitude=1.0, time_constant=4.0),
+    )
+    true = NoiseModel({"gx": axis}).simulate(5000, 80.0, 1)
+    stated = NoiseModel({"gx": axis, "gy": (SampleRateError(ratio=0.8),)}).simulate(5000, 100.0, 1)
+    np.testing.assert_array_equal(stated, true)
+    with pytest.raises(ConfigError, match="below 40 Hz"):
+        NoiseModel({"gx": (Sinusoidal(amplitude=1.0, frequency=45.0), SampleRateError(ratio=0.8))}).stream(100.0, 1)
+
+
+def test_memory_does_not_grow_with_the_length():
+    axis = (
+        QuantizationNoise(Q=1e-5),
+        AngleRandomWalk(N=1e-4),
+        BiasInstability(B=1e-4),
+        RateRandomWalk(K=1e-5),
+        PoissonSteps(rate=5.0, height=1e-4),
+        TemperatureLag(coefficient=1e-5, reference=20.0, time_constant=60.0),
+        SampleHold(fraction=0.01),
+    )
+    model = NoiseModel(dict.fromkeys(AXES, axis), None, Temperature(mean=20.0, wander=1.0, wander_time=9.0))
+    stream = model.stream(RATE_HZ, 1)
+    stream.draw(300_000)  # the lists of events are full
+    tracemalloc.start()
+    for _ in range(30):
+        stream.draw(10_000)
+    held, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert held < 100_000
+    assert peak < 2_000_000  # one block of 10 000 samples is 560 kB

@@ -1,0 +1,53 @@
+"""The demo's sensor takes on an effect while it runs: the sensor's log says so, and the service finds it by itself."""
+
+from dataclasses import replace
+
+import msgspec
+from structlog.testing import capture_logs
+
+from drivers.sample import Event
+from monitor.demo import demo
+from monitor.service import Service
+from monitor.settings import VirtualTable
+from tests.walk.rig import Caught
+
+RATE_HZ = 100.0
+SPEED = 50.0
+AT_S = 80.0
+VIBRATION = "gz.sinusoidal:amplitude=4e-3,frequency=17"
+
+
+class Watching(Caught):
+    """Ends the service at the first change."""
+
+    service: Service | None = None
+    told_s = 0.0  # of the sensor's time
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        super().event(device, unix_s, received, event)
+        if event.kind == "noise_changed" and self.service is not None:
+            self.told_s = received / RATE_HZ
+            self.service.stop()
+
+
+def test_an_effect_that_comes_is_announced_on_its_axis() -> None:
+    config = demo(effects=[VIBRATION], effect_at_s=AT_S)
+    (device,) = config.devices
+    assert isinstance(device.link, VirtualTable)
+    fast = replace(device, link=msgspec.structs.replace(device.link, speed=SPEED))
+    quiet = msgspec.structs.replace(config.zenoh, mode="none"), msgspec.structs.replace(config.viewer, mode="none")
+    service = Service(replace(config, devices=(fast,), zenoh=quiet[0], viewer=quiet[1]))
+    caught = Watching()
+    caught.service = service
+    service.outputs.append(caught)
+    with capture_logs() as lines:
+        service.run(40.0)
+    added = [line for line in lines if line["event"] == "effect added"]
+    assert [(line["device"], line["axis"], line["effect"], line["at_s"]) for line in added] == [
+        ("demo", "gz", VIBRATION, AT_S)
+    ]
+    changes = [event for _, event in caught.events if event.kind == "noise_changed"]
+    assert [event.axis for event in changes] == ["gz"]
+    (change,) = changes
+    assert AT_S <= caught.told_s <= AT_S + 40.0
+    assert "gz" in change.text
