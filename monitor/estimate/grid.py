@@ -54,10 +54,12 @@ def on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Float
     told = [event.text for event in clock.take_events(ended=True)]
     t_ns = np.concatenate([samples.t_ns for samples in stamped])
     lost, late = _without_late(stamped, t_ns)
-    rate = rate_hz or _mean_rate(stamped, t_ns, lost)
+    steps = np.diff(t_ns)
+    going = _going(stamped, t_ns, lost, steps)
+    rate = rate_hz or _mean_rate(going)
     values = _placed(stamped, lost)
     notes = told[:NOTES] + ([f"and {len(told) - NOTES} more notes on the times"] if len(told) > NOTES else [])
-    notes += _said_of_steps(stamped, t_ns, lost, rate) + _said_late(late)
+    notes += _said_of_steps(steps, going, rate) + _said_late(late)
     notes += _said_stale(values) + _said_coarse(coarse(values)) + _said_missing(lost, rate)
     return values, rate, notes
 
@@ -159,12 +161,10 @@ def _said_coarse(found: Sequence[Steps]) -> list[str]:
     return notes
 
 
-def _said_of_steps(stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints, rate_hz: float) -> list[str]:
+def _said_of_steps(steps: Ints, going: tuple[Floats, Floats] | None, rate_hz: float) -> list[str]:
     """Where times step unevenly; where they say another rate."""
-    steps = np.diff(t_ns)
     if not steps.size:
         return []
-    going = _going(stamped, t_ns, lost)
     if going is None:
         return [f"the rate used is {rate_hz:g} Hz; the times do not go on and say none"]
     uneven = _said_uneven(steps, rate_hz)
@@ -178,6 +178,8 @@ def _said_of_steps(stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints, rate_
 
 
 def _said_uneven(steps: Ints, rate_hz: float) -> list[str]:
+    if steps.max() - steps.min() <= STEADY * steps.min():
+        return []
     low, middle, high = (np.quantile(steps, [0.1, 0.5, 0.9]) / NS).tolist()
     alike = middle > 0.0 and high - low <= STEADY * middle
     if alike or max(1.0 / rate_hz - low, high - 1.0 / rate_hz) <= UNEVEN / rate_hz:
@@ -202,30 +204,35 @@ def _unit_s(steps: Ints) -> float:
     return unit / NS if whole.all() else 0.0
 
 
-def _going(stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints) -> tuple[Floats, Floats] | None:
-    """Samples that came by each row, missing ones included, and s that passed, where times do not jump."""
-    steps_s = np.diff(t_ns) / NS
-    samples_each = np.ones(t_ns.size, np.int64)
+def _going(stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints, steps: Ints) -> tuple[Floats, Floats] | None:
+    """Samples that came, missing ones too, and s that passed, by the ends of STRETCHES, where times do not jump."""
+    rows = np.unique(np.linspace(0, steps.size, STRETCHES + 1).astype(np.int64))
     starts = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])
-    samples_each[starts] += lost
-    steady = (steps_s > -JUMP_S) & (steps_s < LONG_S)
-    came, passed_s = np.cumsum(samples_each[1:][steady]).astype(np.float64), np.cumsum(steps_s[steady])
-    return (came, passed_s) if came.size and passed_s[-1] > 0.0 else None
+    missing = np.cumsum(np.concatenate([[0], lost[1:]]))
+    low, high = int(steps.min(initial=0)), int(steps.max(initial=0))
+    jumps = np.zeros(0, np.int64)
+    if low <= -JUMP_S * NS or high >= LONG_S * NS:
+        jumps = np.flatnonzero((steps <= -JUMP_S * NS) | (steps >= LONG_S * NS)) + 1
+    # what a jump skips is neither time nor samples
+    over = np.concatenate([[0], np.cumsum(steps[jumps - 1])])[np.searchsorted(jumps, rows, "right")]
+    at_jumps = np.where(np.isin(jumps, starts), lost[np.searchsorted(starts, jumps, "right") - 1], 0) + 1
+    left_out = np.concatenate([[0], np.cumsum(at_jumps)])[np.searchsorted(jumps, rows, "right")]
+    came = rows + missing[np.searchsorted(starts, rows, "right") - 1] - left_out
+    passed_s = (t_ns[rows] - t_ns[0] - over) / NS
+    return (came.astype(np.float64), passed_s) if came[-1] > 0 and passed_s[-1] > 0.0 else None
 
 
 def _rate(came: Floats, passed_s: Floats) -> tuple[float, float]:
     """Samples a second over all, and its relative standard error by the scatter of stretches; 1 where there are few."""
     mean_hz = float(came[-1] / passed_s[-1])
-    if came.size < 2 * STRETCHES:
+    if came[-1] < 2 * STRETCHES or (np.diff(came) <= 0.0).any():
         return mean_hz, 1.0
-    at = np.linspace(0, came.size - 1, STRETCHES + 1).astype(np.int64)
-    periods = np.diff(passed_s[at]) / np.diff(came[at])
+    periods = np.diff(passed_s) / np.diff(came)
     return mean_hz, float(periods.std(ddof=1)) / STRETCHES**0.5 * mean_hz
 
 
-def _mean_rate(stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints) -> float:
+def _mean_rate(going: tuple[Floats, Floats] | None) -> float:
     """The rate of a recording of which none is stated."""
-    going = _going(stamped, t_ns, lost)
     if going is None:
         raise NotReady("the times of the recording do not go on, so that its rate is unknown; state it with --rate HZ")
     return made_rate(_rate(*going)[0])
