@@ -59,26 +59,17 @@ def fit_axis(  # type: ignore[no-untyped-def]
 ):
     """Fit one axis; ``warm``: begin with the weights of ``answer.theta``. Without enough τ nothing is said."""
     m = known.whole.size
-    curve, level, stretch, rows = avar[axis], np.empty(m), np.empty(m), np.empty(m, np.int64)
+    curve, level, stretch = avar[axis], np.empty(m), np.empty(m)
     straight = slope == slope
     flat = known.flat if straight else known.columns
-    count = 0
-    for i in range(m):
-        if curve[i] > 0.0 and terms[axis, i] > 0.0 and known.whole[i] > 0.0:
-            rows[count] = i
-            stretch[i] = np.sqrt(known.whole[i] / terms[axis, i])
-            # the curve of the same samples without the line of that slope
-            line = slope * (2.0 * slopes[axis, i] - slope) if straight else 0.0
-            level[i] = curve[i] - line * known.columns[i, R]
-            count += 1
+    rows = _levels(known, curve, terms[axis], slope, slopes[axis], level, stretch)
     gains.used[axis] = 0
     gains.either[axis] = False
     gains.straight[axis] = straight
-    if count < MIN_ROWS:
+    if rows.size < MIN_ROWS:
         answer.entered[axis] = False
         answer.status[axis] = 0
         return
-    rows = rows[:count]
     theta, entered, status = answer.theta[axis], answer.entered[axis], answer.status[axis]
     lo, hi = answer.lo[axis], answer.hi[axis]
     variance, weighted, normal, right = np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5)
@@ -115,16 +106,7 @@ def fit_axis(  # type: ignore[no-untyped-def]
         else status[K] == 2
     )
     variances(rows, theta, known.covariance, stretch, variance)
-    for k in range(count):
-        i = rows[k]
-        model, positive = 0.0, 0.0
-        for a in range(5):
-            model += known.columns[i, a] * theta[a]
-            positive += known.columns[i, a] * max(theta[a], 0.0)
-        answer.fitted[axis, i] = model if k >= first and model > 0.0 else np.nan
-        # a ramp multiplies the noise of the mean second difference: 4 R² (m²/2)² Var(slope)
-        variance[i] += 4.0 * theta[R] * known.columns[i, R] ** 2 * noise
-        answer.edf[axis, i] = 2.0 * positive * positive / variance[i]
+    _draw(rows, first, theta, known.columns, noise, variance, answer.fitted[axis], answer.edf[axis])
     answer.left_out[axis] = first
     answer.misfit[axis], answer.scatter[axis] = misfit, scatter
     freeze(
@@ -136,6 +118,35 @@ def fit_axis(  # type: ignore[no-untyped-def]
     if free:
         i = rows[0]
         bound_by_first_point(curve[i], answer.edf[axis, i], known.columns[i, Q], entered, lo, hi, status)
+
+
+@compiled
+def _levels(known, curve, terms, slope, slopes, level, stretch):  # type: ignore[no-untyped-def]
+    """The τ in use, and of each the curve that its samples have without the line of that slope, if there is one."""
+    rows, count = np.empty(curve.size, np.int64), 0
+    for i in range(curve.size):
+        if curve[i] > 0.0 and terms[i] > 0.0 and known.whole[i] > 0.0:
+            rows[count] = i
+            stretch[i] = np.sqrt(known.whole[i] / terms[i])
+            line = slope * (2.0 * slopes[i] - slope) if slope == slope else 0.0
+            level[i] = curve[i] - line * known.columns[i, R]
+            count += 1
+    return rows[:count]
+
+
+@compiled
+def _draw(rows, first, theta, columns, noise, variance, fitted, edf):  # type: ignore[no-untyped-def]
+    """The fitted model, NaN where it was left out, and the degrees of freedom of the curve under it."""
+    for k in range(rows.size):
+        i = rows[k]
+        model, positive = 0.0, 0.0
+        for a in range(5):
+            model += columns[i, a] * theta[a]
+            positive += columns[i, a] * max(theta[a], 0.0)
+        fitted[i] = model if k >= first and model > 0.0 else np.nan
+        # a ramp multiplies the noise of the mean second difference: 4 R² (m²/2)² Var(slope)
+        variance[i] += 4.0 * theta[R] * columns[i, R] ** 2 * noise
+        edf[i] = 2.0 * positive * positive / variance[i]
 
 
 @compiled
