@@ -177,9 +177,10 @@ class Service:
 
     def _drain(self) -> None:
         """End the readers, and publish what they still brought."""
-        self._ready.all.wait()
         for station in self.stations:
             station.stop()
+        if any(station.waits_for_all for station in self.stations):
+            self._ready.all.wait()  # their samples are still in the ring
         for imu in self.virtual.values():
             imu.stop()
         for station in self.stations:

@@ -96,7 +96,7 @@ class Station:
         self._wake = wake
         self._ready = ready
         # a recording is over before its changes could be looked for
-        self._waits_for_all = device.refit_s == 0.0 or device.leave_out_motion or isinstance(link, ReplayLink)
+        self.waits_for_all = device.refit_s == 0.0 or device.leave_out_motion or isinstance(link, ReplayLink)
         self._patient = link.epoch == "unix"
         self._wall = WallClock(time.monotonic_ns(), time.time_ns())
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
@@ -230,7 +230,7 @@ class Station:
 
     def _compiled(self) -> bool:
         """Whether samples can be taken at once: to compile what they need in this loop would hold up all devices."""
-        return (self._ready.all if self._waits_for_all else self._ready.window).is_set()
+        return (self._ready.all if self.waits_for_all else self._ready.window).is_set()
 
     def _take(self) -> list[SampleBlock]:
         came_ns, self._waiting_since_ns = self._waiting_since_ns, 0

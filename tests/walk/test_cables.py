@@ -10,7 +10,6 @@ import pytest
 
 from drivers import driver
 from drivers.sample import join
-from monitor.estimate.estimator import warm_up
 from tests.walk.rig import Running, running, wait_for
 
 WARM_UP, CYCLES = 10, 50
@@ -58,7 +57,6 @@ def measured() -> tuple[int, int, int]:
 def test_fifty_pulled_cables_leave_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver, "FIRST_PAUSE_S", 0.01)
     monkeypatch.setattr(driver, "LONGEST_PAUSE_S", 0.05)
-    assert list(warm_up()) == ["window", "fit", "all"]  # the compiler takes 50 MB, and must not take them meanwhile
     with running(tmp_path, CONFIG) as run:
         for station in run.service.stations:
             counts = station.driver.counts
