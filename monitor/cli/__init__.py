@@ -202,6 +202,44 @@ def simulate(
 
 
 @app.command()
+def reconcile(
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the report and the augmented model.")],
+    model: Annotated[
+        str | None,
+        typer.Option(metavar="MODEL.toml|NAME", help="Model under test; else the five classic terms are fitted first."),
+    ] = None,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Same seed, same report.")] = 1,
+    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate, where the file says none.")] = None,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
+) -> None:
+    """Where recording and model disagree, which effect is missing, and what is left once it is added."""
+    from rich.console import Console
+
+    from monitor import reconciling
+    from monitor.catalogue import load
+    from monitor.publish.reconcile_text import tell as print_result
+    from monitor.reconcile.report import to_json
+
+    if rate is not None and not 0.0 < rate < float("inf"):
+        raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
+    output.check_place("--json", json)
+    tested = None if model is None else load(model, Path.cwd())
+    serving.end_on_sigterm()
+    try:
+        with output.progress() as tell:
+            result = reconciling.make(reconciling.Request(recording, tested, out, seed, rate), tell)
+    except NotReady as error:
+        if json is not None:
+            output.write("--json", json, reconciling.no_answer(str(error), 0) + b"\n")
+        raise
+    if json is not None:
+        output.write("--json", json, to_json(result) + b"\n")
+    if json != Path("-"):
+        print_result(result, Console())
+
+
+@app.command()
 def export(
     source: Annotated[
         Path,

@@ -49,6 +49,27 @@ def on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Float
 
     The values may be the blocks' own memory: to be read, not written.
     """
+    stamped, lost, rate, notes = _timed(blocks, rate_hz)
+    values = _placed(stamped, lost)
+    return values, rate, [*notes, *_said_of_values(values), *_said_missing(lost, rate)]
+
+
+def with_temperature(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Floats, Floats, float, list[str]]:
+    """As ``on_grid``, and the temperature [n] in °C between values and rate."""
+    stamped, lost, rate, notes = _timed(blocks, rate_hz)
+    values = _placed(stamped, lost)
+    missing = np.where(lost > LONGEST_HOLE, 1, lost).tolist()
+    parts = [
+        part
+        for samples, hole in zip(stamped, missing, strict=True)
+        for part in (np.full(hole, np.nan), samples.temperature_c)
+    ]
+    notes = [*notes, *_said_of_values(values), *_said_missing(lost, rate)]
+    return values, np.concatenate(parts), rate, notes
+
+
+def _timed(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[list[SampleBlock], Ints, float, list[str]]:
+    """Blocks as they follow each other, how many samples are missing before each, the rate, and what the times say."""
     clock = SampleClock(Given(), rate_hz)
     stamped = [one for samples in blocks for one in clock.stamp(samples)]
     told = [event.text for event in clock.take_events(ended=True)]
@@ -57,11 +78,12 @@ def on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Float
     steps = np.diff(t_ns)
     going = _going(stamped, t_ns, lost, steps)
     rate = rate_hz or _mean_rate(going)
-    values = _placed(stamped, lost)
     notes = told[:NOTES] + ([f"and {len(told) - NOTES} more notes on the times"] if len(told) > NOTES else [])
-    notes += _said_of_steps(steps, going, rate) + _said_late(late)
-    notes += _said_stale(values) + _said_coarse(coarse(values)) + _said_missing(lost, rate)
-    return values, rate, notes
+    return stamped, lost, rate, notes + _said_of_steps(steps, going, rate) + _said_late(late)
+
+
+def _said_of_values(values: Floats) -> list[str]:
+    return _said_stale(values) + _said_coarse(coarse(values))
 
 
 def _without_late(stamped: Sequence[SampleBlock], t_ns: Ints) -> tuple[Ints, int]:

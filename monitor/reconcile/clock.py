@@ -1,0 +1,132 @@
+"""The clock of the whole recording: is its true rate the stated one?
+
+A wrong rate moves everything along the axis of frequency, on all axes by one ratio. It can be told where the model has
+a feature that stands at one frequency, a line or a resonance: such a feature is then missing where it should be, and
+one stands where it should not. Without a feature a wrong rate is a wrong N, and nobody can tell.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from math import exp, log
+from typing import Any, Final
+
+import numpy as np
+
+from monitor.noise.effect import Effect
+from monitor.noise.effects import Narrowband, Sinusoidal
+from monitor.reconcile.axis import Axis, Effects
+from monitor.reconcile.candidates import line_frequency, peaks
+from monitor.reconcile.hypothesis import GOLDEN, HALF, believed
+from monitor.reconcile.lenses import line_peaks, sight
+from monitor.reconcile.reconciliation import Bounds
+
+FURTHEST: Final = 0.15
+"""A clock that is further off is another sensor."""
+PRICE: Final = 12.0
+"""Nats: for the ratio, and for the features that may be meant."""
+POWERS: Final[Mapping[str, float]] = {
+    "Q": 1.5,
+    "N": 0.5,
+    "K": -0.5,
+    "R": -1.0,
+    "frequency": -1.0,
+    "bandwidth": -1.0,
+    "cutoff": -1.0,
+    "correlation_time": 1.0,
+    "dwell_time": 1.0,
+    "time_constant": 1.0,
+    "time": 1.0,
+    "rate": -1.0,
+}
+"""Power of (true rate over stated rate) by which a parameter reads in stated time: S(f) becomes r S(rf), τ becomes
+τ/r."""
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """A rate that is not the stated one."""
+
+    ratio: Bounds  # true over stated
+    gain: float  # nats over all axes
+    axis: str  # where it shows most
+    frequency: tuple[float, float]  # Hz, of the feature: as the model has it, as it is seen
+
+
+def restated(effect: Effect, ratio: float) -> Effect:
+    """The effect as it reads in a recording whose clock states 1/ratio of the true rate.
+
+    >>> restated(Sinusoidal(amplitude=1.0, frequency=10.1), 1.01).frequency
+    10.0
+    """
+    changed: dict[str, Any] = {
+        name: getattr(effect, name) * ratio**power for name, power in POWERS.items() if getattr(effect, name, None)
+    }
+    return replace(effect, **changed) if changed else effect  # type: ignore[type-var]
+
+
+def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clock | None:
+    """The ratio at which all axes together fit best, if it is worth its price."""
+    trials = _ratios(axes, effects)
+    if not trials:
+        return None
+    before = {name: believed(axes[name], effects[name]).likely.log_likelihood for name in axes}
+
+    def gains(x: float) -> dict[str, float]:
+        changed = {name: tuple(restated(effect, exp(x)) for effect in effects[name]) for name in axes}
+        return {name: believed(axes[name], changed[name]).likely.log_likelihood - before[name] for name in axes}
+
+    def gain(x: float) -> float:
+        return sum(gains(x).values())
+
+    ratio, name, seen = max(trials, key=lambda one: gain(log(one[0])))
+    axis = axes[name]
+    width = 2.0 / (axis.n / axis.rate_hz * seen)
+    x = _highest(gain, log(ratio), width)
+    top = gain(x)
+    if top < PRICE:
+        return None
+    ends = [_end(gain, x, top, sign * width) for sign in (-1.0, 1.0)]
+    of_axes = gains(x)
+    strongest = max(of_axes, key=lambda one: of_axes[one])
+    features = [e for e in effects[strongest] if isinstance(e, (Sinusoidal, Narrowband))]
+    stated = features[0].frequency if features else seen * ratio
+    return Clock(Bounds(exp(x), exp(ends[0]), exp(ends[1])), top, strongest, (stated, stated / exp(x)))
+
+
+def _ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> list[tuple[float, str, float]]:
+    """(ratio, axis, Hz) by which a feature of the model would stand where something is seen."""
+    found: list[tuple[float, str, float]] = []
+    for name, axis in axes.items():
+        features = [effect for effect in effects[name] if isinstance(effect, (Sinusoidal, Narrowband))]
+        if not features:
+            continue
+        view = sight(axis, believed(axis, effects[name]).likely)
+        places = [line_frequency(view, f_hz) for _, f_hz in line_peaks(view.white, axis.rate_hz, 4)]
+        places += [middle for middle, _ in peaks(view, 4)]
+        for effect in features:
+            for place in places:
+                ratio = effect.frequency / place
+                if abs(np.log(ratio)) < FURTHEST:
+                    found.append((float(ratio), name, place))
+    return found
+
+
+def _highest(gain: Any, x: float, width: float) -> float:
+    lo, hi = x - width, x + width
+    for _ in range(18):
+        a, b = hi - GOLDEN * (hi - lo), lo + GOLDEN * (hi - lo)
+        lo, hi = (lo, b) if gain(a) > gain(b) else (a, hi)
+    return 0.5 * (lo + hi)
+
+
+def _end(gain: Any, x: float, top: float, step: float) -> float:
+    """Where the gain has fallen by HALF, on one side."""
+    near, far = x, x + step
+    for _ in range(12):
+        if top - gain(far) > HALF:
+            break
+        near, far = far, x + 2.0 * (far - x)
+    for _ in range(10):
+        middle = 0.5 * (near + far)
+        near, far = (near, middle) if top - gain(middle) > HALF else (middle, far)
+    return far

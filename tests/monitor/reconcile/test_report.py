@@ -1,0 +1,125 @@
+"""The report for programs: the keys of its schema, numbers that JSON has, the same bytes every time."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from monitor.reconcile.reconciliation import AxisResult, Bounds, Look, Reconciliation, Score, Step, Where
+from monitor.reconcile.report import to_json
+from tests.monitor.reconcile import samples
+
+
+def written(r: Reconciliation) -> dict[str, Any]:
+    return dict(json.loads(to_json(r)))
+
+
+def with_step(r: Reconciliation, **changed: object) -> Reconciliation:
+    """The first step of gz, changed."""
+    gz = r.axes["gz"]
+    return replace(r, axes={**r.axes, "gz": replace(gz, steps=(replace(gz.steps[0], **changed), *gz.steps[1:]))})
+
+
+def test_a_step_is_written_as_its_schema_says() -> None:
+    report = written(samples.explained())
+    assert report["schema"] == "imu-monitor/reconcile/1"
+    assert report["verdict"] == "explained"
+    assert report["axes"]["gz"]["verdict"] == "explained"
+    assert report["axes"]["gz"]["left_over"] == []
+    step = report["axes"]["gz"]["steps"][0]
+    del step["scores"], step["because"]
+    assert step == {
+        "found": {
+            "lens": "psd", "where": {"frequency": [17.1, 17.5]}, "gap": 41.2, "null95": 1.9, "threshold": 2.6,
+        },
+        "kind": "added",
+        "effect": "sinusoidal",
+        "parameters": {
+            "amplitude": {"value": 1.5e-4, "lo": 1.474e-4, "hi": 1.526e-4},
+            "frequency": {"value": 17.300012, "lo": 17.299912, "hi": 17.300112},
+        },
+        "confidence": 0.9983,
+        "runners_up": [
+            {"effect": "narrowband", "confidence": 0.0016},
+            {"effect": "sample_rate_error", "confidence": 0.0001},
+        ],
+        "gap": {"before": 41.2, "after": samples.explained().axes["gz"].steps[0].after.gap,
+                "null95": 1.9, "threshold": 2.6},
+        "held_out_gap": {"before": 39.7, "after": 1.0, "null95": 1.9, "threshold": 2.6},
+    }  # fmt: skip
+
+
+def test_what_was_compared_stands_beside_it() -> None:
+    report = written(samples.explained())
+    about = {name: report[name] for name in ("rate", "samples", "seconds", "seed", "fitted_first")}
+    assert about == {"rate": 100.0, "samples": 360_000, "seconds": 3600.0, "seed": 7, "fitted_first": False}
+    assert report["notes"] == ["12 missing samples <in 1 gap> & filled"]
+    lenses = ["psd", "allan", "level", "distribution", "other_axes"]
+    assert [score["lens"] for score in report["axes"]["gx"]["scores"]] == lenses
+    assert [score["lens"] for score in report["axes"]["gz"]["steps"][1]["scores"]] == lenses
+
+
+def test_what_happens_once_has_a_reason_instead_of_a_held_out_gap() -> None:
+    first, second = written(samples.explained())["axes"]["gz"]["steps"]
+    assert second["held_out_gap"] is None
+    assert second["held_out_reason"] == "a known term of another size is not held out"
+    assert "held_out_reason" not in first
+
+
+def test_the_threshold_beside_a_gap_is_the_one_after_the_step() -> None:
+    after = Score("psd", Where(), 1.0, 1.7, 2.2)
+    step = written(with_step(samples.explained(), after=after))["axes"]["gz"]["steps"][0]
+    assert step["gap"] == {"before": 41.2, "after": 1.0, "null95": 1.7, "threshold": 2.2}
+    assert step["found"]["threshold"] == 2.6
+
+
+def test_what_is_no_number_is_null_and_an_axis_has_no_interval() -> None:
+    parameters = {
+        "source": Bounds("ax"),
+        "coefficient": Bounds(np.float64(2e-4), np.nan, np.inf),
+        "order": Bounds(2),
+    }
+    found = Score("other_axes", Where(source="ax", value=(-np.inf, 0.1)), np.inf, np.nan, 2.5)
+    changed = with_step(samples.explained(), parameters=parameters, found=found, confidence=np.nan)
+    step = written(changed)["axes"]["gz"]["steps"][0]
+    assert step["parameters"] == {
+        "source": {"value": "ax"},
+        "coefficient": {"value": 2e-4, "lo": None, "hi": None},
+        "order": {"value": 2.0, "lo": None, "hi": None},
+    }
+    assert step["found"] == {
+        "lens": "other_axes", "where": {"value": [None, 0.1], "source": "ax"},
+        "gap": None, "null95": None, "threshold": 2.5,
+    }  # fmt: skip
+    assert step["confidence"] is None
+
+
+def test_what_is_left_over_has_its_place_and_no_name() -> None:
+    axis = written(samples.unexplained())["axes"]["ax"]
+    assert axis["verdict"] == "unexplained"
+    assert axis["steps"] == []
+    assert axis["left_over"] == [
+        {"lens": "psd", "where": {"frequency": [6.0, 11.0]}, "gap": 7.9, "null95": 1.9, "threshold": 2.6}
+    ]
+
+
+def test_the_same_reconciliation_gives_the_same_bytes_in_the_order_of_the_axes() -> None:
+    r = samples.explained()
+    backwards = replace(r, axes=dict(reversed(r.axes.items())))
+    assert to_json(samples.explained()) == to_json(r) == to_json(backwards)
+    assert list(written(backwards)["axes"]) == ["gx", "gy", "gz", "ax", "ay", "az"]
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    score = Score("psd", Where(frequency=(np.float64(1), np.float64(2))), np.float64(3), np.float64(1), np.float64(2))
+    look = Look((score,), ())
+    step = Step(
+        score, "added", "bias_step", {}, np.float64(0.5), (), score, score, None, None, "once", "it jumps", look
+    )
+    axes = {"gx": AxisResult("gx", "explained", look, (step,), ())}
+    model = samples.explained().model
+    r = Reconciliation("explained", axes, model, model, False, np.float64(10), np.int64(20), np.float64(2), np.int64(1))
+    report = written(r)
+    assert report["samples"] == 20
+    assert report["axes"]["gx"]["steps"][0]["found"]["where"] == {"frequency": [1.0, 2.0]}
