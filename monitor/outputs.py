@@ -11,6 +11,7 @@ from drivers.sample_message import pack
 from monitor import topics
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.hadamard import HadamardCurve
+from monitor.estimate.model_gap import ModelGap
 from monitor.estimate.total import TotalCurve
 from monitor.health import Health
 from monitor.publish import message
@@ -43,6 +44,10 @@ class ZenohOutput:
         self._zenoh.put(topics.ALLAN, device, message.allan(device, unix_s, estimate))
         self._zenoh.put(topics.COEFFICIENTS, device, message.coefficients(device, unix_s, estimate))
 
+    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
+        """The window beside the model in force."""
+        self._zenoh.put(topics.GAP, device, message.gap(device, unix_s, gap))
+
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
         """Total and Hadamard deviations."""
         self._zenoh.put(topics.TOTAL, device, message.total(device, unix_s, received, total, hadamard))
@@ -73,6 +78,10 @@ class ViewerOutput:
         """Curve and coefficients."""
         self._view.estimate(device, unix_s, estimate)
 
+    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
+        """Courses of the gaps, and the model's curves beside those measured."""
+        self._view.gap(device, unix_s, gap)
+
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
         """Not shown."""
 
@@ -99,6 +108,9 @@ class LogOutput:
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         """Not logged."""
 
+    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
+        """Not logged."""
+
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
         """Not said."""
 
@@ -122,6 +134,7 @@ class TableOutput:
         self.board = board
         self._live = live
         self._latest: dict[str, tuple[float, Estimate]] = {}
+        self._gaps: dict[str, tuple[float, ModelGap]] = {}
 
     def viewer_at(self, url: str) -> None:
         """The line above the table: where the viewer's page is, "" = nowhere."""
@@ -133,6 +146,10 @@ class TableOutput:
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         """Kept until the table is drawn."""
         self._latest[device] = (unix_s, estimate)
+
+    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
+        """Kept until the table is drawn."""
+        self._gaps[device] = (unix_s, gap)
 
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
         """Not shown."""
@@ -147,5 +164,7 @@ class TableOutput:
         if device in self._latest:
             at_s, estimate = self._latest.pop(device)
             self.board.take(topics.COEFFICIENTS.key(PREFIX, device), message.coefficients(device, at_s, estimate))
+        if device in self._gaps:
+            self.board.take(topics.GAP.key(PREFIX, device), message.gap(device, *self._gaps.pop(device)))
         if self._live is not None:
             self._live.update(self.board.table(time.monotonic()), refresh=True)

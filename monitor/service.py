@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from monitor.estimate.estimator import warm_up
+from monitor.live_reconcile import Job, Reconciler
 from monitor.outputs import TableOutput, ViewerOutput, ZenohOutput
 from monitor.publish import message
 from monitor.publish.viewer import DeviceInfo, ViewerSettings
@@ -40,10 +41,14 @@ class Service:
     Args:
         config: what to run
         more: further outputs, e.g. the table in the terminal
+        reconciler: runs ``command/reconcile``
+    Raises:
+        ConfigError: a simulated sensor or a model in force that cannot be
     """
 
-    def __init__(self, config: Config, more: Sequence[Output] = ()) -> None:
+    def __init__(self, config: Config, more: Sequence[Output] = (), reconciler: Reconciler | None = None) -> None:
         self.config = config
+        self._reconciler = reconciler or Reconciler()
         self._wake = threading.Event()
         self._ready = Ready()
         self._stop = threading.Event()
@@ -91,6 +96,7 @@ class Service:
                 station.work(self.outputs, now_s)
                 self.zenoh.alive(station.name, station.driver.state == "running")
             self._answer()
+            self._tell_reconciled()
             if now_s >= status_s:
                 status_s = now_s + STATUS_S
                 self._report()
@@ -159,18 +165,38 @@ class Service:
             self._obey(command, stations[command.device])
 
     def _obey(self, command: Command, station: Station) -> None:
-        if command.verb != "reset":
-            command.refuse(f'unknown command "{command.verb}"; known are reset')
+        match command.verb:
+            case "reset":
+                station.reset()
+                received = station.driver.counts.received
+                command.answer(message.reply(station.name, station.now_unix_s(), received, "the window is empty"))
+                _log.info("reset", device=station.name)
+            case "reconcile":
+                self._reconcile(command, station)
+            case other:
+                command.refuse(f'unknown command "{other}"; known are reset, reconcile')
+
+    def _reconcile(self, command: Command, station: Station) -> None:
+        """Hand a copy of the window over; the answer comes from a thread of its own."""
+        held = station.held()
+        if held is None:
+            command.refuse("no samples yet")
             return
-        station.reset()
-        received = station.driver.counts.received
-        command.answer(message.reply(station.name, station.now_unix_s(), received, "the window is empty"))
-        _log.info("reset", device=station.name)
+        received, device = station.driver.counts.received, station.device
+        job = Job(station.name, station.now_unix_s(), received, *held, device.model, device.reconcile_folder)
+        self._reconciler.start(job, command)
+
+    def _tell_reconciled(self) -> None:
+        stations = {station.name: station for station in self.stations}
+        for finished in self._reconciler.take():
+            stations[finished.device].announce(self.outputs, "reconciled", finished.text)
 
     def _close(self) -> None:
         try:
             self._drain()
         finally:
+            self._reconciler.close()
+            self._tell_reconciled()
             if self.view is not None:
                 self.view.close()
             self.zenoh.close()
@@ -215,7 +241,7 @@ def _viewer(config: Config) -> "RerunView | None":
     from monitor.publish.rerun_view import RerunView
 
     own = config.viewer
-    devices = [DeviceInfo(device.name, _about(device)) for device in config.devices]
+    devices = [DeviceInfo(device.name, _about(device), device.model is not None) for device in config.devices]
     return RerunView(ViewerSettings(own.mode, own.port, own.web_port, own.memory), devices)
 
 

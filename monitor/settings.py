@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import msgspec
 
@@ -21,7 +21,26 @@ from drivers.decoders.base import Addressed, Decoder
 from drivers.driver import AxisMap, axis_map
 from drivers.errors import ConfigError
 from drivers.links.base import Filtering, Link, LinkSettings
+from monitor.tables import DeviceTable, FaultsTable, FileTable, LogTable, ViewerTable, VirtualTable, ZenohTable
 from monitor.topics import ENDPOINT
+
+__all__ = [
+    "CONFIG_FOLDER",
+    "Config",
+    "Device",
+    "DeviceTable",
+    "FaultsTable",
+    "LogTable",
+    "ViewerTable",
+    "VirtualTable",
+    "ZenohTable",
+    "load",
+    "model_path",
+    "period",
+    "read",
+    "seconds",
+    "viewer_mode",
+]
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -33,106 +52,6 @@ WINDOW_LONGEST_S: Final = 40 * 86400.0
 DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
 IS_ENDPOINT: Final = re.compile(r"[a-z]+/.+")
 MEMORY: Final = re.compile(r"[0-9]+(\.[0-9]+)?\s*([kMGT]?i?B|%)")
-
-Positive = Annotated[float, msgspec.Meta(gt=0.0)]
-Port = Annotated[int, msgspec.Meta(ge=0, le=65535)]
-Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
-
-
-class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One table of the file."""
-
-
-class DeviceTable(_Table, frozen=True, kw_only=True):
-    """``[[device]]``."""
-
-    name: str
-    driver: dict[str, Any]
-    rate: Positive | None = None
-    window: Positive | str = 3600.0
-    tau: Literal["octave", "decade10"] | list[Positive] = "octave"
-    refit: str = "10 Hz"
-    publish: str = "10 Hz"
-    motion: Literal["tell", "leave out"] = "tell"
-    alarms_per_day: Annotated[float, msgspec.Meta(ge=0.0)] = 0.033
-    """False alarms of changed noise to bear; 0 = do not look."""
-    restart: bool = True
-    model: Path | None = None
-    axes: dict[str, str] = {}
-
-
-class FaultsTable(_Table, frozen=True, kw_only=True):
-    """``[device.driver.faults]``: what goes wrong on the way from a simulated sensor, all of it drawn from its seed."""
-
-    lost: Share = 0.0
-    """Share of samples that are never sent; their count goes on."""
-    repeated: Share = 0.0
-    """Share of samples that are sent twice."""
-    flipped: Share = 0.0
-    """Share of samples one bit of which is flipped."""
-    cut: Share = 0.0
-    """Share of samples whose frame ends before it is whole."""
-    jitter: Annotated[float, msgspec.Meta(ge=0.0, le=0.5)] = 0.0
-    """s: each burst is held back by a random time of up to so much."""
-    unplugged: Share = 0.0
-    """Chance at each sample that the cable is pulled before it."""
-    unplugged_for: Annotated[float, msgspec.Meta(gt=0.0)] = 2.0
-    """s of the sensor's time until it is put back."""
-    clock: Annotated[float, msgspec.Meta(ge=0.5, le=2.0)] = 1.0
-    """True rate over the rate that the sensor's clock and settings claim."""
-
-
-class VirtualTable(LinkSettings, frozen=True, kw_only=True):
-    """Keys of ``link = "virtual"``: a simulated IMU that speaks a real wire format over a real link.
-
-    The decoder says which: a stream of bytes over a pseudo-terminal, CAN frames over a bus of python-can in this
-    process, messages over zenoh on loopback.
-    """
-
-    model: str = "consumer-mems"
-    """Path of a model file, or the name of one in the shipped ``config/models``."""
-    seed: Annotated[int, msgspec.Meta(ge=0)] = 1
-    speed: Annotated[float, msgspec.Meta(gt=0.0, le=10_000.0)] = 1.0
-    """Times real time."""
-    effect: tuple[str, ...] = ()
-    """Effects that the sensor takes on while it runs: "gz.sinusoidal:amplitude=1e-3,frequency=17"."""
-    effect_at: Annotated[float, msgspec.Meta(ge=0.0)] = 90.0
-    """s of the sensor's time; by then changes are looked for."""
-    faults: FaultsTable = FaultsTable()
-
-
-class ZenohTable(_Table, frozen=True, kw_only=True):
-    """``[zenoh]``."""
-
-    mode: Literal["peer", "client", "router", "none"] | None = "peer"
-    listen: tuple[str, ...] | None = (ENDPOINT,)
-    """These two are None where a zenoh file is named and they are not given beside it: then the file's hold."""
-    connect: tuple[str, ...] = ()
-    config: Path | None = None
-    prefix: Annotated[str, msgspec.Meta(pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$")] = "imu"
-
-
-class ViewerTable(_Table, frozen=True, kw_only=True):
-    """``[viewer]``."""
-
-    mode: str = "auto"
-    port: Port = 9876
-    web_port: Port = 9090
-    memory: str = "256MiB"
-
-
-class LogTable(_Table, frozen=True, kw_only=True):
-    """``[log]``."""
-
-    level: Literal["debug", "info", "warning", "error"] = "info"
-    format: Literal["text", "json"] = "text"
-
-
-class _File(_Table, frozen=True, kw_only=True):
-    device: list[dict[str, Any]] = []
-    zenoh: dict[str, Any] = {}
-    viewer: dict[str, Any] = {}
-    log: dict[str, Any] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +71,8 @@ class Device:
     leave_out_motion: bool = False
     alarms_per_day: float = 0.033  # 0 = changes are not looked for
     restart: bool = True  # the estimate of an axis begins anew where its noise has changed
+    model: Path | None = None  # the model in force
+    reconcile_folder: Path | None = None  # where reports are kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,7 +123,7 @@ class _Reader:
         self._folder = folder
 
     def config(self, table: Mapping[str, Any]) -> Config | None:
-        file = self.fill(_File, table, "")
+        file = self.fill(FileTable, table, "")
         if file is None:
             return None
         if not file.device:
@@ -254,14 +175,14 @@ class _Reader:
         if window_s is None or refit_s is None or publish_s is None or axes is None or link is None or decoder is None:
             return None
         self._try(f"{at}: window", _possible_window, window_s, entry.rate)
-        if entry.model is not None and not entry.model.is_file():
-            self.wrong.append(f"{at}: model: {entry.model}: no such file")
+        model = None if entry.model is None else self._try(f"{at}: model", model_path, entry.model, self._folder)
         tau = entry.tau if isinstance(entry.tau, str) else tuple(entry.tau)
         self._try(f"{at}: tau", _possible_tau, tau, window_s, entry.rate)
         silence_s = float(entry.driver.get("silence", LinkSettings().silence))
         return Device(
             entry.name, entry.rate, window_s, tau, refit_s, publish_s, link, decoder, axes, silence_s,
-            entry.motion == "leave out", entry.alarms_per_day, entry.restart,
+            entry.motion == "leave out", entry.alarms_per_day, entry.restart, model,
+            entry.reconcile_folder,
         )  # fmt: skip
 
     def driver(self, table: Mapping[str, Any], at: str) -> tuple[Link | VirtualTable | None, Decoder | None]:

@@ -7,7 +7,7 @@ and none of them waits: each has a queue or drops.
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, Protocol
 
 import numpy as np
@@ -18,10 +18,14 @@ from drivers.driver import Driver
 from drivers.errors import ConfigError, NotReady
 from drivers.links.base import Link
 from drivers.links.replay_link import ReplayLink
-from drivers.sample import Event, SampleBlock, unbroken
+from drivers.sample import Event, Floats, SampleBlock, unbroken
+from monitor.catalogue import read_model
+from monitor.estimate.agreement import Agreement
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.estimator import Estimator
 from monitor.estimate.hadamard import HadamardCurve
+from monitor.estimate.held import Held, Temperatures
+from monitor.estimate.model_gap import ModelGap, ModelInForce
 from monitor.estimate.total import TotalCurve
 from monitor.estimate.watch import Watch
 from monitor.health import Health
@@ -61,6 +65,9 @@ class Output(Protocol):
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         """One refit."""
 
+    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
+        """The window beside the model in force, with each estimate; never where there is no model."""
+
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
         """Total and Hadamard deviations, renewed in rounds."""
 
@@ -79,6 +86,8 @@ class Station:
         link: what its samples come by
         wake: set whenever samples have come
         ready: which of the estimator's kernels are compiled; samples wait in order until they are
+    Raises:
+        ConfigError: the model in force is none
     """
 
     def __init__(self, device: Device, link: Link, decoder: Decoder, wake: threading.Event, ready: Ready) -> None:
@@ -92,6 +101,10 @@ class Station:
         self.estimator: Estimator | None = None
         self.watch: Watch | None = None
         self.latest: Estimate | None = None
+        self._model = None if device.model is None else read_model(device.model)
+        self._in_force: ModelInForce | None = None
+        self._agreement = Agreement()
+        self._temperatures: Temperatures | None = None  # of the samples in the window
         self.published = 0  # samples handed to the outputs
         self._wake = wake
         self._ready = ready
@@ -145,9 +158,7 @@ class Station:
             self._advance(blocks)
         if drain:
             self._estimate(self.watch.flush() if self.watch is not None else [])
-        for event in self.driver.take_events() + (self.watch.take_events() if self.watch is not None else []):
-            for output in outputs:
-                output.event(self.name, self.unix_s(event.t_ns), self.driver.counts.received, event)
+        self._tell(outputs, self.driver.take_events() + (self.watch.take_events() if self.watch is not None else []))
         published = self._publish_samples(outputs, now_s, drain)
         published |= self._publish_estimate(outputs, now_s, drain)
         self._publish_total(outputs, now_s)
@@ -159,6 +170,16 @@ class Station:
         """Empty the window."""
         if self.estimator is not None:
             self.estimator.reset()
+
+    def held(self) -> tuple[Held, Floats] | None:
+        """The samples in the window and their temperature [n], as of now; None while there are none."""
+        if self.estimator is None or self._temperatures is None or not self.estimator.filled:
+            return None
+        return self.estimator.held(), self._temperatures.newest(self.estimator.filled)
+
+    def announce(self, outputs: Sequence[Output], kind: str, text: str) -> None:
+        """An event that happened outside of the samples, now."""
+        self._tell(outputs, [Event(kind, self._newest_ns, text)])
 
     def report(self, outputs: Sequence[Output], states: dict[str, str], memory_bytes: int) -> Health:
         """Tell the outputs how the device does, and ease its wall clock."""
@@ -245,6 +266,9 @@ class Station:
             try:
                 every_sample = self.device.refit_s == 0.0
                 self.estimator = Estimator(rate, self.device.window_s, self.device.tau, every_sample)
+                self._temperatures = Temperatures(self.estimator.length)
+                if self._model is not None:
+                    self._in_force = ModelInForce(self._model, self.estimator.length)
             except ConfigError as error:  # a list of τ that does not fit the rate found; samples go on
                 self._no_estimate = f"no estimate: {error}"
                 return
@@ -257,10 +281,11 @@ class Station:
 
     def _estimate(self, blocks: list[SampleBlock]) -> None:
         """Advance the estimate, and let axes begin anew whose noise was found changed."""
-        if self.estimator is None:
+        if self.estimator is None or self._temperatures is None:
             return
         for samples in blocks:
             self.estimator.update(samples)
+            self._temperatures.push(samples.lost, samples.temperature_c)
             self._advanced = True
         for restart in self.watch.take_restarts() if self.watch is not None else ():
             if self.device.restart:
@@ -295,7 +320,21 @@ class Station:
         self._refitted = False
         for output in outputs:
             output.estimate(self.name, self.unix_s(self.latest.t_ns), self.latest)
+        if self._in_force is not None:
+            self._publish_gap(outputs, self._in_force.look(self.latest))
         return True
+
+    def _publish_gap(self, outputs: Sequence[Output], look: ModelGap) -> None:
+        events = self._agreement.update(look)
+        look = replace(look, agrees=self._agreement.verdicts)
+        for output in outputs:
+            output.gap(self.name, self.unix_s(look.t_ns), look)
+        self._tell(outputs, events)
+
+    def _tell(self, outputs: Sequence[Output], events: Sequence[Event]) -> None:
+        for event in events:
+            for output in outputs:
+                output.event(self.name, self.unix_s(event.t_ns), self.driver.counts.received, event)
 
     def _publish_total(self, outputs: Sequence[Output], now_s: float) -> None:
         """One step of the slow statistics, as often as they may take their share of the time."""

@@ -25,6 +25,7 @@ from monitor.estimate.estimate import Course, Estimate
 from monitor.estimate.estimate import joined as joined_courses
 from monitor.estimate.fit import Fit, Looks, design, fit, joined, nothing_fitted
 from monitor.estimate.hadamard import HadamardCurve
+from monitor.estimate.held import Held, held
 from monitor.estimate.refit import Refit
 from monitor.estimate.slow import SlowStatistics
 from monitor.estimate.total import TotalCurve
@@ -89,6 +90,15 @@ class Estimator:
     def filled(self) -> int:
         """Samples in the window now, missing ones included."""
         return self._window.n
+
+    @property
+    def length(self) -> int:
+        """Samples in the full window."""
+        return self._window.length
+
+    def held(self) -> Held:
+        """The samples in the window now."""
+        return held(self._window, self.rate_hz)
 
     def update(self, samples: SampleBlock) -> None:
         """Advance by the samples missing before the block, then by the block."""

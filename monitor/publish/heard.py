@@ -76,7 +76,28 @@ class EventMessage(msgspec.Struct, frozen=True):
     text: str
 
 
-M = TypeVar("M", StatusMessage, CoefficientsMessage, EventMessage)
+class Place(msgspec.Struct, frozen=True):
+    """Where a gap is."""
+
+    tau: tuple[float, float]
+
+
+class AxisGapMessage(msgspec.Struct, frozen=True):
+    """One axis beside its model."""
+
+    gap: float
+    where: Place
+    agrees: bool | None = None
+
+
+class GapMessage(msgspec.Struct, frozen=True):
+    """``imu/<device>/gap``."""
+
+    schema: str
+    axes: dict[str, AxisGapMessage]
+
+
+M = TypeVar("M", StatusMessage, CoefficientsMessage, EventMessage, GapMessage)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +117,7 @@ class Heard:
     heard_s: float  # newest message of any kind
     status: StatusMessage | None = None
     noise: Noise | None = None
+    gap: GapMessage | None = None
     there: bool | None = None  # liveliness; None: never told
 
     def state(self, now_s: float) -> str:
@@ -118,7 +140,7 @@ class Heard:
         if status is None or state != "running":
             return 1
         well = all(output in QUIET or output.startswith("ok,") for output in status.outputs.values())
-        return 2 if well and not status.text and not status.overflowed else 1
+        return 2 if well and not status.text and not status.overflowed and not self.disagreements() else 1
 
     def trouble(self) -> str:
         """What is wrong, in words; empty while all is well."""
@@ -129,7 +151,16 @@ class Heard:
         said += [f"{clean(name)}: {clean(state)}" for name, state in outputs if state not in QUIET]
         if self.status.overflowed:
             said.append(f"{self.status.overflowed:,} samples overwritten before they were used: too slow here")
-        return "; ".join(said)
+        return "; ".join([*said, *self.disagreements()])
+
+    def disagreements(self) -> list[str]:
+        """Of each axis that disagrees with its model, by how much and where."""
+        found = [] if self.gap is None else [item for item in self.gap.axes.items() if item[1].agrees is False]
+        return [
+            f"{clean(axis)} disagrees with its model: {one.gap:.3g} σ at τ {one.where.tau[0]:.3g} to "
+            f"{one.where.tau[1]:.3g} s"
+            for axis, one in found
+        ]
 
 
 def split(key: str) -> tuple[str, topics.Topic] | None:
@@ -137,7 +168,7 @@ def split(key: str) -> tuple[str, topics.Topic] | None:
 
     >>> split("imu/bench-1/status")
     ('imu/bench-1', Topic(name='status', encoding='application/json', when='1 Hz'))
-    >>> split("imu/bench-1/gap")
+    >>> split("imu/bench-1/mood")
     """
     for topic in topics.TOPICS:
         device = key.removesuffix(f"/{topic.name}")

@@ -3,7 +3,7 @@
 NaN becomes null, as JSON has no word for it. ``t`` is the Unix time of the newest sample in s.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import msgspec
@@ -18,6 +18,7 @@ from monitor.estimate.curve import AllanCurve
 from monitor.estimate.dynamic import Dynamic
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.hadamard import HadamardCurve
+from monitor.estimate.model_gap import ModelGap
 from monitor.estimate.rest import Motion
 from monitor.estimate.total import TotalCurve
 from monitor.health import Health
@@ -46,6 +47,36 @@ def coefficients(device: str, unix_s: float, estimate: Estimate) -> bytes:
         for i, axis in measured_axes(estimate)
     }
     return _encode(topics.COEFFICIENTS, device, unix_s, estimate.samples, _window(estimate, axes=axes))
+
+
+def gap(device: str, unix_s: float, look: ModelGap) -> bytes:
+    """``imu/<device>/gap``: deviations beside those of the model in force, axes that can be judged.
+
+    ``agrees`` is the verdict that stands (null: none yet), see ``agreement``: it changes later than ``gap`` passes.
+    """
+    axes = {
+        axis: {
+            "agrees": look.agrees.get(axis),
+            "gap": one.gap,
+            "where": {"tau": one.tau_s},
+            "ratio": one.ratio,
+            "null95": one.null95,
+            "threshold": one.threshold,
+            "measured": _list(one.measured),
+            "model": _list(one.model),
+            "z": _list(one.z),
+        }
+        for axis, one in look.axes.items()
+    }
+    filled_s = look.n / look.rate_hz
+    payload = {
+        "rate": look.rate_hz,
+        "window": look.window_s,
+        "filled": filled_s,
+        "tau": _list(look.tau_s),
+        "axes": axes,
+    }
+    return _encode(topics.GAP, device, unix_s, look.samples, payload)
 
 
 def total(device: str, unix_s: float, samples: int, total: TotalCurve, hadamard: HadamardCurve) -> bytes:
@@ -124,6 +155,17 @@ def status(device: str, unix_s: float, health: Health) -> bytes:
 def reply(device: str, unix_s: float, samples: int, text: str) -> bytes:
     """Answer of ``imu/<device>/command/<verb>``."""
     return _encode(topics.RESET, device, unix_s, samples, {"text": text})
+
+
+def reconciled(
+    device: str, unix_s: float, samples: int, result: Mapping[str, Any], status: int, folder: str | None
+) -> bytes:
+    """Answer of ``imu/<device>/command/reconcile``: the report's own keys, and how it came about.
+
+    ``status`` is the command's exit status, ``folder`` where the whole report is kept, if it is.
+    """
+    own = {key: value for key, value in result.items() if key not in ("schema", "device", "t", "samples")}
+    return _encode(topics.RECONCILE, device, unix_s, samples, {**own, "exit": status, "folder": folder})
 
 
 def analysis(

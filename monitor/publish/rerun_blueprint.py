@@ -5,7 +5,7 @@ time. The time panel follows the newest sample. Layout only: nothing here knows 
 Rerun.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Final
 
 import rerun as rr
@@ -35,9 +35,9 @@ COLUMNS: Final = 4
 SHORT: Final = {"gyro": "Gyro", "accel": "Accel"}
 
 
-def blueprint(devices: Sequence[str]) -> rrb.Blueprint:
-    """The layout for these devices."""
-    pages = [_device(d) for d in devices]
+def blueprint(devices: Sequence[str], with_model: Collection[str] = ()) -> rrb.Blueprint:
+    """The layout for these devices, some of which have a model in force."""
+    pages = [_device(d, d in with_model) for d in devices]
     root = pages[0] if len(pages) == 1 else rrb.Tabs(_overview(devices), *pages, active_tab=0)
     return rrb.Blueprint(
         root,
@@ -49,7 +49,7 @@ def blueprint(devices: Sequence[str]) -> rrb.Blueprint:
     )
 
 
-def _device(device: str) -> rrb.Container:
+def _device(device: str, has_model: bool) -> rrb.Container:
     left = rrb.Vertical(
         rrb.TextDocumentView(origin=f"/{device}/status", name="Is it healthy?"),
         rrb.TextDocumentView(origin=f"/{device}/coefficients", contents="$origin", name="What is its noise now?"),
@@ -59,8 +59,9 @@ def _device(device: str) -> rrb.Container:
     right = rrb.Vertical(
         rrb.Horizontal(*(_allan(device, kind) for kind in KINDS)),
         rrb.Horizontal(*(_course(device, kind, letter) for kind in KINDS for letter in COURSES)),
+        *([rrb.Horizontal(*(_gap(device, kind) for kind in KINDS))] if has_model else []),
         rrb.Horizontal(*(_raw(device, kind) for kind in KINDS), _temperature(device), column_shares=[2, 2, 1]),
-        row_shares=[5, 2.2, 2.2],
+        row_shares=[5, 2.2, 1.6, 2.2] if has_model else [5, 2.2, 2.2],
     )
     now = rrb.Horizontal(left, right, column_shares=[3, 7], name="Now")
     return rrb.Tabs(now, _dynamic(device), active_tab=0, name=device)
@@ -147,6 +148,16 @@ def _temperature(device: str) -> rrb.View:
     )
 
 
+def _gap(device: str, kind: Kind) -> rrb.View:
+    return rrb.TimeSeriesView(
+        origin=f"/{device}/gap",
+        contents=["+ $origin/threshold", *(f"+ $origin/{axis}" for axis in axes_of(kind))],
+        name=f"{KIND_NAMES[kind]}: gap to the model, σ, and its threshold",
+        plot_legend=rrb.PlotLegend(visible=False),
+        axis_x=_all_so_far(),
+    )
+
+
 def _log_columns() -> rrb.TextLogColumns:
     """The time of the day stands in the text: a column for it would be cut off to the date."""
     hidden = TimelineColumn(timeline=TIMELINE, visible=False)
@@ -164,6 +175,6 @@ def _all_so_far() -> rrb.TimeAxis:
     return rrb.TimeAxis(view_range=rr.TimeRange(rr.TimeRangeBoundary.infinite(), now))
 
 
-def send(stream: rr.RecordingStream, devices: Sequence[str]) -> None:
+def send(stream: rr.RecordingStream, devices: Sequence[str], with_model: Collection[str] = ()) -> None:
     """Make the layout the active one of the stream's viewer."""
-    stream.send_blueprint(blueprint(devices), make_active=True, make_default=True)
+    stream.send_blueprint(blueprint(devices, with_model), make_active=True, make_default=True)

@@ -64,6 +64,18 @@ def runs(positions: Floats) -> list[Floats]:
     return [positions[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
 
 
+def dashes(line: Floats, length: float = 0.22) -> list[Floats]:
+    """A line [n, 2] as strokes of that length with gaps as long between them.
+
+    >>> [stroke.tolist() for stroke in dashes(np.array([[0.0, 0.0], [4.0, 0.0]]), 1.0)]
+    [[[0.0, 0.0], [1.0, 0.0]], [[2.0, 0.0], [3.0, 0.0]]]
+    """
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    edges = np.arange(0.0, along[-1] + 1e-9, length)
+    points = np.column_stack([np.interp(edges, along, line[:, 0]), np.interp(edges, along, line[:, 1])])
+    return [points[i : i + 2] for i in range(0, len(points) - 1, 2)]
+
+
 def band(low: Floats, high: Floats) -> Floats:
     """[FILL_STEPS, 2, 2] vertical strokes side by side that fill the space between two curves."""
     good = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)

@@ -18,6 +18,7 @@ import rerun as rr
 from drivers.sample import AXES, Event, Floats
 from monitor.estimate.coefficients import LETTERS, Status
 from monitor.estimate.estimate import Estimate
+from monitor.estimate.model_gap import ModelGap
 from monitor.health import Health
 from monitor.publish import colours, rerun_dynamic
 from monitor.publish.decimate import extremes, means
@@ -28,6 +29,7 @@ from monitor.publish.rerun_chart import (
     WIDTH,
     Scale,
     band,
+    dashes,
     decades,
     grid,
     runs,
@@ -68,6 +70,7 @@ class _Device:
 
     about: str
     scales: dict[Kind, Scale] = field(default_factory=dict)
+    gap: ModelGap | None = None  # the newest
     surface: Surface = field(default_factory=Surface)
 
 
@@ -87,6 +90,8 @@ class Scene:
                 self._style_axis(device, axis)
             line = rr.SeriesLines(colors=[colours.TEMPERATURE], widths=[1.5], names=["temperature, °C"])
             self._stream.log(f"{device}/temperature", line, static=True)
+            line = rr.SeriesLines(colors=[colours.mixed(colours.TEXT, 0.6)], widths=[1.0], names=["threshold"])
+            self._stream.log(f"{device}/gap/threshold", line, static=True)
 
     def samples(self, device: str, wall_s: Floats, values: Floats, temperature_c: Floats) -> None:
         """Raw samples since the last flush: [n], [n, 6] SI, [n] °C. At most 200 rows/s and axis are drawn."""
@@ -122,6 +127,19 @@ class Scene:
                     factor = COEFFICIENT_UNITS[kind_of(axis)][letter].factor
                     self._scalars(f"{device}/coefficients/{letter}/{axis}", at, values * factor)
 
+    def gaps(self, device: str, wall_s: Floats, looks: Sequence[ModelGap]) -> None:
+        """The course of the gap to the model in force: a line an axis, and the threshold that chance stays below.
+
+        The model's own curve is drawn with the next estimate.
+        """
+        self._devices[device].gap = looks[-1]
+        highest = [max((one.threshold for one in look.axes.values()), default=np.nan) for look in looks]
+        self._scalars(f"{device}/gap/threshold", wall_s, np.array(highest))
+        for axis in AXES:
+            gap = np.array([look.axes[axis].gap if axis in look.axes else np.nan for look in looks])
+            if np.isfinite(gap).any():
+                self._scalars(f"{device}/gap/{axis}", wall_s, gap)
+
     def event(self, device: str, wall_s: float, event: Event) -> None:
         """One line in the log of the device, and in that of the overview."""
         self._at(wall_s)
@@ -145,6 +163,8 @@ class Scene:
         unit = SAMPLE_UNITS[kind_of(axis)].name
         line = rr.SeriesLines(colors=[colour], widths=[1.0], names=[f"{axis}, {unit}"])
         self._stream.log(f"{device}/samples/{axis}", line, static=True)
+        line = rr.SeriesLines(colors=[colour], widths=[1.5], names=[f"{axis}, σ from its model"])
+        self._stream.log(f"{device}/gap/{axis}", line, static=True)
         dim = colours.mixed(colour, 0.45)
         for letter in LETTERS:
             unit = COEFFICIENT_UNITS[kind_of(axis)][letter].name
@@ -174,7 +194,8 @@ class Scene:
         self._stream.set_time(TIMELINE, timestamp=_stamps(np.array([wall_s]))[0])
 
     def _allan(self, device: str, kind: Kind, estimate: Estimate) -> None:
-        curves = [c for axis in axes_of(kind) if (c := _Curve.of(estimate, axis)) is not None]
+        gap = self._devices[device].gap
+        curves = [c for axis in axes_of(kind) if (c := _Curve.of(estimate, axis, gap)) is not None]
         if not curves:
             return
         scale = Scale(decades(c.tau for c in curves), decades(part for c in curves for part in c.shown))
@@ -220,7 +241,7 @@ class Scene:
         self._stream.log(path, points)
 
     def _curve(self, path: str, scale: Scale, curve: "_Curve") -> None:
-        """Band, fitted line, intervals and measured points of one axis."""
+        """Band, fitted line, intervals and measured points of one axis, and dashed the model in force."""
         colour = colours.AXIS_COLOURS[curve.axis]
         low, high = scale.place(curve.tau, curve.lo), scale.place(curve.tau, curve.hi)
         fill = rr.LineStrips2D(
@@ -237,6 +258,9 @@ class Scene:
         fitted = runs(scale.place(curve.tau, curve.fitted))
         fit = rr.LineStrips2D(fitted, colors=[colour], radii=rr.Radius.ui_points(1.25), draw_order=10.0)
         self._stream.log(f"{path}/fit", fit)
+        dashed = [stroke for run in runs(scale.place(curve.tau, curve.model)) for stroke in dashes(run)]
+        model = rr.LineStrips2D(dashed, colors=[colours.TEXT], radii=rr.Radius.ui_points(0.75), draw_order=15.0)
+        self._stream.log(f"{path}/model", model)
         points = rr.Points2D(
             scale.place(curve.tau, curve.deviation),
             colors=[colour],
@@ -256,15 +280,16 @@ class _Curve:
     lo: Floats
     hi: Floats
     fitted: Floats
+    model: Floats  # of the model in force; NaN where there is none
     si: dict[str, Floats]
 
     @property
-    def shown(self) -> tuple[Floats, Floats]:
+    def shown(self) -> tuple[Floats, ...]:
         """What the plot's height must hold; an interval may leave it."""
-        return self.deviation, self.fitted
+        return self.deviation, self.fitted, self.model
 
     @classmethod
-    def of(cls, estimate: Estimate, axis: str) -> "_Curve | None":
+    def of(cls, estimate: Estimate, axis: str, gap: ModelGap | None) -> "_Curve | None":
         """None while the axis has not two points."""
         curve, i = estimate.curve, AXES.index(axis)
         rows = np.isfinite(curve.avar[:, i]) & (curve.avar[:, i] > 0)
@@ -272,8 +297,11 @@ class _Curve:
             return None
         deviation, fitted = (np.sqrt(a[rows, i]) for a in (curve.avar, estimate.fitted))
         si = {"tau": curve.tau_s[rows], "deviation": deviation, "lo": curve.lo[rows, i], "hi": curve.hi[rows, i]}
+        model = np.full(fitted.shape, np.nan)
+        if gap is not None and axis in gap.axes and gap.axes[axis].model.shape == rows.shape:
+            model = gap.axes[axis].model[rows]
         f = DEVIATION_UNITS[kind_of(axis)].factor
-        return cls(axis, si["tau"], deviation * f, si["lo"] * f, si["hi"] * f, fitted * f, si)
+        return cls(axis, si["tau"], deviation * f, si["lo"] * f, si["hi"] * f, fitted * f, model * f, si)
 
 
 def _between(wall_s: float, estimate: Estimate) -> tuple[Floats, Floats]:

@@ -24,6 +24,7 @@ import numpy as np
 
 from drivers.sample import Event, Floats
 from monitor.estimate.estimate import Estimate, joined
+from monitor.estimate.model_gap import ModelGap
 from monitor.health import Health
 from monitor.publish.backlog import Backlog
 from monitor.publish.viewer import DeviceInfo, ViewerClosed, ViewerSettings, ViewerTrouble
@@ -43,7 +44,7 @@ COURSE_STEP_S: Final = 1.0  # of sample time between two points of a course
 EARLY_END_S: Final = 10.0  # a window that ends sooner never worked
 MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
 
-Message = tuple[str, "_Samples | _Estimate | _Event | _Health"]
+Message = tuple[str, "_Samples | _Estimate | _Gap | _Event | _Health"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +58,12 @@ class _Samples:
 class _Estimate:
     wall_s: float
     estimate: Estimate
+
+
+@dataclass(frozen=True, slots=True)
+class _Gap:
+    wall_s: float
+    gap: ModelGap
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +125,10 @@ class RerunView:
         """A refit; of a fast stream of them the viewer draws the newest, once a second."""
         self._put(device, _Estimate(wall_s, estimate), estimate.curve.avar.nbytes * 8)
 
+    def gap(self, device: str, wall_s: float, gap: ModelGap) -> None:
+        """The window beside the model in force."""
+        self._put(device, _Gap(wall_s, gap), 6 * 4 * gap.tau_s.nbytes)
+
     def event(self, device: str, wall_s: float, event: Event) -> None:
         """Something happened to a device."""
         self._put(device, _Event(wall_s, event), 1000)
@@ -140,7 +151,7 @@ class RerunView:
         thread.join(0.25 * timeout_s)
         self._phase = "closed"
 
-    def _put(self, device: str, message: "_Samples | _Estimate | _Event | _Health", weight: int) -> None:
+    def _put(self, device: str, message: "_Samples | _Estimate | _Gap | _Event | _Health", weight: int) -> None:
         if self._thread is not None:
             self._backlog.push((device, message), weight)
 
@@ -187,7 +198,9 @@ class RerunView:
             names = [(d.name, d.about) for d in self._devices]
             scene = rerun_scene.Scene(output.stream, names)
             self._inside_since = time.monotonic()
-            rerun_blueprint.send(output.stream, [d.name for d in self._devices])
+            rerun_blueprint.send(
+                output.stream, [d.name for d in self._devices], [d.name for d in self._devices if d.has_model]
+            )
             scene.open()
             self._phase = "ok"
             self._draw(output, scene)
@@ -232,6 +245,7 @@ class _Pending:
     samples: dict[str, list[_Samples]] = field(default_factory=dict)
     newest: dict[str, _Estimate] = field(default_factory=dict)  # for the Allan plots
     course: dict[str, list[_Estimate]] = field(default_factory=dict)
+    gaps: dict[str, list[_Gap]] = field(default_factory=dict)
     healths: dict[str, _Health] = field(default_factory=dict)
     events: list[tuple[str, _Event]] = field(default_factory=list)
     drawn: dict[tuple[str, str], float] = field(default_factory=dict)  # (what, device) -> monotonic s
@@ -245,6 +259,8 @@ class _Pending:
                 case _Estimate():
                     self.newest[device] = message
                     self._add_to_course(device, message)
+                case _Gap():
+                    self._add_gap(device, message)
                 case _Event():
                     self.events.append((device, message))
                 case _Health():
@@ -266,6 +282,10 @@ class _Pending:
         for device, seen in self.healths.items():
             scene.health(device, seen.wall_s, seen.health)
         self.healths.clear()
+        for device in list(self.gaps):  # before the plot, that has the model's curve too
+            if everything or self._due("gap", device, COURSE_STEP_S):
+                looks = self.gaps.pop(device)
+                scene.gaps(device, np.array([g.wall_s for g in looks]), [g.gap for g in looks])
         for device in list(self.newest):
             if everything or self._due("plot", device, self.plot_every_s):
                 newest = self.newest.pop(device)
@@ -282,6 +302,12 @@ class _Pending:
             course = joined([part for part in (points.pop().estimate.course, message.estimate.course) if part])
             message = _Estimate(message.wall_s, replace(message.estimate, course=course))
         points.append(message)
+
+    def _add_gap(self, device: str, message: _Gap) -> None:
+        looks = self.gaps.setdefault(device, [])
+        if len(looks) > 1 and message.wall_s - looks[-2].wall_s < COURSE_STEP_S:
+            looks.pop()
+        looks.append(message)
 
     def _due(self, what: str, device: str, every_s: float) -> bool:
         now = time.monotonic()

@@ -124,6 +124,9 @@ class Board:
         elif topic is topics.COEFFICIENTS:
             noise = heard.noise(heard.read(heard.CoefficientsMessage, topic, payload))
             self._heard(device).noise = noise
+        elif topic is topics.GAP:
+            gap = heard.read(heard.GapMessage, topic, payload)
+            self._heard(device).gap = gap
         elif topic is topics.EVENT:
             event = heard.read(heard.EventMessage, topic, payload)
             self._heard(device)

@@ -27,3 +27,4 @@ class DeviceInfo:
 
     name: str
     about: str = ""  # a few words: decoder, link, port
+    has_model: bool = False  # one is in force

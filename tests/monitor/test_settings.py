@@ -131,7 +131,10 @@ CASES = {
     "refit": (device('refit = "often"'), ['device a: refit: "often" is no rate; write "10 Hz" or "every sample"']),
     "publish": (device('publish = "0 Hz"'), ['device a: publish: "0 Hz" is no rate; write "10 Hz" or "every block"']),
     "axes": (device('axes = { gx = "up" }'), ['device a: axes: gx = "up"; both are one of gx gy gz ax ay az']),
-    "a model that is not there": (device('model = "models/none.toml"'), ["models/none.toml: no such file"]),
+    "a model that is not there": (
+        device('model = "models/none.toml"'),
+        ['device a: model: no model "models/none.toml"'],
+    ),
     "silence below 0": (
         device(driver='driver = { link = "serial", port = "x", decoder = "stim300", silence = "3" }'),
         ["device a: driver.silence: Expected `float`"],
@@ -347,6 +350,24 @@ def test_virtual_model_may_be_a_file_beside_the_configuration(tmp_path):
     link = load(path).devices[0].link
     assert isinstance(link, VirtualTable)
     assert Path(link.model) == tmp_path / "mine.toml"
+
+
+def test_the_model_in_force_is_a_file_beside_the_configuration_or_a_name_of_the_catalogue(tmp_path):
+    (tmp_path / "mine.toml").write_text((CONFIG_FOLDER / "models" / "bmi088.toml").read_text())
+    path = tmp_path / "my.toml"
+    given = {
+        'model = "mine.toml"': tmp_path / "mine.toml",
+        'model = "bmi088"': CONFIG_FOLDER / "models" / "bmi088.toml",
+    }
+    for text, found in given.items():
+        path.write_text(device(text + '\nreconcile_folder = "reports"'))
+        (one,) = load(path).devices
+        assert (one.model, one.reconcile_folder) == (found, tmp_path / "reports")
+    path.write_text(device())
+    (one,) = load(path).devices
+    assert (one.model, one.reconcile_folder) == (None, None)
+    path.write_text(device('model = "bmi08"'))
+    assert read(path)[1][0].endswith('did you mean "bmi088"?')
 
 
 @pytest.mark.parametrize(

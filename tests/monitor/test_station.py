@@ -8,6 +8,7 @@ import pytest
 
 from drivers.decoders import text, vectornav_binary
 from drivers.driver import AxisMap
+from drivers.errors import ConfigError
 from drivers.links.loopback_link import LoopbackLink
 from drivers.sample import block
 from monitor.settings import Device
@@ -21,6 +22,7 @@ class Caught:
 
     def __init__(self):
         self.blocks, self.counts, self.estimates, self.events, self.healths, self.totals = [], [], [], [], [], []
+        self.gaps = []
 
     def samples(self, device, received, samples, offset_ns):
         self.blocks.append(samples)
@@ -28,6 +30,9 @@ class Caught:
 
     def estimate(self, device, unix_s, estimate):
         self.estimates.append((unix_s, estimate))
+
+    def gap(self, device, unix_s, gap):
+        self.gaps.append((unix_s, gap))
 
     def total(self, device, unix_s, received, total, hadamard):
         self.totals.append((received, total, hadamard))
@@ -40,10 +45,14 @@ class Caught:
 
 
 class Rig:
-    def __init__(self, rate=RATE, window_s=20.0, refit_s=0.1, publish_s=0.1, tau="octave", decoder=None, ready=None):
+    def __init__(
+        self, rate=RATE, window_s=20.0, refit_s=0.1, publish_s=0.1, tau="octave", decoder=None, ready=None, model=None
+    ):
         decoder = decoder or vectornav_binary.build(vectornav_binary.Settings())
         self.link = LoopbackLink()
-        device = Device("bench", rate, window_s, tau, refit_s, publish_s, self.link, decoder, AxisMap(), 0.0)
+        device = Device(
+            "bench", rate, window_s, tau, refit_s, publish_s, self.link, decoder, AxisMap(), 0.0, model=model
+        )
         self.wake = threading.Event()
         self.ready = ready or Ready()
         if ready is None:
@@ -55,13 +64,13 @@ class Rig:
         self.sent = 0
         self.link.open()
 
-    def bring(self, n, lost=0):
+    def bring(self, n, lost=0, scale=1.0):
         """As the reader would push them; the times are the host's."""
         self.sent += lost
         index = np.arange(self.sent, self.sent + n)
         self.sent += n
-        values = 1e-3 * np.random.default_rng(self.sent).standard_normal((n, 6))
-        samples = block(index * 10_000_000, values, None, index, lost)
+        values = 1e-3 * scale * np.random.default_rng(self.sent).standard_normal((n, 6))
+        samples = block(index * 10_000_000, values, 20.0 + 1e-3 * index, index, lost)
         self.station.driver.counts.received += n
         self.station._push(samples)
 
@@ -310,3 +319,71 @@ def test_samples_whose_rate_cannot_be_told_go_on():
     rig.work(1000.0)
     assert sum(map(len, rig.caught.blocks)) == 40_000
     assert rig.caught.estimates == []
+
+
+def model_file(folder):
+    """White noise as ``Rig.bring`` has it."""
+    path = folder / "mine.toml"
+    path.write_text('["g*".angle_random_walk]\nN = 1e-4\n["a*".angle_random_walk]\nN = 1e-4\n')
+    return path
+
+
+def test_the_window_is_held_against_the_model_in_force(tmp_path):
+    rig = Rig(model=model_file(tmp_path))
+    for i in range(30):
+        rig.bring(50)
+        rig.work(1000.0 + 0.5 * i)
+    unix_s, look = rig.caught.gaps[-1]
+    assert (unix_s, look.samples) == (rig.caught.estimates[-1][0], 1500)
+    assert len(rig.caught.gaps) == len(rig.caught.estimates)
+    assert rig.caught.gaps[0][1].axes == {}  # too few yet
+    assert look.agrees == dict.fromkeys(look.axes, True)
+    assert len(look.axes) == 6
+    assert not any(one.passes for one in look.axes.values())
+    assert rig.caught.events == []
+
+
+def test_the_moment_it_disagrees_is_an_event_and_so_is_the_return(tmp_path):
+    rig = Rig(window_s=20.0, model=model_file(tmp_path))
+    told = {}
+    for i in range(240):
+        rig.bring(50, scale=1.5 if 60 <= i < 100 else 1.0)
+        rig.work(1000.0 + 0.5 * i)
+        for _, event in rig.caught.events:
+            if event.kind == "model_disagrees":
+                told.setdefault((event.axis, event.what["model"]["agrees"]), i)
+    assert {axis for axis, _ in told} == {"gx", "gy", "gz", "ax", "ay", "az"}
+    assert all(60 < i < 100 for (_, agrees), i in told.items() if not agrees)
+    assert sum(1 for _, agrees in told if agrees) == 6
+    assert all(i > 100 for (_, agrees), i in told.items() if agrees)
+    assert set(rig.caught.gaps[-1][1].agrees.values()) == {True}
+
+
+def test_without_a_model_there_is_no_gap():
+    rig = Rig()
+    rig.bring(2000)
+    rig.work(1000.0, drain=True)
+    assert (len(rig.caught.estimates), rig.caught.gaps) == (1, [])
+
+
+def test_a_model_that_is_none_is_said_at_once(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("[gz.angle_random_wolk]\nN = 1e-4\n")
+    with pytest.raises(ConfigError, match=r"mine\.toml: .*angle_random_walk"):
+        Rig(model=path)
+
+
+def test_the_samples_of_the_window_and_their_temperature():
+    rig = Rig(window_s=5.0)
+    assert rig.station.held() is None
+    for i in range(14):
+        rig.bring(50, lost=3 if i == 12 else 0)
+        rig.work(1000.0 + 0.1 * i)
+    held, temperature_c = rig.station.held()
+    values = held.values()
+    sent = np.concatenate([samples.values for samples in rig.caught.blocks] + [np.empty((0, 6))])
+    assert (len(held), temperature_c.shape) == (500, (500,))
+    assert np.isnan(values[397:400]).all()
+    assert np.isnan(temperature_c[397:400]).all()
+    np.testing.assert_allclose(values[400:], sent[-100:], rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(temperature_c[400:], 20.0 + 1e-3 * np.arange(603, 703), rtol=1e-6)

@@ -16,6 +16,7 @@ from drivers.sample import Event, SampleBlock, join
 from monitor import settings
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.hadamard import HadamardCurve
+from monitor.estimate.model_gap import ModelGap
 from monitor.estimate.total import TotalCurve
 from monitor.health import Health
 from monitor.service import Service
@@ -29,6 +30,7 @@ class Caught:
         self.blocks: dict[str, list[SampleBlock]] = {}
         self.estimates: dict[str, Estimate] = {}
         self.totals: dict[str, tuple[TotalCurve, HadamardCurve]] = {}
+        self.gaps: dict[str, ModelGap] = {}
         self.events: list[tuple[str, Event]] = []
         self.healths: dict[str, Health] = {}
 
@@ -37,6 +39,9 @@ class Caught:
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         self.estimates[device] = estimate
+
+    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
+        self.gaps[device] = gap
 
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
         self.totals[device] = (total, hadamard)

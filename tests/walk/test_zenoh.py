@@ -128,6 +128,7 @@ def test_a_client_behind_a_router_receives_every_key(tmp_path: Path, router: str
     config = f"""[[device]]
 name = "bench-1"
 rate = 100.0
+model = "consumer-mems"
 driver = {{ link = "virtual" }}
 [zenoh]
 listen = ["tcp/127.0.0.1:{free_port()}"]

@@ -1,15 +1,20 @@
 """Estimates made by hand from the five-term formula, for everything that draws or prints them."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from drivers.sample import AXES
 from monitor.estimate.analysis import Analysis
 from monitor.estimate.coefficients import Coefficients, Status
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.fit import nothing_fitted
 from monitor.estimate.hadamard import HadamardCurve, hadamard_curve
+from monitor.estimate.model_gap import ModelGap, ModelInForce
 from monitor.estimate.total import TotalCurve, total_curve
 from monitor.health import Health
+from monitor.noise.model import NoiseModel
 
 GYRO = np.array([2.0e-6, 1.5e-4, 4.0e-5, 1.5e-6, 0.0])  # Q N B K R in SI
 ACCEL = np.array([4.0e-6, 6.0e-4, 2.5e-4, 6.0e-6, 0.0])
@@ -77,6 +82,19 @@ def fitted(truth: np.ndarray, seconds: float, rng: np.random.Generator) -> Coeff
     if seconds < 1500:
         status[4], lo[4], hi[4] = Status.UNESTIMATED, np.nan, np.nan
     return Coefficients(value=value, lo=lo, hi=hi, status=status)
+
+
+def look(found: Estimate | None = None, scale: float = 1.0, **agrees: bool) -> ModelGap:
+    """That estimate beside the model of ``true_coefficients(scale)``, with these verdicts."""
+    found = found or estimate()
+    letters = true_coefficients(scale)
+    names = ("quantization_noise.Q", "angle_random_walk.N", "bias_instability.B", "rate_random_walk.K")
+    text = "\n".join(
+        f"[{axis}]\n" + "\n".join(f"{name} = {float(letters[row, i])}" for row, name in enumerate(names))
+        for i, axis in enumerate(AXES)
+    )
+    in_force = ModelInForce(NoiseModel.from_toml(text), 360_000)
+    return replace(in_force.look(found), agrees=agrees)
 
 
 def slow_curves() -> tuple[TotalCurve, HadamardCurve]:

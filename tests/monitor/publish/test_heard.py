@@ -112,3 +112,17 @@ def test_a_topic_of_two_parts_and_keys_that_are_none() -> None:
     assert heard.split("status") is None
     assert heard.split("/status") is None
     assert heard.split("imu/bench-1/statuses") is None
+
+
+def test_disagreement_with_a_model_is_trouble_and_ranks_before_what_runs_well() -> None:
+    status = heard.read(heard.StatusMessage, topics.STATUS, message.status("a", 1.0, made.health()))
+    payload = message.gap("a", 1.0, made.look(scale=1.2, gz=False, gx=True))
+    one = Heard("imu/a", 0.0, status)
+    assert one.rank(0.0) == 2
+    one.gap = heard.read(heard.GapMessage, topics.GAP, payload)
+    assert one.rank(0.0) == 1
+    found = one.gap.axes["gz"]
+    lo, hi = found.where.tau
+    assert one.trouble() == f"gz disagrees with its model: {found.gap:.3g} σ at τ {lo:.3g} to {hi:.3g} s"
+    one.gap = heard.read(heard.GapMessage, topics.GAP, message.gap("a", 1.0, made.look(gz=True)))
+    assert (one.rank(0.0), one.trouble()) == (2, "")

@@ -41,9 +41,11 @@ ALL = {
     topics.ALLAN: message.allan("bench-1", UNIX_S, made.estimate()),
     topics.COEFFICIENTS: message.coefficients("bench-1", UNIX_S, made.estimate()),
     topics.TOTAL: message.total("bench-1", UNIX_S, 360_000, *made.slow_curves()),
+    topics.GAP: message.gap("bench-1", UNIX_S, made.look(gz=False, gx=True)),
     topics.EVENT: message.event("bench-1", UNIX_S, 360_000, Event("link_back", 0, "back"), None),
     topics.STATUS: message.status("bench-1", UNIX_S, made.health()),
     topics.RESET: message.reply("bench-1", UNIX_S, 360_000, "the window is empty"),
+    topics.RECONCILE: message.reconciled("bench-1", UNIX_S, 360_000, {"schema": "x", "verdict": "agrees"}, 0, None),
 }
 
 
@@ -87,6 +89,39 @@ def test_total_and_hadamard_have_their_own_tau() -> None:
     assert gz["deviation"] == np.sqrt(total.tvar[:, 2]).tolist()
     assert gz["lo"][0] == total.lo[0, 2]
     assert gz["hi"][-1] is None  # beyond half the window there is no interval
+
+
+def test_gap() -> None:
+    look = made.look(made.estimate(seconds=600.0), scale=1.1, gz=False, gx=True)
+    found = parsed(message.gap("a", UNIX_S, look))
+    assert (found["rate"], found["window"], found["filled"]) == (100.0, 3600.0, 600.0)
+    assert found["tau"] == look.tau_s.tolist()
+    assert list(found["axes"]) == list(AXES)
+    gz = found["axes"]["gz"]
+    one = look.axes["gz"]
+    assert (gz["gap"], gz["threshold"], gz["null95"]) == (one.gap, one.threshold, one.null95)
+    assert gz["null95"] < gz["threshold"] < gz["gap"]
+    assert gz["ratio"] == pytest.approx(1 / 1.1, rel=0.02)
+    assert gz["where"] == {"tau": list(one.tau_s)}
+    assert gz["measured"] == one.measured.tolist()
+    assert gz["model"] == one.model.tolist()
+    assert len(gz["z"]) == len(found["tau"])
+    assert [found["axes"][axis]["agrees"] for axis in ("gx", "gy", "gz")] == [True, None, False]
+
+
+def test_where_a_model_knows_nothing_it_says_null() -> None:
+    look = made.look(made.estimate(seconds=600.0))
+    look.axes["gz"].z[0] = np.nan
+    assert parsed(message.gap("a", UNIX_S, look))["axes"]["gz"]["z"][0] is None
+
+
+def test_the_reports_own_words_are_kept_and_the_head_is_ours() -> None:
+    result = {"schema": "x", "samples": 5, "verdict": "explained", "axes": {"gz": {"steps": []}}}
+    found = parsed(message.reconciled("a", UNIX_S, 360_000, result, 3, "/reports/a"))
+    assert (found["schema"], found["samples"]) == ("imu-monitor/reconcile/1", 360_000)
+    assert (found["verdict"], found["axes"], found["exit"], found["folder"]) == (
+        "explained", {"gz": {"steps": []}}, 3, "/reports/a"
+    )  # fmt: skip
 
 
 def test_too_few_data_are_null_and_say_so() -> None:

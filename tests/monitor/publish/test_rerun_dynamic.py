@@ -94,6 +94,22 @@ def test_a_device_has_a_tab_for_now_and_one_for_the_time() -> None:
     assert [page.name for page in fleet.contents] == ["Overview", "nose", "tail"]
 
 
+def test_gaps_have_their_row_only_where_there_is_a_model() -> None:
+    def views(page: object) -> list[str]:
+        return [getattr(page, "name", None) or ""] + [
+            name for one in getattr(page, "contents", []) for name in views(one)
+        ]
+
+    assert not [name for name in views(rerun_blueprint.blueprint(["a"]).root_container) if "gap" in str(name)]
+    fleet = rerun_blueprint.blueprint(["a", "b"], ["b"]).root_container
+    (_, first, second) = fleet.contents
+    assert not [name for name in views(first) if "gap" in str(name)]
+    assert [name for name in views(second) if "gap" in str(name)] == [
+        "Gyroscopes: gap to the model, σ, and its threshold",
+        "Accelerometers: gap to the model, σ, and its threshold",
+    ]
+
+
 def test_the_view_holds_picture_and_labels() -> None:
     (left, right), (top, bottom) = rerun_dynamic.bounds(17)
     assert left < -11.0

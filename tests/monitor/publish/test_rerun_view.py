@@ -99,6 +99,30 @@ def test_a_recording_holds_what_was_shown(tmp_path: Path) -> None:
     assert times[[0, -1]] / 1e9 == pytest.approx([T0, T0 + 0.99], abs=1e-6)
 
 
+def test_the_gap_has_a_course_and_the_model_a_line(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    view = RerunView(ViewerSettings(mode=str(path)), [DeviceInfo("bench-1", has_model=True), DeviceInfo("plain")])
+    view.start()
+    assert wait_for(lambda: view.state == "ok"), view.state
+    looks = [made.look(made.estimate(T0 + i, seed=i), scale=1.1) for i in range(3)]
+    for i, look in enumerate(looks):
+        view.gap("bench-1", T0 + 0.1 * i, look)
+    view.estimate("bench-1", T0 + 1, made.estimate(T0 + 1))
+    view.estimate("plain", T0 + 1, made.estimate(T0 + 1))
+    view.close()
+    rows = read(path)
+    # within a second the newest counts
+    gz = column(rows["/bench-1/gap/gz"], "Scalars:scalars")
+    assert gz.tolist() == [looks[0].axes["gz"].gap, looks[2].axes["gz"].gap]
+    threshold = column(rows["/bench-1/gap/threshold"], "Scalars:scalars")
+    assert threshold.tolist() == [looks[0].axes["gz"].threshold] * 2
+    assert (gz > threshold).all()
+    strokes = [cell for cell in rows["/bench-1/allan/gz/model"]["LineStrips2D:strips"] if cell]
+    assert len(strokes[-1]) > 10
+    assert not [cell for cell in rows["/plain/allan/gz/model"]["LineStrips2D:strips"] if cell]
+    assert not [entity for entity in rows if entity.startswith("/plain/gap/") and "Scalars:scalars" in rows[entity]]
+
+
 def read(path: Path) -> dict[str, dict[str, list[object]]]:
     """Entity -> column -> cells of the recording, the blueprint's not among them."""
     from rerun.chunk import RrdReader

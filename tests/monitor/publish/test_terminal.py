@@ -225,15 +225,15 @@ def test_a_time_that_is_no_date(board: Board) -> None:
 def test_malformed_messages_are_counted_and_change_nothing(board: Board) -> None:
     status(board, "a")
     before = shown(board)
-    for topic in (topics.STATUS, topics.COEFFICIENTS, topics.EVENT):
+    for topic in (topics.STATUS, topics.COEFFICIENTS, topics.GAP, topics.EVENT):
         for payload in (b"", b"{", b"null", b'{"schema":"imu-monitor/status/9"}', b"\xff"):
             board.take(topic.key("imu", "a"), payload)
             board.take(topic.key("imu", "nobody"), payload)
     board.take("imu/a/samples", b"not read")
-    board.take("imu/a/gap", b"not known")
-    assert board.malformed == 30
+    board.take("imu/a/mood", b"not known")
+    assert board.malformed == 40
     after = shown(board)
-    assert after.replace("  30 malformed messages", "") == before
+    assert after.replace("  40 malformed messages", "") == before
 
 
 def test_a_sender_cannot_steer_the_terminal(board: Board) -> None:
@@ -280,3 +280,11 @@ def test_watch_refuses_what_zenoh_refuses() -> None:
         terminal.watch("imu/***", console=console, once_s=0.0)
     with pytest.raises(ConfigError, match='connect "nowhere"'):
         terminal.watch(connect=["nowhere"], console=console, once_s=0.0)
+
+
+def test_a_device_that_disagrees_with_its_model_says_so(board: Board) -> None:
+    status(board, "a")
+    board.take("imu/a/gap", message.gap("a", 1.0, made.look(scale=1.2, gz=False)))
+    assert "gz disagrees with its model: " in shown(board, 160)
+    board.take("imu/a/gap", message.gap("a", 1.0, made.look(gz=True)))
+    assert "disagrees" not in shown(board, 160)

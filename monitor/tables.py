@@ -1,0 +1,118 @@
+"""The tables of a configuration file: which keys there are, of what kind, and what holds where one is absent.
+
+What a value means, and whether values fit each other, is for ``settings`` to say. Links and decoders bring tables of
+their own.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from drivers.links.base import LinkSettings
+from monitor.topics import ENDPOINT
+
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+Port = Annotated[int, msgspec.Meta(ge=0, le=65535)]
+Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+
+
+class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One table of the file."""
+
+
+class DeviceTable(_Table, frozen=True, kw_only=True):
+    """``[[device]]``."""
+
+    name: str
+    driver: dict[str, Any]
+    rate: Positive | None = None
+    window: Positive | str = 3600.0
+    tau: Literal["octave", "decade10"] | list[Positive] = "octave"
+    refit: str = "10 Hz"
+    publish: str = "10 Hz"
+    motion: Literal["tell", "leave out"] = "tell"
+    alarms_per_day: Annotated[float, msgspec.Meta(ge=0.0)] = 0.033
+    """False alarms of changed noise to bear; 0 = do not look."""
+    restart: bool = True
+    model: str | None = None
+    """The model in force: path of a model file, or the name of one in the shipped ``config/models``."""
+    reconcile_folder: Path | None = None
+    """Where the reports of ``command/reconcile`` are kept; None: they are not."""
+    axes: dict[str, str] = {}
+
+
+class FaultsTable(_Table, frozen=True, kw_only=True):
+    """``[device.driver.faults]``: what goes wrong on the way from a simulated sensor, all of it drawn from its seed."""
+
+    lost: Share = 0.0
+    """Share of samples that are never sent; their count goes on."""
+    repeated: Share = 0.0
+    """Share of samples that are sent twice."""
+    flipped: Share = 0.0
+    """Share of samples one bit of which is flipped."""
+    cut: Share = 0.0
+    """Share of samples whose frame ends before it is whole."""
+    jitter: Annotated[float, msgspec.Meta(ge=0.0, le=0.5)] = 0.0
+    """s: each burst is held back by a random time of up to so much."""
+    unplugged: Share = 0.0
+    """Chance at each sample that the cable is pulled before it."""
+    unplugged_for: Annotated[float, msgspec.Meta(gt=0.0)] = 2.0
+    """s of the sensor's time until it is put back."""
+    clock: Annotated[float, msgspec.Meta(ge=0.5, le=2.0)] = 1.0
+    """True rate over the rate that the sensor's clock and settings claim."""
+
+
+class VirtualTable(LinkSettings, frozen=True, kw_only=True):
+    """Keys of ``link = "virtual"``: a simulated IMU that speaks a real wire format over a real link.
+
+    The decoder says which: a stream of bytes over a pseudo-terminal, CAN frames over a bus of python-can in this
+    process, messages over zenoh on loopback.
+    """
+
+    model: str = "consumer-mems"
+    """Path of a model file, or the name of one in the shipped ``config/models``."""
+    seed: Annotated[int, msgspec.Meta(ge=0)] = 1
+    speed: Annotated[float, msgspec.Meta(gt=0.0, le=10_000.0)] = 1.0
+    """Times real time."""
+    effect: tuple[str, ...] = ()
+    """Effects that the sensor takes on while it runs: "gz.sinusoidal:amplitude=1e-3,frequency=17"."""
+    effect_at: Annotated[float, msgspec.Meta(ge=0.0)] = 90.0
+    """s of the sensor's time; by then changes are looked for."""
+    faults: FaultsTable = FaultsTable()
+
+
+class ZenohTable(_Table, frozen=True, kw_only=True):
+    """``[zenoh]``."""
+
+    mode: Literal["peer", "client", "router", "none"] | None = "peer"
+    listen: tuple[str, ...] | None = (ENDPOINT,)
+    """These two are None where a zenoh file is named and they are not given beside it: then the file's hold."""
+    connect: tuple[str, ...] = ()
+    config: Path | None = None
+    prefix: Annotated[str, msgspec.Meta(pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$")] = "imu"
+
+
+class ViewerTable(_Table, frozen=True, kw_only=True):
+    """``[viewer]``."""
+
+    mode: str = "auto"
+    port: Port = 9876
+    web_port: Port = 9090
+    memory: str = "256MiB"
+
+
+class LogTable(_Table, frozen=True, kw_only=True):
+    """``[log]``."""
+
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    format: Literal["text", "json"] = "text"
+
+
+class FileTable(_Table, frozen=True, kw_only=True):
+    """The whole file."""
+
+    device: list[dict[str, Any]] = []
+    zenoh: dict[str, Any] = {}
+    viewer: dict[str, Any] = {}
+    log: dict[str, Any] = {}
