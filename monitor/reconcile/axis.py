@@ -14,7 +14,16 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.noise.effect import Effect, Leak, Transform
-from monitor.noise.effects import ORDER, AngleRandomWalk, BandwidthLimit, NoiseStep, Resolution, SampleHold, Saturation
+from monitor.noise.effects import (
+    ORDER,
+    AngleRandomWalk,
+    BandwidthLimit,
+    Bias,
+    NoiseStep,
+    Resolution,
+    SampleHold,
+    Saturation,
+)
 from monitor.noise.spectrum import Spectrum, white
 from monitor.reconcile.bins import Bins, transform
 from monitor.reconcile.terms import COURSE, NOISE, basis, columns, resized, size, sized
@@ -29,6 +38,8 @@ FEWEST_KEPT: Final = 16
 PRODUCTS: Final = 4096
 """Sums over bins that an axis keeps."""
 Effects = tuple[Effect, ...]
+CURVE: Final = Bias(value=1.0)
+"""Stands for t² among regressors: as an effect it would be none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +87,8 @@ class Courses:
         def make(effect: Effect) -> list[Floats]:
             return [transform(one) for one in columns(effect, n, rate_hz, temperature_c)]
 
+        self.curve = transform(np.linspace(-1.0, 1.0, n) ** 2)
+        """[n − 1] of t², for which there is no name."""
         self._make = lru_cache(max(FEWEST_KEPT, KEPT_BYTES // (8 * n)))(make)
 
     def columns(self, effect: Effect) -> list[Floats]:
@@ -131,13 +144,20 @@ class Axis:
         """Transforms [n − 1] of the series of a course with size one."""
         return [self.others[effect.source]] if isinstance(effect, Leak) else self.courses.columns(effect)
 
-    def fit(self, effects: Sequence[Effect], held: frozenset[int] = frozenset(), extra: Floats | None = None) -> Likely:
+    def fit(
+        self,
+        effects: Sequence[Effect],
+        held: frozenset[int] = frozenset(),
+        extra: Floats | None = None,
+        curved: bool = False,
+    ) -> Likely:
         """The maximum over all sizes that are not held.
 
         Args:
             effects: of the axis; shapes stay, sizes are where the search begins
             held: indices of noises whose size stays
             extra: [r, m] nameless bases besides, of variance for θ = 1
+            curved: t² besides, nameless too
         """
         f_hz, tau0_s = self.bins.f_hz, 1.0 / self.rate_hz
         transforms = sorted((e for e in effects if self._shapes(e)), key=lambda e: ORDER.index(type(e)))
@@ -167,6 +187,8 @@ class Axis:
                 made_columns = self.columns(effect)
                 courses.append((at, slice(len(regressors), len(regressors) + len(made_columns))))
                 regressors += [(effect, i) for i in range(len(made_columns))]
+        if curved:
+            regressors.append((CURVE, 0))
         found = self._sums(regressors)
         stacked = np.asarray(bases).reshape(len(bases), f_hz.size)
         fitted = maximise(self.bins.count * self.heard, found, stacked, constant, np.asarray(start, np.float64))
@@ -233,11 +255,16 @@ class Axis:
         """Sums over bins of the product of two columns; None is the axis itself."""
         key = (_key(one), _key(other))
         if key not in self._products:
-            a, b = (self.coefficients if x is None else self.columns(x[0])[x[1]] for x in (one, other))
+            a, b = (self._column(x) for x in (one, other))
             if len(self._products) > PRODUCTS:
                 self._products.clear()
             self._products[key] = self.bins.sums(a * b) * self.heard
         return self._products[key]
+
+    def _column(self, one: tuple[Effect, int] | None) -> Floats:
+        if one is None:
+            return self.coefficients
+        return self.courses.curve if one[0] is CURVE else self.columns(one[0])[one[1]]
 
     @staticmethod
     def _resized(
@@ -267,4 +294,6 @@ def _key(one: tuple[Effect, int] | None) -> tuple[object, int] | None:
     if one is None:
         return None
     effect, at = one
+    if effect is CURVE:
+        return effect, at
     return (resized(effect, 1.0) if isinstance(effect, Leak) else sized(effect, np.ones(2)), at)

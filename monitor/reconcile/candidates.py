@@ -39,7 +39,7 @@ PRICE: Final[dict[str, float]] = {
     "bias_instability": 8.5,
     "rate_random_walk": 8.5,
     "rate_ramp": 8.5,
-    "exponentially_correlated": 9.5 + 2.0,
+    "exponentially_correlated": 9.5 + 3.0,
     "sinusoidal": 21.0,
     "narrowband": 14.5 + 2.0,
     "temperature_bias": 9.0,

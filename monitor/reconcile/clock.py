@@ -15,13 +15,15 @@ import numpy as np
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Narrowband, Sinusoidal
 from monitor.reconcile.axis import Axis, Effects
-from monitor.reconcile.candidates import line_frequency, peaks
+from monitor.reconcile.candidates import peaks
 from monitor.reconcile.hypothesis import GOLDEN, HALF, believed
-from monitor.reconcile.lenses import line_peaks, sight
+from monitor.reconcile.lenses import periodogram, sight
 from monitor.reconcile.reconciliation import Bounds
 
 FURTHEST: Final = 0.15
 """A clock that is further off is another sensor."""
+TRIED: Final = 12
+"""Ratios at which all axes are fitted."""
 PRICE: Final = 12.0
 """Nats: for the ratio, and for the features that may be meant."""
 POWERS: Final[Mapping[str, float]] = {
@@ -94,20 +96,36 @@ def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clo
 
 
 def _ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> list[tuple[float, str, float]]:
-    """(ratio, axis, Hz) by which a feature of the model would stand where something is seen."""
+    """(ratio, axis, Hz) by which features of the model would stand where something is seen: the best of many."""
     found: list[tuple[float, str, float]] = []
+    features = {name: [e for e in of if isinstance(e, (Sinusoidal, Narrowband))] for name, of in effects.items()}
+    if not any(features.values()):
+        return []
+    highest = max(one.frequency for of in features.values() for one in of)
+    first = next(iter(axes.values()))
+    step = 0.25 * first.rate_hz / first.n / highest
+    grid = np.arange(-FURTHEST, FURTHEST, step)  # ln ratio
+    power = np.zeros(grid.size)
     for name, axis in axes.items():
-        features = [effect for effect in effects[name] if isinstance(effect, (Sinusoidal, Narrowband))]
-        if not features:
+        lines = [one for one in features[name] if isinstance(one, Sinusoidal)]
+        if not features[name]:
             continue
         view = sight(axis, believed(axis, effects[name]).likely)
-        places = [line_frequency(view, f_hz) for _, f_hz in line_peaks(view.white, axis.rate_hz, 4)]
-        places += [middle for middle, _ in peaks(view, 4)]
-        for effect in features:
-            for place in places:
-                ratio = effect.frequency / place
-                if abs(np.log(ratio)) < FURTHEST:
-                    found.append((float(ratio), name, place))
+        turned = periodogram(view.white)
+        spacing = axis.rate_hz / (2 * (turned.size - 1))
+        for line in lines:
+            power += turned[
+                np.minimum(np.rint(line.frequency * np.exp(-grid) / spacing).astype(np.int64), turned.size - 1)
+            ]
+        for one in features[name]:
+            if isinstance(one, Narrowband):
+                places = [middle for middle, _ in peaks(view, 4)]
+                near = [place for place in places if abs(log(one.frequency / place)) < FURTHEST]
+                found += [(one.frequency / place, name, one.frequency) for place in near]
+    strongest = max(axes, key=lambda name: max((one.frequency for one in features[name]), default=0.0))
+    for at in np.argsort(power)[-TRIED:]:
+        if power[at] > 0.0:
+            found.append((exp(float(grid[at])), strongest, highest))
     return found
 
 

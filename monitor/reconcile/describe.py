@@ -81,7 +81,7 @@ def described(found: Search, null: Mapping[str, Null], final: Mapping[str, Null]
             if noise < found.state.given and noise not in before and noise in found.state.likely.noises:
                 steps.append(_step(found, one, noise, "retuned", looks[at], looks[at + 1]))
     left_over = tuple(score for score in looks[-1].scores if score.passes)
-    return AxisResult(found.axis.name, _verdict(bool(found.rounds), bool(left_over)), looks[0], tuple(steps), left_over)
+    return AxisResult(found.axis.name, _verdict(bool(steps), bool(left_over)), looks[0], tuple(steps), left_over)
 
 
 def _verdict(steps: bool, left: bool) -> Verdict:

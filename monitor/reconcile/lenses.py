@@ -14,7 +14,7 @@ from math import ceil
 from typing import Final
 
 import numpy as np
-from scipy.fft import fft, irfft, next_fast_len, rfft
+from scipy.fft import irfft, next_fast_len, rfft
 
 from drivers.sample import Floats
 from monitor.noise.effect import first_sample
@@ -149,12 +149,8 @@ def lines(seen: Sight) -> Finding:
 
 def line_peaks(white: Floats, rate_hz: float, most: int) -> list[tuple[float, float]]:
     """(gain, Hz) of the largest peaks of the periodogram of a white series, strongest first, apart from each other."""
-    n = white.size
-    size = next_fast_len(2 * n, real=True)
-    turned = rfft(white, size)
-    power = (turned.real**2 + turned.imag**2) / n
-    power[: 2 * size // n] = 0.0  # slower than one turn
-    power[-2:] = 0.0
+    power = periodogram(white)
+    size = 2 * (power.size - 1)
     found = []
     for _ in range(most):
         at = int(np.argmax(power))
@@ -163,6 +159,18 @@ def line_peaks(white: Floats, rate_hz: float, most: int) -> list[tuple[float, fl
         found.append((float(power[at]), at * rate_hz / size))
         power[max(at - 12, 0) : at + 13] = 0.0
     return found
+
+
+def periodogram(white: Floats) -> Floats:
+    """Gain of a line [m + 1] at frequencies from 0 to half the rate, more than twice as many as samples have turns."""
+    n = white.size
+    size = next_fast_len(2 * n, real=True)
+    size += size % 2
+    turned = rfft(white, size)
+    power = (turned.real**2 + turned.imag**2) / n
+    power[: 2 * size // n] = 0.0  # slower than one turn
+    power[-2:] = 0.0
+    return np.asarray(power)
 
 
 def level(seen: Sight) -> Finding:
@@ -177,7 +185,8 @@ def level(seen: Sight) -> Finding:
         gain = course_gain(seen, axis.columns(effect))
         if gain > best.gain:
             best = Finding(gain, Where(time=(0.0, effect.time_constant)))
-    gain = course_gain(seen, axis.columns(RateRamp(R=1.0)))
+    ramp = axis.columns(RateRamp(R=1.0))
+    gain = max(course_gain(seen, ramp), course_gain(seen, [*ramp, axis.courses.curve]) - 1.0)
     return max(best, Finding(gain, Where(time=(0.0, length_s))), key=lambda one: one.gain)
 
 
@@ -194,7 +203,8 @@ def step_gains(seen: Sight) -> tuple[Floats, Floats]:
     product = np.cumsum(weighted[::-1])[::-1]  # [n] of a step at each sample
     u = np.zeros(n)
     u[1:] = seen.weight**2 / (4.0 * n * np.sin(0.5 * np.pi * k / n) ** 2)
-    length = u.sum() - fft(u).real
+    cosines = rfft(u).real  # of s up to n/2; those beyond are the same, backwards
+    length = u.sum() - np.concatenate([cosines, cosines[1 : n - cosines.size + 1][::-1]])
     margin = ceil(MARGIN * n)
     inside = slice(margin, n - margin)
     gains = 0.5 * product[inside] ** 2 / np.maximum(length[inside], 1e-300)

@@ -6,21 +6,21 @@ the gap shrinks and the likelihood of the unseen half grows. Where one half alon
 of what happens once, there is nothing to hold out, and the reason is told.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 from typing import Final
 
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effects import NoiseStep, Outliers, Resolution, SampleHold, Saturation, Sinusoidal
+from monitor.noise.effects import Outliers, Resolution, SampleHold, Saturation, Sinusoidal
 from monitor.reconcile.axis import Axis, Courses, Effects, Likely
 from monitor.reconcile.bins import bins, series, transform
 from monitor.reconcile.gap import Null
 from monitor.reconcile.hypothesis import Hypothesis
 from monitor.reconcile.lenses import LENSES, sight
 from monitor.reconcile.prepare import again, look_at_values
-from monitor.reconcile.terms import COURSE, NOISE, size
+from monitor.reconcile.terms import COURSE, NOISE, ONCE, size
 
 FAINT: Final = 5.0
 """Nats that a half must be able to show."""
@@ -48,7 +48,7 @@ def proof(axis: Axis, before: Hypothesis, after: Hypothesis, lens: str, null: Nu
         null: of that lens
     """
     added = after.effects[-1] if len(after.effects) > len(before.effects) else None
-    if isinstance(added, NoiseStep):
+    if added is not None and added.name in ONCE:
         return _nothing("it happens once")
     parts = [slice(0, axis.n // 2), slice(axis.n - axis.n // 2, axis.n)]
     halves = [_half(axis, part, before.effects, rng) for part in parts]
@@ -119,17 +119,33 @@ def _shown(half: Axis, state: Hypothesis, at: int) -> float:
 
 
 def _beside(half: Axis, learned: Likely) -> Likely:
-    """A half beside what the other half taught: noises and courses at the sizes learned there; a line has its own
-    phase."""
+    """A half beside what the other half taught.
+
+    Noises have the sizes learned there. So have courses, as far as they are known there: with sizes β₁ of covariance C₁
+    from the one half, and β₂, C₂ from this one alone, the evidence is that of β₂ less the price of their distance,
+    ½ Δ'(C₁ + C₂)⁻¹Δ + ½ ln |C₁ + C₂|/|C₂|, and the sizes are the mean of both by their weights. A line begins anew.
+    """
     effects = learned.effects
     held = frozenset(at for at, effect in enumerate(effects) if type(effect) in NOISE)
-    fixed = half.fit(effects, held)
-    beta = fixed.fitted.beta.copy()
-    for at, place in fixed.courses:
-        if not isinstance(effects[at], Sinusoidal):
-            quadratic = getattr(effects[at], "quadratic", None)
-            beta[place] = size(effects[at]) if quadratic is None else (size(effects[at]), quadratic)
-    return half.at(fixed, beta)
+    free = half.fit(effects, held)
+    known = [
+        k
+        for at, place in free.courses
+        for k in range(place.start, place.stop)
+        if not isinstance(effects[at], Sinusoidal)
+    ]
+    if not known:
+        return free
+    pick = np.ix_(known, known)
+    here, there = free.fitted.beta_covariance[pick], learned.fitted.beta_covariance[pick]
+    apart = free.fitted.beta[known] - learned.fitted.beta[known]
+    both = here + there
+    price = 0.5 * float(apart @ np.linalg.pinv(both) @ apart)
+    price += 0.5 * float(np.linalg.slogdet(both)[1] - np.linalg.slogdet(here)[1])
+    beta = free.fitted.beta.copy()
+    beta[known] -= here @ np.linalg.pinv(both) @ apart
+    fixed = half.at(free, beta)
+    return replace(fixed, log_likelihood=free.log_likelihood - price)
 
 
 def _of_samples(halves: list[Axis], mended: list[Axis], before: Hypothesis, after: Hypothesis, lens: str) -> Proof:

@@ -5,7 +5,7 @@ is left or nothing known helps → simulate the new model and compare once more.
 for the clock, which is one for all.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -66,20 +66,33 @@ class Recording:
         return next(iter(self.values.values())).size
 
 
-def null_of(
-    model: NoiseModel, like: Recording, courses: Courses, seed: int, each: Each = map, runs: int = RUNS
-) -> dict[str, dict[str, Null]]:
-    """What recordings of a true model look like: of each axis, through each lens."""
+def seen_in(
+    model: NoiseModel,
+    like: Recording,
+    courses: Courses,
+    seed: int,
+    each: Each = map,
+    runs: int = RUNS,
+    only: Collection[str] | None = None,
+) -> dict[str, list[Findings]]:
+    """What the lenses see in recordings simulated from a model, of each axis.
+
+    Args:
+        like: the recording that these are as long and as warm as
+        only: axes to look at; all
+    """
     effects = effects_of(model, like)
+    wanted = [name for name in like.values if only is None or name in only]
 
     def one(run: int) -> dict[str, Findings]:
         drawn = model.simulate(like.samples, like.rate_hz, seed + run, like.temperature_c)
         raw = {axis: drawn[:, AXES.index(axis)] for axis in like.values}
-        axes = prepared(raw, like.rate_hz, effects, like.temperature_c, courses, np.random.default_rng(seed + run))
-        return {name: look(sight(axis, believed(axis, effects[name]).likely)) for name, axis in axes.items()}
+        rng = np.random.default_rng(seed + run)
+        axes = prepared(raw, like.rate_hz, effects, like.temperature_c, courses, rng)
+        return {name: look(sight(axes[name], believed(axes[name], effects[name]).likely)) for name in wanted}
 
     seen = list(each(one, range(runs)))
-    return nulls({axis: [run[axis] for run in seen] for axis in like.values}, len(like.values))
+    return {axis: [run[axis] for run in seen] for axis in wanted}
 
 
 def smooth(temperature_c: Floats) -> Floats:
@@ -156,7 +169,8 @@ def reconcile(
         tell("fitting the five terms")
     tested = model or five_terms(recording, courses, seed)
     tell("simulating the model")
-    null = null_of(tested, recording, courses, seed, each)
+    simulated = seen_in(tested, recording, courses, seed, each)
+    null = nulls(simulated, len(simulated))
     tell("looking for what is missing")
     found = searched(recording, tested, null, courses, seed, each)
     rounds = {name: one for name, one in found.searches.items() if one.rounds}
@@ -164,7 +178,9 @@ def reconcile(
     final = null
     if rounds or found.clock:
         tell("simulating the new model")
-        final = {**null, **null_of(augmented, recording, courses, seed + RUNS, each)}
+        changed = None if found.clock else rounds
+        simulated |= seen_in(augmented, recording, courses, seed + RUNS, each, only=changed)
+        final = nulls(simulated, len(simulated))
     tell("writing down")
     axes = {name: described(one, null[name], final[name]) for name, one in found.searches.items()}
     if found.clock is not None:

@@ -23,9 +23,11 @@ from drivers.sample import Floats
 from monitor.noise.effect import Effect
 from monitor.noise.effects import (
     AngleRandomWalk,
+    BiasStep,
     ExponentiallyCorrelated,
     NoiseStep,
     Outliers,
+    RateRamp,
     RateRandomWalk,
     Resolution,
     SampleHold,
@@ -34,15 +36,16 @@ from monitor.noise.effects import (
 )
 from monitor.reconcile.axis import Axis, Effects
 from monitor.reconcile.bins import bins
-from monitor.reconcile.candidates import COURSE_FAMILIES, NOISE_FAMILIES, PRICE, peaks
+from monitor.reconcile.candidates import COURSE_FAMILIES, NOISE_FAMILIES, PRICE, correlated, peaks
 from monitor.reconcile.gap import Findings, Null, look
 from monitor.reconcile.hypothesis import GOLDEN, RETUNED, Hypothesis, believed, settled
 from monitor.reconcile.lenses import MARGIN, Sight, sight
 from monitor.reconcile.prepare import again
 from monitor.reconcile.proof import Proof, proof
 from monitor.reconcile.reconciliation import Bounds
+from monitor.reconcile.steady import upheld
 from monitor.reconcile.terms import COURSE, NOISE
-from monitor.reconcile.twins import WORTH, poisson, telegraph
+from monitor.reconcile.twins import WORTH, Twin, poisson, telegraph
 from monitor.reconcile.values import Size
 
 ROUNDS: Final = 8
@@ -52,12 +55,16 @@ NAMELESS: Final = "power_law"
 RETUNE: Final = "retuned"
 """No new effect: other sizes of known ones."""
 EXPONENTS: Final = (0.5, 1.5, 2.5, 3.0)
+BEND: Final = 2.5
+"""What a second parameter costs."""
 STUDENT: Final = 2.0
 """Nats that outliers must gain over Student's t."""
 ODD: Final = 4.0
 """Deviations: outliers that keep together more than this, or whose sizes fit less, are none."""
 RIVAL: Final = 1.0
 """Nats by which a step of the noise may be behind its rivals, which have more parameters."""
+FAR_MORE: Final = 5.0
+"""Nats."""
 OPEN: Final = 2.0
 """Nats by which a nameless rival must be better for no name to be given."""
 
@@ -68,7 +75,8 @@ class Trial:
 
     name: str
     effect: Effect | None  # None: nameless, or nothing new
-    value: float  # nats above its price
+    value: float  # nats above its price; of a course beside the slow noise that could best stand in for it
+    total: float = 0.0  # nats above its price, of a course and that noise together
     bounds: Mapping[str, Bounds] = field(default_factory=dict)  # of parameters that no spectrum tells
     events: int = 0  # that were seen
 
@@ -108,24 +116,51 @@ def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.
     """
     state = start = believed(axis, model)
     rounds: list[Round] = []
+    rivals: tuple[Trial, ...] = ()
     while True:
         view = sight(axis, state.likely)
         seen = look(view)
-        if not any(one.gain > null[lens].threshold for lens, one in seen.items()) or len(rounds) == ROUNDS:
-            return Search(start, tuple(rounds), axis, state, view, seen, ())
+        closed = not any(one.gain > null[lens].threshold for lens, one in seen.items())
+        if len(rounds) == ROUNDS:
+            break
+        instead = _instead(axis, state, view) if closed and state.freed else []
+        if closed and not instead:
+            jumps = poisson(axis, state, model) if rounds else None
+            if jumps is None or jumps.gain <= WORTH:
+                break
+            state = settled(axis, jumps.effects, state.given)
+            rounds.append(Round(view, seen, (_twin(jumps, jumps.gain),), state, SHARED))
+            continue
         finer = bins(axis.n, axis.rate_hz, peaks(view))
         if finer.count.size > axis.bins.count.size + 8:
             axis = axis.rebinned(finer)
             state = Hypothesis(state.given, axis.fit(state.effects, state.likely.held))
             start = start if rounds else state
             view = sight(axis, state.likely)
-        trials = tried(axis, state, view)
+        trials = instead or tried(axis, state, view)
         taken = _taken(axis, state, model, trials, view, seen, null, rng)
         if taken is None:
-            return Search(start, tuple(rounds), axis, state, view, seen, tuple(trials))
+            rivals = tuple(trials)
+            break
         axis, done = taken
         state = done.state
         rounds.append(done)
+    kept = upheld(state, seen, null)
+    if kept != state.effects:
+        state = settled(axis, kept, state.given)
+        view = sight(axis, state.likely)
+        seen = look(view)
+    return Search(start, tuple(rounds), axis, state, view, seen, rivals)
+
+
+def _instead(axis: Axis, state: Hypothesis, view: Sight) -> list[Trial]:
+    """A correlated noise, where it explains better what other sizes of known noises were bent to explain."""
+    found = []
+    for effect in correlated(axis, state, view):
+        value = settled(axis, (*state.effects, effect), state.given).score - state.score - PRICE[effect.name]
+        if value > 0.0:
+            found.append(Trial(effect.name, effect, value))
+    return found
 
 
 def _taken(
@@ -153,38 +188,45 @@ def _taken(
     return None
 
 
+SHARED: Final = Proof(float("nan"), float("nan"), True, "its spectrum is that of what it stands for, and was held out")
+"""Of a twin that is told by its distribution."""
 MENDED: Final = frozenset({Saturation, SampleHold, Outliers})
 """Effects after which the samples are put right."""
 
 
 def tried(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
     """All candidates, best first."""
-    for family in (_values, _samples, _courses):
+    for family in (_values, _samples):
         found = family(axis, state, seen)
         if found and found[0].value > 0.0:
             return found
-    return _noises(axis, state, seen)
+    courses, noises = _courses(axis, state, seen), _noises(axis, state, seen)
+    # a noise that explains far more comes first: what is left of a wrong spectrum looks like steps and slopes
+    if courses and courses[0].value > 0.0 and courses[0].total > noises[0].value - FAR_MORE:
+        return courses
+    return noises
 
 
 def told_apart(axis: Axis, state: Hypothesis, model: Effects, trials: list[Trial]) -> tuple[Hypothesis, list[Trial]]:
     """The state with what was just found under its right name, where second moments do not tell."""
-    last = len(state.effects) - 1
-    twins = [poisson(axis, state, model)]
+    last, twin = len(state.effects) - 1, None
     if isinstance(trials[0].effect, ExponentiallyCorrelated) and isinstance(
         state.effects[last], ExponentiallyCorrelated
     ):
-        twins.append(telegraph(axis, state, last))
-    for twin in twins:
-        if twin is None:
-            continue
-        effect = twin.effects[-1]
-        one = Trial(effect.name, effect, trials[0].value + twin.gain, twin.bounds, twin.events)
-        trials = sorted([one, *trials], key=lambda one: -one.value)
-        if twin.gain > WORTH:
-            state = settled(axis, twin.effects, state.given)
-        elif trials[0] is one:
-            trials = [trials[1], one, *trials[2:]]
-    return state, trials
+        twin = telegraph(axis, state, last)
+    elif isinstance(trials[0].effect, BiasStep):
+        twin = poisson(axis, state, model)
+    if twin is None:
+        return state, trials
+    one = _twin(twin, trials[0].value + twin.gain)
+    if twin.gain <= WORTH:
+        return state, [trials[0], one, *trials[1:]]
+    return settled(axis, twin.effects, state.given), [one, *trials]
+
+
+def _twin(twin: Twin, value: float) -> Trial:
+    effect = twin.effects[-1]
+    return Trial(effect.name, effect, value, bounds=twin.bounds, events=twin.events)
 
 
 def _values(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
@@ -242,7 +284,7 @@ def _unit(axis: Axis, state: Hypothesis) -> float:
 
 
 def _trial(effect: Effect, gain: float, bounds: Mapping[str, Bounds], events: int = 0) -> Trial:
-    return Trial(effect.name, effect, gain - PRICE[effect.name], bounds, events)
+    return Trial(effect.name, effect, gain - PRICE[effect.name], bounds=bounds, events=events)
 
 
 def _bounds(found: Size, unit: float = 1.0) -> Bounds:
@@ -291,14 +333,26 @@ def _courses(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
     trials = []
     for effect in kept:
         with_it = (*state.effects, effect)
-        gain = max(settled(axis, with_it, state.given).score, *(one(with_it) for one in beside)) - without
-        trials.append(Trial(effect.name, effect, gain - PRICE[effect.name] - _beyond(effect)))
-    return sorted(trials, key=lambda one: -one.value)
+        score = max(settled(axis, with_it, state.given).score, *(one(with_it) for one in beside))
+        score -= PRICE[effect.name] + _beyond(effect)
+        trials.append(Trial(effect.name, effect, score - without, score - state.score))
+    trials.sort(key=lambda one: -one.value)
+    curved = _curved(axis, state) - without
+    if curved > max(0.0, trials[0].value) + OPEN:
+        return [Trial(NAMELESS, None, curved, curved + without - state.score), *trials]
+    return trials
+
+
+def _curved(axis: Axis, state: Hypothesis) -> float:
+    """Score of a drift that is a curve and nothing else, less its price."""
+    ramp = RateRamp(R=1e-3 * float(np.sqrt(np.mean(axis.coefficients**2))))
+    bent = axis.fit((*state.effects, ramp), state.likely.held, curved=True)
+    return bent.log_likelihood - RETUNED * state.freed - PRICE["rate_ramp"] - BEND
 
 
 def _beyond(effect: Effect) -> float:
     """What a second parameter costs."""
-    return 2.5 if getattr(effect, "quadratic", None) is not None else 0.0
+    return BEND if getattr(effect, "quadratic", None) is not None else 0.0
 
 
 def _slow(axis: Axis, state: Hypothesis) -> list[Callable[[Effects], float]]:

@@ -56,8 +56,8 @@ COURSE: Final[dict[type[Effect], str]] = {
     CrossAxis: "coefficient",
 }
 
-ONCE: Final = frozenset({"bias_step", "noise_step", "turn_on_transient", "saturation"})
-"""Effects that happen once, or at the ends of the range: one part of a recording says nothing of another."""
+ONCE: Final = frozenset({"bias_step", "noise_step", "turn_on_transient"})
+"""Effects that happen once: one part of a recording says nothing of another."""
 
 
 def size(effect: Effect) -> float:

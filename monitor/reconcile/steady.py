@@ -1,0 +1,95 @@
+"""Names that do not stand once everything is found: an oscillation that is not steady, a comb of lines, a band that
+moves.
+
+A line whose amplitude or frequency wanders is well described by several lines, or by a resonance that is none; a chirp
+by a wide one; a pulse by its harmonics. Each would be a name with high confidence, and wrong. So of what was found at
+some frequency, the names are withdrawn where
+
+- several lines or resonances stand in one place;
+- COMB or more lines are harmonics of one frequency, and it is that of none of the model's;
+- power at that very place still changes in time, or is still not what it should be, by more than a share of what it
+was.
+
+What is withdrawn is left over at its place, without a name.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from monitor.noise.effect import Effect
+from monitor.noise.effects import BandwidthLimit, Narrowband, Sinusoidal
+from monitor.reconcile.axis import Effects
+from monitor.reconcile.gap import Findings, Null
+from monitor.reconcile.hypothesis import Hypothesis
+
+COMB: Final = 4
+HIGHEST: Final = 60
+"""Harmonic that is still thought of."""
+HARMONIC: Final = 2e-4
+"""Of the fundamental: lines that near to a multiple are harmonics."""
+WIDTHS: Final = 3.0
+"""Of a resonance, to each side: what stands there is in one place with it."""
+NEAR_HZ: Final = 0.1
+"""The same for lines."""
+LOCAL: Final = ("psd", "lines", "spectrogram")
+
+
+def upheld(state: Hypothesis, seen: Findings, null: Mapping[str, Null]) -> Effects:
+    """The effects of an axis without those whose names do not stand."""
+    found = range(state.given, len(state.effects))
+    tones = [at for at in found if isinstance(state.effects[at], (Sinusoidal, Narrowband))]
+    fallen = set(_crowded([(at, state.effects[at]) for at in tones]))
+    fallen |= set(_comb([(at, e.frequency) for at in tones if isinstance(e := state.effects[at], Sinusoidal)]))
+    for lens in LOCAL:
+        place = seen[lens].where.frequency
+        if place is None or seen[lens].gain <= null[lens].threshold:
+            continue
+        fallen |= {at for at in found if _covers(state.effects[at], place)}
+    return tuple(effect for at, effect in enumerate(state.effects) if at not in fallen)
+
+
+def _reach(effect: Effect) -> tuple[float, float]:
+    """Hz, from and to."""
+    if isinstance(effect, Narrowband):
+        half = max(WIDTHS * 0.5 * effect.bandwidth, NEAR_HZ)
+        return effect.frequency - half, effect.frequency + half
+    assert isinstance(effect, Sinusoidal)
+    return effect.frequency - NEAR_HZ, effect.frequency + NEAR_HZ
+
+
+def _covers(effect: Effect, place: tuple[float, float]) -> bool:
+    if isinstance(effect, BandwidthLimit):
+        return place[1] > 0.5 * effect.cutoff
+    if not isinstance(effect, (Narrowband, Sinusoidal)):
+        return False
+    lo, hi = _reach(effect)
+    return lo < place[1] and place[0] < hi
+
+
+def _crowded(tones: Sequence[tuple[int, Effect]]) -> list[int]:
+    """Those that stand within each other's reach."""
+    fallen = []
+    for at, one in tones:
+        lo, hi = _reach(one)
+        if any(other != at and lo < two.frequency < hi for other, two in tones):  # type: ignore[attr-defined]
+            fallen.append(at)
+    return fallen
+
+
+def _comb(lines: Sequence[tuple[int, float]]) -> list[int]:
+    """Harmonics of one fundamental: it is a difference of two of them, or one of them."""
+    f = np.array([one for _, one in lines])
+    if f.size < COMB:
+        return []
+    apart = np.abs(f[:, None] - f[None, :])[np.triu_indices(f.size, 1)]
+    best: list[int] = []
+    for fundamental in np.concatenate([apart, f]):
+        if fundamental < f.max() / HIGHEST:
+            continue
+        order = np.rint(f / fundamental)
+        near = (np.abs(f - order * fundamental) < HARMONIC * f.max()) & (order > 0)
+        if near.sum() > len(best):
+            best = [at for (at, _), one in zip(lines, near.tolist(), strict=True) if one]
+    return best if len(best) >= COMB else []
