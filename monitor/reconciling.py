@@ -4,10 +4,13 @@ leaves.
 ``DIR/`` gets ``report.html``, ``report.json``, ``model.toml`` and ``reconcile.rrd``; each appears whole or not at all.
 Where the data do not support an answer there is ``report.json`` alone, and it says why. Kernels and transforms run
 without the GIL, so that axes and simulated recordings are looked at side by side.
+
+Several recordings are compared with one model, one after the other, each into a folder of its own in ``DIR/``; what
+they have in common and what only some show goes to ``DIR/`` itself.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,16 +19,18 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from drivers.errors import ConfigError, NotReady
+from drivers.errors import ConfigError, NotReady, RecordingError
+from drivers.recording import FORMATS, iter_blocks, load_samples
 from drivers.recording import Recording as Samples
-from drivers.recording import iter_blocks, load_samples
 from drivers.recording.saving import whole
 from drivers.sample import AXES
 from monitor.estimate.grid import with_temperature
 from monitor.noise.model import NoiseModel
+from monitor.reconcile import runs_report
 from monitor.reconcile.reconcile import Recording, reconcile
 from monitor.reconcile.reconciliation import Reconciliation
 from monitor.reconcile.report import SCHEMA, to_json
+from monitor.reconcile.runs import Comparison, Run, compare
 
 Tell = Callable[[str, float | None], None]
 """Told what is being done, and the share that is done where that is known."""
@@ -38,6 +43,18 @@ class Request:
 
     recording: Path
     model: NoiseModel | None  # None: the five terms are fitted first
+    out: Path
+    seed: int = 1
+    rate_hz: float | None = None
+    notes: tuple[str, ...] = ()  # what is to be said besides
+
+
+@dataclass(frozen=True, slots=True)
+class RunsRequest:
+    """Several recordings of one sensor, to be compared with one model."""
+
+    recordings: tuple[Path, ...]
+    model: NoiseModel | None  # None: the five terms are fitted to the first recording
     out: Path
     seed: int = 1
     rate_hz: float | None = None
@@ -60,10 +77,85 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Reconcili
     except NotReady as error:
         _write(request.out / REPORT, no_answer(str(error), len(found)))
         raise
-    result = replace(result, notes=(*found.notes, *notes, *result.notes))
+    result = replace(result, notes=(*request.notes, *found.notes, *notes, *result.notes))
     tell("writing", None)
     write(result, request.out, request.recording.name)
     return result
+
+
+def make_runs(request: RunsRequest, tell: Tell = lambda _what, _share: None) -> Comparison:
+    """Compare each by itself, then all with each other, and write the folders.
+
+    Raises:
+        RecordingError, ConfigError: as ``make``; a recording that is given twice
+        NotReady: the first supports no answer where the model was to be fitted to it, or fewer than two do
+    """
+    named = names(request.recordings)
+    _check_recordings(named, request.out)
+    check_folder(request.out)
+    model, runs, silent = request.model, list[Run](), dict[str, str]()
+    fitted_to = next(iter(named)) if model is None else None
+    for at, (name, path) in enumerate(named.items(), start=1):
+        notes = (f"The model under test are the five terms of {fitted_to}.",) if fitted_to and at > 1 else ()
+        one = Request(path, model, request.out / name, request.seed, request.rate_hz, notes)
+        try:
+            result = make(one, _told(tell, f"{name}, {at} of {len(named)}"))
+        except NotReady as error:
+            silent[name] = str(error)
+            if model is None:
+                break
+            continue
+        model = result.baseline
+        runs.append(Run(name, result))
+    if len(runs) < 2:
+        why = "; ".join(f"{name}: {said}" for name, said in silent.items())
+        why = f"two recordings at least are compared with each other, and {len(runs)} can be: {why}"
+        _write(request.out / REPORT, no_answer(why, 0, runs_report.SCHEMA))
+        raise NotReady(why)
+    tell("writing", None)
+    comparison = compare(runs, fitted_to, silent)
+    write_runs(comparison, request.out)
+    return comparison
+
+
+def write_runs(result: Comparison, folder: Path) -> None:
+    """What is said of all recordings together."""
+    from monitor.publish.reconcile_runs_page import page
+
+    _write(folder / REPORT, runs_report.to_json(result))
+    _write(folder / "model.toml", result.model.to_toml().encode())
+    _write(folder / "report.html", page(result).encode())
+
+
+def names(recordings: Sequence[Path]) -> dict[str, Path]:
+    """Name -> recording: that of the file without its suffix, with a number where two would be the same.
+
+    >>> list(names([Path("a/run.csv"), Path("b/run.csv.gz"), Path("c/warm.npz")]))
+    ['run', 'run-2', 'warm']
+    """
+    found: dict[str, Path] = {}
+    for path in recordings:
+        if path.resolve() in [other.resolve() for other in found.values()]:
+            raise ConfigError(f"{path}: is given twice; recordings that are compared must be different ones")
+        full = path.resolve().name
+        suffix = next((one for one in FORMATS if full.lower().endswith(one)), "")
+        stem = full[: len(full) - len(suffix)] or full
+        possible = (stem, *(f"{stem}-{k}" for k in range(2, len(recordings) + 1)))
+        found[next(name for name in possible if name not in found)] = path
+    return found
+
+
+def _check_recordings(named: Mapping[str, Path], out: Path) -> None:
+    """Before the first of them is worked on: all are there, and none would be written into."""
+    for path in named.values():
+        if not path.exists():
+            raise RecordingError(f"{path}: cannot be read: there is no such file or folder")
+        if any((out / name).resolve() == path.resolve() for name in named):
+            raise ConfigError(f"--out: {out}: {path} is a recording, and a report would be written into it")
+
+
+def _told(tell: Tell, which: str) -> Tell:
+    return lambda what, share: tell(f"{which}: {what}", share)
 
 
 def write(result: Reconciliation, folder: Path, title: str) -> None:
@@ -81,9 +173,9 @@ def write(result: Reconciliation, folder: Path, title: str) -> None:
         write_rrd(result, place)
 
 
-def no_answer(why: str, samples: int) -> bytes:
+def no_answer(why: str, samples: int, schema: str = SCHEMA) -> bytes:
     """``report.json`` where there is no verdict."""
-    return msgspec.json.encode({"schema": SCHEMA, "verdict": None, "why": why, "samples": samples})
+    return msgspec.json.encode({"schema": schema, "verdict": None, "why": why, "samples": samples})
 
 
 def check_folder(folder: Path) -> None:

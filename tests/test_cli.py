@@ -26,7 +26,7 @@ from monitor.cli import main
 from monitor.settings import CONFIG_FOLDER, load
 
 PROGRAM = [sys.executable, "-m", "monitor.cli"]
-COMMANDS = ("demo", "run", "check", "watch", "analyze", "simulate", "export")
+COMMANDS = ("demo", "run", "check", "watch", "analyze", "simulate", "reconcile", "export")
 RATE_HZ = 100.0
 DEVICE = '[[device]]\nname = "bench-1"\n'
 VIRTUAL = DEVICE + 'driver = { link = "virtual" }\n'
@@ -228,6 +228,10 @@ def simulating(*arguments: str) -> tuple[str, ...]:
     return ("simulate", "--seconds", "1", "--out", "x.csv", *arguments)
 
 
+def comparing(*arguments: str) -> tuple[str, ...]:
+    return ("reconcile", "x.csv", "--out", "found", *arguments)
+
+
 WRONG_ARGUMENTS = {
     "no command": ((), "Missing command"),
     "unknown command": (("analyse",), "No such command 'analyse'"),
@@ -295,6 +299,14 @@ WRONG_ARGUMENTS = {
         simulating("consumer-mems", "--temperature-from", "nowhere.csv"),
         "nowhere.csv: cannot be read: No such file or directory",
     ),
+    "nowhere to leave it": (("reconcile", "x.csv"), "Missing option '--out'"),
+    "nothing to compare": (("reconcile", "--out", "x"), "Missing argument 'RECORDING"),
+    "no rate to compare at": (comparing("--rate", "0"), "--rate: 0 Hz; it must be above 0"),
+    "infinite rate to compare at": (comparing("--rate", "inf"), "--rate: inf Hz; it must be above 0"),
+    "negative seed to compare by": (comparing("--seed", "-1"), "Invalid value for '--seed'"),
+    "no model to compare with": (comparing("--model", "nothing.toml"), 'no model "nothing.toml", neither a file nor'),
+    "nearest model to compare with": (comparing("--model", "consumer-mem"), 'did you mean "consumer-mems"?'),
+    "nowhere to say what differs": (comparing("--json", "nowhere/x.json"), "--json: nowhere/x.json: cannot be"),
     "no recording": (("analyze", "nowhere.csv"), "nowhere.csv: cannot be read: No such file or directory"),
 }
 
@@ -704,6 +716,91 @@ def test_what_cannot_be_exported_is_said_in_one_line(call: Call, content: bytes,
     assert words in said.only_line()
 
 
+# --- reconcile -------------------------------------------------------------------------------------
+
+GYROS = "".join(f"[{axis}.angle_random_walk]\nN = 1.0e-4\n" for axis in AXES[:3])
+
+
+@pytest.fixture(scope="session")
+def hidden_line(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two minutes of three gyroscopes, a line of 17.3 Hz on one of them; ``model.toml`` beside it does not know."""
+    folder = tmp_path_factory.mktemp("hidden")
+    n = 12_000
+    values = 1e-3 * np.random.default_rng(3).standard_normal((n, 3))
+    values[:, 2] += 3e-4 * np.sin(2.0 * np.pi * 17.3 * np.arange(n) / RATE_HZ)
+    np.savez(folder / "bench.npz", fs=RATE_HZ, **dict(zip(AXES[:3], values.T, strict=True)))
+    (folder / "model.toml").write_text(GYROS)
+    return folder / "bench.npz"
+
+
+def test_what_is_missing_is_named_and_written_down(call: Call, hidden_line: Path) -> None:
+    model = str(hidden_line.with_name("model.toml"))
+    said = call("reconcile", str(hidden_line), "--model", model, "--out", "found", "--seed", "4")
+    assert (said.status, said.err) == (0, "")
+    assert "sinusoidal" in said.out
+    assert re.search(r"17\.(29|30)", said.out)
+    report = json.loads(Path("found/report.json").read_bytes())
+    assert (report["verdict"], report["seed"]) == ("explained", 4)
+    assert [step["effect"] for step in report["axes"]["gz"]["steps"]] == ["sinusoidal"]
+    assert report["axes"]["gx"]["steps"] == []
+    assert re.search(r"17\.(29|30)", Path("found/report.html").read_text("utf-8"))
+    again = call("reconcile", str(hidden_line), "--model", "found/model.toml", "--out", "again", "--json", "-")
+    assert (again.status, again.err) == (0, "")
+    assert json.loads(again.out)["verdict"] == "agrees"
+    assert json.loads(again.out) == json.loads(Path("again/report.json").read_bytes())
+
+
+def test_what_is_no_recording_is_compared_with_nothing(call: Call) -> None:
+    said = call("reconcile", "nowhere.csv", "--out", "found")
+    assert said.status == 2
+    assert "nowhere.csv: cannot be read: No such file or directory" in said.only_line()
+    Path("x.csv").write_bytes(b"t,speed\n" + b"0.1,1\n" * 100)
+    said = call("reconcile", "x.csv", "--out", "found")
+    assert said.status == 2
+    assert "x.csv: no axis among its columns" in said.only_line()
+    assert not list(Path().glob("found/*"))
+
+
+def test_a_wrong_model_is_compared_with_nothing(call: Call, hidden_line: Path) -> None:
+    Path("m.toml").write_text("[gz.sinusodal]\namplitude = 1.0\n")
+    said = call("reconcile", str(hidden_line), "--model", "m.toml", "--out", "found")
+    assert said.status == 2
+    assert 'did you mean "sinusoidal"?' in said.only_line()
+    assert not Path("found").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(call: Call, hidden_line: Path) -> None:
+    Path("file").touch()
+    for place in ("file", "file/found"):
+        said = call("reconcile", str(hidden_line), "--out", place)
+        assert said.status == 2
+        assert f"--out: {place}: cannot be" in said.only_line()
+
+
+@pytest.mark.parametrize("target", ["-", "why.json"])
+def test_too_short_a_recording_is_an_answer_of_the_comparison_too(call: Call, target: str) -> None:
+    rows = np.random.default_rng(1).standard_normal(500)
+    Path("x.csv").write_text("t,gx\n" + "".join(f"{i / 100},{x}\n" for i, x in enumerate(rows)))
+    said = call("reconcile", "x.csv", "--out", "found", "--json", target)
+    assert said.status == 3
+    assert said.err.count("\n") == 1
+    assert "500 samples; " in said.err
+    assert [path.name for path in Path("found").iterdir()] == ["report.json"]
+    for text in (Path("found/report.json").read_bytes(), said.out if target == "-" else Path(target).read_bytes()):
+        report = json.loads(text)
+        assert report["schema"] == "imu-monitor/reconcile/1"
+        assert report["verdict"] is None
+        assert "500 samples; " in report["why"]
+
+
+def test_an_axis_that_stands_still_is_no_answer(call: Call) -> None:
+    np.savez("x.npz", fs=100.0, gx=np.full(6000, 0.1))
+    said = call("reconcile", "x.npz", "--out", "found")
+    assert said.status == 3
+    assert "gx: all samples are the same" in said.err
+    assert "gx: all samples are the same" in json.loads(Path("found/report.json").read_bytes())["why"]
+
+
 # --- as a process ----------------------------------------------------------------------------------
 
 
@@ -742,6 +839,29 @@ main()
         one.hears("working")
         assert one.status_after(signal.SIGINT, 10.0) == 128 + signal.SIGINT
         assert one.rest() == ""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_comparison_in_one_line(tmp_path: Path, number: int) -> None:
+    values = np.random.default_rng(1).standard_normal((400_000, 6))
+    np.savez(tmp_path / "long.npz", fs=100.0, **dict(zip(AXES, values.T, strict=True)))
+    source = """
+import sys
+import monitor.reconciling as reconciling
+from monitor.cli import main
+original = reconciling.reconcile
+def told(recording, model, seed, each, tell):
+    print("working", file=sys.stderr, flush=True)
+    return original(recording, model, seed, each, tell)
+reconciling.reconcile = told
+main()
+"""
+    command = [sys.executable, "-c", source, "reconcile", str(tmp_path / "long.npz"), "--out", str(tmp_path / "found")]
+    with daemon(command) as one:
+        one.hears("working")
+        assert one.status_after(number, 20.0) == 128 + number
+        assert "Traceback" not in one.rest()
+    assert not list((tmp_path / "found").iterdir())
 
 
 def test_a_wrong_file_ends_a_real_process(tmp_path: Path) -> None:

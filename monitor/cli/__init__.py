@@ -7,6 +7,7 @@ finished, but the data do not support an answer. Heavy libraries are imported by
 import contextlib
 import signal
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final, NoReturn
 
@@ -203,11 +204,17 @@ def simulate(
 
 @app.command()
 def reconcile(
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(metavar="RECORDING…", help="File, or folder of segments; several of one sensor are compared."),
+    ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the report and the augmented model.")],
     model: Annotated[
         str | None,
-        typer.Option(metavar="MODEL.toml|NAME", help="Model under test; else the five classic terms are fitted first."),
+        typer.Option(
+            metavar="MODEL.toml|NAME",
+            help="Model under test; else the five classic terms are fitted first, to the first recording.",
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Same seed, same report.")] = 1,
     rate: Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate, where the file says none.")] = None,
@@ -218,25 +225,32 @@ def reconcile(
 
     from monitor import reconciling
     from monitor.catalogue import load
-    from monitor.publish.reconcile_text import tell as print_result
-    from monitor.reconcile.report import to_json
+    from monitor.publish import reconcile_text as text
+    from monitor.reconcile import report, runs_report
 
     if rate is not None and not 0.0 < rate < float("inf"):
         raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
     output.check_place("--json", json)
     tested = None if model is None else load(model, Path.cwd())
+    several = len(recordings) > 1
     serving.end_on_sigterm()
     try:
         with output.progress() as tell:
-            result = reconciling.make(reconciling.Request(recording, tested, out, seed, rate), tell)
+            if several:
+                runs = reconciling.make_runs(reconciling.RunsRequest(tuple(recordings), tested, out, seed, rate), tell)
+                data, show = runs_report.to_json(runs), partial(text.tell_runs, runs)
+            else:
+                one = reconciling.make(reconciling.Request(recordings[0], tested, out, seed, rate), tell)
+                data, show = report.to_json(one), partial(text.tell, one)
     except NotReady as error:
         if json is not None:
-            output.write("--json", json, reconciling.no_answer(str(error), 0) + b"\n")
+            schema = runs_report.SCHEMA if several else report.SCHEMA
+            output.write("--json", json, reconciling.no_answer(str(error), 0, schema) + b"\n")
         raise
     if json is not None:
-        output.write("--json", json, to_json(result) + b"\n")
+        output.write("--json", json, data + b"\n")
     if json != Path("-"):
-        print_result(result, Console())
+        show(Console())
 
 
 @app.command()

@@ -2,6 +2,8 @@
 
 In comes a ``Reconciliation``, out go lines of rich at any width: long ones wrap inside their column. A verdict has a
 sign and a word beside its colour. Words and units come from ``reconcile_words``.
+
+Of several recordings: a table of axes and recordings, and a line for each effect that is common or single.
 """
 
 from typing import Final
@@ -12,9 +14,11 @@ from rich.table import Table
 from rich.text import Text
 
 from drivers.sample import AXES
+from monitor.publish import reconcile_runs_words as runs_words
 from monitor.publish import reconcile_words as words
 from monitor.publish.panels import duration
 from monitor.reconcile.reconciliation import AxisResult, Reconciliation, Step
+from monitor.reconcile.runs import AxisRuns, Comparison, Seen
 
 STYLES: Final = {
     "agrees": ("●", "green"),
@@ -67,3 +71,78 @@ def _step(r: Reconciliation, axis: str, step: Step) -> tuple[str, str, Text]:
 def _verdict(verdict: str) -> Text:
     sign, style = STYLES[verdict]
     return Text(f"{sign} {words.VERDICTS[verdict]}", style=style)
+
+
+def tell_runs(c: Comparison, console: Console) -> None:
+    """Print what several recordings show together."""
+    console.print(_verdict(c.verdict), Text(runs_words.summary(c)))
+    console.print(Padding(_axes_by_runs(c), (1, 0)))
+    for title, found in (("common to all", _common(c)), ("in some only", _single(c))):
+        if found:
+            console.print(Text(title, style="bold"))
+            console.print(Padding(_lines(found), (0, 0, 1, 2)))
+    for name, why in c.silent.items():
+        console.print(f"note: {name} is left out: {why}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _axes_by_runs(c: Comparison) -> Table:
+    rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
+    rows.add_column("axis", no_wrap=True)
+    for run in c.runs:
+        rows.add_column(Text(run.name), overflow="fold")
+    for axis, one in c.axes.items():
+        rows.add_row(Text(axis, style="bold"), *(_cell(one.results.get(run.name)) for run in c.runs))
+    return rows
+
+
+def _cell(result: AxisResult | None) -> Text:
+    said = Text(runs_words.cell(result), style="dim")
+    return (
+        said
+        if result is None
+        else Text("\n").join([_verdict(result.verdict), said])
+        if said
+        else _verdict(result.verdict)
+    )
+
+
+def _lines(found: list[tuple[str, Text]]) -> Table:
+    rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, show_header=False)
+    rows.add_column(no_wrap=True, style="bold")
+    rows.add_column(overflow="fold")
+    for axis, said in found:
+        rows.add_row(axis, said)
+    return rows
+
+
+def _common(c: Comparison) -> list[tuple[str, Text]]:
+    found = []
+    for axis, one in c.axes.items():
+        for seen in one.common:
+            said = _effect(c, axis, seen)
+            said.append(f"; {runs_words.agreement(seen)}", style="yellow" if seen.consistent is False else "")
+            found.append((axis, said))
+    return found
+
+
+def _single(c: Comparison) -> list[tuple[str, Text]]:
+    return [line for axis, one in c.axes.items() for line in _single_on(c, axis, one)]
+
+
+def _single_on(c: Comparison, axis: str, one: AxisRuns) -> list[tuple[str, Text]]:
+    found = []
+    for seen in one.single:
+        said = _effect(c, axis, seen)
+        said.append(f"; in {', '.join(seen.steps)}")
+        found.append((axis, said))
+        for absence in seen.absent:
+            style = "yellow" if absence.meaning == "contradiction" else "dim"
+            meaning = f"not in {absence.run}: {runs_words.MEANINGS[absence.meaning]}: {absence.because}"
+            found.append(("", Text(meaning, style=style)))
+    return found
+
+
+def _effect(c: Comparison, axis: str, seen: Seen) -> Text:
+    said = Text(f"{seen.kind} {runs_words.line(seen, axis, c.baseline)}")
+    said.highlight_words([words.plain(seen.effect)], "bold")
+    return said

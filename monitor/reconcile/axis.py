@@ -32,6 +32,8 @@ from monitor.reconcile.whittle import Fitted, Sums, maximise
 
 DEEP: Final = 1e-4
 """Of the power in the median bin: below that, in a filter's stop band, the ends of a recording are all there is."""
+SLOW: Final = 0.02
+"""Of the rate: no stop band begins below, but bins of one coefficient may be that low by chance."""
 KEPT_BYTES: Final = 1 << 28
 FEWEST_KEPT: Final = 16
 """Series that are kept however long they are: as many as the lenses ask for."""
@@ -114,7 +116,8 @@ class Axis:
 
     def __post_init__(self) -> None:
         power = self.bins.sums(self.coefficients**2) / self.bins.count
-        self.heard = (power > DEEP * np.median(power)).astype(np.float64)
+        slow = self.bins.f_hz < SLOW * self.bins.rate_hz
+        self.heard = ((power > DEEP * np.median(power)) | slow).astype(np.float64)
 
     @property
     def n(self) -> int:

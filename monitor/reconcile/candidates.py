@@ -21,7 +21,9 @@ from monitor.noise.effects import (
     ExponentiallyCorrelated,
     GSensitivity,
     Narrowband,
+    PoissonSteps,
     QuantizationNoise,
+    RandomTelegraph,
     RateRamp,
     RateRandomWalk,
     Sinusoidal,
@@ -65,6 +67,8 @@ LONGEST: Final = 0.1
 """Of the recording: a correlation that is longer reads as a random walk."""
 SLOWEST: Final = 0.4
 """Of the recording: a transient or a delay that is longer reads as a slope."""
+APART: Final = 24
+"""Quarters of a width, to each side: windows nearer than that see one peak."""
 PROMPT: Final = 0.002
 """Of the recording: what follows temperature with less delay follows it at once; the thermometer's noise does the
 rest."""
@@ -131,9 +135,11 @@ def peaks(seen: Sight, most: int = PEAKS) -> list[tuple[float, float]]:
         gains = power_gain(
             np.maximum((running[first + width] - running[first]) / width, 1.0), np.full(first.size, width)
         )
-        for at in np.argsort(gains)[-most:]:
+        for _ in range(most):
+            at = int(np.argmax(gains))
             middle = (first[at] + 0.5 * width) * step_hz
             found.append((float(gains[at]), float(middle), float(width * step_hz)))
+            gains[max(at - APART, 0) : at + APART + 1] = 0.0
         width *= 2
     chosen: list[tuple[float, float]] = []
     for gain, middle, wide in sorted(found, reverse=True):
@@ -200,8 +206,9 @@ def drifts(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
         effects = refined(axis, (*state.effects, best), at, ["time_constant"], 1.6)
         if effects[at].time_constant <= SLOWEST * length_s:  # type: ignore[attr-defined]
             found.append(effects[at])
-    gains, times = step_gains(seen)
-    found.append(BiasStep(time=float(times[int(np.argmax(gains))]), height=1.0))
+    if not have & {PoissonSteps, RandomTelegraph}:
+        gains, times = step_gains(seen)
+        found.append(BiasStep(time=float(times[int(np.argmax(gains))]), height=1.0))
     return found
 
 

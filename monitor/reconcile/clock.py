@@ -27,7 +27,7 @@ TRIED: Final = 12
 PRICE: Final = 12.0
 """Nats: for the ratio, and for the features that may be meant."""
 POWERS: Final[Mapping[str, float]] = {
-    "Q": 1.5,
+    "Q": 1.0,
     "N": 0.5,
     "K": -0.5,
     "R": -1.0,
@@ -80,9 +80,7 @@ def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clo
     def gain(x: float) -> float:
         return sum(gains(x).values())
 
-    ratio, name, seen = max(trials, key=lambda one: gain(log(one[0])))
-    axis = axes[name]
-    width = 2.0 / (axis.n / axis.rate_hz * seen)
+    ratio, width = max(trials, key=lambda one: gain(log(one[0])))
     x = _highest(gain, log(ratio), width)
     top = gain(x)
     if top < PRICE:
@@ -91,13 +89,13 @@ def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clo
     of_axes = gains(x)
     strongest = max(of_axes, key=lambda one: of_axes[one])
     features = [e for e in effects[strongest] if isinstance(e, (Sinusoidal, Narrowband))]
-    stated = features[0].frequency if features else seen * ratio
+    stated = features[0].frequency if features else 0.0
     return Clock(Bounds(exp(x), exp(ends[0]), exp(ends[1])), top, strongest, (stated, stated / exp(x)))
 
 
-def _ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> list[tuple[float, str, float]]:
-    """(ratio, axis, Hz) by which features of the model would stand where something is seen: the best of many."""
-    found: list[tuple[float, str, float]] = []
+def _ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> list[tuple[float, float]]:
+    """(ratio, how far to look around it) that put features of the model where something is seen: the best of many."""
+    found: list[tuple[float, float]] = []
     features = {name: [e for e in of if isinstance(e, (Sinusoidal, Narrowband))] for name, of in effects.items()}
     if not any(features.values()):
         return []
@@ -121,11 +119,10 @@ def _ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> list[tu
             if isinstance(one, Narrowband):
                 places = [middle for middle, _ in peaks(view, 4)]
                 near = [place for place in places if abs(log(one.frequency / place)) < FURTHEST]
-                found += [(one.frequency / place, name, one.frequency) for place in near]
-    strongest = max(axes, key=lambda name: max((one.frequency for one in features[name]), default=0.0))
+                found += [(one.frequency / place, 2.0 * one.bandwidth / one.frequency) for place in near]
     for at in np.argsort(power)[-TRIED:]:
         if power[at] > 0.0:
-            found.append((exp(float(grid[at])), strongest, highest))
+            found.append((exp(float(grid[at])), 8.0 * step))
     return found
 
 

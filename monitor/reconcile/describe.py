@@ -22,7 +22,7 @@ from monitor.reconcile.gap import Null, scores
 from monitor.reconcile.hypothesis import Z95, Hypothesis, shape_bounds, size_bounds
 from monitor.reconcile.reconciliation import AxisResult, Bounds, Kind, Look, RunnerUp, Score, Step, Verdict
 from monitor.reconcile.search import RETUNE, Round, Search, Trial
-from monitor.reconcile.terms import COURSE, NOISE
+from monitor.reconcile.terms import COURSE, NATURAL, NOISE
 from monitor.reconcile.views import views
 
 SHAPES: Final[dict[type[Effect], tuple[str, ...]]] = {
@@ -35,24 +35,6 @@ SHAPES: Final[dict[type[Effect], tuple[str, ...]]] = {
     BandwidthLimit: ("cutoff",),
     ScaleFactor: ("factor",),
 }
-NATURAL: Final = {
-    "sinusoidal": "lines",
-    "narrowband": "psd",
-    "bandwidth_limit": "psd",
-    "temperature_bias": "temperature",
-    "temperature_lag": "temperature",
-    "g_sensitivity": "other_axes",
-    "cross_axis": "other_axes",
-    "bias_step": "level",
-    "rate_ramp": "level",
-    "turn_on_transient": "level",
-    "outliers": "tails",
-    "noise_step": "variance",
-    "resolution": "values",
-    "saturation": "values",
-    "sample_hold": "values",
-}
-"""The lens through which a person would look for an effect, if it passes its threshold there."""
 SHOWN: Final = 3
 """Runners-up that are told."""
 LEAST: Final = 0.001
@@ -81,7 +63,9 @@ def described(found: Search, null: Mapping[str, Null], final: Mapping[str, Null]
             if noise < found.state.given and noise not in before and noise in found.state.likely.noises:
                 steps.append(_step(found, one, noise, "retuned", looks[at], looks[at + 1]))
     left_over = tuple(score for score in looks[-1].scores if score.passes)
-    return AxisResult(found.axis.name, _verdict(bool(steps), bool(left_over)), looks[0], tuple(steps), left_over)
+    return AxisResult(
+        found.axis.name, _verdict(bool(steps), bool(left_over)), looks[0], tuple(steps), left_over, looks[-1]
+    )
 
 
 def _verdict(steps: bool, left: bool) -> Verdict:

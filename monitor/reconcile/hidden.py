@@ -31,7 +31,7 @@ ANYWHERE: Final = 100.0
 """Variance of the first level, in variances of the data: as good as infinite, and the same for both models."""
 DECADE: Final = 10.0
 """Spacing of the processes that make flicker: their sum then ripples by 5 % about 1/f."""
-WHITE_RULES: Final = 4.0
+WHITE_RULES: Final = 20.0
 """Flicker is not modelled above this many times the frequency at which it crosses the white noise."""
 DEVIATIONS: Final = 1.96
 """Standard deviations either side that hold 95 of 100."""

@@ -30,8 +30,18 @@ GOLDEN: Final = 0.6180339887498949
 class Hypothesis:
     """Effects, fitted."""
 
-    given: int  # the first so many effects stand in the model under test
+    model: Effects  # of the model under test, as it stands; they are the first of ``effects``
     likely: Likely
+
+    @property
+    def given(self) -> int:
+        """How many effects stand in the model under test."""
+        return len(self.model)
+
+    @property
+    def found(self) -> Effects:
+        """Beyond the model."""
+        return self.likely.effects[self.given :]
 
     @property
     def effects(self) -> Effects:
@@ -49,28 +59,29 @@ class Hypothesis:
         return self.likely.log_likelihood - RETUNED * self.freed
 
 
-def believed(axis: Axis, given: Sequence[Effect]) -> Hypothesis:
+def believed(axis: Axis, model: Effects) -> Hypothesis:
     """A model as it stands: only courses, whose sizes differ from run to run, are fitted."""
-    return Hypothesis(len(given), axis.fit(given, frozenset(at for at, e in enumerate(given) if type(e) in NOISE)))
+    return Hypothesis(model, axis.fit(model, frozenset(at for at, e in enumerate(model) if type(e) in NOISE)))
 
 
-def settled(axis: Axis, effects: Sequence[Effect], given: int) -> Hypothesis:
-    """Fit, with as few other sizes of given noises as the data ask for."""
-    held = frozenset(at for at in range(given) if type(effects[at]) in NOISE)
-    best = Hypothesis(given, axis.fit(effects, held))
+def settled(axis: Axis, found: Sequence[Effect], model: Effects) -> Hypothesis:
+    """Fit what was found beside a model, with as few other sizes of the model's noises as the data ask for."""
+    effects = (*model, *found)
+    held = frozenset(at for at, effect in enumerate(model) if type(effect) in NOISE)
+    best = Hypothesis(model, axis.fit(effects, held))
     if not held:
         return best
     free = axis.fit(effects)
     if free.log_likelihood - best.likely.log_likelihood < RETUNED:
         return best
     while held:
-        trials = [Hypothesis(given, axis.fit(effects, held - {at})) for at in sorted(held)]
+        trials = [Hypothesis(model, axis.fit(effects, held - {at})) for at in sorted(held)]
         better = max(trials, key=lambda one: one.score)
         if better.score <= best.score:
             break
         best, held = better, better.likely.held
     # one noise may have stood in for two others
-    loose = Hypothesis(given, free)
+    loose = Hypothesis(model, free)
     if loose.score > best.score:
         best = loose
     return best

@@ -20,6 +20,8 @@ from drivers.sample import Floats
 from monitor.noise.effect import first_sample
 from monitor.noise.effects import (
     NoiseStep,
+    PoissonSteps,
+    RandomTelegraph,
     RateRamp,
     Resolution,
     SampleHold,
@@ -41,8 +43,9 @@ DECAYS: Final = 0.3 / 3.0 ** np.arange(6)
 DELAYS_S: Final = (10.0, 30.0, 90.0, 270.0, 810.0)
 SLOW: Final = 0.01
 """Of the band: slower parts say nothing of tails and variance, and are the first that a model misses."""
-FEW: Final = 16
-"""Coefficients whose power is known to a third."""
+FEW: Final = 64
+"""Coefficients whose power is known to a sixth; where a bin has fewer, NEIGHBOURS bins are taken together."""
+NEIGHBOURS: Final = 9
 MARGIN: Final = 0.001
 """Of the recording, at each end: no step is looked for there, where the ends show in the spectrum themselves."""
 LOW: Final = 1e-3
@@ -94,8 +97,11 @@ def sight(axis: Axis, likely: Likely) -> Sight:
 
 def _fast(axis: Axis, likely: Likely, whitened: Floats) -> Floats:
     """Whatever the spectrum is, tails and variance are then those of white noise."""
-    power = axis.bins.sums(whitened**2) / axis.bins.count
-    flat = whitened * axis.bins.spread(np.where(axis.bins.count >= FEW, 1.0 / np.sqrt(power), 1.0))
+    count, together = axis.bins.count, np.ones(NEIGHBOURS)
+    sums = axis.bins.sums(whitened**2)
+    around = np.convolve(sums, together, "same") / np.convolve(count, together, "same")
+    power = np.where(count >= FEW, sums / count, around)
+    flat = whitened * axis.bins.spread(1.0 / np.sqrt(power))
     density = power * likely.fitted.variance
     silent = np.flatnonzero(axis.bins.spread(density) < LOW * np.median(density))
     flat[silent] = np.random.default_rng(silent.size).standard_normal(silent.size)
@@ -174,7 +180,12 @@ def periodogram(white: Floats) -> Floats:
 
 
 def level(seen: Sight) -> Finding:
-    """The level over time: a step at any time, a slope, or a transient after the start."""
+    """The level over time: a step at any time, a slope, or a transient after the start.
+
+    Where the model itself jumps, a level that moves says nothing: no spectrum takes jumps out.
+    """
+    if any(isinstance(effect, (PoissonSteps, RandomTelegraph)) for effect in seen.likely.effects):
+        return Finding(0.0, Where())
     gains, times_s = step_gains(seen)
     at = int(np.argmax(gains))
     best = Finding(float(gains[at]), Where(time=(float(times_s[at]), float(times_s[at]))))
@@ -265,7 +276,8 @@ def variance(seen: Sight) -> Finding:
 
 def spectrogram(seen: Sight) -> Finding:
     """Power over time and frequency: the rectangle, or the row, that is least steady."""
-    found = tiles(seen.fast, 1.0 / seen.axis.rate_hz)
+    axis = seen.axis
+    found = tiles(seen.white / noise_course(seen.likely.effects, axis.n, axis.rate_hz), 1.0 / axis.rate_hz)
     if found.gain >= found.row_gain:
         return Finding(found.gain, Where(time=found.time, frequency=found.frequency))
     return Finding(found.row_gain, Where(frequency=found.row))

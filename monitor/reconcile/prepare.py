@@ -25,6 +25,9 @@ FEWEST: Final = 4096
 """Samples: with fewer there is no spectrum to speak of, and no spectrogram."""
 NEAR: Final = 1e-9
 """Relative: a sample that near to the limit is at it."""
+TURNS: Final = 40
+STILL: Final = 5e-4
+"""Relative change of the deviation that ends the turns."""
 E = TypeVar("E", bound=Effect)
 
 
@@ -94,8 +97,19 @@ def mend(y: Floats, shown: Shown, effects: Effects, rng: np.random.Generator) ->
         at = shown.clipped.limit.value
         inside = np.abs(mended) < at * (1.0 - NEAR)
         sigma = float(np.std(np.diff(mended)[inside[1:] & inside[:-1]])) / 2.0**0.5
-        mended = unclipped(mended, at, sigma, rng)
+        return _beyond(mended, at, sigma, rng)
     return mended
+
+
+def _beyond(y: Floats, limit: float, sigma: float, rng: np.random.Generator) -> Floats:
+    """Clipped samples drawn anew, and the deviation of all with them, in turns: where few were clipped few turns do."""
+    whole = y
+    for _ in range(TURNS):
+        whole = unclipped(y, limit, sigma, rng)
+        before, sigma = sigma, float(np.std(np.diff(whole))) / 2.0**0.5
+        if abs(sigma - before) < STILL * sigma:
+            break
+    return whole
 
 
 def without_outliers(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:

@@ -123,11 +123,18 @@ def _beside(half: Axis, learned: Likely) -> Likely:
 
     Noises have the sizes learned there. So have courses, as far as they are known there: with sizes β₁ of covariance C₁
     from the one half, and β₂, C₂ from this one alone, the evidence is that of β₂ less the price of their distance,
-    ½ Δ'(C₁ + C₂)⁻¹Δ + ½ ln |C₁ + C₂|/|C₂|, and the sizes are the mean of both by their weights. A line begins anew.
+    ½ Δ'(C₁ + C₂)⁻¹Δ + ½ ln |C₁ + C₂|/|C₂|, and the sizes are the mean of both by their weights. Of a line the phase
+    begins anew.
     """
     effects = learned.effects
     held = frozenset(at for at, effect in enumerate(effects) if type(effect) in NOISE)
     free = half.fit(effects, held)
+    beta = free.fitted.beta.copy()
+    for at, place in free.courses:
+        line = effects[at]
+        if isinstance(line, Sinusoidal):  # its phase begins anew, its amplitude does not
+            beta[place] *= line.amplitude / max(float(np.hypot(*beta[place])), 1e-300)
+    free = half.at(free, beta)
     known = [
         k
         for at, place in free.courses
@@ -137,15 +144,19 @@ def _beside(half: Axis, learned: Likely) -> Likely:
     if not known:
         return free
     pick = np.ix_(known, known)
-    here, there = free.fitted.beta_covariance[pick], learned.fitted.beta_covariance[pick]
+    here, there = (_regular(one.fitted.beta_covariance[pick]) for one in (free, learned))
     apart = free.fitted.beta[known] - learned.fitted.beta[known]
     both = here + there
     price = 0.5 * float(apart @ np.linalg.pinv(both) @ apart)
     price += 0.5 * float(np.linalg.slogdet(both)[1] - np.linalg.slogdet(here)[1])
-    beta = free.fitted.beta.copy()
     beta[known] -= here @ np.linalg.pinv(both) @ apart
     fixed = half.at(free, beta)
     return replace(fixed, log_likelihood=free.log_likelihood - price)
+
+
+def _regular(covariance: Floats) -> Floats:
+    """With a little on its diagonal, so that what one half cannot tell has a determinant."""
+    return covariance + np.diag(1e-9 * np.diag(covariance) + 1e-300)
 
 
 def _of_samples(halves: list[Axis], mended: list[Axis], before: Hypothesis, after: Hypothesis, lens: str) -> Proof:

@@ -119,6 +119,7 @@ class AxisResult:
     start: Look  # beside the model that was given, or the five terms
     steps: tuple[Step, ...]
     left_over: tuple[Score, ...]
+    end: Look  # beside the model with everything that was found
 
 
 @dataclass(frozen=True, slots=True)

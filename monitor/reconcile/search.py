@@ -44,7 +44,7 @@ from monitor.reconcile.prepare import again
 from monitor.reconcile.proof import Proof, proof
 from monitor.reconcile.reconciliation import Bounds
 from monitor.reconcile.steady import upheld
-from monitor.reconcile.terms import COURSE, NOISE
+from monitor.reconcile.terms import COURSE, NATURAL, NOISE, size
 from monitor.reconcile.twins import WORTH, Twin, poisson, telegraph
 from monitor.reconcile.values import Size
 
@@ -76,7 +76,7 @@ class Trial:
     name: str
     effect: Effect | None  # None: nameless, or nothing new
     value: float  # nats above its price; of a course beside the slow noise that could best stand in for it
-    total: float = 0.0  # nats above its price, of a course and that noise together
+    alone: float = 0.0  # nats above its price, of a course with no such noise beside it
     bounds: Mapping[str, Bounds] = field(default_factory=dict)  # of parameters that no spectrum tells
     events: int = 0  # that were seen
 
@@ -87,7 +87,7 @@ class Round:
 
     sight: Sight  # before
     seen: Findings  # before
-    trials: tuple[Trial, ...]  # best first; the first was taken
+    trials: tuple[Trial, ...]  # the first was taken; the others best first
     state: Hypothesis  # after
     proof: Proof
 
@@ -125,48 +125,47 @@ def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.
             break
         instead = _instead(axis, state, view) if closed and state.freed else []
         if closed and not instead:
-            jumps = poisson(axis, state, model) if rounds else None
+            jumps = poisson(axis, state) if rounds else None
             if jumps is None or jumps.gain <= WORTH:
                 break
-            state = settled(axis, jumps.effects, state.given)
+            state = settled(axis, jumps.found, model)
             rounds.append(Round(view, seen, (_twin(jumps, jumps.gain),), state, SHARED))
             continue
         finer = bins(axis.n, axis.rate_hz, peaks(view))
         if finer.count.size > axis.bins.count.size + 8:
             axis = axis.rebinned(finer)
-            state = Hypothesis(state.given, axis.fit(state.effects, state.likely.held))
+            state = Hypothesis(model, axis.fit(state.effects, state.likely.held))
             start = start if rounds else state
             view = sight(axis, state.likely)
         trials = instead or tried(axis, state, view)
-        taken = _taken(axis, state, model, trials, view, seen, null, rng)
+        taken = _taken(axis, state, trials, view, seen, null, rng)
         if taken is None:
             rivals = tuple(trials)
             break
         axis, done = taken
         state = done.state
         rounds.append(done)
-    kept = upheld(state, seen, null)
-    if kept != state.effects:
-        state = settled(axis, kept, state.given)
+    kept = tuple(effect for effect in upheld(state, seen, null) if not _nothing(effect))
+    if kept != state.found:
+        state = settled(axis, kept, model)
         view = sight(axis, state.likely)
         seen = look(view)
     return Search(start, tuple(rounds), axis, state, view, seen, rivals)
 
 
 def _instead(axis: Axis, state: Hypothesis, view: Sight) -> list[Trial]:
-    """A correlated noise, where it explains better what other sizes of known noises were bent to explain."""
-    found = []
+    """A course or a correlated noise that explains better what other sizes of known noises were bent to explain."""
+    found = [one for one in _courses(axis, state, view) if one.alone > 0.0 and one.value > 0.0]
     for effect in correlated(axis, state, view):
-        value = settled(axis, (*state.effects, effect), state.given).score - state.score - PRICE[effect.name]
+        value = settled(axis, (*state.found, effect), state.model).score - state.score - PRICE[effect.name]
         if value > 0.0:
             found.append(Trial(effect.name, effect, value))
-    return found
+    return sorted(found, key=lambda one: -one.value)
 
 
 def _taken(
     axis: Axis,
     state: Hypothesis,
-    model: Effects,
     trials: list[Trial],
     view: Sight,
     seen: Findings,
@@ -174,14 +173,17 @@ def _taken(
     rng: np.random.Generator,
 ) -> tuple[Axis, Round] | None:
     """The best trial that holds on data that did not choose it."""
-    lens = max(seen, key=lambda name: seen[name].gain - null[name].threshold)
+    strongest = max(seen, key=lambda name: seen[name].gain - null[name].threshold)
     for at, trial in enumerate(trials[:CHANCES]):
         if trial.value <= 0.0 or trial.name == NAMELESS:
             return None
-        effects = state.effects if trial.effect is None else (*state.effects, trial.effect)
-        mended = again(axis, effects, rng) if type(trial.effect) in MENDED else axis
-        after = pruned(mended, settled(mended, effects, state.given))
-        after, told = told_apart(mended, after, model, trials[at:])
+        lens = NATURAL.get(trial.name, strongest)
+        found = state.found if trial.effect is None else (*state.found, trial.effect)
+        mended = again(axis, (*state.model, *found), rng) if type(trial.effect) in MENDED else axis
+        after = pruned(mended, settled(mended, found, state.model))
+        if trial.effect is not None and after.found and _nothing(after.found[-1]):
+            continue
+        after, told = told_apart(mended, after, trials[at:])
         proven = proof(mended, state, after, lens, null[lens], rng)
         if proven.kept:
             return mended, Round(view, seen, tuple(told), after, proven)
@@ -202,12 +204,12 @@ def tried(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
             return found
     courses, noises = _courses(axis, state, seen), _noises(axis, state, seen)
     # a noise that explains far more comes first: what is left of a wrong spectrum looks like steps and slopes
-    if courses and courses[0].value > 0.0 and courses[0].total > noises[0].value - FAR_MORE:
+    if courses and courses[0].value > 0.0 and courses[0].alone > noises[0].value - FAR_MORE:
         return courses
     return noises
 
 
-def told_apart(axis: Axis, state: Hypothesis, model: Effects, trials: list[Trial]) -> tuple[Hypothesis, list[Trial]]:
+def told_apart(axis: Axis, state: Hypothesis, trials: list[Trial]) -> tuple[Hypothesis, list[Trial]]:
     """The state with what was just found under its right name, where second moments do not tell."""
     last, twin = len(state.effects) - 1, None
     if isinstance(trials[0].effect, ExponentiallyCorrelated) and isinstance(
@@ -215,17 +217,22 @@ def told_apart(axis: Axis, state: Hypothesis, model: Effects, trials: list[Trial
     ):
         twin = telegraph(axis, state, last)
     elif isinstance(trials[0].effect, BiasStep):
-        twin = poisson(axis, state, model)
+        twin = poisson(axis, state)
     if twin is None:
         return state, trials
     one = _twin(twin, trials[0].value + twin.gain)
     if twin.gain <= WORTH:
         return state, [trials[0], one, *trials[1:]]
-    return settled(axis, twin.effects, state.given), [one, *trials]
+    return settled(axis, twin.found, state.model), [one, *trials]
+
+
+def _nothing(effect: Effect) -> bool:
+    """Whether the fit left a noise without any size."""
+    return type(effect) in NOISE and size(effect) == 0.0
 
 
 def _twin(twin: Twin, value: float) -> Trial:
-    effect = twin.effects[-1]
+    effect = twin.found[-1]
     return Trial(effect.name, effect, value, bounds=twin.bounds, events=twin.events)
 
 
@@ -293,10 +300,10 @@ def _bounds(found: Size, unit: float = 1.0) -> Bounds:
 
 def _noises(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
     """Noises by their score, a nameless one among them."""
-    found = [Trial(RETUNE, None, settled(axis, state.effects, state.given).score - state.score)]
+    found = [Trial(RETUNE, None, settled(axis, state.found, state.model).score - state.score)]
     for family in NOISE_FAMILIES:
         for effect in family(axis, state, seen):
-            value = settled(axis, (*state.effects, effect), state.given).score - state.score - PRICE[effect.name]
+            value = settled(axis, (*state.found, effect), state.model).score - state.score - PRICE[effect.name]
             found.append(Trial(effect.name, effect, value))
     found.append(_scaled(axis, state))
     found.sort(key=lambda one: -one.value)
@@ -329,13 +336,14 @@ def _courses(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
     if not kept:
         return []
     beside = _slow(axis, state)
-    without = max(settled(axis, state.effects, state.given).score, *(one(state.effects) for one in beside))
+    without = max(settled(axis, state.found, state.model).score, *(one(state.effects) for one in beside))
     trials = []
     for effect in kept:
         with_it = (*state.effects, effect)
-        score = max(settled(axis, with_it, state.given).score, *(one(with_it) for one in beside))
-        score -= PRICE[effect.name] + _beyond(effect)
-        trials.append(Trial(effect.name, effect, score - without, score - state.score))
+        alone = settled(axis, (*state.found, effect), state.model).score
+        gain = max(alone, *(one(with_it) for one in beside)) - without
+        price = PRICE[effect.name] + _beyond(effect)
+        trials.append(Trial(effect.name, effect, gain - price, alone - state.score - price))
     trials.sort(key=lambda one: -one.value)
     curved = _curved(axis, state) - without
     if curved > max(0.0, trials[0].value) + OPEN:
@@ -387,10 +395,11 @@ def _power_law(axis: Axis, exponent: float) -> Floats:
 
 def _scaled(axis: Axis, state: Hypothesis) -> Trial:
     """All noises of the model by one factor, their sizes held to each other."""
-    held = frozenset(at for at in range(state.given) if type(state.effects[at]) in NOISE)
+    effects = (*state.model, *state.found)
+    held = frozenset(at for at, effect in enumerate(state.model) if type(effect) in NOISE)
 
     def value(x: float) -> float:
-        return axis.fit((*state.effects, ScaleFactor(factor=float(np.exp(x)))), held).log_likelihood
+        return axis.fit((*effects, ScaleFactor(factor=float(np.exp(x)))), held).log_likelihood
 
     x = float(max(np.linspace(-3.0, 3.0, 13), key=value))
     lo, hi = x - 0.5, x + 0.5
@@ -403,9 +412,9 @@ def _scaled(axis: Axis, state: Hypothesis) -> Trial:
 
 def pruned(axis: Axis, state: Hypothesis) -> Hypothesis:
     """Without what was found before and is worth nothing any more."""
-    for at in range(len(state.effects) - 2, state.given - 1, -1):
-        effect = state.effects[at]
-        less = settled(axis, state.effects[:at] + state.effects[at + 1 :], state.given)
+    for at in range(len(state.found) - 2, -1, -1):
+        effect = state.found[at]
+        less = settled(axis, state.found[:at] + state.found[at + 1 :], state.model)
         if state.score - less.score < 0.5 * PRICE.get(effect.name, 0.0) and type(effect) in NOISE | COURSE:
             state = less
     return state

@@ -37,7 +37,7 @@ LOCAL: Final = ("psd", "lines", "spectrogram")
 
 
 def upheld(state: Hypothesis, seen: Findings, null: Mapping[str, Null]) -> Effects:
-    """The effects of an axis without those whose names do not stand."""
+    """What was found on an axis without those whose names do not stand."""
     found = range(state.given, len(state.effects))
     tones = [at for at in found if isinstance(state.effects[at], (Sinusoidal, Narrowband))]
     fallen = set(_crowded([(at, state.effects[at]) for at in tones]))
@@ -47,7 +47,7 @@ def upheld(state: Hypothesis, seen: Findings, null: Mapping[str, Null]) -> Effec
         if place is None or seen[lens].gain <= null[lens].threshold:
             continue
         fallen |= {at for at in found if _covers(state.effects[at], place)}
-    return tuple(effect for at, effect in enumerate(state.effects) if at not in fallen)
+    return tuple(effect for at, effect in enumerate(state.found, state.given) if at not in fallen)
 
 
 def _reach(effect: Effect) -> tuple[float, float]:

@@ -60,6 +60,32 @@ ONCE: Final = frozenset({"bias_step", "noise_step", "turn_on_transient"})
 """Effects that happen once: one part of a recording says nothing of another."""
 
 
+NATURAL: Final[dict[str, str]] = {
+    "quantization_noise": "psd",
+    "angle_random_walk": "psd",
+    "bias_instability": "psd",
+    "rate_random_walk": "psd",
+    "exponentially_correlated": "psd",
+    "scale_factor": "psd",
+    "sinusoidal": "lines",
+    "narrowband": "psd",
+    "bandwidth_limit": "psd",
+    "temperature_bias": "temperature",
+    "temperature_lag": "temperature",
+    "g_sensitivity": "other_axes",
+    "cross_axis": "other_axes",
+    "bias_step": "level",
+    "rate_ramp": "level",
+    "turn_on_transient": "level",
+    "outliers": "tails",
+    "noise_step": "variance",
+    "resolution": "values",
+    "saturation": "values",
+    "sample_hold": "values",
+}
+"""The lens through which a person would look for an effect, if it passes its threshold there."""
+
+
 def size(effect: Effect) -> float:
     """Of a noise or a course."""
     return float(getattr(effect, (NOISE | COURSE)[type(effect)]))

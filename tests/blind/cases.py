@@ -30,7 +30,7 @@ PAIRS: Final = (
     "sinusoidal@same+rate_random_walk",
     "sinusoidal+cross_axis",
     "narrowband+temperature_bias",
-    "narrowband@same+bandwidth_limit",
+    "narrowband@same+rate_ramp",
     "narrowband@same+exponentially_correlated",
     "exponentially_correlated+random_telegraph",
     "exponentially_correlated@same+temperature_bias",

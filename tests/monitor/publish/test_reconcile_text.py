@@ -6,9 +6,11 @@ import pytest
 from rich.cells import cell_len
 from rich.console import Console
 
-from monitor.publish.reconcile_text import tell
+from monitor.publish.reconcile_text import tell, tell_runs
 from monitor.reconcile.reconciliation import Reconciliation
+from monitor.reconcile.runs import Comparison, compare
 from tests.monitor.reconcile import samples
+from tests.monitor.reconcile.runs_made import line, run, step, with_axes
 
 
 def told(r: Reconciliation, width: int = 140) -> list[str]:
@@ -56,3 +58,41 @@ def test_long_lines_wrap_inside_their_column(width: int) -> None:
     words = " ".join(" ".join(lines).split())
     for word in ("17.300012", "0.000100", "Hz", "left", "over:", "threshold"):
         assert word in words
+
+
+def told_runs(c: Comparison, width: int = 140) -> list[str]:
+    console = Console(width=width, file=io.StringIO(), record=True)
+    tell_runs(c, console)
+    return console.export_text().splitlines()
+
+
+def runs() -> Comparison:
+    both = with_axes(run("warm", line(), step("bias_step", time=350.0, height=1e-3)), run("warm", axis="gx"))
+    return compare([run("cold", line(3e-4)), both], None, {"short": "200 samples"})
+
+
+def test_several_recordings_stand_beside_each_other() -> None:
+    lines = [joined(one) for one in told_runs(runs())]
+    assert lines[0] == (
+        "● explained 2 recordings beside the model. Common to all: sinusoidal (gz). In some only: bias step (gz, warm)."
+    )
+    at = lines.index("axis cold warm")
+    assert lines[at + 1 : at + 4] == ["gx not recorded ● agrees", "gz ● explained ● explained", "1 effect 2 effects"]
+    assert lines[-1] == "note: short is left out: 200 samples"
+
+
+def test_common_effects_say_whether_they_agree_and_single_ones_where_they_are() -> None:
+    lines = [joined(one) for one in told_runs(runs())]
+    common, single = lines.index("common to all"), lines.index("in some only")
+    assert lines[common + 1].startswith(
+        "gz added sinusoidal: amplitude 46 ± 30 °/h, frequency 17.30000 ± 0.00071 Hz; sizes differ"
+    )
+    assert lines[single + 1].endswith("; in warm")
+    assert lines[single + 2] == "not in cold: may differ: what happens once need not happen in another recording"
+
+
+@pytest.mark.parametrize("width", [60, 80])
+def test_long_lines_of_several_recordings_wrap(width: int) -> None:
+    lines = told_runs(runs(), width)
+    assert all(cell_len(line) <= width for line in lines if not line.startswith("note"))
+    assert "17.30000" in " ".join(" ".join(lines).split())

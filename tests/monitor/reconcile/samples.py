@@ -78,7 +78,7 @@ def look(
 
 def agrees(fitted_first: bool = False) -> Reconciliation:
     """Six axes of which nothing is to be said."""
-    axes = {a: AxisResult(a, "agrees", look(a), (), ()) for a in AXES}
+    axes = {a: AxisResult(a, "agrees", look(a), (), (), look(a)) for a in AXES}
     model = NoiseModel(dict.fromkeys(axes, _terms()), sample_rate_hz=RATE_HZ)
     return Reconciliation("agrees", axes, model, model, fitted_first, RATE_HZ, 360_000, SECONDS, 7)
 
@@ -123,7 +123,7 @@ def explained() -> Reconciliation:
         look=with_all,
     )
     whole = agrees()
-    axes = {**whole.axes, "gz": AxisResult("gz", "explained", start, (line, white), ())}
+    axes = {**whole.axes, "gz": AxisResult("gz", "explained", start, (line, white), (), white.look)}
     found = (AngleRandomWalk(N=MORE_N), *_terms()[1:], Sinusoidal(amplitude=1.5e-4, frequency=17.300012))
     return replace(
         whole,
@@ -146,7 +146,7 @@ def partly_explained() -> Reconciliation:
 def unexplained() -> Reconciliation:
     """One accelerometer with a hump in its spectrum."""
     start = look("ax", hump=True)
-    result = AxisResult("ax", "unexplained", start, (), (start.scores[0],))
+    result = AxisResult("ax", "unexplained", start, (), (start.scores[0],), start)
     model = NoiseModel({"ax": _terms()}, sample_rate_hz=RATE_HZ)
     return Reconciliation("unexplained", {"ax": result}, model, model, True, RATE_HZ, 360_000, SECONDS, 7)
 

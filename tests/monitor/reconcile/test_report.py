@@ -117,7 +117,7 @@ def test_numbers_of_numpy_are_numbers() -> None:
     step = Step(
         score, "added", "bias_step", {}, np.float64(0.5), (), score, score, None, None, "once", "it jumps", look
     )
-    axes = {"gx": AxisResult("gx", "explained", look, (step,), ())}
+    axes = {"gx": AxisResult("gx", "explained", look, (step,), (), look)}
     model = samples.explained().model
     r = Reconciliation("explained", axes, model, model, False, np.float64(10), np.int64(20), np.float64(2), np.int64(1))
     report = written(r)

@@ -1,0 +1,199 @@
+"""What every lens must pass, found by listing ``LENSES``: no gap where there is none, a null that holds, no memory.
+
+Noise is made by SciPy, white with a random walk; two minutes, beside a temperature and another axis.
+"""
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from monitor.reconcile.bins import series, transform
+from monitor.reconcile.gap import look, nulls
+from monitor.reconcile.lenses import LENSES, Finding, Sight
+from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, N, axes, correlated, seen, time_s, walk, warmth, white
+
+NAMES = sorted(LENSES)
+n = 6000
+SIGMA = N * RATE_HZ**0.5
+RUNS = 240
+OTHER = correlated(n, np.random.default_rng(99_999), 1e-2, 1.0)
+
+
+def beside_white(y: np.ndarray) -> Sight:
+    """A series beside white noise of its own size."""
+    return seen(axes({"gx": OTHER, "gz": y}, (WHITE,), warmth(n))["gz"], (WHITE,))
+
+
+@cache
+def findings(first: int, runs: int) -> list[dict[str, Finding]]:
+    """Of recordings of one model."""
+    found = []
+    for seed in range(first, first + runs):
+        rng = np.random.default_rng(seed)
+        y = white(n, rng) + walk(n, rng)
+        one = axes({"gx": OTHER, "gz": y}, {"gx": (WHITE,), "gz": (WHITE, WALK)}, warmth(n))["gz"]
+        found.append(dict(look(seen(one, (WHITE, WALK)))))
+    return found
+
+
+@cache
+def all_nulls(name: str) -> np.ndarray:
+    """null95 of a lens, nats, as often as three axes of six recordings each give one."""
+    found = findings(0, 108)
+    parts = [found[at : at + 18] for at in range(0, 108, 18)]
+    each = [nulls({axis: part[k::3] for k, axis in enumerate(("gx", "gy", "gz"))}, 3) for part in parts]
+    return np.array([null[axis][name].null95 for null in each for axis in null])
+
+
+def null95(name: str) -> float:
+    return float(np.median(all_nulls(name)))
+
+
+def signs(size: int) -> np.ndarray:
+    return SIGMA * np.random.default_rng(1).choice([-1.0, 1.0], size)
+
+
+def impulse() -> np.ndarray:
+    """An even periodogram, and a little noise so that no bin of the cosine transform is silent."""
+    y = white(n, np.random.default_rng(0), 0.1 * N)
+    y[1] = SIGMA * n**0.5
+    return y
+
+
+def impulses(apart: int) -> np.ndarray:
+    """The same power at each time and frequency."""
+    y = np.zeros(n)
+    y[apart // 2 :: apart] = signs(y[apart // 2 :: apart].size) * apart**0.5
+    return y
+
+
+def flat() -> np.ndarray:
+    """White noise whose slow half hardly moves the level."""
+    coefficients = transform(white(n, np.random.default_rng(2)))
+    coefficients[: n // 2] *= 0.2
+    return series(coefficients)
+
+
+def without(column: np.ndarray) -> np.ndarray:
+    """White noise that has nothing of a column, nor of its square, in it."""
+    stacked = np.stack([np.ones(n), column, column**2], axis=1)
+    y = white(n, np.random.default_rng(3))
+    return y - stacked @ np.linalg.lstsq(stacked, y, rcond=None)[0]
+
+
+EQUAL: dict[str, Callable[[], np.ndarray]] = {
+    "values": lambda: white(n, np.random.default_rng(4)),
+    "psd": lambda: series(signs(n - 1)),
+    "lines": impulse,
+    "autocorrelation": lambda: series(signs(n - 1)),
+    "level": flat,
+    "temperature": lambda: without(warmth(n) - 25.0),
+    "other_axes": lambda: without(OTHER),
+    "tails": lambda: np.random.default_rng(5).permutation(SIGMA * norm.ppf((np.arange(n) + 0.5) / n)),
+    "variance": lambda: signs(n),
+    "spectrogram": lambda: impulses(128),
+}
+"""Data that are what each lens expects: an even spectrum, no correlation, a steady level, Gaussian quantiles, …"""
+
+HIDDEN: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "values": lambda y: 5e-4 * np.rint(y / 5e-4),
+    "psd": lambda y: y + correlated(n, np.random.default_rng(6), 5e-4, 0.02),
+    "lines": lambda y: y + 4e-4 * np.sin(2.0 * np.pi * 17.3 * time_s(n)),
+    "autocorrelation": lambda y: y + np.append(0.3 * y[1:], 0.0),
+    "level": lambda y: y + 4e-4 * (time_s(n) > 23.0),
+    "temperature": lambda y: y + 1e-4 * (warmth(n) - 25.0),
+    "other_axes": lambda y: y + 0.02 * OTHER,
+    "tails": lambda y: np.where(np.random.default_rng(7).random(n) < 2e-3, 8.0 * y, y),
+    "variance": lambda y: np.where(time_s(n) < 40.0, y, 1.4 * y),
+    "spectrogram": lambda y: y + 8e-4 * np.sin(2.0 * np.pi * 17.3 * time_s(n)) * (time_s(n) % 30.0 < 6.0),
+}
+"""What each lens is there to see."""
+
+
+def test_every_lens_is_here():
+    assert set(EQUAL) == set(HIDDEN) == set(LENSES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_data_that_equal_the_expectation_have_no_gap(name):
+    found = LENSES[name](beside_white(EQUAL[name]()))
+    assert 0.0 <= found.gain < 0.2 * null95(name)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_it_is_there_for_is_seen(name):
+    y = white(n, np.random.default_rng(8))
+    found, before = LENSES[name](beside_white(HIDDEN[name](y))), LENSES[name](beside_white(y))
+    assert found.gain > 3.0 * null95(name)
+    assert found.gain > before.gain + 10.0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_runs_of_one_model_stay_under_their_null(name):
+    gains = np.array([one[name].gain for one in findings(1000, RUNS)])
+    assert np.all(np.isfinite(gains))
+    assert np.all(gains >= 0.0)
+
+    def beyond(factor: float) -> float:
+        """Of the runs, averaged over nulls."""
+        return float(np.mean(gains > factor * all_nulls(name)[:, None]) * RUNS)
+
+    # of 240 runs 12 are expected: 28 or more once in 10 000
+    assert beyond(1.0) < 28
+    if np.median(gains) > 0.0:  # where most runs show nothing at all, 95 of 100 is no more than a bound
+        assert beyond(1.0) > 1.5  # 1 or less once in 10 000
+        assert beyond(0.5) >= 28
+        assert beyond(2.0) <= 1.5
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_same_data_same_finding_and_nothing_is_changed(name):
+    rng = np.random.default_rng(9)
+    y = HIDDEN[name](white(n, rng))
+    kept = y.copy()
+    one, other = beside_white(y), beside_white(kept)
+    arrays = {field: getattr(one, field).copy() for field in ("whitened", "weight", "white", "fast")}
+    coefficients, samples = one.axis.coefficients.copy(), one.axis.y.copy()
+    found = LENSES[name](one)
+    assert LENSES[name](one) == found == LENSES[name](other)
+    for field, before in arrays.items():
+        np.testing.assert_array_equal(getattr(one, field), before)
+    np.testing.assert_array_equal(one.axis.coefficients, coefficients)
+    np.testing.assert_array_equal(one.axis.y, samples)
+    np.testing.assert_array_equal(y, kept)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_place_is_inside_the_recording(name):
+    where = LENSES[name](beside_white(HIDDEN[name](white(n, np.random.default_rng(10))))).where
+    limits = {
+        "frequency": (-0.05, 0.5 * RATE_HZ + 0.05),
+        "tau": (0.0, n / RATE_HZ),
+        "time": (0.0, n / RATE_HZ),
+        "temperature": (warmth(n).min() - 1e-9, warmth(n).max() + 1e-9),
+    }
+    for kind, place in where.found().items():
+        if kind in limits:
+            assert limits[kind][0] <= place[0] <= place[1] <= limits[kind][1]
+    if name == "other_axes":
+        assert where.source == "gx"
+
+
+def test_the_place_is_that_of_what_is_hidden():
+    def where(name):
+        return LENSES[name](beside_white(HIDDEN[name](white(n, np.random.default_rng(11))))).where
+
+    lo, hi = where("lines").frequency
+    assert lo < 17.3 < hi
+    assert hi - lo < 0.1
+    lo, hi = where("psd").frequency
+    assert 0.5 * (lo + hi) < 20.0
+    assert where("level").time[0] == pytest.approx(23.0, abs=2.0)
+    lo, hi = where("variance").time
+    assert lo - 1.0 < 40.0 < hi + 1.0
+    assert where("autocorrelation").tau == (0.01, 0.01)
+    lo, hi = where("spectrogram").frequency
+    assert lo < 17.3 < hi

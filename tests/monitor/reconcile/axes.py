@@ -1,0 +1,145 @@
+"""Axes, recordings and reports for the tests of the search: series made by SciPy, not by the simulator."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from scipy.signal import lfilter
+
+from drivers.sample import AXES, Floats
+from monitor.noise.effect import Effect
+from monitor.noise.effects import EFFECTS, AngleRandomWalk, BiasInstability, RateRandomWalk
+from monitor.noise.model import NoiseModel
+from monitor.reconcile.axis import Axis, Courses
+from monitor.reconcile.gap import Null
+from monitor.reconcile.hypothesis import believed
+from monitor.reconcile.lenses import LENSES, Sight, sight
+from monitor.reconcile.prepare import prepared
+from monitor.reconcile.reconcile import Recording
+
+RATE_HZ = 100.0
+N, B, K = 1e-4, 2e-5, 2e-6  # rad/√s, rad/s, rad/s/√s
+TERMS = (AngleRandomWalk(N=N), BiasInstability(B=B), RateRandomWalk(K=K))
+WHITE, WALK = TERMS[0], TERMS[2]
+GYRO_AXES = ("gx", "gy", "gz")
+MODEL = NoiseModel(dict.fromkeys(GYRO_AXES, TERMS), RATE_HZ)
+STRICT = dict.fromkeys(LENSES, Null(7.0, 15.0))
+"""Null and threshold in nats, near those of a true model; what is hidden in these tests gains far more."""
+
+
+def white(n: int, rng: np.random.Generator, size: float = N) -> Floats:
+    return size * RATE_HZ**0.5 * rng.standard_normal(n)
+
+
+def walk(n: int, rng: np.random.Generator, size: float = K) -> Floats:
+    return size / RATE_HZ**0.5 * np.cumsum(rng.standard_normal(n))
+
+
+def correlated(n: int, rng: np.random.Generator, sigma: float, time_s: float) -> Floats:
+    """Gauss-Markov, by its recursion from a stationary start."""
+    decay = np.exp(-1.0 / (RATE_HZ * time_s))
+    drawn = rng.standard_normal(n) * sigma * np.sqrt(1.0 - decay**2)
+    drawn[0] = sigma * rng.standard_normal()
+    return np.asarray(lfilter([1.0], [1.0, -decay], drawn))
+
+
+def ringing(n: int, rng: np.random.Generator, sigma: float, f_hz: float, width_hz: float) -> Floats:
+    """Second-order autoregression with a pole at the frequency."""
+    radius = np.exp(-np.pi * width_hz / RATE_HZ)
+    poles = [1.0, -2.0 * radius * np.cos(2.0 * np.pi * f_hz / RATE_HZ), radius**2]
+    made = lfilter([1.0], poles, rng.standard_normal(n + 5000))[5000:]
+    return np.asarray(sigma * made / made.std())
+
+
+def time_s(n: int) -> Floats:
+    return np.arange(n) / RATE_HZ
+
+
+def warmth(n: int) -> Floats:
+    """Temperature [n], °C: up and down with a drift."""
+    t = np.arange(n) / n
+    return 25.0 + 3.0 * np.sin(2.0 * np.pi * 1.7 * t) + 2.0 * t
+
+
+def axes(
+    values: Mapping[str, Floats],
+    effects: Mapping[str, tuple[Effect, ...]] | tuple[Effect, ...] = (),
+    temperature_c: Floats | None = None,
+    seed: int = 0,
+) -> dict[str, Axis]:
+    """As a search gets them."""
+    n = next(iter(values.values())).size
+    each = effects if isinstance(effects, Mapping) else dict.fromkeys(values, effects)
+    courses = Courses(n, RATE_HZ, temperature_c)
+    return prepared(values, RATE_HZ, each, temperature_c, courses, np.random.default_rng(seed))
+
+
+def axis(y: Floats, effects: tuple[Effect, ...] = (), temperature_c: Floats | None = None) -> Axis:
+    """One axis alone."""
+    return axes({"gz": y}, effects, temperature_c)["gz"]
+
+
+def seen(one: Axis, effects: tuple[Effect, ...]) -> Sight:
+    """Beside a model as it stands."""
+    return sight(one, believed(one, effects).likely)
+
+
+def recording(
+    model: NoiseModel, n: int, seed: int, temperature_c: Floats | None = None, names: tuple[str, ...] = GYRO_AXES
+) -> Recording:
+    """Drawn by the simulator."""
+    drawn = model.simulate(n, RATE_HZ, seed, temperature_c)
+    return Recording({name: drawn[:, AXES.index(name)].copy() for name in names}, RATE_HZ, temperature_c)
+
+
+# --- the contract of report.json
+
+VERDICTS = {"agrees", "explained", "partly_explained", "unexplained"}
+SCORE = {"lens", "where", "gap", "null95", "threshold"}
+
+
+def check_report(report: dict[str, Any]) -> None:
+    """All that the schema imu-monitor/reconcile/1 promises of a report with a verdict."""
+    assert report["schema"] == "imu-monitor/reconcile/1"
+    assert report["verdict"] in VERDICTS
+    assert report["axes"]
+    for name, one in report["axes"].items():
+        assert name in AXES
+        expected = {
+            (False, False): "agrees",
+            (True, False): "explained",
+            (True, True): "partly_explained",
+            (False, True): "unexplained",
+        }
+        assert one["verdict"] == expected[bool(one["steps"]), bool(one["left_over"])]
+        for score in one["left_over"]:
+            assert set(score) == SCORE
+            assert score["lens"] in LENSES
+            assert score["gap"] > score["threshold"]
+        for step in one["steps"]:
+            _check_step(step)
+
+
+def _check_step(step: dict[str, Any]) -> None:
+    assert set(step["found"]) == SCORE
+    assert step["kind"] in ("added", "retuned")
+    assert step["effect"] in EFFECTS
+    assert 0.0 <= step["confidence"] <= 1.0
+    allowed = set(EFFECTS[step["effect"]].__dataclass_fields__)
+    assert set(step["parameters"]) <= allowed
+    assert step["parameters"]
+    for bounds in step["parameters"].values():
+        assert isinstance(bounds["value"], float | str)
+        if bounds.get("lo") is not None:
+            assert bounds["lo"] <= bounds["value"] <= bounds["hi"]
+    for other in step["runners_up"]:
+        assert other["effect"] in EFFECTS
+        assert other["effect"] != step["effect"]
+        assert 0.0 < other["confidence"] <= 1.0
+    assert step["confidence"] + sum(other["confidence"] for other in step["runners_up"]) <= 1.0 + 1e-9
+    assert set(step["gap"]) == {"before", "after", "null95", "threshold"}
+    if step["held_out_gap"] is None:
+        assert step["held_out_reason"]
+    else:
+        assert set(step["held_out_gap"]) == set(step["gap"])
+    assert step["because"].endswith(".")

@@ -1,0 +1,83 @@
+"""Runs of one sensor made by hand: the line of ``samples`` on gz, of any size and place, and what else is wanted."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from monitor.noise.effect import Effect
+from monitor.noise.effects import EFFECTS, Sinusoidal
+from monitor.noise.model import NoiseModel
+from monitor.reconcile.reconciliation import AxisResult, Bounds, Look, RunnerUp, Score, Step, Verdict, Where
+from monitor.reconcile.runs import Run
+from tests.monitor.reconcile import samples
+
+LENS = Score("lines", Where(frequency=(17.0, 18.0)), 1.2, 2.0, 4.0)
+"""What a lens shows of an axis of which nothing is to be said."""
+
+
+def step(
+    effect: str, gap: float = 30.0, rivals: Sequence[str] = (), kind: str = "added", **given: Bounds | float
+) -> Step:
+    """Found through ``LENS`` with that gap; a bare number has an interval of one in a hundred."""
+    before = replace(LENS, gap=gap)
+    parameters = {name: one if isinstance(one, Bounds) else around(one, 0.01 * abs(one)) for name, one in given.items()}
+    return Step(
+        before, kind, effect, parameters, 0.99, tuple(RunnerUp(one, 0.01) for one in rivals),  # type: ignore[arg-type]
+        before, LENS, None, None, "made by hand", "it was made by hand", Look((LENS,), ()),
+    )  # fmt: skip
+
+
+def around(value: float, half: float) -> Bounds:
+    return Bounds(value, value - half, value + half)
+
+
+def line(amplitude: float = 1.5e-4, frequency: float = 17.3, half: float = 3e-6) -> Step:
+    return step(
+        "sinusoidal",
+        amplitude=around(amplitude, half),
+        frequency=around(frequency, 1e-3),
+        phase=around(1.0, 0.1),
+    )
+
+
+def run(name: str, *steps: Step, axis: str = "gz", seconds: float = 600.0, left: Sequence[Score] = ()) -> Run:
+    """A recording of one axis with these steps; its model has their effects."""
+    verdict: Verdict = ("partly_explained" if steps else "unexplained") if left else "explained" if steps else "agrees"
+    result = AxisResult(axis, verdict, Look((LENS,), ()), steps, tuple(left), Look((LENS,), ()))
+    whole = samples.agrees()
+    given = whole.baseline.effects[axis]
+    baseline = NoiseModel({axis: given}, samples.RATE_HZ)
+    added = [made(one) for one in steps if one.kind == "added"]
+    retuned = {one.effect: made(one) for one in steps if one.kind == "retuned"}
+    effects = (*(retuned.get(effect.name, effect) for effect in given), *added)
+    return Run(
+        name,
+        replace(
+            whole, verdict=verdict, axes={axis: result}, baseline=baseline, seconds=seconds,
+            model=NoiseModel({axis: effects}, samples.RATE_HZ),
+        ),
+    )  # fmt: skip
+
+
+def made(one: Step) -> Effect:
+    extra = {"reference": 25.0} if one.effect == "temperature_lag" else {}
+    values = {name: bounds.value for name, bounds in one.parameters.items()}
+    return EFFECTS[one.effect](**extra, **values)
+
+
+def with_axes(first: Run, *others: Run) -> Run:
+    """One recording with the axes of all."""
+    axes = {axis: one for run in (first, *others) for axis, one in run.result.axes.items()}
+    models = [
+        NoiseModel(
+            {axis: effects for run in (first, *others) for axis, effects in getattr(run.result, which).effects.items()},
+            samples.RATE_HZ,
+        )
+        for which in ("baseline", "model")
+    ]
+    return replace(first, result=replace(first.result, axes=axes, baseline=models[0], model=models[1]))
+
+
+def known_lines(models: Sequence[Sinusoidal], one: Run) -> Run:
+    """The same beside a model that has these lines as well."""
+    effects = {axis: (*given, *models) for axis, given in one.result.baseline.effects.items()}
+    return replace(one, result=replace(one.result, baseline=NoiseModel(effects, samples.RATE_HZ)))

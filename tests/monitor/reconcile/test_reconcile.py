@@ -1,0 +1,240 @@
+"""The whole walk on ten minutes of three axes: nothing, one thing, or too little to say anything."""
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import numpy as np
+import pytest
+
+from drivers.errors import NotReady
+from drivers.sample import AXES
+from monitor.noise.effects import (
+    AngleRandomWalk,
+    Bias,
+    CrossAxis,
+    Outliers,
+    QuantizationNoise,
+    RateRamp,
+    RateRandomWalk,
+    SampleRateError,
+    Sinusoidal,
+    TemperatureBias,
+)
+from monitor.noise.model import NoiseModel
+from monitor.reconcile.axis import Courses
+from monitor.reconcile.prepare import FEWEST
+from monitor.reconcile.reconcile import Recording, effects_of, five_terms, overall, reconcile, smooth, usable
+from monitor.reconcile.report import to_json
+from tests.monitor.reconcile.axes import (
+    GYRO_AXES,
+    MODEL,
+    RATE_HZ,
+    TERMS,
+    WALK,
+    WHITE,
+    N,
+    check_report,
+    recording,
+    time_s,
+    walk,
+    white,
+)
+
+n = 60_000
+
+
+def changing(size):
+    """Temperature [size], °C: no sine, so that no line stands in for it."""
+    t = np.arange(size) / size
+    return 25.0 + 6.0 * np.abs(t - 0.35) + 2.0 * np.sin(2 * np.pi * 2.3 * t**2)
+
+
+HIDDEN = {
+    "sinusoidal": ("gz", Sinusoidal(amplitude=1.2e-4, frequency=17.3, phase=0.5)),
+    "outliers": ("gy", Outliers(fraction=1e-3, scale=1.5e-2)),
+    "temperature_bias": ("gx", TemperatureBias(coefficient=1e-4, reference=25.0)),
+}
+
+
+@cache
+def result(name, seed=1):
+    more = NoiseModel({HIDDEN[name][0]: (HIDDEN[name][1],)}) if name else NoiseModel({})
+    return reconcile(recording(MODEL + more, n, seed + 50, changing(n)), MODEL, seed)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_true_model_agrees(seed):
+    found = result("", seed)
+    assert found.verdict == "agrees"
+    assert {one.verdict for one in found.axes.values()} == {"agrees"}
+    assert found.model.effects == MODEL.effects
+    assert list(found.axes) == list(GYRO_AXES)
+    assert (found.samples, found.seconds, found.rate_hz, found.fitted_first) == (n, n / RATE_HZ, RATE_HZ, False)
+    check_report(json.loads(to_json(found)))
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+def test_what_was_hidden_is_found_on_its_axis(name):
+    found, (where, effect) = result(name), HIDDEN[name]
+    check_report(json.loads(to_json(found)))
+    assert found.verdict == "explained"
+    assert {axis for axis, one in found.axes.items() if one.steps} == {where}
+    added = [step for step in found.axes[where].steps if step.kind == "added"]
+    assert [step.effect for step in added] == [name]
+    (step,) = added
+    assert step.found.passes
+    assert not step.after.passes
+    for parameter, bounds in step.parameters.items():
+        if bounds.lo is not None and parameter != "phase":
+            deviation = (bounds.hi - bounds.lo) / 3.92
+            assert abs(bounds.value - getattr(effect, parameter)) < 4.0 * deviation
+    assert type(effect) in {type(one) for one in found.model.effects[where]}
+    assert found.baseline.effects == MODEL.effects
+    assert NoiseModel.from_toml(found.model.to_toml()) == found.model
+
+
+def test_the_model_that_was_found_agrees_with_another_run():
+    found = result("sinusoidal")
+    where, effect = HIDDEN["sinusoidal"]
+    other = recording(MODEL + NoiseModel({where: (effect,)}), n, 77, changing(n))
+    assert reconcile(other, found.model, 3).verdict == "agrees"
+
+
+def test_same_seed_same_bytes_also_in_threads():
+    small = recording(MODEL + NoiseModel({"gy": (HIDDEN["outliers"][1],)}), 12_000, 5)
+    first = reconcile(small, MODEL, 4)
+    one = to_json(first)
+    with ThreadPoolExecutor(3) as pool:
+        assert to_json(reconcile(small, MODEL, 4, pool.map)) == one
+    other = reconcile(small, MODEL, 5)
+    assert other.seed == 5
+    # other simulated recordings stand behind its thresholds
+    for axis in GYRO_AXES:
+        limits = [[score.threshold for score in found.axes[axis].start.scores] for found in (first, other)]
+        assert limits[0] != limits[1]
+
+
+def test_a_wrong_clock_is_one_step_for_all_axes():
+    line = Sinusoidal(amplitude=3e-4, frequency=17.3)
+    plain = NoiseModel(dict.fromkeys(GYRO_AXES, (WHITE, WALK))) + NoiseModel({"gy": (line,)})
+    unknown = Sinusoidal(amplitude=3e-4, frequency=31.0)
+    drawn = recording(plain + NoiseModel({"gy": (SampleRateError(ratio=1.004),), "gz": (unknown,)}), 24_000, 6)
+    found = reconcile(drawn, plain, 1)
+    check_report(json.loads(to_json(found)))
+    assert found.verdict == "explained"
+    (step,) = (step for one in found.axes.values() for step in one.steps if step.effect == "sample_rate_error")
+    assert step.parameters["ratio"].value == pytest.approx(1.004, abs=1e-4)
+    assert found.model.rate_ratio == pytest.approx(1.004, abs=1e-4)
+    # what was found in stated time stands in the model in true time
+    assert found.axes["gz"].steps[0].parameters["frequency"].value == pytest.approx(31.0 / 1.004, abs=1e-3)
+    added = next(effect for effect in found.model.effects["gz"] if isinstance(effect, Sinusoidal))
+    assert added.frequency == pytest.approx(31.0, abs=4e-3)
+
+
+def test_of_two_axes_that_correlate_one_leaks():
+    loud = (AngleRandomWalk(N=20 * N),)
+    plain = NoiseModel({"gx": (WHITE,), "gy": loud, "gz": (WHITE,)})
+    leaking = plain + NoiseModel({"gx": (CrossAxis(source="gy", coefficient=0.02),)})
+    found = reconcile(recording(leaking, 12_000, 7), plain, 1)
+    assert {axis: [s.effect for s in one.steps] for axis, one in found.axes.items() if one.steps} == {
+        "gx": ["cross_axis"]
+    }
+    parameters = found.axes["gx"].steps[0].parameters
+    assert parameters["source"].value == "gy"
+    assert parameters["coefficient"].lo < 0.02 < parameters["coefficient"].hi
+
+
+def test_without_a_model_the_five_terms_come_first():
+    drawn = recording(MODEL, 24_000, 8)
+    told = []
+    found = reconcile(drawn, None, 1, tell=told.append)
+    assert found.fitted_first
+    assert found.verdict == "agrees"
+    assert told[0] == "fitting the five terms"
+    for axis in GYRO_AXES:
+        sizes = {effect.name: effect for effect in found.baseline.effects[axis]}
+        assert pytest.approx(N, rel=0.03) == sizes["angle_random_walk"].N
+
+
+def test_only_terms_that_the_data_support_are_fitted():
+    rng = np.random.default_rng(9)
+    values = {
+        "gx": white(n, rng),
+        "gy": white(n, rng) + walk(n, rng, 1e-4),
+        "gz": white(n, rng) + 1e-5 * time_s(n),
+        "ax": NoiseModel({"ax": (WHITE, QuantizationNoise(Q=5e-6))}).simulate(n, RATE_HZ, 1)[:, 3].copy(),
+    }
+    courses = Courses(n, RATE_HZ, None)
+    found = five_terms(Recording(values, RATE_HZ), courses, 1)
+    kinds = {axis: {type(effect) for effect in effects} for axis, effects in found.effects.items()}
+    assert kinds["gx"] == {AngleRandomWalk}
+    assert kinds["gy"] >= {AngleRandomWalk, RateRandomWalk}
+    assert kinds["gz"] == {AngleRandomWalk, RateRamp}
+    assert kinds["ax"] == {AngleRandomWalk, QuantizationNoise}
+    ramp = next(effect for effect in found.effects["gz"] if isinstance(effect, RateRamp))
+    assert pytest.approx(1e-5, rel=0.05) == ramp.R
+    assert found.sample_rate_hz == RATE_HZ
+
+
+# --- what cannot be compared
+
+
+def drawn(**changed):
+    small = recording(MODEL, FEWEST, 1)
+    return Recording({**small.values, **changed}, RATE_HZ)
+
+
+def test_too_few_samples_say_how_many_are_needed():
+    with pytest.raises(NotReady, match=rf"{FEWEST - 1} samples; {FEWEST} are .*100 Hz"):
+        usable(recording(MODEL, FEWEST - 1, 1), MODEL)
+    assert usable(drawn(), MODEL)[1] == ()
+
+
+def test_axes_that_cannot_be_compared_are_left_out_and_told():
+    values = drawn().values
+    holed = values["gx"].copy()
+    holed[10:] = np.nan
+    kept, notes = usable(drawn(gx=holed, gy=np.full(FEWEST, 0.3), ax=values["gz"]), MODEL)
+    assert list(kept.values) == ["gz"]
+    assert [note.split(":")[0] for note in notes] == ["gx", "gy", "ax"]
+    assert all(note.endswith("left out") for note in notes)
+    with pytest.raises(NotReady, match=r"no axis to compare: gx: .*; gy: "):
+        usable(Recording({"gx": holed, "gy": holed}, RATE_HZ), MODEL)
+
+
+def test_a_constant_bias_is_no_part_of_the_comparison():
+    model = MODEL + NoiseModel({"gz": (Bias(value=0.3),)})
+    assert effects_of(model, drawn())["gz"] == TERMS
+    assert effects_of(NoiseModel({}), drawn()) == dict.fromkeys(GYRO_AXES, ())
+
+
+def test_temperature_is_made_smooth_and_whole():
+    rng = np.random.default_rng(1)
+    true = changing(n)
+    noisy = true + 0.3 * rng.standard_normal(n)
+    noisy[rng.random(n) < 0.5] = np.nan
+    found = smooth(noisy)
+    assert np.isfinite(found).all()
+    inside = slice(100, -100)
+    assert np.std((found - true)[inside]) < 0.1
+    np.testing.assert_allclose(smooth(np.full(n, 25.0)), 25.0)
+    assert smooth(np.array([1.0, np.nan, 3.0])).tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("axes", "whole"),
+    [
+        (["agrees", "agrees"], "agrees"),
+        (["agrees", "explained"], "explained"),
+        (["agrees", "unexplained"], "unexplained"),
+        (["explained", "unexplained"], "partly_explained"),
+        (["agrees", "partly_explained"], "partly_explained"),
+    ],
+)
+def test_verdict_of_the_whole(axes, whole):
+    assert overall(axes) == whole
+
+
+def test_sizes_are_told_in_the_order_of_the_axes():
+    assert list(result("outliers").axes) == [axis for axis in AXES if axis in GYRO_AXES]
