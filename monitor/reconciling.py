@@ -67,9 +67,9 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Reconcili
         RecordingError, ConfigError: no recording, or a folder that cannot be written
         NotReady: the data do not support an answer; the folder says why
     """
-    check_folder(request.out)
     tell("reading", None)
     found = load_samples(request.recording, request.rate_hz)
+    check_folder(request.out)
     try:
         recording, notes = _recording(found)
         with ThreadPoolExecutor(os.cpu_count()) as pool:

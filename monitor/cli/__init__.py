@@ -76,6 +76,7 @@ def check(
 ) -> None:
     """Read the file and say all that is wrong with it; opens nothing."""
     from monitor import settings
+    from monitor.catalogue import read_model
     from monitor.virtual import Sensor
 
     if print_defaults:
@@ -85,11 +86,13 @@ def check(
         raise ConfigError("CONFIG.toml is missing; --print-defaults prints one to start from")
     found, wrong = settings.read(config)
     for device in found.devices if found else ():
-        if isinstance(device.link, settings.VirtualTable):
-            try:
+        try:
+            if device.model is not None:
+                read_model(device.model)
+            if isinstance(device.link, settings.VirtualTable):
                 Sensor(device.link, device.decoder, device.name)
-            except ConfigError as error:
-                wrong.append(f"{config}: device {device.name}: {error}")
+        except ConfigError as error:
+            wrong.append(f"{config}: device {device.name}: {error}")
     for line in wrong:
         typer.echo(line, err=True)
     if wrong:
@@ -242,10 +245,9 @@ def reconcile(
             else:
                 one = reconciling.make(reconciling.Request(recordings[0], tested, out, seed, rate), tell)
                 data, show = report.to_json(one), partial(text.tell, one)
-    except NotReady as error:
+    except NotReady:
         if json is not None:
-            schema = runs_report.SCHEMA if several else report.SCHEMA
-            output.write("--json", json, reconciling.no_answer(str(error), 0, schema) + b"\n")
+            output.write("--json", json, (out / reconciling.REPORT).read_bytes() + b"\n")
         raise
     if json is not None:
         output.write("--json", json, data + b"\n")

@@ -17,7 +17,6 @@ from monitor.noise.effect import Effect, Leak, Transform
 from monitor.noise.effects import (
     ORDER,
     AngleRandomWalk,
-    BandwidthLimit,
     Bias,
     NoiseStep,
     Resolution,
@@ -176,10 +175,6 @@ class Axis:
                 noises.append(at)
                 bases.append(made)
                 start.append(min(size(effect) ** 2, self._whole(made)))
-        if any(isinstance(effect, BandwidthLimit) for effect in transforms):
-            # what stands behind a filter: the converter's own noise, and what the ends of the recording leak
-            bases.append(np.ones_like(f_hz))
-            start.append(1e-5 * self._whole(bases[-1]))
         for row in extra if extra is not None else ():
             bases.append(row)
             start.append(1e-2 * self._whole(row))

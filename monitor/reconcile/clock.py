@@ -22,6 +22,12 @@ from monitor.reconcile.reconciliation import Bounds
 
 FURTHEST: Final = 0.15
 """A clock that is further off is another sensor."""
+FEATURES: Final = 2
+"""Frequencies that must agree."""
+SAME: Final = 1.01
+"""Factor between frequencies of one feature, seen on several axes."""
+EACH: Final = 3.0
+"""Nats by which each must."""
 TRIED: Final = 12
 """Ratios at which all axes are fitted."""
 PRICE: Final = 12.0
@@ -83,7 +89,7 @@ def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clo
     ratio, width = max(trials, key=lambda one: gain(log(one[0])))
     x = _highest(gain, log(ratio), width)
     top = gain(x)
-    if top < PRICE:
+    if top < PRICE or _agreeing(axes, effects, before, exp(x)) < FEATURES:
         return None
     ends = [_end(gain, x, top, sign * width) for sign in (-1.0, 1.0)]
     of_axes = gains(x)
@@ -91,6 +97,29 @@ def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clo
     features = [e for e in effects[strongest] if isinstance(e, (Sinusoidal, Narrowband))]
     stated = features[0].frequency if features else 0.0
     return Clock(Bounds(exp(x), exp(ends[0]), exp(ends[1])), top, strongest, (stated, stated / exp(x)))
+
+
+def _agreeing(
+    axes: Mapping[str, Axis], effects: Mapping[str, Effects], before: Mapping[str, float], ratio: float
+) -> int:
+    """How many features, at frequencies of their own, stand where the ratio puts them; one alone may itself have
+    moved."""
+    features = sorted({e.frequency for of in effects.values() for e in of if isinstance(e, (Sinusoidal, Narrowband))})
+    groups: list[list[float]] = []
+    for f_hz in features:
+        if groups and f_hz < groups[-1][-1] * SAME:
+            groups[-1].append(f_hz)
+        else:
+            groups.append([f_hz])
+    count = 0
+    for group in groups:
+        gain = 0.0
+        for name, of in effects.items():
+            moved = tuple(restated(e, ratio) if getattr(e, "frequency", None) in group else e for e in of)
+            if moved != of:
+                gain += believed(axes[name], moved).likely.log_likelihood - before[name]
+        count += gain > EACH
+    return count
 
 
 def _ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> list[tuple[float, float]]:

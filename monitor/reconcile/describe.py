@@ -21,8 +21,9 @@ from monitor.reconcile.axis import Axis
 from monitor.reconcile.gap import Null, scores
 from monitor.reconcile.hypothesis import Z95, Hypothesis, shape_bounds, size_bounds
 from monitor.reconcile.reconciliation import AxisResult, Bounds, Kind, Look, RunnerUp, Score, Step, Verdict
-from monitor.reconcile.search import RETUNE, Round, Search, Trial
+from monitor.reconcile.search import Round, Search
 from monitor.reconcile.terms import COURSE, NATURAL, NOISE
+from monitor.reconcile.trials import RETUNE, Trial
 from monitor.reconcile.views import views
 
 SHAPES: Final[dict[type[Effect], tuple[str, ...]]] = {

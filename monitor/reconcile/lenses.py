@@ -31,6 +31,7 @@ from monitor.noise.effects import (
     TurnOnTransient,
 )
 from monitor.reconcile.axis import Axis, Effects, Likely
+from monitor.reconcile.bins import bins as even_bins
 from monitor.reconcile.bins import series
 from monitor.reconcile.course import Course, tiles, variance_course
 from monitor.reconcile.reconciliation import Where
@@ -121,7 +122,7 @@ def noise_course(effects: Effects, n: int, rate_hz: float) -> Floats:
 
 def psd(seen: Sight) -> Finding:
     """Power over frequency: the run of bins, of any width, that is furthest from its expectation."""
-    bins = seen.axis.bins
+    bins = even_bins(seen.axis.n, seen.axis.rate_hz)  # the same for recordings with peaks and without
     power = np.concatenate([[0.0], np.cumsum(bins.sums(seen.whitened**2))])
     count = np.concatenate([[0.0], np.cumsum(bins.count)])
     best, place = 0.0, (0, 1)

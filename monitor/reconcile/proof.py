@@ -6,6 +6,7 @@ the gap shrinks and the likelihood of the unseen half grows. Where one half alon
 of what happens once, there is nothing to hold out, and the reason is told.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from math import sqrt
 from typing import Final
@@ -13,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import Floats
+from monitor.noise.effect import Effect
 from monitor.noise.effects import Outliers, Resolution, SampleHold, Saturation, Sinusoidal
 from monitor.reconcile.axis import Axis, Courses, Effects, Likely
 from monitor.reconcile.bins import bins, series, transform
@@ -38,22 +40,31 @@ class Proof:
     reason: str  # why there is no such data; then the gaps are NaN and the step is kept
 
 
-def proof(axis: Axis, before: Hypothesis, after: Hypothesis, lens: str, null: Null, rng: np.random.Generator) -> Proof:
+def proof(
+    axis: Axis,
+    before: Hypothesis,
+    after: Hypothesis,
+    added: Effect | None,
+    lens: str,
+    null: Null,
+    rng: np.random.Generator,
+) -> Proof:
     """Hold out one half of the axis, then the other.
 
     Args:
         axis: mended for ``after``
         before, after: fitted to the whole axis
+        added: what was tried; None: other sizes of known noises
         lens: that found the gap
         null: of that lens
     """
-    added = after.effects[-1] if len(after.effects) > len(before.effects) else None
     if added is not None and added.name in ONCE:
         return _nothing("it happens once")
     parts = [slice(0, axis.n // 2), slice(axis.n - axis.n // 2, axis.n)]
-    halves = [_half(axis, part, before.effects, rng) for part in parts]
-    mended = [_half(axis, part, after.effects, rng) for part in parts]
+    sources = {getattr(effect, "source", "") for effect in (*before.effects, *after.effects)}
+    mended = [_half(axis, part, after.effects, sources, rng) for part in parts]
     if isinstance(added, PER_SAMPLE):
+        halves = [_half(axis, part, before.effects, sources, rng) for part in parts]
         return _of_samples(halves, mended, before, after, lens)
     if type(added) in COURSE and min(_shown(half, after, len(after.effects) - 1) for half in mended) < FAINT:
         return _nothing("one half of the recording alone shows too little of it")
@@ -77,11 +88,11 @@ def _nothing(reason: str) -> Proof:
     return Proof(float("nan"), float("nan"), True, reason)
 
 
-def _half(axis: Axis, part: slice, effects: Effects, rng: np.random.Generator) -> Axis:
+def _half(axis: Axis, part: slice, effects: Effects, sources: Collection[str], rng: np.random.Generator) -> Axis:
     raw = axis.raw[part]
     n = raw.size
     warmth = None if axis.temperature_c is None else axis.temperature_c[part]
-    others = {name: transform(_part(one, part)) for name, one in axis.others.items() if _uses(effects, name)}
+    others = {name: transform(_part(one, part)) for name, one in axis.others.items() if name in sources}
     y = axis.y[part]
     half = Axis(
         axis.name,
@@ -99,10 +110,6 @@ def _half(axis: Axis, part: slice, effects: Effects, rng: np.random.Generator) -
 
 def _part(coefficients: Floats, part: slice) -> Floats:
     return series(coefficients)[part]
-
-
-def _uses(effects: Effects, source: str) -> bool:
-    return any(getattr(effect, "source", None) == source for effect in effects)
 
 
 def _shown(half: Axis, state: Hypothesis, at: int) -> float:

@@ -143,7 +143,7 @@ def searched(
         return search(axes[name], effects[name], null[name], np.random.default_rng([seed, AXES.index(name)]))
 
     found = dict(zip(axes, each(one, axes), strict=True))
-    for name, innocent in _wrongly_accused(found).items():
+    for name, innocent in _wrongly_accused(found, null).items():
         axes[name] = without_sources(axes[name], innocent)
         found[name] = one(name)
     return Explained(found, clock)
@@ -309,8 +309,8 @@ def overall(verdicts: Iterable[Verdict]) -> Verdict:
     return "unexplained" if every <= {"agrees", "unexplained"} else "partly_explained"
 
 
-def _wrongly_accused(found: Mapping[str, Search]) -> dict[str, frozenset[str]]:
-    """Axis -> sources that do not leak into it: of two axes that leak into each other it is the one that gains less."""
+def _wrongly_accused(found: Mapping[str, Search], null: Mapping[str, Mapping[str, Null]]) -> dict[str, frozenset[str]]:
+    """Axis -> axes that do not leak into it, though they seem to: it is the axis that leaks into them, and more."""
     gains = {
         (name, effect.source): step.trials[0].value
         for name, one in found.items()
@@ -319,6 +319,10 @@ def _wrongly_accused(found: Mapping[str, Search]) -> dict[str, frozenset[str]]:
     }
     back: dict[str, frozenset[str]] = {}
     for (name, source), gain in gains.items():
-        if gains.get((source, name), -np.inf) > gain:
-            back[name] = back.get(name, frozenset()) | {source}
+        if source not in found:
+            continue
+        seen = found[source].seen["other_axes"]
+        suspected = seen.where.source == name and seen.gain > null[source]["other_axes"].threshold
+        if suspected or gains.get((source, name), np.inf) < gain:
+            back[source] = back.get(source, frozenset()) | {name}
     return back

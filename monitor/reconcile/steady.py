@@ -27,17 +27,26 @@ from monitor.reconcile.hypothesis import Hypothesis
 COMB: Final = 4
 HIGHEST: Final = 60
 """Harmonic that is still thought of."""
+PARTS: Final = (1, 2, 3)
 HARMONIC: Final = 2e-4
 """Of the fundamental: lines that near to a multiple are harmonics."""
-WIDTHS: Final = 3.0
+WIDTHS: Final = 2.0
 """Of a resonance, to each side: what stands there is in one place with it."""
 NEAR_HZ: Final = 0.1
 """The same for lines."""
+SHARE: Final = 0.1
+"""Of what an effect was to close: with less left at its place the name stands, though not its shape."""
 LOCAL: Final = ("psd", "lines", "spectrogram")
 
 
-def upheld(state: Hypothesis, seen: Findings, null: Mapping[str, Null]) -> Effects:
-    """What was found on an axis without those whose names do not stand."""
+def upheld(
+    state: Hypothesis, closing: Mapping[type[Effect], float], seen: Findings, null: Mapping[str, Null]
+) -> Effects:
+    """What was found on an axis without those whose names do not stand.
+
+    Args:
+        closing: kind of effect -> the gain, in nats, that it was to close
+    """
     found = range(state.given, len(state.effects))
     tones = [at for at in found if isinstance(state.effects[at], (Sinusoidal, Narrowband))]
     fallen = set(_crowded([(at, state.effects[at]) for at in tones]))
@@ -46,7 +55,8 @@ def upheld(state: Hypothesis, seen: Findings, null: Mapping[str, Null]) -> Effec
         place = seen[lens].where.frequency
         if place is None or seen[lens].gain <= null[lens].threshold:
             continue
-        fallen |= {at for at in found if _covers(state.effects[at], place)}
+        much = {at for at in found if seen[lens].gain > SHARE * closing.get(type(state.effects[at]), 0.0)}
+        fallen |= {at for at in much if _covers(state.effects[at], place)}
     return tuple(effect for at, effect in enumerate(state.found, state.given) if at not in fallen)
 
 
@@ -70,22 +80,22 @@ def _covers(effect: Effect, place: tuple[float, float]) -> bool:
 
 def _crowded(tones: Sequence[tuple[int, Effect]]) -> list[int]:
     """Those that stand within each other's reach."""
-    fallen = []
+    fallen: set[int] = set()
     for at, one in tones:
         lo, hi = _reach(one)
-        if any(other != at and lo < two.frequency < hi for other, two in tones):  # type: ignore[attr-defined]
-            fallen.append(at)
-    return fallen
+        near = {other for other, two in tones if other != at and lo < two.frequency < hi}  # type: ignore[attr-defined]
+        fallen |= near | {at} if near else set()
+    return sorted(fallen)
 
 
 def _comb(lines: Sequence[tuple[int, float]]) -> list[int]:
-    """Harmonics of one fundamental: it is a difference of two of them, or one of them."""
+    """Harmonics of one fundamental: it is one of them, or a whole part of a difference of two."""
     f = np.array([one for _, one in lines])
     if f.size < COMB:
         return []
     apart = np.abs(f[:, None] - f[None, :])[np.triu_indices(f.size, 1)]
     best: list[int] = []
-    for fundamental in np.concatenate([apart, f]):
+    for fundamental in np.concatenate([f, *(apart / part for part in PARTS)]):
         if fundamental < f.max() / HIGHEST:
             continue
         order = np.rint(f / fundamental)

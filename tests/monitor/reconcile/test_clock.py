@@ -53,11 +53,13 @@ def test_there_and_back():
 
 
 LINE = Sinusoidal(amplitude=3e-4, frequency=17.3, phase=0.4)
+OTHER = Sinusoidal(amplitude=1e-4, frequency=8.1, phase=2.0)
 RESONANCE = Narrowband(sigma=8e-4, frequency=31.0, bandwidth=0.8)
+HUM = Narrowband(sigma=4e-4, frequency=12.0, bandwidth=0.5)
 
 
 def measured(feature, ratio, seed=1):
-    """Three axes of a sensor whose clock is off; the feature is on gy."""
+    """Three axes of a sensor whose clock is off; the features are on gy."""
     plain = NoiseModel(dict.fromkeys(GYRO_AXES, (WHITE, WALK)), RATE_HZ)
     model = plain + NoiseModel({"gy": feature})
     drawn = recording(model + NoiseModel({"gy": (SampleRateError(ratio=ratio),)}), n, seed)
@@ -67,7 +69,7 @@ def measured(feature, ratio, seed=1):
 
 @pytest.mark.parametrize("ratio", [1.0007, 0.992, 1.05])
 def test_the_ratio_is_found_by_a_line(ratio):
-    found = wrong_clock(*measured((LINE,), ratio))
+    found = wrong_clock(*measured((LINE, OTHER), ratio))
     assert found is not None
     assert found.axis == "gy"
     assert found.ratio.value == pytest.approx(ratio, abs=3e-5)
@@ -78,11 +80,15 @@ def test_the_ratio_is_found_by_a_line(ratio):
 
 
 def test_the_ratio_is_found_by_a_resonance():
-    found = wrong_clock(*measured((RESONANCE,), 1.02))
+    found = wrong_clock(*measured((RESONANCE, HUM), 1.02))
     assert found is not None
     assert found.ratio.lo < 1.02 < found.ratio.hi
     assert found.axis == "gy"
     assert found.gain > 100.0
+
+
+def test_one_line_that_moved_is_no_clock():
+    assert wrong_clock(*measured((LINE,), 1.0007)) is None
 
 
 def test_a_clock_that_is_right_is_left_alone():

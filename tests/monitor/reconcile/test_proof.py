@@ -36,7 +36,7 @@ def noise(seed=0):
 
 def proven(one, effect, lens, model=MODEL):
     before, after = believed(one, model), settled(one, (effect,), model)
-    return proof(one, before, after, lens, NULL, np.random.default_rng(0))
+    return proof(one, before, after, after.effects[-1], lens, NULL, np.random.default_rng(0))
 
 
 LINE = 3e-4 * np.sin(2 * np.pi * 17.3 * time_s(n))
@@ -84,7 +84,7 @@ def test_what_one_half_contradicts_is_not_kept(name):
     before, after = believed(one, MODEL), settled(one, (effect,), MODEL)
     # on the data that chose it, it is worth its name
     assert after.likely.log_likelihood - before.likely.log_likelihood > 20.0
-    found = proof(one, before, after, lens, NULL, np.random.default_rng(0))
+    found = proof(one, before, after, effect, lens, NULL, np.random.default_rng(0))
     assert not found.kept
 
 
@@ -104,7 +104,7 @@ def test_another_size_of_a_known_noise():
     before = believed(one, MODEL)
     after = settled(one, (), MODEL)
     assert after.freed >= 1
-    found = proof(one, before, after, "psd", NULL, np.random.default_rng(0))
+    found = proof(one, before, after, None, "psd", NULL, np.random.default_rng(0))
     assert found.kept
     assert found.after < 0.2 * found.before
 
@@ -142,7 +142,7 @@ def test_single_samples_are_looked_at_in_each_half(kind):
     one = again(plain, (*MODEL, effect), rng)
     before = settled(plain, (), MODEL)
     after = settled(one, (effect,), MODEL)
-    found = proof(one, before, after, lens, NULL, rng)
+    found = proof(one, before, after, effect, lens, NULL, rng)
     assert found.kept
     assert found.reason == ""
     assert found.after < 0.5 * found.before

@@ -117,7 +117,8 @@ def test_same_seed_same_bytes_also_in_threads():
 
 def test_a_wrong_clock_is_one_step_for_all_axes():
     line = Sinusoidal(amplitude=3e-4, frequency=17.3)
-    plain = NoiseModel(dict.fromkeys(GYRO_AXES, (WHITE, WALK))) + NoiseModel({"gy": (line,)})
+    other = Sinusoidal(amplitude=3e-4, frequency=9.0)
+    plain = NoiseModel(dict.fromkeys(GYRO_AXES, (WHITE, WALK))) + NoiseModel({"gy": (line,), "gx": (other,)})
     unknown = Sinusoidal(amplitude=3e-4, frequency=31.0)
     drawn = recording(plain + NoiseModel({"gy": (SampleRateError(ratio=1.004),), "gz": (unknown,)}), 24_000, 6)
     found = reconcile(drawn, plain, 1)

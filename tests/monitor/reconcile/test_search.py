@@ -12,7 +12,8 @@ from monitor.noise.effects import (
     Sinusoidal,
 )
 from monitor.reconcile.hypothesis import believed, settled
-from monitor.reconcile.search import Search, pruned, search, tried
+from monitor.reconcile.search import Search, pruned, search
+from monitor.reconcile.trials import tried
 from tests.monitor.reconcile.axes import (
     RATE_HZ,
     STRICT,
@@ -158,7 +159,7 @@ def test_candidates_on_a_true_model_are_not_worth_their_price():
     wrong = 0
     for seed in range(6):
         one = axis(noise(20 + seed), MODEL)
-        trials = tried(one, believed(one, MODEL), seen(one, MODEL))
+        trials = [each for kind in tried(one, believed(one, MODEL), seen(one, MODEL)) for each in kind]
         assert trials
-        wrong += trials[0].value > 0.0
+        wrong += max(each.value for each in trials) > 0.0
     assert wrong <= 1
