@@ -3,12 +3,13 @@
 Nothing is drawn by hand. The shipped model ``consumer-mems``, with the temperature of a sensor that warms up, is
 simulated into a recording; ``Service`` replays an hour of it sixty times as fast into a native viewer without a
 screen (software Vulkan), then into the page inside a real Chromium, driven by its DevTools protocol, and is stopped
-as by a signal; ``imu-monitor analyze`` makes the plot of the same hour. Curves over time, in the viewer, the picture
-and the page, are those of the same hour with a gyroscope that becomes noisier. The fleet are simulated devices in real
+as by a signal; ``imu-monitor analyze`` makes the plot of the same hour. ``imu-monitor reconcile`` finds what was
+hidden in an hour of the model, before and after. Curves over time, in the viewer, the picture and the page, are those
+of the same hour with a gyroscope that becomes noisier. The fleet are simulated devices in real
 time; one cable is pulled and put back, another is pulled for good. ``demo --effect`` runs in real time too. Needs the
 packages chromium, mesa-vulkan-drivers and libvulkan1 (Debian's names); network traffic stays on loopback.
 
-    python -m tests.pictures [--out docs/pictures] [--only native surfaces fleet effect web plot dynamic report]
+    python -m tests.pictures [--out docs/pictures] [--only native surfaces fleet effect web plot dynamic report …]
 """
 
 import argparse
@@ -38,7 +39,11 @@ from drivers.recording import save_samples
 from monitor import settings
 from monitor.catalogue import read_model
 from monitor.demo import demo
+from monitor.noise.model import NoiseModel
 from monitor.publish import rerun_sinks
+from monitor.publish.reconcile_chart import chart
+from monitor.reconcile.reconciliation import AxisResult
+from monitor.reconciling import Request, make
 from monitor.service import Service
 from monitor.virtual import ROOM_C, WARM_UP_C, WARM_UP_S
 
@@ -63,6 +68,16 @@ CHROMIUM_FLAGS = (
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
     *("--hide-scrollbars", f"--window-size={SIZE[0]},{SIZE[1] + 143}"),
 )
+HIDDEN = """
+[gz.narrowband]
+sigma = 1.2e-3
+frequency = 17.0
+bandwidth = 2.0
+
+[gz.outliers]
+fraction = 2e-4
+scale = 0.02
+"""
 REPLAY = """
 [[device]]
 name = "bench-1"
@@ -204,6 +219,45 @@ def report(out: Path, folder: Path) -> Path:
     return small(path)
 
 
+def before(out: Path, folder: Path) -> Path:
+    """gz beside the shipped model, which does not know what was hidden."""
+    return looked_at(hidden(folder), "start", out / "reconcile-before.png")
+
+
+def after(out: Path, folder: Path) -> Path:
+    """The same beside the model that reconcile wrote."""
+    return looked_at(hidden(folder), "end", out / "reconcile-after.png")
+
+
+def hidden(folder: Path) -> AxisResult:
+    """What reconcile finds of HIDDEN."""
+    source = folder / "hidden.npz"
+    if not source.exists():
+        model = read_model(MODEL) + NoiseModel.from_toml(HIDDEN)
+        rate_hz = model.sample_rate_hz
+        assert rate_hz is not None
+        n = round(HOUR_S * rate_hz)
+        save_samples(source, np.arange(n) / rate_hz, model.simulate(n, rate_hz, 1), None)
+    return make(Request(source, read_model(MODEL), folder / "result")).axes["gz"]
+
+
+def looked_at(result: AxisResult, when: str, path: Path) -> Path:
+    """Spectrum, Allan deviation and tails of one axis beside one model, as the report draws them."""
+    views = {view.lens: view for view in getattr(result, when).views}
+    drawn = [chart([(lens, views[lens])], result.axis, 520.0, 330.0) for lens in ("psd", "allan", "tails")]
+    page = path.with_suffix(".html")
+    style = "body{margin:8px;display:flex;font-family:sans-serif;background:white}svg{width:520px;height:330px}"
+    page.write_text(f"<meta charset=utf-8><style>{style}</style>{''.join(drawn)}")
+    with browser() as tab:
+        tab.call("Page.navigate", url=page.as_uri())
+        time.sleep(SETTLE_S)
+        clip = {"x": 0, "y": 0, "width": 1590, "height": 350, "scale": 1}
+        shot = tab.call("Page.captureScreenshot", format="png", clip=clip)
+    page.unlink()
+    path.write_bytes(base64.b64decode(shot["data"]))
+    return small(path)
+
+
 def small(path: Path) -> Path:
     """The same picture in so many colours as a byte can tell, for the documentation: a third of its size."""
     from PIL import Image
@@ -230,6 +284,8 @@ PICTURES: dict[str, Callable[[Path, Path], Path]] = {
     "plot": allan,
     "dynamic": dynamic,
     "report": report,
+    "before": before,
+    "after": after,
 }
 
 

@@ -22,12 +22,10 @@ from monitor.reconcile.reconciliation import Bounds
 
 FURTHEST: Final = 0.15
 """A clock that is further off is another sensor."""
-FEATURES: Final = 2
-"""Frequencies that must agree."""
+OTHERS: Final = 6.0
+"""Nats that everything but the strongest feature must gain: the others, and the noise of all axes."""
 SAME: Final = 1.01
 """Factor between frequencies of one feature, seen on several axes."""
-EACH: Final = 3.0
-"""Nats by which each must."""
 TRIED: Final = 12
 """Ratios at which all axes are fitted."""
 PRICE: Final = 12.0
@@ -89,7 +87,7 @@ def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clo
     ratio, width = max(trials, key=lambda one: gain(log(one[0])))
     x = _highest(gain, log(ratio), width)
     top = gain(x)
-    if top < PRICE or _agreeing(axes, effects, before, exp(x)) < FEATURES:
+    if top < PRICE or top - _strongest(axes, effects, before, exp(x)) < OTHERS:
         return None
     ends = [_end(gain, x, top, sign * width) for sign in (-1.0, 1.0)]
     of_axes = gains(x)
@@ -99,11 +97,10 @@ def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clo
     return Clock(Bounds(exp(x), exp(ends[0]), exp(ends[1])), top, strongest, (stated, stated / exp(x)))
 
 
-def _agreeing(
+def _strongest(
     axes: Mapping[str, Axis], effects: Mapping[str, Effects], before: Mapping[str, float], ratio: float
-) -> int:
-    """How many features, at frequencies of their own, stand where the ratio puts them; one alone may itself have
-    moved."""
+) -> float:
+    """Nats of the feature that gains most where the ratio puts it: that one may have moved itself."""
     features = sorted({e.frequency for of in effects.values() for e in of if isinstance(e, (Sinusoidal, Narrowband))})
     groups: list[list[float]] = []
     for f_hz in features:
@@ -111,15 +108,15 @@ def _agreeing(
             groups[-1].append(f_hz)
         else:
             groups.append([f_hz])
-    count = 0
+    gains = [0.0]
     for group in groups:
         gain = 0.0
         for name, of in effects.items():
             moved = tuple(restated(e, ratio) if getattr(e, "frequency", None) in group else e for e in of)
             if moved != of:
                 gain += believed(axes[name], moved).likely.log_likelihood - before[name]
-        count += gain > EACH
-    return count
+        gains.append(gain)
+    return max(gains)
 
 
 def _ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> list[tuple[float, float]]:

@@ -147,7 +147,8 @@ def _parameters(axis: Axis, state: Hypothesis, index: int, trial: Trial, kind: K
     if isinstance(effect, BandwidthLimit):
         found["order"] = Bounds(float(effect.order))
     if isinstance(effect, Sinusoidal) and effect.phase is not None and effect.amplitude > 0.0:
-        error = Z95 * state.likely.error(index) / effect.amplitude
+        # at the start of a recording a frequency that is fitted too doubles the error (Rife & Boorstyn 1974)
+        error = 2.0 * Z95 * state.likely.error(index) / effect.amplitude
         found["phase"] = Bounds(effect.phase, effect.phase - error, effect.phase + error)
     return found
 
