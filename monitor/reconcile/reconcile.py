@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+from scipy.special import expit
 
 from drivers.errors import NotReady
 from drivers.sample import AXES, Floats
@@ -26,6 +27,7 @@ from monitor.noise.effects import (
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.axis import Axis, Courses, Effects
 from monitor.reconcile.candidates import PRICE
+from monitor.reconcile.clock import PRICE as CLOCK_PRICE
 from monitor.reconcile.clock import Clock, restated, wrong_clock
 from monitor.reconcile.describe import described
 from monitor.reconcile.gap import Findings, Null, look, nulls
@@ -280,7 +282,7 @@ def with_clock(
         kind="added",
         effect=SampleRateError.name,
         parameters={"ratio": clock.ratio},
-        confidence=0.99,
+        confidence=float(expit(clock.gain - CLOCK_PRICE)),
         runners_up=(),
         before=score,
         after=after,
