@@ -93,8 +93,10 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1200.0)
     parser.add_argument("--only", nargs="*", choices=VARIANTS, default=list(VARIANTS))
     asked = parser.parse_args()
-    print("| | true models given a name | hidden and named | with 5 % off | false names beside | foreign named |")
-    print("| --- | --- | --- | --- | --- | --- |")
+    print(
+        "| | true models accused | given a name | hidden and named | with 5 % off | false names beside | foreign named |"
+    )
+    print("| --- | --- | --- | --- | --- | --- | --- |")
     for name in asked.only:
         print(f"| {name} | " + " | ".join(_counts(VARIANTS[name], asked.seeds, asked.seconds)) + " |", flush=True)
 
@@ -112,6 +114,7 @@ def _counts(variant: Callable[[], Any], seeds: int, seconds: float) -> list[str]
         foreign = [run(job(name, seed), in_process=True) for name in FOREIGN for seed in range(seeds)]
     named = [sum(not one.missed for one in group) for group in (hidden, off)]
     return [
+        f"{sum(one.verdict != 'agrees' for one in nulls)} of {len(nulls)}",
         f"{sum(bool(one.names) for one in nulls)} of {len(nulls)}",
         f"{named[0]} of {len(hidden)}",
         f"{named[1]} of {len(off)}",
