@@ -93,9 +93,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1200.0)
     parser.add_argument("--only", nargs="*", choices=VARIANTS, default=list(VARIANTS))
     asked = parser.parse_args()
-    print(
-        "| | true models accused | given a name | hidden and named | with 5 % off | false names beside | foreign named |"
-    )
+    heads = ("", "true models accused", "given a name", "hidden and named", "5 % off", "false names", "foreign named")
+    print("| " + " | ".join(heads) + " |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for name in asked.only:
         print(f"| {name} | " + " | ".join(_counts(VARIANTS[name], asked.seeds, asked.seconds)) + " |", flush=True)
