@@ -17,6 +17,7 @@ from monitor.noise.effect import Effect, Leak, Transform
 from monitor.noise.effects import (
     ORDER,
     AngleRandomWalk,
+    BandwidthLimit,
     Bias,
     NoiseStep,
     Resolution,
@@ -53,6 +54,7 @@ class Likely:
     fitted: Fitted
     noises: tuple[int, ...]  # index in ``effects`` of each fitted θ
     courses: tuple[tuple[int, slice], ...]  # index in ``effects`` and place in β of each course
+    behind: float = 0.0  # variance of a coefficient, of the white noise behind a low-pass
 
     def error(self, at: int) -> float:
         """Standard error of the size of an effect; NaN where it was held."""
@@ -152,6 +154,7 @@ class Axis:
         held: frozenset[int] = frozenset(),
         extra: Floats | None = None,
         curved: bool = False,
+        floor: bool = True,
     ) -> Likely:
         """The maximum over all sizes that are not held.
 
@@ -160,6 +163,8 @@ class Axis:
             held: indices of noises whose size stays
             extra: [r, m] nameless bases besides, of variance for θ = 1
             curved: t² besides, nameless too
+            floor: where there is a low-pass, white noise behind it: a real sensor aliases, its converter is noisy, and
+                the null that a digital filter has at half the rate is never seen
         """
         f_hz, tau0_s = self.bins.f_hz, 1.0 / self.rate_hz
         transforms = sorted((e for e in effects if self._shapes(e)), key=lambda e: ORDER.index(type(e)))
@@ -175,6 +180,10 @@ class Axis:
                 noises.append(at)
                 bases.append(made)
                 start.append(min(size(effect) ** 2, self._whole(made)))
+        floor = floor and any(isinstance(one, BandwidthLimit) for one in transforms)
+        if floor:
+            bases.append(np.ones_like(f_hz))
+            start.append(1e-3 * self._whole(bases[-1]))
         for row in extra if extra is not None else ():
             bases.append(row)
             start.append(1e-2 * self._whole(row))
@@ -197,6 +206,7 @@ class Axis:
             fitted,
             tuple(noises),
             tuple(courses),
+            float(fitted.theta[len(noises)]) if floor else 0.0,
         )
 
     def at(self, likely: Likely, beta: Floats) -> Likely:

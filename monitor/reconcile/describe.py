@@ -1,7 +1,7 @@
 """From a search to what people read: each step with its sizes, its confidence, and a sentence that can be checked."""
 
 from collections.abc import Mapping
-from math import exp, inf
+from math import erf, exp, inf, log
 from typing import Final
 
 from monitor.noise.effect import Effect, Leak
@@ -20,9 +20,9 @@ from monitor.noise.effects import (
 from monitor.reconcile.axis import Axis
 from monitor.reconcile.gap import Null, scores
 from monitor.reconcile.hypothesis import Z95, Hypothesis, shape_bounds, size_bounds
-from monitor.reconcile.reconciliation import AxisResult, Bounds, Kind, Look, RunnerUp, Score, Step, Verdict
+from monitor.reconcile.reconciliation import AxisResult, Bounds, Kind, Look, RunnerUp, Score, Step, Verdict, Where
 from monitor.reconcile.search import Round, Search
-from monitor.reconcile.terms import COURSE, NATURAL, NOISE
+from monitor.reconcile.terms import COURSE, NATURAL, NOISE, size
 from monitor.reconcile.trials import RETUNE, Trial
 from monitor.reconcile.views import views
 
@@ -63,10 +63,24 @@ def described(found: Search, null: Mapping[str, Null], final: Mapping[str, Null]
         for noise in one.state.likely.noises:
             if noise < found.state.given and noise not in before and noise in found.state.likely.noises:
                 steps.append(_step(found, one, noise, "retuned", looks[at], looks[at + 1]))
-    left_over = tuple(score for score in looks[-1].scores if score.passes)
+    left_over = (*(score for score in looks[-1].scores if score.passes), *_behind(found, looks[-1]))
     return AxisResult(
         found.axis.name, _verdict(bool(steps), bool(left_over)), looks[0], tuple(steps), left_over, looks[-1]
     )
+
+
+def _behind(found: Search, look: Look) -> tuple[Score, ...]:
+    """White noise behind a low-pass that was found: no effect makes it, and it is left over where it is no chance."""
+    state, axis = found.state, found.axis
+    limit = next((effect for effect in state.found if isinstance(effect, BandwidthLimit)), None)
+    if limit is None or not state.likely.behind > 0.0:
+        return ()
+    without = axis.fit(state.effects, state.likely.held, floor=False)
+    gain = max(state.likely.log_likelihood - without.log_likelihood, 0.0)
+    psd = next(score for score in look.scores if score.lens == "psd")
+    place = Where(frequency=(limit.cutoff, 0.5 * axis.rate_hz))
+    score = Score("psd", place, (2.0 * gain) ** 0.5, psd.null95, psd.threshold)
+    return (score,) if score.passes else ()
 
 
 def _verdict(steps: bool, left: bool) -> Verdict:
@@ -86,8 +100,9 @@ def _step(found: Search, one: Round, index: int, kind: Kind, before: Look, after
             Score(score.lens, score.where, proof.before, score.null95, score.threshold),
             Score(score.lens, score.where, proof.after, later.null95, later.threshold),
         )
-    name = effect.name if kind == "added" else RETUNE
-    confidence, others = _confidence(name, one.trials)
+    confidence, others = _confidence(effect.name if kind == "added" else RETUNE, one.trials)
+    if kind == "retuned" and one.trials[0].name != RETUNE:  # it moved beside something that was added
+        confidence, others = _moved(found.state, index), ()
     return Step(
         found=score,
         kind=kind,
@@ -126,6 +141,15 @@ def _confidence(name: str, trials: tuple[Trial, ...]) -> tuple[float, tuple[Runn
     return chances.get(name, chances[max(best, key=lambda one: best[one])]), tuple(
         RunnerUp(other, chance) for chance, other in reversed(others[-SHOWN:])
     )
+
+
+def _moved(state: Hypothesis, index: int) -> float:
+    """Probability that a size is another than the model's, by its distance in standard errors of its logarithm."""
+    now, before = size(state.effects[index]), size(state.model[index])
+    error = state.likely.error(index)
+    if not (now > 0.0 and before > 0.0 and error > 0.0):
+        return 1.0  # gone, or where none was
+    return erf(abs(log(now / before)) * now / error / 2.0**0.5)
 
 
 def _parameters(axis: Axis, state: Hypothesis, index: int, trial: Trial, kind: Kind) -> dict[str, Bounds]:

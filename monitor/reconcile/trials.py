@@ -45,6 +45,8 @@ RETUNE: Final = "retuned"
 EXPONENTS: Final = (0.5, 1.5, 2.5, 3.0)
 IDLE: Final = 1.0
 """Nats: other sizes that gain less are the same sizes."""
+AS_WELL: Final = 3.0
+"""Nats by which sizes of their own may be better than one factor, which has fewer."""
 GROUPS: Final = 8
 """Of frequencies, in which a leak must have one size."""
 UNLIKELY: Final = 1e-5
@@ -163,12 +165,13 @@ def _bounds(found: Size, unit: float = 1.0) -> Bounds:
 
 def _noises(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
     """Noises by their score, a nameless one among them."""
-    found = [Trial(RETUNE, None, settled(axis, state.found, state.model).score - state.score - IDLE)]
+    resized = settled(axis, state.found, state.model)
+    found = [Trial(RETUNE, None, resized.score - state.score - IDLE)]
     for family in NOISE_FAMILIES:
         for effect in family(axis, state, seen):
             value = settled(axis, (*state.found, effect), state.model).score - state.score - PRICE[effect.name]
             found.append(Trial(effect.name, effect, value))
-    found.append(_scaled(axis, state))
+    found.append(_scaled(axis, state, resized))
     found.sort(key=lambda one: -one.value)
     value = max(_nameless(axis, state, exponent) for exponent in EXPONENTS) - state.score - PRICE[NAMELESS]
     if value > max(found[0].value, 0.0) + OPEN and found[0].name in SMOOTH:
@@ -268,8 +271,12 @@ def _power_law(axis: Axis, exponent: float) -> Floats:
     return np.asarray((axis.bins.f_hz / axis.bins.f_hz[0]) ** -exponent)[None, :]
 
 
-def _scaled(axis: Axis, state: Hypothesis) -> Trial:
-    """All noises of the model by one factor, their sizes held to each other."""
+def _scaled(axis: Axis, state: Hypothesis, resized: Hypothesis) -> Trial:
+    """All noises of the model by one factor, their sizes held to each other.
+
+    One size that is off says nothing of the others, and stays one size. Where two or more are off, and by one factor
+    as well as by two, it is one factor.
+    """
     effects = (*state.model, *state.found)
     held = frozenset(at for at, effect in enumerate(state.model) if type(effect) in NOISE)
 
@@ -282,4 +289,7 @@ def _scaled(axis: Axis, state: Hypothesis) -> Trial:
         a, b = hi - GOLDEN * (hi - lo), lo + GOLDEN * (hi - lo)
         lo, hi = (lo, b) if value(a) > value(b) else (a, hi)
     x = 0.5 * (lo + hi)
-    return Trial("scale_factor", ScaleFactor(factor=float(np.exp(x))), value(x) - state.score - PRICE["scale_factor"])
+    worth = value(x) - state.score - PRICE["scale_factor"]
+    if resized.freed > 1 and value(x) > resized.likely.log_likelihood - AS_WELL:
+        worth = max(worth, resized.score - state.score)
+    return Trial("scale_factor", ScaleFactor(factor=float(np.exp(x))), worth)

@@ -12,7 +12,7 @@ from drivers import driver
 from drivers.sample import join
 from tests.walk.rig import Running, running, wait_for
 
-WARM_UP, CYCLES = 10, 50
+WARM_UP, CYCLES, TEN = 10, 50, 10
 NOISE_BYTES = 2_000_000
 """40 kB a cycle. About 0.6 MB come by themselves: samples kept by this test, pages of the ring touched first."""
 PERIOD_NS = 10_000_000
@@ -64,11 +64,15 @@ def test_fifty_pulled_cables_leave_nothing_behind(tmp_path: Path, monkeypatch: p
         for _ in range(WARM_UP):
             pull_and_put_back(run)
         threads, files, memory = measured()
-        for _ in range(CYCLES):
+        memories = [memory]
+        for cycle in range(1, CYCLES + 1):
             pull_and_put_back(run)
+            if cycle % TEN == 0:
+                memories.append(measured()[2])
         # the estimate is the service's last chance to be in the middle of something
         wait_for(lambda: measured()[:2] == (threads, files), 5.0, "as many threads and files as before")
-        assert measured()[2] - memory < NOISE_BYTES
+        # what leaks grows with every ten cables; what the service takes once, in one of them
+        assert np.median(np.diff(memories)) < NOISE_BYTES * TEN / CYCLES
     kinds = [event.kind for device, event in run.caught.events if device == "loose"]
     assert (kinds.count("link_lost"), kinds.count("link_back")) == (WARM_UP + CYCLES, WARM_UP + CYCLES)
     assert [device for device, event in run.caught.events if event.kind.startswith("link")].count("firm") == 0
