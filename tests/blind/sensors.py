@@ -72,7 +72,7 @@ def with_lines(world: World, rng: np.random.Generator) -> World:
     lines = []
     for axis, harmonic in zip(felt, (1, 2, 1), strict=False):
         phase = uniform(rng, 0.0, 2.0 * np.pi)
-        amplitude = world.noise(axis)  # for now: see levels
+        amplitude = world.noise(axis)  # until levels.size_lines sets it
         shape = {"amplitude": amplitude, "frequency": frequency * harmonic, "phase": phase}
         lines.append(Effect(axis, "sinusoidal", shape))
     return replace(world, baseline=(*world.baseline, *lines))
