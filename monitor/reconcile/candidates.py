@@ -1,9 +1,9 @@
 """From what a lens shows to effects worth trying, with first guesses from the data.
 
-Every function looks at one family and gives effects whose shapes are the best of their kind beside the effects at hand;
-their sizes are fitted by whoever tries them. ``PRICE`` is what a name must be worth before it is given: what chance gives
-a true model, more for names that can stand in many places, and an allowance for the shapes that were fitted. The numbers
-are empirical.
+Every function looks at one family and gives effects whose shapes are the best of their kind beside the effects at
+hand; their sizes are fitted by whoever tries them. ``PRICE`` is what a name must be worth before it is given: what
+chance gives a true model, more for names that can stand in many places, and an allowance for the shapes that were
+fitted. The numbers are empirical.
 """
 
 from collections.abc import Callable
