@@ -98,13 +98,13 @@ def test_nobody_reads_and_the_sensor_goes_on():
 
 def test_plugging_twice_and_pulling_twice_is_harmless_and_leaves_nothing_open():
     rig = Rig()
-    files = os.listdir("/dev/fd")
+    files = set(os.listdir("/dev/fd"))
     for _ in range(20):
         rig.imu.plug()
         rig.imu.plug()
         rig.imu.unplug()
         rig.imu.unplug()
-    assert len(os.listdir("/dev/fd")) == len(files)
+    assert set(os.listdir("/dev/fd")) <= files  # what an earlier test left may have been closed meanwhile
     rig.imu.stop()
 
 
