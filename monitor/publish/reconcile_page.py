@@ -164,7 +164,7 @@ def _axis(r: Reconciliation, result: AxisResult) -> AxisPart:
         _step(r, result.axis, i, step, before)
         for i, (step, before) in enumerate(zip(result.steps, looks, strict=False), start=1)
     )
-    left = tuple((words.score(one, result.axis), _where(looks[-1], one, result.axis)) for one in result.left_over)
+    left = tuple((words.score(one, result.axis), _where(result.end, one, result.axis)) for one in result.left_over)
     alone = not result.steps
     return AxisPart(
         result.axis,

@@ -119,8 +119,8 @@ def _axes(r: Reconciliation) -> list[str]:
 
 
 def _looks(result: AxisResult) -> list[Look]:
-    """Beside the first model, then after each step."""
-    return [result.start, *(step.look for step in result.steps)]
+    """Beside the first model, then after each step; after the last, without the names that were withdrawn."""
+    return [result.start, *(step.look for step in result.steps[:-1]), *([result.end] if result.steps else [])]
 
 
 def _lenses(result: AxisResult) -> list[str]:

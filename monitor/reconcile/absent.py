@@ -57,8 +57,7 @@ def _meaning(shown: Shown, other: Reconciliation) -> tuple[Meaning, str]:
         return "may_differ", "what happens once need not happen in another recording"
     if rival := _other_name(step, of, there):
         return "other_name", f"what is seen there was named {rival}, and the two are hard to tell apart"
-    looks = [there.start, *(one.look for one in there.steps)]
-    seen = next((score for score in looks[-1].scores if score.lens == step.found.lens), None)
+    seen = next((score for score in there.end.scores if score.lens == step.found.lens), None)
     if any(score.lens == step.found.lens for score in there.left_over):
         return "unnamed", f"through the same lens ({step.found.lens}) something without a name is left over there"
     if step.effect in LEAKS:

@@ -96,7 +96,7 @@ def correlated(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
     best = _best(axis, state.effects, trials)
     found = refined(axis, (*state.effects, best), len(state.effects), ["correlation_time"], 2.0)[-1]
     assert isinstance(found, ExponentiallyCorrelated)
-    return [found] if found.correlation_time <= longest else []
+    return [found] if shortest <= found.correlation_time <= longest else []
 
 
 def ringing(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:

@@ -50,7 +50,8 @@ def described(found: Search, null: Mapping[str, Null], final: Mapping[str, Null]
         final: of the model with everything found, which decides what is left
     """
     looks = [Look(scores(one.seen, null), views(one.sight)) for one in found.rounds]
-    looks.append(Look(scores(found.seen, final), views(found.sight)))
+    end = Look(scores(found.seen, final), views(found.sight))
+    looks.append(end if found.before is None else Look(scores(found.before[1], null), views(found.before[0])))
     steps: list[Step] = []
     left = sorted(range(found.state.given, len(found.state.effects)))
     for at, one in enumerate(found.rounds):
@@ -63,20 +64,22 @@ def described(found: Search, null: Mapping[str, Null], final: Mapping[str, Null]
         for noise in one.state.likely.noises:
             if noise < found.state.given and noise not in before and noise in found.state.likely.noises:
                 steps.append(_step(found, one, noise, "retuned", looks[at], looks[at + 1]))
-    left_over = (*(score for score in looks[-1].scores if score.passes), *_behind(found, looks[-1]))
-    return AxisResult(
-        found.axis.name, _verdict(bool(steps), bool(left_over)), looks[0], tuple(steps), left_over, looks[-1]
-    )
+    left_over = (*(score for score in end.scores if score.passes), *_behind(found, end))
+    return AxisResult(found.axis.name, _verdict(bool(steps), bool(left_over)), looks[0], tuple(steps), left_over, end)
 
 
 def _behind(found: Search, look: Look) -> tuple[Score, ...]:
-    """White noise behind a low-pass that was found: no effect makes it, and it is left over where it is no chance."""
+    """White noise behind a low-pass that was found: no effect makes it, and it is left over where it is no chance.
+
+    Its gap is what the low-pass alone would leave, and never more than what there was without one.
+    """
     state, axis = found.state, found.axis
     limit = next((effect for effect in state.found if isinstance(effect, BandwidthLimit)), None)
     if limit is None or not state.likely.behind > 0.0:
         return ()
     without = axis.fit(state.effects, state.likely.held, floor=False)
-    gain = max(state.likely.log_likelihood - without.log_likelihood, 0.0)
+    most = max(one.seen["psd"].gain for one in found.rounds)
+    gain = max(min(state.likely.log_likelihood - without.log_likelihood, most), 0.0)
     psd = next(score for score in look.scores if score.lens == "psd")
     place = Where(frequency=(limit.cutoff, 0.5 * axis.rate_hz))
     score = Score("psd", place, (2.0 * gain) ** 0.5, psd.null95, psd.threshold)

@@ -33,7 +33,7 @@ from monitor.noise.effects import (
 from monitor.reconcile.axis import Axis, Effects, Likely
 from monitor.reconcile.bins import bins as even_bins
 from monitor.reconcile.bins import series
-from monitor.reconcile.course import Course, tiles, variance_course
+from monitor.reconcile.course import Course, Tiles, tiles, variance_course
 from monitor.reconcile.reconciliation import Where
 from monitor.reconcile.tails import Outliers, outliers
 
@@ -277,11 +277,16 @@ def variance(seen: Sight) -> Finding:
 
 def spectrogram(seen: Sight) -> Finding:
     """Power over time and frequency: the rectangle, or the row, that is least steady."""
-    axis = seen.axis
-    found = tiles(seen.white / noise_course(seen.likely.effects, axis.n, axis.rate_hz), 1.0 / axis.rate_hz)
+    found = unsteady(seen)
     if found.gain >= found.row_gain:
         return Finding(found.gain, Where(time=found.time, frequency=found.frequency))
     return Finding(found.row_gain, Where(frequency=found.row))
+
+
+def unsteady(seen: Sight) -> Tiles:
+    """The least steady places over time and frequency, beside the noise steps of the axis."""
+    axis = seen.axis
+    return tiles(seen.white / noise_course(seen.likely.effects, axis.n, axis.rate_hz), 1.0 / axis.rate_hz)
 
 
 def tails(seen: Sight) -> Finding:

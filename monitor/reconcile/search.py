@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from monitor.noise.effect import Effect
+from monitor.noise.effect import Effect, Leak
 from monitor.noise.effects import BiasStep, ExponentiallyCorrelated, Outliers, SampleHold, Saturation
 from monitor.reconcile.axis import Axis, Effects
 from monitor.reconcile.bins import bins
@@ -32,6 +32,8 @@ CHANCES: Final = 3
 """Candidates of one kind that may fail on unseen data before the next kind is asked."""
 MENDED: Final = frozenset({Saturation, SampleHold, Outliers})
 """Effects after which the samples are put right."""
+DISTRIBUTION: Final = ("tails", "variance")
+"""Lenses that tell whether samples are Gaussian and steady."""
 SHARED: Final = Proof(float("nan"), float("nan"), True, "its spectrum is that of what it stands for, and was held out")
 """Of a twin that is told by its distribution."""
 
@@ -57,6 +59,7 @@ class Search:
     state: Hypothesis
     sight: Sight  # at the end
     seen: Findings
+    before: tuple[Sight, Findings] | None  # before names were withdrawn, if any were
     rivals: tuple[Trial, ...]  # of a round that took nothing
 
 
@@ -80,7 +83,7 @@ def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.
             break
         better = instead(axis, state, view) if closed and state.freed else []
         if closed and not better:
-            jumps = poisson(axis, state) if rounds else None
+            jumps = poisson(axis, state) if rounds and _well_formed(view, null) else None
             if jumps is None or jumps.gain <= WORTH:
                 break
             state = settled(axis, jumps.found, model)
@@ -106,11 +109,13 @@ def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.
         state = done.state
         rounds.append(done)
     kept = tuple(effect for effect in upheld(state, _closing(rounds), seen, null) if not _nothing(effect))
+    before = None
     if kept != state.found:
+        before = view, seen
         state = settled(axis, kept, model)
         view = sight(axis, state.likely)
         seen = look(view)
-    return Search(start, tuple(rounds), axis, state, view, seen, rivals)
+    return Search(start, tuple(rounds), axis, state, view, seen, before, rivals)
 
 
 def _taken(
@@ -136,7 +141,9 @@ def _taken(
         if trial.name in ONCE and LENSES[lens](sight(mended, after.likely)).gain >= seen[lens].gain:
             continue
         added = None if trial.effect is None else after.found[-1]
-        after, told = told_apart(mended, after, trials[at:])
+        told = trials[at:]
+        if _well_formed(sight(mended, after.likely), null):
+            after, told = told_apart(mended, after, told)
         proven = proof(mended, state, after, added, lens, null[lens], rng)
         if proven.kept:
             return mended, Round(view, seen, tuple(told), after, proven)
@@ -160,6 +167,11 @@ def told_apart(axis: Axis, state: Hypothesis, trials: list[Trial]) -> tuple[Hypo
     return settled(axis, twin.found, state.model), [one, *trials]
 
 
+def _well_formed(view: Sight, null: Mapping[str, Null]) -> bool:
+    """Whether samples are Gaussian and steady: among others, names that rest on a distribution mean nothing."""
+    return all(LENSES[lens](view).gain <= null[lens].threshold for lens in DISTRIBUTION)
+
+
 def pruned(axis: Axis, state: Hypothesis) -> Hypothesis:
     """Without what was found before and is worth nothing any more."""
     for at in range(len(state.found) - 2, -1, -1):
@@ -171,12 +183,17 @@ def pruned(axis: Axis, state: Hypothesis) -> Hypothesis:
 
 
 def _closing(rounds: list[Round]) -> dict[type[Effect], float]:
-    """Kind of effect -> the largest gain of a lens when one of its kind was taken: what it was to close."""
+    """Kind of effect -> the largest gain of a lens when one of its kind was taken: what it was to close.
+
+    Of leaks and steps, that of the lens which shows them.
+    """
     found: dict[type[Effect], float] = {}
     for one in rounds:
         if one.state.found:
             kind = type(one.state.found[-1])
-            found[kind] = max(found.get(kind, 0.0), *(seen.gain for seen in one.seen.values()))
+            own = issubclass(kind, (Leak, BiasStep))
+            lenses = (NATURAL[kind.name],) if own else tuple(one.seen)
+            found[kind] = max(found.get(kind, 0.0), *(one.seen[lens].gain for lens in lenses))
     return found
 
 

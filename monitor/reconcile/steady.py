@@ -10,6 +10,9 @@ some frequency, the names are withdrawn where
 - power at that very place still changes in time, or is still not what it should be, by more than a share of what it
 was.
 
+Leaks are withdrawn where more than half of what the other axes explain is open still: something shakes several axes,
+and no coefficient is right. So are single steps of a level that goes on moving.
+
 What is withdrawn is left over at its place, without a name.
 """
 
@@ -18,8 +21,8 @@ from typing import Final
 
 import numpy as np
 
-from monitor.noise.effect import Effect
-from monitor.noise.effects import BandwidthLimit, Narrowband, Sinusoidal
+from monitor.noise.effect import Effect, Leak
+from monitor.noise.effects import BandwidthLimit, BiasStep, Narrowband, Sinusoidal
 from monitor.reconcile.axis import Effects
 from monitor.reconcile.gap import Findings, Null
 from monitor.reconcile.hypothesis import Hypothesis
@@ -36,6 +39,8 @@ NEAR_HZ: Final = 0.1
 """The same for lines."""
 SHARE: Final = 0.1
 """Of what an effect was to close: with less left at its place the name stands, though not its shape."""
+OPEN: Final = 0.5
+"""The same for leaks."""
 LOCAL: Final = ("psd", "lines", "spectrogram")
 
 
@@ -57,6 +62,12 @@ def upheld(
             continue
         much = {at for at in found if seen[lens].gain > SHARE * closing.get(type(state.effects[at]), 0.0)}
         fallen |= {at for at in much if _covers(state.effects[at], place)}
+    others = seen["other_axes"]
+    if others.gain > null["other_axes"].threshold:
+        leaks = {at for at in found if isinstance(state.effects[at], Leak)}
+        fallen |= {at for at in leaks if others.gain > OPEN * closing.get(type(state.effects[at]), 0.0)}
+    if seen["level"].gain > max(null["level"].threshold, SHARE * closing.get(BiasStep, 0.0)):
+        fallen |= {at for at in found if isinstance(state.effects[at], BiasStep)}
     return tuple(effect for at, effect in enumerate(state.found, state.given) if at not in fallen)
 
 

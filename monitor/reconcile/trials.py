@@ -34,7 +34,7 @@ from monitor.noise.effects import (
 from monitor.reconcile.axis import Axis, Effects
 from monitor.reconcile.candidates import COURSE_FAMILIES, NOISE_FAMILIES, PRICE, correlated
 from monitor.reconcile.hypothesis import GOLDEN, RETUNED, Hypothesis, settled
-from monitor.reconcile.lenses import MARGIN, Sight
+from monitor.reconcile.lenses import MARGIN, Sight, unsteady
 from monitor.reconcile.reconciliation import Bounds
 from monitor.reconcile.terms import NOISE
 from monitor.reconcile.values import Size
@@ -59,6 +59,8 @@ ODD: Final = 4.0
 """Deviations: outliers that keep together more than this, or whose sizes fit less, are none."""
 RIVAL: Final = 1.0
 """Nats by which a step of the noise may be behind its rivals, which have more parameters."""
+BAND: Final = 0.25
+"""Of the sample rate, half of all that is seen: what is narrower is a band."""
 FAR_MORE: Final = 5.0
 """Nats."""
 OPEN: Final = 2.0
@@ -134,7 +136,7 @@ def _samples(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
         effect = Outliers(fraction=min(far.fraction.value, 1.0), scale=unit * far.scale.value)
         bounds = {"fraction": _bounds(far.fraction), "scale": _bounds(far.scale, unit)}
         found.append(_trial(effect, far.gain, bounds, far.count))
-    rival = max(course.trend, course.periodic.gain, course.wander)
+    rival = max(course.trend, course.periodic.gain, course.wander, _burst(seen))
     length_s = axis.n / axis.rate_hz
     inside = MARGIN * length_s < course.step.time.value < (1.0 - MARGIN) * length_s
     if (
@@ -146,6 +148,12 @@ def _samples(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
         bounds = {"time": _bounds(course.step.time), "ratio": _bounds(course.step.ratio)}
         found.append(_trial(step, course.step.gain, bounds))
     return sorted(found, key=lambda one: -one.value)
+
+
+def _burst(seen: Sight) -> float:
+    """Nats of the least steady place of the spectrogram where it is a band: then no white noise has changed."""
+    found = unsteady(seen)
+    return found.gain if np.ptp(found.frequency) < BAND * seen.axis.rate_hz else 0.0
 
 
 def _unit(axis: Axis, state: Hypothesis) -> float:

@@ -40,6 +40,8 @@ SMOOTH: Final = 0.5
 """Of a step: noise below it leaves to the level between two steps what the ends look like."""
 SMOOTHER: Final = 0.9
 """Of a step: with noise above it the level moves the chance of repeats by less than exp(−π²·0.8) = 4·10⁻⁴."""
+PERCENT: Final = 0.01
+"""To which the share of neighbours that are equal by chance is known, as noise is nearly Gaussian at best."""
 CHANCE: Final = 1e-3
 """Expected coincidences are never taken for fewer."""
 UNITS: Final = (1.0, np.pi / 180.0, np.pi / 180.0 / 3600.0, 9.80665)
@@ -347,17 +349,24 @@ def _from_neighbours(values: Floats) -> tuple[Floats, float]:
 def _known_repeats(y: Floats, pairs: Mask, apart: Floats, noise: float) -> Repeats | None:
     """Of values without a step that is known.
 
-    Values that come back after another one between them do so by chance, as often as neighbours are equal by chance.
+    Where values come back after another one between them they stand on steps all the same: then neighbours are equal by
+    chance as often as every other sample is, but for those that were repeated twice.
     """
     mask = np.zeros(y.size, dtype=np.bool_)
     mask[1:] = pairs & (y[1:] == y[:-1])
-    count, back = int(mask.sum()), int(np.count_nonzero((y[2:] == y[:-2]) & ~mask[2:] & ~mask[1:-1] & pairs[1:]))
-    if back:
-        gain = _larger_share(np.array([count, back], dtype=float), np.full(2, float(apart.size)))
-        excess, error = count - back, (count + back) ** 0.5
-        lo, hi = ((excess + sign * Z95 * error) / apart.size for sign in (-1.0, 1.0))
-        size = Size(excess / apart.size, max(lo, 0.0), hi)
-        return Repeats(size, float(excess), np.zeros_like(mask), gain) if gain > 0.0 else None
+    count = int(mask.sum())
+    later = (y[2:] == y[:-2]) & pairs[1:] & pairs[:-1]
+    if np.count_nonzero(later & ~mask[2:]):
+        n = float(apart.size)
+        again = int(np.count_nonzero(later)) / n
+        share = 0.0
+        for _ in range(3):
+            chance = max(again - share**2, 0.0)
+            share = max(count / n - chance, 0.0) / (1.0 - chance)
+        gain = min(_larger_share(np.array([count, n * chance]), np.full(2, n)), _beyond(count, n * chance, 0.0))
+        error = Z95 * (count + n * again) ** 0.5 / n
+        size = Size(share, max(share - error, 0.0), share + error)
+        return Repeats(size, n * share, np.zeros_like(mask), gain) if gain > 0.0 else None
     chance = max(CHANCE, apart.size * _spacing(_finite(y)) / (noise * 2.0 * np.pi**0.5))  # density at 0 of a difference
     gain = _poisson_gain(count, chance)
     return Repeats(_wilson(count, apart.size), float(count), mask, gain) if gain > 0.0 else None
@@ -367,28 +376,39 @@ def _counted_repeats(apart: Floats, twice: Floats, n: int) -> Repeats | None:
     """Of stepped values, from distances in steps of samples that follow each other, and of every other one.
 
     Differences of stepped values with a Gaussian difference behind them have a known form (``_steps_apart``): zero has
-    too many. Outliers and modulated noise have too many as well, but then also over two samples, where repeats
-    of a share h have h² only. So the lesser gain counts.
+    too many. Outliers, modulated noise and a level that stays between two steps make too many as well, but then over
+    two samples too, where repeats of a share h have h² only. So the lesser gain counts.
     """
     most = int(np.clip(np.ceil(GAUSSIAN * 2.0**0.5 * apart.mean()), 2, 64))
-    counts = np.bincount(np.minimum(np.rint(apart), most + 1).astype(np.int64), minlength=most + 2)[:-1].astype(float)
-    alone, spread = _best_spread(counts, 0)
-    others, spread = _best_spread(counts, 1)
-    form = _steps_apart(spread, most)
-    chance = float(form[0] / form[1:].sum() * counts[1:].sum())
-    free = (
-        others + xlogy(counts[0], counts[0] / counts.sum()) + xlogy(counts[1:].sum(), counts[1:].sum() / counts.sum())
-    )
-    two = np.array([np.count_nonzero(apart < 0.5), np.count_nonzero(twice < 0.5)], dtype=float)
-    all_ = np.array([apart.size, twice.size], dtype=float)
-    gain = min(float(free) - alone, _larger_share(two, all_))
+    counts, chance, gain = _beside_form(apart, most)
+    _, chance_of_two, _ = _beside_form(twice, most)
+    of_two = float(np.count_nonzero(twice < 0.5)) - chance_of_two
     excess = float(counts[0] - chance)
+    gain = min(gain, _beyond(float(counts[0]), chance + max(of_two, 0.0), 3.0 * chance**2 / max(counts[1:].sum(), 1.0)))
     if not (excess > 0.0 and gain > 0.0):
         return None
     error = (counts[0] + 3.0 * chance**2 / max(counts[1:].sum(), 1.0)) ** 0.5
     lo, hi = ((excess + sign * Z95 * error) / apart.size for sign in (-1.0, 1.0))
     fraction = Size(excess / apart.size, max(float(lo), 0.0), float(hi))
     return Repeats(fraction, excess, np.zeros(n, dtype=np.bool_), gain)
+
+
+def _beside_form(apart: Floats, most: int) -> tuple[Floats, float, float]:
+    """Counts of 0, 1, … ``most`` steps apart; the zeros that the form of the others lets expect; nats for their own."""
+    counts = np.bincount(np.minimum(np.rint(apart), most + 1).astype(np.int64), minlength=most + 2)[:-1].astype(float)
+    alone, _ = _best_spread(counts, 0)
+    others, spread = _best_spread(counts, 1)
+    form = _steps_apart(spread, most)
+    chance = float(form[0] / form[1:].sum() * counts[1:].sum())
+    free = others + xlogy(counts[0], counts[0] / counts.sum())
+    free += xlogy(counts[1:].sum(), counts[1:].sum() / counts.sum())
+    return counts, chance, float(free - alone)
+
+
+def _beyond(count: float, chance: float, variance: float) -> float:
+    """Gain of a count over what chance lets expect, known to ``variance`` and to a PERCENT of itself."""
+    excess = count - chance
+    return 0.5 * excess**2 / (count + chance + variance + (PERCENT * chance) ** 2) if excess > 0.0 else 0.0
 
 
 def _best_spread(counts: Floats, first: int) -> tuple[float, float]:

@@ -24,7 +24,8 @@ def seen_through(score: Score, seconds: float = 600.0) -> Reconciliation:
     """An axis that agrees, with one lens."""
     agreeing = run("two", seconds=seconds).result
     gz = agreeing.axes["gz"]
-    return replace(agreeing, axes={"gz": replace(gz, start=replace(gz.start, scores=(score,)))})
+    seen = replace(gz.end, scores=(score,))
+    return replace(agreeing, axes={"gz": replace(gz, start=seen, end=seen)})
 
 
 def test_what_would_have_been_seen_contradicts() -> None:

@@ -3,16 +3,17 @@
 import numpy as np
 import pytest
 
-from monitor.noise.effects import BandwidthLimit, BiasStep, Narrowband, Sinusoidal
+from monitor.noise.effects import BandwidthLimit, BiasStep, CrossAxis, Narrowband, Sinusoidal
 from monitor.reconcile.gap import Null
 from monitor.reconcile.hypothesis import settled
 from monitor.reconcile.lenses import Finding
 from monitor.reconcile.reconciliation import Where
 from monitor.reconcile.steady import upheld
-from tests.monitor.reconcile.axes import WALK, WHITE, axis, white
+from tests.monitor.reconcile.axes import WALK, WHITE, axes, white
 
 MODEL = (WHITE, WALK)
 QUIET = {lens: Finding(1.0, Where(frequency=(1.0, 2.0))) for lens in ("psd", "lines", "spectrogram")}
+QUIET |= {lens: Finding(1.0, Where()) for lens in ("level", "other_axes")}
 NULL = dict.fromkeys(QUIET, Null(6.0, 12.0))
 
 
@@ -21,7 +22,8 @@ def lines(*f_hz):
 
 
 def kept(found, seen=QUIET, closing=None):
-    one = axis(white(20_000, np.random.default_rng(1)))
+    rng = np.random.default_rng(1)
+    one = axes({"gz": white(20_000, rng), "gx": white(20_000, rng)}, MODEL)["gz"]
     state = settled(one, found, MODEL)
     return [type(effect) for effect in upheld(state, closing or {}, seen, NULL)]
 
@@ -59,3 +61,15 @@ def test_a_low_pass_stands_whatever_is_left_elsewhere():
     assert kept((BandwidthLimit(cutoff=20.0, order=2),), seen, {BandwidthLimit: 200.0}) == [BandwidthLimit]
     above = {**QUIET, "psd": Finding(150.0, Where(frequency=(30.0, 40.0)))}
     assert kept((BandwidthLimit(cutoff=20.0, order=2),), above, {BandwidthLimit: 200.0}) == []
+
+
+@pytest.mark.parametrize(("left", "stands"), [(150.0, False), (50.0, True)])
+def test_a_leak_stands_when_it_closed_most_of_what_other_axes_show(left, stands):
+    seen = {**QUIET, "other_axes": Finding(left, Where(source="ay"))}
+    assert bool(kept((CrossAxis(source="gx", coefficient=0.01),), seen, {CrossAxis: 200.0})) == stands
+
+
+@pytest.mark.parametrize(("left", "stands"), [(50.0, False), (15.0, True)])
+def test_steps_stand_when_the_level_rests_after_them(left, stands):
+    seen = {**QUIET, "level": Finding(left, Where(time=(100.0, 100.0)))}
+    assert bool(kept((BiasStep(time=60.0, height=1.0),), seen, {BiasStep: 200.0})) == stands
