@@ -143,11 +143,8 @@ class Reconciler:
 
     def _child(self, device: str, arguments: list[str]) -> tuple[int, bytes, bytes]:
         """Status, standard output and error of the program."""
-        one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-        child = subprocess.Popen(
-            arguments, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            env={**os.environ, **one_thread}, start_new_session=True,
-        )  # fmt: skip
+        pipe = subprocess.PIPE
+        child = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, start_new_session=True)
         self._children[device] = child
         try:
             with contextlib.suppress(ProcessLookupError):

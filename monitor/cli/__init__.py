@@ -5,6 +5,7 @@ finished, but the data do not support an answer. Heavy libraries are imported by
 """
 
 import contextlib
+import os
 import signal
 import sys
 from functools import partial
@@ -16,6 +17,10 @@ from typer.exceptions import TyperException
 
 from drivers.errors import ConfigError, ImuError, NotReady, RecordingError
 from monitor.cli import options, output, serving
+
+# before NumPy is imported: matrices are small here and threads of our own share the work, where more would only spin
+for _pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_pool, "1")
 
 FAILED: Final = 1
 WRONG: Final = 2

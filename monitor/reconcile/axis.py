@@ -92,6 +92,8 @@ class Courses:
 
         self.curve = transform(np.linspace(-1.0, 1.0, n) ** 2)
         """[n − 1] of t², for which there is no name."""
+        self.steps = 0.25 / n / np.sin(0.5 * np.pi * np.arange(1, n) / n) ** 2
+        """[n − 1] mean squares, over all times, of the coefficients of a step of one."""
         self._make = lru_cache(max(FEWEST_KEPT, KEPT_BYTES // (8 * n)))(make)
 
     def columns(self, effect: Effect) -> list[Floats]:

@@ -275,9 +275,8 @@ def _rectangle(power: Floats, piece: int) -> tuple[Place, Place]:
         while tall.shape[0] >= 2:
             low, low_at, high, high_at, logs = _columns(tall)
             for x, at in ((low, low_at), (high, high_at)):
-                gains, ratios = _over_rest(x, total, 2 * a * b, 2 * power.shape[0] * b)
-                j = int(gains.argmax())
-                best = max(best, (float(gains[j]), piece, a, int(at[j]), b, j, float(ratios[j])))
+                gain, j, ratio = _over_rest(x, total, 2 * a * b, 2 * power.shape[0] * b)
+                best = max(best, (gain, piece, a, int(at[j]), b, j, ratio))
             if 2 * a * b >= EVEN_ROWS or a == 1:
                 gain, j = _uneven(tall.sum(axis=0), logs, tall.shape[0], 2 * a * b)
                 row = max(row, (gain, piece, a, 0, b, j, 1.0))
@@ -310,17 +309,25 @@ def _columns(power):  # type: ignore[no-untyped-def]
     return low, low_at, high, high_at, logs
 
 
-def _over_rest(x: Floats, total: Floats, inside: int, whole: int) -> tuple[Floats, Floats]:
-    """Gains of energies of ``inside`` squares each over the rest of their columns, and the ratios of mean powers.
+@compiled
+def _over_rest(x, total, inside, whole):  # type: ignore[no-untyped-def]
+    """The best of energies of ``inside`` squares each over the rest of their columns: gain, which, ratio of powers.
 
     With x of c squares inside and R of d outside: (c+d)/2 ln((x+R)/(c+d)) − c/2 ln(x/c) − d/2 ln(R/d), which is convex
     in x: of a column only its least and its largest can be the best. That a few squares are silent is no evidence.
     """
     outside = whole - inside
-    u = np.maximum(x * whole / (inside * total), 1e-30)
-    v = np.maximum((total - x) * whole / (outside * total), 1e-30)
-    gains = -0.5 * (inside * np.log(u) + outside * np.log(v))
-    return np.where((u < 1.0) & (inside < QUIET), 0.0, gains), u / v
+    best, place, ratio = -1.0, 0, 1.0
+    for j in range(x.size):
+        u = max(x[j] * whole / (inside * total[j]), 1e-30)
+        if u < 1.0 and inside < QUIET:
+            gain, v = 0.0, 1.0
+        else:
+            v = max((total[j] - x[j]) * whole / (outside * total[j]), 1e-30)
+            gain = -0.5 * (inside * np.log(u) + outside * np.log(v))
+        if gain > best:
+            best, place, ratio = gain, j, u / v
+    return best, place, ratio
 
 
 def _uneven(total: Floats, logs: Floats, count: int, squares: int) -> tuple[float, int]:

@@ -16,7 +16,6 @@ from math import ceil, exp, log, pi
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
 
 from drivers.sample import Floats
 from monitor.compiled import compiled
@@ -164,6 +163,8 @@ def flicker(rest: Rest, block_s: float, span_s: float) -> list[tuple[float, floa
 
 def maximise(log_likelihood: Callable[..., float], start: Sequence[float]) -> Peak:
     """The maximum over positive parameters, by the simplex method in their logarithms from ``start``."""
+    from scipy.optimize import minimize
+
     origin = np.log(np.asarray(start, np.float64))
     found = minimize(
         lambda at: -log_likelihood(*np.exp(at)),

@@ -210,11 +210,10 @@ def step_gains(seen: Sight) -> tuple[Floats, Floats]:
     """
     axis = seen.axis
     n = axis.n
-    k = np.arange(1, n)
     weighted = series(seen.whitened * seen.weight)
     product = np.cumsum(weighted[::-1])[::-1]  # [n] of a step at each sample
     u = np.zeros(n)
-    u[1:] = seen.weight**2 / (4.0 * n * np.sin(0.5 * np.pi * k / n) ** 2)
+    u[1:] = seen.weight**2 * axis.courses.steps
     cosines = rfft(u).real  # of s up to n/2; those beyond are the same, backwards
     length = u.sum() - np.concatenate([cosines, cosines[1 : n - cosines.size + 1][::-1]])
     margin = ceil(MARGIN * n)

@@ -14,8 +14,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln, ndtr
-from scipy.stats import binom, chi2, norm, poisson
+from scipy.special import bdtrc, chdtrc, gammaln, ndtr, ndtri, pdtrc
 
 from drivers.sample import Floats, Ints
 from monitor.compiled import compiled
@@ -251,24 +250,25 @@ def _clustering(when: Ints, n: int) -> float:
     pairs = sum(int(np.count_nonzero(when[k:] - when[:-k] <= NEAR)) for k in range(1, min(NEAR, when.size - 1) + 1))
     expected = NEAR * when.size * (when.size - 1.0) / n
     if expected < 0.2 * when.size:
-        logs = [float(poisson.logsf(pairs - 1, expected)) if pairs else 0.0]
+        chances = [float(pdtrc(pairs - 1, expected)) if pairs else 1.0]
     else:  # so many that only the next sample tells
-        logs = [float(binom.logsf(np.count_nonzero(np.diff(when) == 1) - 1, when.size, when.size / n))]
+        following = int(np.count_nonzero(np.diff(when) == 1))
+        chances = [float(bdtrc(following - 1, when.size, when.size / n)) if following else 1.0]
     parts = 4
     while 2 * parts <= when.size and parts <= 4096:
         held = np.bincount(when * parts // n, minlength=parts)
         mean = when.size / parts
         spread = float(((held - mean) ** 2).sum()) / (mean * (1.0 - when.size / n))
-        logs.append(float(chi2.logsf(spread, parts - 1)))
+        chances.append(float(chdtrc(parts - 1, spread)))
         parts *= 2
-    return _z(min(logs) + float(np.log(len(logs))))
+    return _z(min(chances) * len(chances))
 
 
-def _z(log_p: float) -> float:
+def _z(chance: float) -> float:
     """The z that a Gaussian exceeds with that chance; 0 for even chances and better ones."""
-    if log_p > -0.6931471805599453:
+    if chance > 0.5:
         return 0.0
-    return float(norm.isf(np.exp(log_p))) if log_p > -700.0 else Z_MOST
+    return -float(ndtri(chance)) if chance > 1e-300 else Z_MOST
 
 
 def _misfit(counts: Floats, kept: NDArray[np.intp], narrow: float, wide: float, share: float) -> float:
@@ -284,4 +284,4 @@ def _misfit(counts: Floats, kept: NDArray[np.intp], narrow: float, wide: float, 
     want, have = np.bincount(groups, expected), np.bincount(groups, seen)
     some = want > 5.0
     square = float(((have - want)[some] ** 2 / want[some]).sum())
-    return _z(float(chi2.logsf(square, max(int(some.sum()) - 4, 1))))
+    return _z(float(chdtrc(max(int(some.sum()) - 4, 1), square)))

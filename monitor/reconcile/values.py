@@ -19,7 +19,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 from scipy.special import log_ndtr, ndtr, xlogy
 
 from drivers.sample import Floats
@@ -418,6 +417,8 @@ def _best_spread(counts: Floats, first: int) -> tuple[float, float]:
     def cost(log_spread: float) -> float:
         form = _steps_apart(float(np.exp(log_spread)), counts.size - 1)[first:]
         return -float(xlogy(kept, form / form.sum()).sum())
+
+    from scipy.optimize import minimize_scalar
 
     best = minimize_scalar(cost, bounds=(np.log(0.2), np.log(4.0 * counts.size)), method="bounded")
     return -float(best.fun), float(np.exp(best.x))

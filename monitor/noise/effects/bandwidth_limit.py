@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.signal import butter, sosfilt, sosfilt_zi
 
 from drivers.sample import Floats
 from monitor.noise.effect import Running, Transform, below_nyquist, parameter
@@ -48,6 +47,8 @@ class BandwidthLimit(Transform):
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_LowPass":
         """Settled at the first sample."""
+        from scipy.signal import butter  # half a second that only such a sensor needs
+
         return _LowPass(butter(int(self.order), self.cutoff, fs=rate_hz, output="sos"))
 
 
@@ -57,6 +58,8 @@ class _LowPass(Running):
         self._state: Any = None
 
     def apply(self, values: Floats) -> None:
+        from scipy.signal import sosfilt, sosfilt_zi
+
         if self._state is None:
             self._state = sosfilt_zi(self._sections) * values[0]
         values[:], self._state = sosfilt(self._sections, values, zi=self._state)
