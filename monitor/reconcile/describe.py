@@ -24,7 +24,6 @@ from monitor.reconcile.reconciliation import AxisResult, Bounds, Kind, Look, Run
 from monitor.reconcile.search import Round, Search
 from monitor.reconcile.terms import COURSE, NATURAL, NOISE, size
 from monitor.reconcile.trials import RETUNE, Trial
-from monitor.reconcile.views import views
 
 SHAPES: Final[dict[type[Effect], tuple[str, ...]]] = {
     ExponentiallyCorrelated: ("correlation_time",),
@@ -49,9 +48,9 @@ def described(found: Search, null: Mapping[str, Null], final: Mapping[str, Null]
         null: of the model under test, which decided
         final: of the model with everything found, which decides what is left
     """
-    looks = [Look(scores(one.seen, null), views(one.sight)) for one in found.rounds]
-    end = Look(scores(found.seen, final), views(found.sight))
-    looks.append(end if found.before is None else Look(scores(found.before[1], null), views(found.before[0])))
+    looks = [Look(scores(one.seen, null), one.views) for one in found.rounds]
+    end = Look(scores(found.seen, final), found.views)
+    looks.append(end if found.before is None else Look(scores(found.before[1], null), found.before[0]))
     steps: list[Step] = []
     left = sorted(range(found.state.given, len(found.state.effects)))
     for at, one in enumerate(found.rounds):

@@ -22,10 +22,12 @@ from monitor.reconcile.hypothesis import Hypothesis, believed, settled
 from monitor.reconcile.lenses import LENSES, Sight, sight
 from monitor.reconcile.prepare import again
 from monitor.reconcile.proof import Proof, proof
+from monitor.reconcile.reconciliation import View
 from monitor.reconcile.steady import upheld
 from monitor.reconcile.terms import COURSE, NATURAL, NOISE, ONCE, size
 from monitor.reconcile.trials import NAMELESS, Trial, instead, tried
 from monitor.reconcile.twins import WORTH, Twin, poisson, telegraph
+from monitor.reconcile.views import views
 
 ROUNDS: Final = 8
 CHANCES: Final = 3
@@ -42,7 +44,7 @@ SHARED: Final = Proof(float("nan"), float("nan"), True, "its spectrum is that of
 class Round:
     """What one round found."""
 
-    sight: Sight  # before
+    views: tuple[View, ...]  # before
     seen: Findings  # before
     trials: tuple[Trial, ...]  # the first was taken; the others best first
     state: Hypothesis  # after
@@ -57,9 +59,9 @@ class Search:
     rounds: tuple[Round, ...]
     axis: Axis  # mended, with bins as fine as its peaks
     state: Hypothesis
-    sight: Sight  # at the end
+    views: tuple[View, ...]  # at the end
     seen: Findings
-    before: tuple[Sight, Findings] | None  # before names were withdrawn, if any were
+    before: tuple[tuple[View, ...], Findings] | None  # before names were withdrawn, if any were
     rivals: tuple[Trial, ...]  # of a round that took nothing
 
 
@@ -87,7 +89,7 @@ def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.
             if jumps is None or jumps.gain <= WORTH:
                 break
             state = settled(axis, jumps.found, model)
-            rounds.append(Round(view, seen, (_twin(jumps, jumps.gain),), state, SHARED))
+            rounds.append(Round(views(view), seen, (_twin(jumps, jumps.gain),), state, SHARED))
             continue
         finer = bins(axis.n, axis.rate_hz, peaks(view))
         if finer.count.size > axis.bins.count.size + 8:
@@ -111,11 +113,11 @@ def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.
     kept = tuple(effect for effect in upheld(state, _closing(rounds), seen, null) if not _nothing(effect))
     before = None
     if kept != state.found:
-        before = view, seen
+        before = views(view), seen
         state = settled(axis, kept, model)
         view = sight(axis, state.likely)
         seen = look(view)
-    return Search(start, tuple(rounds), axis, state, view, seen, before, rivals)
+    return Search(start, tuple(rounds), axis, state, views(view), seen, before, rivals)
 
 
 def _taken(
@@ -146,7 +148,7 @@ def _taken(
             after, told = told_apart(mended, after, told)
         proven = proof(mended, state, after, added, lens, null[lens], rng)
         if proven.kept:
-            return mended, Round(view, seen, tuple(told), after, proven)
+            return mended, Round(views(view), seen, tuple(told), after, proven)
     return None
 
 
