@@ -260,6 +260,88 @@ def reconcile(
         show(Console())
 
 
+thermal_app = typer.Typer(
+    help="Bias against temperature: fit a model to a recording, predict another.", rich_markup_mode=None
+)
+app.add_typer(thermal_app, name="thermal")
+
+RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")]
+Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate, where the file says none.")]
+JsonPath = Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")]
+PlotPath = Annotated[Path | None, typer.Option(metavar="FILE.png", help="Means and model as a picture.")]
+
+
+@thermal_app.command("fit")
+def thermal_fit(
+    recording: RecordingPath,
+    out: Annotated[Path | None, typer.Option(metavar="MODEL.json", help="Where to write the model.")] = None,
+    interval: Annotated[
+        str | None, typer.Option(metavar="S", help="Length of a mean; also 10min, 1h. Else about 72 in the recording.")
+    ] = None,
+    rate: Rate = None,
+    json: JsonPath = None,
+    plot: PlotPath = None,
+) -> None:
+    """Fit the bias of each axis as a function of temperature and its past."""
+    from rich.console import Console
+
+    from monitor import thermal
+    from monitor.publish import thermal_text as text
+
+    _check_thermal(rate, json, plot)
+    output.check_place("--out", out)
+    study = thermal.fit(recording, options.duration("--interval", interval), rate)
+    if json is not None:
+        output.write("--json", json, text.study_json(study) + b"\n")
+    if not study.fits:
+        raise NotReady("; ".join(f"{axis}: {why}" for axis, why in study.refused.items()))
+    if out is not None:
+        output.write("--out", out, thermal.to_file(study) + b"\n")
+    if plot is not None:
+        from monitor.publish.thermal_plot import study_plot
+
+        study_plot(study, plot)
+    if Path("-") not in (json, out):
+        text.tell(study, Console())
+
+
+@thermal_app.command("predict")
+def thermal_predict(
+    recording: RecordingPath,
+    model: Annotated[Path, typer.Option(metavar="MODEL.json", help="What thermal fit wrote.")],
+    rate: Rate = None,
+    json: JsonPath = None,
+    plot: PlotPath = None,
+) -> None:
+    """What a model expects of another recording's bias, and how far off it is."""
+    from rich.console import Console
+
+    from monitor import thermal
+    from monitor.publish import thermal_text as text
+
+    _check_thermal(rate, json, plot)
+    outlook = thermal.predict(recording, thermal.from_file(model), rate)
+    if json is not None:
+        output.write("--json", json, text.outlook_json(outlook) + b"\n")
+    if not outlook.judged:
+        raise NotReady("; ".join(f"{axis}: {why}" for axis, why in outlook.refused.items()))
+    if plot is not None:
+        from monitor.publish.thermal_plot import outlook_plot
+
+        outlook_plot(outlook, plot)
+    if json != Path("-"):
+        text.tell_outlook(outlook, Console())
+
+
+def _check_thermal(rate: float | None, json: Path | None, plot: Path | None) -> None:
+    if rate is not None and not 0.0 < rate < float("inf"):
+        raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
+    if plot is not None and plot.suffix != ".png":
+        raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
+    output.check_place("--json", json)
+    output.check_place("--plot", plot)
+
+
 @app.command()
 def export(
     source: Annotated[

@@ -1,4 +1,4 @@
-"""A few steps that happened once each, against a process that goes on: random telegraph, or Poisson steps.
+"""A few steps that happened once each, against Poisson steps, a process that goes on.
 
 Steps at fixed times with free heights are found one after the other, where the smoother of the rest of the noise sees
 the likeliest shock of the level (de Jong & Penzer, "Diagnosing shocks in time series", JASA 93, 1998), and each once
@@ -17,7 +17,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.compiled import compiled
-from monitor.reconcile import steps, telegraph
+from monitor.reconcile import steps
 from monitor.reconcile.hidden import (
     DEVIATIONS,
     Contest,
@@ -57,26 +57,11 @@ class Steps(NamedTuple):
         return found
 
 
-def telegraph_or_once(
-    y: Floats, tau0_s: float, rest: Rest, sigma: float, correlation_time: float, most: int = 3
-) -> Contest:
-    """Random telegraph (first) against none to ``most`` steps that happened once (second).
-
-    Arguments, errors and the first's parameters are those of ``telegraph_or_correlated``; the second's are ``time_1``,
-    s from the start, and ``height_1``, ``time_2``, ….
-    """
-    means, block_s = block_means(y, tau0_s, telegraph.block_for(y.size * tau0_s, correlation_time))
-    around = parts(rest, block_s, means.size * block_s)
-    first = telegraph.fit_levels(means, block_s, around, sigma, correlation_time)
-    second = fit_once(means, around, most)
-    return Contest(first.peak.height - second.height, first.parameters, second.parameters(block_s), round(first.events))
-
-
 def steps_or_once(y: Floats, tau0_s: float, rest: Rest, K: float, most: int = 5) -> Contest:
     """Poisson steps (first) against none to ``most`` steps that happened once (second).
 
-    Arguments, errors and the first's parameters are those of ``steps_or_walk``, the second's as in
-    ``telegraph_or_once``.
+    Arguments, errors and the first's parameters are those of ``steps_or_walk``; the second's are ``time_1``, s from the
+    start, and ``height_1``, ``time_2``, ….
     """
     means, block_s = block_means(y, tau0_s, steps.block_for(y.size * tau0_s, rest, K))
     first = steps.fit_jumps(means, block_s, rest, K)

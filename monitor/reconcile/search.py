@@ -7,16 +7,16 @@ level are closed, twins are told apart; at the end names that do not stand are w
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from monitor.noise.effect import Effect, Leak
-from monitor.noise.effects import BiasStep, ExponentiallyCorrelated, Outliers, SampleHold, Saturation
+from monitor.noise.effects import BiasStep, ExponentiallyCorrelated, Outliers, RateRandomWalk, SampleHold, Saturation
 from monitor.reconcile.axis import Axis, Effects
 from monitor.reconcile.bins import bins
-from monitor.reconcile.candidates import PRICE, peaks
+from monitor.reconcile.candidates import PRICE, correlated, peaks
 from monitor.reconcile.gap import Findings, Null, look
 from monitor.reconcile.hypothesis import Hypothesis, believed, settled
 from monitor.reconcile.lenses import LENSES, Sight, sight
@@ -36,6 +36,8 @@ MENDED: Final = frozenset({Saturation, SampleHold, Outliers})
 """Effects after which the samples are put right."""
 DISTRIBUTION: Final = ("tails", "variance")
 """Lenses that tell whether samples are Gaussian and steady."""
+WALKS: Final = frozenset({BiasStep, RateRandomWalk})
+"""Effects that jumps are told from."""
 SHARED: Final = Proof(float("nan"), float("nan"), True, "its spectrum is that of what it stands for, and was held out")
 """Of a twin that is told by its distribution."""
 
@@ -85,7 +87,7 @@ def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.
             break
         better = instead(axis, state, view) if closed and state.freed else []
         if closed and not better:
-            jumps = poisson(axis, state) if rounds and _well_formed(view, null) else None
+            jumps = jumping(axis, state, view) if rounds and _well_formed(view, null) else None
             if jumps is None or jumps.gain <= WORTH:
                 break
             state = settled(axis, jumps.found, model)
@@ -144,15 +146,16 @@ def _taken(
             continue
         added = None if trial.effect is None else after.found[-1]
         told = trials[at:]
-        if _well_formed(sight(mended, after.likely), null):
-            after, told = told_apart(mended, after, told)
+        beside = sight(mended, after.likely)
+        if _well_formed(beside, null):
+            after, told = told_apart(mended, after, told, beside)
         proven = proof(mended, state, after, added, lens, null[lens], rng)
         if proven.kept:
             return mended, Round(views(view), seen, tuple(told), after, proven)
     return None
 
 
-def told_apart(axis: Axis, state: Hypothesis, trials: list[Trial]) -> tuple[Hypothesis, list[Trial]]:
+def told_apart(axis: Axis, state: Hypothesis, trials: list[Trial], view: Sight) -> tuple[Hypothesis, list[Trial]]:
     """The state with what was just found under its right name, where second moments do not tell."""
     last, twin = len(state.effects) - 1, None
     if isinstance(trials[0].effect, ExponentiallyCorrelated) and isinstance(
@@ -160,13 +163,37 @@ def told_apart(axis: Axis, state: Hypothesis, trials: list[Trial]) -> tuple[Hypo
     ):
         twin = telegraph(axis, state, last)
     elif isinstance(trials[0].effect, BiasStep):
-        twin = poisson(axis, state)
+        twin = jumping(axis, state, view)
     if twin is None:
         return state, trials
     one = _twin(twin, trials[0].value + twin.gain)
     if twin.gain <= WORTH:
         return state, [trials[0], one, *trials[1:]]
     return settled(axis, twin.found, state.model), [one, *trials]
+
+
+def jumping(axis: Axis, state: Hypothesis, view: Sight) -> Twin | None:
+    """Poisson steps instead of a walk or of single steps, or a slow telegraph where that explains the same better."""
+    steps = poisson(axis, state)
+    if steps is None or steps.gain <= WORTH:
+        return steps
+    # the walk of the model as it was: with what it grew by, a telegraph would have nothing left to explain
+    walks = frozenset(at for at, effect in enumerate(state.model) if type(effect) in WALKS)
+    held = state.likely.held | walks
+    known = [state.model[at] if at in walks else state.effects[at] for at in range(state.given)]
+    bare = (*known, *(one for one in state.found if type(one) not in WALKS))
+    for noise in correlated(axis, Hypothesis(state.model, axis.fit(bare, held)), view):
+        other = Hypothesis(state.model, axis.fit((*bare, noise), held))
+        if _nothing(other.found[-1]):
+            continue
+        switching = telegraph(axis, other, len(other.effects) - 1)
+        if switching is None:
+            continue
+        over = other.likely.log_likelihood + switching.gain - steps.whole
+        over -= PRICE["random_telegraph"] - PRICE["poisson_steps"]
+        if over > 0.0:
+            return replace(switching, gain=steps.gain + over)
+    return steps
 
 
 def _well_formed(view: Sight, null: Mapping[str, Null]) -> bool:

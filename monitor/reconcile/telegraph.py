@@ -34,8 +34,12 @@ from monitor.reconcile.hidden import (
 
 BLOCKS: Final = 8.0
 """Blocks in a correlation time: one dwell in sixteen blocks ends."""
+FINEST: Final = 20_000.0
+"""Blocks in a recording, at most, for sharper times."""
 AMPLITUDES: Final = np.geomspace(0.5, 2.0, 7)
 """Where the search begins, times 2 σ: few dwells tell σ badly, and between two wrong levels a likelihood is rough."""
+DWELLS: Final = (0.35, 1.0)
+"""The same for the dwell time, times 2 T_c: a random walk beside it makes correlation longer."""
 HEAD: Final = 1024
 """Blocks, 64 dwells, after which it is no longer asked in which level the recording began."""
 NEVER: Final = 1e-300
@@ -56,7 +60,7 @@ def telegraph_or_correlated(y: Floats, tau0_s: float, rest: Rest, sigma: float, 
     Raises:
         ValueError: hardly any samples, or no white noise
     """
-    means, block_s = block_means(y, tau0_s, block_for(y.size * tau0_s, correlation_time))
+    means, block_s = block_means(y, tau0_s, block_for(y.size * tau0_s, correlation_time, rest.white, sigma))
     around, start = parts(rest, block_s, means.size * block_s), anywhere(means)
 
     def correlated(sigma: float, time_s: float) -> float:
@@ -73,9 +77,10 @@ def telegraph_or_correlated(y: Floats, tau0_s: float, rest: Rest, sigma: float, 
     )
 
 
-def block_for(span_s: float, correlation_time: float) -> float:
-    """Length of a block, s."""
-    return min(correlation_time / BLOCKS, span_s / WANTED)
+def block_for(span_s: float, correlation_time: float, white: float, sigma: float) -> float:
+    """Length of a block, s: so long that its white noise is half the amplitude, where that times switches better."""
+    sharp_s = max(white / sigma**2, span_s / FINEST) if sigma > 0.0 else span_s
+    return min(correlation_time / BLOCKS, span_s / WANTED, sharp_s)
 
 
 def fit_levels(means: Floats, block_s: float, around: Parts, sigma: float, correlation_time: float) -> Process:
@@ -85,8 +90,8 @@ def fit_levels(means: Floats, block_s: float, around: Parts, sigma: float, corre
     def two_levels(amplitude: float, dwell_s: float, odds: float) -> float:
         return log_likelihood(means, around, start, amplitude, block_s / dwell_s, odds)
 
-    dwell_s = 2.0 * correlation_time
-    amplitude = max(2.0 * sigma * AMPLITUDES, key=lambda a: two_levels(a, dwell_s, 1.0))
+    starts = [(2.0 * sigma * a, 2.0 * correlation_time * d) for a in AMPLITUDES.tolist() for d in DWELLS]
+    amplitude, dwell_s = max(starts, key=lambda start: two_levels(start[0], start[1], 1.0))
     return fit_process(two_levels, {"amplitude": amplitude, "dwell_time": dwell_s})
 
 

@@ -47,6 +47,9 @@ class Twin:
     gain: float  # nats over that
     bounds: Mapping[str, Bounds]  # its parameters
     events: int  # switches or jumps that were seen
+    whole: float = (
+        0.0  # of Poisson steps, ln L: that of the random walk which is their limit, and what they gain over it
+    )
 
 
 def telegraph(axis: Axis, state: Hypothesis, at: int) -> Twin | None:
@@ -80,21 +83,21 @@ def poisson(axis: Axis, state: Hypothesis) -> Twin | None:
     held = frozenset(at for at in range(state.given) if at in state.likely.held or at in walks)
     without = axis.fit((*sizes, *bare), held)
     known = max((size(sizes[at]) for at in walks if at < state.given), default=0.0)
-    excess = size(axis.fit((*sizes, *bare, RateRandomWalk(K=max(known, 1e-12))), held).effects[-1])
+    walk = axis.fit((*sizes, *bare, RateRandomWalk(K=max(known, 1e-12))), held)
+    excess = size(walk.effects[-1])
     rest = _rest(without.effects)
     if not (excess > 0.0 and rest.white > 0.0):
         return None
     left, tau0_s = series(axis.residual(without)), 1.0 / axis.rate_hz
+    contest = steps_or_walk(left, tau0_s, rest, excess)
+    gain, whole = contest.gain, walk.log_likelihood + contest.gain
     if steps:
         contest = steps_or_once(left, tau0_s, rest, excess, most=max(len(steps), SINGLE))
         single = sum(name.startswith("time") for name in contest.second)
         gain = contest.gain + MORE * max(single - FEW, 0)
-    else:
-        contest = steps_or_walk(left, tau0_s, rest, excess)
-        gain = contest.gain
     rate, height = (float(contest.first[name].value) for name in ("rate", "height"))
     found = (*bare, PoissonSteps(rate=rate, height=height))
-    return Twin(found, gain - CAUTION, contest.first, contest.events)
+    return Twin(found, gain - CAUTION, contest.first, contest.events, whole)
 
 
 def _rest(effects: Effects, without: int | None = None) -> Rest:

@@ -19,6 +19,8 @@ TARGETS: Final[Mapping[str, tuple[float, float, float]]] = {
     "plain": (60.0, 180.0, 12.0),
     "faint": (18.0, 38.0, 6.0),
 }  # gain over the baseline between these; and over the best wrong name at least this
+FARTHEST: Final = 1e4
+"""Times the guess of a size: where that gains too little, no size does."""
 ENLARGED: Final = 12.0  # how far a size may grow for its margin
 
 
@@ -76,9 +78,11 @@ def _search(world: World, effect: Effect, aimed: Aim) -> tuple[Effect, Gains]:
         return Observer(world, sized(effect, size, aimed.sense))
 
     recipe = RECIPES[effect.name]
-    hi = recipe.guess(world, effect.axis)
+    hi = guess = recipe.guess(world, effect.axis)
     while observer(hi).gain() < aimed.target:
         hi *= 2.0
+        if hi > FARTHEST * guess:
+            raise NotIdentifiable(f"{effect.name}: no size gains {aimed.target:.3g}")
     lo = 0.5 * hi
     while lo > recipe.least and observer(lo).gain() > aimed.target:
         lo, hi = 0.5 * lo, lo

@@ -6,8 +6,8 @@ from scipy.stats import multivariate_normal
 
 from monitor.reconcile import once
 from monitor.reconcile.hidden import Rest, parts
-from monitor.reconcile.once import steps_or_once, telegraph_or_once
-from tests.monitor.reconcile.made import BLOCK_S, HOUR, TAU0_S, N, dense, jumps, two_levels, white
+from monitor.reconcile.once import steps_or_once
+from tests.monitor.reconcile.made import BLOCK_S, HOUR, TAU0_S, N, dense, jumps, white
 
 REST = Rest(1.0, walk=0.01, correlated=((1.0, 30.0),))
 M = 60
@@ -65,12 +65,9 @@ def test_finds_times_and_heights():
 
 
 def test_nothing_is_no_step():
-    for contest in (
-        steps_or_once(white(HOUR, np.random.default_rng(1)), TAU0_S, Rest(N * N), 2e-6),
-        telegraph_or_once(white(HOUR, np.random.default_rng(1)), TAU0_S, Rest(N * N), 1e-5, 600.0),
-    ):
-        assert contest.second == {}
-        assert abs(contest.gain) < 2.0
+    contest = steps_or_once(white(HOUR, np.random.default_rng(1)), TAU0_S, Rest(N * N), 2e-6)
+    assert contest.second == {}
+    assert abs(contest.gain) < 2.0
 
 
 def test_no_more_than_are_asked_for():
@@ -78,20 +75,10 @@ def test_no_more_than_are_asked_for():
     assert len(steps_or_once(y, TAU0_S, Rest(N * N), 1e-5, most=2).second) == 4
 
 
-def test_one_step_is_no_telegraph_and_no_process():
+def test_one_step_is_no_process():
     for seed in range(3):
         y = stepped((1234.5,), (3e-4,), np.random.default_rng(seed))
-        assert telegraph_or_once(y, TAU0_S, Rest(N * N), 1.5e-4, 600.0).gain < 3.0
         assert steps_or_once(y, TAU0_S, Rest(N * N), 5e-6).gain < 2.0
-
-
-def test_two_levels_many_times_are_a_telegraph():
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        y = white(HOUR, rng) + two_levels(HOUR, 4e-4, 300.0, rng)
-        found = telegraph_or_once(y, TAU0_S, Rest(N * N), 2e-4, 150.0)
-        assert found.gain > 50.0
-        assert found.events >= 4
 
 
 def test_many_steps_are_a_process():

@@ -1,0 +1,1 @@
+"""What the bias does, and taking it out: bias against temperature."""

@@ -1,0 +1,169 @@
+"""``thermal fit`` and ``thermal predict`` on files: a recording in, models of its axes or what they expect out.
+
+An axis that cannot be answered says why and holds up no other. The model file is JSON; ``predict`` reads what ``fit``
+wrote.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from drivers.errors import ConfigError, NotReady
+from drivers.recording import iter_blocks, load_samples
+from drivers.sample import AXES, Floats
+from monitor.drift.heat import Shape, equation
+from monitor.drift.means import Means, interval_means
+from monitor.drift.study import Outlook, Study, judge, nice_interval
+from monitor.drift.thermal import ThermalModel, fitted
+from monitor.estimate.grid import with_temperature
+from monitor.publish.thermal_text import SCHEMA
+
+
+class AxisRow(msgspec.Struct):
+    """One axis in a model file."""
+
+    powers: int
+    time_constants: list[float]
+    reference: float
+    sizes: list[float]
+    start: list[float]
+    phi: float
+    sigma: float
+    covariance: list[list[float]]
+    temperature: tuple[float, float]
+    equation: dict[str, Any] = msgspec.field(default_factory=dict)
+
+
+class ModelFile(msgspec.Struct):
+    """A model file."""
+
+    schema: str
+    interval: float
+    axes: dict[str, AxisRow]
+
+
+def fit(recording: Path, interval_s: float | None = None, rate_hz: float | None = None) -> Study:
+    """Means and models of every axis.
+
+    Raises:
+        RecordingError, ConfigError: no recording, or none with temperature
+    """
+    values, temperature_c, rate, notes = _read(recording, rate_hz)
+    interval = interval_s or nice_interval(temperature_c.size / rate, rate)
+    means = _means(values, temperature_c, rate, interval)
+    fits, refused = {}, {}
+    for axis, one in means.items():
+        try:
+            fits[axis] = fitted(one)
+        except NotReady as error:
+            refused[axis] = str(error)
+    return Study(recording.name, interval, means, fits, refused, notes)
+
+
+def predict(recording: Path, models: Mapping[str, ThermalModel], rate_hz: float | None = None) -> Outlook:
+    """What models of an earlier recording expect of this one."""
+    values, temperature_c, rate, notes = _read(recording, rate_hz)
+    interval = next(iter(models.values())).interval_s
+    means = _means(values, temperature_c, rate, interval)
+    judged, refused = {}, {}
+    for axis, one in means.items():
+        if axis not in models:
+            refused[axis] = "the model says nothing of it"
+        elif one.known.sum() < 2:
+            refused[axis] = f"fewer than two intervals of {interval:g} s"
+        else:
+            judged[axis] = judge(models[axis], one)
+    return Outlook(recording.name, interval, means, judged, refused, notes)
+
+
+def to_file(study: Study) -> bytes:
+    """The model file of all axes that were fitted."""
+    rows = {axis: _row(one.model) for axis, one in study.fits.items()}
+    return msgspec.json.format(msgspec.json.encode(ModelFile(SCHEMA, study.interval_s, rows)), indent=1)
+
+
+def from_file(path: Path) -> dict[str, ThermalModel]:
+    """Models by axis.
+
+    Raises:
+        ConfigError: what is wrong with the file
+    """
+    try:
+        found = msgspec.json.decode(path.read_bytes(), type=ModelFile)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except msgspec.DecodeError as error:
+        raise ConfigError(f"{path}: no thermal model: {error}") from error
+    if found.schema != SCHEMA:
+        raise ConfigError(f'{path}: schema "{found.schema}"; "{SCHEMA}" is read')
+    if not found.axes:
+        raise ConfigError(f"{path}: no axis in it")
+    if not found.interval > 0.0:
+        raise ConfigError(f"{path}: interval: {found.interval:g} s; it must be above 0")
+    return {axis: _model(path, axis, row, found.interval) for axis, row in found.axes.items()}
+
+
+def _row(model: ThermalModel) -> AxisRow:
+    a, b, c = equation(model.shape, model.sizes, model.interval_s) if model.shape.memory else (None, None, None)
+    return AxisRow(
+        powers=model.shape.powers,
+        time_constants=list(model.shape.constants_s),
+        reference=model.reference_c,
+        sizes=model.sizes.tolist(),
+        start=model.start.tolist(),
+        phi=model.phi,
+        sigma=model.sigma,
+        covariance=model.covariance.tolist(),
+        temperature=(model.lowest_c, model.highest_c),
+        equation={} if a is None or b is None else {"a": a.tolist(), "b": b.tolist(), "c": c},
+    )
+
+
+def _model(path: Path, axis: str, row: AxisRow, interval_s: float) -> ThermalModel:
+    k = len(row.time_constants)
+    terms = 1 + row.powers + k
+    covariance = np.array(row.covariance, dtype=np.float64)
+    wrong = [
+        (axis in AXES, f"no such axis; possible are {', '.join(AXES)}"),
+        (row.powers >= 0, f"powers: {row.powers}; it must be 0 or more"),
+        (all(one > 0.0 for one in row.time_constants), "time_constants: each must be above 0 s"),
+        (len(row.sizes) == terms, f"sizes: {len(row.sizes)} of them; {terms} are needed"),
+        (len(row.start) == k, f"start: {len(row.start)} of them; {k} are needed"),
+        (0.0 <= row.phi < 1.0, f"phi: {row.phi:g}; it must be from 0 to below 1"),
+        (covariance.shape == (terms + 2 * k,) * 2, f"covariance: {terms + 2 * k} rows and columns are needed"),
+    ]
+    for right, text in wrong:
+        if not right:
+            raise ConfigError(f"{path}: axes.{axis}: {text}")
+    return ThermalModel(
+        shape=Shape(row.powers, tuple(row.time_constants)),
+        interval_s=interval_s,
+        reference_c=row.reference,
+        sizes=np.array(row.sizes),
+        start=np.array(row.start),
+        phi=row.phi,
+        sigma=row.sigma,
+        covariance=covariance,
+        lowest_c=row.temperature[0],
+        highest_c=row.temperature[1],
+    )
+
+
+def _read(recording: Path, rate_hz: float | None) -> tuple[Floats, Floats, float, tuple[str, ...]]:
+    """Values [n, 6], temperature [n], rate and notes."""
+    found = load_samples(recording, rate_hz)
+    values, temperature_c, rate, notes = with_temperature(list(iter_blocks(found)), found.rate_hz)
+    if not np.isfinite(temperature_c).any():
+        raise ConfigError(f"{recording}: no temperature in it; a column temp or temperature, in °C, is needed")
+    return values, temperature_c, rate, (*found.notes, *notes)
+
+
+def _means(values: Floats, temperature_c: Floats, rate_hz: float, interval_s: float) -> dict[str, Means]:
+    return {
+        axis: interval_means(values[:, at], temperature_c, rate_hz, interval_s)
+        for at, axis in enumerate(AXES)
+        if np.isfinite(values[:, at]).any()
+    }
