@@ -151,7 +151,7 @@ def _size(axis: str, si: float) -> str:
 def _table(*heads: str) -> Table:
     rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
     for head in heads:
-        rows.add_column(head)
+        rows.add_column(head, no_wrap=head in ("axis", "model"))
     return rows
 
 

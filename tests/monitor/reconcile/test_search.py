@@ -83,6 +83,14 @@ def test_what_was_hidden_is_named(name):
     assert found.state.effects[:2] == MODEL  # what is right stays as it is
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_a_slow_telegraph_is_no_random_walk_and_no_poisson_steps(seed):
+    """With a walk in the model that need only be stronger to have its spectrum."""
+    rng = np.random.default_rng(seed)
+    levels = np.cumsum(rng.random(n) < 1.0 / (25.0 * RATE_HZ)) % 2
+    assert names(looked(noise(seed) + 1e-3 * levels)) == ["random_telegraph"]
+
+
 def test_noise_that_becomes_another_is_a_step_of_it():
     found = looked(white(n, np.random.default_rng(3)) * np.where(T < 150.0, 1.0, 1.5), (WHITE,))
     assert names(found) == ["noise_step"]
