@@ -25,7 +25,7 @@ def tell(study: Study, console: Console) -> None:
     """Print what was fitted."""
     console.print(_head(study.recording, study.interval_s, study.means), highlight=False)
     if study.fits:
-        rows = _table("axis", "model", "per °C", "late by", "loop", "leaves", "explained", "validated")
+        rows = _table("axis", "model", "per °C", "late by", "loop", "leaves", "explains", "validated")
         for axis, one in study.fits.items():
             rows.add_row(axis, *_fit_row(axis, one))
         console.print(Padding(rows, (1, 0)))
