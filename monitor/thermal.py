@@ -52,8 +52,8 @@ def fit(recording: Path, interval_s: float | None = None, rate_hz: float | None 
         RecordingError, ConfigError: no recording, or none with temperature
     """
     values, temperature_c, rate, notes = _read(recording, rate_hz)
-    interval = interval_s or nice_interval(temperature_c.size / rate, rate)
-    means = _means(values, temperature_c, rate, interval)
+    means = _means(values, temperature_c, rate, interval_s or nice_interval(temperature_c.size / rate, rate))
+    interval = next(iter(means.values())).interval_s  # of whole samples
     fits, refused = {}, {}
     for axis, one in means.items():
         try:

@@ -42,7 +42,7 @@ def test_fit_then_predict_another_start(tmp_path, capsys):
     gz = found["axes"]["gz"]
     assert gz["slope"] == pytest.approx(COEFFICIENT, rel=0.1)
     assert gz["time_constants"][0] == pytest.approx(7200.0, rel=0.3)
-    assert gz["equation"]["a"][0] == pytest.approx(-np.exp(-3600.0 / gz["time_constants"][0]))
+    assert gz["equation"]["a"][0] == pytest.approx(-np.exp(-found["interval"] / gz["time_constants"][0]))
     assert plot.read_bytes().startswith(b"\x89PNG")
     assert run("thermal", "predict", second, "--model", model, "--json", out, "--plot", plot) == 0
     judged = json.loads(out.read_bytes())["axes"]["gz"]
