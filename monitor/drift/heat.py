@@ -9,7 +9,8 @@ whose roots are p_1 … p_k is k lags side by side, each of its own size; m = k 
 follows at once. It is stable by construction. Each root also leaves p^n, what the time before the first interval left
 behind.
 
-A **polynomial** in T is the established alternative: no memory.
+A **polynomial** in T is the established alternative: no memory. Outside the temperatures of its fit it goes on
+along the chord between their ends, as a power would run away.
 """
 
 from dataclasses import dataclass
@@ -50,11 +51,14 @@ def roots(shape: Shape, interval_s: float) -> Floats:
     return np.exp(-interval_s / np.asarray(shape.constants_s, dtype=np.float64))
 
 
-def responses(shape: Shape, excess_c: Floats, interval_s: float, began: bool = False) -> Floats:
+def responses(
+    shape: Shape, excess_c: Floats, interval_s: float, began: bool = False, ends: tuple[float, float] | None = None
+) -> Floats:
     """Columns [n, terms]: one, powers of T − reference, lags, and what was left behind at the start.
 
     Args:
         excess_c: [n] T − reference, °C, without holes
+        ends: T − reference of the coldest and the warmest that was fitted, °C; beyond them powers are chords
         began: each lag has a start of its own, as the temperature before is not known; else it was what it is at first
 
     >>> responses(Shape(1, ()), np.array([0.0, 2.0]), 60.0).tolist()
@@ -62,12 +66,24 @@ def responses(shape: Shape, excess_c: Floats, interval_s: float, began: bool = F
     """
     n = excess_c.size
     columns = [np.ones(n)]
-    columns += [excess_c**power for power in range(1, shape.powers + 1)]
+    columns += [_power(excess_c, power, ends) for power in range(1, shape.powers + 1)]
     p = roots(shape, interval_s)
     columns += [lagged(excess_c, one) for one in p]
     if began:
         columns += [one ** np.arange(n, dtype=np.float64) for one in p]
     return np.stack(columns, axis=1)
+
+
+def outside(excess_c: Floats, ends: tuple[float, float]) -> Floats:
+    """How far each is beyond the ends, °C."""
+    return excess_c - np.clip(excess_c, *ends)
+
+
+def _power(x: Floats, power: int, ends: tuple[float, float] | None) -> Floats:
+    if ends is None or ends[1] <= ends[0]:
+        return np.asarray(x**power)
+    chord = (ends[1] ** power - ends[0] ** power) / (ends[1] - ends[0])
+    return np.asarray(np.clip(x, *ends) ** power + chord * outside(x, ends))
 
 
 @compiled

@@ -24,7 +24,7 @@ import numpy as np
 
 from drivers.errors import NotReady
 from drivers.sample import Floats
-from monitor.drift.heat import Shape, responses, solved
+from monitor.drift.heat import Shape, outside, responses, solved
 from monitor.drift.means import Means
 
 FEWEST: Final = 12
@@ -82,9 +82,15 @@ class ThermalModel:
 
     @property
     def slope(self) -> float:
-        """Bias per °C in the end, at the reference temperature."""
-        first = float(self.sizes[1]) if self.shape.powers else 0.0
-        return first + float(self.sizes[1 + self.shape.powers :].sum())
+        """Bias per °C, in the end, from the coldest to the warmest of the fit."""
+        (lo, hi), powers = self.ends, np.arange(1, self.shape.powers + 1)
+        chords = (hi**powers - lo**powers) / (hi - lo)
+        return float(self.sizes[1 : 1 + self.shape.powers] @ chords + self.sizes[1 + self.shape.powers :].sum())
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The coldest and the warmest of the fit less the reference, °C."""
+        return self.lowest_c - self.reference_c, self.highest_c - self.reference_c
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,9 +159,12 @@ def predicted(
     Args:
         began: the first interval is the first of the fit, whose start is known; else temperature is taken to have been
             long what it is at first, and intervals are as wide as not knowing that asks for
+
+    Beyond the temperatures of the fit nothing is known: the model goes on along its chord, and as much as that changes
+    it by is added to the interval.
     """
     excess = _whole(temperature_c) - model.reference_c
-    columns = responses(model.shape, excess, model.interval_s, began=True)
+    columns = responses(model.shape, excess, model.interval_s, began=True, ends=model.ends)
     k = model.shape.memory
     if not began:
         columns[:, columns.shape[1] - k :] = 0.0
@@ -171,6 +180,7 @@ def predicted(
         bias[1:] += model.phi * last
         sigma[1:][known] = model.sigma
     variance = np.einsum("ij,jk,ik->i", rows, model.covariance, rows) + sigma**2
+    variance += (model.slope * outside(excess, model.ends)) ** 2
     if not began and k:
         swing = (model.highest_c - model.lowest_c) / 12.0**0.5
         lags = model.sizes[1 + model.shape.powers :]
@@ -367,6 +377,7 @@ def _slopes(model: ThermalModel, excess: Floats, sizes: Floats, began: bool) -> 
                 excess,
                 model.interval_s,
                 began=True,
+                ends=model.ends,
             )
             for by in (-STEP, STEP)
         ]

@@ -92,6 +92,18 @@ def test_another_start_of_the_sensor_is_an_offset():
     assert judged.rms > 10.0 * judged.rms_moved
 
 
+def test_beyond_the_temperatures_of_the_fit_nothing_runs_away():
+    """A curve fitted up to 30 °C is asked at 40: it goes on along its chord, and says how little it knows."""
+    t = np.linspace(20.0, 30.0, 60)
+    rng = np.random.default_rng(10)
+    bias = 1e-5 * (t - 25.0) + 4e-7 * (t - 25.0) ** 3 + 1e-6 * rng.standard_normal(60)
+    model = fitted(Means(60.0, bias, np.full(60, 1e-6), t)).model
+    assert model.shape.powers >= 3
+    beyond = predicted(model, np.array([30.0, 35.0, 40.0]))
+    np.testing.assert_allclose(np.diff(beyond.bias), 5.0 * model.slope, rtol=1e-9)
+    assert np.all(np.diff(beyond.hi - beyond.lo) > 5.0 * model.slope)
+
+
 def test_one_way_says_nothing_of_lateness():
     t = np.arange(60.0)
     warmth = 25.0 + 8.0 * (1.0 - np.exp(-t / 20.0))
