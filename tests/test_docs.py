@@ -40,6 +40,12 @@ COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 PRINTED_BY = "tcp/127.0.0.1:7450"
 
 
+def options(command: str) -> set[str]:
+    """All that a command takes, or its own commands do."""
+    each = [COMMANDS[command], *getattr(COMMANDS[command], "commands", {}).values()]
+    return {option for one in each for parameter in one.params for option in parameter.opts if option.startswith("--")}
+
+
 def title(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
@@ -99,8 +105,7 @@ def test_every_command_is_one(page: Path) -> None:
         for line in text.splitlines():
             for word, rest in re.findall(r"\bimu-monitor ([a-z]\w*)(.*)", line):
                 assert word in COMMANDS, line
-                known = {option for parameter in COMMANDS[word].params for option in parameter.opts}
-                assert set(re.findall(r"--[a-z-]+", rest)) <= known, line
+                assert set(re.findall(r"--[a-z-]+", rest)) <= options(word), line
 
 
 def test_the_table_has_every_command_and_its_options() -> None:
@@ -108,8 +113,7 @@ def test_the_table_has_every_command_and_its_options() -> None:
     assert [name for name, _ in rows] == list(COMMANDS)
     everywhere = {"--help", "--seconds", "--viewer"}
     for name, row in rows:
-        own = {option for parameter in COMMANDS[name].params for option in parameter.opts if option.startswith("--")}
-        assert own - everywhere == set(re.findall(r"--[a-z-]+", row)), name
+        assert options(name) - everywhere == set(re.findall(r"--[a-z-]+", row)), name
 
 
 def test_the_viewers_address_is_the_one_it_listens_on() -> None:
