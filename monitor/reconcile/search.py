@@ -36,6 +36,8 @@ MENDED: Final = frozenset({Saturation, SampleHold, Outliers})
 """Effects after which the samples are put right."""
 DISTRIBUTION: Final = ("tails", "variance")
 """Lenses that tell whether samples are Gaussian and steady."""
+SWITCHES: Final = 10
+"""Of a telegraph that is told from Poisson steps: fewer may well alternate by chance."""
 WALKS: Final = frozenset({BiasStep, RateRandomWalk})
 """Effects that jumps are told from."""
 SHARED: Final = Proof(float("nan"), float("nan"), True, "its spectrum is that of what it stands for, and was held out")
@@ -91,7 +93,7 @@ def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.
             if jumps is None or jumps.gain <= WORTH:
                 break
             state = settled(axis, jumps.found, model)
-            rounds.append(Round(views(view), seen, (_twin(jumps, jumps.gain),), state, SHARED))
+            rounds.append(Round(views(view), seen, _names(jumps, 0.0), state, SHARED))
             continue
         finer = bins(axis.n, axis.rate_hz, peaks(view))
         if finer.count.size > axis.bins.count.size + 8:
@@ -166,10 +168,10 @@ def told_apart(axis: Axis, state: Hypothesis, trials: list[Trial], view: Sight) 
         twin = jumping(axis, state, view)
     if twin is None:
         return state, trials
-    one = _twin(twin, trials[0].value + twin.gain)
+    named = _names(twin, trials[0].value)
     if twin.gain <= WORTH:
-        return state, [trials[0], one, *trials[1:]]
-    return settled(axis, twin.found, state.model), [one, *trials]
+        return state, [trials[0], *named, *trials[1:]]
+    return settled(axis, twin.found, state.model), [*named, *trials]
 
 
 def jumping(axis: Axis, state: Hypothesis, view: Sight) -> Twin | None:
@@ -187,12 +189,12 @@ def jumping(axis: Axis, state: Hypothesis, view: Sight) -> Twin | None:
         if _nothing(other.found[-1]):
             continue
         switching = telegraph(axis, other, len(other.effects) - 1)
-        if switching is None:
+        if switching is None or switching.events < SWITCHES:
             continue
         over = other.likely.log_likelihood + switching.gain - steps.whole
         over -= PRICE["random_telegraph"] - PRICE["poisson_steps"]
         if over > 0.0:
-            return replace(switching, gain=steps.gain + over)
+            return replace(switching, gain=steps.gain + over, rival=steps)
     return steps
 
 
@@ -231,6 +233,8 @@ def _nothing(effect: Effect) -> bool:
     return type(effect) in NOISE and size(effect) == 0.0
 
 
-def _twin(twin: Twin, value: float) -> Trial:
+def _names(twin: Twin, value: float) -> tuple[Trial, ...]:
+    """A twin of what is worth ``value``, and the twin's own rival."""
     effect = twin.found[-1]
-    return Trial(effect.name, effect, value, bounds=twin.bounds, events=twin.events)
+    one = Trial(effect.name, effect, value + twin.gain, bounds=twin.bounds, events=twin.events)
+    return (one,) if twin.rival is None else (one, *_names(twin.rival, value))

@@ -47,9 +47,8 @@ class Twin:
     gain: float  # nats over that
     bounds: Mapping[str, Bounds]  # its parameters
     events: int  # switches or jumps that were seen
-    whole: float = (
-        0.0  # of Poisson steps, ln L: that of the random walk which is their limit, and what they gain over it
-    )
+    whole: float = 0.0  # ln L with Poisson steps: that of the walk which is their limit, and what they gain over it
+    rival: "Twin | None" = None  # what it would have been otherwise
 
 
 def telegraph(axis: Axis, state: Hypothesis, at: int) -> Twin | None:
@@ -97,7 +96,7 @@ def poisson(axis: Axis, state: Hypothesis) -> Twin | None:
         gain = contest.gain + MORE * max(single - FEW, 0)
     rate, height = (float(contest.first[name].value) for name in ("rate", "height"))
     found = (*bare, PoissonSteps(rate=rate, height=height))
-    return Twin(found, gain - CAUTION, contest.first, contest.events, whole)
+    return Twin(found, gain - CAUTION, contest.first, contest.events, whole=whole)
 
 
 def _rest(effects: Effects, without: int | None = None) -> Rest:
