@@ -139,6 +139,8 @@ def clipped(y: Floats, step: float = 0.0) -> Clipped | None:
     if values.size < FEW:
         return None
     ends = np.array([values.max(), -values.min()])
+    if step == 0.0 and max(np.count_nonzero(values == ends[0]), np.count_nonzero(values == -ends[1])) < 2:
+        return None  # as of nearly all, and soon said
     noise = _noise(values)
     pile = _stepped_pile if step >= 0.5 * SHAPING * noise > 0.0 else _tied_pile
     gains = np.array([pile(sign * values, end, step, noise) for sign, end in zip((1.0, -1.0), ends, strict=True)])
@@ -173,6 +175,8 @@ def repeats(y: Floats, step: float = 0.0, limit: float = np.inf) -> Repeats | No
     >>> repeats(x).count
     1.0
     """
+    if step == 0.0 and not (y[1:] == y[:-1]).any():
+        return None  # as above
     good = np.isfinite(y) & (np.abs(y) < limit - max(0.5 * step, 1e-9 * abs(limit)) if np.isfinite(limit) else True)
     pairs = good[1:] & good[:-1]
     apart = np.diff(y)[pairs]
