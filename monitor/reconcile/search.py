@@ -23,7 +23,7 @@ from monitor.reconcile.lenses import LENSES, Sight, sight
 from monitor.reconcile.prepare import again
 from monitor.reconcile.proof import Proof, proof
 from monitor.reconcile.reconciliation import View
-from monitor.reconcile.steady import upheld
+from monitor.reconcile.steady import SMOOTH, upheld
 from monitor.reconcile.terms import COURSE, NATURAL, NOISE, ONCE, size
 from monitor.reconcile.trials import NAMELESS, Trial, instead, tried
 from monitor.reconcile.twins import WORTH, Twin, poisson, telegraph
@@ -216,13 +216,13 @@ def pruned(axis: Axis, state: Hypothesis) -> Hypothesis:
 def _closing(rounds: list[Round]) -> dict[type[Effect], float]:
     """Kind of effect -> the largest gain of a lens when one of its kind was taken: what it was to close.
 
-    Of leaks and steps, that of the lens which shows them.
+    Of leaks, steps and smooth spectra, that of the lens which shows them.
     """
     found: dict[type[Effect], float] = {}
     for one in rounds:
         if one.state.found:
             kind = type(one.state.found[-1])
-            own = issubclass(kind, (Leak, BiasStep))
+            own = issubclass(kind, (Leak, BiasStep, *SMOOTH))
             lenses = (NATURAL[kind.name],) if own else tuple(one.seen)
             found[kind] = max(found.get(kind, 0.0), *(one.seen[lens].gain for lens in lenses))
     return found

@@ -11,7 +11,8 @@ some frequency, the names are withdrawn where
 was.
 
 Leaks are withdrawn where more than half of what the other axes explain is open still: something shakes several axes,
-and no coefficient is right. So are single steps of a level that goes on moving.
+and no coefficient is right. So are single steps of a level that goes on moving, and smooth spectra where what is not
+steady, not Gaussian or shared with other axes is DROWNED times as much: it has a spectrum too.
 
 What is withdrawn is left over at its place, without a name.
 """
@@ -22,7 +23,7 @@ from typing import Final
 import numpy as np
 
 from monitor.noise.effect import Effect, Leak
-from monitor.noise.effects import BandwidthLimit, BiasStep, Narrowband, Sinusoidal
+from monitor.noise.effects import BandwidthLimit, BiasStep, ExponentiallyCorrelated, Narrowband, Sinusoidal
 from monitor.reconcile.axis import Effects
 from monitor.reconcile.gap import Findings, Null
 from monitor.reconcile.hypothesis import Hypothesis
@@ -41,6 +42,9 @@ SHARE: Final = 0.1
 """Of what an effect was to close: with less left at its place the name stands, though not its shape."""
 OPEN: Final = 0.5
 """The same for leaks."""
+DROWNED: Final = 100.0
+SMOOTH: Final = (BandwidthLimit, ExponentiallyCorrelated)
+FOREIGN: Final = ("tails", "variance", "other_axes")
 LOCAL: Final = ("psd", "lines", "spectrogram")
 
 
@@ -68,6 +72,9 @@ def upheld(
         fallen |= {at for at in leaks if others.gain > OPEN * closing.get(type(state.effects[at]), 0.0)}
     if seen["level"].gain > max(null["level"].threshold, SHARE * closing.get(BiasStep, 0.0)):
         fallen |= {at for at in found if isinstance(state.effects[at], BiasStep)}
+    rest = max((seen[lens].gain for lens in FOREIGN if seen[lens].gain > null[lens].threshold), default=0.0)
+    smooth = {at for at in found if isinstance(state.effects[at], SMOOTH)}
+    fallen |= {at for at in smooth if rest > DROWNED * closing.get(type(state.effects[at]), 0.0)}
     return tuple(effect for at, effect in enumerate(state.found, state.given) if at not in fallen)
 
 

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from monitor.noise.effects import BandwidthLimit, BiasStep, CrossAxis, Narrowband, Sinusoidal
+from monitor.noise.effects import (
+    BandwidthLimit,
+    BiasStep,
+    CrossAxis,
+    ExponentiallyCorrelated,
+    Narrowband,
+    Sinusoidal,
+)
 from monitor.reconcile.gap import Null
 from monitor.reconcile.hypothesis import settled
 from monitor.reconcile.lenses import Finding
@@ -13,7 +20,7 @@ from tests.monitor.reconcile.axes import WALK, WHITE, axes, white
 
 MODEL = (WHITE, WALK)
 QUIET = {lens: Finding(1.0, Where(frequency=(1.0, 2.0))) for lens in ("psd", "lines", "spectrogram")}
-QUIET |= {lens: Finding(1.0, Where()) for lens in ("level", "other_axes")}
+QUIET |= {lens: Finding(1.0, Where()) for lens in ("level", "other_axes", "tails", "variance")}
 NULL = dict.fromkeys(QUIET, Null(6.0, 12.0))
 
 
@@ -73,3 +80,10 @@ def test_a_leak_stands_when_it_closed_most_of_what_other_axes_show(left, stands)
 def test_steps_stand_when_the_level_rests_after_them(left, stands):
     seen = {**QUIET, "level": Finding(left, Where(time=(100.0, 100.0)))}
     assert bool(kept((BiasStep(time=60.0, height=1.0),), seen, {BiasStep: 200.0})) == stands
+
+
+@pytest.mark.parametrize(("left", "stands"), [(2500.0, False), (1500.0, True)])
+def test_a_smooth_spectrum_stands_unless_far_more_is_unsteady(left, stands):
+    seen = {**QUIET, "variance": Finding(left, Where(time=(100.0, 200.0)))}
+    found = (ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.5), *lines(17.3))
+    assert len(kept(found, seen, {ExponentiallyCorrelated: 20.0})) == 1 + stands
