@@ -23,7 +23,8 @@ from monitor.reconcile.reconciliation import Bounds
 FURTHEST: Final = 0.15
 """A clock that is further off is another sensor."""
 OTHERS: Final = 6.0
-"""Nats that everything but the strongest feature must gain: the others, and the noise of all axes."""
+"""Nats that everything but the strongest feature must gain, the others and the noise of all axes; and that no feature
+loses, which would then stand where it was."""
 SAME: Final = 1.01
 """Factor between frequencies of one feature, seen on several axes."""
 TRIED: Final = 12
@@ -87,7 +88,10 @@ def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clo
     ratio, width = max(trials, key=lambda one: gain(log(one[0])))
     x = _highest(gain, log(ratio), width)
     top = gain(x)
-    if top < PRICE or top - _strongest(axes, effects, before, exp(x)) < OTHERS:
+    if top < PRICE:
+        return None
+    alone = _each(axes, effects, before, exp(x))
+    if top - max(alone) < OTHERS or min(alone) < -OTHERS:
         return None
     ends = [_end(gain, x, top, sign * width) for sign in (-1.0, 1.0)]
     of_axes = gains(x)
@@ -97,10 +101,10 @@ def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clo
     return Clock(Bounds(exp(x), exp(ends[0]), exp(ends[1])), top, strongest, (stated, stated / exp(x)))
 
 
-def _strongest(
+def _each(
     axes: Mapping[str, Axis], effects: Mapping[str, Effects], before: Mapping[str, float], ratio: float
-) -> float:
-    """Nats of the feature that gains most where the ratio puts it: that one may have moved itself."""
+) -> list[float]:
+    """Nats that each feature gains where the ratio puts it, alone; the strongest may have moved itself."""
     features = sorted({e.frequency for of in effects.values() for e in of if isinstance(e, (Sinusoidal, Narrowband))})
     groups: list[list[float]] = []
     for f_hz in features:
@@ -116,7 +120,7 @@ def _strongest(
             if moved != of:
                 gain += believed(axes[name], moved).likely.log_likelihood - before[name]
         gains.append(gain)
-    return max(gains)
+    return gains
 
 
 def _ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> list[tuple[float, float]]:

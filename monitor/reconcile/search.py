@@ -116,11 +116,12 @@ def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.
         rounds.append(done)
     kept = tuple(effect for effect in upheld(state, _closing(rounds), seen, null) if not _nothing(effect))
     before = None
-    if kept != state.found:
-        before = views(view), seen
+    while kept != state.found:
+        before = before or (views(view), seen)
         state = settled(axis, kept, model)
         view = sight(axis, state.likely)
         seen = look(view)
+        kept = tuple(effect for effect in state.found if not _nothing(effect))
     return Search(start, tuple(rounds), axis, state, views(view), seen, before, rivals)
 
 

@@ -107,3 +107,14 @@ def test_a_line_that_went_away_is_no_clock():
 
 def test_white_noise_alone_reads_as_another_size():
     assert pytest.approx(1.1) == restated(AngleRandomWalk(N=1.0), 1.21).N
+
+
+def test_a_line_that_stands_where_it_was_says_that_the_clock_is_right():
+    """Two lines that moved by one ratio are worth far more than the third loses, and still it was not the clock."""
+    plain = NoiseModel(dict.fromkeys(GYRO_AXES, (WHITE, WALK)), RATE_HZ)
+    third = Sinusoidal(amplitude=6e-5, frequency=23.9, phase=1.0)
+    model = plain + NoiseModel({"gy": (LINE, OTHER, third)})
+    moved = [Sinusoidal(amplitude=one.amplitude, frequency=one.frequency / 1.02, phase=0.0) for one in (LINE, OTHER)]
+    drawn = recording(plain + NoiseModel({"gy": (*moved, third)}), n, 1)
+    effects = {name: tuple(model.effects[name]) for name in GYRO_AXES}
+    assert wrong_clock(axes(dict(drawn.values), effects), effects) is None
