@@ -36,6 +36,8 @@ BLOCKS: Final = 8.0
 """Blocks in a correlation time: one dwell in sixteen blocks ends."""
 FINEST: Final = 20_000.0
 """Blocks in a recording, at most, for sharper times."""
+SAMPLES: Final = 20
+"""In a block, where a correlation time has as many: a sensor's noise is white from a few samples on only."""
 AMPLITUDES: Final = np.geomspace(0.5, 2.0, 7)
 """Where the search begins, times 2 σ: few dwells tell σ badly, and between two wrong levels a likelihood is rough."""
 DWELLS: Final = (0.35, 1.0)
@@ -60,7 +62,7 @@ def telegraph_or_correlated(y: Floats, tau0_s: float, rest: Rest, sigma: float, 
     Raises:
         ValueError: hardly any samples, or no white noise
     """
-    means, block_s = block_means(y, tau0_s, block_for(y.size * tau0_s, correlation_time, rest.white, sigma))
+    means, block_s = block_means(y, tau0_s, block_for(y.size * tau0_s, tau0_s, correlation_time, rest.white / sigma**2))
     around, start = parts(rest, block_s, means.size * block_s), anywhere(means)
 
     def correlated(sigma: float, time_s: float) -> float:
@@ -77,10 +79,13 @@ def telegraph_or_correlated(y: Floats, tau0_s: float, rest: Rest, sigma: float, 
     )
 
 
-def block_for(span_s: float, correlation_time: float, white: float, sigma: float) -> float:
-    """Length of a block, s: so long that its white noise is half the amplitude, where that times switches better."""
-    sharp_s = max(white / sigma**2, span_s / FINEST) if sigma > 0.0 else span_s
-    return min(correlation_time / BLOCKS, span_s / WANTED, sharp_s)
+def block_for(span_s: float, tau0_s: float, correlation_time: float, even_s: float) -> float:
+    """Length of a block, s; switches are timed better by short ones.
+
+    Args:
+        even_s: white noise of blocks as long is half of the amplitude; shorter ones tell nothing more
+    """
+    return min(correlation_time / BLOCKS, span_s / WANTED, max(even_s, span_s / FINEST, SAMPLES * tau0_s))
 
 
 def fit_levels(means: Floats, block_s: float, around: Parts, sigma: float, correlation_time: float) -> Process:

@@ -157,7 +157,9 @@ def test_a_start_far_off_finds_the_same_levels():
 
 def test_blocks_follow_the_correlation_time():
     means, block_s = block_means(
-        np.random.default_rng(0).standard_normal(HOUR), TAU0_S, telegraph.block_for(3600.0, 8.0, 1.0, 0.5)
+        np.random.default_rng(0).standard_normal(HOUR), TAU0_S, telegraph.block_for(3600.0, TAU0_S, 8.0, 4.0)
     )
     assert (means.size, block_s) == (3600, pytest.approx(1.0))
-    assert telegraph.block_for(3600.0, 5000.0, 1.0, 0.1) == pytest.approx(18.0)
+    assert telegraph.block_for(3600.0, TAU0_S, 5000.0, 100.0) == pytest.approx(18.0)
+    assert telegraph.block_for(3600.0, TAU0_S, 64.0, 2.0) == pytest.approx(2.0)
+    assert telegraph.block_for(3600.0, TAU0_S, 64.0, 1e-3) == pytest.approx(20 * TAU0_S)
