@@ -84,6 +84,15 @@ def program(*arguments: str, **more: Any) -> "subprocess.CompletedProcess[str]":
     return subprocess.run([*PROGRAM, *arguments], capture_output=True, text=True, timeout=60, check=False, **more)
 
 
+def test_linear_algebra_keeps_to_one_thread_unless_told() -> None:
+    """Threads of the program's own share the work; a user's own setting stays."""
+    command = [sys.executable, "-c", "import monitor.cli, os; print(os.environ['OPENBLAS_NUM_THREADS'])"]
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    for given, seen in (({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")):
+        done = subprocess.run(command, capture_output=True, text=True, env=environment | given, check=True)
+        assert done.stdout.strip() == seen
+
+
 # --- configuration files ---------------------------------------------------------------------------
 
 WRONG_FILES = {

@@ -12,7 +12,7 @@ from monitor.drift.thermal import Prediction, ThermalFit, ThermalModel, predicte
 
 INTERVALS: Final = 72
 """In a recording, unless an interval is given: the number of the paper, 72 h by the hour."""
-NICE_S: Final = (1, 2, 5, 10, 15, 20, 30, 60, 120, 300, 600, 900, 1200, 1800, 3600, 7200, 14400)
+NICE_S: Final = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 20, 30, 60, 120, 300, 600, 900, 1200, 1800, 3600, 7200, 14400)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ def nice_interval(seconds: float, rate_hz: float) -> float:
     """A round interval of which a recording has about INTERVALS.
 
     >>> nice_interval(72 * 3600.0, 100.0), nice_interval(8784.0, 4.16), nice_interval(60.0, 100.0)
-    (3600, 120, 1)
+    (3600, 120, 0.5)
     """
     most = max(seconds / INTERVALS, 1.0 / rate_hz) * 1.01
     return max((one for one in NICE_S if 1.0 / rate_hz <= one <= most), default=1.0 / rate_hz)
