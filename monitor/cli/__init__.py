@@ -25,6 +25,7 @@ for _pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 FAILED: Final = 1
 WRONG: Final = 2
 NO_ANSWER: Final = 3
+INTERRUPTED: Final = 128 + signal.SIGINT
 
 app = typer.Typer(
     help="Live noise monitor for MEMS IMUs: windowed Allan variance and Q, N, B, K, R while the sensor runs.",
@@ -377,7 +378,10 @@ def main() -> None:
     """The program: every error is one line and a status."""
     try:
         # without its own error pages, typer hands an Exit's status back
-        sys.exit(app(standalone_mode=False))
+        status = app(standalone_mode=False)
+        if status == INTERRUPTED:  # Ctrl-C, of which typer makes an Exit
+            _fail("interrupted", INTERRUPTED)
+        sys.exit(status)
     except TyperException as error:
         _fail(error.format_message(), WRONG)
     except (ConfigError, RecordingError) as error:
@@ -387,7 +391,7 @@ def main() -> None:
     except ImuError as error:
         _fail(str(error), FAILED)
     except typer.Abort:
-        _fail("interrupted", 128 + signal.SIGINT)
+        _fail("interrupted", INTERRUPTED)
     except BrokenPipeError:
         sys.stderr.close()  # whoever read our output has gone; nothing to say and nobody to say it to
         sys.exit(FAILED)
