@@ -132,6 +132,7 @@ def _model(path: Path, axis: str, row: AxisRow, interval_s: float) -> ThermalMod
         (all(one > 0.0 for one in row.time_constants), "time_constants: each must be above 0 s"),
         (len(row.sizes) == terms, f"sizes: {len(row.sizes)} of them; {terms} are needed"),
         (len(row.start) == k, f"start: {len(row.start)} of them; {k} are needed"),
+        (row.temperature[0] < row.temperature[1], "temperature: the coldest and the warmest of the fit are needed"),
         (0.0 <= row.phi < 1.0, f"phi: {row.phi:g}; it must be from 0 to below 1"),
         (covariance.shape == (terms + 2 * k,) * 2, f"covariance: {terms + 2 * k} rows and columns are needed"),
     ]

@@ -119,9 +119,7 @@ class ThermalFit:
     model: ThermalModel
     candidates: tuple[Candidate, ...]  # the one that was taken, and the others by their AICc
     both_ways: bool  # temperature rose and fell
-    hysteresis: (
-        float | None
-    )  # largest difference of rising and falling at one temperature; None where that was not seen
+    hysteresis: float | None  # largest difference of rising and falling at one temperature; None if it went one way
     explained: float  # share of the variance of the means
 
 
@@ -145,10 +143,8 @@ def fitted(means: Means) -> ThermalFit:
     known = means.known
     left = means.bias[known] - (best.columns @ best.sizes)[known]
     explained = 1.0 - float(np.var(left) / np.var(means.bias[known]))
-    loop = _loop(means.temperature_c, best.columns @ best.sizes) if both_ways and model.shape.memory else None
-    return ThermalFit(
-        model, candidates, both_ways, loop if model.shape.memory else (0.0 if both_ways else None), explained
-    )
+    loop = _loop(means.temperature_c, best.columns @ best.sizes) if model.shape.memory else 0.0
+    return ThermalFit(model, candidates, both_ways, loop if both_ways else None, explained)
 
 
 def predicted(
@@ -170,7 +166,7 @@ def predicted(
         columns[:, columns.shape[1] - k :] = 0.0
     sizes = np.concatenate([model.sizes, model.start if began else np.zeros(k)])
     bias = columns @ sizes
-    rows = np.hstack([columns, _slopes(model, excess, sizes, began)])
+    rows = np.hstack([columns, _slopes(model, excess, sizes)])
     sigma = np.full(excess.size, model.spread)
     if measured is not None:
         known = np.isfinite(measured[:-1])
@@ -281,8 +277,6 @@ def _with_phi(means: Means, excess: Floats, shape: Shape, phi: float) -> _Tried:
 
     for _ in range(k):
         free = [one for one in grid.tolist() if all(max(one / c, c / one) >= APART for c in constants)]
-        if not free:
-            return of((*constants, slowest))
         constants = min(((*constants, one) for one in free), key=lambda each: of(each).aicc)
     for _ in range(2 if k > 1 else 1):
         for at in range(k):
@@ -359,14 +353,14 @@ def _model(means: Means, excess: Floats, reference_c: float, one: _Tried) -> The
         lowest_c=float(np.nanmin(means.temperature_c)),
         highest_c=float(np.nanmax(means.temperature_c)),
     )
-    rows = np.hstack([one.columns, _slopes(model, excess, one.sizes, began=True)])
+    rows = np.hstack([one.columns, _slopes(model, excess, one.sizes)])
     x, _, _ = _whitened(rows, np.zeros(excess.size), means.known, one.phi)
     scale = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
     inverse = np.linalg.pinv((x / scale).T @ (x / scale), rcond=1e-10) / np.outer(scale, scale)
     return replace(model, covariance=one.sigma**2 * inverse)
 
 
-def _slopes(model: ThermalModel, excess: Floats, sizes: Floats, began: bool) -> Floats:
+def _slopes(model: ThermalModel, excess: Floats, sizes: Floats) -> Floats:
     """Derivatives [n, k] of the bias by the logarithm of each time constant."""
     constants = model.shape.constants_s
     out = np.zeros((excess.size, len(constants)))

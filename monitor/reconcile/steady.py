@@ -43,6 +43,7 @@ SHARE: Final = 0.1
 OPEN: Final = 0.5
 """The same for leaks."""
 DROWNED: Final = 100.0
+"""Times what a smooth spectrum was to close: with as much left of what is FOREIGN to any spectrum it does not stand."""
 SMOOTH: Final = (BandwidthLimit, ExponentiallyCorrelated)
 FOREIGN: Final = ("tails", "variance", "other_axes")
 LOCAL: Final = ("psd", "lines", "spectrogram")

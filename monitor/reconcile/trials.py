@@ -136,13 +136,14 @@ def _samples(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
         effect = Outliers(fraction=min(far.fraction.value, 1.0), scale=unit * far.scale.value)
         bounds = {"fraction": _bounds(far.fraction), "scale": _bounds(far.scale, unit)}
         found.append(_trial(effect, far.gain, bounds, far.count))
-    rival = max(course.trend, course.periodic.gain, course.wander, _burst(seen))
+    rival = max(course.trend, course.periodic.gain, course.wander)
     length_s = axis.n / axis.rate_hz
     inside = MARGIN * length_s < course.step.time.value < (1.0 - MARGIN) * length_s
     if (
         inside
         and course.step.gain > rival - RIVAL
         and any(isinstance(effect, AngleRandomWalk) for effect in state.effects)
+        and course.step.gain > _burst(seen) - RIVAL
     ):
         step = NoiseStep(time=course.step.time.value, ratio=course.step.ratio.value)
         bounds = {"time": _bounds(course.step.time), "ratio": _bounds(course.step.ratio)}

@@ -92,6 +92,7 @@ def good(tmp_path):
         (lambda m: m["axes"].update(gq=m["axes"].pop("gz")), "axes.gq: no such axis"),
         (lambda m: m["axes"]["gz"].update(sizes=[1.0]), "axes.gz: sizes: 1 of them"),
         (lambda m: m["axes"]["gz"].update(time_constants=[-1.0]), "axes.gz: time_constants"),
+        (lambda m: m["axes"]["gz"].update(temperature=[25.0, 25.0]), "axes.gz: temperature"),
         (lambda m: m["axes"]["gz"].update(phi=1.0), "axes.gz: phi: 1"),
         (lambda m: m["axes"]["gz"].update(covariance=[[1.0]]), "axes.gz: covariance"),
         (lambda m: m["axes"]["gz"].pop("sigma"), "sigma"),
