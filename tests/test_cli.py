@@ -847,7 +847,7 @@ main()
     with daemon([sys.executable, "-c", source, "analyze", str(tmp_path / "long.npz"), "--window", "1000"]) as one:
         one.hears("working")
         assert one.status_after(signal.SIGINT, 10.0) == 128 + signal.SIGINT
-        assert one.rest() == ""
+        assert one.rest() == "imu-monitor: interrupted\n"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
