@@ -16,7 +16,7 @@ import typer
 from typer.exceptions import TyperException
 
 from drivers.errors import ConfigError, ImuError, NotReady, RecordingError
-from monitor.cli import options, output, serving
+from monitor.cli import drift, options, output, serving
 
 # before NumPy is imported: matrices are small here and threads of our own share the work, where more would only spin
 for _pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -265,6 +265,8 @@ thermal_app = typer.Typer(
     help="Bias against temperature: fit a model to a recording, predict another.", rich_markup_mode=None
 )
 app.add_typer(thermal_app, name="thermal")
+
+app.command()(drift.compensate)
 
 RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")]
 Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate, where the file says none.")]

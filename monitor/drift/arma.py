@@ -13,7 +13,7 @@ kept stable and invertible by writing the coefficients through partial autocorre
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import atanh, exp, log, pi, sqrt, tanh
 from typing import Final
 
@@ -37,7 +37,11 @@ HALF_CHI2: Final = 1.920729
 """Half of the 95 % quantile of χ² with one degree of freedom."""
 BISECTIONS: Final = 6
 """Of the last step outwards."""
-FIRST: Final = {0: ((),), 1: ((0.3,), (0.9,), (0.99,)), 2: ((0.5, 0.0), (0.9, 0.0), (0.99, 0.0), (0.9, -0.5), (0.3, 0.4))}
+FIRST: Final = {
+    0: ((),),
+    1: ((0.3,), (0.9,), (0.99,)),
+    2: ((0.5, 0.0), (0.9, 0.0), (0.99, 0.0), (0.9, -0.5), (0.3, 0.4)),
+}
 """Partial autocorrelations to begin from."""
 FIRST_MOVING: Final = (-0.9, -0.5, 0.0, 0.5)
 SHARES: Final = (1e-3, 0.03, 0.5)
@@ -80,12 +84,13 @@ class Arma:
         return f"ARMA({self.order[0]}, {self.order[1]})" if self.order != (0, 0) else "constant"
 
 
-def identify(z: Floats, white: float = 0.0, orders: Sequence[Order] = ORDERS) -> Arma:
-    """The order with the least BIC (Schwarz 1978), with its parameters and their intervals.
+def identify(z: Floats, white: float = 0.0, orders: Sequence[Order] = ORDERS, intervals: bool = False) -> Arma:
+    """The order with the least BIC (Schwarz 1978), and its parameters.
 
     Args:
         z: [n] rad/s; NaN = missing
         white: variance of v, (rad/s)²
+        intervals: of the coefficients too, which takes ten times as long
     Raises:
         NotReady: fewer than FEWEST values, or all the same
     """
@@ -98,17 +103,11 @@ def identify(z: Floats, white: float = 0.0, orders: Sequence[Order] = ORDERS) ->
     unit = (z - origin) / scale
     share = white / scale**2
     best = min((_fitted(unit, share, order) for order in orders), key=lambda one: one[0])
-    return _arma(unit, share, origin, scale, best)
-
-
-def expected(arma: Arma, steps: int) -> Floats:
-    """Variance [steps] of x when nothing is measured any more, 1, 2, … steps after it was known."""
-    p11, p12, p22 = 0.0, 0.0, 0.0
-    out = np.empty(steps)
-    for k in range(steps):
-        p11, p12, p22 = _forward(p11, p12, p22, *arma.phi, arma.phi[0] + arma.theta, arma.variance)
-        out[k] = p11
-    return out
+    found = _arma(unit, share, origin, scale, best)
+    if not intervals:
+        return found
+    lo, hi = _interval(unit, share, *best[1:])
+    return replace(found, lo=lo, hi=hi)
 
 
 @compiled
@@ -187,9 +186,9 @@ def _likelihood(z: Floats, white: float, order: Order, u: Floats) -> float:
     phi1, phi2, theta, variance = _natural(order, u, white)
     count, logs, square, _ = innovations(z, phi1, phi2, theta, variance, white)
     if white > 0.0 and order != (0, 0):
-        return -0.5 * (count * log(2.0 * pi) + logs + square)
+        return float(-0.5 * (count * log(2.0 * pi) + logs + square))
     size = max(square / count, 1e-300)
-    return -0.5 * (count * (log(2.0 * pi * size) + 1.0) + logs)
+    return float(-0.5 * (count * (log(2.0 * pi * size) + 1.0) + logs))
 
 
 def _natural(order: Order, u: Floats, white: float) -> tuple[float, float, float, float]:
@@ -214,7 +213,6 @@ def _arma(z: Floats, white: float, origin: float, scale: float, best: _Tried) ->
     if seen == 0.0:
         variance = square / count
     nothing = order == (0, 0) and white > 0.0
-    lo, hi = _interval(z, white, order, u)
     return Arma(
         phi=(phi1, phi2),
         theta=theta,
@@ -222,8 +220,6 @@ def _arma(z: Floats, white: float, origin: float, scale: float, best: _Tried) ->
         mean=origin + scale * mean,
         white=(variance if nothing else white) * scale**2,
         order=order,
-        lo=lo,
-        hi=hi,
         likelihood=_likelihood(z, white, order, u) - count * log(scale),
         bic=bic + 2.0 * count * log(scale),
         count=count,
@@ -276,9 +272,7 @@ def _others(order: Order, u: Floats, which: int) -> Floats:
     return np.delete(u, held)
 
 
-def _profile(
-    z: Floats, white: float, order: Order, which: int, value: float, near: Floats
-) -> tuple[float, Floats]:
+def _profile(z: Floats, white: float, order: Order, which: int, value: float, near: Floats) -> tuple[float, Floats]:
     """The likelihood with one coefficient held, and where the others have it at its best."""
 
     def full(free: Floats) -> Floats:
@@ -296,5 +290,7 @@ def _profile(
 
     if not near.size:
         return _likelihood(z, white, order, full(near)), near
-    found = minimize(lambda free: -_likelihood(z, white, order, full(free)), near, method="BFGS", options={"gtol": 1e-2})
+    found = minimize(
+        lambda free: -_likelihood(z, white, order, full(free)), near, method="BFGS", options={"gtol": 1e-2}
+    )
     return -float(found.fun), found.x

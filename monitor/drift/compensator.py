@@ -41,6 +41,8 @@ FADE: Final = 1.0 / 16.0
 LOUD: Final = (0.02,) * 3 + (0.3,) * 3
 """rad/s and m/s²: rms about the mean of a block that is no rest for certain, whatever the sensor has got used to: a car
 that drives all day. Nothing is learned then, and rates come out nearly as they came in."""
+LARGEST: Final = 0.35
+"""rad/s, 20 °/s: no gyro's mean at rest is beyond."""
 LONGEST_GAP: Final = 100_000
 """Intervals predicted over: after more nothing is known any more in any case."""
 
@@ -68,7 +70,7 @@ class State(NamedTuple):
     sums: Floats  # [SLOTS, 3, filters + 1, 2] of ``follow``, for each
     means: Floats  # [3, BLOCKS] of blocks at rest in the interval; NaN = not at rest
     followed: Floats  # [3, filters + 1, 2] sums of those blocks
-    count: Floats  # [3] samples of them
+    samples: Floats  # [3] how many they are of
     table: Floats  # gains
     first: Ints
     verdicts: Ints  # [3, 4] scratch: blocks, whether they move; episodes are not used
@@ -245,7 +247,7 @@ def _state(rate_hz: float, adapts: bool) -> State:
         sums=np.zeros((SLOTS, GYROS, filters + 1, 2)),
         means=np.full((GYROS, BLOCKS), np.nan),
         followed=np.zeros((GYROS, filters + 1, 2)),
-        count=np.zeros(GYROS),
+        samples=np.zeros(GYROS),
         table=table,
         first=first,
         verdicts=np.zeros((2, SLOTS), np.int64),
@@ -269,37 +271,40 @@ def _advance(values, index, size, s, out, taught):  # type: ignore[no-untyped-de
             s.waiting[slot, :, NUMBER] = number
             s.waiting[slot, :, COUNT:] = 0.0
             s.sums[slot] = 0.0
-        for k in range(i, end):
-            for a in range(GYROS):
-                out[k, a] = _taken_out(values[k, a], a, s.sums[slot, a], s, keep)
-            for a in range(len(AXES)):
-                _add(values[k, a], s.waiting[slot, a])
+        for a in range(GYROS):
+            _take_out(values[i:end, a], a, s.sums[slot, a], s, keep, out[i:end, a])
+        for a in range(len(AXES)):
+            _add(values[i:end, a], s.waiting[slot, a])
         i = end
     return filled
 
 
 @compiled
-def _taken_out(z, axis, sums, s, keep):  # type: ignore[no-untyped-def]
-    """One sample of one gyro axis without its drift."""
-    if z != z:
-        coast(s.bank[axis], s.ages[axis], 1)
-        return z
-    if s.bias[axis] == s.bias[axis]:
-        z -= s.bias[axis]
-    rate, _ = follow(z, s.bank[axis], s.ages[axis], s.table, s.first, sums, s.feedback[axis], keep)
-    if s.place[DONE] >= LEAST:
-        return rate
-    s.feedback[axis, 0] = 0.0
-    return z
+def _take_out(z, axis, sums, s, keep, out):  # type: ignore[no-untyped-def]
+    """Samples of one gyro axis without its drift; NaN = missing."""
+    bank, ages, feedback = s.bank[axis], s.ages[axis], s.feedback[axis]
+    bias = s.bias[axis] if s.bias[axis] == s.bias[axis] else 0.0
+    trusted = s.place[DONE] >= LEAST
+    for k in range(z.size):
+        if z[k] != z[k]:
+            coast(bank, ages, 1)
+            out[k] = z[k]
+            continue
+        rate = follow(z[k] - bias, bank, ages, s.table, s.first, sums, feedback, keep)
+        if not trusted:
+            rate, feedback[0] = z[k] - bias, 0.0
+        out[k] = rate
 
 
 @compiled
-def _add(value, sums):  # type: ignore[no-untyped-def]
+def _add(values, sums):  # type: ignore[no-untyped-def]
     """To the sums of a block; NaN = missing."""
-    if value == value:
+    for k in range(values.size):
+        if values[k] != values[k]:
+            continue
         if sums[COUNT] == 0.0:
-            sums[ORIGIN] = value
-        off = value - sums[ORIGIN]
+            sums[ORIGIN] = values[k]
+        off = values[k] - sums[ORIGIN]
         sums[COUNT] += 1.0
         sums[SUM] += off
         sums[SQUARES] += off * off
@@ -323,7 +328,7 @@ def _judged(number, moves, s, taught, filled):  # type: ignore[no-untyped-def]
         count = s.waiting[slot, a, COUNT]
         if count > 0.0:
             s.means[a, number % BLOCKS] = s.waiting[slot, a, ORIGIN] + s.waiting[slot, a, SUM] / count
-            s.count[a] += count
+            s.samples[a] += count
             s.followed[a] += s.sums[slot, a]
     return filled
 
@@ -333,7 +338,12 @@ def _loud(waiting):  # type: ignore[no-untyped-def]
     """Whether a block is no rest for certain."""
     for a in range(len(AXES)):
         n = waiting[a, COUNT]
-        if n > 0.0 and waiting[a, SQUARES] / n - (waiting[a, SUM] / n) ** 2 > LOUD[a] ** 2:
+        if n == 0.0:
+            continue
+        mean = waiting[a, SUM] / n
+        if waiting[a, SQUARES] / n - mean * mean > LOUD[a] ** 2:
+            return True
+        if a < GYROS and abs(waiting[a, ORIGIN] + mean) > LARGEST:
             return True
     return False
 
@@ -352,14 +362,16 @@ def _over(s, taught):  # type: ignore[no-untyped-def]
             told[DRIFT_ERROR] = np.sqrt(sage_husa.drift(s.row[a])[1])
         count, mean, scatter = _mean(s.means[a])
         if count >= ENOUGH:
-            e, variance, became = sage_husa.measure(s.row[a], mean, scatter, _least(a, s))
+            variance, became = sage_husa.measure(s.row[a], mean, scatter, _least(a, s))
             told[MEAN], told[ERROR], told[BECAME], told[SCATTER] = mean, np.sqrt(variance), became, scatter
             if known and became == sage_husa.USED:
-                learn(s.bank[a], s.followed[a], s.count[a], s.place[DONE] + 1)
+                learn(s.bank[a], s.followed[a], s.samples[a], s.place[DONE] + 1)
                 learned = True
+        else:
+            sage_husa.not_seen(s.row[a])
         _forward(a, s)
     s.place[DONE] += learned
-    s.means[:], s.followed[:], s.count[:] = np.nan, 0.0, 0.0
+    s.means[:], s.followed[:], s.samples[:] = np.nan, 0.0, 0.0
 
 
 @compiled
@@ -382,8 +394,8 @@ def _least(axis, s):  # type: ignore[no-untyped-def]
 
 @compiled
 def _forward(axis, s):  # type: ignore[no-untyped-def]
-    """To the next interval, once anything is known."""
-    if s.row[axis, sage_husa.COUNT] > 0.0:
+    """To the next interval, once a level is confirmed."""
+    if s.row[axis, sage_husa.COUNT] >= sage_husa.CONFIRMED:
         sage_husa.forward(s.row[axis])
         _renew(axis, s)
 

@@ -2,8 +2,8 @@
 
 Zhou & Kumar 1984, with the one-step prediction as the mean of the acceleration (Yuan et al. 2010): state [ω, ω̇],
 transition [[1, T], [0, 1]], process noise 2ασ_a² ∫ over T. With that mean the manoeuvre frequency α and the variance
-σ_a² enter by their product alone; while αT ≪ 1 that is white noise of intensity 2ασ_a² in ω̈. In units of one sample, and
-of what the rate is measured by, one number q is left, and with it the steady gains: a filter of ``memory`` samples.
+σ_a² enter by their product alone; while αT ≪ 1 that is white noise of intensity 2ασ_a² in ω̈. In units of one sample,
+and of the noise of the measured rate, one number q is left, and with it the gains: a filter of ``memory`` samples.
 
 σ_a² adapts with the motion: filters with memories of 2, 4, 8, … samples run side by side, and at every sample the one
 with the least estimated error is taken, or the measured rate itself. By Mallows' C_p (Technometrics 15, 1973) the mean
@@ -40,8 +40,8 @@ DIFFUSE: Final = 1e12
 """Variance of a state of which nothing is known, over that of a sample."""
 
 RATE, SLOPE, RESIDUAL, NOISE, REST = range(5)
-"""Columns of ``bank``: ω and ω̇ a sample, mean square residual of late, variance of the estimate and mean square residual
-at rest. The first row is the measured rate itself: of it only NOISE is used."""
+"""Columns of ``bank``: ω and ω̇ a sample, mean square residual of late, variance of the estimate and mean square
+residual at rest. The first row is the measured rate itself: of it only NOISE is used."""
 AGE, FAR = range(2)
 """Columns of ``ages``: samples since a filter began, samples beyond the gate in a row."""
 
@@ -98,9 +98,9 @@ def follow(z, bank, ages, table, first, sums, feedback, keep):  # type: ignore[n
         feedback: [1] angle that has not come out yet, in samples
         keep: share of it that comes out with a sample
     Returns:
-        The rate, and which filter it is of; 0 = as measured.
+        The rate.
     """
-    least, taken, rate = bank[0, NOISE], 0, z
+    least, rate = bank[0, NOISE], z
     sums[0, 0] += z * z
     for j in range(ages.shape[0]):
         row, age = bank[j + 1], ages[j, AGE]
@@ -125,10 +125,10 @@ def follow(z, bank, ages, table, first, sums, feedback, keep):  # type: ignore[n
         ages[j, FAR] = 0
         error = row[NOISE] + row[RESIDUAL] - row[REST]
         if error < least:
-            least, taken, rate = error, j + 1, row[RATE]
+            least, rate = error, row[RATE]
     rate += keep * feedback[0]
     feedback[0] += z - rate
-    return rate, taken
+    return rate
 
 
 @compiled

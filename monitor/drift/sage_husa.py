@@ -29,6 +29,8 @@ FLOOR: Final = 0.05
 OUTLIER: Final = 6.0
 STAYS: Final = (10.0, 300.0)
 """Intervals."""
+CONFIRMED: Final = 5
+"""Intervals at rest, one after the other, that a first level takes: a carrier may rotate when all begins."""
 SCATTERED: Final = 0.02
 """Share of one interval in the scatter within intervals."""
 SHORTEST, LONGEST = 100, 1000
@@ -39,8 +41,8 @@ PHI1, PHI2, G1, VARIANCE, LEVEL = range(12, 17)
 S, R, SCATTER, SEEN, COUNT, SKIPPED, LATEST, ADAPTS, KNOWN = range(17, 26)
 SIZE: Final = 26
 """Layout of a row: state [3], its covariance [9], the model, and what is estimated of the noise: s, R̂, scatter within
-intervals, intervals with a scatter, intervals at rest, outliers in a row, the latest of them, whether noise is estimated,
-whether a model was identified."""
+intervals, intervals with a scatter, intervals at rest, outliers in a row, the latest of them, whether noise is
+estimated, whether a model was identified."""
 NOT_SEEN, USED, LEFT_OUT, STEPPED = range(4)
 """What became of an interval."""
 
@@ -83,6 +85,13 @@ def forward(row):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def not_seen(row):  # type: ignore[no-untyped-def]
+    """An interval that was not at rest."""
+    if row[COUNT] < CONFIRMED:
+        row[COUNT] = 0.0
+
+
+@compiled
 def drift(row):  # type: ignore[no-untyped-def]
     """Expected bias of the interval, and its variance."""
     return row[X] + row[X + 2], row[P] + 2.0 * row[P + 2] + row[P + 8]
@@ -93,7 +102,7 @@ def measure(row, z, scatter, least):  # type: ignore[no-untyped-def]
     """An interval at rest: its mean z, the variance that the scatter within it gives z (NaN = none), the least of that.
 
     Returns:
-        ε, its variance S, and what became of it.
+        The variance S of ε, and what became of the interval.
     """
     if scatter == scatter:
         row[SEEN] += 1.0
@@ -108,11 +117,14 @@ def measure(row, z, scatter, least):  # type: ignore[no-untyped-def]
     e, total = z - expected, known + row[R]
     became = USED
     if e * e > OUTLIER * OUTLIER * total:
+        if row[COUNT] < CONFIRMED:
+            row[X + 2], row[P + 8], row[COUNT] = z, row[R], 1.0
+            return total, LEFT_OUT
         alike = (z - row[LATEST]) ** 2 < 2.0 * OUTLIER * OUTLIER * row[R]
         row[SKIPPED] = row[SKIPPED] + 1.0 if alike else 1.0
         row[LATEST] = z
         if row[SKIPPED] < min(max(row[COUNT], STAYS[0]), STAYS[1]):
-            return e, total, LEFT_OUT
+            return total, LEFT_OUT
         became = STEPPED
         row[P + 8] += e * e
     row[SKIPPED] = 0.0
@@ -124,7 +136,7 @@ def measure(row, z, scatter, least):  # type: ignore[no-untyped-def]
         row[R] = max((1.0 - d) * row[R] + d * (left * left * e * e + drift(row)[1]), 0.5 * row[SCATTER], least)
         s = row[S]
         row[S] = max(s + d * s * s * (e * e - total) / (total * total), FLOOR * row[VARIANCE])
-    return e, total, became
+    return total, became
 
 
 @compiled

@@ -1,0 +1,50 @@
+"""Commands on drift: ``compensate``."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drivers.errors import ConfigError
+from monitor.cli import output, serving
+
+
+def compensate(
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The recording without drift: .npz, .csv, .parquet, ….")],
+    method: Annotated[
+        str,
+        typer.Option(
+            metavar="M", help="adaptive, as the daemon does; to compare with: fixed, ar, emd, wavelet (extra: denoise)."
+        ),
+    ] = "adaptive",
+    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate, where the file says none.")] = None,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Drift and Allan curves as a picture.")] = None,
+) -> None:
+    """A recording without the drift of its gyros: what the daemon does live, and others to compare with."""
+    from rich.console import Console
+
+    from monitor import compensating
+    from monitor.publish import compensate_text as text
+
+    if rate is not None and not 0.0 < rate < float("inf"):
+        raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
+    if plot is not None and plot.suffix != ".png":
+        raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
+    for option, place in (("--out", out), ("--json", json), ("--plot", plot)):
+        output.check_place(option, place)
+    for option, place in (("--json", json), ("--plot", plot), ("RECORDING", recording)):
+        if place is not None and place.resolve() == out.resolve():
+            raise ConfigError(f"{option}: {place} is what --out writes; another name is needed")
+    serving.end_on_sigterm()
+    with output.progress() as tell:
+        result = compensating.make(compensating.Request(recording, out, method, rate), tell)
+    if json is not None:
+        output.write("--json", json, text.to_json(result) + b"\n")
+    if plot is not None:
+        from monitor.publish.compensate_plot import compensate_plot
+
+        compensate_plot(result, plot)
+    if json != Path("-"):
+        text.tell(result, Console())
