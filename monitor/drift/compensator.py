@@ -35,7 +35,8 @@ SLOTS: Final = 4
 REMEMBERED: Final = 2048
 """Intervals that a model is identified from."""
 FIRST: Final = 60
-"""Intervals at rest after which a model is identified; then at each doubling, and every so many as are remembered."""
+"""Intervals at rest after which a model is identified; then when there are half as many more, and every so many as are
+remembered at the latest."""
 FADE: Final = 1.0 / 16.0
 """Share of an interval in the recent mean of squared innovations."""
 LOUD: Final = (0.02,) * 3 + (0.3,) * 3
@@ -176,7 +177,7 @@ class Compensator:
 
     def adopt(self, axis: int, model: Arma | None) -> None:
         """Take a model over, and go through what is remembered again with it; None: none was found, ask later."""
-        self._due[axis] = self._at_rest[axis] + min(max(self._at_rest[axis], FIRST), REMEMBERED)
+        self._due[axis] = self._at_rest[axis] + min(max(self._at_rest[axis], FIRST) // 2, REMEMBERED)
         if model is None:
             return
         self.models[axis] = model

@@ -14,7 +14,7 @@ beyond GATE deviations bars a filter at once, and makes it begin anew when it st
 Where filters take turns, angle would get lost: what has not come out yet is fed back, slowly.
 """
 
-from math import log2, sqrt
+from math import inf, log2, sqrt
 from typing import Final
 
 import numpy as np
@@ -30,8 +30,8 @@ GATE: Final = 5.0
 """Standard deviations of a residual at rest."""
 BARRED: Final = 3
 """Samples beyond the gate, one after the other, after which a filter begins anew."""
-SETTLED: Final = 4
-"""Memories after which a filter that began anew has its steady gains."""
+SETTLED: Final = (6, 48)
+"""Memories, and samples at the least, after which a filter that began anew has its steady gains."""
 LEAST: Final = 5
 """Intervals at rest before filters are trusted."""
 LEARNED: Final = 60
@@ -68,7 +68,7 @@ def gains(each: Ints) -> tuple[Floats, Ints]:
 
     The last row of a filter is its steady gain.
     """
-    tables = [_gains(intensity(int(memory)), int(SETTLED * memory)) for memory in each]
+    tables = [_gains(intensity(int(memory)), max(SETTLED[0] * int(memory), SETTLED[1])) for memory in each]
     return np.concatenate(tables), np.cumsum([0, *(len(one) for one in tables)])
 
 
@@ -112,8 +112,8 @@ def follow(z, bank, ages, table, first, sums, feedback, keep):  # type: ignore[n
         ages[j, AGE] = age + 1
         off = row[RATE] - z
         square = off * off
-        gate = GATE * GATE * row[REST]
-        bounded = min(square, gate) if gate > 0.0 else square
+        gate = GATE * GATE * row[REST] if row[REST] > 0.0 else inf
+        bounded = min(square, gate)
         row[RESIDUAL] += (bounded - row[RESIDUAL]) / RECENT
         sums[j + 1, 0] += row[RATE] * row[RATE]
         sums[j + 1, 1] += bounded

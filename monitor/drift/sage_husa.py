@@ -33,7 +33,7 @@ CONFIRMED: Final = 5
 """Intervals at rest, one after the other, that a first level takes: a carrier may rotate when all begins."""
 SCATTERED: Final = 0.02
 """Share of one interval in the scatter within intervals."""
-SHORTEST, LONGEST = 100, 1000
+SHORTEST, LONGEST = 40, 1000
 """Intervals of the level's memory: a third of what the model was identified from, within these."""
 
 X, P = 0, 3
