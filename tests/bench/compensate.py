@@ -3,8 +3,8 @@
     python -m tests.bench.compensate [rest|recordings|motion|slow|doubling|coast|arma|robust|speed …] [--seeds 5]
 
 Simulated gyros are those of the catalogue. Whatever learns from a whole recording learns from its first third, or from
-the rest before the motion; the daemon's filter learns as it goes, and is judged on the same stretch. "Before" has the mean
-of what was learned from taken out.
+the rest before the motion; the daemon's filter learns as it goes, and is judged on the same stretch. "Before" has the
+mean of what was learned from taken out.
 """
 
 import argparse
@@ -200,7 +200,7 @@ def slow(seeds: int) -> None:
 
 
 def doubling(seeds: int) -> None:
-    """White noise of the interval means that doubles, or grows fourfold, half way: noise estimated, or as identified."""
+    """White noise of the means that doubles, or grows fourfold, half way: noise estimated, or as identified."""
     made = table(
         "rms error of the drift, in units of its own deviation",
         "white noise",
@@ -276,7 +276,8 @@ def _coast_cells(rows: Floats) -> list[str]:
 def _coasted(values: Floats, rate_hz: float, spans: tuple[float, ...]) -> Floats:
     """[3, spans] rms over axes and places: of the last minute's mean, of the filter's, and what the filter said."""
     one = Compensator(rate_hz)
-    size, kept, taught = BLOCKS * one.size, [], []
+    size, kept = BLOCKS * one.size, []
+    taught: list[Floats] = []
     for start in range(0, len(values) - size, size):
         one.update(values[start : start + size])
         one.identify()
@@ -326,7 +327,7 @@ def arma(seeds: int) -> None:
 
 
 def robust(_seeds: int) -> None:
-    """10⁸ samples with outliers, gaps, saturation, missing values, a stuck sensor, motion and steps: all stays finite."""
+    """10⁸ samples with outliers, gaps, saturation, missing values, stuck values, motion, steps: all stays finite."""
     rng, one = np.random.default_rng(0), Compensator(RATE_HZ)
     size, done, bias = 400_000, 0, np.zeros(6)
     least = np.inf
@@ -361,7 +362,7 @@ def robust(_seeds: int) -> None:
         done += size
     seconds = time.perf_counter() - began
     console.print(
-        f"{done:.0f} samples in {seconds:.0f} s: all finite; least eigenvalue of a covariance over its trace {least:.1e}"
+        f"{done:.0f} samples, {seconds:.0f} s: all finite; least eigenvalue of a covariance over its trace {least:.0e}"
     )
 
 

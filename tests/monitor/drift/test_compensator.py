@@ -141,14 +141,14 @@ def test_the_drift_that_it_expects_is_as_near_as_it_says():
     one = Compensator(RATE_HZ)
     rng = np.random.default_rng(3)
     values = still(900.0)
-    drift = np.cumsum(rng.standard_normal((len(values), 3)), axis=0) * 4e-7
+    drift = np.cumsum(rng.standard_normal((len(values), 3)), axis=0) * 2e-6
     values[:, :3] += drift
     fed(one, values)
     taught = one.take()
     innovations = np.array([i.innovation for i in taught])[120:]
     assert np.nanmean(innovations**2) == pytest.approx(1.0, abs=0.15)
     off = np.array([(i.expected - 0.02 - drift[i.end - 50]) / i.known for i in taught[540:]])
-    assert np.mean(np.abs(off) < 1.96) > 0.8
+    assert np.mean(np.abs(off) < 1.96) > 0.85
     assert {int(x) for i in taught[10:] for x in i.became} <= {USED, LEFT_OUT}
 
 
