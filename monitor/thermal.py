@@ -6,7 +6,7 @@ wrote.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -14,12 +14,14 @@ import numpy as np
 from drivers.errors import ConfigError, NotReady
 from drivers.recording import iter_blocks, load_samples
 from drivers.sample import AXES, Floats
-from monitor.drift.heat import Shape, equation
+from monitor.drift.heat import Shape
 from monitor.drift.means import Means, interval_means
+from monitor.drift.model import ThermalModel
 from monitor.drift.study import Outlook, Study, judge, nice_interval
-from monitor.drift.thermal import ThermalModel, fitted
+from monitor.drift.thermal import fitted
 from monitor.estimate.grid import with_temperature
-from monitor.publish.thermal_text import SCHEMA
+
+SCHEMA: Final = "imu-monitor/thermal-model/1"
 
 
 class AxisRow(msgspec.Struct):
@@ -34,7 +36,8 @@ class AxisRow(msgspec.Struct):
     sigma: float
     covariance: list[list[float]]
     temperature: tuple[float, float]
-    equation: dict[str, Any] = msgspec.field(default_factory=dict)
+    equation: dict[str, list[float] | float] | None = None
+    """For other readers; not read back."""
 
 
 class ModelFile(msgspec.Struct):
@@ -107,7 +110,6 @@ def from_file(path: Path) -> dict[str, ThermalModel]:
 
 
 def _row(model: ThermalModel) -> AxisRow:
-    a, b, c = equation(model.shape, model.sizes, model.interval_s) if model.shape.memory else (None, None, None)
     return AxisRow(
         powers=model.shape.powers,
         time_constants=list(model.shape.constants_s),
@@ -118,7 +120,7 @@ def _row(model: ThermalModel) -> AxisRow:
         sigma=model.sigma,
         covariance=model.covariance.tolist(),
         temperature=(model.lowest_c, model.highest_c),
-        equation={} if a is None or b is None else {"a": a.tolist(), "b": b.tolist(), "c": c},
+        equation=model.equation,
     )
 
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.drift.means import Means
-from monitor.drift.thermal import Prediction, ThermalFit, ThermalModel, predicted
+from monitor.drift.model import Prediction, ThermalModel, predicted
+from monitor.drift.thermal import ThermalFit
 
 INTERVALS: Final = 72
 """In a recording, unless an interval is given: the number of the paper, 72 h by the hour."""

@@ -1,4 +1,4 @@
-"""Bias against temperature: which model, how large, how sure; and what it expects next.
+"""Bias against temperature: which model, how large, how sure.
 
 Polynomials and difference equations (``heat``) are fitted to interval means by least squares of the whole course: an
 equation's own outputs are fed back, never measured ones, so that noise in the means does not pull its roots towards
@@ -8,24 +8,25 @@ Stat. Soc. B 39, 1977) and needs no samples set aside, of which there are few. A
 BLOCKS parts of the record, each predicted from the others. A form that predicts them worse than a constant is not
 taken, as slow heating leaves one end of a polynomial to itself.
 
-A multi-step estimate knows temperature alone; a one-step estimate also knows the bias measured one interval before.
+The search takes some 50 ms to a second, and ``fitting`` does it in pieces of less than a millisecond.
 
 After Wang et al., bias modelling of MEMS gyroscopes under small temperature changes (72 h, means of 1 h), with a
 constant, which the paper has not, and fed-back outputs.
 """
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import log
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 
 from drivers.errors import NotReady
 from drivers.sample import Floats
-from monitor.drift.heat import Shape, outside, responses, solved
+from monitor.drift.heat import Shape, responses, solved
 from monitor.drift.means import Means
+from monitor.drift.model import ThermalModel, covariance, slopes, whole
 
 FEWEST: Final = 12
 """Intervals that anything can be said of."""
@@ -54,52 +55,7 @@ CLEAR: Final = 5.0
 """Standard errors of a mean of temperature: less has hardly moved."""
 ONE_WAY: Final = 0.1
 """Of all movement: if less goes the other way, temperature only rose, or only fell."""
-STEP: Final = 1e-3
-"""Of the logarithm of a time constant, for its derivative."""
-Z95: Final = 1.959964
 GOLDEN: Final = 0.6180339887498949
-
-
-@dataclass(frozen=True, slots=True)
-class ThermalModel:
-    """The bias of one axis as a function of temperature and its past."""
-
-    shape: Shape
-    interval_s: float
-    reference_c: float  # temperature at which the constant holds
-    sizes: Floats  # [terms] constant, powers, lags: rad/s (m/s²) by powers of °C
-    start: Floats  # [k] what each lag had left behind when the fit began
-    phi: float  # of what is left, from one interval to the next
-    sigma: float  # rad/s (m/s²): deviation of what no interval knows before
-    covariance: Floats  # of sizes, start and logarithms of the time constants
-    lowest_c: float
-    highest_c: float
-
-    @property
-    def spread(self) -> float:
-        """Deviation of what the model leaves of a mean."""
-        return float(self.sigma / (1.0 - self.phi**2) ** 0.5)
-
-    @property
-    def slope(self) -> float:
-        """Bias per °C, in the end, from the coldest to the warmest of the fit."""
-        (lo, hi), powers = self.ends, np.arange(1, self.shape.powers + 1)
-        chords = (hi**powers - lo**powers) / (hi - lo)
-        return float(self.sizes[1 : 1 + self.shape.powers] @ chords + self.sizes[1 + self.shape.powers :].sum())
-
-    @property
-    def ends(self) -> tuple[float, float]:
-        """The coldest and the warmest of the fit less the reference, °C."""
-        return self.lowest_c - self.reference_c, self.highest_c - self.reference_c
-
-
-@dataclass(frozen=True, slots=True)
-class Prediction:
-    """What a model expects of each interval."""
-
-    bias: Floats  # [n] rad/s or m/s²
-    lo: Floats  # [n] 95 % interval of the mean that is measured
-    hi: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,67 +79,59 @@ class ThermalFit:
     explained: float  # share of the variance of the means
 
 
+T = TypeVar("T")
+Pieces = Generator[None, None, T]
+"""Work that pauses: each ``next`` does one piece, and what it makes comes with the end."""
+
+
 def fitted(means: Means) -> ThermalFit:
     """Choose and fit.
 
     Raises:
         NotReady: too few intervals, or temperature hardly moved
     """
+    return finished(fitting(means))
+
+
+def finished(pieces: Pieces[T]) -> T:
+    """All of the work at once."""
+    try:
+        while True:
+            next(pieces)
+    except StopIteration as end:
+        made: T = end.value
+        return made
+
+
+def fitting(means: Means) -> Pieces[ThermalFit]:
+    """Choose and fit, a candidate's time constants at a time.
+
+    Raises:
+        NotReady: too few intervals, or temperature hardly moved; with the first piece
+    """
     _check(means)
     excess, reference_c = _excess(means)
     both_ways = _both_ways(means.temperature_c)
-    tried = sorted((_best(means, excess, shape) for shape in _shapes(means, both_ways)), key=lambda one: one.aicc)
-    errors = [_validated(means, excess, one) for one in tried]
+    tried = []
+    for shape in _shapes(means, both_ways):
+        tried.append((yield from _best(means, excess, shape)))
+    tried.sort(key=lambda one: one.aicc)
+    errors = []
+    for one in tried:
+        yield
+        errors.append(_validated(means, excess, one))
     alone = next(error for one, error in zip(tried, errors, strict=True) if one.shape == Shape(0, ()))
     at = next(i for i, error in enumerate(errors) if error <= WORSE * alone)
     best = tried.pop(at)
     kept = [(best, errors.pop(at)), *zip(tried, errors, strict=True)]
     candidates = tuple(Candidate(one.shape, one.aicc - best.aicc, one.rms, error) for one, error in kept)
+    yield
     model = _model(means, excess, reference_c, best)
     known = means.known
     left = means.bias[known] - (best.columns @ best.sizes)[known]
     explained = 1.0 - float(np.var(left) / np.var(means.bias[known]))
     loop = _loop(means.temperature_c, best.columns @ best.sizes) if model.shape.memory else 0.0
     return ThermalFit(model, candidates, both_ways, loop if both_ways else None, explained)
-
-
-def predicted(
-    model: ThermalModel, temperature_c: Floats, measured: Floats | None = None, began: bool = False
-) -> Prediction:
-    """Multi-step from temperature [n] alone, or one-step beside the biases measured [n] until the interval before.
-
-    Args:
-        began: the first interval is the first of the fit, whose start is known; else temperature is taken to have been
-            long what it is at first, and intervals are as wide as not knowing that asks for
-
-    Beyond the temperatures of the fit nothing is known: the model goes on along its chord, and as much as that changes
-    it by is added to the interval.
-    """
-    excess = _whole(temperature_c) - model.reference_c
-    columns = responses(model.shape, excess, model.interval_s, began=True, ends=model.ends)
-    k = model.shape.memory
-    if not began:
-        columns[:, columns.shape[1] - k :] = 0.0
-    sizes = np.concatenate([model.sizes, model.start if began else np.zeros(k)])
-    bias = columns @ sizes
-    rows = np.hstack([columns, _slopes(model, excess, sizes)])
-    sigma = np.full(excess.size, model.spread)
-    if measured is not None:
-        known = np.isfinite(measured[:-1])
-        last = np.where(known, measured[:-1] - bias[:-1], 0.0)
-        rows[1:] -= model.phi * known[:, None] * rows[:-1]
-        bias = bias.copy()
-        bias[1:] += model.phi * last
-        sigma[1:][known] = model.sigma
-    variance = np.einsum("ij,jk,ik->i", rows, model.covariance, rows) + sigma**2
-    variance += (model.slope * outside(excess, model.ends)) ** 2
-    if not began and k:
-        swing = (model.highest_c - model.lowest_c) / 12.0**0.5
-        lags = model.sizes[1 + model.shape.powers :]
-        p = np.exp(-model.interval_s / np.asarray(model.shape.constants_s))
-        variance += ((lags * swing) ** 2 * p ** (2.0 * np.arange(excess.size)[:, None])).sum(axis=1)
-    half = Z95 * np.sqrt(variance)
-    return Prediction(bias, bias - half, bias + half)
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,21 +166,14 @@ def _check(means: Means) -> None:
 
 
 def _excess(means: Means) -> tuple[Floats, float]:
-    whole = _whole(means.temperature_c)
-    reference_c = round(float(whole.mean()), 2)
-    return whole - reference_c, reference_c
-
-
-def _whole(temperature_c: Floats) -> Floats:
-    """Without holes: lags need to know what temperature was meanwhile."""
-    there = np.flatnonzero(np.isfinite(temperature_c))
-    return np.interp(np.arange(temperature_c.size), there, temperature_c[there])
+    known = whole(means.temperature_c)
+    reference_c = round(float(known.mean()), 2)
+    return known - reference_c, reference_c
 
 
 def _both_ways(temperature_c: Floats) -> bool:
     """Whether temperature rose and fell by more than ONE_WAY of its movement, its noise apart."""
-    whole = _whole(temperature_c)
-    smooth = np.convolve(np.pad(whole, 1, mode="edge"), np.full(3, 1.0 / 3.0), mode="valid")
+    smooth = np.convolve(np.pad(whole(temperature_c), 1, mode="edge"), np.full(3, 1.0 / 3.0), mode="valid")
     moved = np.diff(smooth)
     up, down = float(moved[moved > 0.0].sum()), float(-moved[moved < 0.0].sum())
     return min(up, down) > ONE_WAY * (up + down)
@@ -250,22 +191,25 @@ def _shapes(means: Means, both_ways: bool) -> Iterator[Shape]:
                 yield Shape(powers, tuple(means.interval_s * 2.0**i for i in range(k)))
 
 
-def _best(means: Means, excess: Floats, shape: Shape) -> _Tried:
+def _best(means: Means, excess: Floats, shape: Shape) -> Pieces[_Tried]:
     """The form with its best time constants and φ."""
-    return min((_with_phi(means, excess, shape, phi) for phi in PHI), key=lambda one: one.aicc)
+    best = yield from _with_phi(means, excess, shape, PHI[0])
+    for phi in PHI[1:]:
+        other = yield from _with_phi(means, excess, shape, phi)
+        best = min(best, other, key=lambda one: one.aicc)
+    return best
 
 
-def _with_phi(means: Means, excess: Floats, shape: Shape, phi: float) -> _Tried:
+def _with_phi(means: Means, excess: Floats, shape: Shape, phi: float) -> Pieces[_Tried]:
     """Time constants: from a grid one after the other, each beside those found, then once more between neighbours."""
     k = shape.memory
-    if not k:
-        return _tried(means, excess, shape, phi)
     fastest, slowest = FASTEST * means.interval_s, SLOWEST * means.interval_s * excess.size
     grid = np.geomspace(fastest, slowest, GRID)
     ratio = float(grid[1] / grid[0])
     constants: tuple[float, ...] = ()
 
-    def of(each: tuple[float, ...]) -> _Tried:
+    def of(each: tuple[float, ...]) -> Pieces[_Tried]:
+        yield
         return _tried(means, excess, replace(shape, constants_s=tuple(sorted(each))), phi)
 
     def room(at: int) -> tuple[float, float]:
@@ -277,19 +221,20 @@ def _with_phi(means: Means, excess: Floats, shape: Shape, phi: float) -> _Tried:
 
     for _ in range(k):
         free = [one for one in grid.tolist() if all(max(one / c, c / one) >= APART for c in constants)]
-        constants = min(((*constants, one) for one in free), key=lambda each: of(each).aicc)
-    for _ in range(2 if k > 1 else 1):
+        looks = []
+        for one in free:
+            looks.append((yield from of((*constants, one))).aicc)
+        constants = (*constants, free[int(np.argmin(looks))])
+    for _ in range(2 if k > 1 else min(k, 1)):
         for at in range(k):
             lo, hi = room(at)
             for _ in range(10):
                 a, b = hi * (lo / hi) ** GOLDEN, lo * (hi / lo) ** GOLDEN
-                less = (
-                    of((*constants[:at], a, *constants[at + 1 :])).aicc
-                    < of((*constants[:at], b, *constants[at + 1 :])).aicc
-                )
-                lo, hi = (lo, b) if less else (a, hi)
+                below = yield from of((*constants[:at], a, *constants[at + 1 :]))
+                above = yield from of((*constants[:at], b, *constants[at + 1 :]))
+                lo, hi = (lo, b) if below.aicc < above.aicc else (a, hi)
             constants = (*constants[:at], (lo * hi) ** 0.5, *constants[at + 1 :])
-    return of(constants)
+    return (yield from of(constants))
 
 
 def _tried(means: Means, excess: Floats, shape: Shape, phi: float) -> _Tried:
@@ -353,38 +298,17 @@ def _model(means: Means, excess: Floats, reference_c: float, one: _Tried) -> The
         lowest_c=float(np.nanmin(means.temperature_c)),
         highest_c=float(np.nanmax(means.temperature_c)),
     )
-    rows = np.hstack([one.columns, _slopes(model, excess, one.sizes)])
+    rows = np.hstack([one.columns, slopes(model, excess, one.sizes)])
     x, _, _ = _whitened(rows, np.zeros(excess.size), means.known, one.phi)
-    scale = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
-    inverse = np.linalg.pinv((x / scale).T @ (x / scale), rcond=1e-10) / np.outer(scale, scale)
-    return replace(model, covariance=one.sigma**2 * inverse)
-
-
-def _slopes(model: ThermalModel, excess: Floats, sizes: Floats) -> Floats:
-    """Derivatives [n, k] of the bias by the logarithm of each time constant."""
-    constants = model.shape.constants_s
-    out = np.zeros((excess.size, len(constants)))
-    for at, one in enumerate(constants):
-        moved = [
-            responses(
-                replace(model.shape, constants_s=(*constants[:at], one * np.exp(by), *constants[at + 1 :])),
-                excess,
-                model.interval_s,
-                began=True,
-                ends=model.ends,
-            )
-            for by in (-STEP, STEP)
-        ]
-        out[:, at] = (moved[1] - moved[0]) @ sizes / (2.0 * STEP)
-    return out
+    return replace(model, covariance=covariance(x, one.sigma))
 
 
 def _loop(temperature_c: Floats, bias: Floats) -> float:
     """Largest difference of the modelled bias between rising and falling, at one temperature."""
-    whole = _whole(temperature_c)
-    rising = np.gradient(whole) > 0.0
-    edges = np.linspace(whole.min(), whole.max(), 9)
-    place = np.clip(np.searchsorted(edges, whole) - 1, 0, 7)
+    warmth = whole(temperature_c)
+    rising = np.gradient(warmth) > 0.0
+    edges = np.linspace(warmth.min(), warmth.max(), 9)
+    place = np.clip(np.searchsorted(edges, warmth) - 1, 0, 7)
     worst = 0.0
     for at in range(8):
         up, down = bias[(place == at) & rising], bias[(place == at) & ~rising]

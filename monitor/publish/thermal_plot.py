@@ -11,8 +11,8 @@ import numpy as np
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Floats
 from monitor.drift.means import Means
+from monitor.drift.model import Prediction, predicted
 from monitor.drift.study import Outlook, Study
-from monitor.drift.thermal import Prediction, predicted
 from monitor.publish.allan_figure import COLOURS, GREY
 from monitor.publish.panels import duration
 from monitor.publish.plot import DPI, MISSING

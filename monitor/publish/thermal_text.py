@@ -8,14 +8,16 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
 
-from monitor.drift.heat import Shape, equation
+from monitor.drift.heat import Shape
 from monitor.drift.means import Means
+from monitor.drift.model import Prediction
 from monitor.drift.study import Judged, Outlook, Study
-from monitor.drift.thermal import Prediction, ThermalFit
+from monitor.drift.thermal import ThermalFit
 from monitor.publish.panels import duration
 from monitor.publish.units import DEVIATION_UNITS, kind_of
 
-SCHEMA: Final = "imu-monitor/thermal/1"
+FIT_SCHEMA: Final = "imu-monitor/thermal-fit/1"
+PREDICT_SCHEMA: Final = "imu-monitor/thermal-predict/1"
 ONE_WAY: Final = (
     "temperature only rose, or only fell: how late its effect is, and whether there is hysteresis, cannot be told"
 )
@@ -56,13 +58,12 @@ def study_json(study: Study) -> bytes:
     axes: dict[str, Any] = {}
     for axis, one in study.fits.items():
         model = one.model
-        a, b, c = equation(model.shape, model.sizes, model.interval_s) if model.shape.powers < 2 else (None, None, None)
         axes[axis] = {
             "model": model.shape.name,
             "reference": model.reference_c,
             "sizes": model.sizes.tolist(),
             "time_constants": list(model.shape.constants_s),
-            "equation": None if a is None or b is None else {"a": a.tolist(), "b": b.tolist(), "c": c},
+            "equation": model.equation,
             "slope": model.slope,
             "hysteresis": one.hysteresis,
             "both_directions": one.both_ways,
@@ -76,13 +77,13 @@ def study_json(study: Study) -> bytes:
             "bias": study.means[axis].bias,
             "error": study.means[axis].error,
         }
-    return _json(study.recording, study.interval_s, axes, study.refused, study.notes)
+    return _json(FIT_SCHEMA, study.recording, study.interval_s, axes, study.refused, study.notes)
 
 
 def outlook_json(outlook: Outlook) -> bytes:
     """What was expected and what came; SI units."""
     axes = {axis: _judged(outlook.means[axis], one) for axis, one in outlook.judged.items()}
-    return _json(outlook.recording, outlook.interval_s, axes, outlook.refused, outlook.notes)
+    return _json(PREDICT_SCHEMA, outlook.recording, outlook.interval_s, axes, outlook.refused, outlook.notes)
 
 
 def _judged(means: Means, one: Judged) -> dict[str, Any]:
@@ -104,9 +105,11 @@ def _band(one: Prediction) -> dict[str, Any]:
     return {"bias": one.bias, "lo": one.lo, "hi": one.hi}
 
 
-def _json(recording: str, interval_s: float, axes: dict[str, Any], refused: Any, notes: tuple[str, ...]) -> bytes:
+def _json(
+    schema: str, recording: str, interval_s: float, axes: dict[str, Any], refused: Any, notes: tuple[str, ...]
+) -> bytes:
     whole = {
-        "schema": SCHEMA,
+        "schema": schema,
         "recording": recording,
         "interval": interval_s,
         "axes": axes,

@@ -12,7 +12,8 @@ from collections import Counter
 
 import numpy as np
 
-from monitor.drift.thermal import fitted, predicted
+from monitor.drift.model import predicted
+from monitor.drift.thermal import fitted
 from tests.bench.machine import console, table
 from tests.monitor.drift.made import hourly
 

@@ -38,14 +38,16 @@ def test_fit_then_predict_another_start(tmp_path, capsys):
     assert run("thermal", "fit", first, "--interval", "1h", "--out", model, "--plot", plot, "--json", out) == 0
     assert "difference 1" in capsys.readouterr().out
     found = json.loads(out.read_bytes())
-    assert found["schema"] == "imu-monitor/thermal/1"
+    assert found["schema"] == "imu-monitor/thermal-fit/1"
     gz = found["axes"]["gz"]
     assert gz["slope"] == pytest.approx(COEFFICIENT, rel=0.1)
     assert gz["time_constants"][0] == pytest.approx(7200.0, rel=0.3)
     assert gz["equation"]["a"][0] == pytest.approx(-np.exp(-found["interval"] / gz["time_constants"][0]))
     assert plot.read_bytes().startswith(b"\x89PNG")
     assert run("thermal", "predict", second, "--model", model, "--json", out, "--plot", plot) == 0
-    judged = json.loads(out.read_bytes())["axes"]["gz"]
+    found = json.loads(out.read_bytes())
+    assert found["schema"] == "imu-monitor/thermal-predict/1"
+    judged = found["axes"]["gz"]
     assert judged["offset"] == pytest.approx(1e-4, rel=0.05)
     assert judged["rms_offset_out"] < 0.2 * judged["rms_alone"]
 
@@ -55,6 +57,9 @@ def test_the_model_file_comes_back_as_it_went(tmp_path):
     path = tmp_path / "m.json"
     path.write_bytes(thermal.to_file(study))
     one, other = study.fits["gz"].model, thermal.from_file(path)["gz"]
+    written = json.loads(path.read_bytes())
+    assert written["schema"] == "imu-monitor/thermal-model/1"
+    assert written["axes"]["gz"]["equation"] == one.equation == other.equation
     assert one.shape == other.shape
     for name in ("sizes", "start", "covariance"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
@@ -86,7 +91,7 @@ def good(tmp_path):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda m: m.update(schema="imu-monitor/thermal/9"), 'schema "imu-monitor/thermal/9"'),
+        (lambda m: m.update(schema="imu-monitor/thermal-model/9"), 'schema "imu-monitor/thermal-model/9"'),
         (lambda m: m.update(interval=0.0), "interval: 0 s"),
         (lambda m: m["axes"].clear(), "no axis in it"),
         (lambda m: m["axes"].update(gq=m["axes"].pop("gz")), "axes.gq: no such axis"),

@@ -8,8 +8,9 @@ import pytest
 from drivers.errors import NotReady
 from monitor.drift.heat import Shape
 from monitor.drift.means import Means
+from monitor.drift.model import predicted
 from monitor.drift.study import judge
-from monitor.drift.thermal import fitted, predicted
+from monitor.drift.thermal import fitted
 from tests.monitor.drift.made import COEFFICIENT, hourly
 
 DAY = 24  # h, to fit; two more to judge
