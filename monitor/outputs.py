@@ -9,6 +9,7 @@ import structlog
 from drivers.sample import Event, SampleBlock
 from drivers.sample_message import pack
 from monitor import topics
+from monitor.drift.live import ThermalLook
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.hadamard import HadamardCurve
 from monitor.estimate.model_gap import ModelGap
@@ -52,6 +53,10 @@ class ZenohOutput:
         """Total and Hadamard deviations."""
         self._zenoh.put(topics.TOTAL, device, message.total(device, unix_s, received, total, hadamard))
 
+    def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
+        """The mean of an interval beside what was expected of it."""
+        self._zenoh.put(topics.THERMAL, device, message.thermal(device, unix_s, received, look))
+
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """One event."""
         since_s = None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
@@ -85,6 +90,10 @@ class ViewerOutput:
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
         """Not shown."""
 
+    def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
+        """Courses of the means beside what was expected of them."""
+        self._view.thermal(device, unix_s, look)
+
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """One line of the log."""
         self._view.event(device, unix_s, event)
@@ -113,6 +122,9 @@ class LogOutput:
 
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
         """Not said."""
+
+    def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
+        """Not logged."""
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """One line an event."""
@@ -152,6 +164,9 @@ class TableOutput:
         self._gaps[device] = (unix_s, gap)
 
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
+        """Not shown."""
+
+    def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
         """Not shown."""
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:

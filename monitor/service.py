@@ -241,7 +241,10 @@ def _viewer(config: Config) -> "RerunView | None":
     from monitor.publish.rerun_view import RerunView
 
     own = config.viewer
-    devices = [DeviceInfo(device.name, _about(device), device.model is not None) for device in config.devices]
+    devices = [
+        DeviceInfo(device.name, _about(device), device.model is not None, device.thermal_s is not None)
+        for device in config.devices
+    ]
     return RerunView(ViewerSettings(own.mode, own.port, own.web_port, own.memory), devices)
 
 

@@ -49,6 +49,9 @@ CONFIG_FOLDER: Final = Path(__file__).resolve().parent.parent / "config"
 UNITS_S: Final = {"": 1.0, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 WINDOW_SAMPLES: Final = (100, 10_000_000)
 WINDOW_LONGEST_S: Final = 40 * 86400.0
+THERMAL_SAMPLES: Final = 8
+"""In an interval at the least: its scatter tells how well its mean is known."""
+THERMAL_LONGEST_S: Final = 86400.0
 DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
 IS_ENDPOINT: Final = re.compile(r"[a-z]+/.+")
 MEMORY: Final = re.compile(r"[0-9]+(\.[0-9]+)?\s*([kMGT]?i?B|%)")
@@ -73,6 +76,7 @@ class Device:
     restart: bool = True  # the estimate of an axis begins anew where its noise has changed
     model: Path | None = None  # the model in force
     reconcile_folder: Path | None = None  # where reports are kept
+    thermal_s: float | None = 600.0  # of the means that are held against temperature; None: they are not
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,6 +179,7 @@ class _Reader:
         if window_s is None or refit_s is None or publish_s is None or axes is None or link is None or decoder is None:
             return None
         self._try(f"{at}: window", _possible_window, window_s, entry.rate)
+        thermal_s = self._try(f"{at}: thermal_interval", _thermal_interval, entry.thermal_interval, entry.rate)
         model = None if entry.model is None else self._try(f"{at}: model", model_path, entry.model, self._folder)
         tau = entry.tau if isinstance(entry.tau, str) else tuple(entry.tau)
         self._try(f"{at}: tau", _possible_tau, tau, window_s, entry.rate)
@@ -182,7 +187,7 @@ class _Reader:
         return Device(
             entry.name, entry.rate, window_s, tau, refit_s, publish_s, link, decoder, axes, silence_s,
             entry.motion == "leave out", entry.alarms_per_day, entry.restart, model,
-            entry.reconcile_folder,
+            entry.reconcile_folder, thermal_s,
         )  # fmt: skip
 
     def driver(self, table: Mapping[str, Any], at: str) -> tuple[Link | VirtualTable | None, Decoder | None]:
@@ -371,6 +376,25 @@ def _possible_window(window_s: float, rate_hz: float | None) -> None:
             f"{window_s:g} s at {rate_hz:g} Hz are {window_s * rate_hz:.0f} samples; "
             f"possible are {low} to {high}: {low / rate_hz:g} to {high / rate_hz:g} s"
         )
+
+
+def _thermal_interval(value: float | str, rate_hz: float | None) -> float | None:
+    """s; None for "off".
+
+    >>> _thermal_interval("10min", 100.0), _thermal_interval("off", 100.0)
+    (600.0, None)
+    """
+    if value == "off":
+        return None
+    try:
+        interval_s = seconds(value)
+    except ConfigError:
+        raise ConfigError(f'"{value}" is neither a duration nor "off"; write seconds, or "10min", "1h"') from None
+    shortest_s = THERMAL_SAMPLES / rate_hz if rate_hz else 0.0
+    if not shortest_s <= interval_s <= THERMAL_LONGEST_S:
+        few = f"{shortest_s:g} s ({THERMAL_SAMPLES} samples)" if rate_hz else f"{THERMAL_SAMPLES} samples"
+        raise ConfigError(f"{interval_s:g} s; possible are {few} to {THERMAL_LONGEST_S:g} s")
+    return interval_s
 
 
 def _possible_tau(tau: str | tuple[float, ...], window_s: float, rate_hz: float | None) -> None:

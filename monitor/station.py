@@ -6,6 +6,7 @@ and none of them waits: each has a queue or drops.
 
 import threading
 import time
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final, Protocol
@@ -20,6 +21,7 @@ from drivers.links.base import Link
 from drivers.links.replay_link import ReplayLink
 from drivers.sample import Event, Floats, SampleBlock, unbroken
 from monitor.catalogue import read_model
+from monitor.drift.live import LiveThermal, ThermalLook
 from monitor.estimate.agreement import Agreement
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.estimator import Estimator
@@ -40,6 +42,11 @@ SAMPLES_EVERY_S: Final = 0.1
 """Raw samples travel in batches of at most this long, unless every block is wanted."""
 PIECE: Final = 512
 """Samples estimated before it is asked whether the noise has changed: a fast replay brings thousands at once."""
+CHOOSING_S: Final = 0.001
+"""In a round, that choosing a model of temperature may take for a sensor; a recording waits for it, and has longer."""
+CHOOSING_RECORDED_S: Final = 0.02
+CHOOSING_SHARE: Final = 0.02
+"""Of a processor, that it may take for a device."""
 TOTAL_EVERY_S: Final = 0.1
 TOTAL_SHARE: Final = 0.005
 """Of a processor, that total and Hadamard deviations may take for a device."""
@@ -67,6 +74,9 @@ class Output(Protocol):
 
     def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
         """The window beside the model in force, with each estimate; never where there is no model."""
+
+    def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
+        """An interval beside what temperature let expect of it; never where none is measured."""
 
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
         """Total and Hadamard deviations, renewed in rounds."""
@@ -104,6 +114,9 @@ class Station:
         self._model = None if device.model is None else read_model(device.model)
         self._in_force: ModelInForce | None = None
         self._agreement = Agreement()
+        self.thermal: LiveThermal | None = None
+        self._looks: list[ThermalLook] = []  # not published yet
+        self._handled = 0  # as often as the watch has said it
         self._temperatures: Temperatures | None = None  # of the samples in the window
         self.published = 0  # samples handed to the outputs
         self._wake = wake
@@ -114,12 +127,13 @@ class Station:
         self._wall = WallClock(time.monotonic_ns(), time.time_ns())
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
         self._batch: list[SampleBlock] = []  # not published yet
+        self._pieces: deque[SampleBlock] = deque()  # of a recording, that wait until a model is chosen
         self._waiting_since_ns = 0
         self._unpublished_since_ns = 0  # of the oldest sample that was taken and not published yet
         self._latencies: list[float] = []
         self._started_s = time.monotonic()
         self._no_estimate = ""  # why there can be none
-        self._next_s = dict.fromkeys(("refit", "publish", "samples", "total"), 0.0)
+        self._next_s = dict.fromkeys(("refit", "publish", "samples", "total", "thermal"), 0.0)
         self._advanced = False  # samples since the last refit
         self._refitted = False  # a refit since the last publication
         self._newest_ns = 0
@@ -145,7 +159,7 @@ class Station:
         """A replay that has given all it had, and all of it is worked off."""
         if self.driver.state != "ended" or self._thread.is_alive() or not self._ready.all.is_set():
             return False
-        return not self._waiting_since_ns or self.clock.rate_hz is None
+        return not self._pieces and (not self._waiting_since_ns or self.clock.rate_hz is None)
 
     # --- one round
 
@@ -155,10 +169,17 @@ class Station:
         if blocks:
             self._newest_ns = int(blocks[-1].t_ns[-1])
             self._batch += blocks
-            self._advance(blocks)
+        self._advance(blocks, drain)
         if drain:
             self._estimate(self.watch.flush() if self.watch is not None else [])
-        self._tell(outputs, self.driver.take_events() + (self.watch.take_events() if self.watch is not None else []))
+            self._follow()
+        happened = self.driver.take_events()
+        if self.thermal is not None and any(event.kind == "link_back" for event in happened):
+            self.thermal.offset_is_new()
+        for source in (self.watch, self.thermal):
+            happened += source.take_events() if source is not None else []
+        self._tell(outputs, happened)
+        self._publish_thermal(outputs, now_s)
         published = self._publish_samples(outputs, now_s, drain)
         published |= self._publish_estimate(outputs, now_s, drain)
         self._publish_total(outputs, now_s)
@@ -189,6 +210,8 @@ class Station:
             self.estimator.relabel(rate)
             if self.watch is not None:
                 self.watch.relabel(rate)
+            if self.thermal is not None:
+                self.thermal.relabel(rate)
         health = self.health(states, memory_bytes)
         for output in outputs:
             output.health(self.name, self.now_unix_s(), health)
@@ -243,6 +266,8 @@ class Station:
 
     def _can_take(self) -> bool:
         """Until the rate is known and the kernels are compiled, samples wait in the ring."""
+        if self._pieces:
+            return False
         if self.estimator is not None or self._no_estimate:
             return True
         if self.clock.rate_hz is None:  # times from which no rate can be told must not stop the samples
@@ -258,7 +283,7 @@ class Station:
         self._unpublished_since_ns = self._unpublished_since_ns or came_ns
         return self.ring.take()
 
-    def _advance(self, blocks: list[SampleBlock]) -> None:
+    def _advance(self, blocks: list[SampleBlock], drain: bool) -> None:
         rate = self.clock.rate_hz
         if self.estimator is None:
             if rate is None or self._no_estimate or not self._compiled():
@@ -273,11 +298,25 @@ class Station:
                 self._no_estimate = f"no estimate: {error}"
                 return
         if self.watch is None and self._ready.all.is_set():
-            self.watch = Watch(self.estimator.rate_hz, self.device.leave_out_motion, self.device.alarms_per_day)
-        for samples in blocks:
-            for start in range(0, len(samples), PIECE):
-                piece = samples[start : start + PIECE]
-                self._estimate(self.watch.update(piece) if self.watch is not None else [piece])
+            rate_hz, thermal_s = self.estimator.rate_hz, self.device.thermal_s
+            wanted = thermal_s is not None
+            self.watch = Watch(rate_hz, self.device.leave_out_motion, self.device.alarms_per_day, keep_still=wanted)
+            self.thermal = None if thermal_s is None else LiveThermal(rate_hz, thermal_s)
+        self._pieces += [samples[at : at + PIECE] for samples in blocks for at in range(0, len(samples), PIECE)]
+        while self._pieces and (drain or not self._patient or self.thermal is None or not self.thermal.choosing):
+            piece = self._pieces.popleft()
+            self._estimate(self.watch.update(piece) if self.watch is not None else [piece])
+            self._follow()
+
+    def _follow(self) -> None:
+        """Hand on what is at rest to the models of temperature."""
+        if self.watch is None or self.thermal is None:
+            return
+        if self.watch.handled != self._handled:
+            self._handled = self.watch.handled
+            self.thermal.offset_is_new()
+        for samples in self.watch.take_still():
+            self._looks += self.thermal.update(samples)
 
     def _estimate(self, blocks: list[SampleBlock]) -> None:
         """Advance the estimate, and let axes begin anew whose noise was found changed."""
@@ -346,6 +385,23 @@ class Station:
         if found is not None:
             for output in outputs:
                 output.total(self.name, self.unix_s(self._newest_ns), self.driver.counts.received, *found)
+
+    def _publish_thermal(self, outputs: Sequence[Output], now_s: float) -> None:
+        """Intervals that are over; and a piece of choosing models."""
+        looks, self._looks = self._looks, []
+        for look in looks:
+            for output in outputs:
+                output.thermal(self.name, self.unix_s(look.t_ns), self.driver.counts.received, look)
+        if self.thermal is None or not self.thermal.choosing or now_s < self._next_s["thermal"]:
+            return
+        begun_s = time.perf_counter()
+        until_s = begun_s + (CHOOSING_RECORDED_S if self._patient else CHOOSING_S)
+        while self.thermal.step() and time.perf_counter() < until_s:
+            pass
+        if self._patient:
+            self._wake.set()  # what waits in the ring goes on
+        else:
+            self._next_s["thermal"] = now_s + (time.perf_counter() - begun_s) / CHOOSING_SHARE
 
     def _due(self, what: str, every_s: float, now_s: float) -> bool:
         if now_s < self._next_s[what]:

@@ -37,6 +37,8 @@ class DeviceTable(_Table, frozen=True, kw_only=True):
     restart: bool = True
     model: str | None = None
     """The model in force: path of a model file, or the name of one in the shipped ``config/models``."""
+    thermal_interval: Positive | str = "10min"
+    """Of the means that are held against temperature; "off": they are not."""
     reconcile_folder: Path | None = None
     """Where the reports of ``command/reconcile`` are kept; None: they are not."""
     axes: dict[str, str] = {}

@@ -18,7 +18,7 @@ class Topic:
 
     name: str
     encoding: str
-    when: Literal["batches", "publish", "rounds", "event", "1 Hz", "presence", "query"]
+    when: Literal["batches", "publish", "rounds", "intervals", "event", "1 Hz", "presence", "query"]
 
     def key(self, prefix: str, device: str) -> str:
         """The key expression of this topic for one device."""
@@ -34,10 +34,11 @@ ALLAN: Final = Topic("allan", JSON, "publish")
 COEFFICIENTS: Final = Topic("coefficients", JSON, "publish")
 TOTAL: Final = Topic("total", JSON, "rounds")
 GAP: Final = Topic("gap", JSON, "publish")
+THERMAL: Final = Topic("thermal", JSON, "intervals")
 EVENT: Final = Topic("event", JSON, "event")
 STATUS: Final = Topic("status", JSON, "1 Hz")
 ALIVE: Final = Topic("alive", "", "presence")
 RESET: Final = Topic("command/reset", JSON, "query")
 RECONCILE: Final = Topic("command/reconcile", JSON, "query")
 
-TOPICS: Final = (SAMPLES, ALLAN, COEFFICIENTS, TOTAL, GAP, EVENT, STATUS, ALIVE, RESET, RECONCILE)
+TOPICS: Final = (SAMPLES, ALLAN, COEFFICIENTS, TOTAL, GAP, THERMAL, EVENT, STATUS, ALIVE, RESET, RECONCILE)

@@ -5,11 +5,12 @@ simulated into a recording; ``Service`` replays an hour of it sixty times as fas
 screen (software Vulkan), then into the page inside a real Chromium, driven by its DevTools protocol, and is stopped
 as by a signal; ``imu-monitor analyze`` makes the plot of the same hour. ``imu-monitor reconcile`` finds what was
 hidden in an hour of the model, before and after. Curves over time, in the viewer, the picture and the page, are those
-of the same hour with a gyroscope that becomes noisier. The fleet are simulated devices in real
-time; one cable is pulled and put back, another is pulled for good. ``demo --effect`` runs in real time too. Needs the
-packages chromium, mesa-vulkan-drivers and libvulkan1 (Debian's names); network traffic stays on loopback.
+of the same hour with a gyroscope that becomes noisier. Bias beside temperature is that of two days of ``stim300``,
+replayed faster still. The fleet are simulated devices in real time; one cable is pulled and put back, another is pulled
+for good. ``demo --effect`` runs in real time too. Needs the packages chromium, mesa-vulkan-drivers and libvulkan1
+(Debian's names); network traffic stays on loopback.
 
-    python -m tests.pictures [--out docs/pictures] [--only native surfaces fleet effect web plot dynamic report …]
+    python -m tests.pictures [--out docs/pictures] [--only native surfaces temperature fleet effect web plot …]
 """
 
 import argparse
@@ -78,6 +79,28 @@ bandwidth = 2.0
 fraction = 2e-4
 scale = 0.02
 """
+WARM_S, WARM_HZ, WARM_SPEED = 48 * 3600.0, 10.0, 4000.0
+WARM = """
+[temperature]
+mean = 24.0
+swing = 3.0
+period = 86400.0
+wander = 0.3
+wander_time = 7200.0
+
+["g*".temperature_lag]
+coefficient = 1.0e-5
+reference = 24.0
+time_constant = 5400.0
+
+["a*".temperature_bias]
+coefficient = 5.0e-4
+reference = 24.0
+
+[gz.bias_step]
+time = 130000.0
+height = 3.0e-5
+"""
 REPLAY = """
 [[device]]
 name = "bench-1"
@@ -128,22 +151,45 @@ def native(out: Path, folder: Path) -> Path:
 
 def surfaces(out: Path, folder: Path) -> Path:
     """The same viewer's tab with the curves over time, of a device that has changed."""
-    from rerun.experimental import ViewerClient
-
     path = out / "viewer-dynamic.png"
     with window() as (port, shoot):
         with serving(folder, replay(folder, changed=True), port) as service:
             until(lambda: replayed(service, HOUR_S), 300.0)
-        viewer = ViewerClient(rerun_sinks.server_url(port))
-        layout = viewer.get_blueprint().blueprint
-        for part in layout.values():
-            tabs = part.get("ContainerBlueprint", {})
-            if "active_tab" in tabs:
-                tabs["active_tab"] = tabs["contents"][1]
-        viewer.set_blueprint(layout, of="recording")
+        turn_to(port, 1)
         time.sleep(SETTLE_S)
         shoot(path)
     return path
+
+
+def temperature(out: Path, folder: Path) -> Path:
+    """The tab with bias beside temperature, of two days on which gz stepped once."""
+    path = out / "viewer-temperature.png"
+    source = folder / "warm.npz"
+    model = read_model(settings.CONFIG_FOLDER / "models" / "stim300.toml") + NoiseModel.from_toml(WARM)
+    n = round(WARM_S * WARM_HZ)
+    drawn = model.stream(WARM_HZ, 1).draw_all(n)
+    save_samples(source, T0 + np.arange(n) / WARM_HZ, drawn.values, drawn.temperature_c)
+    devices = REPLAY.format(recording=source, speed=WARM_SPEED).replace("rate = 100.0", f"rate = {WARM_HZ}")
+    with window() as (port, shoot):
+        with serving(folder, devices, port) as service:
+            until(lambda: replayed(service, WARM_S - 600.0), 300.0)
+        turn_to(port, 2)
+        time.sleep(SETTLE_S)
+        shoot(path)
+    return path
+
+
+def turn_to(port: int, tab: int) -> None:
+    """Show that tab of the device in the viewer that is open at ``port``."""
+    from rerun.experimental import ViewerClient
+
+    viewer = ViewerClient(rerun_sinks.server_url(port))
+    layout = viewer.get_blueprint().blueprint
+    for part in layout.values():
+        tabs = part.get("ContainerBlueprint", {})
+        if "active_tab" in tabs:
+            tabs["active_tab"] = tabs["contents"][tab]
+    viewer.set_blueprint(layout, of="recording")
 
 
 def fleet(out: Path, folder: Path) -> Path:
@@ -278,6 +324,7 @@ def analyzed(source: Path, plot: Path, *more: str) -> Path:
 PICTURES: dict[str, Callable[[Path, Path], Path]] = {
     "native": native,
     "surfaces": surfaces,
+    "temperature": temperature,
     "fleet": fleet,
     "effect": effect,
     "web": web,

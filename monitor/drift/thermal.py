@@ -77,6 +77,8 @@ class ThermalFit:
     both_ways: bool  # temperature rose and fell
     hysteresis: float | None  # largest difference of rising and falling at one temperature; None if it went one way
     explained: float  # share of the variance of the means
+    aicc: float  # of the model; only differences between fits of the same means say anything
+    step: float = 0.0  # of the offset, where one was asked for: after it less before
 
 
 T = TypeVar("T")
@@ -103,9 +105,12 @@ def finished(pieces: Pieces[T]) -> T:
         return made
 
 
-def fitting(means: Means) -> Pieces[ThermalFit]:
-    """Choose and fit, a candidate's time constants at a time.
+def fitting(means: Means, since: int | None = None, lags: bool = False) -> Pieces[ThermalFit]:
+    """Choose and fit, one least squares at a time.
 
+    Args:
+        since: from this interval on the bias may have another offset, which is one size more
+        lags: look for them also where temperature went one way
     Raises:
         NotReady: too few intervals, or temperature hardly moved; with the first piece
     """
@@ -113,25 +118,26 @@ def fitting(means: Means) -> Pieces[ThermalFit]:
     excess, reference_c = _excess(means)
     both_ways = _both_ways(means.temperature_c)
     tried = []
-    for shape in _shapes(means, both_ways):
-        tried.append((yield from _best(means, excess, shape)))
+    for shape in _shapes(means, both_ways or lags):
+        tried.append((yield from _best(means, excess, shape, since)))
     tried.sort(key=lambda one: one.aicc)
     errors = []
     for one in tried:
         yield
-        errors.append(_validated(means, excess, one))
+        errors.append(_validated(_less(means, since, one.step), excess, one))
     alone = next(error for one, error in zip(tried, errors, strict=True) if one.shape == Shape(0, ()))
     at = next(i for i, error in enumerate(errors) if error <= WORSE * alone)
     best = tried.pop(at)
     kept = [(best, errors.pop(at)), *zip(tried, errors, strict=True)]
     candidates = tuple(Candidate(one.shape, one.aicc - best.aicc, one.rms, error) for one, error in kept)
     yield
+    means = _less(means, since, best.step)
     model = _model(means, excess, reference_c, best)
     known = means.known
     left = means.bias[known] - (best.columns @ best.sizes)[known]
     explained = 1.0 - float(np.var(left) / np.var(means.bias[known]))
     loop = _loop(means.temperature_c, best.columns @ best.sizes) if model.shape.memory else 0.0
-    return ThermalFit(model, candidates, both_ways, loop if both_ways else None, explained)
+    return ThermalFit(model, candidates, both_ways, loop if both_ways else None, explained, best.aicc, best.step)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +149,7 @@ class _Tried:
     sigma: float
     rms: float
     aicc: float
+    step: float
 
 
 def _check(means: Means) -> None:
@@ -179,28 +186,28 @@ def _both_ways(temperature_c: Floats) -> bool:
     return min(up, down) > ONE_WAY * (up + down)
 
 
-def _shapes(means: Means, both_ways: bool) -> Iterator[Shape]:
-    """Forms that so many intervals can tell; how late heat is, only where temperature went both ways."""
+def _shapes(means: Means, lags: bool) -> Iterator[Shape]:
+    """Forms that so many intervals can tell."""
     count = int(means.known.sum())
     for powers in range(POWERS + 1):
         if powers + 3 < count / 2:
             yield Shape(powers, ())
     for k in range(1, MEMORY + 1):
         for powers in (0, 1):
-            if both_ways and ENOUGH * k**2 < count:
+            if lags and ENOUGH * k**2 < count:
                 yield Shape(powers, tuple(means.interval_s * 2.0**i for i in range(k)))
 
 
-def _best(means: Means, excess: Floats, shape: Shape) -> Pieces[_Tried]:
+def _best(means: Means, excess: Floats, shape: Shape, since: int | None) -> Pieces[_Tried]:
     """The form with its best time constants and φ."""
-    best = yield from _with_phi(means, excess, shape, PHI[0])
+    best = yield from _with_phi(means, excess, shape, PHI[0], since)
     for phi in PHI[1:]:
-        other = yield from _with_phi(means, excess, shape, phi)
+        other = yield from _with_phi(means, excess, shape, phi, since)
         best = min(best, other, key=lambda one: one.aicc)
     return best
 
 
-def _with_phi(means: Means, excess: Floats, shape: Shape, phi: float) -> Pieces[_Tried]:
+def _with_phi(means: Means, excess: Floats, shape: Shape, phi: float, since: int | None) -> Pieces[_Tried]:
     """Time constants: from a grid one after the other, each beside those found, then once more between neighbours."""
     k = shape.memory
     fastest, slowest = FASTEST * means.interval_s, SLOWEST * means.interval_s * excess.size
@@ -210,7 +217,7 @@ def _with_phi(means: Means, excess: Floats, shape: Shape, phi: float) -> Pieces[
 
     def of(each: tuple[float, ...]) -> Pieces[_Tried]:
         yield
-        return _tried(means, excess, replace(shape, constants_s=tuple(sorted(each))), phi)
+        return _tried(means, excess, replace(shape, constants_s=tuple(sorted(each))), phi, since)
 
     def room(at: int) -> tuple[float, float]:
         """How far a time constant may go: to its neighbours on the grid, and not near the others."""
@@ -237,12 +244,15 @@ def _with_phi(means: Means, excess: Floats, shape: Shape, phi: float) -> Pieces[
     return (yield from of(constants))
 
 
-def _tried(means: Means, excess: Floats, shape: Shape, phi: float) -> _Tried:
+def _tried(means: Means, excess: Floats, shape: Shape, phi: float, since: int | None = None) -> _Tried:
     """Sizes by least squares of what is new in each interval."""
     known = means.known
     columns = responses(shape, excess, means.interval_s, began=True)
+    own = columns.shape[1]
+    if since is not None:
+        columns = np.hstack([columns, (np.arange(excess.size) >= since)[:, None]])
     y = np.where(known, means.bias, 0.0)
-    x, z, fresh = _whitened(columns, y, known, phi)
+    x, z, fresh = whitened(columns, y, known, phi)
     sizes = solved(x, z)
     count = x.shape[0]
     square = max(float(((z - x @ sizes) ** 2).sum()), 1e-300)
@@ -251,10 +261,18 @@ def _tried(means: Means, excess: Floats, shape: Shape, phi: float) -> _Tried:
     aicc = likelihood + 2.0 * free * count / max(count - free - 1.0, 0.5)
     rms = float(np.sqrt(np.mean((y - columns @ sizes)[known] ** 2)))
     sigma = (square / max(count - free + 1, 1)) ** 0.5
-    return _Tried(shape, columns, sizes, phi, sigma, rms, aicc)
+    step = 0.0 if since is None else float(sizes[own])
+    return _Tried(shape, columns[:, :own], sizes[:own], phi, sigma, rms, aicc, step)
 
 
-def _whitened(columns: Floats, y: Floats, known: np.ndarray, phi: float) -> tuple[Floats, Floats, int]:
+def _less(means: Means, since: int | None, step: float) -> Means:
+    """As if the offset had always been that of before."""
+    if since is None:
+        return means
+    return replace(means, bias=means.bias - step * (np.arange(means.bias.size) >= since))
+
+
+def whitened(columns: Floats, y: Floats, known: np.ndarray, phi: float) -> tuple[Floats, Floats, int]:
     """Rows less φ times the row before where that is known; the first after a hole in the measure of the others."""
     follows = known[1:] & known[:-1]
     x, z = columns.copy(), y.copy()
@@ -277,7 +295,7 @@ def _validated(means: Means, excess: Floats, one: _Tried) -> float:
         used = means.known.copy()
         used[lo:hi] = False
         columns = one.columns if lo else responses(one.shape, excess, means.interval_s)
-        x, z, _ = _whitened(columns, np.where(used, means.bias, 0.0), used, one.phi)
+        x, z, _ = whitened(columns, np.where(used, means.bias, 0.0), used, one.phi)
         apart = (means.bias - columns @ solved(x, z))[lo:hi]
         square += float((apart[means.known[lo:hi]] ** 2).sum())
     return float((square / means.known.sum()) ** 0.5)
@@ -299,7 +317,7 @@ def _model(means: Means, excess: Floats, reference_c: float, one: _Tried) -> The
         highest_c=float(np.nanmax(means.temperature_c)),
     )
     rows = np.hstack([one.columns, slopes(model, excess, one.sizes)])
-    x, _, _ = _whitened(rows, np.zeros(excess.size), means.known, one.phi)
+    x, _, _ = whitened(rows, np.zeros(excess.size), means.known, one.phi)
     return replace(model, covariance=covariance(x, one.sigma))
 
 

@@ -60,7 +60,7 @@ from monitor.estimate.change_kernel import (
     set_due,
 )
 from monitor.estimate.change_size import Octaves, named
-from monitor.estimate.words import amount
+from monitor.words import amount
 
 LONGEST_S: Final = 300.0
 """The longest clusters; longer ones would learn for days, and show temperature rather than noise."""

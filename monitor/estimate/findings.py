@@ -19,7 +19,7 @@ from monitor.estimate.departures import FAR, Line, added
 from monitor.estimate.fit import Fit
 from monitor.estimate.least_squares import K, Q
 from monitor.estimate.rest import Motion
-from monitor.estimate.words import amount, plain
+from monitor.words import amount, plain
 
 Run = tuple[int, int]
 """First and last τ, by their places."""

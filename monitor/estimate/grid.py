@@ -20,7 +20,7 @@ from drivers.sample import AXES, Floats, Given, Ints, SampleBlock
 from monitor.estimate.late import truly_missing
 from monitor.estimate.resolution import Steps, coarse
 from monitor.estimate.stale import stale_share
-from monitor.estimate.words import amount, plain
+from monitor.words import amount, plain
 
 OFF_RATE: Final = 0.002
 """A stated rate further than this from what the times say is told, where they say it that well."""

@@ -32,7 +32,7 @@ from monitor.estimate.rest_kernel import (
     finish,
     state,
 )
-from monitor.estimate.words import amount
+from monitor.words import amount
 
 BLOCK_S: Final = 0.25
 FEWEST: Final = 8

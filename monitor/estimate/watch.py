@@ -33,12 +33,19 @@ class Watch:
         rate_hz: samples a second
         leave_out: hand on moving stretches as missing; else all samples pass at once, as they are
         alarms_per_day: false alarms of changes to bear; 0 = do not look for changes
+        keep_still: have ``take_still`` give the samples at rest, whatever is handed on
     """
 
-    def __init__(self, rate_hz: float, leave_out: bool = False, alarms_per_day: float = 1.0 / 30.0) -> None:
+    def __init__(
+        self, rate_hz: float, leave_out: bool = False, alarms_per_day: float = 1.0 / 30.0, keep_still: bool = False
+    ) -> None:
         self._rate_hz = rate_hz
         self._leave_out = leave_out
         self._alarms_per_day = alarms_per_day
+        self._keep_still = keep_still
+        self._still: list[SampleBlock] = []
+        self.handled = 0
+        """How often the device was left in another orientation."""
         self._came = 0  # samples since the start, missing ones included
         self._newest_ns = 0
         self._moved_before = 0
@@ -89,6 +96,11 @@ class Watch:
         restarts, self._restarts = self._restarts, []
         return restarts
 
+    def take_still(self) -> list[SampleBlock]:
+        """Samples that are judged, those of moving stretches struck out, since the last call; 0.5 s late."""
+        still, self._still = self._still, []
+        return still
+
     def _begin(self) -> None:
         self._began = self._came
         self._rest = Rest(self._rate_hz)
@@ -103,7 +115,11 @@ class Watch:
         return earlier + still
 
     def _look(self, still: list[SampleBlock]) -> None:
-        self._events += [self._moved(motion) for motion in self._rest.take()]
+        if self._keep_still:
+            self._still += still
+        motions = self._rest.take()
+        self.handled += sum(motion.kind == "handling/orientation" for motion in motions)
+        self._events += [self._moved(motion) for motion in motions]
         if self._changes is None:
             return
         for samples in still:

@@ -11,6 +11,8 @@ import numpy as np
 
 from drivers.sample import AXES, Event, Floats
 from monitor import topics
+from monitor.drift.live import ThermalLook
+from monitor.drift.recursion import Band
 from monitor.estimate.analysis import Analysis
 from monitor.estimate.change import Change
 from monitor.estimate.coefficients import LETTERS, Coefficients, Status
@@ -77,6 +79,28 @@ def gap(device: str, unix_s: float, look: ModelGap) -> bytes:
         "axes": axes,
     }
     return _encode(topics.GAP, device, unix_s, look.samples, payload)
+
+
+def thermal(device: str, unix_s: float, samples: int, look: ThermalLook) -> bytes:
+    """``imu/<device>/thermal``: the mean of an interval beside what was expected of it; ``t`` is its end.
+
+    ``multi_step`` knows temperature alone, ``one_step`` the bias before too; null where there is no model, and then
+    ``text`` says why.
+    """
+    axes = {
+        axis: {
+            "bias": _number(one.bias),
+            "error": _number(one.error),
+            "multi_step": _band(one.multi_step),
+            "one_step": _band(one.one_step),
+            "model": one.model or None,
+            "slope": _number(one.slope),
+            "text": one.text,
+        }
+        for axis, one in look.axes.items()
+    }
+    payload = {"interval": look.interval_s, "temperature": look.temperature_c, "axes": axes}
+    return _encode(topics.THERMAL, device, unix_s, samples, payload)
 
 
 def total(device: str, unix_s: float, samples: int, total: TotalCurve, hadamard: HadamardCurve) -> bytes:
@@ -281,7 +305,11 @@ def _dynamic(dynamic: Dynamic, axes: Sequence[tuple[int, str]]) -> dict[str, Any
     }
 
 
-def _number(value: np.float64) -> float | None:
+def _band(band: Band | None) -> dict[str, float] | None:
+    return None if band is None else {"bias": band.bias, "lo": band.lo, "hi": band.hi}
+
+
+def _number(value: float | np.float64) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 

@@ -1,8 +1,8 @@
 """What the viewer opens on: is it healthy, what is its noise now, has it changed.
 
 One device fills the window; several get an overview and a tab each. A second tab of a device shows its noise over
-time. The time panel follows the newest sample. Layout only: nothing here knows a number. Importing this module imports
-Rerun.
+time, a third its bias beside its temperature. The time panel follows the newest sample. Layout only: nothing here knows
+a number. Importing this module imports Rerun.
 """
 
 from collections.abc import Collection, Sequence
@@ -23,6 +23,7 @@ from monitor.publish.units import (
     SAMPLE_UNITS,
     Kind,
     axes_of,
+    kind_of,
 )
 
 RAW_SPAN_S: Final = 30.0  # of raw samples in view, up to the cursor
@@ -35,9 +36,11 @@ COLUMNS: Final = 4
 SHORT: Final = {"gyro": "Gyro", "accel": "Accel"}
 
 
-def blueprint(devices: Sequence[str], with_model: Collection[str] = ()) -> rrb.Blueprint:
-    """The layout for these devices, some of which have a model in force."""
-    pages = [_device(d, d in with_model) for d in devices]
+def blueprint(
+    devices: Sequence[str], with_model: Collection[str] = (), with_thermal: Collection[str] = ()
+) -> rrb.Blueprint:
+    """The layout for these devices, some of which have a model in force, or a bias held against temperature."""
+    pages = [_device(d, d in with_model, d in with_thermal) for d in devices]
     root = pages[0] if len(pages) == 1 else rrb.Tabs(_overview(devices), *pages, active_tab=0)
     return rrb.Blueprint(
         root,
@@ -49,7 +52,7 @@ def blueprint(devices: Sequence[str], with_model: Collection[str] = ()) -> rrb.B
     )
 
 
-def _device(device: str, has_model: bool) -> rrb.Container:
+def _device(device: str, has_model: bool, has_thermal: bool) -> rrb.Container:
     left = rrb.Vertical(
         rrb.TextDocumentView(origin=f"/{device}/status", name="Is it healthy?"),
         rrb.TextDocumentView(origin=f"/{device}/coefficients", contents="$origin", name="What is its noise now?"),
@@ -64,7 +67,23 @@ def _device(device: str, has_model: bool) -> rrb.Container:
         row_shares=[5, 2.2, 1.6, 2.2] if has_model else [5, 2.2, 2.2],
     )
     now = rrb.Horizontal(left, right, column_shares=[3, 7], name="Now")
-    return rrb.Tabs(now, _dynamic(device), active_tab=0, name=device)
+    pages = [now, _dynamic(device), *([_thermal(device)] if has_thermal else [])]
+    return rrb.Tabs(*pages, active_tab=0, name=device)
+
+
+def _thermal(device: str) -> rrb.Container:
+    """Bias of each axis beside what was expected of it, and the temperature."""
+    columns = [rrb.Vertical(*(_bias(device, axis) for axis in axes_of(kind))) for kind in KINDS]
+    return rrb.Vertical(rrb.Horizontal(*columns), _temperature(device), row_shares=[4, 1], name="Temperature")
+
+
+def _bias(device: str, axis: str) -> rrb.View:
+    return rrb.TimeSeriesView(
+        origin=f"/{device}/thermal/{axis}",
+        name=f"{axis}: bias, and what its temperature lets expect, {DEVIATION_UNITS[kind_of(axis)].name}",
+        plot_legend=rrb.PlotLegend(visible=False),
+        axis_x=_all_so_far(),
+    )
 
 
 def _dynamic(device: str) -> rrb.Container:
@@ -175,6 +194,11 @@ def _all_so_far() -> rrb.TimeAxis:
     return rrb.TimeAxis(view_range=rr.TimeRange(rr.TimeRangeBoundary.infinite(), now))
 
 
-def send(stream: rr.RecordingStream, devices: Sequence[str], with_model: Collection[str] = ()) -> None:
+def send(
+    stream: rr.RecordingStream,
+    devices: Sequence[str],
+    with_model: Collection[str] = (),
+    with_thermal: Collection[str] = (),
+) -> None:
     """Make the layout the active one of the stream's viewer."""
-    stream.send_blueprint(blueprint(devices, with_model), make_active=True, make_default=True)
+    stream.send_blueprint(blueprint(devices, with_model, with_thermal), make_active=True, make_default=True)

@@ -16,6 +16,8 @@ import numpy as np
 import rerun as rr
 
 from drivers.sample import AXES, Event, Floats
+from monitor.drift.following import AxisThermal
+from monitor.drift.live import ThermalLook
 from monitor.estimate.coefficients import LETTERS, Status
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.model_gap import ModelGap
@@ -140,6 +142,13 @@ class Scene:
             if np.isfinite(gap).any():
                 self._scalars(f"{device}/gap/{axis}", wall_s, gap)
 
+    def thermal(self, device: str, wall_s: Floats, looks: Sequence[ThermalLook]) -> None:
+        """The means of each axis, and what was expected of them with its interval."""
+        for axis in AXES:
+            rows = np.array([_thermal(look.axes.get(axis)) for look in looks])
+            if np.isfinite(rows).any():
+                self._scalars(f"{device}/thermal/{axis}", wall_s, rows * DEVIATION_UNITS[kind_of(axis)].factor)
+
     def event(self, device: str, wall_s: float, event: Event) -> None:
         """One line in the log of the device, and in that of the overview."""
         self._at(wall_s)
@@ -166,6 +175,10 @@ class Scene:
         line = rr.SeriesLines(colors=[colour], widths=[1.5], names=[f"{axis}, σ from its model"])
         self._stream.log(f"{device}/gap/{axis}", line, static=True)
         dim = colours.mixed(colour, 0.45)
+        unit = DEVIATION_UNITS[kind_of(axis)].name
+        names = [f"{axis} bias, {unit}", f"{axis} expected", f"{axis} 95 % low", f"{axis} 95 % high"]
+        line = rr.SeriesLines(colors=[colour, colours.TEXT, dim, dim], widths=[2.0, 1.0, 0.75, 0.75], names=names)
+        self._stream.log(f"{device}/thermal/{axis}", line, static=True)
         for letter in LETTERS:
             unit = COEFFICIENT_UNITS[kind_of(axis)][letter].name
             names = [f"{axis}, {unit}", f"{axis} 95 % low", f"{axis} 95 % high"]
@@ -327,6 +340,14 @@ def _course(estimate: Estimate, row: int, column: int) -> tuple[float, float, fl
         return np.nan, np.nan, np.nan
     value, lo, hi = (float(part[row, column]) for part in (c.value, c.lo, c.hi))
     return (value, lo, hi) if lo * NARROW > value and hi < value * NARROW else (value, np.nan, np.nan)
+
+
+def _thermal(one: AxisThermal | None) -> tuple[float, float, float, float]:
+    """bias, expected, lo, hi: those that an event is judged by."""
+    if one is None:
+        return np.nan, np.nan, np.nan, np.nan
+    band = one.one_step
+    return (one.bias, np.nan, np.nan, np.nan) if band is None else (one.bias, band.bias, band.lo, band.hi)
 
 
 def _stamps(wall_s: Floats) -> "np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]":

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from drivers.sample import Event, Floats
+from monitor.drift.live import ThermalLook
 from monitor.estimate.estimate import Estimate, joined
 from monitor.estimate.model_gap import ModelGap
 from monitor.health import Health
@@ -44,7 +45,7 @@ COURSE_STEP_S: Final = 1.0  # of sample time between two points of a course
 EARLY_END_S: Final = 10.0  # a window that ends sooner never worked
 MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
 
-Message = tuple[str, "_Samples | _Estimate | _Gap | _Event | _Health"]
+Message = tuple[str, "_Samples | _Estimate | _Gap | _Thermal | _Event | _Health"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +65,12 @@ class _Estimate:
 class _Gap:
     wall_s: float
     gap: ModelGap
+
+
+@dataclass(frozen=True, slots=True)
+class _Thermal:
+    wall_s: float
+    look: ThermalLook
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +136,10 @@ class RerunView:
         """The window beside the model in force."""
         self._put(device, _Gap(wall_s, gap), 6 * 4 * gap.tau_s.nbytes)
 
+    def thermal(self, device: str, wall_s: float, look: ThermalLook) -> None:
+        """An interval beside what temperature let expect of it."""
+        self._put(device, _Thermal(wall_s, look), 1000)
+
     def event(self, device: str, wall_s: float, event: Event) -> None:
         """Something happened to a device."""
         self._put(device, _Event(wall_s, event), 1000)
@@ -151,7 +162,9 @@ class RerunView:
         thread.join(0.25 * timeout_s)
         self._phase = "closed"
 
-    def _put(self, device: str, message: "_Samples | _Estimate | _Gap | _Event | _Health", weight: int) -> None:
+    def _put(
+        self, device: str, message: "_Samples | _Estimate | _Gap | _Thermal | _Event | _Health", weight: int
+    ) -> None:
         if self._thread is not None:
             self._backlog.push((device, message), weight)
 
@@ -199,7 +212,10 @@ class RerunView:
             scene = rerun_scene.Scene(output.stream, names)
             self._inside_since = time.monotonic()
             rerun_blueprint.send(
-                output.stream, [d.name for d in self._devices], [d.name for d in self._devices if d.has_model]
+                output.stream,
+                [d.name for d in self._devices],
+                [d.name for d in self._devices if d.has_model],
+                [d.name for d in self._devices if d.has_thermal],
             )
             scene.open()
             self._phase = "ok"
@@ -246,6 +262,7 @@ class _Pending:
     newest: dict[str, _Estimate] = field(default_factory=dict)  # for the Allan plots
     course: dict[str, list[_Estimate]] = field(default_factory=dict)
     gaps: dict[str, list[_Gap]] = field(default_factory=dict)
+    thermals: dict[str, list[_Thermal]] = field(default_factory=dict)
     healths: dict[str, _Health] = field(default_factory=dict)
     events: list[tuple[str, _Event]] = field(default_factory=list)
     drawn: dict[tuple[str, str], float] = field(default_factory=dict)  # (what, device) -> monotonic s
@@ -261,6 +278,8 @@ class _Pending:
                     self._add_to_course(device, message)
                 case _Gap():
                     self._add_gap(device, message)
+                case _Thermal():
+                    self.thermals.setdefault(device, []).append(message)
                 case _Event():
                     self.events.append((device, message))
                 case _Health():
@@ -282,6 +301,9 @@ class _Pending:
         for device, seen in self.healths.items():
             scene.health(device, seen.wall_s, seen.health)
         self.healths.clear()
+        for device, means in self.thermals.items():
+            scene.thermal(device, np.array([one.wall_s for one in means]), [one.look for one in means])
+        self.thermals.clear()
         for device in list(self.gaps):  # before the plot, that has the model's curve too
             if everything or self._due("gap", device, COURSE_STEP_S):
                 looks = self.gaps.pop(device)

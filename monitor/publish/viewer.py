@@ -28,3 +28,4 @@ class DeviceInfo:
     name: str
     about: str = ""  # a few words: decoder, link, port
     has_model: bool = False  # one is in force
+    has_thermal: bool = False  # its bias is held against its temperature, once one comes

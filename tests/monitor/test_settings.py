@@ -371,6 +371,37 @@ def test_the_model_in_force_is_a_file_beside_the_configuration_or_a_name_of_the_
 
 
 @pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("", 600.0),
+        ('thermal_interval = "1h"', 3600.0),
+        ("thermal_interval = 90", 90.0),
+        ('thermal_interval = "off"', None),
+    ],
+)
+def test_the_interval_that_is_held_against_temperature(tmp_path, text, found):
+    path = tmp_path / "my.toml"
+    path.write_text(device(text))
+    assert load(path).devices[0].thermal_s == found
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('thermal_interval = "none"', 'thermal_interval: "none" is neither a duration nor "off"'),
+        ("rate = 10.0\nthermal_interval = 0.5", "thermal_interval: 0.5 s; possible are 0.8 s (8 samples) to 86400 s"),
+        ('thermal_interval = "2d"', "thermal_interval: 172800 s; possible are 8 samples to 86400 s"),
+        ("thermal_interval = -3", "thermal_interval: Expected `float` > 0"),
+    ],
+)
+def test_an_interval_that_cannot_be_says_why(tmp_path, text, says):
+    path = tmp_path / "my.toml"
+    path.write_text(device(text))
+    (line,) = read(path)[1]
+    assert says in line
+
+
+@pytest.mark.parametrize(
     ("decoder", "carrier"), [("vectornav_ascii", "bytes"), ("ros2_imu", "messages"), ("samples", "messages")]
 )
 def test_a_virtual_device_speaks_any_wire_format(tmp_path, decoder, carrier):

@@ -22,7 +22,7 @@ class Caught:
 
     def __init__(self):
         self.blocks, self.counts, self.estimates, self.events, self.healths, self.totals = [], [], [], [], [], []
-        self.gaps = []
+        self.gaps, self.thermals = [], []
 
     def samples(self, device, received, samples, offset_ns):
         self.blocks.append(samples)
@@ -33,6 +33,9 @@ class Caught:
 
     def gap(self, device, unix_s, gap):
         self.gaps.append((unix_s, gap))
+
+    def thermal(self, device, unix_s, received, look):
+        self.thermals.append((unix_s, look))
 
     def total(self, device, unix_s, received, total, hadamard):
         self.totals.append((received, total, hadamard))
@@ -46,12 +49,33 @@ class Caught:
 
 class Rig:
     def __init__(
-        self, rate=RATE, window_s=20.0, refit_s=0.1, publish_s=0.1, tau="octave", decoder=None, ready=None, model=None
+        self,
+        rate=RATE,
+        window_s=20.0,
+        refit_s=0.1,
+        publish_s=0.1,
+        tau="octave",
+        decoder=None,
+        ready=None,
+        model=None,
+        thermal_s=600.0,
+        link=None,
     ):
         decoder = decoder or vectornav_binary.build(vectornav_binary.Settings())
-        self.link = LoopbackLink()
+        self.link = link or LoopbackLink()
         device = Device(
-            "bench", rate, window_s, tau, refit_s, publish_s, self.link, decoder, AxisMap(), 0.0, model=model
+            "bench",
+            rate,
+            window_s,
+            tau,
+            refit_s,
+            publish_s,
+            self.link,
+            decoder,
+            AxisMap(),
+            0.0,
+            model=model,
+            thermal_s=thermal_s,
         )
         self.wake = threading.Event()
         self.ready = ready or Ready()
@@ -357,6 +381,76 @@ def test_the_moment_it_disagrees_is_an_event_and_so_is_the_return(tmp_path):
     assert sum(1 for _, agrees in told if agrees) == 6
     assert all(i > 100 for (_, agrees), i in told.items() if agrees)
     assert set(rig.caught.gaps[-1][1].agrees.values()) == {True}
+
+
+def follow_temperature(rig, seconds, begin_s=0.0):
+    """Samples whose bias follows a temperature that swings by 2 °C in 50 s, a tenth of a second at a time."""
+    for i in range(round(10 * seconds)):
+        index = np.arange(rig.sent, rig.sent + 10)
+        rig.sent += 10
+        warmth = 25.0 + np.sin(2.0 * np.pi * index / 5000.0)
+        values = 1e-3 * np.random.default_rng(rig.sent).standard_normal((10, 6)) + 2e-3 * (warmth - 25.0)[:, None]
+        rig.station._push(block(index * 10_000_000, values, warmth, index))
+        rig.work(begin_s + 0.1 * i)
+
+
+def test_bias_is_held_against_temperature():
+    rig = Rig(thermal_s=1.0)
+    follow_temperature(rig, 60.0)
+    looks = [look for _, look in rig.caught.thermals]
+    assert len(looks) >= 58
+    unix_s, look = rig.caught.thermals[-1]
+    assert unix_s == rig.station.unix_s(look.t_ns)
+    assert set(look.axes) == {"gx", "gy", "gz", "ax", "ay", "az"}
+    last = look.axes["gz"]
+    assert last.one_step.bias == pytest.approx(last.bias, abs=5e-4)
+    assert last.slope == pytest.approx(2e-3, rel=0.3)
+
+
+def test_choosing_a_model_holds_no_round_up():
+    rig = Rig(thermal_s=1.0)
+    follow_temperature(rig, 14.0)
+    assert rig.station.thermal.choosing
+    took = []
+    for i in range(50):
+        begun = time.perf_counter()
+        rig.work(100.0 + i)
+        took.append(time.perf_counter() - begun)
+    assert np.median(took) < 0.01
+    assert rig.station._can_take()  # a sensor never waits
+
+
+def test_a_recording_waits_for_its_model():
+    rig = Rig(thermal_s=1.0, link=LoopbackLink(epoch="unix"))
+    index = np.arange(4000)
+    warmth = 25.0 + np.sin(2.0 * np.pi * index / 5000.0)
+    values = 1e-3 * np.random.default_rng(1).standard_normal((4000, 6)) + 2e-3 * (warmth - 25.0)[:, None]
+    rig.station._push(block(index * 10_000_000, values, warmth, index))  # as fast as can be
+    rig.work(1000.0)
+    assert rig.station.thermal.choosing
+    assert 12 <= len(rig.caught.thermals) <= 20
+    assert not rig.station._can_take()
+    for i in range(2000):
+        rig.work(1000.0 + i)
+    assert len(rig.caught.thermals) == 39
+    assert rig.station._can_take()
+    assert all(look.axes["gz"].one_step is not None for _, look in rig.caught.thermals[20:])
+
+
+def test_at_the_end_nothing_waits_for_a_model():
+    rig = Rig(thermal_s=1.0, link=LoopbackLink(epoch="unix"))
+    rig.bring(4000)
+    rig.work(1000.0, drain=True)
+    assert sum(map(len, rig.caught.blocks)) == 4000
+    assert rig.caught.estimates[-1][1].samples == 4000
+    assert len(rig.caught.thermals) == 40
+
+
+def test_where_it_is_off_nothing_is_held_against_temperature():
+    rig = Rig(thermal_s=None)
+    follow_temperature(rig, 5.0)
+    assert (rig.station.thermal, rig.caught.thermals) == (None, [])
+    assert rig.station.watch.take_still() == []
 
 
 def test_without_a_model_there_is_no_gap():

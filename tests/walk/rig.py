@@ -14,6 +14,7 @@ import pytest
 
 from drivers.sample import Event, SampleBlock, join
 from monitor import settings
+from monitor.drift.live import ThermalLook
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.hadamard import HadamardCurve
 from monitor.estimate.model_gap import ModelGap
@@ -31,6 +32,7 @@ class Caught:
         self.estimates: dict[str, Estimate] = {}
         self.totals: dict[str, tuple[TotalCurve, HadamardCurve]] = {}
         self.gaps: dict[str, ModelGap] = {}
+        self.thermals: dict[str, list[ThermalLook]] = {}
         self.events: list[tuple[str, Event]] = []
         self.healths: dict[str, Health] = {}
 
@@ -42,6 +44,9 @@ class Caught:
 
     def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
         self.gaps[device] = gap
+
+    def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
+        self.thermals.setdefault(device, []).append(look)
 
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
         self.totals[device] = (total, hadamard)

@@ -68,6 +68,40 @@ def test_motion_is_told_and_left_out_only_where_that_is_wanted(leave_out):
     assert event.what["moved"]["peak"] == pytest.approx(0.5, rel=0.1)
 
 
+@pytest.mark.parametrize("leave_out", [False, True])
+def test_what_is_at_rest_can_be_had_whatever_is_handed_on(leave_out):
+    values = noise(12_000)
+    values[8_000:8_300, 0] += 0.5 * np.sin(np.arange(300) / 15.0)
+    watch = Watch(RATE_HZ, leave_out, keep_still=True)
+    feed(watch, values)
+    still = np.concatenate([one.values for one in watch.take_still()])
+    assert len(still) < len(values)  # the last are not judged yet
+    watch.flush()
+    still = np.concatenate([still, *(one.values for one in watch.take_still())])
+    struck = np.isnan(still[:, 0])
+    assert struck.sum() == watch.moved_samples > 300
+    assert np.array_equal(still[~struck], values[~struck])
+    assert watch.take_still() == []
+    assert watch.handled == 0
+
+
+def test_still_samples_are_kept_only_for_who_wants_them():
+    watch = Watch(RATE_HZ)
+    feed(watch, noise(1000))
+    assert watch.take_still() == []
+
+
+def test_being_left_in_another_orientation_is_counted():
+    values = noise(12_000)
+    values[:, 5] += 9.81
+    values[6_000:6_200, 1] += 1.0
+    values[6_100:, 3:6] = noise(12_000, 1)[6_100:, 3:6] + [9.81, 0.0, 0.0]
+    watch = Watch(RATE_HZ)
+    feed(watch, values)
+    watch.flush()
+    assert watch.handled == 1
+
+
 def test_motion_is_no_change_of_noise():
     values = noise(30_000)
     values[20_000:21_000, 3:] += 2.0 * np.random.default_rng(1).standard_normal((1000, 3))

@@ -5,6 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from drivers.sample import AXES
+from monitor.drift.following import AxisThermal
+from monitor.drift.live import ThermalLook
+from monitor.drift.recursion import Band
 from monitor.estimate.analysis import Analysis
 from monitor.estimate.coefficients import Coefficients, Status
 from monitor.estimate.curve import AllanCurve
@@ -95,6 +98,13 @@ def look(found: Estimate | None = None, scale: float = 1.0, **agrees: bool) -> M
     )
     in_force = ModelInForce(NoiseModel.from_toml(text), 360_000)
     return replace(in_force.look(found), agrees=agrees)
+
+
+def thermal_look(t_ns: int = 0, bias: float = 3e-4) -> ThermalLook:
+    """Ten minutes of a device that measures gz and az; az has no model yet."""
+    gz = AxisThermal(bias, 1e-6, Band(2e-4, 1e-4, 3e-4), Band(2.2e-4, 1.8e-4, 2.6e-4), "polynomial 1", 2e-5, "")
+    az = AxisThermal(9.81, np.nan, None, None, "", np.nan, "temperature hardly moved")
+    return ThermalLook(t_ns, 600.0, 25.5, {"gz": gz, "az": az})
 
 
 def slow_curves() -> tuple[TotalCurve, HadamardCurve]:

@@ -42,6 +42,7 @@ ALL = {
     topics.COEFFICIENTS: message.coefficients("bench-1", UNIX_S, made.estimate()),
     topics.TOTAL: message.total("bench-1", UNIX_S, 360_000, *made.slow_curves()),
     topics.GAP: message.gap("bench-1", UNIX_S, made.look(gz=False, gx=True)),
+    topics.THERMAL: message.thermal("bench-1", UNIX_S, 360_000, made.thermal_look()),
     topics.EVENT: message.event("bench-1", UNIX_S, 360_000, Event("link_back", 0, "back"), None),
     topics.STATUS: message.status("bench-1", UNIX_S, made.health()),
     topics.RESET: message.reply("bench-1", UNIX_S, 360_000, "the window is empty"),
@@ -89,6 +90,31 @@ def test_total_and_hadamard_have_their_own_tau() -> None:
     assert gz["deviation"] == np.sqrt(total.tvar[:, 2]).tolist()
     assert gz["lo"][0] == total.lo[0, 2]
     assert gz["hi"][-1] is None  # beyond half the window there is no interval
+
+
+def test_thermal() -> None:
+    found = parsed(ALL[topics.THERMAL])
+    assert (found["interval"], found["temperature"]) == (600.0, 25.5)
+    assert found["axes"] == {
+        "gz": {
+            "bias": 3e-4,
+            "error": 1e-6,
+            "multi_step": {"bias": 2e-4, "lo": 1e-4, "hi": 3e-4},
+            "one_step": {"bias": 2.2e-4, "lo": 1.8e-4, "hi": 2.6e-4},
+            "model": "polynomial 1",
+            "slope": 2e-5,
+            "text": "",
+        },
+        "az": {
+            "bias": 9.81,
+            "error": None,
+            "multi_step": None,
+            "one_step": None,
+            "model": None,
+            "slope": None,
+            "text": "temperature hardly moved",
+        },
+    }
 
 
 def test_gap() -> None:

@@ -94,6 +94,14 @@ def test_a_device_has_a_tab_for_now_and_one_for_the_time() -> None:
     assert [page.name for page in fleet.contents] == ["Overview", "nose", "tail"]
 
 
+def test_the_tab_of_temperature_is_there_only_where_bias_is_held_against_it() -> None:
+    fleet = rerun_blueprint.blueprint(["a", "b"], [], ["b"]).root_container
+    (_, first, second) = fleet.contents
+    assert [page.name for page in first.contents] == ["Now", "Dynamic"]
+    assert [page.name for page in second.contents] == ["Now", "Dynamic", "Temperature"]
+    assert second.active_tab == 0
+
+
 def test_gaps_have_their_row_only_where_there_is_a_model() -> None:
     def views(page: object) -> list[str]:
         return [getattr(page, "name", None) or ""] + [

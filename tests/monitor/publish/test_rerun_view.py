@@ -123,6 +123,27 @@ def test_the_gap_has_a_course_and_the_model_a_line(tmp_path: Path) -> None:
     assert not [entity for entity in rows if entity.startswith("/plain/gap/") and "Scalars:scalars" in rows[entity]]
 
 
+def test_means_have_a_course_beside_what_was_expected(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    view = RerunView(ViewerSettings(mode=str(path)), [DeviceInfo("bench-1", has_thermal=True)])
+    view.start()
+    assert wait_for(lambda: view.state == "ok"), view.state
+    for i in range(3):
+        view.thermal("bench-1", T0 + 600.0 * i, made.thermal_look(bias=1e-4 * (i + 1)))
+    view.close()
+    rows = read(path)
+    gz = column(rows["/bench-1/thermal/gz"], "Scalars:scalars").reshape(3, 4)
+    hour = np.degrees(3600.0)
+    assert gz[:, 0] == pytest.approx(np.array([1e-4, 2e-4, 3e-4]) * hour)
+    assert gz[:, 1:] == pytest.approx(np.tile(np.array([2.2e-4, 1.8e-4, 2.6e-4]) * hour, (3, 1)))
+    assert column(rows["/bench-1/thermal/gz"], "sample_time") / 1e9 == pytest.approx(
+        T0 + 600.0 * np.arange(3), abs=1e-6
+    )
+    az = column(rows["/bench-1/thermal/az"], "Scalars:scalars").reshape(3, 4)
+    assert np.isfinite(az).tolist() == [[True, False, False, False]] * 3
+    assert "Scalars:scalars" not in rows.get("/bench-1/thermal/gx", {})
+
+
 def read(path: Path) -> dict[str, dict[str, list[object]]]:
     """Entity -> column -> cells of the recording, the blueprint's not among them."""
     from rerun.chunk import RrdReader

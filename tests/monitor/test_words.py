@@ -5,7 +5,7 @@ import math
 import pytest
 
 from drivers.sample import AXES
-from monitor.estimate.words import amount
+from monitor.words import amount
 
 
 @pytest.mark.parametrize(
