@@ -105,7 +105,7 @@ class Event:
     """Something happened to a device: what, when, how large, how sure.
 
     Kinds so far: ``link_lost``, ``link_back``, ``samples_lost``, ``samples_repeated``, ``clock_jumped``, ``moved``,
-    ``noise_changed``, ``bias_stepped``, ``outlier_burst``, ``model_disagrees``,
+    ``noise_changed``, ``bias_stepped``, ``outlier_burst``, ``drift_unexplained``, ``model_disagrees``,
     ``temperature_unexplained``, ``reconciled``.
     """
 

@@ -10,6 +10,7 @@ from drivers.sample import Event, SampleBlock
 from drivers.sample_message import pack
 from monitor import topics
 from monitor.drift.live import ThermalLook
+from monitor.drift.live_compensation import DriftLook
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.hadamard import HadamardCurve
 from monitor.estimate.model_gap import ModelGap
@@ -53,6 +54,14 @@ class ZenohOutput:
         """Total and Hadamard deviations."""
         self._zenoh.put(topics.TOTAL, device, message.total(device, unix_s, received, total, hadamard))
 
+    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        """One msgpack batch."""
+        schema = topics.COMPENSATED.schema()
+        self._zenoh.put(topics.COMPENSATED, device, pack(device, received, samples, offset_ns, schema))
+
+    def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
+        """Not sent: the compensated rate is."""
+
     def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
         """The mean of an interval beside what was expected of it."""
         self._zenoh.put(topics.THERMAL, device, message.thermal(device, unix_s, received, look))
@@ -90,6 +99,14 @@ class ViewerOutput:
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
         """Not shown."""
 
+    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        """Rates beside those measured."""
+        self._view.compensated(device, (samples.t_ns + offset_ns) / 1e9, samples.values[:, :3])
+
+    def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
+        """Courses of the drift and of its innovations, and the models."""
+        self._view.drift(device, unix_s, look)
+
     def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
         """Courses of the means beside what was expected of them."""
         self._view.thermal(device, unix_s, look)
@@ -122,6 +139,12 @@ class LogOutput:
 
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
         """Not said."""
+
+    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        """Not shown."""
+
+    def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
+        """Not shown."""
 
     def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
         """Not logged."""
@@ -164,6 +187,12 @@ class TableOutput:
         self._gaps[device] = (unix_s, gap)
 
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
+        """Not shown."""
+
+    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        """Not shown."""
+
+    def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
         """Not shown."""
 
     def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
+from monitor.drift import compensator
 from monitor.estimate.estimator import warm_up
 from monitor.live_reconcile import Job, Reconciler
 from monitor.outputs import TableOutput, ViewerOutput, ZenohOutput
@@ -120,6 +121,8 @@ class Service:
         """Beside the loop, so that a first start's compilation holds up neither samples nor status."""
         try:
             for kernel in warm_up():
+                if kernel == "all" and any(device.compensate for device in self.config.devices):
+                    compensator.warm_up()
                 getattr(self._ready, kernel).set()
                 self._wake.set()
         except OSError as error:
@@ -242,7 +245,9 @@ def _viewer(config: Config) -> "RerunView | None":
 
     own = config.viewer
     devices = [
-        DeviceInfo(device.name, _about(device), device.model is not None, device.thermal_s is not None)
+        DeviceInfo(
+            device.name, _about(device), device.model is not None, device.thermal_s is not None, device.compensate
+        )
         for device in config.devices
     ]
     return RerunView(ViewerSettings(own.mode, own.port, own.web_port, own.memory), devices)

@@ -77,6 +77,7 @@ class Device:
     model: Path | None = None  # the model in force
     reconcile_folder: Path | None = None  # where reports are kept
     thermal_s: float | None = 600.0  # of the means that are held against temperature; None: they are not
+    compensate: bool = True  # take the gyros' drift out of a copy of the samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +188,7 @@ class _Reader:
         return Device(
             entry.name, entry.rate, window_s, tau, refit_s, publish_s, link, decoder, axes, silence_s,
             entry.motion == "leave out", entry.alarms_per_day, entry.restart, model,
-            entry.reconcile_folder, thermal_s,
+            entry.reconcile_folder, thermal_s, entry.compensate,
         )  # fmt: skip
 
     def driver(self, table: Mapping[str, Any], at: str) -> tuple[Link | VirtualTable | None, Decoder | None]:

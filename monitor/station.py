@@ -22,6 +22,7 @@ from drivers.links.replay_link import ReplayLink
 from drivers.sample import Event, Floats, SampleBlock, unbroken
 from monitor.catalogue import read_model
 from monitor.drift.live import LiveThermal, ThermalLook
+from monitor.drift.live_compensation import DriftLook, LiveCompensation
 from monitor.estimate.agreement import Agreement
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.estimator import Estimator
@@ -31,6 +32,7 @@ from monitor.estimate.model_gap import ModelGap, ModelInForce
 from monitor.estimate.total import TotalCurve
 from monitor.estimate.watch import Watch
 from monitor.health import Health
+from monitor.identifier import Identifier
 from monitor.ring import RingBuffer
 from monitor.settings import Device
 from monitor.wall import WallClock
@@ -78,6 +80,12 @@ class Output(Protocol):
     def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
         """An interval beside what temperature let expect of it; never where none is measured."""
 
+    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        """As ``samples``, the gyros' drift taken out."""
+
+    def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
+        """What an interval of a second taught of the gyros' drift."""
+
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
         """Total and Hadamard deviations, renewed in rounds."""
 
@@ -117,6 +125,7 @@ class Station:
         self.thermal: LiveThermal | None = None
         self._looks: list[ThermalLook] = []  # not published yet
         self._handled = 0  # as often as the watch has said it
+        self.compensation: LiveCompensation | None = None
         self._temperatures: Temperatures | None = None  # of the samples in the window
         self.published = 0  # samples handed to the outputs
         self._wake = wake
@@ -124,6 +133,7 @@ class Station:
         # a recording is over before its changes could be looked for
         self.waits_for_all = device.refit_s == 0.0 or device.leave_out_motion or isinstance(link, ReplayLink)
         self._patient = link.epoch == "unix"
+        self._identifier = Identifier(f"drift of {device.name}", at_once=self._patient)
         self._wall = WallClock(time.monotonic_ns(), time.time_ns())
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
         self._batch: list[SampleBlock] = []  # not published yet
@@ -176,11 +186,11 @@ class Station:
         happened = self.driver.take_events()
         if self.thermal is not None and any(event.kind == "link_back" for event in happened):
             self.thermal.offset_is_new()
-        for source in (self.watch, self.thermal):
+        published = self._publish_samples(outputs, now_s, drain)
+        for source in (self.watch, self.thermal, self.compensation):
             happened += source.take_events() if source is not None else []
         self._tell(outputs, happened)
         self._publish_thermal(outputs, now_s)
-        published = self._publish_samples(outputs, now_s, drain)
         published |= self._publish_estimate(outputs, now_s, drain)
         self._publish_total(outputs, now_s)
         if published and self._unpublished_since_ns:
@@ -210,8 +220,9 @@ class Station:
             self.estimator.relabel(rate)
             if self.watch is not None:
                 self.watch.relabel(rate)
-            if self.thermal is not None:
-                self.thermal.relabel(rate)
+            for one in (self.thermal, self.compensation):
+                if one is not None:
+                    one.relabel(rate)
         health = self.health(states, memory_bytes)
         for output in outputs:
             output.health(self.name, self.now_unix_s(), health)
@@ -302,6 +313,7 @@ class Station:
             wanted = thermal_s is not None
             self.watch = Watch(rate_hz, self.device.leave_out_motion, self.device.alarms_per_day, keep_still=wanted)
             self.thermal = None if thermal_s is None else LiveThermal(rate_hz, thermal_s)
+            self.compensation = LiveCompensation(rate_hz) if self.device.compensate else None
         self._pieces += [samples[at : at + PIECE] for samples in blocks for at in range(0, len(samples), PIECE)]
         while self._pieces and (drain or not self._patient or self.thermal is None or not self.thermal.choosing):
             piece = self._pieces.popleft()
@@ -339,7 +351,20 @@ class Station:
             self.published += len(samples)
             for output in outputs:
                 output.samples(self.name, self.published, samples, self._offset_ns())
+            if self.compensation is not None and np.isfinite(samples.values[:, :3]).any():
+                self._publish_compensated(outputs, self.compensation, samples)
         return True
+
+    def _publish_compensated(self, outputs: Sequence[Output], live: LiveCompensation, samples: SampleBlock) -> None:
+        """The same samples without drift, and what they taught of it."""
+        for piece in (samples[at : at + PIECE] for at in range(0, len(samples), PIECE)):
+            without = live.update(piece)
+            self._identifier.renew(live)
+            for output in outputs:
+                output.compensated(self.name, self.published, without, self._offset_ns())
+        for look in live.take():
+            for output in outputs:
+                output.drift(self.name, self.unix_s(look.t_ns), look)
 
     def _publish_estimate(self, outputs: Sequence[Output], now_s: float, drain: bool) -> bool:
         # at every sample the course follows by itself: a look before that is published would take its samples away

@@ -37,6 +37,8 @@ class DeviceTable(_Table, frozen=True, kw_only=True):
     restart: bool = True
     model: str | None = None
     """The model in force: path of a model file, or the name of one in the shipped ``config/models``."""
+    compensate: bool = True
+    """Take the gyros' drift out of a copy of the samples."""
     thermal_interval: Positive | str = "10min"
     """Of the means that are held against temperature; "off": they are not."""
     reconcile_folder: Path | None = None

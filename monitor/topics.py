@@ -30,6 +30,7 @@ class Topic:
 
 
 SAMPLES: Final = Topic("samples", MSGPACK, "batches")
+COMPENSATED: Final = Topic("compensated", MSGPACK, "batches")
 ALLAN: Final = Topic("allan", JSON, "publish")
 COEFFICIENTS: Final = Topic("coefficients", JSON, "publish")
 TOTAL: Final = Topic("total", JSON, "rounds")
@@ -41,4 +42,17 @@ ALIVE: Final = Topic("alive", "", "presence")
 RESET: Final = Topic("command/reset", JSON, "query")
 RECONCILE: Final = Topic("command/reconcile", JSON, "query")
 
-TOPICS: Final = (SAMPLES, ALLAN, COEFFICIENTS, TOTAL, GAP, THERMAL, EVENT, STATUS, ALIVE, RESET, RECONCILE)
+TOPICS: Final = (
+    SAMPLES,
+    COMPENSATED,
+    ALLAN,
+    COEFFICIENTS,
+    TOTAL,
+    GAP,
+    THERMAL,
+    EVENT,
+    STATUS,
+    ALIVE,
+    RESET,
+    RECONCILE,
+)

@@ -225,9 +225,12 @@ class Compensator:
         )
 
 
-def axis_names() -> tuple[str, ...]:
-    """Of the columns of an ``Interval``."""
-    return AXES[:GYROS]
+def warm_up() -> None:
+    """Have the kernels compiled, or loaded from the disk cache: those of every sample and those of identification."""
+    rng, one = np.random.default_rng(0), Compensator(100.0)
+    one.update(1e-3 * rng.standard_normal((3000, len(AXES))))
+    one.adopt(0, identify(*one.window(0), [(2, 1)]))
+    one.update(np.zeros((1, len(AXES))), lost=1)
 
 
 def _state(rate_hz: float, adapts: bool) -> State:

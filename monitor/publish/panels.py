@@ -4,14 +4,18 @@ In come a ``Health`` or an ``Estimate``, out goes text; numbers stand in the fie
 that what a person reads can be tested without a viewer.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Final
 
+from monitor.drift.arma import Arma
+from monitor.drift.live_compensation import DriftLook
 from monitor.estimate.coefficients import LETTERS
 from monitor.estimate.estimate import Estimate
 from monitor.health import Health
 from monitor.publish.units import (
     COEFFICIENT_UNITS,
+    DEVIATION_UNITS,
     KIND_NAMES,
     KINDS,
     Kind,
@@ -68,6 +72,31 @@ def noise_text(estimate: Estimate) -> str:
     seen_s = estimate.curve.n / estimate.rate_hz
     head = f"Last **{duration(min(seen_s, estimate.window_s))}**, 95 % intervals; ≤ bound; — too few data"
     return "\n\n".join([head, *tables])
+
+
+def drift_text(look: DriftLook) -> str:
+    """The models that the gyros' drift is expected by, and what is taken out now."""
+    unit = DEVIATION_UNITS["gyro"]
+    rows = ["| axis | drift now | model | φ₁ | φ₂ | θ₁ |", "|---|---|---|---|---|---|"]
+    for at, axis in enumerate(axes_of("gyro")):
+        expected, model = float(look.expected[at]), look.models[at]
+        if not math.isfinite(expected):
+            rows.append(f"| {axis} | not known yet | | | | |")
+            continue
+        now = f"{number(unit.factor * expected)} ± {number(1.96 * unit.factor * float(look.error[at]), 2)} {unit.name}"
+        if model is None:
+            rows.append(f"| {axis} | {now} | learning | | | |")
+            continue
+        parts = [
+            f"{x:.4f}" if there else "" for x, there in zip((*model.phi, model.theta), _entered(model), strict=True)
+        ]
+        rows.append(f"| {axis} | {now} | {model.name} | {' | '.join(parts)} |")
+    head = f"Learned at rest, from means of {duration(look.interval_s)}; what every one brings anew is below."
+    return "\n".join([head, "", *rows])
+
+
+def _entered(model: Arma) -> tuple[bool, bool, bool]:
+    return model.order[0] > 0, model.order[0] > 1, model.order[1] > 0
 
 
 def duration(seconds: float) -> str:

@@ -37,10 +37,13 @@ SHORT: Final = {"gyro": "Gyro", "accel": "Accel"}
 
 
 def blueprint(
-    devices: Sequence[str], with_model: Collection[str] = (), with_thermal: Collection[str] = ()
+    devices: Sequence[str],
+    with_model: Collection[str] = (),
+    with_thermal: Collection[str] = (),
+    compensated: Collection[str] = (),
 ) -> rrb.Blueprint:
-    """The layout for these devices, some of which have a model in force, or a bias held against temperature."""
-    pages = [_device(d, d in with_model, d in with_thermal) for d in devices]
+    """The layout for these devices; some have a model in force, a bias held against temperature, or are compensated."""
+    pages = [_device(d, d in with_model, d in with_thermal, d in compensated) for d in devices]
     root = pages[0] if len(pages) == 1 else rrb.Tabs(_overview(devices), *pages, active_tab=0)
     return rrb.Blueprint(
         root,
@@ -52,7 +55,7 @@ def blueprint(
     )
 
 
-def _device(device: str, has_model: bool, has_thermal: bool) -> rrb.Container:
+def _device(device: str, has_model: bool, has_thermal: bool, compensated: bool) -> rrb.Container:
     left = rrb.Vertical(
         rrb.TextDocumentView(origin=f"/{device}/status", name="Is it healthy?"),
         rrb.TextDocumentView(origin=f"/{device}/coefficients", contents="$origin", name="What is its noise now?"),
@@ -67,7 +70,9 @@ def _device(device: str, has_model: bool, has_thermal: bool) -> rrb.Container:
         row_shares=[5, 2.2, 1.6, 2.2] if has_model else [5, 2.2, 2.2],
     )
     now = rrb.Horizontal(left, right, column_shares=[3, 7], name="Now")
-    pages = [now, _dynamic(device), *([_thermal(device)] if has_thermal else [])]
+    pages = [now, _dynamic(device)]
+    pages += [_thermal(device)] if has_thermal else []
+    pages += [_drift(device)] if compensated else []
     return rrb.Tabs(*pages, active_tab=0, name=device)
 
 
@@ -75,6 +80,38 @@ def _thermal(device: str) -> rrb.Container:
     """Bias of each axis beside what was expected of it, and the temperature."""
     columns = [rrb.Vertical(*(_bias(device, axis) for axis in axes_of(kind))) for kind in KINDS]
     return rrb.Vertical(rrb.Horizontal(*columns), _temperature(device), row_shares=[4, 1], name="Temperature")
+
+
+def _drift(device: str) -> rrb.Container:
+    """Rates before and after, the drift that was taken out, and what was new in each interval."""
+    rows = [
+        rrb.Horizontal(
+            rrb.TimeSeriesView(
+                origin=f"/{device}",
+                contents=[f"+ $origin/samples/{axis}", f"+ $origin/compensated/{axis}"],
+                name=f"{axis}: rate as measured, and without drift, {SAMPLE_UNITS['gyro'].name}",
+                plot_legend=rrb.PlotLegend(visible=False),
+                overrides={f"/{device}/samples/{axis}": rr.SeriesLines(colors=[colours.FRAME], widths=[0.75])},
+                axis_x=_last(RAW_SPAN_S),
+            ),
+            rrb.TimeSeriesView(
+                origin=f"/{device}/drift/{axis}",
+                name=f"{axis}: means at rest, and the drift expected, {DEVIATION_UNITS['gyro'].name}",
+                plot_legend=rrb.PlotLegend(visible=False),
+                axis_x=_all_so_far(),
+            ),
+            rrb.TimeSeriesView(
+                origin=f"/{device}/innovation/{axis}",
+                name=f"{axis}: innovation, σ",
+                plot_legend=rrb.PlotLegend(visible=False),
+                axis_x=_all_so_far(),
+            ),
+            column_shares=[3, 3, 2],
+        )
+        for axis in axes_of("gyro")
+    ]
+    text = rrb.TextDocumentView(origin=f"/{device}/drift", contents="$origin", name="Drift of the gyros")
+    return rrb.Vertical(*rows, text, row_shares=[3, 3, 3, 1.6], name="Drift")
 
 
 def _bias(device: str, axis: str) -> rrb.View:
@@ -199,6 +236,9 @@ def send(
     devices: Sequence[str],
     with_model: Collection[str] = (),
     with_thermal: Collection[str] = (),
+    compensated: Collection[str] = (),
 ) -> None:
     """Make the layout the active one of the stream's viewer."""
-    stream.send_blueprint(blueprint(devices, with_model, with_thermal), make_active=True, make_default=True)
+    stream.send_blueprint(
+        blueprint(devices, with_model, with_thermal, compensated), make_active=True, make_default=True
+    )

@@ -18,13 +18,14 @@ import rerun as rr
 from drivers.sample import AXES, Event, Floats
 from monitor.drift.following import AxisThermal
 from monitor.drift.live import ThermalLook
+from monitor.drift.live_compensation import DriftLook
 from monitor.estimate.coefficients import LETTERS, Status
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.model_gap import ModelGap
 from monitor.health import Health
 from monitor.publish import colours, rerun_dynamic
 from monitor.publish.decimate import extremes, means
-from monitor.publish.panels import health_text, noise_text, overview_text
+from monitor.publish.panels import drift_text, health_text, noise_text, overview_text
 from monitor.publish.rerun_chart import (
     FILL_STEPS,
     HEIGHT,
@@ -52,6 +53,7 @@ TIMELINE: Final = "sample_time"
 TEMPERATURES_PER_S: Final = 5.0
 BETWEEN: Final = 20
 """Points on the course of a coefficient from one estimate to the next, where it follows every sample."""
+Z95: Final = 1.959964
 NARROW: Final = 1.5  # ends of an interval further than this factor from their value are not on the course
 LEVELS: Final = {
     "link_lost": "ERROR",
@@ -61,6 +63,7 @@ LEVELS: Final = {
     "limit_crossed": "WARN",
     "model_disagrees": "WARN",
     "temperature_unexplained": "WARN",
+    "drift_unexplained": "WARN",
     "clock_jumped": "WARN",
 }
 """Event kind -> level of the line in the log; all others are INFO."""
@@ -149,6 +152,24 @@ class Scene:
             if np.isfinite(rows).any():
                 self._scalars(f"{device}/thermal/{axis}", wall_s, rows * DEVIATION_UNITS[kind_of(axis)].factor)
 
+    def compensated(self, device: str, wall_s: Floats, values: Floats) -> None:
+        """Rates without drift since the last flush: [n], [n, 3] rad/s; thinned like the samples."""
+        for i, axis in enumerate(axes_of("gyro")):
+            t, y = extremes(wall_s, values[:, i])
+            self._scalars(f"{device}/compensated/{axis}", t, y * SAMPLE_UNITS["gyro"].factor)
+
+    def drift(self, device: str, wall_s: Floats, looks: Sequence[DriftLook]) -> None:
+        """Means at rest beside the drift that was expected, innovations, and the models."""
+        factor = DEVIATION_UNITS["gyro"].factor
+        for i, axis in enumerate(axes_of("gyro")):
+            rows = np.array([_drift(look, i) for look in looks])
+            if np.isfinite(rows).any():
+                self._scalars(f"{device}/drift/{axis}", wall_s, rows * factor)
+                new = np.array([look.innovation[i] for look in looks])
+                self._scalars(f"{device}/innovation/{axis}", wall_s, new)
+        self._at(float(wall_s[-1]))
+        self._stream.log(f"{device}/drift", _markdown(drift_text(looks[-1])))
+
     def event(self, device: str, wall_s: float, event: Event) -> None:
         """One line in the log of the device, and in that of the overview."""
         self._at(wall_s)
@@ -179,6 +200,8 @@ class Scene:
         names = [f"{axis} bias, {unit}", f"{axis} expected", f"{axis} 95 % low", f"{axis} 95 % high"]
         line = rr.SeriesLines(colors=[colour, colours.TEXT, dim, dim], widths=[2.0, 1.0, 0.75, 0.75], names=names)
         self._stream.log(f"{device}/thermal/{axis}", line, static=True)
+        if kind_of(axis) == "gyro":
+            self._style_drift(device, axis)
         for letter in LETTERS:
             unit = COEFFICIENT_UNITS[kind_of(axis)][letter].name
             names = [f"{axis}, {unit}", f"{axis} 95 % low", f"{axis} 95 % high"]
@@ -186,6 +209,18 @@ class Scene:
             self._stream.log(f"{device}/coefficients/{letter}/{axis}", line, static=True)
             mark = rr.SeriesPoints(colors=[colour], markers=["diamond"], marker_sizes=[7.0], names=[f"{axis} changed"])
             self._stream.log(f"{device}/coefficients/{letter}/{axis}/changed", mark, static=True)
+
+    def _style_drift(self, device: str, axis: str) -> None:
+        colour = colours.AXIS_COLOURS[axis]
+        dim = colours.mixed(colour, 0.45)
+        unit = DEVIATION_UNITS["gyro"].name
+        names = [f"{axis} at rest, {unit}", f"{axis} expected", f"{axis} 95 % low", f"{axis} 95 % high"]
+        line = rr.SeriesLines(colors=[dim, colours.TEXT, colour, colour], widths=[0.75, 1.5, 1.0, 1.0], names=names)
+        self._stream.log(f"{device}/drift/{axis}", line, static=True)
+        line = rr.SeriesLines(colors=[colour], widths=[1.0], names=[f"{axis}, σ"])
+        self._stream.log(f"{device}/innovation/{axis}", line, static=True)
+        line = rr.SeriesLines(colors=[colour], widths=[1.0], names=[f"{axis}, {SAMPLE_UNITS['gyro'].name}"])
+        self._stream.log(f"{device}/compensated/{axis}", line, static=True)
 
     def _mark(self, device: str, wall_s: float, event: Event) -> None:
         """A change of a coefficient, on its course: a diamond at the size that it has now."""
@@ -348,6 +383,12 @@ def _thermal(one: AxisThermal | None) -> tuple[float, float, float, float]:
         return np.nan, np.nan, np.nan, np.nan
     band = one.one_step
     return (one.bias, np.nan, np.nan, np.nan) if band is None else (one.bias, band.bias, band.lo, band.hi)
+
+
+def _drift(look: DriftLook, axis: int) -> tuple[float, float, float, float]:
+    """mean at rest, expected, lo, hi."""
+    expected, wide = float(look.expected[axis]), Z95 * float(look.error[axis])
+    return float(look.mean[axis]), expected, expected - wide, expected + wide
 
 
 def _stamps(wall_s: Floats) -> "np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]":

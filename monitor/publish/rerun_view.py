@@ -24,6 +24,7 @@ import numpy as np
 
 from drivers.sample import Event, Floats
 from monitor.drift.live import ThermalLook
+from monitor.drift.live_compensation import DriftLook
 from monitor.estimate.estimate import Estimate, joined
 from monitor.estimate.model_gap import ModelGap
 from monitor.health import Health
@@ -45,7 +46,7 @@ COURSE_STEP_S: Final = 1.0  # of sample time between two points of a course
 EARLY_END_S: Final = 10.0  # a window that ends sooner never worked
 MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
 
-Message = tuple[str, "_Samples | _Estimate | _Gap | _Thermal | _Event | _Health"]
+Message = tuple[str, "_Samples | _Estimate | _Gap | _Thermal | _Rates | _Drift | _Event | _Health"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +66,18 @@ class _Estimate:
 class _Gap:
     wall_s: float
     gap: ModelGap
+
+
+@dataclass(frozen=True, slots=True)
+class _Rates:
+    wall_s: Floats
+    values: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class _Drift:
+    wall_s: float
+    look: DriftLook
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +149,14 @@ class RerunView:
         """The window beside the model in force."""
         self._put(device, _Gap(wall_s, gap), 6 * 4 * gap.tau_s.nbytes)
 
+    def compensated(self, device: str, wall_s: Floats, values: Floats) -> None:
+        """Rates without drift at Unix times ``wall_s`` [n]: [n, 3] rad/s."""
+        self._put(device, _Rates(wall_s, values), wall_s.nbytes + values.nbytes)
+
+    def drift(self, device: str, wall_s: float, look: DriftLook) -> None:
+        """What an interval taught of the gyros' drift."""
+        self._put(device, _Drift(wall_s, look), 1000)
+
     def thermal(self, device: str, wall_s: float, look: ThermalLook) -> None:
         """An interval beside what temperature let expect of it."""
         self._put(device, _Thermal(wall_s, look), 1000)
@@ -163,7 +184,10 @@ class RerunView:
         self._phase = "closed"
 
     def _put(
-        self, device: str, message: "_Samples | _Estimate | _Gap | _Thermal | _Event | _Health", weight: int
+        self,
+        device: str,
+        message: "_Samples | _Estimate | _Gap | _Thermal | _Rates | _Drift | _Event | _Health",
+        weight: int,
     ) -> None:
         if self._thread is not None:
             self._backlog.push((device, message), weight)
@@ -216,6 +240,7 @@ class RerunView:
                 [d.name for d in self._devices],
                 [d.name for d in self._devices if d.has_model],
                 [d.name for d in self._devices if d.has_thermal],
+                [d.name for d in self._devices if d.compensated],
             )
             scene.open()
             self._phase = "ok"
@@ -263,6 +288,8 @@ class _Pending:
     course: dict[str, list[_Estimate]] = field(default_factory=dict)
     gaps: dict[str, list[_Gap]] = field(default_factory=dict)
     thermals: dict[str, list[_Thermal]] = field(default_factory=dict)
+    rates: dict[str, list[_Rates]] = field(default_factory=dict)
+    drifts: dict[str, list[_Drift]] = field(default_factory=dict)
     healths: dict[str, _Health] = field(default_factory=dict)
     events: list[tuple[str, _Event]] = field(default_factory=list)
     drawn: dict[tuple[str, str], float] = field(default_factory=dict)  # (what, device) -> monotonic s
@@ -278,6 +305,10 @@ class _Pending:
                     self._add_to_course(device, message)
                 case _Gap():
                     self._add_gap(device, message)
+                case _Rates():
+                    self.rates.setdefault(device, []).append(message)
+                case _Drift():
+                    self.drifts.setdefault(device, []).append(message)
                 case _Thermal():
                     self.thermals.setdefault(device, []).append(message)
                 case _Event():
@@ -301,6 +332,14 @@ class _Pending:
         for device, seen in self.healths.items():
             scene.health(device, seen.wall_s, seen.health)
         self.healths.clear()
+        for device, rates in self.rates.items():
+            scene.compensated(
+                device, np.concatenate([one.wall_s for one in rates]), np.concatenate([one.values for one in rates])
+            )
+        self.rates.clear()
+        for device, drifts in self.drifts.items():
+            scene.drift(device, np.array([one.wall_s for one in drifts]), [one.look for one in drifts])
+        self.drifts.clear()
         for device, means in self.thermals.items():
             scene.thermal(device, np.array([one.wall_s for one in means]), [one.look for one in means])
         self.thermals.clear()

@@ -29,3 +29,4 @@ class DeviceInfo:
     about: str = ""  # a few words: decoder, link, port
     has_model: bool = False  # one is in force
     has_thermal: bool = False  # its bias is held against its temperature, once one comes
+    compensated: bool = False  # the drift of its gyros is taken out

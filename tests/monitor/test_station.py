@@ -9,8 +9,9 @@ import pytest
 from drivers.decoders import text, vectornav_binary
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
+from drivers.links import replay_link
 from drivers.links.loopback_link import LoopbackLink
-from drivers.sample import block
+from drivers.sample import block, join
 from monitor.settings import Device
 from monitor.station import Ready, Station
 
@@ -23,6 +24,7 @@ class Caught:
     def __init__(self):
         self.blocks, self.counts, self.estimates, self.events, self.healths, self.totals = [], [], [], [], [], []
         self.gaps, self.thermals = [], []
+        self.rates, self.drifts = [], []
 
     def samples(self, device, received, samples, offset_ns):
         self.blocks.append(samples)
@@ -36,6 +38,12 @@ class Caught:
 
     def thermal(self, device, unix_s, received, look):
         self.thermals.append((unix_s, look))
+
+    def compensated(self, device, received, samples, offset_ns):
+        self.rates.append(samples)
+
+    def drift(self, device, unix_s, look):
+        self.drifts.append((unix_s, look))
 
     def total(self, device, unix_s, received, total, hadamard):
         self.totals.append((received, total, hadamard))
@@ -59,6 +67,7 @@ class Rig:
         ready=None,
         model=None,
         thermal_s=600.0,
+        compensate=True,
         link=None,
     ):
         decoder = decoder or vectornav_binary.build(vectornav_binary.Settings())
@@ -76,6 +85,7 @@ class Rig:
             0.0,
             model=model,
             thermal_s=thermal_s,
+            compensate=compensate,
         )
         self.wake = threading.Event()
         self.ready = ready or Ready()
@@ -481,3 +491,63 @@ def test_the_samples_of_the_window_and_their_temperature():
     assert np.isnan(temperature_c[397:400]).all()
     np.testing.assert_allclose(values[400:], sent[-100:], rtol=0.0, atol=1e-10)
     np.testing.assert_allclose(temperature_c[400:], 20.0 + 1e-3 * np.arange(603, 703), rtol=1e-6)
+
+
+def test_every_sample_comes_out_without_drift_too_and_models_are_identified_beside_the_loop():
+    rig = Rig()
+    for i in range(75):
+        rig.bring(100)
+        rig.work(1000.0 + i)
+    thread = rig.station._identifier._work.thread
+    assert thread.name == "drift of bench"
+    thread.join(10.0)
+    rig.bring(100)
+    rig.work(1100.0, drain=True)
+    measured, rates = join(rig.caught.blocks), join(rig.caught.rates)
+    np.testing.assert_array_equal(rates.t_ns, measured.t_ns)
+    np.testing.assert_array_equal(rates.values[:, 3:], measured.values[:, 3:])
+    assert rates.values[2000:, :3].std() < 0.3 * measured.values[2000:, :3].std()
+    ends = [look.t_ns for _, look in rig.caught.drifts]
+    assert ends == [k * 1_000_000_000 + 990_000_000 for k in range(len(ends))]
+    assert len(ends) == 75
+    assert rig.station.compensation.compensator.models[0] is not None
+
+
+def test_a_recording_waits_for_its_models(tmp_path):
+    np.savez(tmp_path / "a.npz", fs=100.0, gz=np.zeros(10))
+    rig = Rig(link=replay_link.build(replay_link.Settings(path=str(tmp_path / "a.npz"))))
+    for i in range(65):
+        rig.bring(100)
+        rig.work(1000.0 + i)
+    assert all(model is not None for model in rig.station.compensation.compensator.models)
+
+
+def test_nothing_is_compensated_where_it_is_not_wanted_or_no_gyro_is_measured():
+    off = Rig(compensate=False)
+    off.bring(500)
+    off.work(1000.0, drain=True)
+    blind = Rig()
+    values = np.full((500, 6), np.nan)
+    values[:, 3:] = 1.0
+    blind.station._push(block(np.arange(500) * 10_000_000, values))
+    blind.work(1000.0, drain=True)
+    for rig in (off, blind):
+        assert rig.caught.blocks
+        assert not rig.caught.rates
+
+
+def test_a_step_of_the_bias_is_an_event_of_its_time():
+    rig = Rig(thermal_s=None)
+    for i in range(60):
+        rig.bring(1000)
+        if i >= 20:
+            rig.station.ring.take()
+            at = np.arange(rig.sent - 1000, rig.sent)
+            values = 1e-3 * np.random.default_rng(i).standard_normal((1000, 6))
+            values[:, 1] += 0.02
+            rig.station._push(block(at * 10_000_000, values, np.full(1000, 20.0), at))
+        rig.work(1000.0 + i, drain=i == 59)
+    told = [event for _, event in rig.caught.events if event.kind == "drift_unexplained" and "stepped" in event.text]
+    assert [event.axis for event in told] == ["gy"]
+    assert told[0].what["bias"]["size"] == pytest.approx(0.02, rel=0.05)
+    assert 390 < told[0].t_ns / 1e9 < 440  # 200 s after the first: as long as the level before had been confirmed

@@ -15,6 +15,7 @@ import pytest
 from drivers.sample import Event, SampleBlock, join
 from monitor import settings
 from monitor.drift.live import ThermalLook
+from monitor.drift.live_compensation import DriftLook
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.hadamard import HadamardCurve
 from monitor.estimate.model_gap import ModelGap
@@ -33,6 +34,8 @@ class Caught:
         self.totals: dict[str, tuple[TotalCurve, HadamardCurve]] = {}
         self.gaps: dict[str, ModelGap] = {}
         self.thermals: dict[str, list[ThermalLook]] = {}
+        self.rates: dict[str, list[SampleBlock]] = {}
+        self.drifts: dict[str, list[DriftLook]] = {}
         self.events: list[tuple[str, Event]] = []
         self.healths: dict[str, Health] = {}
 
@@ -47,6 +50,12 @@ class Caught:
 
     def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
         self.thermals.setdefault(device, []).append(look)
+
+    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        self.rates.setdefault(device, []).append(samples)
+
+    def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
+        self.drifts.setdefault(device, []).append(look)
 
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
         self.totals[device] = (total, hadamard)
