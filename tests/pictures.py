@@ -6,11 +6,11 @@ screen (software Vulkan), then into the page inside a real Chromium, driven by i
 as by a signal; ``imu-monitor analyze`` makes the plot of the same hour. ``imu-monitor reconcile`` finds what was
 hidden in an hour of the model, before and after. Curves over time, in the viewer, the picture and the page, are those
 of the same hour with a gyroscope that becomes noisier. Bias beside temperature is that of two days of ``stim300``,
-replayed faster still. The fleet are simulated devices in real time; one cable is pulled and put back, another is pulled
-for good. ``demo --effect`` runs in real time too. Needs the packages chromium, mesa-vulkan-drivers and libvulkan1
-(Debian's names); network traffic stays on loopback.
+replayed faster still, drift that of ``adis16470``, which is turned now and then. The fleet are simulated devices in
+real time; one cable is pulled and put back, another is pulled for good. ``demo --effect`` runs in real time too. Needs
+the packages chromium, mesa-vulkan-drivers and libvulkan1 (Debian's names); network traffic stays on loopback.
 
-    python -m tests.pictures [--out docs/pictures] [--only native surfaces temperature fleet effect web plot …]
+    python -m tests.pictures [--out docs/pictures] [--only native surfaces temperature drift fleet effect web plot …]
 """
 
 import argparse
@@ -79,6 +79,7 @@ bandwidth = 2.0
 fraction = 2e-4
 scale = 0.02
 """
+TURNED_S, TURNS_S = 2700.0, (900.0, 1300.0, 1700.0)
 WARM_S, WARM_HZ, WARM_SPEED = 48 * 3600.0, 10.0, 4000.0
 WARM = """
 [temperature]
@@ -174,6 +175,28 @@ def temperature(out: Path, folder: Path) -> Path:
         with serving(folder, devices, port) as service:
             until(lambda: replayed(service, WARM_S - 600.0), 300.0)
         turn_to(port, 2)
+        time.sleep(SETTLE_S)
+        shoot(path)
+    return path
+
+
+def drift(out: Path, folder: Path) -> Path:
+    """The tab with rates before and after compensation, of a sensor that is turned now and then."""
+    path = out / "viewer-drift.png"
+    source = folder / "turned.npz"
+    n = round(TURNED_S * 100.0)
+    t_s = np.arange(n) / 100.0
+    values = read_model(settings.CONFIG_FOLDER / "models" / "adis16470.toml").stream(100.0, 1).draw_all(n).values.copy()
+    for axis, since_s in enumerate(TURNS_S):
+        turning = (t_s >= since_s) & (t_s < since_s + 60.0)
+        values[turning, axis] += np.radians(1.0) * np.sin(2.0 * np.pi * (t_s[turning] - since_s) / 20.0)
+    turning = t_s >= TURNED_S - 12.0
+    values[turning, 2] += np.radians(1.0) * np.sin(2.0 * np.pi * (t_s[turning] - t_s[turning][0]) / 6.0)
+    save_samples(source, T0 + t_s, values)
+    with window() as (port, shoot):
+        with serving(folder, REPLAY.format(recording=source, speed=SPEED), port) as service:
+            until(lambda: replayed(service, TURNED_S - 2.0), 120.0)
+        turn_to(port, 3)
         time.sleep(SETTLE_S)
         shoot(path)
     return path
@@ -325,6 +348,7 @@ PICTURES: dict[str, Callable[[Path, Path], Path]] = {
     "native": native,
     "surfaces": surfaces,
     "temperature": temperature,
+    "drift": drift,
     "fleet": fleet,
     "effect": effect,
     "web": web,

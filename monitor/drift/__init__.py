@@ -1,1 +1,1 @@
-"""What the bias does, and taking it out: bias against temperature."""
+"""What the bias does, and taking it out: bias against temperature, drift compensated while the carrier may move."""
