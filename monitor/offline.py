@@ -7,7 +7,7 @@ thread, so that Ctrl-C ends them at once.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,14 +16,17 @@ import numpy as np
 
 from drivers.errors import NotReady
 from drivers.recording import iter_blocks, load_samples
-from drivers.sample import AXES, Ints
+from drivers.sample import AXES, Ints, SampleBlock
 from monitor.estimate.analysis import Analysis, analyze, events_of
 from monitor.estimate.batch import TauGrid
 from monitor.estimate.dynamic import Dynamic, dynamic
+from monitor.estimate.grid import with_temperature
 from monitor.estimate.hadamard import HadamardCurve, hadamard_curve
 from monitor.estimate.total import TotalCurve, total_curve
 from monitor.publish.allan_figure import besides
 from monitor.publish.dynamic_figure import Mark
+from monitor.publish.thermal_text import notes_without
+from monitor.warmth import WithoutTemperature, moved, without_temperature
 
 Tell = Callable[[str, float | None], None]
 """Told what is being done, and the share that is done where that is known."""
@@ -58,6 +61,7 @@ class Results:
     hadamard: HadamardCurve | None = None
     dynamic: Dynamic | None = None
     lacking: str = ""  # why there are no dynamic curves, where they were wanted
+    warmth: WithoutTemperature | None = None  # the coefficients without what temperature explains, where it moved
 
 
 def make(request: Request, tell: Tell = lambda _what, _share: None) -> Results:
@@ -80,12 +84,14 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Results:
         tell("motion and changes" + (", total and Hadamard deviations" if request.others else ""), None)
         events = pool.submit(events_of, result)
         others = pool.submit(_others, result, request.tau) if request.others else None
+        warmth = pool.submit(_without_temperature, result, blocks, found.rate_hz)
         courses, lacking = _courses(result, request, tell)
         total, hadamard = others.result() if others else (None, None)
         found_all = events.result()
-        if lacking:
-            found_all = replace(found_all, notes=(*found_all.notes, lacking))
-        return Results(found_all, total, hadamard, courses, lacking)
+        without = warmth.result()
+        said = [] if without is None else notes_without(without)
+        found_all = replace(found_all, notes=(*found_all.notes, *said, *([lacking] if lacking else [])))
+        return Results(found_all, total, hadamard, courses, lacking, without)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
@@ -107,6 +113,16 @@ def draw(results: Results, path: Path, title: str) -> None:
         from monitor.publish.plot import allan_plot
 
         allan_plot(result.estimate, path, title, beside, results.dynamic, marks)
+
+
+def _without_temperature(
+    result: Analysis, blocks: Sequence[SampleBlock], rate_hz: float | None
+) -> WithoutTemperature | None:
+    """Nothing is worked out where no temperature came, or where it stayed."""
+    if not moved(np.concatenate([samples.temperature_c for samples in blocks])):
+        return None
+    _, temperature_c, _, _ = with_temperature(blocks, rate_hz)
+    return without_temperature(result, temperature_c)
 
 
 def _courses(result: Analysis, request: Request, tell: Tell) -> tuple[Dynamic | None, str]:

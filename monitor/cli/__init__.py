@@ -162,7 +162,7 @@ def analyze(
             output.write("--json", json, message.no_analysis(str(error), error.samples) + b"\n")
         raise
     if json is not None:
-        payload = message.analysis(results.analysis, results.total, results.hadamard, results.dynamic)
+        payload = message.analysis(results.analysis, results.total, results.hadamard, results.dynamic, results.warmth)
         output.write("--json", json, payload + b"\n")
     if plot is not None:
         offline.draw(results, plot, recording.name)

@@ -118,6 +118,12 @@ def events_of(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analysis:
     return replace(result, notes=tuple(notes), motions=motions, changes=changes)
 
 
+def refitted(result: Analysis, values: Floats, each: EachAxis = map) -> Fit:
+    """The fit to the same averaging times of other samples [n, 6], such as what is left of those of an analysis."""
+    _, found, _ = _fitted(values, result.estimate.rate_hz, result.estimate.curve.factors, each)
+    return found
+
+
 def _at_rest(values: Floats, rate_hz: float) -> tuple[Floats, tuple[Motion, ...]]:
     """The samples with moving stretches missing, and the stretches."""
     moving, motions = find(values, rate_hz)

@@ -24,6 +24,7 @@ from monitor.estimate.model_gap import ModelGap
 from monitor.estimate.rest import Motion
 from monitor.estimate.total import TotalCurve
 from monitor.health import Health
+from monitor.warmth import SLOW, WithoutTemperature
 
 ANALYZE_SCHEMA: Final = "imu-monitor/analyze/1"
 _ENCODER: Final = msgspec.json.Encoder()
@@ -197,6 +198,7 @@ def analysis(
     total: TotalCurve | None = None,
     hadamard: HadamardCurve | None = None,
     dynamic: Dynamic | None = None,
+    warmth: WithoutTemperature | None = None,
 ) -> bytes:
     """``analyze --json``: schema imu-monitor/analyze/1, with those of the other curves that were made."""
     estimate = result.estimate
@@ -210,6 +212,7 @@ def analysis(
             **({"hadamard": _beside(hadamard.tau_s, hadamard.hvar, hadamard.lo, hadamard.hi, i)} if hadamard else {}),
             "coefficients": coefficient_table(estimate.coefficients, i, bool(estimate.k_or_r[i])),
             "bandwidth": _number(result.bandwidth_hz[i]),
+            **({"without_temperature": _without(warmth, axis)} if warmth and axis in warmth.models else {}),
         }
     payload = {
         "schema": ANALYZE_SCHEMA,
@@ -255,6 +258,17 @@ def _beside(tau_s: Floats, variance: Floats, lo: Floats, hi: Floats, axis: int) 
     """Another deviation of one axis."""
     columns = {"deviation": np.sqrt(variance), "lo": lo, "hi": hi}
     return {"tau": _list(tau_s), **{name: _list(column[:, axis]) for name, column in columns.items()}}
+
+
+def _without(warmth: WithoutTemperature, axis: str) -> dict[str, Any]:
+    """K and R of an axis whose bias follows temperature, without that."""
+    i = AXES.index(axis)
+    table = coefficient_table(warmth.coefficients, i, warmth.k_or_r[i])
+    return {
+        "model": warmth.models[axis],
+        "coefficients": {letter: table[letter] for letter in SLOW},
+        "share": {letter: warmth.share(letter, axis) for letter in SLOW},
+    }
 
 
 def _motion(motion: Motion, rate_hz: float) -> dict[str, Any]:

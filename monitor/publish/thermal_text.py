@@ -14,7 +14,8 @@ from monitor.drift.model import Prediction
 from monitor.drift.study import Judged, Outlook, Study
 from monitor.drift.thermal import ThermalFit
 from monitor.publish.panels import duration
-from monitor.publish.units import DEVIATION_UNITS, kind_of
+from monitor.publish.units import DEVIATION_UNITS, kind_of, reading
+from monitor.warmth import SLOW, WithoutTemperature
 
 FIT_SCHEMA: Final = "imu-monitor/thermal-fit/1"
 PREDICT_SCHEMA: Final = "imu-monitor/thermal-predict/1"
@@ -51,6 +52,21 @@ def tell_outlook(outlook: Outlook, console: Console) -> None:
             rows.add_row(axis, *(_size(axis, x) for x in each), f"{100.0 * one.within:.0f} %")
         console.print(Padding(rows, (1, 0)))
     _tell_rest(outlook.refused, outlook.notes, console)
+
+
+def notes_without(found: WithoutTemperature) -> list[str]:
+    """A sentence for each axis whose drift was temperature for a part that matters."""
+    notes = []
+    for axis, model in found.models.items():
+        said = [
+            f"{letter} falls from {before.value} to {after.value} {after.unit} ({100.0 * share:.0f} % of its variance)"
+            for letter in SLOW
+            if found.matters(letter, axis) and (share := found.share(letter, axis)) is not None
+            for before, after in [(reading(found.before, letter, axis), reading(found.coefficients, letter, axis))]
+        ]
+        if said:
+            notes.append(f"{axis} follows its temperature ({model}): without that, {' and '.join(said)}")
+    return notes
 
 
 def study_json(study: Study) -> bytes:

@@ -1,5 +1,6 @@
 """A recording through all that ``analyze`` can make of it, and what is made only on demand."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from drivers.errors import ConfigError, RecordingError
 from drivers.recording import save_samples
 from monitor import offline
 from monitor.offline import Request, TooShort, make
+from monitor.publish import message
 
 RATE_HZ = 100.0
 
@@ -25,7 +27,7 @@ def recording(tmp_path: Path) -> Path:
 
 def test_only_what_is_wanted_is_made(recording: Path) -> None:
     results = make(Request(recording))
-    assert results.total is results.hadamard is results.dynamic is None
+    assert results.total is results.hadamard is results.dynamic is results.warmth is None
     assert results.lacking == ""
     [change] = results.analysis.changes  # told in the notes, so always looked for
     assert (change.axis, change.since) == (0, pytest.approx(15_000, abs=50))
@@ -47,6 +49,24 @@ def test_all_of_it(recording: Path) -> None:
     shares = [share for what, share in told if what == "dynamic curves"]
     assert shares == sorted(shares)  # type: ignore[type-var]
     assert shares[-1] == 1.0
+
+
+def test_drift_that_was_temperature_is_told(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    t = np.arange(43_200) / 2.0
+    warmth = 25.0 + 2.0 * np.sin(2.0 * np.pi * t / 7200.0) + 1.5 * np.sin(2.0 * np.pi * t / 3100.0)
+    values = 1e-4 * rng.standard_normal((t.size, 6))
+    values[:, 2] += 3e-5 * (warmth - 25.0)
+    save_samples(tmp_path / "warm.npz", t, values, warmth)
+    results = make(Request(tmp_path / "warm.npz"))
+    (note,) = (one for one in results.analysis.notes if "follows its temperature" in one)
+    assert note.startswith("gz follows its temperature")
+    written = json.loads(message.analysis(results.analysis, warmth=results.warmth))
+    gz = written["axes"]["gz"]["without_temperature"]
+    assert set(gz) == {"model", "coefficients", "share"}
+    assert gz["share"]["K"] > 0.9
+    assert gz["coefficients"]["K"]["hi"] < written["axes"]["gz"]["coefficients"]["K"]["lo"]
+    assert "without_temperature" not in written["axes"]["gx"]
 
 
 def test_listed_tau_are_those_of_every_curve_as_far_as_they_are_possible(recording: Path) -> None:

@@ -1,0 +1,100 @@
+"""How much of a recording's drift was temperature: K and R once what temperature explains of the bias is taken out.
+
+Comes in: an analysis and the temperature on its grid. The bias of each axis is fitted to temperature as ``thermal fit``
+does it, and what the model makes of temperature alone is taken from the samples, drawn smoothly through the middles of
+the intervals, as steps or corners would be noise of their own. Then curve and coefficients are made again. Axes whose
+bias temperature does not explain stay as they are and are not named.
+
+A model may take some of a random walk along, as two slow courses are alike by chance: it is chosen with that in mind
+(AICc, what it leaves being correlated), and a share of a few percent says nothing.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from drivers.errors import NotReady
+from drivers.sample import AXES, Floats
+from monitor.drift.means import interval_means
+from monitor.drift.model import predicted
+from monitor.drift.study import nice_interval
+from monitor.drift.thermal import LEAST_C, fitted
+from monitor.estimate.analysis import Analysis, refitted
+from monitor.estimate.batch import EachAxis
+from monitor.estimate.coefficients import LETTERS, Coefficients, Status
+
+SLOW: Final = ("K", "R")
+
+
+@dataclass(frozen=True, slots=True)
+class WithoutTemperature:
+    """The coefficients with temperature taken out of the bias."""
+
+    models: Mapping[str, str]  # axis -> form of its model; axes that temperature explains something of
+    before: Coefficients
+    coefficients: Coefficients
+    k_or_r: tuple[bool, ...]  # [6] as in ``Estimate``
+
+    def share(self, letter: str, axis: str) -> float | None:
+        """Of the letter's variance that was temperature: 1 − after²/before², at least; None where it was not there.
+
+        Where the rest is only bounded, the bound stands for it.
+        """
+        at = LETTERS.index(letter), AXES.index(axis)
+        if self.before.status[at] != Status.ESTIMATED or self.coefficients.status[at] == Status.UNESTIMATED:
+            return None
+        bounded = self.coefficients.status[at] == Status.UPPER_BOUND
+        after = float((self.coefficients.hi if bounded else self.coefficients.value)[at])
+        return max(1.0 - (after / float(self.before.value[at])) ** 2, 0.0)
+
+    def matters(self, letter: str, axis: str) -> bool:
+        """Whether the letter is another one: what is left lies below its interval before."""
+        at = LETTERS.index(letter), AXES.index(axis)
+        return self.share(letter, axis) is not None and bool(self.coefficients.hi[at] < self.before.lo[at])
+
+
+def moved(temperatures_c: Floats) -> bool:
+    """Whether temperature [n] is there and moved enough for a question."""
+    return (
+        bool(np.isfinite(temperatures_c).any()) and float(np.ptp(temperatures_c[np.isfinite(temperatures_c)])) > LEAST_C
+    )
+
+
+def without_temperature(result: Analysis, temperature_c: Floats, each: EachAxis = map) -> WithoutTemperature | None:
+    """The same analysis with temperature [n] in °C taken out; None where it explains nothing of any axis."""
+    rate_hz = result.estimate.rate_hz
+    interval_s = nice_interval(len(result.values) / rate_hz, rate_hz)
+    values, models = result.values.copy(), {}
+    for at, axis in enumerate(AXES):
+        means = interval_means(values[:, at], temperature_c, rate_hz, interval_s)
+        try:
+            model = fitted(means).model
+        except NotReady:
+            continue
+        if model.shape.memory or model.shape.powers:
+            course = predicted(model, means.temperature_c, began=True).bias
+            values[:, at] -= drawn(course, round(means.interval_s * rate_hz), len(values))
+            models[axis] = model.shape.name
+    if not models:
+        return None
+    fit = refitted(result, values, each)
+    k_or_r = tuple(bool(one) for one in fit.k_or_r)
+    return WithoutTemperature(models, result.estimate.coefficients, fit.coefficients, k_or_r)
+
+
+def drawn(course: Floats, length: int, n: int) -> Floats:
+    """Values of intervals of so many samples as a smooth course of n samples, about zero; straight beyond the ends.
+
+    >>> drawn(np.array([1.0, 3.0, 5.0]), 2, 6).tolist()
+    [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
+    """
+    middle = (np.arange(course.size) + 0.5) * length - 0.5
+    smooth = CubicSpline(middle, course, bc_type="natural")
+    at = np.arange(n, dtype=np.float64)
+    inside = np.clip(at, middle[0], middle[-1])
+    slope = np.where(at < middle[0], smooth(middle[0], 1), smooth(middle[-1], 1))
+    made = smooth(inside) + slope * (at - inside)
+    return np.asarray(made - made.mean())
