@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from monitor.drift import compensator
+from monitor.drift import compensator, heat
 from monitor.estimate.estimator import warm_up
 from monitor.live_reconcile import Job, Reconciler
 from monitor.outputs import TableOutput, ViewerOutput, ZenohOutput
@@ -121,7 +121,8 @@ class Service:
         """Beside the loop, so that a first start's compilation holds up neither samples nor status."""
         try:
             for kernel in warm_up():
-                if kernel == "all" and any(device.compensate for device in self.config.devices):
+                if kernel == "all":
+                    heat.warm_up()
                     compensator.warm_up()
                 getattr(self._ready, kernel).set()
                 self._wake.set()

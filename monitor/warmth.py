@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from drivers.errors import NotReady
 from drivers.sample import AXES, Floats
@@ -91,6 +90,8 @@ def drawn(course: Floats, length: int, n: int) -> Floats:
     >>> drawn(np.array([1.0, 3.0, 5.0]), 2, 6).tolist()
     [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
     """
+    from scipy.interpolate import CubicSpline  # costly to load, and the service never draws
+
     middle = (np.arange(course.size) + 0.5) * length - 0.5
     smooth = CubicSpline(middle, course, bc_type="natural")
     at = np.arange(n, dtype=np.float64)

@@ -13,7 +13,7 @@ what came after, takes what lies between.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from drivers.sample import Floats
 from monitor.drift.heat import Shape, responses
@@ -81,7 +81,7 @@ class Recursion:
         sizes = np.concatenate([model.sizes, model.start])
         own = sizes.size
         bends = bent(model.shape, rows[:, own:], sizes)
-        wide = float(student.ppf(0.975, self.free))
+        wide = float(stdtrit(self.free, 0.975))
         both = []
         for measured in (None, np.array([self._bias, np.nan])):
             bias, variance = expected(model, excess, rows[:, :own], sizes, bends, measured)
