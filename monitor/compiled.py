@@ -21,7 +21,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 ROOT: Final = Path(__file__).parents[1]
-IMPORTS: Final = re.compile(r"^from (monitor[\w.]*) import", re.MULTILINE)
+NAME: Final = re.compile(r"\w+")
+IMPORTS: Final = re.compile(r"^from (monitor[\w.]*) import (?:\(([^)]*)\)|(.*))", re.MULTILINE)
 
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
@@ -43,6 +44,8 @@ def stamp(path: Path, root: Path = ROOT) -> str:
         one = left.pop()
         if one not in texts and one.is_file():
             texts[one] = one.read_bytes()
-            names = IMPORTS.findall(texts[one].decode())
-            left += [root / f"{name.replace('.', '/')}.py" for name in names]
+            for package, listed, plain in IMPORTS.findall(texts[one].decode()):
+                place = root / package.replace(".", "/")
+                left.append(place.with_suffix(".py"))
+                left += [place / f"{name}.py" for name in NAME.findall(listed or plain)]  # those that are modules
     return sha256(b"\0".join(texts[one] for one in sorted(texts))).hexdigest()

@@ -10,8 +10,10 @@ Q̂ begins as s B Bᵀ, and so it stays: s ← s + d s² (ε² − S)/S². R̂ c
 what the scatter within intervals says, and s above a share of what was identified. Means of the noise, q̂ and r̂, are not
 estimated: on recordings at rest they made the error up to three times as large, as nothing tells them from the level.
 
-An innovation beyond OUTLIER deviations is left out: a slow rotation looks like it. Only what stays the same for as long
-as the level before it had been confirmed, 10 s to 5 min, is a step of the bias.
+An innovation beyond OUTLIER deviations is left out, and so is an interval that scatters LOUDER than usual: a slow
+rotation looks like it, and it may swing through nothing, so after it GUARD intervals in a row have to agree before one
+counts again. Only what stays the same for as long as the level before it had been confirmed, 10 s to 5 min, is a step
+of the bias.
 """
 
 from typing import Final
@@ -27,6 +29,12 @@ FADING: Final = 0.995
 FLOOR: Final = 0.05
 """Of the identified variance of a, below which s does not fall."""
 OUTLIER: Final = 6.0
+LOUDER: Final = (9.0, 10.0)
+"""Times the usual variance within intervals, once so many have told what is usual; chance passes it in 6e-6."""
+GUARD: Final = 5.0
+"""Intervals."""
+AGREE: Final = 4.0
+"""Deviations of the difference of two intervals at rest."""
 STAYS: Final = (10.0, 300.0)
 """Intervals."""
 CONFIRMED: Final = 5
@@ -38,11 +46,11 @@ SHORTEST, LONGEST = 40, 1000
 
 X, P = 0, 3
 PHI1, PHI2, G1, VARIANCE, LEVEL = range(12, 17)
-S, R, SCATTER, SEEN, COUNT, SKIPPED, LATEST, ADAPTS, KNOWN = range(17, 26)
-SIZE: Final = 26
+S, R, SCATTER, SEEN, COUNT, SKIPPED, LATEST, WAITS, ADAPTS, KNOWN = range(17, 27)
+SIZE: Final = 27
 """Layout of a row: state [3], its covariance [9], the model, and what is estimated of the noise: s, R̂, scatter within
-intervals, intervals with a scatter, intervals at rest, outliers in a row, the latest of them, whether noise is
-estimated, whether a model was identified."""
+intervals, intervals with a scatter, intervals at rest, outliers in a row, the latest of them, intervals to wait,
+whether noise is estimated, whether a model was identified."""
 NOT_SEEN, USED, LEFT_OUT, STEPPED = range(4)
 """What became of an interval."""
 
@@ -66,7 +74,7 @@ def adopt(row: Floats, arma: Arma) -> None:
     slow = arma.white + arma.variance * ((1.0 + arma.theta) / (1.0 - phi1 - phi2)) ** 2  # spectrum at f = 0
     row[LEVEL] = slow / min(max(arma.count / 3.0, SHORTEST), LONGEST) ** 2
     row[P + 8] = slow / arma.count
-    row[SKIPPED] = 0.0
+    row[SKIPPED] = row[WAITS] = 0.0
     row[KNOWN] = 1.0
 
 
@@ -104,7 +112,8 @@ def measure(row, z, scatter, least):  # type: ignore[no-untyped-def]
     Returns:
         The variance S of ε, and what became of the interval.
     """
-    if scatter == scatter:
+    loud = row[SEEN] >= LOUDER[1] and scatter > LOUDER[0] * max(row[SCATTER], least)
+    if scatter == scatter and not loud:
         row[SEEN] += 1.0
         row[SCATTER] += max(SCATTERED, 1.0 / row[SEEN]) * (scatter - row[SCATTER])
     if row[KNOWN] == 0.0:  # a level alone: all that is not level is what scatters
@@ -116,7 +125,7 @@ def measure(row, z, scatter, least):  # type: ignore[no-untyped-def]
     expected, known = drift(row)
     e, total = z - expected, known + row[R]
     became = USED
-    if e * e > OUTLIER * OUTLIER * total:
+    if loud or e * e > OUTLIER * OUTLIER * total:
         if row[COUNT] < CONFIRMED:
             row[X + 2], row[P + 8], row[COUNT] = z, row[R], 1.0
             return total, LEFT_OUT
@@ -124,10 +133,17 @@ def measure(row, z, scatter, least):  # type: ignore[no-untyped-def]
         row[SKIPPED] = row[SKIPPED] + 1.0 if alike else 1.0
         row[LATEST] = z
         if row[SKIPPED] < min(max(row[COUNT], STAYS[0]), STAYS[1]):
+            row[WAITS] = GUARD
             return total, LEFT_OUT
-        became = STEPPED
+        became, row[WAITS] = STEPPED, 0.0
         row[P + 8] += e * e
+        row[SEEN] = 0.0  # its noise may be another one too
     row[SKIPPED] = 0.0
+    if row[WAITS] > 0.0:
+        agrees = (z - row[LATEST]) ** 2 < 2.0 * AGREE * AGREE * row[R]
+        row[WAITS] = row[WAITS] - 1.0 if agrees else GUARD
+        row[LATEST] = z
+        return total, LEFT_OUT
     row[COUNT] += 1.0
     _correct(row, e)
     if row[ADAPTS] > 0.0 and row[KNOWN] > 0.0 and became == USED:

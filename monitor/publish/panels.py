@@ -91,7 +91,9 @@ def drift_text(look: DriftLook) -> str:
             f"{x:.4f}" if there else "" for x, there in zip((*model.phi, model.theta), _entered(model), strict=True)
         ]
         rows.append(f"| {axis} | {now} | {model.name} | {' | '.join(parts)} |")
-    head = f"Learned at rest, from means of {duration(look.interval_s)}; what every one brings anew is below."
+    head = (
+        f"Learned at rest, from means of {duration(look.interval_s)}; what each of them brought anew is the innovation."
+    )
     return "\n".join([head, "", *rows])
 
 

@@ -263,7 +263,7 @@ def coast(seeds: int) -> None:
     for name in RECORDINGS if folder else ():
         found = load_samples(Path(str(folder)) / name)
         rate_hz = float(found.rate_hz or RATE_HZ)
-        within = tuple(s for s in spans if 180.0 * s < len(found) / rate_hz)
+        within = tuple(s for s in spans if 120.0 * s < len(found) / rate_hz)
         made.add_row(name, *_coast_cells(np.array([_coasted(found.values, rate_hz, within)])))
     console.print(made)
 

@@ -552,4 +552,4 @@ def test_a_step_of_the_bias_is_an_event_of_its_time():
     told = [event for _, event in rig.caught.events if event.kind == "drift_unexplained" and "stepped" in event.text]
     assert [event.axis for event in told] == ["gy"]
     assert told[0].what["bias"]["size"] == pytest.approx(0.02, rel=0.05)
-    assert 390 < told[0].t_ns / 1e9 < 440  # 200 s after the first: as long as the level before had been confirmed
+    assert 390 < told[0].t_ns / 1e9 < 510  # as long as the level before had been confirmed, 5 min at most
