@@ -1,6 +1,6 @@
 """Drift compensation before one judge: at rest, in motion, while noise changes, without learning, and its cost.
 
-    python -m tests.bench.compensate [rest|recordings|motion|slow|doubling|coast|arma|robust|speed …] [--seeds 5]
+    python -m tests.bench.compensate [PART …] [--seeds 5]
 
 Simulated gyros are those of the catalogue. Whatever learns from a whole recording learns from its first third, or from
 the rest before the motion; the daemon's filter learns as it goes, and is judged on the same stretch. "Before" has the
@@ -15,9 +15,10 @@ from pathlib import Path
 
 import numpy as np
 from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
 
 from drivers.recording import load_samples
-from drivers.sample import Floats
+from drivers.sample import AXES, Floats
 from monitor.catalogue import load
 from monitor.compensating import METHODS, Request, make
 from monitor.drift import sage_husa
@@ -304,6 +305,75 @@ def _coasted(values: Floats, rate_hz: float, spans: tuple[float, ...]) -> Floats
     return np.sqrt(squares)
 
 
+def consistency(_seeds: int) -> None:
+    """Recordings in motion beside another witness: the robot's attitude, the car's yaw, two other gyros."""
+    folder = os.environ.get("IMU_MONITOR_DATA")
+    if not folder:
+        console.print("IMU_MONITOR_DATA is not set: no recordings")
+        return
+    made = table("rms difference to the witness: before → after", "recording", "learned at rest", "°/s, or °")
+    for name in ("mpu9150", "mpu6500", "mpu6050"):
+        with np.load(Path(folder) / f"robot-arm/{name}.npz") as found:
+            values, rate_hz, t = _six(found), float(found["fs"]), found["t"]
+            attitude = Rotation.from_quat(found["ref_quat"][:, [1, 2, 3, 0]])
+        out, one = live(values, rate_hz)
+        made.add_row(
+            f"robot-arm {name}, ° turned in 100 samples",
+            _known(one),
+            " → ".join(f"{_turned_apart(x[:, :3], t, attitude):.3g}" for x in (values, out)),
+        )
+    with np.load(Path(folder) / "car-phone-can/minute.npz") as found:
+        values, rate_hz = _six(found), float(found["fs"])
+        t = np.arange(len(values)) / rate_hz if "t" not in found else found["t"] - found["t"][0]
+        yaw = np.interp(t, found["t_yaw"] - found["t_yaw"][0], found["yaw_counts"] * 0.24 * DEGREE)
+    out, one = live(values, rate_hz)
+    made.add_row(
+        "car-phone-can, yaw",
+        _known(one),
+        _differences([x[:, 2] - x[:, 2].mean() for x in (values, out)], yaw.mean() - yaw),
+    )
+    each = []
+    for imu in ("imu1", "imu2", "imu3"):
+        found_one = load_samples(Path(folder) / f"autopilot-3imu/{imu}.npz")
+        out, one = live(found_one.values, 50.0)
+        still = found_one.values[1000:2500, :3].mean(axis=0)  # on the ground from 20 s on
+        each.append((found_one.values[:, :3] - still, out[:, :3], _known(one)))
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        n = min(len(each[a][0]), len(each[b][0]))
+        cells = []
+        for k in (0, 1):
+            apart = each[a][k][3750:n] - each[b][k][3750:n]  # in flight
+            means = apart[: len(apart) // 500 * 500].reshape(-1, 500, 3).mean(axis=1)
+            cells.append((np.sqrt(np.mean(apart**2)), np.sqrt(np.mean(means**2))))
+        text = ", ".join(f"{x / DEGREE:.3g} → {y / DEGREE:.3g}" for x, y in zip(*cells, strict=True))
+        made.add_row(f"autopilot-3imu {a + 1} and {b + 1} in flight; means of 10 s", each[a][2], text)
+    console.print(made)
+
+
+def _six(found) -> Floats:  # type: ignore[no-untyped-def]
+    return np.stack([found[axis].astype(np.float64) for axis in AXES], axis=1)
+
+
+def _turned_apart(rates: Floats, t: Floats, attitude: Rotation) -> float:
+    """rms, °, of the angle turned within 100 samples by the gyros less that by the attitude, which comes 10 earlier."""
+    apart = []
+    for start in range(100, len(rates) - 200, 50):
+        turned = Rotation.identity()
+        for k in range(start, start + 100):
+            turned = turned * Rotation.from_rotvec(rates[k] * (t[k + 1] - t[k]))
+        known = attitude[start - 10].inv() * attitude[start + 90]
+        apart.append(turned.magnitude() - known.magnitude())
+    return float(np.sqrt(np.mean(np.square(apart))) / DEGREE)
+
+
+def _known(one: Compensator) -> str:
+    return "yes" if np.isfinite(one.bias).all() else "no"
+
+
+def _differences(both: list[Floats], truth: Floats) -> str:
+    return " → ".join(f"{np.sqrt(np.nanmean((x - truth) ** 2)) / DEGREE:.3g}" for x in both)
+
+
 def arma(seeds: int) -> None:
     """Intervals of the coefficients, 95 %: how many of 20 times ``seeds`` simulated drifts they hold."""
     count = 20 * seeds
@@ -390,7 +460,9 @@ def speed(_seeds: int) -> None:
     console.print(made)
 
 
-PARTS = {one.__name__: one for one in (rest, recordings, motion, slow, doubling, coast, arma, robust, speed)}
+PARTS = {
+    one.__name__: one for one in (rest, recordings, motion, slow, doubling, coast, consistency, arma, robust, speed)
+}
 
 
 def main() -> None:
