@@ -332,7 +332,7 @@ def consistency(_seeds: int) -> None:
         _known(one),
         _differences([x[:, 2] - x[:, 2].mean() for x in (values, out)], yaw.mean() - yaw),
     )
-    each = []
+    each: list[tuple[Floats, Floats, str]] = []
     for imu in ("imu1", "imu2", "imu3"):
         found_one = load_samples(Path(folder) / f"autopilot-3imu/{imu}.npz")
         out, one = live(found_one.values, 50.0)
@@ -341,8 +341,8 @@ def consistency(_seeds: int) -> None:
     for a, b in ((0, 1), (0, 2), (1, 2)):
         n = min(len(each[a][0]), len(each[b][0]))
         cells = []
-        for k in (0, 1):
-            apart = each[a][k][3750:n] - each[b][k][3750:n]  # in flight
+        for one_way, other_way in zip(each[a][:2], each[b][:2], strict=True):
+            apart = one_way[3750:n] - other_way[3750:n]  # in flight
             means = apart[: len(apart) // 500 * 500].reshape(-1, 500, 3).mean(axis=1)
             cells.append((np.sqrt(np.mean(apart**2)), np.sqrt(np.mean(means**2))))
         text = ", ".join(f"{x / DEGREE:.3g} → {y / DEGREE:.3g}" for x, y in zip(*cells, strict=True))
