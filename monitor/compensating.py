@@ -18,7 +18,7 @@ from drivers.plugin import nearest
 from drivers.recording import iter_blocks, load_samples
 from drivers.recording.saving import writing
 from drivers.sample import AXES, Floats
-from monitor.drift.arma import identify
+from monitor.drift.arma import ORDERS, Order, identify
 from monitor.drift.compensator import BLOCKS, Compensator, Interval
 from monitor.drift.judge import at_rest
 from monitor.drift.outcome import Axis, Result
@@ -44,6 +44,7 @@ class Request:
     out: Path
     method: str = "adaptive"
     rate_hz: float | None = None
+    order: Order | None = None  # of the ARMA model of the drift; None: by criterion
 
 
 def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
@@ -61,7 +62,8 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
     if not axes:
         raise ConfigError(f"{request.recording}: no gyro axis in it; columns gx, gy, gz in rad/s are needed")
     values, temperature_c, rate_hz, notes = with_temperature(list(iter_blocks(found)), found.rate_hz)
-    live = Compensator(rate_hz, adapts=request.method != "fixed")
+    orders = ORDERS if request.order is None else (request.order,)
+    live = Compensator(rate_hz, adapts=request.method != "fixed", orders=orders)
     out = _run(live, values, tell)
     intervals = tuple(live.take())
     rest = _at_rest(intervals, len(values), live.size * BLOCKS)

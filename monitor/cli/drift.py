@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from drivers.errors import ConfigError
-from monitor.cli import output, serving
+from monitor.cli import options, output, serving
 
 
 def compensate(
@@ -18,6 +18,9 @@ def compensate(
             metavar="M", help="adaptive, as the daemon does; to compare with: fixed, ar, emd, wavelet (extra: denoise)."
         ),
     ] = "adaptive",
+    order: Annotated[
+        str | None, typer.Option(metavar="P,Q", help="Of the ARMA model of the drift, up to 2,1; else by criterion.")
+    ] = None,
     rate: Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate, where the file says none.")] = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
     plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Drift and Allan curves as a picture.")] = None,
@@ -39,7 +42,7 @@ def compensate(
             raise ConfigError(f"{option}: {place} is what --out writes; another name is needed")
     serving.end_on_sigterm()
     with output.progress() as tell:
-        result = compensating.make(compensating.Request(recording, out, method, rate), tell)
+        result = compensating.make(compensating.Request(recording, out, method, rate, options.order(order)), tell)
     if json is not None:
         output.write("--json", json, text.to_json(result) + b"\n")
     if plot is not None:

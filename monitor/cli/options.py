@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, overload
 from drivers.errors import ConfigError
 
 if TYPE_CHECKING:
+    from monitor.drift.arma import Order
     from monitor.estimate.batch import TauGrid
     from monitor.export import Noise
 
@@ -38,6 +39,18 @@ def duration(option: str, text: str | None) -> float | None:
         return None if text is None else seconds(text)
     except ConfigError as error:
         raise ConfigError(f"{option}: {error}") from None
+
+
+def order(text: str | None) -> "Order | None":
+    """p and q of an ARMA model."""
+    from monitor.drift.arma import ORDERS
+
+    if text is None:
+        return None
+    for one in ORDERS:
+        if text.replace(" ", "") == f"{one[0]},{one[1]}":
+            return one
+    raise ConfigError(f'--order: "{text}"; possible are {" ".join(f"{p},{q}" for p, q in ORDERS)}')
 
 
 def noise(source: Path) -> "Noise":

@@ -69,6 +69,15 @@ def test_every_method_is_judged_on_the_same_stretch(tmp_path, capsys, method):
         assert one["after"]["deviation"] < 0.8 * one["before"]["deviation"]
 
 
+def test_the_order_can_be_given(tmp_path, capsys):
+    recording = write(tmp_path / "a.npz")
+    assert run("compensate", recording, "--out", tmp_path / "out.npz", "--order", "2,1", "--json", "-") == 0
+    model = json.loads(capsys.readouterr().out)["axes"]["gz"]["model"]
+    assert model["order"] == [2, 1]
+    for name in ("phi1", "phi2", "theta1"):
+        assert model[name]["lo"] <= model[name]["value"] <= model[name]["hi"]
+
+
 def test_missing_samples_stay_missing_and_temperature_stays(tmp_path):
     recording = write(tmp_path / "a.npz", temp=np.full(30_000, 25.0))
     with np.load(recording) as whole:
@@ -88,6 +97,7 @@ def test_what_is_wrong_is_one_line_and_nothing_is_written(tmp_path, capsys):
     np.savez(tmp_path / "c.npz", fs=RATE_HZ, gz=moving)
     for arguments, status, said in (
         ([recording, "--method", "adaptve"], 2, 'did you mean "adaptive"?'),
+        ([recording, "--order", "3,1"], 2, "possible are 0,0 1,0 1,1 2,0 2,1"),
         ([tmp_path / "none.npz"], 2, "none.npz"),
         ([tmp_path / "b.npz"], 2, "no gyro axis in it"),
         ([tmp_path / "c.npz"], 3, "never at rest"),
