@@ -37,8 +37,6 @@ REMEMBERED: Final = 2048
 FIRST: Final = 60
 """Intervals at rest after which a model is identified; then when there are half as many more, and every so many as are
 remembered at the latest."""
-FADE: Final = 1.0 / 16.0
-"""Share of an interval in the recent mean of squared innovations."""
 LOUD: Final = (0.02,) * 3 + (0.3,) * 3
 """rad/s and m/s²: rms about the mean of a block that is no rest for certain, whatever the sensor has got used to: a car
 that drives all day. Nothing is learned then, and rates come out nearly as they came in."""
@@ -49,8 +47,6 @@ LONGEST_GAP: Final = 100_000
 
 NUMBER, COUNT, ORIGIN, SUM, SQUARES = range(5)
 """Columns of ``waiting``: number of the block, samples, what sums are about, sums."""
-CURRENT, DONE = range(2)
-"""Of ``place``: interval being filled (-1 = none yet), intervals at rest that filters learned from."""
 MEAN, EXPECTED, ERROR, BECAME, DRIFT_ERROR, SCATTER = range(6)
 """Columns of what an interval taught: its mean (NaN = not at rest), what was expected, the deviation of that difference
 that was expected, what became of it, the standard error of what was expected, and the variance of the mean by the
@@ -61,7 +57,8 @@ class State(NamedTuple):
     """All that is remembered; arrays only."""
 
     rest: rest_kernel.State
-    place: Ints  # [3]
+    current: Ints  # [1] interval being filled; -1 = none yet
+    learned: Ints  # [3] intervals at rest that filters learned from
     row: Floats  # [3 axes, …] of sage_husa
     bias: Floats  # [3] that is taken out now; NaN = not known yet
     bank: Floats  # [3, filters + 1, 5]
@@ -116,7 +113,6 @@ class Compensator:
         self.models: list[Arma | None] = [None] * GYROS
         self._orders = tuple(orders)
         self._state = _state(rate_hz, adapts)
-        self._adapts = adapts
         self._index = 0
         self._means = np.full((GYROS, REMEMBERED), np.nan)  # a ring of intervals
         self._scatter = np.full((GYROS, REMEMBERED), np.nan)
@@ -210,7 +206,7 @@ class Compensator:
         self._means[became == sage_husa.STEPPED] = np.nan  # what was before belongs to another level
         used = (became == sage_husa.USED) | (became == sage_husa.STEPPED)
         self._means[:, at] = np.where(used, columns[:, MEAN], np.nan)
-        self._scatter[:, at] = columns[:, SCATTER]
+        self._scatter[:, at] = np.where(used, columns[:, SCATTER], np.nan)
         self._kept += 1
         self._at_rest += used
         self._taught.append(
@@ -237,11 +233,10 @@ def _state(rate_hz: float, adapts: bool) -> State:
     each = memories(rate_hz)
     table, first = gains(each)
     filters = each.size
-    place = np.zeros(2, np.int64)
-    place[CURRENT] = -1
     return State(
         rest=rest_kernel.state(),
-        place=place,
+        current=np.full(1, -1, np.int64),
+        learned=np.zeros(GYROS, np.int64),
         row=np.stack([sage_husa.unknown(adapts)] * GYROS),
         bias=np.full(GYROS, np.nan),
         bank=np.zeros((GYROS, filters + 1, 5)),
@@ -288,7 +283,7 @@ def _take_out(z, axis, sums, s, keep, out):  # type: ignore[no-untyped-def]
     """Samples of one gyro axis without its drift; NaN = missing."""
     bank, ages, feedback = s.bank[axis], s.ages[axis], s.feedback[axis]
     bias = s.bias[axis] if s.bias[axis] == s.bias[axis] else 0.0
-    trusted = s.place[DONE] >= LEAST
+    trusted = s.learned[axis] >= LEAST
     for k in range(z.size):
         if z[k] != z[k]:
             coast(bank, ages, 1)
@@ -318,13 +313,13 @@ def _add(values, sums):  # type: ignore[no-untyped-def]
 def _judged(number, moves, s, taught, filled):  # type: ignore[no-untyped-def]
     """A verdict has become final: the interval learns from the block; one that is over is told."""
     interval = number // BLOCKS
-    if s.place[CURRENT] >= 0 and interval > s.place[CURRENT]:
+    if s.current[0] >= 0 and interval > s.current[0]:
         _over(s, taught[filled])
         filled += 1
-        for _ in range(min(interval - s.place[CURRENT] - 1, LONGEST_GAP)):
+        for _ in range(min(interval - s.current[0] - 1, LONGEST_GAP)):
             for a in range(GYROS):
                 _forward(a, s)
-    s.place[CURRENT] = interval
+    s.current[0] = interval
     slot = number % SLOTS
     if moves or s.waiting[slot, 0, NUMBER] != number or _loud(s.waiting[slot]):
         return filled
@@ -355,8 +350,7 @@ def _loud(waiting):  # type: ignore[no-untyped-def]
 @compiled
 def _over(s, taught):  # type: ignore[no-untyped-def]
     """The interval is over: drift and filters learn from it, and the drift is predicted for the next."""
-    taught[0] = s.place[CURRENT]
-    learned = False
+    taught[0] = s.current[0]
     for a in range(GYROS):
         told = taught[1 + 6 * a : 7 + 6 * a]
         known = s.bias[a] == s.bias[a]
@@ -369,12 +363,11 @@ def _over(s, taught):  # type: ignore[no-untyped-def]
             variance, became = sage_husa.measure(s.row[a], mean, scatter, _least(a, s))
             told[MEAN], told[ERROR], told[BECAME], told[SCATTER] = mean, np.sqrt(variance), became, scatter
             if known and became == sage_husa.USED:
-                learn(s.bank[a], s.followed[a], s.samples[a], s.place[DONE] + 1)
-                learned = True
+                s.learned[a] += 1
+                learn(s.bank[a], s.followed[a], s.samples[a], s.learned[a])
         else:
             sage_husa.not_seen(s.row[a])
         _forward(a, s)
-    s.place[DONE] += learned
     s.means[:], s.followed[:], s.samples[:] = np.nan, 0.0, 0.0
 
 
