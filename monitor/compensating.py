@@ -19,7 +19,7 @@ from drivers.recording import iter_blocks, load_samples
 from drivers.recording.saving import writing
 from drivers.sample import AXES, Floats
 from monitor.drift.arma import ORDERS, Order, identify
-from monitor.drift.compensator import BLOCKS, Compensator, Interval
+from monitor.drift.compensator import Compensator, Interval
 from monitor.drift.judge import at_rest
 from monitor.drift.outcome import Axis, Result
 from monitor.drift.sage_husa import CONFIRMED, LEFT_OUT, STEPPED, USED
@@ -66,7 +66,7 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
     live = Compensator(rate_hz, adapts=request.method != "fixed", orders=orders)
     out = _run(live, values, tell)
     intervals = tuple(live.take())
-    rest = _at_rest(intervals, len(values), live.size * BLOCKS)
+    rest = _at_rest(intervals, len(values), live.interval)
     learned, judged = _thirds(rest)
     if not judged.any():
         raise NotReady(
@@ -98,7 +98,7 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
 def _run(live: Compensator, values: Floats, tell: Tell) -> Floats:
     """As the daemon does, but that a model is identified at once when it is due."""
     out = np.empty_like(values)
-    size = live.size * BLOCKS
+    size = live.interval
     for start in range(0, len(values), size):
         out[start : start + size] = live.update(values[start : start + size])
         live.identify()

@@ -357,11 +357,15 @@ class Station:
 
     def _publish_compensated(self, outputs: Sequence[Output], live: LiveCompensation, samples: SampleBlock) -> None:
         """The same samples without drift, and what they taught of it."""
-        for piece in (samples[at : at + PIECE] for at in range(0, len(samples), PIECE)):
+        at = 0
+        while at < len(samples):
+            piece = samples[at : at + live.compensator.ahead]
+            at += len(piece)
             without = live.update(piece)
-            self._identifier.renew(live)
+            if live.compensator.ahead == live.compensator.interval:
+                self._identifier.renew(live)
             for output in outputs:
-                output.compensated(self.name, self.published, without, self._offset_ns())
+                output.compensated(self.name, self.published - len(samples) + at, without, self._offset_ns())
         for look in live.take():
             for output in outputs:
                 output.drift(self.name, self.unix_s(look.t_ns), look)

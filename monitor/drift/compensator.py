@@ -122,9 +122,14 @@ class Compensator:
         self._taught: list[Interval] = []
 
     @property
+    def interval(self) -> int:
+        """Samples of a mean that the drift is learned from."""
+        return BLOCKS * self.size
+
+    @property
     def interval_s(self) -> float:
-        """Of the means that the drift is learned from."""
-        return BLOCKS * self.size / self.rate_hz
+        """The same in seconds."""
+        return self.interval / self.rate_hz
 
     @property
     def bias(self) -> Floats:
@@ -146,7 +151,7 @@ class Compensator:
             _gap(lost, self._state)
             self._index += lost
         out = np.array(values, dtype=np.float64)
-        taught = np.empty((len(values) // (BLOCKS * self.size) + 2, 1 + 6 * GYROS))
+        taught = np.empty((len(values) // self.interval + 2, 1 + 6 * GYROS))
         filled = _advance(values, self._index, self.size, self._state, out, taught)
         self._index += len(values)
         for k in range(filled):
@@ -159,6 +164,12 @@ class Compensator:
         return taught
 
     # --- identification
+
+    @property
+    def ahead(self) -> int:
+        """Samples to the end of the interval: where models change there, they change at the same samples however the
+        stream is cut."""
+        return self.interval - self._index % self.interval
 
     @property
     def due(self) -> tuple[int, ...]:
@@ -211,7 +222,7 @@ class Compensator:
         self._at_rest += used
         self._taught.append(
             Interval(
-                int(taught[0] + 1) * BLOCKS * self.size,
+                int(taught[0] + 1) * self.interval,
                 columns[:, MEAN].copy(),
                 columns[:, EXPECTED].copy(),
                 columns[:, ERROR].copy(),

@@ -23,7 +23,7 @@ from monitor.catalogue import load
 from monitor.compensating import METHODS, Request, make
 from monitor.drift import sage_husa
 from monitor.drift.arma import identify
-from monitor.drift.compensator import BLOCKS, Compensator
+from monitor.drift.compensator import Compensator
 from monitor.drift.judge import InMotion, in_motion
 from monitor.drift.live_compensation import LiveCompensation
 from monitor.drift.means import interval_means
@@ -64,7 +64,7 @@ def profiles(t: Floats) -> Iterator[tuple[str, Floats]]:
 def live(values: Floats, rate_hz: float, adapts: bool = True) -> tuple[Floats, Compensator]:
     """As the daemon does."""
     one, out = Compensator(rate_hz, adapts), np.empty_like(values)
-    size = BLOCKS * one.size
+    size = one.interval
     for start in range(0, len(values), size):
         out[start : start + size] = one.update(values[start : start + size])
         one.identify()
@@ -305,7 +305,7 @@ def _coast_cells(rows: Floats) -> list[str]:
 def _coasted(values: Floats, rate_hz: float, spans: tuple[float, ...]) -> Floats:
     """[3, spans] rms over axes and places: of the last minute's mean, of the filter's, and what the filter said."""
     one = Compensator(rate_hz)
-    size, kept = BLOCKS * one.size, []
+    size, kept = one.interval, []
     taught: list[Floats] = []
     for start in range(0, len(values) - size, size):
         one.update(values[start : start + size])
