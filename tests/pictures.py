@@ -10,7 +10,7 @@ replayed faster still, drift that of ``adis16470``, which is turned now and then
 real time; one cable is pulled and put back, another is pulled for good. ``demo --effect`` runs in real time too. Needs
 the packages chromium, mesa-vulkan-drivers and libvulkan1 (Debian's names); network traffic stays on loopback.
 
-    python -m tests.pictures [--out docs/pictures] [--only native surfaces temperature drift fleet effect web plot …]
+    python -m tests.pictures [--out docs/pictures] [--only native surfaces temperature drift compensation …]
 """
 
 import argparse
@@ -202,6 +202,17 @@ def drift(out: Path, folder: Path) -> Path:
     return path
 
 
+def compensation(out: Path, folder: Path) -> Path:
+    """What ``imu-monitor compensate --plot`` makes of three hours of a sensor at rest."""
+    path, source = out / "compensate.png", folder / "still.npz"
+    n = 1_080_000
+    values = read_model(settings.CONFIG_FOLDER / "models" / "adis16470.toml").stream(100.0, 2).draw_all(n).values
+    save_samples(source, np.arange(n) / 100.0, values)
+    arguments = ["compensate", str(source), "--out", str(folder / "out.npz"), "--plot", str(path)]
+    subprocess.run([sys.executable, "-m", "monitor.cli", *arguments], check=True)
+    return path
+
+
 def turn_to(port: int, tab: int) -> None:
     """Show that tab of the device in the viewer that is open at ``port``."""
     from rerun.experimental import ViewerClient
@@ -349,6 +360,7 @@ PICTURES: dict[str, Callable[[Path, Path], Path]] = {
     "surfaces": surfaces,
     "temperature": temperature,
     "drift": drift,
+    "compensation": compensation,
     "fleet": fleet,
     "effect": effect,
     "web": web,

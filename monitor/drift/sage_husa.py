@@ -29,8 +29,8 @@ FADING: Final = 0.995
 FLOOR: Final = 0.05
 """Of the identified variance of a, below which s does not fall."""
 OUTLIER: Final = 6.0
-LOUDER: Final = (9.0, 10.0)
-"""Times the usual variance within intervals, once so many have told what is usual; chance passes it in 6e-6."""
+LOUDER: Final = (16.0, 10.0)
+"""Times the usual variance within intervals, once so many have told what is usual; chance passes it in 1e-6 or less."""
 GUARD: Final = 5.0
 """Intervals."""
 AGREE: Final = 4.0

@@ -115,9 +115,7 @@ def _pair(before: float, after: float) -> str:
 def _unexplained(one: Axis, interval_s: float) -> str:
     parts = []
     if one.left_out:
-        parts.append(
-            f"{one.left_out} intervals of {interval_s:g} s held still at a rate that no drift explains: left out"
-        )
+        parts.append(f"{one.left_out} intervals of {interval_s:g} s left out, as no drift explains them")
     if one.steps:
         parts.append(f"{one.steps} step{'s' if one.steps > 1 else ''} of the bias")
     return "; ".join(parts)

@@ -78,10 +78,11 @@ def goes_on(run: Running) -> None:
 
 def says(run: Running, device: str, words: str, timeout_s: float = 15.0) -> None:
     """The status that goes out for a device says so."""
+    healths = run.caught.healths
     try:
-        wait_for(lambda: words in run.caught.healths[device].text, timeout_s, f'"{words}"')
+        wait_for(lambda: device in healths and words in healths[device].text, timeout_s, f'"{words}"')
     except AssertionError as error:
-        raise AssertionError(f"{error}; it says: {run.caught.healths[device].text!r}") from None
+        raise AssertionError(f"{error}; it says: {healths[device].text!r}") from None
 
 
 def output_says(run: Running, output: str, right: Callable[[str], bool], timeout_s: float = 40.0) -> str:
