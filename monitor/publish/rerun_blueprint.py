@@ -111,7 +111,7 @@ def _drift(device: str) -> rrb.Container:
         for axis in axes_of("gyro")
     ]
     text = rrb.TextDocumentView(origin=f"/{device}/drift", contents="$origin", name="Drift of the gyros")
-    return rrb.Vertical(*rows, text, row_shares=[3, 3, 3, 2.1], name="Drift")
+    return rrb.Vertical(*rows, text, row_shares=[3, 3, 3, 2.5], name="Drift")
 
 
 def _bias(device: str, axis: str) -> rrb.View:
