@@ -35,6 +35,10 @@ NEAREST: Final = 0.99999
 """Of a partial autocorrelation to one."""
 HALF_CHI2: Final = 1.920729
 """Half of the 95 % quantile of χ² with one degree of freedom."""
+MOST: Final = 3
+"""Coefficients of the highest order: with fewer nothing can nearly cancel in two ways."""
+APART: Final = 0.1
+"""Of partial autocorrelations: maxima nearer to each other are one."""
 BISECTIONS: Final = 6
 """Of the last step outwards."""
 FIRST: Final = {
@@ -165,12 +169,7 @@ def _fitted(z: Floats, white: float, order: Order) -> _Tried:
     def loss(u: Floats) -> float:
         return -_likelihood(z, white, order, u)
 
-    starts = [
-        np.array([*map(atanh, partial), *((atanh(theta),) if order[1] else ()), *((log(share),) if share else ())])
-        for partial in FIRST[order[0]]
-        for theta in (FIRST_MOVING if order[1] else (0.0,))
-        for share in (SHARES if white > 0.0 and order != (0, 0) else (0.0,))
-    ]
+    starts = _starts(white, order)
     tried = sorted(((loss(u), i) for i, u in enumerate(starts)))
     best, at = tried[0][0], starts[tried[0][1]]
     if free:
@@ -179,6 +178,15 @@ def _fitted(z: Floats, white: float, order: Order) -> _Tried:
             if found.fun < best:
                 best, at = float(found.fun), found.x
     return 2.0 * best + (free + 2) * log(count), order, at
+
+
+def _starts(white: float, order: Order) -> list[Floats]:
+    return [
+        np.array([*map(atanh, partial), *((atanh(theta),) if order[1] else ()), *((log(share),) if share else ())])
+        for partial in FIRST[order[0]]
+        for theta in (FIRST_MOVING if order[1] else (0.0,))
+        for share in (SHARES if white > 0.0 and order != (0, 0) else (0.0,))
+    ]
 
 
 def _likelihood(z: Floats, white: float, order: Order, u: Floats) -> float:
@@ -229,17 +237,33 @@ def _arma(z: Floats, white: float, origin: float, scale: float, best: _Tried) ->
 def _interval(z: Floats, white: float, order: Order, u: Floats) -> tuple[Triple, Triple]:
     """95 % of φ1, φ2, θ1 where the likelihood, at its best in all the others, has fallen by half of χ²(1)'s quantile.
 
-    Where a root nearly cancels θ the likelihood has a long ridge, on which its curvature tells too little.
+    Where a root nearly cancels θ the likelihood has a long ridge, on which its curvature tells too little, or two tops:
+    then the interval reaches from one to the other.
     """
     there = (order[0] > 0, order[0] > 1, order[1] > 0)
-    ends = [_ends(z, white, order, u, i) if there[i] else (np.nan, np.nan) for i in range(3)]
-    return (ends[0][0], ends[1][0], ends[2][0]), (ends[0][1], ends[1][1], ends[2][1])
+    tops = _tops(z, white, order, u)
+    best = max(_likelihood(z, white, order, one) for one in tops)
+    nothing = (np.nan, np.nan)
+    ends = [[_ends(z, white, order, one, i, best) if there[i] else nothing for i in range(3)] for one in tops]
+    lo, hi = np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]
+    return (float(lo[0]), float(lo[1]), float(lo[2])), (float(hi[0]), float(hi[1]), float(hi[2]))
 
 
-def _ends(z: Floats, white: float, order: Order, u: Floats, which: int) -> tuple[float, float]:
-    """Both ends of one coefficient's interval."""
-    natural = _natural(order, u, white)
-    top, value = _likelihood(z, white, order, u), natural[which]
+def _tops(z: Floats, white: float, order: Order, u: Floats) -> list[Floats]:
+    """The maxima of the likelihood that are nearly as high as the highest, which is first."""
+    found = [u]
+    if sum(order) == MOST:
+        for start in _starts(white, order):
+            one = minimize(lambda u: -_likelihood(z, white, order, u), start, method="BFGS", options={"gtol": 0.1}).x
+            if all(np.abs(np.tanh(one[:MOST]) - np.tanh(other[:MOST])).max() > APART for other in found):
+                found.append(one)
+    best = max(_likelihood(z, white, order, one) for one in found)
+    return [one for one in found if best - _likelihood(z, white, order, one) < HALF_CHI2]
+
+
+def _ends(z: Floats, white: float, order: Order, u: Floats, which: int, top: float) -> tuple[float, float]:
+    """Both ends of one coefficient's interval about one maximum, where the highest is ``top``."""
+    value = _natural(order, u, white)[which]
     limits = (-NEAREST, NEAREST) if which or order[0] < 2 else (-2.0 * NEAREST, 2.0 * NEAREST)
     found = []
     for limit in limits:

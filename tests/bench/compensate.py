@@ -474,13 +474,10 @@ def robust(_seeds: int) -> None:
         one.identify()
         one.take()
         assert np.array_equal(np.isfinite(out), np.isfinite(values))
-        least = min(
-            least,
-            *(
-                np.linalg.eigvalsh(row[3:12].reshape(3, 3))[0] / np.trace(row[3:12].reshape(3, 3))
-                for row in one._state.row
-            ),
-        )
+        for row in one._state.row:
+            covariance = row[3:12].reshape(3, 3)
+            if np.trace(covariance) > 0.0:  # something is known
+                least = min(least, float(np.linalg.eigvalsh(covariance)[0] / np.trace(covariance)))
         done += size
     seconds = time.perf_counter() - began
     console.print(
