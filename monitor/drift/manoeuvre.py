@@ -103,29 +103,30 @@ def follow(z, bank, ages, table, first, sums, feedback, keep):  # type: ignore[n
     least, rate = bank[0, NOISE], z
     sums[0, 0] += z * z
     for j in range(ages.shape[0]):
-        row, age = bank[j + 1], ages[j, AGE]
-        at = min(first[j] + age, first[j + 1] - 1)
-        ahead = row[RATE] + row[SLOPE]
+        at = min(first[j] + ages[j, AGE], first[j + 1] - 1)
+        ages[j, AGE] += 1
+        ahead = bank[j + 1, RATE] + bank[j + 1, SLOPE]
         new = z - ahead
-        row[RATE] = ahead + table[at, 0] * new
-        row[SLOPE] += table[at, 1] * new
-        ages[j, AGE] = age + 1
-        off = row[RATE] - z
-        square = off * off
-        gate = GATE * GATE * row[REST] if row[REST] > 0.0 else inf
+        now = ahead + table[at, 0] * new
+        bank[j + 1, RATE] = now
+        bank[j + 1, SLOPE] += table[at, 1] * new
+        square = (now - z) * (now - z)
+        usual = bank[j + 1, REST]
+        gate = GATE * GATE * usual if usual > 0.0 else inf
         bounded = min(square, gate)
-        row[RESIDUAL] += (bounded - row[RESIDUAL]) / RECENT
-        sums[j + 1, 0] += row[RATE] * row[RATE]
+        recent = bank[j + 1, RESIDUAL] + (bounded - bank[j + 1, RESIDUAL]) / RECENT
+        bank[j + 1, RESIDUAL] = recent
+        sums[j + 1, 0] += now * now
         sums[j + 1, 1] += bounded
         if square > gate:
             ages[j, FAR] += 1
             if ages[j, FAR] >= BARRED:
-                row[RATE], row[SLOPE], ages[j, AGE], ages[j, FAR] = z, 0.0, 1, 0
+                bank[j + 1, RATE], bank[j + 1, SLOPE], ages[j, AGE], ages[j, FAR] = z, 0.0, 1, 0
             continue
         ages[j, FAR] = 0
-        error = row[NOISE] + row[RESIDUAL] - row[REST]
+        error = bank[j + 1, NOISE] + recent - usual
         if error < least:
-            least, rate = error, row[RATE]
+            least, rate = error, now
     rate += keep * feedback[0]
     feedback[0] += z - rate
     return rate

@@ -6,7 +6,7 @@ zero. What the model leaves, r_n, may know of the one before: r_n = φ r_{n−1}
 least AICc (Hurvich & Tsai, Biometrika 76, 1989) is taken; it is what leave-one-out validation tends to (Stone, J. R.
 Stat. Soc. B 39, 1977) and needs no samples set aside, of which there are few. A validated error stands beside: that of
 BLOCKS parts of the record, each predicted from the others. A form that predicts them worse than a constant is not
-taken, as slow heating leaves one end of a polynomial to itself.
+taken, as slow heating leaves one end of a polynomial to itself; lags and high powers have to win by a margin.
 
 The search takes some 50 ms to a second, and ``fitting`` does it in pieces of less than a millisecond.
 
@@ -32,6 +32,7 @@ FEWEST: Final = 12
 """Intervals that anything can be said of."""
 POWERS: Final = 5
 """Highest order of a polynomial."""
+CUBIC: Final = 3
 MEMORY: Final = 3
 """Highest order of a difference equation."""
 ENOUGH: Final = 8
@@ -49,6 +50,10 @@ BLOCKS: Final = 6
 """Parts of the record that are predicted from the others."""
 WORSE: Final = 1.05
 """Of the validated error of a constant: what chance lets a form be worse."""
+LAG_WINS: Final = 6.0
+CURVE_WINS: Final = 10.0
+"""AICc by which a lag, and a power beyond the third, have to win: of so few means noise looks like either now and then,
+and both are wrong by much where they are."""
 LEAST_C: Final = 0.1
 """Swing of temperature that anything can be said of."""
 CLEAR: Final = 5.0
@@ -63,7 +68,7 @@ class Candidate:
     """One form that was tried."""
 
     shape: Shape
-    aicc: float  # above that of the one that was taken
+    aicc: float  # above that of the one that was taken; below it where a margin was not reached
     rms: float  # of what it leaves, multi-step, rad/s or m/s²
     validated: float  # the same on parts that were predicted from the others
 
@@ -120,7 +125,7 @@ def fitting(means: Means, since: int | None = None, lags: bool = False) -> Piece
     tried = []
     for shape in _shapes(means, both_ways or lags):
         tried.append((yield from _best(means, excess, shape, since)))
-    tried.sort(key=lambda one: one.aicc)
+    tried.sort(key=lambda one: one.aicc + _margin(one.shape))
     errors = []
     for one in tried:
         yield
@@ -170,6 +175,12 @@ def _check(means: Means) -> None:
         )
     if not np.ptp(means.bias[means.known]) > 0.0:
         raise NotReady("the bias is the same in all intervals")
+
+
+def _margin(shape: Shape) -> float:
+    if shape.memory:
+        return LAG_WINS
+    return CURVE_WINS if shape.powers > CUBIC else 0.0
 
 
 def _excess(means: Means) -> tuple[Floats, float]:
