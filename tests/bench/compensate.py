@@ -9,6 +9,7 @@ mean of what was learned from taken out.
 
 import argparse
 import os
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,6 +28,7 @@ from monitor.drift.compensator import Compensator
 from monitor.drift.judge import InMotion, in_motion
 from monitor.drift.live_compensation import LiveCompensation
 from monitor.drift.means import interval_means
+from monitor.drift.outcome import Axis
 from monitor.drift.variants import VARIANTS, compensated
 from monitor.identifier import Identifier
 from tests.bench.joint import compiled_joint, joint
@@ -89,7 +91,7 @@ def rest(seeds: int) -> None:
         "10 min",
         "60 min",
     )
-    folder = Path(os.environ.get("TMPDIR", "/tmp"))
+    folder = Path(tempfile.gettempdir())
     for sensor in SENSORS:
         for method in METHODS:
             rows = []
@@ -128,17 +130,37 @@ def recordings(_seeds: int) -> None:
     console.print(made)
 
 
+def allan(_seeds: int) -> None:
+    """Allan deviations of recordings at rest, before and after: root mean square of the axes."""
+    folder = os.environ.get("IMU_MONITOR_DATA")
+    if not folder:
+        console.print("IMU_MONITOR_DATA is not set: no recordings")
+        return
+    taus = (0.1, 1.0, 10.0, 100.0)
+    made = table("Allan deviation at rest, °/h: before → after", "recording", *(f"{tau:g} s" for tau in taus))
+    for name in RECORDINGS:
+        curves = [
+            [
+                [np.interp(np.log(tau), np.log(one.tau_s), one.allan) for tau in taus]
+                for one in (axis.before, axis.after)
+            ]
+            for axis in _axes(Path(folder) / name, "adaptive")
+        ]
+        made.add_row(name, *_row(np.array(curves)))
+    console.print(made)
+
+
 def _judged(recording: Path, method: str) -> Floats:
     """[2, 5] before and after: root mean squares over the axes of rms, worst minute and drift over each span, rad/s."""
-    out = (
-        recording.with_name("out.npz")
-        if os.access(recording.parent, os.W_OK)
-        else Path("/tmp/bench-compensate-out.npz")
-    )
-    axes = make(Request(recording, out, method)).axes.values()
-    out.unlink()
+    axes = _axes(recording, method)
     rows = [[[one.deviation, one.worst_minute, *one.drift] for one in (axis.before, axis.after)] for axis in axes]
     return np.asarray(np.sqrt(np.mean(np.square(rows), axis=0)))
+
+
+def _axes(recording: Path, method: str) -> list[Axis]:
+    """What compensation made of each axis; the recording that comes out is not kept."""
+    with tempfile.TemporaryDirectory() as folder:
+        return list(make(Request(recording, Path(folder) / "out.npz", method)).axes.values())
 
 
 def _row(rows: Floats) -> list[str]:
@@ -509,10 +531,8 @@ def speed(_seeds: int) -> None:
     console.print(made)
 
 
-PARTS = {
-    one.__name__: one
-    for one in (rest, recordings, motion, one_filter, slow, doubling, coast, alarms, consistency, arma, robust, speed)
-}
+EACH = (rest, recordings, allan, motion, one_filter, slow, doubling, coast, alarms, consistency, arma, robust, speed)
+PARTS = {one.__name__: one for one in EACH}
 
 
 def main() -> None:
