@@ -113,7 +113,7 @@ class Compensator:
         self.models: list[Arma | None] = [None] * GYROS
         self._orders = tuple(orders)
         self._state = _state(rate_hz, adapts)
-        self._index = 0
+        self.came = 0  # samples, missing ones included
         self._means = np.full((GYROS, REMEMBERED), np.nan)  # a ring of intervals
         self._scatter = np.full((GYROS, REMEMBERED), np.nan)
         self._kept = 0
@@ -149,11 +149,11 @@ class Compensator:
         """
         if lost:
             _gap(lost, self._state)
-            self._index += lost
+            self.came += lost
         out = np.array(values, dtype=np.float64)
         taught = np.empty((len(values) // self.interval + 2, 1 + 6 * GYROS))
-        filled = _advance(values, self._index, self.size, self._state, out, taught)
-        self._index += len(values)
+        filled = _advance(values, self.came, self.size, self._state, out, taught)
+        self.came += len(values)
         for k in range(filled):
             self._learn(taught[k])
         return out
@@ -169,7 +169,7 @@ class Compensator:
     def ahead(self) -> int:
         """Samples to the end of the interval: where models change there, they change at the same samples however the
         stream is cut."""
-        return self.interval - self._index % self.interval
+        return self.interval - self.came % self.interval
 
     @property
     def due(self) -> tuple[int, ...]:

@@ -185,7 +185,7 @@ class Following:
         try:
             stepped = yield from fitting(self._means(), len(self._rows) - (self._came - self._since))
         except NotReady:
-            pass
+            pass  # the size that the mean told stays
         else:
             size, model = stepped.step, stepped.model
         self._learning = None

@@ -18,11 +18,10 @@ from monitor.drift.following import KEPT, AxisThermal, Following
 from monitor.drift.means import PARTS
 from monitor.drift.running_means import Interval, RunningMeans
 from monitor.drift.unexplained import Unexplained
+from monitor.estimate.watch import OTHER_RATE
 from monitor.words import amount
 
 KIND: Final = "temperature_unexplained"
-OTHER_RATE: Final = 0.02
-"""Rates that differ by less make intervals of the same length."""
 
 
 @dataclass(frozen=True, slots=True)

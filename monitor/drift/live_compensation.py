@@ -15,11 +15,10 @@ from monitor.drift.arma import Arma
 from monitor.drift.compensator import GYROS, Compensator, Interval
 from monitor.drift.innovations import INTERVALS, Innovations
 from monitor.drift.sage_husa import STEPPED, USED
+from monitor.estimate.watch import OTHER_RATE
 from monitor.words import amount
 
 KIND: Final = "drift_unexplained"
-OTHER_RATE: Final = 0.02
-"""A rate known better by less than this share is the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +50,9 @@ class LiveCompensation:
     def update(self, samples: SampleBlock) -> SampleBlock:
         """The block, drift taken out; times, temperature and accelerometers as they are."""
         values = self.compensator.update(samples.values, samples.lost)
-        self._came += samples.lost + len(samples)
         newest_ns = int(samples.t_ns[-1])
         for interval in self.compensator.take():
-            t_ns = newest_ns - round((self._came - interval.end) / self._rate_hz * 1e9)
+            t_ns = newest_ns - round((self.compensator.came - interval.end) / self._rate_hz * 1e9)
             self._look(interval, t_ns)
         return block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
 
@@ -83,7 +81,6 @@ class LiveCompensation:
     def _begin(self) -> None:
         self.compensator = Compensator(self._rate_hz)
         self._innovations = [Innovations() for _ in range(GYROS)]
-        self._came = 0
 
     def _look(self, interval: Interval, t_ns: int) -> None:
         used = interval.became == USED

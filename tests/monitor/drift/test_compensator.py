@@ -110,7 +110,7 @@ def test_a_stuck_sensor_stays_finite(value):
 
 def test_gaps_outliers_and_missing_values():
     rng = np.random.default_rng(2)
-    one, finite = Compensator(RATE_HZ), 0
+    one = Compensator(RATE_HZ)
     for k in range(200):
         values = still(3.0, k)
         values[rng.integers(300, size=5)] *= 1e4
@@ -118,8 +118,6 @@ def test_gaps_outliers_and_missing_values():
         out = one.update(values, lost=int(rng.choice([0, 0, 1, 30, 5000, 10**8])))
         one.identify()
         np.testing.assert_array_equal(np.isfinite(out), np.isfinite(values))
-        finite += 1
-    assert finite == 200
     np.testing.assert_allclose(one.bias, 0.02, atol=1e-3)
 
 
