@@ -19,6 +19,7 @@ from monitor.health import Health
 from monitor.publish import message
 from monitor.publish.terminal import Board
 from monitor.publish.zenoh_out import ZenohOut
+from monitor.station import Output
 
 if TYPE_CHECKING:
     from rich.live import Live
@@ -31,7 +32,7 @@ OPENING_S: Final = 10.0
 _log = structlog.get_logger("imu-monitor")
 
 
-class ZenohOutput:
+class ZenohOutput(Output):
     """Results as zenoh messages."""
 
     def __init__(self, zenoh: ZenohOut) -> None:
@@ -59,9 +60,6 @@ class ZenohOutput:
         schema = topics.COMPENSATED.schema()
         self._zenoh.put(topics.COMPENSATED, device, pack(device, received, samples, offset_ns, schema))
 
-    def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
-        """Not sent: the compensated rate is."""
-
     def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
         """The mean of an interval beside what was expected of it."""
         self._zenoh.put(topics.THERMAL, device, message.thermal(device, unix_s, received, look))
@@ -76,7 +74,7 @@ class ZenohOutput:
         self._zenoh.put(topics.STATUS, device, message.status(device, unix_s, health))
 
 
-class ViewerOutput:
+class ViewerOutput(Output):
     """Results into the Rerun viewer."""
 
     def __init__(self, view: "RerunView", recorded: Collection[str] = ()) -> None:
@@ -95,9 +93,6 @@ class ViewerOutput:
     def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
         """Courses of the gaps, and the model's curves beside those measured."""
         self._view.gap(device, unix_s, gap)
-
-    def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
-        """Not shown."""
 
     def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         """Rates beside those measured."""
@@ -122,32 +117,11 @@ class ViewerOutput:
         self._view.health(device, unix_s, health)
 
 
-class LogOutput:
+class LogOutput(Output):
     """Events and changes of state as log lines."""
 
     def __init__(self) -> None:
         self._said: dict[str, tuple[str, str]] = {}
-
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
-        """Not logged."""
-
-    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """Not logged."""
-
-    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
-        """Not logged."""
-
-    def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
-        """Not said."""
-
-    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
-        """Not shown."""
-
-    def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
-        """Not shown."""
-
-    def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
-        """Not logged."""
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """One line an event."""
@@ -162,7 +136,7 @@ class LogOutput:
             say("status", device=device, state=health.state, text=health.text, received=health.received)
 
 
-class TableOutput:
+class TableOutput(Output):
     """Results as the table in the terminal, drawn once a second: the one that ``watch`` shows of other processes."""
 
     def __init__(self, board: Board, live: "Live | None" = None) -> None:
@@ -175,9 +149,6 @@ class TableOutput:
         """The line above the table: where the viewer's page is, "" = nowhere."""
         self.board.note = f"viewer: {url}" if url else ""
 
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
-        """Not shown."""
-
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         """Kept until the table is drawn."""
         self._latest[device] = (unix_s, estimate)
@@ -185,18 +156,6 @@ class TableOutput:
     def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
         """Kept until the table is drawn."""
         self._gaps[device] = (unix_s, gap)
-
-    def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
-        """Not shown."""
-
-    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
-        """Not shown."""
-
-    def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
-        """Not shown."""
-
-    def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
-        """Not shown."""
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """One of the last lines."""

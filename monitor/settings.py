@@ -21,7 +21,16 @@ from drivers.decoders.base import Addressed, Decoder
 from drivers.driver import AxisMap, axis_map
 from drivers.errors import ConfigError
 from drivers.links.base import Filtering, Link, LinkSettings
-from monitor.tables import DeviceTable, FaultsTable, FileTable, LogTable, ViewerTable, VirtualTable, ZenohTable
+from monitor.tables import (
+    DeviceTable,
+    FaultsTable,
+    FileTable,
+    LogTable,
+    StorageTable,
+    ViewerTable,
+    VirtualTable,
+    ZenohTable,
+)
 from monitor.topics import ENDPOINT
 
 __all__ = [
@@ -31,6 +40,7 @@ __all__ = [
     "DeviceTable",
     "FaultsTable",
     "LogTable",
+    "Storage",
     "ViewerTable",
     "VirtualTable",
     "ZenohTable",
@@ -52,6 +62,7 @@ WINDOW_LONGEST_S: Final = 40 * 86400.0
 THERMAL_SAMPLES: Final = 8
 """In an interval at the least: its scatter tells how well its mean is known."""
 THERMAL_LONGEST_S: Final = 86400.0
+SEGMENT_S: Final = (10.0, 86400.0)
 DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
 IS_ENDPOINT: Final = re.compile(r"[a-z]+/.+")
 MEMORY: Final = re.compile(r"[0-9]+(\.[0-9]+)?\s*([kMGT]?i?B|%)")
@@ -81,6 +92,19 @@ class Device:
 
 
 @dataclass(frozen=True, slots=True)
+class Storage:
+    """What is kept on disk, and where."""
+
+    folder: Path
+    record: bool = True  # samples
+    raw: bool = False  # bytes as they came
+    segment_s: float = 3600.0  # of one file
+    keep_s: float = 30 * 86400.0
+    disk_share: float = 0.9  # taken, above which the oldest segments go
+    history: bool = True  # results, events, status
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """A whole configuration file."""
 
@@ -88,6 +112,7 @@ class Config:
     zenoh: ZenohTable
     viewer: ViewerTable
     log: LogTable
+    storage: Storage | None = None
 
 
 def load(path: Path) -> Config:
@@ -147,12 +172,28 @@ class _Reader:
                 self.wrong.append(f'viewer.memory: "{viewer.memory}" is no size; write "256MiB", "1GB" or "25%"')
         if zenoh is not None:
             self._reachable(zenoh)
+        storage = self._storage(file.storage)
         if zenoh is None or viewer is None or log is None:
             return None
         if viewer.mode.endswith(".rrd"):
             path = self._folder / Path(viewer.mode).expanduser()
             viewer = msgspec.structs.replace(viewer, mode=str(path))
-        return Config(tuple(device for device in devices if device is not None), zenoh, viewer, log)
+        return Config(tuple(device for device in devices if device is not None), zenoh, viewer, log, storage)
+
+    def _storage(self, keys: Mapping[str, Any]) -> Storage | None:
+        """None where nothing is to be kept, or a key is wrong."""
+        table = self.fill(StorageTable, keys, "storage")
+        if table is None:
+            return None
+        segment_s = self._try("storage.segment", seconds, table.segment)
+        keep_s = self._try("storage.keep", seconds, table.keep)
+        if table.folder is None or segment_s is None or keep_s is None:
+            return None
+        if not SEGMENT_S[0] <= segment_s <= SEGMENT_S[1]:
+            self.wrong.append(f"storage.segment: {segment_s:g} s; possible are 10 s to 1 d")
+        if keep_s < segment_s:
+            self.wrong.append(f"storage.keep: {keep_s:g} s is shorter than a segment of {segment_s:g} s")
+        return Storage(table.folder, table.record, table.raw, segment_s, keep_s, table.disk_share, table.history)
 
     def _reachable(self, zenoh: ZenohTable) -> None:
         """Whether the session could ever open."""

@@ -9,7 +9,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -65,8 +65,8 @@ class Ready:
     all: threading.Event = field(default_factory=threading.Event)
 
 
-class Output(Protocol):
-    """Where a station's results go; no call waits for anyone."""
+class Output:
+    """Where a station's results go; no call waits for anyone. What an output does not override it does not show."""
 
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         """A block, and how many samples had come with it; ``offset_ns`` makes its times Unix time."""

@@ -106,6 +106,23 @@ class ViewerTable(_Table, frozen=True, kw_only=True):
     memory: str = "256MiB"
 
 
+class StorageTable(_Table, frozen=True, kw_only=True):
+    """``[storage]``: what is kept on disk; without a folder nothing is."""
+
+    folder: Path | None = None
+    record: bool = True
+    """Samples as received and decoded, in segments."""
+    raw: bool = False
+    """The bytes as they came too, so that a decoder's fault can be replayed."""
+    segment: Positive | str = "1h"
+    keep: Positive | str = "30d"
+    """Segments older than this are deleted."""
+    disk_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.9
+    """The oldest segments are deleted while more than this share of the disk is taken."""
+    history: bool = True
+    """Results, events and status, thinned with age."""
+
+
 class LogTable(_Table, frozen=True, kw_only=True):
     """``[log]``."""
 
@@ -119,4 +136,5 @@ class FileTable(_Table, frozen=True, kw_only=True):
     device: list[dict[str, Any]] = []
     zenoh: dict[str, Any] = {}
     viewer: dict[str, Any] = {}
+    storage: dict[str, Any] = {}
     log: dict[str, Any] = {}
