@@ -47,6 +47,16 @@ LATE: Final = 8.0
 """A given time is late, and no sample missing, up to so many times the upper quartile of what is usual."""
 
 
+@dataclass(frozen=True, slots=True)
+class Before:
+    """The last sample before a restart of the program."""
+
+    t_ns: int  # in the epoch of the device's times
+    tick: int  # of the device's counter; NO_TICK = none
+    rate_hz: float | None
+    tick_step: float | None  # ticks a sample
+
+
 class SampleClock:
     """Sample times and missing samples of one device.
 
@@ -78,12 +88,30 @@ class SampleClock:
         self._given_steps: deque[float] = deque(maxlen=STEPS_KEPT)  # s
         self._stuck = 0
         self._paused = False
+        self._earlier_hz: float | None = None  # rate before a restart of the program, until the line knows better
+
+    def resume(self, before: Before) -> None:
+        """Go on from the last sample that was recorded before a restart of the program: what came since is missing."""
+        self._earlier_hz = self._nominal_hz or before.rate_hz
+        self._last_t_ns = self._arrived_ns = before.t_ns
+        self._origin_ns = before.t_ns
+        if isinstance(self._timing, Given):
+            self._line.add(self._index, 0.0, self._earlier_hz)
+        if before.tick != NO_TICK and before.tick_step is not None:
+            self._tick = before.tick
+            self._tick_step.see(np.array([round(before.tick_step)]))
+        self._paused = True
+
+    @property
+    def tick_step(self) -> float | None:
+        """Ticks of the device's counter a sample; None until it has moved."""
+        return self._tick_step.usual()
 
     @property
     def rate_hz(self) -> float | None:
         """Samples a second: nominal where stated, else found from the data and made better with them; None at first."""
         if self._nominal_hz or not self._line.settled():
-            return self._nominal_hz
+            return self._nominal_hz or self._earlier_hz
         measured = self._line.rate_hz()
         return made_rate(measured) if measured else None
 
@@ -220,8 +248,8 @@ class SampleClock:
         """What a gap is measured by; None as long as all that came may be one burst of a late sender."""
         if self._line.settled():
             return self._line.period_s()
-        if self._nominal_hz:
-            return 1.0 / self._nominal_hz
+        if rate := self._nominal_hz or self._earlier_hz:
+            return 1.0 / rate
         return _usual(steps) if steps.sum() > LEARN_S * NS else None
 
     def _tell_jumps(self, t: Ints, steps: Ints) -> None:
@@ -288,7 +316,7 @@ class SampleClock:
         """Whole turns of a short counter, hidden in a pause of the link or in a delay that was never made good."""
         if size is None:
             return 0
-        rate = self._line.rate_hz() or (1.0 / (size * counter.tick_s) if counter.tick_s else None)
+        rate = self._line.rate_hz() or (1.0 / (size * counter.tick_s) if counter.tick_s else self._earlier_hz)
         if rate is None:
             return 0
         turn = counter.modulus / size  # samples
@@ -322,7 +350,7 @@ class SampleClock:
 
     def _ran_ahead(self, missing: int, step: int, counter: Counter, arrived_ns: int) -> bool:
         """Whether so many samples cannot be missing, as the time for them has not passed on the host."""
-        period_s = self._line.period_s()
+        period_s = self._line.period_s() or (1.0 / self._earlier_hz if self._earlier_hz else None)
         if period_s is not None:
             lasted_s = missing * period_s
         elif counter.tick_s is not None:
@@ -347,7 +375,7 @@ class SampleClock:
         return missing
 
     def _missing_in(self, elapsed_s: float, arrived: int) -> int:
-        rate = self._line.rate_hz() or self._nominal_hz
+        rate = self._line.rate_hz() or self._nominal_hz or self._earlier_hz
         return max(0, round(elapsed_s * rate) - arrived) if rate and self._arrived_ns else 0
 
     def _never_caught_up(self, arrived_ns: int, counted: int, least: float = HOLE_PERIODS) -> int:

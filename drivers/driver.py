@@ -8,7 +8,7 @@ growing pauses until the driver is stopped or a replay has ended. Nothing that h
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -18,7 +18,7 @@ from drivers.clock import SampleClock
 from drivers.decoders.base import Decoder
 from drivers.errors import ConfigError, LinkEnded, LinkError, LinkLost
 from drivers.links.base import Link
-from drivers.sample import AXES, Event, Given, SampleBlock, block
+from drivers.sample import AXES, Chunk, Event, Given, SampleBlock, block
 
 READ_TIMEOUT_S: Final = 0.2
 FIRST_PAUSE_S: Final = 0.1
@@ -66,6 +66,7 @@ class Driver:
         axes: the mounting
         push: takes each stamped block; must not block
         silence_s: the link is opened anew after so long without a byte; 0 = never
+        keep: takes the bytes as they came, too; must not block
     """
 
     def __init__(
@@ -77,6 +78,7 @@ class Driver:
         push: Callable[[SampleBlock], None],
         axes: AxisMap | None = None,
         silence_s: float = 3.0,
+        keep: Callable[[Sequence[Chunk]], None] | None = None,
     ) -> None:
         self.name = name
         self.link = link
@@ -87,6 +89,7 @@ class Driver:
         self.text = f"waiting for {link.name}"
         self.times_are_unix = link.epoch == "unix" or isinstance(decoder.timing, Given)
         self._push = push
+        self._keep = keep
         self._axes = axes or AxisMap()
         self._silence_s = silence_s
         self._events: deque[Event] = deque(maxlen=EVENTS_KEPT)
@@ -147,6 +150,8 @@ class Driver:
             self._watch_silence()
             return
         self._heard_s = time.monotonic()
+        if self._keep is not None:
+            self._keep(chunks)
         samples = self.decoder.feed(chunks)
         if not samples:
             self._watch_undecoded(sum(len(chunk.data) for chunk in chunks))

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import DecodeError
-from drivers.sample import AXES, Floats, Ints, SampleBlock, block
+from drivers.sample import AXES, Floats, Ints, SampleBlock, block, ns_to_seconds, seconds_to_ns
 
 SCHEMA: Final = "imu-monitor/samples/1"
 SCHEMAS: Final = (SCHEMA, "imu-monitor/compensated/1")
@@ -112,14 +112,6 @@ def unpack(data: bytes) -> Batch:
     return Batch(payload.device, payload.samples, rows)
 
 
-def seconds_to_ns(seconds: Floats) -> Ints:
-    """Whole nanoseconds; the integer part is kept apart, so nothing is lost beyond the float's own 0.24 µs."""
-    whole = np.floor(seconds)
-    fraction = np.rint((seconds - whole) * 1e9)
-    result: Ints = whole.astype(np.int64) * 1_000_000_000 + fraction.astype(np.int64)
-    return result
-
-
 def _times(unix_ns: Ints) -> tuple[float | bytes, float | None, float | None]:
     """``t``, ``t0``, ``rate``: the short form where the rows are evenly spaced."""
     n = unix_ns.size
@@ -128,13 +120,7 @@ def _times(unix_ns: Ints) -> tuple[float | bytes, float | None, float | None]:
         grid = unix_ns[0] + np.rint(np.arange(n) * (span_ns / (n - 1))).astype(np.int64)
         if np.abs(unix_ns - grid).max() <= EVEN_NS:
             return float(unix_ns[-1]) * 1e-9, float(unix_ns[0]) * 1e-9, (n - 1) * 1e9 / span_ns
-    return _ns_to_seconds(unix_ns).astype("<f8").tobytes(), None, None
-
-
-def _ns_to_seconds(t_ns: Ints) -> Floats:
-    whole, rest = np.divmod(t_ns, 1_000_000_000)
-    result: Floats = whole + rest * 1e-9
-    return result
+    return ns_to_seconds(unix_ns).astype("<f8").tobytes(), None, None
 
 
 def _table(payload: _Payload) -> Floats:

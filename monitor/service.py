@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
+from drivers.links.replay_link import ReplayLink
 from monitor.drift import compensator, heat
 from monitor.estimate.estimator import warm_up
 from monitor.live_reconcile import Job, Reconciler
@@ -20,6 +21,7 @@ from monitor.outputs import TableOutput, ViewerOutput, ZenohOutput
 from monitor.publish import message
 from monitor.publish.viewer import DeviceInfo, ViewerSettings
 from monitor.publish.zenoh_out import Command, ZenohOut
+from monitor.recorder import Recorder, origin
 from monitor.settings import Config, Device, VirtualTable
 from monitor.station import Output, Ready, Station
 from monitor.virtual import VirtualImu
@@ -54,6 +56,7 @@ class Service:
         self._ready = Ready()
         self._stop = threading.Event()
         self.virtual: dict[str, VirtualImu] = {}
+        self.recorder = _recorder(config)
         self.stations = [self._station(device) for device in config.devices]
         self.zenoh = ZenohOut(config.zenoh, [station.name for station in self.stations])
         self.view = _viewer(config)
@@ -87,6 +90,9 @@ class Service:
             imu.start()
         for station in self.stations:
             station.start()
+        if self.recorder is not None:
+            self.recorder.start()
+            threading.Thread(target=self._rebuild, name="rebuild", daemon=True).start()
 
     def loop(self, until_s: float | None) -> None:
         """Rounds over all devices; status once a second."""
@@ -115,7 +121,15 @@ class Service:
         states = {"zenoh": self.zenoh.state}
         if self.view is not None:
             states["viewer"] = self.view.state
+        if self.recorder is not None:
+            states["recording"] = self.recorder.state
         return states
+
+    def _rebuild(self) -> None:
+        """Windows from the recording, as soon as that can be computed."""
+        self._ready.all.wait()
+        for station in self.stations:
+            station.rebuild()
 
     def _warm_up(self) -> None:
         """Beside the loop, so that a first start's compilation holds up neither samples nor status."""
@@ -140,13 +154,19 @@ class Service:
             imu = VirtualImu(link, device.decoder, device.name)
             self.virtual[device.name] = imu
             link = imu.link
-        return Station(device, link, device.decoder, self._wake, self._ready)
+        return Station(device, link, device.decoder, self._wake, self._ready, self.recorder)
 
     def _report(self) -> None:
+        self._tell_recording()
         states, memory = self.states(), memory_bytes()
         self._tell_page()
         for station in self.stations:
             station.report(self.outputs, states, memory)
+
+    def _tell_recording(self) -> None:
+        stations = {station.name: station for station in self.stations}
+        for told in self.recorder.take() if self.recorder is not None else ():
+            stations[told.device].announce(self.outputs, told.kind, told.text)
 
     def _tell_page(self) -> None:
         """Say where the viewer's page is, once for each place; a window needs no address."""
@@ -201,6 +221,8 @@ class Service:
         finally:
             self._reconciler.close()
             self._tell_reconciled()
+            if self.recorder is not None:
+                self.recorder.close()
             if self.view is not None:
                 self.view.close()
             self.zenoh.close()
@@ -222,6 +244,19 @@ class Service:
             station.work(self.outputs, time.monotonic(), drain=True)
             self.zenoh.alive(station.name, False)
         self._report()
+
+
+def _recorder(config: Config) -> Recorder | None:
+    """What is wanted of the recording; a replay is one already."""
+    storage = config.storage
+    if storage is None:
+        return None
+    devices = [device for device in config.devices if not isinstance(device.link, ReplayLink)]
+    origins = [origin(device.name, device.axes) for device in devices] if storage.record else []
+    if storage.raw:
+        carriers = [device.decoder.carrier for device in devices]
+        origins += [origin(one.name, one.axes, "raw", carrier) for one, carrier in zip(devices, carriers, strict=True)]
+    return Recorder(storage, origins) if origins else None
 
 
 def memory_bytes() -> int:

@@ -13,13 +13,14 @@ from typing import Final
 
 import numpy as np
 
-from drivers.clock import SampleClock
+from drivers.clock import Before, SampleClock
 from drivers.decoders.base import Decoder
 from drivers.driver import Driver
-from drivers.errors import ConfigError, NotReady
+from drivers.errors import ConfigError, ImuError, NotReady
 from drivers.links.base import Link
 from drivers.links.replay_link import ReplayLink
-from drivers.sample import Event, Floats, SampleBlock, unbroken
+from drivers.recording.segment import State
+from drivers.sample import AXES, Chunk, Event, Floats, SampleBlock, block, unbroken
 from monitor.catalogue import read_model
 from monitor.drift.live import LiveThermal, ThermalLook
 from monitor.drift.live_compensation import DriftLook, LiveCompensation
@@ -33,6 +34,7 @@ from monitor.estimate.total import TotalCurve
 from monitor.estimate.watch import Watch
 from monitor.health import Health
 from monitor.identifier import Identifier
+from monitor.recorder import Recorder, Tail
 from monitor.ring import RingBuffer
 from monitor.settings import Device
 from monitor.wall import WallClock
@@ -49,6 +51,8 @@ CHOOSING_S: Final = 0.001
 CHOOSING_RECORDED_S: Final = 0.02
 CHOOSING_SHARE: Final = 0.02
 """Of a processor, that it may take for a device."""
+REBUILT_LEAST_S: Final = 600.0
+"""Of the recording, read after a restart however short the window is: changes are looked for in what is known."""
 TOTAL_EVERY_S: Final = 0.1
 TOTAL_SHARE: Final = 0.005
 """Of a processor, that total and Hadamard deviations may take for a device."""
@@ -104,18 +108,29 @@ class Station:
         link: what its samples come by
         wake: set whenever samples have come
         ready: which of the estimator's kernels are compiled; samples wait in order until they are
+        recorder: keeps what comes, and has what came before
     Raises:
         ConfigError: the model in force is none
     """
 
-    def __init__(self, device: Device, link: Link, decoder: Decoder, wake: threading.Event, ready: Ready) -> None:
+    def __init__(
+        self,
+        device: Device,
+        link: Link,
+        decoder: Decoder,
+        wake: threading.Event,
+        ready: Ready,
+        recorder: Recorder | None = None,
+    ) -> None:
         self.device = device
         self.name = device.name
         rate = device.rate_hz or 1000.0
         low, high = RING_SAMPLES
         self.ring = RingBuffer(int(min(max(rate * RING_SECONDS, low), high)))
         self.clock = SampleClock(decoder.timing, device.rate_hz)
-        self.driver = Driver(device.name, link, decoder, self.clock, self._push, device.axes, device.silence_s)
+        self._recorder = recorder
+        keep = None if recorder is None else self._keep
+        self.driver = Driver(device.name, link, decoder, self.clock, self._push, device.axes, device.silence_s, keep)
         self.estimator: Estimator | None = None
         self.watch: Watch | None = None
         self.latest: Estimate | None = None
@@ -143,6 +158,9 @@ class Station:
         self._latencies: list[float] = []
         self._started_s = time.monotonic()
         self._no_estimate = ""  # why there can be none
+        self._happened: list[Event] = []
+        self._tail: Tail | None = None  # of the recording, that the window is rebuilt from first
+        self._since: list[float | None] = [None] * len(AXES)  # Unix s, where the samples of an axis count from
         self._next_s = dict.fromkeys(("refit", "publish", "samples", "total", "thermal"), 0.0)
         self._advanced = False  # samples since the last refit
         self._refitted = False  # a refit since the last publication
@@ -151,8 +169,24 @@ class Station:
     # --- life
 
     def start(self) -> None:
-        """Start reading."""
+        """Start reading; where the recording ends less than a window ago, the samples go on from it."""
+        if self._recorder is not None and not self._patient:
+            self._resume(self._recorder.tail(self.name))
         self._thread.start()
+
+    def rebuild(self) -> None:
+        """Fill the window from the recording, while samples wait in the ring; to be called in a thread of its own."""
+        tail = self._tail
+        if tail is None:
+            return
+        try:
+            self._rebuild(tail)
+        except (ImuError, OSError) as error:
+            self._happened.append(Event("window_rebuilt", self._newest_ns, f"the window could not be rebuilt: {error}"))
+            self.reset()
+        finally:
+            self._tail = None
+            self._wake.set()
 
     def stop(self) -> None:
         """Stop reading; what is in the ring stays there to be worked off."""
@@ -183,7 +217,7 @@ class Station:
         if drain:
             self._estimate(self.watch.flush() if self.watch is not None else [])
             self._follow()
-        happened = self.driver.take_events()
+        happened, self._happened = self._happened + self.driver.take_events(), []
         if self.thermal is not None and any(event.kind == "link_back" for event in happened):
             self.thermal.offset_is_new()
         published = self._publish_samples(outputs, now_s, drain)
@@ -201,6 +235,8 @@ class Station:
         """Empty the window."""
         if self.estimator is not None:
             self.estimator.reset()
+            for axis in range(len(AXES)):
+                self._count_from(axis, 0)
 
     def held(self) -> tuple[Held, Floats] | None:
         """The samples in the window and their temperature [n], as of now; None while there are none."""
@@ -223,6 +259,9 @@ class Station:
             for one in (self.thermal, self.compensation):
                 if one is not None:
                     one.relabel(rate)
+        if self._recorder is not None:
+            known_hz = None if self.estimator is None else self.estimator.rate_hz
+            self._recorder.know(self.name, State(known_hz, tuple(self._since), self.clock.tick_step))
         health = self.health(states, memory_bytes)
         for output in outputs:
             output.health(self.name, self.now_unix_s(), health)
@@ -261,10 +300,73 @@ class Station:
             return self.unix_s(self._newest_ns)
         return self._wall.unix_ns(time.monotonic_ns()) / 1e9
 
+    # --- going on after a restart
+
+    def _resume(self, tail: Tail | None) -> None:
+        """Let samples count as missing that came since the recording's end."""
+        if tail is None:
+            return
+        newest, state = tail.newest.samples, tail.newest.state
+        t_ns = int(newest.t_ns[-1]) - self._offset_ns()
+        ago_s = (self._wall.unix_ns(time.monotonic_ns()) - int(newest.t_ns[-1])) / 1e9
+        rate = self.device.rate_hz or state.rate
+        if rate is None or not 0.0 <= ago_s <= self.device.window_s:
+            text = f"the recording ends {ago_s:.4g} s ago: the window begins anew"
+            if ago_s < 0.0:
+                text = "the recording ends after the host's clock: the window begins anew"
+            self._happened.append(Event("window_rebuilt", time.monotonic_ns(), text))
+            return
+        self.clock.resume(Before(t_ns, int(newest.ticks[-1]), rate, state.tick_step))
+        self._tail = tail
+
+    def _rebuild(self, tail: Tail) -> None:
+        """What the samples of the last window would have made of it, but for what was told of them then."""
+        offset_ns, since, since_places = self._offset_ns(), tail.newest.state.since, np.zeros(len(AXES), np.int64)
+        places = 0
+        for piece in tail.pieces(max(self.device.window_s, REBUILT_LEAST_S)):
+            samples = piece.samples
+            places += samples.lost + len(samples)
+            for axis, unix_s in enumerate(since):
+                if unix_s is not None:
+                    counts = samples.t_ns / 1e9 >= unix_s
+                    since_places[axis] += np.count_nonzero(counts) + (samples.lost if counts[0] else 0)
+            self._relive(block(samples.t_ns - offset_ns, samples.values, samples.temperature_c, lost=samples.lost))
+        if self.estimator is None:
+            return
+        for axis, unix_s in enumerate(since):
+            if unix_s is not None:
+                self.estimator.restart(axis, int(since_places[axis]))
+        self._since = list(since)
+        filled_s = self.estimator.filled / self.estimator.rate_hz
+        text = f"{filled_s:.6g} s of the window were rebuilt from the recording"
+        self._happened.append(Event("window_rebuilt", self._newest_ns, text))
+
+    def _relive(self, samples: SampleBlock) -> None:
+        self._newest_ns = int(samples.t_ns[-1])
+        self._advance([samples], drain=True)
+        if self.compensation is not None and np.isfinite(samples.values[:, :3]).any():
+            for at in range(0, len(samples), PIECE):
+                self.compensation.update(samples[at : at + PIECE])
+            self._identifier.renew(self.compensation)
+            self.compensation.take()
+        for source in (self.watch, self.thermal, self.compensation):
+            if source is not None:
+                source.take_events()
+        self._looks = []
+
     # --- inside
+
+    def _keep(self, chunks: Sequence[Chunk]) -> None:
+        """Called by the reader's thread."""
+        if self._recorder is not None:
+            self._recorder.chunks(self.name, chunks, self._offset_ns())
 
     def _push(self, samples: SampleBlock) -> None:
         """Called by the reader's thread. A sensor is never kept waiting; a recording waits for room."""
+        if self._recorder is not None:
+            self._recorder.samples(self.name, samples, self._offset_ns())
+            while self._patient and self._recorder.full(self.name):
+                time.sleep(PATIENCE_S)
         while self._patient and self.ring.room < len(samples) < self.ring.capacity:
             time.sleep(PATIENCE_S)
         self.ring.push(samples)
@@ -277,7 +379,7 @@ class Station:
 
     def _can_take(self) -> bool:
         """Until the rate is known and the kernels are compiled, samples wait in the ring."""
-        if self._pieces:
+        if self._pieces or self._tail is not None:
             return False
         if self.estimator is not None or self._no_estimate:
             return True
@@ -339,8 +441,14 @@ class Station:
             self._temperatures.push(samples.lost, samples.temperature_c)
             self._advanced = True
         for restart in self.watch.take_restarts() if self.watch is not None else ():
-            if self.device.restart:
+            if self.device.restart and self._tail is None:
                 self.estimator.restart(restart.axis, restart.samples)
+                self._count_from(restart.axis, restart.samples)
+
+    def _count_from(self, axis: int, samples: int) -> None:
+        """Note for the recording that of an axis only the newest samples count."""
+        if self.estimator is not None:
+            self._since[axis] = self.unix_s(self._newest_ns) - (samples - 0.5) / self.estimator.rate_hz
 
     def _publish_samples(self, outputs: Sequence[Output], now_s: float, drain: bool) -> bool:
         every_s = min(self.device.publish_s, SAMPLES_EVERY_S)
@@ -440,6 +548,8 @@ class Station:
         return True
 
     def _text(self) -> str:
+        if self._tail is not None and self._ready.all.is_set() and self.driver.state == "running":
+            return "the window is being rebuilt from the recording; no sample is lost"
         if not self._ready.fit.is_set() and self.driver.state == "running":
             return "first start: compiling the estimator; no coefficients yet, no sample is lost"
         nominal, measured = self.device.rate_hz, self.clock.measured_hz

@@ -14,11 +14,16 @@ from drivers.errors import ConfigError, RecordingError
 from drivers.recording.table import BATCH_ROWS, PART, Append, Table, chosen_columns
 from drivers.sample import Floats
 
+OWN: Final = b"imu-monitor"
+"""Key of the metadata by which a segment of the daemon's recordings is known."""
+BOOKKEEPING: Final = ("ticks", "lost")
+"""Columns of such a segment that are no measurement: a reader is not told that they were left aside."""
 ARROW_MAGIC: Final = b"ARROW1\0\0"
 ARROW_END: Final = b"\xff\xff\xff\xff\0\0\0\0"  # end-of-stream mark of Arrow IPC
 
 
-def _arrow(path: Path) -> Any:
+def library(path: Path) -> Any:
+    """pyarrow. ConfigError where it is not installed: ``path`` cannot be read or written."""
     try:
         import pyarrow as pa
     except ImportError as error:
@@ -29,7 +34,7 @@ def _arrow(path: Path) -> Any:
 
 def read_parquet(path: Path) -> Table:
     """Only the columns that mean something are read; RecordingError when the file is not whole."""
-    pa = _arrow(path)
+    pa = library(path)
     from pyarrow import parquet
 
     notes: list[str] = []
@@ -47,13 +52,14 @@ def read_parquet(path: Path) -> Table:
 
 def read_ipc(path: Path) -> Table:
     """Arrow IPC up to a cut. A file is a stream after one magic word, so both are read as streams."""
-    pa = _arrow(path)
+    pa = library(path)
     notes: list[str] = []
     data = path.read_bytes()
     is_file = data.startswith(ARROW_MAGIC)
     try:
         reader = pa.ipc.open_stream(pa.py_buffer(data).slice(len(ARROW_MAGIC) if is_file else 0))
-        names = reader.schema.names
+        own = OWN in (reader.schema.metadata or {})
+        names = [name for name in reader.schema.names if not (own and name in BOOKKEEPING)]
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: is no Arrow IPC file or stream ({_first_line(error)})") from error
     chosen = chosen_columns(path, names, notes)
@@ -77,7 +83,7 @@ def _table(path: Path, table: Any, chosen: Mapping[str, str], notes: list[str]) 
 
 def _column(path: Path, key: str, column: Any) -> Floats:
     """One column as float64, null as NaN."""
-    pa = _arrow(path)
+    pa = library(path)
     numeric = (pa.types.is_floating, pa.types.is_integer, pa.types.is_null)
     if not any(is_type(column.type) for is_type in numeric):
         unit = "; t is in seconds" if key == "t" else ""
@@ -92,7 +98,7 @@ def _first_line(error: Exception) -> str:
 @contextmanager
 def parquet_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
     """Write with Parquet's default compression; what is appended at once is one row group."""
-    pa = _arrow(path)
+    pa = library(path)
     from pyarrow import parquet
 
     schema = _schema(pa, names)
@@ -102,17 +108,17 @@ def parquet_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
 
 def ipc_file_writer(path: Path, names: Sequence[str]) -> AbstractContextManager[Append]:
     """Write an Arrow file (Feather version 2)."""
-    return _ipc_writer(_arrow(path).ipc.new_file, path, names)
+    return _ipc_writer(library(path).ipc.new_file, path, names)
 
 
 def ipc_stream_writer(path: Path, names: Sequence[str]) -> AbstractContextManager[Append]:
     """Write an Arrow stream."""
-    return _ipc_writer(_arrow(path).ipc.new_stream, path, names)
+    return _ipc_writer(library(path).ipc.new_stream, path, names)
 
 
 @contextmanager
 def _ipc_writer(new: Any, path: Path, names: Sequence[str]) -> Iterator[Append]:
-    pa = _arrow(path)
+    pa = library(path)
     schema = _schema(pa, names)
     with new(str(path), schema) as file:
         yield lambda columns: file.write_table(pa.table(dict(columns), schema), max_chunksize=BATCH_ROWS)

@@ -1,0 +1,52 @@
+"""How long recordings are kept: by age, and by how full the disk is. Deletes segments, the oldest first."""
+
+import shutil
+from collections import deque
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+from drivers.recording import segment
+
+NEWEST_KEPT: Final = 2
+"""Segments of a folder that are never deleted: the window is rebuilt from them."""
+
+
+def delete_old(folders: Sequence[Path], keep_s: float) -> None:
+    """Delete segments that ended more than ``keep_s`` before the newest of their folder began.
+
+    By the times in their names, not by the host's clock: one that is set wrong must not delete a year.
+    """
+    for folder in folders:
+        known = segment.segments(folder)
+        for path, after in pairwise(known[: 1 - NEWEST_KEPT]):
+            if segment.began_s(known[-1]) - segment.began_s(after) > keep_s:  # it ended where the next began
+                path.unlink(missing_ok=True)
+
+
+def make_room(folder: Path, folders: Sequence[Path], share: float) -> str:
+    """Delete the oldest segments while more than ``share`` of the disk of ``folder`` is taken.
+
+    Returns "" where there is room then, else in a sentence why not.
+    """
+    if not folder.is_dir():
+        return ""
+    olds: deque[Path] | None = None
+    while (taken := taken_share(folder)) > share:
+        if olds is None:
+            every = [path for one in folders for path in segment.segments(one)[:-NEWEST_KEPT]]
+            olds = deque(sorted(every, key=segment.began_s))
+        if not olds:
+            return (
+                f"{folder}: the disk is {100 * taken:.4g} % full, disk_share allows {100 * share:.4g} %, and no older "
+                f"segment is left to delete; recording stopped"
+            )
+        olds.popleft().unlink(missing_ok=True)
+    return ""
+
+
+def taken_share(folder: Path) -> float:
+    """Of the disk, as seen by whoever is not root."""
+    usage = shutil.disk_usage(folder)
+    return 1.0 - usage.free / usage.total
