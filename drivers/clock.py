@@ -304,9 +304,12 @@ class SampleClock:
         if size is not None:
             missing = np.maximum(np.rint(steps / size).astype(np.int64) - 1 - waited, 0)
         if first or steps.sum() == 0:  # a counter that stands still says nothing
-            missing[0] = samples.lost
+            unseen = self._missing_in(elapsed_s, len(samples)) if first and self._paused else 0
+            missing[0] = max(samples.lost, unseen)
         elif self._ran_ahead(int(missing.max()), int(steps.max()), counter, arrived_ns):
-            text = f"counter moved by {steps.max()} ticks within {elapsed_s:.3f} s"
+            ahead = int(steps.max())
+            moved = f"back by {counter.modulus - ahead}" if 2 * ahead > counter.modulus else f"on by {ahead}"
+            text = f"counter went {moved} ticks within {elapsed_s:.3f} s"
             self._event("clock_jumped", int(samples.t_ns[0]), text)
             missing[np.argmax(steps)] = self._missing_in(elapsed_s, len(samples) + int(missing.sum() - missing.max()))
         self._paused = False

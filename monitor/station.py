@@ -260,8 +260,7 @@ class Station:
                 if one is not None:
                     one.relabel(rate)
         if self._recorder is not None:
-            known_hz = None if self.estimator is None else self.estimator.rate_hz
-            self._recorder.know(self.name, State(known_hz, tuple(self._since), self.clock.tick_step))
+            self._recorder.know(self.name, self._known())
         health = self.health(states, memory_bytes)
         for output in outputs:
             output.health(self.name, self.now_unix_s(), health)
@@ -337,6 +336,11 @@ class Station:
             if unix_s is not None:
                 self.estimator.restart(axis, int(since_places[axis]))
         self._since = list(since)
+        state = tail.newest.state
+        if state.theta:
+            shape = (-1, len(AXES))
+            theta = np.array(state.theta, np.float64).reshape(shape)
+            self.estimator.start_from(np.array(state.entered).reshape(shape), theta)
         filled_s = self.estimator.filled / self.estimator.rate_hz
         text = f"{filled_s:.6g} s of the window were rebuilt from the recording"
         self._happened.append(Event("window_rebuilt", self._newest_ns, text))
@@ -353,6 +357,20 @@ class Station:
             if source is not None:
                 source.take_events()
         self._looks = []
+
+    def _known(self) -> State:
+        """What goes into the recording beside the samples."""
+        if self.estimator is None:
+            return State(tick_step=self.clock.tick_step)
+        entered, theta = self.estimator.fitted()
+        sizes = [None if np.isnan(size) else float(size) for size in theta.ravel()]
+        return State(
+            self.estimator.rate_hz,
+            tuple(self._since),
+            self.clock.tick_step,
+            tuple(sizes),
+            tuple(entered.ravel().tolist()),
+        )
 
     # --- inside
 

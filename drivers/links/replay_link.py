@@ -5,9 +5,11 @@ What the file is decides what the link carries:
 - recordings (``drivers.recording``: CSV, .npz, Parquet, Arrow, a folder) travel as messages for the decoder
   ``samples``;
 - CAN logs (.asc .blf .log .trc, CSV of python-can, CSV with ``t``, ``id_hex``, ``data_hex``) travel as frames;
-- captured bytes (.bin .raw .txt, also with .gz) travel as bytes.
+- captured bytes (.bin .raw .txt, also with .gz) travel as bytes;
+- the raw bytes that the daemon kept (a folder of segments, or one of them) travel as what they came in as: bytes,
+  frames or messages.
 
-Recordings and logs keep their own times (``epoch`` unix). Bytes have none: with ``bytes_per_second`` each
+Recordings, logs and raw bytes keep their own times (``epoch`` unix). Bytes have none: with ``bytes_per_second`` each
 chunk gets the time at which that rate brings it, without it the time it was read.
 
 ``read`` raises ``LinkEnded`` once all was given. A file cut off in the middle is given up to the cut, and
@@ -30,7 +32,7 @@ from typing import IO, TYPE_CHECKING, BinaryIO, Final, Literal, cast
 from drivers.errors import ConfigError, LinkEnded, LinkLost, LinkUnavailable, RecordingError
 from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.plugin import FilePath, nearest
-from drivers.recording import FORMATS, Recording, iter_blocks, load_samples
+from drivers.recording import FORMATS, Recording, iter_blocks, load_samples, segment
 from drivers.sample import EXTENDED_ID, Chunk
 from drivers.sample_message import pack
 
@@ -52,12 +54,13 @@ LARGEST_STANDARD_ID: Final = 0x7FF
 DAMAGE: Final = (EOFError, LookupError, zlib.error, gzip.BadGzipFile, struct.error, binascii.Error)
 """What readers raise at a place where a file is cut or damaged, beside ValueError."""
 
-Kind = Literal["recording", "log", "capture"]
+Kind = Literal["recording", "log", "capture", "raw"]
 Timed = tuple[float, Chunk]
 """Seconds from the start of the file, and what comes then."""
 CARRIERS: Final[dict[Kind, Carrier]] = {"recording": "messages", "log": "frames", "capture": "bytes"}
+"""What each kind carries; raw bytes say it themselves."""
 
-DEFAULT_DECODERS: Final[dict[Kind, str]] = {"recording": DEFAULT_DECODER, "log": "dbc", "capture": ""}
+DEFAULT_DECODERS: Final[dict[Kind, str]] = {"recording": DEFAULT_DECODER, "log": "dbc", "capture": "", "raw": ""}
 """Decoder of each kind, where the settings name none; "" = they must."""
 
 
@@ -91,7 +94,7 @@ class ReplayLink:
         self._path = Path(settings.path).expanduser()
         self._kind: Kind = kind
         self._pace = pace  # file seconds a second; inf = no waiting
-        self.carrier: Carrier = CARRIERS[kind]
+        self.carrier: Carrier = _raw_carrier(self._path) if kind == "raw" else CARRIERS[kind]
         self.epoch: Literal["monotonic", "unix"] = "monotonic" if kind == "capture" else "unix"
         self.default_decoder = DEFAULT_DECODERS[kind]
         self.name = f"replay of {settings.path}"
@@ -176,6 +179,9 @@ class ReplayLink:
             recording = load_samples(self._path, self._settings.rate)
             self.notes = recording.notes
             return _Source(_messages(recording, self._rows(recording)), lambda: None)
+        if self._kind == "raw":
+            chunks = (chunk for path in _raw_segments(self._path) for chunk in segment.read_chunks(path))
+            return _Source(_from_start(chunks), lambda: None)
         if self._kind == "log":
             return _log(self._path, self._settings.channel)
         return _capture(self._path, self._settings.bytes_per_second)
@@ -269,6 +275,34 @@ def _from_start(chunks: Iterator[Chunk]) -> Iterator[Timed]:
         yield (chunk.t_ns - start_ns) * 1e-9, chunk
 
 
+# --- raw bytes -------------------------------------------------------------------------------------
+
+
+def _raw_segments(path: Path) -> list[Path]:
+    """Segments of raw bytes, oldest first: of a folder, or the one that is named."""
+    return segment.segments(path) if path.is_dir() else [path]
+
+
+def _is_raw(path: Path) -> bool:
+    """Whether the newest segment holds raw bytes; one that cannot be read says so when it is opened."""
+    found = _raw_segments(path)
+    if not found or not segment.NAME.fullmatch(found[-1].name):
+        return False
+    try:
+        return segment.origin(found[-1]).kind == "raw"
+    except (OSError, RecordingError):
+        return False
+
+
+def _raw_carrier(path: Path) -> Carrier:
+    carrier = segment.origin(_raw_segments(path)[-1]).carrier
+    known: tuple[Carrier, ...] = ("bytes", "frames", "messages")
+    for one in known:
+        if one == carrier:
+            return one
+    raise ConfigError(f'path "{path}": carries "{carrier}", where {", ".join(known)} are known')
+
+
 # --- captured bytes ------------------------------------------------------------------------------
 
 
@@ -304,6 +338,8 @@ def _kind(path: Path) -> Kind:
         return "log"
     if suffix in CAPTURES:
         return "capture"
+    if _is_raw(path):
+        return "raw"
     if path.is_dir():
         return "recording"
     if suffix == ".csv":

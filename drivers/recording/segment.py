@@ -55,6 +55,9 @@ class State(msgspec.Struct, frozen=True):
     since: tuple[float | None, ...] = (None,) * 6
     """Unix s from which on the samples of an axis count, where its noise has changed or the window was emptied."""
     tick_step: float | None = None  # of the device's counter, a sample
+    theta: tuple[float | None, ...] = ()
+    entered: tuple[bool, ...] = ()
+    """Sizes of the terms of the newest fit, and which it has, [5, 6] row by row."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +72,7 @@ class SegmentWriter:
     """Appends to one segment.
 
     Args:
-        path: the new file
+        path: the new file; it appears with its first batch
         origin: what it is of
     Raises:
         OSError: whatever the disk says, from every method; what was whole before stays readable
@@ -80,14 +83,10 @@ class SegmentWriter:
         self._pa = library(path)
         self._schema = _schema(self._pa, origin)
         self._state = State()
-        self._file: IO[bytes] = path.open("xb", buffering=0)
+        self._part = path.with_name(path.name + PART)
+        self._file: IO[bytes] = self._part.open("wb", buffering=0)
+        self._writer = self._pa.ipc.new_stream(self._file, self._schema)
         self._whole = 0  # bytes that hold whole batches
-        try:
-            self._writer = self._stream()
-        except OSError:
-            self._file.close()
-            path.unlink(missing_ok=True)  # a segment without a head is none
-            raise
 
     def samples(self, blocks: Sequence[SampleBlock], state: State) -> None:
         """One batch of blocks whose ``t_ns`` are Unix times."""
@@ -107,6 +106,7 @@ class SegmentWriter:
             self._writer.close()
         finally:
             self._file.close()
+            self._part.unlink(missing_ok=True)
 
     def _write(self, batch: Any, meta: dict[bytes, bytes] | None) -> None:
         try:
@@ -116,12 +116,9 @@ class SegmentWriter:
             self._file.truncate(self._whole)
             self._file.seek(self._whole)
             raise
+        if not self._whole:
+            os.rename(self._part, self.path)
         self._whole = self._file.tell()
-
-    def _stream(self) -> Any:
-        writer = self._pa.ipc.new_stream(self._file, self._schema)
-        self._whole = self._file.tell()
-        return writer
 
 
 def segment_name(number: int, unix_s: float) -> str:

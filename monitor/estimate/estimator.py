@@ -33,6 +33,8 @@ from monitor.estimate.uncertainty import AxisTables, Spans, Table, intervals
 from monitor.estimate.watch import Watch
 from monitor.estimate.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_spans
 
+SETTLING: Final = 10
+"""Looks that take a fit to its end; each leaves a quarter of what was left."""
 FEWEST: Final = 8
 """Samples before the first answer: three τ with a few terms each."""
 POWER_ROWS: Final = 65_536
@@ -134,6 +136,20 @@ class Estimator:
         self._entered[:, axis], self._theta[:, axis] = False, np.nan
         if self._refit is not None:
             self._refit.restart(axis)
+
+    def fitted(self) -> tuple[NDArray[np.bool_], Floats]:
+        """Which terms the newest fit has, and their sizes [5, 6]: what the next one starts from."""
+        return (self._entered if self._refit is None else self._refit.entered).copy(), self._theta.copy()
+
+    def start_from(self, entered: NDArray[np.bool_], theta: Floats) -> None:
+        """Let the next fit start from one before a restart of the program, and take it to its end.
+
+        A term that is in the fit leaves it later than it enters, and the live fit follows by a step each look.
+        """
+        self._entered, self._theta = entered.copy(), theta.copy()
+        if self._window.n >= FEWEST:
+            for _ in range(SETTLING):
+                self.get()
 
     def relabel(self, rate_hz: float) -> None:
         """The rate is known better now: the same clusters of samples, other τ and units."""

@@ -22,10 +22,10 @@ from monitor.estimate.model_gap import ModelGap
 from monitor.estimate.total import TotalCurve
 from monitor.health import Health
 from monitor.service import Service
-from monitor.station import Station
+from monitor.station import Output, Station
 
 
-class Caught:
+class Caught(Output):
     """An output that keeps everything."""
 
     def __init__(self) -> None:
