@@ -151,7 +151,8 @@ class Compensator:
             _gap(lost, self._state)
             self.came += lost
         out = np.array(values, dtype=np.float64)
-        taught = np.empty((len(values) // self.interval + 2, 1 + 6 * GYROS))
+        # after a hole, verdicts on all blocks that waited come at once, and each may end an interval
+        taught = np.empty((len(values) // self.interval + 2 + SLOTS, 1 + 6 * GYROS))
         filled = _advance(values, self.came, self.size, self._state, out, taught)
         self.came += len(values)
         for k in range(filled):

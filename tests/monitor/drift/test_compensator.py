@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from monitor.drift.arma import Arma
-from monitor.drift.compensator import REMEMBERED, Compensator
+from monitor.drift.compensator import REMEMBERED, SLOTS, Compensator
 from monitor.drift.sage_husa import LEFT_OUT, NOT_SEEN, STEPPED, USED
 
 RATE_HZ = 100.0
@@ -119,6 +119,19 @@ def test_gaps_outliers_and_missing_values():
         one.identify()
         np.testing.assert_array_equal(np.isfinite(out), np.isfinite(values))
     np.testing.assert_allclose(one.bias, 0.02, atol=1e-3)
+
+
+def test_all_intervals_that_a_hole_ends_at_once_find_room():
+    """Compiled code writes where it is told to: what has no room would be written beside it."""
+    rng = np.random.default_rng(0)
+    most = 0
+    for rate_hz in (10.0, 333.0, 1000.0):
+        one = Compensator(rate_hz)
+        for lost in rng.integers(0, 20_000, 200):
+            n = int(rng.integers(1, 600))
+            one.update(1e-3 * rng.standard_normal((n, 6)), int(lost))
+            most = max(most, len(one.take()) - n // one.interval)
+    assert 2 < most <= 2 + SLOTS
 
 
 def test_models_are_identified_as_rest_goes_on_and_memory_stays():
