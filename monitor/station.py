@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
+import msgspec
 import numpy as np
 
 from drivers.clock import Before, SampleClock
@@ -158,6 +159,7 @@ class Station:
         self._latencies: list[float] = []
         self._started_s = time.monotonic()
         self._no_estimate = ""  # why there can be none
+        self._before = State()  # what was known before a restart
         self._happened: list[Event] = []
         self._tail: Tail | None = None  # of the recording, that the window is rebuilt from first
         self._since: list[float | None] = [None] * len(AXES)  # Unix s, where the samples of an axis count from
@@ -316,7 +318,9 @@ class Station:
             self._happened.append(Event("window_rebuilt", time.monotonic_ns(), text))
             return
         self.clock.resume(Before(t_ns, int(newest.ticks[-1]), rate, state.tick_step))
-        self._tail = tail
+        self._tail, self._before = tail, state
+        if self._recorder is not None:
+            self._recorder.know(self.name, state)  # the next restart may come before anything else is known
 
     def _rebuild(self, tail: Tail) -> None:
         """What the samples of the last window would have made of it, but for what was told of them then."""
@@ -360,8 +364,9 @@ class Station:
 
     def _known(self) -> State:
         """What goes into the recording beside the samples."""
-        if self.estimator is None:
-            return State(tick_step=self.clock.tick_step)
+        if self.estimator is None or self._tail is not None:
+            rate_hz, tick_step = self.clock.rate_hz or self._before.rate, self.clock.tick_step or self._before.tick_step
+            return msgspec.structs.replace(self._before, rate=rate_hz, tick_step=tick_step)
         entered, theta = self.estimator.fitted()
         sizes = [None if np.isnan(size) else float(size) for size in theta.ravel()]
         return State(
@@ -382,6 +387,8 @@ class Station:
     def _push(self, samples: SampleBlock) -> None:
         """Called by the reader's thread. A sensor is never kept waiting; a recording waits for room."""
         if self._recorder is not None:
+            if self.estimator is None:  # a crash may come before the first report
+                self._recorder.know(self.name, self._known())
             self._recorder.samples(self.name, samples, self._offset_ns())
             while self._patient and self._recorder.full(self.name):
                 time.sleep(PATIENCE_S)
