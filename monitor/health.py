@@ -24,3 +24,4 @@ class Health:
     late: int = 0  # samples that came when their place had passed as missing, left out
     moving: bool = False  # the device is moved just now
     moved: int = 0  # samples of moving stretches
+    crossed: tuple[str, ...] = ()  # the user's limits that are passed now: "gz N"

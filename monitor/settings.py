@@ -5,10 +5,13 @@ known one. Links and decoders bring their own keys: their modules' ``Settings`` 
 and ``[device.driver.decoder_options]``. Relative paths are relative to the configuration file.
 """
 
+import dataclasses
+import os
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
@@ -21,11 +24,15 @@ from drivers.decoders.base import Addressed, Decoder
 from drivers.driver import AxisMap, axis_map
 from drivers.errors import ConfigError
 from drivers.links.base import Filtering, Link, LinkSettings
+from drivers.sample import AXES, KINDS
 from monitor.tables import (
     DeviceTable,
     FaultsTable,
     FileTable,
+    HookTable,
+    LimitTable,
     LogTable,
+    MetricsTable,
     StorageTable,
     ViewerTable,
     VirtualTable,
@@ -39,7 +46,10 @@ __all__ = [
     "Device",
     "DeviceTable",
     "FaultsTable",
+    "Hook",
+    "Limit",
     "LogTable",
+    "Metrics",
     "Storage",
     "ViewerTable",
     "VirtualTable",
@@ -65,7 +75,20 @@ THERMAL_LONGEST_S: Final = 86400.0
 SEGMENT_S: Final = (10.0, 86400.0)
 DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
 IS_ENDPOINT: Final = re.compile(r"[a-z]+/.+")
+LISTEN: Final = re.compile(r"(\[[0-9a-fA-F:]+\]|[\w.-]+):([0-9]{1,5})")
 MEMORY: Final = re.compile(r"[0-9]+(\.[0-9]+)?\s*([kMGT]?i?B|%)")
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """What one coefficient of some axes must not pass; SI unit of letter and axis."""
+
+    axes: tuple[str, ...]
+    letter: str
+    above: float | None
+    below: float | None
+    times_model: float | None  # instead of above
+    hold_s: float  # that it has to be beyond, or back
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +112,26 @@ class Device:
     reconcile_folder: Path | None = None  # where reports are kept
     thermal_s: float | None = 600.0  # of the means that are held against temperature; None: they are not
     compensate: bool = True  # take the gyros' drift out of a copy of the samples
+    limits: tuple[Limit, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Hook:
+    """What events of some kinds, of some devices, set off: a command, a message, or both."""
+
+    on: frozenset[str]
+    devices: frozenset[str]  # none: all
+    command: tuple[str, ...]
+    key: str | None
+    timeout_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Metrics:
+    """Where Prometheus finds the numbers."""
+
+    host: str
+    port: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +156,12 @@ class Config:
     viewer: ViewerTable
     log: LogTable
     storage: Storage | None = None
+    hooks: tuple[Hook, ...] = ()
+    metrics: Metrics | None = None
+    path: Path | None = None  # of the file
+    table: Mapping[str, Any] = dataclasses.field(
+        default_factory=dict
+    )  # as it stands in the file, for a reload to compare
 
 
 def load(path: Path) -> Config:
@@ -142,7 +191,9 @@ def read(path: Path) -> tuple[Config | None, list[str]]:
         return None, [f"{path}: not TOML: {error}"]
     reader = _Reader(path.resolve().parent)
     config = reader.config(table)
-    return (None if reader.wrong else config), [f"{path}: {line}" for line in reader.wrong]
+    if config is None or reader.wrong:
+        return None, [f"{path}: {line}" for line in reader.wrong]
+    return replace(config, path=path, table=table), []
 
 
 class _Reader:
@@ -173,12 +224,71 @@ class _Reader:
         if zenoh is not None:
             self._reachable(zenoh)
         storage = self._storage(file.storage)
+        hooks = self._hooks(file.hook, [str(name) for name in names], zenoh is not None and zenoh.mode == "none")
+        metrics = self._metrics(file.metrics)
         if zenoh is None or viewer is None or log is None:
             return None
         if viewer.mode.endswith(".rrd"):
             path = self._folder / Path(viewer.mode).expanduser()
             viewer = msgspec.structs.replace(viewer, mode=str(path))
-        return Config(tuple(device for device in devices if device is not None), zenoh, viewer, log, storage)
+        known = tuple(device for device in devices if device is not None)
+        return Config(known, zenoh, viewer, log, storage, hooks, metrics)
+
+    def _limits(self, tables: list[dict[str, Any]], has_model: bool, at: str) -> tuple[Limit, ...]:
+        filled = [(self.fill(LimitTable, one, f"{at}[{i}]"), f"{at}[{i}]") for i, one in enumerate(tables)]
+        limits = []
+        for table, here in filled:
+            if table is None:
+                continue
+            axes = self._try(f"{here}.axes", _axes, table.axes)
+            hold_s = self._try(f"{here}.hold", seconds, table.hold)
+            if self._bounds(table, has_model, here) and axes and hold_s:
+                limits.append(Limit(axes, table.letter, table.above, table.below, table.times_model, hold_s))
+        return tuple(limits)
+
+    def _bounds(self, table: LimitTable, has_model: bool, at: str) -> bool:
+        """Whether the bounds of a limit fit each other."""
+        before = len(self.wrong)
+        if table.above is None and table.below is None and table.times_model is None:
+            self.wrong.append(f"{at}: no bound; add above, below or times_model")
+        if table.above is not None and table.times_model is not None:
+            self.wrong.append(f"{at}: above and times_model are two words for one bound; leave one out")
+        if table.above is not None and table.below is not None and table.below >= table.above:
+            self.wrong.append(f"{at}: below {table.below:g} is not under above {table.above:g}: nothing lies between")
+        if table.times_model is not None and not has_model:
+            self.wrong.append(f"{at}.times_model: the device has no model to be relative to; add model")
+        return len(self.wrong) == before
+
+    def _hooks(self, tables: list[dict[str, Any]], devices: list[str], no_zenoh: bool) -> tuple[Hook, ...]:
+        hooks = []
+        for i, one in enumerate(tables):
+            at = f"hook[{i}]"
+            table = self.fill(HookTable, one, at)
+            timeout_s = None if table is None else self._try(f"{at}.timeout", seconds, table.timeout)
+            if table is None or timeout_s is None:
+                continue
+            for key, said, known in (("on", table.on, (*KINDS, "*")), ("devices", table.devices, devices)):
+                for word in (word for word in said if word not in known):
+                    self.wrong.append(f'{at}.{key}: unknown "{word}"{plugin.nearest(word, known)}')
+            if not table.on:
+                self.wrong.append(f'{at}.on: empty; write kinds of events, or ["*"]')
+            if not table.command and table.key is None:
+                self.wrong.append(f"{at}: nothing to do; add command or key")
+            if table.key is not None and no_zenoh:
+                self.wrong.append(f'{at}.key: zenoh.mode is "none", so nothing can be put there')
+            command = self._try(f"{at}.command", _command, table.command, self._folder)
+            hooks.append(Hook(frozenset(table.on), frozenset(table.devices), command or (), table.key, timeout_s))
+        return tuple(hooks)
+
+    def _metrics(self, keys: Mapping[str, Any]) -> Metrics | None:
+        table = self.fill(MetricsTable, keys, "metrics")
+        if table is None or table.listen is None:
+            return None
+        match = LISTEN.fullmatch(table.listen)
+        if match is None or not 0 < int(match[2]) < 65536:
+            self.wrong.append(f'metrics.listen: "{table.listen}" is no host and port; write "127.0.0.1:9464"')
+            return None
+        return Metrics(match[1].strip("[]"), int(match[2]))
 
     def _storage(self, keys: Mapping[str, Any]) -> Storage | None:
         """None where nothing is to be kept, or a key is wrong."""
@@ -225,11 +335,12 @@ class _Reader:
         model = None if entry.model is None else self._try(f"{at}: model", model_path, entry.model, self._folder)
         tau = entry.tau if isinstance(entry.tau, str) else tuple(entry.tau)
         self._try(f"{at}: tau", _possible_tau, tau, window_s, entry.rate)
+        limits = self._limits(entry.limit, entry.model is not None, f"{at}: limit")
         silence_s = float(entry.driver.get("silence", LinkSettings().silence))
         return Device(
             entry.name, entry.rate, window_s, tau, refit_s, publish_s, link, decoder, axes, silence_s,
             entry.motion == "leave out", entry.alarms_per_day, entry.restart, model,
-            entry.reconcile_folder, thermal_s, entry.compensate,
+            entry.reconcile_folder, thermal_s, entry.compensate, limits,
         )  # fmt: skip
 
     def driver(self, table: Mapping[str, Any], at: str) -> tuple[Link | VirtualTable | None, Decoder | None]:
@@ -448,6 +559,33 @@ def _possible_tau(tau: str | tuple[float, ...], window_s: float, rate_hz: float 
     if not any(0.5 * shortest_s < one <= 0.5 * window_s for one in tau):
         low = f"{shortest_s:g} s, one sample," if rate_hz else "one sample"
         raise ConfigError(f"none of {list(tau)} s lies between {low} and {window_s / 2:g} s, half the window")
+
+
+def _axes(pattern: str) -> tuple[str, ...]:
+    """Axes of a name or "g*", "a*", "*".
+
+    >>> _axes("g*"), _axes("az")
+    (('gx', 'gy', 'gz'), ('az',))
+    """
+    if pattern in (*AXES, "g*", "a*", "*"):
+        return tuple(axis for axis in AXES if fnmatch(axis, pattern))
+    raise ConfigError(f'"{pattern}"; possible are {", ".join(AXES)}, g*, a*, *')
+
+
+def _command(words: list[str], folder: Path) -> tuple[str, ...]:
+    """A program and its arguments; a relative path begins at ``folder``."""
+    if not words:
+        return ()
+    if "/" not in words[0]:
+        raise ConfigError(f'"{words[0]}" is no path; write where the program is, e.g. "/usr/bin/{words[0]}"')
+    if any("\0" in word for word in words):
+        raise ConfigError("a word with a NUL character cannot be handed to a program")
+    path = folder / Path(words[0]).expanduser()
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such file")
+    if not os.access(path, os.X_OK):
+        raise ConfigError(f"{path}: not executable; chmod +x it")
+    return (str(path), *words[1:])
 
 
 def _narrow(link: object, decoder: object) -> None:

@@ -35,6 +35,7 @@ from monitor.estimate.total import TotalCurve
 from monitor.estimate.watch import Watch
 from monitor.health import Health
 from monitor.identifier import Identifier
+from monitor.limits import Limits
 from monitor.recorder import Recorder, Tail
 from monitor.ring import RingBuffer
 from monitor.settings import Device
@@ -138,6 +139,7 @@ class Station:
         self._model = None if device.model is None else read_model(device.model)
         self._in_force: ModelInForce | None = None
         self._agreement = Agreement()
+        self._limits = Limits(device.limits, self._model)
         self.thermal: LiveThermal | None = None
         self._looks: list[ThermalLook] = []  # not published yet
         self._handled = 0  # as often as the watch has said it
@@ -246,6 +248,16 @@ class Station:
             return None
         return self.estimator.held(), self._temperatures.newest(self.estimator.filled)
 
+    def limit(self, device: Device) -> None:
+        """From now on the limits of these settings, which are otherwise those that it runs with.
+
+        Raises:
+            ConfigError: a limit that cannot be
+        """
+        limits = Limits(device.limits, self._model)
+        limits.take_over(self._limits)
+        self.device, self._limits = device, limits
+
     def announce(self, outputs: Sequence[Output], kind: str, text: str) -> None:
         """An event that happened outside of the samples, now."""
         self._tell(outputs, [Event(kind, self._newest_ns, text)])
@@ -289,6 +301,7 @@ class Station:
             late=self.clock.late,
             moving=self.watch is not None and self.watch.moving,
             moved=self.watch.moved_samples if self.watch is not None else 0,
+            crossed=self._limits.crossed,
         )
 
     def unix_s(self, t_ns: int) -> float:
@@ -523,6 +536,7 @@ class Station:
             output.estimate(self.name, self.unix_s(self.latest.t_ns), self.latest)
         if self._in_force is not None:
             self._publish_gap(outputs, self._in_force.look(self.latest))
+        self._tell(outputs, self._limits.update(self.latest))
         return True
 
     def _publish_gap(self, outputs: Sequence[Output], look: ModelGap) -> None:

@@ -44,6 +44,7 @@ class StatusMessage(msgspec.Struct, frozen=True):
     overflowed: int = 0
     latency: Latency = Latency()
     outputs: dict[str, str] = {}
+    crossed: tuple[str, ...] = ()
     text: str = ""
 
 
@@ -140,7 +141,8 @@ class Heard:
         if status is None or state != "running":
             return 1
         well = all(output in QUIET or output.startswith("ok,") for output in status.outputs.values())
-        return 2 if well and not status.text and not status.overflowed and not self.disagreements() else 1
+        well &= not status.text and not status.overflowed and not status.crossed
+        return 2 if well and not self.disagreements() else 1
 
     def trouble(self) -> str:
         """What is wrong, in words; empty while all is well."""
@@ -151,6 +153,8 @@ class Heard:
         said += [f"{clean(name)}: {clean(state)}" for name, state in outputs if state not in QUIET]
         if self.status.overflowed:
             said.append(f"{self.status.overflowed:,} samples overwritten before they were used: too slow here")
+        if self.status.crossed:
+            said.append(f"beyond its limit: {', '.join(clean(one) for one in self.status.crossed)}")
         return "; ".join([*said, *self.disagreements()])
 
     def disagreements(self) -> list[str]:

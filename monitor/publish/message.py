@@ -172,6 +172,7 @@ def status(device: str, unix_s: float, health: Health) -> bytes:
         "late": health.late,
         "moving": health.moving,
         "moved": health.moved,
+        "crossed": health.crossed,
         "text": health.text,
     }
     return _encode(topics.STATUS, device, unix_s, health.received, payload)
