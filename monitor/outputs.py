@@ -66,8 +66,8 @@ class ZenohOutput(Output):
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """One event."""
-        since_s = None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
-        self._zenoh.put(topics.EVENT, device, message.event(device, unix_s, received, event, since_s))
+        payload = message.event(device, unix_s, received, event, message.since_s(unix_s, event))
+        self._zenoh.put(topics.EVENT, device, payload)
 
     def health(self, device: str, unix_s: float, health: Health) -> None:
         """Status."""

@@ -16,6 +16,7 @@ import structlog
 from drivers.links.replay_link import ReplayLink
 from monitor.drift import compensator, heat
 from monitor.estimate.estimator import warm_up
+from monitor.hooks import Hooks
 from monitor.live_reconcile import Job, Reconciler
 from monitor.outputs import TableOutput, ViewerOutput, ZenohOutput
 from monitor.publish import message
@@ -61,7 +62,8 @@ class Service:
         self.zenoh = ZenohOut(config.zenoh, [station.name for station in self.stations])
         self.view = _viewer(config)
         self._page = ""  # where the viewer's page is, as it was said last
-        self.outputs: list[Output] = [ZenohOutput(self.zenoh), *more]
+        self.hooks = Hooks(config.hooks, self.zenoh.put_on)
+        self.outputs: list[Output] = [ZenohOutput(self.zenoh), self.hooks, *more]
         if self.view is not None:
             recorded = {station.name for station in self.stations if station.driver.times_are_unix}
             self.outputs.append(ViewerOutput(self.view, recorded))
@@ -123,6 +125,8 @@ class Service:
             states["viewer"] = self.view.state
         if self.recorder is not None:
             states["recording"] = self.recorder.state
+        if self.hooks.hooks:
+            states["hook"] = self.hooks.state
         return states
 
     def _rebuild(self) -> None:
@@ -223,6 +227,7 @@ class Service:
             self._tell_reconciled()
             if self.recorder is not None:
                 self.recorder.close()
+            self.hooks.close()
             if self.view is not None:
                 self.view.close()
             self.zenoh.close()
