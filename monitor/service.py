@@ -2,12 +2,13 @@
 
 ``Service.loop`` is a corridor: take, update, publish, for each device in turn; it decides nothing. It sleeps until a
 reader has pushed samples. An output that cannot start or does not keep up is shown in the status of every device;
-samples go on. Stopping: readers first, then what is in the rings is worked off and published, then the outputs close.
+samples go on. systemd, where it asks, is told once all outputs are up or were tried. Stopping: readers first, then what
+is in the rings is worked off and published, then the outputs close.
 """
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -16,6 +17,7 @@ import structlog
 from drivers.links.replay_link import ReplayLink
 from monitor.drift import compensator, heat
 from monitor.estimate.estimator import warm_up
+from monitor.health import Health, sentence
 from monitor.hooks import Hooks
 from monitor.live_reconcile import Job, Reconciler
 from monitor.outputs import TableOutput, ViewerOutput, ZenohOutput
@@ -25,6 +27,7 @@ from monitor.publish.zenoh_out import Command, ZenohOut
 from monitor.recorder import Recorder, origin
 from monitor.settings import Config, Device, VirtualTable
 from monitor.station import Output, Ready, Station
+from monitor.systemd import Unit
 from monitor.virtual import VirtualImu
 
 if TYPE_CHECKING:
@@ -34,6 +37,10 @@ IDLE_S: Final = 0.05
 PACE_S: Final = 0.02
 """Between two rounds where no device wants every block published."""
 STATUS_S: Final = 1.0
+STARTING: Final = ("not open yet", "starting")
+"""What outputs say that were not tried yet."""
+READY_S: Final = 30.0
+"""The service counts as started after so long, whatever its outputs do."""
 JOIN_S: Final = 3.0
 
 _log = structlog.get_logger("imu-monitor")
@@ -46,12 +53,21 @@ class Service:
         config: what to run
         more: further outputs, e.g. the table in the terminal
         reconciler: runs ``command/reconcile``
+        unit: where systemd is told how it goes
     Raises:
         ConfigError: a simulated sensor or a model in force that cannot be
     """
 
-    def __init__(self, config: Config, more: Sequence[Output] = (), reconciler: Reconciler | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        more: Sequence[Output] = (),
+        reconciler: Reconciler | None = None,
+        unit: Unit | None = None,
+    ) -> None:
         self.config = config
+        self._unit = unit or Unit()
+        self._started_s = time.monotonic()
         self._reconciler = reconciler or Reconciler()
         self._wake = threading.Event()
         self._ready = Ready()
@@ -164,8 +180,18 @@ class Service:
         self._tell_recording()
         states, memory = self.states(), memory_bytes()
         self._tell_page()
-        for station in self.stations:
-            station.report(self.outputs, states, memory)
+        healths = {station.name: station.report(self.outputs, states, memory) for station in self.stations}
+        self._tell_unit(healths, states)
+
+    def _tell_unit(self, healths: Mapping[str, Health], states: Mapping[str, str]) -> None:
+        """systemd: whether all is up, how it goes, and that the readers move on."""
+        now_s = time.monotonic()
+        tried = not any(state in STARTING for state in states.values()) or now_s - self._started_s > READY_S
+        if tried and not self._unit.told_ready:
+            self._unit.ready()
+        turns = {station.name: station.turns for station in self.stations}
+        stuck = self._unit.alive({name: count for name, count in turns.items() if count is not None}, now_s)
+        self._unit.status(sentence(healths, states, stuck))
 
     def _tell_recording(self) -> None:
         stations = {station.name: station for station in self.stations}
@@ -220,6 +246,7 @@ class Service:
             stations[finished.device].announce(self.outputs, "reconciled", finished.text)
 
     def _close(self) -> None:
+        self._unit.stopping()
         try:
             self._drain()
         finally:

@@ -209,6 +209,11 @@ class Station:
             return False
         return not self._pieces and (not self._waiting_since_ns or self.clock.rate_hz is None)
 
+    @property
+    def turns(self) -> int | None:
+        """Of its reader, see ``Driver.turns``; None where it may stand still: a recording waits for room, and ends."""
+        return None if self._patient or self.driver.state == "ended" else self.driver.turns
+
     # --- one round
 
     def work(self, outputs: Sequence[Output], now_s: float, drain: bool = False) -> None:

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import signal
 import sys
 from collections.abc import Callable
@@ -27,12 +28,15 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
     from monitor.outputs import LogOutput, TableOutput
     from monitor.publish.terminal import Board
     from monitor.service import Service
+    from monitor.systemd import Unit
 
+    unit = Unit.of(os.environ)
     config = _with_viewer(config, viewer)
     _log_as(config)
     console, board = Console(), Board()
     live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
-    service = Service(config, [TableOutput(board, live)] if live else [TableOutput(board), LogOutput()])
+    shown = [TableOutput(board, live)] if live else [TableOutput(board), LogOutput()]
+    service = Service(config, shown, unit=unit)
     on_signals(service.stop)
     with live or nullcontext():
         service.run(seconds)
