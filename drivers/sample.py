@@ -115,6 +115,9 @@ KINDS: Final = (
     "reconciled",
     "limit_crossed",
     "limit_back",
+    "window_rebuilt",
+    "recording_stopped",
+    "recording_back",
 )
 """Of an ``Event``: what a hook may wait for."""
 

@@ -135,6 +135,10 @@ class LogOutput(Output):
             say = _log.info if health.state in ("running", "ended") and not health.text else _log.warning
             say("status", device=device, state=health.state, text=health.text, received=health.received)
 
+    def gone(self, device: str) -> None:
+        """Its state is news again, should it come back."""
+        self._said.pop(device, None)
+
 
 class TableOutput(Output):
     """Results as the table in the terminal, drawn once a second: the one that ``watch`` shows of other processes."""
@@ -171,3 +175,9 @@ class TableOutput(Output):
             self.board.take(topics.GAP.key(PREFIX, device), message.gap(device, *self._gaps.pop(device)))
         if self._live is not None:
             self._live.update(self.board.table(time.monotonic()), refresh=True)
+
+    def gone(self, device: str) -> None:
+        """No row."""
+        self._latest.pop(device, None)
+        self._gaps.pop(device, None)
+        self.board.forget(topics.STATUS.key(PREFIX, device))

@@ -8,24 +8,29 @@ is in the rings is worked off and published, then the outputs close.
 
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import structlog
 
+from drivers.errors import ConfigError
 from drivers.links.replay_link import ReplayLink
+from drivers.recording.segment import Origin
+from monitor import reload
 from monitor.drift import compensator, heat
 from monitor.estimate.estimator import warm_up
 from monitor.health import Health, sentence
 from monitor.hooks import Hooks
 from monitor.live_reconcile import Job, Reconciler
+from monitor.logs import LEVEL
 from monitor.outputs import TableOutput, ViewerOutput, ZenohOutput
 from monitor.publish import message
 from monitor.publish.viewer import DeviceInfo, ViewerSettings
 from monitor.publish.zenoh_out import Command, ZenohOut
 from monitor.recorder import Recorder, origin
-from monitor.settings import Config, Device, VirtualTable
+from monitor.reload import Change
+from monitor.settings import Config, Device, Storage, VirtualTable
 from monitor.station import Output, Ready, Station
 from monitor.systemd import Unit
 from monitor.virtual import VirtualImu
@@ -72,23 +77,29 @@ class Service:
         self._wake = threading.Event()
         self._ready = Ready()
         self._stop = threading.Event()
+        self._reload_asked = False
         self.virtual: dict[str, VirtualImu] = {}
         self.recorder = _recorder(config)
-        self.stations = [self._station(device) for device in config.devices]
+        self.stations: list[Station] = []
+        self._recorded: set[str] = set()  # devices whose times are not the host's
+        for device in config.devices:
+            self._take_on(*self._built(device))
         self.zenoh = ZenohOut(config.zenoh, [station.name for station in self.stations])
         self.view = _viewer(config)
         self._page = ""  # where the viewer's page is, as it was said last
         self.hooks = Hooks(config.hooks, self.zenoh.put_on)
         self.outputs: list[Output] = [ZenohOutput(self.zenoh), self.hooks, *more]
         if self.view is not None:
-            recorded = {station.name for station in self.stations if station.driver.times_are_unix}
-            self.outputs.append(ViewerOutput(self.view, recorded))
-        every_block = any(device.publish_s == 0.0 for device in config.devices)
-        self._pace_s = 0.0 if every_block else PACE_S
+            self.outputs.append(ViewerOutput(self.view, self._recorded))
 
     def stop(self) -> None:
         """Ask the loop to end; may be called from another thread."""
         self._stop.set()
+        self._wake.set()
+
+    def reload(self) -> None:
+        """Ask the loop to read the configuration again; may be called from another thread."""
+        self._reload_asked = True
         self._wake.set()
 
     def run(self, seconds: float | None = None) -> None:
@@ -110,16 +121,14 @@ class Service:
             station.start()
         if self.recorder is not None:
             self.recorder.start()
-            threading.Thread(target=self._rebuild, name="rebuild", daemon=True).start()
+            threading.Thread(target=self._rebuild, args=(self.stations,), name="rebuild", daemon=True).start()
 
     def loop(self, until_s: float | None) -> None:
         """Rounds over all devices; status once a second."""
         status_s = 0.0
         while not self._stop.is_set():
             now_s = time.monotonic()
-            for station in self.stations:
-                station.work(self.outputs, now_s)
-                self.zenoh.alive(station.name, station.driver.state == "running")
+            self._work(now_s)
             self._answer()
             self._tell_reconciled()
             if now_s >= status_s:
@@ -129,10 +138,18 @@ class Service:
                 return
             if all(station.ended for station in self.stations):
                 return
+            if self._reload_asked:
+                self._reload_asked = False
+                self._reload()
             self._wake.wait(IDLE_S)
             self._wake.clear()
-            if self._pace_s:
-                self._stop.wait(self._pace_s)
+            if not any(station.device.publish_s == 0.0 for station in self.stations):
+                self._stop.wait(PACE_S)
+
+    def _work(self, now_s: float) -> None:
+        for station in self.stations:
+            station.work(self.outputs, now_s)
+            self.zenoh.alive(station.name, station.driver.state == "running")
 
     def states(self) -> dict[str, str]:
         """Output -> "ok" or what is wrong with it."""
@@ -145,10 +162,10 @@ class Service:
             states["hook"] = self.hooks.state
         return states
 
-    def _rebuild(self) -> None:
+    def _rebuild(self, stations: Sequence[Station]) -> None:
         """Windows from the recording, as soon as that can be computed."""
         self._ready.all.wait()
-        for station in self.stations:
+        for station in stations:
             station.rebuild()
 
     def _warm_up(self) -> None:
@@ -168,13 +185,93 @@ class Service:
                 kernels.set()
             self._wake.set()
 
-    def _station(self, device: Device) -> Station:
-        link = device.link
+    def _built(self, device: Device) -> tuple[Station, VirtualImu | None]:
+        """A device, and the sensor where it is simulated; nothing of it is open."""
+        link, imu = device.link, None
         if isinstance(link, VirtualTable):
             imu = VirtualImu(link, device.decoder, device.name)
-            self.virtual[device.name] = imu
             link = imu.link
-        return Station(device, link, device.decoder, self._wake, self._ready, self.recorder)
+        return Station(device, link, device.decoder, self._wake, self._ready, self.recorder), imu
+
+    def _take_on(self, station: Station, imu: VirtualImu | None) -> None:
+        self.stations = [*self.stations, station]
+        if station.driver.times_are_unix:
+            self._recorded.add(station.name)
+        if imu is not None:
+            self.virtual[station.name] = imu
+
+    # --- another configuration
+
+    def _reload(self) -> None:
+        """What another reading of the file changes; where anything is wrong with it, nothing."""
+        self._unit.reloading()
+        try:
+            change = reload.change(self.config, {station.name: station.model for station in self.stations})
+            built = [self._built(device) for device in change.added]
+        except ConfigError as error:
+            _log.error("not reloaded, all goes on as it was", error=str(error))
+        else:
+            self._apply(change, built)
+            (_log.warning if change.restart else _log.info)("reloaded", text=change.text())
+        if self._unit.told_ready:
+            self._unit.ready()
+
+    def _apply(self, change: Change, built: Sequence[tuple[Station, VirtualImu | None]]) -> None:
+        leaving = [station for station in self.stations if station.name in change.removed]
+        for station in leaving:
+            station.stop()  # all at once: each may take a moment
+        for station in leaving:
+            self._remove(station)
+        for device in change.limited:
+            next(station for station in self.stations if station.name == device.name).limit(device)
+        self.config = change.config
+        self.hooks.hooks = change.config.hooks
+        LEVEL.name = change.config.log.level
+        for station, imu in built:
+            self._take_on(station, imu)
+        order = [device.name for device in change.config.devices]
+        self.stations.sort(key=lambda station: order.index(station.name))
+        if self.view is not None:
+            self.view.show(_shown(change.config.devices))
+        for station, imu in built:
+            self._add(station, imu)
+
+    def _add(self, station: Station, imu: VirtualImu | None) -> None:
+        """Start a device while the others run."""
+        self.zenoh.add(station.name)
+        if self.recorder is not None:
+            self.recorder.add(_origins(self.config.storage, station.device))
+        if imu is not None:
+            imu.start()
+        station.start()
+        if self.recorder is not None:
+            threading.Thread(target=self._rebuild, args=([station],), name="rebuild", daemon=True).start()
+
+    def _remove(self, station: Station) -> None:
+        """Part with a device that was asked to stop, and publish what it still brought, while the others run."""
+        if station.name in self.virtual:
+            self.virtual.pop(station.name).stop()
+        if not self._meanwhile(lambda: station.join(0.0) and not station.rebuilding):
+            _log.warning("reader did not end in time", device=station.name)
+        station.work(self.outputs, time.monotonic(), drain=True)
+        self.stations = [one for one in self.stations if one is not station]
+        self.zenoh.remove(station.name)
+        if self.recorder is not None:
+            self.recorder.remove(station.name)
+            self._meanwhile(lambda: self.recorder is None or not self.recorder.has(station.name))
+        self._recorded.discard(station.name)
+        for output in self.outputs:
+            output.gone(station.name)
+
+    def _meanwhile(self, done: Callable[[], bool]) -> bool:
+        """Go on with all devices until something is done, JOIN_S at most; whether it is."""
+        until_s = time.monotonic() + JOIN_S
+        while not (ended := done()) and time.monotonic() < until_s:
+            self._work(time.monotonic())
+            time.sleep(PACE_S)
+        return ended
+
+    # --- telling
 
     def _report(self) -> None:
         self._tell_recording()
@@ -196,7 +293,8 @@ class Service:
     def _tell_recording(self) -> None:
         stations = {station.name: station for station in self.stations}
         for told in self.recorder.take() if self.recorder is not None else ():
-            stations[told.device].announce(self.outputs, told.kind, told.text)
+            if told.device in stations:
+                stations[told.device].announce(self.outputs, told.kind, told.text)
 
     def _tell_page(self) -> None:
         """Say where the viewer's page is, once for each place; a window needs no address."""
@@ -216,7 +314,10 @@ class Service:
         stations = {station.name: station for station in self.stations}
         while not self.zenoh.commands.empty():
             command = self.zenoh.commands.get_nowait()
-            self._obey(command, stations[command.device])
+            if command.device in stations:
+                self._obey(command, stations[command.device])
+            else:
+                command.refuse("the device was taken out of the configuration")
 
     def _obey(self, command: Command, station: Station) -> None:
         match command.verb:
@@ -243,7 +344,8 @@ class Service:
     def _tell_reconciled(self) -> None:
         stations = {station.name: station for station in self.stations}
         for finished in self._reconciler.take():
-            stations[finished.device].announce(self.outputs, "reconciled", finished.text)
+            if finished.device in stations:
+                stations[finished.device].announce(self.outputs, "reconciled", finished.text)
 
     def _close(self) -> None:
         self._unit.stopping()
@@ -279,16 +381,17 @@ class Service:
 
 
 def _recorder(config: Config) -> Recorder | None:
-    """What is wanted of the recording; a replay is one already."""
     storage = config.storage
-    if storage is None:
-        return None
-    devices = [device for device in config.devices if not isinstance(device.link, ReplayLink)]
-    origins = [origin(device.name, device.axes) for device in devices] if storage.record else []
-    if storage.raw:
-        carriers = [device.decoder.carrier for device in devices]
-        origins += [origin(one.name, one.axes, "raw", carrier) for one, carrier in zip(devices, carriers, strict=True)]
-    return Recorder(storage, origins) if origins else None
+    origins = [one for device in config.devices for one in _origins(storage, device)]
+    return Recorder(storage, origins) if storage is not None and origins else None
+
+
+def _origins(storage: Storage | None, device: Device) -> list[Origin]:
+    """What of a device is wanted in the recording; a replay is one already."""
+    if storage is None or isinstance(device.link, ReplayLink):
+        return []
+    origins = [origin(device.name, device.axes)] if storage.record else []
+    return origins + ([origin(device.name, device.axes, "raw", device.decoder.carrier)] if storage.raw else [])
 
 
 def memory_bytes() -> int:
@@ -312,13 +415,16 @@ def _viewer(config: Config) -> "RerunView | None":
     from monitor.publish.rerun_view import RerunView
 
     own = config.viewer
-    devices = [
+    return RerunView(ViewerSettings(own.mode, own.port, own.web_port, own.memory), _shown(config.devices))
+
+
+def _shown(devices: Sequence[Device]) -> list[DeviceInfo]:
+    return [
         DeviceInfo(
             device.name, _about(device), device.model is not None, device.thermal_s is not None, device.compensate
         )
-        for device in config.devices
+        for device in devices
     ]
-    return RerunView(ViewerSettings(own.mode, own.port, own.web_port, own.memory), devices)
 
 
 def _about(device: Device) -> str:

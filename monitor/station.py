@@ -101,6 +101,9 @@ class Output:
     def health(self, device: str, unix_s: float, health: Health) -> None:
         """Once a second."""
 
+    def gone(self, device: str) -> None:
+        """The device was taken out of the configuration; one of its name may come again."""
+
 
 class Station:
     """One device of the service.
@@ -136,10 +139,10 @@ class Station:
         self.estimator: Estimator | None = None
         self.watch: Watch | None = None
         self.latest: Estimate | None = None
-        self._model = None if device.model is None else read_model(device.model)
+        self.model = None if device.model is None else read_model(device.model)
         self._in_force: ModelInForce | None = None
         self._agreement = Agreement()
-        self._limits = Limits(device.limits, self._model)
+        self._limits = Limits(device.limits, self.model)
         self.thermal: LiveThermal | None = None
         self._looks: list[ThermalLook] = []  # not published yet
         self._handled = 0  # as often as the watch has said it
@@ -191,6 +194,11 @@ class Station:
         finally:
             self._tail = None
             self._wake.set()
+
+    @property
+    def rebuilding(self) -> bool:
+        """Whether the window is still being filled from the recording."""
+        return self._tail is not None
 
     def stop(self) -> None:
         """Stop reading; what is in the ring stays there to be worked off."""
@@ -259,7 +267,7 @@ class Station:
         Raises:
             ConfigError: a limit that cannot be
         """
-        limits = Limits(device.limits, self._model)
+        limits = Limits(device.limits, self.model)
         limits.take_over(self._limits)
         self.device, self._limits = device, limits
 
@@ -448,8 +456,8 @@ class Station:
                 every_sample = self.device.refit_s == 0.0
                 self.estimator = Estimator(rate, self.device.window_s, self.device.tau, every_sample)
                 self._temperatures = Temperatures(self.estimator.length)
-                if self._model is not None:
-                    self._in_force = ModelInForce(self._model, self.estimator.length)
+                if self.model is not None:
+                    self._in_force = ModelInForce(self.model, self.estimator.length)
             except ConfigError as error:  # a list of τ that does not fit the rate found; samples go on
                 self._no_estimate = f"no estimate: {error}"
                 return

@@ -37,7 +37,8 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
     live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
     shown = [TableOutput(board, live)] if live else [TableOutput(board), LogOutput()]
     service = Service(config, shown, unit=unit)
-    on_signals(service.stop)
+    # in a terminal it means that the terminal is closed
+    on_signals(service.stop, service.stop if live else service.reload)
     with live or nullcontext():
         service.run(seconds)
     if live is not None or seconds is not None:
@@ -79,21 +80,25 @@ def _log_as(config: "Config") -> None:
 
     import structlog
 
+    from monitor.logs import LEVEL
+
     json = config.log.format == "json"
+    LEVEL.name = config.log.level
     structlog.configure(
         processors=[
+            LEVEL,
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
             structlog.processors.JSONRenderer() if json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
         ],
-        wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, config.log.level.upper())),
+        wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG),
         logger_factory=structlog.PrintLoggerFactory(cast("TextIO", _Lines())),
         cache_logger_on_first_use=True,
     )
 
 
-def on_signals(stop: Callable[[], None]) -> None:
-    """First SIGINT or SIGTERM: stop in order. A second SIGINT ends at once."""
+def on_signals(stop: Callable[[], None], hung_up: Callable[[], None] | None = None) -> None:
+    """First SIGINT or SIGTERM: stop in order. A second SIGINT ends at once. SIGHUP: what it means here, if anything."""
     import threading
 
     def first(number: int, _frame: Any) -> None:
@@ -103,6 +108,9 @@ def on_signals(stop: Callable[[], None]) -> None:
 
     signal.signal(signal.SIGINT, first)
     signal.signal(signal.SIGTERM, first)
+    if hung_up is not None:
+        call = hung_up  # in a thread, as above
+        signal.signal(signal.SIGHUP, lambda *_: threading.Thread(target=call, name="hung up", daemon=True).start())
 
 
 def end_on_sigterm() -> None:

@@ -82,11 +82,23 @@ class _Device:
 class Scene:
     """Draws on one stream. Not thread-safe; see the module about blocking."""
 
-    def __init__(self, stream: rr.RecordingStream, devices: Sequence[tuple[str, str]]) -> None:
+    def __init__(self, stream: rr.RecordingStream, devices: Sequence[tuple[str, str]] = ()) -> None:
         """``devices``: name and a few words about each."""
         self._stream = stream
         self._devices = {name: _Device(about) for name, about in devices}
+        self._shown = set(self._devices)
         self._healths: dict[str, Health] = {}
+
+    def show(self, devices: Sequence[tuple[str, str]]) -> None:
+        """From now on these devices; those that it knows go on as they are.
+
+        What still comes of one that is not among them any more is drawn.
+        """
+        self._shown = {name for name, _ in devices}
+        self._healths = {name: health for name, health in self._healths.items() if name in self._shown}
+        for name, about in devices:
+            self._devices.setdefault(name, _Device(about)).about = about
+        self.open()
 
     def open(self) -> None:
         """What does not change: names, colours and widths of the lines."""
@@ -175,17 +187,18 @@ class Scene:
         self._at(wall_s)
         level, at = LEVELS.get(event.kind, "INFO"), _clock_time(wall_s)
         self._stream.log(f"{device}/events", rr.TextLog(f"{at}  {event.text}", level=level))
-        if len(self._devices) > 1:
+        if len(self._shown) > 1:
             self._stream.log("overview/events", rr.TextLog(f"{at}  {device}: {event.text}", level=level))
         self._mark(device, wall_s, event)
 
     def health(self, device: str, wall_s: float, health: Health) -> None:
         """The health panel of the device, and its row in the overview."""
         self._at(wall_s)
-        self._healths[device] = health
+        if device in self._shown:
+            self._healths[device] = health
         about = self._devices[device].about
         self._stream.log(f"{device}/status", _markdown(health_text(device, health, about)))
-        if len(self._devices) > 1:
+        if len(self._shown) > 1:
             self._stream.log("overview", _markdown(overview_text(self._healths)))
 
     def _style_axis(self, device: str, axis: str) -> None:

@@ -136,6 +136,10 @@ class RerunView:
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
         self._thread.start()
 
+    def show(self, devices: Sequence[DeviceInfo]) -> None:
+        """From now on these devices; to be called before anything is said of a new one."""
+        self._devices = tuple(devices)
+
     def samples(self, device: str, wall_s: Floats, values: Floats, temperature_c: Floats) -> None:
         """Samples at Unix times ``wall_s`` [n]: [n, 6] rad/s and m/s², [n] °C; NaN = not measured."""
         weight = wall_s.nbytes + values.nbytes + temperature_c.nbytes
@@ -227,36 +231,44 @@ class RerunView:
 
     def _show(self, settings: ViewerSettings) -> None:
         """One viewer, from opening to its end."""
-        from monitor.publish import rerun_blueprint, rerun_scene, rerun_sinks
+        from monitor.publish import rerun_scene, rerun_sinks
 
         output = rerun_sinks.open_output(settings, self._recording_id, self._closing.is_set)
         self._child, self._url = output.child, output.url
         try:
-            names = [(d.name, d.about) for d in self._devices]
-            scene = rerun_scene.Scene(output.stream, names)
-            self._inside_since = time.monotonic()
-            rerun_blueprint.send(
-                output.stream,
-                [d.name for d in self._devices],
-                [d.name for d in self._devices if d.has_model],
-                [d.name for d in self._devices if d.has_thermal],
-                [d.name for d in self._devices if d.compensated],
-            )
-            scene.open()
-            self._phase = "ok"
+            scene = rerun_scene.Scene(output.stream)
             self._draw(output, scene)
         finally:
             self._child = None
             output.close()
 
+    def _lay_out(self, output: "Output", scene: "Scene", devices: Sequence[DeviceInfo]) -> None:
+        """A place for each device."""
+        from monitor.publish import rerun_blueprint
+
+        rerun_blueprint.send(
+            output.stream,
+            [d.name for d in devices],
+            [d.name for d in devices if d.has_model],
+            [d.name for d in devices if d.has_thermal],
+            [d.name for d in devices if d.compensated],
+        )
+        scene.show([(d.name, d.about) for d in devices])
+        self._phase = "ok"
+
     def _draw(self, output: "Output", scene: "Scene") -> None:
         """Draw what comes until closed or nobody looks any more."""
-        queue = _Pending(plot_every_s=max(1.0, len(self._devices) / PLOTS_PER_S))
+        queue = _Pending(plot_every_s=1.0)
+        shown: tuple[DeviceInfo, ...] | None = None
         checked = time.monotonic()
         while True:
             closing = self._closing.is_set()
-            queue.add(self._backlog.take(0.0))
+            queue.add(self._backlog.take(0.0))  # before it is asked which devices there are: none is unknown then
             self._inside_since = time.monotonic()
+            if self._devices is not shown:
+                shown = self._devices
+                queue.plot_every_s = max(1.0, len(shown) / PLOTS_PER_S)
+                self._lay_out(output, scene, shown)
             queue.draw(scene, everything=closing)
             now = time.monotonic()
             if closing or now - checked > CHECK_EVERY_S:

@@ -54,6 +54,8 @@ class ZenohOut:
         self._session: zenoh.Session | None = None
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._tokens: dict[str, Any] = {}
+        self._queryables: dict[str, Any] = {}
+        self._declaring = threading.Lock()  # the opener declares all devices, the loop those that come or go
         self._showing = threading.Lock()  # the opener and the loop both show who is alive
         self._opener = threading.Thread(target=self._open_until_open, name="zenoh open", daemon=True)
         self._takers: list[threading.Thread] = []
@@ -111,6 +113,27 @@ class ZenohOut:
             self._alive[device] = flowing
             self._show_alive(device)
 
+    def add(self, device: str) -> None:
+        """Publish another device too."""
+        with self._declaring:
+            self._devices += (device,)
+            self._alive[device] = False
+            if self._session is not None:
+                with contextlib.suppress(*_zenoh_errors()):  # the session is being closed
+                    self._declare(self._session, device)
+
+    def remove(self, device: str) -> None:
+        """Take a device's keys away."""
+        self.alive(device, False)
+        with self._declaring, contextlib.suppress(*_zenoh_errors()):  # the session is being closed
+            self._devices = tuple(one for one in self._devices if one != device)
+            del self._alive[device]
+            keys = {topic.key(self.settings.prefix, device) for topic in topics.TOPICS}
+            gone = [self._publishers[key] for key in keys & self._publishers.keys()]
+            self._publishers = {key: one for key, one in self._publishers.items() if key not in keys}
+            for one in [*gone, *filter(None, [self._queryables.pop(device, None)])]:
+                one.undeclare()
+
     def close(self) -> None:
         """Close the session, which takes away tokens, and end the threads."""
         atexit.unregister(self.close)
@@ -138,7 +161,7 @@ class ZenohOut:
     def _end(self) -> None:
         """Close the session, which ends the threads that take from it."""
         session, self._session = self._session, None
-        self._publishers = {}
+        self._publishers, self._queryables = {}, {}
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
         with self._showing:
@@ -149,17 +172,20 @@ class ZenohOut:
 
     def _open(self) -> None:
         session, said = self._open_session()
-        self._session = session
-        publishers = {}
-        for device in self._devices:
-            for topic in topics.TOPICS:
-                if topic.when not in ("presence", "query"):
-                    key = topic.key(self.settings.prefix, device)
-                    publishers[key] = self._publisher(session, topic, key)
-            self._declare_commands(session, device)
-        self._publishers, self._said = publishers, said
-        for device in self._devices:
-            self._show_alive(device)
+        with self._declaring:
+            self._session = session
+            for device in self._devices:
+                self._declare(session, device)
+            self._said = said
+
+    def _declare(self, session: "zenoh.Session", device: str) -> None:
+        """All keys of a device."""
+        keys = {topic: topic.key(self.settings.prefix, device) for topic in topics.TOPICS}
+        published = {topic: key for topic, key in keys.items() if topic.when not in ("presence", "query")}
+        new = {key: self._publisher(session, topic, key) for topic, key in published.items()}
+        self._declare_commands(session, device)
+        self._publishers = {**self._publishers, **new}
+        self._show_alive(device)
 
     def _open_session(self) -> tuple["zenoh.Session", str]:
         """The session; on a busy port with any free one, and what to say of it."""
@@ -220,7 +246,8 @@ class ZenohOut:
             target=self._take_queries, args=(device, queryable), name=f"commands of {device}", daemon=True
         )
         taker.start()
-        self._takers.append(taker)
+        self._queryables[device] = queryable
+        self._takers = [*(one for one in self._takers if one.is_alive()), taker]
 
     def _take_queries(self, device: str, queryable: Any) -> None:
         """Queries until the session is closed."""
