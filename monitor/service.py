@@ -24,6 +24,7 @@ from monitor.health import Health, sentence
 from monitor.hooks import Hooks
 from monitor.live_reconcile import Job, Reconciler
 from monitor.logs import LEVEL
+from monitor.metrics import MetricsOutput
 from monitor.outputs import TableOutput, ViewerOutput, ZenohOutput
 from monitor.publish import message
 from monitor.publish.viewer import DeviceInfo, ViewerSettings
@@ -89,6 +90,9 @@ class Service:
         self._page = ""  # where the viewer's page is, as it was said last
         self.hooks = Hooks(config.hooks, self.zenoh.put_on)
         self.outputs: list[Output] = [ZenohOutput(self.zenoh), self.hooks, *more]
+        self.metrics = None if config.metrics is None else MetricsOutput(config.metrics)
+        if self.metrics is not None:
+            self.outputs.append(self.metrics)
         if self.view is not None:
             self.outputs.append(ViewerOutput(self.view, self._recorded))
 
@@ -113,6 +117,8 @@ class Service:
 
     def _start(self) -> None:
         self.zenoh.start()
+        if self.metrics is not None:
+            self.metrics.start()
         if self.view is not None:
             self.view.start()
         for imu in self.virtual.values():
@@ -158,6 +164,8 @@ class Service:
             states["viewer"] = self.view.state
         if self.recorder is not None:
             states["recording"] = self.recorder.state
+        if self.metrics is not None:
+            states["metrics"] = self.metrics.state
         if self.hooks.hooks:
             states["hook"] = self.hooks.state
         return states
@@ -357,6 +365,8 @@ class Service:
             if self.recorder is not None:
                 self.recorder.close()
             self.hooks.close()
+            if self.metrics is not None:
+                self.metrics.close()
             if self.view is not None:
                 self.view.close()
             self.zenoh.close()
