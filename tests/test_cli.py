@@ -26,7 +26,7 @@ from monitor.cli import main
 from monitor.settings import CONFIG_FOLDER, load
 
 PROGRAM = [sys.executable, "-m", "monitor.cli"]
-COMMANDS = ("demo", "run", "check", "watch", "analyze", "simulate", "reconcile", "export")
+COMMANDS = ("demo", "run", "check", "doctor", "watch", "analyze", "simulate", "reconcile", "export")
 RATE_HZ = 100.0
 DEVICE = '[[device]]\nname = "bench-1"\n'
 VIRTUAL = DEVICE + 'driver = { link = "virtual" }\n'
@@ -248,6 +248,7 @@ WRONG_ARGUMENTS = {
     "missing argument": (("analyze",), "Missing argument 'RECORDING'"),
     "missing configuration": (("run",), "Missing argument 'CONFIG.toml'"),
     "nothing to check": (("check",), "--print-defaults"),
+    "findings nowhere": (("doctor", "--json", "nowhere/x.json"), "--json: nowhere/x.json: cannot be written"),
     "missing file": (("run", "nowhere.toml"), "nowhere.toml: no such file"),
     "folder for a file": (("run", "."), ".: cannot be read"),
     "bad viewer": (("demo", "--viewer", "nativ"), '--viewer: "nativ"; possible are auto, native, web, none'),

@@ -16,7 +16,7 @@ import typer
 from typer.exceptions import TyperException
 
 from drivers.errors import ConfigError, ImuError, NotReady, RecordingError
-from monitor.cli import drift, options, output, serving
+from monitor.cli import doctor, drift, options, output, serving
 
 # before NumPy is imported: matrices are small here and threads of our own share the work, where more would only spin
 for _pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -105,6 +105,9 @@ def check(
         raise typer.Exit(WRONG)
     count = len(found.devices) if found else 0
     typer.echo(f"{config}: {count} device{'s' if count != 1 else ''}, nothing wrong")
+
+
+app.command()(doctor.doctor)
 
 
 @app.command()
