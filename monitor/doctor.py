@@ -29,8 +29,7 @@ from typing import Any, Final, Literal
 from drivers.errors import ConfigError
 from drivers.links.replay_link import ReplayLink
 from monitor import settings
-from monitor.catalogue import read_model
-from monitor.limits import bounds
+from monitor.limits import model_of
 from monitor.settings import Config, Storage
 
 Mark = Literal["well", "doubt", "wrong"]
@@ -91,9 +90,9 @@ def read(path: Path) -> tuple[Config | None, list[Finding]]:
     config, wrong = settings.read(path)
     for one in config.devices if config else ():
         try:
-            bounds(one.limits, None if one.model is None else read_model(one.model))
+            model_of(one)
         except ConfigError as error:
-            wrong.append(f"{path}: device {one.name}: {error}")
+            wrong.append(f"{path}: {error}")
     if wrong or config is None:
         return None, [Finding("wrong", "configuration", line) for line in wrong]
     count = len(config.devices)

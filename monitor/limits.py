@@ -18,11 +18,12 @@ from typing import Final
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Event
+from monitor.catalogue import read_model
 from monitor.estimate.coefficients import LETTERS, Status
 from monitor.estimate.estimate import Estimate
 from monitor.export.noise import from_model
 from monitor.noise.model import NoiseModel
-from monitor.settings import Limit
+from monitor.settings import Device, Limit
 from monitor.units import COEFFICIENT_NAMES, kind_of, unit_of
 
 CROSSED: Final = "limit_crossed"
@@ -107,6 +108,20 @@ class Limits:
             return None
         state.crossed, state.since = not state.crossed, None
         return _event(bound, seen, state.crossed, estimate.t_ns, since_ns)
+
+
+def model_of(device: Device) -> NoiseModel | None:
+    """The model in force, where there is one; its limits can be held against it.
+
+    Raises:
+        ConfigError: there is none at its place, it is none, or a limit is relative to what it does not have
+    """
+    model = None if device.model is None else read_model(device.model)
+    try:
+        bounds(device.limits, model)
+    except ConfigError as error:
+        raise ConfigError(f"device {device.name}: {error}") from None
+    return model
 
 
 def bounds(limits: Sequence[Limit], model: NoiseModel | None) -> list[Bound]:

@@ -12,8 +12,7 @@ from typing import Any, Final
 
 from drivers.errors import ConfigError
 from monitor import settings
-from monitor.catalogue import read_model
-from monitor.limits import bounds
+from monitor.limits import model_of
 from monitor.noise.model import NoiseModel
 from monitor.settings import Config, Device
 
@@ -61,8 +60,7 @@ def change(running: Config, models: Mapping[str, NoiseModel | None]) -> Change:
     old_tables, new_tables = _by_name(running.table), _by_name(new.table)
     added, limited = [], []
     for device in new.devices:
-        model = None if device.model is None else read_model(device.model)
-        bounds(device.limits, model)
+        model = model_of(device)
         before, now = old_tables.get(device.name), new_tables[device.name]
         if before is None or _without_limits(before) != _without_limits(now) or models.get(device.name) != model:
             added.append(device)

@@ -22,7 +22,6 @@ from drivers.links.base import Link
 from drivers.links.replay_link import ReplayLink
 from drivers.recording.segment import State
 from drivers.sample import AXES, Chunk, Event, Floats, SampleBlock, block, unbroken
-from monitor.catalogue import read_model
 from monitor.drift.live import LiveThermal, ThermalLook
 from monitor.drift.live_compensation import DriftLook, LiveCompensation
 from monitor.estimate.agreement import Agreement
@@ -35,7 +34,7 @@ from monitor.estimate.total import TotalCurve
 from monitor.estimate.watch import Watch
 from monitor.health import Health
 from monitor.identifier import Identifier
-from monitor.limits import Limits
+from monitor.limits import Limits, model_of
 from monitor.recorder import Recorder, Tail
 from monitor.ring import RingBuffer
 from monitor.settings import Device
@@ -139,7 +138,7 @@ class Station:
         self.estimator: Estimator | None = None
         self.watch: Watch | None = None
         self.latest: Estimate | None = None
-        self.model = None if device.model is None else read_model(device.model)
+        self.model = model_of(device)
         self._in_force: ModelInForce | None = None
         self._agreement = Agreement()
         self._limits = Limits(device.limits, self.model)

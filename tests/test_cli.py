@@ -212,6 +212,16 @@ def test_check_reads_the_effects_of_a_simulated_device_too(call: Call) -> None:
         assert 'effect "gz.sinusoidal:amplitude=1,frequency=60": ' in said.only_line()
 
 
+def test_check_holds_limits_against_the_model_too(call: Call) -> None:
+    limit = '[[device.limit]]\naxes = "gz"\nletter = "R"\ntimes_model = 2.0\n'
+    device = DEVICE + 'model = "consumer-mems"\n' + limit + '[device.driver]\nlink = "virtual"\n'
+    Path("c.toml").write_text(device + QUIET)
+    for command in ("check", "run"):
+        said = call(command, "c.toml")
+        assert said.status == 2
+        assert "device bench-1: limit of R: times_model = 2, but the model in force has no R on gz" in said.only_line()
+
+
 @pytest.mark.parametrize("name", sorted(path.name for path in CONFIG_FOLDER.glob("*.toml")))
 def test_check_accepts_every_shipped_file(call: Call, recording: Path, name: str) -> None:
     shutil.copy(CONFIG_FOLDER / name, name)

@@ -82,7 +82,7 @@ def check(
 ) -> None:
     """Read the file and say all that is wrong with it; opens nothing."""
     from monitor import settings
-    from monitor.catalogue import read_model
+    from monitor.limits import model_of
     from monitor.virtual import Sensor
 
     if print_defaults:
@@ -93,12 +93,12 @@ def check(
     found, wrong = settings.read(config)
     for device in found.devices if found else ():
         try:
-            if device.model is not None:
-                read_model(device.model)
+            model_of(device)
             if isinstance(device.link, settings.VirtualTable):
                 Sensor(device.link, device.decoder, device.name)
         except ConfigError as error:
-            wrong.append(f"{config}: device {device.name}: {error}")
+            at = f"device {device.name}: "
+            wrong.append(f"{config}: {at}{str(error).removeprefix(at)}")
     for line in wrong:
         typer.echo(line, err=True)
     if wrong:

@@ -1,11 +1,17 @@
 """A sensor's noise rises past the user's limit: an event, a command that is handed it, a message on the user's key."""
 
 import json
+import re
 import sys
+import urllib.request
 from pathlib import Path
 
+import pytest
+
+pytest.importorskip("prometheus_client", reason="prometheus-client is not installed")
+
 from tests.monitor.publish.zenoh_world import free_endpoint, session
-from tests.walk.rig import Caught, running, wait_for
+from tests.walk.rig import Caught, free_port, running, wait_for
 
 RATE_HZ = 100.0
 AT_S = 60.0
@@ -34,6 +40,8 @@ key = "site/alarms"
 listen = ["{endpoint}"]
 [viewer]
 mode = "none"
+[metrics]
+listen = "127.0.0.1:{port}"
 """
 TELL = """
 import os, sys
@@ -46,7 +54,7 @@ def test_noise_that_rises_past_a_limit_is_told_to_the_users_program(tmp_path: Pa
     tell, out, endpoint = tmp_path / "tell", tmp_path / "event.json", free_endpoint()
     tell.write_text(f"#!{sys.executable} -S\n{TELL}")
     tell.chmod(0o755)
-    config = CONFIG.format(at_s=AT_S, out=out, endpoint=endpoint)
+    config = CONFIG.format(at_s=AT_S, out=out, endpoint=endpoint, port=(port := free_port()))
     with running(tmp_path, config, caught := Caught()) as service:
         wait_for(lambda: service.service.zenoh.state == "ok", 20.0, "zenoh")
         with session(connect=[endpoint]) as listener:
@@ -55,7 +63,11 @@ def test_noise_that_rises_past_a_limit_is_told_to_the_users_program(tmp_path: Pa
             wait_for(out.exists, 60.0, "the hook")
             wait_for(lambda: bool(heard), 20.0, "the message")
         wait_for(lambda: caught.healths["bench"].crossed == ("gz N",), 20.0, "the status")
-    assert caught.healths["bench"].outputs["hook"] == "ok"
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=30.0) as answer:
+            numbers = answer.read().decode()
+    assert (caught.healths["bench"].outputs["hook"], caught.healths["bench"].outputs["metrics"]) == ("ok", "ok")
+    assert 'imu_monitor_limits_crossed{device="bench"} 1.0' in numbers
+    assert re.search(r'imu_monitor_coefficient_lo\{axis="gz",device="bench",letter="N"\} \d', numbers)
     crossed = [event for _, event in caught.events if event.kind == "limit_crossed"]
     assert [event.axis for event in crossed] == ["gz"]
     told = json.loads(out.read_text())
