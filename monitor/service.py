@@ -18,6 +18,7 @@ from drivers.errors import ConfigError
 from drivers.links.replay_link import ReplayLink
 from drivers.recording.segment import Origin
 from monitor import reload
+from monitor.chain import Ready
 from monitor.drift import compensator, heat
 from monitor.estimate.estimator import warm_up
 from monitor.health import Health, sentence
@@ -32,7 +33,7 @@ from monitor.publish.zenoh_out import Command, ZenohOut
 from monitor.recorder import Recorder, origin
 from monitor.reload import Change
 from monitor.settings import Config, Device, Storage, VirtualTable
-from monitor.station import Output, Ready, Station
+from monitor.station import Output, Station
 from monitor.systemd import Unit
 from monitor.virtual import VirtualImu
 

@@ -188,7 +188,8 @@ def _tell(service: Service, wire: Wire, course: Course, took_s: float, store: Pa
     names = ("memory MB", "descriptors", "threads", "store MB")
     for at, name in enumerate(names):
         print(f"{name}: most before the half {early[at]:.1f}, after it {late[at]:.1f}")
-    print(f"last estimate over {service.stations[0].estimator.filled if service.stations[0].estimator else 0} samples")
+    estimator = service.stations[0].chain.estimator
+    print(f"the window holds {estimator.filled if estimator is not None else 0} samples")
 
 
 def _sum(counts: Counts, truth: Truth) -> int:
