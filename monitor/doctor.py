@@ -44,6 +44,7 @@ TIME_ERROR: Final = 5
 """What adjtimex(2) returns while nothing keeps the clock."""
 CAN_TYPE: Final = "280"
 """ARPHRD_CAN, in /sys/class/net/NAME/type."""
+LAST_PORT: Final = 65535
 UNIT: Final = "imu-monitor.service"
 PACKAGE: Final = "imu-monitor"
 PROJECT: Final = Path(__file__).resolve().parent.parent / "pyproject.toml"
@@ -222,15 +223,18 @@ def free(about: str, endpoint: str) -> list[Finding]:
     match = TCP.fullmatch(endpoint)
     if match is None:
         return [Finding("well", about, f"{endpoint}: not tried, only TCP ports can be from here")]
+    if int(match[2]) > LAST_PORT:
+        return [Finding("wrong", about, f"{endpoint}: cannot be listened on: ports end at {LAST_PORT}")]
     try:
         family = socket.AF_INET6 if ":" in match[1] else socket.AF_INET
         with socket.create_server((match[1], int(match[2])), family=family):
             return [Finding("well", about, f"{endpoint}: free to listen on")]
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
+    except (OSError, UnicodeError) as error:
+        if getattr(error, "errno", None) == errno.EADDRINUSE:
             text = f"{endpoint}: another program listens there"
             return [Finding("doubt", about, text, "well if it is this service; else end it or name another port")]
-        return [Finding("wrong", about, f"{endpoint}: cannot be listened on: {error.strerror or error}")]
+        why = getattr(error, "strerror", None) or error
+        return [Finding("wrong", about, f"{endpoint}: cannot be listened on: {why}")]
 
 
 def reachable(about: str, endpoint: str) -> list[Finding]:
@@ -238,11 +242,13 @@ def reachable(about: str, endpoint: str) -> list[Finding]:
     match = TCP.fullmatch(endpoint)
     if match is None:
         return [Finding("well", about, f"{endpoint}: not tried, only TCP can be from here")]
+    if int(match[2]) > LAST_PORT:
+        return [Finding("wrong", about, f"{endpoint}: nobody answers: ports end at {LAST_PORT}")]
     try:
         with socket.create_connection((match[1], int(match[2])), timeout=CONNECT_S):
             return [Finding("well", about, f"{endpoint}: somebody answers")]
-    except OSError as error:
-        text = f"{endpoint}: nobody answers: {error.strerror or error}"
+    except (OSError, UnicodeError) as error:
+        text = f"{endpoint}: nobody answers: {getattr(error, 'strerror', None) or error}"
         return [Finding("doubt", about, text, "start it, or look at cables and firewalls; the service tries again")]
 
 

@@ -128,12 +128,13 @@ class Hooks(Output):
         return may
 
     def _start(self, job: _Job) -> None:
-        if not self._threads:
-            self._threads = [
-                threading.Thread(target=self._take, name=f"hooks {i}", daemon=True) for i in range(AT_ONCE)
-            ]
-            for thread in self._threads:
+        try:
+            while len(self._threads) < AT_ONCE:
+                thread = threading.Thread(target=self._take, name=f"hooks {len(self._threads)}", daemon=True)
                 thread.start()
+                self._threads.append(thread)
+        except RuntimeError as error:  # the system gives no more threads
+            self._told(job.hook.command[0], f"cannot be started: {error}")
         try:
             self._jobs.put_nowait(job)
         except queue.Full:
@@ -171,19 +172,31 @@ def run(hook: Hook, payload: bytes, named: Mapping[str, str], ending: Callable[[
         )
     except (OSError, ValueError) as error:
         return f"cannot be started: {getattr(error, 'strerror', None) or error}"
-    until_s = time.monotonic() + hook.timeout_s
-    with _Pipes(process, payload) as pipes:
-        while process.poll() is None:
-            pipes.move()
-            if time.monotonic() > until_s or ending():
-                os.killpg(process.pid, signal.SIGKILL)  # not waited for yet: the number is still its own
-                process.wait()
-                return "killed, as the service ended" if ending() else f"killed after {hook.timeout_s:g} s"
-        if process.returncode == 0:
-            return ""
-        pipes.drain()
-        how = f"signal {-process.returncode}" if process.returncode < 0 else f"exit status {process.returncode}"
-        return f"{how}{pipes.last_line()}"
+    try:
+        with _Pipes(process, payload) as pipes:
+            return _followed(process, pipes, hook.timeout_s, ending)
+    except OSError as error:  # out of file descriptors
+        return f"killed: {error.strerror or error}"
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)  # not waited for yet: the number is still its own
+            process.wait()
+
+
+def _followed(process: "subprocess.Popen[bytes]", pipes: "_Pipes", timeout_s: float, ending: Callable[[], bool]) -> str:
+    """To its end, or until it is to be killed; "" or what went wrong."""
+    until_s = time.monotonic() + timeout_s
+    while process.poll() is None:
+        pipes.move()
+        if ending():
+            return "killed, as the service ended"
+        if time.monotonic() > until_s:
+            return f"killed after {timeout_s:g} s"
+    if process.returncode == 0:
+        return ""
+    pipes.drain()
+    how = f"signal {-process.returncode}" if process.returncode < 0 else f"exit status {process.returncode}"
+    return f"{how}{pipes.last_line()}"
 
 
 class _Pipes:

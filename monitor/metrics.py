@@ -8,6 +8,7 @@ are SI; a coefficient that the data only bound has ``hi`` and no value, one with
 
 import socketserver
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from http.server import BaseHTTPRequestHandler
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 RETRY_S: Final = 5.0
 TIMEOUT_S: Final = 10.0
 AT_ONCE: Final = 8
+PAUSE_S: Final = 0.1
 PATH: Final = "/metrics"
 MISSING: Final = 'prometheus-client is not installed: pip install "imu-monitor[metrics]"'
 STATES: Final = ("running", "waiting", "lost", "ended")
@@ -131,9 +133,9 @@ class MetricsOutput(Output):
         while not self._closing.is_set():
             try:
                 server = _Server((self._settings.host, self._settings.port), registry)
-            except OSError as error:
+            except (OSError, UnicodeError) as error:
                 where = f"{self._settings.host}:{self._settings.port}"
-                self.state = f"{where}: {error.strerror or error}; trying again"
+                self.state = f"{where}: {getattr(error, 'strerror', None) or error}; trying again"
                 self._closing.wait(RETRY_S)
                 continue
             with server:
@@ -159,12 +161,24 @@ class _Server(socketserver.ThreadingTCPServer):
             self.address_family = socket.AF_INET6
         super().__init__(address, _Scrape)
 
+    def get_request(self) -> Any:
+        """The next; where there are no file descriptors for it, not at full speed again and again."""
+        try:
+            return super().get_request()
+        except OSError:
+            time.sleep(PAUSE_S)
+            raise
+
     def process_request(self, request: Any, client_address: Any) -> None:
         """A thread, or the door where too many are inside."""
-        if self.room.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
+        if not self.room.acquire(blocking=False):
             self.shutdown_request(request)
+            return
+        try:
+            super().process_request(request, client_address)
+        except RuntimeError:  # the system gives no more threads
+            self.room.release()
+            raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         """In the thread."""

@@ -196,6 +196,13 @@ def test_ports_that_are_taken_and_routers_that_do_not_answer_are_told(tmp_path: 
     assert one_of(found, "metrics").mark == "doubt"
 
 
+@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:99999", f"tcp/{'a' * 70}.example:1", "tcp/192.0.2.1:7447"])
+def test_an_address_that_cannot_be_listened_on_is_wrong(endpoint: str) -> None:
+    (found,) = doctor.free("zenoh", endpoint)
+    assert found.mark == "wrong"
+    assert found.text.startswith(f"{endpoint}: cannot be listened on: ")
+
+
 def test_what_listens_beyond_this_machine_without_protection_is_told(tmp_path: Path) -> None:
     text = (
         VIRTUAL + '[zenoh]\nlisten = ["tcp/0.0.0.0:0"]\n[viewer]\nmode = "none"\n[metrics]\nlisten = "0.0.0.0:9464"\n'
