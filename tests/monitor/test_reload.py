@@ -12,13 +12,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 from structlog.testing import capture_logs
 
 from drivers.errors import ConfigError
+from drivers.sample import Event
 from monitor import reload, settings
 from monitor.catalogue import read_model
+from monitor.outputs import TableOutput
+from monitor.publish.terminal import Board
 from monitor.service import Service
 from monitor.station import Output
+from tests.monitor.publish import made
 from tests.monitor.publish.zenoh_world import eventually, free_endpoint, session
 from tests.monitor.test_systemd import Listening
 
@@ -219,3 +224,42 @@ def test_a_hang_up_reloads_and_systemd_is_told(tmp_path: Path) -> None:
     order = [line.partition("=")[0] for line in systemd.heard if not line.startswith(("STATUS=", "WATCHDOG="))]
     again = ["RELOADING", "MONOTONIC_USEC", "READY"]
     assert order == ["READY", *again, *again, "STOPPING"]
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc")
+def test_reloads_leave_nothing_behind(tmp_path: Path) -> None:
+    """Descriptors and threads of a device that comes and goes."""
+    path, rest = tmp_path / "c.toml", f'[zenoh]\nlisten = ["{free_endpoint()}"]\n[viewer]\nmode = "none"\n'
+    path.write_text(device("stays") + device("a") + rest)
+    with running(path) as service:
+        eventually(lambda: service.zenoh.state == "ok" and all(one.published > 50 for one in service.stations), 90.0)
+        most = (0, 0)
+        for i in range(8):
+            name = "ba"[i % 2]
+            path.write_text(device("stays") + device(name) + rest)
+            service.reload()
+            eventually(
+                lambda name=name: service.stations[-1].name == name and service.stations[-1].published > 50, 30.0
+            )
+            if i == 1:
+                most = in_use()
+            elif i > 1:
+                eventually(lambda: all(now <= then for now, then in zip(in_use(), most, strict=True)))
+
+
+def in_use() -> tuple[int, int]:
+    """Descriptors and threads of this process."""
+    return len(os.listdir("/proc/self/fd")), threading.active_count()
+
+
+def test_a_device_that_is_gone_has_no_row() -> None:
+    board = Board()
+    table = TableOutput(board)
+    for name in ("first", "second"):
+        table.health(name, 0.0, made.health())
+        table.event(name, 0.0, 1, Event("moved", 0, f"{name} was moved"))
+    table.gone("first")
+    with (console := Console(width=200)).capture() as captured:
+        console.print(board.table(0.0))
+    assert "second was moved" in captured.get()
+    assert "first" not in captured.get()
