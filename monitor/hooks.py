@@ -81,10 +81,10 @@ class Hooks(Output):
     @property
     def state(self) -> str:
         """``ok``, or what went wrong with the newest run."""
-        said = [f"{self._wrong} ({self._failed} failed since the start)"] if self._wrong else []
-        if self._held_back:
-            said.append(f"{self._held_back} held back, too many at once")
-        return "; ".join(said) or "ok"
+        held_back = f"{self._held_back} held back, too many at once" if self._held_back else ""
+        if self._wrong:
+            return "; ".join(filter(None, [f"{self._wrong} ({self._failed} failed since the start)", held_back]))
+        return f"ok, but {held_back}" if held_back else "ok"
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Set off what waits for this."""

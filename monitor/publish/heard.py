@@ -20,6 +20,8 @@ QUIET: Final = ("ok", "off")
 """States of an output that need no word."""
 GONE_S: Final = 2.0
 """The liveliness token is away and no status (1 Hz) came for so long."""
+NAMED: Final = 6
+"""Of the limits that are passed."""
 SILENT_S: Final = 5.0
 """The token is there, or was never seen, and nothing came for so long."""
 
@@ -153,8 +155,9 @@ class Heard:
         said += [f"{clean(name)}: {clean(state)}" for name, state in outputs if state not in QUIET]
         if self.status.overflowed:
             said.append(f"{self.status.overflowed:,} samples overwritten before they were used: too slow here")
-        if self.status.crossed:
-            said.append(f"beyond its limit: {', '.join(clean(one) for one in self.status.crossed)}")
+        if crossed := self.status.crossed:
+            more = f" and {len(crossed) - NAMED} more" if len(crossed) > NAMED else ""
+            said.append(f"beyond its limit: {', '.join(clean(one) for one in crossed[:NAMED])}{more}")
         return "; ".join([*said, *self.disagreements()])
 
     def disagreements(self) -> list[str]:

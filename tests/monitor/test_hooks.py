@@ -143,7 +143,7 @@ def test_a_flood_is_held_back_and_does_not_drown_what_is_rare() -> None:
         running.happen()
         assert len(running.sent) == BURST + 1
         assert json.loads(running.sent[-1][1])["kind"] == "limit_crossed"
-        assert running.hooks.state == f"{1000 - BURST} held back, too many at once"
+        assert running.hooks.state == f"ok, but {1000 - BURST} held back, too many at once"
         running.now_s = 2.5 * EVERY_S
         for _ in range(10):
             running.happen(Event("samples_lost", 0, "1 sample missing"))

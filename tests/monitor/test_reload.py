@@ -244,7 +244,7 @@ def test_reloads_leave_nothing_behind(tmp_path: Path) -> None:
             if i == 1:
                 most = in_use()
             elif i > 1:
-                eventually(lambda: all(now <= then for now, then in zip(in_use(), most, strict=True)))
+                eventually(lambda most=most: all(now <= then for now, then in zip(in_use(), most, strict=True)))
 
 
 def in_use() -> tuple[int, int]:
