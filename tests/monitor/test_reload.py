@@ -138,7 +138,7 @@ def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None
         stations = {station.name: station for station in service.stations}
         eventually(lambda: all(station.published > 300 for station in service.stations), 90.0)
         eventually(lambda: service.zenoh.state == "ok" and service.view is not None and service.view.state == "ok")
-        ring, estimator = stations["stays"].ring, stations["stays"].estimator
+        ring, estimator = stations["stays"].ring, stations["stays"].chain.estimator
         path.write_text(device("stays") + device("comes") + device("changes", 'publish = "5 Hz"') + rest)
         with session(connect=[endpoint]) as listener:
             heard: dict[str, list[Any]] = {}
@@ -161,7 +161,7 @@ def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None
             assert not [one for one in listener.get("imu/goes/command/reset", timeout=5.0) if one.ok is not None]
         new = {station.name: station for station in service.stations}
         assert new["stays"] is stations["stays"]
-        assert (new["stays"].ring, new["stays"].estimator) == (ring, estimator)
+        assert (new["stays"].ring, new["stays"].chain.estimator) == (ring, estimator)
         assert new["stays"].driver.counts.lost == 0
         assert new["changes"] is not stations["changes"]
         # what was recorded of it is in its window again
