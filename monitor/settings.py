@@ -8,10 +8,10 @@ and ``[device.driver.decoder_options]``. Relative paths are relative to the conf
 import dataclasses
 import os
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
+from math import inf
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
@@ -22,9 +22,10 @@ import drivers.links
 from drivers import plugin
 from drivers.decoders.base import Addressed, Decoder
 from drivers.driver import AxisMap, axis_map
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, in_one_line
 from drivers.links.base import Filtering, Link, LinkSettings
 from drivers.sample import AXES, KINDS
+from monitor import toml
 from monitor.tables import (
     DeviceTable,
     FaultsTable,
@@ -72,6 +73,7 @@ WINDOW_LONGEST_S: Final = 40 * 86400.0
 THERMAL_SAMPLES: Final = 8
 """In an interval at the least: its scatter tells how well its mean is known."""
 THERMAL_LONGEST_S: Final = 86400.0
+RATES_HZ: Final = (1e-9, 1e9)
 SEGMENT_S: Final = (10.0, 86400.0)
 DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
 IS_ENDPOINT: Final = re.compile(r"[a-z]+/.+")
@@ -186,13 +188,13 @@ def read(path: Path) -> tuple[Config | None, list[str]]:
     except (OSError, UnicodeDecodeError) as error:
         return None, [f"{path}: cannot be read: {error}"]
     try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        return None, [f"{path}: not TOML: {error}"]
+        table = toml.tables(text)
+    except ConfigError as error:
+        return None, [f"{path}: {error}"]
     reader = _Reader(path.resolve().parent)
     config = reader.config(table)
     if config is None or reader.wrong:
-        return None, [f"{path}: {line}" for line in reader.wrong]
+        return None, [in_one_line(f"{path}: {line}") for line in reader.wrong]
     return replace(config, path=path, table=table), []
 
 
@@ -485,10 +487,11 @@ def seconds(value: float | str) -> float:
             duration = float(match[1]) * UNITS_S[match[2]] if match else 0.0
         except (KeyError, ValueError):
             duration = 0.0
-        if duration <= 0.0:
-            raise ConfigError(f'"{value}" is no duration; write seconds, or "90s", "30min", "1h", "2d"')
-        return duration
-    return float(value)
+    else:
+        duration = float(value)
+    if not 0.0 < duration < inf:
+        raise ConfigError(f'"{value}" is no duration; write seconds, or "90s", "30min", "1h", "2d"')
+    return duration
 
 
 def period(value: str, always: str) -> float:
@@ -501,9 +504,10 @@ def period(value: str, always: str) -> float:
         return 0.0
     match = re.fullmatch(r"\s*([0-9.]+)\s*Hz\s*", value)
     try:
-        return 1.0 / float(match[1]) if match else _no_rate(value, always)
-    except (ValueError, ZeroDivisionError):
-        return _no_rate(value, always)
+        rate_hz = float(match[1]) if match else 0.0
+    except ValueError:
+        rate_hz = 0.0
+    return 1.0 / rate_hz if RATES_HZ[0] <= rate_hz <= RATES_HZ[1] else _no_rate(value, always)
 
 
 def viewer_mode(mode: str) -> str:

@@ -25,6 +25,9 @@ NAMED: Final = 6
 SILENT_S: Final = 5.0
 """The token is there, or was never seen, and nothing came for so long."""
 
+LARGEST_BYTES: Final = 1_000_000
+"""Of a payload: six axes are some kilobytes."""
+
 
 class Latency(msgspec.Struct, frozen=True):
     """Receipt to published, s."""
@@ -186,7 +189,12 @@ def split(key: str) -> tuple[str, topics.Topic] | None:
 
 def read(kind: type[M], topic: topics.Topic, payload: bytes) -> M:
     """The message of ``payload``; ValueError when it is none of this topic and schema."""
-    found = msgspec.json.decode(payload, type=kind)  # its errors are ValueErrors
+    if len(payload) > LARGEST_BYTES:
+        raise ValueError(f"{len(payload)} bytes; {LARGEST_BYTES} are the most that is read")
+    try:
+        found = msgspec.json.decode(payload, type=kind)  # its errors are ValueErrors
+    except RecursionError as error:
+        raise ValueError(str(error)) from error
     if found.schema != topic.schema():
         raise ValueError(f'schema "{found.schema}" where {topic.schema()} is known')
     return found

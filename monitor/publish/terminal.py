@@ -35,6 +35,8 @@ PLAIN_S: Final = 1.0
 """Between two tables where output is no terminal."""
 EVENTS: Final = 5
 TROUBLES: Final = 6
+MOST_DEVICES: Final = 20_000
+"""Names beyond are passed over: whoever may publish could otherwise fill the memory."""
 HEADS: Final = 6
 """Lines of the screen that are no row: summary, note, heads, and those left empty."""
 SHOWN: Final[tuple[tuple[Kind, str], ...]] = (("gyro", "N"), ("gyro", "B"), ("accel", "N"))
@@ -99,7 +101,7 @@ class Board:
         found = heard.split(key)
         if found is None or found[1] is not topics.ALIVE:
             return
-        with self._lock:
+        with self._lock, contextlib.suppress(ValueError):
             self._device(found[0]).there = there
 
     def forget(self, key: str) -> None:
@@ -148,6 +150,8 @@ class Board:
         return known
 
     def _device(self, device: str) -> Heard:
+        if device not in self._devices and len(self._devices) >= MOST_DEVICES:
+            raise ValueError(f"more than {MOST_DEVICES} devices")
         return self._devices.setdefault(device, Heard(device, self._clock()))
 
     def _summary(self, devices: list[Heard], now_s: float) -> Text:

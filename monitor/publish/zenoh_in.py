@@ -176,6 +176,8 @@ def _check_keys(keyexpr: str, keys: list[str]) -> None:
     try:
         for key in keys:
             zenoh.KeyExpr(key)
+    except UnicodeEncodeError as error:
+        raise ConfigError(f'key expression "{keyexpr!a}": no UTF-8') from error
     except zenoh.ZError as error:
         raise ConfigError(f'key expression "{keyexpr}": {plain(error)}') from error
     if not keys:
@@ -189,6 +191,6 @@ def _configuration(connect: tuple[str, ...]) -> "zenoh.Config":
     for endpoint in connect:
         try:
             configuration({"connect/endpoints": [endpoint]})
-        except zenoh.ZError as error:
+        except (zenoh.ZError, UnicodeEncodeError) as error:
             raise ConfigError(f'connect "{endpoint}": no endpoint; write e.g. {topics.ENDPOINT}') from error
     return configuration({"connect/endpoints": connect})
