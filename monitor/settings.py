@@ -19,7 +19,7 @@ import msgspec
 
 import drivers.decoders
 import drivers.links
-from drivers import plugin
+from drivers import plugin, small_file
 from drivers.decoders.base import Addressed, Decoder
 from drivers.driver import AxisMap, axis_map
 from drivers.errors import ConfigError, in_one_line
@@ -182,7 +182,7 @@ def load(path: Path) -> Config:
 def read(path: Path) -> tuple[Config | None, list[str]]:
     """The configuration, or None and all that is wrong with the file, a line each."""
     try:
-        text = path.read_text("utf-8")
+        text = small_file.read(path).decode("utf-8")
     except FileNotFoundError:
         return None, [f"{path}: no such file; imu-monitor check --print-defaults prints one to start from"]
     except (OSError, UnicodeDecodeError) as error:

@@ -11,6 +11,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from drivers import small_file
 from drivers.errors import ConfigError, NotReady
 from drivers.recording import iter_blocks, load_samples
 from drivers.sample import AXES, Floats
@@ -95,7 +96,7 @@ def from_file(path: Path) -> dict[str, ThermalModel]:
         ConfigError: what is wrong with the file
     """
     try:
-        found = msgspec.json.decode(path.read_bytes(), type=ModelFile)
+        found = msgspec.json.decode(small_file.read(path), type=ModelFile)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
