@@ -42,6 +42,8 @@ FASTEST_HZ: Final = 32_000.0
 """No inertial sensor is read faster: where a rate is not known or cannot be, no more samples are missing."""
 LONGEST_GAP: Final = 10**10
 """Samples, 116 days at 1 kHz: given times that go on by more were set anew, and count as so many missing."""
+FAR_S: Final = 4.6e9
+"""From the first sample: half of what int64 nanoseconds hold."""
 LARGEST_STEP: Final = 1 << 62
 """Ticks."""
 STUCK_SAMPLES: Final = 10
@@ -442,7 +444,10 @@ class SampleClock:
         period_s = self._line.period_s() or 1.0 / NS  # the first samples of an unknown rate: in order at least
         # no sample is newer than its arrival, but for the scatter of the line
         newest_s = min(self._line.at(self._index), arrived_s + JUMP_S)
-        t_ns = np.rint((newest_s - (self._index - index) * period_s) * NS).astype(np.int64) + (self._origin_ns or 0)
+        t_s = newest_s - (self._index - index) * period_s
+        if t_s[0] < -FAR_S or t_s[-1] > FAR_S:  # arrivals decades apart: no time beyond int64
+            t_s = np.clip(t_s, -FAR_S, FAR_S)
+        t_ns = np.rint(t_s * NS).astype(np.int64) + (self._origin_ns or 0)
         if t_ns[0] <= self._last_t_ns or (t_ns[1:] <= t_ns[:-1]).any():
             # the line was corrected backwards, or far from its origin is coarser than a period: never out of order
             order = np.arange(len(samples))
