@@ -16,6 +16,9 @@ from monitor.estimate.hadamard import HadamardCurve
 from monitor.estimate.model_gap import ModelGap
 from monitor.estimate.total import TotalCurve
 from monitor.health import Health
+from monitor.history.minutes import Minutes
+from monitor.history.store import PastEvent
+from monitor.history.writer import Writer
 from monitor.publish import message
 from monitor.publish.terminal import Board
 from monitor.publish.zenoh_out import ZenohOut
@@ -115,6 +118,54 @@ class ViewerOutput(Output):
         if device in self._recorded and not health.received and health.uptime_s < OPENING_S:
             return
         self._view.health(device, unix_s, health)
+
+
+class HistoryOutput(Output):
+    """Results gathered by the minute, and events, for the file that keeps them."""
+
+    def __init__(self, writer: Writer, recorded: Collection[str] = ()) -> None:
+        """``recorded``: devices whose times are not the host's."""
+        self.received: dict[str, int] = {}  # samples of each device since the start
+        self._writer = writer
+        self._recorded = recorded
+        self._minutes: dict[str, Minutes] = {}
+
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        """Their temperature."""
+        unix_s = (int(samples.t_ns[-1]) + offset_ns) / 1e9
+        self._writer.put(device, self._of(device).temperature(unix_s, samples.temperature_c))
+
+    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
+        """Coefficients, and deviations on a coarse grid."""
+        self._writer.put(device, self._of(device).estimate(unix_s, estimate))
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        """One event."""
+        since_s = None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
+        told = PastEvent(unix_s, event.kind, event.text, event.axis, event.what, since_s, event.sigma)
+        self._writer.tell(device, told)
+
+    def health(self, device: str, unix_s: float, health: Health) -> None:
+        """Counts and state. Before a recording of last year has begun, it is not today that anything happens."""
+        if device in self._recorded and not health.received:
+            return
+        self.received[device] = health.received
+        self._writer.put(device, self._of(device).health(unix_s, health))
+
+    def gone(self, device: str) -> None:
+        """A device that was taken out: its minute is as full as it will be."""
+        self.received.pop(device, None)
+        minutes = self._minutes.pop(device, None)
+        if minutes is not None:
+            self._writer.put(device, minutes.end())
+
+    def end(self) -> None:
+        """Hand over the minutes that are not full yet."""
+        for device, minutes in self._minutes.items():
+            self._writer.put(device, minutes.end())
+
+    def _of(self, device: str) -> Minutes:
+        return self._minutes.setdefault(device, Minutes())
 
 
 class LogOutput(Output):

@@ -22,12 +22,16 @@ from monitor.chain import Ready
 from monitor.drift import compensator, heat
 from monitor.estimate.estimator import warm_up
 from monitor.health import Health, sentence
+from monitor.history import past
+from monitor.history.question import question
+from monitor.history.store import FILE, reading
+from monitor.history.writer import Writer
 from monitor.hooks import Hooks
 from monitor.live_reconcile import Job, Reconciler
 from monitor.logs import LEVEL
 from monitor.metrics import MetricsOutput
-from monitor.outputs import TableOutput, ViewerOutput, ZenohOutput
-from monitor.publish import message
+from monitor.outputs import HistoryOutput, TableOutput, ViewerOutput, ZenohOutput
+from monitor.publish import history_message, message
 from monitor.publish.viewer import DeviceInfo, ViewerSettings
 from monitor.publish.zenoh_out import Command, ZenohOut
 from monitor.recorder import Recorder, origin
@@ -86,7 +90,9 @@ class Service:
         self._recorded: set[str] = set()  # devices whose times are not the host's
         for device in config.devices:
             self._take_on(*self._built(device))
-        self.zenoh = ZenohOut(config.zenoh, [station.name for station in self.stations])
+        self.history = _history(config)
+        recall = None if self.history is None else self._recall
+        self.zenoh = ZenohOut(config.zenoh, [station.name for station in self.stations], recall)
         self.view = _viewer(config)
         self._page = ""  # where the viewer's page is, as it was said last
         self.hooks = Hooks(config.hooks, self.zenoh.put_on)
@@ -96,6 +102,9 @@ class Service:
             self.outputs.append(self.metrics)
         if self.view is not None:
             self.outputs.append(ViewerOutput(self.view, self._recorded))
+        self._kept = None if self.history is None else HistoryOutput(self.history, self._recorded)
+        if self._kept is not None:
+            self.outputs.append(self._kept)
 
     def stop(self) -> None:
         """Ask the loop to end; may be called from another thread."""
@@ -117,6 +126,8 @@ class Service:
             self._close()
 
     def _start(self) -> None:
+        if self.history is not None:
+            self.history.start()
         self.zenoh.start()
         if self.metrics is not None:
             self.metrics.start()
@@ -165,6 +176,8 @@ class Service:
             states["viewer"] = self.view.state
         if self.recorder is not None:
             states["recording"] = self.recorder.state
+        if self.history is not None:
+            states["history"] = self.history.state
         if self.metrics is not None:
             states["metrics"] = self.metrics.state
         if self.hooks.hooks:
@@ -176,6 +189,20 @@ class Service:
         self._ready.all.wait()
         for station in stations:
             station.rebuild()
+
+    def _recall(self, device: str, parameters: str) -> bytes:
+        """The answer to a query of a device's history; called by a thread of its own.
+
+        Raises:
+            ImuError: the question is wrong, or there is nothing to answer it with
+        """
+        assert self.history is not None
+        assert self._kept is not None
+        asked = question(parameters, time.time())
+        with reading(self.history.path) as reader:
+            found = past.read(reader, device, asked.span, asked.wants, asked.step_s)
+            newest_s = reader.newest_s(device)
+        return history_message.history(found, asked, newest_s, self._kept.received.get(device, 0))
 
     def _warm_up(self) -> None:
         """Beside the loop, so that a first start's compilation holds up neither samples nor status."""
@@ -371,6 +398,9 @@ class Service:
             if self.view is not None:
                 self.view.close()
             self.zenoh.close()
+            if self.history is not None and self._kept is not None:
+                self._kept.end()
+                self.history.close()
 
     def _drain(self) -> None:
         """End the readers, and publish what they still brought."""
@@ -418,6 +448,12 @@ def memory_bytes() -> int:
     import resource
 
     return pages * resource.getpagesize()
+
+
+def _history(config: Config) -> Writer | None:
+    if config.storage is None or not config.storage.history:
+        return None
+    return Writer(config.storage.folder / FILE, time.time)
 
 
 def _viewer(config: Config) -> "RerunView | None":

@@ -38,6 +38,7 @@ GAP: Final = Topic("gap", JSON, "publish")
 THERMAL: Final = Topic("thermal", JSON, "intervals")
 EVENT: Final = Topic("event", JSON, "event")
 STATUS: Final = Topic("status", JSON, "1 Hz")
+HISTORY: Final = Topic("history", JSON, "query")
 ALIVE: Final = Topic("alive", "", "presence")
 RESET: Final = Topic("command/reset", JSON, "query")
 RECONCILE: Final = Topic("command/reconcile", JSON, "query")
@@ -53,6 +54,7 @@ TOPICS: Final = (
     EVENT,
     STATUS,
     ALIVE,
+    HISTORY,
     RESET,
     RECONCILE,
 )

@@ -5,6 +5,8 @@ If it cannot open (port busy: any free one is taken and said; anything else: tri
 was to be put is dropped: samples go on. zenoh queues what it sends and drops for a subscriber that does not keep up,
 so ``put`` does not wait for anyone.
 
+Queries of ``history`` are answered by the thread that takes them, one a device: a file is read, nothing here waits.
+
 Commands arrive on a queryable whose queries a thread of this class takes from zenoh's channel (a Python callback that
 is alive at exit would hang the process) and hands to the service by a queue; the service's loop answers them.
 """
@@ -20,6 +22,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from drivers.errors import ImuError
 from drivers.zenoh_session import CLOSED, configuration, plain
 from monitor import topics
 from monitor.settings import ZenohTable
@@ -41,11 +44,22 @@ class Command:
     refuse: Callable[[str], None]
 
 
-class ZenohOut:
-    """The daemon's session and what it declares for each device."""
+Recall = Callable[[str, str], bytes]
+"""Device and a selector's parameters in, past results out; ImuError says why there are none."""
 
-    def __init__(self, settings: ZenohTable, devices: Sequence[str]) -> None:
+
+class ZenohOut:
+    """The daemon's session and what it declares for each device.
+
+    Args:
+        settings: of the session
+        devices: their names
+        recall: answers queries of ``history``; None where none is kept
+    """
+
+    def __init__(self, settings: ZenohTable, devices: Sequence[str], recall: Recall | None = None) -> None:
         self.settings = settings
+        self._recall = recall
         self._said = "off" if settings.mode == "none" else "not open yet"
         self._unsent = ""  # why the newest message did not go out
         self.commands: queue.Queue[Command] = queue.Queue(QUERIES_WAITING)
@@ -54,7 +68,7 @@ class ZenohOut:
         self._session: zenoh.Session | None = None
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._tokens: dict[str, Any] = {}
-        self._queryables: dict[str, Any] = {}
+        self._queryables: dict[str, list[Any]] = {}
         self._declaring = threading.Lock()  # the opener declares all devices, the loop those that come or go
         self._showing = threading.Lock()  # the opener and the loop both show who is alive
         self._opener = threading.Thread(target=self._open_until_open, name="zenoh open", daemon=True)
@@ -131,7 +145,7 @@ class ZenohOut:
             keys = {topic.key(self.settings.prefix, device) for topic in topics.TOPICS}
             gone = [self._publishers[key] for key in keys & self._publishers.keys()]
             self._publishers = {key: one for key, one in self._publishers.items() if key not in keys}
-            for one in [*gone, *filter(None, [self._queryables.pop(device, None)])]:
+            for one in [*gone, *self._queryables.pop(device, [])]:
                 one.undeclare()
 
     def close(self) -> None:
@@ -184,6 +198,8 @@ class ZenohOut:
         published = {topic: key for topic, key in keys.items() if topic.when not in ("presence", "query")}
         new = {key: self._publisher(session, topic, key) for topic, key in published.items()}
         self._declare_commands(session, device)
+        if self._recall is not None:
+            self._declare_history(session, device, self._recall)
         self._publishers = {**self._publishers, **new}
         self._show_alive(device)
 
@@ -246,8 +262,39 @@ class ZenohOut:
             target=self._take_queries, args=(device, queryable), name=f"commands of {device}", daemon=True
         )
         taker.start()
-        self._queryables[device] = queryable
+        self._keep(device, queryable, taker)
+
+    def _declare_history(self, session: "zenoh.Session", device: str, recall: Recall) -> None:
+        import zenoh
+
+        key = topics.HISTORY.key(self.settings.prefix, device)
+        queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(QUERIES_WAITING))
+        taker = threading.Thread(
+            target=self._remember, args=(device, key, queryable, recall), name=f"history of {device}", daemon=True
+        )
+        taker.start()
+        self._keep(device, queryable, taker)
+
+    def _keep(self, device: str, queryable: Any, taker: threading.Thread) -> None:
+        self._queryables.setdefault(device, []).append(queryable)
         self._takers = [*(one for one in self._takers if one.is_alive()), taker]
+
+    def _remember(self, device: str, key: str, queryable: Any, recall: Recall) -> None:
+        """Questions about the past, until the session is closed."""
+        handler = queryable.handler
+        while not self._closing.is_set():
+            try:
+                query = handler.recv()
+            except _zenoh_errors():
+                return
+            answer, refuse = _answers(query, key)
+            with contextlib.suppress(*_zenoh_errors()):  # the session was closed meanwhile
+                try:
+                    payload = recall(device, str(query.parameters))
+                except ImuError as error:
+                    refuse(str(error))
+                else:
+                    answer(payload)
 
     def _take_queries(self, device: str, queryable: Any) -> None:
         """Queries until the session is closed."""
