@@ -17,6 +17,7 @@ from typer.exceptions import TyperException
 
 from drivers.errors import ConfigError, ImuError, NotReady, RecordingError
 from monitor.cli import doctor, drift, options, output, serving
+from monitor.cli import history as history_command
 
 # before NumPy is imported: matrices are small here and threads of our own share the work, where more would only spin
 for _pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -270,6 +271,7 @@ thermal_app = typer.Typer(
 app.add_typer(thermal_app, name="thermal")
 
 app.command()(drift.compensate)
+app.command()(history_command.history)
 
 RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")]
 Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate, where the file says none.")]

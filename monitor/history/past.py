@@ -22,8 +22,12 @@ from monitor.history.times import Span
 POINTS: Final = 1000
 """Of a table, about; at most twice so many where old and new rows differ in width."""
 EVENTS: Final = 1000
-STEPS_S: Final = (60, 300, 900, 3600, 10_800, 21_600, 86_400, 604_800, 2_592_000, 31_536_000)
-"""Widths of buckets: multiples of those before, or of the rows' own."""
+DAY_S: Final = 86_400
+STEPS_S: Final = (
+    *(60, 300, 900, 1800, 3600, 10_800, 21_600, 43_200),
+    *(days * DAY_S for days in (1, 2, 4, 7, 30, 90, 365)),
+)
+"""Widths of buckets: multiples of the widths of all rows that are not wider."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,13 +116,11 @@ def read(
     parts: dict[tuple[int, int], list[Row]] = {}
     names: dict[tuple[str, ...], tuple[str, ...]] = {}
     for key, rows in groupby(reader.rows(device, span), key=lambda row: _bucket(row, step_s)):
-        fitting = []
-        for row in rows:
-            if row.names not in names:
-                names[row.names] = tuple(name for name in row.names if wanted(name))
-            fitting.append(chosen(row, names[row.names]))
-        parts.setdefault(key, []).append(merged(fitting, *key))
-    found = [merged(rows, *key) for key, rows in sorted(parts.items())]
+        one = merged(list(rows), *key)
+        if one.names not in names:
+            names[one.names] = tuple(name for name in one.names if wanted(name))
+        parts.setdefault(key, []).append(chosen(one, names[one.names]))
+    found = [merged(part, *key) for key, part in sorted(parts.items())]
     events, in_all = reader.events(device, span, EVENTS)
     if not found and not events:
         raise NotReady(f"{device}: nothing in that time; kept are {_said(held)}")

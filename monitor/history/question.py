@@ -53,6 +53,21 @@ class Question:
         letter = rest.split(".")[0]
         return DEVIATIONS in self.what if letter == "sigma" else COEFFICIENTS in self.what and letter in self.letters
 
+    def parameters(self) -> str:
+        """As a selector's parameters.
+
+        >>> Question(Span(0.0, float("inf"), end_in=False), 900, ("status",), ("gz",)).parameters()
+        '_time=[1970-01-01T00:00:00.000000Z..[;step=900s;what=status;axis=gz;letter=Q,N,B,K,R'
+        """
+        parts = {
+            "_time": "" if self.span is None else self.span.zenoh(),
+            "step": "" if self.step_s is None else f"{self.step_s}s",
+            "what": ",".join(self.what),
+            "axis": ",".join(self.axes),
+            "letter": ",".join(self.letters),
+        }
+        return ";".join(f"{key}={value}" for key, value in parts.items() if value)
+
 
 def question(parameters: str, now_s: float) -> Question:
     """The question of a selector's parameters.

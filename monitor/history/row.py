@@ -12,6 +12,7 @@ compressed: values of a minute differ little, and most of it is zeros.
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -106,18 +107,24 @@ def chosen(row: Row, names: tuple[str, ...]) -> Row:
     """The same with these numbers, in this order; those that it has not are missing."""
     if names == row.names:
         return row
-    at = {name: i for i, name in enumerate(row.names)}
-    index = np.array([at.get(name, -1) for name in names], np.int64)
+    index = _places(row.names, names)
     n = np.append(row.n, 0)[index]
     low, high, last = (np.append(part, np.float32(np.nan))[index] for part in (row.low, row.high, row.last))
     return Row(row.start_s, row.width_s, row.newest_s, names, n, low, high, last, row.counts, row.state)
+
+
+@lru_cache(maxsize=64)
+def _places(names: tuple[str, ...], wanted: tuple[str, ...]) -> NDArray[np.int64]:
+    """Where each wanted name stands; -1 = nowhere."""
+    at = {name: i for i, name in enumerate(names)}
+    return np.array([at.get(name, -1) for name in wanted], np.int64)
 
 
 def merged(rows: Sequence[Row], start_s: int, width_s: int) -> Row:
     """One row of several, one at least; the last value of a number is that of the newest row that has it."""
     rows = sorted(rows, key=lambda row: row.newest_s)
     names = rows[0].names
-    if any(row.names != names for row in rows):
+    if any(row.names is not names and row.names != names for row in rows):
         names = tuple(dict.fromkeys(name for row in rows for name in row.names))
         rows = [chosen(row, names) for row in rows]
     n = np.stack([row.n for row in rows])

@@ -29,6 +29,7 @@ UNITS_S: Final = {
 """Zenoh's units; ``min`` is the configuration file's word for its ``m``."""
 LIMIT_S: Final = 1e11
 """Times further from 1970 than some three thousand years are a slip."""
+DATES_END_S: Final = 253_402_300_800.0  # the year 10000
 _DURATION: Final = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([a-z]*)\s*")
 _NOW: Final = re.compile(r"now\(\s*([+-]?)\s*([^)]*)\)")
 
@@ -51,6 +52,14 @@ class Span:
         after = t_s >= self.start_s if self.start_in else t_s > self.start_s
         before = t_s <= self.end_s if self.end_in else t_s < self.end_s
         return after and before
+
+    def zenoh(self) -> str:
+        """As zenoh writes it; before 1970 nothing is kept."""
+        ends = [
+            "" if not 0.0 <= one < DATES_END_S else f"{datetime.fromtimestamp(one, UTC):%Y-%m-%dT%H:%M:%S.%fZ}"
+            for one in (self.start_s, self.end_s)
+        ]
+        return f"{'[' if self.start_in else ']'}{'..'.join(ends)}{']' if self.end_in else '['}"
 
     def touches(self, start_s: float, end_s: float) -> bool:
         """Whether anything of [start_s, end_s), a row's time, can be in it.

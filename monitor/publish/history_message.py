@@ -168,7 +168,7 @@ def read(payload: bytes) -> Past:
         _singles([getattr(one, part) for one in columns.values()], p) for part in ("low", "high", "last")
     )
     return Past(
-        _clean(said.device),
+        clean(said.device),
         Span(said.from_, said.to),
         said.step,
         _integers(said.start, p),
@@ -271,7 +271,7 @@ def _read_event(said: EventOfPast) -> PastEvent:
         name: {key: np.nan if one is None else one for key, one in sides.items()} for name, sides in said.what.items()
     }
     axis = said.axis if said.axis in AXES else None
-    return PastEvent(said.t, _clean(said.kind), _clean(said.text), axis, what, said.since, said.sigma, said.stands_for)
+    return PastEvent(said.t, clean(said.kind), clean(said.text), axis, what, said.since, said.sigma, said.stands_for)
 
 
 def _list(column: Floats) -> Numbers:
@@ -308,6 +308,6 @@ def _integers(numbers: Sequence[int], p: int) -> "np.ndarray[tuple[int], np.dtyp
     return found
 
 
-def _clean(text: str) -> str:
+def clean(text: str) -> str:
     """Without control characters: it ends on a terminal."""
     return "".join(one if one.isprintable() else " " for one in text)

@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from drivers.errors import ImuError
+from drivers.errors import ConfigError, ImuError, NotReady
 from drivers.zenoh_session import CLOSED, configuration, plain
 from monitor import topics
 from monitor.settings import ZenohTable
@@ -287,12 +287,12 @@ class ZenohOut:
                 query = handler.recv()
             except _zenoh_errors():
                 return
-            answer, refuse = _answers(query, key)
+            answer, _ = _answers(query, key)
             with contextlib.suppress(*_zenoh_errors()):  # the session was closed meanwhile
                 try:
                     payload = recall(device, str(query.parameters))
                 except ImuError as error:
-                    refuse(str(error))
+                    _no_answer(query, error)
                 else:
                     answer(payload)
 
@@ -326,6 +326,16 @@ def _answers(query: Any, key: str) -> tuple[Callable[[bytes], None], Callable[[s
             query.reply_err(json.dumps({"error": why}).encode(), encoding=zenoh.Encoding(topics.JSON))
 
     return answer, refuse
+
+
+def _no_answer(query: Any, error: ImuError) -> None:
+    """End a query with what is wrong, and with the exit status that a command would have."""
+    import zenoh
+
+    status = 3 if isinstance(error, NotReady) else 2 if isinstance(error, ConfigError) else 1
+    with query:
+        said = json.dumps({"error": str(error), "exit": status}).encode()
+        query.reply_err(said, encoding=zenoh.Encoding(topics.JSON))
 
 
 def _free_port(endpoint: str) -> str:
