@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, NotReady, RecordingError
 from drivers.links.replay_link import ReplayLink
 from drivers.recording.segment import Origin
 from monitor import reload
@@ -23,8 +23,10 @@ from monitor.drift import compensator, heat
 from monitor.estimate.estimator import warm_up
 from monitor.health import Health, sentence
 from monitor.history import past
+from monitor.history.past import Past
 from monitor.history.question import question
 from monitor.history.store import FILE, reading
+from monitor.history.times import Span
 from monitor.history.writer import Writer
 from monitor.hooks import Hooks
 from monitor.live_reconcile import Job, Reconciler
@@ -93,7 +95,7 @@ class Service:
         self.history = _history(config)
         recall = None if self.history is None else self._recall
         self.zenoh = ZenohOut(config.zenoh, [station.name for station in self.stations], recall)
-        self.view = _viewer(config)
+        self.view = _viewer(config, self._last)
         self._page = ""  # where the viewer's page is, as it was said last
         self.hooks = Hooks(config.hooks, self.zenoh.put_on)
         self.outputs: list[Output] = [ZenohOutput(self.zenoh), self.hooks, *more]
@@ -189,6 +191,19 @@ class Service:
         self._ready.all.wait()
         for station in stations:
             station.rebuild()
+
+    def _last(self, device: str) -> Past | None:
+        """What the viewer opens on; called by its thread. A recording that is replayed brings its own past."""
+        history_s = self.config.viewer.history
+        if self.history is None or history_s is None or device in self._recorded:
+            return None
+        assert isinstance(history_s, float)
+        now_s = time.time()
+        try:
+            with reading(self.history.path) as reader:
+                return past.read(reader, device, Span(now_s - history_s, now_s))
+        except (NotReady, RecordingError):  # nothing yet; what is wrong with the file the writer says
+            return None
 
     def _recall(self, device: str, parameters: str) -> bytes:
         """The answer to a query of a device's history; called by a thread of its own.
@@ -456,13 +471,13 @@ def _history(config: Config) -> Writer | None:
     return Writer(config.storage.folder / FILE, time.time)
 
 
-def _viewer(config: Config) -> "RerunView | None":
+def _viewer(config: Config, recall: Callable[[str], Past | None]) -> "RerunView | None":
     if config.viewer.mode == "none":
         return None
     from monitor.publish.rerun_view import RerunView
 
     own = config.viewer
-    return RerunView(ViewerSettings(own.mode, own.port, own.web_port, own.memory), _shown(config.devices))
+    return RerunView(ViewerSettings(own.mode, own.port, own.web_port, own.memory), _shown(config.devices), recall)
 
 
 def _shown(devices: Sequence[Device]) -> list[DeviceInfo]:

@@ -228,13 +228,24 @@ class _Reader:
         storage = self._storage(file.storage)
         hooks = self._hooks(file.hook, [str(name) for name in names], zenoh is not None and zenoh.mode == "none")
         metrics = self._metrics(file.metrics)
+        history_s = self._shown_history(viewer, storage)
         if zenoh is None or viewer is None or log is None:
             return None
+        viewer = msgspec.structs.replace(viewer, history=history_s)
         if viewer.mode.endswith(".rrd"):
             path = self._folder / Path(viewer.mode).expanduser()
             viewer = msgspec.structs.replace(viewer, mode=str(path))
         known = tuple(device for device in devices if device is not None)
         return Config(known, zenoh, viewer, log, storage, hooks, metrics)
+
+    def _shown_history(self, viewer: ViewerTable | None, storage: Storage | None) -> float | None:
+        """s of it that the viewer opens on."""
+        if viewer is None or viewer.history is None:
+            return None
+        if storage is None or not storage.history:
+            self.wrong.append("viewer.history: none is kept; [storage] folder says where it would be")
+        found: float | None = self._try("viewer.history", seconds, viewer.history)
+        return found
 
     def _limits(self, tables: list[dict[str, Any]], has_model: bool, at: str) -> tuple[Limit, ...]:
         filled = [(self.fill(LimitTable, one, f"{at}[{i}]"), f"{at}[{i}]") for i, one in enumerate(tables)]

@@ -119,6 +119,8 @@ class ViewerTable(_Table, frozen=True, kw_only=True):
     port: Port = 9876
     web_port: Port = 9090
     memory: str = "256MiB"
+    history: Positive | str | None = None
+    """Of what is kept, shown when the view opens; None: nothing."""
 
 
 class StorageTable(_Table, frozen=True, kw_only=True):

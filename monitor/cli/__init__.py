@@ -67,11 +67,19 @@ def demo(
 
 
 @app.command()
-def run(config: ConfigPath, seconds: Seconds = None, viewer: Viewer = None) -> None:
+def run(
+    config: ConfigPath,
+    seconds: Seconds = None,
+    viewer: Viewer = None,
+    history: Annotated[
+        str | None, typer.Option(metavar="S", help="Open the live view on what was: 1d, 12h; needs [storage].")
+    ] = None,
+) -> None:
     """The daemon: every device in the file, until a signal."""
     from monitor import settings
 
-    serving.serve(settings.load(config), seconds, viewer)
+    found = serving.with_history(settings.load(config), options.duration("--history", history))
+    serving.serve(found, seconds, viewer)
 
 
 @app.command()

@@ -45,6 +45,19 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
         console.print(board.table(time.monotonic()))
 
 
+def with_history(config: "Config", history_s: float | None) -> "Config":
+    """A configuration whose live view opens on so much of what is kept; None: as it says itself."""
+    import dataclasses
+
+    import msgspec
+
+    if history_s is None:
+        return config
+    if config.storage is None or not config.storage.history:
+        raise ConfigError("--history: none is kept; [storage] folder says where it would be")
+    return dataclasses.replace(config, viewer=msgspec.structs.replace(config.viewer, history=history_s))
+
+
 def _with_viewer(config: "Config", viewer: str | None) -> "Config":
     import dataclasses
 

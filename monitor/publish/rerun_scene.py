@@ -23,7 +23,9 @@ from monitor.estimate.coefficients import LETTERS, Status
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.model_gap import ModelGap
 from monitor.health import Health
-from monitor.publish import colours, rerun_dynamic
+from monitor.history.past import Past
+from monitor.history.times import said
+from monitor.publish import colours, rerun_dynamic, rerun_past
 from monitor.publish.decimate import extremes, means
 from monitor.publish.panels import drift_text, health_text, noise_text, overview_text
 from monitor.publish.rerun_chart import (
@@ -54,6 +56,8 @@ TEMPERATURES_PER_S: Final = 5.0
 BETWEEN: Final = 20
 """Points on the course of a coefficient from one estimate to the next, where it follows every sample."""
 Z95: Final = 1.959964
+PAST_EVENTS: Final = 200
+"""Of those before the view opened, the newest."""
 NARROW: Final = 1.5  # ends of an interval further than this factor from their value are not on the course
 LEVELS: Final = {
     "link_lost": "ERROR",
@@ -143,6 +147,26 @@ class Scene:
                 if np.isfinite(values).any():
                     factor = COEFFICIENT_UNITS[kind_of(axis)][letter].factor
                     self._scalars(f"{device}/coefficients/{letter}/{axis}", at, values * factor)
+
+    def past(self, device: str, past: Past) -> None:
+        """What was before the view opened: courses of coefficients and temperature with their extremes, and events.
+
+        Where a bucket was left out, and behind the last one, a course has a gap: what comes is another stretch.
+        """
+        for letter in LETTERS:
+            for axis in past.axes():
+                course, lo, hi = (past.column(f"{axis}.{letter}{end}") for end in ("", ".lo", ".hi"))
+                if np.isfinite(course.last).any():
+                    at, values = rerun_past.points(past, course, lo.last, hi.last)
+                    factor = COEFFICIENT_UNITS[kind_of(axis)][letter].factor
+                    self._scalars(f"{device}/coefficients/{letter}/{axis}", at, values * factor)
+        temperature = past.column("temperature")
+        if np.isfinite(temperature.last).any():
+            at, values = rerun_past.points(past, temperature, temperature.last, temperature.last)
+            self._scalars(f"{device}/temperature", at, values[:, 0])
+        for event in past.events[-PAST_EVENTS:]:
+            text = f"{said(event.t_s)[:10]}: {event.text}"  # the line has only its time of the day
+            self.event(device, event.t_s, Event(event.kind, round(event.t_s * 1e9), text, event.axis, event.what))
 
     def gaps(self, device: str, wall_s: Floats, looks: Sequence[ModelGap]) -> None:
         """The course of the gap to the model in force: a line an axis, and the threshold that chance stays below.

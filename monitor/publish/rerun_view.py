@@ -16,7 +16,7 @@ import os
 import threading
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
@@ -28,6 +28,7 @@ from monitor.drift.live_compensation import DriftLook
 from monitor.estimate.estimate import Estimate, joined
 from monitor.estimate.model_gap import ModelGap
 from monitor.health import Health
+from monitor.history.past import Past
 from monitor.publish.backlog import Backlog
 from monitor.publish.viewer import DeviceInfo, ViewerClosed, ViewerSettings, ViewerTrouble
 
@@ -46,6 +47,7 @@ COURSE_STEP_S: Final = 1.0  # of sample time between two points of a course
 EARLY_END_S: Final = 10.0  # a window that ends sooner never worked
 MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
 
+Recall = Callable[[str], Past | None]
 Message = tuple[str, "_Samples | _Estimate | _Gap | _Thermal | _Rates | _Drift | _Event | _Health"]
 
 
@@ -101,9 +103,10 @@ class _Health:
 class RerunView:
     """One viewer for all devices. Called by one thread; every call returns at once."""
 
-    def __init__(self, settings: ViewerSettings, devices: Sequence[DeviceInfo]) -> None:
-        """Opens nothing yet."""
+    def __init__(self, settings: ViewerSettings, devices: Sequence[DeviceInfo], recall: Recall | None = None) -> None:
+        """Opens nothing yet. ``recall``: what is kept of a device, asked for in the viewer's thread when it opens."""
         self._settings = settings
+        self._recall = recall or _nothing
         self._devices = tuple(devices)
         self._backlog: Backlog[Message] = Backlog(BACKLOG_BYTES)
         self._closing = threading.Event()
@@ -256,10 +259,19 @@ class RerunView:
         scene.show([(d.name, d.about) for d in devices])
         self._phase = "ok"
 
+    def _begin(self, scene: "Scene", device: str) -> None:
+        """What was, before what comes."""
+        self._inside_since = None  # a disk may be slow; that is not the viewer's fault
+        past = self._recall(device)
+        self._inside_since = time.monotonic()
+        if past is not None:
+            scene.past(device, past)
+
     def _draw(self, output: "Output", scene: "Scene") -> None:
         """Draw what comes until closed or nobody looks any more."""
         queue = _Pending(plot_every_s=1.0)
         shown: tuple[DeviceInfo, ...] | None = None
+        begun: set[str] = set()
         checked = time.monotonic()
         while True:
             closing = self._closing.is_set()
@@ -269,6 +281,9 @@ class RerunView:
                 shown = self._devices
                 queue.plot_every_s = max(1.0, len(shown) / PLOTS_PER_S)
                 self._lay_out(output, scene, shown)
+                for device in [one.name for one in shown if one.name not in begun]:
+                    begun.add(device)
+                    self._begin(scene, device)
             queue.draw(scene, everything=closing)
             now = time.monotonic()
             if closing or now - checked > CHECK_EVERY_S:
@@ -288,6 +303,10 @@ class RerunView:
             if self._closing.is_set():
                 return
         self._stalled = False
+
+
+def _nothing(_device: str) -> Past | None:
+    return None
 
 
 @dataclass
