@@ -1161,6 +1161,14 @@ def test_what_history_cannot_do_is_one_line(
     assert line in said.only_line()
 
 
+def test_a_view_of_what_is_not_kept_is_refused(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text(VIRTUAL + QUIET)
+    said = call("run", "c.toml", "--history", "1d")
+    assert said.status == 2
+    assert said.only_line() == "imu-monitor: --history: none is kept; [storage] folder says where it would be\n"
+    assert "no duration" in call("run", "c.toml", "--history", "long").only_line()
+
+
 def test_history_without_storage_is_said(call: Call, tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text(VIRTUAL)
     said = call("history", "c.toml")

@@ -232,6 +232,10 @@ CASES = {
     ),
     "viewer": (device() + '[viewer]\nmode = "window"', ['viewer.mode: "window"; possible are auto']),
     "viewer's port": (device() + "[viewer]\nport = 70000", ["viewer.port: Expected `int` <= 65535"]),
+    "viewer's history": (
+        device() + '[viewer]\nhistory = "soon"',
+        ["viewer.history: none is kept; [storage] folder", 'viewer.history: "soon" is no duration'],
+    ),
     "viewer's memory": (device() + "[viewer]\nmemory = 3", ["viewer.memory: Expected `str`"]),
     "zenoh's mode": (device() + '[zenoh]\nmode = "pear"', ["zenoh.mode: Invalid enum value 'pear'"]),
     "zenoh's prefix": (device() + '[zenoh]\nprefix = "a/*"', ["zenoh.prefix: "]),
@@ -401,6 +405,15 @@ def test_rates(text, value):
 def test_words_that_are_no_rates(text):
     with pytest.raises(ConfigError, match="no rate"):
         period(text, "always")
+
+
+def test_the_viewer_opens_on_so_much_of_what_is_kept(tmp_path):
+    path = tmp_path / "my.toml"
+    path.write_text(device() + '[viewer]\nhistory = "12h"\n[storage]\nfolder = "kept"\n')
+    assert load(path).viewer.history == 43_200.0
+    path.write_text(device() + '[viewer]\nhistory = "12h"\n[storage]\nfolder = "kept"\nhistory = false\n')
+    with pytest.raises(ConfigError, match="none is kept"):
+        load(path)
 
 
 def test_viewer_modes():
