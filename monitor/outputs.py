@@ -142,7 +142,10 @@ class HistoryOutput(Output):
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """One event."""
         since_s = None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
-        told = PastEvent(unix_s, event.kind, event.text, event.axis, event.what, since_s, event.sigma)
+        # plain numbers: an array's own are none to SQLite
+        what = {name: {side: float(one) for side, one in sides.items()} for name, sides in event.what.items()}
+        sigma = None if event.sigma is None else float(event.sigma)
+        told = PastEvent(unix_s, event.kind, event.text, event.axis, what, since_s, sigma)
         self._writer.tell(device, told)
 
     def health(self, device: str, unix_s: float, health: Health) -> None:
