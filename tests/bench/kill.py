@@ -8,9 +8,11 @@ read, and each row's count must follow from the one before by what it says was l
 """
 
 import argparse
+import contextlib
 import os
 import select
 import signal
+import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -25,6 +27,8 @@ import numpy as np
 
 from drivers.recording import load_samples, segment
 from drivers.sample import Floats, Ints
+from monitor.history.store import reading
+from monitor.history.times import Span
 
 RATE = 1000
 CONFIG = """
@@ -170,6 +174,18 @@ class Bench:
             assert len(recording) == len(self.ticks())
         for path in segment.segments(self.folder / "bench" / "raw"):
             assert sum(1 for _ in segment.read_chunks(path)), path
+        self._check_history()
+
+    def _check_history(self) -> None:
+        """The store is whole, and no minute stands in it twice."""
+        path = self.folder / "history.sqlite"
+        if not path.exists():
+            return
+        with contextlib.closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as store:
+            assert store.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+        with reading(path) as reader:
+            starts = [row.start_s for row in reader.rows("bench", Span(-np.inf, np.inf))]
+        assert starts == sorted(set(starts))
 
     def _start(self) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", "monitor.cli", "run", str(self._config)]
