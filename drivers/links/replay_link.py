@@ -33,7 +33,7 @@ from drivers.errors import ConfigError, LinkEnded, LinkLost, LinkUnavailable, Re
 from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.plugin import FilePath, nearest
 from drivers.recording import FORMATS, Recording, iter_blocks, load_samples, segment
-from drivers.recording.formats import T_LIMIT_S
+from drivers.recording.table import T_LIMIT_S
 from drivers.sample import EXTENDED_ID, Chunk
 from drivers.sample_message import pack
 

@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import ConfigError, RecordingError
-from drivers.recording.formats import FORMATS, T_LIMIT_S, format_of, is_recording
+from drivers.recording.formats import FORMATS, format_of, is_recording
 from drivers.recording.saving import save_samples, writing
-from drivers.recording.table import EXAMPLE_HEADER, Table
+from drivers.recording.table import EXAMPLE_HEADER, T_LIMIT_S, Table
 from drivers.sample import AXES, Floats, SampleBlock, block
 
 __all__ = ["FORMATS", "Recording", "is_recording", "iter_blocks", "load_samples", "save_samples", "writing"]

@@ -13,8 +13,8 @@ from typing import Protocol
 import numpy as np
 
 from drivers.errors import ConfigError, RecordingError
-from drivers.recording.formats import T_LIMIT_S, format_of
-from drivers.recording.table import PART, listed
+from drivers.recording.formats import format_of
+from drivers.recording.table import PART, T_LIMIT_S, listed
 from drivers.sample import AXES, Floats
 
 

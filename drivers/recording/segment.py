@@ -13,7 +13,7 @@ compressed batches, and takes the other's place whole or not at all.
 import os
 import re
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -23,15 +23,17 @@ from typing import IO, Any, Final, Literal
 import msgspec
 import numpy as np
 
-from drivers.errors import RecordingError
+from drivers.errors import ImuError, RecordingError
 from drivers.recording.arrow_format import BOOKKEEPING, OWN, library
-from drivers.recording.table import BATCH_ROWS, PART
+from drivers.recording.table import BATCH_ROWS, PART, T_LIMIT_S
 from drivers.sample import AXES, Chunk, SampleBlock, block, join, ns_to_seconds, seconds_to_ns
 
 SUFFIX: Final = ".arrows"
 NAME: Final = re.compile(r"(\d{8})_[0-9TZ-]+\.arrows")
 SCHEMA: Final = "imu-monitor/recording/1"
 RAW_BATCH_BYTES: Final = 4_000_000
+LARGEST_LOSS: Final = 10**11
+"""Samples missing at one place; above what any clock tells."""
 
 Kind = Literal["samples", "raw"]
 
@@ -184,10 +186,12 @@ def read_samples(path: Path) -> Iterator[Piece]:
 
 
 def _pieces(batch: Any, meta: Any) -> Iterator[Piece]:
-    """A batch, cut where samples are missing."""
+    """A batch, cut where samples are missing; none where a disk has spoilt what is in it."""
     columns = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in batch.schema.names}
-    state = msgspec.json.decode(meta.get(b"state", b"{}"), type=State) if meta else State()
     values = np.column_stack([columns[axis] for axis in AXES])
+    if not _possible(columns) or np.isinf(values).any():
+        return
+    state = _state(meta)
     rows = block(seconds_to_ns(columns["t"]), values, columns["temperature"].copy(), columns["ticks"].copy())
     lost = columns["lost"]
     edges = [0, *(np.flatnonzero(lost[1:]) + 1).tolist(), len(rows)]
@@ -196,12 +200,31 @@ def _pieces(batch: Any, meta: Any) -> Iterator[Piece]:
         yield Piece(block(part.t_ns, part.values, part.temperature_c, part.ticks, int(lost[a])), state)
 
 
+def _possible(columns: Mapping[str, Any]) -> bool:
+    """Whether times, counts and losses are such as are written; one that is absent has made floats of whole numbers."""
+    lost, ticks = columns["lost"], columns["ticks"]
+    whole = lost.dtype == ticks.dtype == np.int64
+    return bool(whole and (np.abs(columns["t"]) < T_LIMIT_S).all() and ((lost >= 0) & (lost <= LARGEST_LOSS)).all())
+
+
+def _state(meta: Any) -> State:
+    """What the daemon knew; nothing where that cannot be read."""
+    try:
+        found = msgspec.json.decode(meta.get(b"state", b"{}"), type=State) if meta else State()
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return State()
+    sizes = len(found.theta) == len(found.entered) and len(found.theta) in (0, 5 * len(AXES))
+    known = (one is None or one > 0.0 for one in (found.rate, found.tick_step))
+    return found if sizes and len(found.since) == len(AXES) and all(known) else State()
+
+
 def read_chunks(path: Path) -> Iterator[Chunk]:
     """The chunks of a raw segment, up to a cut; ``t_ns`` are Unix times. RecordingError when it is none."""
     for batch, _ in _batches(path, "raw"):
         columns = (batch.column(name).to_pylist() for name in ("t_ns", "address", "data", "attachment"))
         for t_ns, address, data, attachment in zip(*columns, strict=True):
-            yield Chunk(data, t_ns, address, attachment)
+            if None not in (t_ns, address, data, attachment) and abs(t_ns) < T_LIMIT_S * 1e9:
+                yield Chunk(data, t_ns, address, attachment)
 
 
 def pack(path: Path) -> Iterator[None]:
@@ -278,7 +301,9 @@ class _reading:  # noqa: N801 - reads as a word
     def __enter__(self) -> None: ...
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> None:
-        if isinstance(error, library(self._path).ArrowException | UnicodeDecodeError | msgspec.DecodeError):
+        unread = UnicodeDecodeError | RecursionError | msgspec.DecodeError
+        nonsense = isinstance(error, OSError) and error.errno is None and not isinstance(error, ImuError)
+        if nonsense or isinstance(error, library(self._path).ArrowException | unread):
             first = str(error).strip().partition("\n")[0]
             raise RecordingError(f"{self._path}: is no segment of a recording ({first})") from error
 
@@ -290,6 +315,8 @@ def _origin(path: Path, schema: Any) -> Origin:
     found = msgspec.json.decode(meta, type=Origin)
     if found.schema != SCHEMA:
         raise RecordingError(f'{path}: schema "{found.schema[:64]}" is not {SCHEMA}')
+    if not schema.equals(_schema(library(path), found), check_metadata=False):
+        raise RecordingError(f"{path}: is no segment of a recording: its columns are others")
     return found
 
 

@@ -18,6 +18,9 @@ EXAMPLE_HEADER: Final = "t,gx,gy,gz,ax,ay,az"
 
 BATCH_ROWS: Final = 1 << 16  # rows written at a time; a cut Arrow file loses at most so many
 
+T_LIMIT_S: Final = 4.6e9
+"""The difference of two is within int64 nanoseconds, 9.22e9 s; what is beyond is not in seconds."""
+
 PART: Final = ".part"
 """End of a file's name while it is being written."""
 
