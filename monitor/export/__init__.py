@@ -22,6 +22,9 @@ from monitor.export.noise import Noise, Term, from_analysis, from_model, lacking
 
 __all__ = ["FORMATS", "Noise", "Term", "export", "from_analysis", "from_model"]
 
+SIZES: Final = (1e-30, 1e30)
+"""SI; far beyond every sensor, and their squares and quotients are still numbers."""
+
 FORMATS: Final[dict[str, Callable[..., str]]] = {"kalibr": kalibr, "gyroparams": gyroparams, "kalman": kalman}
 
 
@@ -43,4 +46,8 @@ def export(noise: Noise, form: str, inflation: float = 1.0, **options: Any) -> s
         raise ConfigError(f"inflation {inflation:g}; it must be 1 or more")
     if not noise.axes:
         raise lacking(noise, "nothing to export: no axis has any of Q, N, B, K, R")
+    for axis, terms in noise.axes.items():
+        for letter, term in terms.items():
+            if term.value and not SIZES[0] <= term.value <= SIZES[1]:
+                raise ConfigError(f"{axis}: {letter} = {term.value:g}; no sensor has that")
     return FORMATS[form](noise, inflation, **options)
