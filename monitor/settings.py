@@ -8,7 +8,7 @@ and ``[device.driver.decoder_options]``. Relative paths are relative to the conf
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
@@ -21,6 +21,8 @@ from drivers.decoders.base import Addressed, Decoder
 from drivers.driver import AxisMap, axis_map
 from drivers.errors import ConfigError
 from drivers.links.base import Filtering, Link, LinkSettings
+from drivers.zenoh_session import configuration, plain, secret_files
+from monitor import permissions
 from monitor.tables import (
     DeviceTable,
     FaultsTable,
@@ -113,6 +115,7 @@ class Config:
     viewer: ViewerTable
     log: LogTable
     storage: Storage | None = None
+    warnings: tuple[str, ...] = ()  # a line each: what is not wrong, but should not stay
 
 
 def load(path: Path) -> Config:
@@ -142,7 +145,11 @@ def read(path: Path) -> tuple[Config | None, list[str]]:
         return None, [f"{path}: not TOML: {error}"]
     reader = _Reader(path.resolve().parent)
     config = reader.config(table)
-    return (None if reader.wrong else config), [f"{path}: {line}" for line in reader.wrong]
+    reader.trust(path)
+    wrong = [f"{path}: {line}" for line in reader.wrong]
+    if config is None or wrong:
+        return None, wrong
+    return replace(config, warnings=tuple(f"{path}: {line}" for line in reader.warnings)), []
 
 
 class _Reader:
@@ -150,7 +157,15 @@ class _Reader:
 
     def __init__(self, folder: Path) -> None:
         self.wrong: list[str] = []
+        self.warnings: list[str] = []
         self._folder = folder
+
+    def trust(self, path: Path) -> None:
+        """Who else may change the file itself, or read a secret in it."""
+        if line := permissions.changeable(path):
+            self.wrong.append(line)
+        if line := permissions.exposed(path):
+            self.warnings.append(line)
 
     def config(self, table: Mapping[str, Any]) -> Config | None:
         file = self.fill(FileTable, table, "")
@@ -201,10 +216,22 @@ class _Reader:
             for endpoint in endpoints:
                 if not IS_ENDPOINT.fullmatch(endpoint):
                     self.wrong.append(f'zenoh.{key}: "{endpoint}" is no endpoint; write "{ENDPOINT}"')
-        if zenoh.config is not None and zenoh.mode != "none" and not zenoh.config.is_file():
-            self.wrong.append(f"zenoh.config: {zenoh.config}: no such file")
+        if zenoh.config is not None and zenoh.mode != "none":
+            self._zenoh_file(zenoh.config)
         if zenoh.mode == "client" and not zenoh.connect and zenoh.config is None:
             self.wrong.append('zenoh.connect: empty, but a client needs a router, e.g. ["tcp/127.0.0.1:7447"]')
+
+    def _zenoh_file(self, path: Path) -> None:
+        """Whether zenoh takes it, and who else may change it or read the secrets in it."""
+        if not path.is_file():
+            self.wrong.append(f"zenoh.config: {path}: no such file")
+            return
+        if line := permissions.changeable(path):
+            self.wrong.append(f"zenoh.config: {line}")
+        files = self._try("zenoh.config", zenoh_file_secrets, path)
+        for file, secret in ((path, None), *((one, True) for one in files or ())):
+            if line := permissions.exposed(file, secret):
+                self.warnings.append(f"zenoh.config: {file.name}: {line}")
 
     def device(self, table: Mapping[str, Any], at: str) -> Device | None:
         entry = self.fill(DeviceTable, table, at)
@@ -360,6 +387,20 @@ def model_path(name: str, folder: Path) -> Path:
         return path
     names = sorted(file.stem for file in models.glob("*.toml"))
     raise ConfigError(f'no model "{name}", neither a file nor one of those shipped{plugin.nearest(name, names)}')
+
+
+def zenoh_file_secrets(path: Path) -> tuple[Path, ...]:
+    """Files of keys and passwords that a zenoh file names.
+
+    Raises:
+        ConfigError: zenoh refuses the file
+    """
+    import zenoh
+
+    try:
+        return secret_files(configuration({}, path))
+    except zenoh.ZError as error:
+        raise ConfigError(f"{path}: {plain(error)}") from error
 
 
 def seconds(value: float | str) -> float:

@@ -99,7 +99,7 @@ def check(
                 Sensor(device.link, device.decoder, device.name)
         except ConfigError as error:
             wrong.append(f"{config}: device {device.name}: {error}")
-    for line in wrong:
+    for line in (*wrong, *(f"warning: {line}" for line in (found.warnings if found else ()))):
         typer.echo(line, err=True)
     if wrong:
         raise typer.Exit(WRONG)
@@ -109,10 +109,9 @@ def check(
 
 @app.command()
 def watch(
-    keyexpr: Annotated[str, typer.Argument(metavar="[KEYEXPR]", help="Which keys to show.")] = "imu/**",
-    connect: Annotated[
-        list[str] | None, typer.Option(metavar="ENDPOINT", help="Daemon or router, e.g. tcp/127.0.0.1:7450.")
-    ] = None,
+    keyexpr: options.KeyExpr = "imu/**",
+    connect: options.Connect = None,
+    zenoh: options.ZenohFile = None,
     seconds: Seconds = None,
 ) -> None:
     """A live table of any number of daemons, from zenoh alone."""
@@ -121,11 +120,10 @@ def watch(
     from rich.console import Console
 
     from monitor.publish.terminal import watch as show
-    from monitor.topics import ENDPOINT
 
     stop = threading.Event()
     serving.on_signals(stop.set)
-    show(keyexpr, connect or [ENDPOINT], stop, Console(), seconds)
+    show(keyexpr, connect or (), stop, Console(), seconds, zenoh)
 
 
 @app.command()

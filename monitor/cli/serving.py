@@ -8,8 +8,11 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO, cast
 
 from drivers.errors import ConfigError
+from drivers.masked import masked
 
 if TYPE_CHECKING:
+    from collections.abc import MutableMapping
+
     from monitor.settings import Config
 
 
@@ -21,6 +24,7 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
     import time
     from contextlib import nullcontext
 
+    import structlog
     from rich.console import Console
     from rich.live import Live
 
@@ -30,6 +34,8 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
 
     config = _with_viewer(config, viewer)
     _log_as(config)
+    for line in config.warnings:
+        structlog.get_logger("imu-monitor").warning(line)
     console, board = Console(), Board()
     live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
     service = Service(config, [TableOutput(board, live)] if live else [TableOutput(board), LogOutput()])
@@ -80,12 +86,18 @@ def _log_as(config: "Config") -> None:
         processors=[
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
+            _without_secrets,
             structlog.processors.JSONRenderer() if json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
         ],
         wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, config.log.level.upper())),
         logger_factory=structlog.PrintLoggerFactory(cast("TextIO", _Lines())),
         cache_logger_on_first_use=True,
     )
+
+
+def _without_secrets(_logger: Any, _method: str, line: "MutableMapping[str, Any]") -> "MutableMapping[str, Any]":
+    """Every text of a log line, whatever brought it there."""
+    return {key: masked(value) if isinstance(value, str) else value for key, value in line.items()}
 
 
 def on_signals(stop: Callable[[], None]) -> None:

@@ -6,7 +6,7 @@ characters, as they end on a terminal. Pure.
 """
 
 from dataclasses import dataclass
-from typing import Any, Final, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
 import msgspec
 import numpy as np
@@ -22,6 +22,12 @@ GONE_S: Final = 2.0
 """The liveliness token is away and no status (1 Hz) came for so long."""
 SILENT_S: Final = 5.0
 """The token is there, or was never seen, and nothing came for so long."""
+LONGEST_BYTES: Final = 65_536
+"""A payload of one device's result is a few kilobytes; what is longer is none, and not read."""
+LONGEST_TEXT: Final = 400
+MOST_OUTPUTS: Final = 16
+
+Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 
 
 class Latency(msgspec.Struct, frozen=True):
@@ -37,11 +43,11 @@ class StatusMessage(msgspec.Struct, frozen=True):
     schema: str
     t: float
     state: str
-    received: int
-    lost: int
-    bad: int
+    received: Count
+    lost: Count
+    bad: Count
     rate: float | None = None
-    overflowed: int = 0
+    overflowed: Count = 0
     latency: Latency = Latency()
     outputs: dict[str, str] = {}
     text: str = ""
@@ -60,7 +66,7 @@ class CoefficientsMessage(msgspec.Struct, frozen=True):
     """``imu/<device>/coefficients``."""
 
     schema: str
-    samples: int
+    samples: Count
     axes: dict[str, dict[str, Letter]]
     rate: float | None = None
     window: float | None = None
@@ -179,10 +185,36 @@ def split(key: str) -> tuple[str, topics.Topic] | None:
 
 def read(kind: type[M], topic: topics.Topic, payload: bytes) -> M:
     """The message of ``payload``; ValueError when it is none of this topic and schema."""
-    found = msgspec.json.decode(payload, type=kind)  # its errors are ValueErrors
+    if len(payload) > LONGEST_BYTES:
+        raise ValueError(f"{len(payload)} bytes are no message of this kind")
+    try:
+        found = msgspec.json.decode(payload, type=kind)  # its errors are ValueErrors
+    except RecursionError as error:
+        raise ValueError("too deep for a message of this kind") from error
     if found.schema != topic.schema():
         raise ValueError(f'schema "{found.schema}" where {topic.schema()} is known')
     return found
+
+
+def status(payload: bytes) -> StatusMessage:
+    """Texts cut to what a table can show, so that no device can fill a watcher's memory."""
+    found = read(StatusMessage, topics.STATUS, payload)
+    outputs = {name[:LONGEST_TEXT]: said[:LONGEST_TEXT] for name, said in list(found.outputs.items())[:MOST_OUTPUTS]}
+    return msgspec.structs.replace(
+        found, state=found.state[:LONGEST_TEXT], text=found.text[:LONGEST_TEXT], outputs=outputs
+    )
+
+
+def event(payload: bytes) -> EventMessage:
+    """Texts cut like those of a status."""
+    found = read(EventMessage, topics.EVENT, payload)
+    return msgspec.structs.replace(found, kind=found.kind[:LONGEST_TEXT], text=found.text[:LONGEST_TEXT])
+
+
+def gap(payload: bytes) -> GapMessage:
+    """Of the axes that there are."""
+    found = read(GapMessage, topics.GAP, payload)
+    return msgspec.structs.replace(found, axes={axis: found.axes[axis] for axis in AXES if axis in found.axes})
 
 
 def noise(message: CoefficientsMessage) -> Noise:
