@@ -13,6 +13,8 @@ import ssl
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
+from drivers.masked import masked
+
 if TYPE_CHECKING:
     import zenoh
 
@@ -34,7 +36,7 @@ _OF_TLS: Final = {
 def refused(endpoints: Sequence[str], config: "zenoh.Config") -> str:
     """Why these do not let us in, those that have no reason left out."""
     found = [(endpoint, why(endpoint, config)) for endpoint in endpoints]
-    return "; ".join(f"{endpoint}: {reason}" for endpoint, reason in found if reason)
+    return "; ".join(f"{masked(endpoint)}: {reason}" for endpoint, reason in found if reason)
 
 
 def why(endpoint: str, config: "zenoh.Config", timeout_s: float = TIMEOUT_S) -> str:

@@ -1,9 +1,10 @@
 """Other daemons' results from zenoh: what ``watch`` listens to.
 
-The session is closed but for the endpoints given: a peer that listens nowhere and scouts nobody. A peer and not a
-client, as a client stays with the first endpoint that answers, while a peer goes to all of them, waits for those that
-are not there yet and goes back to those that went. A zenoh file may bring certificates, user and password. Raw samples
-and curves, the bulk of what daemons send, are subscribed to for devices in detail alone.
+Each endpoint given has a session of its own, closed to all else: a client that listens nowhere and scouts nobody. A
+client and not a peer, as a router passes nothing on between two peers, and daemons are peers; one for each endpoint, as
+a client stays with the first that answers. An endpoint that is not there is tried again. A zenoh file may bring
+certificates, user and password. Raw samples and curves, the bulk of what daemons send, are subscribed to for devices in
+detail alone.
 
 Who comes late gets the last values that daemons keep for that, and their last events; of events those too that a
 broken connection kept away. Each subscription ends in a ring of zenoh's that drops its oldest, and a thread of this
@@ -13,13 +14,16 @@ takes in no message above ``MESSAGE_BYTES``, and the backlog drops its oldest.
 """
 
 import threading
-from collections.abc import Sequence
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.errors import ConfigError
-from drivers.zenoh_refusal import refused
+from drivers.masked import masked
+from drivers.zenoh_refusal import why
 from drivers.zenoh_session import CLOSED, alone, configuration, endpoints, plain
 from monitor import permissions, topics
 from monitor.publish.backlog import Backlog
@@ -35,11 +39,16 @@ RING_MESSAGES: Final = 4096
 BACKLOG_BYTES: Final = 16_000_000
 MESSAGE_BYTES: Final = 4_000_000
 """Longest message taken in: batches of samples of a fast replay; all else is a few kilobytes."""
+BEAT_S: Final = 0.25
+"""Between two looks whether an endpoint has gone."""
+TOKENS: Final = 20_000
 LOOK_S: Final = 3.0
 """Between two looks why an endpoint does not let us in."""
-RETRY_S: Final = 2.0
+RETRY_S: Final = 1.0
 OPENING_S: Final = 5.0
-"""zenoh waits up to half a second for peers when a session opens; much longer is a fault of its own."""
+"""An endpoint that does not answer is waited for so long at most."""
+REMEMBERED: Final = 20_000
+"""Messages, to know those that come by several endpoints: two seconds of a thousand devices at 10 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,18 +80,13 @@ class ZenohIn:
         file: Path | None = None,
         detail: Sequence[str] = (),
     ) -> None:
-        self._keys = {topic: narrowed(keyexpr, topic) for topic in (*TOPICS, topics.ALIVE)}
-        _check_keys(keyexpr, [key for keys in self._keys.values() for key in keys])
-        self._keys |= {topic: tuple(f"{device}/{topic.name}" for device in detail) for topic in DETAIL}
-        self._config = listener(connect, file)
-        self._connect = endpoints(self._config)
-        self._said = "not open yet"
-        self._why = ""  # why nobody lets us in, as it was found last
+        keys = {topic: narrowed(keyexpr, topic) for topic in (*TOPICS, topics.ALIVE)}
+        _check_keys(keyexpr, [key for part in keys.values() for key in part])
+        keys |= {topic: tuple(f"{device}/{topic.name}" for device in detail) for topic in DETAIL}
         self._backlog: Backlog[Message] = Backlog(BACKLOG_BYTES)
-        self._session: zenoh.Session | None = None
-        self._closing = threading.Event()
-        self._opener = threading.Thread(target=self._keep_open, name="zenoh open", daemon=True)
-        self._takers: list[threading.Thread] = []
+        found = listeners(connect, file)
+        self._once = _Once() if len(found) > 1 else None
+        self._doors = [_Door(endpoint, config, keys, self._push) for endpoint, config in found.items()]
 
     @property
     def dropped(self) -> int:
@@ -92,51 +96,118 @@ class ZenohIn:
     @property
     def state(self) -> str:
         """``ok``, or in a few words who is not there."""
-        session = self._session
-        if session is None:
-            return self._said
-        connected = len(session.info.peers_zid()) + len(session.info.routers_zid())
-        if connected >= len(self._connect):
+        absent = {door.endpoint: door.why for door in self._doors if not door.open}
+        if not absent:
             return "ok"
-        if not connected:
-            return f"{self._why or 'nobody at ' + ', '.join(self._connect)}; trying again"
-        return f"{connected} of {len(self._connect)} there ({', '.join(self._connect)}); trying the rest again"
+        every = ", ".join(door.endpoint for door in self._doors)
+        reasons = "; ".join(f"{endpoint}: {why}" for endpoint, why in absent.items() if why)
+        if len(absent) == len(self._doors):
+            return f"{reasons or 'nobody at ' + every}; trying again"
+        there = f"{len(self._doors) - len(absent)} of {len(self._doors)} there ({every})"
+        return f"{there}; {reasons + '; ' if reasons else ''}trying the rest again"
 
     def start(self) -> None:
-        """Open in a thread of its own; returns at once."""
-        self._opener.start()
+        """Open in threads of their own; returns at once."""
+        for door in self._doors:
+            door.start()
 
     def take(self, timeout_s: float) -> list[Message]:
         """What came since the last call; waits up to ``timeout_s`` when nothing did."""
         return self._backlog.take(timeout_s)
 
     def close(self) -> None:
-        """Close the session and end the threads."""
-        self._closing.set()
+        """Close the sessions and end the threads."""
+        for door in self._doors:
+            door.closing.set()
+        for door in self._doors:
+            door.close()
+        self._backlog.wake()
+
+    def _push(self, message: Message, stamp: str) -> None:
+        if self._once is None or self._once.is_new(message.key, stamp):
+            self._backlog.push(message, 100 + len(message.payload or b""))
+
+
+class _Once:
+    """What several endpoints of one network bring twice, passed on once: by zenoh's time stamps, which are unique."""
+
+    def __init__(self) -> None:
+        self._seen: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def is_new(self, key: str, stamp: str) -> bool:
+        if not stamp:
+            return True
+        with self._lock:
+            if (key, stamp) in self._seen:
+                return False
+            self._seen[key, stamp] = None
+            if len(self._seen) > REMEMBERED:
+                self._seen.popitem(last=False)
+            return True
+
+
+class _Door:
+    """The session at one endpoint: opened until it opens, in a thread of its own."""
+
+    def __init__(
+        self,
+        endpoint: str,
+        config: "zenoh.Config",
+        keys: Mapping[topics.Topic, Sequence[str]],
+        push: Callable[[Message, str], None],
+    ) -> None:
+        self.endpoint = masked(endpoint)
+        self.why = ""  # why it does not let us in, as it was found last; "": nobody is there
+        self.closing = threading.Event()
+        self._endpoint, self._config, self._keys, self._push = endpoint, config, keys, push
+        self._session: zenoh.Session | None = None
+        self._opener = threading.Thread(target=self._keep_open, name=f"zenoh {self.endpoint}", daemon=True)
+        self._takers: list[threading.Thread] = []
+        self._there: set[str] = set()  # keys of tokens
+
+    @property
+    def open(self) -> bool:
+        session = self._session
+        return session is not None and not alone(session)
+
+    def start(self) -> None:
+        self._opener.start()
+
+    def close(self) -> None:
+        self.closing.set()
         if self._opener.is_alive():
             self._opener.join(OPENING_S)
         self._end()
-        self._backlog.wake()
 
     def _keep_open(self) -> None:
         """Thread: open, and then find out why nobody is there whenever nobody is."""
         import zenoh
 
-        while not self._closing.is_set():
+        while not self.closing.is_set():
             try:
-                session = zenoh.open(self._config)
-                self._session = session
+                session = self._session = zenoh.open(self._config)
                 self._subscribe(session)
-            except zenoh.ZError as error:
-                self._said = f"{refused(self._connect, self._config) or plain(error)}; trying again"
+            except zenoh.ZError:
                 self._end()
-                self._closing.wait(RETRY_S)
+                self.why = why(self._endpoint, self._config)
+                self.closing.wait(RETRY_S)
             else:
                 break
-        wait_s = 0.0
-        while not self._closing.wait(wait_s):
-            self._why = refused(self._connect, self._config) if alone(session) else ""
-            wait_s = LOOK_S
+        self._look_after()
+
+    def _look_after(self) -> None:
+        """Until closed: zenoh reconnects by itself, but takes away no token when it is the endpoint that went."""
+        asked_s = -LOOK_S
+        while not self.closing.wait(BEAT_S):
+            if self.open:
+                self.why = ""
+                continue
+            while self._there:
+                self._push(Message(self._there.pop(), None, there=False), "")
+            if time.monotonic() - asked_s >= LOOK_S:
+                self.why = why(self._endpoint, self._config)
+                asked_s = time.monotonic()
 
     def _end(self) -> None:
         """Close the session, which ends the threads that take from it."""
@@ -162,14 +233,19 @@ class ZenohIn:
         import zenoh
 
         handler = subscriber.handler  # the subscriber itself could not be undeclared while it waits
-        while not self._closing.is_set():
+        while not self.closing.is_set():
             try:
                 sample = handler.recv()
             except zenoh.ZError:
                 return  # closed
-            payload = None if liveliness else bytes(sample.payload)
-            there = sample.kind == zenoh.SampleKind.PUT
-            self._backlog.push(Message(str(sample.key_expr), payload, there), 100 + len(payload or b""))
+            key, there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+            if liveliness:
+                if not there:
+                    self._there.discard(key)
+                elif len(self._there) < TOKENS:
+                    self._there.add(key)
+            stamp = "" if liveliness or sample.timestamp is None else str(sample.timestamp)
+            self._push(Message(key, None if liveliness else bytes(sample.payload), there), stamp)
 
 
 def narrowed(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
@@ -189,24 +265,25 @@ def narrowed(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
     return ("/".join([*parts[:-1], topic.name]), below) if parts[-1] == "*" else (below,)
 
 
-def listener(connect: Sequence[str], file: Path | None) -> "zenoh.Config":
-    """zenoh's configuration of a session that only listens to daemons, see ``ZenohIn``."""
+def listeners(connect: Sequence[str], file: Path | None) -> dict[str, "zenoh.Config"]:
+    """Endpoint -> zenoh's configuration of a session there that only listens and asks, see ``ZenohIn``."""
     import zenoh
 
-    try:
-        own = endpoints(configuration({}, file))
-    except zenoh.ZError as error:
-        raise ConfigError(f"{file}: {plain(error)}") from error
     if file is not None and (line := permissions.changeable(file)):
         raise ConfigError(f"{file}: {line}")
-    wanted = connect or own or (topics.ENDPOINT,)
-    for endpoint in wanted:
-        try:
-            configuration({"connect/endpoints": [endpoint]})
-        except zenoh.ZError as error:
-            raise ConfigError(f'connect "{endpoint}": no endpoint; write e.g. {topics.ENDPOINT}') from error
+    try:
+        theirs = endpoints(configuration({}, file))
+    except zenoh.ZError as error:
+        raise ConfigError(f"{file}: {plain(error)}") from error
     unsaid = {**CLOSED, "transport/link/rx/max_message_size": MESSAGE_BYTES}
-    return configuration({"connect/endpoints": list(connect or wanted) if connect or not own else None}, file, unsaid)
+    found = {}
+    for endpoint in dict.fromkeys(connect or theirs or (topics.ENDPOINT,)):
+        own = {"mode": "client", "connect/endpoints": [endpoint], "listen/endpoints": []}
+        try:
+            found[endpoint] = configuration(own, file, unsaid)
+        except zenoh.ZError as error:
+            raise ConfigError(f'connect "{masked(endpoint)}": no endpoint; write e.g. {topics.ENDPOINT}') from error
+    return found
 
 
 def _subscriber(session: "zenoh.Session", topic: topics.Topic, key: str) -> Any:

@@ -21,6 +21,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from drivers.masked import masked
 from drivers.zenoh_refusal import refused
 from drivers.zenoh_session import CLOSED, alone, configuration, endpoints, plain
 from monitor import topics
@@ -73,7 +74,7 @@ class ZenohOut:
         if self._unsent or session is None or not self._connect:
             return self._unsent or self._said
         if alone(session):
-            return f"{self._why or 'nobody at ' + ', '.join(self._connect)}; trying again"
+            return f"{self._why or 'nobody at ' + masked(', '.join(self._connect))}; trying again"
         return self._said
 
     def start(self) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from drivers.errors import ConfigError
 from monitor import permissions, settings
-from monitor.publish.zenoh_in import listener
+from monitor.publish.zenoh_in import listeners
 from tests.test_cli import VIRTUAL
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="permissions are not POSIX's here")
@@ -93,7 +93,7 @@ def test_a_zenoh_file_that_anyone_may_change_or_that_zenoh_refuses_is_wrong(fold
     path = made(folder / "a.toml", VIRTUAL + '[zenoh]\nconfig = "z.json5"\n', 0o644)
     assert "zenoh.config: anyone on this machine may change it" in settings.read(path)[1][0]
     with pytest.raises(ConfigError, match="anyone on this machine may change it"):
-        listener((), zenoh)
+        listeners((), zenoh)
     made(zenoh, SECRET.replace('"hunter2"', '"hunter2" x'), 0o600)
     (line,) = settings.read(path)[1]
     assert line == f"{path}: zenoh.config: {zenoh}: line 1, column 54: expected boolean or null"
