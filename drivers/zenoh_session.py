@@ -25,8 +25,8 @@ CLOSED: Final[Mapping[str, Any]] = {
 }
 """What a session is unless told otherwise; zenoh's own defaults scout and listen everywhere, and take in 1 GiB at once.
 
-Who was there once is looked for every second. A longer message is dropped piece by piece as it comes, and the connection stays. An hour of a 1 kHz sensor in one batch
-would fit.
+Who was there once is looked for every second. A longer message is dropped piece by piece as it comes, and the
+connection stays; an hour of a 1 kHz sensor in one batch would fit.
 """
 
 

@@ -127,6 +127,21 @@ def watch(
 
 
 @app.command()
+def view(
+    keyexpr: options.KeyExpr = "imu/**",
+    connect: options.Connect = None,
+    zenoh: options.ZenohFile = None,
+    detail: Annotated[
+        list[str] | None, typer.Option(metavar="DEVICE", help="Show its samples and curves too; repeatable.")
+    ] = None,
+    viewer: Viewer = None,
+    seconds: Seconds = None,
+) -> None:
+    """One viewer for any number of daemons, from zenoh alone: a table of all, chosen devices in detail."""
+    serving.view(keyexpr, connect or (), zenoh, detail or (), viewer or "auto", seconds)
+
+
+@app.command()
 def analyze(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
     rate: Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate, where the file says none.")] = None,

@@ -4,7 +4,8 @@ import contextlib
 import io
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO, cast
 
 from drivers.errors import ConfigError
@@ -44,6 +45,33 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
         service.run(seconds)
     if live is not None or seconds is not None:
         console.print(board.table(time.monotonic()))
+
+
+def view(
+    keyexpr: str, connect: Sequence[str], file: Path | None, detail: Sequence[str], mode: str, seconds: float | None
+) -> None:
+    """The viewer of a fleet, until a signal; where its page is, and what is wrong, a line each on standard error."""
+    import threading
+
+    from monitor import settings
+    from monitor.publish.fleet import FleetView, detail_key
+    from monitor.publish.rerun_view import RerunView
+    from monitor.publish.viewer import DeviceInfo, ViewerSettings
+    from monitor.publish.zenoh_in import ZenohIn
+
+    try:
+        settings.viewer_mode(mode)
+    except ConfigError as error:
+        raise ConfigError(f"--viewer: {error}") from None
+    keys = tuple(dict.fromkeys(detail_key(device, keyexpr) for device in detail))
+    arriving = ZenohIn(keyexpr, connect, file, keys)
+    rerun = RerunView(ViewerSettings(mode=mode), [DeviceInfo(key, "over zenoh") for key in keys], fleet=True)
+    stop = threading.Event()
+    on_signals(stop.set)
+    with contextlib.closing(arriving), contextlib.closing(rerun):
+        arriving.start()
+        rerun.start()
+        FleetView(arriving, rerun, keys).run(stop, lambda said: print(said, file=_Lines(), flush=True), seconds)
 
 
 def _with_viewer(config: "Config", viewer: str | None) -> "Config":

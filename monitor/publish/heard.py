@@ -18,8 +18,8 @@ from monitor.estimate.coefficients import LETTERS, Coefficients, Status
 STATUSES: Final = {status.name.lower(): status for status in Status}
 QUIET: Final = ("ok", "off")
 """States of an output that need no word."""
-GONE_S: Final = 2.0
-"""The liveliness token is away and no status (1 Hz) came for so long."""
+GONE_S: Final = 1.5
+"""The liveliness token is away and no status (1 Hz) came for so long: who is killed is missed within two seconds."""
 SILENT_S: Final = 5.0
 """The token is there, or was never seen, and nothing came for so long."""
 LONGEST_BYTES: Final = 65_536
@@ -51,6 +51,8 @@ class StatusMessage(msgspec.Struct, frozen=True):
     latency: Latency = Latency()
     outputs: dict[str, str] = {}
     text: str = ""
+    memory: Count = 0
+    uptime: float = 0.0
 
 
 class Letter(msgspec.Struct, frozen=True):
@@ -60,6 +62,8 @@ class Letter(msgspec.Struct, frozen=True):
     value: float | None = None
     lo: float | None = None
     hi: float | None = None
+    either: str | None = msgspec.field(name="or", default=None)
+    """The other letter of K and R, where which of the two is there is not known."""
 
 
 class CoefficientsMessage(msgspec.Struct, frozen=True):
@@ -80,6 +84,29 @@ class EventMessage(msgspec.Struct, frozen=True):
     t: float
     kind: str
     text: str
+    axis: str | None = None
+    what: dict[str, dict[str, Any]] = {}
+
+
+class Curve(msgspec.Struct, frozen=True):
+    """Deviations of one axis, SI."""
+
+    deviation: list[float | None]
+    lo: list[float | None]
+    hi: list[float | None]
+
+
+class AllanMessage(msgspec.Struct, frozen=True):
+    """``imu/<device>/allan``."""
+
+    schema: str
+    t: float
+    samples: Count
+    rate: float
+    window: float
+    filled: float
+    tau: list[float]
+    axes: dict[str, Curve]
 
 
 class Place(msgspec.Struct, frozen=True):
@@ -103,7 +130,7 @@ class GapMessage(msgspec.Struct, frozen=True):
     axes: dict[str, AxisGapMessage]
 
 
-M = TypeVar("M", StatusMessage, CoefficientsMessage, EventMessage, GapMessage)
+M = TypeVar("M", StatusMessage, CoefficientsMessage, EventMessage, GapMessage, AllanMessage)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +140,7 @@ class Noise:
     coefficients: Coefficients
     axes: tuple[str, ...]  # those that are measured
     seen_s: float | None  # how much of the window is full
+    either: frozenset[str] = frozenset()  # axes on which K or R is there, which of them not known
 
 
 @dataclass(slots=True)
@@ -208,7 +236,8 @@ def status(payload: bytes) -> StatusMessage:
 def event(payload: bytes) -> EventMessage:
     """Texts cut like those of a status."""
     found = read(EventMessage, topics.EVENT, payload)
-    return msgspec.structs.replace(found, kind=found.kind[:LONGEST_TEXT], text=found.text[:LONGEST_TEXT])
+    what = {letter: found.what[letter] for letter in LETTERS if letter in found.what}
+    return msgspec.structs.replace(found, kind=found.kind[:LONGEST_TEXT], text=found.text[:LONGEST_TEXT], what=what)
 
 
 def gap(payload: bytes) -> GapMessage:
@@ -229,7 +258,8 @@ def noise(message: CoefficientsMessage) -> Noise:
             at = LETTERS.index(letter), AXES.index(axis)
             value[at], lo[at], hi[at] = (np.nan if x is None else x for x in (one.value, one.lo, one.hi))
             status[at] = _status(one.status)
-    return Noise(Coefficients(value, lo, hi, status), axes, message.filled)
+    either = frozenset(axis for axis in axes if any(one.either for one in message.axes[axis].values()))
+    return Noise(Coefficients(value, lo, hi, status), axes, message.filled, either)
 
 
 def clean(text: Any) -> str:

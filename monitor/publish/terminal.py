@@ -114,7 +114,7 @@ class Board:
     def table(self, now_s: float) -> RenderableType:
         """All of it, at one moment."""
         with self._lock:
-            devices = sorted(self._devices.values(), key=lambda one: (one.rank(now_s), one.key))
+            devices = self._sorted(now_s)
             parts: list[RenderableType] = [self._summary(devices, now_s)]
             if devices:
                 parts.append(Fleet(devices, now_s))
@@ -124,6 +124,14 @@ class Board:
             names = _names(list(self._devices))
             parts += _apart([_event(names[device], event) for device, event in self._events])
         return Group(*parts)
+
+    def devices(self, now_s: float) -> list[Heard]:
+        """All that are known, those in trouble first."""
+        with self._lock:
+            return self._sorted(now_s)
+
+    def _sorted(self, now_s: float) -> list[Heard]:
+        return sorted(self._devices.values(), key=lambda one: (one.rank(now_s), one.key))
 
     def _read(self, device: str, topic: topics.Topic, payload: bytes) -> None:
         """ValueError for a malformed one, which then leaves no trace."""
@@ -265,11 +273,18 @@ def _newest(board: Board, arriving: ZenohIn) -> RenderableType:
             board.alive(message.key, message.there)
         else:
             board.take(message.key, message.payload)
+    board.note = note(board, arriving)
+    return board.table(time.monotonic())
+
+
+def note(board: Board, arriving: ZenohIn) -> str:
+    """What is wrong between here and the daemons; empty while all is well."""
     state, dropped = arriving.state, arriving.dropped
     notes = [state] if state != "ok" else []
+    if state == "ok" and arriving.open_s > QUIET_S and not board.devices(time.monotonic()):
+        notes.append("connected, but nothing comes: no daemon there, or no right to listen")
     notes += [f"{dropped:,} messages dropped: too slow here"] if dropped else []
-    board.note = "; ".join(notes)
-    return board.table(time.monotonic())
+    return "; ".join(notes)
 
 
 # --- cells

@@ -106,6 +106,11 @@ class ZenohIn:
         there = f"{len(self._doors) - len(absent)} of {len(self._doors)} there ({every})"
         return f"{there}; {reasons + '; ' if reasons else ''}trying the rest again"
 
+    @property
+    def open_s(self) -> float:
+        """For how long every endpoint has been there."""
+        return min(door.open_s for door in self._doors)
+
     def start(self) -> None:
         """Open in threads of their own; returns at once."""
         for door in self._doors:
@@ -165,11 +170,17 @@ class _Door:
         self._opener = threading.Thread(target=self._keep_open, name=f"zenoh {self.endpoint}", daemon=True)
         self._takers: list[threading.Thread] = []
         self._there: set[str] = set()  # keys of tokens
+        self._since_s: float | None = None  # monotonic s since which it is open
 
     @property
     def open(self) -> bool:
         session = self._session
         return session is not None and not alone(session)
+
+    @property
+    def open_s(self) -> float:
+        since_s = self._since_s
+        return 0.0 if since_s is None else time.monotonic() - since_s
 
     def start(self) -> None:
         self._opener.start()
@@ -201,8 +212,9 @@ class _Door:
         asked_s = -LOOK_S
         while not self.closing.wait(BEAT_S):
             if self.open:
-                self.why = ""
+                self.why, self._since_s = "", self._since_s or time.monotonic()
                 continue
+            self._since_s = None
             while self._there:
                 self._push(Message(self._there.pop(), None, there=False), "")
             if time.monotonic() - asked_s >= LOOK_S:
