@@ -72,7 +72,7 @@ def overview_text(healths: Mapping[str, Health]) -> str:
 def fleet_text(devices: Sequence[Heard], now_s: float, rows: int, note: str = "") -> str:
     """One line a device, those in trouble first, at most ``rows`` of them; above it how many are in which state."""
     counts = Counter(one.state(now_s) for one in devices)
-    states = ", ".join(f"**{count:,}** {state}" for state, count in counts.most_common())
+    states = ", ".join(f"**{count:,}** {_cell(state)}" for state, count in counts.most_common())
     head = [f"**{len(devices):,}** device{'' if len(devices) == 1 else 's'}{': ' if states else ''}{states}"]
     head += [f"**{heard.clean(note)}**"] if note else []
     table = [_fleet_row(one, now_s) for one in devices[:rows]]
@@ -86,7 +86,7 @@ def fleet_text(devices: Sequence[Heard], now_s: float, rows: int, note: str = ""
 def _fleet_row(one: Heard, now_s: float) -> str:
     state, status = one.state(now_s), one.status
     name = _cell(one.key)
-    word = f"**{state.upper()}**" if one.rank(now_s) == 0 else state
+    word = f"**{state.upper()}**" if one.rank(now_s) == 0 else _cell(state)
     noise = [
         "" if one.noise is None else reading(one.noise.coefficients, "N", axis).value.replace("| ", "")
         for axis in SHOWN
