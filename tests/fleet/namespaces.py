@@ -27,7 +27,7 @@ class Pair:
 
     def cable(self, state: str) -> None:
         """``up`` or ``down``."""
-        _ip("-n", self.inside, "link", "set", "a", state)
+        _ip("-n", self.inside, "link", "set", "inside", state)
 
 
 @contextlib.contextmanager
@@ -42,8 +42,21 @@ def pair() -> Iterator[Pair]:
             if made.returncode:
                 pytest.skip(f"no network namespaces here: {made.stderr.strip()}")
             ending.callback(_ip, "netns", "del", name)
-        _ip("-n", found.inside, "link", "add", "a", "type", "veth", "peer", "name", "b", "netns", found.outside)
-        for name, end, address in ((found.inside, "a", INSIDE), (found.outside, "b", OUTSIDE)):
+        _ip(
+            "-n",
+            found.inside,
+            "link",
+            "add",
+            "inside",
+            "type",
+            "veth",
+            "peer",
+            "name",
+            "outside",
+            "netns",
+            found.outside,
+        )
+        for name, end, address in ((found.inside, "inside", INSIDE), (found.outside, "outside", OUTSIDE)):
             _ip("-n", name, "addr", "add", f"{address}/30", "dev", end)
             _ip("-n", name, "link", "set", end, "up")
             _ip("-n", name, "link", "set", "lo", "up")

@@ -98,6 +98,7 @@ def test_a_scan_from_another_namespace_finds_nothing(tmp_path: Path) -> None:
             assert beside.stdout is not None
             assert beside.stdout.readline() == "up\n"
             with daemon(tmp_path / "a.toml", "ip", "netns", "exec", namespaces.inside) as process:
+                eventually(lambda: any(one.name().startswith("rerun") for one in process.children(True)), 60.0)
                 eventually(lambda: taking(process.pid) >= 4, 60.0)  # zenoh, the viewer's two, and that one
                 scan = namespaces.python(namespaces.outside, "-c", SCAN, INSIDE)
                 said, _ = scan.communicate(timeout=120.0)
