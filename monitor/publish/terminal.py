@@ -201,16 +201,19 @@ class Fleet:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The table, and how many did not find room."""
         layout = next((one for one in LAYOUTS if self._fits(one, console, options)), NARROW)
-        lines_each = 3 if layout.stacked else 1
-        room = len(self._devices)
-        if console.is_terminal:
-            room = max((console.size.height - EVENTS - TROUBLES - HEADS) // lines_each, 3)
+        room = self._room(layout, console)
         yield fleet_table(self._devices[:room], self._now_s, layout)
         if len(self._devices) > room:
             yield Text(f"… and {len(self._devices) - room} more with less trouble", style="dim")
 
+    def _room(self, layout: Layout, console: Console) -> int:
+        """Rows that are shown: all of them where the output is no terminal."""
+        if not console.is_terminal:
+            return len(self._devices)
+        return max((console.size.height - EVENTS - TROUBLES - HEADS) // (3 if layout.stacked else 1), 3)
+
     def _fits(self, layout: Layout, console: Console, options: ConsoleOptions) -> bool:
-        table = fleet_table(self._devices, self._now_s, layout)
+        table = fleet_table(self._devices[: self._room(layout, console)], self._now_s, layout)
         return console.measure(table, options=options.update(max_width=10_000)).maximum <= options.max_width
 
 

@@ -197,13 +197,11 @@ def _steady(watcher: Watcher, running: list[Process], routing: list[Process], se
     lo = _loopback_bytes()
     watcher.until(lambda: time.monotonic() - begun_s > seconds, "the measurement")
     took_s = time.monotonic() - begun_s
-    lo = _loopback_bytes() - lo
+    lo, seen = _loopback_bytes() - lo, dict(watcher.states())
     cpu = [(after.cpu_s() - b) / took_s for after, b in zip((*running, *routing), before, strict=True)]
     memory = sorted(p.memory_bytes() for p in running)
-    table_s = time.monotonic()
-    watcher.board.devices(table_s)
     return {
-        "seen": dict(watcher.states()),
+        "seen": seen,
         "payload bytes/s of a device": {topic: round(size / took_s / n, 1) for topic, size in watcher.bytes.items()},
         "messages/s of a device": {topic: round(count / took_s / n, 2) for topic, count in watcher.messages.items()},
         "loopback bytes/s of a device, three hops": round(lo / took_s / n),
