@@ -74,6 +74,7 @@ def fleet_text(devices: Sequence[Heard], now_s: float, rows: int, note: str = ""
     counts = Counter(one.state(now_s) for one in devices)
     states = ", ".join(f"**{count:,}** {_cell(state)}" for state, count in counts.most_common())
     head = [f"**{len(devices):,}** device{'' if len(devices) == 1 else 's'}{': ' if states else ''}{states}"]
+    head[0] += f"; N in {COEFFICIENT_UNITS['gyro']['N'].name}" if devices else ""
     head += [f"**{heard.clean(note)}**"] if note else []
     table = [_fleet_row(one, now_s) for one in devices[:rows]]
     if table:

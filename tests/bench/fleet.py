@@ -240,7 +240,8 @@ def settings(seconds: float) -> list[dict[str, Any]]:
             ending.callback(process.end)
             own = {"mode": "client", "connect/endpoints": [root], "connect/timeout_ms": -1}
             session: Any = ending.enter_context(zenoh.open(configuration(own)))
-            channel: Any = session.declare_subscriber("imu/**", zenoh.handlers.RingChannel(100_000)).handler
+            subscriber: Any = session.declare_subscriber("imu/**", zenoh.handlers.RingChannel(100_000))
+            channel = subscriber.handler
             _wait_for_coefficients(channel)
             time.sleep(seconds)
             while channel.try_recv() is not None:

@@ -103,7 +103,7 @@ def test_the_table_has_trouble_first_and_texts_of_others_cannot_leave_their_cell
         board.take(f"imu/{device}/coefficients", message.coefficients(device, 1.0, made.estimate()))
     text = fleet_text(board.devices(10.0), 10.0, 40, "1 of 2 there")
     lines = text.splitlines()
-    assert lines[0] == "**2** devices: **1** lost, **1** running"
+    assert lines[0] == "**2** devices: **1** lost, **1** running; N in °/√h"
     assert "**1 of 2 there**" in lines
     table = [line for line in lines if line.startswith("|")]
     assert table[2].startswith("| **imu/bad** | **LOST** |")
