@@ -112,6 +112,7 @@ def route(endpoint: str, *above: str) -> None:
     """A router in this process, until its input ends."""
     own: dict[str, Any] = {"mode": "router", "listen/endpoints": [endpoint], "connect/endpoints": list(above)}
     own["connect/timeout_ms"] = -1  # what is above may start later
+    own["transport/shared_memory/enabled"] = False  # on one machine longer messages would not pass the interface
     with zenoh.open(configuration(own)):
         while sys.stdin.readline():
             pass

@@ -67,13 +67,16 @@ def test_daemon_and_watcher_find_each_other_again(tmp_path: Path) -> None:
             eventually(lambda: newest[0].startswith(("silent", "gone")), 60.0)
             time.sleep(12.0)  # longer than zenoh's lease: the session is given up on both sides
             namespaces.cable("up")
-            eventually(lambda: newest[0].startswith("running") and newest[0].rstrip().endswith("ok"), 60.0)
-            after = int(newest[0].split()[1])
-            assert after - before > 1000  # the samples of the cut are among those that were received
+            # the samples of the cut are among those that were received
+            eventually(lambda: newest[0].startswith("running") and int(newest[0].split()[1]) > before + 1000, 60.0)
+            eventually(lambda: newest[0].rstrip().endswith("ok"))
         finally:
             _end(daemon, watcher)
             for reader in readers:
                 reader.join(10.0)
+            for pipe in (daemon.stdout, daemon.stderr, watcher.stdout, watcher.stderr):
+                assert pipe is not None
+                pipe.close()
 
 
 def _end(*children: "subprocess.Popen[str]") -> None:
@@ -84,5 +87,3 @@ def _end(*children: "subprocess.Popen[str]") -> None:
         except subprocess.TimeoutExpired:
             child.kill()
             child.wait()
-        assert child.stderr is not None
-        child.stderr.close()
