@@ -38,6 +38,14 @@ JUMP_S: Final = 1.0
 """A device counter that runs ahead of the host's clock by more than this at one step has jumped."""
 LONG_S: Final = 3600.0
 """Given times that go on by more than this at one step are told as an event too."""
+FASTEST_HZ: Final = 32_000.0
+"""No inertial sensor is read faster: where a rate is not known or cannot be, no more samples are missing."""
+LONGEST_GAP: Final = 10**10
+"""Samples, 116 days at 1 kHz: given times that go on by more were set anew, and count as so many missing."""
+FAR_S: Final = 4.6e9
+"""From the first sample: half of what int64 nanoseconds hold."""
+LARGEST_STEP: Final = 1 << 62
+"""Ticks."""
 STUCK_SAMPLES: Final = 10
 STEPS_KEPT: Final = 255
 """The last steps of a counter, or of given times, that tell what is usual."""
@@ -240,7 +248,7 @@ class SampleClock:
         self._index, self._last_t_ns = float(index[-1]), int(t[-1])
         if period_s and missing.any():
             for row in np.flatnonzero((missing > 0) & (missing <= BACK)).tolist():
-                places = np.arange(1, missing[row] + 1) * (period_s * NS)
+                places = np.arange(1, missing[row] + 1) * min(period_s * NS, float(1 << 54))  # 2 years: all in int64
                 self._holes.extend((t[row] - np.rint(places)).astype(np.int64).tolist())
         return _cut(samples, t, missing)
 
@@ -278,7 +286,7 @@ class SampleClock:
         off = np.abs(np.array(self._given_steps) / period_s - 1.0)
         if np.median(off) > NEAR:
             return np.zeros(steps_s.size, np.int64)
-        gap = np.rint(periods).astype(np.int64) - 1
+        gap = np.rint(np.clip(periods, 0.0, LONGEST_GAP)).astype(np.int64) - 1
         late = (periods < SURELY_MISSING) & (np.abs(periods - np.rint(periods)) > NEAR)
         late |= periods < 1.0 + max(0.5, LATE * float(np.quantile(off, 0.75)))
         late |= steps_s + np.minimum(before, after) < 2.5 * period_s
@@ -298,20 +306,26 @@ class SampleClock:
         size = self._ticks_a_sample(counter)
         if not first:
             steps[0] += counter.modulus * self._hidden_turns(steps, size, counter, arrived_ns)
-        self._tick = previous + int(steps.sum())
+        self._tick = int(samples.ticks[-1])
         waited = self._watch_stuck(samples, steps[1:] if first else steps)
         missing = np.zeros(len(samples), np.int64)
         if size is not None:
-            missing = np.maximum(np.rint(steps / size).astype(np.int64) - 1 - waited, 0)
-        if first or steps.sum() == 0:  # a counter that stands still says nothing
-            unseen = self._missing_in(elapsed_s, len(samples)) if first and self._paused else 0
+            missing = np.maximum(np.rint(np.minimum(steps / size, LONGEST_GAP)).astype(np.int64) - 1 - waited, 0)
+        unseen = self._missing_in(elapsed_s, len(samples)) if first and self._paused else 0
+        if not steps.any():  # a counter that stands still says nothing
             missing[0] = max(samples.lost, unseen)
-        elif self._ran_ahead(int(missing.max()), int(steps.max()), counter, arrived_ns):
+        elif self._ran_ahead(missing, steps, counter, arrived_ns):
             ahead = int(steps.max())
             moved = f"back by {counter.modulus - ahead}" if 2 * ahead > counter.modulus else f"on by {ahead}"
             text = f"counter went {moved} ticks within {elapsed_s:.3f} s"
             self._event("clock_jumped", int(samples.t_ns[0]), text)
-            missing[np.argmax(steps)] = self._missing_in(elapsed_s, len(samples) + int(missing.sum() - missing.max()))
+            at = int(np.argmax(steps))
+            missing[at] = steps[at] = 0
+            if self._ran_ahead(missing, steps, counter, arrived_ns):  # not one jump alone: no step tells anything
+                missing[:] = 0
+            missing[at] = 0 if first else self._missing_in(elapsed_s, len(samples) + int(missing.sum()))
+        if first:
+            missing[0] = max(samples.lost, unseen)
         self._paused = False
         return missing
 
@@ -327,8 +341,10 @@ class SampleClock:
         if self._paused:
             self._delay = None
             elapsed_s = (arrived_ns - self._arrived_ns) / NS
-            return max(0, round((elapsed_s * rate - counted) / turn))
-        return round(self._never_caught_up(arrived_ns, counted, turn / 2.0) / turn)
+            turns = max(0, round((elapsed_s * rate - counted) / turn))
+        else:
+            turns = round(self._never_caught_up(arrived_ns, counted, turn / 2.0) / turn)
+        return turns if turns * counter.modulus < LARGEST_STEP else 0
 
     def _ticks_a_sample(self, counter: Counter) -> float | None:
         seen = self._tick_step.usual()
@@ -351,17 +367,20 @@ class SampleClock:
             waited[at] = np.diff(moved, prepend=-1 - before) - 1
         return np.where(waited >= STUCK_SAMPLES, waited, 0)
 
-    def _ran_ahead(self, missing: int, step: int, counter: Counter, arrived_ns: int) -> bool:
+    def _ran_ahead(self, missing: Ints, steps: Ints, counter: Counter, arrived_ns: int) -> bool:
         """Whether so many samples cannot be missing, as the time for them has not passed on the host."""
         period_s = self._line.period_s() or (1.0 / self._earlier_hz if self._earlier_hz else None)
+        lost = float(missing.sum(dtype=np.float64))
         if period_s is not None:
-            lasted_s = missing * period_s
+            lasted_s = lost * max(period_s, 1.0 / FASTEST_HZ)
         elif counter.tick_s is not None:
-            lasted_s = step * counter.tick_s
-        else:  # half a turn on is more likely a step back
-            return 2 * step > counter.modulus
+            lasted_s = max(float(steps.sum(dtype=np.float64)) * counter.tick_s, lost / FASTEST_HZ)
+        elif 2 * int(steps.max()) > counter.modulus:  # half a turn on is more likely a step back
+            return True
+        else:
+            lasted_s = lost / FASTEST_HZ
         # samples may wait in buffers before the host sees them, but none arrives before it was taken
-        known_s = self._line.at(self._index) if self._line.count else self._seconds(self._arrived_ns)
+        known_s = self._line.at(self._index) if self._line.count else self._seconds(self._arrived_ns or arrived_ns)
         return lasted_s > max(self._seconds(arrived_ns) - known_s, 0.0) + JUMP_S
 
     def _arrival_gaps(self, samples: SampleBlock) -> Ints:
@@ -379,7 +398,9 @@ class SampleClock:
 
     def _missing_in(self, elapsed_s: float, arrived: int) -> int:
         rate = self._line.rate_hz() or self._nominal_hz or self._earlier_hz
-        return max(0, round(elapsed_s * rate) - arrived) if rate and self._arrived_ns else 0
+        if not rate or not self._arrived_ns:
+            return 0
+        return min(max(0, round(elapsed_s * min(rate, FASTEST_HZ)) - arrived), LONGEST_GAP)
 
     def _never_caught_up(self, arrived_ns: int, counted: int, least: float = HOLE_PERIODS) -> int:
         """Samples missing by a sudden delay that CATCH_UP_S ago began and was not made good since.
@@ -404,7 +425,7 @@ class SampleClock:
             return 0
         if arrived_ns - self._delay.since_ns < CATCH_UP_S * NS:
             return 0
-        hole = round(self._delay.least_s / period_s)
+        hole = min(round(self._delay.least_s / max(period_s, 1.0 / FASTEST_HZ)), LONGEST_GAP)
         rest_s = behind_s - hole * period_s
         # another delay may have begun meanwhile
         self._delay = _Delay(arrived_ns, rest_s) if rest_s > least_s else None
@@ -423,9 +444,14 @@ class SampleClock:
         period_s = self._line.period_s() or 1.0 / NS  # the first samples of an unknown rate: in order at least
         # no sample is newer than its arrival, but for the scatter of the line
         newest_s = min(self._line.at(self._index), arrived_s + JUMP_S)
-        t_ns = np.rint((newest_s - (self._index - index) * period_s) * NS).astype(np.int64) + (self._origin_ns or 0)
-        if t_ns[0] <= self._last_t_ns:  # the line was corrected backwards: never out of order
-            t_ns = np.maximum(t_ns, self._last_t_ns + np.arange(1, len(samples) + 1))
+        t_s = newest_s - (self._index - index) * period_s
+        if t_s[0] < -FAR_S or t_s[-1] > FAR_S:  # arrivals decades apart: no time beyond int64
+            t_s = np.clip(t_s, -FAR_S, FAR_S)
+        t_ns = np.rint(t_s * NS).astype(np.int64) + (self._origin_ns or 0)
+        if t_ns[0] <= self._last_t_ns or (t_ns[1:] <= t_ns[:-1]).any():
+            # the line was corrected backwards, or far from its origin is coarser than a period: never out of order
+            order = np.arange(len(samples))
+            t_ns = np.maximum.accumulate(np.maximum(t_ns - order, self._last_t_ns + 1)) + order
         self._last_t_ns = int(t_ns[-1])
         return _cut(samples, t_ns, missing)
 

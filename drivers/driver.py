@@ -87,6 +87,7 @@ class Driver:
         self.counts = Counts()
         self.state: State = "waiting"
         self.text = f"waiting for {link.name}"
+        self.turns = 0  # how often it has read, with or without bytes, or tried to open: stands still when it is stuck
         self.times_are_unix = link.epoch == "unix" or isinstance(decoder.timing, Given)
         self._push = push
         self._keep = keep
@@ -124,6 +125,7 @@ class Driver:
         pause_s = FIRST_PAUSE_S
         while not self._stop.is_set():
             received = self.counts.received
+            self.turns += 1
             try:
                 self.link.open()
                 self._heard_s = time.monotonic()
@@ -144,6 +146,7 @@ class Driver:
 
     def step(self) -> None:
         """One read and all that follows from it."""
+        self.turns += 1
         chunks = self.link.read(READ_TIMEOUT_S)
         self._tell_lost()
         if chunks is None:

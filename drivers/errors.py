@@ -14,9 +14,27 @@ Vendor exceptions are turned into these at the link, with ``from``. Any other ex
 pure room is a bug.
 """
 
+from typing import Final
+
+LONGEST: Final = 2000
+"""Characters of an error's text; it may quote what somebody sent."""
+
 
 class ImuError(Exception):
-    """Root of all that this project raises on purpose."""
+    """Root of all that this project raises on purpose; its text is one line that a terminal can be given."""
+
+    def __str__(self) -> str:
+        return in_one_line(super().__str__())
+
+
+def in_one_line(text: str) -> str:
+    """The text without line ends and control characters, and not endless.
+
+    >>> in_one_line("no key \\x1b[2J\\nhere")
+    'no key  [2J here'
+    """
+    text = "".join(c if c.isprintable() else " " for c in text[: LONGEST + 1].strip())
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]} …"
 
 
 class ConfigError(ImuError, ValueError):

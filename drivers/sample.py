@@ -99,17 +99,34 @@ class Given:
 
 Timing = Arrival | Counter | Given
 
+KINDS: Final = (
+    "link_lost",
+    "link_back",
+    "samples_lost",
+    "samples_repeated",
+    "clock_jumped",
+    "moved",
+    "noise_changed",
+    "bias_stepped",
+    "outlier_burst",
+    "drift_unexplained",
+    "model_disagrees",
+    "temperature_unexplained",
+    "reconciled",
+    "limit_crossed",
+    "limit_back",
+    "window_rebuilt",
+    "recording_stopped",
+    "recording_back",
+)
+"""Of an ``Event``: what a hook may wait for."""
+
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something happened to a device: what, when, how large, how sure.
+    """Something happened to a device: what, when, how large, how sure."""
 
-    Kinds so far: ``link_lost``, ``link_back``, ``samples_lost``, ``samples_repeated``, ``clock_jumped``, ``moved``,
-    ``noise_changed``, ``bias_stepped``, ``outlier_burst``, ``drift_unexplained``, ``model_disagrees``,
-    ``temperature_unexplained``, ``reconciled``.
-    """
-
-    kind: str
+    kind: str  # of KINDS
     t_ns: int
     text: str
     axis: str | None = None

@@ -28,13 +28,16 @@ TEMPERATURE: Final = "temperature"
 COLUMNS: Final = (*AXES, TEMPERATURE)
 MAX_ROWS: Final = 1_000_000
 MAX_COLUMNS: Final = 64
+MAX_BYTES: Final = 1 << 26  # a million rows of seven columns
 EVEN_NS: Final = 500
 """A row may stand this far from an even grid: twice the resolution of a float64 of Unix seconds."""
-T_LIMIT_S: Final = 9.2e9
-"""int64 nanoseconds end at 9.22e9 s."""
+T_LIMIT_S: Final = 4.6e9
+"""Years 1824 to 2115: the difference of any two is within int64 nanoseconds."""
 RATE_LIMITS_HZ: Final = (1e-6, 1e9)
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 53)]
+Lost = Annotated[int, msgspec.Meta(ge=0, le=1_000_000_000)]
+"""Eleven days at 1 kHz: more is no loss that a publisher can know of."""
 
 
 class _Payload(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -46,7 +49,7 @@ class _Payload(msgspec.Struct, frozen=True, omit_defaults=True):
     t: float | bytes
     samples: Count
     device: str = ""
-    lost: Count = 0
+    lost: Lost = 0
     t0: float | None = None
     rate: float | None = None
 
@@ -128,6 +131,8 @@ def _table(payload: _Payload) -> Floats:
     names: Sequence[str] = payload.axes
     if not 0 < len(names) <= MAX_COLUMNS or len(set(names)) != len(names):
         raise DecodeError(f"axes: {len(names)} names; need 1 to {MAX_COLUMNS}, each once")
+    if len(payload.data) > MAX_BYTES:
+        raise DecodeError(f"data: {len(payload.data)} bytes; at most {MAX_BYTES} are read")
     n, rest = divmod(len(payload.data), 8 * len(names))
     if rest or not 0 < n <= MAX_ROWS:
         raise DecodeError(f"data: {len(payload.data)} bytes are no 1 to {MAX_ROWS} rows of {len(names)} float64")

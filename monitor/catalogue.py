@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from drivers import small_file
 from drivers.errors import ConfigError
 from monitor.noise.model import NoiseModel
 from monitor.settings import model_path
@@ -14,7 +15,7 @@ def read_model(path: Path) -> NoiseModel:
         ConfigError: one line: the file, the place in it, what is wrong
     """
     try:
-        return NoiseModel.from_toml(path.read_text("utf-8"))
+        return NoiseModel.from_toml(small_file.read(path).decode("utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:

@@ -8,6 +8,7 @@ other files, and their constants, are compiled into it. So here the stamp of the
 
 import contextlib
 import inspect
+import os
 import re
 from collections.abc import Callable
 from functools import cache
@@ -33,6 +34,21 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
         kept = cast("Any", kernel)._cache._cache_file  # noqa: SLF001
         kept._source_stamp = (kept._source_stamp, stamp(Path(inspect.getfile(function))))  # noqa: SLF001
     return cast("Callable[P, R]", kernel)
+
+
+def cache_folder() -> Path | None:
+    """Where this machine keeps compiled kernels; None where it cannot."""
+    kernel: Any = numba.njit(_nothing)
+    try:
+        kernel.enable_caching()
+        folder = Path(kernel._cache.cache_path)  # noqa: SLF001
+        folder.mkdir(parents=True, exist_ok=True)
+    except (RuntimeError, OSError):
+        return None
+    return folder if os.access(folder, os.W_OK) else None
+
+
+def _nothing() -> None: ...
 
 
 @cache

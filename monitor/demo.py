@@ -45,7 +45,7 @@ def demo(sensor: str | None = None, effects: Sequence[str] = (), effect_at_s: fl
     window_s = min(device.window_s, settings.WINDOW_SAMPLES[1] / rate_hz)
     # its own model is in force, so that the viewer tells when the sensor stops agreeing with it
     device = replace(device, link=table, rate_hz=rate_hz, window_s=window_s, model=Path(table.model))
-    return replace(config, devices=(device,))
+    return replace(config, devices=(device,), path=None)
 
 
 def _said_of(option: str, function: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:

@@ -16,6 +16,9 @@ from monitor.estimate.hadamard import HadamardCurve
 from monitor.estimate.model_gap import ModelGap
 from monitor.estimate.total import TotalCurve
 from monitor.health import Health
+from monitor.history.minutes import Minutes
+from monitor.history.store import PastEvent
+from monitor.history.writer import Writer
 from monitor.publish import message
 from monitor.publish.terminal import Board
 from monitor.publish.zenoh_out import ZenohOut
@@ -66,8 +69,8 @@ class ZenohOutput(Output):
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """One event."""
-        since_s = None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
-        self._zenoh.put(topics.EVENT, device, message.event(device, unix_s, received, event, since_s))
+        payload = message.event(device, unix_s, received, event, message.since_s(unix_s, event))
+        self._zenoh.put(topics.EVENT, device, payload)
 
     def health(self, device: str, unix_s: float, health: Health) -> None:
         """Status."""
@@ -117,6 +120,57 @@ class ViewerOutput(Output):
         self._view.health(device, unix_s, health)
 
 
+class HistoryOutput(Output):
+    """Results gathered by the minute, and events, for the file that keeps them."""
+
+    def __init__(self, writer: Writer, recorded: Collection[str] = ()) -> None:
+        """``recorded``: devices whose times are not the host's."""
+        self.received: dict[str, int] = {}  # samples of each device since the start
+        self._writer = writer
+        self._recorded = recorded
+        self._minutes: dict[str, Minutes] = {}
+
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        """Their temperature."""
+        unix_s = (int(samples.t_ns[-1]) + offset_ns) / 1e9
+        self._writer.put(device, self._of(device).temperature(unix_s, samples.temperature_c))
+
+    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
+        """Coefficients, and deviations on a coarse grid."""
+        self._writer.put(device, self._of(device).estimate(unix_s, estimate))
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        """One event."""
+        since_s = None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
+        # plain numbers: an array's own are none to SQLite
+        what = {name: {side: float(one) for side, one in sides.items()} for name, sides in event.what.items()}
+        sigma = None if event.sigma is None else float(event.sigma)
+        told = PastEvent(unix_s, event.kind, event.text, event.axis, what, since_s, sigma)
+        self._writer.tell(device, told)
+
+    def health(self, device: str, unix_s: float, health: Health) -> None:
+        """Counts and state. Before a recording of last year has begun, it is not today that anything happens."""
+        if device in self._recorded and not health.received:
+            return
+        self.received[device] = health.received
+        self._writer.put(device, self._of(device).health(unix_s, health))
+
+    def gone(self, device: str) -> None:
+        """A device that was taken out: its minute is as full as it will be."""
+        self.received.pop(device, None)
+        minutes = self._minutes.pop(device, None)
+        if minutes is not None:
+            self._writer.put(device, minutes.end())
+
+    def end(self) -> None:
+        """Hand over the minutes that are not full yet."""
+        for device, minutes in self._minutes.items():
+            self._writer.put(device, minutes.end())
+
+    def _of(self, device: str) -> Minutes:
+        return self._minutes.setdefault(device, Minutes())
+
+
 class LogOutput(Output):
     """Events and changes of state as log lines."""
 
@@ -134,6 +188,10 @@ class LogOutput(Output):
             self._said[device] = now
             say = _log.info if health.state in ("running", "ended") and not health.text else _log.warning
             say("status", device=device, state=health.state, text=health.text, received=health.received)
+
+    def gone(self, device: str) -> None:
+        """Its state is news again, should it come back."""
+        self._said.pop(device, None)
 
 
 class TableOutput(Output):
@@ -171,3 +229,9 @@ class TableOutput(Output):
             self.board.take(topics.GAP.key(PREFIX, device), message.gap(device, *self._gaps.pop(device)))
         if self._live is not None:
             self._live.update(self.board.table(time.monotonic()), refresh=True)
+
+    def gone(self, device: str) -> None:
+        """No row."""
+        self._latest.pop(device, None)
+        self._gaps.pop(device, None)
+        self.board.forget(topics.STATUS.key(PREFIX, device))

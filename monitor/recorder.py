@@ -103,6 +103,7 @@ class _Track:
     unsynced: bool = False
     trouble: str = ""
     stopped_s: float = 0.0
+    leaving: bool = False  # the device is no more: what waits is written, and that is all
 
 
 class Recorder:
@@ -127,6 +128,23 @@ class Recorder:
         self._packing: Iterator[None] | None = None
         self._to_pack: deque[Path] = deque()
         self._full = ""  # why the disk takes no more
+
+    def add(self, origins: Sequence[Origin]) -> None:
+        """Record another device too."""
+        with self._lock:
+            self._tracks = {
+                **self._tracks,
+                **{(one.device, one.kind): _Track(one, self.folder(one)) for one in origins},
+            }
+
+    def remove(self, device: str) -> None:
+        """Record a device no more, once what waits of it is written; ``has`` tells when."""
+        for track in self._tracks.values():
+            track.leaving |= track.origin.device == device
+
+    def has(self, device: str) -> bool:
+        """Whether something of the device is recorded, or waits to be."""
+        return any(name == device for name, _ in self._tracks)
 
     def folder(self, origin: Origin) -> Path:
         """Where the segments of a device are."""
@@ -230,7 +248,10 @@ class Recorder:
         while True:
             closing = self._closing.wait(WRITE_S)
             for track in self._tracks.values():
+                leaving = track.leaving  # before what waits is looked at: nothing comes after it
                 self._write(track)
+                if leaving:
+                    self._leave(track)
             if closing:
                 break
             self._sync()
@@ -238,6 +259,12 @@ class Recorder:
             self._pack()
         for track in self._tracks.values():
             self._end(track)
+
+    def _leave(self, track: _Track) -> None:
+        """End the file of a device that is no more."""
+        self._end(track)
+        with self._lock:
+            self._tracks = {key: one for key, one in self._tracks.items() if one is not track}
 
     def _write(self, track: _Track) -> None:
         """Append what waits; where that fails it goes on waiting, as far as there is room."""

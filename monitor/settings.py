@@ -5,10 +5,13 @@ known one. Links and decoders bring their own keys: their modules' ``Settings`` 
 and ``[device.driver.decoder_options]``. Relative paths are relative to the configuration file.
 """
 
+import dataclasses
+import os
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from fnmatch import fnmatch
+from math import inf
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
@@ -16,18 +19,22 @@ import msgspec
 
 import drivers.decoders
 import drivers.links
-from drivers import plugin
+from drivers import plugin, small_file
 from drivers.decoders.base import Addressed, Decoder
 from drivers.driver import AxisMap, axis_map
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, in_one_line
 from drivers.links.base import Filtering, Link, LinkSettings
+from drivers.sample import AXES, KINDS
 from drivers.zenoh_session import configuration, plain, secret_files
-from monitor import permissions
+from monitor import permissions, toml
 from monitor.tables import (
     DeviceTable,
     FaultsTable,
     FileTable,
+    HookTable,
+    LimitTable,
     LogTable,
+    MetricsTable,
     StorageTable,
     ViewerTable,
     VirtualTable,
@@ -41,7 +48,10 @@ __all__ = [
     "Device",
     "DeviceTable",
     "FaultsTable",
+    "Hook",
+    "Limit",
     "LogTable",
+    "Metrics",
     "Storage",
     "ViewerTable",
     "VirtualTable",
@@ -64,10 +74,24 @@ WINDOW_LONGEST_S: Final = 40 * 86400.0
 THERMAL_SAMPLES: Final = 8
 """In an interval at the least: its scatter tells how well its mean is known."""
 THERMAL_LONGEST_S: Final = 86400.0
+RATES_HZ: Final = (1e-9, 1e9)
 SEGMENT_S: Final = (10.0, 86400.0)
 DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
 IS_ENDPOINT: Final = re.compile(r"[a-z]+/.+")
+LISTEN: Final = re.compile(r"(\[[0-9a-fA-F:]+\]|[\w.-]+):([0-9]{1,5})", re.ASCII)
 MEMORY: Final = re.compile(r"[0-9]+(\.[0-9]+)?\s*([kMGT]?i?B|%)")
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """What one coefficient of some axes must not pass; SI unit of letter and axis."""
+
+    axes: tuple[str, ...]
+    letter: str
+    above: float | None
+    below: float | None
+    times_model: float | None  # instead of above
+    hold_s: float  # that it has to be beyond, or back
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +115,26 @@ class Device:
     reconcile_folder: Path | None = None  # where reports are kept
     thermal_s: float | None = 600.0  # of the means that are held against temperature; None: they are not
     compensate: bool = True  # take the gyros' drift out of a copy of the samples
+    limits: tuple[Limit, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Hook:
+    """What events of some kinds, of some devices, set off: a command, a message, or both."""
+
+    on: frozenset[str]
+    devices: frozenset[str]  # none: all
+    command: tuple[str, ...]
+    key: str | None
+    timeout_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Metrics:
+    """Where Prometheus finds the numbers."""
+
+    host: str
+    port: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +159,12 @@ class Config:
     viewer: ViewerTable
     log: LogTable
     storage: Storage | None = None
+    hooks: tuple[Hook, ...] = ()
+    metrics: Metrics | None = None
+    path: Path | None = None  # of the file
+    table: Mapping[str, Any] = dataclasses.field(
+        default_factory=dict
+    )  # as it stands in the file, for a reload to compare
     warnings: tuple[str, ...] = ()  # a line each: what is not wrong, but should not stay
 
 
@@ -134,22 +184,22 @@ def load(path: Path) -> Config:
 def read(path: Path) -> tuple[Config | None, list[str]]:
     """The configuration, or None and all that is wrong with the file, a line each."""
     try:
-        text = path.read_text("utf-8")
+        text = small_file.read(path).decode("utf-8")
     except FileNotFoundError:
         return None, [f"{path}: no such file; imu-monitor check --print-defaults prints one to start from"]
     except (OSError, UnicodeDecodeError) as error:
         return None, [f"{path}: cannot be read: {error}"]
     try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        return None, [f"{path}: not TOML: {error}"]
+        table = toml.tables(text)
+    except ConfigError as error:
+        return None, [f"{path}: {error}"]
     reader = _Reader(path.resolve().parent)
     config = reader.config(table)
     reader.trust(path)
-    wrong = [f"{path}: {line}" for line in reader.wrong]
-    if config is None or wrong:
-        return None, wrong
-    return replace(config, warnings=tuple(f"{path}: {line}" for line in reader.warnings)), []
+    if config is None or reader.wrong:
+        return None, [in_one_line(f"{path}: {line}") for line in reader.wrong]
+    warnings = tuple(f"{path}: {line}" for line in reader.warnings)
+    return replace(config, path=path, table=table, warnings=warnings), []
 
 
 class _Reader:
@@ -188,12 +238,82 @@ class _Reader:
         if zenoh is not None:
             self._reachable(zenoh)
         storage = self._storage(file.storage)
+        hooks = self._hooks(file.hook, [str(name) for name in names], zenoh is not None and zenoh.mode == "none")
+        metrics = self._metrics(file.metrics)
+        history_s = self._shown_history(viewer, storage)
         if zenoh is None or viewer is None or log is None:
             return None
+        viewer = msgspec.structs.replace(viewer, history=history_s)
         if viewer.mode.endswith(".rrd"):
             path = self._folder / Path(viewer.mode).expanduser()
             viewer = msgspec.structs.replace(viewer, mode=str(path))
-        return Config(tuple(device for device in devices if device is not None), zenoh, viewer, log, storage)
+        known = tuple(device for device in devices if device is not None)
+        return Config(known, zenoh, viewer, log, storage, hooks, metrics)
+
+    def _shown_history(self, viewer: ViewerTable | None, storage: Storage | None) -> float | None:
+        """s of it that the viewer opens on."""
+        if viewer is None or viewer.history is None:
+            return None
+        if storage is None or not storage.history:
+            self.wrong.append("viewer.history: none is kept; [storage] folder says where it would be")
+        found: float | None = self._try("viewer.history", seconds, viewer.history)
+        return found
+
+    def _limits(self, tables: list[dict[str, Any]], has_model: bool, at: str) -> tuple[Limit, ...]:
+        filled = [(self.fill(LimitTable, one, f"{at}[{i}]"), f"{at}[{i}]") for i, one in enumerate(tables)]
+        limits = []
+        for table, here in filled:
+            if table is None:
+                continue
+            axes = self._try(f"{here}.axes", _axes, table.axes)
+            hold_s = self._try(f"{here}.hold", seconds, table.hold)
+            if self._bounds(table, has_model, here) and axes and hold_s:
+                limits.append(Limit(axes, table.letter, table.above, table.below, table.times_model, hold_s))
+        return tuple(limits)
+
+    def _bounds(self, table: LimitTable, has_model: bool, at: str) -> bool:
+        """Whether the bounds of a limit fit each other."""
+        before = len(self.wrong)
+        if table.above is None and table.below is None and table.times_model is None:
+            self.wrong.append(f"{at}: no bound; add above, below or times_model")
+        if table.above is not None and table.times_model is not None:
+            self.wrong.append(f"{at}: above and times_model are two words for one bound; leave one out")
+        if table.above is not None and table.below is not None and table.below >= table.above:
+            self.wrong.append(f"{at}: below {table.below:g} is not under above {table.above:g}: nothing lies between")
+        if table.times_model is not None and not has_model:
+            self.wrong.append(f"{at}.times_model: the device has no model to be relative to; add model")
+        return len(self.wrong) == before
+
+    def _hooks(self, tables: list[dict[str, Any]], devices: list[str], no_zenoh: bool) -> tuple[Hook, ...]:
+        hooks = []
+        for i, one in enumerate(tables):
+            at = f"hook[{i}]"
+            table = self.fill(HookTable, one, at)
+            timeout_s = None if table is None else self._try(f"{at}.timeout", seconds, table.timeout)
+            if table is None or timeout_s is None:
+                continue
+            for key, said, known in (("on", table.on, (*KINDS, "*")), ("devices", table.devices, devices)):
+                for word in (word for word in said if word not in known):
+                    self.wrong.append(f'{at}.{key}: unknown "{word}"{plugin.nearest(word, known)}')
+            if not table.on:
+                self.wrong.append(f'{at}.on: empty; write kinds of events, or ["*"]')
+            if not table.command and table.key is None:
+                self.wrong.append(f"{at}: nothing to do; add command or key")
+            if table.key is not None and no_zenoh:
+                self.wrong.append(f'{at}.key: zenoh.mode is "none", so nothing can be put there')
+            command = self._try(f"{at}.command", _command, table.command, self._folder)
+            hooks.append(Hook(frozenset(table.on), frozenset(table.devices), command or (), table.key, timeout_s))
+        return tuple(hooks)
+
+    def _metrics(self, keys: Mapping[str, Any]) -> Metrics | None:
+        table = self.fill(MetricsTable, keys, "metrics")
+        if table is None or table.listen is None:
+            return None
+        match = LISTEN.fullmatch(table.listen)
+        if match is None or not 0 < int(match[2]) < 65536:
+            self.wrong.append(f'metrics.listen: "{table.listen}" is no host and port; write "127.0.0.1:9464"')
+            return None
+        return Metrics(match[1].strip("[]"), int(match[2]))
 
     def _storage(self, keys: Mapping[str, Any]) -> Storage | None:
         """None where nothing is to be kept, or a key is wrong."""
@@ -252,11 +372,12 @@ class _Reader:
         model = None if entry.model is None else self._try(f"{at}: model", model_path, entry.model, self._folder)
         tau = entry.tau if isinstance(entry.tau, str) else tuple(entry.tau)
         self._try(f"{at}: tau", _possible_tau, tau, window_s, entry.rate)
+        limits = self._limits(entry.limit, entry.model is not None, f"{at}: limit")
         silence_s = float(entry.driver.get("silence", LinkSettings().silence))
         return Device(
             entry.name, entry.rate, window_s, tau, refit_s, publish_s, link, decoder, axes, silence_s,
             entry.motion == "leave out", entry.alarms_per_day, entry.restart, model,
-            entry.reconcile_folder, thermal_s, entry.compensate,
+            entry.reconcile_folder, thermal_s, entry.compensate, limits,
         )  # fmt: skip
 
     def driver(self, table: Mapping[str, Any], at: str) -> tuple[Link | VirtualTable | None, Decoder | None]:
@@ -415,10 +536,11 @@ def seconds(value: float | str) -> float:
             duration = float(match[1]) * UNITS_S[match[2]] if match else 0.0
         except (KeyError, ValueError):
             duration = 0.0
-        if duration <= 0.0:
-            raise ConfigError(f'"{value}" is no duration; write seconds, or "90s", "30min", "1h", "2d"')
-        return duration
-    return float(value)
+    else:
+        duration = float(value)
+    if not 0.0 < duration < inf:
+        raise ConfigError(f'"{value}" is no duration; write seconds, or "90s", "30min", "1h", "2d"')
+    return duration
 
 
 def period(value: str, always: str) -> float:
@@ -431,9 +553,10 @@ def period(value: str, always: str) -> float:
         return 0.0
     match = re.fullmatch(r"\s*([0-9.]+)\s*Hz\s*", value)
     try:
-        return 1.0 / float(match[1]) if match else _no_rate(value, always)
-    except (ValueError, ZeroDivisionError):
-        return _no_rate(value, always)
+        rate_hz = float(match[1]) if match else 0.0
+    except ValueError:
+        rate_hz = 0.0
+    return 1.0 / rate_hz if RATES_HZ[0] <= rate_hz <= RATES_HZ[1] else _no_rate(value, always)
 
 
 def viewer_mode(mode: str) -> str:
@@ -489,6 +612,33 @@ def _possible_tau(tau: str | tuple[float, ...], window_s: float, rate_hz: float 
     if not any(0.5 * shortest_s < one <= 0.5 * window_s for one in tau):
         low = f"{shortest_s:g} s, one sample," if rate_hz else "one sample"
         raise ConfigError(f"none of {list(tau)} s lies between {low} and {window_s / 2:g} s, half the window")
+
+
+def _axes(pattern: str) -> tuple[str, ...]:
+    """Axes of a name or "g*", "a*", "*".
+
+    >>> _axes("g*"), _axes("az")
+    (('gx', 'gy', 'gz'), ('az',))
+    """
+    if pattern in (*AXES, "g*", "a*", "*"):
+        return tuple(axis for axis in AXES if fnmatch(axis, pattern))
+    raise ConfigError(f'"{pattern}"; possible are {", ".join(AXES)}, g*, a*, *')
+
+
+def _command(words: list[str], folder: Path) -> tuple[str, ...]:
+    """A program and its arguments; a relative path begins at ``folder``."""
+    if not words:
+        return ()
+    if "/" not in words[0]:
+        raise ConfigError(f'"{words[0]}" is no path; write where the program is, e.g. "/usr/bin/{words[0]}"')
+    if any("\0" in word for word in words):
+        raise ConfigError("a word with a NUL character cannot be handed to a program")
+    path = folder / Path(words[0]).expanduser()
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such file")
+    if not os.access(path, os.X_OK):
+        raise ConfigError(f"{path}: not executable; chmod +x it")
+    return (str(path), *words[1:])
 
 
 def _narrow(link: object, decoder: object) -> None:

@@ -6,35 +6,32 @@ and none of them waits: each has a queue or drops.
 
 import threading
 import time
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Final
 
-import msgspec
 import numpy as np
 
 from drivers.clock import Before, SampleClock
 from drivers.decoders.base import Decoder
 from drivers.driver import Driver
-from drivers.errors import ConfigError, ImuError, NotReady
+from drivers.errors import ImuError, NotReady
 from drivers.links.base import Link
 from drivers.links.replay_link import ReplayLink
 from drivers.recording.segment import State
-from drivers.sample import AXES, Chunk, Event, Floats, SampleBlock, block, unbroken
-from monitor.catalogue import read_model
-from monitor.drift.live import LiveThermal, ThermalLook
+from drivers.sample import Chunk, Event, Floats, SampleBlock, unbroken
+from monitor import rebuilding
+from monitor.chain import Chain, Ready
+from monitor.drift.live import ThermalLook
 from monitor.drift.live_compensation import DriftLook, LiveCompensation
 from monitor.estimate.agreement import Agreement
 from monitor.estimate.estimate import Estimate
-from monitor.estimate.estimator import Estimator
 from monitor.estimate.hadamard import HadamardCurve
-from monitor.estimate.held import Held, Temperatures
-from monitor.estimate.model_gap import ModelGap, ModelInForce
+from monitor.estimate.held import Held
+from monitor.estimate.model_gap import ModelGap
 from monitor.estimate.total import TotalCurve
-from monitor.estimate.watch import Watch
 from monitor.health import Health
-from monitor.identifier import Identifier
+from monitor.limits import Limits, model_of
 from monitor.recorder import Recorder, Tail
 from monitor.ring import RingBuffer
 from monitor.settings import Device
@@ -45,29 +42,16 @@ RING_SAMPLES: Final = (65_536, 1_000_000)
 PATIENCE_S: Final = 0.002
 SAMPLES_EVERY_S: Final = 0.1
 """Raw samples travel in batches of at most this long, unless every block is wanted."""
-PIECE: Final = 512
-"""Samples estimated before it is asked whether the noise has changed: a fast replay brings thousands at once."""
 CHOOSING_S: Final = 0.001
 """In a round, that choosing a model of temperature may take for a sensor; a recording waits for it, and has longer."""
 CHOOSING_RECORDED_S: Final = 0.02
 CHOOSING_SHARE: Final = 0.02
 """Of a processor, that it may take for a device."""
-REBUILT_LEAST_S: Final = 600.0
-"""Of the recording, read after a restart however short the window is: changes are looked for in what is known."""
 TOTAL_EVERY_S: Final = 0.1
 TOTAL_SHARE: Final = 0.005
 """Of a processor, that total and Hadamard deviations may take for a device."""
 OFF_NOMINAL: Final = 0.02
 """A measured rate further than this from the configured one is said."""
-
-
-@dataclass(frozen=True, slots=True)
-class Ready:
-    """Which kernels are compiled, see ``estimator.warm_up``."""
-
-    window: threading.Event = field(default_factory=threading.Event)
-    fit: threading.Event = field(default_factory=threading.Event)
-    all: threading.Event = field(default_factory=threading.Event)
 
 
 class Output:
@@ -99,6 +83,9 @@ class Output:
 
     def health(self, device: str, unix_s: float, health: Health) -> None:
         """Once a second."""
+
+    def gone(self, device: str) -> None:
+        """The device was taken out of the configuration; one of its name may come again."""
 
 
 class Station:
@@ -132,39 +119,28 @@ class Station:
         self._recorder = recorder
         keep = None if recorder is None else self._keep
         self.driver = Driver(device.name, link, decoder, self.clock, self._push, device.axes, device.silence_s, keep)
-        self.estimator: Estimator | None = None
-        self.watch: Watch | None = None
         self.latest: Estimate | None = None
-        self._model = None if device.model is None else read_model(device.model)
-        self._in_force: ModelInForce | None = None
+        self.model = model_of(device)
         self._agreement = Agreement()
-        self.thermal: LiveThermal | None = None
-        self._looks: list[ThermalLook] = []  # not published yet
-        self._handled = 0  # as often as the watch has said it
-        self.compensation: LiveCompensation | None = None
-        self._temperatures: Temperatures | None = None  # of the samples in the window
+        self._limits = Limits(device.limits, self.model)
         self.published = 0  # samples handed to the outputs
         self._wake = wake
         self._ready = ready
         # a recording is over before its changes could be looked for
         self.waits_for_all = device.refit_s == 0.0 or device.leave_out_motion or isinstance(link, ReplayLink)
         self._patient = link.epoch == "unix"
-        self._identifier = Identifier(f"drift of {device.name}", at_once=self._patient)
+        self.chain = Chain(device, self.model, ready, self._patient, self.waits_for_all)
         self._wall = WallClock(time.monotonic_ns(), time.time_ns())
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
         self._batch: list[SampleBlock] = []  # not published yet
-        self._pieces: deque[SampleBlock] = deque()  # of a recording, that wait until a model is chosen
         self._waiting_since_ns = 0
         self._unpublished_since_ns = 0  # of the oldest sample that was taken and not published yet
         self._latencies: list[float] = []
         self._started_s = time.monotonic()
-        self._no_estimate = ""  # why there can be none
         self._before = State()  # what was known before a restart
         self._happened: list[Event] = []
         self._tail: Tail | None = None  # of the recording, that the window is rebuilt from first
-        self._since: list[float | None] = [None] * len(AXES)  # Unix s, where the samples of an axis count from
         self._next_s = dict.fromkeys(("refit", "publish", "samples", "total", "thermal"), 0.0)
-        self._advanced = False  # samples since the last refit
         self._refitted = False  # a refit since the last publication
         self._newest_ns = 0
 
@@ -181,14 +157,21 @@ class Station:
         tail = self._tail
         if tail is None:
             return
+        rate_hz = self.clock.rate_hz or tail.newest.state.rate or 0.0
         try:
-            self._rebuild(tail)
+            text = rebuilding.rebuild(self.chain, tail, rate_hz, self.device.window_s, self._offset_ns())
         except (ImuError, OSError) as error:
-            self._happened.append(Event("window_rebuilt", self._newest_ns, f"the window could not be rebuilt: {error}"))
-            self.reset()
+            text = f"the window could not be rebuilt: {error}"
+            self.chain.reset()
         finally:
+            self._happened.append(Event("window_rebuilt", int(tail.newest.samples.t_ns[-1]) - self._offset_ns(), text))
             self._tail = None
             self._wake.set()
+
+    @property
+    def rebuilding(self) -> bool:
+        """Whether the window is still being filled from the recording."""
+        return self._tail is not None
 
     def stop(self) -> None:
         """Stop reading; what is in the ring stays there to be worked off."""
@@ -205,27 +188,32 @@ class Station:
         """A replay that has given all it had, and all of it is worked off."""
         if self.driver.state != "ended" or self._thread.is_alive() or not self._ready.all.is_set():
             return False
-        return not self._pieces and (not self._waiting_since_ns or self.clock.rate_hz is None)
+        return not self.chain.waiting and (not self._waiting_since_ns or self.clock.rate_hz is None)
+
+    @property
+    def turns(self) -> int | None:
+        """Of its reader, see ``Driver.turns``; None where it may stand still: a recording waits for room, and ends."""
+        return None if self._patient or self.driver.state == "ended" else self.driver.turns
 
     # --- one round
 
     def work(self, outputs: Sequence[Output], now_s: float, drain: bool = False) -> None:
         """Take what came, advance the estimate, publish what is due; all of it when draining."""
+        happened, self._happened = self._happened + self.driver.take_events(), []
+        if self._tail is not None:  # the chain is another thread's until the window is rebuilt
+            self._tell(outputs, happened)
+            return
         blocks = self._take() if drain or self._can_take() else []
         if blocks:
             self._newest_ns = int(blocks[-1].t_ns[-1])
             self._batch += blocks
-        self._advance(blocks, drain)
+        self.chain.advance(blocks, self.clock.rate_hz, drain)
         if drain:
-            self._estimate(self.watch.flush() if self.watch is not None else [])
-            self._follow()
-        happened, self._happened = self._happened + self.driver.take_events(), []
-        if self.thermal is not None and any(event.kind == "link_back" for event in happened):
-            self.thermal.offset_is_new()
+            self.chain.flush()
+        if self.chain.thermal is not None and any(event.kind == "link_back" for event in happened):
+            self.chain.thermal.offset_is_new()
         published = self._publish_samples(outputs, now_s, drain)
-        for source in (self.watch, self.thermal, self.compensation):
-            happened += source.take_events() if source is not None else []
-        self._tell(outputs, happened)
+        self._tell(outputs, happened + self.chain.take_events())
         self._publish_thermal(outputs, now_s)
         published |= self._publish_estimate(outputs, now_s, drain)
         self._publish_total(outputs, now_s)
@@ -235,16 +223,22 @@ class Station:
 
     def reset(self) -> None:
         """Empty the window."""
-        if self.estimator is not None:
-            self.estimator.reset()
-            for axis in range(len(AXES)):
-                self._count_from(axis, 0)
+        if self._tail is None:
+            self.chain.reset()
 
     def held(self) -> tuple[Held, Floats] | None:
         """The samples in the window and their temperature [n], as of now; None while there are none."""
-        if self.estimator is None or self._temperatures is None or not self.estimator.filled:
-            return None
-        return self.estimator.held(), self._temperatures.newest(self.estimator.filled)
+        return None if self._tail is not None else self.chain.held()
+
+    def limit(self, device: Device) -> None:
+        """From now on the limits of these settings, which are otherwise those that it runs with.
+
+        Raises:
+            ConfigError: a limit that cannot be
+        """
+        limits = Limits(device.limits, self.model)
+        limits.take_over(self._limits)
+        self.device, self._limits = device, limits
 
     def announce(self, outputs: Sequence[Output], kind: str, text: str) -> None:
         """An event that happened outside of the samples, now."""
@@ -253,14 +247,9 @@ class Station:
     def report(self, outputs: Sequence[Output], states: dict[str, str], memory_bytes: int) -> Health:
         """Tell the outputs how the device does, and ease its wall clock."""
         self._wall.follow(time.monotonic_ns(), time.time_ns())
-        rate = self.clock.rate_hz
-        if self.estimator is not None and rate is not None and rate != self.estimator.rate_hz:
-            self.estimator.relabel(rate)
-            if self.watch is not None:
-                self.watch.relabel(rate)
-            for one in (self.thermal, self.compensation):
-                if one is not None:
-                    one.relabel(rate)
+        rate_hz = self.clock.rate_hz
+        if rate_hz is not None and self._tail is None:
+            self.chain.relabel(rate_hz)
         if self._recorder is not None:
             self._recorder.know(self.name, self._known())
         health = self.health(states, memory_bytes)
@@ -270,7 +259,7 @@ class Station:
 
     def health(self, states: dict[str, str], memory_bytes: int) -> Health:
         """How the device does now."""
-        counts, latencies = self.driver.counts, np.array(self._latencies)
+        counts, latencies, watch = self.driver.counts, np.array(self._latencies), self.chain.watch
         self._latencies = []
         return Health(
             state=self.driver.state,
@@ -287,8 +276,9 @@ class Station:
             uptime_s=time.monotonic() - self._started_s,
             repeated=self.clock.repeated,
             late=self.clock.late,
-            moving=self.watch is not None and self.watch.moving,
-            moved=self.watch.moved_samples if self.watch is not None else 0,
+            moving=watch is not None and watch.moving,
+            moved=watch.moved_samples if watch is not None else 0,
+            crossed=self._limits.crossed,
         )
 
     def unix_s(self, t_ns: int) -> float:
@@ -322,60 +312,11 @@ class Station:
         if self._recorder is not None:
             self._recorder.know(self.name, state)  # the next restart may come before anything else is known
 
-    def _rebuild(self, tail: Tail) -> None:
-        """What the samples of the last window would have made of it, but for what was told of them then."""
-        offset_ns, since, since_places = self._offset_ns(), tail.newest.state.since, np.zeros(len(AXES), np.int64)
-        places = 0
-        for piece in tail.pieces(max(self.device.window_s, REBUILT_LEAST_S)):
-            samples = piece.samples
-            places += samples.lost + len(samples)
-            for axis, unix_s in enumerate(since):
-                if unix_s is not None:
-                    counts = samples.t_ns / 1e9 >= unix_s
-                    since_places[axis] += np.count_nonzero(counts) + (samples.lost if counts[0] else 0)
-            self._relive(block(samples.t_ns - offset_ns, samples.values, samples.temperature_c, lost=samples.lost))
-        if self.estimator is None:
-            return
-        for axis, unix_s in enumerate(since):
-            if unix_s is not None:
-                self.estimator.restart(axis, int(since_places[axis]))
-        self._since = list(since)
-        state = tail.newest.state
-        if state.theta:
-            shape = (-1, len(AXES))
-            theta = np.array(state.theta, np.float64).reshape(shape)
-            self.estimator.start_from(np.array(state.entered).reshape(shape), theta)
-        filled_s = self.estimator.filled / self.estimator.rate_hz
-        text = f"{filled_s:.6g} s of the window were rebuilt from the recording"
-        self._happened.append(Event("window_rebuilt", self._newest_ns, text))
-
-    def _relive(self, samples: SampleBlock) -> None:
-        self._newest_ns = int(samples.t_ns[-1])
-        self._advance([samples], drain=True)
-        if self.compensation is not None and np.isfinite(samples.values[:, :3]).any():
-            for at in range(0, len(samples), PIECE):
-                self.compensation.update(samples[at : at + PIECE])
-            self._identifier.renew(self.compensation)
-            self.compensation.take()
-        for source in (self.watch, self.thermal, self.compensation):
-            if source is not None:
-                source.take_events()
-        self._looks = []
-
     def _known(self) -> State:
         """What goes into the recording beside the samples."""
-        if self.estimator is None or self._tail is not None:
-            rate_hz, tick_step = self.clock.rate_hz or self._before.rate, self.clock.tick_step or self._before.tick_step
-            return msgspec.structs.replace(self._before, rate=rate_hz, tick_step=tick_step)
-        entered, theta = self.estimator.fitted()
-        sizes = [None if np.isnan(size) else float(size) for size in theta.ravel()]
-        return State(
-            self.estimator.rate_hz,
-            tuple(self._since),
-            self.clock.tick_step,
-            tuple(sizes),
-            tuple(entered.ravel().tolist()),
-        )
+        if self._tail is not None:
+            return self._before
+        return rebuilding.known(self.chain, self._before, self.clock.rate_hz, self.clock.tick_step, self._offset_ns())
 
     # --- inside
 
@@ -387,7 +328,7 @@ class Station:
     def _push(self, samples: SampleBlock) -> None:
         """Called by the reader's thread. A sensor is never kept waiting; a recording waits for room."""
         if self._recorder is not None:
-            if self.estimator is None:  # a crash may come before the first report
+            if self.chain.estimator is None:  # a crash may come before the first report
                 self._recorder.know(self.name, self._known())
             self._recorder.samples(self.name, samples, self._offset_ns())
             while self._patient and self._recorder.full(self.name):
@@ -404,76 +345,19 @@ class Station:
 
     def _can_take(self) -> bool:
         """Until the rate is known and the kernels are compiled, samples wait in the ring."""
-        if self._pieces or self._tail is not None:
+        chain = self.chain
+        if chain.waiting or self._tail is not None:
             return False
-        if self.estimator is not None or self._no_estimate:
+        if chain.estimator is not None or chain.refused:
             return True
         if self.clock.rate_hz is None:  # times from which no rate can be told must not stop the samples
             return self.ring.room < self.ring.capacity // 2
-        return self._compiled()
-
-    def _compiled(self) -> bool:
-        """Whether samples can be taken at once: to compile what they need in this loop would hold up all devices."""
-        return (self._ready.all if self.waits_for_all else self._ready.window).is_set()
+        return chain.compiled
 
     def _take(self) -> list[SampleBlock]:
         came_ns, self._waiting_since_ns = self._waiting_since_ns, 0
         self._unpublished_since_ns = self._unpublished_since_ns or came_ns
         return self.ring.take()
-
-    def _advance(self, blocks: list[SampleBlock], drain: bool) -> None:
-        rate = self.clock.rate_hz
-        if self.estimator is None:
-            if rate is None or self._no_estimate or not self._compiled():
-                return
-            try:
-                every_sample = self.device.refit_s == 0.0
-                self.estimator = Estimator(rate, self.device.window_s, self.device.tau, every_sample)
-                self._temperatures = Temperatures(self.estimator.length)
-                if self._model is not None:
-                    self._in_force = ModelInForce(self._model, self.estimator.length)
-            except ConfigError as error:  # a list of τ that does not fit the rate found; samples go on
-                self._no_estimate = f"no estimate: {error}"
-                return
-        if self.watch is None and self._ready.all.is_set():
-            rate_hz, thermal_s = self.estimator.rate_hz, self.device.thermal_s
-            wanted = thermal_s is not None
-            self.watch = Watch(rate_hz, self.device.leave_out_motion, self.device.alarms_per_day, keep_still=wanted)
-            self.thermal = None if thermal_s is None else LiveThermal(rate_hz, thermal_s)
-            self.compensation = LiveCompensation(rate_hz) if self.device.compensate else None
-        self._pieces += [samples[at : at + PIECE] for samples in blocks for at in range(0, len(samples), PIECE)]
-        while self._pieces and (drain or not self._patient or self.thermal is None or not self.thermal.choosing):
-            piece = self._pieces.popleft()
-            self._estimate(self.watch.update(piece) if self.watch is not None else [piece])
-            self._follow()
-
-    def _follow(self) -> None:
-        """Hand on what is at rest to the models of temperature."""
-        if self.watch is None or self.thermal is None:
-            return
-        if self.watch.handled != self._handled:
-            self._handled = self.watch.handled
-            self.thermal.offset_is_new()
-        for samples in self.watch.take_still():
-            self._looks += self.thermal.update(samples)
-
-    def _estimate(self, blocks: list[SampleBlock]) -> None:
-        """Advance the estimate, and let axes begin anew whose noise was found changed."""
-        if self.estimator is None or self._temperatures is None:
-            return
-        for samples in blocks:
-            self.estimator.update(samples)
-            self._temperatures.push(samples.lost, samples.temperature_c)
-            self._advanced = True
-        for restart in self.watch.take_restarts() if self.watch is not None else ():
-            if self.device.restart and self._tail is None:
-                self.estimator.restart(restart.axis, restart.samples)
-                self._count_from(restart.axis, restart.samples)
-
-    def _count_from(self, axis: int, samples: int) -> None:
-        """Note for the recording that of an axis only the newest samples count."""
-        if self.estimator is not None:
-            self._since[axis] = self.unix_s(self._newest_ns) - (samples - 0.5) / self.estimator.rate_hz
 
     def _publish_samples(self, outputs: Sequence[Output], now_s: float, drain: bool) -> bool:
         every_s = min(self.device.publish_s, SAMPLES_EVERY_S)
@@ -484,8 +368,8 @@ class Station:
             self.published += len(samples)
             for output in outputs:
                 output.samples(self.name, self.published, samples, self._offset_ns())
-            if self.compensation is not None and np.isfinite(samples.values[:, :3]).any():
-                self._publish_compensated(outputs, self.compensation, samples)
+            if self.chain.compensation is not None and np.isfinite(samples.values[:, :3]).any():
+                self._publish_compensated(outputs, self.chain.compensation, samples)
         return True
 
     def _publish_compensated(self, outputs: Sequence[Output], live: LiveCompensation, samples: SampleBlock) -> None:
@@ -495,8 +379,7 @@ class Station:
             piece = samples[at : at + live.compensator.ahead]
             at += len(piece)
             without = live.update(piece)
-            if live.compensator.ahead == live.compensator.interval:
-                self._identifier.renew(live)
+            self.chain.renew()
             for output in outputs:
                 output.compensated(self.name, self.published - len(samples) + at, without, self._offset_ns())
         for look in live.take():
@@ -506,11 +389,12 @@ class Station:
     def _publish_estimate(self, outputs: Sequence[Output], now_s: float, drain: bool) -> bool:
         # at every sample the course follows by itself: a look before that is published would take its samples away
         every_s = self.device.refit_s or self.device.publish_s
-        if self.estimator is not None and self._advanced and (self._due("refit", every_s, now_s) or drain):
+        estimator = self.chain.estimator
+        if estimator is not None and self.chain.advanced and (self._due("refit", every_s, now_s) or drain):
             fitted = self._ready.fit.is_set()
-            self._advanced = not fitted  # a curve alone is fitted as soon as that can be
+            self.chain.advanced = not fitted  # a curve alone is fitted as soon as that can be
             try:
-                self.latest = self.estimator.get(fitted=fitted)
+                self.latest = estimator.get(fitted=fitted)
             except NotReady:
                 return False
             self._refitted = True
@@ -521,8 +405,9 @@ class Station:
         self._refitted = False
         for output in outputs:
             output.estimate(self.name, self.unix_s(self.latest.t_ns), self.latest)
-        if self._in_force is not None:
-            self._publish_gap(outputs, self._in_force.look(self.latest))
+        if self.chain.in_force is not None:
+            self._publish_gap(outputs, self.chain.in_force.look(self.latest))
+        self._tell(outputs, self._limits.update(self.latest))
         return True
 
     def _publish_gap(self, outputs: Sequence[Output], look: ModelGap) -> None:
@@ -539,10 +424,11 @@ class Station:
 
     def _publish_total(self, outputs: Sequence[Output], now_s: float) -> None:
         """One step of the slow statistics, as often as they may take their share of the time."""
-        if self.estimator is None or not self._ready.all.is_set() or now_s < self._next_s["total"]:
+        estimator = self.chain.estimator
+        if estimator is None or not self._ready.all.is_set() or now_s < self._next_s["total"]:
             return
         begun_s = time.perf_counter()
-        found = self.estimator.step()
+        found = estimator.step()
         self._next_s["total"] = now_s + max(TOTAL_EVERY_S, (time.perf_counter() - begun_s) / TOTAL_SHARE)
         if found is not None:
             for output in outputs:
@@ -550,15 +436,15 @@ class Station:
 
     def _publish_thermal(self, outputs: Sequence[Output], now_s: float) -> None:
         """Intervals that are over; and a piece of choosing models."""
-        looks, self._looks = self._looks, []
-        for look in looks:
+        for look in self.chain.take_looks():
             for output in outputs:
                 output.thermal(self.name, self.unix_s(look.t_ns), self.driver.counts.received, look)
-        if self.thermal is None or not self.thermal.choosing or now_s < self._next_s["thermal"]:
+        thermal = self.chain.thermal
+        if thermal is None or not thermal.choosing or now_s < self._next_s["thermal"]:
             return
         begun_s = time.perf_counter()
         until_s = begun_s + (CHOOSING_RECORDED_S if self._patient else CHOOSING_S)
-        while self.thermal.step() and time.perf_counter() < until_s:
+        while thermal.step() and time.perf_counter() < until_s:
             pass
         if self._patient:
             self._wake.set()  # what waits in the ring goes on
@@ -580,8 +466,8 @@ class Station:
         nominal, measured = self.device.rate_hz, self.clock.measured_hz
         if self.driver.text or self.driver.state != "running":
             return self.driver.text
-        if self._no_estimate or not nominal or not measured:
-            return self._no_estimate
+        if self.chain.refused or not nominal or not measured:
+            return self.chain.refused
         if abs(measured / nominal - 1.0) > OFF_NOMINAL:
             return f"samples come at {measured:.4g} Hz, configured are {nominal:g} Hz"
         return ""

@@ -44,6 +44,21 @@ class DeviceTable(_Table, frozen=True, kw_only=True):
     reconcile_folder: Path | None = None
     """Where the reports of ``command/reconcile`` are kept; None: they are not."""
     axes: dict[str, str] = {}
+    limit: list[dict[str, Any]] = []
+
+
+class LimitTable(_Table, frozen=True, kw_only=True):
+    """``[[device.limit]]``: what a coefficient must not pass; one of the three bounds at least."""
+
+    axes: str
+    letter: Literal["Q", "N", "B", "K", "R"]
+    above: Positive | None = None
+    """SI unit of letter and axis, as in a model file."""
+    below: Positive | None = None
+    times_model: Positive | None = None
+    """Too much is so many times what the model in force says."""
+    hold: Positive | str = "1min"
+    """It has to be beyond, or back, for so long."""
 
 
 class FaultsTable(_Table, frozen=True, kw_only=True):
@@ -104,6 +119,8 @@ class ViewerTable(_Table, frozen=True, kw_only=True):
     port: Port = 9876
     web_port: Port = 9090
     memory: str = "256MiB"
+    history: Positive | str | None = None
+    """Of what is kept, shown when the view opens; None: nothing."""
 
 
 class StorageTable(_Table, frozen=True, kw_only=True):
@@ -123,6 +140,28 @@ class StorageTable(_Table, frozen=True, kw_only=True):
     """Results, events and status, thinned with age."""
 
 
+class HookTable(_Table, frozen=True, kw_only=True):
+    """``[[hook]]``: what an event sets off, a command or a message."""
+
+    on: list[str]
+    """Kinds of events; "*" is every one."""
+    devices: list[str] = []
+    """Names; none: all."""
+    command: list[str] = []
+    """A program's path and its arguments, never a shell's line; the event comes as JSON on standard input."""
+    key: Annotated[str, msgspec.Meta(pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$")] | None = None
+    """Of zenoh, where the event is put as JSON."""
+    timeout: Positive | str = "30s"
+    """After which the command is killed, with all that it started."""
+
+
+class MetricsTable(_Table, frozen=True, kw_only=True):
+    """``[metrics]``: numbers for Prometheus."""
+
+    listen: str | None = None
+    """Host and port; None: nothing listens."""
+
+
 class LogTable(_Table, frozen=True, kw_only=True):
     """``[log]``."""
 
@@ -137,4 +176,6 @@ class FileTable(_Table, frozen=True, kw_only=True):
     zenoh: dict[str, Any] = {}
     viewer: dict[str, Any] = {}
     storage: dict[str, Any] = {}
+    hook: list[dict[str, Any]] = []
+    metrics: dict[str, Any] = {}
     log: dict[str, Any] = {}

@@ -11,6 +11,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from drivers import small_file
 from drivers.errors import ConfigError, NotReady
 from drivers.recording import iter_blocks, load_samples
 from drivers.sample import AXES, Floats
@@ -95,10 +96,10 @@ def from_file(path: Path) -> dict[str, ThermalModel]:
         ConfigError: what is wrong with the file
     """
     try:
-        found = msgspec.json.decode(path.read_bytes(), type=ModelFile)
+        found = msgspec.json.decode(small_file.read(path), type=ModelFile)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"{path}: no thermal model: {error}") from error
     if found.schema != SCHEMA:
         raise ConfigError(f'{path}: schema "{found.schema}"; "{SCHEMA}" is read')
@@ -127,7 +128,8 @@ def _row(model: ThermalModel) -> AxisRow:
 def _model(path: Path, axis: str, row: AxisRow, interval_s: float) -> ThermalModel:
     k = len(row.time_constants)
     terms = 1 + row.powers + k
-    covariance = np.array(row.covariance, dtype=np.float64)
+    size = terms + 2 * k
+    square = len(row.covariance) == size and all(len(one) == size for one in row.covariance)
     wrong = [
         (axis in AXES, f"no such axis; possible are {', '.join(AXES)}"),
         (row.powers >= 0, f"powers: {row.powers}; it must be 0 or more"),
@@ -136,7 +138,7 @@ def _model(path: Path, axis: str, row: AxisRow, interval_s: float) -> ThermalMod
         (len(row.start) == k, f"start: {len(row.start)} of them; {k} are needed"),
         (row.temperature[0] < row.temperature[1], "temperature: the coldest and the warmest of the fit are needed"),
         (0.0 <= row.phi < 1.0, f"phi: {row.phi:g}; it must be from 0 to below 1"),
-        (covariance.shape == (terms + 2 * k,) * 2, f"covariance: {terms + 2 * k} rows and columns are needed"),
+        (square, f"covariance: {size} rows and columns are needed"),
     ]
     for right, text in wrong:
         if not right:
@@ -149,7 +151,7 @@ def _model(path: Path, axis: str, row: AxisRow, interval_s: float) -> ThermalMod
         start=np.array(row.start),
         phi=row.phi,
         sigma=row.sigma,
-        covariance=covariance,
+        covariance=np.array(row.covariance, dtype=np.float64),
         lowest_c=row.temperature[0],
         highest_c=row.temperature[1],
     )

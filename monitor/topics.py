@@ -39,6 +39,7 @@ GAP: Final = Topic("gap", JSON, "publish", kept=1)
 THERMAL: Final = Topic("thermal", JSON, "intervals", kept=1)
 EVENT: Final = Topic("event", JSON, "event", kept=10)
 STATUS: Final = Topic("status", JSON, "1 Hz", kept=1)
+HISTORY: Final = Topic("history", JSON, "query")
 ALIVE: Final = Topic("alive", "", "presence")
 RESET: Final = Topic("command/reset", JSON, "query")
 RECONCILE: Final = Topic("command/reconcile", JSON, "query")
@@ -54,6 +55,7 @@ TOPICS: Final = (
     EVENT,
     STATUS,
     ALIVE,
+    HISTORY,
     RESET,
     RECONCILE,
 )

@@ -38,9 +38,13 @@ import msgspec
 import numpy as np
 
 from drivers.recording import save_samples
+from drivers.sample import Floats
 from monitor import settings
 from monitor.catalogue import read_model
 from monitor.demo import demo
+from monitor.estimate.estimate import Estimate
+from monitor.history.minutes import Minutes
+from monitor.history.store import FILE, PastEvent, Store
 from monitor.noise.model import NoiseModel
 from monitor.publish import rerun_sinks
 from monitor.publish.fleet import FleetView
@@ -52,6 +56,7 @@ from monitor.reconcile.reconciliation import AxisResult
 from monitor.reconciling import Request, make
 from monitor.service import Service
 from monitor.virtual import ROOM_C, WARM_UP_C, WARM_UP_S
+from tests.monitor.publish.made import estimate, true_coefficients
 
 SIZE = (1600, 1000)
 MODEL = settings.CONFIG_FOLDER / "models" / "consumer-mems.toml"
@@ -66,6 +71,7 @@ SPEED = 60.0
 SETTLE_S = 6.0  # for a software renderer to paint what has arrived
 STILL_S = 5.0  # a page that has not changed for so long has caught up with what was sent
 PULLED_S, PLUGGED_S, PULLED_AGAIN_S, LOOKED_S = 30.0, 34.0, 70.0, 74.0  # since the fleet's start
+DEMO_LETTERS = (8e-6, 1.5e-4, 2e-4, 4e-5, 1e-9)  # Q N B K R of its gyros
 VIBRATION = "gz.sinusoidal:amplitude=4e-3,frequency=17"
 SHOWN_S = 45.0  # after the vibration began
 CHROMIUM_FLAGS = (
@@ -295,6 +301,57 @@ def view(out: Path, folder: Path) -> Path:
     return path
 
 
+def yesterday(out: Path, folder: Path) -> Path:
+    """A daemon that was started anew: its view opens on the last day, of which an hour is missing."""
+    path = out / "viewer-history.png"
+    config = demo()
+    (device,) = config.devices
+    remember(folder / "kept" / FILE, device.name, time.time())
+    zenoh = msgspec.structs.replace(config.zenoh, mode="none")
+    storage = settings.Storage(folder / "kept", record=False)
+    with window() as (port, shoot):
+        viewer = msgspec.structs.replace(config.viewer, mode="native", port=port, history=86_400.0)
+        with running(replace(config, zenoh=zenoh, viewer=viewer, storage=storage)) as service:
+            until(lambda: fitted(service), 240.0)
+            time.sleep(SHOWN_S)
+            shoot(path)
+    return path
+
+
+def fitted(service: Service) -> bool:
+    """Whether there are coefficients."""
+    latest = service.stations[0].latest
+    return latest is not None and bool(np.isfinite(latest.fitted).any())
+
+
+def remember(path: Path, device: str, now_s: float) -> None:
+    """A day of rows that ends ten minutes ago, for a sensor like the demo's, that was knocked and got warm."""
+    rng, minutes = np.random.default_rng(1), Minutes()
+    rows = []
+    wander = np.cumsum(0.004 * rng.standard_normal((1440, 6)), axis=0)
+    for i in range(1430):
+        if not 800 <= i < 860:
+            scale = (1.0 + wander[i]) * (1.5 if i == 500 else 1.0)
+            rows.append(minutes.estimate(now_s - 86_400.0 + 60.0 * i, like(scale, rng)))
+            rows.append(minutes.temperature(now_s - 86_400.0 + 60.0 * i, np.array([24.0 + 4.0 * np.sin(i / 229.0)])))
+    store = Store(path)
+    times = [now_s - 86_400.0 + 60.0 * i for i in (500, 800, 860)]
+    told = [("noise_changed", "gz angle random walk rose by 50 %"), ("link_lost", "/dev/ttyUSB0: gone"),
+            ("link_back", "/dev/ttyUSB0: back after 1 h 00 min")]  # fmt: skip
+    events = [PastEvent(at, kind, text) for at, (kind, text) in zip(times, told, strict=True)]
+    store.add([(device, row) for row in (*rows, minutes.end()) if row is not None], [(device, one) for one in events])
+    store.close()
+
+
+def like(scale: Floats, rng: np.random.Generator) -> Estimate:
+    """What an hour of the demo's sensor gives, but for a factor an axis."""
+    one = estimate(seed=int(rng.integers(1 << 30)))
+    c = one.coefficients
+    wanted = np.outer(DEMO_LETTERS, np.repeat([1.0, 10.0], 3)) * scale
+    factor = np.divide(wanted, true_coefficients(), out=np.ones((5, 6)), where=true_coefficients() > 0.0)
+    return replace(one, coefficients=replace(c, value=c.value * factor, lo=c.lo * factor, hi=c.hi * factor))
+
+
 def effect(out: Path, _: Path) -> Path:
     """The demo, whose sensor has begun to vibrate."""
     path = out / "demo-effect.png"
@@ -414,6 +471,7 @@ PICTURES: dict[str, Callable[[Path, Path], Path]] = {
     "compensation": compensation,
     "fleet": fleet,
     "view": view,
+    "yesterday": yesterday,
     "effect": effect,
     "web": web,
     "plot": allan,

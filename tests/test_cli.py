@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -26,7 +27,7 @@ from monitor.cli import main
 from monitor.settings import CONFIG_FOLDER, load
 
 PROGRAM = [sys.executable, "-m", "monitor.cli"]
-COMMANDS = ("demo", "run", "check", "watch", "analyze", "simulate", "reconcile", "export")
+COMMANDS = ("demo", "run", "check", "doctor", "watch", "analyze", "simulate", "reconcile", "export")
 RATE_HZ = 100.0
 DEVICE = '[[device]]\nname = "bench-1"\n'
 VIRTUAL = DEVICE + 'driver = { link = "virtual" }\n'
@@ -212,6 +213,16 @@ def test_check_reads_the_effects_of_a_simulated_device_too(call: Call) -> None:
         assert 'effect "gz.sinusoidal:amplitude=1,frequency=60": ' in said.only_line()
 
 
+def test_check_holds_limits_against_the_model_too(call: Call) -> None:
+    limit = '[[device.limit]]\naxes = "gz"\nletter = "R"\ntimes_model = 2.0\n'
+    device = DEVICE + 'model = "consumer-mems"\n' + limit + '[device.driver]\nlink = "virtual"\n'
+    Path("c.toml").write_text(device + QUIET)
+    for command in ("check", "run"):
+        said = call(command, "c.toml")
+        assert said.status == 2
+        assert "device bench-1: limit of R: times_model = 2, but the model in force has no R on gz" in said.only_line()
+
+
 @pytest.mark.parametrize("name", sorted(path.name for path in CONFIG_FOLDER.glob("*.toml")))
 def test_check_accepts_every_shipped_file(call: Call, recording: Path, name: str) -> None:
     shutil.copy(CONFIG_FOLDER / name, name)
@@ -248,6 +259,7 @@ WRONG_ARGUMENTS = {
     "missing argument": (("analyze",), "Missing argument 'RECORDING'"),
     "missing configuration": (("run",), "Missing argument 'CONFIG.toml'"),
     "nothing to check": (("check",), "--print-defaults"),
+    "findings nowhere": (("doctor", "--json", "nowhere/x.json"), "--json: nowhere/x.json: cannot be written"),
     "missing file": (("run", "nowhere.toml"), "nowhere.toml: no such file"),
     "folder for a file": (("run", "."), ".: cannot be read"),
     "bad viewer": (("demo", "--viewer", "nativ"), '--viewer: "nativ"; possible are auto, native, web, none'),
@@ -333,6 +345,7 @@ def test_help_of_every_command_is_quick() -> None:
     """None of the heavy libraries is loaded for it."""
     source = f"""
 import sys
+import threading
 from monitor.cli import main
 for command in ([], *([name] for name in {COMMANDS!r})):
     sys.argv = ["imu-monitor", *command, "--help"]
@@ -835,6 +848,7 @@ def test_an_interrupt_ends_an_analysis_in_one_line(tmp_path: Path) -> None:
     np.savez(tmp_path / "long.npz", fs=100.0, **dict(zip(AXES, values.T, strict=True)))
     source = """
 import sys
+import threading
 import monitor.offline as offline
 from monitor.cli import main
 def told(values, rate_hz, window_s, tau, progress):
@@ -856,6 +870,7 @@ def test_a_signal_ends_a_comparison_in_one_line(tmp_path: Path, number: int) -> 
     np.savez(tmp_path / "long.npz", fs=100.0, **dict(zip(AXES, values.T, strict=True)))
     source = """
 import sys
+import threading
 import monitor.reconciling as reconciling
 from monitor.cli import main
 original = reconciling.reconcile
@@ -1067,3 +1082,122 @@ def test_watching_listens_nowhere() -> None:
             time.sleep(0.1)
         assert opened
         assert one.process.wait(20.0) == 0
+
+
+# --- history
+
+
+@pytest.fixture(scope="session")
+def histories(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what was kept of two devices for two hours."""
+    from monitor.history.row import Row
+    from monitor.history.store import FILE, PastEvent, Store
+
+    folder = tmp_path_factory.mktemp("kept")
+    store = Store(folder / FILE)
+    names, rng = ("gz.N", "gz.N.lo", "gz.N.hi", "gz.B", "temperature"), np.random.default_rng(1)
+    for device in ("bench-1", "bench-2"):
+        for i in range(120):
+            last = np.array([1.5e-4, 1.4e-4, 1.6e-4, 4e-5, 25.0], np.float32) * np.float32(rng.uniform(0.9, 1.1))
+            start_s, n = 1_763_683_200 + 60 * i, np.full(5, 600)
+            row = Row(start_s, 60, start_s + 59.0, names, n, last, last, last, (6000, 0, 0, 0), 1)
+            store.add(
+                [(device, row)], [(device, PastEvent(start_s + 1.0, "moved", f"moved {i}"))] if i % 50 == 0 else []
+            )
+    store.close()
+    return folder
+
+
+def test_history_prints_plots_and_exports(call: Call, histories: Path, tmp_path: Path) -> None:
+    said = call(
+        "history", str(histories), "--device", "bench-1", "--axis", "gz",
+        "--json", "h.json", "--out", "h.csv", "--plot", "h.png",
+    )  # fmt: skip
+    assert (said.status, said.err) == (0, "")
+    assert "bench-1: 2025-11-21 00:00 to 2025-11-21 02:00 UTC, 120 rows of 1 min, 720,000 samples" in said.out
+    assert "moved 100" in said.out
+    told = json.loads((tmp_path / "h.json").read_bytes())
+    assert (told["schema"], told["device"], len(told["start"])) == ("imu-monitor/history/1", "bench-1", 120)
+    assert told["axes"]["gz"]["N"]["n"] == [600] * 120
+    header, *rows = (tmp_path / "h.csv").read_text().splitlines()
+    assert header.startswith("t (Unix s),width (s),gz.N (rad/sqrt(s))")
+    assert len(rows) == 120
+    assert (tmp_path / "h.png").stat().st_size > 10_000
+
+
+def test_history_of_a_span_and_a_step_by_its_configuration(call: Call, histories: Path, tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text(f'{VIRTUAL}[storage]\nfolder = "{histories}"\n')
+    more = ("--from", "2025-11-21T00:30", "--to", "2025-11-21 01:30", "--step", "15min")
+    said = call("history", "c.toml", "--device", "bench-2", "--json", "-", *more)
+    told = json.loads(said.out)
+    assert said.status == 0
+    assert told["start"] == [1_763_683_200 + 900 * i for i in range(2, 6)]
+    assert told["axes"]["gz"]["N"]["n"] == [9000] * 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "line"),
+    [
+        ((), 2, "CONFIG.toml or a folder is missing"),
+        (("{kept}",), 2, "choose with --device: bench-1, bench-2"),
+        (("{kept}", "--device", "bench-3"), 2, 'did you mean "bench-'),
+        (("{kept}", "--device", "bench-1", "--from", "-1h"), 3, "nothing in that time; kept are 2025-11-21 00:00:00"),
+        (("{kept}", "--from", "soon"), 2, '--from: "soon" is no time'),
+        (("{kept}", "--from", "2025-11-22", "--to", "2025-11-21"), 2, "is not after --from"),
+        (("{kept}", "--axis", "g"), 2, "possible are gx, gy"),
+        (("{kept}", "--plot", "h.pdf"), 2, "ending in .png"),
+        (("{kept}", "--out", "h.xls"), 2, "known are .csv"),
+        (("{kept}", "--connect", "tcp/127.0.0.1:1"), 2, "not both"),
+        ((".",), 2, "history.sqlite: no such file"),
+        (("absent.toml",), 2, "no such file"),
+        (("--connect", "here"), 2, "no endpoint"),
+    ],
+)
+def test_what_history_cannot_do_is_one_line(
+    call: Call, histories: Path, arguments: tuple[str, ...], status: int, line: str
+) -> None:
+    said = call("history", *(one.replace("{kept}", str(histories)) for one in arguments))
+    assert said.status == status
+    assert line in said.only_line()
+
+
+def test_a_view_of_what_is_not_kept_is_refused(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text(VIRTUAL + QUIET)
+    said = call("run", "c.toml", "--history", "1d")
+    assert said.status == 2
+    assert said.only_line() == "imu-monitor: --history: none is kept; [storage] folder says where it would be\n"
+    assert "no duration" in call("run", "c.toml", "--history", "long").only_line()
+
+
+def test_history_without_storage_is_said(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text(VIRTUAL)
+    said = call("history", "c.toml")
+    assert said.status == 2
+    assert "[storage] folder is missing" in said.only_line()
+
+
+def test_history_of_a_running_daemon(call: Call, histories: Path, tmp_path: Path) -> None:
+    from monitor.service import Service
+    from tests.monitor.publish.zenoh_world import eventually, free_endpoint
+
+    endpoint = free_endpoint()
+    histories = Path(shutil.copytree(histories, tmp_path / "kept"))  # the daemon adds to it
+    zenoh = f'[zenoh]\nlisten = ["{endpoint}"]\n[viewer]\nmode = "none"\n'
+    (tmp_path / "c.toml").write_text(f'{VIRTUAL}{zenoh}[storage]\nrecord = false\nfolder = "{histories}"\n')
+    service = Service(load(tmp_path / "c.toml"))
+    thread = threading.Thread(target=service.run, args=(60.0,))
+    thread.start()
+    try:
+        eventually(lambda: service.zenoh.state == "ok")
+        span = ("--from", "2025-11-21", "--to", "2025-11-22")
+        said = call("history", "--connect", endpoint, "--json", "-", *span)
+        there = call("history", str(histories), "--device", "bench-1", "--json", "-", *span)
+        nothing = call("history", "--connect", endpoint, "--from", "2000-01-01", "--to", "2000-01-02")
+    finally:
+        service.stop()
+        thread.join(30.0)
+    assert not thread.is_alive()
+    told, kept = json.loads(said.out), json.loads(there.out)
+    assert (told["axes"], told["start"]) == (kept["axes"], kept["start"])
+    assert nothing.status == 3
+    assert "nothing in that time" in nothing.only_line()

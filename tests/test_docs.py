@@ -18,7 +18,7 @@ import typer
 import drivers.decoders
 from drivers import plugin
 from drivers.recording import FORMATS
-from drivers.sample import block
+from drivers.sample import KINDS, block
 from drivers.sample_message import pack
 from monitor import settings, topics
 from monitor.catalogue import read_model
@@ -131,6 +131,21 @@ def test_the_keys_are_those_that_are_published() -> None:
     encodings = {topics.JSON: "JSON", topics.MSGPACK: "msgpack", "": ""}
     published = [(topic.key("imu", "<device>"), encodings[topic.encoding]) for topic in topics.TOPICS]
     assert sorted(rows) == sorted(published)
+
+
+def test_the_kinds_of_events_are_those_that_a_hook_may_wait_for() -> None:
+    (row,) = re.findall(r"^\| `imu/<device>/event` \|.*$", section(README, "zenoh"), re.M)
+    assert sorted(re.findall(r"`(\w+)`", row)) == sorted(KINDS)
+    made = re.compile(
+        r'(?:Event\(|Told\([\w.]+, |_event\(|announce\([\w.]+, |^(?:KIND|CROSSED|BACK): Final = )"([a-z]+_[a-z_]+)"',
+        re.M,
+    )
+    sources = [*ROOT.glob("drivers/**/*.py"), *ROOT.glob("monitor/**/*.py")]
+    said = {
+        kind for path in sources if "Event" in path.read_text("utf-8") for kind in made.findall(path.read_text("utf-8"))
+    }
+    assert len(said) > 5
+    assert said <= set(KINDS)
 
 
 def test_the_protocols_are_those_that_are_decoded() -> None:

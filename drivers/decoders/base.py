@@ -138,6 +138,7 @@ class Frames:
     data: list[bytes]
     t_ns: Ints  # [n] arrival of the chunk that completed each frame
     bad_before: Ints  # [n] frames rejected just before each
+    at_once: NDArray[np.bool_]  # [n] whether no other byte stood between it and the frame before
 
     def keep(self, rows: Sequence[int]) -> tuple["Frames", int]:
         """Those frames alone, and how many were rejected behind the last of them.
@@ -147,7 +148,8 @@ class Frames:
         places = np.cumsum(self.bad_before)
         at_kept = places[list(rows)]
         after = int(places[-1] if places.size else 0) - int(at_kept[-1] if at_kept.size else 0)
-        kept = Frames([self.data[i] for i in rows], self.t_ns[list(rows)], np.diff(at_kept, prepend=0))
+        at = list(rows)
+        kept = Frames([self.data[i] for i in rows], self.t_ns[at], np.diff(at_kept, prepend=0), self.at_once[at])
         return kept, after
 
 
@@ -166,15 +168,16 @@ QUIET_FRAMES: Final = 1000
 class FrameBuffer:
     """Finds frames in a byte stream that may be cut, damaged or joined late.
 
-    ``sync`` is the fixed start of a frame (it may be changed between frames; empty = any byte), ``match``
-    checks one candidate. After a rejection the search goes on one byte further in the same bytes, as a
-    sync may occur inside a payload. A hole between two frames counts as the larger of: candidates rejected
-    a frame's length apart, and whole frames that would fit in it. What comes before the first frame
-    (joined mid-stream) is not counted. Memory: never more than ``longest`` bytes are kept between feeds.
+    ``sync`` is the fixed start of a frame (empty = any byte), ``match`` checks one candidate. A match may narrow
+    ``sync`` to the one byte that further frames begin with; it is wide again after MUTE_BYTES without a frame. After a
+    rejection the search goes on one byte further in the same bytes, as a sync may occur inside a payload. A hole
+    between two frames counts as the larger of: candidates rejected a frame's length apart, and whole frames that would
+    fit in it. What comes before the first frame (joined mid-stream) is not counted. Memory: never more than ``longest``
+    bytes are kept between feeds.
     """
 
     def __init__(self, sync: bytes, match: Match, longest: int) -> None:
-        self.sync = sync
+        self.sync = self._wide = sync
         self._match = match
         self._longest = longest
         self._buffer = b""
@@ -183,7 +186,8 @@ class FrameBuffer:
         self.reset()
 
     def reset(self) -> None:
-        """Forget buffered bytes and being in step."""
+        """Forget buffered bytes, being in step and what frames were found to begin with."""
+        self.sync = self._wide
         self._dropped += len(self._buffer)
         self._buffer = b""
         self._arrivals.clear()
@@ -214,9 +218,16 @@ class FrameBuffer:
         found: list[bytes] = []
         ends: list[int] = []  # offset in the buffer behind each frame
         bad_before: list[int] = []
+        at_once: list[bool] = []
         at = 0
         while True:
             start = buffer.find(self.sync, at)
+            if self.sync != self._wide:
+                mute = at + MUTE_BYTES - self._hole
+                if mute <= len(buffer) and not at <= start < mute:
+                    self._hole += mute - at
+                    at, self.sync = mute, self._wide
+                    continue
             if start < 0:
                 # the tail may be the first part of a sync
                 start = max(at, len(buffer) - len(self.sync) + 1)
@@ -229,6 +240,7 @@ class FrameBuffer:
                 at = start + length
                 found.append(buffer[start:at])
                 ends.append(at)
+                at_once.append(not self._hole)
                 bad_before.append(self._close_hole() if self._hole else 0)
                 self._frame_length = length
                 self._in_step = True
@@ -239,7 +251,7 @@ class FrameBuffer:
                 self._reject(start)
                 self._hole += 1
                 at = start + 1
-        frames = Frames(found, self._arrived(ends), np.array(bad_before, np.int64))
+        frames = Frames(found, self._arrived(ends), np.array(bad_before, np.int64), np.array(at_once, np.bool_))
         self._buffer = buffer[at:]
         self._dropped += at
         while len(self._arrivals) > 1 and self._arrivals[0][0] <= self._dropped:

@@ -132,7 +132,7 @@ class Ros2ImuDecoder:
         before = self._sequence if publisher == self._publisher else None
         self._sequence, self._publisher = sequence, publisher
         if before is not None and 0 < sequence - before <= LONGEST_GAP:
-            self._lost += sequence - before - 1
+            self._lost = min(self._lost + sequence - before - 1, LONGEST_GAP)
         return sequence
 
 

@@ -7,7 +7,7 @@ its rows are ``lost`` before the batch. A count that goes back is a publisher st
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from drivers.decoders.base import QUIET_FRAMES, Decoder, DecoderSettings, Given,
 from drivers.errors import DecodeError
 from drivers.sample import Chunk, SampleBlock
 from drivers.sample_message import pack, unpack
+
+LONGEST_GAP: Final = 1_000_000_000
+"""Samples; a larger jump of the count, eleven days at 1 kHz, is another count, not a loss."""
 
 
 class Settings(DecoderSettings, frozen=True):
@@ -67,7 +70,7 @@ class SamplesDecoder:
     def _message(self, data: bytes) -> list[SampleBlock]:
         batch = unpack(data)
         rows = batch.block
-        self._lost += rows.lost + self._skipped(batch.samples, len(rows))
+        self._lost = min(self._lost + rows.lost + self._skipped(batch.samples, len(rows)), LONGEST_GAP)
         blocks = self._rows.blocks(
             rows.t_ns, rows.values, rows.temperature_c, rows.ticks, np.zeros(len(rows), np.int64)
         )
@@ -79,7 +82,8 @@ class SamplesDecoder:
     def _skipped(self, received: int, rows: int) -> int:
         """Samples of messages that did not arrive."""
         before, self._received = self._received, received
-        return 0 if before is None else max(received - rows - before, 0)
+        missing = 0 if before is None else received - rows - before
+        return missing if 0 <= missing <= LONGEST_GAP else 0
 
 
 def build(settings: Settings) -> Decoder:

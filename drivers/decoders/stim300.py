@@ -100,8 +100,8 @@ class Stim300Decoder:
         bits = ACCEL_BITS[settings.accelerometer_range]
         increment = settings.accelerometer_output == "increment"
         self._accel_step = rate / 2 ** (bits + 3) if increment else G0 / 2**bits
-        self._wanted = b"" if settings.identifier == "auto" else bytes([settings.identifier])
-        self._buffer = FrameBuffer(self._wanted, self._match, LONGEST)
+        wanted = b"" if settings.identifier == "auto" else bytes([settings.identifier])
+        self._buffer = FrameBuffer(wanted, self._match, LONGEST)
         self._rows = Rows()
         self._status = 0
 
@@ -122,7 +122,6 @@ class Stim300Decoder:
     def reset(self) -> None:
         """Forget half a datagram, and with auto which identifier it had."""
         self._buffer.reset()
-        self._buffer.sync = self._wanted
         self._rows.reset()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
@@ -130,12 +129,21 @@ class Stim300Decoder:
         frames = self._buffer.feed(chunks)
         n = len(frames.data)
         if not n:
-            if self._buffer.mute:  # the sensor may have been set to another datagram
-                self._buffer.sync = self._wanted
             return []
-        data = np.frombuffer(b"".join(frames.data), np.uint8).reshape(n, -1)
-        parts = IDENTIFIERS[int(data[0, 0])]
         values = np.full((n, 6), np.nan)
+        temperature_c = np.full(n, np.nan)
+        ticks = np.empty(n, np.int64)
+        identifiers = [frame[0] for frame in frames.data]
+        for identifier in dict.fromkeys(identifiers):  # the sensor may have been set to another datagram
+            at = [i for i, one in enumerate(identifiers) if one == identifier]
+            data = np.frombuffer(b"".join([frames.data[i] for i in at]), np.uint8).reshape(len(at), -1)
+            values[at], temperature_c[at] = self._read(data, IDENTIFIERS[identifier])
+            ticks[at] = data[:, -7]
+        return self._rows.blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before)
+
+    def _read(self, data: NDArray[np.uint8], parts: int) -> tuple[Floats, Floats]:
+        """Values [n, 6], infinite where the status byte says that they do not hold, and temperatures [n]."""
+        values = np.full((len(data), 6), np.nan)
         values[:, :3] = triples(data, 1) * self._gyro_step
         status = data[:, 10]
         if parts & ACCEL_PART:
@@ -143,13 +151,12 @@ class Stim300Decoder:
             status = status | data[:, 20]
         values[status & ERRORS != 0] = np.inf
         self._status = int(status[-1]) & ERRORS
-        temperature_c = np.full(n, np.nan)
+        temperature_c = np.full(len(data), np.nan)
         if parts & TEMPERATURE_PART:
             at = _temperature_at(parts)
             mean = np.ascontiguousarray(data[:, at : at + 6]).view(">i2").mean(axis=1) / 2**8
             temperature_c = np.where(data[:, at + 6] & ERRORS, np.nan, mean)
-        ticks = data[:, -7].astype(np.int64)
-        return self._rows.blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before)
+        return values, temperature_c
 
     def _match(self, buffer: bytes, at: int) -> int:
         if at >= len(buffer):

@@ -216,7 +216,8 @@ class TextDecoder:
     def _blocks(self, table: Floats, t_ns: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> list[SampleBlock]:
         n = len(table)
         bad = np.isinf(table).any(axis=1)
-        scaled = table * self._factor + self._offset
+        with np.errstate(over="ignore", invalid="ignore"):  # too large for a float is too large for a sensor
+            scaled = table * self._factor + self._offset
         values = np.full((n, 6), np.nan)
         for axis, name in enumerate(AXES):
             if name in self._at:

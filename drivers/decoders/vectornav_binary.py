@@ -20,6 +20,7 @@ from functools import lru_cache
 from typing import ClassVar, Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.decoders.base import (
     NEED_MORE,
@@ -32,7 +33,7 @@ from drivers.decoders.base import (
     invalid,
     one_chunk_each,
 )
-from drivers.sample import NO_TICK, Arrival, Chunk, Counter, SampleBlock, Timing
+from drivers.sample import NO_TICK, Arrival, Chunk, Counter, Floats, SampleBlock, Timing
 
 FIELD_SIZES: Final = {
     1: (8, 8, 8, 12, 16, 12, 24, 12, 12, 24, 20, 28, 2, 4, 8),
@@ -186,11 +187,11 @@ class VectornavBinaryDecoder:
         for form, at in groups:
             got = np.frombuffer(b"".join([frames.data[i] for i in at]), form.row)
             if "gyro" in form.names:
-                values[at, :3] = invalid(got["gyro"])
+                values[at, :3] = invalid(_wide(got["gyro"]))
             if "accel" in form.names:
-                values[at, 3:] = invalid(got["accel"])
+                values[at, 3:] = invalid(_wide(got["accel"]))
             if "temperature" in form.names:
-                temperature_c[at] = got["temperature"]
+                temperature_c[at] = _wide(got["temperature"])
             if "time" in form.names and self._counts:
                 ticks[at] = got["time"] & np.uint64(TICKS - 1)
         if n:
@@ -227,6 +228,11 @@ class VectornavBinaryDecoder:
         inner = [header + row.tobytes()[1 + len(header) : -2] for row in rows]
         frames = [b"\xfa" + part + binascii.crc_hqx(part, 0).to_bytes(2, "big") for part in inner]
         return one_chunk_each(frames, samples.t_ns)
+
+
+def _wide(numbers: NDArray[np.float32]) -> Floats:
+    with np.errstate(invalid="ignore"):  # a signalling NaN on the wire is just NaN
+        return numbers.astype(np.float64)
 
 
 def build(settings: Settings) -> Decoder:

@@ -150,7 +150,7 @@ class Pairs:
         self.unpaired = 0  # packets since the last pair
         self._last = bytes(UART_LENGTH)  # the packet before the next one
         self._elapsed = 0  # packets since the last pair's end, rejected ones too
-        self._rejected = 0  # those of them that were rejected
+        self._rejected = 0  # those of them that were rejected, and halves torn apart
         self._cycle = 2  # packets a sample, when none is rejected
         self._first = True
 
@@ -159,10 +159,12 @@ class Pairs:
         joined = np.frombuffer(self._last + b"".join(frames.data), np.uint8).reshape(-1, UART_LENGTH)
         self._last = frames.data[-1]
         kinds = joined[:, 1]
-        is_pair = (kinds[:-1] == ACCEL) & (kinds[1:] == RATE) & (frames.bad_before == 0)
-        at = np.flatnonzero(is_pair)
+        fits = (kinds[:-1] == ACCEL) & (kinds[1:] == RATE)
+        at = np.flatnonzero(fits & frames.at_once)
+        # bytes too few for a packet may be the rest of many: the halves need not be of one sample
+        torn = fits & ~frames.at_once & (frames.bad_before == 0)
         elapsed = self._elapsed + np.cumsum(1 + frames.bad_before)
-        rejected = self._rejected + np.cumsum(frames.bad_before)
+        rejected = self._rejected + np.cumsum(frames.bad_before + torn)
         steps = np.diff(elapsed[at], prepend=0)
         holes = np.diff(rejected[at], prepend=0)
         missing, harmless = self._count(steps, holes)

@@ -222,7 +222,8 @@ def numbers(packets: NDArray[np.uint8], at: int, did: int, count: int) -> Floats
     kind = did & 3
     data = np.ascontiguousarray(packets[:, at : at + count * SIZES[kind]])
     if kind == 0:
-        return data.view(">f4").astype(np.float64)
+        with np.errstate(invalid="ignore"):  # a signalling NaN on the wire is just NaN
+            return data.view(">f4").astype(np.float64)
     if kind == 1:
         return data.view(">i4") / 2.0**20
     if kind == 2:

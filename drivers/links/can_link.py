@@ -48,6 +48,8 @@ HOST_STAMPED: Final = ("socketcan", "virtual", "udp_multicast")
 """Interfaces whose time stamps are the host's system clock when the frame came in."""
 OLDEST_S: Final = 1.0
 PROBE_S: Final = 2.0
+SAY_BUS_OFF: Final = ("socketcan", "virtual", "udp_multicast")
+"""Interfaces whose error frames have SocketCAN's classes in their identifier."""
 BUS_OFF: Final = 0x40
 """CAN_ERR_BUSOFF of linux/can/error.h, in the identifier of a socketcan error frame."""
 ID_MASK: Final = 0x1FFF_FFFF
@@ -210,7 +212,7 @@ class CanLink:
 
     def _note_error(self, message: "can.Message") -> None:
         self.error_frames += 1
-        if self._settings.interface == "socketcan" and message.arbitration_id & BUS_OFF:
+        if self._settings.interface in SAY_BUS_OFF and message.arbitration_id & BUS_OFF:
             self._shut_down()
             raise LinkLost(f"{self.name}: bus off; check the bit rate, the wiring and the terminators")
 

@@ -33,6 +33,7 @@ from drivers.errors import ConfigError, LinkEnded, LinkLost, LinkUnavailable, Re
 from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.plugin import FilePath, nearest
 from drivers.recording import FORMATS, Recording, iter_blocks, load_samples, segment
+from drivers.recording.formats import T_LIMIT_S
 from drivers.sample import EXTENDED_ID, Chunk
 from drivers.sample_message import pack
 
@@ -51,7 +52,15 @@ STEP_S: Final = 0.02
 CHUNK_BYTES: Final = 4096
 PYTHON_CAN_HEADER: Final = "timestamp,arbitration_id"
 LARGEST_STANDARD_ID: Final = 0x7FF
-DAMAGE: Final = (EOFError, LookupError, zlib.error, gzip.BadGzipFile, struct.error, binascii.Error)
+LARGEST_ID: Final = 0x1FFF_FFFF
+LONGEST_FRAME: Final = 64  # bytes, of CAN FD
+READ_BYTES: Final = 1 << 20
+BLF_OBJECT: Final = b"LOBJ"
+BLF_SIZE: Final = slice(8, 12)  # of the object, little-endian, in its header
+BLF_HEADER: Final = 16
+DAMAGE: Final = (
+    EOFError, LookupError, OverflowError, zlib.error, gzip.BadGzipFile, struct.error, binascii.Error, csv.Error,
+)  # fmt: skip
 """What readers raise at a place where a file is cut or damaged, beside ValueError."""
 
 Kind = Literal["recording", "log", "capture", "raw"]
@@ -224,12 +233,42 @@ def _blf(path: Path) -> "can.BLFReader":
     import can
     from can.io.blf import BLFParseError
 
-    stream = cast("BinaryIO", _binary(path))
+    class Reader(can.BLFReader):
+        """Not for ever at an object that says to end where it begins."""
+
+        def _parse_container(self, data: bytes) -> "Iterator[can.Message]":
+            at = data.find(BLF_OBJECT)
+            while at >= 0:
+                size = data[at:][BLF_SIZE]
+                if len(size) == 4 and int.from_bytes(size, "little") < BLF_HEADER:
+                    raise BLFParseError("an object is shorter than its header")
+                at = data.find(BLF_OBJECT, at + 1)
+            yield from super()._parse_container(data)
+
+    stream = _Parts(_binary(path))
     try:
-        return can.BLFReader(stream)
+        return Reader(cast("BinaryIO", stream))
     except (BLFParseError, struct.error) as error:
         stream.close()
         raise ValueError(f"no BLF log: {error}") from error
+
+
+class _Parts:
+    """A file read in parts, so that a length of gigabytes that the file only claims makes no room for them."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self._stream = stream
+        self.close = stream.close
+
+    def read(self, size: int) -> bytes:
+        """So many bytes, fewer at the end."""
+        if size < 0:
+            raise ValueError("an object is shorter than its header")
+        parts = []
+        while size > 0 and (part := self._stream.read(min(size, READ_BYTES))):
+            parts.append(part)
+            size -= len(part)
+        return b"".join(parts)
 
 
 def _log_frames(messages: "Iterator[can.Message]", channel: str | None) -> Iterator[Chunk]:
@@ -247,7 +286,7 @@ def _log_frames(messages: "Iterator[can.Message]", channel: str | None) -> Itera
             continue
         if channel is None or str(message.channel) == channel:
             address = message.arbitration_id | (EXTENDED_ID if message.is_extended_id else 0)
-            yield Chunk(bytes(message.data), round(message.timestamp * 1e9), address)
+            yield _frame(bytes(message.data), message.timestamp, address)
 
 
 def _csv_frames(stream: IO[str], channel: str | None) -> Iterator[Chunk]:
@@ -265,7 +304,16 @@ def _csv_frames(stream: IO[str], channel: str | None) -> Iterator[Chunk]:
         address = int(row[identifier], 16)
         wide = address > LARGEST_STANDARD_ID if extended is None else row[extended] == "1"
         flag = EXTENDED_ID if wide else 0
-        yield Chunk(bytes.fromhex(row[data]), round(float(row[t]) * 1e9), address | flag)
+        yield _frame(bytes.fromhex(row[data]), float(row[t]), address | flag)
+
+
+def _frame(data: bytes, t_s: float, address: int) -> Chunk:
+    """A frame of a log; ValueError for one that no bus could carry, or at no time."""
+    if not abs(t_s) < T_LIMIT_S:
+        raise ValueError(f"{t_s:g} s is no time")
+    if not 0 <= address & ~EXTENDED_ID <= LARGEST_ID or address < 0 or len(data) > LONGEST_FRAME:
+        raise ValueError(f"no CAN frame: identifier 0x{address & ~EXTENDED_ID:X}, {len(data)} bytes")
+    return Chunk(data, round(t_s * 1e9), address)
 
 
 def _from_start(chunks: Iterator[Chunk]) -> Iterator[Timed]:

@@ -18,6 +18,9 @@ OWN: Final = b"imu-monitor"
 """Key of the metadata by which a segment of the daemon's recordings is known."""
 BOOKKEEPING: Final = ("ticks", "lost")
 """Columns of such a segment that are no measurement: a reader is not told that they were left aside."""
+ROWS_ANYWAY: Final = 1_000_000
+ROWS_A_BYTE: Final = 8
+"""Of measured values not even one fits in a byte."""
 ARROW_MAGIC: Final = b"ARROW1\0\0"
 ARROW_END: Final = b"\xff\xff\xff\xff\0\0\0\0"  # end-of-stream mark of Arrow IPC
 
@@ -41,6 +44,7 @@ def read_parquet(path: Path) -> Table:
     try:
         with parquet.ParquetFile(path) as file:
             chosen = chosen_columns(path, file.schema_arrow.names, notes)
+            _check_rows(path, file.metadata.num_rows, path.stat().st_size)
             table = file.read(columns=list(chosen.values()))
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise RecordingError(
@@ -68,12 +72,21 @@ def read_ipc(path: Path) -> Table:
     batches: list[Any] = []
     try:
         while True:
-            batches.append(reader.read_next_batch())
+            batch = reader.read_next_batch()
+            _check_rows(path, batch.num_rows, len(data))
+            batch.select(list(chosen.values())).validate()
+            batches.append(batch)
     except StopIteration:
         pass  # the regular end
     except (pa.ArrowException, OSError) as error:
         notes.append(f"Only {len(batches)} whole batches could be read: {_first_line(error)}.")
     return _table(path, pa.Table.from_batches(batches, reader.schema), chosen, notes)
+
+
+def _check_rows(path: Path, rows: int, size: int) -> None:
+    """No row costs nothing: a file that says otherwise would fill the memory with what it does not hold."""
+    if rows > ROWS_ANYWAY + ROWS_A_BYTE * size:
+        raise RecordingError(f"{path}: {rows} rows in {size} bytes: no recording is so small")
 
 
 def _table(path: Path, table: Any, chosen: Mapping[str, str], notes: list[str]) -> Table:

@@ -5,6 +5,7 @@ from a cut file the arrays are found again by the header that stands before each
 """
 
 import io
+import math
 import shutil
 import struct
 import zipfile
@@ -13,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
+from tokenize import TokenError
 from typing import IO, Any, BinaryIO, Final, cast
 
 import numpy as np
@@ -81,7 +83,7 @@ def _npz_array(path: Path, archive: Mapping[str, Any], key: str) -> NDArray[Any]
         return np.asarray(archive[key])
     except zipfile.BadZipFile as error:
         raise RecordingError(f"{path}: {key} is damaged: {error}") from error
-    except (ValueError, EOFError, MemoryError, RuntimeError, zlib.error) as error:
+    except (ValueError, EOFError, MemoryError, OverflowError, RuntimeError, TokenError, zlib.error) as error:
         why = "holds Python objects, not numbers" if "bject array" in str(error) else f"is unreadable: {error}"
         raise RecordingError(f"{path}: {key} {why}") from error
 
@@ -141,13 +143,14 @@ def _array_up_to_cut(raw: bytes) -> NDArray[Any] | None:
         if np.lib.format.read_magic(file) != (1, 0):
             return None
         shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-    except ValueError:
+    except (ValueError, TokenError):
         return None
-    if dtype.hasobject or dtype.itemsize == 0 or len(shape) > 1:
+    if dtype.hasobject or dtype.itemsize == 0 or len(shape) > 1 or min(shape, default=0) < 0:
         return None
-    count = min(int(np.prod(shape)), (len(raw) - file.tell()) // dtype.itemsize)
+    stated = math.prod(shape)
+    count = min(stated, (len(raw) - file.tell()) // dtype.itemsize)
     array = np.frombuffer(raw, dtype, count, file.tell())
-    return array.reshape(shape) if array.size == np.prod(shape) else array
+    return array.reshape(shape) if array.size == stated else array
 
 
 @contextmanager

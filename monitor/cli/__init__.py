@@ -16,7 +16,8 @@ import typer
 from typer.exceptions import TyperException
 
 from drivers.errors import ConfigError, ImuError, NotReady, RecordingError
-from monitor.cli import drift, options, output, serving
+from monitor.cli import doctor, drift, options, output, serving
+from monitor.cli import history as history_command
 
 # before NumPy is imported: matrices are small here and threads of our own share the work, where more would only spin
 for _pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -66,11 +67,19 @@ def demo(
 
 
 @app.command()
-def run(config: ConfigPath, seconds: Seconds = None, viewer: Viewer = None) -> None:
+def run(
+    config: ConfigPath,
+    seconds: Seconds = None,
+    viewer: Viewer = None,
+    history: Annotated[
+        str | None, typer.Option(metavar="S", help="Open the live view on what was: 1d, 12h; needs [storage].")
+    ] = None,
+) -> None:
     """The daemon: every device in the file, until a signal."""
     from monitor import settings
 
-    serving.serve(settings.load(config), seconds, viewer)
+    found = serving.with_history(settings.load(config), options.duration("--history", history))
+    serving.serve(found, seconds, viewer)
 
 
 @app.command()
@@ -82,7 +91,7 @@ def check(
 ) -> None:
     """Read the file and say all that is wrong with it; opens nothing."""
     from monitor import settings
-    from monitor.catalogue import read_model
+    from monitor.limits import model_of
     from monitor.virtual import Sensor
 
     if print_defaults:
@@ -93,18 +102,21 @@ def check(
     found, wrong = settings.read(config)
     for device in found.devices if found else ():
         try:
-            if device.model is not None:
-                read_model(device.model)
+            model_of(device)
             if isinstance(device.link, settings.VirtualTable):
                 Sensor(device.link, device.decoder, device.name)
         except ConfigError as error:
-            wrong.append(f"{config}: device {device.name}: {error}")
+            at = f"device {device.name}: "
+            wrong.append(f"{config}: {at}{str(error).removeprefix(at)}")
     for line in (*wrong, *(f"warning: {line}" for line in (found.warnings if found else ()))):
         typer.echo(line, err=True)
     if wrong:
         raise typer.Exit(WRONG)
     count = len(found.devices) if found else 0
     typer.echo(f"{config}: {count} device{'s' if count != 1 else ''}, nothing wrong")
+
+
+app.command()(doctor.doctor)
 
 
 @app.command()
@@ -280,6 +292,7 @@ thermal_app = typer.Typer(
 app.add_typer(thermal_app, name="thermal")
 
 app.command()(drift.compensate)
+app.command()(history_command.history)
 
 RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")]
 Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate, where the file says none.")]

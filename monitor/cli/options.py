@@ -66,11 +66,12 @@ def order(text: str | None) -> "Order | None":
 
 def noise(source: Path) -> "Noise":
     """What is known of each axis; JSON begins with a brace, as no model does."""
+    from drivers import small_file
     from monitor.export import from_analysis, from_model
     from monitor.noise.model import NoiseModel
 
     try:
-        text = sys.stdin.buffer.read() if source == Path("-") else source.read_bytes()
+        text = sys.stdin.buffer.read() if source == Path("-") else small_file.read(source)
         if text.lstrip().startswith(b"{"):
             return from_analysis(text, source.name)
         return from_model(NoiseModel.from_toml(text.decode()), source.name)

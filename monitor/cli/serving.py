@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -32,15 +33,19 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
     from monitor.outputs import LogOutput, TableOutput
     from monitor.publish.terminal import Board
     from monitor.service import Service
+    from monitor.systemd import Unit
 
+    unit = Unit.of(os.environ)
     config = _with_viewer(config, viewer)
     _log_as(config)
     for line in config.warnings:
         structlog.get_logger("imu-monitor").warning(line)
     console, board = Console(), Board()
     live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
-    service = Service(config, [TableOutput(board, live)] if live else [TableOutput(board), LogOutput()])
-    on_signals(service.stop)
+    shown = [TableOutput(board, live)] if live else [TableOutput(board), LogOutput()]
+    service = Service(config, shown, unit=unit)
+    # in a terminal it means that the terminal is closed
+    on_signals(service.stop, service.stop if live else service.reload)
     with live or nullcontext():
         service.run(seconds)
     if live is not None or seconds is not None:
@@ -72,6 +77,19 @@ def view(
         arriving.start()
         rerun.start()
         FleetView(arriving, rerun, keys).run(stop, lambda said: print(said, file=_Lines(), flush=True), seconds)
+
+
+def with_history(config: "Config", history_s: float | None) -> "Config":
+    """A configuration whose live view opens on so much of what is kept; None: as it says itself."""
+    import dataclasses
+
+    import msgspec
+
+    if history_s is None:
+        return config
+    if config.storage is None or not config.storage.history:
+        raise ConfigError("--history: none is kept; [storage] folder says where it would be")
+    return dataclasses.replace(config, viewer=msgspec.structs.replace(config.viewer, history=history_s))
 
 
 def _with_viewer(config: "Config", viewer: str | None) -> "Config":
@@ -109,15 +127,19 @@ def _log_as(config: "Config") -> None:
 
     import structlog
 
+    from monitor.logs import LEVEL
+
     json = config.log.format == "json"
+    LEVEL.name = config.log.level
     structlog.configure(
         processors=[
+            LEVEL,
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
             _without_secrets,
             structlog.processors.JSONRenderer() if json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
         ],
-        wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, config.log.level.upper())),
+        wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG),
         logger_factory=structlog.PrintLoggerFactory(cast("TextIO", _Lines())),
         cache_logger_on_first_use=True,
     )
@@ -128,8 +150,8 @@ def _without_secrets(_logger: Any, _method: str, line: "MutableMapping[str, Any]
     return {key: masked(value) if isinstance(value, str) else value for key, value in line.items()}
 
 
-def on_signals(stop: Callable[[], None]) -> None:
-    """First SIGINT or SIGTERM: stop in order. A second SIGINT ends at once."""
+def on_signals(stop: Callable[[], None], hung_up: Callable[[], None] | None = None) -> None:
+    """First SIGINT or SIGTERM: stop in order. A second SIGINT ends at once. SIGHUP: what it means here, if anything."""
     import threading
 
     def first(number: int, _frame: Any) -> None:
@@ -139,6 +161,9 @@ def on_signals(stop: Callable[[], None]) -> None:
 
     signal.signal(signal.SIGINT, first)
     signal.signal(signal.SIGTERM, first)
+    if hung_up is not None:
+        call = hung_up  # in a thread, as above
+        signal.signal(signal.SIGHUP, lambda *_: threading.Thread(target=call, name="hung up", daemon=True).start())
 
 
 def end_on_sigterm() -> None:

@@ -96,7 +96,7 @@ def from_analysis(text: bytes | str, source: str = "analysis of a recording") ->
     """
     try:
         found = msgspec.json.decode(text, type=_Analysis)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"not the JSON of an analysis: {error}") from error
     if not found.schema.startswith("imu-monitor/analyze/"):
         raise ConfigError(f'schema "{found.schema}"; an export needs "imu-monitor/analyze/1"')

@@ -6,7 +6,6 @@ is a ConfigError of one line that names the place and the nearest known word. Pa
 """
 
 import contextlib
-import tomllib
 from collections.abc import Iterator
 from dataclasses import fields
 from math import inf
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from drivers.errors import ConfigError
 from drivers.plugin import nearest
 from drivers.sample import AXES
+from monitor import toml
 from monitor.noise.effect import GYROS, Effect, required, units
 from monitor.noise.effects import EFFECTS
 from monitor.noise.temperature import UNITS, Temperature
@@ -31,10 +31,7 @@ Placed = tuple[tuple[str, ...], tuple[Effect, ...]]  # axes, their effects
 
 def read(text: str) -> tuple[list[Placed], float | None, Temperature | None]:
     """Effects, sample rate in Hz and temperature of a model file's text; ConfigError says what is wrong in one line."""
-    try:
-        tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"not TOML: {error}") from error
+    tables = toml.tables(text)
     rate_hz = tables.pop("sample_rate", None)
     if rate_hz is not None and (
         isinstance(rate_hz, bool) or not isinstance(rate_hz, int | float) or not 0.0 < rate_hz < inf

@@ -20,14 +20,17 @@ QUIET: Final = ("ok", "off")
 """States of an output that need no word."""
 GONE_S: Final = 1.5
 """The liveliness token is away and no status (1 Hz) came for so long: who is killed is missed within two seconds."""
+NAMED: Final = 6
+"""Of the limits that are passed."""
 SILENT_S: Final = 5.0
 """The token is there, or was never seen, and nothing came for so long."""
-LONGEST_BYTES: Final = 65_536
-"""A payload of one device's result is a few kilobytes; what is longer is none, and not read."""
 LONGEST_TEXT: Final = 400
 MOST_OUTPUTS: Final = 16
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
+
+LARGEST_BYTES: Final = 1_000_000
+"""Of a payload: six axes are some kilobytes."""
 
 
 class Latency(msgspec.Struct, frozen=True):
@@ -50,6 +53,7 @@ class StatusMessage(msgspec.Struct, frozen=True):
     overflowed: Count = 0
     latency: Latency = Latency()
     outputs: dict[str, str] = {}
+    crossed: tuple[str, ...] = ()
     text: str = ""
     memory: Count = 0
     uptime: float = 0.0
@@ -174,7 +178,8 @@ class Heard:
         if status is None or state != "running":
             return 1
         well = all(output in QUIET or output.startswith("ok,") for output in status.outputs.values())
-        return 2 if well and not status.text and not status.overflowed and not self.disagreements() else 1
+        well &= not status.text and not status.overflowed and not status.crossed
+        return 2 if well and not self.disagreements() else 1
 
     def trouble(self) -> str:
         """What is wrong, in words; empty while all is well."""
@@ -185,6 +190,9 @@ class Heard:
         said += [f"{clean(name)}: {clean(state)}" for name, state in outputs if state not in QUIET]
         if self.status.overflowed:
             said.append(f"{self.status.overflowed:,} samples overwritten before they were used: too slow here")
+        if crossed := self.status.crossed:
+            more = f" and {len(crossed) - NAMED} more" if len(crossed) > NAMED else ""
+            said.append(f"beyond its limit: {', '.join(clean(one) for one in crossed[:NAMED])}{more}")
         return "; ".join([*said, *self.disagreements()])
 
     def disagreements(self) -> list[str]:
@@ -213,12 +221,12 @@ def split(key: str) -> tuple[str, topics.Topic] | None:
 
 def read(kind: type[M], topic: topics.Topic, payload: bytes) -> M:
     """The message of ``payload``; ValueError when it is none of this topic and schema."""
-    if len(payload) > LONGEST_BYTES:
-        raise ValueError(f"{len(payload)} bytes are no message of this kind")
+    if len(payload) > LARGEST_BYTES:
+        raise ValueError(f"{len(payload)} bytes; {LARGEST_BYTES} are the most that is read")
     try:
         found = msgspec.json.decode(payload, type=kind)  # its errors are ValueErrors
     except RecursionError as error:
-        raise ValueError("too deep for a message of this kind") from error
+        raise ValueError(str(error)) from error
     if found.schema != topic.schema():
         raise ValueError(f'schema "{found.schema}" where {topic.schema()} is known')
     return found

@@ -156,6 +156,11 @@ def event(device: str, unix_s: float, samples: int, what: Event, since_s: float 
     return _encode(topics.EVENT, device, unix_s, samples, payload)
 
 
+def since_s(unix_s: float, what: Event) -> float | None:
+    """Unix time at which what is told at ``unix_s`` began; None where that is not known."""
+    return None if what.since_ns is None else unix_s - (what.t_ns - what.since_ns) / 1e9
+
+
 def status(device: str, unix_s: float, health: Health) -> bytes:
     """``imu/<device>/status``."""
     payload = {
@@ -173,6 +178,7 @@ def status(device: str, unix_s: float, health: Health) -> bytes:
         "late": health.late,
         "moving": health.moving,
         "moved": health.moved,
+        "crossed": health.crossed,
         "text": masked(health.text),
     }
     return _encode(topics.STATUS, device, unix_s, health.received, payload)

@@ -44,6 +44,8 @@ def health_text(device: str, health: Health, about: str = "") -> str:
     lines = [f"## {WORDS.get(health.state, health.state)}"]
     if health.text:
         lines.append(f"**{health.text}**")
+    if health.crossed:
+        lines.append(f"beyond its limit: **{', '.join(health.crossed)}**")
     rate = "rate not known yet" if health.rate_hz is None else f"{health.rate_hz:.2f} Hz"
     lines.append(f"**{device}** {about}".rstrip() + f", **{rate}**")
     lines.append(

@@ -23,7 +23,9 @@ from monitor.estimate.coefficients import LETTERS, Status
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.model_gap import ModelGap
 from monitor.health import Health
-from monitor.publish import colours, rerun_dynamic
+from monitor.history.past import Past
+from monitor.history.times import said
+from monitor.publish import colours, rerun_dynamic, rerun_past
 from monitor.publish.decimate import extremes, means
 from monitor.publish.panels import drift_text, health_text, noise_text, overview_text
 from monitor.publish.rerun_chart import (
@@ -54,6 +56,8 @@ TEMPERATURES_PER_S: Final = 5.0
 BETWEEN: Final = 20
 """Points on the course of a coefficient from one estimate to the next, where it follows every sample."""
 Z95: Final = 1.959964
+PAST_EVENTS: Final = 200
+"""Of those before the view opened, the newest."""
 NARROW: Final = 1.5  # ends of an interval further than this factor from their value are not on the course
 LEVELS: Final = {
     "link_lost": "ERROR",
@@ -82,12 +86,26 @@ class _Device:
 class Scene:
     """Draws on one stream. Not thread-safe; see the module about blocking."""
 
-    def __init__(self, stream: rr.RecordingStream, devices: Sequence[tuple[str, str]], fleet: bool = False) -> None:
+    def __init__(
+        self, stream: rr.RecordingStream, devices: Sequence[tuple[str, str]] = (), fleet: bool = False
+    ) -> None:
         """``devices``: name and a few words about each; ``fleet``: many more have only a row in the overview."""
         self._fleet = fleet
         self._stream = stream
         self._devices = {name: _Device(about) for name, about in devices}
+        self._shown = set(self._devices)
         self._healths: dict[str, Health] = {}
+
+    def show(self, devices: Sequence[tuple[str, str]]) -> None:
+        """From now on these devices; those that it knows go on as they are.
+
+        What still comes of one that is not among them any more is drawn.
+        """
+        self._shown = {name for name, _ in devices}
+        self._healths = {name: health for name, health in self._healths.items() if name in self._shown}
+        for name, about in devices:
+            self._devices.setdefault(name, _Device(about)).about = about
+        self.open()
 
     def open(self) -> None:
         """What does not change: names, colours and widths of the lines."""
@@ -133,6 +151,26 @@ class Scene:
                     factor = COEFFICIENT_UNITS[kind_of(axis)][letter].factor
                     self._scalars(f"{device}/coefficients/{letter}/{axis}", at, values * factor)
 
+    def past(self, device: str, past: Past) -> None:
+        """What was before the view opened: courses of coefficients and temperature with their extremes, and events.
+
+        Where a bucket was left out, and behind the last one, a course has a gap: what comes is another stretch.
+        """
+        for letter in LETTERS:
+            for axis in past.axes():
+                course, lo, hi = (past.column(f"{axis}.{letter}{end}") for end in ("", ".lo", ".hi"))
+                if np.isfinite(course.last).any():
+                    at, values = rerun_past.points(past, course, lo.last, hi.last)
+                    factor = COEFFICIENT_UNITS[kind_of(axis)][letter].factor
+                    self._scalars(f"{device}/coefficients/{letter}/{axis}", at, values * factor)
+        temperature = past.column("temperature")
+        if np.isfinite(temperature.last).any():
+            at, values = rerun_past.points(past, temperature, temperature.last, temperature.last)
+            self._scalars(f"{device}/temperature", at, values[:, 0])
+        for event in past.events[-PAST_EVENTS:]:
+            text = f"{said(event.t_s)[:10]}: {event.text}"  # the line has only its time of the day
+            self.event(device, event.t_s, Event(event.kind, round(event.t_s * 1e9), text, event.axis, event.what))
+
     def gaps(self, device: str, wall_s: Floats, looks: Sequence[ModelGap]) -> None:
         """The course of the gap to the model in force: a line an axis, and the threshold that chance stays below.
 
@@ -175,7 +213,7 @@ class Scene:
         """One line in the log of the device, and in that of the overview."""
         self._at(wall_s)
         level, at = LEVELS.get(event.kind, "INFO"), _clock_time(wall_s)
-        if self._fleet or len(self._devices) > 1:
+        if self._fleet or len(self._shown) > 1:
             self._stream.log("overview/events", rr.TextLog(f"{at}  {device}: {event.text}", level=level))
         if device in self._devices:
             self._stream.log(f"{device}/events", rr.TextLog(f"{at}  {event.text}", level=level))
@@ -184,10 +222,11 @@ class Scene:
     def health(self, device: str, wall_s: float, health: Health) -> None:
         """The health panel of the device, and its row in the overview."""
         self._at(wall_s)
-        self._healths[device] = health
+        if device in self._shown:
+            self._healths[device] = health
         about = self._devices[device].about
         self._stream.log(f"{device}/status", _markdown(health_text(device, health, about)))
-        if len(self._devices) > 1 and not self._fleet:
+        if len(self._shown) > 1 and not self._fleet:
             self._stream.log("overview", _markdown(overview_text(self._healths)))
 
     def overview(self, wall_s: float, text: str) -> None:

@@ -16,7 +16,7 @@ import os
 import threading
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
@@ -28,6 +28,7 @@ from monitor.drift.live_compensation import DriftLook
 from monitor.estimate.estimate import Estimate, joined
 from monitor.estimate.model_gap import ModelGap
 from monitor.health import Health
+from monitor.history.past import Past
 from monitor.publish.backlog import Backlog
 from monitor.publish.viewer import DeviceInfo, ViewerClosed, ViewerSettings, ViewerTrouble
 
@@ -46,6 +47,7 @@ COURSE_STEP_S: Final = 1.0  # of sample time between two points of a course
 EARLY_END_S: Final = 10.0  # a window that ends sooner never worked
 MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
 
+Recall = Callable[[str], Past | None]
 Message = tuple[str, "_Samples | _Estimate | _Gap | _Thermal | _Rates | _Drift | _Event | _Health | _Overview"]
 
 
@@ -110,9 +112,16 @@ class RerunView:
     ``fleet``: the devices are those in detail of many more, whose table comes by ``overview``.
     """
 
-    def __init__(self, settings: ViewerSettings, devices: Sequence[DeviceInfo], fleet: bool = False) -> None:
-        """Opens nothing yet."""
+    def __init__(
+        self,
+        settings: ViewerSettings,
+        devices: Sequence[DeviceInfo],
+        recall: Recall | None = None,
+        fleet: bool = False,
+    ) -> None:
+        """Opens nothing yet. ``recall``: what is kept of a device, asked for in the viewer's thread when it opens."""
         self._settings = settings
+        self._recall = recall or _nothing
         self._fleet = fleet
         self._devices = tuple(devices)
         self._backlog: Backlog[Message] = Backlog(BACKLOG_BYTES)
@@ -145,6 +154,10 @@ class RerunView:
         self._phase = "starting"
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
         self._thread.start()
+
+    def show(self, devices: Sequence[DeviceInfo]) -> None:
+        """From now on these devices; to be called before anything is said of a new one."""
+        self._devices = tuple(devices)
 
     def samples(self, device: str, wall_s: Floats, values: Floats, temperature_c: Floats) -> None:
         """Samples at Unix times ``wall_s`` [n]: [n, 6] rad/s and m/s², [n] °C; NaN = not measured."""
@@ -241,37 +254,57 @@ class RerunView:
 
     def _show(self, settings: ViewerSettings) -> None:
         """One viewer, from opening to its end."""
-        from monitor.publish import rerun_blueprint, rerun_scene, rerun_sinks
+        from monitor.publish import rerun_scene, rerun_sinks
 
         output = rerun_sinks.open_output(settings, self._recording_id, self._closing.is_set)
         self._child, self._url = output.child, output.url
         try:
-            names = [(d.name, d.about) for d in self._devices]
-            scene = rerun_scene.Scene(output.stream, names, self._fleet)
-            self._inside_since = time.monotonic()
-            rerun_blueprint.send(
-                output.stream,
-                [d.name for d in self._devices],
-                [d.name for d in self._devices if d.has_model],
-                [d.name for d in self._devices if d.has_thermal],
-                [d.name for d in self._devices if d.compensated],
-                self._fleet,
-            )
-            scene.open()
-            self._phase = "ok"
+            scene = rerun_scene.Scene(output.stream, fleet=self._fleet)
             self._draw(output, scene)
         finally:
             self._child = None
             output.close()
 
+    def _lay_out(self, output: "Output", scene: "Scene", devices: Sequence[DeviceInfo]) -> None:
+        """A place for each device."""
+        from monitor.publish import rerun_blueprint
+
+        rerun_blueprint.send(
+            output.stream,
+            [d.name for d in devices],
+            [d.name for d in devices if d.has_model],
+            [d.name for d in devices if d.has_thermal],
+            [d.name for d in devices if d.compensated],
+            self._fleet,
+        )
+        scene.show([(d.name, d.about) for d in devices])
+        self._phase = "ok"
+
+    def _begin(self, scene: "Scene", device: str) -> None:
+        """What was, before what comes."""
+        self._inside_since = None  # a disk may be slow; that is not the viewer's fault
+        past = self._recall(device)
+        self._inside_since = time.monotonic()
+        if past is not None:
+            scene.past(device, past)
+
     def _draw(self, output: "Output", scene: "Scene") -> None:
         """Draw what comes until closed or nobody looks any more."""
-        queue = _Pending(plot_every_s=max(1.0, len(self._devices) / PLOTS_PER_S))
+        queue = _Pending(plot_every_s=1.0)
+        shown: tuple[DeviceInfo, ...] | None = None
+        begun: set[str] = set()
         checked = time.monotonic()
         while True:
             closing = self._closing.is_set()
-            queue.add(self._backlog.take(0.0))
+            queue.add(self._backlog.take(0.0))  # before it is asked which devices there are: none is unknown then
             self._inside_since = time.monotonic()
+            if self._devices is not shown:
+                shown = self._devices
+                queue.plot_every_s = max(1.0, len(shown) / PLOTS_PER_S)
+                self._lay_out(output, scene, shown)
+                for device in [one.name for one in shown if one.name not in begun]:
+                    begun.add(device)
+                    self._begin(scene, device)
             queue.draw(scene, everything=closing)
             now = time.monotonic()
             if closing or now - checked > CHECK_EVERY_S:
@@ -291,6 +324,10 @@ class RerunView:
             if self._closing.is_set():
                 return
         self._stalled = False
+
+
+def _nothing(_device: str) -> Past | None:
+    return None
 
 
 @dataclass

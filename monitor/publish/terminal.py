@@ -111,6 +111,16 @@ class Board:
             if known := self._device(found[0]):
                 known.there = there
 
+    def forget(self, key: str) -> None:
+        """The device of the key has no row any more."""
+        found = heard.split(key)
+        if found is None:
+            return
+        with self._lock:
+            self._devices.pop(found[0], None)
+            for one in [one for one in self._events if one[0] == found[0]]:
+                self._events.remove(one)
+
     def table(self, now_s: float) -> RenderableType:
         """All of it, at one moment."""
         with self._lock:

@@ -293,7 +293,7 @@ def listeners(connect: Sequence[str], file: Path | None) -> dict[str, "zenoh.Con
         own = {"mode": "client", "connect/endpoints": [endpoint], "listen/endpoints": []}
         try:
             found[endpoint] = configuration(own, file, unsaid)
-        except zenoh.ZError as error:
+        except (zenoh.ZError, UnicodeEncodeError) as error:
             raise ConfigError(f'connect "{masked(endpoint)}": no endpoint; write e.g. {topics.ENDPOINT}') from error
     return found
 
@@ -318,6 +318,8 @@ def _check_keys(keyexpr: str, keys: list[str]) -> None:
     try:
         for key in keys:
             zenoh.KeyExpr(key)
+    except UnicodeEncodeError as error:
+        raise ConfigError(f'key expression "{keyexpr!a}": no UTF-8') from error
     except zenoh.ZError as error:
         raise ConfigError(f'key expression "{keyexpr}": {plain(error)}') from error
     if not keys:

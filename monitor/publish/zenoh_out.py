@@ -6,6 +6,8 @@ was to be put is dropped: samples go on. zenoh queues what it sends and drops fo
 so ``put`` does not wait for anyone. Who subscribes late can ask for the last values: an advanced publisher keeps them,
 and plain subscribers notice nothing of it.
 
+Queries of ``history`` are answered by the thread that takes them, one a device: a file is read, nothing here waits.
+
 Commands arrive on a queryable whose queries a thread of this class takes from zenoh's channel (a Python callback that
 is alive at exit would hang the process) and hands to the service by a queue; the service's loop answers them.
 """
@@ -21,6 +23,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from drivers.errors import ConfigError, ImuError, NotReady
 from drivers.masked import masked
 from drivers.zenoh_refusal import refused
 from drivers.zenoh_session import CLOSED, alone, configuration, endpoints, plain
@@ -47,11 +50,22 @@ class Command:
     refuse: Callable[[str], None]
 
 
-class ZenohOut:
-    """The daemon's session and what it declares for each device."""
+Recall = Callable[[str, str], bytes]
+"""Device and a selector's parameters in, past results out; ImuError says why there are none."""
 
-    def __init__(self, settings: ZenohTable, devices: Sequence[str]) -> None:
+
+class ZenohOut:
+    """The daemon's session and what it declares for each device.
+
+    Args:
+        settings: of the session
+        devices: their names
+        recall: answers queries of ``history``; None where none is kept
+    """
+
+    def __init__(self, settings: ZenohTable, devices: Sequence[str], recall: Recall | None = None) -> None:
         self.settings = settings
+        self._recall = recall
         self._said = "off" if settings.mode == "none" else "not open yet"
         self._unsent = ""  # why the newest message did not go out
         self.commands: queue.Queue[Command] = queue.Queue(QUERIES_WAITING)
@@ -62,6 +76,8 @@ class ZenohOut:
         self._connect: tuple[str, ...] = settings.connect
         self._publishers: dict[str, zenoh.Publisher | AdvancedPublisher] = {}
         self._tokens: dict[str, Any] = {}
+        self._queryables: dict[str, list[Any]] = {}
+        self._declaring = threading.Lock()  # the opener declares all devices, the loop those that come or go
         self._showing = threading.Lock()  # the opener and the loop both show who is alive
         self._opener = threading.Thread(target=self._keep_open, name="zenoh open", daemon=True)
         self._takers: list[threading.Thread] = []
@@ -99,11 +115,45 @@ class ZenohOut:
         else:
             self._unsent = ""
 
+    def put_on(self, key: str, payload: bytes) -> str:
+        """Send JSON on a key of the user's; "" or why it did not go out."""
+        import zenoh
+
+        session = self._session
+        if session is None:
+            return f"not sent: zenoh: {self._said}"
+        try:
+            session.put(key, payload, encoding=zenoh.Encoding(topics.JSON), express=True)
+        except zenoh.ZError as error:
+            return f"not sent: zenoh: {plain(error)}"
+        return ""
+
     def alive(self, device: str, flowing: bool) -> None:
         """Show or take away the device's liveliness token."""
         if self._alive[device] != flowing:
             self._alive[device] = flowing
             self._show_alive(device)
+
+    def add(self, device: str) -> None:
+        """Publish another device too."""
+        with self._declaring:
+            self._devices += (device,)
+            self._alive[device] = False
+            if self._session is not None:
+                with contextlib.suppress(*_zenoh_errors()):  # the session is being closed
+                    self._declare(self._session, device)
+
+    def remove(self, device: str) -> None:
+        """Take a device's keys away."""
+        self.alive(device, False)
+        with self._declaring, contextlib.suppress(*_zenoh_errors()):  # the session is being closed
+            self._devices = tuple(one for one in self._devices if one != device)
+            del self._alive[device]
+            keys = {topic.key(self.settings.prefix, device) for topic in topics.TOPICS}
+            gone = [self._publishers[key] for key in keys & self._publishers.keys()]
+            self._publishers = {key: one for key, one in self._publishers.items() if key not in keys}
+            for one in [*gone, *self._queryables.pop(device, [])]:
+                one.undeclare()
 
     def close(self) -> None:
         """Close the session, which takes away tokens, and end the threads."""
@@ -142,7 +192,7 @@ class ZenohOut:
     def _end(self) -> None:
         """Close the session, which ends the threads that take from it."""
         session, self._session = self._session, None
-        self._publishers = {}
+        self._publishers, self._queryables = {}, {}
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
         with self._showing:
@@ -153,17 +203,22 @@ class ZenohOut:
 
     def _open(self) -> None:
         session, said = self._open_session()
-        self._session = session
-        publishers = {}
-        for device in self._devices:
-            for topic in topics.TOPICS:
-                if topic.when not in ("presence", "query"):
-                    key = topic.key(self.settings.prefix, device)
-                    publishers[key] = self._publisher(session, topic, key)
-            self._declare_commands(session, device)
-        self._publishers, self._said = publishers, said
-        for device in self._devices:
-            self._show_alive(device)
+        with self._declaring:
+            self._session = session
+            for device in self._devices:
+                self._declare(session, device)
+            self._said = said
+
+    def _declare(self, session: "zenoh.Session", device: str) -> None:
+        """All keys of a device."""
+        keys = {topic: topic.key(self.settings.prefix, device) for topic in topics.TOPICS}
+        published = {topic: key for topic, key in keys.items() if topic.when not in ("presence", "query")}
+        new = {key: self._publisher(session, topic, key) for topic, key in published.items()}
+        self._declare_commands(session, device)
+        if self._recall is not None:
+            self._declare_history(session, device, self._recall)
+        self._publishers = {**self._publishers, **new}
+        self._show_alive(device)
 
     def _open_session(self) -> tuple["zenoh.Session", str]:
         """The session; on a busy port with any free one, and what to say of it."""
@@ -235,7 +290,39 @@ class ZenohOut:
             target=self._take_queries, args=(device, queryable), name=f"commands of {device}", daemon=True
         )
         taker.start()
-        self._takers.append(taker)
+        self._keep(device, queryable, taker)
+
+    def _declare_history(self, session: "zenoh.Session", device: str, recall: Recall) -> None:
+        import zenoh
+
+        key = topics.HISTORY.key(self.settings.prefix, device)
+        queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(QUERIES_WAITING))
+        taker = threading.Thread(
+            target=self._remember, args=(device, key, queryable, recall), name=f"history of {device}", daemon=True
+        )
+        taker.start()
+        self._keep(device, queryable, taker)
+
+    def _keep(self, device: str, queryable: Any, taker: threading.Thread) -> None:
+        self._queryables.setdefault(device, []).append(queryable)
+        self._takers = [*(one for one in self._takers if one.is_alive()), taker]
+
+    def _remember(self, device: str, key: str, queryable: Any, recall: Recall) -> None:
+        """Questions about the past, until the session is closed."""
+        handler = queryable.handler
+        while not self._closing.is_set():
+            try:
+                query = handler.recv()
+            except _zenoh_errors():
+                return
+            answer, _ = _answers(query, key)
+            with contextlib.suppress(*_zenoh_errors()):  # the session was closed meanwhile
+                try:
+                    payload = recall(device, str(query.parameters))
+                except ImuError as error:
+                    _no_answer(query, error)
+                else:
+                    answer(payload)
 
     def _take_queries(self, device: str, queryable: Any) -> None:
         """Queries until the session is closed."""
@@ -267,6 +354,16 @@ def _answers(query: Any, key: str) -> tuple[Callable[[bytes], None], Callable[[s
             query.reply_err(json.dumps({"error": why}).encode(), encoding=zenoh.Encoding(topics.JSON))
 
     return answer, refuse
+
+
+def _no_answer(query: Any, error: ImuError) -> None:
+    """End a query with what is wrong, and with the exit status that a command would have."""
+    import zenoh
+
+    status = 3 if isinstance(error, NotReady) else 2 if isinstance(error, ConfigError) else 1
+    with query:
+        said = json.dumps({"error": str(error), "exit": status}).encode()
+        query.reply_err(said, encoding=zenoh.Encoding(topics.JSON))
 
 
 def _free_port(endpoint: str) -> str:

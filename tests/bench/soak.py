@@ -28,6 +28,8 @@ from drivers.recording import segment
 from drivers.sample import Chunk, block
 from monitor import settings
 from monitor.catalogue import read_model
+from monitor.history.store import reading
+from monitor.history.times import Span
 from monitor.service import Service
 
 ROWS: Final = 8192
@@ -184,11 +186,20 @@ def _tell(service: Service, wire: Wire, course: Course, took_s: float, store: Pa
             recorded += len(piece.samples)
             missing += piece.samples.lost
     print(f"recorded {recorded}, missing in the recording {missing}: sum {recorded + missing}")
+    with reading(store / "history.sqlite") as reader:
+        kept = list(reader.rows("soak", Span(-np.inf, np.inf)))
+        _, events = reader.events("soak", Span(-np.inf, np.inf), 1)
+    print(f"history: {len(kept)} rows of {', '.join(sorted({f'{row.width_s} s' for row in kept}))}, {events} events")
+    sums = [sum(row.counts[at] for row in kept) for at in range(3)]
+    print(f"received, lost and bad of all its rows: {sums}")
+    assert sums == [counts.received, counts.lost, counts.bad]
+    assert recorded == counts.received
     early, late = _half(course, 0.1, 0.5), _half(course, 0.5, 1.0)
     names = ("memory MB", "descriptors", "threads", "store MB")
     for at, name in enumerate(names):
         print(f"{name}: most before the half {early[at]:.1f}, after it {late[at]:.1f}")
-    print(f"last estimate over {service.stations[0].estimator.filled if service.stations[0].estimator else 0} samples")
+    estimator = service.stations[0].chain.estimator
+    print(f"the window holds {estimator.filled if estimator is not None else 0} samples")
 
 
 def _sum(counts: Counts, truth: Truth) -> int:

@@ -17,9 +17,10 @@ from drivers.recording import load_samples, segment
 from drivers.recording.segment import Origin, SegmentWriter, State
 from drivers.sample import Chunk, SampleBlock, block, join
 from monitor import recorder as room
+from monitor.chain import Ready
 from monitor.recorder import Recorder, origin
 from monitor.settings import Device, Storage
-from monitor.station import Ready, Station
+from monitor.station import Station
 
 pytest.importorskip("pyarrow", reason="recording needs the extra arrow")
 
@@ -285,17 +286,17 @@ def test_the_window_after_a_restart_is_the_one_before(tmp_path: Path) -> None:
     assert not after._can_take()  # new samples wait
     after.rebuild()
     assert after._can_take()
-    old, new = before.estimator.get(), after.estimator.get()
+    old, new = before.chain.estimator.get(), after.chain.estimator.get()
     assert new.curve.n == old.curve.n == 3000
     np.testing.assert_array_equal(new.curve.terms, old.curve.terms)
     np.testing.assert_allclose(new.curve.avar, old.curve.avar, rtol=1e-9)
     for _ in range(10):  # the live fit takes a step each look
-        old = before.estimator.get()
+        old = before.chain.estimator.get()
     np.testing.assert_allclose(new.coefficients.value, old.coefficients.value, rtol=1e-9)
     # bounds are sought to seven digits
     np.testing.assert_allclose(new.coefficients.hi, old.coefficients.hi, rtol=1e-6)
     np.testing.assert_array_equal(new.coefficients.status, old.coefficients.status)
-    assert after.watch is not None
+    assert after.chain.watch is not None
     (event,) = after._happened
     assert event.kind == "window_rebuilt"
     assert event.text == "30 s of the window were rebuilt from the recording"
@@ -310,8 +311,8 @@ def test_an_axis_that_began_anew_counts_from_there_after_a_restart_too(tmp_path:
         before._push(rows(first, 50, start_ns=mono_ns - 6000 * 10_000_000))
         before.work([], first / 100.0)
         if first == 5000:
-            before.estimator.restart(2, 1000)
-            before._count_from(2, 1000)
+            before.chain.estimator.restart(2, 1000)
+            before.chain.since_ns[2] = before._newest_ns - 9_995_000_000
             before.report([], {}, 0)
             time.sleep(0.1)
     wait_for(lambda: sum(len(piece.samples) for piece in written(tmp_path / "bench")) == 6000)
@@ -319,7 +320,7 @@ def test_an_axis_that_began_anew_counts_from_there_after_a_restart_too(tmp_path:
     after = station(tmp_path, Recorder(Storage(tmp_path), [origin("bench", AxisMap())]))
     after._resume(after._recorder.tail("bench"))
     after.rebuild()
-    old, new = before.estimator.get(), after.estimator.get()
+    old, new = before.chain.estimator.get(), after.chain.estimator.get()
     assert old.curve.terms[0, 2] < old.curve.terms[0, 0]
     np.testing.assert_array_equal(new.curve.terms, old.curve.terms)
     np.testing.assert_allclose(new.curve.avar, old.curve.avar, rtol=1e-9)
@@ -340,8 +341,8 @@ def test_what_came_while_nobody_was_there_is_lost_and_keeps_its_place(tmp_path: 
             assert after.driver.counts.lost == 40
         else:
             assert 0 < after.driver.counts.lost < 2000
-        wait_for(lambda: after.work([], time.monotonic()) or after.estimator.samples >= 6059)
-        assert after.estimator.filled == 3000
+        wait_for(lambda: after.work([], time.monotonic()) or after.chain.estimator.samples >= 6059)
+        assert after.chain.estimator.filled == 3000
     finally:
         after.stop()
         after.join(5.0)
@@ -364,7 +365,7 @@ def test_what_the_samples_cannot_go_on_from_begins_anew(tmp_path, axes, older_s:
     after = station(tmp_path, Recorder(Storage(tmp_path), [origin("bench", axes)]), axes=axes)
     after._resume(after._recorder.tail("bench"))
     after.rebuild()
-    assert after.estimator is None
+    assert after.chain.estimator is None
     assert after._can_take() is False or after.ring.room == after.ring.capacity
     texts = [event.text for event in after._happened]
     assert texts == [] if reason is None else reason in texts[0]
@@ -377,4 +378,4 @@ def test_files_that_are_no_segments_are_passed_over(tmp_path: Path) -> None:
     after = station(tmp_path, Recorder(Storage(tmp_path), [origin("bench", AxisMap())]))
     after._resume(after._recorder.tail("bench"))
     after.rebuild()
-    assert after.estimator.filled == 3000
+    assert after.chain.estimator.filled == 3000

@@ -28,6 +28,7 @@ from monitor.settings import (
     seconds,
     viewer_mode,
 )
+from monitor.tables import HookTable, LimitTable, MetricsTable
 
 DRIVER = 'driver = { link = "serial", port = "/dev/null", decoder = "vectornav_ascii" }'
 
@@ -55,7 +56,72 @@ def test_a_device_needs_its_name_and_driver_only(tmp_path):
     assert isinstance(one.decoder, VectornavAsciiDecoder)
 
 
+LIMIT = "[[device.limit]]\n"
+HOOK = "[[hook]]\n"
 CASES = {
+    "limit without a bound": (
+        device() + LIMIT + 'axes = "gz"\nletter = "N"',
+        ["device a: limit[0]: no bound; add above, below or times_model"],
+    ),
+    "limit of no axis": (
+        device() + LIMIT + 'axes = "g"\nletter = "N"\nabove = 1.0',
+        ['device a: limit[0].axes: "g"; possible are gx, gy, gz, ax, ay, az, g*, a*, *'],
+    ),
+    "limit of no letter": (
+        device() + LIMIT + 'axes = "gz"\nletter = "X"\nabove = 1.0',
+        ["device a: limit[0].letter: Invalid enum value 'X'"],
+    ),
+    "limit without a letter": (
+        device() + LIMIT + 'axes = "gz"\nabove = 1.0',
+        ["device a: limit[0].letter: missing"],
+    ),
+    "limit relative to nothing": (
+        device() + LIMIT + 'axes = "gz"\nletter = "N"\ntimes_model = 1.5',
+        ["device a: limit[0].times_model: the device has no model to be relative to; add model"],
+    ),
+    "limit said twice": (
+        device('model = "consumer-mems"') + LIMIT + 'axes = "gz"\nletter = "N"\ntimes_model = 1.5\nabove = 1.0',
+        ["device a: limit[0]: above and times_model are two words for one bound; leave one out"],
+    ),
+    "limits that cross": (
+        device() + LIMIT + 'axes = "gz"\nletter = "N"\nbelow = 2.0\nabove = 1.0',
+        ["device a: limit[0]: below 2 is not under above 1: nothing lies between"],
+    ),
+    "limit held for nothing": (
+        device() + LIMIT + 'axes = "gz"\nletter = "N"\nabove = 1.0\nhold = "often"',
+        ['device a: limit[0].hold: "often" is no duration'],
+    ),
+    "hook on nothing": (
+        device() + HOOK + 'on = []\nkey = "x"',
+        ['hook[0].on: empty; write kinds of events, or ["*"]'],
+    ),
+    "hook on what never happens": (
+        device() + HOOK + 'on = ["limit_cross"]\nkey = "x"',
+        ['hook[0].on: unknown "limit_cross"; did you mean "limit_crossed"?'],
+    ),
+    "hook of no device": (
+        device() + HOOK + 'on = ["*"]\ndevices = ["b"]\nkey = "x"',
+        ['hook[0].devices: unknown "b"; known are a'],
+    ),
+    "hook that does nothing": (device() + HOOK + 'on = ["*"]', ["hook[0]: nothing to do; add command or key"]),
+    "hook by a name": (
+        device() + HOOK + 'on = ["*"]\ncommand = ["mail"]',
+        ['hook[0].command: "mail" is no path; write where the program is, e.g. "/usr/bin/mail"'],
+    ),
+    "hook that is not there": (device() + HOOK + 'on = ["*"]\ncommand = ["/none/x"]', ["/none/x: no such file"]),
+    "hook that is no program": (
+        device() + HOOK + f'on = ["*"]\ncommand = ["{CONFIG_FOLDER}/demo.toml"]',
+        ["demo.toml: not executable; chmod +x it"],
+    ),
+    "hook on any key": (device() + HOOK + 'on = ["*"]\nkey = "site/*"', ["hook[0].key: Expected `str` matching"]),
+    "hook without zenoh": (
+        device() + HOOK + 'on = ["*"]\nkey = "x"\n[zenoh]\nmode = "none"',
+        ['hook[0].key: zenoh.mode is "none", so nothing can be put there'],
+    ),
+    "metrics nowhere": (
+        device() + '[metrics]\nlisten = "9464"',
+        ['metrics.listen: "9464" is no host and port; write "127.0.0.1:9464"'],
+    ),
     "unknown key": (device("windw = 60.0"), ['device[0].windw: unknown key; did you mean "window"?']),
     "unknown table": ("[zenho]\n" + device(), ['zenho: unknown key; did you mean "zenoh"?']),
     "unknown key of zenoh": (
@@ -166,6 +232,10 @@ CASES = {
     ),
     "viewer": (device() + '[viewer]\nmode = "window"', ['viewer.mode: "window"; possible are auto']),
     "viewer's port": (device() + "[viewer]\nport = 70000", ["viewer.port: Expected `int` <= 65535"]),
+    "viewer's history": (
+        device() + '[viewer]\nhistory = "soon"',
+        ["viewer.history: none is kept; [storage] folder", 'viewer.history: "soon" is no duration'],
+    ),
     "viewer's memory": (device() + "[viewer]\nmemory = 3", ["viewer.memory: Expected `str`"]),
     "zenoh's mode": (device() + '[zenoh]\nmode = "pear"', ["zenoh.mode: Invalid enum value 'pear'"]),
     "zenoh's prefix": (device() + '[zenoh]\nprefix = "a/*"', ["zenoh.prefix: "]),
@@ -272,6 +342,9 @@ def test_the_printed_defaults_are_the_defaults():
         (serial_link.Settings, driver),
         (ZenohTable, table["zenoh"]),
         (ViewerTable, table["viewer"]),
+        (LimitTable, {}),
+        (HookTable, {}),
+        (MetricsTable, table["metrics"]),
         (LogTable, table["log"]),
     ):
         for field in msgspec.structs.fields(kind):
@@ -281,7 +354,8 @@ def test_the_printed_defaults_are_the_defaults():
                 if default is not None:
                     assert (tuple(value) if isinstance(default, tuple) else value) == default, field.name
             else:  # no default: told as a comment
-                assert f"\n# {field.encode_name} = " in text, field.name
+                name = field.encode_name
+                assert f"\n# {name} = " in text or f"\n# [[device.{name}]]" in text, name
     config, lines = read(CONFIG_FOLDER / "defaults.toml")
     assert lines == []
     assert config is not None
@@ -331,6 +405,15 @@ def test_rates(text, value):
 def test_words_that_are_no_rates(text):
     with pytest.raises(ConfigError, match="no rate"):
         period(text, "always")
+
+
+def test_the_viewer_opens_on_so_much_of_what_is_kept(tmp_path):
+    path = tmp_path / "my.toml"
+    path.write_text(device() + '[viewer]\nhistory = "12h"\n[storage]\nfolder = "kept"\n')
+    assert load(path).viewer.history == 43_200.0
+    path.write_text(device() + '[viewer]\nhistory = "12h"\n[storage]\nfolder = "kept"\nhistory = false\n')
+    with pytest.raises(ConfigError, match="none is kept"):
+        load(path)
 
 
 def test_viewer_modes():

@@ -12,8 +12,9 @@ from drivers.errors import ConfigError
 from drivers.links import replay_link
 from drivers.links.loopback_link import LoopbackLink
 from drivers.sample import block, join
+from monitor.chain import Ready
 from monitor.settings import Device
-from monitor.station import Ready, Station
+from monitor.station import Station
 
 RATE = 100.0
 
@@ -338,12 +339,12 @@ def test_a_replay_has_ended_when_its_samples_are_fitted():
     rig.ready.fit.set()
     rig.work(1002.0)
     assert rig.caught.estimates[-1][1].coefficients.status.max() > 0
-    assert rig.station.watch is None
+    assert rig.station.chain.watch is None
     rig.ready.all.set()
     assert rig.station.ended
     rig.bring(10)
     rig.work(1003.0)
-    assert rig.station.watch is not None
+    assert rig.station.chain.watch is not None
 
 
 def test_samples_whose_rate_cannot_be_told_go_on():
@@ -407,7 +408,7 @@ def follow_temperature(rig, seconds, begin_s=0.0):
 def test_bias_is_held_against_temperature():
     rig = Rig(thermal_s=1.0)
     follow_temperature(rig, 30.0)
-    while rig.station.thermal.step():  # until the models are chosen
+    while rig.station.chain.thermal.step():  # until the models are chosen
         pass
     follow_temperature(rig, 3.0, 100.0)
     assert len(rig.caught.thermals) >= 31
@@ -422,7 +423,7 @@ def test_bias_is_held_against_temperature():
 def test_choosing_a_model_holds_no_round_up():
     rig = Rig(thermal_s=1.0)
     follow_temperature(rig, 14.0)
-    assert rig.station.thermal.choosing
+    assert rig.station.chain.thermal.choosing
     took = []
     for i in range(50):
         begun = time.perf_counter()
@@ -439,7 +440,7 @@ def test_a_recording_waits_for_its_model():
     values = 1e-3 * np.random.default_rng(1).standard_normal((4000, 6)) + 2e-3 * (warmth - 25.0)[:, None]
     rig.station._push(block(index * 10_000_000, values, warmth, index))  # as fast as can be
     rig.work(1000.0)
-    assert rig.station.thermal.choosing
+    assert rig.station.chain.thermal.choosing
     assert 12 <= len(rig.caught.thermals) <= 20
     assert not rig.station._can_take()
     for i in range(2000):
@@ -461,8 +462,8 @@ def test_at_the_end_nothing_waits_for_a_model():
 def test_where_it_is_off_nothing_is_held_against_temperature():
     rig = Rig(thermal_s=None)
     follow_temperature(rig, 5.0)
-    assert (rig.station.thermal, rig.caught.thermals) == (None, [])
-    assert rig.station.watch.take_still() == []
+    assert (rig.station.chain.thermal, rig.caught.thermals) == (None, [])
+    assert rig.station.chain.watch.take_still() == []
 
 
 def test_without_a_model_there_is_no_gap():
@@ -500,7 +501,7 @@ def test_every_sample_comes_out_without_drift_too_and_models_are_identified_besi
     for i in range(75):
         rig.bring(100)
         rig.work(1000.0 + i)
-    thread = rig.station._identifier._work.thread
+    thread = rig.station.chain.identifier._work.thread
     assert thread.name == "drift of bench"
     thread.join(10.0)
     rig.bring(100)
@@ -512,7 +513,7 @@ def test_every_sample_comes_out_without_drift_too_and_models_are_identified_besi
     ends = [look.t_ns for _, look in rig.caught.drifts]
     assert ends == [k * 1_000_000_000 + 990_000_000 for k in range(len(ends))]
     assert len(ends) == 75
-    assert rig.station.compensation.compensator.models[0] is not None
+    assert rig.station.chain.compensation.compensator.models[0] is not None
 
 
 def test_a_recording_waits_for_its_models(tmp_path):
@@ -521,7 +522,7 @@ def test_a_recording_waits_for_its_models(tmp_path):
     for i in range(65):
         rig.bring(100)
         rig.work(1000.0 + i)
-    assert all(model is not None for model in rig.station.compensation.compensator.models)
+    assert all(model is not None for model in rig.station.chain.compensation.compensator.models)
 
 
 def test_nothing_is_compensated_where_it_is_not_wanted_or_no_gyro_is_measured():

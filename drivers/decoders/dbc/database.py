@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 import drivers
-from drivers import units
+from drivers import small_file, units
 from drivers.decoders.base import Arrival, Counter, Timing
 from drivers.decoders.dbc.bits import Bits
 from drivers.decoders.dbc.join import COLUMNS, Column, Message
@@ -203,6 +203,7 @@ def _load(path: Path) -> Any:
 
     try:
         if path.suffix.lower() != ".dbc":
+            small_file.read(path)  # to know that it is one: what follows opens it anew
             return cantools.database.load_file(path, strict=False)
         return cantools.database.load_string(_text(path), "dbc", strict=False)
     except OSError as error:
@@ -213,7 +214,7 @@ def _load(path: Path) -> Any:
 
 def _text(path: Path) -> str:
     """DBC editors write the code page of Windows, others UTF-8; degree signs tell them apart."""
-    data = path.read_bytes()
+    data = small_file.read(path)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:

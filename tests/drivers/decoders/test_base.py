@@ -121,7 +121,7 @@ def test_hints() -> None:
 
 
 def test_keep_carries_rejected_frames_to_the_next_kept_one() -> None:
-    frames = Frames([b"0", b"1", b"2", b"3"], np.arange(4), np.array([1, 2, 4, 8]))
+    frames = Frames([b"0", b"1", b"2", b"3"], np.arange(4), np.array([1, 2, 4, 8]), np.zeros(4, np.bool_))
     kept, after = frames.keep([1, 2])
     assert (kept.data, kept.t_ns.tolist(), kept.bad_before.tolist(), after) == (
         [b"1", b"2"],

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from drivers.decoders.base import MUTE_BYTES
 from drivers.decoders.stim300 import IDENTIFIERS, SIZES, Settings, build, crc, crc_holds
 from drivers.errors import ConfigError
 from drivers.sample import Chunk, Counter, SampleBlock, block, join
@@ -135,9 +136,13 @@ def test_auto_follows_a_device_that_is_set_anew() -> None:
     short = [c.data for c in build(Settings(identifier=0x91)).encode(block(np.arange(200), np.zeros((200, 6))))]
     decoder = build(Settings())
     assert len(decoder.feed([Chunk(PUBLISHED * 3, 0)])) == 1
-    assert decoder.feed([Chunk(b"".join(short), 0)]) == []
+    size = len(short[0])
+    assert decoder.feed([Chunk(b"".join(short)[:MUTE_BYTES], 0)]) == []
     assert "baud rate" in decoder.hint
-    assert sum(len(b) for b in decoder.feed([Chunk(b"".join(short), 0)])) == 200
+    got = sum(len(b) for b in decoder.feed([Chunk(b"".join(short)[MUTE_BYTES:], 0)]))
+    assert got == 200 - MUTE_BYTES // size - 1
+    once = build(Settings())
+    assert sum(len(b) for b in once.feed([Chunk(PUBLISHED * 3 + b"".join(short), 0)])) == 3 + got
     decoder = build(Settings(identifier=0xAF))
     assert decoder.feed([Chunk(b"".join(short), 0)]) == []
 

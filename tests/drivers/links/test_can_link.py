@@ -128,7 +128,7 @@ def test_accepting_nothing_in_particular_is_accepting_all(peer: can.BusABC, chan
 def test_error_and_remote_frames_are_left_aside(peer: can.BusABC, channel: str) -> None:
     link = build(interface="virtual", channel=channel)
     link.open()
-    peer.send(can.Message(is_error_frame=True, arbitration_id=0x40))
+    peer.send(can.Message(is_error_frame=True, arbitration_id=0x04))
     peer.send(can.Message(is_remote_frame=True, arbitration_id=5, is_extended_id=False))
     peer.send(message(7))
     got: list[Chunk] = []

@@ -126,3 +126,11 @@ def test_disagreement_with_a_model_is_trouble_and_ranks_before_what_runs_well() 
     assert one.trouble() == f"gz disagrees with its model: {found.gap:.3g} σ at τ {lo:.3g} to {hi:.3g} s"
     one.gap = heard.read(heard.GapMessage, topics.GAP, message.gap("a", 1.0, made.look(gz=True)))
     assert (one.rank(0.0), one.trouble()) == (2, "")
+
+
+def test_a_limit_that_is_passed_is_trouble() -> None:
+    one = device(crossed=("gz N",))
+    assert one.rank(100.0) == 1
+    assert one.trouble() == "beyond its limit: gz N"
+    many = device(crossed=tuple(f"gz {i}" for i in range(100)))
+    assert many.trouble() == "beyond its limit: gz 0, gz 1, gz 2, gz 3, gz 4, gz 5 and 94 more"

@@ -212,6 +212,7 @@ def test_status() -> None:
         "late": 0,
         "moving": False,
         "moved": 0,
+        "crossed": [],
         "text": "…",
     }
 

@@ -44,3 +44,8 @@ def test_the_overview_has_a_line_a_device():
     text = overview_text({"a": made.health(), "b": made.health(state="waiting", rate_hz=None)})
     assert "| **a** | running | 99.98 Hz |" in text
     assert "| **b** | waiting | — |" in text
+
+
+def test_a_limit_that_is_passed_stands_in_the_health_panel() -> None:
+    assert "beyond its limit: **gz N, az B**" in health_text("b", made.health(crossed=("gz N", "az B")))
+    assert "limit" not in health_text("b", made.health())

@@ -1,0 +1,23 @@
+"""Files that people write, read whole: a configuration, a model, a CAN database. None is large, and a device that never
+ends is none.
+"""
+
+import errno
+from pathlib import Path
+from typing import Final
+
+MOST_BYTES: Final = 32_000_000
+"""The largest CAN databases of whole vehicles have some megabytes."""
+
+
+def read(path: Path) -> bytes:
+    """All of a file.
+
+    Raises:
+        OSError: it cannot be read, or is larger than MOST_BYTES
+    """
+    with path.open("rb") as file:
+        data = file.read(MOST_BYTES + 1)
+    if len(data) > MOST_BYTES:
+        raise OSError(errno.EFBIG, f"more than {MOST_BYTES // 1_000_000} MB", str(path))
+    return data

@@ -1,0 +1,47 @@
+"""``doctor``: what was found, as a table or as JSON."""
+
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from monitor.cli import output
+
+SCHEMA: Final = "imu-monitor/doctor/1"
+SIGNS: Final = {"well": "[green]✓[/]", "doubt": "[yellow]![/]", "wrong": "[red]✗[/]"}
+WRONG: Final = 1
+
+
+def doctor(
+    config: Annotated[
+        Path | None, typer.Argument(metavar="[CONFIG.toml]", help="Configuration file; else the machine alone.")
+    ] = None,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Findings as JSON; - = standard output.")] = None,
+) -> None:
+    """Look at this machine and a configuration before they are left alone; opens no device."""
+    import msgspec
+
+    from monitor import doctor as checks
+
+    output.check_place("--json", json)
+    findings = checks.examine(config)
+    if json is not None:
+        output.write("--json", json, msgspec.json.encode({"schema": SCHEMA, "findings": findings}) + b"\n")
+    if json != Path("-"):
+        _print(findings)
+    if checks.worst(findings) == "wrong":
+        raise typer.Exit(WRONG)
+
+
+def _print(findings: list) -> None:  # type: ignore[type-arg]
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for column in ("sign", "about", "text"):
+        table.add_column(column, overflow="fold")
+    for one in findings:
+        do = f"\n[dim]→[/] {escape(one.do)}" if one.do else ""
+        table.add_row(SIGNS[one.mark], escape(one.about), escape(one.text) + do)
+    Console().print(table)

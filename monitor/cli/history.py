@@ -1,0 +1,168 @@
+"""Past results: ``history``, from a daemon's file or from a running daemon."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from drivers.errors import ConfigError
+from monitor.cli import output
+
+if TYPE_CHECKING:
+    from monitor.history.past import Past
+    from monitor.history.question import Question
+    from monitor.history.times import Span
+
+ROWS: Final = 24
+"""Of one axis over time, on a terminal."""
+Get = Callable[["Question"], "Past"]
+
+
+def history(
+    source: Annotated[
+        Path | None, typer.Argument(metavar="[CONFIG.toml|FOLDER]", help="Whose history: configuration, or its folder.")
+    ] = None,
+    connect: Annotated[
+        str | None, typer.Option(metavar="ENDPOINT", help="Ask a running daemon instead, e.g. tcp/127.0.0.1:7450.")
+    ] = None,
+    device: Annotated[str | None, typer.Option(metavar="NAME", help="Which device, where there are several.")] = None,
+    since: Annotated[
+        str | None, typer.Option("--from", metavar="T", help="-1d, 2026-11-20, 2026-11-20T14:30; the last day.")
+    ] = None,
+    until: Annotated[str | None, typer.Option("--to", metavar="T", help="As --from.")] = None,
+    step: Annotated[str | None, typer.Option(metavar="S", help="Rows at least so long: 15min, 1h, 1d.")] = None,
+    axis: Annotated[str | None, typer.Option(metavar="AXIS", help="One axis over time: gz.")] = None,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="All numbers as a table: .csv, .parquet, .npz, .arrow.")
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Courses and events as a picture.")] = None,
+) -> None:
+    """What the noise was: coefficients, temperature, losses and events of hours or years."""
+    from rich.console import Console
+
+    from drivers.recording.formats import format_of
+    from drivers.sample import AXES
+    from monitor.estimate.coefficients import LETTERS
+    from monitor.history.past import step as width_of
+    from monitor.history.question import WHAT, Question
+    from monitor.history.times import length
+    from monitor.publish import history_file, history_message, history_text
+
+    if axis is not None and axis not in AXES:
+        raise ConfigError(f'--axis: "{axis}"; possible are {", ".join(AXES)}')
+    if plot is not None and plot.suffix != ".png":
+        raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
+    for option, place in (("--json", json), ("--out", out), ("--plot", plot)):
+        output.check_place(option, place)
+    if out is not None:
+        format_of(out)
+    span = _span(since, until)
+    step_s = None if step is None else max(int(_said_of("--step", length, step)), 1)
+    axes = AXES if axis is None else (axis,)
+    asked = Question(span, step_s, WHAT, axes)
+    if source is not None and connect is not None:
+        raise ConfigError(f"{source}: either a file's history or --connect, not both")
+    get = _from_daemon(connect, device) if connect is not None else _from_file(source, device)
+    past = get(asked)
+    if json is not None:
+        newest_s = float(past.end_s[-1]) if len(past) else past.span.end_s
+        payload = history_message.history(past, asked, newest_s, int(past.counts[:, 0].sum()))
+        output.write("--json", json, payload + b"\n")
+    if out is not None:
+        history_file.save(past, out)
+    if plot is not None:
+        from monitor.publish.history_plot import history_plot
+
+        history_plot(past, plot, axes)
+    if json == Path("-"):
+        return
+    console = Console()
+    history_text.tell(past, axes, LETTERS if axis else history_text.LETTERS, console)
+    if axis is not None and len(past):
+        few_s = max(width_of(past.span, None, ROWS), past.step_s)
+        few = past if few_s == past.step_s else get(Question(span, few_s, ("coefficients", "status"), axes))
+        history_text.tell_course(few, axis, LETTERS, console)
+
+
+def _from_file(source: Path | None, name: str | None) -> Get:
+    """Answers from a file, that a daemon may be writing to."""
+    from monitor.history import past
+    from monitor.history.store import reading
+
+    if source is None:
+        raise ConfigError("CONFIG.toml or a folder is missing; or --connect ENDPOINT for a running daemon")
+    path = _file(source)
+    with reading(path) as reader:
+        device = _one(name, list(reader.devices()), str(path))
+
+    def get(asked: "Question") -> "Past":
+        with reading(path) as reader:
+            return past.read(reader, device, asked.span, asked.wants, asked.step_s)
+
+    return get
+
+
+def _from_daemon(endpoint: str, name: str | None) -> Get:
+    """Answers over zenoh."""
+    from monitor.publish.history_ask import ask
+
+    def get(asked: "Question") -> "Past":
+        found = {one.device: one for one in ask(endpoint, name or "*", asked.parameters())}
+        return found[_one(name, list(found), endpoint)]
+
+    return get
+
+
+def _file(source: Path) -> Path:
+    """The file of a configuration, or of a folder."""
+    from monitor import settings
+    from monitor.history.store import FILE
+
+    if source.is_dir():
+        return source / FILE
+    if source.name == FILE:
+        return source
+    config = settings.load(source)
+    if config.storage is None:
+        raise ConfigError(f"{source}: keeps no history; [storage] folder is missing")
+    return config.storage.folder / FILE
+
+
+def _one(name: str | None, there: list[str], where: str) -> str:
+    """The device that is meant."""
+    from drivers.errors import NotReady
+    from drivers.plugin import nearest
+
+    if not there:
+        raise NotReady(f"{where}: nothing is kept yet")
+    if name is None and len(there) == 1:
+        return there[0]
+    if name is None:
+        raise ConfigError(f"{where}: history of {len(there)} devices; choose with --device: {', '.join(there)}")
+    if name not in there:
+        raise ConfigError(f'--device: "{name}"{nearest(name, there)}')
+    return name
+
+
+def _span(since: str | None, until: str | None) -> "Span | None":
+    """None where neither is said."""
+    from monitor.history.times import Span, moment
+
+    if since is None and until is None:
+        return None
+    now_s = time.time()
+    start_s = float("-inf") if since is None else _said_of("--from", moment, since, now_s)
+    end_s = float("inf") if until is None else _said_of("--to", moment, until, now_s)
+    if end_s <= start_s:
+        raise ConfigError(f"--to: {until} is not after --from {since}")
+    return Span(start_s, end_s, end_in=False)
+
+
+def _said_of(option: str, function: Callable[..., float], *arguments: object) -> float:
+    try:
+        return function(*arguments)
+    except ConfigError as error:
+        raise ConfigError(f"{option}: {error}") from None

@@ -1,0 +1,1 @@
+"""Results of years: gathered by the minute, kept in one file, thinned with age without losing extremes."""

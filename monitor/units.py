@@ -1,0 +1,113 @@
+"""From SI to the units people know, written once: viewer, terminal, plots and events take them from here.
+
+In comes a number in SI units (rad, m, s); out goes the same number in the field's
+unit, or a short text with the unit beside it. Nothing here computes with field units, and nothing
+elsewhere converts. Factors follow from 1 rad = 180/π °, 1 h = 3600 s (√h = 60 √s) and
+1 g = 9.80665 m/s² (standard gravity, CGPM 1901).
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from drivers.sample import AXES
+
+Kind = Literal["gyro", "accel"]
+KINDS: Final[tuple[Kind, Kind]] = ("gyro", "accel")
+KIND_NAMES: Final = {"gyro": "Gyroscopes", "accel": "Accelerometers"}
+
+DEGREE: Final = 180.0 / math.pi  # degrees in a radian
+HOUR: Final = 3600.0  # seconds in an hour
+ROOT_HOUR: Final = 60.0  # √s in a √h
+MICRO_G: Final = 1e6 / 9.80665  # µg in a m/s²
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """A field unit: multiply an SI number by ``factor`` and write ``name`` beside it."""
+
+    factor: float
+    name: str
+
+    def text(self, si: float, digits: int = 3) -> str:
+        """The number in this unit, with the unit.
+
+        >>> COEFFICIENT_UNITS["gyro"]["N"].text(1.5e-4)
+        '0.516 °/√h'
+        """
+        return f"{number(si * self.factor, digits)} {self.name}"
+
+
+COEFFICIENT_UNITS: Final[dict[Kind, dict[str, Unit]]] = {
+    "gyro": {
+        "Q": Unit(1e6, "µrad"),
+        "N": Unit(DEGREE * ROOT_HOUR, "°/√h"),
+        "B": Unit(DEGREE * HOUR, "°/h"),
+        "K": Unit(DEGREE * HOUR * ROOT_HOUR, "°/h/√h"),
+        "R": Unit(DEGREE * HOUR * HOUR, "°/h/h"),
+    },
+    "accel": {
+        "Q": Unit(1e6, "µm/s"),
+        "N": Unit(ROOT_HOUR, "m/s/√h"),
+        "B": Unit(MICRO_G, "µg"),
+        "K": Unit(MICRO_G * ROOT_HOUR, "µg/√h"),
+        "R": Unit(MICRO_G * HOUR, "µg/h"),
+    },
+}
+"""Letter -> field unit, of a gyroscope and of an accelerometer."""
+
+DEVIATION_UNITS: Final[dict[Kind, Unit]] = {
+    "gyro": Unit(DEGREE * HOUR, "°/h"),
+    "accel": Unit(MICRO_G, "µg"),
+}
+SAMPLE_UNITS: Final[dict[Kind, Unit]] = {"gyro": Unit(DEGREE, "°/s"), "accel": Unit(1.0, "m/s²")}
+
+COEFFICIENT_NAMES: Final[dict[Kind, dict[str, str]]] = {
+    "gyro": {
+        "Q": "quantization noise",
+        "N": "angle random walk",
+        "B": "bias instability",
+        "K": "rate random walk",
+        "R": "rate ramp",
+    },
+    "accel": {
+        "Q": "quantization noise",
+        "N": "velocity random walk",
+        "B": "bias instability",
+        "K": "acceleration random walk",
+        "R": "acceleration ramp",
+    },
+}
+
+
+def kind_of(axis: str) -> Kind:
+    """Which kind of sensor an axis of ``AXES`` belongs to."""
+    return "gyro" if axis.startswith("g") else "accel"
+
+
+def axes_of(kind: Kind) -> tuple[str, ...]:
+    """The three axes of a kind, x y z."""
+    return AXES[:3] if kind == "gyro" else AXES[3:]
+
+
+def unit_of(letter: str, axis: str) -> Unit:
+    """Field unit of one coefficient on one axis."""
+    return COEFFICIENT_UNITS[kind_of(axis)][letter]
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number with ``digits`` significant digits, without an exponent where a person reads it easily.
+
+    >>> number(0.51566), number(1234.5), number(2.4e-6), number(float("nan"))
+    ('0.516', '1230', '2.40e-6', '—')
+    """
+    if not math.isfinite(value):
+        return "—" if math.isnan(value) else ("∞" if value > 0 else "−∞")
+    if value == 0.0:
+        return "0"
+    rounded = float(f"{value:.{digits - 1}e}")
+    exponent = math.floor(math.log10(abs(rounded)))
+    if not -4 <= exponent < 6:
+        mantissa, power = f"{value:.{digits - 1}e}".split("e")
+        return f"{mantissa}e{int(power)}"
+    return f"{rounded:.{max(0, digits - 1 - exponent)}f}"

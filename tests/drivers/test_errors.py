@@ -1,0 +1,18 @@
+"""The text of an error is one line that a terminal can be given."""
+
+import pytest
+
+from drivers import errors
+from drivers.errors import ConfigError, DecodeError, LinkLost, RecordingError, in_one_line
+
+
+@pytest.mark.parametrize("kind", [ConfigError, DecodeError, LinkLost, RecordingError])
+def test_one_line_whatever_it_quotes(kind: type[Exception]) -> None:
+    assert str(kind("a\r\nb \x1b[2J ü")) == "a  b  [2J ü"
+
+
+def test_not_endless() -> None:
+    text = in_one_line("x" * 10**6)
+    assert len(text) == errors.LONGEST + 2
+    assert text.endswith(" …")
+    assert in_one_line("x" * errors.LONGEST) == "x" * errors.LONGEST

@@ -1,0 +1,31 @@
+"""Files that people write are read whole, and no more than a bounded part of anything else."""
+
+from pathlib import Path
+
+import pytest
+
+from drivers import small_file
+from drivers.errors import ConfigError
+from monitor import settings, thermal
+from monitor.catalogue import read_model
+
+
+def test_all_of_a_file(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"1\r\n2")
+    assert small_file.read(tmp_path / "a") == b"1\r\n2"
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "big"])
+def test_what_is_too_large_is_one_line_for_every_reader(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    if name == "big":
+        with path.open("wb") as file:
+            file.truncate(small_file.MOST_BYTES + 1)
+    with pytest.raises(OSError, match="more than 32 MB"):
+        small_file.read(path)
+    config, wrong = settings.read(path)
+    assert config is None
+    assert "more than 32 MB" in wrong[0]
+    for read in (read_model, thermal.from_file):
+        with pytest.raises(ConfigError, match="more than 32 MB"):
+            read(path)

@@ -1,0 +1,169 @@
+"""History through the whole service: a recording replayed, what is kept of it, and what a query over zenoh answers."""
+
+import json
+import math
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.recording import save_samples
+from drivers.sample import Event, SampleBlock
+from monitor import settings
+from monitor.catalogue import read_model
+from monitor.estimate.estimate import Estimate
+from monitor.history import past
+from monitor.history.past import Past
+from monitor.history.store import FILE, PastEvent, reading
+from monitor.history.times import Span, said
+from monitor.publish import history_message
+from monitor.service import Service
+from monitor.settings import CONFIG_FOLDER
+from monitor.station import Output
+from tests.monitor.publish.zenoh_world import eventually, free_endpoint, session
+
+T0 = 1_600_000_020.0
+SECONDS = 400
+RATE_HZ = 50.0
+MODEL = CONFIG_FOLDER / "models" / "consumer-mems.toml"
+CONFIG = """
+[[device]]
+name = "bench-1"
+rate = 50.0
+window = "2min"
+driver = {{ link = "replay", path = "{recording}", speed = {speed} }}
+[zenoh]
+{zenoh}
+[viewer]
+mode = "none"
+[storage]
+folder = "kept"
+record = false
+"""
+
+
+class Told(Output):
+    """All that was published."""
+
+    def __init__(self) -> None:
+        self.estimates: list[tuple[float, Estimate]] = []
+        self.events: list[tuple[float, Event]] = []
+        self.received = 0
+
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        self.received = received
+
+    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
+        self.estimates.append((unix_s, estimate))
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        self.events.append((unix_s, event))
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With a hole of two seconds in it."""
+    path = tmp_path_factory.mktemp("recording") / "r.npz"
+    n = round(SECONDS * RATE_HZ)
+    drawn = read_model(MODEL).stream(RATE_HZ, 3).draw_all(n)
+    rows = np.delete(np.arange(n), slice(5000, 5100))
+    save_samples(path, T0 + rows / RATE_HZ, drawn.values[rows], 20.0 + rows / 1000.0)
+    return path
+
+
+def config(folder: Path, recording: Path, zenoh: str = 'mode = "none"', speed: float = 100.0) -> settings.Config:
+    path = folder / "config.toml"
+    path.write_text(CONFIG.format(recording=recording, zenoh=zenoh, speed=speed))
+    return settings.load(path)
+
+
+def kept(folder: Path, step_s: int | None = 60) -> Past:
+    with reading(folder / "kept" / FILE) as reader:
+        return past.read(reader, "bench-1", Span(-math.inf, math.inf), step_s=step_s)
+
+
+def test_what_was_published_is_kept_and_a_second_run_adds_to_it(tmp_path: Path, recording: Path) -> None:
+    told = Told()
+    service = Service(config(tmp_path, recording), [told])
+    service.run(60.0)
+    assert service.states()["history"] == "ok"
+    found = kept(tmp_path)
+    minutes = found.start_s.tolist()
+    assert set(minutes) <= {int(T0) + 60 * i for i in range(math.ceil(SECONDS / 60))}  # a busy machine skips some
+    assert len(minutes) >= 3
+    n = found.column("gz.N")
+    assert len(told.estimates) > 3
+    for p, start_s in enumerate(found.start_s.tolist()):
+        values = [one.coefficients.value[1, 2] for at, one in told.estimates if start_s <= at < start_s + 60]
+        values = [float(np.float32(one)) for one in values if not math.isnan(one)]
+        assert n.n[p] == len(values)
+        if values:
+            assert (n.low[p], n.high[p], n.last[p]) == (min(values), max(values), values[-1])
+    assert found.counts.sum(axis=0)[0] == told.received == round(SECONDS * RATE_HZ) - 100
+    assert [(one.t_s, one.text) for one in found.events] == [(at, event.text) for at, event in told.events]
+    assert found.column("temperature").low[0] == pytest.approx(20.0, abs=1.5)
+
+    Service(config(tmp_path, recording)).run(60.0)
+    again = kept(tmp_path)
+    assert set(again.start_s.tolist()) >= set(minutes)
+    assert again.counts[:, 0].sum() == 2 * found.counts[:, 0].sum()
+
+
+@pytest.fixture
+def asked(tmp_path: Path, recording: Path) -> Iterator[tuple[Service, Any]]:
+    """A service that runs on for a while, and a session beside it."""
+    endpoint = free_endpoint()
+    Service(config(tmp_path, recording)).run(60.0)
+    service = Service(config(tmp_path, recording, f'listen = ["{endpoint}"]', 1.0))
+    thread = threading.Thread(target=service.run, args=(60.0,))
+    thread.start()
+    try:
+        eventually(lambda: service.zenoh.state == "ok")
+        with session(connect=[endpoint]) as client:
+            eventually(lambda: list(client.get("imu/bench-1/history", timeout=5.0)))
+            yield service, client
+    finally:
+        service.stop()
+        thread.join(30.0)
+        assert not thread.is_alive()
+
+
+def test_a_query_over_zenoh_honours_its_time(asked: tuple[Service, Any]) -> None:
+    _, client = asked
+
+    def answer(parameters: str) -> Any:
+        (reply,) = client.get(f"imu/*/history?{parameters}", timeout=10.0)
+        if reply.ok is None:
+            return json.loads(bytes(reply.err.payload))["error"]
+        assert (str(reply.ok.key_expr), str(reply.ok.encoding)) == ("imu/bench-1/history", "application/json")
+        return history_message.read(bytes(reply.ok.payload))
+
+    whole = answer("step=1m")
+    minutes = whole.start_s.tolist()
+    assert len(minutes) >= 3
+    first, last = (said(one).replace(" ", "T") + "Z" for one in (minutes[1], minutes[2] + 60))
+    some = answer(f"_time=[{first}..{last}[;step=1m;axis=gz;what=coefficients")
+    assert some.start_s.tolist() == minutes[1:3]
+    assert some.axes() == ("gz",)
+    np.testing.assert_array_equal(some.column("gz.N").last, whole.column("gz.N").last[1:3])
+    duration = answer(f"_time=[{first};60s[;step=60s")
+    assert duration.start_s.tolist() == minutes[1:2]
+    assert "did you mean" in answer("axes=gz")
+    assert "no brackets" in answer("_time=yesterday")
+    assert "nothing in that time; kept are 2020-09-13" in answer("_time=[now(-1h)..]")
+
+
+def test_a_damaged_history_is_said_in_the_status_and_to_who_asks(asked: tuple[Service, Any]) -> None:
+    service, client = asked
+    assert service.history is not None
+    path = service.history.path
+    path.with_name(FILE + "-wal").unlink(missing_ok=True)
+    path.write_bytes(b"no more" * 1000)
+    (reply,) = client.get("imu/bench-1/history", timeout=10.0)
+    assert "damaged" in json.loads(bytes(reply.err.payload))["error"]
+    service.history.tell("bench-1", PastEvent(T0, "moved", "once more"))
+    eventually(lambda: "damaged" in service.states()["history"], 30.0)
+    assert path.read_bytes() == b"no more" * 1000
