@@ -25,7 +25,8 @@ from drivers.driver import AxisMap, axis_map
 from drivers.errors import ConfigError, in_one_line
 from drivers.links.base import Filtering, Link, LinkSettings
 from drivers.sample import AXES, KINDS
-from monitor import toml
+from drivers.zenoh_session import configuration, plain, secret_files
+from monitor import permissions, toml
 from monitor.tables import (
     DeviceTable,
     FaultsTable,
@@ -164,6 +165,7 @@ class Config:
     table: Mapping[str, Any] = dataclasses.field(
         default_factory=dict
     )  # as it stands in the file, for a reload to compare
+    warnings: tuple[str, ...] = ()  # a line each: what is not wrong, but should not stay
 
 
 def load(path: Path) -> Config:
@@ -193,9 +195,11 @@ def read(path: Path) -> tuple[Config | None, list[str]]:
         return None, [f"{path}: {error}"]
     reader = _Reader(path.resolve().parent)
     config = reader.config(table)
+    reader.trust(path)
     if config is None or reader.wrong:
         return None, [in_one_line(f"{path}: {line}") for line in reader.wrong]
-    return replace(config, path=path, table=table), []
+    warnings = tuple(f"{path}: {line}" for line in reader.warnings)
+    return replace(config, path=path, table=table, warnings=warnings), []
 
 
 class _Reader:
@@ -203,7 +207,15 @@ class _Reader:
 
     def __init__(self, folder: Path) -> None:
         self.wrong: list[str] = []
+        self.warnings: list[str] = []
         self._folder = folder
+
+    def trust(self, path: Path) -> None:
+        """Who else may change the file itself, or read a secret in it."""
+        if line := permissions.changeable(path):
+            self.wrong.append(line)
+        if line := permissions.exposed(path):
+            self.warnings.append(line)
 
     def config(self, table: Mapping[str, Any]) -> Config | None:
         file = self.fill(FileTable, table, "")
@@ -324,10 +336,22 @@ class _Reader:
             for endpoint in endpoints:
                 if not IS_ENDPOINT.fullmatch(endpoint):
                     self.wrong.append(f'zenoh.{key}: "{endpoint}" is no endpoint; write "{ENDPOINT}"')
-        if zenoh.config is not None and zenoh.mode != "none" and not zenoh.config.is_file():
-            self.wrong.append(f"zenoh.config: {zenoh.config}: no such file")
+        if zenoh.config is not None and zenoh.mode != "none":
+            self._zenoh_file(zenoh.config)
         if zenoh.mode == "client" and not zenoh.connect and zenoh.config is None:
             self.wrong.append('zenoh.connect: empty, but a client needs a router, e.g. ["tcp/127.0.0.1:7447"]')
+
+    def _zenoh_file(self, path: Path) -> None:
+        """Whether zenoh takes it, and who else may change it or read the secrets in it."""
+        if not path.is_file():
+            self.wrong.append(f"zenoh.config: {path}: no such file")
+            return
+        if line := permissions.changeable(path):
+            self.wrong.append(f"zenoh.config: {line}")
+        files = self._try("zenoh.config", zenoh_file_secrets, path)
+        for file, secret in ((path, None), *((one, True) for one in files or ())):
+            if line := permissions.exposed(file, secret):
+                self.warnings.append(f"zenoh.config: {file.name}: {line}")
 
     def device(self, table: Mapping[str, Any], at: str) -> Device | None:
         entry = self.fill(DeviceTable, table, at)
@@ -484,6 +508,20 @@ def model_path(name: str, folder: Path) -> Path:
         return path
     names = sorted(file.stem for file in models.glob("*.toml"))
     raise ConfigError(f'no model "{name}", neither a file nor one of those shipped{plugin.nearest(name, names)}')
+
+
+def zenoh_file_secrets(path: Path) -> tuple[Path, ...]:
+    """Files of keys and passwords that a zenoh file names.
+
+    Raises:
+        ConfigError: zenoh refuses the file
+    """
+    import zenoh
+
+    try:
+        return secret_files(configuration({}, path))
+    except zenoh.ZError as error:
+        raise ConfigError(f"{path}: {plain(error)}") from error
 
 
 def seconds(value: float | str) -> float:

@@ -19,6 +19,7 @@ class Topic:
     name: str
     encoding: str
     when: Literal["batches", "publish", "rounds", "intervals", "event", "1 Hz", "presence", "query"]
+    kept: int = 0  # messages that a daemon keeps for subscribers that come late
 
     def key(self, prefix: str, device: str) -> str:
         """The key expression of this topic for one device."""
@@ -31,13 +32,13 @@ class Topic:
 
 SAMPLES: Final = Topic("samples", MSGPACK, "batches")
 COMPENSATED: Final = Topic("compensated", MSGPACK, "batches")
-ALLAN: Final = Topic("allan", JSON, "publish")
-COEFFICIENTS: Final = Topic("coefficients", JSON, "publish")
+ALLAN: Final = Topic("allan", JSON, "publish", kept=1)
+COEFFICIENTS: Final = Topic("coefficients", JSON, "publish", kept=1)
 TOTAL: Final = Topic("total", JSON, "rounds")
-GAP: Final = Topic("gap", JSON, "publish")
-THERMAL: Final = Topic("thermal", JSON, "intervals")
-EVENT: Final = Topic("event", JSON, "event")
-STATUS: Final = Topic("status", JSON, "1 Hz")
+GAP: Final = Topic("gap", JSON, "publish", kept=1)
+THERMAL: Final = Topic("thermal", JSON, "intervals", kept=1)
+EVENT: Final = Topic("event", JSON, "event", kept=10)
+STATUS: Final = Topic("status", JSON, "1 Hz", kept=1)
 HISTORY: Final = Topic("history", JSON, "query")
 ALIVE: Final = Topic("alive", "", "presence")
 RESET: Final = Topic("command/reset", JSON, "query")

@@ -15,6 +15,7 @@ the packages chromium, mesa-vulkan-drivers and libvulkan1 (Debian's names); netw
 
 import argparse
 import base64
+import contextlib
 import json
 import os
 import secrets
@@ -46,7 +47,11 @@ from monitor.history.minutes import Minutes
 from monitor.history.store import FILE, PastEvent, Store
 from monitor.noise.model import NoiseModel
 from monitor.publish import rerun_sinks
+from monitor.publish.fleet import FleetView
 from monitor.publish.reconcile_chart import chart
+from monitor.publish.rerun_view import RerunView
+from monitor.publish.viewer import DeviceInfo, ViewerSettings
+from monitor.publish.zenoh_in import ZenohIn
 from monitor.reconcile.reconciliation import AxisResult
 from monitor.reconciling import Request, make
 from monitor.service import Service
@@ -113,6 +118,13 @@ REPLAY = """
 name = "bench-1"
 rate = 100.0
 driver = {{ link = "replay", path = "{recording}", speed = {speed} }}
+"""
+MEMBERS = tuple(f"{place}-{side}" for place in ("nose", "wing", "tail", "gear") for side in ("left", "mid", "right"))
+MEMBER = """
+[[device]]
+name = "{name}"
+rate = 100.0
+driver = {{ link = "virtual", seed = {seed} }}
 """
 FLEET = """
 [[device]]
@@ -247,6 +259,45 @@ def fleet(out: Path, folder: Path) -> Path:
         ):
             time.sleep(max(begun_s + at_s - time.monotonic(), 0.0))
             act()
+    return path
+
+
+def view(out: Path, folder: Path) -> Path:
+    """``imu-monitor view``: a dozen devices of three daemons, one of which is gone; two cables are pulled."""
+    path = out / "view-fleet.png"
+    with window() as (port, shoot), contextlib.ExitStack() as ending:
+        daemons, places = [], []
+        for daemon in range(3):
+            places.append(f"tcp/127.0.0.1:{free_port()}")
+            file = folder / f"daemon{daemon}.toml"
+            devices = "".join(
+                MEMBER.format(name=name, seed=seed) for seed, name in enumerate(MEMBERS) if seed % 3 == daemon
+            )
+            rest = f'[zenoh]\nlisten = ["{places[-1]}"]\nprefix = "fleet"\n[viewer]\nmode = "none"\n'
+            file.write_text(devices + rest)
+            daemons.append(ending.enter_context(running(settings.load(file))))
+        detail = [f"fleet/{name}" for name in MEMBERS[:2]]
+        viewer = RerunView(
+            ViewerSettings("native", port), [DeviceInfo(key, "over zenoh") for key in detail], fleet=True
+        )
+        arriving = ending.enter_context(contextlib.closing(ZenohIn("fleet/**", places, None, detail)))
+        ending.enter_context(contextlib.closing(viewer))
+        stop = threading.Event()
+        looking = threading.Thread(target=FleetView(arriving, viewer, detail).run, args=(stop, print))
+        arriving.start()
+        viewer.start()
+        looking.start()
+        try:
+            until(lambda: all(station.latest is not None for one in daemons for station in one.stations), 120.0)
+            time.sleep(PULLED_AGAIN_S)
+            daemons[0].virtual[MEMBERS[3]].unplug()
+            daemons[1].virtual[MEMBERS[4]].unplug()
+            daemons[2].stop()
+            time.sleep(SETTLE_S)
+            shoot(path)
+        finally:
+            stop.set()
+            looking.join()
     return path
 
 
@@ -419,6 +470,7 @@ PICTURES: dict[str, Callable[[Path, Path], Path]] = {
     "drift": drift,
     "compensation": compensation,
     "fleet": fleet,
+    "view": view,
     "yesterday": yesterday,
     "effect": effect,
     "web": web,

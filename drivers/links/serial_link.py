@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
+from drivers.masked import masked
 from drivers.plugin import nearest
 from drivers.sample import Chunk
 
@@ -67,7 +68,7 @@ class SerialLink:
         self._plenty = False  # the last read brought so much that the next must not wait
         self._closing = threading.Event()
         self._in_use = threading.Lock()  # held while the port is read, opened or closed
-        self.name = f"{settings.port} at {settings.baudrate} baud"
+        self.name = f"{masked(settings.port)} at {settings.baudrate} baud"
 
     def open(self) -> None:
         """Open the port; ``LinkUnavailable`` says why it cannot be, and what to do."""
@@ -91,7 +92,7 @@ class SerialLink:
                     **({"exclusive": True} if s.exclusive else {}),
                 )
             except (OSError, ValueError, NotImplementedError) as error:
-                raise LinkUnavailable(_why_not_open(s.port, error)) from error
+                raise LinkUnavailable(masked(_why_not_open(s.port, error))) from error
             self._closing.clear()
 
     def read(self, timeout_s: float) -> list[Chunk] | None:
@@ -105,7 +106,7 @@ class SerialLink:
                     return [Chunk(data, time.monotonic_ns())]
                 if time.monotonic() >= deadline:
                     return None
-        raise LinkLost(f"{self._settings.port}: the link is closed")
+        raise LinkLost(f"{masked(self._settings.port)}: the link is closed")
 
     def close(self) -> None:
         """Close the port, once a waiting ``read`` has ended."""
@@ -135,7 +136,7 @@ class SerialLink:
         except OSError as error:
             self._drop_port()
             raise LinkLost(
-                f"{self._settings.port}: the device is gone (unplugged, switched off, or read by "
+                f"{masked(self._settings.port)}: the device is gone (unplugged, switched off, or read by "
                 f"another program): {_plain(error)}"
             ) from error
         return data

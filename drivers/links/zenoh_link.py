@@ -1,8 +1,10 @@
 """Messages of another system over zenoh: one message a chunk, with its attachment.
 
 The session is the link's own, and closed: no scouting, no listening, only the endpoints that the
-settings name. As a peer it opens at once and zenoh itself goes on trying to connect in the background,
-so an absent publisher shows as silence, not as ``LinkLost``; as a client it needs its router to open.
+settings name. With one endpoint it is a client, which needs that to open: a router passes nothing on between two
+peers, and publishers mostly are peers. With several it is a peer, as a client would stay with the first that
+answers: it opens at once and zenoh itself goes on trying to connect in the background, so an absent publisher
+shows as silence, not as ``LinkLost``.
 
 zenoh fills a ring channel that overwrites its oldest when full (a decoder sees that in the sequence
 numbers). A thread of the link's own takes from it and stamps each message, as zenoh's channels cannot be
@@ -21,9 +23,11 @@ import msgspec
 
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
+from drivers.masked import masked
 from drivers.plugin import FilePath
 from drivers.sample import Chunk
-from drivers.zenoh_session import configuration, plain
+from drivers.zenoh_refusal import refused
+from drivers.zenoh_session import CLOSED, configuration, endpoints, plain
 
 if TYPE_CHECKING:
     import zenoh
@@ -31,6 +35,8 @@ if TYPE_CHECKING:
 DEFAULT_DECODER: Final = "samples"
 RING_SIZE: Final = 4096
 """Messages; four seconds at 1 kHz."""
+WAITING_BYTES: Final = 128_000_000
+"""Of all that wait to be read: twice the longest message that a session takes in."""
 
 
 class Settings(LinkSettings, frozen=True, kw_only=True):
@@ -39,7 +45,7 @@ class Settings(LinkSettings, frozen=True, kw_only=True):
     key: str
     """Key expression: "imu/bench-1/samples", "0/imu/data/sensor_msgs::msg::dds_::Imu_/**"."""
     mode: Literal["peer", "client"] | None = None
-    """Absent: as the file says, else peer."""
+    """Absent: as the file says, else client where one endpoint is named, and peer where several are or none."""
     connect: list[str] = msgspec.field(default_factory=list)
     """Endpoints, "tcp/127.0.0.1:7447"."""
     listen: list[str] = msgspec.field(default_factory=list)
@@ -58,7 +64,8 @@ class ZenohLink:
         self.name = f"zenoh {settings.key}"
         self._opening = threading.Lock()
         self._changed = threading.Condition()
-        self._waiting: deque[Chunk] = deque(maxlen=RING_SIZE)
+        self._waiting: deque[Chunk] = deque()
+        self._bytes = 0  # of all that wait
         self._session: zenoh.Session | None = None
         self._taker: threading.Thread | None = None
         self._running = False
@@ -83,7 +90,7 @@ class ZenohLink:
             except zenoh.ZError as error:
                 self._close_session()
                 raise LinkUnavailable(f"{self.name}: cannot subscribe: {plain(error)}") from error
-            self._waiting.clear()
+            self._forget()
             self._running = True
             self._taker = threading.Thread(
                 target=self._take, args=(subscriber,), name=f"{self.name} taker", daemon=True
@@ -97,7 +104,7 @@ class ZenohLink:
             self._changed.wait_for(lambda: self._waiting or not self._running, timeout_s)
             if self._waiting:
                 chunks = list(self._waiting)
-                self._waiting.clear()
+                self._forget()
                 return chunks
             if not self._running:
                 raise LinkLost(f"{self.name}: the session is closed")
@@ -118,7 +125,7 @@ class ZenohLink:
                 sample = handler.recv()
                 chunk = _chunk(sample, time.monotonic_ns())
                 with self._changed:
-                    self._waiting.append(chunk)
+                    self._keep(chunk)
                     self._changed.notify_all()
         except zenoh.ZError:
             pass  # the channel was closed: by close(), or by a session that failed
@@ -127,13 +134,24 @@ class ZenohLink:
                 self._running = False
                 self._changed.notify_all()
 
+    def _forget(self) -> None:
+        self._waiting.clear()
+        self._bytes = 0
+
+    def _keep(self, chunk: Chunk) -> None:
+        """The newest; the oldest give way."""
+        self._waiting.append(chunk)
+        self._bytes += len(chunk.data)
+        while len(self._waiting) > 1 and (self._bytes > WAITING_BYTES or len(self._waiting) > RING_SIZE):
+            self._bytes -= len(self._waiting.popleft().data)
+
     def _close_session(self) -> None:
         atexit.unregister(self.close)
         session, self._session = self._session, None
         taker, self._taker = self._taker, None
         with self._changed:
             self._running = False
-            self._waiting.clear()
+            self._forget()
             self._changed.notify_all()
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
@@ -141,12 +159,14 @@ class ZenohLink:
             taker.join()
 
     def _why_not_open(self, error: Exception) -> str:
-        s = self._settings
-        if s.mode == "client":
-            help_ = f'no router at {", ".join(s.connect) or "(connect is empty)"}; start it, or use mode = "peer"'
-        else:
-            help_ = "check the endpoints of listen and connect"
-        return f"{self.name}: {help_}: {plain(error)}"
+        config = _configuration(self._settings)
+        places = endpoints(config)
+        nobody = (
+            f"nobody at {masked(', '.join(places)) or '(connect is empty)'}; start the router or the publisher there"
+        )
+        if config.get_json("mode") == '"client"':
+            return f"{self.name}: {refused(places, config) or nobody}"
+        return f"{self.name}: check the endpoints of listen and connect: {plain(error)}"
 
 
 def _chunk(sample: Any, t_ns: int) -> Chunk:
@@ -160,7 +180,10 @@ def _configuration(settings: Settings) -> "zenoh.Config":
         "connect/endpoints": settings.connect or None,
         "listen/endpoints": settings.listen or None,
     }
-    return configuration(own, settings.config)
+    config = configuration(own, settings.config)
+    if settings.mode is None and not settings.listen and len(endpoints(config)) == 1:
+        return configuration(own, settings.config, {**CLOSED, "mode": "client"})
+    return config
 
 
 def build(settings: Settings) -> Link:

@@ -108,7 +108,7 @@ def check(
         except ConfigError as error:
             at = f"device {device.name}: "
             wrong.append(f"{config}: {at}{str(error).removeprefix(at)}")
-    for line in wrong:
+    for line in (*wrong, *(f"warning: {line}" for line in (found.warnings if found else ()))):
         typer.echo(line, err=True)
     if wrong:
         raise typer.Exit(WRONG)
@@ -121,10 +121,9 @@ app.command()(doctor.doctor)
 
 @app.command()
 def watch(
-    keyexpr: Annotated[str, typer.Argument(metavar="[KEYEXPR]", help="Which keys to show.")] = "imu/**",
-    connect: Annotated[
-        list[str] | None, typer.Option(metavar="ENDPOINT", help="Daemon or router, e.g. tcp/127.0.0.1:7450.")
-    ] = None,
+    keyexpr: options.KeyExpr = "imu/**",
+    connect: options.Connect = None,
+    zenoh: options.ZenohFile = None,
     seconds: Seconds = None,
 ) -> None:
     """A live table of any number of daemons, from zenoh alone."""
@@ -133,11 +132,25 @@ def watch(
     from rich.console import Console
 
     from monitor.publish.terminal import watch as show
-    from monitor.topics import ENDPOINT
 
     stop = threading.Event()
     serving.on_signals(stop.set)
-    show(keyexpr, connect or [ENDPOINT], stop, Console(), seconds)
+    show(keyexpr, connect or (), stop, Console(), seconds, zenoh)
+
+
+@app.command()
+def view(
+    keyexpr: options.KeyExpr = "imu/**",
+    connect: options.Connect = None,
+    zenoh: options.ZenohFile = None,
+    detail: Annotated[
+        list[str] | None, typer.Option(metavar="DEVICE", help="Show its samples and curves too; repeatable.")
+    ] = None,
+    viewer: Viewer = None,
+    seconds: Seconds = None,
+) -> None:
+    """One viewer for any number of daemons, from zenoh alone: a table of all, chosen devices in detail."""
+    serving.view(keyexpr, connect or (), zenoh, detail or (), viewer or "auto", seconds)
 
 
 @app.command()

@@ -2,7 +2,9 @@
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Annotated, overload
+
+import typer
 
 from drivers.errors import ConfigError
 
@@ -10,6 +12,15 @@ if TYPE_CHECKING:
     from monitor.drift.arma import Order
     from monitor.estimate.batch import TauGrid
     from monitor.export import Noise
+
+KeyExpr = Annotated[str, typer.Argument(metavar="[KEYEXPR]", help="Which keys to show.")]
+Connect = Annotated[
+    list[str] | None, typer.Option(metavar="ENDPOINT", help="Daemon or router, e.g. tcp/127.0.0.1:7450; repeatable.")
+]
+ZenohFile = Annotated[
+    Path | None,
+    typer.Option("--zenoh", metavar="FILE.json5", help="A zenoh file: certificates, user and password, endpoints."),
+]
 
 
 def tau(text: str) -> "TauGrid":

@@ -5,12 +5,16 @@ import io
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO, cast
 
 from drivers.errors import ConfigError
+from drivers.masked import masked
 
 if TYPE_CHECKING:
+    from collections.abc import MutableMapping
+
     from monitor.settings import Config
 
 
@@ -22,6 +26,7 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
     import time
     from contextlib import nullcontext
 
+    import structlog
     from rich.console import Console
     from rich.live import Live
 
@@ -33,6 +38,8 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
     unit = Unit.of(os.environ)
     config = _with_viewer(config, viewer)
     _log_as(config)
+    for line in config.warnings:
+        structlog.get_logger("imu-monitor").warning(line)
     console, board = Console(), Board()
     live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
     shown = [TableOutput(board, live)] if live else [TableOutput(board), LogOutput()]
@@ -43,6 +50,33 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
         service.run(seconds)
     if live is not None or seconds is not None:
         console.print(board.table(time.monotonic()))
+
+
+def view(
+    keyexpr: str, connect: Sequence[str], file: Path | None, detail: Sequence[str], mode: str, seconds: float | None
+) -> None:
+    """The viewer of a fleet, until a signal; where its page is, and what is wrong, a line each on standard error."""
+    import threading
+
+    from monitor import settings
+    from monitor.publish.fleet import FleetView, detail_key
+    from monitor.publish.rerun_view import RerunView
+    from monitor.publish.viewer import DeviceInfo, ViewerSettings
+    from monitor.publish.zenoh_in import ZenohIn
+
+    try:
+        settings.viewer_mode(mode)
+    except ConfigError as error:
+        raise ConfigError(f"--viewer: {error}") from None
+    keys = tuple(dict.fromkeys(detail_key(device, keyexpr) for device in detail))
+    arriving = ZenohIn(keyexpr, connect, file, keys)
+    rerun = RerunView(ViewerSettings(mode=mode), [DeviceInfo(key, "over zenoh") for key in keys], fleet=True)
+    stop = threading.Event()
+    on_signals(stop.set)
+    with contextlib.closing(arriving), contextlib.closing(rerun):
+        arriving.start()
+        rerun.start()
+        FleetView(arriving, rerun, keys).run(stop, lambda said: print(said, file=_Lines(), flush=True), seconds)
 
 
 def with_history(config: "Config", history_s: float | None) -> "Config":
@@ -102,12 +136,18 @@ def _log_as(config: "Config") -> None:
             LEVEL,
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
+            _without_secrets,
             structlog.processors.JSONRenderer() if json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
         ],
         wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG),
         logger_factory=structlog.PrintLoggerFactory(cast("TextIO", _Lines())),
         cache_logger_on_first_use=True,
     )
+
+
+def _without_secrets(_logger: Any, _method: str, line: "MutableMapping[str, Any]") -> "MutableMapping[str, Any]":
+    """Every text of a log line, whatever brought it there."""
+    return {key: masked(value) if isinstance(value, str) else value for key, value in line.items()}
 
 
 def on_signals(stop: Callable[[], None], hung_up: Callable[[], None] | None = None) -> None:

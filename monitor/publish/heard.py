@@ -6,7 +6,7 @@ characters, as they end on a terminal. Pure.
 """
 
 from dataclasses import dataclass
-from typing import Any, Final, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
 import msgspec
 import numpy as np
@@ -18,12 +18,16 @@ from monitor.estimate.coefficients import LETTERS, Coefficients, Status
 STATUSES: Final = {status.name.lower(): status for status in Status}
 QUIET: Final = ("ok", "off")
 """States of an output that need no word."""
-GONE_S: Final = 2.0
-"""The liveliness token is away and no status (1 Hz) came for so long."""
+GONE_S: Final = 1.5
+"""The liveliness token is away and no status (1 Hz) came for so long: who is killed is missed within two seconds."""
 NAMED: Final = 6
 """Of the limits that are passed."""
 SILENT_S: Final = 5.0
 """The token is there, or was never seen, and nothing came for so long."""
+LONGEST_TEXT: Final = 400
+MOST_OUTPUTS: Final = 16
+
+Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 
 LARGEST_BYTES: Final = 1_000_000
 """Of a payload: six axes are some kilobytes."""
@@ -42,15 +46,17 @@ class StatusMessage(msgspec.Struct, frozen=True):
     schema: str
     t: float
     state: str
-    received: int
-    lost: int
-    bad: int
+    received: Count
+    lost: Count
+    bad: Count
     rate: float | None = None
-    overflowed: int = 0
+    overflowed: Count = 0
     latency: Latency = Latency()
     outputs: dict[str, str] = {}
     crossed: tuple[str, ...] = ()
     text: str = ""
+    memory: Count = 0
+    uptime: float = 0.0
 
 
 class Letter(msgspec.Struct, frozen=True):
@@ -60,13 +66,15 @@ class Letter(msgspec.Struct, frozen=True):
     value: float | None = None
     lo: float | None = None
     hi: float | None = None
+    either: str | None = msgspec.field(name="or", default=None)
+    """The other letter of K and R, where which of the two is there is not known."""
 
 
 class CoefficientsMessage(msgspec.Struct, frozen=True):
     """``imu/<device>/coefficients``."""
 
     schema: str
-    samples: int
+    samples: Count
     axes: dict[str, dict[str, Letter]]
     rate: float | None = None
     window: float | None = None
@@ -80,6 +88,29 @@ class EventMessage(msgspec.Struct, frozen=True):
     t: float
     kind: str
     text: str
+    axis: str | None = None
+    what: dict[str, dict[str, Any]] = {}
+
+
+class Curve(msgspec.Struct, frozen=True):
+    """Deviations of one axis, SI."""
+
+    deviation: list[float | None]
+    lo: list[float | None]
+    hi: list[float | None]
+
+
+class AllanMessage(msgspec.Struct, frozen=True):
+    """``imu/<device>/allan``."""
+
+    schema: str
+    t: float
+    samples: Count
+    rate: float
+    window: float
+    filled: float
+    tau: list[float]
+    axes: dict[str, Curve]
 
 
 class Place(msgspec.Struct, frozen=True):
@@ -103,7 +134,7 @@ class GapMessage(msgspec.Struct, frozen=True):
     axes: dict[str, AxisGapMessage]
 
 
-M = TypeVar("M", StatusMessage, CoefficientsMessage, EventMessage, GapMessage)
+M = TypeVar("M", StatusMessage, CoefficientsMessage, EventMessage, GapMessage, AllanMessage)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +144,7 @@ class Noise:
     coefficients: Coefficients
     axes: tuple[str, ...]  # those that are measured
     seen_s: float | None  # how much of the window is full
+    either: frozenset[str] = frozenset()  # axes on which K or R is there, which of them not known
 
 
 @dataclass(slots=True)
@@ -200,6 +232,28 @@ def read(kind: type[M], topic: topics.Topic, payload: bytes) -> M:
     return found
 
 
+def status(payload: bytes) -> StatusMessage:
+    """Texts cut to what a table can show, so that no device can fill a watcher's memory."""
+    found = read(StatusMessage, topics.STATUS, payload)
+    outputs = {name[:LONGEST_TEXT]: said[:LONGEST_TEXT] for name, said in list(found.outputs.items())[:MOST_OUTPUTS]}
+    return msgspec.structs.replace(
+        found, state=found.state[:LONGEST_TEXT], text=found.text[:LONGEST_TEXT], outputs=outputs
+    )
+
+
+def event(payload: bytes) -> EventMessage:
+    """Texts cut like those of a status."""
+    found = read(EventMessage, topics.EVENT, payload)
+    what = {letter: found.what[letter] for letter in LETTERS if letter in found.what}
+    return msgspec.structs.replace(found, kind=found.kind[:LONGEST_TEXT], text=found.text[:LONGEST_TEXT], what=what)
+
+
+def gap(payload: bytes) -> GapMessage:
+    """Of the axes that there are."""
+    found = read(GapMessage, topics.GAP, payload)
+    return msgspec.structs.replace(found, axes={axis: found.axes[axis] for axis in AXES if axis in found.axes})
+
+
 def noise(message: CoefficientsMessage) -> Noise:
     """Coefficients as arrays [5, 6] of SI; ValueError for a status that is not known."""
     value, lo, hi = (np.full((len(LETTERS), len(AXES)), np.nan) for _ in range(3))
@@ -212,7 +266,8 @@ def noise(message: CoefficientsMessage) -> Noise:
             at = LETTERS.index(letter), AXES.index(axis)
             value[at], lo[at], hi[at] = (np.nan if x is None else x for x in (one.value, one.lo, one.hi))
             status[at] = _status(one.status)
-    return Noise(Coefficients(value, lo, hi, status), axes, message.filled)
+    either = frozenset(axis for axis in axes if any(one.either for one in message.axes[axis].values()))
+    return Noise(Coefficients(value, lo, hi, status), axes, message.filled, either)
 
 
 def clean(text: Any) -> str:

@@ -9,6 +9,7 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
+from drivers.masked import masked
 from drivers.sample import AXES, Event, Floats
 from monitor import topics
 from monitor.drift.live import ThermalLook
@@ -150,7 +151,7 @@ def event(device: str, unix_s: float, samples: int, what: Event, since_s: float 
         "what": what.what,
         "since": since_s,
         "sigma": what.sigma,
-        "text": what.text,
+        "text": masked(what.text),
     }
     return _encode(topics.EVENT, device, unix_s, samples, payload)
 
@@ -171,14 +172,14 @@ def status(device: str, unix_s: float, health: Health) -> bytes:
         "overflowed": health.overflowed,
         "latency": {"p50": health.latency_p50_s, "p99": health.latency_p99_s},
         "memory": health.memory_bytes,
-        "outputs": health.outputs,
+        "outputs": {name: masked(said) for name, said in health.outputs.items()},
         "uptime": health.uptime_s,
         "repeated": health.repeated,
         "late": health.late,
         "moving": health.moving,
         "moved": health.moved,
         "crossed": health.crossed,
-        "text": health.text,
+        "text": masked(health.text),
     }
     return _encode(topics.STATUS, device, unix_s, health.received, payload)
 

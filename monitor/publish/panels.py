@@ -5,7 +5,9 @@ that what a person reads can be tested without a viewer.
 """
 
 import math
-from collections.abc import Mapping
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from monitor.drift.arma import Arma
@@ -13,6 +15,8 @@ from monitor.drift.live_compensation import DriftLook
 from monitor.estimate.coefficients import LETTERS
 from monitor.estimate.estimate import Estimate
 from monitor.health import Health
+from monitor.publish import heard
+from monitor.publish.heard import Heard
 from monitor.publish.units import (
     COEFFICIENT_UNITS,
     DEVIATION_UNITS,
@@ -25,6 +29,8 @@ from monitor.publish.units import (
     reading,
 )
 
+SHOWN: Final = ("gx", "gy", "gz")
+"""Axes whose white noise stands in the table of a fleet, in °/√h."""
 WORDS: Final = {
     "running": "RUNNING",
     "waiting": "WAITING for the device",
@@ -63,6 +69,42 @@ def overview_text(healths: Mapping[str, Health]) -> str:
     ]
     head = "| device | state | rate | received | lost | bad | |\n|:--|:--|--:|--:|--:|--:|:--|"
     return "\n".join([head, *rows])
+
+
+def fleet_text(devices: Sequence[Heard], now_s: float, rows: int, note: str = "") -> str:
+    """One line a device, those in trouble first, at most ``rows`` of them; above it how many are in which state."""
+    counts = Counter(one.state(now_s) for one in devices)
+    states = ", ".join(f"**{count:,}** {_cell(state)}" for state, count in counts.most_common())
+    head = [f"**{len(devices):,}** device{'' if len(devices) == 1 else 's'}{': ' if states else ''}{states}"]
+    head[0] += f"; N in {COEFFICIENT_UNITS['gyro']['N'].name}" if devices else ""
+    head += [f"**{heard.clean(note)}**"] if note else []
+    table = [_fleet_row(one, now_s) for one in devices[:rows]]
+    if table:
+        columns = [*("device", "state", "rate", "received", "lost", "bad"), *(f"N {axis}" for axis in SHOWN), ""]
+        table = [f"| {' | '.join(columns)} |", "|:--|:--|" + "--:|" * (len(columns) - 3) + ":--|", *table]
+    left = [f"… and {len(devices) - rows:,} more with less trouble"] if len(devices) > rows else []
+    return "\n\n".join([*head, *(["\n".join(table)] if table else []), *left])
+
+
+def _fleet_row(one: Heard, now_s: float) -> str:
+    state, status = one.state(now_s), one.status
+    name = _cell(one.key)
+    word = f"**{state.upper()}**" if one.rank(now_s) == 0 else _cell(state)
+    noise = [
+        "" if one.noise is None else reading(one.noise.coefficients, "N", axis).value.replace("| ", "")
+        for axis in SHOWN
+    ]
+    if status is None:
+        return f"| **{name}** | {word} | | | | | {' | '.join(noise)} | nothing known yet |"
+    rate = "—" if status.rate is None else f"{status.rate:.2f} Hz"
+    trouble = _cell(one.trouble()) or ("nothing comes any more" if state in ("gone", "silent") else "")
+    counts = f"{status.received:,} | {status.lost:,} | {status.bad:,}"
+    return f"| **{name}** | {word} | {rate} | {counts} | {' | '.join(noise)} | {trouble} |"
+
+
+def _cell(text: str) -> str:
+    """Text of another process inside a table: it cannot end its cell, nor become a link or a picture."""
+    return re.sub(r"([\\`*_\[\]<>!|#])", r"\\\1", heard.clean(text))
 
 
 def noise_text(estimate: Estimate) -> str:

@@ -41,10 +41,17 @@ def blueprint(
     with_model: Collection[str] = (),
     with_thermal: Collection[str] = (),
     compensated: Collection[str] = (),
+    fleet: bool = False,
 ) -> rrb.Blueprint:
-    """The layout for these devices; some have a model in force, a bias held against temperature, or are compensated."""
+    """The layout for these devices; some have a model in force, a bias held against temperature, or are compensated.
+
+    ``fleet``: they are those in detail of many more, and the overview is a table of all.
+    """
     pages = [_device(d, d in with_model, d in with_thermal, d in compensated) for d in devices]
-    root = pages[0] if len(pages) == 1 else rrb.Tabs(_overview(devices), *pages, active_tab=0)
+    if fleet:
+        root: rrb.Container = rrb.Tabs(_fleet(devices), *pages, active_tab=0)
+    else:
+        root = pages[0] if len(pages) == 1 else rrb.Tabs(_overview(devices), *pages, active_tab=0)
     return rrb.Blueprint(
         root,
         rrb.BlueprintPanel(state="collapsed"),
@@ -162,6 +169,18 @@ def _overview(devices: Sequence[str]) -> rrb.Container:
     )
 
 
+def _fleet(devices: Sequence[str]) -> rrb.Container:
+    """The table of all devices, their events, and the Allan plots of those in detail."""
+    table = rrb.TextDocumentView(origin="/overview", contents="$origin", name="Is it healthy?")
+    events = rrb.TextLogView(origin="/overview/events", name="Has it changed?", columns=_log_columns())
+    charts = [_allan(device, kind, f"{device}: ") for device in devices for kind in KINDS]
+    if not charts:
+        return rrb.Vertical(table, events, row_shares=[4, 1], name="Fleet")
+    left = rrb.Vertical(table, events, row_shares=[4, 1])
+    right = rrb.Grid(*charts, grid_columns=1 if len(devices) == 1 else 2)
+    return rrb.Horizontal(left, right, column_shares=[6, 5], name="Fleet")
+
+
 def _allan(device: str, kind: Kind, prefix: str = "") -> rrb.View:
     paths = [f"+ /{device}/allan/{kind}/**", *(f"+ /{device}/allan/{axis}/**" for axis in axes_of(kind))]
     bounds = rrb.VisualBounds2D(x_range=[-1.6, WIDTH + 0.6], y_range=[-1.3, HEIGHT + 1.7])
@@ -237,8 +256,9 @@ def send(
     with_model: Collection[str] = (),
     with_thermal: Collection[str] = (),
     compensated: Collection[str] = (),
+    fleet: bool = False,
 ) -> None:
     """Make the layout the active one of the stream's viewer."""
     stream.send_blueprint(
-        blueprint(devices, with_model, with_thermal, compensated), make_active=True, make_default=True
+        blueprint(devices, with_model, with_thermal, compensated, fleet), make_active=True, make_default=True
     )

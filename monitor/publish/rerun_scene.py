@@ -86,8 +86,11 @@ class _Device:
 class Scene:
     """Draws on one stream. Not thread-safe; see the module about blocking."""
 
-    def __init__(self, stream: rr.RecordingStream, devices: Sequence[tuple[str, str]] = ()) -> None:
-        """``devices``: name and a few words about each."""
+    def __init__(
+        self, stream: rr.RecordingStream, devices: Sequence[tuple[str, str]] = (), fleet: bool = False
+    ) -> None:
+        """``devices``: name and a few words about each; ``fleet``: many more have only a row in the overview."""
+        self._fleet = fleet
         self._stream = stream
         self._devices = {name: _Device(about) for name, about in devices}
         self._shown = set(self._devices)
@@ -210,10 +213,11 @@ class Scene:
         """One line in the log of the device, and in that of the overview."""
         self._at(wall_s)
         level, at = LEVELS.get(event.kind, "INFO"), _clock_time(wall_s)
-        self._stream.log(f"{device}/events", rr.TextLog(f"{at}  {event.text}", level=level))
-        if len(self._shown) > 1:
+        if self._fleet or len(self._shown) > 1:
             self._stream.log("overview/events", rr.TextLog(f"{at}  {device}: {event.text}", level=level))
-        self._mark(device, wall_s, event)
+        if device in self._devices:
+            self._stream.log(f"{device}/events", rr.TextLog(f"{at}  {event.text}", level=level))
+            self._mark(device, wall_s, event)
 
     def health(self, device: str, wall_s: float, health: Health) -> None:
         """The health panel of the device, and its row in the overview."""
@@ -222,8 +226,13 @@ class Scene:
             self._healths[device] = health
         about = self._devices[device].about
         self._stream.log(f"{device}/status", _markdown(health_text(device, health, about)))
-        if len(self._shown) > 1:
+        if len(self._shown) > 1 and not self._fleet:
             self._stream.log("overview", _markdown(overview_text(self._healths)))
+
+    def overview(self, wall_s: float, text: str) -> None:
+        """The table of a fleet."""
+        self._at(wall_s)
+        self._stream.log("overview", _markdown(text))
 
     def _style_axis(self, device: str, axis: str) -> None:
         colour = colours.AXIS_COLOURS[axis]

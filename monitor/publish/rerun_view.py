@@ -48,7 +48,7 @@ EARLY_END_S: Final = 10.0  # a window that ends sooner never worked
 MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
 
 Recall = Callable[[str], Past | None]
-Message = tuple[str, "_Samples | _Estimate | _Gap | _Thermal | _Rates | _Drift | _Event | _Health"]
+Message = tuple[str, "_Samples | _Estimate | _Gap | _Thermal | _Rates | _Drift | _Event | _Health | _Overview"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,13 +100,29 @@ class _Health:
     health: Health
 
 
-class RerunView:
-    """One viewer for all devices. Called by one thread; every call returns at once."""
+@dataclass(frozen=True, slots=True)
+class _Overview:
+    wall_s: float
+    text: str
 
-    def __init__(self, settings: ViewerSettings, devices: Sequence[DeviceInfo], recall: Recall | None = None) -> None:
+
+class RerunView:
+    """One viewer for all devices. Called by one thread; every call returns at once.
+
+    ``fleet``: the devices are those in detail of many more, whose table comes by ``overview``.
+    """
+
+    def __init__(
+        self,
+        settings: ViewerSettings,
+        devices: Sequence[DeviceInfo],
+        recall: Recall | None = None,
+        fleet: bool = False,
+    ) -> None:
         """Opens nothing yet. ``recall``: what is kept of a device, asked for in the viewer's thread when it opens."""
         self._settings = settings
         self._recall = recall or _nothing
+        self._fleet = fleet
         self._devices = tuple(devices)
         self._backlog: Backlog[Message] = Backlog(BACKLOG_BYTES)
         self._closing = threading.Event()
@@ -176,6 +192,10 @@ class RerunView:
         """How a device does, about once a second."""
         self._put(device, _Health(wall_s, health), 1000)
 
+    def overview(self, wall_s: float, text: str) -> None:
+        """The table of a fleet, as Markdown."""
+        self._put("", _Overview(wall_s, text), len(text))
+
     def close(self, timeout_s: float = 2.0) -> None:
         """Draw what is left for at most ``timeout_s``, then end the viewer that was started here."""
         thread, self._thread = self._thread, None
@@ -193,7 +213,7 @@ class RerunView:
     def _put(
         self,
         device: str,
-        message: "_Samples | _Estimate | _Gap | _Thermal | _Rates | _Drift | _Event | _Health",
+        message: "_Samples | _Estimate | _Gap | _Thermal | _Rates | _Drift | _Event | _Health | _Overview",
         weight: int,
     ) -> None:
         if self._thread is not None:
@@ -239,7 +259,7 @@ class RerunView:
         output = rerun_sinks.open_output(settings, self._recording_id, self._closing.is_set)
         self._child, self._url = output.child, output.url
         try:
-            scene = rerun_scene.Scene(output.stream)
+            scene = rerun_scene.Scene(output.stream, fleet=self._fleet)
             self._draw(output, scene)
         finally:
             self._child = None
@@ -255,6 +275,7 @@ class RerunView:
             [d.name for d in devices if d.has_model],
             [d.name for d in devices if d.has_thermal],
             [d.name for d in devices if d.compensated],
+            self._fleet,
         )
         scene.show([(d.name, d.about) for d in devices])
         self._phase = "ok"
@@ -323,6 +344,7 @@ class _Pending:
     drifts: dict[str, list[_Drift]] = field(default_factory=dict)
     healths: dict[str, _Health] = field(default_factory=dict)
     events: list[tuple[str, _Event]] = field(default_factory=list)
+    overview: _Overview | None = None
     drawn: dict[tuple[str, str], float] = field(default_factory=dict)  # (what, device) -> monotonic s
 
     def add(self, messages: Sequence[Message]) -> None:
@@ -346,6 +368,8 @@ class _Pending:
                     self.events.append((device, message))
                 case _Health():
                     self.healths[device] = message
+                case _Overview():
+                    self.overview = message
 
     def draw(self, scene: "Scene", everything: bool) -> None:
         """Hand all over to the scene; plots and courses when they are due, or ``everything``."""
@@ -363,6 +387,9 @@ class _Pending:
         for device, seen in self.healths.items():
             scene.health(device, seen.wall_s, seen.health)
         self.healths.clear()
+        if self.overview is not None:
+            scene.overview(self.overview.wall_s, self.overview.text)
+            self.overview = None
         for device, rates in self.rates.items():
             scene.compensated(
                 device, np.concatenate([one.wall_s for one in rates]), np.concatenate([one.values for one in rates])

@@ -9,10 +9,11 @@ A state has a word and a sign beside its colour. Numbers stand in the field's un
 import contextlib
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from pathlib import Path
 from typing import Final
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
@@ -31,12 +32,16 @@ from monitor.publish.units import Kind
 from monitor.publish.zenoh_in import KEYEXPR, ZenohIn
 
 REFRESH_S: Final = 0.5
+DEVICES: Final = 20_000
+"""Known at most; then a new one takes the place of one that has been silent for long, or is passed over."""
+FORGET_S: Final = 600.0
+KEY_LENGTH: Final = 200
+QUIET_S: Final = 5.0
+"""Connected for so long without a word of anyone: said, as access control refuses without saying so."""
 PLAIN_S: Final = 1.0
 """Between two tables where output is no terminal."""
 EVENTS: Final = 5
 TROUBLES: Final = 6
-MOST_DEVICES: Final = 20_000
-"""Names beyond are passed over: whoever may publish could otherwise fill the memory."""
 HEADS: Final = 6
 """Lines of the screen that are no row: summary, note, heads, and those left empty."""
 SHOWN: Final[tuple[tuple[Kind, str], ...]] = (("gyro", "N"), ("gyro", "B"), ("accel", "N"))
@@ -79,8 +84,9 @@ class Board:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.note = ""  # a line above the table, e.g. who cannot be reached
         self.malformed = 0  # messages that are not what their key says
+        self.passed_over = 0  # messages of devices that found no room
         self._clock = clock
-        self._devices: dict[str, Heard] = {}
+        self._devices: OrderedDict[str, Heard] = OrderedDict()  # longest silent first
         self._events: deque[tuple[str, heard.EventMessage]] = deque(maxlen=EVENTS)
         self._lock = threading.Lock()
 
@@ -101,8 +107,9 @@ class Board:
         found = heard.split(key)
         if found is None or found[1] is not topics.ALIVE:
             return
-        with self._lock, contextlib.suppress(ValueError):
-            self._device(found[0]).there = there
+        with self._lock:
+            if known := self._device(found[0]):
+                known.there = there
 
     def forget(self, key: str) -> None:
         """The device of the key has no row any more."""
@@ -117,7 +124,7 @@ class Board:
     def table(self, now_s: float) -> RenderableType:
         """All of it, at one moment."""
         with self._lock:
-            devices = sorted(self._devices.values(), key=lambda one: (one.rank(now_s), one.key))
+            devices = self._sorted(now_s)
             parts: list[RenderableType] = [self._summary(devices, now_s)]
             if devices:
                 parts.append(Fleet(devices, now_s))
@@ -128,31 +135,53 @@ class Board:
             parts += _apart([_event(names[device], event) for device, event in self._events])
         return Group(*parts)
 
+    def devices(self, now_s: float) -> list[Heard]:
+        """All that are known, those in trouble first."""
+        with self._lock:
+            return self._sorted(now_s)
+
+    def _sorted(self, now_s: float) -> list[Heard]:
+        return sorted(self._devices.values(), key=lambda one: (one.rank(now_s), one.key))
+
     def _read(self, device: str, topic: topics.Topic, payload: bytes) -> None:
         """ValueError for a malformed one, which then leaves no trace."""
         if topic is topics.STATUS:
-            status = heard.read(heard.StatusMessage, topic, payload)
-            self._heard(device).status = status
+            status = heard.status(payload)
+            if known := self._heard(device):
+                known.status = status
         elif topic is topics.COEFFICIENTS:
             noise = heard.noise(heard.read(heard.CoefficientsMessage, topic, payload))
-            self._heard(device).noise = noise
+            if known := self._heard(device):
+                known.noise = noise
         elif topic is topics.GAP:
-            gap = heard.read(heard.GapMessage, topic, payload)
-            self._heard(device).gap = gap
+            gap = heard.gap(payload)
+            if known := self._heard(device):
+                known.gap = gap
         elif topic is topics.EVENT:
-            event = heard.read(heard.EventMessage, topic, payload)
-            self._heard(device)
-            self._events.append((device, event))
+            event = heard.event(payload)
+            if self._heard(device):
+                self._events.append((device, event))
 
-    def _heard(self, device: str) -> Heard:
+    def _heard(self, device: str) -> Heard | None:
         known = self._device(device)
-        known.heard_s = self._clock()
+        if known is not None:
+            known.heard_s = self._clock()
+            self._devices.move_to_end(device)
         return known
 
-    def _device(self, device: str) -> Heard:
-        if device not in self._devices and len(self._devices) >= MOST_DEVICES:
-            raise ValueError(f"more than {MOST_DEVICES} devices")
-        return self._devices.setdefault(device, Heard(device, self._clock()))
+    def _device(self, device: str) -> Heard | None:
+        """The device, from now on known; None where there is no room for another."""
+        known = self._devices.get(device)
+        if known is not None:
+            return known
+        now_s = self._clock()
+        full = len(self._devices) >= DEVICES
+        if len(device) > KEY_LENGTH or (full and now_s - next(iter(self._devices.values())).heard_s < FORGET_S):
+            self.passed_over += 1
+            return None
+        if full:
+            self._devices.popitem(last=False)
+        return self._devices.setdefault(device, Heard(device, now_s))
 
     def _summary(self, devices: list[Heard], now_s: float) -> Text:
         line = Text("imu-monitor", style="bold")
@@ -165,6 +194,8 @@ class Board:
             line.append(
                 f"  {self.malformed:,} malformed message{'' if self.malformed == 1 else 's'}", style="not bold yellow"
             )
+        if self.passed_over:
+            line.append(f"  {self.passed_over:,} of devices beyond {DEVICES:,}", style="not bold yellow")
         if self.note:
             line.append(f"\n{self.note}", style="not bold yellow")
         return line
@@ -180,16 +211,19 @@ class Fleet:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The table, and how many did not find room."""
         layout = next((one for one in LAYOUTS if self._fits(one, console, options)), NARROW)
-        lines_each = 3 if layout.stacked else 1
-        room = len(self._devices)
-        if console.is_terminal:
-            room = max((console.size.height - EVENTS - TROUBLES - HEADS) // lines_each, 3)
+        room = self._room(layout, console)
         yield fleet_table(self._devices[:room], self._now_s, layout)
         if len(self._devices) > room:
             yield Text(f"… and {len(self._devices) - room} more with less trouble", style="dim")
 
+    def _room(self, layout: Layout, console: Console) -> int:
+        """Rows that are shown: all of them where the output is no terminal."""
+        if not console.is_terminal:
+            return len(self._devices)
+        return max((console.size.height - EVENTS - TROUBLES - HEADS) // (3 if layout.stacked else 1), 3)
+
     def _fits(self, layout: Layout, console: Console, options: ConsoleOptions) -> bool:
-        table = fleet_table(self._devices, self._now_s, layout)
+        table = fleet_table(self._devices[: self._room(layout, console)], self._now_s, layout)
         return console.measure(table, options=options.update(max_width=10_000)).maximum <= options.max_width
 
 
@@ -218,19 +252,20 @@ def fleet_table(devices: Sequence[Heard], now_s: float, layout: Layout) -> Table
 
 def watch(
     keyexpr: str = KEYEXPR,
-    connect: Sequence[str] = (topics.ENDPOINT,),
+    connect: Sequence[str] = (),
     stop: threading.Event | None = None,
     console: Console | None = None,
     once_s: float | None = None,
+    file: Path | None = None,
 ) -> None:
     """Show the table until ``stop`` or Ctrl-C; with ``once_s`` listen for so long and print it once.
 
     Raises:
-        ConfigError: zenoh refuses the key expression or an endpoint
+        ConfigError: zenoh refuses the key expression, an endpoint or the ``file`` with certificates and passwords
     """
     stop, console = stop or threading.Event(), console or Console()
     board = Board()
-    with contextlib.closing(ZenohIn(keyexpr, connect)) as arriving, contextlib.suppress(KeyboardInterrupt):
+    with contextlib.closing(ZenohIn(keyexpr, connect, file)) as arriving, contextlib.suppress(KeyboardInterrupt):
         arriving.start()
         if once_s is not None:
             stop.wait(once_s)
@@ -251,11 +286,18 @@ def _newest(board: Board, arriving: ZenohIn) -> RenderableType:
             board.alive(message.key, message.there)
         else:
             board.take(message.key, message.payload)
+    board.note = note(board, arriving)
+    return board.table(time.monotonic())
+
+
+def note(board: Board, arriving: ZenohIn) -> str:
+    """What is wrong between here and the daemons; empty while all is well."""
     state, dropped = arriving.state, arriving.dropped
     notes = [state] if state != "ok" else []
+    if state == "ok" and arriving.open_s > QUIET_S and not board.devices(time.monotonic()):
+        notes.append("connected, but nothing comes: no daemon there, or no right to listen")
     notes += [f"{dropped:,} messages dropped: too slow here"] if dropped else []
-    board.note = "; ".join(notes)
-    return board.table(time.monotonic())
+    return "; ".join(notes)
 
 
 # --- cells

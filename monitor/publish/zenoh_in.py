@@ -1,23 +1,31 @@
 """Other daemons' results from zenoh: what ``watch`` listens to.
 
-The session is closed but for the endpoints given: a peer that listens nowhere and scouts nobody. A peer and not a
-client, as a client stays with the first endpoint that answers, while a peer goes to all of them, waits for those that
-are not there yet and goes back to those that went. Raw samples and curves, the bulk of what daemons send, are not
-subscribed to.
+Each endpoint given has a session of its own, closed to all else: a client that listens nowhere and scouts nobody. A
+client and not a peer, as a router passes nothing on between two peers, and daemons are peers; one for each endpoint, as
+a client stays with the first that answers. An endpoint that is not there is tried again. A zenoh file may bring
+certificates, user and password. Raw samples and curves, the bulk of what daemons send, are subscribed to for devices in
+detail alone.
 
-Each subscription ends in a ring of zenoh's that drops its oldest, and a thread of this class moves what comes to one
-backlog (a Python callback that is alive at exit would hang the process). ``take`` gives what came, in order of arrival
-within a topic; nothing here reads a payload.
+Who comes late gets the last values that daemons keep for that, and their last events; of events those too that a
+broken connection kept away. Each subscription ends in a ring of zenoh's that drops its oldest, and a thread of this
+class moves what comes to one backlog (a Python callback that is alive at exit would hang the process). ``take`` gives
+what came, in order of arrival within a topic; nothing here reads a payload. Memory is bounded whatever is sent: zenoh
+takes in no message above ``MESSAGE_BYTES``, and the backlog drops its oldest.
 """
 
 import threading
-from collections.abc import Sequence
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.errors import ConfigError
-from drivers.zenoh_session import configuration, plain
-from monitor import topics
+from drivers.masked import masked
+from drivers.zenoh_refusal import why
+from drivers.zenoh_session import CLOSED, alone, configuration, endpoints, plain
+from monitor import permissions, topics
 from monitor.publish.backlog import Backlog
 
 if TYPE_CHECKING:
@@ -25,11 +33,22 @@ if TYPE_CHECKING:
 
 KEYEXPR: Final = "imu/**"
 TOPICS: Final = (topics.STATUS, topics.COEFFICIENTS, topics.EVENT)
+DETAIL: Final = (topics.SAMPLES, topics.ALLAN, topics.GAP)
+"""Of devices in detail, beside those of all."""
 RING_MESSAGES: Final = 4096
 BACKLOG_BYTES: Final = 16_000_000
-RETRY_S: Final = 2.0
+MESSAGE_BYTES: Final = 4_000_000
+"""Longest message taken in: batches of samples of a fast replay; all else is a few kilobytes."""
+BEAT_S: Final = 0.25
+"""Between two looks whether an endpoint has gone."""
+TOKENS: Final = 20_000
+LOOK_S: Final = 3.0
+"""Between two looks why an endpoint does not let us in."""
+RETRY_S: Final = 1.0
 OPENING_S: Final = 5.0
-"""zenoh waits up to half a second for peers when a session opens; much longer is a fault of its own."""
+"""An endpoint that does not answer is waited for so long at most."""
+REMEMBERED: Final = 20_000
+"""Messages, to know those that come by several endpoints: two seconds of a thousand devices at 10 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,23 +65,28 @@ class ZenohIn:
 
     Args:
         keyexpr: whose results, e.g. ``imu/**``, ``imu/bench-1``, ``*/*/status``
-        connect: endpoints of daemons or routers
+        connect: endpoints of daemons or routers; none: the file's, else the one where a daemon listens by default
+        file: a zenoh file for all else (TLS, user and password)
+        detail: keys of devices whose samples and curves are wanted too, e.g. ``imu/bench-1``
 
     Raises:
-        ConfigError: zenoh refuses the key expression or an endpoint
+        ConfigError: zenoh refuses the key expression, an endpoint or the file, or anyone may change the file
     """
 
-    def __init__(self, keyexpr: str = KEYEXPR, connect: Sequence[str] = (topics.ENDPOINT,)) -> None:
-        self._keys = {topic: narrowed(keyexpr, topic) for topic in (*TOPICS, topics.ALIVE)}
-        self._connect = tuple(connect)
-        self._config = _configuration(self._connect)
-        self._said = "not open yet"
+    def __init__(
+        self,
+        keyexpr: str = KEYEXPR,
+        connect: Sequence[str] = (),
+        file: Path | None = None,
+        detail: Sequence[str] = (),
+    ) -> None:
+        keys = {topic: narrowed(keyexpr, topic) for topic in (*TOPICS, topics.ALIVE)}
+        _check_keys(keyexpr, [key for part in keys.values() for key in part])
+        keys |= {topic: tuple(f"{device}/{topic.name}" for device in detail) for topic in DETAIL}
         self._backlog: Backlog[Message] = Backlog(BACKLOG_BYTES)
-        self._session: zenoh.Session | None = None
-        self._closing = threading.Event()
-        self._opener = threading.Thread(target=self._open_until_open, name="zenoh open", daemon=True)
-        self._takers: list[threading.Thread] = []
-        _check_keys(keyexpr, [key for keys in self._keys.values() for key in keys])
+        found = listeners(connect, file)
+        self._once = _Once() if len(found) > 1 else None
+        self._doors = [_Door(endpoint, config, keys, self._push) for endpoint, config in found.items()]
 
     @property
     def dropped(self) -> int:
@@ -72,46 +96,130 @@ class ZenohIn:
     @property
     def state(self) -> str:
         """``ok``, or in a few words who is not there."""
-        session = self._session
-        if session is None:
-            return self._said
-        connected = len(session.info.peers_zid()) + len(session.info.routers_zid())
-        if connected >= len(self._connect):
+        absent = {door.endpoint: door.why for door in self._doors if not door.open}
+        if not absent:
             return "ok"
-        if not connected:
-            return f"nobody at {', '.join(self._connect)}; trying again"
-        return f"{connected} of {len(self._connect)} there ({', '.join(self._connect)}); trying the rest again"
+        every = ", ".join(door.endpoint for door in self._doors)
+        reasons = "; ".join(f"{endpoint}: {why}" for endpoint, why in absent.items() if why)
+        if len(absent) == len(self._doors):
+            return f"{reasons or 'nobody at ' + every}; trying again"
+        there = f"{len(self._doors) - len(absent)} of {len(self._doors)} there ({every})"
+        return f"{there}; {reasons + '; ' if reasons else ''}trying the rest again"
+
+    @property
+    def open_s(self) -> float:
+        """For how long every endpoint has been there."""
+        return min(door.open_s for door in self._doors)
 
     def start(self) -> None:
-        """Open in a thread of its own; returns at once."""
-        self._opener.start()
+        """Open in threads of their own; returns at once."""
+        for door in self._doors:
+            door.start()
 
     def take(self, timeout_s: float) -> list[Message]:
         """What came since the last call; waits up to ``timeout_s`` when nothing did."""
         return self._backlog.take(timeout_s)
 
     def close(self) -> None:
-        """Close the session and end the threads."""
-        self._closing.set()
+        """Close the sessions and end the threads."""
+        for door in self._doors:
+            door.closing.set()
+        for door in self._doors:
+            door.close()
+        self._backlog.wake()
+
+    def _push(self, message: Message, stamp: str) -> None:
+        if self._once is None or self._once.is_new(message.key, stamp):
+            self._backlog.push(message, 100 + len(message.payload or b""))
+
+
+class _Once:
+    """What several endpoints of one network bring twice, passed on once: by zenoh's time stamps, which are unique."""
+
+    def __init__(self) -> None:
+        self._seen: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def is_new(self, key: str, stamp: str) -> bool:
+        if not stamp:
+            return True
+        with self._lock:
+            if (key, stamp) in self._seen:
+                return False
+            self._seen[key, stamp] = None
+            if len(self._seen) > REMEMBERED:
+                self._seen.popitem(last=False)
+            return True
+
+
+class _Door:
+    """The session at one endpoint: opened until it opens, in a thread of its own."""
+
+    def __init__(
+        self,
+        endpoint: str,
+        config: "zenoh.Config",
+        keys: Mapping[topics.Topic, Sequence[str]],
+        push: Callable[[Message, str], None],
+    ) -> None:
+        self.endpoint = masked(endpoint)
+        self.why = ""  # why it does not let us in, as it was found last; "": nobody is there
+        self.closing = threading.Event()
+        self._endpoint, self._config, self._keys, self._push = endpoint, config, keys, push
+        self._session: zenoh.Session | None = None
+        self._opener = threading.Thread(target=self._keep_open, name=f"zenoh {self.endpoint}", daemon=True)
+        self._takers: list[threading.Thread] = []
+        self._there: set[str] = set()  # keys of tokens
+        self._since_s: float | None = None  # monotonic s since which it is open
+
+    @property
+    def open(self) -> bool:
+        session = self._session
+        return session is not None and not alone(session)
+
+    @property
+    def open_s(self) -> float:
+        since_s = self._since_s
+        return 0.0 if since_s is None else time.monotonic() - since_s
+
+    def start(self) -> None:
+        self._opener.start()
+
+    def close(self) -> None:
+        self.closing.set()
         if self._opener.is_alive():
             self._opener.join(OPENING_S)
         self._end()
-        self._backlog.wake()
 
-    def _open_until_open(self) -> None:
+    def _keep_open(self) -> None:
+        """Thread: open, and then find out why nobody is there whenever nobody is."""
         import zenoh
 
-        while not self._closing.is_set():
+        while not self.closing.is_set():
             try:
-                session = zenoh.open(self._config)
-                self._session = session
+                session = self._session = zenoh.open(self._config)
                 self._subscribe(session)
-            except zenoh.ZError as error:
-                self._said = f"{plain(error)}; trying again"
+            except zenoh.ZError:
                 self._end()
-                self._closing.wait(RETRY_S)
+                self.why = why(self._endpoint, self._config)
+                self.closing.wait(RETRY_S)
             else:
-                return
+                break
+        self._look_after()
+
+    def _look_after(self) -> None:
+        """Until closed: zenoh reconnects by itself, but takes away no token when it is the endpoint that went."""
+        asked_s = -LOOK_S
+        while not self.closing.wait(BEAT_S):
+            if self.open:
+                self.why, self._since_s = "", self._since_s or time.monotonic()
+                continue
+            self._since_s = None
+            while self._there:
+                self._push(Message(self._there.pop(), None, there=False), "")
+            if time.monotonic() - asked_s >= LOOK_S:
+                self.why = why(self._endpoint, self._config)
+                asked_s = time.monotonic()
 
     def _end(self) -> None:
         """Close the session, which ends the threads that take from it."""
@@ -123,15 +231,9 @@ class ZenohIn:
             taker.join(RETRY_S)
 
     def _subscribe(self, session: "zenoh.Session") -> None:
-        import zenoh
-
         for topic, keys in self._keys.items():
             for key in keys:
-                ring: Any = zenoh.handlers.RingChannel(RING_MESSAGES)
-                if topic is topics.ALIVE:
-                    subscriber: Any = session.liveliness().declare_subscriber(key, ring, history=True)
-                else:
-                    subscriber = session.declare_subscriber(key, ring)
+                subscriber = _subscriber(session, topic, key)
                 taker = threading.Thread(
                     target=self._take, args=(subscriber, topic is topics.ALIVE), name=f"zenoh {key}", daemon=True
                 )
@@ -143,14 +245,19 @@ class ZenohIn:
         import zenoh
 
         handler = subscriber.handler  # the subscriber itself could not be undeclared while it waits
-        while not self._closing.is_set():
+        while not self.closing.is_set():
             try:
                 sample = handler.recv()
             except zenoh.ZError:
                 return  # closed
-            payload = None if liveliness else bytes(sample.payload)
-            there = sample.kind == zenoh.SampleKind.PUT
-            self._backlog.push(Message(str(sample.key_expr), payload, there), 100 + len(payload or b""))
+            key, there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+            if liveliness:
+                if not there:
+                    self._there.discard(key)
+                elif len(self._there) < TOKENS:
+                    self._there.add(key)
+            stamp = "" if liveliness or sample.timestamp is None else str(sample.timestamp)
+            self._push(Message(key, None if liveliness else bytes(sample.payload), there), stamp)
 
 
 def narrowed(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
@@ -170,6 +277,41 @@ def narrowed(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
     return ("/".join([*parts[:-1], topic.name]), below) if parts[-1] == "*" else (below,)
 
 
+def listeners(connect: Sequence[str], file: Path | None) -> dict[str, "zenoh.Config"]:
+    """Endpoint -> zenoh's configuration of a session there that only listens and asks, see ``ZenohIn``."""
+    import zenoh
+
+    if file is not None and (line := permissions.changeable(file)):
+        raise ConfigError(f"{file}: {line}")
+    try:
+        theirs = endpoints(configuration({}, file))
+    except zenoh.ZError as error:
+        raise ConfigError(f"{file}: {plain(error)}") from error
+    unsaid = {**CLOSED, "transport/link/rx/max_message_size": MESSAGE_BYTES}
+    found = {}
+    for endpoint in dict.fromkeys(connect or theirs or (topics.ENDPOINT,)):
+        own = {"mode": "client", "connect/endpoints": [endpoint], "listen/endpoints": []}
+        try:
+            found[endpoint] = configuration(own, file, unsaid)
+        except (zenoh.ZError, UnicodeEncodeError) as error:
+            raise ConfigError(f'connect "{masked(endpoint)}": no endpoint; write e.g. {topics.ENDPOINT}') from error
+    return found
+
+
+def _subscriber(session: "zenoh.Session", topic: topics.Topic, key: str) -> Any:
+    """With what daemons keep for those who come late; after a broken connection events that were missed come too."""
+    import zenoh
+    from zenoh import ext
+
+    ring: Any = zenoh.handlers.RingChannel(RING_MESSAGES)
+    if topic is topics.ALIVE:
+        return session.liveliness().declare_subscriber(key, ring, history=True)
+    if not topic.kept:
+        return session.declare_subscriber(key, ring)
+    history = ext.HistoryConfig(detect_late_publishers=topic is topics.EVENT)
+    return ext.declare_advanced_subscriber(session, key, ring, history=history)
+
+
 def _check_keys(keyexpr: str, keys: list[str]) -> None:
     import zenoh
 
@@ -183,14 +325,3 @@ def _check_keys(keyexpr: str, keys: list[str]) -> None:
     if not keys:
         shown = ", ".join(topic.name for topic in (*TOPICS, topics.ALIVE))
         raise ConfigError(f'key expression "{keyexpr}": nothing to show of it; shown are {shown}')
-
-
-def _configuration(connect: tuple[str, ...]) -> "zenoh.Config":
-    import zenoh
-
-    for endpoint in connect:
-        try:
-            configuration({"connect/endpoints": [endpoint]})
-        except (zenoh.ZError, UnicodeEncodeError) as error:
-            raise ConfigError(f'connect "{endpoint}": no endpoint; write e.g. {topics.ENDPOINT}') from error
-    return configuration({"connect/endpoints": connect})

@@ -3,7 +3,8 @@
 The session is closed unless the configuration says otherwise: a peer without scouting that listens on loopback only.
 If it cannot open (port busy: any free one is taken and said; anything else: tried again), ``state`` says so, and what
 was to be put is dropped: samples go on. zenoh queues what it sends and drops for a subscriber that does not keep up,
-so ``put`` does not wait for anyone.
+so ``put`` does not wait for anyone. Who subscribes late can ask for the last values: an advanced publisher keeps them,
+and plain subscribers notice nothing of it.
 
 Queries of ``history`` are answered by the thread that takes them, one a device: a file is read, nothing here waits.
 
@@ -23,15 +24,20 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.errors import ConfigError, ImuError, NotReady
-from drivers.zenoh_session import CLOSED, configuration, plain
+from drivers.masked import masked
+from drivers.zenoh_refusal import refused
+from drivers.zenoh_session import CLOSED, alone, configuration, endpoints, plain
 from monitor import topics
 from monitor.settings import ZenohTable
 
 if TYPE_CHECKING:
     import zenoh
+    from zenoh.ext import AdvancedPublisher
 
 RETRY_S: Final = 2.0
 QUERIES_WAITING: Final = 64
+LOOK_S: Final = 3.0
+"""Between two looks why a router does not let us in."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +72,14 @@ class ZenohOut:
         self._devices = tuple(devices)
         self._alive: dict[str, bool] = dict.fromkeys(devices, False)
         self._session: zenoh.Session | None = None
-        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._why = ""  # why nobody lets us in, as it was found last
+        self._connect: tuple[str, ...] = settings.connect
+        self._publishers: dict[str, zenoh.Publisher | AdvancedPublisher] = {}
         self._tokens: dict[str, Any] = {}
         self._queryables: dict[str, list[Any]] = {}
         self._declaring = threading.Lock()  # the opener declares all devices, the loop those that come or go
         self._showing = threading.Lock()  # the opener and the loop both show who is alive
-        self._opener = threading.Thread(target=self._open_until_open, name="zenoh open", daemon=True)
+        self._opener = threading.Thread(target=self._keep_open, name="zenoh open", daemon=True)
         self._takers: list[threading.Thread] = []
         self._closing = threading.Event()
 
@@ -79,11 +87,10 @@ class ZenohOut:
     def state(self) -> str:
         """``ok``, or what is wrong: for the status."""
         session = self._session
-        if self._unsent or session is None or not self.settings.connect:
+        if self._unsent or session is None or not self._connect:
             return self._unsent or self._said
-        with contextlib.suppress(*_zenoh_errors()):  # the session is being closed
-            if not session.info.routers_zid() and not session.info.peers_zid():
-                return f"nobody at {', '.join(self.settings.connect)}; trying again"
+        if alone(session):
+            return f"{self._why or 'nobody at ' + masked(', '.join(self._connect))}; trying again"
         return self._said
 
     def start(self) -> None:
@@ -158,19 +165,29 @@ class ZenohOut:
 
     # --- opening
 
-    def _open_until_open(self) -> None:
+    def _keep_open(self) -> None:
+        """Thread: open, and then find out why nobody lets us in whenever nobody does."""
         errors: tuple[type[Exception], ...] = (*_zenoh_errors(), OSError)
         while not self._closing.is_set():
             try:
                 self._open()
             except errors as error:
-                self._said = f"{plain(error)}; trying again"
+                self._said = f"{self._refused() or plain(error)}; trying again"
                 self._end()
                 self._closing.wait(RETRY_S)
             else:
-                if self._closing.is_set():  # it took longer than close waits
-                    self._end()
-                return
+                break
+        while self._connect and not self._closing.wait(LOOK_S):
+            session = self._session
+            self._why = self._refused() if session is not None and alone(session) else ""
+        if self._closing.is_set():  # opening took longer than close waits
+            self._end()
+
+    def _refused(self) -> str:
+        """Why the endpoints do not let us in, "" where simply nobody is there."""
+        with contextlib.suppress(*_zenoh_errors()):  # a file that zenoh refuses: it has said so itself
+            return refused(self._connect, self._configuration(None))
+        return ""
 
     def _end(self) -> None:
         """Close the session, which ends the threads that take from it."""
@@ -208,8 +225,10 @@ class ZenohOut:
         import zenoh
 
         listen = self.settings.listen
+        config = self._configuration(listen)
+        self._connect = endpoints(config)
         try:
-            return zenoh.open(self._configuration(listen)), "ok"
+            return zenoh.open(config), "ok"
         except zenoh.ZError as error:
             if "in use" not in str(error) or listen is None:
                 raise
@@ -228,15 +247,24 @@ class ZenohOut:
         unsaid = {**CLOSED, "listen/endpoints": [topics.ENDPOINT], "timestamping/enabled": True}
         return configuration(keys, own.config, unsaid)
 
-    def _publisher(self, session: "zenoh.Session", topic: topics.Topic, key: str) -> "zenoh.Publisher":
+    def _publisher(
+        self, session: "zenoh.Session", topic: topics.Topic, key: str
+    ) -> "zenoh.Publisher | AdvancedPublisher":
         import zenoh
+        from zenoh import ext
 
-        # results are few and wanted soon; batches of samples may share a packet
-        return session.declare_publisher(
+        encoding, drop = zenoh.Encoding(topic.encoding), zenoh.CongestionControl.DROP
+        express = topic.when != "batches"  # results are few and wanted soon; batches of samples may share a packet
+        if not topic.kept:
+            return session.declare_publisher(key, encoding=encoding, congestion_control=drop, express=express)
+        return ext.declare_advanced_publisher(
+            session,
             key,
-            encoding=zenoh.Encoding(topic.encoding),
-            congestion_control=zenoh.CongestionControl.DROP,
-            express=topic.when != "batches",
+            encoding=encoding,
+            congestion_control=drop,
+            express=express,
+            cache=ext.CacheConfig(topic.kept),
+            publisher_detection=topic is topics.EVENT,
         )
 
     # --- presence and commands

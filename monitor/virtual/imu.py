@@ -84,7 +84,8 @@ class VirtualImu:
     def _run(self) -> None:
         self._sensor.switch_on()
         begun_s, made = time.monotonic(), 0
-        while not self._stop.wait(STEP_S + self._held_s()):
+        step_s = max(STEP_S, 0.5 / self._pace_hz)  # a slow sensor is not looked at more often than twice a sample
+        while not self._stop.wait(step_s + self._held_s()):
             due = int((time.monotonic() - begun_s) * self._pace_hz)
             late = due - made - int(BEHIND_S * self._pace_hz)
             if late > 0:  # the machine slept: the sensor ran on meanwhile

@@ -81,7 +81,7 @@ def test_messages_come_in_order_and_none_is_lost(router: Any, endpoint: str) -> 
 
 
 def test_a_peer_finds_a_router_that_comes_later(endpoint: str) -> None:
-    link = build(key="k", connect=[endpoint])
+    link = build(key="k", mode="peer", connect=[endpoint])
     link.open()
     assert link.read(0.1) is None
     with open_router(endpoint) as session:
@@ -90,7 +90,7 @@ def test_a_peer_finds_a_router_that_comes_later(endpoint: str) -> None:
 
 
 def test_a_client_needs_its_router(endpoint: str) -> None:
-    with pytest.raises(LinkUnavailable, match="no router at") as raised:
+    with pytest.raises(LinkUnavailable, match="nobody at") as raised:
         build(key="k", mode="client", connect=[endpoint]).open()
     # where in its own source code zenoh failed is nobody's business here
     assert ".rs" not in str(raised.value)
@@ -99,6 +99,34 @@ def test_a_client_needs_its_router(endpoint: str) -> None:
 def test_a_busy_listening_port(router: Any, endpoint: str) -> None:
     with pytest.raises(LinkUnavailable, match="listen"):
         build(key="k", listen=[endpoint]).open()
+
+
+def test_a_peer_behind_the_same_router_is_heard(router: Any, endpoint: str) -> None:
+    config = zenoh.Config()
+    for key, value in {"mode": "peer", "connect/endpoints": [endpoint], "listen/endpoints": []}.items():
+        config.insert_json5(key, json.dumps(value))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    link = build(key="k", connect=[endpoint])
+    link.open()
+    with zenoh.open(config) as publisher:
+        assert until_it_comes(link, lambda: publisher.put("k", b"x"))[0].data == b"x"
+    link.close()
+
+
+def test_long_messages_that_nobody_reads_give_way(router: Any, endpoint: str) -> None:
+    link = build(key="k", connect=[endpoint])
+    link.open()
+    until_it_comes(link, lambda: router.put("k", b"ready"))
+    for i in range(12):
+        router.put("k", bytes([i]) * 20_000_000, congestion_control=zenoh.CongestionControl.BLOCK)
+        time.sleep(0.05)
+    end = time.monotonic() + 10.0
+    while link._waiting[-1].data[:1] != b"\x0b" and time.monotonic() < end:
+        time.sleep(0.05)
+    held = sum(len(chunk.data) for chunk in link._waiting)
+    assert held <= zenoh_link.WAITING_BYTES
+    assert link.read(0.1)
+    link.close()
 
 
 def configured(**keys: Any) -> Any:
@@ -147,7 +175,7 @@ def test_wrong_settings_refuse_to_start(keys: dict[str, Any]) -> None:
 def test_a_process_that_forgets_to_close_still_ends(endpoint: str) -> None:
     program = f"""
         from drivers.links import zenoh_link
-        link = zenoh_link.build(zenoh_link.Settings(key="k", connect=["{endpoint}"]))
+        link = zenoh_link.build(zenoh_link.Settings(key="k", mode="peer", connect=["{endpoint}"]))
         link.open()
         assert link.read(0.1) is None
         print("done", flush=True)

@@ -1,6 +1,7 @@
 """The table as it is read: at several widths, with and without a terminal, of good and of malicious messages."""
 
 import io
+import json
 import threading
 from dataclasses import replace
 
@@ -132,6 +133,45 @@ def test_trouble_comes_first_and_has_a_sign_and_a_word(board: Board) -> None:
     assert text.splitlines()[0].split("  ")[1:] == [
         "5 devices", "✖ 1 lost", "◌ 1 waiting", "● 2 running", "■ 1 ended"
     ]  # fmt: skip
+
+
+def test_hostile_messages_leave_a_bounded_board(board: Board) -> None:
+    status(board, "good")
+    known = message.status("good", 1.0, made.health())
+    deep = known[:-1] + b',"more":' + b"[" * 20_000 + b"]" * 20_000 + b"}"
+    many_axes = (
+        b'{"schema":"imu-monitor/coefficients/1","samples":1,"axes":{'
+        + b",".join(b'"a%d":{}' % i for i in range(1_000_000))
+        + b"}}"
+    )
+    for payload in (b"x" * 100_000, deep, known.replace(b'"received":', b'"received":1'.ljust(500, b"0") + b',"x":')):
+        board.take("imu/good/status", payload)
+    board.take("imu/good/coefficients", many_axes)
+    assert board.malformed == 4
+    long = json.loads(known) | {"text": "x" * 60_000, "outputs": {f"o{i}": "y" * 500 for i in range(100)}}
+    board.take("imu/good/status", json.dumps(long).encode())
+    held = board._devices["imu/good"].status
+    assert held is not None
+    assert len(held.text) + sum(len(a) + len(b) for a, b in held.outputs.items()) < 10_000
+    assert "good" in shown(board)
+
+
+def test_devices_beyond_the_bound_are_passed_over_until_others_have_been_silent_for_long(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(terminal, "DEVICES", 3)
+    clock = [0.0]
+    board = Board(lambda: clock[0])
+    payload = message.status("a", 1.0, made.health())
+    for device in ("a", "b", "c", "d", "x" * 300):
+        board.take(f"imu/{device}/status", payload)
+        board.alive(f"imu/{device}/alive", True)
+    assert list(board._devices) == ["imu/a", "imu/b", "imu/c"]
+    assert board.passed_over == 4
+    clock[0] = terminal.FORGET_S + 1.0
+    board.take("imu/a/status", payload)
+    board.take("imu/e/status", payload)
+    assert sorted(board._devices) == ["imu/a", "imu/c", "imu/e"]
 
 
 def test_states_have_different_signs_for_different_ranks() -> None:

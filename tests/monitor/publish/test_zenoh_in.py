@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
+import zenoh
 from rich.console import Console
 
 from drivers.errors import ConfigError
@@ -23,7 +24,7 @@ from monitor.publish.zenoh_in import Message, ZenohIn
 from monitor.publish.zenoh_out import ZenohOut
 from monitor.settings import ZenohTable
 from tests.monitor.publish import made
-from tests.monitor.publish.zenoh_world import eventually, free_endpoint, router
+from tests.monitor.publish.zenoh_world import eventually, free_endpoint, router, session
 
 
 @pytest.fixture
@@ -111,10 +112,10 @@ def test_daemons_that_come_late_go_and_come_back() -> None:
     with listening("imu/**", first, second) as (arriving, got):
         eventually(lambda: arriving.state == f"nobody at {first}, {second}; trying again")
         with daemon(second, "b"):
-            eventually(lambda: "imu/b/status" in keys(arriving, got))
+            eventually(lambda: keys(arriving, got) >= {"imu/b/status", "imu/b/alive"})
             assert arriving.state.startswith("1 of 2 there")
             with daemon(first, "a"):
-                eventually(lambda: "imu/a/status" in keys(arriving, got))
+                eventually(lambda: keys(arriving, got) >= {"imu/a/status", "imu/a/alive"})
                 assert arriving.state == "ok"
             eventually(lambda: keys(arriving, got) and Message("imu/a/alive", None, False) in got)
             assert Message("imu/b/alive", None, False) not in got
@@ -126,6 +127,74 @@ def test_daemons_that_come_late_go_and_come_back() -> None:
 def test_through_a_router(endpoint: str) -> None:
     with router(endpoint), daemon(endpoint, "a", mode="client"), listening("imu/**", endpoint) as (arriving, got):
         eventually(lambda: keys(arriving, got) >= EVERYTHING)
+        assert arriving.state == "ok"
+
+
+def test_a_daemon_that_is_a_peer_is_heard_through_a_router(endpoint: str) -> None:
+    """A router passes nothing on from a peer to a peer."""
+    out = ZenohOut(ZenohTable(listen=(free_endpoint(),), connect=(endpoint,)), ["a"])
+    with router(endpoint), contextlib.closing(out), listening("imu/**", endpoint) as (arriving, got):
+        out.start()
+        out.alive("a", True)
+
+        def both() -> bool:
+            out.put(topics.STATUS, "a", message.status("a", time.time(), made.health()))
+            return keys(arriving, got) >= {"imu/a/status", "imu/a/alive"}
+
+        eventually(both)
+
+
+def test_two_ways_to_the_same_daemon_bring_each_message_once() -> None:
+    first, second = free_endpoint(), free_endpoint()
+    with (
+        session(mode="router", listen=[first]),
+        session(mode="router", listen=[second], connect=[first]),
+        contextlib.closing(ZenohOut(ZenohTable(mode="client", connect=(first,)), ["a"])) as out,
+        listening("imu/**", first, second) as (arriving, got),
+    ):
+        out.start()
+        eventually(lambda: out.state == arriving.state == "ok")
+        sent = [f"{i}".encode() for i in range(20)]
+        eventually(lambda: out.put(topics.EVENT, "a", b"ready") or keys(arriving, got))
+        eventually(lambda: not keys(arriving, []))
+        got.clear()
+        for payload in sent:
+            out.put(topics.EVENT, "a", payload)
+        eventually(lambda: keys(arriving, got) and got[-1].payload == sent[-1])
+        time.sleep(0.3)
+        keys(arriving, got)
+        assert [one.payload for one in got] == sent
+
+
+def test_who_comes_late_gets_the_last_values_and_events(endpoint: str) -> None:
+    kept = {topic: topic.kept for topic in (topics.STATUS, topics.COEFFICIENTS, topics.EVENT)}
+    far = free_endpoint()
+    with (
+        session(mode="router", listen=[endpoint]),
+        session(mode="router", listen=[far], connect=[endpoint]),
+        contextlib.closing(ZenohOut(ZenohTable(listen=(), connect=(endpoint,)), ["a"])) as out,
+    ):
+        out.start()
+        eventually(lambda: out.state == "ok")
+        for i in range(15):
+            for topic in kept:
+                out.put(topic, "a", f"{topic.name} {i}".encode())
+        with listening("imu/**", far) as (arriving, got):
+            expected = {f"{topic.name} {i}".encode() for topic, n in kept.items() for i in range(15 - n, 15)}
+            eventually(lambda: keys(arriving, got) and {one.payload for one in got} >= expected)
+            assert {one.payload for one in got} == expected
+
+
+def test_a_message_that_is_too_long_does_not_arrive_and_those_after_it_do(endpoint: str) -> None:
+    with session(mode="router", listen=[endpoint]) as sender, listening("imu/**", endpoint) as (arriving, got):
+
+        def send(payload: bytes) -> None:
+            sender.put("imu/a/status", payload, congestion_control=zenoh.CongestionControl.BLOCK)
+
+        eventually(lambda: send(b"ready") or keys(arriving, got))
+        send(b"x" * 100_000_000)
+        eventually(lambda: send(b"after") or (keys(arriving, got) and got[-1].payload == b"after"))
+        assert max(len(one.payload or b"") for one in got) < 10
         assert arriving.state == "ok"
 
 

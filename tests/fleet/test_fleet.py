@@ -1,0 +1,13 @@
+"""A small fleet of real daemons and routers: all are seen, and one that is killed is missed at once."""
+
+from tests.bench.fleet import fleet
+
+
+def test_four_daemons_behind_three_routers_are_seen_and_a_killed_one_is_missed() -> None:
+    found = fleet(4, 10.0, "1 Hz", 3.0)
+    assert found["seen"] == {"running": 4}
+    assert found["payload bytes/s of a device"]["status"] > 100
+    assert found["dropped"] == 0
+    # on a machine with nothing else to do 0.05 s and at most 1.5 s; loaded ones may take their time
+    assert found["killed"]["token gone after s"] < 5.0
+    assert found["killed"]["shown after s"] < 10.0

@@ -1,0 +1,62 @@
+"""A configured password is found in nothing that the program says: standard output, logs at their finest, status."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.monitor.publish.zenoh_world import free_endpoint, router
+
+PASSWORD = "tr0ub4dor-and-3"
+ZENOH = """{{
+  mode: "peer", listen: {{endpoints: []}}, connect: {{endpoints: ["{endpoint}"]}},
+  transport: {{auth: {{usrpwd: {{user: "nose", password: "{password}"{broken} }}}}}},
+}}"""
+CONFIG = """
+[[device]]
+name = "nose"
+rate = 100.0
+driver = {{ link = "virtual" }}
+[[device]]
+name = "far"
+rate = 100.0
+driver = {{ link = "serial", port = "socket://bench:{password}@127.0.0.1:1", decoder = "vectornav_ascii" }}
+[zenoh]
+config = "z.json5"
+[viewer]
+mode = "none"
+[log]
+level = "debug"
+format = "json"
+"""
+
+
+def said_by(*arguments: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "monitor.cli", *arguments], capture_output=True, text=True, timeout=120.0, check=False
+    )
+    return done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("broken", ["", " x", ', pasword: "tr0ub4dor-and-3"'])
+def test_a_password_is_said_nowhere(tmp_path: Path, broken: str) -> None:
+    endpoint = free_endpoint()
+    (tmp_path / "z.json5").write_text(ZENOH.format(endpoint=endpoint, password=PASSWORD, broken=broken))
+    path = tmp_path / "a.toml"
+    path.write_text(CONFIG.format(password=PASSWORD))
+    with router(endpoint):
+        said = {
+            "check": said_by("check", str(path)),
+            "run": said_by("run", str(path), "--seconds", "4"),
+            "watch": said_by("watch", "--zenoh", str(tmp_path / "z.json5"), "--seconds", "2"),
+        }
+    assert all(said.values()), said
+    for command, text in said.items():
+        assert PASSWORD not in text, (command, text)
+    if not broken:
+        lines = [json.loads(line) for line in said["run"].splitlines() if line.startswith("{")]
+        assert any("socket://bench:***@127.0.0.1:1" in str(line) for line in lines)
+    else:
+        assert "line 3" in said["run"]

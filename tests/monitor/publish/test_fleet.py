@@ -1,0 +1,112 @@
+"""One viewer for many daemons: what reaches it of devices in detail and of all others, and hostile messages."""
+
+import contextlib
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from drivers.sample import Event, block
+from drivers.sample_message import pack
+from monitor import topics
+from monitor.publish import message
+from monitor.publish.fleet import FleetView, detail_key
+from monitor.publish.panels import fleet_text
+from monitor.publish.terminal import Board
+from monitor.publish.viewer import DeviceInfo, ViewerSettings
+from monitor.publish.zenoh_in import Message, ZenohIn
+from monitor.publish.zenoh_out import ZenohOut
+from monitor.settings import ZenohTable
+from tests.monitor.publish import made
+from tests.monitor.publish.zenoh_world import eventually, free_endpoint, router
+
+pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+
+from monitor.publish.rerun_view import RerunView
+from tests.monitor.publish.test_rerun_view import read
+
+
+def test_the_keys_of_devices_in_detail() -> None:
+    assert detail_key("nose", "**") == "nose"
+    assert detail_key("imu/nose", "imu/**") == "imu/nose"
+    assert detail_key("nose", "fleet/*/**") == "fleet/nose"
+    assert detail_key("nose", "imu/nose") == "imu/nose"
+
+
+def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path) -> None:
+    endpoint, path = free_endpoint(), tmp_path / "fleet.rrd"
+    stop, told = threading.Event(), []
+    viewer = RerunView(ViewerSettings(mode=str(path)), [DeviceInfo("imu/nose", "over zenoh")], fleet=True)
+    out = ZenohOut(ZenohTable(listen=(), connect=(endpoint,)), ["nose", "tail"])
+    with (
+        router(endpoint),
+        contextlib.closing(out),
+        contextlib.closing(ZenohIn("imu/**", [endpoint], None, ["imu/nose"])) as arriving,
+        contextlib.closing(viewer),
+    ):
+        fleet = FleetView(arriving, viewer, ["imu/nose"])
+        looking = threading.Thread(target=fleet.run, args=(stop, told.append))
+        out.start()
+        arriving.start()
+        viewer.start()
+        looking.start()
+        eventually(lambda: out.state == arriving.state == viewer.state == "ok")
+        t_s, values, temperature_c = made.samples(1.76e9, 0.1)
+        rows = block((t_s * 1e9).astype("int64"), values, temperature_c)
+        begun_s = time.monotonic()
+        while time.monotonic() - begun_s < 3.0:
+            for device in ("nose", "tail"):
+                out.alive(device, True)
+                out.put(topics.STATUS, device, message.status(device, time.time(), made.health()))
+                out.put(topics.COEFFICIENTS, device, message.coefficients(device, 1.76e9, made.estimate()))
+                out.put(topics.ALLAN, device, message.allan(device, 1.76e9, made.estimate()))
+                out.put(topics.SAMPLES, device, pack(device, 10, rows))
+            time.sleep(0.2)
+        out.put(topics.EVENT, "tail", message.event("tail", 1.76e9, 5, Event("moved", 0, "gz moved", "gz"), None))
+        eventually(lambda: len(fleet.board.devices(time.monotonic())) == 2)
+        time.sleep(1.5)
+        stop.set()
+        looking.join(10.0)
+    entities = read(path)
+    assert {"/imu/nose/samples/gz", "/imu/nose/allan/gx", "/imu/nose/coefficients/N/gz", "/overview"} <= entities.keys()
+    assert not [name for name in entities if name.startswith("/imu/tail")]
+    table = str(entities["/overview"])
+    assert "imu/nose" in table
+    assert "imu/tail" in table
+    assert "imu/tail: gz moved" in str(entities["/overview/events"])
+    assert fleet.malformed == 0
+
+
+def test_hostile_messages_change_nothing_and_are_counted() -> None:
+    viewer = RerunView(ViewerSettings(mode="none"), [DeviceInfo("imu/a")], fleet=True)
+    fleet = FleetView(ZenohIn("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
+    fleet.take(Message("imu/a/coefficients", message.coefficients("a", 1.0, made.estimate())))
+    for key, payload in {
+        "imu/a/samples": b"\x81" * 10_000,
+        "imu/a/allan": b'{"schema":"imu-monitor/allan/1","tau":[1]}',
+        "imu/a/event": b"[" * 60_000,
+        "other": b"",
+    }.items():
+        fleet.take(Message(key, payload))
+    assert fleet.malformed == 3
+    assert [one.key for one in fleet.board.devices(time.monotonic())] == ["imu/a"]
+
+
+def test_the_table_has_trouble_first_and_texts_of_others_cannot_leave_their_cell() -> None:
+    board = Board(lambda: 10.0)
+    for device, changed in {
+        "well": {},
+        "bad": {"state": "lost", "text": "gone | <img src=x> [a](http://b)\n\n# head"},
+    }.items():
+        board.take(f"imu/{device}/status", message.status(device, 1.0, made.health(**changed)))
+        board.take(f"imu/{device}/coefficients", message.coefficients(device, 1.0, made.estimate()))
+    text = fleet_text(board.devices(10.0), 10.0, 40, "1 of 2 there")
+    lines = text.splitlines()
+    assert lines[0] == "**2** devices: **1** lost, **1** running; N in °/√h"
+    assert "**1 of 2 there**" in lines
+    table = [line for line in lines if line.startswith("|")]
+    assert table[2].startswith("| **imu/bad** | **LOST** |")
+    assert table[3].startswith("| **imu/well** | running | 99.98 Hz | 360,000 | 3 | 1 | 0.515 |")
+    assert r"gone \| \<img src=x\> \[a\](http://b)  \# head" in table[2]
+    assert "… and 1 more with less trouble" in fleet_text(board.devices(10.0), 10.0, 1)
