@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from drivers.errors import ConfigError
-from monitor.cli import output
+from drivers.masked import masked
+from monitor.cli import options, output
 
 if TYPE_CHECKING:
     from monitor.history.past import Past
@@ -27,6 +28,8 @@ def history(
     connect: Annotated[
         str | None, typer.Option(metavar="ENDPOINT", help="Ask a running daemon instead, e.g. tcp/127.0.0.1:7450.")
     ] = None,
+    zenoh: options.ZenohFile = None,
+    prefix: Annotated[str, typer.Option(metavar="KEY", help="Of the daemon's keys.")] = "imu",
     device: Annotated[str | None, typer.Option(metavar="NAME", help="Which device, where there are several.")] = None,
     since: Annotated[
         str | None, typer.Option("--from", metavar="T", help="-1d, 2026-11-20, 2026-11-20T14:30; the last day.")
@@ -63,9 +66,10 @@ def history(
     step_s = None if step is None else max(int(_said_of("--step", length, step)), 1)
     axes = AXES if axis is None else (axis,)
     asked = Question(span, step_s, WHAT, axes)
-    if source is not None and connect is not None:
+    live = connect is not None or zenoh is not None
+    if source is not None and live:
         raise ConfigError(f"{source}: either a file's history or --connect, not both")
-    get = _from_daemon(connect, device) if connect is not None else _from_file(source, device)
+    get = _from_daemon(connect, zenoh, prefix, device) if live else _from_file(source, device)
     past = get(asked)
     if json is not None:
         newest_s = float(past.end_s[-1]) if len(past) else past.span.end_s
@@ -105,13 +109,13 @@ def _from_file(source: Path | None, name: str | None) -> Get:
     return get
 
 
-def _from_daemon(endpoint: str, name: str | None) -> Get:
+def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> Get:
     """Answers over zenoh."""
     from monitor.publish.history_ask import ask
 
     def get(asked: "Question") -> "Past":
-        found = {one.device: one for one in ask(endpoint, name or "*", asked.parameters())}
-        return found[_one(name, list(found), endpoint)]
+        found = {one.device: one for one in ask(endpoint, name or "*", asked.parameters(), prefix, file)}
+        return found[_one(name, list(found), masked(endpoint or str(file)))]
 
     return get
 

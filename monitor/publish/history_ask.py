@@ -5,38 +5,46 @@ answer of a history is left out and said; where none comes, the reason is an err
 """
 
 import json
+from pathlib import Path
 from typing import Any, Final
 
 from drivers.errors import ConfigError, LinkUnavailable, NotReady
-from drivers.zenoh_session import CLOSED, configuration, plain
+from drivers.masked import masked
+from drivers.zenoh_refusal import refused
+from drivers.zenoh_session import plain
 from monitor import topics
 from monitor.history.past import Past
 from monitor.publish import history_message
+from monitor.publish.zenoh_in import listeners
 
 PATIENCE_S: Final = 20.0
 ERRORS: Final = {2: ConfigError, 3: NotReady}
 
 
-def ask(endpoint: str, device: str, parameters: str, prefix: str = "imu") -> list[Past]:
+def ask(
+    endpoint: str | None, device: str, parameters: str, prefix: str = "imu", file: Path | None = None
+) -> list[Past]:
     """The histories that answer, by device; ``device`` may be ``*``.
 
+    Args:
+        endpoint: a daemon or router; None: the first that the file names, or the default
+        prefix: of the daemon's keys
+        file: a zenoh file, with certificates or a password
     Raises:
-        ConfigError: no endpoint, or a question that is wrong
-        LinkUnavailable: nobody is there, or nobody answers
+        ConfigError: no endpoint, a file that is wrong, or a question that is
+        LinkUnavailable: nobody is there, lets us in, or answers
         NotReady: there is nothing in that time
     """
     import zenoh
 
-    try:
-        config = configuration({"connect/endpoints": [endpoint], "mode": "client"}, None, CLOSED)
-    except zenoh.ZError as error:
-        raise ConfigError(f'--connect: "{endpoint}": no endpoint; write e.g. {topics.ENDPOINT}') from error
+    endpoint, config = next(iter(listeners([endpoint] if endpoint else [], file).items()))
     selector = f"{topics.HISTORY.key(prefix, device)}?{parameters}"
     try:
         with zenoh.open(config) as session:
             replies = list(session.get(selector, timeout=PATIENCE_S))
     except zenoh.ZError as error:
-        raise LinkUnavailable(f"{endpoint}: {plain(error)}") from error
+        raise LinkUnavailable(refused([endpoint], config) or f"{masked(endpoint)}: {plain(error)}") from error
+    endpoint = masked(endpoint)
     found, wrong = [], [_wrong(reply.err) for reply in replies if reply.ok is None]
     for reply in replies:
         if reply.ok is not None:

@@ -16,11 +16,12 @@ import pytest
 import trustme
 import zenoh
 
-from drivers.errors import LinkUnavailable
+from drivers.errors import LinkUnavailable, NotReady
 from drivers.links import zenoh_link
 from drivers.zenoh_session import configuration
 from monitor import settings, topics
 from monitor.publish import message
+from monitor.publish.history_ask import ask
 from monitor.publish.zenoh_in import ZenohIn
 from monitor.publish.zenoh_out import ZenohOut
 from monitor.settings import CONFIG_FOLDER, ZenohTable
@@ -93,10 +94,15 @@ def by_password(tmp_path: Path, certificates: Path) -> Iterator[World]:
         yield world
 
 
+def nothing_kept(device: str, _parameters: str) -> bytes:
+    raise NotReady(f"nothing is kept of {device}")
+
+
 @contextlib.contextmanager
 def daemon(file: Path) -> Iterator[ZenohOut]:
     """A daemon's session that sends status ten times a second and answers ``reset``."""
-    out, ending = ZenohOut(ZenohTable(mode=None, listen=None, config=file), ["nose"]), threading.Event()
+    table = ZenohTable(mode=None, listen=None, config=file)
+    out, ending = ZenohOut(table, ["nose"], recall=nothing_kept), threading.Event()
 
     def work() -> None:
         while not ending.wait(0.1):
@@ -221,6 +227,17 @@ def test_the_wrong_password_is_refused_and_not_repeated(by_password: World, user
     said = refusal(by_password.user(user, password))
     assert "answers, but lets us not in: check user and password" in said
     assert not password or password not in said
+
+
+def test_the_past_is_told_to_those_who_get_in_alone(by_certificate: World) -> None:
+    with daemon(by_certificate.file("daemon.json5")) as out:
+        eventually(lambda: out.state == "ok")
+        operator = by_certificate.certified("operator")
+        eventually(lambda: replies(operator, "imu/nose/command/reset"))
+        with pytest.raises(NotReady, match="nothing is kept of nose"):  # the daemon's own word
+            ask(None, "nose", "", file=by_certificate.certified("reader"))
+        with pytest.raises(LinkUnavailable, match="not signed by its authority"):
+            ask(None, "nose", "", file=by_certificate.certified("impostor"))
 
 
 # --- the link and the files
