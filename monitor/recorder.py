@@ -154,6 +154,8 @@ class Recorder:
     @property
     def state(self) -> str:
         """``ok``, or what is wrong: for the status."""
+        if self._thread.ident is not None and not self._thread.is_alive() and not self._closing.is_set():
+            return "recording ended by a fault of the program"
         wrong = sorted({track.trouble for track in self._tracks.values() if track.trouble})
         if wrong:
             return wrong[0]
