@@ -156,7 +156,7 @@ def step(span: Span, step_s: int | None = None, points: int = POINTS) -> int:
     """Width of the buckets, s: as narrow as so many points allow, and not narrower than asked for.
 
     >>> step(Span(0.0, 86_400.0)), step(Span(0.0, 5 * 31_536_000.0)), step(Span(0.0, 3600.0), 900)
-    (300, 604800, 900)
+    (300, 172800, 900)
     """
     least_s = max((span.end_s - span.start_s) / points, step_s or 0)
     return next((one for one in STEPS_S if one >= least_s), math.ceil(least_s / STEPS_S[-1]) * STEPS_S[-1])

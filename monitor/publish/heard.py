@@ -209,7 +209,7 @@ def split(key: str) -> tuple[str, topics.Topic] | None:
     """A key -> the device's part and the topic; None for what is no key of ``monitor.topics``.
 
     >>> split("imu/bench-1/status")
-    ('imu/bench-1', Topic(name='status', encoding='application/json', when='1 Hz'))
+    ('imu/bench-1', Topic(name='status', encoding='application/json', when='1 Hz', kept=1))
     >>> split("imu/bench-1/mood")
     """
     for topic in topics.TOPICS:

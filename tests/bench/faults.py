@@ -278,7 +278,7 @@ def cable(folder: Path, times: int) -> Outcome:
             _wait(lambda: rig.station.driver.state == "lost", "the loss")
             rig.board.plug()
             _wait(lambda: rig.station.driver.state == "running", "samples after it")
-        said = rig.said.wait("trying again")
+        said = rig.said.wait("the device is gone")
         return rig.outcome(f"cable out and in, {times} times", said)
 
 

@@ -9,7 +9,7 @@ import pytest
 from tests.bench import faults
 
 SAYS = {
-    "cable": "trying again",
+    "cable": "the device is gone",
     "half_baud": "no sample in",
     "can_bus": "bus off",
     "two_daemons": "held by another program",
