@@ -334,6 +334,8 @@ def test_what_came_while_nobody_was_there_is_lost_and_keeps_its_place(tmp_path: 
     after.start()
     try:
         after.rebuild()
+        if tick_step is None:
+            time.sleep(1.0)  # longer than the lines that come at once would take
         lines = "".join(f"{count},0.001,0,0,0,0,9.8\n" for count in range(6041, 6100))
         after.driver.link.write(b"\n" + lines.encode())
         wait_for(lambda: after.driver.counts.received == 59)
