@@ -372,7 +372,7 @@ class Recorder:
         self._tidied_s = time.monotonic()
         folders = [track.folder for track in self._tracks.values()]
         try:
-            retention.delete_old(folders, self._storage.keep_s)
+            retention.delete_old(folders, self._storage.keep_s, self._storage.segment_s)
             self._full = retention.make_room(self._storage.folder, folders, self._storage.disk_share)
         except OSError as error:
             self._full = f"{self._storage.folder}: {error.strerror or error}; recording stopped, trying again"

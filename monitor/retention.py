@@ -13,15 +13,18 @@ NEWEST_KEPT: Final = 2
 """Segments of a folder that are never deleted: the window is rebuilt from them."""
 
 
-def delete_old(folders: Sequence[Path], keep_s: float) -> None:
+def delete_old(folders: Sequence[Path], keep_s: float, segment_s: float) -> None:
     """Delete segments that ended more than ``keep_s`` before the newest of their folder began.
 
-    By the times in their names, not by the host's clock: one that is set wrong must not delete a year.
+    Two clocks have to say so: the times in the names, and how many segments of ``segment_s`` at most came after. The
+    first alone would delete a year for a host's clock that is set wrong once, the second for many short segments.
     """
     for folder in folders:
         known = segment.segments(folder)
-        for path, after in pairwise(known[: 1 - NEWEST_KEPT]):
-            if segment.began_s(known[-1]) - segment.began_s(after) > keep_s:  # it ended where the next began
+        for at, (path, after) in enumerate(pairwise(known[: 1 - NEWEST_KEPT])):
+            by_name_s = segment.began_s(known[-1]) - segment.began_s(after)  # it ended where the next began
+            by_number_s = (len(known) - 1 - at) * segment_s
+            if min(by_name_s, by_number_s) > keep_s:
                 path.unlink(missing_ok=True)
 
 

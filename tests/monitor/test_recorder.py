@@ -202,16 +202,27 @@ def test_what_a_slow_disk_cannot_take_is_a_hole_that_is_counted(tmp_path, disk, 
         counted += len(piece.samples)
 
 
-def test_old_segments_go_by_the_times_in_their_names(tmp_path: Path) -> None:
+def test_old_segments_go_when_both_their_names_and_their_number_say_so(tmp_path: Path) -> None:
     folder = tmp_path / "bench"
     folder.mkdir()
     names = [segment.segment_name(i, 1.7e9 + 100.0 * i) for i in range(10)]
     for name in names:
         (folder / name).write_bytes(b"x")
     (folder / "notes.txt").write_text("mine")
-    room.retention.delete_old([folder], keep_s=350.0)
+    room.retention.delete_old([folder], keep_s=350.0, segment_s=100.0)
     assert [path.name for path in segment.segments(folder)] == names[5:]
     assert (folder / "notes.txt").exists()
+
+
+@pytest.mark.parametrize(("step_s", "newest_s"), [(100.0, 3.0e8), (1.0, 10.0)], ids=["a clock set wrong", "restarts"])
+def test_neither_a_clock_set_wrong_nor_many_restarts_delete_what_is_new(tmp_path, step_s: float, newest_s) -> None:
+    folder = tmp_path / "bench"
+    folder.mkdir()
+    began = [1.7e9 + step_s * i for i in range(9)] + [1.7e9 + newest_s]
+    for i, unix_s in enumerate(began):
+        (folder / segment.segment_name(i, unix_s)).write_bytes(b"x")
+    room.retention.delete_old([folder], keep_s=2000.0 if step_s > 1.0 else 350.0, segment_s=100.0)
+    assert len(segment.segments(folder)) == 10
 
 
 def test_the_oldest_of_all_devices_go_while_the_disk_is_too_full(tmp_path: Path, monkeypatch) -> None:
