@@ -120,6 +120,7 @@ class SegmentWriter:
             raise
         if not self._whole:
             os.rename(self._part, self.path)
+            _keep_names(self.path.parent)
         self._whole = self._file.tell()
 
 
@@ -249,8 +250,18 @@ def pack(path: Path) -> Iterator[None]:
         with part.open("rb") as file:
             os.fsync(file.fileno())
         os.replace(part, path)
+        _keep_names(path.parent)
     finally:
         part.unlink(missing_ok=True)
+
+
+def _keep_names(folder: Path) -> None:
+    """Have the disk keep which files are there: a name that was not would be gone after a power cut, whatever it held."""
+    place = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(place)
+    finally:
+        os.close(place)
 
 
 def _joined(pa: Any, schema: Any, path: Path, kind: Kind) -> Iterator[tuple[Any, dict[bytes, bytes] | None]]:
