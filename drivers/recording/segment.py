@@ -256,7 +256,7 @@ def pack(path: Path) -> Iterator[None]:
 
 
 def _keep_names(folder: Path) -> None:
-    """Have the disk keep which files are there: a name that was not would be gone after a power cut, whatever it held."""
+    """Have the disk keep which files are there: without it a power cut takes a new file away, whatever it held."""
     place = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(place)
