@@ -35,7 +35,7 @@ from monitor.limits import Limits, model_of
 from monitor.recorder import Recorder, Tail
 from monitor.ring import RingBuffer
 from monitor.settings import Device
-from monitor.wall import WallClock
+from monitor.wall import EASE, WallClock
 
 RING_SECONDS: Final = 10.0
 RING_SAMPLES: Final = (65_536, 1_000_000)
@@ -52,6 +52,8 @@ TOTAL_SHARE: Final = 0.005
 """Of a processor, that total and Hadamard deviations may take for a device."""
 OFF_NOMINAL: Final = 0.02
 """A measured rate further than this from the configured one is said."""
+SET_S: Final = 1.0
+"""A host's clock that is set by more is told, and so are times that are further from it."""
 
 
 class Output:
@@ -246,7 +248,7 @@ class Station:
 
     def report(self, outputs: Sequence[Output], states: dict[str, str], memory_bytes: int) -> Health:
         """Tell the outputs how the device does, and ease its wall clock."""
-        self._wall.follow(time.monotonic_ns(), time.time_ns())
+        self._follow_host(outputs)
         rate_hz = self.clock.rate_hz
         if rate_hz is not None and self._tail is None:
             self.chain.relabel(rate_hz)
@@ -319,6 +321,17 @@ class Station:
         return rebuilding.known(self.chain, self._before, self.clock.rate_hz, self.clock.tick_step, self._offset_ns())
 
     # --- inside
+
+    def _follow_host(self, outputs: Sequence[Output]) -> None:
+        now_ns = time.monotonic_ns()
+        set_s = self._wall.follow(now_ns, time.time_ns()) / 1e9
+        if abs(set_s) < SET_S or self.driver.times_are_unix:
+            return
+        text = (
+            f"the host's clock was set {'on' if set_s > 0.0 else 'back'} by {abs(set_s):.6g} s; times follow by "
+            f"{EASE * 3600.0:g} s an hour, a restart takes the new time over at once"
+        )
+        self._tell(outputs, [Event("clock_jumped", now_ns, text)])
 
     def _keep(self, chunks: Sequence[Chunk]) -> None:
         """Called by the reader's thread."""
@@ -466,8 +479,15 @@ class Station:
         nominal, measured = self.device.rate_hz, self.clock.measured_hz
         if self.driver.text or self.driver.state != "running":
             return self.driver.text
-        if self.chain.refused or not nominal or not measured:
+        if self.chain.refused:
             return self.chain.refused
-        if abs(measured / nominal - 1.0) > OFF_NOMINAL:
+        if nominal and measured and abs(measured / nominal - 1.0) > OFF_NOMINAL:
             return f"samples come at {measured:.4g} Hz, configured are {nominal:g} Hz"
-        return ""
+        return self._wall_text()
+
+    def _wall_text(self) -> str:
+        behind_s = 0.0 if self.driver.times_are_unix else self._wall.behind_ns / 1e9
+        if abs(behind_s) < SET_S:
+            return ""
+        where = "behind" if behind_s > 0.0 else "ahead of"
+        return f"times are {abs(behind_s):.6g} s {where} the host's clock, which was set"

@@ -554,3 +554,33 @@ def test_a_step_of_the_bias_is_an_event_of_its_time():
     assert [event.axis for event in told] == ["gy"]
     assert told[0].what["bias"]["size"] == pytest.approx(0.02, rel=0.05)
     assert 390 < told[0].t_ns / 1e9 < 510  # as long as the level before had been confirmed, 5 min at most
+
+
+@pytest.mark.parametrize(("step_s", "text", "status"), [
+    (-3600, "the host's clock was set back by 3600 s; times follow by 1.8 s an hour", "ahead of the host's clock"),
+    (86_400, "the host's clock was set on by 86400 s; times follow by 1.8 s an hour", "behind the host's clock"),
+])  # fmt: skip
+def test_a_host_clock_that_is_set_is_told_once_and_stands_in_the_status(monkeypatch, step_s, text, status):
+    rig = Rig()
+    rig.station.driver.state, rig.station.driver.text = "running", ""
+    host = time.time_ns
+    assert rig.station.report([rig.caught], {}, 0).text == ""
+    monkeypatch.setattr(time, "time_ns", lambda: host() + step_s * 1_000_000_000)
+    texts = [rig.station.report([rig.caught], {}, 0).text for _ in range(3)]
+    assert all(status in one for one in texts), texts
+    (event,) = [event for _, event in rig.caught.events]
+    assert event.kind == "clock_jumped"
+    assert event.text.startswith(text)
+    monkeypatch.undo()
+    assert rig.station.report([rig.caught], {}, 0).text == ""
+
+
+def test_a_recording_has_its_own_times_whatever_the_host_does(monkeypatch, tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("t,gx\n0.0,1.0\n0.01,2.0\n")
+    rig = Rig(link=replay_link.build(replay_link.Settings(path=str(path))))
+    rig.station.driver.state, rig.station.driver.text = "running", ""
+    host = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: host() + 10**13)
+    assert rig.station.report([rig.caught], {}, 0).text == ""
+    assert rig.caught.events == []

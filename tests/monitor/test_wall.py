@@ -57,3 +57,10 @@ def test_following_twice_at_one_moment_corrects_once(wall: WallClock) -> None:
     wall.follow(START + S, UNIX + 10 * S)
     wall.follow(START, UNIX + 10 * S)
     assert wall.offset_ns == once
+
+
+def test_says_by_how_much_the_host_was_set_and_how_far_it_is_off(wall: WallClock) -> None:
+    assert wall.follow(START + S, UNIX + S) == 0
+    assert wall.follow(START + 2 * S, UNIX - 3598 * S) == -3600 * S
+    assert wall.follow(START + 3 * S, UNIX - 3597 * S) == 0
+    assert wall.behind_ns == -3600 * S + 2 * int(EASE * S)
