@@ -46,31 +46,51 @@ def history(
     """What the noise was: coefficients, temperature, losses and events of hours or years."""
     from rich.console import Console
 
-    from drivers.recording.formats import format_of
     from drivers.sample import AXES
     from monitor.estimate.coefficients import LETTERS
     from monitor.history.past import step as width_of
     from monitor.history.question import WHAT, Question
     from monitor.history.times import length
-    from monitor.publish import history_file, history_message, history_text
+    from monitor.publish import history_text
 
     if axis is not None and axis not in AXES:
         raise ConfigError(f'--axis: "{axis}"; possible are {", ".join(AXES)}')
+    _check_places(json, out, plot)
+    live = connect is not None or zenoh is not None
+    if source is not None and live:
+        raise ConfigError(f"{source}: either a file's history or --connect, not both")
+    step_s = None if step is None else max(int(_said_of("--step", length, step)), 1)
+    axes = AXES if axis is None else (axis,)
+    asked = Question(_span(since, until), step_s, WHAT, axes)
+    get = _from_daemon(connect, zenoh, prefix, device) if live else _from_file(source, device)
+    past = get(asked)
+    _save(past, asked, json, out, plot)
+    if json == Path("-"):
+        return
+    console = Console()
+    history_text.tell(past, axes, LETTERS if axis else history_text.LETTERS, console)
+    if axis is not None and len(past):
+        few_s = max(width_of(past.span, None, ROWS), past.step_s)
+        few = past if few_s == past.step_s else get(Question(asked.span, few_s, ("coefficients", "status"), axes))
+        history_text.tell_course(few, axis, LETTERS, console)
+
+
+def _check_places(json: Path | None, out: Path | None, plot: Path | None) -> None:
+    """Files that cannot be written, before anything is asked."""
+    from drivers.recording.formats import format_of
+
     if plot is not None and plot.suffix != ".png":
         raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
     for option, place in (("--json", json), ("--out", out), ("--plot", plot)):
         output.check_place(option, place)
     if out is not None:
         format_of(out)
-    span = _span(since, until)
-    step_s = None if step is None else max(int(_said_of("--step", length, step)), 1)
-    axes = AXES if axis is None else (axis,)
-    asked = Question(span, step_s, WHAT, axes)
-    live = connect is not None or zenoh is not None
-    if source is not None and live:
-        raise ConfigError(f"{source}: either a file's history or --connect, not both")
-    get = _from_daemon(connect, zenoh, prefix, device) if live else _from_file(source, device)
-    past = get(asked)
+
+
+def _save(past: "Past", asked: "Question", json: Path | None, out: Path | None, plot: Path | None) -> None:
+    """The same in files."""
+    from monitor.publish import history_file, history_message
+
     if json is not None:
         newest_s = float(past.end_s[-1]) if len(past) else past.span.end_s
         payload = history_message.history(past, asked, newest_s, int(past.counts[:, 0].sum()))
@@ -80,15 +100,7 @@ def history(
     if plot is not None:
         from monitor.publish.history_plot import history_plot
 
-        history_plot(past, plot, axes)
-    if json == Path("-"):
-        return
-    console = Console()
-    history_text.tell(past, axes, LETTERS if axis else history_text.LETTERS, console)
-    if axis is not None and len(past):
-        few_s = max(width_of(past.span, None, ROWS), past.step_s)
-        few = past if few_s == past.step_s else get(Question(span, few_s, ("coefficients", "status"), axes))
-        history_text.tell_course(few, axis, LETTERS, console)
+        history_plot(past, plot, asked.axes)
 
 
 def _from_file(source: Path | None, name: str | None) -> Get:
