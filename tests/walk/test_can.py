@@ -115,6 +115,7 @@ def slcan(message: can.Message) -> bytes:
 def test_a_serial_can_adapter_gives_the_recorded_samples(tmp_path: Path, name: str) -> None:
     folder = recordings()
     messages = frames(folder / f"{name}-frames.csv.gz")
+    messages = [message for message in messages if message.timestamp < messages[0].timestamp + 60.0]
     cable = Cable(tmp_path)
     adapter = SlcanAdapter(cable)
     adapter.start()
@@ -131,11 +132,11 @@ decoder = "dbc"
 """
     with running(tmp_path, config + OPTIONS) as run:
         assert adapter.opened.wait(10.0)
-        paced(cable.write, [slcan(message) for message in messages], 4000.0)
+        # faster than it was, and slow enough that a machine that is late makes good for it
+        paced(cable.write, [slcan(message) for message in messages], 1500.0)
         counts = run.station("imu").driver.counts
         sent = len(imu_frames(messages))
         wait_for(lambda: counts.received + counts.bad >= sent, 10.0, "the last frame")
     assert (counts.received, counts.bad, counts.lost) == (sent, 0, 0)
-    want = expected(folder / f"{name}.npz")
-    assert len(want) == sent
+    want = expected(folder / f"{name}.npz")[:sent]
     assert (np.abs(run.caught.values("imu") - want) <= HALF_BIT).all()
