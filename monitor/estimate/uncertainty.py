@@ -191,11 +191,11 @@ def intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Flo
     """
     tail = (1.0 - probability) / 2.0
     safe = np.where(edf > 0.0, edf, np.nan)
-    with np.errstate(divide="ignore", over="ignore"):  # a fraction of one degree of freedom bounds nothing from above
-        return (
-            np.sqrt(avar * safe / chdtri(safe, tail)),
-            np.sqrt(avar * safe / chdtri(safe, 1.0 - tail)),
-        )
+    low, high = chdtri(safe, 1.0 - tail), chdtri(safe, tail)
+    # a fraction of one degree of freedom bounds nothing from above, not even a sum of zeros
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        lo, hi = np.sqrt(avar * safe / high), np.sqrt(avar * safe / low)
+    return lo, np.where((low == 0.0) & (avar >= 0.0), np.inf, hi)
 
 
 @compiled

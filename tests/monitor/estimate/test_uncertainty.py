@@ -90,6 +90,12 @@ def test_interval_is_chi_square():
     np.testing.assert_allclose([lo[0], hi[0]], expected)
 
 
+def test_a_fraction_of_a_degree_of_freedom_bounds_nothing_from_above_not_even_zeros():
+    lo, hi = intervals(np.array([0.0, 1.0, np.nan, 0.0]), np.array([1e-3, 1e-3, 1e-3, 10.0]))
+    np.testing.assert_array_equal(lo[[0, 2, 3]], [0.0, np.nan, 0.0])
+    np.testing.assert_array_equal(hi, [np.inf, np.inf, np.nan, 0.0])
+
+
 def test_too_short_a_window_is_nan_not_a_number():
     t = table(100, np.array([1, 50, 51]))
     assert t.terms.tolist() == [99, 1, -1]
