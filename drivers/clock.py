@@ -301,7 +301,10 @@ class SampleClock:
         elapsed_s = (arrived_ns - self._arrived_ns) / NS
         first = self._tick is None
         previous = int(samples.ticks[0]) if self._tick is None else self._tick
-        steps = np.diff(samples.ticks, prepend=previous % counter.modulus) % counter.modulus
+        steps = np.empty(len(samples), np.int64)
+        steps[0] = samples.ticks[0] - previous % counter.modulus
+        np.subtract(samples.ticks[1:], samples.ticks[:-1], out=steps[1:])
+        steps %= counter.modulus
         self._tick_step.see(steps)
         size = self._ticks_a_sample(counter)
         if not first:
@@ -357,6 +360,8 @@ class SampleClock:
     def _watch_stuck(self, samples: SampleBlock, steps: Ints) -> Ints:
         """Samples [n] that came with the counter standing still, at the row where it goes on."""
         before = self._stuck
+        if not before and steps.all():
+            return np.zeros(len(samples), np.int64)
         moved = np.flatnonzero(steps)
         self._stuck = before + len(steps) if moved.size == 0 else len(steps) - 1 - int(moved[-1])
         if before < STUCK_SAMPLES <= self._stuck:

@@ -25,6 +25,8 @@ GYRO_LIMIT: Final = 1000.0
 """rad/s; no MEMS gyroscope turns this fast (the widest range sold is 4000 °/s = 70 rad/s)."""
 ACCEL_LIMIT: Final = 10_000.0
 """m/s²; about 1000 g, above every inertial-grade MEMS range."""
+LIMITS: Final = np.repeat([GYRO_LIMIT, ACCEL_LIMIT], 3)
+"""[6], in the order of ``AXES``."""
 TEMPERATURE_LIMITS_C: Final = (-100.0, 300.0)
 
 
@@ -95,6 +97,10 @@ class Rows:
         and leaves an empty place; NaN means "not measured" and passes, but not on every axis.
         """
         good = plausible(values)
+        if good.size and good.all() and not bad_before.any():  # as nearly always, and most chunks hold few frames
+            carried, self._missing = self._missing, bad_after
+            self.bad += bad_after
+            return [block(t_ns, values, _possible(temperature_c), ticks, carried)]
         kept = np.flatnonzero(good)
         # places lost before each kept row: rejected frames plus implausible rows since the last kept one
         places = np.cumsum(bad_before + ~good)
@@ -108,7 +114,7 @@ class Rows:
             return []
         missing[0] += carried
         self._missing += total - int(at_kept[-1])
-        temperature_c = np.where(_possible_temperature(temperature_c), temperature_c, np.nan)
+        temperature_c = _possible(temperature_c)
         cuts = np.flatnonzero(missing[1:]) + 1
         return [
             block(t_ns[rows], values[rows], temperature_c[rows], ticks[rows], int(missing[at]))
@@ -119,16 +125,14 @@ class Rows:
 def plausible(values: Floats) -> NDArray[np.bool_]:
     """Rows [n] with at least one measured axis and none infinite or beyond what a MEMS IMU can show."""
     size = np.abs(values)
-    limits = np.repeat([GYRO_LIMIT, ACCEL_LIMIT], 3)
-    too_large: NDArray[np.bool_] = np.any(size > limits, axis=1)
+    too_large: NDArray[np.bool_] = np.any(size > LIMITS, axis=1)
     absent: NDArray[np.bool_] = np.all(np.isnan(values), axis=1)
-    return ~too_large & ~absent
+    return ~(too_large | absent)
 
 
-def _possible_temperature(temperature_c: Floats) -> NDArray[np.bool_]:
+def _possible(temperature_c: Floats) -> Floats:
     low, high = TEMPERATURE_LIMITS_C
-    result: NDArray[np.bool_] = (temperature_c >= low) & (temperature_c <= high)
-    return result
+    return np.where((temperature_c >= low) & (temperature_c <= high), temperature_c, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +149,8 @@ class Frames:
 
         Rejected frames that stood before a frame left out count before the next kept one.
         """
+        if len(rows) == len(self.data):
+            return self, 0
         places = np.cumsum(self.bad_before)
         at_kept = places[list(rows)]
         after = int(places[-1] if places.size else 0) - int(at_kept[-1] if at_kept.size else 0)
