@@ -1,7 +1,7 @@
 """Frames a second of every decoder, found by listing the folder: ``python tests/bench/bench_decoders.py``.
 
-Byte streams are fed in 4 KiB chunks, frames and messages 100 at a time; and all of them ten frames at a
-time, as a slow line delivers them. ``encode`` makes the bytes; the best of three runs counts.
+Byte streams are fed in 4 KiB chunks, frames and messages 100 at a time; and all of them ten samples and one at
+a time, as a sensor of 1 kHz and one of 100 Hz deliver them. ``encode`` makes the bytes; the best of three runs counts.
 """
 
 import sys
@@ -56,8 +56,8 @@ def rate(example: Example, folder: Path, fed: list[list[Chunk]]) -> float:
     return SAMPLES / best
 
 
-def measure(example: Example, folder: Path) -> tuple[str, int, float, float]:
-    """(carrier, bytes a sample, samples a second in large and in small portions)."""
+def measure(example: Example, folder: Path) -> tuple[str, int, list[float]]:
+    """(carrier, bytes a sample, samples a second in large, small and single portions)."""
     decoder = example.build(folder)
     samples = made(SAMPLES)
     # ten samples at a time: a message may hold more than one
@@ -68,21 +68,23 @@ def measure(example: Example, folder: Path) -> tuple[str, int, float, float]:
     else:
         large = [[c for ten in tens[i : i + 10] for c in ten] for i in range(0, len(tens), 10)]
     small = [fed_at(ten, decoder.carrier) for ten in tens]
+    ones = [decoder.encode(samples[i : i + 1]) for i in range(SAMPLES)]
+    single = [fed_at(one, decoder.carrier) for one in ones]
     size = sum(len(c.data) for c in flat) // SAMPLES
-    return decoder.carrier, size, rate(example, folder, large), rate(example, folder, small)
+    return decoder.carrier, size, [rate(example, folder, fed) for fed in (large, small, single)]
 
 
 def main() -> None:
     """Measure and print: the first example of every decoder, or of those named as arguments."""
     table = Table(title="decoders: samples a second")
     table.add_column("decoder")
-    for heading in ("carrier", "bytes a sample", "4 KiB / 100 at a time", "10 at a time"):
+    for heading in ("carrier", "bytes a sample", "4 KiB / 100 at a time", "10 at a time", "1 at a time"):
         table.add_column(heading, justify="right")
     firsts = {example.name: example for example in reversed(EXAMPLES)}
     with TemporaryDirectory() as folder:
         for name in sys.argv[1:] or sorted(firsts):
-            carrier, size, large, small = measure(firsts[name], Path(folder))
-            table.add_row(name, carrier, f"{size}", f"{large:,.0f}", f"{small:,.0f}")
+            carrier, size, rates = measure(firsts[name], Path(folder))
+            table.add_row(name, carrier, f"{size}", *(f"{one:,.0f}" for one in rates))
     Console().print(table)
 
 
