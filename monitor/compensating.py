@@ -45,6 +45,7 @@ class Request:
     method: str = "adaptive"
     rate_hz: float | None = None
     order: Order | None = None  # of the ARMA model of the drift; None: by criterion
+    last_s: float | None = None  # the end of the recording alone
 
 
 def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
@@ -57,7 +58,7 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
     if request.method not in METHODS:
         raise ConfigError(f'--method: unknown method "{request.method}"{nearest(request.method, METHODS)}')
     tell("reading", None)
-    found = load_samples(request.recording, request.rate_hz)
+    found = load_samples(request.recording, request.rate_hz, request.last_s)
     axes = tuple(axis for axis in GYROS if axis in found.axes)
     if not axes:
         raise ConfigError(f"{request.recording}: no gyro axis in it; columns gx, gy, gz in rad/s are needed")

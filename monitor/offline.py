@@ -50,6 +50,7 @@ class Request:
     window_s: float | None = None  # of dynamic curves
     rest: bool = False  # strike out motion
     others: bool = False  # total and Hadamard deviations too
+    last_s: float | None = None  # the end of the recording alone
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +73,7 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Results:
         TooShort: too few samples for any answer
     """
     tell("reading", None)
-    found = load_samples(request.recording, request.rate_hz)
+    found = load_samples(request.recording, request.rate_hz, request.last_s)
     blocks = list(iter_blocks(found))
     pool = ThreadPoolExecutor(os.cpu_count())
     try:

@@ -47,6 +47,7 @@ class Request:
     seed: int = 1
     rate_hz: float | None = None
     notes: tuple[str, ...] = ()  # what is to be said besides
+    last_s: float | None = None  # the end of the recording alone
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +59,7 @@ class RunsRequest:
     out: Path
     seed: int = 1
     rate_hz: float | None = None
+    last_s: float | None = None  # the end of each alone
 
 
 def make(request: Request, tell: Tell = lambda _what, _share: None) -> Reconciliation:
@@ -68,7 +70,7 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Reconcili
         NotReady: the data do not support an answer; the folder says why
     """
     tell("reading", None)
-    found = load_samples(request.recording, request.rate_hz)
+    found = load_samples(request.recording, request.rate_hz, request.last_s)
     check_folder(request.out)
     try:
         recording, notes = _recording(found)
@@ -97,7 +99,7 @@ def make_runs(request: RunsRequest, tell: Tell = lambda _what, _share: None) -> 
     fitted_to = next(iter(named)) if model is None else None
     for at, (name, path) in enumerate(named.items(), start=1):
         notes = (f"The model under test are the five terms of {fitted_to}.",) if fitted_to and at > 1 else ()
-        one = Request(path, model, request.out / name, request.seed, request.rate_hz, notes)
+        one = Request(path, model, request.out / name, request.seed, request.rate_hz, notes, request.last_s)
         try:
             result = make(one, _told(tell, f"{name}, {at} of {len(named)}"))
         except NotReady as error:

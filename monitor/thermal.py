@@ -49,13 +49,15 @@ class ModelFile(msgspec.Struct):
     axes: dict[str, AxisRow]
 
 
-def fit(recording: Path, interval_s: float | None = None, rate_hz: float | None = None) -> Study:
-    """Means and models of every axis.
+def fit(
+    recording: Path, interval_s: float | None = None, rate_hz: float | None = None, last_s: float | None = None
+) -> Study:
+    """Means and models of every axis; with ``last_s`` of the recording's end alone.
 
     Raises:
         RecordingError, ConfigError: no recording, or none with temperature
     """
-    values, temperature_c, rate, notes = _read(recording, rate_hz)
+    values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
     means = _means(values, temperature_c, rate, interval_s or nice_interval(temperature_c.size / rate, rate))
     interval = next(iter(means.values())).interval_s  # of whole samples
     fits, refused = {}, {}
@@ -67,9 +69,11 @@ def fit(recording: Path, interval_s: float | None = None, rate_hz: float | None 
     return Study(recording.name, interval, means, fits, refused, notes)
 
 
-def predict(recording: Path, models: Mapping[str, ThermalModel], rate_hz: float | None = None) -> Outlook:
+def predict(
+    recording: Path, models: Mapping[str, ThermalModel], rate_hz: float | None = None, last_s: float | None = None
+) -> Outlook:
     """What models of an earlier recording expect of this one."""
-    values, temperature_c, rate, notes = _read(recording, rate_hz)
+    values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
     interval = next(iter(models.values())).interval_s
     means = _means(values, temperature_c, rate, interval)
     judged, refused = {}, {}
@@ -157,9 +161,11 @@ def _model(path: Path, axis: str, row: AxisRow, interval_s: float) -> ThermalMod
     )
 
 
-def _read(recording: Path, rate_hz: float | None) -> tuple[Floats, Floats, float, tuple[str, ...]]:
+def _read(
+    recording: Path, rate_hz: float | None, last_s: float | None
+) -> tuple[Floats, Floats, float, tuple[str, ...]]:
     """Values [n, 6], temperature [n], rate and notes."""
-    found = load_samples(recording, rate_hz)
+    found = load_samples(recording, rate_hz, last_s)
     values, temperature_c, rate, notes = with_temperature(list(iter_blocks(found)), found.rate_hz)
     if not np.isfinite(temperature_c).any():
         raise ConfigError(f"{recording}: no temperature in it; a column temp or temperature, in °C, is needed")

@@ -459,6 +459,20 @@ def test_what_was_simulated_is_analyzed(call: Call) -> None:
     assert noise["lo"] <= 1.5e-4 <= noise["hi"]
 
 
+def test_the_end_of_a_recording_alone(call: Call, recording: Path) -> None:
+    said = call("analyze", str(recording), "--last", "1min", "--json", "-")
+    assert said.status == 0
+    found = json.loads(said.out)
+    assert found["samples"] == 6000
+    assert "Its last 60 s were taken, 6000 samples." in found["notes"]
+    said = call("reconcile", str(recording), "--last", "never", "--out", "r")
+    assert (said.status, said.err.count("\n")) == (2, 1)
+    assert "--last: " in said.err
+    said = call("compensate", str(recording), "--last", "20s", "--out", "x.npz", "--json", "-")
+    with np.load("x.npz") as found:
+        assert len(found["gx"]) == 2000
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("suffix", [".csv", ".npz"])
 def test_a_simulation_that_is_broken_off_leaves_nothing(tmp_path: Path, number: int, suffix: str) -> None:

@@ -18,17 +18,22 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import ConfigError, RecordingError
+from drivers.recording import room
 from drivers.recording.formats import FORMATS, format_of, is_recording
 from drivers.recording.saving import save_samples, writing
 from drivers.recording.table import EXAMPLE_HEADER, T_LIMIT_S, Table
 from drivers.sample import AXES, Floats, SampleBlock, block
 
 __all__ = ["FORMATS", "Recording", "is_recording", "iter_blocks", "load_samples", "save_samples", "writing"]
+
+RESOLUTION_S: Final = 1e-6
+"""Of Unix times in a double, and a little more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,20 +51,22 @@ class Recording:
         return int(self.values.shape[0])
 
 
-def load_samples(path: Path, rate_hz: float | None = None) -> Recording:
+def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None = None) -> Recording:
     """Read a recording, or a folder of segments sorted by name as one recording.
 
-    ``rate_hz`` is used where the file has no ``t``, and goes before the file's own ``fs``.
+    ``rate_hz`` is used where the file has no ``t``, and goes before the file's own ``fs``; of a long recording
+    ``last_s`` takes the end alone, and of a folder only the segments for it are read.
 
-    Raises RecordingError when the path holds no recording, ConfigError when a rate or a library is missing
-    or the suffix is unknown.
+    Raises RecordingError when the path holds no recording, ConfigError when a rate or a library is missing,
+    the suffix is unknown, or the folder holds more than the memory does.
     """
     if rate_hz is not None and not (np.isfinite(rate_hz) and rate_hz > 0.0):
         raise ConfigError(f"--rate {rate_hz:g}: a sample rate is a positive number of Hz")
     try:
-        return _load_folder(path, rate_hz) if path.is_dir() else _load_file(path, rate_hz)
+        found = _load_folder(path, rate_hz, last_s) if path.is_dir() else _load_file(path, rate_hz)
     except OSError as error:
         raise RecordingError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
+    return found if last_s is None else _end(found, last_s)
 
 
 def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]:
@@ -174,24 +181,49 @@ def _times_ns(recording: Recording, part: slice) -> NDArray[np.int64]:
 # --- folders -------------------------------------------------------------------------------------
 
 
-def _load_folder(path: Path, rate_hz: float | None) -> Recording:
+def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Recording:
     """Segments in the order of their names; one that cannot be read is left out, with a note."""
     segments = sorted(p for p in path.iterdir() if is_recording(p) and p.name[0] != "." and p.is_file())
     if not segments:
         raise RecordingError(f"{path}: no recordings in this folder; known are {' '.join(FORMATS)}")
-    parts: list[Recording] = []
+    parts: list[Recording] = []  # newest first
     notes: list[str] = []
-    for segment in segments:
+    free = room.free_bytes()
+    for segment in reversed(segments):
         try:
             part = _load_file(segment, rate_hz)
         except RecordingError as error:
             notes.append(f"A segment was left out: {error}.")
             continue
         parts.append(part)
-        notes += [f"{segment.name}: {note}" for note in part.notes]
+        room.check(path, sum(one.values.nbytes + 2 * one.temperature_c.nbytes for one in parts), free)
+        notes += [f"{segment.name}: {note}" for note in reversed(part.notes)]
+        if last_s is not None and _lasted_s(parts) > last_s:
+            break
     if not parts:
-        raise RecordingError(f"{path}: none of {len(segments)} segments can be read; {notes[0]}")
-    return _joined(path, parts, notes)
+        raise RecordingError(f"{path}: none of {len(segments)} segments can be read; {notes[-1]}")
+    return _joined(path, parts[::-1], notes[::-1])
+
+
+def _lasted_s(parts: Sequence[Recording]) -> float:
+    """From the first sample of the last of them to the end of the first."""
+    newest, oldest = parts[0].t_s, parts[-1].t_s
+    if newest is not None and oldest is not None:
+        return float(newest[-1] - oldest[0])
+    return sum(len(one) / one.rate_hz for one in parts if one.rate_hz)
+
+
+def _end(found: Recording, last_s: float) -> Recording:
+    """The last seconds, from where on no sample is older."""
+    if found.t_s is not None:
+        older = np.flatnonzero(found.t_s <= found.t_s[-1] - last_s + RESOLUTION_S)
+        first = int(older[-1]) + 1 if older.size else 0
+    else:
+        first = max(len(found) - max(round(last_s * (found.rate_hz or 0.0)), 1), 0)
+    t_s = None if found.t_s is None else found.t_s[first:]
+    note = f"Its last {last_s:g} s were taken, {len(found) - first} samples."
+    values, temperature_c = found.values[first:].copy(), found.temperature_c[first:].copy()
+    return _recording(t_s, values, temperature_c, found.rate_hz, found.axes, (*found.notes, note))
 
 
 def _joined(path: Path, parts: Sequence[Recording], notes: list[str]) -> Recording:

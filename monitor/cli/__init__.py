@@ -156,7 +156,8 @@ def view(
 @app.command()
 def analyze(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
-    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate, where the file says none.")] = None,
+    rate: options.Rate = None,
+    last: options.Last = None,
     tau: Annotated[
         str, typer.Option(metavar="octave|decade10|S,S,…", help="Averaging times: a grid, or seconds.")
     ] = "octave",
@@ -178,7 +179,8 @@ def analyze(
     if plot is not None and plot.suffix not in (".png", ".html"):
         raise ConfigError(f"--plot: {plot}: a name ending in .png or .html is needed")
     window_s = options.duration("--window", window)
-    wanted = offline.Request(recording, rate, options.tau(tau), window_s, rest, bool(json or plot))
+    last_s = options.duration("--last", last)
+    wanted = offline.Request(recording, rate, options.tau(tau), window_s, rest, bool(json or plot), last_s)
     try:
         with output.progress() as tell:
             results = offline.make(wanted, tell)
@@ -251,7 +253,8 @@ def reconcile(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Same seed, same report.")] = 1,
-    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate, where the file says none.")] = None,
+    rate: options.Rate = None,
+    last: options.Last = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
 ) -> None:
     """Where recording and model disagree, which effect is missing, and what is left once it is added."""
@@ -264,6 +267,7 @@ def reconcile(
 
     if rate is not None and not 0.0 < rate < float("inf"):
         raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
+    last_s = options.duration("--last", last)
     output.check_place("--json", json)
     tested = None if model is None else load(model, Path.cwd())
     several = len(recordings) > 1
@@ -271,10 +275,11 @@ def reconcile(
     try:
         with output.progress() as tell:
             if several:
-                runs = reconciling.make_runs(reconciling.RunsRequest(tuple(recordings), tested, out, seed, rate), tell)
+                every = reconciling.RunsRequest(tuple(recordings), tested, out, seed, rate, last_s)
+                runs = reconciling.make_runs(every, tell)
                 data, show = runs_report.to_json(runs), partial(text.tell_runs, runs)
             else:
-                one = reconciling.make(reconciling.Request(recordings[0], tested, out, seed, rate), tell)
+                one = reconciling.make(reconciling.Request(recordings[0], tested, out, seed, rate, last_s=last_s), tell)
                 data, show = report.to_json(one), partial(text.tell, one)
     except NotReady:
         if json is not None:
@@ -295,7 +300,6 @@ app.command()(drift.compensate)
 app.command()(history_command.history)
 
 RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")]
-Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate, where the file says none.")]
 JsonPath = Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")]
 PlotPath = Annotated[Path | None, typer.Option(metavar="FILE.png", help="Means and model as a picture.")]
 
@@ -307,7 +311,8 @@ def thermal_fit(
     interval: Annotated[
         str | None, typer.Option(metavar="S", help="Length of a mean; also 10min, 1h. Else about 72 in the recording.")
     ] = None,
-    rate: Rate = None,
+    rate: options.Rate = None,
+    last: options.Last = None,
     json: JsonPath = None,
     plot: PlotPath = None,
 ) -> None:
@@ -319,7 +324,8 @@ def thermal_fit(
 
     _check_thermal(rate, json, plot)
     output.check_place("--out", out)
-    study = thermal.fit(recording, options.duration("--interval", interval), rate)
+    interval_s, last_s = options.duration("--interval", interval), options.duration("--last", last)
+    study = thermal.fit(recording, interval_s, rate, last_s)
     if json is not None:
         output.write("--json", json, text.study_json(study) + b"\n")
     if not study.fits:
@@ -338,7 +344,8 @@ def thermal_fit(
 def thermal_predict(
     recording: RecordingPath,
     model: Annotated[Path, typer.Option(metavar="MODEL.json", help="What thermal fit wrote.")],
-    rate: Rate = None,
+    rate: options.Rate = None,
+    last: options.Last = None,
     json: JsonPath = None,
     plot: PlotPath = None,
 ) -> None:
@@ -349,7 +356,7 @@ def thermal_predict(
     from monitor.publish import thermal_text as text
 
     _check_thermal(rate, json, plot)
-    outlook = thermal.predict(recording, thermal.from_file(model), rate)
+    outlook = thermal.predict(recording, thermal.from_file(model), rate, options.duration("--last", last))
     if json is not None:
         output.write("--json", json, text.outlook_json(outlook) + b"\n")
     if not outlook.judged:

@@ -21,7 +21,8 @@ def compensate(
     order: Annotated[
         str | None, typer.Option(metavar="P,Q", help="Of the ARMA model of the drift, up to 2,1; else by criterion.")
     ] = None,
-    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate, where the file says none.")] = None,
+    rate: options.Rate = None,
+    last: options.Last = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
     plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Drift and Allan curves as a picture.")] = None,
 ) -> None:
@@ -41,8 +42,10 @@ def compensate(
         if place is not None and place.resolve() == out.resolve():
             raise ConfigError(f"{option}: {place} is what --out writes; another name is needed")
     serving.end_on_sigterm()
+    last_s = options.duration("--last", last)
+    wanted = compensating.Request(recording, out, method, rate, options.order(order), last_s)
     with output.progress() as tell:
-        result = compensating.make(compensating.Request(recording, out, method, rate, options.order(order)), tell)
+        result = compensating.make(wanted, tell)
     if json is not None:
         output.write("--json", json, text.to_json(result) + b"\n")
     if plot is not None:

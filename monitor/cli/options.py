@@ -21,6 +21,8 @@ ZenohFile = Annotated[
     Path | None,
     typer.Option("--zenoh", metavar="FILE.json5", help="A zenoh file: certificates, user and password, endpoints."),
 ]
+Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate, where the file says none.")]
+Last = Annotated[str | None, typer.Option(metavar="S", help="The end of the recording alone; also 1h, 1d.")]
 
 
 def tau(text: str) -> "TauGrid":

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import ConfigError, ImuError, RecordingError
-from drivers.recording import FORMATS, Recording, is_recording, iter_blocks, load_samples, save_samples, writing
+from drivers.recording import FORMATS, Recording, is_recording, iter_blocks, load_samples, room, save_samples, writing
 from drivers.recording.csv_format import READ_BYTES
 from drivers.recording.saving import whole
 from drivers.sample import AXES, join
@@ -649,6 +649,59 @@ class TestFolder:
         written(tmp_path / "b.csv", "x,y\n1,2\n")
         with pytest.raises(RecordingError, match=r"none of 2 segments can be read.*a\.csv"):
             load_samples(tmp_path)
+
+
+class TestTheEndAlone:
+    def test_of_a_folder_only_its_last_segments_are_read(self, tmp_path):
+        t, values, temperature = samples(300)
+        for name, rows in (("b.npz", slice(100, 200)), ("c.arrows", slice(200, 300))):
+            save_samples(tmp_path / name, t[rows], values[rows], temperature[rows])
+        written(tmp_path / "a.csv", "no recording")  # would be told
+        recording = load_samples(tmp_path, last_s=1.25)
+        assert np.array_equal(recording.t_s, t[175:])
+        assert np.array_equal(recording.values, values[175:])
+        assert np.array_equal(recording.temperature_c, temperature[175:])
+        assert recording.notes == ("Its last 1.25 s were taken, 125 samples.",)
+        assert len(load_samples(tmp_path, last_s=60.0)) == 200
+
+    def test_of_a_file_with_every_format(self, path):
+        t, values, temperature = samples(300)
+        save_samples(path, t, values, temperature)
+        recording = load_samples(path, last_s=0.5)
+        assert np.array_equal(recording.t_s, t[250:])
+        assert np.array_equal(recording.values, values[250:])
+
+    def test_without_times_by_the_rate(self, tmp_path):
+        for name in ("a.npz", "b.npz", "c.npz"):
+            np.savez(tmp_path / name, fs=100.0, gx=np.full(100, float(ord(name[0]))))
+        recording = load_samples(tmp_path, last_s=1.5)
+        assert recording.values[:, 0].tolist() == [float(ord("b"))] * 50 + [float(ord("c"))] * 100
+
+    def test_no_sample_is_older_even_where_times_go_back(self, tmp_path):
+        path = written(tmp_path / "a.csv", "t,gx\n10,1\n11,2\n3,3\n10.5,4\n11.5,5\n")
+        assert load_samples(path, last_s=2.0).values[:, 0].tolist() == [4.0, 5.0]
+
+
+class TestRoom:
+    def test_a_folder_that_does_not_fit_is_refused(self, tmp_path, monkeypatch):
+        t, values, temperature = samples(300)
+        for i in range(3):
+            save_samples(tmp_path / f"{i}.npz", 3.0 * i + t, values, temperature)
+        monkeypatch.setattr(room, "free_bytes", lambda: 3 * 500 * 64)
+        with pytest.raises(ConfigError, match=r"GB of memory would be needed.*--last 1d") as error:
+            load_samples(tmp_path)
+        assert str(error.value).startswith(f"{tmp_path}: ")
+        assert len(load_samples(tmp_path, last_s=1.0)) == 100
+        monkeypatch.setattr(room, "free_bytes", lambda: None)
+        assert len(load_samples(tmp_path)) == 900
+
+    @pytest.mark.parametrize(("text", "free"), [
+        ("MemTotal:  16000 kB\nMemAvailable:    2000 kB\n", 2_048_000), ("MemTotal: 5 kB\n", None), ("", None),
+        ("MemAvailable:\n", None), ("MemAvailable: x kB\n", None),
+    ])  # fmt: skip
+    def test_what_the_system_says(self, tmp_path, text, free):
+        assert room.free_bytes(written(tmp_path / "meminfo", text)) == free
+        assert room.free_bytes(tmp_path / "absent") is None
 
 
 @pytest.mark.data
