@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import ConfigError, RecordingError
+from drivers.errors import ConfigError, RecordingError, in_one_line
 from drivers.recording import room
 from drivers.recording.formats import FORMATS, format_of, is_recording
 from drivers.recording.saving import save_samples, writing
@@ -117,7 +117,7 @@ def _recording(
     for array in (t_s, values, temperature_c):
         if array is not None:
             array.flags.writeable = False
-    return Recording(t_s, values, temperature_c, rate_hz, axes, tuple(notes))
+    return Recording(t_s, values, temperature_c, rate_hz, axes, tuple(map(in_one_line, notes)))
 
 
 def _common_length(path: Path, columns: Mapping[str, Floats]) -> int:

@@ -4,10 +4,10 @@ Arrays of Python objects are refused, never unpickled. A zip archive keeps its i
 from a cut file the arrays are found again by the header that stands before each.
 """
 
-import io
-import math
+import re
 import shutil
 import struct
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +28,17 @@ from drivers.sample import Floats
 LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # PKWARE APPNOTE 4.3.7
 LOCAL_MAGIC: Final = b"PK\3\4"
 ITEM: Final = np.dtype("<f8")
+UNREADABLE: Final = (
+    ValueError, TypeError, SyntaxError, EOFError, MemoryError, OverflowError, RuntimeError, TokenError, zlib.error
+)  # fmt: skip
+"""What NumPy and zlib raise for an array of rubbish."""
 COPY_BYTES: Final = 1 << 18
+NPY: Final = re.compile(
+    rb"\x93NUMPY\x01\x00..{'descr': '(?P<kind>[<>|](?:f[248]|[iu][1248]))', 'fortran_order': (?:False|True), "
+    rb"'shape': \((?:(?P<n>\d{1,18}),)?\), } *\n",
+    re.DOTALL,
+)
+"""The head of an array of numbers with one dimension or none, as every NumPy writes it: nothing in it is evaluated."""
 
 
 def read_npz(path: Path) -> Table:
@@ -80,10 +90,12 @@ def _npz_column(path: Path, archive: Mapping[str, Any], key: str) -> Floats:
 
 def _npz_array(path: Path, archive: Mapping[str, Any], key: str) -> NDArray[Any]:
     try:
-        return np.asarray(archive[key])
+        with warnings.catch_warnings():  # of how old a file is, which is no matter here
+            warnings.simplefilter("ignore")
+            return np.asarray(archive[key])
     except zipfile.BadZipFile as error:
         raise RecordingError(f"{path}: {key} is damaged: {error}") from error
-    except (ValueError, EOFError, MemoryError, OverflowError, RuntimeError, TokenError, zlib.error) as error:
+    except UNREADABLE as error:
         why = "holds Python objects, not numbers" if "bject array" in str(error) else f"is unreadable: {error}"
         raise RecordingError(f"{path}: {key} {why}") from error
 
@@ -137,20 +149,14 @@ def _unpacked(data: bytes, method: int, size: int, *, sized: bool) -> tuple[byte
 
 
 def _array_up_to_cut(raw: bytes) -> NDArray[Any] | None:
-    """The array of .npy bytes, shorter than its header says where the bytes end early."""
-    file = io.BytesIO(raw)
-    try:
-        if np.lib.format.read_magic(file) != (1, 0):
-            return None
-        shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-    except (ValueError, TokenError):
+    """The numbers of .npy bytes, fewer than the header says where the bytes end early."""
+    header = NPY.match(raw)
+    if header is None:
         return None
-    if dtype.hasobject or dtype.itemsize == 0 or len(shape) > 1 or min(shape, default=0) < 0:
-        return None
-    stated = math.prod(shape)
-    count = min(stated, (len(raw) - file.tell()) // dtype.itemsize)
-    array = np.frombuffer(raw, dtype, count, file.tell())
-    return array.reshape(shape) if array.size == stated else array
+    dtype, n = np.dtype(header["kind"].decode()), int(header["n"] or 1)
+    whole = (len(raw) - header.end()) // dtype.itemsize
+    array = np.frombuffer(raw, dtype, min(n, whole), header.end())
+    return array if header["n"] or not array.size else array.reshape(())
 
 
 @contextmanager
