@@ -40,6 +40,10 @@ UART_LENGTH: Final = 11
 BLUETOOTH_LENGTH: Final = 20
 HEADERS: Final = (b"\x55\x61", b"\x55\x71")
 """Of the Bluetooth models: a sample, and the answer to a register read."""
+FEWEST: Final = 2
+"""Packets a sample."""
+USUAL: Final = 8
+"""Samples, of which the shortest tells how many packets there are in one now: others come only now and then."""
 
 # °C = raw * step + offset, by family (WT901 data sheet v20-0702; BWT61CL v20-0630)
 TEMPERATURE: Final = {"wt901": (1.0 / 100.0, 0.0), "jy61": (1.0 / 340.0, 36.53)}
@@ -151,7 +155,7 @@ class Pairs:
         self._last = bytes(UART_LENGTH)  # the packet before the next one
         self._elapsed = 0  # packets since the last pair's end, rejected ones too
         self._rejected = 0  # those of them that were rejected, and halves torn apart
-        self._cycle = 2  # packets a sample, when none is rejected
+        self._usual: list[int] = []  # packets of the last samples of which none was rejected
         self._first = True
 
     def find(self, frames: Frames) -> tuple[Ints, np.ndarray[tuple[int, ...], np.dtype[np.uint8]], Ints, int]:
@@ -178,9 +182,13 @@ class Pairs:
             return steps, 0
         whole = holes == 0
         whole[0] &= not self._first  # it tells when we joined, not how many packets make a sample
-        if whole.any():
-            self._cycle = int(steps[whole].min())
-        missing = np.where(holes > 0, np.maximum(np.rint(steps / self._cycle).astype(np.int64) - 1, 0), 0)
+        usual = [*self._usual, *steps[whole].tolist()]
+        known = len(self._usual) + np.cumsum(whole)
+        missing = np.zeros(steps.size, np.int64)
+        for row in np.flatnonzero(holes).tolist():  # by what came before it, however the bytes are cut
+            cycle = min(usual[max(known[row] - USUAL, 0) : known[row]], default=FEWEST)
+            missing[row] = max(round(steps[row] / cycle) - 1, 0)
+        self._usual = usual[-USUAL:]
         self._first = False
         return missing, int(np.maximum(holes - missing, 0).sum())
 
