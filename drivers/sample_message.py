@@ -119,10 +119,11 @@ def _times(unix_ns: Ints) -> tuple[float | bytes, float | None, float | None]:
     """``t``, ``t0``, ``rate``: the short form where the rows are evenly spaced."""
     n = unix_ns.size
     span_ns = int(unix_ns[-1] - unix_ns[0])
-    if n > 1 and span_ns > 0:
+    rate = (n - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
+    if RATE_LIMITS_HZ[0] <= rate <= RATE_LIMITS_HZ[1]:
         grid = unix_ns[0] + np.rint(np.arange(n) * (span_ns / (n - 1))).astype(np.int64)
         if np.abs(unix_ns - grid).max() <= EVEN_NS:
-            return float(unix_ns[-1]) * 1e-9, float(unix_ns[0]) * 1e-9, (n - 1) * 1e9 / span_ns
+            return float(unix_ns[-1]) * 1e-9, float(unix_ns[0]) * 1e-9, rate
     return ns_to_seconds(unix_ns).astype("<f8").tobytes(), None, None
 
 

@@ -245,7 +245,7 @@ class _Reader:
             return None
         viewer = msgspec.structs.replace(viewer, history=history_s)
         if viewer.mode.endswith(".rrd"):
-            path = self._folder / Path(viewer.mode).expanduser()
+            path = self._folder / small_file.path(viewer.mode)
             viewer = msgspec.structs.replace(viewer, mode=str(path))
         known = tuple(device for device in devices if device is not None)
         return Config(known, zenoh, viewer, log, storage, hooks, metrics)
@@ -343,7 +343,7 @@ class _Reader:
 
     def _zenoh_file(self, path: Path) -> None:
         """Whether zenoh takes it, and who else may change it or read the secrets in it."""
-        if not path.is_file():
+        if not small_file.is_file(path):
             self.wrong.append(f"zenoh.config: {path}: no such file")
             return
         if line := permissions.changeable(path):
@@ -477,14 +477,15 @@ class _Reader:
         wanted = (info.extra or {}).get("file") if isinstance(info, msgspec.inspect.Metadata) else None
         if not wanted or not value:
             return value
-        path = self._folder / Path(value).expanduser()
-        if wanted == "exists" and not path.exists():
+        path = self._folder / small_file.path(value)
+        there = os.path.exists(path)  # false for a name that no file can have
+        if wanted == "exists" and not there:
             raise ValueError(f"{path}: no such file")
-        return str(path) if path.exists() else value
+        return str(path) if there else value
 
     def _path(self, kind: type, value: Any) -> Any:
         if kind is Path and isinstance(value, str):
-            return self._folder / Path(value).expanduser()
+            return self._folder / small_file.path(value)
         raise ValueError(f"expected a path in quotes, got {value!r}")
 
     def _try(self, at: str, function: Any, *arguments: Any) -> Any:
@@ -503,8 +504,8 @@ def model_path(name: str, folder: Path) -> Path:
     """
     models = CONFIG_FOLDER / "models"
     shipped = models / f"{name}.toml"
-    path = shipped if shipped.is_file() else folder / Path(name).expanduser()
-    if path.is_file():
+    path = shipped if small_file.is_file(shipped) else folder / small_file.path(name)
+    if small_file.is_file(path):
         return path
     names = sorted(file.stem for file in models.glob("*.toml"))
     raise ConfigError(f'no model "{name}", neither a file nor one of those shipped{plugin.nearest(name, names)}')
@@ -633,8 +634,8 @@ def _command(words: list[str], folder: Path) -> tuple[str, ...]:
         raise ConfigError(f'"{words[0]}" is no path; write where the program is, e.g. "/usr/bin/{words[0]}"')
     if any("\0" in word for word in words):
         raise ConfigError("a word with a NUL character cannot be handed to a program")
-    path = folder / Path(words[0]).expanduser()
-    if not path.is_file():
+    path = folder / small_file.path(words[0])
+    if not small_file.is_file(path):
         raise ConfigError(f"{path}: no such file")
     if not os.access(path, os.X_OK):
         raise ConfigError(f"{path}: not executable; chmod +x it")

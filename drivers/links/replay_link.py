@@ -29,6 +29,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, BinaryIO, Final, Literal, cast
 
+from drivers import small_file
 from drivers.errors import ConfigError, LinkEnded, LinkLost, LinkUnavailable, RecordingError
 from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.plugin import FilePath, nearest
@@ -100,7 +101,7 @@ class ReplayLink:
 
     def __init__(self, settings: Settings, kind: Kind, pace: float) -> None:
         self._settings = settings
-        self._path = Path(settings.path).expanduser()
+        self._path = small_file.path(settings.path)
         self._kind: Kind = kind
         self._pace = pace  # file seconds a second; inf = no waiting
         self.carrier: Carrier = _raw_carrier(self._path) if kind == "raw" else CARRIERS[kind]
@@ -432,7 +433,7 @@ def build(settings: Settings) -> Link:
 
     Raises ``ConfigError`` for a speed that is none, and for a file that is nothing to replay.
     """
-    return ReplayLink(settings, _kind(Path(settings.path).expanduser()), _pace(settings))
+    return ReplayLink(settings, _kind(small_file.path(settings.path)), _pace(settings))
 
 
 def _pace(settings: Settings) -> float:

@@ -23,6 +23,7 @@ from monitor.settings import (
     VirtualTable,
     ZenohTable,
     load,
+    model_path,
     period,
     read,
     seconds,
@@ -498,3 +499,9 @@ def test_a_virtual_device_speaks_any_wire_format(tmp_path, decoder, carrier):
 
 def test_windows_that_are_accepted_are_those_that_the_estimator_can_hold():
     assert WINDOW_SAMPLES == (MIN_LENGTH, MAX_LENGTH)
+
+
+@pytest.mark.parametrize("name", ["a" * 300, "~nobody-of-that-name/x", "\0"])
+def test_a_name_that_no_file_can_have_is_no_file(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="neither a file nor one of those shipped"):
+        model_path(name, tmp_path)

@@ -5,6 +5,7 @@ its message, or a ``ConfigError`` says in one line which does not and what would
 """
 
 from collections.abc import Mapping
+from math import isfinite
 from pathlib import Path
 from typing import Any, Final
 
@@ -134,8 +135,15 @@ class Database:
         s = self._settings
         big_endian = signal.byte_order == "big_endian"
         first, last = _ends(signal.start, signal.length, big_endian)
-        if last // 8 >= message.length or signal.length > 64:
+        if first < 0 or last // 8 >= message.length or not 0 < signal.length <= 64:
             raise ConfigError(f"{self._path.name}: {signal.name} does not fit in {message.name}")
+        if signal.is_float and signal.length not in (16, 32, 64):
+            raise ConfigError(f"{self._path.name}: {signal.name} is a float of {signal.length} bits; 16, 32, 64 can be")
+        if not (isfinite(signal.scale) and isfinite(signal.offset) and signal.scale):
+            raise ConfigError(
+                f"{self._path.name}: {signal.name} has factor {signal.scale:g} and offset {signal.offset:g}; finite "
+                f"numbers are needed, the factor other than 0"
+            )
         # Motorola counts from the most significant end: the least significant bit is the last one
         shift = 7 - last % 8 if big_endian else first % 8
         rule = self._is_j1939(message) if s.not_available is None else s.not_available
@@ -186,9 +194,9 @@ def _signal_settings(entry: str | SignalSettings) -> SignalSettings:
 
 def _locate(file: str) -> Path:
     """The path itself, or that of a shipped database."""
-    path = Path(file).expanduser()
+    path = small_file.path(file)
     name = file.removeprefix(SHIPPED_PREFIX)
-    if name == file and (path.is_file() or len(path.parts) != 1):
+    if name == file and (small_file.is_file(path) or len(path.parts) != 1):
         return path
     shipped: Mapping[str, Path] = {p.stem: p for p in sorted(SHIPPED.glob("*.dbc"))}
     stem = name.removesuffix(".dbc")
