@@ -188,7 +188,7 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
         raise RecordingError(f"{path}: no recordings in this folder; known are {' '.join(FORMATS)}")
     parts: list[Recording] = []  # newest first
     notes: list[str] = []
-    free = room.free_bytes()
+    free, taken = room.free_bytes(), 0
     for segment in reversed(segments):
         try:
             part = _load_file(segment, rate_hz)
@@ -196,7 +196,8 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
             notes.append(f"A segment was left out: {error}.")
             continue
         parts.append(part)
-        room.check(path, sum(one.values.nbytes + 2 * one.temperature_c.nbytes for one in parts), free)
+        taken += part.values.nbytes + 2 * part.temperature_c.nbytes
+        room.check(path, taken, free)
         notes += [f"{segment.name}: {note}" for note in reversed(part.notes)]
         if last_s is not None and _lasted_s(parts) > last_s:
             break
