@@ -21,7 +21,7 @@ def _kernels() -> None:
 
 
 @pytest.fixture(autouse=True)
-def _identified() -> Iterator[None]:
+def _no_identifier_left() -> Iterator[None]:
     yield
     for thread in threading.enumerate():
         if thread.name.startswith("drift of "):
