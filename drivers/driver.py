@@ -89,6 +89,8 @@ class Driver:
         self.text = f"waiting for {link.name}"
         self.turns = 0  # how often it has read, with or without bytes, or tried to open: stands still when it is stuck
         self.times_are_unix = link.epoch == "unix" or isinstance(decoder.timing, Given)
+        self.first_t_ns: int | None = None
+        """Time of the first sample since the start; None until it has come."""
         self._push = push
         self._keep = keep
         self._axes = axes or AxisMap()
@@ -175,6 +177,8 @@ class Driver:
             self._back()
 
     def _count(self, stamped: SampleBlock, rejected: int) -> None:
+        if self.first_t_ns is None:
+            self.first_t_ns = int(stamped.t_ns[0])
         self.counts.received += len(stamped)
         self._newest_t_ns = int(stamped.t_ns[-1])
         if stamped.lost:

@@ -62,6 +62,8 @@ class Chain:
         """Samples since whoever looks has set it back."""
         self.since_ns: list[int | None] = [None] * len(AXES)
         """Time of the first sample that counts, of axes that began anew."""
+        self.newest_ns = 0
+        """Time of the newest sample that came in; 0 before the first."""
         self.identifier = Identifier(f"drift of {device.name}", at_once=patient)
         self._device = device
         self._model = model
@@ -72,7 +74,6 @@ class Chain:
         self._looks: list[ThermalLook] = []  # not taken yet
         self._handled = 0  # as often as the watch has said it
         self._pieces: deque[SampleBlock] = deque()  # of a recording, that wait until a model is chosen
-        self._newest_ns = 0
         self._reliving = False
 
     @property
@@ -88,7 +89,7 @@ class Chain:
     def advance(self, blocks: Sequence[SampleBlock], rate_hz: float | None, drain: bool) -> None:
         """Take blocks in; nothing waits when draining. Until a rate is known they leave no trace."""
         if blocks:
-            self._newest_ns = int(blocks[-1].t_ns[-1])
+            self.newest_ns = int(blocks[-1].t_ns[-1])
         if self.estimator is None and (rate_hz is None or not self._begin(rate_hz)):
             return
         if self.watch is None and self._ready.all.is_set():
@@ -130,7 +131,7 @@ class Chain:
         """Empty the window."""
         if self.estimator is not None:
             self.estimator.reset()
-            self.since_ns = [self._newest_ns + 1] * len(AXES)
+            self.since_ns = [self.newest_ns + 1] * len(AXES)
 
     def relabel(self, rate_hz: float) -> None:
         """The rate is known better now."""
@@ -198,7 +199,7 @@ class Chain:
         for restart in restarts:
             self.estimator.restart(restart.axis, restart.samples)
             back_ns = round((restart.samples - 0.5) / self.estimator.rate_hz * 1e9)
-            self.since_ns[restart.axis] = self._newest_ns - back_ns
+            self.since_ns[restart.axis] = self.newest_ns - back_ns
 
     def _follow(self) -> None:
         """Hand on what is at rest to the models of temperature."""

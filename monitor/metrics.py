@@ -85,7 +85,7 @@ class MetricsOutput(Output):
         """Counted."""
         self._events[device, event.kind] += 1
 
-    def health(self, device: str, unix_s: float, health: Health) -> None:
+    def health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Kept until the next."""
         self._healths[device] = health
 

@@ -1,7 +1,6 @@
 """Adapters: what a station says, as zenoh messages, in the viewer, as log lines, in the terminal. None waits."""
 
 import time
-from collections.abc import Collection
 from typing import TYPE_CHECKING, Final
 
 import structlog
@@ -30,8 +29,6 @@ if TYPE_CHECKING:
     from monitor.publish.rerun_view import RerunView
 
 PREFIX: Final = "imu"
-OPENING_S: Final = 10.0
-"""To read a long recording before its first sample; what cannot be opened by then is shown."""
 _log = structlog.get_logger("imu-monitor")
 
 
@@ -72,7 +69,7 @@ class ZenohOutput(Output):
         payload = message.event(device, unix_s, received, event, message.since_s(unix_s, event))
         self._zenoh.put(topics.EVENT, device, payload)
 
-    def health(self, device: str, unix_s: float, health: Health) -> None:
+    def health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Status."""
         self._zenoh.put(topics.STATUS, device, message.status(device, unix_s, health))
 
@@ -80,10 +77,8 @@ class ZenohOutput(Output):
 class ViewerOutput(Output):
     """Results into the Rerun viewer."""
 
-    def __init__(self, view: "RerunView", recorded: Collection[str] = ()) -> None:
-        """``recorded``: devices whose times are not the host's."""
+    def __init__(self, view: "RerunView") -> None:
         self._view = view
-        self._recorded = recorded
 
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         """Raw samples."""
@@ -113,21 +108,18 @@ class ViewerOutput(Output):
         """One line of the log."""
         self._view.event(device, unix_s, event)
 
-    def health(self, device: str, unix_s: float, health: Health) -> None:
-        """The health panel. A line at today's date would put all that a recording of last year holds out of sight."""
-        if device in self._recorded and not health.received and health.uptime_s < OPENING_S:
-            return
-        self._view.health(device, unix_s, health)
+    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+        """The health panel. It is not drawn before the first sample's time is known: the viewer has one time axis."""
+        if unix_s is not None:
+            self._view.health(device, unix_s, health)
 
 
 class HistoryOutput(Output):
     """Results gathered by the minute, and events, for the file that keeps them."""
 
-    def __init__(self, writer: Writer, recorded: Collection[str] = ()) -> None:
-        """``recorded``: devices whose times are not the host's."""
+    def __init__(self, writer: Writer) -> None:
         self.received: dict[str, int] = {}  # samples of each device since the start
         self._writer = writer
-        self._recorded = recorded
         self._minutes: dict[str, Minutes] = {}
 
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
@@ -148,11 +140,11 @@ class HistoryOutput(Output):
         told = PastEvent(unix_s, event.kind, event.text, event.axis, what, since_s, sigma)
         self._writer.tell(device, told)
 
-    def health(self, device: str, unix_s: float, health: Health) -> None:
-        """Counts and state. Before a recording of last year has begun, it is not today that anything happens."""
-        if device in self._recorded and not health.received:
-            return
+    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+        """Counts and state. Rows are minutes of the samples' own time, so there is none before the first sample."""
         self.received[device] = health.received
+        if unix_s is None:
+            return
         self._writer.put(device, self._of(device).health(unix_s, health))
 
     def gone(self, device: str) -> None:
@@ -181,7 +173,7 @@ class LogOutput(Output):
         """One line an event."""
         _log.info(event.kind, device=device, axis=event.axis, text=event.text)
 
-    def health(self, device: str, unix_s: float, health: Health) -> None:
+    def health(self, device: str, unix_s: float | None, health: Health) -> None:
         """A line when the state or its sentence has changed."""
         now = (health.state, health.text)
         if self._said.get(device) != now:
@@ -219,7 +211,7 @@ class TableOutput(Output):
         """One of the last lines."""
         self.board.take(topics.EVENT.key(PREFIX, device), message.event(device, unix_s, received, event, None))
 
-    def health(self, device: str, unix_s: float, health: Health) -> None:
+    def health(self, device: str, unix_s: float | None, health: Health) -> None:
         """One row."""
         self.board.take(topics.STATUS.key(PREFIX, device), message.status(device, unix_s, health))
         if device in self._latest:

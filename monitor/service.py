@@ -103,8 +103,8 @@ class Service:
         if self.metrics is not None:
             self.outputs.append(self.metrics)
         if self.view is not None:
-            self.outputs.append(ViewerOutput(self.view, self._recorded))
-        self._kept = None if self.history is None else HistoryOutput(self.history, self._recorded)
+            self.outputs.append(ViewerOutput(self.view))
+        self._kept = None if self.history is None else HistoryOutput(self.history)
         if self._kept is not None:
             self.outputs.append(self._kept)
 
@@ -389,7 +389,8 @@ class Service:
             command.refuse("no samples yet")
             return
         received, device = station.driver.counts.received, station.device
-        job = Job(station.name, station.now_unix_s(), received, *held, device.model, device.reconcile_folder)
+        newest_s = station.unix_s(station.chain.newest_ns)
+        job = Job(station.name, newest_s, received, *held, device.model, device.reconcile_folder)
         self._reconciler.start(job, command)
 
     def _tell_reconciled(self) -> None:

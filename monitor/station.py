@@ -6,6 +6,7 @@ and none of them waits: each has a queue or drops.
 
 import threading
 import time
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
@@ -52,12 +53,19 @@ TOTAL_SHARE: Final = 0.005
 """Of a processor, that total and Hadamard deviations may take for a device."""
 OFF_NOMINAL: Final = 0.02
 """A measured rate further than this from the configured one is said."""
+UNTIMED_KEPT: Final = 100
+"""Events that wait for the first sample's time; the oldest are dropped."""
 SET_S: Final = 1.0
 """A host's clock that is set by more is told, and so are times that are further from it."""
 
 
 class Output:
-    """Where a station's results go; no call waits for anyone. What an output does not override it does not show."""
+    """Where a station's results go; no call waits for anyone. What an output does not override it does not show.
+
+    Every ``unix_s`` is a time on the timeline of the device's own samples. A recording, or a device that stamps its
+    samples itself, may be years away from the host's clock, so its timeline is unknown before its first sample: no
+    event is passed on until then, and ``health`` has None for its time.
+    """
 
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         """A block, and how many samples had come with it; ``offset_ns`` makes its times Unix time."""
@@ -83,8 +91,8 @@ class Output:
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Something happened."""
 
-    def health(self, device: str, unix_s: float, health: Health) -> None:
-        """Once a second."""
+    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+        """Once a second. ``unix_s`` is None while the time on the device's timeline is unknown."""
 
     def gone(self, device: str) -> None:
         """The device was taken out of the configuration; one of its name may come again."""
@@ -141,10 +149,12 @@ class Station:
         self._started_s = time.monotonic()
         self._before = State()  # what was known before a restart
         self._happened: list[Event] = []
+        self._untimed: deque[tuple[str, str]] = deque(maxlen=UNTIMED_KEPT)  # kind and text, see ``_note``
         self._tail: Tail | None = None  # of the recording, that the window is rebuilt from first
         self._next_s = dict.fromkeys(("refit", "publish", "samples", "total", "thermal"), 0.0)
         self._refitted = False  # a refit since the last publication
-        self._newest_ns = 0
+        self._newest_ns: int | None = None  # of the samples that were taken
+        self._taken_ns = 0  # host monotonic, when the newest was taken
 
     # --- life
 
@@ -201,14 +211,15 @@ class Station:
 
     def work(self, outputs: Sequence[Output], now_s: float, drain: bool = False) -> None:
         """Take what came, advance the estimate, publish what is due; all of it when draining."""
-        happened, self._happened = self._happened + self.driver.take_events(), []
+        happened = self.driver.take_events()
         if self._tail is not None:  # the chain is another thread's until the window is rebuilt
-            self._tell(outputs, happened)
+            self._tell(outputs, self._take_noted() + happened)
             return
         blocks = self._take() if drain or self._can_take() else []
         if blocks:
-            self._newest_ns = int(blocks[-1].t_ns[-1])
+            self._newest_ns, self._taken_ns = int(blocks[-1].t_ns[-1]), time.monotonic_ns()
             self._batch += blocks
+        happened = self._take_noted() + happened  # now that the first sample's time is known
         self.chain.advance(blocks, self.clock.rate_hz, drain)
         if drain:
             self.chain.flush()
@@ -243,8 +254,9 @@ class Station:
         self.device, self._limits = device, limits
 
     def announce(self, outputs: Sequence[Output], kind: str, text: str) -> None:
-        """An event that happened outside of the samples, now."""
-        self._tell(outputs, [Event(kind, self._newest_ns, text)])
+        """Pass on an event of this moment that the samples do not tell; it waits while their timeline is unknown."""
+        self._note(kind, text)
+        self._tell(outputs, self._take_noted())
 
     def report(self, outputs: Sequence[Output], states: dict[str, str], memory_bytes: int) -> Health:
         """Tell the outputs how the device does, and ease its wall clock."""
@@ -287,11 +299,18 @@ class Station:
         """Unix time of a sample time."""
         return (t_ns + self._offset_ns()) / 1e9
 
-    def now_unix_s(self) -> float:
-        """Unix time of the newest sample, or of now while a device waits or is lost."""
-        if self.driver.state in ("running", "ended") and self._newest_ns:
-            return self.unix_s(self._newest_ns)
-        return self._wall.unix_ns(time.monotonic_ns()) / 1e9
+    def now_unix_s(self) -> float | None:
+        """Return the present time on the timeline of the device's samples, in Unix seconds.
+
+        Returns
+        -------
+        float or None
+            The time of the newest sample. While the device waits or is lost, time goes on from there. None if the
+            samples bring their own times (a recording, or a decoder that reads times from the payload) and none has
+            come yet: such a timeline cannot be guessed from the host's clock.
+        """
+        now_ns = self._now_ns()
+        return None if now_ns is None else self.unix_s(now_ns)
 
     # --- going on after a restart
 
@@ -307,7 +326,7 @@ class Station:
             text = f"the recording ends {ago_s:.4g} s ago: the window begins anew"
             if ago_s < 0.0:
                 text = "the recording ends after the host's clock: the window begins anew"
-            self._happened.append(Event("window_rebuilt", time.monotonic_ns(), text))
+            self._note("window_rebuilt", text)
             return
         self.clock.resume(Before(t_ns, int(newest.ticks[-1]), rate, state.tick_step))
         self._tail, self._before = tail, state
@@ -321,6 +340,34 @@ class Station:
         return rebuilding.known(self.chain, self._before, self.clock.rate_hz, self.clock.tick_step, self._offset_ns())
 
     # --- inside
+
+    def _now_ns(self) -> int | None:
+        """Present time in the epoch of the samples; None where ``now_unix_s`` is None."""
+        newest_ns, now_ns = self._newest_ns, time.monotonic_ns()
+        if newest_ns is not None and (self._patient or self.driver.state in ("running", "ended")):
+            return newest_ns
+        if not self.driver.times_are_unix:
+            return now_ns
+        if newest_ns is None:  # samples may wait in the ring; only the first may be stamped without running ahead
+            return self.driver.first_t_ns
+        return newest_ns + now_ns - self._taken_ns
+
+    def _note(self, kind: str, text: str) -> None:
+        """Keep an event of this moment; it is stamped as soon as the time on the device's timeline is known."""
+        now_ns = self._now_ns()
+        if now_ns is None:
+            self._untimed.append((kind, text))
+        else:
+            self._happened.append(Event(kind, now_ns, text))
+
+    def _take_noted(self) -> list[Event]:
+        """Return the events that were noted since the last call, as far as they can be stamped."""
+        now_ns = self._now_ns() if self._untimed else None
+        if now_ns is not None:
+            self._happened += [Event(kind, now_ns, text) for kind, text in self._untimed]
+            self._untimed.clear()
+        noted, self._happened = self._happened, []
+        return noted
 
     def _follow_host(self, outputs: Sequence[Output]) -> None:
         now_ns = time.monotonic_ns()
@@ -445,7 +492,7 @@ class Station:
         self._next_s["total"] = now_s + max(TOTAL_EVERY_S, (time.perf_counter() - begun_s) / TOTAL_SHARE)
         if found is not None:
             for output in outputs:
-                output.total(self.name, self.unix_s(self._newest_ns), self.driver.counts.received, *found)
+                output.total(self.name, self.unix_s(self.chain.newest_ns), self.driver.counts.received, *found)
 
     def _publish_thermal(self, outputs: Sequence[Output], now_s: float) -> None:
         """Intervals that are over; and a piece of choosing models."""

@@ -111,7 +111,8 @@ class FleetView:
             self._viewer.estimate(device, allan.t, rebuilt.estimate(allan, self._noise[device]))
         elif topic is topics.STATUS:
             status = heard.status(payload)
-            self._viewer.health(device, status.t, rebuilt.health(status))
+            if status.t is not None:
+                self._viewer.health(device, status.t, rebuilt.health(status))
 
     def _trouble(self) -> str:
         viewer = self._viewer.state

@@ -44,7 +44,8 @@ class StatusMessage(msgspec.Struct, frozen=True):
     """``imu/<device>/status``."""
 
     schema: str
-    t: float
+    t: float | None
+    """Null before the first sample of a device with times of its own."""
     state: str
     received: Count
     lost: Count

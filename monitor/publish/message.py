@@ -1,6 +1,7 @@
 """Results -> bytes: JSON, each payload with schema, device, time and sample count.
 
-NaN becomes null, as JSON has no word for it. ``t`` is the Unix time of the newest sample in s.
+NaN becomes null, as JSON has no word for it. ``t`` is the Unix time of the newest sample in s. In a status and in the
+answer to a reset it is null before the first sample of a recording, or of a device that stamps its samples itself.
 """
 
 from collections.abc import Mapping, Sequence
@@ -161,7 +162,7 @@ def since_s(unix_s: float, what: Event) -> float | None:
     return None if what.since_ns is None else unix_s - (what.t_ns - what.since_ns) / 1e9
 
 
-def status(device: str, unix_s: float, health: Health) -> bytes:
+def status(device: str, unix_s: float | None, health: Health) -> bytes:
     """``imu/<device>/status``."""
     payload = {
         "state": health.state,
@@ -184,7 +185,7 @@ def status(device: str, unix_s: float, health: Health) -> bytes:
     return _encode(topics.STATUS, device, unix_s, health.received, payload)
 
 
-def reply(device: str, unix_s: float, samples: int, text: str) -> bytes:
+def reply(device: str, unix_s: float | None, samples: int, text: str) -> bytes:
     """Answer of ``imu/<device>/command/<verb>``."""
     return _encode(topics.RESET, device, unix_s, samples, {"text": text})
 
@@ -246,7 +247,7 @@ def _window(estimate: Estimate, **more: Any) -> dict[str, Any]:
     return {"rate": estimate.rate_hz, "window": estimate.window_s, "filled": filled_s, **more}
 
 
-def _encode(topic: topics.Topic, device: str, unix_s: float, samples: int, payload: dict[str, Any]) -> bytes:
+def _encode(topic: topics.Topic, device: str, unix_s: float | None, samples: int, payload: dict[str, Any]) -> bytes:
     return _ENCODER.encode({"schema": topic.schema(), "device": device, "t": unix_s, "samples": samples, **payload})
 
 

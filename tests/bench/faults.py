@@ -106,7 +106,7 @@ class Said(Output):
     healths: list[Health] = field(default_factory=list)
     events: list[str] = field(default_factory=list)  # their sentences
 
-    def health(self, device: str, unix_s: float, health: Health) -> None:
+    def health(self, device: str, unix_s: float | None, health: Health) -> None:
         self.healths.append(health)
 
     def event(self, device: str, unix_s: float, received: int, event: Any) -> None:

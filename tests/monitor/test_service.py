@@ -1,5 +1,6 @@
 """What the service says of itself: where its page is, and nothing at a date that is not the samples'."""
 
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -11,11 +12,17 @@ from rich.console import Console
 from structlog.testing import capture_logs
 
 from drivers.recording import save_samples
+from drivers.sample import Event
 from monitor import service as service_module
 from monitor import settings
+from monitor.health import Health
+from monitor.history import past
+from monitor.history.store import FILE, reading
+from monitor.history.times import Span
 from monitor.outputs import TableOutput
 from monitor.publish.terminal import Board
 from monitor.service import Service
+from monitor.station import Output
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
@@ -70,6 +77,93 @@ def test_a_recording_of_long_ago_leaves_nothing_at_todays_date(tmp_path: Path) -
     assert "ENDED" in str(cells["/d/status"])
     times_s = [t / 1e9 for entity in cells.values() for t in entity.get("sample_time", []) if isinstance(t, int)]
     assert RECORDED_S <= min(times_s) <= max(times_s) <= RECORDED_S + 1.0
+
+
+class Times(Output):
+    """The times that were said of a device."""
+
+    def __init__(self) -> None:
+        self.healths: list[tuple[float | None, Health]] = []
+        self.events: list[float] = []
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        self.events.append(unix_s)
+
+    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+        self.healths.append((unix_s, health))
+
+    def count(self, received: bool) -> int:
+        """Reports since, or before, the first sample was received."""
+        return sum(bool(health.received) == received for _, health in self.healths)
+
+
+@pytest.mark.parametrize("kind", ["csv", "npz", "folder"])
+def test_a_recording_that_waits_for_kernels_leaves_nothing_outside_of_its_own_times(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    n, compiled, warm_up = 2000, threading.Event(), service_module.warm_up
+
+    def held_back() -> Iterator[str]:
+        compiled.wait(120.0)
+        yield from warm_up()
+
+    monkeypatch.setattr(service_module, "warm_up", held_back)
+    t_s = np.arange(n) / 100.0
+    values = np.random.default_rng(1).standard_normal((n, 6)) * 1e-3
+    name = {"csv": "r.csv", "npz": "r.npz", "folder": "r"}[kind]
+    recording, away = tmp_path / name, tmp_path / f"away-{name}"
+    if kind == "folder":
+        recording.mkdir()
+        for part in (slice(0, n // 2), slice(n // 2, n)):
+            save_samples(recording / f"{part.start:05d}.csv", t_s[part], values[part])
+    else:
+        save_samples(recording, t_s, values)
+    view = tmp_path / "view.rrd"
+    path = tmp_path / "config.toml"
+    path.write_text(
+        f"""
+[[device]]
+name = "night-run"
+driver = {{ link = "replay", path = "{name}", speed = 1000 }}
+[zenoh]
+mode = "none"
+[viewer]
+mode = "{view}"
+[storage]
+folder = "kept"
+record = false
+"""
+    )
+    told = Times()
+    service = Service(settings.load(path), [told])
+    recording.rename(away)
+    thread = threading.Thread(target=service.run, args=(120.0,))
+    thread.start()
+    try:
+        assert wait_for(lambda: told.count(received=False) >= 2, 60.0)  # there is no recording yet
+        away.rename(recording)
+        assert wait_for(lambda: told.count(received=True) >= 2, 60.0)  # its samples wait in the ring
+        assert service.stations[0].published == 0
+    finally:
+        compiled.set()
+        thread.join(120.0)
+    assert not thread.is_alive()
+    assert service.stations[0].published == n
+    first_s, last_s = 0.0, (n - 1) / 100.0
+    assert {unix_s for unix_s, health in told.healths if not health.received} == {None}
+    stamps = [unix_s for unix_s, health in told.healths if health.received]
+    assert all(unix_s is not None and first_s <= unix_s <= last_s for unix_s in stamps), stamps
+    assert stamps[-1] == last_s
+    assert all(first_s <= unix_s <= last_s for unix_s in told.events), told.events
+    cells = read(view)
+    assert "ENDED" in str(cells["/night-run/status"])
+    times_s = [t / 1e9 for entity in cells.values() for t in entity.get("sample_time", []) if isinstance(t, int)]
+    assert first_s <= min(times_s) <= max(times_s) <= last_s
+    with reading(tmp_path / "kept" / FILE) as reader:
+        kept = past.read(reader, "night-run", Span(-math.inf, math.inf), step_s=60)
+    assert kept.start_s.tolist() == [0]
+    assert kept.counts[:, 0].tolist() == [n]
+    assert all(first_s <= event.t_s <= last_s for event in kept.events)
 
 
 def test_kernels_that_cannot_be_kept_hold_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

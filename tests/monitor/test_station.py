@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from drivers.decoders import text, vectornav_binary
+from drivers.decoders import samples, text, vectornav_binary
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
 from drivers.links import replay_link
@@ -26,6 +26,7 @@ class Caught:
         self.blocks, self.counts, self.estimates, self.events, self.healths, self.totals = [], [], [], [], [], []
         self.gaps, self.thermals = [], []
         self.rates, self.drifts = [], []
+        self.total_times, self.health_times = [], []
 
     def samples(self, device, received, samples, offset_ns):
         self.blocks.append(samples)
@@ -48,12 +49,14 @@ class Caught:
 
     def total(self, device, unix_s, received, total, hadamard):
         self.totals.append((received, total, hadamard))
+        self.total_times.append(unix_s)
 
     def event(self, device, unix_s, received, event):
         self.events.append((unix_s, event))
 
     def health(self, device, unix_s, health):
         self.healths.append(health)
+        self.health_times.append(unix_s)
 
 
 class Rig:
@@ -584,3 +587,71 @@ def test_a_recording_has_its_own_times_whatever_the_host_does(monkeypatch, tmp_p
     monkeypatch.setattr(time, "time_ns", lambda: host() + 10**13)
     assert rig.station.report([rig.caught], {}, 0).text == ""
     assert rig.caught.events == []
+
+
+def replayed(tmp_path, **more):
+    path = tmp_path / "x.csv"
+    path.write_text("t,gx\n0.0,1.0\n0.01,2.0\n")
+    return Rig(link=replay_link.build(replay_link.Settings(path=str(path))), **more)
+
+
+def test_before_its_first_sample_a_recording_has_no_time(tmp_path):
+    rig = replayed(tmp_path)
+    rig.station.report([rig.caught], {}, 0)
+    rig.station.driver.state = "running"
+    rig.station.report([rig.caught], {}, 0)
+    rig.station.announce([rig.caught], "recording_stopped", "no room")
+    rig.work(1000.0)
+    assert rig.caught.health_times == [None, None]
+    assert rig.caught.events == []
+    rig.bring(10)
+    rig.work(1001.0)
+    rig.station.report([rig.caught], {}, 0)
+    assert rig.caught.health_times[2:] == [0.09]
+    assert [(at_s, event.text) for at_s, event in rig.caught.events] == [(0.09, "no room")]
+    rig.station.driver.state = "lost"
+    assert rig.station.now_unix_s() == 0.09  # a recording's time does not go on by itself
+
+
+def test_while_samples_wait_in_the_ring_the_first_has_the_time(tmp_path):
+    rig = replayed(tmp_path, ready=Ready())
+    rig.station.driver.first_t_ns = 10_000_000  # as the reader sees it
+    rig.bring(10)
+    rig.station.driver.state = "running"
+    rig.work(1000.0)
+    assert rig.caught.blocks == []
+    assert rig.station.now_unix_s() == 0.01
+
+
+def test_the_time_of_a_device_with_its_own_clock_goes_on_while_it_is_lost(monkeypatch):
+    rig = Rig(decoder=samples.build(samples.Settings()))
+    assert rig.station.driver.times_are_unix
+    assert rig.station.now_unix_s() is None
+    rig.station.driver.state = "running"
+    rig.bring(11)
+    rig.work(1000.0)
+    assert rig.station.now_unix_s() == 0.1
+    rig.station.driver.state = "lost"
+    host = time.monotonic_ns
+    monkeypatch.setattr(time, "monotonic_ns", lambda: host() + 3_600 * 10**9)
+    assert rig.station.now_unix_s() == pytest.approx(3600.1, abs=60.0)
+
+
+def test_before_its_first_sample_a_sensor_has_the_host_s_time():
+    rig = Rig()
+    rig.station.report([rig.caught], {}, 0)
+    rig.station.announce([rig.caught], "recording_stopped", "no room")
+    assert rig.caught.health_times == [pytest.approx(time.time(), abs=30.0)]
+    assert [at_s for at_s, _ in rig.caught.events] == [pytest.approx(time.time(), abs=30.0)]
+
+
+def test_slow_statistics_of_a_rebuilt_window_have_its_time(tmp_path):
+    rig = replayed(tmp_path)
+    index = np.arange(400)
+    values = 1e-3 * np.random.default_rng(1).standard_normal((400, 6))
+    rig.station.chain.relive(block(10**9 + index * 10_000_000, values), RATE)
+    for i in range(10_000):
+        rig.work(1000.0 + 100.0 * i)
+        if rig.caught.totals:
+            break
+    assert rig.caught.total_times[:1] == [4.99]

@@ -63,7 +63,7 @@ class Caught(Output):
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         self.events.append((device, event))
 
-    def health(self, device: str, unix_s: float, health: Health) -> None:
+    def health(self, device: str, unix_s: float | None, health: Health) -> None:
         self.healths[device] = health
 
     def values(self, device: str) -> np.ndarray:

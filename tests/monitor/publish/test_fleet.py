@@ -78,6 +78,21 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path) -
     assert fleet.malformed == 0
 
 
+def test_a_status_without_a_time_has_a_row_and_is_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    viewer = RerunView(ViewerSettings(mode="none"), [DeviceInfo("imu/a")], fleet=True)
+    drawn: list[float] = []
+    monkeypatch.setattr(viewer, "health", lambda _device, wall_s, _health: drawn.append(wall_s))
+    fleet = FleetView(ZenohIn("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
+    fleet.take(Message("imu/a/status", message.status("a", None, made.health(state="waiting"))))
+    (known,) = fleet.board.devices(time.monotonic())
+    assert known.status is not None
+    assert known.status.state == "waiting"
+    assert drawn == []
+    fleet.take(Message("imu/a/status", message.status("a", 5.0, made.health())))
+    assert drawn == [5.0]
+    assert fleet.malformed == fleet.board.malformed == 0
+
+
 def test_hostile_messages_change_nothing_and_are_counted() -> None:
     viewer = RerunView(ViewerSettings(mode="none"), [DeviceInfo("imu/a")], fleet=True)
     fleet = FleetView(ZenohIn("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])

@@ -38,6 +38,10 @@ def test_what_a_newer_daemon_adds_is_passed_over() -> None:
     assert found.coefficients.value[1, 2] == 1e-4
 
 
+def test_a_status_may_have_no_time_yet() -> None:
+    assert heard.status(message.status("a", None, made.health())).t is None
+
+
 @pytest.mark.parametrize(
     "payload",
     [
