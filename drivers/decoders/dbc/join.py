@@ -126,7 +126,7 @@ class Join:
         return missing
 
     def take_delay_ns(self) -> int:
-        """Return the time from the first to the newest late frame of a sample; 0 if none was late since the last call."""
+        """Return the delay of the newest late frame after the first of its sample; 0 if none since the last call."""
         delay_ns, self._delay_ns = self._delay_ns, 0
         return delay_ns
 
