@@ -105,6 +105,11 @@ class Driver:
         self._untold = self._holes = 0  # samples missing, and in how many places, since that was told
         self._told_s = -TELL_EVERY_S
 
+    @property
+    def late_hint(self) -> str:
+        """By how much frames of one sample come too late and what to do; "" if none has for a while."""
+        return self._counts_late.late_hint if self._counts_late else ""
+
     def take_events(self) -> list[Event]:
         """Events since the last call, oldest first."""
         return [self._events.popleft() for _ in range(len(self._events))]

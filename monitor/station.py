@@ -483,7 +483,7 @@ class Station:
             return self.chain.refused
         if nominal and measured and abs(measured / nominal - 1.0) > OFF_NOMINAL:
             return f"samples come at {measured:.4g} Hz, configured are {nominal:g} Hz"
-        return self.driver.decoder.hint or self._wall_text()
+        return self.driver.late_hint or self._wall_text()
 
     def _wall_text(self) -> str:
         behind_s = 0.0 if self.driver.times_are_unix else self._wall.behind_ns / 1e9

@@ -61,8 +61,8 @@ PACKAGES: Final[Mapping[str, tuple[str, str, str]]] = {
 }
 """Interfaces that need a package which neither this project nor python-can requires: module, package, what to install.
 
-pyserial, for slcan, robotell, seeedstudio and serial, is required by this project; socketcan, socketcand and virtual need
-no package, and the other interfaces need a library of the adapter's maker.
+pyserial, for slcan, robotell, seeedstudio and serial, is required by this project. socketcan, socketcand and virtual
+need no package. The other interfaces need a library of the adapter's maker.
 """
 BUS_OFF: Final = 0x40
 """CAN_ERR_BUSOFF of linux/can/error.h, in the identifier of a socketcan error frame."""

@@ -52,6 +52,7 @@ class DbcDecoder:
         self.timing: Timing = timing
         self.bad = 0
         self.late = 0
+        self.late_hint = ""
         self._left_out = 0  # samples, bad or late
         self.hint = ""
         self._rivals = ""  # the hint that two senders are on the bus
@@ -94,10 +95,10 @@ class DbcDecoder:
         blocks = self._decode(done)
         self._quiet = self._quiet + len(done) if self._rows.bad == self._left_out else 0
         if self._quiet >= QUIET_FRAMES:
-            self.hint = ""
+            self.hint = self.late_hint = ""
         if delay_ns := self._join.take_delay_ns():
             self._quiet = 0
-            self.hint = (
+            self.hint = self.late_hint = (
                 f"frames of one sample arrive {delay_ns * 1e-6:.3g} ms apart, more than "
                 f"window = {self._settings.window:g} s: increase `window` in decoder_options"
             )
