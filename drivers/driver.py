@@ -15,7 +15,7 @@ from typing import Final, Literal
 import numpy as np
 
 from drivers.clock import SampleClock
-from drivers.decoders.base import Decoder
+from drivers.decoders.base import CountingLate, Decoder
 from drivers.errors import ConfigError, LinkEnded, LinkError, LinkLost
 from drivers.links.base import Link
 from drivers.sample import AXES, Chunk, Event, Given, SampleBlock, block
@@ -55,6 +55,7 @@ class Counts:
     received: int = 0
     bad: int = 0
     lost: int = 0
+    late: int = 0  # of the lost: left out by the decoder because some of their frames came too late
 
 
 class Driver:
@@ -98,12 +99,18 @@ class Driver:
         self._events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         self._stop = threading.Event()
         self._undecoded = 0
-        self._placed = 0  # rejected frames whose places have been told as lost
+        self._counts_late = decoder if isinstance(decoder, CountingLate) else None
+        self._placed = 0  # samples left out by the decoder whose places have been told as lost
         self._heard_s = 0.0
         self._sampled_s = 0.0
         self._newest_t_ns = 0
         self._untold = self._holes = 0  # samples missing, and in how many places, since that was told
         self._told_s = -TELL_EVERY_S
+
+    @property
+    def late_hint(self) -> str:
+        """By how much frames of one sample come too late and what to do; "" if none has for a while."""
+        return self._counts_late.late_hint if self._counts_late else ""
 
     def take_events(self) -> list[Event]:
         """Events since the last call, oldest first."""
@@ -163,26 +170,36 @@ class Driver:
             return
         self._sampled_s, self._undecoded = self._heard_s, 0
         for one in samples:
-            # a decoder's hole is of rejected frames, or of messages that a sender counted and nobody received
-            rejected = min(one.lost, self.decoder.bad - self._placed)
-            self._placed += rejected
+            # a decoder's hole is of samples it left out, or of messages that a sender counted and nobody received
+            left_out = min(one.lost, self._left_out() - self._placed)
+            self._placed += left_out
             for stamped in self.clock.stamp(one):
-                self._count(stamped, rejected)
+                self._count(stamped, left_out)
                 self._push(self._axes.apply(stamped))
-                rejected = 0  # they stood before the first row
-        self.counts.bad = self.decoder.bad
+                left_out = 0  # they stood before the first row
+        self._count_left_out()
         self._tell_lost()
         self._events.extend(self.clock.take_events())
         if self.state != "running":
             self._back()
 
-    def _count(self, stamped: SampleBlock, rejected: int) -> None:
+    def _left_out(self) -> int:
+        """Samples that the decoder has left out, bad or late."""
+        return self.decoder.bad + (self._counts_late.late if self._counts_late else 0)
+
+    def _count_left_out(self) -> None:
+        self.counts.bad = self.decoder.bad
+        if self._counts_late:
+            self.counts.lost += self._counts_late.late - self.counts.late
+            self.counts.late = self._counts_late.late
+
+    def _count(self, stamped: SampleBlock, left_out: int) -> None:
         if self.first_t_ns is None:
             self.first_t_ns = int(stamped.t_ns[0])
         self.counts.received += len(stamped)
         self._newest_t_ns = int(stamped.t_ns[-1])
         if stamped.lost:
-            self.counts.lost += max(0, stamped.lost - rejected)
+            self.counts.lost += max(0, stamped.lost - left_out)
             self._untold += stamped.lost
             self._holes += 1
 
@@ -201,7 +218,7 @@ class Driver:
             raise LinkLost(f"{self.link.name} silent for {silent_s:.1f} s")
 
     def _watch_undecoded(self, size: int) -> None:
-        self.counts.bad = self.decoder.bad
+        self._count_left_out()
         self._undecoded += size
         mute_s = self._heard_s - self._sampled_s
         patience_s = max(MUTE_S, 10.0 / (self.clock.rate_hz or 10.0))
@@ -226,7 +243,7 @@ class Driver:
         self.text = f"{error}; trying again"
         self.link.close()
         self.decoder.reset()
-        self._placed = self.decoder.bad
+        self._placed = self._left_out()
         self.clock.pause()
 
     def _event(self, kind: str, text: str) -> None:

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from drivers.errors import ConfigError
+from drivers.links.can_link import missing_package
 from drivers.links.replay_link import ReplayLink
 from monitor import settings
 from monitor.limits import model_of
@@ -178,7 +179,10 @@ def holding(port: Path) -> Iterator[str]:
 
 
 def can_interface(about: str, interface: str, channel: str, sysfs: Path = Path("/sys/class/net")) -> list[Finding]:
-    """Does the kernel have the bus, and is it up."""
+    """Is the package there that the interface needs; does the kernel have the bus, and is it up."""
+    if missing := missing_package(interface):
+        text, _, command = missing.partition(": ")
+        return [Finding("wrong", about, text, command)]
     if interface != "socketcan":
         return [Finding("well", about, f"{interface} {channel}: not tried, only its own driver could tell")]
     if not hasattr(socket, "AF_CAN"):

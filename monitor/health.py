@@ -16,7 +16,7 @@ class Health:
     state: str  # running | waiting | lost | ended
     rate_hz: float | None  # measured; None until known
     received: int
-    lost: int  # missing on the wire, rejected frames not among them
+    lost: int  # missing on the wire, or left out as a frame came too late; rejected frames are not among them
     bad: int  # rejected: failed check, impossible value
     overflowed: int  # overwritten in the ring before the worker took them
     latency_p50_s: float | None  # receipt to published, over the last second

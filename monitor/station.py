@@ -289,7 +289,7 @@ class Station:
             text=self._text(),
             uptime_s=time.monotonic() - self._started_s,
             repeated=self.clock.repeated,
-            late=self.clock.late,
+            late=self.clock.late + counts.late,
             moving=watch is not None and watch.moving,
             moved=watch.moved_samples if watch is not None else 0,
             crossed=self._limits.crossed,
@@ -530,7 +530,7 @@ class Station:
             return self.chain.refused
         if nominal and measured and abs(measured / nominal - 1.0) > OFF_NOMINAL:
             return f"samples come at {measured:.4g} Hz, configured are {nominal:g} Hz"
-        return self._wall_text()
+        return self.driver.late_hint or self._wall_text()
 
     def _wall_text(self) -> str:
         behind_s = 0.0 if self.driver.times_are_unix else self._wall.behind_ns / 1e9

@@ -70,6 +70,19 @@ class Addressed(Protocol):
         """Addresses as of ``Chunk.address``."""
 
 
+@runtime_checkable
+class CountingLate(Protocol):
+    """A decoder that joins several frames to one sample, and tells late frames from missing ones."""
+
+    @property
+    def late(self) -> int:
+        """Samples left out since the decoder was made because some of their frames came too late; not in ``bad``."""
+
+    @property
+    def late_hint(self) -> str:
+        """By how much frames come too late and what to do, for the status; "" if none has for a while."""
+
+
 class Rows:
     """Collects decoded rows in order and cuts them into blocks at the places where frames were bad."""
 

@@ -16,12 +16,13 @@ and remote frames are counted and left aside. Nothing is sent, beyond what an ad
 
 import contextlib
 import errno
+import importlib.util
 import logging
 import math
 import socket
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import msgspec
@@ -50,6 +51,19 @@ OLDEST_S: Final = 1.0
 PROBE_S: Final = 2.0
 SAY_BUS_OFF: Final = ("socketcan", "virtual", "udp_multicast")
 """Interfaces whose error frames have SocketCAN's classes in their identifier."""
+PACKAGES: Final[Mapping[str, tuple[str, str, str]]] = {
+    "udp_multicast": ("msgpack", "msgpack", "imu-monitor[multicast]"),
+    "canalystii": ("canalystii", "canalystii", "python-can[canalystii]"),
+    "cantact": ("cantact", "cantact", "python-can[cantact]"),
+    "gs_usb": ("gs_usb", "gs-usb", "python-can[gs-usb]"),
+    "neovi": ("ics", "python-ics", "python-can[neovi]"),
+    "nixnet": ("nixnet", "nixnet", "python-can[nixnet]"),
+}
+"""Interfaces that need a package which neither this project nor python-can requires: module, package, what to install.
+
+pyserial, for slcan, robotell, seeedstudio and serial, is required by this project. socketcan, socketcand and virtual
+need no package. The other interfaces need a library of the adapter's maker.
+"""
 BUS_OFF: Final = 0x40
 """CAN_ERR_BUSOFF of linux/can/error.h, in the identifier of a socketcan error frame."""
 ID_MASK: Final = 0x1FFF_FFFF
@@ -103,6 +117,8 @@ class CanLink:
             if self._bus is not None:
                 return
             s = self._settings
+            if missing := missing_package(s.interface):
+                raise LinkUnavailable(missing)
             try:
                 _probe(s)
                 self._bus = can.Bus(
@@ -225,6 +241,14 @@ class CanLink:
         # an unplugged adapter cannot be told to close its channel; it is gone all the same
         with contextlib.suppress(can.CanError, OSError):
             bus.shutdown()
+
+
+def missing_package(interface: str) -> str:
+    """Return which package an interface of python-can lacks and how to install it; "" if none is missing."""
+    module, package, requirement = PACKAGES.get(interface, ("", "", ""))
+    if not module or importlib.util.find_spec(module) is not None:
+        return ""
+    return f'CAN interface {interface} needs the package {package}: pip install "{requirement}"'
 
 
 def _probe(s: Settings) -> None:

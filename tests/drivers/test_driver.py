@@ -4,15 +4,17 @@ import os
 import threading
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 
 from drivers import driver as driver_module
 from drivers.clock import SampleClock
+from drivers.decoders import dbc, stim300, text, vectornav_binary
 from drivers.decoders import samples as samples_decoder
-from drivers.decoders import stim300, text, vectornav_binary
 from drivers.driver import UNDECODED_BYTES, AxisMap, Driver, axis_map
 from drivers.errors import ConfigError
 from drivers.links.loopback_link import LoopbackLink
@@ -287,6 +289,52 @@ def test_messages_that_never_came_are_lost_and_rejected_ones_are_bad():
     rig.driver.run()
     counts = rig.driver.counts
     assert (counts.received, counts.bad, counts.lost) == (70, 1, 29)  # a message that cannot be read counts as one
+
+
+SIGNALS = {"gz": "AngularRateInformation.YawRate", "az": "AccelerationSensor.VerticalAcceleration"}
+APART = "frames of one sample arrive 8 ms apart, more than window = 0.005 s: increase `window` in decoder_options"
+
+
+def can_rig(late, n=500):
+    """A driver that has read ``n`` samples of two CAN frames each, 20 ms a sample; in the late samples 8 ms apart."""
+    decoder = dbc.build(msgspec.convert({"file": "j1939_imu", "signals": SIGNALS, "window": 0.005}, dbc.Settings))
+    rig = Rig(decoder, 50.0)
+    index = np.arange(n)
+    sent = decoder.encode(block(index * 20_000_000, np.tile([0.0, 0.0, 0.1, 0.0, 0.0, 9.81], (n, 1))))
+    rig.link.open()
+    for i, chunk in enumerate(sent):
+        delay_ns = i % 2 * (8_000_000 if i // 2 in late else 1_000_000)
+        rig.link.write(replace(chunk, t_ns=chunk.t_ns + delay_ns))
+        if i % 3 == 0:
+            rig.driver.step()
+    rig.driver.step()
+    return rig
+
+
+@pytest.mark.parametrize("late", [range(0), range(7, 500, 7), range(100, 300), range(499, 500), range(500)])
+def test_late_can_frames_are_late_samples_neither_bad_nor_sent_twice(late):
+    counts = can_rig(late).driver.counts
+    assert (counts.received, counts.bad, counts.lost, counts.late) == (500 - len(late), 0, len(late), len(late))
+
+
+def test_late_and_missing_can_frames_add_up_with_the_samples():
+    rig = can_rig(range(0), 0)
+    sent = rig.decoder.encode(block(np.arange(100) * 20_000_000, np.ones((100, 6))))
+    late, missing = {20, 21, 60}, {40, 41, 81}
+    for i, chunk in enumerate(sent):
+        if i // 2 in missing and i % 2 == 1:
+            continue
+        rig.link.write(replace(chunk, t_ns=chunk.t_ns + i % 2 * (8_000_000 if i // 2 in late else 1_000_000)))
+        rig.driver.step()
+    counts = rig.driver.counts
+    assert (counts.received, counts.bad, counts.lost, counts.late) == (94, 3, 3, 3)
+
+
+def test_the_status_of_a_device_whose_can_frames_are_all_late_names_the_window():
+    rig = can_rig(range(500))
+    assert rig.driver.state == "waiting"
+    assert rig.driver.text.startswith("loopback: ")
+    assert rig.driver.text.endswith(f" bytes and no sample in them; {APART}")
 
 
 def test_times_follow_what_the_link_brings():

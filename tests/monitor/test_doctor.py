@@ -174,6 +174,13 @@ def test_a_bus_is_there_and_up_or_what_to_do_is_said(tmp_path: Path) -> None:
     assert said("can7") == ("wrong", "can7: there is no such interface; CAN interfaces are: can0, can1")
 
 
+def test_a_package_that_the_interface_lacks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "msgpack", None)  # as if it were not installed
+    (found,) = doctor.can_interface("device a", "udp_multicast", "239.74.163.2")
+    assert (found.mark, found.text) == ("wrong", "CAN interface udp_multicast needs the package msgpack")
+    assert found.do == 'pip install "imu-monitor[multicast]"'
+
+
 # --- outputs
 
 

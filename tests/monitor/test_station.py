@@ -2,11 +2,13 @@
 
 import threading
 import time
+from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
-from drivers.decoders import samples, text, vectornav_binary
+from drivers.decoders import dbc, samples, text, vectornav_binary
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
 from drivers.links import replay_link
@@ -128,6 +130,24 @@ def test_drained_everything_is_out_and_the_estimate_covers_it():
     assert np.array_equal(np.concatenate([one.t_ns for one in rig.caught.blocks]), np.arange(1507) * 10_000_000)
     _, last = rig.caught.estimates[-1]
     assert (last.samples, last.curve.n, last.t_ns) == (1507, 1507, 15_060_000_000)
+
+
+def test_a_running_device_whose_can_frames_are_late_says_so():
+    signals = {"gz": "AngularRateInformation.YawRate", "az": "AccelerationSensor.VerticalAcceleration"}
+    settings = {"file": "j1939_imu", "signals": signals, "window": 0.005}
+    decoder = dbc.build(msgspec.convert(settings, dbc.Settings))
+    rig = Rig(rate=50.0, decoder=decoder)
+    sent = decoder.encode(block(np.arange(50) * 20_000_000, np.ones((50, 6))))
+    for i, chunk in enumerate(sent):
+        delay_ns = i % 2 * (8_000_000 if i // 2 == 30 else 1_000_000)
+        rig.link.write(replace(chunk, t_ns=chunk.t_ns + delay_ns))
+    rig.station.driver.step()
+    health = rig.station.health({}, 0)
+    assert health.state == "running"
+    assert (health.received, health.bad, health.lost, health.late) == (49, 0, 1, 1)
+    assert health.text == (
+        "frames of one sample arrive 8 ms apart, more than window = 0.005 s: increase `window` in decoder_options"
+    )
 
 
 def test_refits_and_publications_keep_their_beat():

@@ -5,12 +5,14 @@ is not used: frames of one message are stacked to bytes [n, size] and each signa
 once (``drivers.decoders.dbc`` is compared with cantools in the tests).
 
 One sample may be spread over several messages. Its frames are joined in order of arrival: a frame whose
-message the open sample already has, or that is later than ``window`` after its first, starts the next
-sample. With ``join = "counter"`` the counter decides: a frame with another count, or, where the counter
-has a message of its own, the arrival of that message, starts the next sample. A sample with a frame
-missing, too short or not ``valid`` is bad, and leaves its place empty; with ``partial = true`` missing frames
-only leave their axes unmeasured. What stands before the first complete sample (joined mid-stream) is not
-counted. A message that brings nothing but temperature may be slower than the rest: the newest is used.
+message the open sample already has starts the next sample. With ``join = "counter"`` the counter decides: a frame
+with another count, or, where the counter has a message of its own, the arrival of that message, starts the next
+sample. A sample with a frame missing, too short or not ``valid`` is bad, and leaves its place empty; with
+``partial = true`` missing frames only leave their axes unmeasured. A sample whose frames all come, but some of them
+after ``window``, is late: it leaves its place empty too, and is counted in ``late`` instead of ``bad``
+(``drivers.decoders.dbc.join`` says how a late frame is told from a frame of the next sample). Frames before the first
+whole sample are not counted. A message that brings nothing but temperature may be slower than the rest: the newest is
+used.
 
 J1939 messages (attribute VFrameFormat, or ``j1939 = true``) are known by their parameter group, whatever
 priority and sender; the first sender heard is the one listened to, unless ``source`` names another. A raw value in
@@ -49,6 +51,9 @@ class DbcDecoder:
         self._settings = settings
         self.timing: Timing = timing
         self.bad = 0
+        self.late = 0
+        self.late_hint = ""
+        self._left_out = 0  # samples, bad or late
         self.hint = ""
         self._rivals = ""  # the hint that two senders are on the bus
         self._quiet = 0  # good samples since the last rejected one
@@ -88,11 +93,18 @@ class DbcDecoder:
                 self.hint = f"{message}: frames of {len(chunk.data)} bytes, but its signals need {size}"
             self._join.put(which, chunk.data[:size] if len(chunk.data) >= size else b"", chunk.t_ns, done)
         blocks = self._decode(done)
-        self._quiet = self._quiet + len(done) if self._rows.bad == self.bad else 0
+        self._quiet = self._quiet + len(done) if self._rows.bad == self._left_out else 0
         if self._quiet >= QUIET_FRAMES:
-            self.hint = ""
+            self.hint = self.late_hint = ""
+        if delay_ns := self._join.take_delay_ns():
+            self._quiet = 0
+            self.hint = self.late_hint = (
+                f"frames of one sample arrive {delay_ns * 1e-6:.3g} ms apart, more than "
+                f"window = {self._settings.window:g} s: increase `window` in decoder_options"
+            )
         self.hint = self._rivals or self.hint
-        self.bad = self._rows.bad
+        self._left_out, self.late = self._rows.bad, self._join.late
+        self.bad = self._left_out - self.late
         return blocks
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
@@ -179,8 +191,8 @@ class DbcDecoder:
             np.ascontiguousarray(table[:, : len(AXES)]),
             table[:, len(AXES)].copy(),
             ticks,
-            np.array([s.bad_before for s in done], np.int64),
-            self._join.take_bad(),
+            np.array([s.missing_before for s in done], np.int64),
+            self._join.take_missing(),
         )
 
 

@@ -33,7 +33,7 @@ class Settings(DecoderSettings, frozen=True, kw_only=True):
     """Seconds a count; absent: the counter counts samples."""
     join: Literal["time", "counter"] = "time"
     window: float = 0.0
-    """Seconds within which the frames of one sample come; 0 = any."""
+    """Seconds within which the frames of one sample come, at most half a sample period; 0 = any."""
     partial: bool = False
     j1939: bool | None = None
     source: int | None = None

@@ -298,6 +298,86 @@ def test_window_puts_joining_right_after_a_lost_first_frame() -> None:
     assert decoder.bad == 1
 
 
+HINT = "frames of one sample arrive 8 ms apart, more than window = 0.005 s: increase `window` in decoder_options"
+
+
+def delayed(n: int, late: list[int], period_ms: int) -> list[Chunk]:
+    """As ``pairs``; ACCS comes 8 ms after ARI in the late samples and 1 ms after it in the others."""
+    frames = []
+    for i, (rate, acceleration) in enumerate(zip(pairs(n)[::2], pairs(n)[1::2], strict=True)):
+        t_ns = i * period_ms * 1_000_000
+        frames.append(Chunk(rate.data, t_ns, ARI))
+        frames.append(Chunk(acceleration.data, t_ns + (8_000_000 if i in late else 1_000_000), ACCS))
+    return frames
+
+
+def whole(n: int, without: list[int]) -> list[tuple[int, int]]:
+    return [(i, i) for i in range(n) if i not in without]
+
+
+@pytest.mark.parametrize(
+    ("period_ms", "late"),
+    [(10, [3]), (10, [3, 4, 7]), (10, [0]), (10, [9]), (20, [3]), (20, [0, 1, 2]), (20, [7, 8, 9])],
+)
+def test_a_late_frame_makes_its_sample_late_and_not_bad(period_ms: int, late: list[int]) -> None:
+    decoder = build("j1939_imu", SAE, window=0.005)
+    frames = delayed(10, late, period_ms)
+    blocks = decoder.feed(frames)
+    assert counts(blocks) == whole(10, late)
+    assert (decoder.late, decoder.bad) == (len(late), 0)
+    assert sum(b.lost for b in blocks) == len([i for i in late if i < counts(blocks)[-1][0]])  # then a good one follows
+    assert decoder.hint == HINT
+    single = build("j1939_imu", SAE, window=0.005)
+    assert counts([b for frame in frames for b in single.feed([frame])]) == whole(10, late)
+    assert (single.late, single.bad, single.hint) == (len(late), 0, HINT)
+
+
+def test_samples_that_are_all_late_are_told_though_none_is_whole() -> None:
+    decoder = build("j1939_imu", SAE, window=0.005)
+    assert decoder.feed(delayed(10, list(range(10)), 20)) == []
+    assert (decoder.late, decoder.bad, decoder.hint) == (10, 0, HINT)
+    # joined in the middle of a sample, which is not counted
+    decoder = build("j1939_imu", SAE, window=0.005)
+    assert decoder.feed(delayed(10, list(range(10)), 20)[1:]) == []
+    assert (decoder.late, decoder.bad, decoder.hint) == (9, 0, HINT)
+
+
+def test_late_and_missing_frames_are_told_apart() -> None:
+    frames = delayed(12, [3, 6], 10)
+    del frames[21]  # ACCS of sample 10
+    del frames[10]  # ARI of sample 5
+    del frames[9]  # ACCS of sample 4, so that two frames in a row are missing
+    decoder = build("j1939_imu", SAE, window=0.005)
+    blocks = decoder.feed(frames)
+    assert counts(blocks) == whole(12, [3, 4, 5, 6, 10])
+    assert (decoder.late, decoder.bad) == (2, 3)
+    assert [(len(b), b.lost) for b in blocks] == [(3, 0), (3, 4), (1, 1)]
+
+
+def test_a_late_frame_that_is_too_short_makes_its_sample_bad() -> None:
+    frames = delayed(6, [3], 20)
+    frames[7] = Chunk(b"", frames[7].t_ns, ACCS)
+    decoder = build("j1939_imu", SAE, window=0.005)
+    assert counts(decoder.feed(frames)) == whole(6, [3])
+    assert (decoder.late, decoder.bad) == (0, 1)
+
+
+def test_a_partial_sample_is_kept_without_its_late_frame() -> None:
+    decoder = build("j1939_imu", SAE, window=0.005, partial=True)
+    got = join(decoder.feed(delayed(6, [3], 10)))
+    assert np.isnan(got.values).all(axis=1).tolist() == [False] * 6
+    assert np.isnan(got.values[:, 3:]).all(axis=1).tolist() == [i == 3 for i in range(6)]
+    assert (decoder.late, decoder.bad, decoder.hint) == (0, 0, HINT)
+
+
+def test_the_hint_goes_when_no_frame_has_been_late_for_a_while() -> None:
+    decoder = build("j1939_imu", SAE, window=0.005)
+    decoder.feed(delayed(10, [3], 10))
+    assert decoder.hint == HINT
+    decoder.feed([Chunk(c.data, c.t_ns + 1_000_000_000, c.address) for c in delayed(1100, [], 10)])
+    assert decoder.hint == ""
+
+
 def test_joining_mid_stream_is_no_loss() -> None:
     decoder = build("j1939_imu", SAE, window=0.005)
     blocks = decoder.feed(pairs(4)[1:])
@@ -363,6 +443,31 @@ def test_frames_with_equal_counts_belong_together(tmp_path: Path) -> None:
     assert np.rint(got.values[:, 5] * 1e3).astype(int).tolist() == ids.tolist()
     assert (got.ticks == ids % 16).all()
     assert decoder.bad == 2
+
+
+def test_a_frame_behind_the_start_of_the_next_sample_does_not_end_that_sample(tmp_path: Path) -> None:
+    path = tmp_path / "counted.dbc"
+    path.write_text(COUNTED)
+    decoder = build(path, {"gz": "Gyro.Z", "az": "Accel.Z"}, counter="Count", join="counter")
+    frames = [chunk(1 + which, struct.pack("<h5xB", i, i % 16), i) for i in range(10) for which in (0, 1)]
+    frames[9], frames[10] = frames[10], frames[9]  # Accel 4 behind Gyro 5
+    got = join(decoder.feed(frames))
+    assert got.ticks.tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 9]
+    assert (decoder.bad, got.lost) == (1, 1)
+
+
+def test_a_frame_with_the_count_of_its_sample_is_late_after_the_window(tmp_path: Path) -> None:
+    path = tmp_path / "counted.dbc"
+    path.write_text(COUNTED)
+    decoder = build(path, {"gz": "Gyro.Z", "az": "Accel.Z"}, counter="Count", join="counter", window=0.005)
+    frames = [
+        chunk(1 + which, struct.pack("<h5xB", i, i % 16), i * 10_000_000 + which * (8_000_000 if i == 4 else 1_000_000))
+        for i in range(10)
+        for which in (0, 1)
+    ]
+    got = join(decoder.feed(frames))
+    assert got.ticks.tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 9]
+    assert (decoder.late, decoder.bad, got.lost, decoder.hint) == (1, 0, 1, HINT)
 
 
 def test_a_counter_message_starts_the_sample() -> None:

@@ -3,10 +3,15 @@
 import errno
 import itertools
 import os
+import re
 import socket
+import sys
 import time
+import tomllib
 import tty
 from collections.abc import Iterator
+from importlib.metadata import requires
+from pathlib import Path
 from typing import Any
 
 import can
@@ -198,6 +203,39 @@ def test_advice(monkeypatch: pytest.MonkeyPatch, keys: dict[str, Any], error: Ex
         build(channel="can0", **keys).open()
     assert raised.value.__cause__ is error
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("interface", can_link.PACKAGES)
+def test_a_missing_package_is_named_with_the_command_that_installs_it(
+    monkeypatch: pytest.MonkeyPatch, interface: str
+) -> None:
+    module, package, requirement = can_link.PACKAGES[interface]
+    monkeypatch.setitem(sys.modules, module, None)  # as if it were not installed
+    with pytest.raises(LinkUnavailable) as raised:
+        build(interface=interface, channel="239.74.163.2").open()
+    said = f'CAN interface {interface} needs the package {package}: pip install "{requirement}"'
+    assert str(raised.value) == said
+
+
+def test_the_extra_that_a_message_names_brings_the_package() -> None:
+    text = (Path(__file__).parents[3] / "pyproject.toml").read_text("utf-8")
+    extras = tomllib.loads(text)["project"]["optional-dependencies"]
+    ours = {
+        requirement.removeprefix("imu-monitor[").removesuffix("]"): package
+        for _, package, requirement in can_link.PACKAGES.values()
+        if requirement.startswith("imu-monitor[")
+    }
+    for extra, package in ours.items():
+        assert any(re.match(rf"{package}\b", one) for one in extras[extra])
+        assert extra in extras["all"][0]
+
+
+def test_the_packages_of_python_can_are_those_of_its_own_extras() -> None:
+    brought = requires("python-can") or []
+    for _, package, requirement in can_link.PACKAGES.values():
+        if requirement.startswith("python-can["):
+            extra = requirement.removeprefix("python-can[").removesuffix("]")
+            assert any(re.match(rf'{package}\b.*extra == "{extra}"', one) for one in brought), package
 
 
 def test_settings_reach_python_can(monkeypatch: pytest.MonkeyPatch) -> None:
