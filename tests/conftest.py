@@ -1,28 +1,50 @@
-"""Kernels are compiled before the first test: processes that tests start find them on disk, as on any later start.
+"""Start of the test session: kernels, number of parallel workers, and threads that must end with their test."""
 
-A thread that identifies a drift ends with its test: pytest and SciPy both set filters of warnings, which are the whole
-process's, so that one beyond its test would meet those of the next.
-"""
-
+import os
 import threading
 from collections.abc import Iterator
+from typing import Final
 
 import pytest
 
-from monitor.drift import compensator, heat
-from monitor.estimate.estimator import warm_up
+from tests.support.kernels import compile_kernels
+from tests.support.ports import release_claims
+from tests.support.waiting import PATIENCE_S
+
+WORKERS_PER_CORE: Final = 2
+"""Tests wait more than they compute, so two workers for each core keep the processor busy."""
+MAX_WORKERS: Final = 8
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _kernels() -> None:
-    assert list(warm_up()) == ["window", "fit", "all"]
-    heat.warm_up()
-    compensator.warm_up()
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Return the number of workers for ``-n auto``."""
+    return min(WORKERS_PER_CORE * (os.cpu_count() or 1), MAX_WORKERS)
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile the kernels before any worker or test starts, so that no test's time limit includes it."""
+    if session.config.option.collectonly:
+        return
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if reporter is not None and not hasattr(session.config, "workerinput"):
+        reporter.write_line("compiling kernels, or loading them from the cache")
+    compile_kernels()
+
+
+def pytest_unconfigure() -> None:
+    """Release the ports that this process has claimed."""
+    release_claims()
 
 
 @pytest.fixture(autouse=True)
 def _no_identifier_left() -> Iterator[None]:
+    """Wait for the threads that identify a drift.
+
+    pytest and SciPy both set warning filters, which apply to the whole process. A thread that outlives its test would
+    run under the filters of the next test.
+    """
     yield
     for thread in threading.enumerate():
         if thread.name.startswith("drift of "):
-            thread.join(30.0)
+            thread.join(PATIENCE_S)

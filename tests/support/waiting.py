@@ -1,0 +1,41 @@
+"""Waiting for a condition, with one deadline for all tests.
+
+A test never assumes how fast the machine is. It waits for a condition, and the deadline only ends a test whose
+condition never comes true. ``IMU_MONITOR_TEST_PATIENCE`` multiplies the deadline on a very slow machine.
+"""
+
+import os
+import time
+from collections.abc import Callable
+from typing import Final, TypeVar
+
+T = TypeVar("T")
+
+PATIENCE_S: Final = 120.0 * float(os.environ.get("IMU_MONITOR_TEST_PATIENCE", "1"))
+"""Deadline of every wait in a test, in seconds. It is far beyond the time that any condition takes."""
+FOREVER_S: Final = 86_400.0
+"""Timeout for a call that must return early. A call that waits for it runs into the time limit of its test."""
+POLL_S: Final = 0.01
+
+
+def wait_for(condition: Callable[[], T], what: str | Callable[[], object] = "the condition") -> T:
+    """Return the first true result of ``condition``.
+
+    Parameters
+    ----------
+    condition
+        Called every 10 ms until its result is true.
+    what
+        Describes the condition in the error message. A callable is evaluated when the deadline has passed.
+
+    Raises
+    ------
+    AssertionError
+        If the condition is still false after ``PATIENCE_S``.
+    """
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not (found := condition()):
+        if time.monotonic() > deadline_s:
+            raise AssertionError(f"waited {PATIENCE_S:g} s for {what() if callable(what) else what}")
+        time.sleep(POLL_S)
+    return found
