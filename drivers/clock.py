@@ -28,6 +28,7 @@ import numpy as np
 
 from drivers.line import LEARN_S, Line, made_rate
 from drivers.order import BACK, NEAR, NS, Repeats, Telling, steady_order
+from drivers.quantities import RATE_HZ
 from drivers.sample import NO_TICK, Counter, Event, Floats, Given, Ints, SampleBlock, Timing, block
 
 CATCH_UP_S: Final = 3.0
@@ -117,11 +118,14 @@ class SampleClock:
 
     @property
     def rate_hz(self) -> float | None:
-        """Samples a second: nominal where stated, else found from the data and made better with them; None at first."""
+        """Samples a second: nominal where stated, else found from the data and made better with them.
+
+        None at first, and while the data give a rate outside the supported range.
+        """
         if self._nominal_hz or not self._line.settled():
             return self._nominal_hz or self._earlier_hz
         measured = self._line.rate_hz()
-        return made_rate(measured) if measured else None
+        return made_rate(measured) if measured and RATE_HZ.supports(measured) else None
 
     @property
     def measured_hz(self) -> float | None:

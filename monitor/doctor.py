@@ -19,7 +19,7 @@ import stat
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec
@@ -48,6 +48,8 @@ CAN_TYPE: Final = "280"
 LAST_PORT: Final = 65535
 UNIT: Final = "imu-monitor.service"
 PACKAGE: Final = "imu-monitor"
+PACKAGES: Final = ("monitor", "drivers")
+"""Of the program; the names are common ones."""
 PROJECT: Final = Path(__file__).resolve().parent.parent / "pyproject.toml"
 TCP: Final = re.compile(r"(?:tcp|tls)/\[?([^\]]+?)\]?:(\d+)(?:[?#].*)?")
 REQUIREMENT: Final = re.compile(r"([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*\(?([^;)]*)\)?\s*(?:;(.*))?")
@@ -66,7 +68,7 @@ class Finding:
 
 def examine(path: Path | None = None) -> list[Finding]:
     """The machine, and the configuration where one is named."""
-    found = [*libraries(), *kernels(), *clock(), *unit()]
+    found = [*libraries(), *packages(sys.path), *kernels(), *clock(), *unit()]
     if path is None:
         return found
     config, wrong = read(path)
@@ -406,6 +408,31 @@ def satisfies(version: str, wanted: str) -> bool:
         if match is not None and not compare[match[1]](*_same_length(_numbers(version), _numbers(match[2]))):
             return False
     return True
+
+
+def packages(module_path: Sequence[str]) -> list[Finding]:
+    """Report foreign packages and modules that have the name of one of the program's packages and are found first.
+
+    Parameters
+    ----------
+    module_path
+        Folders in the order in which Python searches them, as ``sys.path``.
+    """
+    own = Path(__file__).resolve().parent.parent
+    found = []
+    for entry in module_path:
+        folder = Path(entry or os.curdir).resolve()
+        if folder == own:
+            break
+        for name in PACKAGES:
+            foreign = next((one for one in (folder / name, folder / f"{name}.py") if one.exists()), None)
+            if foreign is not None:
+                text = (
+                    f"{foreign}: is found before the program's own package {name}; imu-monitor uses its own, a script "
+                    f"that imports {name} does not"
+                )
+                found.append(Finding("doubt", "packages", text, f"remove {folder} from PYTHONPATH for such scripts"))
+    return found or [Finding("well", "packages", f"{' and '.join(PACKAGES)} are the program's own, in {own}")]
 
 
 def kernels() -> list[Finding]:

@@ -33,7 +33,8 @@ from monitor.estimate.held import Held
 from monitor.publish import message
 from monitor.publish.zenoh_out import Command
 
-PROGRAM: Final = (sys.executable, "-m", "monitor.cli", "reconcile")
+PROGRAM: Final = (sys.executable, "-P", str(Path(__file__).resolve().parent.parent / "imu_monitor.py"), "reconcile")
+"""By its path and without its folder on the module path: whatever else is named ``monitor``, this one is run."""
 LIMIT_S: Final = 900.0
 NICE: Final = 10
 SEED: Final = 1

@@ -11,7 +11,6 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
-from math import inf
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
@@ -24,6 +23,7 @@ from drivers.decoders.base import Addressed, Decoder
 from drivers.driver import AxisMap, axis_map
 from drivers.errors import ConfigError, in_one_line
 from drivers.links.base import Filtering, Link, LinkSettings
+from drivers.quantities import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ, check_fields
 from drivers.sample import AXES, KINDS
 from drivers.zenoh_session import configuration, plain, secret_files
 from monitor import permissions, toml
@@ -74,12 +74,13 @@ WINDOW_LONGEST_S: Final = 40 * 86400.0
 THERMAL_SAMPLES: Final = 8
 """In an interval at the least: its scatter tells how well its mean is known."""
 THERMAL_LONGEST_S: Final = 86400.0
-RATES_HZ: Final = (1e-9, 1e9)
 SEGMENT_S: Final = (10.0, 86400.0)
 DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
 IS_ENDPOINT: Final = re.compile(r"[a-z]+/.+")
+LONGEST_QUOTE: Final = 60
+"""Characters of a wrong value that a message repeats."""
 LISTEN: Final = re.compile(r"(\[[0-9a-fA-F:]+\]|[\w.-]+):([0-9]{1,5})", re.ASCII)
-MEMORY: Final = re.compile(r"[0-9]+(\.[0-9]+)?\s*([kMGT]?i?B|%)")
+MEMORY: Final = re.compile(r"([0-9]{1,20}(?:\.[0-9]{1,20})?)\s*(?:([kMGT]?)(i?)B|%)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,8 +234,7 @@ class _Reader:
         log = self.fill(LogTable, file.log, "log")
         if viewer is not None:
             self._try("viewer.mode", viewer_mode, viewer.mode)
-            if not MEMORY.fullmatch(viewer.memory):
-                self.wrong.append(f'viewer.memory: "{viewer.memory}" is no size; write "256MiB", "1GB" or "25%"')
+            self._try("viewer.memory", viewer_memory, viewer.memory)
         if zenoh is not None:
             self._reachable(zenoh)
         storage = self._storage(file.storage)
@@ -310,7 +310,7 @@ class _Reader:
         if table is None or table.listen is None:
             return None
         match = LISTEN.fullmatch(table.listen)
-        if match is None or not 0 < int(match[2]) < 65536:
+        if match is None or int(match[2]) == 0 or not PORT.supports(int(match[2])):
             self.wrong.append(f'metrics.listen: "{table.listen}" is no host and port; write "127.0.0.1:9464"')
             return None
         return Metrics(match[1].strip("[]"), int(match[2]))
@@ -463,6 +463,7 @@ class _Reader:
                 continue
             try:
                 converted = msgspec.convert(value, fields[key].type, dec_hook=self._path)
+                check_fields(converted, fields[key].type)
                 values[fields[key].name] = self._beside(converted, fields[key].type)
             except (msgspec.ValidationError, ValueError) as error:
                 self.wrong.append(f"{dot}{key}: {error}")
@@ -539,9 +540,9 @@ def seconds(value: float | str) -> float:
             duration = 0.0
     else:
         duration = float(value)
-    if not 0.0 < duration < inf:
-        raise ConfigError(f'"{value}" is no duration; write seconds, or "90s", "30min", "1h", "2d"')
-    return duration
+    if not duration > 0.0:
+        raise ConfigError(f'"{_shortened(value)}" is no duration; write seconds, or "90s", "30min", "1h", "2d"')
+    return DURATION_S.check(duration)
 
 
 def period(value: str, always: str) -> float:
@@ -557,7 +558,26 @@ def period(value: str, always: str) -> float:
         rate_hz = float(match[1]) if match else 0.0
     except ValueError:
         rate_hz = 0.0
-    return 1.0 / rate_hz if RATES_HZ[0] <= rate_hz <= RATES_HZ[1] else _no_rate(value, always)
+    if not rate_hz > 0.0:
+        raise ConfigError(f'"{_shortened(value)}" is no rate; write "10 Hz" or "{always}"')
+    return 1.0 / UPDATE_RATE_HZ.check(rate_hz)
+
+
+def viewer_memory(size: str) -> str:
+    """The viewer's limit of memory as Rerun reads it; ConfigError for a text that is no size.
+
+    >>> viewer_memory("256MiB"), viewer_memory("25%")
+    ('256MiB', '25%')
+    """
+    match = MEMORY.fullmatch(size)
+    if match is None:
+        raise ConfigError(f'"{_shortened(size)}" is no size; write "256MiB", "1GB" or "25%"')
+    number, prefix, binary = match.groups()
+    if size.endswith("%"):
+        PERCENT.check(float(number))
+    else:
+        SIZE_BYTES.check(float(number) * (1024.0 if binary else 1000.0) ** ("", *"kMGT").index(prefix))
+    return size
 
 
 def viewer_mode(mode: str) -> str:
@@ -568,8 +588,10 @@ def viewer_mode(mode: str) -> str:
     raise ConfigError(f'"{mode}"; possible are {", ".join(modes)} or a file ending in .rrd')
 
 
-def _no_rate(value: str, always: str) -> float:
-    raise ConfigError(f'"{value}" is no rate; write "10 Hz" or "{always}"')
+def _shortened(value: object) -> str:
+    """Enough of a text to recognise it in a message."""
+    text = str(value)
+    return text if len(text) <= LONGEST_QUOTE else f"{text[:LONGEST_QUOTE]}…"
 
 
 def _possible_window(window_s: float, rate_hz: float | None) -> None:

@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 
 from drivers.errors import ConfigError
+from drivers.quantities import SAMPLES
 from drivers.recording import Recording, load_samples, writing
 from drivers.recording.saving import whole
 from drivers.sample import AXES, Floats
@@ -98,8 +99,10 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
     """
     rate_hz = _rate_hz(request)
     n = round(request.seconds * rate_hz)
-    if n < 1:
-        raise ConfigError(f"{request.seconds:g} s at {rate_hz:g} Hz hold no sample")
+    try:
+        SAMPLES.check(n)
+    except ConfigError as error:
+        raise ConfigError(f"{request.seconds:g} s at {rate_hz:g} Hz: {error}") from None
     axes = tuple(axis for axis in AXES if axis in request.model.effects)
     if not axes:
         raise ConfigError(f"{request.name}: names no axis; axes are {' '.join(AXES)}")

@@ -9,12 +9,14 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
+from drivers import quantities
 from drivers.links.base import LinkSettings
 from monitor.topics import ENDPOINT
 
-Positive = Annotated[float, msgspec.Meta(gt=0.0)]
-Port = Annotated[int, msgspec.Meta(ge=0, le=65535)]
-Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+Coefficient = Annotated[float, quantities.COEFFICIENT.meta]
+Duration = Annotated[float, quantities.DURATION_S.meta]
+Port = Annotated[int, quantities.PORT.meta]
+Share = Annotated[float, quantities.SHARE.meta]
 
 
 class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -26,20 +28,20 @@ class DeviceTable(_Table, frozen=True, kw_only=True):
 
     name: str
     driver: dict[str, Any]
-    rate: Positive | None = None
-    window: Positive | str = 3600.0
-    tau: Literal["octave", "decade10"] | list[Positive] = "octave"
+    rate: Annotated[float, quantities.RATE_HZ.meta] | None = None
+    window: Duration | str = 3600.0
+    tau: Literal["octave", "decade10"] | list[Annotated[float, quantities.AVERAGING_TIME_S.meta]] = "octave"
     refit: str = "10 Hz"
     publish: str = "10 Hz"
     motion: Literal["tell", "leave out"] = "tell"
-    alarms_per_day: Annotated[float, msgspec.Meta(ge=0.0)] = 0.033
+    alarms_per_day: Annotated[float, quantities.ALARMS_PER_DAY.meta] = 0.033
     """False alarms of changed noise to bear; 0 = do not look."""
     restart: bool = True
     model: str | None = None
     """The model in force: path of a model file, or the name of one in the shipped ``config/models``."""
     compensate: bool = True
     """Take the gyros' drift out of a copy of the samples."""
-    thermal_interval: Positive | str = "10min"
+    thermal_interval: Duration | str = "10min"
     """Of the means that are held against temperature; "off": they are not."""
     reconcile_folder: Path | None = None
     """Where the reports of ``command/reconcile`` are kept; None: they are not."""
@@ -52,12 +54,12 @@ class LimitTable(_Table, frozen=True, kw_only=True):
 
     axes: str
     letter: Literal["Q", "N", "B", "K", "R"]
-    above: Positive | None = None
+    above: Coefficient | None = None
     """SI unit of letter and axis, as in a model file."""
-    below: Positive | None = None
-    times_model: Positive | None = None
+    below: Coefficient | None = None
+    times_model: Annotated[float, quantities.TIMES.meta] | None = None
     """Too much is so many times what the model in force says."""
-    hold: Positive | str = "1min"
+    hold: Duration | str = "1min"
     """It has to be beyond, or back, for so long."""
 
 
@@ -72,13 +74,13 @@ class FaultsTable(_Table, frozen=True, kw_only=True):
     """Share of samples one bit of which is flipped."""
     cut: Share = 0.0
     """Share of samples whose frame ends before it is whole."""
-    jitter: Annotated[float, msgspec.Meta(ge=0.0, le=0.5)] = 0.0
+    jitter: Annotated[float, quantities.JITTER_S.meta] = 0.0
     """s: each burst is held back by a random time of up to so much."""
     unplugged: Share = 0.0
     """Chance at each sample that the cable is pulled before it."""
-    unplugged_for: Annotated[float, msgspec.Meta(gt=0.0)] = 2.0
+    unplugged_for: Duration = 2.0
     """s of the sensor's time until it is put back."""
-    clock: Annotated[float, msgspec.Meta(ge=0.5, le=2.0)] = 1.0
+    clock: Annotated[float, quantities.CLOCK_RATIO.meta] = 1.0
     """True rate over the rate that the sensor's clock and settings claim."""
 
 
@@ -91,12 +93,12 @@ class VirtualTable(LinkSettings, frozen=True, kw_only=True):
 
     model: str = "consumer-mems"
     """Path of a model file, or the name of one in the shipped ``config/models``."""
-    seed: Annotated[int, msgspec.Meta(ge=0)] = 1
-    speed: Annotated[float, msgspec.Meta(gt=0.0, le=10_000.0)] = 1.0
+    seed: Annotated[int, quantities.SEED.meta] = 1
+    speed: Annotated[float, quantities.SIMULATION_SPEED.meta] = 1.0
     """Times real time."""
     effect: tuple[str, ...] = ()
     """Effects that the sensor takes on while it runs: "gz.sinusoidal:amplitude=1e-3,frequency=17"."""
-    effect_at: Annotated[float, msgspec.Meta(ge=0.0)] = 90.0
+    effect_at: Annotated[float, quantities.DELAY_S.meta] = 90.0
     """s of the sensor's time; by then changes are looked for."""
     faults: FaultsTable = FaultsTable()
 
@@ -119,7 +121,7 @@ class ViewerTable(_Table, frozen=True, kw_only=True):
     port: Port = 9876
     web_port: Port = 9090
     memory: str = "256MiB"
-    history: Positive | str | None = None
+    history: Duration | str | None = None
     """Of what is kept, shown when the view opens; None: nothing."""
 
 
@@ -131,10 +133,10 @@ class StorageTable(_Table, frozen=True, kw_only=True):
     """Samples as received and decoded, in segments."""
     raw: bool = False
     """The bytes as they came too, so that a decoder's fault can be replayed."""
-    segment: Positive | str = "1h"
-    keep: Positive | str = "30d"
+    segment: Duration | str = "1h"
+    keep: Duration | str = "30d"
     """Segments older than this are deleted."""
-    disk_share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.9
+    disk_share: Annotated[float, quantities.POSITIVE_SHARE.meta] = 0.9
     """The oldest segments are deleted while more than this share of the disk is taken."""
     history: bool = True
     """Results, events and status, thinned with age."""
@@ -151,7 +153,7 @@ class HookTable(_Table, frozen=True, kw_only=True):
     """A program's path and its arguments, never a shell's line; the event comes as JSON on standard input."""
     key: Annotated[str, msgspec.Meta(pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$")] | None = None
     """Of zenoh, where the event is put as JSON."""
-    timeout: Positive | str = "30s"
+    timeout: Duration | str = "30s"
     """After which the command is killed, with all that it started."""
 
 

@@ -5,6 +5,7 @@ wrote.
 """
 
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from drivers import small_file
 from drivers.errors import ConfigError, NotReady
+from drivers.quantities import DURATION_S, FIT_NUMBER
 from drivers.recording import iter_blocks, load_samples
 from drivers.sample import AXES, Floats
 from monitor.drift.heat import Shape
@@ -109,8 +111,10 @@ def from_file(path: Path) -> dict[str, ThermalModel]:
         raise ConfigError(f'{path}: schema "{found.schema}"; "{SCHEMA}" is read')
     if not found.axes:
         raise ConfigError(f"{path}: no axis in it")
-    if not found.interval > 0.0:
-        raise ConfigError(f"{path}: interval: {found.interval:g} s; it must be above 0")
+    try:
+        DURATION_S.check(found.interval)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: interval: {error}") from None
     return {axis: _model(path, axis, row, found.interval) for axis, row in found.axes.items()}
 
 
@@ -134,10 +138,12 @@ def _model(path: Path, axis: str, row: AxisRow, interval_s: float) -> ThermalMod
     terms = 1 + row.powers + k
     size = terms + 2 * k
     square = len(row.covariance) == size and all(len(one) == size for one in row.covariance)
+    numbers = (row.reference, row.phi, row.sigma, *row.temperature, *row.sizes, *row.start, *chain(*row.covariance))
     wrong = [
         (axis in AXES, f"no such axis; possible are {', '.join(AXES)}"),
         (row.powers >= 0, f"powers: {row.powers}; it must be 0 or more"),
-        (all(one > 0.0 for one in row.time_constants), "time_constants: each must be above 0 s"),
+        (all(map(DURATION_S.supports, row.time_constants)), f"time_constants: each must be {DURATION_S.range_text()}"),
+        (all(map(FIT_NUMBER.supports, numbers)), f"a number is outside the supported range {FIT_NUMBER.range_text()}"),
         (len(row.sizes) == terms, f"sizes: {len(row.sizes)} of them; {terms} are needed"),
         (len(row.start) == k, f"start: {len(row.start)} of them; {k} are needed"),
         (row.temperature[0] < row.temperature[1], "temperature: the coldest and the warmest of the fit are needed"),

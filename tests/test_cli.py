@@ -118,8 +118,14 @@ WRONG_FILES = {
         DEVICE + 'driver = { link = "serial", port = "x", decoder = "ros2_imu" }\n',
         "ros2_imu reads messages, link serial brings bytes",
     ),
-    "negative silence": (DEVICE + 'driver = { link = "virtual", silence = -1.0 }\n', "driver.silence: Expected"),
-    "negative seed": (DEVICE + 'driver = { link = "virtual", seed = -1 }\n', "driver.seed: Expected"),
+    "negative silence": (
+        DEVICE + 'driver = { link = "virtual", silence = -1.0 }\n',
+        "driver.silence: -1 s is outside the supported range 1 ms to 36525 d, or 0",
+    ),
+    "negative seed": (
+        DEVICE + 'driver = { link = "virtual", seed = -1 }\n',
+        "driver.seed: -1 is outside the supported range 0 to ",
+    ),
     "unknown model": (
         DEVICE + 'driver = { link = "virtual", model = "x" }\n',
         'no model "x", neither a file nor one of those shipped',
@@ -152,7 +158,7 @@ WRONG_FILES = {
         VIRTUAL + '[viewer]\nmode = "nativ"\n',
         'viewer.mode: "nativ"; possible are auto, native, web, none',
     ),
-    "bad port": (VIRTUAL + "[viewer]\nport = 99999\n", "viewer.port: Expected `int` <= 65535"),
+    "bad port": (VIRTUAL + "[viewer]\nport = 99999\n", "viewer.port: 99999 is outside the supported range 0 to 65535"),
     "bad size": (VIRTUAL + '[viewer]\nmemory = "lots"\n', 'viewer.memory: "lots" is no size; write "256MiB"'),
     "bad endpoint": (VIRTUAL + '[zenoh]\nlisten = ["7450"]\n', 'zenoh.listen: "7450" is no endpoint; write "tcp/'),
     "no zenoh file": (VIRTUAL + '[zenoh]\nconfig = "x.json5"\n', "x.json5: no such file"),

@@ -19,7 +19,7 @@ is the mean of the gyro's three sensors, not measured when their status shows an
 
 import zlib
 from collections.abc import Sequence
-from typing import ClassVar, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,7 @@ from drivers.decoders.base import (
     quantize,
 )
 from drivers.errors import ConfigError
+from drivers.quantities import RATE_HZ, check_settings
 from drivers.sample import Chunk, Counter, Floats, Ints, SampleBlock, Timing
 from drivers.units import DEGREE, G0
 
@@ -79,7 +80,7 @@ class Settings(DecoderSettings, frozen=True):
     """rate: angular rate or its mean, °/s; increment: angle of one sample, °."""
     accelerometer_output: Literal["acceleration", "increment"] = "acceleration"
     """acceleration, or its mean, g; increment: velocity of one sample, m/s."""
-    rate: float | None = None
+    rate: Annotated[float, RATE_HZ.meta] | None = None
     """Sample rate in Hz; needed where an output is an increment."""
     identifier: int | Literal["auto"] = "auto"
     """First byte of the datagrams, as 0x93; auto takes that of the first whose CRC holds."""
@@ -233,11 +234,10 @@ PADDING: Final = (b"", b"\0", b"\0\0", b"\0\0\0")
 
 def build(settings: Settings) -> Decoder:
     """A decoder with these settings; ConfigError for an unknown identifier or a missing rate."""
+    check_settings(settings)
     if settings.identifier != "auto" and settings.identifier not in IDENTIFIERS:
         known = ", ".join(f"0x{identifier:02X}" for identifier in sorted(IDENTIFIERS))
         raise ConfigError(f"identifier {settings.identifier}: the STIM300 has {known}")
     if "increment" in (settings.gyro_output, settings.accelerometer_output) and not settings.rate:
         raise ConfigError('an output of "increment" needs rate, the sample rate in Hz')
-    if settings.rate is not None and not settings.rate > 0.0:
-        raise ConfigError(f"rate {settings.rate}: must be above 0 Hz")
     return Stim300Decoder(settings)

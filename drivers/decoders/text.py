@@ -12,7 +12,7 @@ The first line after the link was opened is most often cut in front, and a cut n
 """
 
 from collections.abc import Sequence
-from typing import ClassVar, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 import msgspec
 import numpy as np
@@ -28,6 +28,7 @@ from drivers.decoders.base import (
 )
 from drivers.errors import ConfigError
 from drivers.plugin import nearest
+from drivers.quantities import COUNTER_MODULUS, HEADER_LINES, SCALE, check_settings
 from drivers.sample import AXES, NO_TICK, Arrival, Chunk, Counter, Floats, SampleBlock, Timing
 
 LONGEST: Final = 4096
@@ -58,11 +59,11 @@ class Settings(DecoderSettings, frozen=True):
     """Unit of ax ay az: m/s², g, mg, ..."""
     temperature_unit: str = "°C"
     """Unit of the temperature: °C, K, °F."""
-    scale: dict[str, float] = msgspec.field(default_factory=dict)
+    scale: dict[str, Annotated[float, SCALE.meta]] = msgspec.field(default_factory=dict)
     """Factor of a column before its unit is applied, as gx = 0.0305 for raw counts."""
     comment: str = "#"
     """Lines that begin with it are passed over; "" = none."""
-    header: int = 0
+    header: Annotated[int, HEADER_LINES.meta] = 0
     """Lines to pass over after the link was opened."""
     first_line: Literal["drop", "keep"] = "drop"
     """keep: the link always starts at the beginning of a line."""
@@ -70,7 +71,7 @@ class Settings(DecoderSettings, frozen=True):
     """Lines read $fields*CC."""
     time_unit: Literal["s", "ms", "us", "ns"] = "s"
     """Unit of the t column, the device's own clock."""
-    counter_modulus: int = 1 << 32
+    counter_modulus: Annotated[int, COUNTER_MODULUS.meta] = 1 << 32
     """Counts after which the counter column starts again at 0."""
 
 
@@ -308,11 +309,7 @@ def build(settings: Settings) -> Decoder:
         raise ConfigError(f"columns: none of {', '.join(AXES)} is there")
     if {"t", "counter"} <= set(given):
         raise ConfigError('columns: give one of t and counter, and "-" for the other')
-    for name, factor in settings.scale.items():
-        if not np.isfinite(factor) or factor == 0.0:
-            raise ConfigError(f"scale of {name}: must be a number other than 0")
+    check_settings(settings)
     if not settings.delimiter or not settings.delimiter.isascii() or set(settings.delimiter) & set("\r\n"):
         raise ConfigError(f"delimiter {settings.delimiter!r}: must be auto, or ASCII text within a line")
-    if not 2 <= settings.counter_modulus <= NEVER:
-        raise ConfigError(f"counter_modulus {settings.counter_modulus}: must be from 2 to 2^62")
     return TextDecoder(settings)

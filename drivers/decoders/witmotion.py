@@ -14,7 +14,7 @@ the header of the next follows it, so that a sample comes one packet late.
 """
 
 from collections.abc import Sequence
-from typing import ClassVar, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from drivers.decoders.base import (
     one_chunk_each,
     quantize,
 )
-from drivers.errors import ConfigError
+from drivers.quantities import FULL_SCALE, check_settings
 from drivers.sample import Arrival, Chunk, Floats, Ints, SampleBlock, Timing
 from drivers.units import DEGREE, G0
 
@@ -56,9 +56,9 @@ class Settings(DecoderSettings, frozen=True):
     """uart: 11-byte packets with a checksum; bluetooth: 20-byte packets without one."""
     temperature: Literal["wt901", "jy61"] = "wt901"
     """Rule of the family: raw / 100, or raw / 340 + 36.53 (JY61, BWT61)."""
-    accelerometer_range: float = 16.0
+    accelerometer_range: Annotated[float, FULL_SCALE.meta] = 16.0
     """Full scale in g."""
-    gyro_range: float = 2000.0
+    gyro_range: Annotated[float, FULL_SCALE.meta] = 2000.0
     """Full scale in °/s."""
 
 
@@ -217,8 +217,6 @@ def match_bluetooth(buffer: bytes, at: int) -> int:
 
 
 def build(settings: Settings) -> Decoder:
-    """A decoder with these settings; ConfigError for a range that is none."""
-    for name in ("accelerometer_range", "gyro_range"):
-        if not getattr(settings, name) > 0.0:
-            raise ConfigError(f"{name} {getattr(settings, name)}: must be above 0")
+    """A decoder with these settings; ConfigError for a full scale that no sensor has."""
+    check_settings(settings)
     return WitmotionDecoder(settings)

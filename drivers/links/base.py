@@ -10,6 +10,7 @@ from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import msgspec
 
+from drivers.quantities import SILENCE_S
 from drivers.sample import Chunk
 
 Carrier = Literal["bytes", "frames", "messages"]
@@ -19,7 +20,7 @@ Carrier = Literal["bytes", "frames", "messages"]
 class LinkSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Keys that every link understands."""
 
-    silence: Annotated[float, msgspec.Meta(ge=0.0)] = 3.0
+    silence: Annotated[float, SILENCE_S.meta] = 3.0
     """Seconds without a byte after which the link is opened anew; 0 = never."""
 
 

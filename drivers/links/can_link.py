@@ -23,13 +23,14 @@ import socket
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import msgspec
 
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.plugin import nearest
+from drivers.quantities import BIT_RATE, check_settings
 from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk
 
 if TYPE_CHECKING:
@@ -74,10 +75,10 @@ class Settings(LinkSettings, frozen=True, kw_only=True):
 
     interface: str = "socketcan"
     channel: str | int = "can0"
-    bitrate: int | None = None
+    bitrate: Annotated[int, BIT_RATE.meta] | None = None
     """bit/s; for socketcan it is set with the interface: ip link set can0 up type can bitrate 500000."""
     fd: bool = False
-    data_bitrate: int | None = None
+    data_bitrate: Annotated[int, BIT_RATE.meta] | None = None
     receive_own_messages: bool = False
     options: dict[str, Any] = msgspec.field(default_factory=dict)
     """Further keys of python-can's Bus for this interface."""
@@ -137,6 +138,7 @@ class CanLink:
                 AttributeError,
                 TypeError,
                 ValueError,
+                ArithmeticError,
                 NotImplementedError,
             ) as error:
                 raise LinkUnavailable(_why_not_open(s, error)) from error
@@ -284,7 +286,7 @@ def _why_not_open(s: Settings, error: Exception) -> str:
         return f"{name}: no permission; for a serial adapter, add the user to the group dialout"
     if isinstance(error, ImportError | NameError | can.CanInterfaceNotImplementedError):
         return f"{name}: the vendor's library or driver is not installed: {_plain(error)}"
-    if isinstance(error, TypeError | ValueError):
+    if isinstance(error, TypeError | ValueError | ArithmeticError):
         return f"{name}: python-can refuses these settings: {_plain(error)}"
     return f"{name}: cannot be opened: {_plain(error)}"
 
@@ -296,10 +298,11 @@ def _plain(error: Exception) -> str:
 def build(settings: Settings) -> Link:
     """The link of these settings; opens nothing.
 
-    Raises ``ConfigError`` for an interface that python-can does not know.
+    Raises ``ConfigError`` for an interface that python-can does not know, and for a number outside its range.
     """
     from can.interfaces import VALID_INTERFACES
 
+    check_settings(settings)
     if settings.interface not in VALID_INTERFACES:
         known = tuple(sorted(VALID_INTERFACES))
         raise ConfigError(f'no interface "{settings.interface}" in python-can{nearest(settings.interface, known)}')

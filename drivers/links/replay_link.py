@@ -27,12 +27,13 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, BinaryIO, Final, Literal, cast
+from typing import IO, TYPE_CHECKING, Annotated, BinaryIO, Final, Literal, cast
 
 from drivers import small_file
 from drivers.errors import ConfigError, LinkEnded, LinkLost, LinkUnavailable, RecordingError
 from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.plugin import FilePath, nearest
+from drivers.quantities import BYTE_RATE, RATE_HZ, REPLAY_SPEED, check_settings
 from drivers.recording import FORMATS, Recording, iter_blocks, load_samples, segment
 from drivers.recording.table import T_LIMIT_S
 from drivers.sample import EXTENDED_ID, Chunk
@@ -78,11 +79,11 @@ class Settings(LinkSettings, frozen=True, kw_only=True):
     """Keys of a replay."""
 
     path: FilePath
-    speed: str | float = "recorded"
+    speed: str | Annotated[float, REPLAY_SPEED.meta] = "recorded"
     """"recorded", "max", or a factor: 10 = ten times as fast."""
-    rate: float | None = None
+    rate: Annotated[float, RATE_HZ.meta] | None = None
     """Hz; for a recording with neither t nor fs."""
-    bytes_per_second: float | None = None
+    bytes_per_second: Annotated[float, BYTE_RATE.meta] | None = None
     """Pace of captured bytes, a tenth of the baud rate; absent: as fast as they are read."""
     channel: str | None = None
     """Only frames of this channel of a CAN log."""
@@ -438,12 +439,9 @@ def build(settings: Settings) -> Link:
 
 def _pace(settings: Settings) -> float:
     """File seconds a second."""
-    for key, value in (("rate", settings.rate), ("bytes_per_second", settings.bytes_per_second)):
-        if value is not None and not 0.0 < value < float("inf"):
-            raise ConfigError(f"{key} = {value:g}; it is above 0")
+    check_settings(settings)
     words = {"recorded": 1.0, "max": float("inf")}
     speed = settings.speed
-    factor = words.get(speed, 0.0) if isinstance(speed, str) else speed
-    if not factor > 0.0:
-        raise ConfigError(f'speed = "{speed}"; known are "recorded", "max", or a factor above 0')
-    return factor
+    if isinstance(speed, str) and speed not in words:
+        raise ConfigError(f'speed = "{speed}"; known are "recorded", "max", or a factor without quotes')
+    return words[speed] if isinstance(speed, str) else speed

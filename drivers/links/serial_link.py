@@ -18,12 +18,13 @@ import importlib.util
 import os
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.masked import masked
 from drivers.plugin import nearest
+from drivers.quantities import BIT_RATE, READ_TIMEOUT_S, check_settings
 from drivers.sample import Chunk
 
 if TYPE_CHECKING:
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
 DEFAULT_DECODER: Final = ""
 READ_SIZE: Final = 4096
 """Bytes taken at once; more than 10 ms at 3 Mbit/s. Where they come faster, nothing is waited for."""
-LONGEST_READ_TIMEOUT_S: Final = 0.1
-"""A port without ``cancel_read`` is closed after at most this long."""
 STOP_BITS: Final = (1.0, 1.5, 2.0)
 SCHEMES: Final = ("socket", "rfc2217", "loop", "spy", "alt", "hwgrep", "cp2110")
 """URL schemes that come with pyserial."""
@@ -44,7 +43,7 @@ class Settings(LinkSettings, frozen=True, kw_only=True):
 
     port: str
     """/dev/ttyUSB0, COM3, socket://host:port, rfc2217://host:port, hwgrep://REGEX."""
-    baudrate: int = 115200
+    baudrate: Annotated[int, BIT_RATE.meta] = 115200
     bytesize: Literal[5, 6, 7, 8] = 8
     parity: Literal["N", "E", "O", "M", "S"] = "N"
     stopbits: float = 1.0
@@ -52,7 +51,7 @@ class Settings(LinkSettings, frozen=True, kw_only=True):
     xonxoff: bool = False
     exclusive: bool = True
     """Keep every other program from reading the same port; where the system can."""
-    read_timeout: float = 0.01
+    read_timeout: Annotated[float, READ_TIMEOUT_S.meta] = 0.01
     """Seconds that bytes may wait for more to join them; at most 0.1."""
 
 
@@ -185,18 +184,13 @@ def _plain(error: Exception) -> str:
 def build(settings: Settings) -> Link:
     """The link of these settings; opens nothing.
 
-    Raises ``ConfigError`` for a URL scheme, stop bits or a timeout that cannot be.
+    Raises ``ConfigError`` for a URL scheme or stop bits that do not exist, and for a number outside its range.
     """
     if not settings.port:
         raise ConfigError('port is empty; it is a port ("/dev/ttyUSB0") or a URL ("socket://host:port")')
-    if settings.baudrate <= 0:
-        raise ConfigError(f"baudrate = {settings.baudrate}; it is above 0")
+    check_settings(settings)
     if settings.stopbits not in STOP_BITS:
         raise ConfigError(f"stopbits = {settings.stopbits}; known are 1, 1.5, 2")
-    if not 0.0 < settings.read_timeout <= LONGEST_READ_TIMEOUT_S:
-        raise ConfigError(
-            f"read_timeout = {settings.read_timeout}; it is above 0 and at most {LONGEST_READ_TIMEOUT_S} s"
-        )
     _check_scheme(settings.port)
     return SerialLink(settings)
 

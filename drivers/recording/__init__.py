@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import ConfigError, RecordingError, in_one_line
+from drivers.quantities import DURATION_S, RATE_HZ
 from drivers.recording import room
 from drivers.recording.formats import FORMATS, format_of, is_recording
 from drivers.recording.saving import save_samples, writing
@@ -60,8 +61,12 @@ def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None 
     Raises RecordingError when the path holds no recording, ConfigError when a rate or a library is missing,
     the suffix is unknown, or the folder holds more than the memory does.
     """
-    if rate_hz is not None and not (np.isfinite(rate_hz) and rate_hz > 0.0):
-        raise ConfigError(f"--rate {rate_hz:g}: a sample rate is a positive number of Hz")
+    for option, quantity, value in (("--rate", RATE_HZ, rate_hz), ("--last", DURATION_S, last_s)):
+        try:
+            if value is not None:
+                quantity.check(value)
+        except ConfigError as error:
+            raise ConfigError(f"{option}: {error}") from None
     try:
         found = _load_folder(path, rate_hz, last_s) if path.is_dir() else _load_file(path, rate_hz)
     except OSError as error:
@@ -92,10 +97,13 @@ def _assemble(path: Path, table: Table, rate_hz: float | None) -> Recording:
     """Give columns their meaning: lengths, times, rate, missing values."""
     n = _common_length(path, table.columns)
     notes = list(table.notes)
-    rate = _stated_rate(table.fs, rate_hz, notes)
+    rate = _stated_rate(_supported_fs(table.fs, notes), rate_hz, notes)
     t_s, rows = _usable_times(path, table.columns.get("t"), rate, notes)
     if t_s is None and rate is None:
-        raise ConfigError(f"{path}: has neither t nor fs, so its rate is not known; give it with --rate HZ")
+        why = next((f" ({note.rstrip('.')})" for note in notes if note.startswith("fs ")), "")
+        raise ConfigError(
+            f"{path}: has neither t nor a usable fs{why}, so its rate is not known; give it with --rate HZ"
+        )
     axes = tuple(a for a in AXES if a in table.columns)
     values = np.full((n, len(AXES)), np.nan)
     for axis in axes:
@@ -131,6 +139,15 @@ def _common_length(path: Path, columns: Mapping[str, Floats]) -> int:
     if n == 0:
         raise RecordingError(f"{path}: has columns but no samples")
     return n
+
+
+def _supported_fs(fs: float | None, notes: list[str]) -> float | None:
+    """Return the rate that the file states; None with a note if it is outside the supported range."""
+    try:
+        return fs if fs is None else RATE_HZ.check(fs)
+    except ConfigError as error:
+        notes.append(f"fs was left aside: {error}.")
+        return None
 
 
 def _stated_rate(fs: float | None, rate_hz: float | None, notes: list[str]) -> float | None:
@@ -218,7 +235,8 @@ def _end(found: Recording, last_s: float) -> Recording:
     """The last seconds, from where on no sample is older."""
     if found.t_s is not None:
         older = np.flatnonzero(found.t_s <= found.t_s[-1] - last_s + RESOLUTION_S)
-        first = int(older[-1]) + 1 if older.size else 0
+        # the newest sample is always within a duration, however short that is
+        first = min(int(older[-1]) + 1, len(found) - 1) if older.size else 0
     else:
         first = max(len(found) - max(round(last_s * (found.rate_hz or 0.0)), 1), 0)
     t_s = None if found.t_s is None else found.t_s[first:]

@@ -85,7 +85,8 @@ def _npz_column(path: Path, archive: Mapping[str, Any], key: str) -> Floats:
         raise RecordingError(f"{path}: {key} holds {array.dtype}, not numbers")
     if array.ndim != 1:
         raise RecordingError(f"{path}: {key} has shape {array.shape}; a column has one dimension")
-    return array.astype(np.float64)
+    with np.errstate(over="ignore"):  # a long double beyond the range of float64 becomes infinite: read as missing
+        return array.astype(np.float64)
 
 
 def _npz_array(path: Path, archive: Mapping[str, Any], key: str) -> NDArray[Any]:
@@ -104,9 +105,9 @@ def _npz_rate(path: Path, archive: Mapping[str, Any], notes: list[str]) -> float
     if "fs" not in archive:
         return None
     fs = _npz_array(path, archive, "fs")
-    if fs.size == 1 and fs.dtype.kind in "fiu" and np.isfinite(fs).all() and fs.item() > 0:
+    if fs.size == 1 and fs.dtype.kind in "fiu":
         return float(fs.item())
-    notes.append("fs is not one positive number of Hz and was left aside.")
+    notes.append("fs is not one number of Hz and was left aside.")
     return None
 
 

@@ -24,6 +24,7 @@ import msgspec
 import numpy as np
 
 from drivers.errors import ImuError, RecordingError
+from drivers.quantities import COUNTER_STEP, RATE_HZ
 from drivers.recording.arrow_format import BOOKKEEPING, OWN, library
 from drivers.recording.table import BATCH_ROWS, PART, T_LIMIT_S
 from drivers.sample import AXES, Chunk, SampleBlock, block, join, ns_to_seconds, seconds_to_ns
@@ -215,8 +216,9 @@ def _state(meta: Any) -> State:
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return State()
     sizes = len(found.theta) == len(found.entered) and len(found.theta) in (0, 5 * len(AXES))
-    known = (one is None or one > 0.0 for one in (found.rate, found.tick_step))
-    return found if sizes and len(found.since) == len(AXES) and all(known) else State()
+    rate = found.rate is None or RATE_HZ.supports(found.rate)
+    step = found.tick_step is None or COUNTER_STEP.supports(found.tick_step)
+    return found if sizes and len(found.since) == len(AXES) and rate and step else State()
 
 
 def read_chunks(path: Path) -> Iterator[Chunk]:

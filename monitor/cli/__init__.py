@@ -8,14 +8,17 @@ import contextlib
 import os
 import signal
 import sys
+import traceback
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Final, NoReturn
+from typing import Annotated, Any, Final, NoReturn
 
 import typer
 from typer.exceptions import TyperException
 
-from drivers.errors import ConfigError, ImuError, NotReady, RecordingError
+from drivers.errors import ConfigError, ImuError, NotReady, RecordingError, in_one_line
+from drivers.plugin import nearest
 from monitor.cli import doctor, drift, options, output, serving
 from monitor.cli import history as history_command
 
@@ -27,19 +30,29 @@ FAILED: Final = 1
 WRONG: Final = 2
 NO_ANSWER: Final = 3
 INTERRUPTED: Final = 128 + signal.SIGINT
+DEBUG: Final = "--debug"
+LONGEST_CAUSE: Final = 300
+"""Characters of an unexpected error's text; libraries write pages."""
 
 app = typer.Typer(
-    help="Live noise monitor for MEMS IMUs: windowed Allan variance and Q, N, B, K, R while the sensor runs.",
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
 
 ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="Configuration file.")]
-Seconds = Annotated[float | None, typer.Option(metavar="S", min=0.1, help="Stop by itself after S seconds.")]
 Viewer = Annotated[
     str | None, typer.Option(metavar="auto|native|web|none|FILE.rrd", help="Where to show the live view.")
 ]
+
+
+@app.callback()
+def options_of_all_commands(
+    debug: Annotated[
+        bool, typer.Option(DEBUG, help="Print the traceback of an error and the warnings of libraries.")
+    ] = False,
+) -> None:
+    """Live noise monitor for MEMS IMUs: windowed Allan variance and Q, N, B, K, R while the sensor runs."""
 
 
 @app.command()
@@ -57,7 +70,7 @@ def demo(
     effect_at: Annotated[
         str | None, typer.Option(metavar="S", help="When, after the start; 90 s, by then changes are looked for.")
     ] = None,
-    seconds: Seconds = None,
+    seconds: options.Seconds = None,
     viewer: Viewer = None,
 ) -> None:
     """The whole service on a simulated MEMS IMU that speaks a real wire format over a pseudo-terminal."""
@@ -69,7 +82,7 @@ def demo(
 @app.command()
 def run(
     config: ConfigPath,
-    seconds: Seconds = None,
+    seconds: options.Seconds = None,
     viewer: Viewer = None,
     history: Annotated[
         str | None, typer.Option(metavar="S", help="Open the live view on what was: 1d, 12h; needs [storage].")
@@ -124,7 +137,7 @@ def watch(
     keyexpr: options.KeyExpr = "imu/**",
     connect: options.Connect = None,
     zenoh: options.ZenohFile = None,
-    seconds: Seconds = None,
+    seconds: options.Seconds = None,
 ) -> None:
     """A live table of any number of daemons, from zenoh alone."""
     import threading
@@ -147,7 +160,7 @@ def view(
         list[str] | None, typer.Option(metavar="DEVICE", help="Show its samples and curves too; repeatable.")
     ] = None,
     viewer: Viewer = None,
-    seconds: Seconds = None,
+    seconds: options.Seconds = None,
 ) -> None:
     """One viewer for any number of daemons, from zenoh alone: a table of all, chosen devices in detail."""
     serving.view(keyexpr, connect or (), zenoh, detail or (), viewer or "auto", seconds)
@@ -174,8 +187,6 @@ def analyze(
     from monitor import offline
     from monitor.publish import message
 
-    if rate is not None and not 0.0 < rate < float("inf"):
-        raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
     if plot is not None and plot.suffix not in (".png", ".html"):
         raise ConfigError(f"--plot: {plot}: a name ending in .png or .html is needed")
     window_s = options.duration("--window", window)
@@ -206,8 +217,8 @@ def simulate(
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="What to write: .csv, .csv.gz, .npz, .parquet, .arrow, .feather.")
     ],
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Same seed, same recording.")] = 1,
-    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate; the model's own unless given.")] = None,
+    seed: options.SimulationSeed = 1,
+    rate: options.ModelRate = None,
     temperature_from: Annotated[
         Path | None, typer.Option(metavar="RECORDING", help="Take the temperature of this recording.")
     ] = None,
@@ -221,8 +232,6 @@ def simulate(
     from monitor.catalogue import load
 
     length_s = options.duration("--seconds", seconds)
-    if rate is not None and not 0.0 < rate < float("inf"):
-        raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
     output.check_place("--json", json)
     for option, path in (("--json", json), ("--temperature-from", temperature_from)):
         if path is not None and path.resolve() == out.resolve():
@@ -252,7 +261,7 @@ def reconcile(
             help="Model under test; else the five classic terms are fitted first, to the first recording.",
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Same seed, same report.")] = 1,
+    seed: options.ReportSeed = 1,
     rate: options.Rate = None,
     last: options.Last = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
@@ -265,8 +274,6 @@ def reconcile(
     from monitor.publish import reconcile_text as text
     from monitor.reconcile import report, runs_report
 
-    if rate is not None and not 0.0 < rate < float("inf"):
-        raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
     last_s = options.duration("--last", last)
     output.check_place("--json", json)
     tested = None if model is None else load(model, Path.cwd())
@@ -322,7 +329,7 @@ def thermal_fit(
     from monitor import thermal
     from monitor.publish import thermal_text as text
 
-    _check_thermal(rate, json, plot)
+    _check_thermal(json, plot)
     output.check_place("--out", out)
     interval_s, last_s = options.duration("--interval", interval), options.duration("--last", last)
     study = thermal.fit(recording, interval_s, rate, last_s)
@@ -355,7 +362,7 @@ def thermal_predict(
     from monitor import thermal
     from monitor.publish import thermal_text as text
 
-    _check_thermal(rate, json, plot)
+    _check_thermal(json, plot)
     outlook = thermal.predict(recording, thermal.from_file(model), rate, options.duration("--last", last))
     if json is not None:
         output.write("--json", json, text.outlook_json(outlook) + b"\n")
@@ -369,9 +376,7 @@ def thermal_predict(
         text.tell_outlook(outlook, Console())
 
 
-def _check_thermal(rate: float | None, json: Path | None, plot: Path | None) -> None:
-    if rate is not None and not 0.0 < rate < float("inf"):
-        raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
+def _check_thermal(json: Path | None, plot: Path | None) -> None:
     if plot is not None and plot.suffix != ".png":
         raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
     output.check_place("--json", json)
@@ -385,13 +390,9 @@ def export(
         typer.Argument(metavar="MODEL.toml|RESULT.json", help="Model, or JSON of analyze; - = standard input."),
     ],
     form: Annotated[str, typer.Option("--format", metavar="kalibr|gyroparams|kalman", help="For which tool.")],
-    inflation: Annotated[float, typer.Option(metavar="F", help="Factor on N, B and K, 1 or more.")] = 1.0,
-    dt: Annotated[
-        float | None, typer.Option(metavar="S", help="kalman: time step; the samples' own unless given.")
-    ] = None,
-    correlation_time: Annotated[
-        float | None, typer.Option(metavar="S", help="kalman: of the process that stands for B.")
-    ] = None,
+    inflation: options.Inflation = 1.0,
+    dt: options.TimeStep = None,
+    correlation_time: options.CorrelationTime = None,
     rostopic: Annotated[str | None, typer.Option(metavar="T", help="kalibr: topic of the IMU; /imu0.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where to write; else standard output.")] = None,
 ) -> None:
@@ -410,31 +411,108 @@ def export(
 
 
 def main() -> None:
-    """The program: every error is one line and a status."""
+    """Run the program with the arguments of the process; every error is one line on standard error and a status.
+
+    ``--debug``, before or behind the name of the command, prints the traceback of an error before its line.
+    """
+    arguments, debug = split_debug(sys.argv[1:])
     try:
         # without its own error pages, typer hands an Exit's status back
-        status = app(standalone_mode=False)
-        if status == INTERRUPTED:  # Ctrl-C, of which typer makes an Exit
-            _fail("interrupted", INTERRUPTED)
-        sys.exit(status)
-    except TyperException as error:
-        _fail(error.format_message(), WRONG)
-    except (ConfigError, RecordingError) as error:
-        _fail(str(error), WRONG)
-    except NotReady as error:
-        _fail(str(error), NO_ANSWER)
-    except ImuError as error:
-        _fail(str(error), FAILED)
-    except typer.Abort:
+        status = app(args=arguments, prog_name="imu-monitor", standalone_mode=False)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except Exception as error:  # noqa: BLE001 - the last line of defence: said in one line, and how to report it
+        if debug:
+            traceback.print_exc()
+        line, status = explain(error)
+        if isinstance(error, OSError):
+            _discard_output()
+        if not isinstance(error, BrokenPipeError):  # whoever read the output has gone, and hears nothing
+            _fail(line, status)
+    if status == INTERRUPTED:  # Ctrl-C, of which typer makes an Exit
         _fail("interrupted", INTERRUPTED)
-    except BrokenPipeError:
-        sys.stderr.close()  # whoever read our output has gone; nothing to say and nobody to say it to
-        sys.exit(FAILED)
-    except OSError as error:
-        _fail(str(error), FAILED)
+    sys.exit(status)
+
+
+def split_debug(arguments: Sequence[str]) -> tuple[list[str], bool]:
+    """Return the arguments without ``--debug``, and True if it was among them; ``--`` ends the options.
+
+    >>> split_debug(["analyze", "a.csv", "--debug"]), split_debug(["analyze", "--", "--debug"])
+    ((['analyze', 'a.csv'], True), (['analyze', '--', '--debug'], False))
+    """
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    return [*(one for one in arguments[:end] if one != DEBUG), *arguments[end:]], DEBUG in arguments[:end]
+
+
+def explain(error: Exception) -> tuple[str, int]:
+    """Return the line for standard error and the exit status of an error that ended a command."""
+    match error:
+        case TyperException():
+            return in_one_line(_usage(error)), WRONG
+        case ConfigError() | RecordingError():
+            return str(error), WRONG
+        case NotReady():
+            return str(error), NO_ANSWER
+        case ImuError():
+            return str(error), FAILED
+        case typer.Abort():
+            return "interrupted", INTERRUPTED
+        case OSError():
+            return in_one_line(_system_error(error)), FAILED
+        case MemoryError():
+            why = f" ({cause})" if (cause := _cause(error)) else ""
+            return f"not enough memory{why}; read less at once, e.g. the end of a recording with --last 1h", FAILED
+    return (
+        f"internal error: {type(error).__name__}: {_cause(error)}; please report it with the output of the same "
+        f"command with {DEBUG}",
+        FAILED,
+    )
+
+
+def _cause(error: Exception) -> str:
+    text = " ".join(in_one_line(str(error)).split())
+    return text if len(text) <= LONGEST_CAUSE else f"{text[:LONGEST_CAUSE]} …"
+
+
+def _system_error(error: OSError) -> str:
+    if error.filename is None:
+        try:
+            os.getcwd()
+        except OSError:
+            return f"the current folder is gone or cannot be read ({error.strerror}); change to another folder"
+    return str(error)
+
+
+def _usage(error: TyperException) -> str:
+    """Return what is wrong with the arguments, with what is missing and what is possible."""
+    text, context = error.format_message(), getattr(error, "ctx", None)
+    if isinstance(error, typer.BadParameter) and error.param is not None and not error.message:
+        option: Any = error.param
+        name = option.opts[0] if option.param_type_name == "option" else ""
+        text = f"missing {option.param_type_name} {name} {option.metavar or ''}".replace("  ", " ")
+        return f"{text}: {option.help or ''} See {context.command_path} --help" if context else text
+    if context is None:
+        return text
+    unknown = getattr(error, "option_name", None)
+    if unknown is not None and text.startswith("No such option"):
+        known = sorted({name for option in context.command.params for name in option.opts if name.startswith("--")})
+        return f'no option "{unknown}" of {context.command_path}{nearest(unknown, known)}'
+    commands: Mapping[str, object] = getattr(context.command, "commands", {})
+    if commands and "Did you mean" not in text:
+        return f"{text.rstrip('.')}; known are {', '.join(commands)}"
+    return text
+
+
+def _discard_output() -> None:
+    """Send what is left in the buffer of standard output nowhere: at exit it would fail again, with a traceback."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # closed, or not a file
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
 
 
 def _fail(line: str, status: int) -> NoReturn:
-    with contextlib.suppress(OSError):  # nobody to say it to: the status stays
-        print(f"imu-monitor: {line}", file=sys.stderr)  # noqa: T201
+    if sys.stderr is not None:
+        with contextlib.suppress(OSError, ValueError):  # nobody to say it to: the status stays
+            print(f"imu-monitor: {line}", file=sys.stderr, flush=True)  # noqa: T201
     sys.exit(status)

@@ -1,5 +1,5 @@
 """``python -m monitor.cli``."""
 
-from monitor.cli import main
+from imu_monitor import main
 
 main()

@@ -32,8 +32,6 @@ def compensate(
     from monitor import compensating
     from monitor.publish import compensate_text as text
 
-    if rate is not None and not 0.0 < rate < float("inf"):
-        raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
     if plot is not None and plot.suffix != ".png":
         raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
     for option, place in (("--out", out), ("--json", json), ("--plot", plot)):

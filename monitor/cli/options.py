@@ -1,17 +1,49 @@
 """Arguments that are more than a word or a number; ConfigError names the option."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, overload
+from typing import TYPE_CHECKING, Annotated, Final, overload
 
 import typer
 
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, in_one_line
+from drivers.quantities import (
+    AVERAGING_TIME_S,
+    DURATION_S,
+    INFLATION,
+    RATE_HZ,
+    RUN_TIME_S,
+    SEED,
+    Number,
+    Quantity,
+)
 
 if TYPE_CHECKING:
     from monitor.drift.arma import Order
     from monitor.estimate.batch import TauGrid
     from monitor.export import Noise
+
+MOST_AVERAGING_TIMES: Final = 1000
+
+
+def within(quantity: Quantity) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
+    """Return a callback of typer that checks the number of an option against a quantity.
+
+    Raises
+    ------
+    ConfigError
+        The number is outside the supported range. The text begins with the name of the option.
+    """
+
+    def check(option: typer.CallbackParam, value: Number | None) -> Number | None:
+        try:
+            return None if value is None else quantity.check(value)
+        except ConfigError as error:
+            raise ConfigError(f"{option.opts[0]}: {error}") from None
+
+    return check
+
 
 KeyExpr = Annotated[str, typer.Argument(metavar="[KEYEXPR]", help="Which keys to show.")]
 Connect = Annotated[
@@ -21,7 +53,30 @@ ZenohFile = Annotated[
     Path | None,
     typer.Option("--zenoh", metavar="FILE.json5", help="A zenoh file: certificates, user and password, endpoints."),
 ]
-Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sample rate, where the file says none.")]
+Rate = Annotated[
+    float | None,
+    typer.Option(metavar="HZ", help="Sample rate, where the file says none.", callback=within(RATE_HZ)),
+]
+ModelRate = Annotated[
+    float | None,
+    typer.Option(metavar="HZ", help="Sample rate; the model's own unless given.", callback=within(RATE_HZ)),
+]
+Seconds = Annotated[
+    float | None, typer.Option(metavar="S", help="Stop by itself after S seconds.", callback=within(RUN_TIME_S))
+]
+SimulationSeed = Annotated[int, typer.Option(metavar="N", help="Same seed, same recording.", callback=within(SEED))]
+ReportSeed = Annotated[int, typer.Option(metavar="N", help="Same seed, same report.", callback=within(SEED))]
+Inflation = Annotated[
+    float, typer.Option(metavar="F", help="Factor on N, B and K, 1 or more.", callback=within(INFLATION))
+]
+TimeStep = Annotated[
+    float | None,
+    typer.Option(metavar="S", help="kalman: time step; the samples' own unless given.", callback=within(DURATION_S)),
+]
+CorrelationTime = Annotated[
+    float | None,
+    typer.Option(metavar="S", help="kalman: of the process that stands for B.", callback=within(DURATION_S)),
+]
 Last = Annotated[str | None, typer.Option(metavar="S", help="The end of the recording alone; also 1h, 1d.")]
 
 
@@ -32,10 +87,15 @@ def tau(text: str) -> "TauGrid":
     try:
         listed = tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise ConfigError(f'--tau: "{text}"; possible are octave, decade10, or seconds with commas') from None
-    if not all(0.0 < value < float("inf") for value in listed):
-        raise ConfigError(f'--tau: "{text}"; every averaging time must be above 0 s')
-    return listed
+        raise ConfigError(
+            f'--tau: "{in_one_line(text)[:60]}"; possible are octave, decade10, or seconds with commas'
+        ) from None
+    if len(listed) > MOST_AVERAGING_TIMES:
+        raise ConfigError(f"--tau: {len(listed)} averaging times; at most {MOST_AVERAGING_TIMES} are possible")
+    try:
+        return tuple(AVERAGING_TIME_S.check(value) for value in listed)
+    except ConfigError as error:
+        raise ConfigError(f"--tau: {error}") from None
 
 
 @overload

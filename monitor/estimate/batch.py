@@ -171,8 +171,8 @@ def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints
     if tau == "decade10":
         exponents = np.arange(0, np.log10(max(longest, 1)) + 1e-9, 0.1)
         return np.unique(np.rint(10.0**exponents).astype(np.int64))
-    wanted = np.rint(np.array(tau, float) * rate_hz).astype(np.int64)
-    possible = np.unique(wanted[(wanted >= 1) & (2 * wanted <= samples)])
+    wanted = np.rint(np.array(tau, float) * rate_hz)
+    possible = np.unique(wanted[(wanted >= 1) & (2 * wanted <= samples)].astype(np.int64))
     if possible.size == 0:
         raise ConfigError(
             f"tau: none of {list(tau)} s lies between one sample ({1 / rate_hz:g} s) "

@@ -136,7 +136,8 @@ class ChangeDetector:
         self._octaves = min(max(floor(log2(LONGEST_S * rate_hz)), 7), 20) + 1
         self._state = make_state(self._octaves)
         looks = 86_400.0 * rate_hz * len(AXES)  # z² a day, and pairs of blocks a day
-        once = NormalDist().inv_cdf(1.0 - min(0.5 * OTHER_SHARE * alarms_per_day / looks, 0.01))
+        # by the lower tail: 1 - p would be rounded to 1 for p below 1e-16
+        once = -NormalDist().inv_cdf(min(0.5 * OTHER_SHARE * alarms_per_day / looks, 0.01))
         self._state.levels[:] = (
             max(log(looks * RATE_AT_ZERO / (NOISE_SHARE * alarms_per_day)), 1.0),
             max(log(looks / TICK / (OTHER_SHARE * alarms_per_day)), 1.0),

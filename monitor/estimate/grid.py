@@ -13,9 +13,10 @@ from typing import Final
 import numpy as np
 
 from drivers.clock import JUMP_S, LONG_S, SampleClock
-from drivers.errors import NotReady
+from drivers.errors import ConfigError, NotReady, RecordingError
 from drivers.line import made_rate
 from drivers.order import NS
+from drivers.quantities import RATE_HZ
 from drivers.sample import AXES, Floats, Given, Ints, SampleBlock
 from monitor.estimate.late import truly_missing
 from monitor.estimate.resolution import Steps, coarse
@@ -193,14 +194,14 @@ def _said_of_steps(steps: Ints, going: tuple[Floats, Floats] | None, rate_hz: fl
     mean_hz, known = _rate(*going)
     if abs(mean_hz / rate_hz - 1.0) < min(max(OFF_RATE, SURE * known), FAR_RATE):
         return uneven
-    if steps.max() - steps.min() <= STEADY * steps.min():
+    if _steady(steps):
         step_s = float(steps.mean()) / NS
         return [f"the rate used is {rate_hz:g} Hz, but the times step by {step_s:.6g} s, {1.0 / step_s:.6g} Hz"]
     return [*uneven, f"the rate used is {rate_hz:g} Hz, but by the times {mean_hz:.5g} samples came a second"]
 
 
 def _said_uneven(steps: Ints, rate_hz: float) -> list[str]:
-    if steps.max() - steps.min() <= STEADY * steps.min():
+    if _steady(steps):
         return []
     low, middle, high = (np.quantile(steps, [0.1, 0.5, 0.9]) / NS).tolist()
     alike = middle > 0.0 and high - low <= STEADY * middle
@@ -214,6 +215,14 @@ def _said_uneven(steps: Ints, rate_hz: float) -> list[str]:
         f"times step unevenly: by {middle:.3g} s in the median, {high:.3g} s at 90 %, {worst_s:.3g} s at worst; "
         "samples are taken to be even"
     ]
+
+
+def _steady(steps: Ints) -> bool:
+    """Return True if all steps are alike.
+
+    The difference of two steps may exceed int64 where a time stamp is far off, so it is taken in floating point.
+    """
+    return float(steps.max()) - float(steps.min()) <= STEADY * float(steps.min())
 
 
 def _unit_s(steps: Ints) -> float:
@@ -257,4 +266,11 @@ def _mean_rate(going: tuple[Floats, Floats] | None) -> float:
     """The rate of a recording of which none is stated."""
     if going is None:
         raise NotReady("the times of the recording do not go on, so that its rate is unknown; state it with --rate HZ")
-    return made_rate(_rate(*going)[0])
+    rate_hz = made_rate(_rate(*going)[0])
+    try:
+        return RATE_HZ.check(rate_hz)
+    except ConfigError as error:
+        raise RecordingError(
+            f"the times of the recording give a sample rate that is not supported: {error}; t must be in seconds, or "
+            "state the rate with --rate HZ"
+        ) from None

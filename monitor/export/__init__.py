@@ -10,20 +10,17 @@ upper bound is used by the filters' formats, with a comment, and never by the si
 for is named in a comment. Texts are ASCII, as some of those who read them want it.
 """
 
-import math
 from collections.abc import Callable
 from typing import Any, Final
 
 from drivers.errors import ConfigError
+from drivers.quantities import COEFFICIENT, INFLATION
 from monitor.export.gyroparams import gyroparams
 from monitor.export.kalibr import kalibr
 from monitor.export.kalman import kalman
 from monitor.export.noise import Noise, Term, from_analysis, from_model, lacking
 
 __all__ = ["FORMATS", "Noise", "Term", "export", "from_analysis", "from_model"]
-
-SIZES: Final = (1e-30, 1e30)
-"""SI; far beyond every sensor, and their squares and quotients are still numbers."""
 
 FORMATS: Final[dict[str, Callable[..., str]]] = {"kalibr": kalibr, "gyroparams": gyroparams, "kalman": kalman}
 
@@ -42,12 +39,14 @@ def export(noise: Noise, form: str, inflation: float = 1.0, **options: Any) -> s
     """
     if form not in FORMATS:
         raise ConfigError(f'unknown format "{form}"; possible are {", ".join(FORMATS)}')
-    if not 1.0 <= inflation < math.inf:
-        raise ConfigError(f"inflation {inflation:g}; it must be 1 or more")
+    try:
+        INFLATION.check(inflation)
+    except ConfigError as error:
+        raise ConfigError(f"inflation: {error}") from None
     if not noise.axes:
         raise lacking(noise, "nothing to export: no axis has any of Q, N, B, K, R")
     for axis, terms in noise.axes.items():
         for letter, term in terms.items():
-            if term.value and not SIZES[0] <= term.value <= SIZES[1]:
+            if term.value and not COEFFICIENT.supports(term.value):
                 raise ConfigError(f"{axis}: {letter} = {term.value:g}; no sensor has that")
     return FORMATS[form](noise, inflation, **options)

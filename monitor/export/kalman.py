@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import ConfigError
+from drivers.quantities import DURATION_S
 from drivers.sample import Floats
 from monitor.export.noise import AXES_OF, Noise, Term, head, number, tail, text
 
@@ -45,10 +46,15 @@ def kalman(
 ) -> str:
     """The file; the time step is that of the samples, the correlation time as in the module, unless given."""
     step_s = 1.0 / noise.sample_rate_hz if dt_s is None and noise.sample_rate_hz else dt_s
-    if step_s is None or not 0.0 < step_s < math.inf:
-        raise ConfigError("kalman needs a time step above 0 s: the model's sample_rate, or one that is given")
-    if correlation_time_s is not None and not 0.0 < correlation_time_s < math.inf:
-        raise ConfigError(f"correlation time {correlation_time_s:g} s; it must be above 0")
+    if step_s is None or not DURATION_S.supports(step_s):
+        raise ConfigError(
+            f"kalman needs a time step of {DURATION_S.range_text()}: the model's sample_rate, or one that is given"
+        )
+    if correlation_time_s is not None:
+        try:
+            DURATION_S.check(correlation_time_s)
+        except ConfigError as error:
+            raise ConfigError(f"correlation time: {error}") from None
     lines = [
         *EXPLAINED,
         *head(noise, inflation, "#"),

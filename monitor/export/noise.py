@@ -13,6 +13,7 @@ from typing import Final
 import msgspec
 
 from drivers.errors import ConfigError, ImuError, NotReady
+from drivers.quantities import RATE_HZ
 from drivers.sample import AXES
 from monitor.noise.model import NoiseModel
 
@@ -100,6 +101,11 @@ def from_analysis(text: bytes | str, source: str = "analysis of a recording") ->
         raise ConfigError(f"not the JSON of an analysis: {error}") from error
     if not found.schema.startswith("imu-monitor/analyze/"):
         raise ConfigError(f'schema "{found.schema}"; an export needs "imu-monitor/analyze/1"')
+    try:
+        if found.rate is not None:
+            RATE_HZ.check(found.rate)
+    except ConfigError as error:
+        raise ConfigError(f"rate: {error}") from None
     axes: dict[str, dict[str, Term]] = {}
     for axis in (axis for axis in AXES if axis in found.axes):
         for letter, one in found.axes[axis].coefficients.items():

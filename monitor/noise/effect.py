@@ -23,6 +23,7 @@ import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.plugin import nearest
+from drivers.quantities import PARAMETER
 from drivers.sample import AXES, Floats
 from monitor.noise.spectrum import Spectrum
 
@@ -216,6 +217,8 @@ def _check(effect: str, name: str, value: Any, allows: Mapping[str, Any]) -> Non
         raise ConfigError(f"{effect}: {name} must not be negative, is {value!r}")
     if value == 0.0 and allows["positive"]:
         raise ConfigError(f"{effect}: {name} must be above zero, is {value!r}")
+    if not PARAMETER.supports(value):
+        raise ConfigError(f"{effect}: {name} must be {PARAMETER.range_text()} in SI units, is {value!r}")
     if value > allows["most"]:
         raise ConfigError(f"{effect}: {name} must be at most {allows['most']:g}, is {value!r}")
     if allows["whole"] and value != int(value):

@@ -8,11 +8,11 @@ is a ConfigError of one line that names the place and the nearest known word. Pa
 import contextlib
 from collections.abc import Iterator
 from dataclasses import fields
-from math import inf
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.errors import ConfigError
 from drivers.plugin import nearest
+from drivers.quantities import RATE_HZ
 from drivers.sample import AXES
 from monitor import toml
 from monitor.noise.effect import GYROS, Effect, required, units
@@ -33,10 +33,11 @@ def read(text: str) -> tuple[list[Placed], float | None, Temperature | None]:
     """Effects, sample rate in Hz and temperature of a model file's text; ConfigError says what is wrong in one line."""
     tables = toml.tables(text)
     rate_hz = tables.pop("sample_rate", None)
-    if rate_hz is not None and (
-        isinstance(rate_hz, bool) or not isinstance(rate_hz, int | float) or not 0.0 < rate_hz < inf
-    ):
-        raise ConfigError(f"sample_rate must be a positive number of Hz, is {rate_hz!r}")
+    if rate_hz is not None:
+        if isinstance(rate_hz, bool) or not isinstance(rate_hz, int | float):
+            raise ConfigError(f"sample_rate must be a number of Hz, is {rate_hz!r}")
+        with placed("sample_rate"):
+            RATE_HZ.check(rate_hz)
     temperature = tables.pop("temperature", None)
     effects: list[Placed] = [
         (WILDCARDS.get(axis, (axis,)), tuple(_effects(axis, given))) for axis, given in tables.items()

@@ -12,6 +12,7 @@ import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.plugin import nearest
+from drivers.quantities import DURATION_S, TEMPERATURE_C
 from drivers.sample import Floats
 from monitor.noise.effect import Block, Series
 from monitor.noise.effects.exponentially_correlated import ExponentiallyCorrelated
@@ -44,8 +45,11 @@ class Temperature:
                 raise ConfigError(f"temperature: {f.name} must be a finite number, is {value!r}")
             if f.name in ("swing", "wander") and value < 0.0:
                 raise ConfigError(f"temperature: {f.name} must not be negative, is {value!r}")
-            if f.name in ("period", "wander_time") and value <= 0.0:
-                raise ConfigError(f"temperature: {f.name} must be above zero, is {value!r}")
+            quantity = DURATION_S if f.name in ("period", "wander_time") else TEMPERATURE_C
+            try:
+                quantity.check(value)
+            except ConfigError as error:
+                raise ConfigError(f"temperature: {f.name}: {error}") from None
         if (self.swing is None) != (self.period is None):
             raise ConfigError(
                 "temperature: " + ("swing needs a period" if self.swing is not None else "period needs a swing")

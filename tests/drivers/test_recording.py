@@ -4,6 +4,7 @@ import errno
 import gzip
 import os
 import pickle
+import re
 import sys
 import tracemalloc
 from pathlib import Path
@@ -301,7 +302,7 @@ class TestRate:
         np.savez(path, fs=fs, gx=np.zeros(3))
         with pytest.raises(ConfigError, match="--rate HZ"):
             load_samples(path)
-        assert "fs is not one positive number" in load_samples(path, 9.0).notes[0]
+        assert re.match("fs (is not one number|was left aside: .* Hz is outside)", load_samples(path, 9.0).notes[0])
 
     def test_rows_without_time_are_left_out(self, tmp_path):
         recording = load_samples(written(tmp_path / "x.csv", "t,gx\n0,1\n,2\n2,3\n1e30,4\n4,5\n"))

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import imu_monitor
 from drivers.recording import load_samples
 from drivers.sample import block
 from monitor.estimate.estimator import Estimator
@@ -231,7 +232,7 @@ def test_reports_are_kept_only_where_the_configuration_says(tmp_path: Path) -> N
 
 def test_the_program_is_this_one() -> None:
     assert PROGRAM[0] == sys.executable
-    assert PROGRAM[1:] == ("-m", "monitor.cli", "reconcile")
+    assert PROGRAM[1:] == ("-P", str(Path(imu_monitor.__file__)), "reconcile")
 
 
 def test_a_verdict_without_steps_and_a_step_without_confidence() -> None:

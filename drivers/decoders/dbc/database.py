@@ -9,8 +9,6 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 import drivers
 from drivers import small_file, units
 from drivers.decoders.base import Arrival, Counter, Timing
@@ -19,6 +17,7 @@ from drivers.decoders.dbc.join import COLUMNS, Column, Message
 from drivers.decoders.dbc.settings import Settings, SignalSettings
 from drivers.errors import ConfigError
 from drivers.plugin import nearest
+from drivers.quantities import check_settings
 from drivers.sample import AXES
 
 TEMPERATURE: Final = "temperature"
@@ -174,18 +173,11 @@ def _check(settings: Settings) -> None:
         raise ConfigError(f"signals: no axis but temperature; axes are {', '.join(AXES)}")
     if settings.join == "counter" and not settings.counter:
         raise ConfigError('join = "counter" needs counter = "Message.Signal"')
-    if settings.tick is not None and not settings.tick > 0.0:
-        raise ConfigError(f"tick = {settings.tick:g}; it is seconds a count, above 0")
-    if not 0.0 <= settings.window < 1e6:
-        raise ConfigError(f"window = {settings.window:g}; it is seconds, 0 or more")
-    if settings.source is not None and not 0 <= settings.source <= 255:
-        raise ConfigError(f"source = {settings.source}; a J1939 source address is 0 to 255")
+    check_settings(settings)
 
 
 def _signal_settings(entry: str | SignalSettings) -> SignalSettings:
     if isinstance(entry, SignalSettings):
-        if not (np.isfinite(entry.factor) and entry.factor != 0.0):
-            raise ConfigError(f"signals: factor = {entry.factor:g}; it is a number other than 0")
         return entry
     if entry.startswith("-"):
         return SignalSettings(entry[1:], factor=-1.0)

@@ -161,7 +161,7 @@ def test_an_unmeasured_axis_is_sent_as_a_channel_error() -> None:
         ({"identifier": 0x95}, "0x90"),
         ({"gyro_output": "increment"}, "rate"),
         ({"accelerometer_output": "increment"}, "rate"),
-        ({"rate": -1.0}, "above 0"),
+        ({"rate": -1.0}, "rate: -1 Hz is outside"),
     ],
 )
 def test_wrong_settings_say_what_is_right(settings: dict[str, object], words: str) -> None:

@@ -1,0 +1,225 @@
+"""Quantities that users and files give as numbers, each with the range that the program supports.
+
+A number enters the program through a command-line option, a key of a configuration or model file, or a recording. Each
+of these entries checks the number against one of the quantities below, so that the code behind them never meets a
+value that overflows, divides by zero or asks for more memory than exists. The ranges are wider than any sensor or use
+that is known, and narrow enough that products, squares and quotients of the numbers stay finite.
+
+A field of a settings struct names its quantity in its type: ``Annotated[float, RATE_HZ.meta]``. ``check_fields`` finds
+the quantity there and checks a value that msgspec has converted to that type.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import isfinite
+from typing import Any, Final, TypeVar
+
+import msgspec
+from msgspec import inspect
+
+from drivers.errors import ConfigError
+
+Number = TypeVar("Number", int, float)
+
+DAY_S: Final = 86_400.0
+PREFIXED_UNITS: Final = ("Hz", "bit/s", "byte/s", "byte")
+"""Units that are written with the prefixes k, M, G, T."""
+PREFIXES: Final = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"))
+LARGEST_WRITTEN: Final = 1 << 64
+"""An integer beyond this is described, not written: it may have thousands of digits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A kind of number with its unit and the supported range, both ends included.
+
+    >>> RATE_HZ.check(200.0)
+    200.0
+    >>> RATE_HZ.check(1e300)
+    Traceback (most recent call last):
+    drivers.errors.ConfigError: 1e+300 Hz is outside the supported range 0.001 Hz to 1 MHz
+    """
+
+    unit: str  # "" for a number without a unit
+    low: float
+    high: float
+    zero: bool = False  # True: 0 is supported too, with a meaning of its own
+    signed: bool = False  # True: the range is that of the absolute value
+
+    def check(self, value: Number) -> Number:
+        """Return the value.
+
+        Raises
+        ------
+        ConfigError
+            The value is not a number or outside the supported range. The text names value, unit and range.
+        """
+        if self.supports(value):
+            return value
+        raise ConfigError(f"{_amount(value, self.unit)} is outside the supported range {self.range_text()}")
+
+    def supports(self, value: float) -> bool:
+        """Return True if the value is in the supported range; False for NaN."""
+        size = abs(value) if self.signed else value
+        return self.low <= size <= self.high or (self.zero and value == 0)
+
+    def range_text(self) -> str:
+        """Return the supported range with its unit.
+
+        >>> DURATION_S.range_text(), SILENCE_S.range_text()
+        ('1 µs to 36525 d', '1 ms to 36525 d, or 0')
+        """
+        sign = "±" if self.signed else ""
+        ends = f"{sign}{self.low:g} to {sign}{self.high:g} {self.unit}".rstrip()
+        if self.unit in PREFIXED_UNITS or self.unit == "s":
+            ends = f"{_amount(self.low, self.unit)} to {_amount(self.high, self.unit)}"
+        return f"{ends}, or 0" if self.zero else ends
+
+    @property
+    def meta(self) -> msgspec.Meta:
+        """Annotation of a field of this quantity, for ``check_fields``."""
+        return msgspec.Meta(extra={"quantity": self})
+
+
+# --- time and rates
+
+RATE_HZ: Final = Quantity("Hz", 1e-3, 1e6)
+"""Sample rate: from a sample in a quarter of an hour to far above the fastest vibration sensors (some 30 kHz)."""
+UPDATE_RATE_HZ: Final = Quantity("Hz", 1e-6, 1e6)
+"""Rate of results."""
+DURATION_S: Final = Quantity("s", 1e-6, 36_525.0 * DAY_S)
+"""Length of time: from one period of the highest sample rate to a century."""
+AVERAGING_TIME_S: Final = Quantity("s", 1e-6, 36_525.0 * DAY_S)
+DELAY_S: Final = Quantity("s", 1e-6, 36_525.0 * DAY_S, zero=True)
+"""Time after a start; 0 is the start itself."""
+SILENCE_S: Final = Quantity("s", 1e-3, 36_525.0 * DAY_S, zero=True)
+"""Time without data after which something is done; 0: never."""
+RUN_TIME_S: Final = Quantity("s", 0.1, 36_525.0 * DAY_S)
+"""How long a command runs before it stops by itself."""
+JITTER_S: Final = Quantity("s", 0.0, 0.5)
+READ_TIMEOUT_S: Final = Quantity("s", 1e-4, 0.1)
+"""A serial port without ``cancel_read`` is closed after at most this long."""
+TICK_S: Final = Quantity("s", 1e-12, DAY_S)
+"""Length of one count of a device's clock."""
+
+# --- transmission
+
+BIT_RATE: Final = Quantity("bit/s", 1, 1_000_000_000)
+BYTE_RATE: Final = Quantity("byte/s", 1.0, 1e9)
+PORT: Final = Quantity("", 0, 65_535)
+"""TCP port."""
+SIZE_BYTES: Final = Quantity("byte", 1e6, 1e15)
+"""Limit of memory."""
+
+# --- counts and factors
+
+SHARE: Final = Quantity("", 0.0, 1.0)
+POSITIVE_SHARE: Final = Quantity("", 1e-6, 1.0)
+PERCENT: Final = Quantity("%", 1.0, 100.0)
+SEED: Final = Quantity("", 0, (1 << 63) - 1)
+SAMPLES: Final = Quantity("samples", 1, 10_000_000_000)
+"""Length of a simulated recording."""
+COUNTER_MODULUS: Final = Quantity("counts", 2, 1 << 62)
+"""Counts after which a device's counter starts again at 0."""
+COUNTER_STEP: Final = Quantity("counts", 1e-9, 1 << 62)
+"""Counts of a device's counter from one sample to the next."""
+SOURCE_ADDRESS: Final = Quantity("", 0, 255)
+"""Of SAE J1939."""
+HEADER_LINES: Final = Quantity("lines", 0, 1_000_000)
+ALARMS_PER_DAY: Final = Quantity("a day", 1e-6, 1e4, zero=True)
+"""Rate of false alarms; 0: nothing is looked for."""
+REPLAY_SPEED: Final = Quantity("times", 1e-3, 1e6)
+"""Speed over real time."""
+SIMULATION_SPEED: Final = Quantity("times", 1e-3, 1e4)
+CLOCK_RATIO: Final = Quantity("", 0.5, 2.0)
+INFLATION: Final = Quantity("", 1.0, 1e6)
+SCALE: Final = Quantity("", 1e-15, 1e15, signed=True)
+"""Factor from a device's own numbers."""
+TIMES: Final = Quantity("times", 1e-6, 1e6)
+"""Ratio of two amounts of noise."""
+
+# --- what a sensor measures
+
+FULL_SCALE: Final = Quantity("", 1e-3, 1e6)
+"""Full scale of a sensor, in g or °/s."""
+COEFFICIENT: Final = Quantity("", 1e-30, 1e30)
+"""Size of noise in an SI unit: far beyond every sensor, and squares and quotients are still numbers."""
+PARAMETER: Final = Quantity("", 1e-30, 1e30, zero=True, signed=True)
+"""Any parameter of a noise model, in SI units."""
+FIT_NUMBER: Final = Quantity("", 0.0, 1e30, signed=True)
+"""Any number of a fitted model that was written to a file."""
+TEMPERATURE_C: Final = Quantity("°C", -273.15, 2_000.0)
+
+
+def check_fields(value: Any, kind: Any, place: str = "") -> None:
+    """Check every number in a value against the quantities named in its type.
+
+    Parameters
+    ----------
+    value
+        What ``msgspec.convert`` made of a key for the type ``kind``.
+    kind
+        The type of a field of a struct; unions, containers and structs are searched.
+    place
+        Name of the key, for messages.
+
+    Raises
+    ------
+    ConfigError
+        A number is outside the supported range of its quantity. The text begins with the place in the value.
+    """
+    _check(value, inspect.type_info(kind), place)
+
+
+def check_settings(settings: msgspec.Struct) -> None:
+    """Check every number of a struct, as ``check_fields`` does for one field.
+
+    Raises
+    ------
+    ConfigError
+        A number is outside the supported range. The text begins with the name of its key.
+    """
+    for field in msgspec.structs.fields(settings):
+        check_fields(getattr(settings, field.name), field.type, field.encode_name)
+
+
+def _check(value: Any, info: inspect.Type, place: str) -> None:
+    if isinstance(info, inspect.Metadata):
+        quantity = (info.extra or {}).get("quantity")
+        if isinstance(quantity, Quantity) and isinstance(value, int | float) and not isinstance(value, bool):
+            try:
+                quantity.check(value)
+            except ConfigError as error:
+                raise ConfigError(f"{place}: {error}" if place else str(error)) from None
+        _check(value, info.type, place)
+    elif isinstance(info, inspect.UnionType):
+        for one in info.types:
+            _check(value, one, place)
+    elif isinstance(info, inspect.CollectionType) and isinstance(value, list | tuple | frozenset | set):
+        for one in value:
+            _check(one, info.item_type, place)
+    elif isinstance(info, inspect.DictType) and isinstance(value, Mapping):
+        for key, one in value.items():
+            _check(one, info.value_type, f"{place}.{key}".lstrip("."))
+    elif isinstance(info, inspect.StructType) and isinstance(value, info.cls):
+        for field in info.fields:
+            _check(getattr(value, field.name), field.type, f"{place}.{field.encode_name}".lstrip("."))
+
+
+def _amount(value: float, unit: str) -> str:
+    """Return a number with its unit.
+
+    >>> _amount(2e6, "Hz"), _amount(0.25, "s"), _amount(172_800.0, "s"), _amount(10**400, "")
+    ('2 MHz', '250 ms', '2 d', 'an integer of more than 64 bits')
+    """
+    if isinstance(value, int) and abs(value) > LARGEST_WRITTEN:
+        return "an integer of more than 64 bits"
+    if unit in PREFIXED_UNITS and isfinite(value) and value < 1e15:
+        for factor, prefix in PREFIXES:
+            if value >= factor:
+                return f"{value / factor:g} {prefix}{unit}"
+    if unit == "s" and 0.0 < value < 1e12:
+        for factor, name in ((DAY_S, "d"), (1.0, "s"), (1e-3, "ms"), (1e-6, "µs")):
+            if value >= factor:
+                return f"{value / factor:g} {name}"
+    return f"{value:g} {unit}".rstrip()
