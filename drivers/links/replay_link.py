@@ -24,10 +24,10 @@ import struct
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Annotated, BinaryIO, Final, Literal, cast
+from typing import IO, TYPE_CHECKING, Annotated, Any, BinaryIO, Final, Literal, cast
 
 from drivers import small_file
 from drivers.errors import ConfigError, LinkEnded, LinkLost, LinkUnavailable, RecordingError
@@ -57,6 +57,12 @@ LARGEST_STANDARD_ID: Final = 0x7FF
 LARGEST_ID: Final = 0x1FFF_FFFF
 LONGEST_FRAME: Final = 64  # bytes, of CAN FD
 READ_BYTES: Final = 1 << 20
+MAX_LINE_BYTES: Final = 1 << 20
+MAX_BYTES_WITHOUT_FRAME: Final = 8_000_000
+"""Text of a log that is read without finding a frame, such as comments; a reader needs seconds for it."""
+MAX_OBJECT_BYTES: Final = 64_000_000
+"""Of an object of a BLF log, packed or unpacked; Vector's tools write containers of some hundred kilobytes."""
+MAX_OBJECTS_WITHOUT_FRAME_BYTES: Final = 256_000_000
 BLF_OBJECT: Final = b"LOBJ"
 BLF_SIZE: Final = slice(8, 12)  # of the object, little-endian, in its header
 BLF_HEADER: Final = 16
@@ -222,29 +228,119 @@ def _messages(recording: Recording, rows: int) -> Iterator[Timed]:
 
 def _log(path: Path, channel: str | None) -> _Source:
     if _plain_suffix(path) == ".csv" and not _header(path).startswith(PYTHON_CAN_HEADER):
-        stream = _text(path)
-        return _Source(_from_start(_csv_frames(stream, channel)), stream.close)
+        lines = _Lines(_binary(path))
+        stream = lines.text("")
+        return _Source(_from_start(_csv_frames(stream, channel, lines.found)), stream.close)
+    if _plain_suffix(path) == ".blf":
+        blf = _blf(path)
+        return _Source(_from_start(_log_frames(iter(blf), channel, lambda: None)), blf.stop)
     import can
 
-    reader = _blf(path) if _plain_suffix(path) == ".blf" else can.LogReader(path)
-    return _Source(_from_start(_log_frames(iter(reader), channel)), reader.stop)
+    readers: dict[str, type[can.io.generic.TextIOMessageReader]] = {
+        ".asc": can.ASCReader, ".log": can.CanutilsLogReader, ".trc": can.TRCReader, ".csv": can.CSVReader,
+    }  # fmt: skip
+    lines = _Lines(_binary(path))
+    stream = lines.text(None)
+    try:
+        reader = readers[_plain_suffix(path)](stream)
+    except BaseException:
+        stream.close()
+        raise
+    return _Source(_from_start(_log_frames(iter(reader), channel, lines.found)), stream.close)
+
+
+class _Lines(io.RawIOBase):
+    """A file of lines. ValueError for a line without end, and for text without end that holds no frame."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self._stream = stream
+        self._line = 0  # bytes since the last end of a line
+        self._idle = 0  # bytes since the last frame
+
+    def text(self, newline: str | None) -> io.TextIOWrapper:
+        """The text of the file; its end closes the file."""
+        return io.TextIOWrapper(io.BufferedReader(self), "utf-8", newline=newline)
+
+    def found(self) -> None:
+        """Take note that the text so far held a frame."""
+        self._idle = 0
+
+    def readable(self) -> bool:
+        """Return True, as this can be read."""
+        return True
+
+    def readinto(self, buffer: Any, /) -> int:
+        """Read up to the length of ``buffer`` bytes into it, and return how many."""
+        data = self._stream.read(min(len(buffer), CHUNK_BYTES))
+        end = max(data.rfind(b"\n"), data.rfind(b"\r"))
+        self._line = len(data) - end - 1 if end >= 0 else self._line + len(data)
+        self._idle += len(data)
+        if self._line > MAX_LINE_BYTES:
+            raise ValueError(f"a line is longer than {MAX_LINE_BYTES} bytes")
+        if self._idle > MAX_BYTES_WITHOUT_FRAME:
+            raise ValueError(f"{MAX_BYTES_WITHOUT_FRAME} bytes hold no CAN frame")
+        buffer[: len(data)] = data
+        return len(data)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+        super().close()
 
 
 def _blf(path: Path) -> "can.BLFReader":
     """python-can's own reader would leave the file open when it is none of its kind."""
     import can
+    from can.io import blf
     from can.io.blf import BLFParseError
 
     class Reader(can.BLFReader):
-        """Not for ever at an object that says to end where it begins."""
+        """Not for ever at an object that says to end where it begins, and no object of gigabytes."""
+
+        def __iter__(self) -> "Generator[can.Message, None, None]":
+            idle = 0  # bytes since the last frame
+            while header := self.file.read(blf.OBJ_HEADER_BASE_STRUCT.size):
+                mark, _, _, size, kind = blf.OBJ_HEADER_BASE_STRUCT.unpack(header)
+                if mark != BLF_OBJECT:
+                    raise BLFParseError("no object begins where one ends")
+                if size > MAX_OBJECT_BYTES:
+                    raise BLFParseError(f"an object has {size} bytes, expected at most {MAX_OBJECT_BYTES}")
+                body = self.file.read(size - blf.OBJ_HEADER_BASE_STRUCT.size)
+                self.file.read(size % 4)  # padding
+                if kind != blf.LOG_CONTAINER:
+                    continue
+                data = self._unpacked(body)
+                idle += len(data)
+                for message in self._parse_container(data):
+                    idle = 0
+                    yield message
+                if idle > MAX_OBJECTS_WITHOUT_FRAME_BYTES:
+                    raise BLFParseError(f"{MAX_OBJECTS_WITHOUT_FRAME_BYTES} bytes hold no CAN frame")
+            self.stop()
+
+        def _unpacked(self, container: bytes) -> bytes:
+            """The objects of a container, none of a packing that is unknown."""
+            method, _ = blf.LOG_CONTAINER_STRUCT.unpack_from(container)
+            data = container[blf.LOG_CONTAINER_STRUCT.size :]
+            if method == blf.NO_COMPRESSION:
+                return data
+            if method != blf.ZLIB_DEFLATE:
+                return b""
+            unzip = zlib.decompressobj()
+            data = unzip.decompress(data, MAX_OBJECT_BYTES)
+            if unzip.unconsumed_tail:
+                raise BLFParseError(f"a container unpacks to more than {MAX_OBJECT_BYTES} bytes")
+            return data
 
         def _parse_container(self, data: bytes) -> "Iterator[can.Message]":
             at = data.find(BLF_OBJECT)
             while at >= 0:
-                size = data[at:][BLF_SIZE]
+                size = data[at + BLF_SIZE.start : at + BLF_SIZE.stop]
                 if len(size) == 4 and int.from_bytes(size, "little") < BLF_HEADER:
                     raise BLFParseError("an object is shorter than its header")
                 at = data.find(BLF_OBJECT, at + 1)
+            if len(self._tail) > MAX_OBJECT_BYTES:
+                raise BLFParseError(f"an object has more than {MAX_OBJECT_BYTES} bytes")
             yield from super()._parse_container(data)
 
     stream = _Parts(_binary(path))
@@ -273,8 +369,8 @@ class _Parts:
         return b"".join(parts)
 
 
-def _log_frames(messages: "Iterator[can.Message]", channel: str | None) -> Iterator[Chunk]:
-    """Data frames of a log that python-can reads."""
+def _log_frames(messages: "Iterator[can.Message]", channel: str | None, found: Callable[[], None]) -> Iterator[Chunk]:
+    """Data frames of a log that python-can reads. ``found`` is called for each message, of another channel too."""
     from can.io.blf import BLFParseError
 
     while True:
@@ -284,6 +380,7 @@ def _log_frames(messages: "Iterator[can.Message]", channel: str | None) -> Itera
             raise ValueError(str(error)) from error
         if message is None:
             return
+        found()
         if message.is_error_frame or message.is_remote_frame:
             continue
         if channel is None or str(message.channel) == channel:
@@ -291,8 +388,11 @@ def _log_frames(messages: "Iterator[can.Message]", channel: str | None) -> Itera
             yield _frame(bytes(message.data), message.timestamp, address)
 
 
-def _csv_frames(stream: IO[str], channel: str | None) -> Iterator[Chunk]:
-    """Data frames of a CSV with t (s), id_hex, data_hex and perhaps channel or bus, and extended (0 or 1)."""
+def _csv_frames(stream: IO[str], channel: str | None, found: Callable[[], None]) -> Iterator[Chunk]:
+    """Data frames of a CSV with t (s), id_hex, data_hex and perhaps channel or bus, and extended (0 or 1).
+
+    ``found`` is called for each frame, of another channel too.
+    """
     rows = csv.reader(stream)
     columns = {name: i for i, name in enumerate(next(rows))}
     t, identifier, data = columns["t"], columns["id_hex"], columns["data_hex"]
@@ -301,6 +401,7 @@ def _csv_frames(stream: IO[str], channel: str | None) -> Iterator[Chunk]:
     for row in rows:
         if len(row) != len(columns):
             raise ValueError(f"line {rows.line_num} has {len(row)} fields, not {len(columns)}")
+        found()
         if channel is not None and (lane is None or row[lane] != channel):
             continue
         address = int(row[identifier], 16)

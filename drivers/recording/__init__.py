@@ -14,6 +14,7 @@ Time stamps are passed on as stored, with their jitter, gaps and steps back. Not
 sorted or filled here, no unit is guessed, and nothing is ever unpickled.
 """
 
+import stat
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -71,6 +72,8 @@ def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None 
         found = _load_folder(path, rate_hz, last_s) if path.is_dir() else _load_file(path, rate_hz)
     except OSError as error:
         raise RecordingError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
+    except MemoryError as error:
+        raise ConfigError(f"{path}: does not fit into the memory that is free; read a part of it") from error
     return found if last_s is None else _end(found, last_s)
 
 
@@ -88,9 +91,24 @@ def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]
 
 
 def _load_file(path: Path, rate_hz: float | None) -> Recording:
-    if path.stat().st_size == 0:
-        raise RecordingError(f"{path}: the file is empty; a recording has columns {EXAMPLE_HEADER}")
+    _check_content(path)
     return _assemble(path, format_of(path).read(path), rate_hz)
+
+
+def _check_content(path: Path) -> None:
+    """Raise an error for a file of no bytes, and for what is no file: a pipe or a device has no end."""
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
+        raise RecordingError(f"{path}: is a device or pipe, expected a file; copy what it gives into a file first")
+    if found.st_size:
+        return
+    if not is_recording(path):
+        raise ConfigError(
+            f"{path}: the file is empty, and its name does not end like a recording's; known are {' '.join(FORMATS)}"
+        )
+    raise RecordingError(
+        f"{path}: the file is empty, expected columns such as {EXAMPLE_HEADER}; record it again, or name another file"
+    )
 
 
 def _assemble(path: Path, table: Table, rate_hz: float | None) -> Recording:
@@ -206,6 +224,8 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
     parts: list[Recording] = []  # newest first
     notes: list[str] = []
     free, taken = room.free_bytes(), 0
+    if last_s is None:
+        _check_folder(path, segments, free)
     for segment in reversed(segments):
         try:
             part = _load_file(segment, rate_hz)
@@ -221,6 +241,19 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
     if not parts:
         raise RecordingError(f"{path}: none of {len(segments)} segments can be read; {notes[-1]}")
     return _joined(path, parts[::-1], notes[::-1])
+
+
+def _check_folder(path: Path, segments: Sequence[Path], free: int | None) -> None:
+    """Raise an error if the rows of all segments exceed the limits; segments that cannot be read do not count."""
+    rows = size_bytes = 0
+    for segment in segments:
+        try:
+            _check_content(segment)
+            rows += format_of(segment).count_rows(segment)
+        except RecordingError:
+            continue  # left out, with a note, when it is read
+        size_bytes += segment.stat().st_size
+        room.ReadLimit(path, size_bytes, free).check_rows(rows)
 
 
 def _lasted_s(parts: Sequence[Recording]) -> float:

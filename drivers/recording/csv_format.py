@@ -1,8 +1,13 @@
 """CSV, plain or gzip: one header line, commas, empty field or ``nan`` = missing.
 
+Blank lines and comment lines (``#`` or ``%``) before the header are skipped. A header may itself be a comment.
+
 Text is parsed in pieces of whole lines: quickly where every line is regular, line by line where one
 is not, so that a torn line costs only itself and is named by its number. A last line without its end
 may be cut inside a number, so it is left out. More bad lines than good ones: no recording.
+
+The lines are counted before any is parsed, and checked against the limits of ``drivers.recording.room``. A file is read
+up to a line longer than ``MAX_LINE_BYTES``.
 """
 
 import csv
@@ -19,10 +24,29 @@ from typing import BinaryIO, Final, TextIO
 import numpy as np
 
 from drivers.errors import RecordingError
-from drivers.recording.table import BATCH_ROWS, EXAMPLE_HEADER, Append, Columns, Table, chosen_columns
-from drivers.sample import Floats
+from drivers.recording import room
+from drivers.recording.table import (
+    BATCH_ROWS,
+    EXAMPLE_HEADER,
+    Append,
+    Columns,
+    Table,
+    check_width,
+    chosen_columns,
+    looks_like,
+)
+from drivers.sample import AXES, Floats
 
-READ_BYTES: Final = 1 << 22
+READ_BYTES: Final = 1 << 20
+MAX_LINE_BYTES: Final = 1 << 20
+MAX_PREAMBLE_BYTES: Final = 1 << 20
+"""Blank lines and comments before the header."""
+MAX_EMPTY_MEMBERS: Final = 1000
+"""Members of a gzip file that hold nothing, one after another."""
+SURELY_BAD: Final = 100_000
+"""Bad lines after which a file with more bad lines than good ones is read no further."""
+COMMENTS: Final = (b"#", b"%")
+BOM: Final = b"\xef\xbb\xbf"
 GZIP_BYTES: Final = 1 << 16  # what a damaged gzip file may lose before the damage
 GZIP_MAGIC: Final = b"\x1f\x8b"
 GZIP_LEVEL: Final = 1  # digits of noise hardly compress: level 6 saves another 6 % in eight times the time
@@ -40,35 +64,63 @@ class _BadLines:
         self.count += 1
 
 
+def count_rows(path: Path) -> int:
+    """Count the lines of a plain or gzip text up to a cut, without parsing them.
+
+    Raises
+    ------
+    RecordingError, ConfigError
+        The file exceeds a limit of ``drivers.recording.room``; it is read only so far.
+    """
+    limit = room.limit_of(path)
+    lines = unpacked = 0
+    with path.open("rb") as file:
+        for text in _whole_lines(_unzipped(file, []), []):
+            lines += text.count(b"\n")
+            unpacked += len(text)
+            limit.check_rows(lines)
+            if unpacked > limit.size_bytes:
+                limit.check_unpacked(unpacked)
+    return lines
+
+
 def read_csv(path: Path) -> Table:
     """Plain or gzip text up to a cut; RecordingError when most lines are no samples."""
     notes: list[str] = []
     bad = _BadLines()
+    count_rows(path)
     with path.open("rb") as file:
         texts = _whole_lines(_unzipped(file, notes), notes)
-        text = next(texts, None)
-        if text is None:
-            raise RecordingError(f"{path}: has not one whole line; the first would be {EXAMPLE_HEADER}")
-        head, _, rest = text.partition(b"\n")
+        head = _head(path, texts)
+        if head is None:
+            what = notes[-1] if notes else "It has no line at all."
+            raise RecordingError(f"{path}: has not one whole line, expected {EXAMPLE_HEADER}. {what}")
         names = _header(path, head)
-        chosen = chosen_columns(path, names, notes)
+        chosen = chosen_columns(path, names, notes, f"line {head.number}, read as the header, has ")
         use = [names.index(name) for name in chosen.values()]
-        parts = list(_parsed(rest, texts, names, use, bad))
+        parts = list(_parsed(path, head, texts, names, use, bad))
     rows = np.concatenate(parts) if parts else np.empty((0, len(use)))
     if 2 * bad.count > len(rows):
-        raise RecordingError(
-            f"{path}: {bad.count} of {len(rows)} lines are no samples ({bad.first}); "
-            "every field must be a number, empty or nan"
-        )
+        raise _mostly_bad(path, bad, len(rows))
     if bad.count:
         notes.append(f"{bad.count} of {len(rows)} lines are no samples: read as missing ({bad.first}).")
     if not len(rows):
-        raise RecordingError(f"{path}: has a header line but no whole line of samples after it")
+        what = f". {notes[-1]}" if notes else ""
+        raise RecordingError(f"{path}: has a header line but no whole line of samples after it{what}")
     return Table({name: rows[:, i] for i, name in enumerate(chosen)}, None, notes)
 
 
+def _mostly_bad(path: Path, bad: _BadLines, rows: int) -> RecordingError:
+    return RecordingError(
+        f"{path}: {bad.count} of {rows} lines are no samples ({bad.first}); every field must be a number, empty or nan"
+    )
+
+
 def _unzipped(file: BinaryIO, notes: list[str]) -> Iterator[bytes]:
-    """The text of a plain or gzip file, by its first bytes and not by its name, up to a cut or damage."""
+    """The text of a plain or gzip file, by its first bytes and not by its name, up to a cut or damage.
+
+    The pieces have READ_BYTES at most.
+    """
     zipped = file.read(2) == GZIP_MAGIC
     file.seek(0)
     if not zipped:
@@ -76,65 +128,134 @@ def _unzipped(file: BinaryIO, notes: list[str]) -> Iterator[bytes]:
         return
     unzip = zlib.decompressobj(zlib.MAX_WBITS | 16)
     data = file.read(GZIP_BYTES)
+    empty, held = 0, False  # members in a row that hold nothing; True if the current member holds text
     while data:
         try:
-            text = unzip.decompress(data)
+            text = unzip.decompress(data, READ_BYTES)
         except zlib.error as error:
             notes.append(f"The gzip data are damaged ({error}); read up to the damage.")
             return
         if text:
+            held = True
             yield text
-        data = unzip.unused_data
         if unzip.eof:  # another member may follow: files of gzip can be strung together
-            unzip = zlib.decompressobj(zlib.MAX_WBITS | 16)
-            data = (data or file.read(GZIP_BYTES)).lstrip(b"\0")  # and be padded with zeros
+            empty = 0 if held else empty + 1
+            if empty > MAX_EMPTY_MEMBERS:
+                notes.append(f"{empty} gzip members in a row are empty; read up to there.")
+                return
+            data = (unzip.unused_data or file.read(GZIP_BYTES)).lstrip(b"\0")  # and be padded with zeros
+            unzip, held = zlib.decompressobj(zlib.MAX_WBITS | 16), False
             if not data:
                 return
         else:
-            data = file.read(GZIP_BYTES)
+            data = unzip.unconsumed_tail or file.read(GZIP_BYTES)
     notes.append("The gzip data end in the middle: the file is cut off and was read up to the cut.")
 
 
 def _whole_lines(texts: Iterable[bytes], notes: list[str]) -> Iterator[bytes]:
-    """The same text in pieces that end with a line. A last line without an end may be cut: left out."""
-    rest = b""
+    """The same text in pieces that end with a line. A last line without an end may be cut: left out.
+
+    Reading ends at a line that is longer than MAX_LINE_BYTES.
+    """
+    rest: list[bytes] = []  # the beginning of a line, in parts
+    size = lines = 0
     for text in texts:
-        lines, end, tail = text.rpartition(b"\n")
+        whole, end, tail = text.rpartition(b"\n")
         if end:
-            yield rest + lines + end
-            rest = b""
-        rest += tail
-    if rest.strip():
+            piece = b"".join((*rest, whole, end))
+            lines += piece.count(b"\n")
+            yield piece
+            rest, size = [], 0
+        rest.append(tail)
+        size += len(tail)
+        if size > MAX_LINE_BYTES:
+            notes.append(f"Line {lines + 1} is longer than {MAX_LINE_BYTES} bytes; the file was read up to there.")
+            return
+    if any(part.strip() for part in rest):
         notes.append("The last line has no end: the file may be cut off there, and the line was left out.")
 
 
-def _header(path: Path, line: bytes) -> list[str]:
-    """Column names of the first line; says what is wrong when it is none."""
-    if b"\0" in line or not line.strip():
-        raise RecordingError(f"{path}: is no CSV text; the first line would be {EXAMPLE_HEADER}")
-    text = line.decode("utf-8-sig", errors="replace").strip().lstrip("# ")
+@dataclass(frozen=True, slots=True)
+class _Head:
+    """The header line of a text, and the whole lines that were read with it."""
+
+    line: bytes
+    number: int
+    rest: bytes
+    rest_number: int  # line number of the first line of ``rest``
+
+
+def _head(path: Path, texts: Iterator[bytes]) -> _Head | None:
+    """Find the header line behind blank lines and comments; None where the text has no whole line.
+
+    The header is the first line that is no comment. If it names no axis and the last comment before it does, the
+    comment is the header, as ``numpy.savetxt`` writes it.
+    """
+    number = size = 0
+    comment: _Head | None = None
+    for text in texts:
+        start = 0
+        while (end := text.find(b"\n", start)) >= 0:
+            line = text[start:end].removeprefix(BOM if number == 0 else b"").strip()
+            number, begin, start = number + 1, start, end + 1
+            if line.startswith(COMMENTS):
+                comment = _Head(line.lstrip(b"#% "), number, text[start:], number + 1) if _has_axis(line) else None
+            elif line:
+                if comment is not None and not _has_axis(line):
+                    return _Head(comment.line, comment.number, text[begin:], number)
+                return _Head(line, number, text[start:], number + 1)
+            size += end + 1 - begin
+            if size > MAX_PREAMBLE_BYTES:
+                raise RecordingError(
+                    f"{path}: has no header line within its first {number} lines, only comments and blank lines; "
+                    f"expected {EXAMPLE_HEADER} within {MAX_PREAMBLE_BYTES} bytes"
+                )
+    if comment is None and number:
+        return _Head(b"", number, b"", number + 1)
+    return comment
+
+
+def _has_axis(line: bytes) -> bool:
+    """Return True if a field of this line, without its mark of a comment, is the name of an axis."""
+    fields = line.lstrip(b"#% ").decode("utf-8", errors="replace").split(",")
+    return any(field.strip(' \t"') in AXES for field in fields)
+
+
+def _header(path: Path, head: _Head) -> list[str]:
+    """Column names of the header line; says what is wrong when it is none."""
+    if b"\0" in head.line or not head.line:
+        raise RecordingError(f"{path}: is no CSV text; the first line would be {EXAMPLE_HEADER}{looks_like(path)}")
+    text = head.line.decode("utf-8", errors="replace")
     for separator, word in ((";", "semicolons"), ("\t", "tabs")):
         if separator in text and "," not in text:
-            raise RecordingError(f"{path}: columns are separated by {word}; a recording has commas")
+            raise RecordingError(
+                f"{path}: the columns of line {head.number} are separated by {word}; a recording has commas"
+            )
+    check_width(path, text.count(",") + 1)
     names = [name.strip(' \t"') for name in _fields(text)]
     if all(_number(name) is not None for name in names):
         raise RecordingError(
-            f"{path}: the header line is missing, line 1 is all numbers; it would read like {EXAMPLE_HEADER}"
+            f"{path}: the header line is missing, line {head.number} is all numbers; "
+            f"it would read like {EXAMPLE_HEADER}"
         )
     return names
 
 
 def _parsed(
-    first: bytes, texts: Iterable[bytes], names: Sequence[str], use: Sequence[int], bad: _BadLines
+    path: Path, head: _Head, texts: Iterable[bytes], names: Sequence[str], use: Sequence[int], bad: _BadLines
 ) -> Iterator[Floats]:
     """Arrays [lines, used columns] of each piece of text: quickly where it is regular, else line by line."""
-    number = 2
-    for text in chain((first,), texts):
+    number, rows = head.rest_number, 0
+    for text in chain((head.rest,), texts):
         text = text.replace(b"\r\n", b"\n")
         lines = text.decode("utf-8", errors="replace").split("\n")[:-1]
         if text.strip():
             quick = _parse_quickly(text, lines, len(names), use)
-            yield _parse_slowly(lines, number, names, use, bad) if quick is None else quick
+            part = _parse_slowly(lines, number, names, use, bad) if quick is None else quick
+            rows += len(part)
+            if bad.count > SURELY_BAD and 2 * bad.count > rows:
+                raise _mostly_bad(path, bad, rows)
+            yield part
         number += len(lines)
 
 

@@ -6,7 +6,10 @@ from pathlib import Path
 from typing import Final
 
 from drivers.errors import ConfigError
+from drivers.recording import csv_format, npz_format
 from drivers.recording.arrow_format import (
+    count_rows_ipc,
+    count_rows_parquet,
     ipc_file_writer,
     ipc_stream_writer,
     parquet_writer,
@@ -15,7 +18,7 @@ from drivers.recording.arrow_format import (
 )
 from drivers.recording.csv_format import csv_gz_writer, csv_writer, read_csv
 from drivers.recording.npz_format import npz_writer, read_npz
-from drivers.recording.table import Table, Writer
+from drivers.recording.table import Table, Writer, looks_like
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,16 +27,18 @@ class Format:
 
     read: Callable[[Path], Table]
     writer: Writer
+    count_rows: Callable[[Path], int]
+    """Rows of a file, without reading its samples; raises what ``read`` raises."""
 
 
 FORMATS: Final[Mapping[str, Format]] = {
-    ".csv": Format(read_csv, csv_writer),
-    ".csv.gz": Format(read_csv, csv_gz_writer),
-    ".npz": Format(read_npz, npz_writer),
-    ".parquet": Format(read_parquet, parquet_writer),
-    ".arrow": Format(read_ipc, ipc_file_writer),
-    ".feather": Format(read_ipc, ipc_file_writer),
-    ".arrows": Format(read_ipc, ipc_stream_writer),
+    ".csv": Format(read_csv, csv_writer, csv_format.count_rows),
+    ".csv.gz": Format(read_csv, csv_gz_writer, csv_format.count_rows),
+    ".npz": Format(read_npz, npz_writer, npz_format.count_rows),
+    ".parquet": Format(read_parquet, parquet_writer, count_rows_parquet),
+    ".arrow": Format(read_ipc, ipc_file_writer, count_rows_ipc),
+    ".feather": Format(read_ipc, ipc_file_writer, count_rows_ipc),
+    ".arrows": Format(read_ipc, ipc_stream_writer, count_rows_ipc),
 }
 """Suffixes of recordings, how each is read and written."""
 
@@ -42,7 +47,7 @@ def format_of(path: Path) -> Format:
     """The format of the path's suffix; ConfigError for one that is none."""
     suffix = _suffix(path)
     if not suffix:
-        raise ConfigError(f"{path}: not the suffix of a recording; known are {' '.join(FORMATS)}")
+        raise ConfigError(f"{path}: not the suffix of a recording; known are {' '.join(FORMATS)}{looks_like(path)}")
     return FORMATS[suffix]
 
 

@@ -1,31 +1,196 @@
-"""Whether what is read has room in memory.
+"""Limits on what a reader takes into memory, and the memory that is available.
 
-The kernel ends a program that takes more than there is, and perhaps the daemon beside it.
+A reader checks the size of a recording before it allocates memory for the samples. The kernel ends a process that takes
+more memory than there is, and perhaps the daemon beside it. A compressed file of a few megabytes can hold gigabytes, so
+the size of the file alone says little.
+
+Four limits apply. The memory limit depends on the machine. The other three are constants, documented in
+docs/recording.md:
+
+- the samples and their copies fit into the available memory;
+- a file holds at most ``MIN_ROW_LIMIT`` rows, or ``MAX_ROWS_PER_BYTE`` rows per byte on disk if that is more;
+- a file unpacks to at most ``MIN_UNPACKED_LIMIT_BYTES``, or ``MAX_UNPACKING_RATIO`` times its size if that is more;
+- a file has at most ``MAX_COLUMNS`` columns.
 """
 
+import os
+import resource
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, RecordingError
 
 MEMINFO: Final = Path("/proc/meminfo")
+CGROUPS: Final = Path("/sys/fs/cgroup")
+OWN_CGROUPS: Final = Path("/proc/self/cgroup")
+STATM: Final = Path("/proc/self/statm")
+
 COPIES: Final = 3.0
-"""Of its samples at least, that anything made of a recording holds at once."""
+"""Copies of the samples that an analysis holds at once, at least."""
+ROW_BYTES: Final = 64
+"""One sample in memory: time, six axes and temperature as float64."""
+MIN_ROW_LIMIT: Final = 20_000_000
+MAX_ROWS_PER_BYTE: Final = 8
+"""Rows of measured values need more than one bit each, in every format."""
+MIN_UNPACKED_LIMIT_BYTES: Final = 4_000_000_000
+MAX_UNPACKING_RATIO: Final = 100
+MAX_COLUMNS: Final = 10_000
 
 
-def free_bytes(meminfo: Path = MEMINFO) -> int | None:
-    """Memory that programs may still take; None where the system does not say."""
+@dataclass(frozen=True, slots=True)
+class ReadLimit:
+    """Limits on one file, or on a folder of files.
+
+    Parameters
+    ----------
+    path
+        File or folder that error messages name.
+    size_bytes
+        Size on disk.
+    free
+        Available memory in bytes, None if the system does not say.
+    """
+
+    path: Path
+    size_bytes: int
+    free: int | None
+
+    def check_rows(self, rows: int) -> None:
+        """Check a number of samples before they are read.
+
+        Raises
+        ------
+        RecordingError
+            The file is too small to hold so many measured samples.
+        ConfigError
+            The samples do not fit into the available memory.
+        """
+        if rows > max(MIN_ROW_LIMIT, MAX_ROWS_PER_BYTE * self.size_bytes):
+            raise RecordingError(
+                f"{self.path}: at least {rows} rows in a file of {self.size_bytes} bytes are no measured samples; "
+                f"the limit is {MIN_ROW_LIMIT} rows, or {MAX_ROWS_PER_BYTE} rows per byte in a larger file"
+            )
+        check(self.path, rows * ROW_BYTES, self.free)
+
+    def check_unpacked(self, unpacked_bytes: int) -> None:
+        """Check how much has been unpacked so far.
+
+        Raises
+        ------
+        RecordingError
+            The file unpacks to more than the limit.
+        """
+        if unpacked_bytes > max(MIN_UNPACKED_LIMIT_BYTES, MAX_UNPACKING_RATIO * self.size_bytes):
+            raise RecordingError(
+                f"{self.path}: unpacks to more than {unpacked_bytes / 1e9:.1f} GB from {self.size_bytes / 1e6:.1f} MB; "
+                f"the limit is {MIN_UNPACKED_LIMIT_BYTES / 1e9:g} GB, or {MAX_UNPACKING_RATIO} times the size of the "
+                "file; unpack it and check what it holds"
+            )
+
+
+def limit_of(path: Path) -> ReadLimit:
+    """Return the limits on a file, with the memory that is available now. Raises OSError if there is no such file."""
+    return ReadLimit(path, path.stat().st_size, free_bytes())
+
+
+def free_bytes() -> int | None:
+    """Return the memory that this process can still take, in bytes.
+
+    This is the least of the available memory of the system, of its control groups (container or service limits) and of
+    the limits of the process (``ulimit -v``, ``ulimit -d``). None if the system states none of them.
+    """
+    known = [n for n in (system_bytes(), cgroup_bytes(), process_bytes()) if n is not None]
+    return max(min(known), 0) if known else None
+
+
+def system_bytes(meminfo: Path = MEMINFO) -> int | None:
+    """Return the available memory of the system in bytes; None where the system does not say."""
+    found = _fields(meminfo, ":").get("MemAvailable")
+    return None if found is None else 1024 * found
+
+
+def cgroup_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> int | None:
+    """Return the least memory in bytes that the control groups of this process leave it; None without a limit.
+
+    Page cache counts as available, since the kernel drops it when the group reaches its limit.
+    """
+    left = [n for folder in _cgroup_folders(own, root) if (n := _left_in_cgroup(folder)) is not None]
+    return min(left) if left else None
+
+
+def process_bytes(statm: Path = STATM) -> int | None:
+    """Return the address space and data in bytes that the limits of the process leave it; None without a limit."""
     try:
-        lines = dict(line.split(":", 1) for line in meminfo.read_text().splitlines() if ":" in line)
-        return 1024 * int(lines["MemAvailable"].split()[0])
-    except (OSError, KeyError, ValueError, IndexError):
+        pages = [int(n) for n in statm.read_text().split()]
+    except (OSError, ValueError):
         return None
+    page = resource.getpagesize()
+    taken = ((resource.RLIMIT_AS, pages[0]), (resource.RLIMIT_DATA, pages[5])) if len(pages) > 5 else ()
+    limits = [(resource.getrlimit(kind)[0], page * used) for kind, used in taken]
+    left = [limit - used for limit, used in limits if limit != resource.RLIM_INFINITY]
+    return min(left) if left else None
 
 
 def check(path: Path, needed_bytes: int, free: int | None) -> None:
-    """ConfigError where so much, with what is made of it, does not fit into what was free before."""
+    """Check samples of so many bytes against the memory that was available before.
+
+    Raises
+    ------
+    ConfigError
+        The samples and the copies that an analysis makes of them do not fit.
+    """
     if free is not None and COPIES * needed_bytes > free:
         raise ConfigError(
             f"{path}: more than {COPIES * needed_bytes / 1e9:.1f} GB of memory would be needed, {free / 1e9:.1f} GB "
-            f"are free; take the end of it with --last 1d, or name some of its segments"
+            f"are free; take the end of a folder with --last 1d, or split the file"
         )
+
+
+def _cgroup_folders(own: Path, root: Path) -> Iterator[Path]:
+    """Yield the control groups that limit the memory of this process, each followed by its parents."""
+    try:
+        lines = own.read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        _, _, rest = line.partition(":")
+        controllers, _, name = rest.partition(":")
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        base = root / "memory" if controllers else root
+        folder = Path(os.path.normpath(f"{base}/{name}"))
+        while folder.is_relative_to(base):
+            yield folder
+            folder = folder.parent
+
+
+def _left_in_cgroup(folder: Path) -> int | None:
+    """Return the bytes that one control group leaves; version 2 first, then version 1."""
+    for limit, usage, prefix in (
+        ("memory.max", "memory.current", ""),
+        ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_"),
+    ):
+        try:
+            most, used = int((folder / limit).read_text()), int((folder / usage).read_text())
+        except (OSError, ValueError):  # no such file, or "max"
+            continue
+        cached = _fields(folder / "memory.stat", " ")
+        return most - used + sum(cached.get(f"{prefix}{kind}_file", 0) for kind in ("active", "inactive"))
+    return None
+
+
+def _fields(path: Path, separator: str) -> dict[str, int]:
+    """Return the whole numbers of a file of ``name value`` lines; those that cannot be read are absent."""
+    found: dict[str, int] = {}
+    try:
+        lines = path.read_text().splitlines()
+    except OSError:
+        return found
+    for line in lines:
+        name, _, value = line.partition(separator)
+        digits = value.split()[:1]
+        if digits and digits[0].isdecimal():
+            found[name] = int(digits[0])
+    return found

@@ -26,6 +26,8 @@ import numpy as np
 from drivers.errors import ImuError, RecordingError
 from drivers.quantities import COUNTER_STEP, RATE_HZ
 from drivers.recording.arrow_format import BOOKKEEPING, OWN, library
+from drivers.recording.arrow_messages import batch_sizes
+from drivers.recording.room import ROW_BYTES
 from drivers.recording.table import BATCH_ROWS, PART, T_LIMIT_S
 from drivers.sample import AXES, Chunk, SampleBlock, block, join, ns_to_seconds, seconds_to_ns
 
@@ -33,6 +35,8 @@ SUFFIX: Final = ".arrows"
 NAME: Final = re.compile(r"(\d{8})_[0-9TZ-]+\.arrows")
 SCHEMA: Final = "imu-monitor/recording/1"
 RAW_BATCH_BYTES: Final = 4_000_000
+MAX_BATCH_BYTES: Final = 64_000_000
+"""Of a batch unpacked, far above what ``SegmentWriter`` and ``pack`` write."""
 LARGEST_LOSS: Final = 10**11
 """Samples missing at one place; above what any clock tells."""
 
@@ -224,10 +228,12 @@ def _state(meta: Any) -> State:
 def read_chunks(path: Path) -> Iterator[Chunk]:
     """The chunks of a raw segment, up to a cut; ``t_ns`` are Unix times. RecordingError when it is none."""
     for batch, _ in _batches(path, "raw"):
-        columns = (batch.column(name).to_pylist() for name in ("t_ns", "address", "data", "attachment"))
-        for t_ns, address, data, attachment in zip(*columns, strict=True):
-            if None not in (t_ns, address, data, attachment) and abs(t_ns) < T_LIMIT_S * 1e9:
-                yield Chunk(data, t_ns, address, attachment)
+        for start in range(0, batch.num_rows, BATCH_ROWS):
+            part = batch.slice(start, BATCH_ROWS)
+            columns = (part.column(name).to_pylist() for name in ("t_ns", "address", "data", "attachment"))
+            for t_ns, address, data, attachment in zip(*columns, strict=True):
+                if None not in (t_ns, address, data, attachment) and abs(t_ns) < T_LIMIT_S * 1e9:
+                    yield Chunk(data, t_ns, address, attachment)
 
 
 def pack(path: Path) -> Iterator[None]:
@@ -288,14 +294,17 @@ def _one(pa: Any, schema: Any, batches: list[Any]) -> Any:
 
 
 def _batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any, Any]]:
-    """Batches with their metadata, up to a cut; ``mapped`` leaves rows that are not looked at on the disk."""
+    """Batches with their metadata, up to a cut or a batch that states an impossible size.
+
+    ``mapped`` leaves rows that are not looked at on the disk.
+    """
     pa = library(path)
     with _reading(path), pa.memory_map(str(path)) if mapped else pa.OSFile(str(path), "rb") as file:
         reader = pa.ipc.open_stream(file)
         found = _origin(path, reader.schema)
         if found.kind != kind:
             raise RecordingError(f"{path}: a segment of {found.kind}, where one of {kind} is read")
-        while True:
+        for _ in range(_regular_batches(path)):
             try:
                 batch, meta = reader.read_next_batch_with_custom_metadata()
                 batch.validate(full=not mapped)
@@ -303,6 +312,18 @@ def _batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any
                 return  # the regular end, or a cut: what was whole has been given
             if batch.num_rows:
                 yield batch, meta
+
+
+def _regular_batches(path: Path) -> int:
+    """Number of batches before the first one whose stated size is not that of a batch of the daemon."""
+    count = 0
+    with path.open("rb") as file:
+        for size in batch_sizes(file):
+            large = max(size.rows * ROW_BYTES, sum(size.buffers), size.body_bytes) > MAX_BATCH_BYTES
+            if large or size.dictionary:  # the daemon writes no dictionaries
+                break
+            count += 1
+    return count
 
 
 class _reading:  # noqa: N801 - reads as a word

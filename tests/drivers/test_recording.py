@@ -2,11 +2,15 @@
 
 import errno
 import gzip
+import io
 import os
 import pickle
 import re
+import resource
 import sys
 import tracemalloc
+import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +19,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import ConfigError, ImuError, RecordingError
-from drivers.recording import FORMATS, Recording, is_recording, iter_blocks, load_samples, room, save_samples, writing
-from drivers.recording.csv_format import READ_BYTES
+from drivers.recording import (
+    FORMATS,
+    Recording,
+    arrow_format,
+    is_recording,
+    iter_blocks,
+    load_samples,
+    room,
+    save_samples,
+    writing,
+)
+from drivers.recording.arrow_messages import batch_sizes, buffer_count, check_buffers
+from drivers.recording.csv_format import MAX_LINE_BYTES, READ_BYTES
 from drivers.recording.saving import whole
 from drivers.sample import AXES, join
 
@@ -356,10 +371,32 @@ class TestText:
             ROWS + "\n\n  \n",
             ROWS.replace("\n0.1", "\n\n0.1"),
             "# " + ROWS,
+            "% " + ROWS,
+            "# ADIS16470, 2026-11-22\n% gyro in rad/s\n\n" + ROWS,
+            "\ufeff# log, with a comma\n" + ROWS,
+            "# recorded with gx, az and t\n# t,gx,az\n" + ROWS.partition("\n")[2],
+            "# t,gx,az in SI units\n" + ROWS,
+            "\n \n" + ROWS,
             '"t","gx","az"\n' + ROWS.partition("\n")[2].replace("1.5", '"1.5"'),
             ROWS.replace("0.1,2.5,9.7", "1e-1,+2.5,97E-1"),
         ],
-        ids=["bom", "crlf", "spaces", "tabs", "blank-end", "blank", "hash", "quotes", "exponents"],
+        ids=[
+            "bom",
+            "crlf",
+            "spaces",
+            "tabs",
+            "blank-end",
+            "blank",
+            "hash",
+            "percent",
+            "comments",
+            "bom-comment",
+            "comment-then-hash",
+            "comment-of-names",
+            "blank-start",
+            "quotes",
+            "exponents",
+        ],
     )
     def test_dialects(self, tmp_path, suffix, text):
         recording = load_samples(written(tmp_path / f"x{suffix}", text))
@@ -418,10 +455,16 @@ class TestText:
             ("t,gx\n0.1,2", "no whole line of samples"),
             ("t,gx", "not one whole line"),
             ("\n\n", "no CSV text"),
+            ("# a log\n", "no CSV text"),
+            ("# t,gx,az\n", "no whole line of samples"),
+            ("# a log\n% of nothing\n1,2\n", "header line is missing, line 3 is all numbers"),
+            ("# a log\nstart of the log\nt,gx\n0,1\n", r"line 2, read as the header, has no axis among its columns"),
+            ("# a log\n\nt;gx\n0;1\n", "line 3 are separated by semicolons"),
+            ("# a\n" * 300_000, "no header line within its first 262145 lines"),
             ("0.1,2,3\n0.2,3,4\n", "header line is missing.*t,gx,gy"),
             ("t;gx\n0;1\n", "separated by semicolons; a recording has commas"),
             ("t\tgx\n0\t1\n", "separated by tabs"),
-            ("a,b\n1,2\n", r"no axis among its columns \(a, b\)"),
+            ("a,b\n1,2\n", r"line 1, read as the header, has no axis among its columns \(a, b\)"),
             (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + b"\0" * 99, "no CSV text|no axis"),
             ("t,gx\n".encode("utf-16"), "no CSV text"),
         ],
@@ -529,8 +572,37 @@ class TestNoRecording:
             load_samples(path)
 
     def test_unknown_suffix(self, tmp_path):
-        with pytest.raises(ConfigError, match=r"known are \.csv"):
+        with pytest.raises(ConfigError, match=r"known are \.csv.*like CSV text: rename it to end in \.csv"):
             load_samples(written(tmp_path / "x.txt", ROWS))
+
+    def test_an_empty_file_says_what_to_do(self, path):
+        path.write_bytes(b"")
+        with pytest.raises(RecordingError, match=r"the file is empty, expected columns such as t,gx.*record it again"):
+            load_samples(path)
+        other = written(path.parent / "x.dat", "")
+        with pytest.raises(ConfigError, match=r"the file is empty, and its name does not end like.*known are \.csv"):
+            load_samples(other)
+
+    @pytest.mark.parametrize(
+        ("right", "wrong"),
+        [
+            (right, wrong)
+            for right in (".csv", ".csv.gz", ".npz", ".parquet", ".arrow", ".arrows")
+            for wrong in SUFFIXES
+            if right[:4] != wrong[:4] and {right[:4], wrong[:4]} != {".arr", ".fea"}  # those are told by their content
+        ],
+    )
+    def test_a_wrong_suffix_is_named_with_the_right_one(self, tmp_path, right, wrong):
+        path = tmp_path / f"right{right}"
+        save_samples(path, *samples())
+        renamed = path.rename(tmp_path / f"wrong{wrong}")
+        with pytest.raises(RecordingError, match=rf"; its content .*: rename it to end in {right}$"):
+            load_samples(renamed)
+
+    def test_a_pipe_is_not_waited_for(self, path):
+        os.mkfifo(path)
+        with pytest.raises(RecordingError, match="is a device or pipe, expected a file"):
+            load_samples(path)
 
     @pytest.mark.parametrize("key", ["t", "gx", "fs"])
     def test_objects_are_never_unpickled(self, tmp_path, key):
@@ -701,8 +773,223 @@ class TestRoom:
         ("MemAvailable:\n", None), ("MemAvailable: x kB\n", None),
     ])  # fmt: skip
     def test_what_the_system_says(self, tmp_path, text, free):
-        assert room.free_bytes(written(tmp_path / "meminfo", text)) == free
-        assert room.free_bytes(tmp_path / "absent") is None
+        assert room.system_bytes(written(tmp_path / "meminfo", text)) == free
+        assert room.system_bytes(tmp_path / "absent") is None
+
+    def test_a_control_group_leaves_less(self, tmp_path):
+        def group(name, **files):
+            (tmp_path / name).mkdir(parents=True, exist_ok=True)
+            for file, text in files.items():
+                (tmp_path / name / file.replace("__", ".")).write_text(text)
+
+        own = written(tmp_path / "own", "0::/service/imu\n")
+        assert room.cgroup_bytes(tmp_path / "absent", tmp_path) is None
+        assert room.cgroup_bytes(own, tmp_path) is None
+        group("service/imu", memory__max="max\n", memory__current="5000\n")
+        assert room.cgroup_bytes(own, tmp_path) is None
+        stat = "anon 4000\nactive_file 300\ninactive_file 700\n"
+        group("service", memory__max="9000\n", memory__current="6000\n", memory__stat=stat)
+        assert room.cgroup_bytes(own, tmp_path) == 4000
+        group("service/imu", memory__max="7000\n", memory__current="5000\n")
+        assert room.cgroup_bytes(own, tmp_path) == 2000
+
+    def test_a_control_group_of_version_1(self, tmp_path):
+        own = written(tmp_path / "own", "7:cpu,cpuacct:/a\n4:memory:/a\n")
+        (tmp_path / "memory" / "a").mkdir(parents=True)
+        written(tmp_path / "memory/a/memory.limit_in_bytes", "9000\n")
+        written(tmp_path / "memory/a/memory.usage_in_bytes", "6000\n")
+        written(tmp_path / "memory/a/memory.stat", "total_inactive_file 500\ninactive_file 9\n")
+        assert room.cgroup_bytes(own, tmp_path) == 3500
+
+    def test_a_limit_of_the_process(self, tmp_path, monkeypatch):
+        page = resource.getpagesize()
+        statm = written(tmp_path / "statm", "500 100 50 10 0 200 0\n")
+        limits = {resource.RLIMIT_AS: resource.RLIM_INFINITY, resource.RLIMIT_DATA: resource.RLIM_INFINITY}
+        monkeypatch.setattr(resource, "getrlimit", lambda kind: (limits[kind], limits[kind]))
+        assert room.process_bytes(statm) is None
+        assert room.process_bytes(tmp_path / "absent") is None
+        limits[resource.RLIMIT_AS] = 1500 * page
+        assert room.process_bytes(statm) == 1000 * page
+        limits[resource.RLIMIT_DATA] = 300 * page
+        assert room.process_bytes(statm) == 100 * page
+
+    def test_the_least_counts(self, monkeypatch):
+        for name, free in (("system_bytes", 900), ("cgroup_bytes", None), ("process_bytes", 300)):
+            monkeypatch.setattr(room, name, lambda free=free: free)
+        assert room.free_bytes() == 300
+        monkeypatch.setattr(room, "process_bytes", lambda: -5)
+        assert room.free_bytes() == 0
+
+    def test_a_file_that_does_not_fit_is_refused_before_it_is_read(self, path, monkeypatch):
+        save_samples(path, *samples(3000))
+        monkeypatch.setattr(room, "free_bytes", lambda: 3 * 64 * 2500)
+        with pytest.raises(ConfigError, match="GB of memory would be needed"):
+            load_samples(path)
+        monkeypatch.setattr(room, "free_bytes", lambda: 3 * 64 * 3500)
+        assert len(load_samples(path)) == 3000
+
+    @pytest.mark.parametrize("suffix", [".csv.gz", ".npz", ".parquet", ".arrow", ".arrows"])
+    def test_rows_beyond_what_the_file_can_hold(self, tmp_path, suffix, monkeypatch):
+        path = tmp_path / f"x{suffix}"
+        n = 400_000
+        if suffix == ".arrow" or suffix == ".arrows":
+            pa = pytest.importorskip("pyarrow")
+            batch = pa.record_batch({"gx": pa.nulls(n)})
+            with (pa.ipc.new_file if suffix == ".arrow" else pa.ipc.new_stream)(str(path), batch.schema) as writer:
+                writer.write_batch(batch)
+        elif suffix == ".csv.gz":
+            written(path, "gx\n" + "0\n" * n)
+        elif suffix == ".npz":
+            np.savez_compressed(path, gx=np.zeros(n))
+        else:
+            parquet = pytest.importorskip("pyarrow.parquet")
+            parquet.write_table(pytest.importorskip("pyarrow").table({"gx": np.zeros(n)}), path)
+        assert len(load_samples(path, 100.0)) == n  # below the number of rows that any file may have
+        monkeypatch.setattr(room, "MIN_ROW_LIMIT", n // 2)
+        with pytest.raises(RecordingError, match=r"rows in a file of \d+ bytes are no measured samples"):
+            load_samples(path, 100.0)
+
+    def test_a_file_that_unpacks_to_more_than_the_limit(self, tmp_path, monkeypatch):
+        text = written(tmp_path / "x.csv.gz", "t,gx\n" + ("0,1" + " " * 5000 + "\n") * 2000)
+        np.savez_compressed(tmp_path / "x.npz", gx=np.zeros(10**6))
+        cut = written(tmp_path / "y.npz", (tmp_path / "x.npz").read_bytes()[:-22])
+        assert len(load_samples(text)) == 2000
+        assert len(load_samples(cut, 100.0)) == 10**6
+        monkeypatch.setattr(room, "MIN_UNPACKED_LIMIT_BYTES", 5_000_000)
+        for path in (text, cut):
+            with pytest.raises(RecordingError, match="unpacks to more than"):
+                load_samples(path, 100.0)
+
+    def test_memory_that_is_not_there_is_one_line(self, tmp_path, monkeypatch):
+        def fail(*_args):
+            raise MemoryError
+
+        path = written(tmp_path / "x.csv", ROWS)
+        monkeypatch.setattr("drivers.recording.csv_format.np.concatenate", fail)
+        with pytest.raises(ConfigError, match=r"x\.csv: does not fit into the memory that is free"):
+            load_samples(path)
+
+
+class TestLimits:
+    @pytest.mark.parametrize("suffix", TEXTS)
+    def test_a_line_without_end_ends_the_reading(self, tmp_path, suffix):
+        recording = load_samples(written(tmp_path / f"x{suffix}", ROWS + "0" * (3 * MAX_LINE_BYTES)))
+        assert len(recording) == 3
+        assert recording.notes == ("Line 5 is longer than 1048576 bytes; the file was read up to there.",)
+        with pytest.raises(RecordingError, match=r"not one whole line.*Line 1 is longer than 1048576 bytes"):
+            load_samples(written(tmp_path / f"y{suffix}", "t,gx," + "x" * (3 * MAX_LINE_BYTES)))
+
+    def test_zeros_at_the_end_as_after_a_power_cut(self, tmp_path):
+        recording = load_samples(written(tmp_path / "x.csv", ROWS.encode() + bytes(5 * MAX_LINE_BYTES)))
+        assert len(recording) == 3
+
+    def test_mostly_bad_lines_are_not_all_looked_at(self, tmp_path, monkeypatch):
+        path = written(tmp_path / "x.csv", "t,gx\n" + "x\n" * 3 * READ_BYTES)
+        with pytest.raises(RecordingError, match=r"\d{6} of \d{6} lines are no samples \(line 2"):
+            load_samples(path)
+
+    def test_empty_members_of_gzip(self, tmp_path):
+        path = tmp_path / "x.csv.gz"
+        path.write_bytes(gzip.compress(b"") * 500 + gzip.compress(ROWS.encode()) + gzip.compress(b"") * 5000)
+        recording = load_samples(path)
+        assert len(recording) == 3
+        assert recording.notes == ("1001 gzip members in a row are empty; read up to there.",)
+
+    @pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet", ".arrows"])
+    def test_columns_beyond_the_limit(self, tmp_path, suffix, monkeypatch):
+        monkeypatch.setattr(room, "MAX_COLUMNS", 20)
+        path = tmp_path / f"x{suffix}"
+        names = ["gx", *(f"c{i}" for i in range(25))]
+        if suffix == ".csv":
+            written(path, ",".join(names) + "\n" + ",".join("1" * 1 for _ in names) + "\n")
+        elif suffix == ".npz":
+            np.savez(path, **{name: np.zeros(2) for name in names})
+        else:
+            pa = pytest.importorskip("pyarrow")
+            table = pa.table({name: [0.0] for name in names})
+            if suffix == ".parquet":
+                pytest.importorskip("pyarrow.parquet").write_table(table, path)
+            else:
+                with pa.ipc.new_stream(str(path), table.schema) as writer:
+                    writer.write_table(table)
+        with pytest.raises(RecordingError, match="has 26 columns, expected at most 20"):
+            load_samples(path, 100.0)
+
+    def test_an_archive_that_states_more_than_it_holds(self, tmp_path):
+        path = tmp_path / "x.npz"
+        data = io.BytesIO()
+        np.lib.format.write_array_header_1_0(data, {"descr": "<f8", "fortran_order": False, "shape": (10**6,)})
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("gx.npy", data.getvalue() + bytes(80))
+        with pytest.raises(RecordingError, match="its header states 1000000 values, its data hold 10 at most"):
+            load_samples(path, 100.0)
+
+    @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+    def test_an_archive_packed_otherwise(self, tmp_path, method):
+        path, plain = tmp_path / "x.npz", tmp_path / "plain.npz"
+        np.savez(plain, gx=np.zeros(5))
+        with zipfile.ZipFile(plain) as archive, zipfile.ZipFile(path, "w", method) as other:
+            other.writestr("gx.npy", archive.read("gx.npy"))
+        with pytest.raises(RecordingError, match=rf"gx is packed by method {method} of zip, expected stored"):
+            load_samples(path, 100.0)
+
+    def test_dictionaries_beyond_the_limit(self, tmp_path, monkeypatch):
+        pa = pytest.importorskip("pyarrow")
+        path = tmp_path / "x.arrows"
+        words = pa.array(["x" * 1000, "y"]).dictionary_encode()
+        batch = pa.record_batch({"gx": [1.0, 2.0], "word": words, "t": [0.0, 1.0]})
+        with pa.ipc.new_stream(str(path), batch.schema) as writer:
+            writer.write_batch(batch)
+        assert load_samples(path).values[:, 0].tolist() == [1.0, 2.0]
+        monkeypatch.setattr(arrow_format, "MAX_DICTIONARY_BYTES", 900)
+        with pytest.raises(RecordingError, match=r"its dictionaries unpack to 10.. bytes, expected at most 900"):
+            load_samples(path)
+
+
+class TestArrowMessages:
+    @pytest.mark.parametrize("compression", [None, "lz4", "zstd"])
+    @pytest.mark.parametrize("suffix", [".arrow", ".arrows"])
+    def test_sizes_are_those_that_pyarrow_reads(self, tmp_path, suffix, compression):
+        pa = pytest.importorskip("pyarrow")
+        path = tmp_path / f"x{suffix}"
+        columns = {
+            "gx": np.zeros(5000),
+            "k": np.arange(5000, dtype=np.int32),
+            "s": ["word"] * 5000,
+            "z": pa.nulls(5000),
+        }
+        table = pa.table(columns | {"d": pa.array(["a", None] * 2500).dictionary_encode()})
+        new = pa.ipc.new_file if suffix == ".arrow" else pa.ipc.new_stream
+        with new(str(path), table.schema, options=pa.ipc.IpcWriteOptions(compression=compression)) as writer:
+            writer.write_table(table, max_chunksize=2000)
+        with path.open("rb") as file:
+            dictionary, *batches = batch_sizes(file, 8 if suffix == ".arrow" else 0)
+        assert dictionary.dictionary
+        assert [batch.rows for batch in batches] == [2000, 2000, 1000]
+        counts = [buffer_count(pa, field.type) for field in table.schema]
+        assert counts == [2, 2, 3, 0, 2]
+        for batch in batches:
+            assert len(batch.buffers) == sum(counts)
+            assert batch.buffers[1] == 8 * batch.rows
+            assert batch.buffers[3] == 4 * batch.rows
+            assert batch.buffers[6] == 4 * batch.rows
+            assert check_buffers(batch, counts, 0) == ""
+        assert "unpacks to 16000 bytes" in check_buffers(replace(batches[0], rows=1999), counts, 0)
+        assert check_buffers(replace(batches[0], rows=1999), [-2, -2, -3, 0, -2], 0) == ""
+        assert check_buffers(replace(batches[0], rows=0), [-2, None], 0) != ""
+
+    def test_any_cut_and_any_byte_end_quietly(self, tmp_path):
+        path = tmp_path / "x.arrows"
+        pytest.importorskip("pyarrow")
+        save_samples(path, *samples(50))
+        data = path.read_bytes()
+        rng = np.random.default_rng(2)
+        for cut in range(0, len(data), 7):
+            assert len(list(batch_sizes(io.BytesIO(data[:cut])))) <= 1
+        for _ in range(500):
+            damaged = bytearray(data)
+            damaged[int(rng.integers(len(data)))] = int(rng.integers(256))
+            assert len(list(batch_sizes(io.BytesIO(damaged)))) <= 2
 
 
 @pytest.mark.data

@@ -1,0 +1,194 @@
+"""Sizes of the messages of an Arrow IPC stream, read before any data are unpacked.
+
+A record batch states its number of rows, and a compressed buffer its unpacked size. pyarrow allocates what they state,
+and cannot be given a limit. ``batch_sizes`` therefore reads the metadata of each message itself: the framing, the few
+fields of the flatbuffer that give sizes, and the first eight bytes of each compressed buffer. It reads no data.
+
+Sources: the Arrow columnar format, "Encapsulated message format" and "Compression", https://arrow.apache.org/docs/format;
+format/Message.fbs and Schema.fbs for the numbers of the fields; the FlatBuffers internals for tables and vectors.
+"""
+
+import os
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, BinaryIO, Final
+
+CONTINUATION: Final = 0xFFFFFFFF
+MAX_METADATA_BYTES: Final = 64_000_000
+"""Of one message; a schema of 10 000 columns needs some 2 MB."""
+SCHEMA: Final = 1  # values of MessageHeader
+DICTIONARY_BATCH: Final = 2
+RECORD_BATCH: Final = 3
+MESSAGE_HEADER_TYPE: Final = 1  # fields of Message
+MESSAGE_HEADER: Final = 2
+MESSAGE_BODY_LENGTH: Final = 3
+BATCH_LENGTH: Final = 0  # fields of RecordBatch
+BATCH_BUFFERS: Final = 2
+BATCH_COMPRESSION: Final = 3
+DICTIONARY_DATA: Final = 1  # field of DictionaryBatch
+BUFFER: Final = struct.Struct("<qq")  # offset in the body, length
+
+
+@dataclass(frozen=True, slots=True)
+class BatchSize:
+    """Stated size of one record batch or dictionary."""
+
+    rows: int
+    body_bytes: int  # in the file
+    buffers: tuple[int, ...]  # unpacked size of each buffer in bytes
+    dictionary: bool  # True for a dictionary
+
+
+def batch_sizes(file: BinaryIO, start: int = 0) -> Iterator[BatchSize]:
+    """Yield the stated sizes of the batches of a stream up to its end, a cut or damaged metadata.
+
+    Parameters
+    ----------
+    file
+        Binary file that can seek.
+    start
+        Offset of the stream in the file, in bytes.
+
+    Yields
+    ------
+    BatchSize
+        Of each record batch and dictionary, in the order of the file.
+    """
+    end = file.seek(0, os.SEEK_END)
+    at = start
+    while at + 8 <= end:
+        file.seek(at)
+        mark, size = struct.unpack("<II", file.read(8))
+        at += 8
+        if mark != CONTINUATION:  # streams before Arrow 0.15 have no such mark
+            size, at = mark, at - 4
+        if not 0 < size <= MAX_METADATA_BYTES or at + size > end:
+            return
+        file.seek(at)
+        metadata = file.read(size)
+        body = at + size
+        try:
+            message = _Table.root(metadata)
+            kind = message.number(MESSAGE_HEADER_TYPE, "B")
+            body_bytes = message.number(MESSAGE_BODY_LENGTH, "q")
+            if body_bytes < 0:
+                return
+            if kind in (RECORD_BATCH, DICTIONARY_BATCH):
+                batch = message.table(MESSAGE_HEADER)
+                batch = batch.table(DICTIONARY_DATA) if kind == DICTIONARY_BATCH else batch
+                yield _batch_size(file, batch, body, body_bytes, kind == DICTIONARY_BATCH)
+            elif kind != SCHEMA:
+                return
+        except (struct.error, LookupError):
+            return
+        at = body + body_bytes
+
+
+def check_buffers(size: BatchSize, counts: Sequence[int | None], slack_bytes: int) -> str:
+    """Check that the buffers of numeric columns unpack to no more than their rows need.
+
+    Parameters
+    ----------
+    size
+        Stated size of the batch.
+    counts
+        Number of buffers of each column in the order of the schema; negative if the column is not read, None if the
+        number is unknown. The buffers behind an unknown number are all checked.
+    slack_bytes
+        Allowed above eight bytes per row.
+
+    Returns
+    -------
+    str
+        What is wrong, empty if nothing is.
+    """
+    most = 8 * size.rows + slack_bytes
+    at = 0
+    for count in counts:
+        n = len(size.buffers) - at if count is None else abs(count)
+        used = count is None or count > 0
+        large = max(size.buffers[at : at + n], default=0) if used else 0
+        if large > most:
+            return f"a buffer of {size.rows} rows unpacks to {large} bytes, expected at most {most}"
+        at += n
+        if count is None:
+            break
+    return ""
+
+
+def buffer_count(pa: Any, type_: Any) -> int | None:
+    """Return the number of buffers of a column of this type; None if the type is nested or has views."""
+    types = pa.types
+    if types.is_null(type_):
+        return 0
+    if types.is_nested(type_) or types.is_run_end_encoded(type_) or isinstance(type_, pa.BaseExtensionType):
+        return None
+    if types.is_string_view(type_) or types.is_binary_view(type_):
+        return None
+    variable = (types.is_string, types.is_large_string, types.is_binary, types.is_large_binary)
+    return 3 if any(is_type(type_) for is_type in variable) else 2
+
+
+def _batch_size(file: BinaryIO, batch: "_Table", body: int, body_bytes: int, dictionary: bool) -> BatchSize:
+    rows = batch.number(BATCH_LENGTH, "q")
+    packed = batch.has(BATCH_COMPRESSION)
+    sizes = []
+    for offset, length in batch.structs(BATCH_BUFFERS, BUFFER):
+        unpacked = length
+        if packed and length >= 8 and 0 <= offset <= body_bytes - 8:
+            file.seek(body + offset)
+            (stated,) = struct.unpack("<q", file.read(8))
+            unpacked = length if stated == -1 else stated  # -1: stored as it is
+        sizes.append(max(unpacked, 0))
+    return BatchSize(max(rows, 0), body_bytes, tuple(sizes), dictionary)
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """A table of a flatbuffer. Raises struct.error or LookupError for what lies outside of the buffer."""
+
+    data: bytes
+    at: int
+
+    @classmethod
+    def root(cls, data: bytes) -> "_Table":
+        return cls(data, struct.unpack_from("<I", data)[0])
+
+    def has(self, field: int) -> bool:
+        return self._field(field) != 0
+
+    def number(self, field: int, form: str) -> int:
+        at = self._field(field)
+        return int(_unpack(f"<{form}", self.data, at)) if at else 0
+
+    def table(self, field: int) -> "_Table":
+        at = self._field(field)
+        if not at:
+            raise LookupError(field)
+        return _Table(self.data, at + _unpack("<I", self.data, at))
+
+    def structs(self, field: int, form: struct.Struct) -> Iterator[tuple[Any, ...]]:
+        at = self._field(field)
+        if not at:
+            return iter(())
+        at += _unpack("<I", self.data, at)
+        count = _unpack("<I", self.data, at)
+        if count * form.size > len(self.data):
+            raise LookupError(field)
+        return form.iter_unpack(self.data[at + 4 : at + 4 + count * form.size])
+
+    def _field(self, field: int) -> int:
+        """Offset of a field, 0 where it is absent."""
+        entries = self.at - _unpack("<i", self.data, self.at)
+        place = 4 + 2 * field
+        if entries < 0 or place >= _unpack("<H", self.data, entries):
+            return 0
+        offset = _unpack("<H", self.data, entries + place)
+        return self.at + offset if offset else 0
+
+
+def _unpack(form: str, data: bytes, at: int) -> int:
+    if at < 0:
+        raise LookupError(at)
+    return int(struct.unpack_from(form, data, at)[0])

@@ -1,0 +1,22 @@
+"""Replay the file that is named on the command line to its end: one line of error and status 2 if it is not whole."""
+
+import sys
+
+from drivers.errors import ConfigError, LinkEnded, LinkUnavailable
+from drivers.links.replay_link import Settings, build
+
+
+def main() -> None:
+    """Read until the link ends."""
+    link = build(Settings(path=sys.argv[1], speed="max"))
+    try:
+        link.open()
+        while True:
+            link.read(1.0)
+    except (ConfigError, LinkUnavailable, LinkEnded) as error:
+        print(error, file=sys.stderr)
+        sys.exit(0 if str(error).endswith("the end of the file.") else 2)
+
+
+if __name__ == "__main__":
+    main()
