@@ -37,6 +37,8 @@ PROGRAM: Final = (sys.executable, "-P", str(Path(__file__).resolve().parent.pare
 """By its path and without its folder on the module path: whatever else is named ``monitor``, this one is run."""
 LIMIT_S: Final = 900.0
 NICE: Final = 10
+"""Added to the niceness of the daemon: an unprivileged process cannot lower the niceness of its children."""
+LARGEST_NICENESS: Final = 19
 SEED: Final = 1
 DONE: Final = 0
 NO_ANSWER: Final = 3
@@ -149,7 +151,7 @@ class Reconciler:
         self._children[device] = child
         try:
             with contextlib.suppress(ProcessLookupError):
-                os.setpriority(os.PRIO_PROCESS, child.pid, NICE)
+                os.setpriority(os.PRIO_PROCESS, child.pid, min(os.nice(0) + NICE, LARGEST_NICENESS))
             if self._closing.is_set():  # it began while the others were ended
                 _kill(child)
             output, errors = child.communicate(timeout=self._limit_s)

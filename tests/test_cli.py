@@ -25,6 +25,7 @@ from drivers.sample import AXES
 from monitor.catalogue import read_model
 from monitor.cli import main
 from monitor.settings import CONFIG_FOLDER, load
+from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
 PROGRAM = [sys.executable, "-m", "monitor.cli"]
 COMMANDS = ("demo", "run", "check", "doctor", "watch", "analyze", "simulate", "reconcile", "export")
@@ -82,7 +83,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def program(*arguments: str, **more: Any) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run([*PROGRAM, *arguments], capture_output=True, text=True, timeout=60, check=False, **more)
+    return subprocess.run(
+        [*PROGRAM, *arguments], capture_output=True, text=True, timeout=PATIENCE_S, check=False, **more
+    )
 
 
 def test_linear_algebra_keeps_to_one_thread_unless_told() -> None:
@@ -362,7 +365,9 @@ for command in ([], *([name] for name in {COMMANDS!r})):
 heavy = {{"numpy", "scipy", "numba", "rerun", "zenoh", "can", "matplotlib", "pyarrow"}}
 print("heavy", sorted(heavy & sys.modules.keys()))
 """
-    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", source], capture_output=True, text=True, timeout=PATIENCE_S, check=True
+    )
     assert done.stdout.count("status 0\n") == 1 + len(COMMANDS)
     assert done.stdout.count("--help") >= 1 + len(COMMANDS)
     assert done.stdout.endswith("heavy []\n")
@@ -485,13 +490,10 @@ def test_a_simulation_that_is_broken_off_leaves_nothing(tmp_path: Path, number: 
     arguments = ["simulate", "consumer-mems", "--seconds", "40d", "--out", f"x{suffix}", "--truth"]
     process = subprocess.Popen([*PROGRAM, *arguments], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
     try:
-        until = time.monotonic() + 30.0
-        while not growing(process.pid, tmp_path):
-            assert time.monotonic() < until
-            assert process.poll() is None
-            time.sleep(0.05)
+        wait_for(lambda: process.poll() is not None or growing(process.pid, tmp_path), "a file that grows")
+        assert process.poll() is None
         process.send_signal(number)
-        _, err = process.communicate(timeout=20.0)
+        _, err = process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
     assert process.returncode == 128 + number
@@ -857,7 +859,7 @@ def test_a_bar_shows_on_a_terminal_and_is_gone_at_the_end(recording: Path) -> No
         with contextlib.suppress(OSError):  # Linux ends a pseudo-terminal so
             while part := os.read(master, 65_536):
                 shown += part
-        assert process.wait(60.0) == 0
+        assert process.wait(PATIENCE_S) == 0
     os.close(master)
     assert b"dynamic curves" in shown
     assert shown.rindex(b"\x1b[2K") < shown.index(b"Gyroscopes")  # erased before the table
@@ -880,7 +882,7 @@ main()
 """
     with daemon([sys.executable, "-c", source, "analyze", str(tmp_path / "long.npz"), "--window", "1000"]) as one:
         one.hears("working")
-        assert one.status_after(signal.SIGINT, 10.0) == 128 + signal.SIGINT
+        assert one.status_after(signal.SIGINT) == 128 + signal.SIGINT
         assert one.rest() == "imu-monitor: interrupted\n"
 
 
@@ -903,7 +905,7 @@ main()
     command = [sys.executable, "-c", source, "reconcile", str(tmp_path / "long.npz"), "--out", str(tmp_path / "found")]
     with daemon(command) as one:
         one.hears("working")
-        assert one.status_after(number, 20.0) == 128 + number
+        assert one.status_after(number) == 128 + number
         assert "Traceback" not in one.rest()
     assert not list((tmp_path / "found").iterdir())
 
@@ -926,7 +928,7 @@ def test_a_reader_that_has_gone_is_no_crash(recording: Path, arguments: tuple[st
     os.close(reading)
     with os.fdopen(writing, "wb") as closed:
         command = [*PROGRAM, *(str(recording) if word == "RECORDING" else word for word in arguments)]
-        done = subprocess.run(command, stdout=closed, stderr=subprocess.PIPE, timeout=60, check=False)
+        done = subprocess.run(command, stdout=closed, stderr=subprocess.PIPE, timeout=PATIENCE_S, check=False)
     assert (done.returncode, done.stderr) == (1, b"")
 
 
@@ -935,7 +937,7 @@ def test_a_reader_that_has_gone_is_no_crash(recording: Path, arguments: tuple[st
 def test_a_full_disk_behind_standard_output_is_one_line(recording: Path, arguments: tuple[str, ...]) -> None:
     with open("/dev/full", "wb") as full:
         command = [*PROGRAM, "analyze", *(str(recording) if word == "RECORDING" else word for word in arguments)]
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=PATIENCE_S, check=False)
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert "No space left" in done.stderr
@@ -957,12 +959,9 @@ class Daemon:
                 return
         raise AssertionError(f"it ended without {word}: {''.join(self.lines)}")
 
-    def status_after(self, number: int, within_s: float) -> int:
+    def status_after(self, number: int) -> int:
         self.process.send_signal(number)
-        begun_s = time.monotonic()
-        status = self.process.wait(30.0)
-        assert time.monotonic() - begun_s < within_s
-        return status
+        return self.process.wait(PATIENCE_S)
 
     def rest(self) -> str:
         assert self.process.stderr is not None
@@ -976,7 +975,7 @@ def daemon(command: list[str]) -> Iterator[Daemon]:
         yield one
     finally:
         one.process.kill()
-        one.process.wait(10.0)
+        one.process.wait(PATIENCE_S)
         assert one.process.stderr is not None
         one.process.stderr.close()
 
@@ -991,7 +990,7 @@ def test_a_signal_stops_in_order(tmp_path: Path, command: str, number: int) -> N
         arguments = ["demo", "--viewer", "none"]
     with daemon([*PROGRAM, *arguments]) as one:
         one.hears("state=running")
-        assert one.status_after(number, 3.0) == 0
+        assert one.status_after(number) == 0
         assert "Traceback" not in one.rest()
     port = next(match[1] for line in one.lines if (match := re.search(r"waiting for (\S+)/tty", line)))
     assert not Path(port).exists()  # the simulated port is taken away again
@@ -1004,7 +1003,7 @@ import monitor.service
 from monitor.cli import main
 def stuck(self):
     print("draining", file=sys.stderr, flush=True)
-    time.sleep(60.0)
+    time.sleep(86_400.0)
 monitor.service.Service._drain = stuck
 sys.argv = ["imu-monitor", "demo", "--viewer", "none"]
 main()
@@ -1013,14 +1012,14 @@ main()
         one.hears("state=running")
         one.process.send_signal(signal.SIGINT)
         one.hears("draining")
-        assert one.status_after(signal.SIGINT, 3.0) == -signal.SIGINT
+        assert one.status_after(signal.SIGINT) == -signal.SIGINT
 
 
 def test_the_demo_really_receives_samples() -> None:
     begun_s = time.monotonic()
     done = program("demo", "--seconds", "5", "--viewer", "none")
     assert done.returncode == 0, done.stderr
-    assert 5.0 <= time.monotonic() - begun_s < 30.0
+    assert time.monotonic() - begun_s >= 5.0  # a lower bound holds on any machine
     assert "1 running" in done.stdout
     row = next(line for line in done.stdout.splitlines() if re.match(r"demo\s", line))
     received, lost, bad = map(int, re.findall(r"running\s+[\d.]+\s+(\d+)\s+(\d+)\s+(\d+)", row)[0])
@@ -1040,7 +1039,9 @@ def test_a_log_that_cannot_be_written_stops_no_samples(where: str) -> None:
         os.close(reading)
     command = [*PROGRAM, "demo", "--seconds", "2", "--viewer", "none"]
     with os.fdopen(log, "wb") as closed:
-        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=closed, text=True, timeout=60, check=False)
+        done = subprocess.run(
+            command, stdout=subprocess.PIPE, stderr=closed, text=True, timeout=PATIENCE_S, check=False
+        )
     assert done.returncode == 0
     assert "1 running" in done.stdout
 
@@ -1050,10 +1051,7 @@ def test_a_log_that_cannot_be_written_stops_no_samples(where: str) -> None:
 
 def all_bound(process: psutil.Process, least: int) -> list[tuple[str, int]]:
     """The same, once there are so many."""
-    until_s = time.monotonic() + 40.0
-    while len(found := bound(process)) < least and time.monotonic() < until_s:
-        time.sleep(0.1)
-    return found
+    return wait_for(lambda: found if len(found := bound(process)) >= least else None, f"{least} sockets") or []
 
 
 def bound(process: psutil.Process) -> list[tuple[str, int]]:
@@ -1077,7 +1075,7 @@ def test_defaults_listen_on_loopback_only(viewer: str, least: int) -> None:
         addresses = all_bound(psutil.Process(one.process.pid), least)
         assert len(addresses) >= least, addresses
         assert {address for address, _ in addresses} <= {"127.0.0.1", "::1"}
-        assert one.status_after(signal.SIGTERM, 5.0) == 0
+        assert one.status_after(signal.SIGTERM) == 0
 
 
 def test_a_zenoh_file_opens_nothing_by_what_it_leaves_out(tmp_path: Path) -> None:
@@ -1101,7 +1099,7 @@ def test_watching_listens_nowhere() -> None:
             assert bound(process) == []
             time.sleep(0.1)
         assert opened
-        assert one.process.wait(20.0) == 0
+        assert one.process.wait(PATIENCE_S) == 0
 
 
 # --- history
@@ -1198,24 +1196,24 @@ def test_history_without_storage_is_said(call: Call, tmp_path: Path) -> None:
 
 def test_history_of_a_running_daemon(call: Call, histories: Path, tmp_path: Path) -> None:
     from monitor.service import Service
-    from tests.monitor.publish.zenoh_world import eventually, free_endpoint
+    from tests.support.ports import free_endpoint
 
     endpoint = free_endpoint()
     histories = Path(shutil.copytree(histories, tmp_path / "kept"))  # the daemon adds to it
     zenoh = f'[zenoh]\nlisten = ["{endpoint}"]\n[viewer]\nmode = "none"\n'
     (tmp_path / "c.toml").write_text(f'{VIRTUAL}{zenoh}[storage]\nrecord = false\nfolder = "{histories}"\n')
     service = Service(load(tmp_path / "c.toml"))
-    thread = threading.Thread(target=service.run, args=(60.0,))
+    thread = threading.Thread(target=service.run, args=(FOREVER_S,))
     thread.start()
     try:
-        eventually(lambda: service.zenoh.state == "ok")
+        wait_for(lambda: service.zenoh.state == "ok")
         span = ("--from", "2025-11-21", "--to", "2025-11-22")
         said = call("history", "--connect", endpoint, "--json", "-", *span)
         there = call("history", str(histories), "--device", "bench-1", "--json", "-", *span)
         nothing = call("history", "--connect", endpoint, "--from", "2000-01-01", "--to", "2000-01-02")
     finally:
         service.stop()
-        thread.join(30.0)
+        thread.join(PATIENCE_S)
     assert not thread.is_alive()
     told, kept = json.loads(said.out), json.loads(there.out)
     assert (told["axes"], told["start"]) == (kept["axes"], kept["start"])

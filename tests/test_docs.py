@@ -5,7 +5,6 @@ import re
 import selectors
 import subprocess
 import sys
-import time
 import tomllib
 from pathlib import Path
 from typing import IO
@@ -29,7 +28,8 @@ from monitor.publish.rerun_sinks import server_url
 from monitor.publish.zenoh_out import ZenohOut
 from monitor.settings import ZenohTable
 from tests.monitor.publish.made import estimate
-from tests.monitor.publish.zenoh_world import eventually, free_endpoint
+from tests.support.ports import free_endpoint
+from tests.support.waiting import wait_for
 
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
@@ -229,13 +229,13 @@ def first_line(stdout: IO[str], publish: "list[tuple[topics.Topic, bytes]]", zen
     """What a program prints first, while results are published ten times a second."""
     with selectors.DefaultSelector() as selector:
         selector.register(stdout, selectors.EVENT_READ)
-        until_s = time.monotonic() + 30.0
-        while time.monotonic() < until_s:
+
+        def printed() -> str:
             for topic, payload in publish:
                 zenoh.put(topic, "bench-1", payload)
-            if selector.select(0.1):
-                return stdout.readline()
-    raise AssertionError("it printed nothing")
+            return stdout.readline() if selector.select(0.1) else ""
+
+        return wait_for(printed, "a line of the program")
 
 
 @pytest.mark.parametrize(
@@ -255,7 +255,7 @@ def test_a_subscriber_as_printed_prints_what_is_published(page: Path, word: str)
     zenoh = ZenohOut(ZenohTable(listen=(endpoint,)), ["bench-1"])
     zenoh.start()
     try:
-        eventually(lambda: zenoh.state == "ok")
+        wait_for(lambda: zenoh.state == "ok")
         command = [sys.executable, "-u", "-c", program.replace(PRINTED_BY, endpoint)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             try:

@@ -21,7 +21,7 @@ import zenoh
 
 from tests.bench.machine import Load, about, console, table
 from tests.bench.rig import PATIENCE_S, Daemon, Sensors, subscriber
-from tests.walk.rig import wait_for
+from tests.support.waiting import wait_for
 
 RATE_HZ: Final = 1000
 WARM_UP_S: Final = 5.0

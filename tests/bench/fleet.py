@@ -29,7 +29,7 @@ import zenoh
 from drivers.zenoh_session import configuration
 from monitor.publish.terminal import Board
 from monitor.publish.zenoh_in import ZenohIn
-from tests.walk.rig import free_port
+from tests.support.ports import free_port
 
 PATIENCE_S: Final = 600.0
 TOGETHER: Final = 4

@@ -11,7 +11,6 @@ import argparse
 import contextlib
 import os
 import select
-import signal
 import sqlite3
 import subprocess
 import sys
@@ -29,6 +28,7 @@ from drivers.recording import load_samples, segment
 from drivers.sample import Floats, Ints
 from monitor.history.store import reading
 from monitor.history.times import Span
+from tests.support.waiting import PATIENCE_S, wait_for
 
 RATE = 1000
 CONFIG = """
@@ -67,6 +67,7 @@ class Sensor:
         os.close(slave)
         self.device = os.readlink(self.port)
         self.sent = 0  # counts that have been given to the wire
+        self.still = threading.Lock()  # nothing is sent while it is held
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -80,14 +81,15 @@ class Sensor:
         rng = np.random.default_rng(0)
         begun = time.monotonic()
         while not self._closing.wait(0.01):
-            due = int((time.monotonic() - begun) * RATE)
-            values = 1e-3 * rng.standard_normal((due - self.sent, 6))
-            lines = [
-                ",".join([str(self.sent + i), *(f"{value:.6f}" for value in row)]) + "\n"
-                for i, row in enumerate(values)
-            ]
-            self._write("".join(lines).encode())
-            self.sent = due
+            with self.still:
+                due = int((time.monotonic() - begun) * RATE)
+                values = 1e-3 * rng.standard_normal((due - self.sent, 6))
+                lines = [
+                    ",".join([str(self.sent + i), *(f"{value:.6f}" for value in row)]) + "\n"
+                    for i, row in enumerate(values)
+                ]
+                self._write("".join(lines).encode())
+                self.sent = due
 
     def _write(self, data: bytes) -> None:
         while data and select.select([], [self._master], [], 0.005)[1]:
@@ -123,34 +125,58 @@ class Bench:
 
     def kill(self, after_s: float) -> Kill:
         """Start, kill after so long, look at what there is."""
+        begun = time.monotonic()
+        return self.kill_when(lambda _: time.monotonic() >= begun + after_s)
+
+    def kill_when(self, true: Callable[[int], bool]) -> Kill:
+        """Start a daemon, kill it once ``true`` of its process id holds, and compare the recording with the sensor.
+
+        The sensor sends nothing between the moment at which ``true`` holds and the end of the process.
+        """
         before = self.ticks()
         process, begun = self._start(), time.monotonic()
         opened = None
-        try:
-            while (left_s := begun + after_s - time.monotonic()) > 0.0:
-                if opened is None and self._has_port(process.pid):
+
+        def killed() -> bool:
+            nonlocal opened
+            with self.sensor.still:
+                if opened is None and self.has_port(process.pid):
                     opened = self.sensor.sent
-                time.sleep(min(left_s, 0.01))
+                if not true(process.pid):
+                    return False
+                process.kill()
+                process.wait()
+                return True
+
+        try:
+            wait_for(killed, "the moment of the kill")
+            sent, lived_s = self.sensor.sent, time.monotonic() - begun
         finally:
-            process.send_signal(signal.SIGKILL)
+            process.kill()
             process.wait()
-        sent = self.sensor.sent
         after = self.ticks()
         rows = len(after) - len(before)
         known = int(after[-1]) + 1 if rows else opened
-        return Kill(after_s, rows, 0.0 if known is None else max(sent - known, 0) / RATE)
+        return Kill(lived_s, rows, 0.0 if known is None else max(sent - known, 0) / RATE)
 
-    def live(self, until: Callable[[], bool], patience_s: float) -> int:
+    def recorded(self, rows: int) -> Callable[[int], bool]:
+        """Return a condition: so many more rows are recorded, and at most the last second of the sensor is missing."""
+        before = len(self.ticks())
+
+        def true(_: int) -> bool:
+            ticks = self.ticks()
+            return len(ticks) >= before + rows and self.sensor.sent - int(ticks[-1]) - 1 <= RATE
+
+        return true
+
+    def live(self, until: Callable[[], bool]) -> int:
         """Start, stop in order (SIGTERM) once ``until`` holds; the exit status."""
-        process, begun = self._start(), time.monotonic()
+        process = self._start()
         try:
-            while not until():
-                if time.monotonic() - begun > patience_s:
-                    raise AssertionError(f"it did not come up within {patience_s:g} s")
-                time.sleep(0.05)
+            wait_for(until, "the daemon to come up")
         finally:
             process.terminate()
-        return process.wait(30.0)
+        return process.wait(PATIENCE_S)
 
     def ticks(self) -> Ints:
         """The counts in all segments; AssertionError where a file cannot be read or a count does not follow."""
@@ -191,7 +217,8 @@ class Bench:
         command = [sys.executable, "-m", "monitor.cli", "run", str(self._config)]
         return subprocess.Popen(command, stdout=self._log, stderr=self._log)
 
-    def _has_port(self, pid: int) -> bool:
+    def has_port(self, pid: int) -> bool:
+        """Return True if the process has opened the sensor's port."""
         try:
             names = [os.readlink(f"/proc/{pid}/fd/{fd}") for fd in os.listdir(f"/proc/{pid}/fd")]
         except OSError:  # between two of them
@@ -216,7 +243,7 @@ def main() -> None:
                 one = kills[-1]
                 print(f"{i + 1:4d}  lived {one.lived_s:4.1f} s  {one.rows:6d} rows  {one.missing_s:.3f} s missing")
             rows = len(bench.ticks())
-            status = bench.live(lambda: len(bench.ticks()) > rows + RATE, 60.0)
+            status = bench.live(lambda: len(bench.ticks()) > rows + RATE)
             _tell(kills, bench, status)
         finally:
             bench.close()

@@ -24,7 +24,8 @@ import zenoh
 
 from drivers.decoders import vectornav_binary
 from drivers.sample import Ints, block
-from tests.walk.rig import free_port, wait_for
+from tests.support.ports import free_port
+from tests.support.waiting import wait_for
 
 PATIENCE_S: Final = 60.0
 DAEMON: Final = "from monitor.cli import main; main()"

@@ -2,9 +2,7 @@
 
 import contextlib
 import itertools
-import json
 import os
-import socket
 import threading
 import time
 import tty
@@ -23,6 +21,9 @@ from drivers.errors import LinkLost, LinkUnavailable
 from drivers.links.base import Link, LinkSettings
 from drivers.links.loopback_link import LoopbackLink
 from drivers.sample import Chunk
+from tests.support.ports import free_endpoint
+from tests.support.waiting import FOREVER_S, PATIENCE_S
+from tests.support.zenoh_sessions import router as zenoh_router
 
 UNIQUE = itertools.count()
 DATA = b"12345678"
@@ -101,24 +102,11 @@ def can_slcan_rig(tmp_path: Path) -> Iterator[Rig]:
     pty.close()
 
 
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        port: int = s.getsockname()[1]
-        return port
-
-
 @contextlib.contextmanager
 def router() -> Iterator[tuple[str, Callable[[str, bytes], None]]]:
     """A zenoh router in this process: its endpoint, and a put."""
-    import zenoh
-
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    config = zenoh.Config()
-    keys = {"mode": "router", "listen/endpoints": [endpoint], "scouting/multicast/enabled": False}
-    for key, value in keys.items():
-        config.insert_json5(key, json.dumps(value))
-    with zenoh.open(config) as session:
+    endpoint = free_endpoint()
+    with zenoh_router(endpoint) as session:
         yield endpoint, session.put
 
 
@@ -126,7 +114,7 @@ def router() -> Iterator[tuple[str, Callable[[str, bytes], None]]]:
 def zenoh_rig(tmp_path: Path) -> Iterator[Rig]:
     with router() as (endpoint, put):
         link = build("zenoh", key="contract/**", connect=[endpoint])
-        absent = build("zenoh", key="a/b", mode="client", connect=[f"tcp/127.0.0.1:{free_port()}"])
+        absent = build("zenoh", key="a/b", mode="client", connect=[free_endpoint()])
         why = "zenoh reconnects by itself: a lost publisher is silence, see LinkSettings.silence"
         yield Rig(link, lambda: put("contract/a", DATA), None, absent, why)
         link.close()
@@ -230,7 +218,7 @@ def test_read_returns_none_on_timeout(rig: Rig) -> None:
         pass
     start = time.monotonic()
     assert rig.link.read(rig.quiet_s) is None
-    assert rig.quiet_s * 0.9 <= time.monotonic() - start < rig.quiet_s + 0.5
+    assert time.monotonic() - start >= rig.quiet_s * 0.9  # a lower bound holds on any machine
 
 
 def test_lost_peer_raises_link_lost(rig: Rig) -> None:
@@ -257,22 +245,21 @@ def test_closing_ends_a_waiting_read(rig: Rig) -> None:
     receive(rig)
     while rig.link.read(0.05):
         pass
-    ended: list[float] = []
+    began, ended = threading.Event(), threading.Event()
 
     def wait() -> None:
+        began.set()
         with contextlib.suppress(LinkLost):
-            rig.link.read(30.0)
-        ended.append(time.monotonic())
+            rig.link.read(FOREVER_S)
+        ended.set()
 
     reader = threading.Thread(target=wait)
     reader.start()
-    time.sleep(0.1)
-    assert not ended
-    closed = time.monotonic()
+    assert began.wait(PATIENCE_S)
+    assert not ended.wait(0.1)
     rig.link.close()
-    reader.join(5.0)
-    assert ended
-    assert ended[0] - closed < 0.5
+    assert ended.wait(PATIENCE_S)
+    reader.join(PATIENCE_S)
 
 
 def test_absent_target_is_link_unavailable(rig: Rig) -> None:

@@ -2,9 +2,7 @@
 
 import contextlib
 import io
-import json
 import re
-import socket
 import threading
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -20,6 +17,8 @@ from drivers import sample_message
 from drivers.errors import DecodeError
 from drivers.sample import AXES, SampleBlock, block
 from drivers.sample_message import pack, unpack
+from tests.support.ports import free_endpoint
+from tests.support.zenoh_sessions import router
 
 START_NS = 1_763_700_000_123_456_789
 PAGE = Path(__file__).parents[2] / "docs" / "samples-format.md"
@@ -153,9 +152,7 @@ def test_a_damaged_message_is_refused_or_read(at: int, value: int) -> None:
 
 def test_the_example_of_the_page_reads_what_is_published() -> None:
     program = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)[0]
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{s.getsockname()[1]}"
+    endpoint = free_endpoint()
     program = program.replace("tcp/127.0.0.1:7450", endpoint)
     # as printed, but for one thing: it ends with the first message
     program = program.replace("print(", "break_after(")
@@ -168,17 +165,13 @@ def test_the_example_of_the_page_reads_what_is_published() -> None:
         print(*words, file=printed)
         raise Done
 
-    config = zenoh.Config()
-    keys = {"mode": "router", "listen/endpoints": [endpoint], "scouting/multicast/enabled": False}
-    for key, value in keys.items():
-        config.insert_json5(key, json.dumps(value))
     sent = rows(20)
     stop = threading.Event()
-    with zenoh.open(config) as router:
+    with router(endpoint) as opened:
 
         def publish() -> None:
             while not stop.wait(0.05):
-                router.put("imu/bench-1/samples", pack("bench-1", 20, sent))
+                opened.put("imu/bench-1/samples", pack("bench-1", 20, sent))
 
         publisher = threading.Thread(target=publish)
         publisher.start()

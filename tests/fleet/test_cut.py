@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from tests.fleet.namespaces import INSIDE, pair
-from tests.monitor.publish.zenoh_world import eventually
+from tests.support.waiting import PATIENCE_S, wait_for
 
 CONFIG = f"""
 [[device]]
@@ -61,19 +61,21 @@ def test_daemon_and_watcher_find_each_other_again(tmp_path: Path) -> None:
         for reader in readers:
             reader.start()
         try:
-            eventually(lambda: newest[0].startswith("running"), 90.0)
+            wait_for(lambda: newest[0].startswith("running"))
             before = int(newest[0].split()[1])
             namespaces.cable("down")
-            eventually(lambda: newest[0].startswith(("silent", "gone")), 60.0)
-            time.sleep(12.0)  # longer than zenoh's lease: the session is given up on both sides
+            wait_for(lambda: newest[0].startswith(("silent", "gone")))
+            cut_s = time.monotonic()
+            # zenoh's lease is 10 s: after it the session is given up on both sides
+            wait_for(lambda: time.monotonic() > cut_s + 12.0, "the end of the lease")
             namespaces.cable("up")
             # the samples of the cut are among those that were received
-            eventually(lambda: newest[0].startswith("running") and int(newest[0].split()[1]) > before + 1000, 60.0)
-            eventually(lambda: newest[0].rstrip().endswith("ok"))
+            wait_for(lambda: newest[0].startswith("running") and int(newest[0].split()[1]) > before + 1000)
+            wait_for(lambda: newest[0].rstrip().endswith("ok"))
         finally:
             _end(daemon, watcher)
             for reader in readers:
-                reader.join(10.0)
+                reader.join(PATIENCE_S)
             for pipe in (daemon.stdout, daemon.stderr, watcher.stdout, watcher.stderr):
                 assert pipe is not None
                 pipe.close()
@@ -83,7 +85,7 @@ def _end(*children: "subprocess.Popen[str]") -> None:
     for child in children:
         child.terminate()
         try:
-            child.wait(20.0)
+            child.wait(PATIENCE_S)
         except subprocess.TimeoutExpired:
             child.kill()
             child.wait()

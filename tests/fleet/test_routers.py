@@ -9,7 +9,9 @@ import zenoh
 
 from drivers.zenoh_session import configuration
 from monitor.settings import CONFIG_FOLDER
-from tests.monitor.publish.zenoh_world import eventually, free_endpoint, session
+from tests.support.ports import free_endpoint
+from tests.support.waiting import wait_for
+from tests.support.zenoh_sessions import session
 
 DEVICES = ("nose", "tail")
 
@@ -39,7 +41,7 @@ def test_what_goes_up_is_thinned_device_by_device(tmp_path: Path) -> None:
         session(connect=[up]) as far,
     ):
         watcher = far.declare_subscriber("imu/**", zenoh.handlers.RingChannel(10_000))
-        eventually(lambda: daemon.put("imu/ready/event", b"") or counted(watcher))
+        wait_for(lambda: daemon.put("imu/ready/event", b"") or counted(watcher))
         begun_s = time.monotonic()
         sent = 0
         while time.monotonic() - begun_s < 5.0:
@@ -50,7 +52,7 @@ def test_what_goes_up_is_thinned_device_by_device(tmp_path: Path) -> None:
             time.sleep(0.1)
         took_s = time.monotonic() - begun_s
         got: Counter[str] = Counter()
-        eventually(lambda: got.update(counted(watcher)) or got["imu/tail/event"] >= sent)
+        wait_for(lambda: got.update(counted(watcher)) or got["imu/tail/event"] >= sent)
         for device in DEVICES:
             assert got[f"imu/{device}/event"] == sent
             assert 1 <= got[f"imu/{device}/status"] <= 0.5 * took_s + 2  # of ten a second

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.monitor.publish.zenoh_world import free_endpoint, router
+from tests.support.ports import free_endpoint
+from tests.support.waiting import PATIENCE_S
+from tests.support.zenoh_sessions import router
 
 PASSWORD = "tr0ub4dor-and-3"
 ZENOH = """{{
@@ -35,7 +37,11 @@ format = "json"
 
 def said_by(*arguments: str) -> str:
     done = subprocess.run(
-        [sys.executable, "-m", "monitor.cli", *arguments], capture_output=True, text=True, timeout=120.0, check=False
+        [sys.executable, "-m", "monitor.cli", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
     )
     return done.stdout + done.stderr
 

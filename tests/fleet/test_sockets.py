@@ -13,8 +13,8 @@ import psutil
 import pytest
 
 from tests.fleet.namespaces import INSIDE, pair
-from tests.monitor.publish.zenoh_world import eventually
-from tests.walk.rig import free_port
+from tests.support.ports import free_port
+from tests.support.waiting import PATIENCE_S, wait_for
 
 LOOPBACK = ("127.0.0.1", "::1", "::ffff:127.0.0.1")
 CONFIG = """
@@ -59,7 +59,7 @@ def daemon(path: Path, *before: str) -> Iterator[psutil.Process]:
         yield psutil.Process(child.pid)
     finally:
         child.send_signal(signal.SIGTERM)
-        _, said = child.communicate(timeout=30.0)
+        _, said = child.communicate(timeout=PATIENCE_S)
     assert child.returncode == 0, said
 
 
@@ -83,7 +83,7 @@ def taking(pid: int) -> int:
 def test_every_socket_of_the_daemon_and_its_viewer_is_on_loopback(tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
     with daemon(tmp_path / "a.toml") as process:
-        eventually(lambda: len({name for name, _ in listening(process)}) > 1, 60.0)
+        wait_for(lambda: len({name for name, _ in listening(process)}) > 1)
         time.sleep(1.0)
         sockets = listening(process)
     assert {address for _, address in sockets} <= set(LOOPBACK)
@@ -98,10 +98,10 @@ def test_a_scan_from_another_namespace_finds_nothing(tmp_path: Path) -> None:
             assert beside.stdout is not None
             assert beside.stdout.readline() == "up\n"
             with daemon(tmp_path / "a.toml", "ip", "netns", "exec", namespaces.inside) as process:
-                eventually(lambda: any(one.name().startswith("rerun") for one in process.children(True)), 60.0)
-                eventually(lambda: taking(process.pid) >= 4, 60.0)  # zenoh, the viewer's two, and that one
+                wait_for(lambda: any(one.name().startswith("rerun") for one in process.children(True)))
+                wait_for(lambda: taking(process.pid) >= 4)  # zenoh, the viewer's two, and that one
                 scan = namespaces.python(namespaces.outside, "-c", SCAN, INSIDE)
-                said, _ = scan.communicate(timeout=120.0)
+                said, _ = scan.communicate(timeout=PATIENCE_S)
         finally:
             beside.kill()
             beside.communicate()

@@ -9,6 +9,7 @@ from pathlib import Path
 import monitor.compiled
 from monitor.compiled import IMPORTS, stamp
 from monitor.estimate import fit_kernel
+from tests.support.waiting import PATIENCE_S
 
 
 def test_without_a_place_for_the_cache() -> None:
@@ -25,7 +26,7 @@ def test_without_a_place_for_the_cache() -> None:
         assert twice.nopython_signatures
     """
     root = Path(monitor.compiled.__file__).parents[1]
-    subprocess.run([sys.executable, "-c", textwrap.dedent(program)], cwd=root, timeout=120, check=True)
+    subprocess.run([sys.executable, "-c", textwrap.dedent(program)], cwd=root, timeout=PATIENCE_S, check=True)
 
 
 def test_cached_code_is_stale_when_what_it_calls_has_changed(tmp_path):

@@ -24,6 +24,7 @@ from monitor.compiled import cache_folder
 from monitor.doctor import SAMPLE_BYTES, Finding, bytes_a_day, examine, room, satisfies, worst
 from monitor.recorder import origin
 from monitor.settings import CONFIG_FOLDER, Storage
+from tests.support.waiting import PATIENCE_S
 
 QUIET = '[zenoh]\nmode = "none"\n[viewer]\nmode = "none"\n'
 DEVICE = '[[device]]\nname = "a"\nrate = 100.0\ndriver = {{ {} }}\n'
@@ -339,7 +340,7 @@ def run(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
     command = [sys.executable, "-m", "monitor.cli", "doctor", *arguments]
     environment = {**os.environ, "PYTHONPATH": str(CONFIG_FOLDER.parent), "COLUMNS": "200"}
     return subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120, check=False
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
 
 

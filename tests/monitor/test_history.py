@@ -23,7 +23,9 @@ from monitor.publish import history_message
 from monitor.service import Service
 from monitor.settings import CONFIG_FOLDER
 from monitor.station import Output
-from tests.monitor.publish.zenoh_world import eventually, free_endpoint, session
+from tests.support.ports import free_endpoint
+from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
+from tests.support.zenoh_sessions import session
 
 T0 = 1_600_000_020.0
 SECONDS = 400
@@ -88,7 +90,7 @@ def kept(folder: Path, step_s: int | None = 60) -> Past:
 def test_what_was_published_is_kept_and_a_second_run_adds_to_it(tmp_path: Path, recording: Path) -> None:
     told = Told()
     service = Service(config(tmp_path, recording), [told])
-    service.run(60.0)
+    service.run(PATIENCE_S)
     assert service.states()["history"] == "ok"
     found = kept(tmp_path)
     minutes = found.start_s.tolist()
@@ -106,7 +108,7 @@ def test_what_was_published_is_kept_and_a_second_run_adds_to_it(tmp_path: Path, 
     assert [(one.t_s, one.text) for one in found.events] == [(at, event.text) for at, event in told.events]
     assert found.column("temperature").low[0] == pytest.approx(20.0, abs=1.5)
 
-    Service(config(tmp_path, recording)).run(60.0)
+    Service(config(tmp_path, recording)).run(PATIENCE_S)
     again = kept(tmp_path)
     assert set(again.start_s.tolist()) >= set(minutes)
     assert again.counts[:, 0].sum() == 2 * found.counts[:, 0].sum()
@@ -116,18 +118,18 @@ def test_what_was_published_is_kept_and_a_second_run_adds_to_it(tmp_path: Path, 
 def asked(tmp_path: Path, recording: Path) -> Iterator[tuple[Service, Any]]:
     """A service that runs on for a while, and a session beside it."""
     endpoint = free_endpoint()
-    Service(config(tmp_path, recording)).run(60.0)
+    Service(config(tmp_path, recording)).run(PATIENCE_S)
     service = Service(config(tmp_path, recording, f'listen = ["{endpoint}"]', 1.0))
-    thread = threading.Thread(target=service.run, args=(60.0,))
+    thread = threading.Thread(target=service.run, args=(FOREVER_S,))
     thread.start()
     try:
-        eventually(lambda: service.zenoh.state == "ok")
+        wait_for(lambda: service.zenoh.state == "ok")
         with session(connect=[endpoint]) as client:
-            eventually(lambda: list(client.get("imu/bench-1/history", timeout=5.0)))
+            wait_for(lambda: list(client.get("imu/bench-1/history", timeout=PATIENCE_S)))
             yield service, client
     finally:
         service.stop()
-        thread.join(30.0)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive()
 
 
@@ -135,7 +137,7 @@ def test_a_query_over_zenoh_honours_its_time(asked: tuple[Service, Any]) -> None
     _, client = asked
 
     def answer(parameters: str) -> Any:
-        (reply,) = client.get(f"imu/*/history?{parameters}", timeout=10.0)
+        (reply,) = client.get(f"imu/*/history?{parameters}", timeout=PATIENCE_S)
         if reply.ok is None:
             return json.loads(bytes(reply.err.payload))["error"]
         assert (str(reply.ok.key_expr), str(reply.ok.encoding)) == ("imu/bench-1/history", "application/json")
@@ -162,8 +164,8 @@ def test_a_damaged_history_is_said_in_the_status_and_to_who_asks(asked: tuple[Se
     path = service.history.path
     path.with_name(FILE + "-wal").unlink(missing_ok=True)
     path.write_bytes(b"no more" * 1000)
-    (reply,) = client.get("imu/bench-1/history", timeout=10.0)
+    (reply,) = client.get("imu/bench-1/history", timeout=PATIENCE_S)
     assert "damaged" in json.loads(bytes(reply.err.payload))["error"]
     service.history.tell("bench-1", PastEvent(T0, "moved", "once more"))
-    eventually(lambda: "damaged" in service.states()["history"], 30.0)
+    wait_for(lambda: "damaged" in service.states()["history"])
     assert path.read_bytes() == b"no more" * 1000

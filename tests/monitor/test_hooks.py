@@ -4,7 +4,6 @@ import json
 import os
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,7 @@ import pytest
 from drivers.sample import Event
 from monitor.hooks import AT_ONCE, BURST, EVERY_S, WAITING, Hooks
 from monitor.settings import Hook
-from tests.monitor.publish.zenoh_world import eventually
+from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
 EVENT = Event("limit_crossed", 2_000_000_000, "gz $(touch no) `touch no` ; touch no", "gz", {}, 1_000_000_000, 5.0)
 
@@ -25,7 +24,9 @@ def program(folder: Path, text: str, name: str = "tell") -> str:
     return str(path)
 
 
-def hook(*command: str, timeout_s: float = 30.0, on: str = "*", devices: tuple[str, ...] = (), key: str = "") -> Hook:
+def hook(
+    *command: str, timeout_s: float = PATIENCE_S, on: str = "*", devices: tuple[str, ...] = (), key: str = ""
+) -> Hook:
     return Hook(frozenset({on}), frozenset(devices), command, key or None, timeout_s)
 
 
@@ -61,7 +62,7 @@ def test_a_command_gets_the_event_and_no_word_of_it_is_run(tmp_path: Path) -> No
     )
     with Running(hook(program(tmp_path, write), "$HOME", "; rm -r x")) as running:
         running.happen()
-        eventually(out.exists)
+        wait_for(out.exists)
     arguments, event, named = json.loads(out.read_text())
     assert arguments == ["$HOME", "; rm -r x"]
     assert (event["schema"], event["kind"], event["axis"]) == ("imu-monitor/event/1", "limit_crossed", "gz")
@@ -86,17 +87,17 @@ def test_a_command_that_fails_is_said_until_one_goes_well(tmp_path: Path) -> Non
     text = f"print('first'); print('no modem\\x1b[31m')\nsys.exit(3 if os.path.exists({str(path)!r}) else 0)"
     with Running(hook(program(tmp_path, text))) as running:
         running.happen()
-        eventually(lambda: running.hooks.state != "ok")
+        wait_for(lambda: running.hooks.state != "ok")
         assert running.hooks.state == "tell: exit status 3: no modem�[31m (1 failed since the start)"
         path.unlink()
         running.happen()
-        eventually(lambda: running.hooks.state == "ok")
+        wait_for(lambda: running.hooks.state == "ok")
 
 
 def test_a_program_that_cannot_be_started_is_said(tmp_path: Path) -> None:
     with Running(hook(str(tmp_path / "none"))) as running:
         running.happen()
-        eventually(lambda: "none: cannot be started: No such file" in running.hooks.state)
+        wait_for(lambda: "none: cannot be started: No such file" in running.hooks.state)
 
 
 def test_a_command_that_does_not_end_is_killed_with_all_it_started(tmp_path: Path) -> None:
@@ -107,11 +108,14 @@ def test_a_command_that_does_not_end_is_killed_with_all_it_started(tmp_path: Pat
         f"if pid: open({str(child)!r}, 'w').write(str(pid))\n"
         "while True: os.write(1, b'x' * 1000); time.sleep(0.001)\n"
     )
-    with Running(hook(program(tmp_path, text), timeout_s=2.0)) as running:
-        running.happen()
-        eventually(lambda: "killed after 2 s" in running.hooks.state, 30.0)
-        pid = int(child.read_text())
-        eventually(lambda: not alive(pid))
+    for timeout_s in (2.0, 8.0, 32.0):  # a loaded machine may need longer to start the command
+        with Running(hook(program(tmp_path, text), timeout_s=timeout_s)) as running:
+            running.happen()
+            wait_for(lambda timeout_s=timeout_s: f"killed after {timeout_s:g} s" in running.hooks.state)
+        if child.exists():
+            break
+    pid = int(child.read_text())
+    wait_for(lambda: not alive(pid))
 
 
 def alive(pid: int) -> bool:
@@ -125,14 +129,12 @@ def alive(pid: int) -> bool:
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
 def test_what_still_runs_when_the_service_ends_is_killed(tmp_path: Path) -> None:
     mark = tmp_path / "pid"
-    text = f"open({str(mark)!r}, 'w').write(str(os.getpid()))\ntime.sleep(600)"
-    running = Running(hook(program(tmp_path, text), timeout_s=600.0))
+    text = f"open({str(mark)!r}, 'w').write(str(os.getpid()))\ntime.sleep({FOREVER_S})"
+    running = Running(hook(program(tmp_path, text), timeout_s=FOREVER_S))
     running.happen()
-    eventually(lambda: mark.exists() and mark.read_text() != "")
-    begun_s = time.monotonic()
-    running.hooks.close()
-    assert time.monotonic() - begun_s < 20.0
-    eventually(lambda: not alive(int(mark.read_text())))
+    wait_for(lambda: mark.exists() and mark.read_text() != "")
+    running.hooks.close()  # returns, although the command would run on for a day
+    wait_for(lambda: not alive(int(mark.read_text())))
     assert not [t for t in threading.enumerate() if t.name.startswith("hooks")]
 
 
@@ -153,11 +155,9 @@ def test_a_flood_is_held_back_and_does_not_drown_what_is_rare() -> None:
 def test_no_more_run_or_wait_than_there_is_room_for(tmp_path: Path) -> None:
     marks = tmp_path / "marks"
     marks.mkdir()
-    text = f"open(os.path.join({str(marks)!r}, str(os.getpid())), 'w')\ntime.sleep(600)"
-    with Running(hook(program(tmp_path, text), timeout_s=600.0)) as running:
-        begun_s = time.monotonic()
+    text = f"open(os.path.join({str(marks)!r}, str(os.getpid())), 'w')\ntime.sleep({FOREVER_S})"
+    with Running(hook(program(tmp_path, text), timeout_s=FOREVER_S)) as running:
         for i in range(WAITING + AT_ONCE + 50):
-            running.happen(device=f"d{i}")
-        assert time.monotonic() - begun_s < 20.0
-        eventually(lambda: len(os.listdir(marks)) == AT_ONCE)
+            running.happen(device=f"d{i}")  # returns at once, although no command ends
+        wait_for(lambda: len(os.listdir(marks)) == AT_ONCE)
         assert "held back" in running.hooks.state

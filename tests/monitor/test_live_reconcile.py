@@ -5,7 +5,6 @@ import os
 import sys
 import textwrap
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +17,14 @@ from drivers.sample import block
 from monitor.estimate.estimator import Estimator
 from monitor.live_reconcile import NICE, PROGRAM, Job, Reconciler, said
 from monitor.publish.zenoh_out import Command
+from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
 N = 400
 VALUES = 1e-3 * np.random.default_rng(1).standard_normal((N, 6))
 VALUES[50:60] = np.nan
 VALUES[:, 4] = np.nan
 WARM = np.linspace(20.0, 21.0, N)
+LARGEST_NICENESS = 19
 GIVEN = """
 import json, os, sys, time
 given = dict(zip(sys.argv[2::2], sys.argv[3::2]))
@@ -50,7 +51,7 @@ class Asked:
         self.done.set()
 
     def wait(self) -> "Asked":
-        assert self.done.wait(20.0)
+        assert self.done.wait(PATIENCE_S)
         return self
 
 
@@ -65,7 +66,7 @@ def program(text: str) -> tuple[str, ...]:
     return (sys.executable, "-c", GIVEN + textwrap.dedent(text))
 
 
-def run(text: str, one: Job | None = None, limit_s: float = 20.0) -> tuple[Asked, list[str]]:
+def run(text: str, one: Job | None = None, limit_s: float = PATIENCE_S) -> tuple[Asked, list[str]]:
     """The answer of one query, and what is said of it."""
     reconciler, asked = Reconciler(program(text), limit_s), Asked()
     reconciler.start(one or job(), asked.command)
@@ -96,13 +97,15 @@ def test_the_program_is_given_the_window_as_a_recording(tmp_path: Path) -> None:
     text = f"""
         import shutil
         shutil.copy(sys.argv[1], {str(kept)!r})
+        while os.nice(0) == {os.nice(0)}:  # the parent sets it once the program has been started
+            time.sleep(0.01)
         seen = {{"given": given, "nice": os.nice(0)}}
         print(json.dumps({{"verdict": "agrees", **seen}}))
     """
     asked, told = run(text, job(model=model))
     (answer,) = asked.answers
     assert answer["given"] | {"--out": ""} == {"--out": "", "--json": "-", "--seed": "1", "--model": str(model)}
-    assert answer["nice"] - os.nice(0) == NICE
+    assert answer["nice"] == min(os.nice(0) + NICE, LARGEST_NICENESS)
     assert told == ["reconcile: agrees"]
     recording = load_samples(kept)
     assert recording.rate_hz == 100.0
@@ -151,30 +154,28 @@ def test_a_program_that_is_not_there_is_an_error() -> None:
 
 
 def test_too_long_is_ended_with_all_that_it_started(tmp_path: Path) -> None:
-    begun = time.monotonic()
     text = f"""
         import subprocess
-        grandchild = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-        open({str(tmp_path / "pid")!r}, "w").write(str(grandchild.pid))
+        grandchild = subprocess.Popen([sys.executable, "-c", "import time; time.sleep({FOREVER_S})"])
+        open({str(tmp_path / "part")!r}, "w").write(str(grandchild.pid))
+        os.rename({str(tmp_path / "part")!r}, {str(tmp_path / "pid")!r})
         grandchild.wait()
     """
-    asked, _ = run(text, limit_s=1.5)
-    assert asked.errors == ["reconcile was ended after 1.5 s"]
-    assert time.monotonic() - begun < 15.0
-    assert gone(int((tmp_path / "pid").read_text()))
+    for limit_s in (1.5, 6.0, 24.0, 96.0):  # a loaded machine may need longer to start the grandchild
+        asked, _ = run(text, limit_s=limit_s)
+        assert asked.errors == [f"reconcile was ended after {limit_s:g} s"]
+        if (tmp_path / "pid").exists():
+            break
+    pid = int((tmp_path / "pid").read_text())
+    wait_for(lambda: gone(pid), "the end of the grandchild")
 
 
 def gone(pid: int) -> bool:
-    """Ended, whether or not its parent has noticed."""
-    for _ in range(100):
-        try:
-            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-        except FileNotFoundError:
-            return True
-        if state == "Z":
-            return True
-        time.sleep(0.02)
-    return False
+    """Return True if the process has ended, whether or not its parent has noticed."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except FileNotFoundError:
+        return True
 
 
 def test_one_at_a_time_for_each_device(tmp_path: Path) -> None:
@@ -194,22 +195,17 @@ def test_one_at_a_time_for_each_device(tmp_path: Path) -> None:
     go.touch()
     assert first.wait().answers[0]["device"] == "bench-1"
     assert other.wait().answers[0]["device"] == "bench-2"
-    until = time.monotonic() + 10.0
-    while len(reconciler.take()) == 0 and time.monotonic() < until:
-        time.sleep(0.01)
-    time.sleep(0.2)  # the thread ends after it has said so
+    reconciler._running["bench-1"].join(PATIENCE_S)  # the thread ends after it has answered
     reconciler.start(job(), later.command)
     assert later.wait().errors == []
     reconciler.close()
 
 
 def test_closing_ends_what_runs_and_says_so() -> None:
-    reconciler, asked = Reconciler(program("time.sleep(60)")), Asked()
+    reconciler, asked = Reconciler(program(f"time.sleep({FOREVER_S})")), Asked()
     reconciler.start(job(), asked.command)
-    time.sleep(0.3)
-    begun = time.monotonic()
+    wait_for(lambda: reconciler._children, "the program to be started")
     reconciler.close()
-    assert time.monotonic() - begun < 3.0
     assert asked.wait().errors == ["the service is stopping"]
 
 

@@ -24,8 +24,10 @@ from monitor.publish.terminal import Board
 from monitor.service import Service
 from monitor.station import Output
 from tests.monitor.publish import made
-from tests.monitor.publish.zenoh_world import eventually, free_endpoint, session
 from tests.monitor.test_systemd import Listening
+from tests.support.ports import free_endpoint
+from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.zenoh_sessions import session
 
 QUIET = '[zenoh]\nmode = "none"\n[viewer]\nmode = "none"\n'
 
@@ -125,7 +127,7 @@ def running(path: Path, *outputs: Output) -> Iterator[Service]:
         yield service
     finally:
         service.stop()
-        thread.join(30.0)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive()
 
 
@@ -136,8 +138,8 @@ def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None
     path.write_text(device("stays") + device("goes") + device("changes") + rest)
     with running(path, gone) as service:
         stations = {station.name: station for station in service.stations}
-        eventually(lambda: all(station.published > 300 for station in service.stations), 90.0)
-        eventually(lambda: service.zenoh.state == "ok" and service.view is not None and service.view.state == "ok")
+        wait_for(lambda: all(station.published > 300 for station in service.stations))
+        wait_for(lambda: service.zenoh.state == "ok" and service.view is not None and service.view.state == "ok")
         ring, estimator = stations["stays"].ring, stations["stays"].chain.estimator
         path.write_text(device("stays") + device("comes") + device("changes", 'publish = "5 Hz"') + rest)
         with session(connect=[endpoint]) as listener:
@@ -147,25 +149,25 @@ def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None
                 lambda sample: heard.setdefault(str(sample.key_expr).split("/")[1], []).append(bytes(sample.payload)),
             )
             service.reload()
-            eventually(lambda: [station.name for station in service.stations] == ["stays", "comes", "changes"])
-            eventually(lambda: gone.names == ["goes", "changes"])
+            wait_for(lambda: [station.name for station in service.stations] == ["stays", "comes", "changes"])
+            wait_for(lambda: gone.names == ["goes", "changes"])
             heard.clear()
-            eventually(lambda: {"stays", "comes", "changes"} <= heard.keys(), 30.0)
+            wait_for(lambda: {"stays", "comes", "changes"} <= heard.keys())
             assert "goes" not in heard
             tokens = {
                 str(reply.ok.key_expr)
-                for reply in listener.liveliness().get("imu/*/alive", timeout=10.0)
+                for reply in listener.liveliness().get("imu/*/alive", timeout=PATIENCE_S)
                 if reply.ok is not None
             }
             assert tokens == {f"imu/{name}/alive" for name in ("stays", "comes", "changes")}
-            assert not [one for one in listener.get("imu/goes/command/reset", timeout=5.0) if one.ok is not None]
+            assert not [one for one in listener.get("imu/goes/command/reset", timeout=PATIENCE_S) if one.ok is not None]
         new = {station.name: station for station in service.stations}
         assert new["stays"] is stations["stays"]
         assert (new["stays"].ring, new["stays"].chain.estimator) == (ring, estimator)
         assert new["stays"].driver.counts.lost == 0
         assert new["changes"] is not stations["changes"]
         # what was recorded of it is in its window again
-        eventually(lambda: ("changes", "window_rebuilt") in gone.events, 30.0)
+        wait_for(lambda: ("changes", "window_rebuilt") in gone.events)
         assert service.view is not None
         assert service.view.state == "ok"
         assert set(service.virtual) == {"stays", "comes", "changes"}
@@ -177,19 +179,19 @@ def test_new_limits_and_hooks_hold_at_once_and_a_wrong_file_changes_nothing(tmp_
     path.write_text(device("a") + QUIET)
     with capture_logs() as lines, running(path) as service:
         (station,) = service.stations
-        eventually(lambda: station.latest is not None and station.published > 500, 90.0)
+        wait_for(lambda: station.latest is not None and station.published > 500)
         path.write_text("[[device")
         service.reload()
-        eventually(lambda: any(line["event"].startswith("not reloaded") for line in lines))
+        wait_for(lambda: any(line["event"].startswith("not reloaded") for line in lines))
         limit = '[[device.limit]]\naxes = "a*"\nletter = "N"\nabove = 1e-5\nhold = "1s"\n'
         path.write_text(device("a") + limit + '[[hook]]\non = ["*"]\ncommand = ["/bin/true"]\n' + QUIET)
         service.reload()
-        eventually(lambda: station.health({}, 0).crossed == ("ax N", "ay N", "az N"), 60.0)
+        wait_for(lambda: station.health({}, 0).crossed == ("ax N", "ay N", "az N"))
         assert service.states()["hook"] == "ok"
         assert service.stations == [station]
         path.write_text(device("a") + QUIET)
         service.reload()
-        eventually(lambda: station.health({}, 0).crossed == ())
+        wait_for(lambda: station.health({}, 0).crossed == ())
     wrong = [line for line in lines if line["event"].startswith("not reloaded")]
     assert [line["log_level"] for line in wrong] == ["error"]
     assert "not TOML" in wrong[0]["error"]
@@ -203,18 +205,18 @@ def test_a_hang_up_reloads_and_systemd_is_told(tmp_path: Path) -> None:
         command = [sys.executable, "-m", "monitor.cli", "run", str(path)]
         with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
             try:
-                eventually(lambda: systemd.count("READY=1") == 1, 60.0)
+                wait_for(lambda: systemd.count("READY=1") == 1)
                 path.write_text(device("a") + device("b") + QUIET + '[log]\nformat = "json"\nlevel = "warning"\n')
                 process.send_signal(signal.SIGHUP)
-                eventually(lambda: systemd.count("READY=1") == 2, 60.0)
-                eventually(lambda: any(line.startswith("STATUS=2 devices") for line in systemd.lines()), 30.0)
+                wait_for(lambda: systemd.count("READY=1") == 2)
+                wait_for(lambda: any(line.startswith("STATUS=2 devices") for line in systemd.lines()))
                 path.write_text("[[device")
                 process.send_signal(signal.SIGHUP)
-                eventually(lambda: systemd.count("READY=1") == 3, 60.0)
-                eventually(lambda: systemd.count("WATCHDOG=1") > 0, 60.0)
+                wait_for(lambda: systemd.count("READY=1") == 3)
+                wait_for(lambda: systemd.count("WATCHDOG=1") > 0)
             finally:
                 process.send_signal(signal.SIGTERM)
-                _, said = process.communicate(timeout=60)
+                _, said = process.communicate(timeout=PATIENCE_S)
         systemd.lines()
     assert process.returncode == 0
     lines = [json.loads(line) for line in said.decode().splitlines()]
@@ -232,19 +234,17 @@ def test_reloads_leave_nothing_behind(tmp_path: Path) -> None:
     path, rest = tmp_path / "c.toml", f'[zenoh]\nlisten = ["{free_endpoint()}"]\n[viewer]\nmode = "none"\n'
     path.write_text(device("stays") + device("a") + rest)
     with running(path) as service:
-        eventually(lambda: service.zenoh.state == "ok" and all(one.published > 50 for one in service.stations), 90.0)
+        wait_for(lambda: service.zenoh.state == "ok" and all(one.published > 50 for one in service.stations))
         most = (0, 0)
         for i in range(8):
             name = "ba"[i % 2]
             path.write_text(device("stays") + device(name) + rest)
             service.reload()
-            eventually(
-                lambda name=name: service.stations[-1].name == name and service.stations[-1].published > 50, 30.0
-            )
+            wait_for(lambda name=name: service.stations[-1].name == name and service.stations[-1].published > 50)
             if i == 1:
                 most = in_use()
             elif i > 1:
-                eventually(lambda most=most: all(now <= then for now, then in zip(in_use(), most, strict=True)))
+                wait_for(lambda most=most: all(now <= then for now, then in zip(in_use(), most, strict=True)))
 
 
 def in_use() -> tuple[int, int]:

@@ -26,7 +26,9 @@ from monitor.station import Output
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
-from tests.monitor.publish.test_rerun_view import free_port, read, wait_for
+from tests.monitor.publish.test_rerun_view import read
+from tests.support.ports import free_port
+from tests.support.waiting import PATIENCE_S, wait_for
 
 RECORDED_S = 1_600_000_000.0
 
@@ -38,6 +40,16 @@ def config(folder: Path, driver: str, viewer: str) -> settings.Config:
     return settings.load(path)
 
 
+class Rounds(Output):
+    """Counts the rounds of the status."""
+
+    def __init__(self) -> None:
+        self.healths = 0
+
+    def health(self, device: str, unix_s: float, health: Health) -> None:
+        self.healths += 1
+
+
 def test_the_page_is_told_once_in_the_log_and_stands_above_the_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -45,20 +57,22 @@ def test_the_page_is_told_once_in_the_log_and_stands_above_the_table(
         monkeypatch.delenv(name, raising=False)
     viewer = f'mode = "auto"\nport = {free_port()}\nweb_port = {free_port()}\n'
     board = Board()
-    service = Service(config(tmp_path, 'link = "virtual"', viewer), [TableOutput(board)])
+    rounds = Rounds()
+    service = Service(config(tmp_path, 'link = "virtual"', viewer), [TableOutput(board), rounds])
     assert service.view is not None
     thread = threading.Thread(target=service.run)
     with capture_logs() as logs:
         thread.start()
         try:
-            assert wait_for(lambda: board.note != "")
+            wait_for(lambda: board.note != "")
             url, note = service.view.url, board.note
-            time.sleep(2.5)  # more rounds of the status
+            before = rounds.healths
+            wait_for(lambda: rounds.healths >= before + 2, "two more rounds of the status")
             with (console := Console(width=200)).capture() as captured:
                 console.print(board.table(time.monotonic()))
         finally:
             service.stop()
-            thread.join(20.0)
+            thread.join(PATIENCE_S)
     assert not thread.is_alive()
     assert url.startswith("http://127.0.0.1:")
     assert note == f"viewer: {url}"
@@ -71,7 +85,7 @@ def test_a_recording_of_long_ago_leaves_nothing_at_todays_date(tmp_path: Path) -
     rows = [f"{RECORDED_S + i / 100:.2f},{0.1 * (-1) ** i}" for i in range(100)]
     (tmp_path / "long-ago.csv").write_text("\n".join(["t,gz", *rows]))
     service = Service(config(tmp_path, 'link = "replay", path = "long-ago.csv"', f'mode = "{path}"\n'))
-    service.run(20.0)
+    service.run(PATIENCE_S)
     assert service.stations[0].driver.state == "ended"
     cells = read(path)
     assert "ENDED" in str(cells["/d/status"])
@@ -175,7 +189,7 @@ def test_kernels_that_cannot_be_kept_hold_nothing_up(tmp_path: Path, monkeypatch
     save_samples(tmp_path / "short.npz", np.arange(500) / 100.0, np.random.default_rng(1).standard_normal((500, 6)))
     service = Service(config(tmp_path, 'link = "replay", path = "short.npz", speed = "max"', 'mode = "none"'))
     with capture_logs() as logs:
-        service.run(20.0)
+        service.run(PATIENCE_S)
     latest = service.stations[0].latest
     assert latest is not None
     assert latest.samples == 500
@@ -190,9 +204,9 @@ def test_a_replay_that_is_stopped_loses_nothing_it_has_counted(tmp_path: Path) -
     (station,) = service.stations
     thread = threading.Thread(target=service.run)
     thread.start()
-    assert wait_for(lambda: station.published > 0)
+    wait_for(lambda: station.published > 0)
     service.stop()
-    thread.join(20.0)
+    thread.join(PATIENCE_S)
     assert not thread.is_alive()
     assert station.driver.state != "ended"
     assert station.ring.overflowed == 0

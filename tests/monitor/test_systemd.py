@@ -17,7 +17,8 @@ from monitor import settings
 from monitor.service import Service
 from monitor.settings import CONFIG_FOLDER
 from monitor.systemd import Unit
-from tests.monitor.publish.zenoh_world import eventually, free_endpoint
+from tests.support.ports import free_endpoint
+from tests.support.waiting import PATIENCE_S, wait_for
 
 UNIT = CONFIG_FOLDER / "systemd" / "imu-monitor.service"
 DEVICE = '[[device]]\nname = "{name}"\nrate = 100.0\ndriver = {{ link = "virtual" }}\n'
@@ -145,18 +146,18 @@ def test_a_frozen_reader_ends_the_signs_of_life_and_nothing_else(tmp_path: Path)
         thread = threading.Thread(target=service.run)
         thread.start()
         try:
-            eventually(lambda: systemd.count("READY=1") == 1, 60.0)
-            eventually(lambda: systemd.count("WATCHDOG=1") >= 3, 30.0)
+            wait_for(lambda: systemd.count("READY=1") == 1)
+            wait_for(lambda: systemd.count("WATCHDOG=1") >= 3)
             assert any(line.startswith("STATUS=2 devices, 1 running, 1 waiting; ") for line in systemd.lines())
             link.frozen.set()
-            eventually(lambda: any("frozen: its reader is stuck" in line for line in systemd.lines()), 30.0)
+            wait_for(lambda: any("frozen: its reader is stuck" in line for line in systemd.lines()))
             signs = systemd.count("WATCHDOG=1")
             received = service.stations[0].driver.counts.received
-            eventually(lambda: service.stations[0].driver.counts.received > received + 200, 30.0)
+            wait_for(lambda: service.stations[0].driver.counts.received > received + 200)
             assert systemd.count("WATCHDOG=1") == signs
         finally:
             service.stop()
-            thread.join(30.0)
+            thread.join(PATIENCE_S)
         assert not thread.is_alive()
         assert systemd.lines()[-1].startswith(("STOPPING=1", "STATUS="))
         assert systemd.count("STOPPING=1") == systemd.count("READY=1") == 1
@@ -171,7 +172,7 @@ def test_the_unit_is_one(tmp_path: Path) -> None:
     unit = tmp_path / UNIT.name
     unit.write_text(UNIT.read_text("utf-8").replace("/opt/imu-monitor/bin/imu-monitor", "/bin/true"))
     command = ["systemd-analyze", "verify", "--man=no", str(unit)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 
 

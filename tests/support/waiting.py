@@ -18,7 +18,9 @@ FOREVER_S: Final = 86_400.0
 POLL_S: Final = 0.01
 
 
-def wait_for(condition: Callable[[], T], what: str | Callable[[], object] = "the condition") -> T:
+def wait_for(
+    condition: Callable[[], T], what: str | Callable[[], object] = "the condition", patience_s: float = PATIENCE_S
+) -> T:
     """Return the first true result of ``condition``.
 
     Parameters
@@ -27,15 +29,17 @@ def wait_for(condition: Callable[[], T], what: str | Callable[[], object] = "the
         Called every 10 ms until its result is true.
     what
         Describes the condition in the error message. A callable is evaluated when the deadline has passed.
+    patience_s
+        Deadline in seconds.
 
     Raises
     ------
     AssertionError
-        If the condition is still false after ``PATIENCE_S``.
+        If the condition is still false after ``patience_s``.
     """
-    deadline_s = time.monotonic() + PATIENCE_S
+    deadline_s = time.monotonic() + patience_s
     while not (found := condition()):
         if time.monotonic() > deadline_s:
-            raise AssertionError(f"waited {PATIENCE_S:g} s for {what() if callable(what) else what}")
+            raise AssertionError(f"waited {patience_s:g} s for {what() if callable(what) else what}")
         time.sleep(POLL_S)
     return found

@@ -1,7 +1,6 @@
-"""What the walks share: a service in this process with its results caught, and ports that nobody uses."""
+"""What the walks share: a service in this process with its results caught."""
 
 import os
-import socket
 import threading
 import time
 import tty
@@ -10,7 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from drivers.sample import Event, SampleBlock, join
 from monitor import settings
@@ -23,6 +21,7 @@ from monitor.estimate.total import TotalCurve
 from monitor.health import Health
 from monitor.service import Service
 from monitor.station import Output, Station
+from tests.support.waiting import PATIENCE_S
 
 
 class Caught(Output):
@@ -85,10 +84,10 @@ class Running:
 
     def stop(self) -> None:
         self.service.stop()
-        self.join(20.0)
+        self.join()
 
-    def join(self, timeout_s: float) -> None:
-        self._thread.join(timeout_s)
+    def join(self) -> None:
+        self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive(), "the service did not stop in time"
 
 
@@ -139,23 +138,3 @@ def paced(send: Callable[[bytes], None], frames: list[bytes], per_second: float,
             time.sleep(early)
         send(b"".join(frames[start : start + burst]))
     return time.monotonic() - begun
-
-
-def wait_for(condition: Callable[[], bool], timeout_s: float, what: str) -> None:
-    until = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < until, f"waited {timeout_s} s for {what}"
-        time.sleep(0.02)
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port: int = server.getsockname()[1]
-        return port
-
-
-def recordings() -> Path:
-    folder = os.environ.get("IMU_MONITOR_DATA")
-    if not folder:
-        pytest.skip("IMU_MONITOR_DATA is not set: this test reads real recordings")
-    return Path(folder)

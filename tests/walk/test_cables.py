@@ -10,7 +10,8 @@ import pytest
 
 from drivers import driver
 from drivers.sample import join
-from tests.walk.rig import Running, running, wait_for
+from tests.support.waiting import wait_for
+from tests.walk.rig import Running, running
 
 WARM_UP, CYCLES, TEN = 10, 50, 10
 NOISE_BYTES = 2_000_000
@@ -38,13 +39,13 @@ def pull_and_put_back(run: Running) -> None:
     """A few samples are sent into the air, and some come after it."""
     imu, station = run.service.virtual["loose"], run.station("loose")
     imu.unplug()
-    wait_for(lambda: station.driver.state == "lost", 10.0, "the loss")
+    wait_for(lambda: station.driver.state == "lost", "the loss")
     before = imu.truth.dropped
-    wait_for(lambda: imu.truth.dropped >= before + 3, 10.0, "samples that find no cable")
+    wait_for(lambda: imu.truth.dropped >= before + 3, "samples that find no cable")
     received = station.driver.counts.received
     imu.plug()
-    wait_for(lambda: station.driver.counts.received >= received + 3, 10.0, "samples after the pause")
-    wait_for(lambda: station.driver.state == "running", 10.0, "the state")
+    wait_for(lambda: station.driver.counts.received >= received + 3, "samples after the pause")
+    wait_for(lambda: station.driver.state == "running", "the state")
 
 
 def measured() -> tuple[int, int, int]:
@@ -60,7 +61,7 @@ def test_fifty_pulled_cables_leave_nothing_behind(tmp_path: Path, monkeypatch: p
     with running(tmp_path, CONFIG) as run:
         for station in run.service.stations:
             counts = station.driver.counts
-            wait_for(lambda counts=counts: counts.received >= 10, 20.0, "the first samples")  # type: ignore[misc]
+            wait_for(lambda counts=counts: counts.received >= 10, "the first samples")  # type: ignore[misc]
         for _ in range(WARM_UP):
             pull_and_put_back(run)
         threads, files, memory = measured()
@@ -70,7 +71,7 @@ def test_fifty_pulled_cables_leave_nothing_behind(tmp_path: Path, monkeypatch: p
             if cycle % TEN == 0:
                 memories.append(measured()[2])
         # the estimate is the service's last chance to be in the middle of something
-        wait_for(lambda: measured()[:2] == (threads, files), 5.0, "as many threads and files as before")
+        wait_for(lambda: measured()[:2] == (threads, files), "as many threads and files as before")
         # what leaks grows with every ten cables; what the service takes once, in one of them
         assert np.median(np.diff(memories)) < NOISE_BYTES * TEN / CYCLES
     kinds = [event.kind for device, event in run.caught.events if device == "loose"]
@@ -87,4 +88,5 @@ def test_fifty_pulled_cables_leave_nothing_behind(tmp_path: Path, monkeypatch: p
         assert station.ring.overflowed == 0
     loose, firm = (run.station(name).driver.counts for name in ("loose", "firm"))
     assert loose.lost >= 3 * (WARM_UP + CYCLES)
-    assert (firm.lost, firm.bad) == (0, 0)
+    # the simulated sensor drops what a reader does not fetch in time on a loaded machine; nothing else may be missing
+    assert firm.lost + firm.bad <= run.service.virtual["firm"].truth.dropped

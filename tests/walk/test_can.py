@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from drivers.sample import AXES
-from tests.walk.rig import Cable, paced, recordings, running, wait_for
+from tests.support.recordings import recordings
+from tests.support.waiting import PATIENCE_S, wait_for
+from tests.walk.rig import Cable, paced, running
 
 OPTIONS = """
 [device.driver.decoder_options]
@@ -76,7 +78,7 @@ speed = "max"
 decoder = "dbc"
 """
     with running(tmp_path, config + OPTIONS) as run:
-        run.join(60.0)  # a replay that has ended ends the service
+        run.join()  # a replay that has ended ends the service
         counts = run.station("imu").driver.counts
     sent = imu_frames(messages)
     valid = np.array([frame.data[0] & 1 for frame in sent], bool)  # two frames of drive-b say that they are not
@@ -131,12 +133,12 @@ bitrate = 500000
 decoder = "dbc"
 """
     with running(tmp_path, config + OPTIONS) as run:
-        assert adapter.opened.wait(10.0)
+        assert adapter.opened.wait(PATIENCE_S)
         # faster than it was, and slow enough that a machine that is late makes good for it
         paced(cable.write, [slcan(message) for message in messages], 1500.0)
         counts = run.station("imu").driver.counts
         sent = len(imu_frames(messages))
-        wait_for(lambda: counts.received + counts.bad >= sent, 10.0, "the last frame")
+        wait_for(lambda: counts.received + counts.bad >= sent, "the last frame")
     assert (counts.received, counts.bad, counts.lost) == (sent, 0, 0)
     want = expected(folder / f"{name}.npz")[:sent]
     assert (np.abs(run.caught.values("imu") - want) <= HALF_BIT).all()

@@ -15,7 +15,8 @@ from monitor.estimate.coefficients import LETTERS, Status
 from monitor.estimate.estimate import Course, Estimate
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
 from monitor.noise.model import NoiseModel
-from tests.walk.rig import Caught, running, wait_for
+from tests.support.waiting import wait_for
+from tests.walk.rig import Caught, running
 
 RATE_HZ = 100.0
 JUMP_S = 250.0
@@ -70,7 +71,7 @@ def walked(tmp_path_factory: pytest.TempPathFactory) -> Kept:
     )
     np.savez(folder / "jump.npz", fs=RATE_HZ, **dict(zip(AXES, values.T, strict=True)))
     with running(folder, CONFIG, kept := Kept()) as service:
-        wait_for(lambda: service.station("gyro").ended, 60.0, "the recording's end")
+        wait_for(lambda: service.station("gyro").ended, "the recording's end")
     return kept
 
 

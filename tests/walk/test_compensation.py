@@ -9,8 +9,10 @@ from drivers.recording import load_samples, save_samples
 from drivers.sample import join
 from drivers.sample_message import unpack
 from monitor.compensating import Request, make
-from tests.monitor.publish.zenoh_world import free_endpoint, session
-from tests.walk.rig import Caught, running, wait_for
+from tests.support.ports import free_endpoint
+from tests.support.waiting import wait_for
+from tests.support.zenoh_sessions import session
+from tests.walk.rig import Caught, running
 
 RATE_HZ, SECONDS, T0 = 100.0, 200.0, 1_763_705_400.0
 SIGMA = 1e-3
@@ -42,8 +44,8 @@ def test_rates_come_out_without_drift_live_as_offline(tmp_path: Path) -> None:
     with session(mode="router", listen=[endpoint]) as listener:
         heard = listener.declare_subscriber("imu/bench-1/compensated", zenoh.handlers.FifoChannel(10_000))
         with running(tmp_path, CONFIG.format(path=recording, endpoint=endpoint), caught) as service:
-            wait_for(lambda: service.service.zenoh.state == "ok" or "bench-1" in caught.rates, 40.0, "zenoh")
-            wait_for(lambda: sum(map(len, caught.rates.get("bench-1", []))) == n, 60.0, "all samples")
+            wait_for(lambda: service.service.zenoh.state == "ok" or "bench-1" in caught.rates, "zenoh")
+            wait_for(lambda: sum(map(len, caught.rates.get("bench-1", []))) == n, "all samples")
         batches = []
         while (one := heard.try_recv()) is not None:
             batches.append(unpack(bytes(one.payload)))

@@ -10,8 +10,10 @@ import pytest
 
 pytest.importorskip("prometheus_client", reason="prometheus-client is not installed")
 
-from tests.monitor.publish.zenoh_world import free_endpoint, session
-from tests.walk.rig import Caught, free_port, running, wait_for
+from tests.support.ports import free_endpoint, free_port
+from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.zenoh_sessions import session
+from tests.walk.rig import Caught, running
 
 RATE_HZ = 100.0
 AT_S = 60.0
@@ -56,14 +58,14 @@ def test_noise_that_rises_past_a_limit_is_told_to_the_users_program(tmp_path: Pa
     tell.chmod(0o755)
     config = CONFIG.format(at_s=AT_S, out=out, endpoint=endpoint, port=(port := free_port()))
     with running(tmp_path, config, caught := Caught()) as service:
-        wait_for(lambda: service.service.zenoh.state == "ok", 20.0, "zenoh")
+        wait_for(lambda: service.service.zenoh.state == "ok", "zenoh")
         with session(connect=[endpoint]) as listener:
             heard = []
             listener.declare_subscriber("site/**", lambda sample: heard.append(bytes(sample.payload)))
-            wait_for(out.exists, 60.0, "the hook")
-            wait_for(lambda: bool(heard), 20.0, "the message")
-        wait_for(lambda: caught.healths["bench"].crossed == ("gz N",), 20.0, "the status")
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=30.0) as answer:
+            wait_for(out.exists, "the hook")
+            wait_for(lambda: bool(heard), "the message")
+        wait_for(lambda: caught.healths["bench"].crossed == ("gz N",), "the status")
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=PATIENCE_S) as answer:
             numbers = answer.read().decode()
     assert (caught.healths["bench"].outputs["hook"], caught.healths["bench"].outputs["metrics"]) == ("ok", "ok")
     assert 'imu_monitor_limits_crossed{device="bench"} 1.0' in numbers

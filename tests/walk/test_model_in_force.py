@@ -20,8 +20,10 @@ from monitor.estimate.model_gap import ModelGap
 from monitor.live_reconcile import Reconciler
 from monitor.service import Service
 from monitor.settings import CONFIG_FOLDER, Config, VirtualTable, ZenohTable
-from tests.monitor.publish.zenoh_world import eventually, free_endpoint, session
-from tests.walk.rig import Caught, wait_for
+from tests.support.ports import free_endpoint
+from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.zenoh_sessions import session
+from tests.walk.rig import Caught
 
 MODEL = CONFIG_FOLDER / "models" / "consumer-mems.toml"
 RATE_HZ = 100.0
@@ -103,27 +105,27 @@ def test_reconcile_is_asked_for_over_zenoh_and_holds_nothing_up(tmp_path: Path) 
     thread = threading.Thread(target=service.run)
     thread.start()
     try:
-        wait_for(lambda: "demo" in caught.gaps and caught.gaps["demo"].samples > 3000, 40.0, "samples")
-        wait_for(lambda: service.zenoh.state == "ok", 20.0, "zenoh")
+        wait_for(lambda: "demo" in caught.gaps and caught.gaps["demo"].samples > 3000, "samples")
+        wait_for(lambda: service.zenoh.state == "ok", "zenoh")
         with session(connect=[endpoint]) as client:
             gaps = client.declare_subscriber("imu/demo/gap", zenoh.handlers.FifoChannel(1000))
-            asked = client.get("imu/demo/command/reconcile", timeout=60.0)
-            wait_for(kept.exists, 20.0, "the program")
-            (again,) = eventually(lambda: list(client.get("imu/demo/command/reconcile", timeout=10.0)))
+            asked = client.get("imu/demo/command/reconcile", timeout=PATIENCE_S)
+            wait_for(kept.exists, "the program")
+            (again,) = wait_for(lambda: list(client.get("imu/demo/command/reconcile", timeout=PATIENCE_S)))
             assert json.loads(bytes(again.err.payload)) == {"error": "busy: reconcile runs already for this device"}
-            (reset,) = eventually(lambda: list(client.get("imu/demo/command/reset", timeout=10.0)))
+            (reset,) = wait_for(lambda: list(client.get("imu/demo/command/reset", timeout=PATIENCE_S)))
             assert reset.ok is not None  # another command is answered meanwhile
             before = caught.healths["demo"].received
-            wait_for(lambda: caught.healths["demo"].received > before + 2000, 20.0, "samples that go on")
+            wait_for(lambda: caught.healths["demo"].received > before + 2000, "samples that go on")
             go.touch()
             (reply,) = list(asked)
             found: dict[str, Any] = json.loads(bytes(reply.ok.payload))
-            told = eventually(lambda: [event for _, event in caught.events if event.kind == "reconciled"])
-            shown = eventually(gaps.try_recv)
+            told = wait_for(lambda: [event for _, event in caught.events if event.kind == "reconciled"])
+            shown = wait_for(gaps.try_recv)
     finally:
         go.touch()
         service.stop()
-        thread.join(20.0)
+        thread.join(PATIENCE_S)
     assert not thread.is_alive()
     assert str(reply.ok.encoding) == topics.JSON
     assert (found["schema"], found["device"], found["verdict"]) == ("imu-monitor/reconcile/1", "demo", "explained")

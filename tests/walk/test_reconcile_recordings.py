@@ -5,7 +5,7 @@ import pytest
 
 from monitor.reconcile.reconcile import Recording, reconcile
 from monitor.reconcile.reconciliation import Reconciliation, Step
-from tests.walk.rig import recordings
+from tests.support.recordings import recordings
 
 pytestmark = pytest.mark.data
 

@@ -10,27 +10,21 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-import zenoh
 
 from drivers.sample_message import unpack
 from monitor import topics
-from tests.walk.rig import Cable, free_port, recordings, running, wait_for
-
-# A message that meets a full queue is dropped after 1 ms by zenoh's default; on a busy machine the thread that
-# empties the queue may not run that soon. Tests that count batches wait longer.
-PATIENCE = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
-PATIENT_US = 1_000_000
+from tests.support.ports import free_endpoint
+from tests.support.recordings import recordings
+from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.zenoh_sessions import DROP_WAIT, PATIENT_US
+from tests.support.zenoh_sessions import router as zenoh_router
+from tests.walk.rig import Cable, running
 
 
 @pytest.fixture
 def router() -> Iterator[str]:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    config = zenoh.Config()
-    config.insert_json5("mode", '"router"')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("listen/endpoints", f'["{endpoint}"]')
-    config.insert_json5(PATIENCE, str(PATIENT_US))
-    with zenoh.open(config):
+    endpoint = free_endpoint()
+    with zenoh_router(endpoint):
         yield endpoint
 
 
@@ -56,8 +50,8 @@ mode = "none"
     with running(tmp_path, config) as run:
         counts = run.station("run1").driver.counts
         command = [sys.executable, "-m", "tests.walk.publisher", str(path), "lab/run1", router, "40000"]
-        subprocess.run(command, check=True, timeout=60)
-        wait_for(lambda: counts.received == 1_000_000, 20.0, "the last sample")
+        subprocess.run(command, check=True, timeout=PATIENCE_S)
+        wait_for(lambda: counts.received == 1_000_000, "the last sample")
     assert (counts.received, counts.bad, counts.lost, run.station("run1").ring.overflowed) == (1_000_000, 0, 0, 0)
     curve = run.caught.estimates["run1"].curve
     shared = [(i, table[int(m)]) for i, m in enumerate(curve.factors) if int(m) in table]
@@ -125,14 +119,14 @@ class Listener:
     def close(self) -> None:
         assert self._process.stdin is not None
         self._process.stdin.close()
-        assert self._process.wait(10.0) == 0
+        assert self._process.wait(PATIENCE_S) == 0
         assert self._process.stdout is not None
         self._process.stdout.close()
 
 
 def test_a_client_behind_a_router_receives_every_key(tmp_path: Path, router: str) -> None:
     patient = tmp_path / "patient.json5"
-    *tables, key = PATIENCE.split("/")
+    *tables, key = DROP_WAIT.split("/")
     patient.write_text("".join(f"{{{table}:" for table in tables) + f"{{{key}:{PATIENT_US}}}" + "}" * len(tables))
     config = f"""[[device]]
 name = "bench-1"
@@ -142,7 +136,7 @@ driver = {{ link = "virtual" }}
 [zenoh]
 config = "{patient}"
 mode = "peer"
-listen = ["tcp/127.0.0.1:{free_port()}"]
+listen = ["{free_endpoint()}"]
 connect = ["{router}"]
 [viewer]
 mode = "none"
@@ -152,16 +146,16 @@ mode = "none"
     listener = Listener(router)
     with running(tmp_path, config) as run:
         imu = run.service.virtual["bench-1"]
-        wait_for(lambda: listener.hears(lambda: "imu/bench-1/coefficients" in listener.heard), 20.0, "coefficients")
+        wait_for(lambda: listener.hears(lambda: "imu/bench-1/coefficients" in listener.heard), "coefficients")
         assert listener.alive == [("imu/bench-1/alive", True)]
         imu.unplug()
-        wait_for(lambda: listener.hears(lambda: len(listener.alive) == 2), 5.0, "the token to go")
+        wait_for(lambda: listener.hears(lambda: len(listener.alive) == 2), "the token to go")
         imu.plug()
-        wait_for(lambda: listener.hears(lambda: len(listener.alive) == 3), 10.0, "the token to come back")
+        wait_for(lambda: listener.hears(lambda: len(listener.alive) == 3), "the token to come back")
         assert listener.alive[1:] == [("imu/bench-1/alive", False), ("imu/bench-1/alive", True)]
-        wait_for(lambda: listener.hears(lambda: len(events(listener)) >= 2), 5.0, "both events")
+        wait_for(lambda: listener.hears(lambda: len(events(listener)) >= 2), "both events")
         listener.poll("reset", "jump")
-        wait_for(lambda: listener.hears(lambda: keys <= set(listener.heard)), 10.0, "every key")
+        wait_for(lambda: listener.hears(lambda: keys <= set(listener.heard)), "every key")
     listener.poll()
     listener.close()
     assert set(listener.heard) == keys
@@ -203,13 +197,13 @@ mode = "none"
 """
     with running(tmp_path, config) as run:
         station = run.station("board")
-        wait_for(lambda: station.driver.link._port is not None, 10.0, "the port")
+        wait_for(lambda: station.driver.link._port is not None, "the port")
         cable.write(b"0.1\n0.2\n0.3\n0.")
-        wait_for(lambda: station.driver.counts.received == 2, 5.0, "two whole lines behind the first")
+        wait_for(lambda: station.driver.counts.received == 2, "two whole lines behind the first")
         cable.pull()
-        wait_for(lambda: station.driver.state == "lost", 5.0, "the loss")
+        wait_for(lambda: station.driver.state == "lost", "the loss")
         cable.plug()
-        wait_for(lambda: station.driver.link._port is not None, 10.0, "the port again")
+        wait_for(lambda: station.driver.link._port is not None, "the port again")
         cable.write(b"4\n0.5\n0.6\n")
-        wait_for(lambda: station.driver.counts.received == 4, 5.0, "two more lines")
+        wait_for(lambda: station.driver.counts.received == 4, "two more lines")
     assert run.caught.values("board")[:, 0].tolist() == [0.2, 0.3, 0.5, 0.6]

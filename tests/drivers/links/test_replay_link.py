@@ -1,7 +1,6 @@
 """Replay: every kind of file, its pace, its end, and files that are damaged."""
 
 import gzip
-import time
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +35,25 @@ def read_all(link: Link) -> tuple[list[Chunk], str]:
     finally:
         link.close()
     raise AssertionError("no end")
+
+
+class Clock:
+    """The clock of a replay: it advances only while the replay waits."""
+
+    def __init__(self, link: Link, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now_s = 0.0
+        monkeypatch.setattr(replay_link, "time", self)
+        monkeypatch.setattr(link._closing, "wait", self._wait)  # type: ignore[attr-defined]
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def monotonic_ns(self) -> int:
+        return round(self.now_s * 1e9)
+
+    def _wait(self, seconds: float) -> bool:
+        self.now_s += seconds
+        return False
 
 
 def write_recording(path: Path, n: int = 1000, rate_hz: float = 100.0) -> None:
@@ -94,15 +112,18 @@ def test_rate_of_a_recording_without_times(tmp_path: Path) -> None:
     assert got.t_ns.tolist() == [0, 20_000_000, 40_000_000]
 
 
-def test_recorded_pace_and_factor(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("speed", "expected_s"), [("recorded", 0.99), (4, 0.2475)])
+def test_recorded_pace_and_factor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, speed: str | float, expected_s: float
+) -> None:
     path = tmp_path / "r.npz"
     write_recording(path, n=100)
-    for speed, expected_s in (("recorded", 0.99), (4, 0.2475)):
-        start = time.monotonic()
-        chunks, _ = read_all(build(path, speed))
-        assert expected_s <= time.monotonic() - start < expected_s + 0.5
-        # pieces of 20 ms of the reader's time, not one lump
-        assert len(chunks) >= 10
+    link = build(path, speed)
+    clock = Clock(link, monkeypatch)
+    chunks, _ = read_all(link)
+    assert clock.now_s == pytest.approx(expected_s, abs=1e-6)
+    # pieces of 20 ms of the reader's time, not one lump
+    assert len(chunks) >= 10
 
 
 def test_each_opening_starts_anew(tmp_path: Path) -> None:
@@ -181,12 +202,13 @@ def test_a_damaged_line_ends_the_log(tmp_path: Path) -> None:
     assert "damaged" in end
 
 
-def test_logs_keep_their_pace(tmp_path: Path) -> None:
+def test_logs_keep_their_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "frames.csv.gz"
     write_frames(path)
-    start = time.monotonic()
-    chunks, _ = read_all(build(path, "recorded"))
-    assert 0.39 <= time.monotonic() - start < 0.9
+    link = build(path, "recorded")
+    clock = Clock(link, monkeypatch)
+    chunks, _ = read_all(link)
+    assert clock.now_s == pytest.approx(0.39, abs=1e-6)
     assert len(chunks) == len(FRAMES)
 
 
@@ -204,19 +226,17 @@ def test_bytes(tmp_path: Path, name: str) -> None:
     assert b"".join(c.data for c in chunks) == data
 
 
-def test_bytes_at_a_rate(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("speed", "expected_s"), [("recorded", 0.5), ("max", 0.0)])
+def test_bytes_at_a_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, speed: str, expected_s: float) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(bytes(10_000))
-    start = time.monotonic()
-    paced, _ = read_all(build(path, "recorded", bytes_per_second=20_000.0))
-    assert 0.5 <= time.monotonic() - start < 1.0
-    start = time.monotonic()
-    at_once, _ = read_all(build(path, "max", bytes_per_second=20_000.0))
-    assert time.monotonic() - start < 0.4
-    for chunks in (paced, at_once):
-        # the times are those of the line, whatever the pace of reading
-        spacing = np.diff([c.t_ns for c in chunks]) / [len(c.data) for c in chunks[1:]]
-        assert spacing == pytest.approx(np.full(len(chunks) - 1, 1e9 / 20_000), rel=1e-4)
+    link = build(path, speed, bytes_per_second=20_000.0)
+    clock = Clock(link, monkeypatch)
+    chunks, _ = read_all(link)
+    assert clock.now_s == pytest.approx(expected_s, abs=1e-6)
+    # the times are those of the line, whatever the pace of reading
+    spacing = np.diff([c.t_ns for c in chunks]) / [len(c.data) for c in chunks[1:]]
+    assert spacing == pytest.approx(np.full(len(chunks) - 1, 1e9 / 20_000), rel=1e-4)
 
 
 # --- what is wrong -------------------------------------------------------------------------------

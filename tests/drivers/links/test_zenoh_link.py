@@ -1,7 +1,6 @@
 """zenoh: a router in this process, everything on loopback, no scouting."""
 
 import json
-import socket
 import subprocess
 import sys
 import textwrap
@@ -18,6 +17,10 @@ from drivers.errors import ConfigError, LinkUnavailable
 from drivers.links import zenoh_link
 from drivers.links.base import Link
 from drivers.sample import Chunk
+from tests.support.ports import free_endpoint
+from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.zenoh_sessions import router as open_router
+from tests.support.zenoh_sessions import session
 
 
 def build(**keys: Any) -> Link:
@@ -26,32 +29,17 @@ def build(**keys: Any) -> Link:
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{s.getsockname()[1]}"
-
-
-def open_router(endpoint: str) -> Any:
-    config = zenoh.Config()
-    keys = {"mode": "router", "listen/endpoints": [endpoint], "scouting/multicast/enabled": False}
-    for key, value in keys.items():
-        config.insert_json5(key, json.dumps(value))
-    return zenoh.open(config)
+    return free_endpoint()
 
 
 @pytest.fixture
 def router(endpoint: str) -> Iterator[Any]:
-    with open_router(endpoint) as session:
-        yield session
+    with open_router(endpoint) as opened:
+        yield opened
 
 
 def until_it_comes(link: Link, put: Any) -> list[Chunk]:
-    for _ in range(200):
-        put()
-        chunks = link.read(0.05)
-        if chunks:
-            return chunks
-    raise AssertionError("nothing came")
+    return wait_for(lambda: put() or link.read(0.05), "a message") or []
 
 
 def test_payload_and_attachment(router: Any, endpoint: str) -> None:
@@ -73,9 +61,12 @@ def test_messages_come_in_order_and_none_is_lost(router: Any, endpoint: str) -> 
     for i in range(1000):
         router.put("k", i.to_bytes(4, "little"), congestion_control=zenoh.CongestionControl.BLOCK)
     got: list[bytes] = []
-    deadline = time.monotonic() + 20.0
-    while len(got) < 1000 and time.monotonic() < deadline:
-        got += [c.data for c in link.read(0.1) or () if c.data != b"ready"]
+
+    def read() -> bool:
+        got.extend(c.data for c in link.read(0.1) or () if c.data != b"ready")
+        return len(got) >= 1000
+
+    wait_for(read, lambda: f"1000 messages, {len(got)} came")
     link.close()
     assert got == [i.to_bytes(4, "little") for i in range(1000)]
 
@@ -84,8 +75,8 @@ def test_a_peer_finds_a_router_that_comes_later(endpoint: str) -> None:
     link = build(key="k", mode="peer", connect=[endpoint])
     link.open()
     assert link.read(0.1) is None
-    with open_router(endpoint) as session:
-        assert until_it_comes(link, lambda: session.put("k", b"x"))
+    with open_router(endpoint) as opened:
+        assert until_it_comes(link, lambda: opened.put("k", b"x"))
     link.close()
 
 
@@ -102,13 +93,9 @@ def test_a_busy_listening_port(router: Any, endpoint: str) -> None:
 
 
 def test_a_peer_behind_the_same_router_is_heard(router: Any, endpoint: str) -> None:
-    config = zenoh.Config()
-    for key, value in {"mode": "peer", "connect/endpoints": [endpoint], "listen/endpoints": []}.items():
-        config.insert_json5(key, json.dumps(value))
-    config.insert_json5("scouting/multicast/enabled", "false")
     link = build(key="k", connect=[endpoint])
     link.open()
-    with zenoh.open(config) as publisher:
+    with session(mode="peer", connect=[endpoint]) as publisher:
         assert until_it_comes(link, lambda: publisher.put("k", b"x"))[0].data == b"x"
     link.close()
 
@@ -120,9 +107,7 @@ def test_long_messages_that_nobody_reads_give_way(router: Any, endpoint: str) ->
     for i in range(12):
         router.put("k", bytes([i]) * 20_000_000, congestion_control=zenoh.CongestionControl.BLOCK)
         time.sleep(0.05)
-    end = time.monotonic() + 10.0
-    while link._waiting[-1].data[:1] != b"\x0b" and time.monotonic() < end:
-        time.sleep(0.05)
+    wait_for(lambda: link._waiting[-1].data[:1] == b"\x0b", "the last message")
     held = sum(len(chunk.data) for chunk in link._waiting)
     assert held <= zenoh_link.WAITING_BYTES
     assert link.read(0.1)
@@ -180,14 +165,12 @@ def test_a_process_that_forgets_to_close_still_ends(endpoint: str) -> None:
         assert link.read(0.1) is None
         print("done", flush=True)
     """
-    start = time.monotonic()
     ran = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(program)],
         cwd=Path(zenoh_link.__file__).parents[2],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE_S,
         check=True,
     )
     assert ran.stdout == "done\n"
-    assert time.monotonic() - start < 30.0

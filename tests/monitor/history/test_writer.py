@@ -6,8 +6,7 @@ import sqlite3
 import subprocess
 import sys
 import textwrap
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from monitor.history.store import PastEvent, Store, reading
 from monitor.history.writer import Writer
 from tests.monitor.history.kills import ALL
 from tests.monitor.history.made import row
+from tests.support.waiting import PATIENCE_S, wait_for
 
 T0 = 1_760_400_000
 RNG = np.random.default_rng(1)
@@ -31,13 +31,6 @@ def started(path: Path) -> Iterator[Writer]:
         yield writer
     finally:
         writer.close()
-
-
-def eventually(true: Callable[[], bool], within_s: float = 30.0) -> None:
-    until_s = time.monotonic() + within_s
-    while not true():
-        assert time.monotonic() < until_s, "it did not come to that in time"
-        time.sleep(0.01)
 
 
 def count(path: Path) -> tuple[int, int]:
@@ -69,10 +62,10 @@ def test_a_damaged_file_is_left_alone_and_history_goes_on_when_it_is_moved(
     path.write_bytes(b"this was a history once" * 1000)
     with started(path) as writer:
         fill(writer, 10)
-        eventually(lambda: "damaged" in writer.state)
+        wait_for(lambda: "damaged" in writer.state)
         assert path.read_bytes().startswith(b"this was a history once")
         path.rename(tmp_path / "aside")
-        eventually(lambda: writer.state == "ok")
+        wait_for(lambda: writer.state == "ok")
     assert count(path) == (10, 10)
 
 
@@ -83,9 +76,9 @@ def test_a_queue_that_is_full_drops_and_counts(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(writers, "RETRY_S", 0.05)
     with started(folder / "h.sqlite") as writer:
         fill(writer, 40)
-        eventually(lambda: "trying again (30 results not kept)" in writer.state)
+        wait_for(lambda: "trying again (30 results not kept)" in writer.state)
         folder.unlink()
-        eventually(lambda: writer.written == 50)
+        wait_for(lambda: writer.written == 50)
         assert writer.state == "ok, but 30 results not kept"
     assert count(folder / "h.sqlite") == (25, 25)
 
@@ -98,9 +91,9 @@ def test_a_file_that_is_held_by_another_is_waited_for(tmp_path: Path, monkeypatc
     with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as other, started(path) as writer:
         other.execute("BEGIN IMMEDIATE")
         fill(writer, 5)
-        eventually(lambda: "locked" in writer.state)
+        wait_for(lambda: "locked" in writer.state)
         other.execute("COMMIT")
-        eventually(lambda: writer.state == "ok")
+        wait_for(lambda: writer.state == "ok")
     assert count(path) == (5, 5)
 
 
@@ -110,27 +103,32 @@ def test_a_full_disk_keeps_nothing_half_and_resumes(tmp_path: Path) -> None:
         import resource, signal, time
         from pathlib import Path
         from monitor.history import writer as writers
-        from tests.monitor.history.test_writer import count, eventually, fill
+        from tests.monitor.history.test_writer import count, fill
+        from tests.support.waiting import wait_for
         writers.RETRY_S = 0.05
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         path = Path({str(tmp_path / "h.sqlite")!r})
         writer = writers.Writer(path, lambda: 0.0)
         writer.start()
         fill(writer, 20)
-        eventually(lambda: writer.written == 40)
+        wait_for(lambda: writer.written == 40)
         resource.setrlimit(resource.RLIMIT_FSIZE, (path.with_name("h.sqlite-wal").stat().st_size + 5000, -1))
         fill(writer, 400, 20)
-        eventually(lambda: "trying again" in writer.state)
+        wait_for(lambda: "trying again" in writer.state)
         rows, events = count(path)
         assert rows == events, (rows, events)
         assert rows < 420
         resource.setrlimit(resource.RLIMIT_FSIZE, (-1, -1))
-        eventually(lambda: writer.written == 840)
+        wait_for(lambda: writer.written == 840)
         writer.close()
         print(writer.state, count(path))
     """
     assert resource.RLIM_INFINITY == -1
     done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-c", textwrap.dedent(program)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
     )
     assert (done.returncode, done.stdout.splitlines()[-1:]) == (0, ["ok (420, 420)"]), done.stderr

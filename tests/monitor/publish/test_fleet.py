@@ -19,7 +19,9 @@ from monitor.publish.zenoh_in import Message, ZenohIn
 from monitor.publish.zenoh_out import ZenohOut
 from monitor.settings import ZenohTable
 from tests.monitor.publish import made
-from tests.monitor.publish.zenoh_world import eventually, free_endpoint, router
+from tests.support.ports import free_endpoint
+from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.zenoh_sessions import router
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
@@ -51,7 +53,7 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path) -
         arriving.start()
         viewer.start()
         looking.start()
-        eventually(lambda: out.state == arriving.state == viewer.state == "ok")
+        wait_for(lambda: out.state == arriving.state == viewer.state == "ok")
         t_s, values, temperature_c = made.samples(1.76e9, 0.1)
         rows = block((t_s * 1e9).astype("int64"), values, temperature_c)
         begun_s = time.monotonic()
@@ -64,10 +66,10 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path) -
                 out.put(topics.SAMPLES, device, pack(device, 10, rows))
             time.sleep(0.2)
         out.put(topics.EVENT, "tail", message.event("tail", 1.76e9, 5, Event("moved", 0, "gz moved", "gz"), None))
-        eventually(lambda: len(fleet.board.devices(time.monotonic())) == 2)
+        wait_for(lambda: len(fleet.board.devices(time.monotonic())) == 2)
         time.sleep(1.5)
         stop.set()
-        looking.join(10.0)
+        looking.join(PATIENCE_S)
     entities = read(path)
     assert {"/imu/nose/samples/gz", "/imu/nose/allan/gx", "/imu/nose/coefficients/N/gz", "/overview"} <= entities.keys()
     assert not [name for name in entities if name.startswith("/imu/tail")]

@@ -2,7 +2,6 @@
 
 import re
 import sys
-import time
 from html import unescape
 from html.parser import HTMLParser
 
@@ -125,13 +124,8 @@ def test_the_page_is_complete_in_itself_and_escaped() -> None:
     assert not [one for one in re.findall(r"<svg.*?</svg>", text, flags=re.S) if "nan" in one]
 
 
-def test_two_steps_are_written_quickly_and_stay_small() -> None:
-    made = samples.explained()
-    page(made)  # Jinja2 is imported, the template compiled
-    begun = time.perf_counter()
-    text = page(made)
-    assert time.perf_counter() - begun < 2.0
-    assert len(text.encode()) < 1_000_000
+def test_two_steps_stay_small() -> None:
+    assert len(page(samples.explained()).encode()) < 1_000_000
 
 
 def test_the_same_reconciliation_gives_the_same_page() -> None:

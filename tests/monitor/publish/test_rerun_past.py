@@ -17,7 +17,8 @@ pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 from monitor.publish.rerun_past import points
 from monitor.publish.rerun_view import RerunView
 from monitor.publish.viewer import DeviceInfo, ViewerSettings
-from tests.monitor.publish.test_rerun_view import column, read, wait_for
+from tests.monitor.publish.test_rerun_view import column, read
+from tests.support.waiting import wait_for
 
 T0 = 1_760_000_040
 
@@ -63,7 +64,7 @@ def test_the_view_opens_on_what_was(tmp_path: Path) -> None:
 
     view = RerunView(ViewerSettings(str(path)), [DeviceInfo("bench-1"), DeviceInfo("bench-2")], recall)
     view.start()
-    assert wait_for(lambda: view.state == "ok" and len(asked) == 2)
+    wait_for(lambda: view.state == "ok" and len(asked) == 2)
     view.close(10.0)
     cells = read(path)
     for axis in AXES:

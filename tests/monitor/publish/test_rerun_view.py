@@ -8,7 +8,8 @@ import sys
 import textwrap
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ from monitor.publish import rerun_view
 from monitor.publish.rerun_view import MISSING, RerunView
 from monitor.publish.viewer import DeviceInfo, ViewerSettings
 from tests.monitor.publish import made
+from tests.support.ports import free_port
+from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
@@ -26,21 +29,6 @@ from monitor.publish import rerun_sinks
 
 DEVICE = [DeviceInfo("bench-1", "stim300 on a test")]
 T0 = 1.76e9
-
-
-def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> bool:
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if condition():
-            return True
-        time.sleep(0.02)
-    return condition()
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return int(s.getsockname()[1])
 
 
 @pytest.fixture
@@ -51,28 +39,26 @@ def server() -> Iterator[rerun_sinks.Child]:
         ["--serve-web", "--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(web_port)]
     )
     child.port = port  # type: ignore[attr-defined]
-    assert wait_for(lambda: rerun_sinks.is_rerun(port))
+    wait_for(lambda: rerun_sinks.is_rerun(port))
     yield child
     child.kill()
     child.end()
 
 
-def feed(view: RerunView, i: int) -> float:
-    """A tenth of a second of everything; returns how long the calls took, s."""
+def feed(view: RerunView, i: int) -> None:
+    """Pass a tenth of a second of everything to the view. The calls never wait for a viewer."""
     t = T0 + 0.1 * i
     samples, estimate, health = made.samples(t, 0.1), made.estimate(t, seconds=60 + i, seed=i), made.health()
-    started = time.perf_counter()
     view.samples("bench-1", *samples)
     view.estimate("bench-1", t, estimate)
     view.health("bench-1", t, health)
-    return time.perf_counter() - started
 
 
 def test_a_recording_holds_what_was_shown(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     view = RerunView(ViewerSettings(mode=str(path)), DEVICE)
     view.start()
-    assert wait_for(lambda: view.state == "ok"), view.state
+    wait_for(lambda: view.state == "ok")
     t, values, temperature_c = made.samples(T0, 1.0)
     estimate = made.estimate(T0 + 1)
     view.samples("bench-1", t, values, temperature_c)
@@ -103,7 +89,7 @@ def test_the_gap_has_a_course_and_the_model_a_line(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     view = RerunView(ViewerSettings(mode=str(path)), [DeviceInfo("bench-1", has_model=True), DeviceInfo("plain")])
     view.start()
-    assert wait_for(lambda: view.state == "ok"), view.state
+    wait_for(lambda: view.state == "ok")
     looks = [made.look(made.estimate(T0 + i, seed=i), scale=1.1) for i in range(3)]
     for i, look in enumerate(looks):
         view.gap("bench-1", T0 + 0.1 * i, look)
@@ -127,7 +113,7 @@ def test_means_have_a_course_beside_what_was_expected(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     view = RerunView(ViewerSettings(mode=str(path)), [DeviceInfo("bench-1", has_thermal=True)])
     view.start()
-    assert wait_for(lambda: view.state == "ok"), view.state
+    wait_for(lambda: view.state == "ok")
     for i in range(3):
         view.thermal("bench-1", T0 + 600.0 * i, made.thermal_look(bias=1e-4 * (i + 1)))
     view.close()
@@ -173,18 +159,14 @@ def column(cells: dict[str, list[object]], name: str) -> np.ndarray:
 def test_a_frozen_viewer_delays_nobody_and_is_said(server: rerun_sinks.Child) -> None:
     view = RerunView(ViewerSettings("native", port=server.port), DEVICE)  # type: ignore[attr-defined]
     view.start()
-    assert wait_for(lambda: view.state == "ok"), view.state
+    wait_for(lambda: view.state == "ok")
     server.signal(signal.SIGSTOP)
-    slowest = 0.0
-    for i in range(600):
-        slowest = max(slowest, feed(view, i))
-        if view.state.startswith("stalled"):
-            break
-        time.sleep(0.02)
-    assert view.state.startswith("stalled"), view.state
-    assert slowest < 0.05
+    given = count()
+    # the server answers nothing from here on: a call that waited for it would not return
+    wait_for(lambda: feed(view, next(given)) or view.state.startswith("stalled"), "the view to say that it stalls")
+    feed(view, next(given))
     server.signal(signal.SIGCONT)
-    assert wait_for(lambda: view.state == "ok"), view.state
+    wait_for(lambda: view.state == "ok")
     view.close()
 
 
@@ -192,15 +174,13 @@ def test_a_stalled_view_counts_what_it_drops(server: rerun_sinks.Child, monkeypa
     monkeypatch.setattr(rerun_view, "BACKLOG_BYTES", 100_000)
     view = RerunView(ViewerSettings("native", port=server.port), DEVICE)  # type: ignore[attr-defined]
     view.start()
-    assert wait_for(lambda: view.state == "ok"), view.state
+    wait_for(lambda: view.state == "ok")
     server.signal(signal.SIGSTOP)
-    assert wait_for(lambda: view.state.startswith("stalled")), view.state
+    wait_for(lambda: view.state.startswith("stalled"))
     for i in range(100):
         feed(view, i)
-    assert wait_for(lambda: view.state.startswith("stalled") and "(0 dropped)" not in view.state), view.state
-    started = time.monotonic()
-    view.close(1.0)
-    assert time.monotonic() - started < 2.0
+    wait_for(lambda: view.state.startswith("stalled") and "(0 dropped)" not in view.state)
+    view.close(1.0)  # returns, although the viewer stays frozen
 
 
 def test_a_process_with_a_frozen_viewer_exits(server: rerun_sinks.Child) -> None:
@@ -221,14 +201,13 @@ def test_a_process_with_a_frozen_viewer_exits(server: rerun_sinks.Child) -> None
             time.sleep(0.005)
         while not view.state.startswith("stalled"):
             time.sleep(0.05)
-        started = time.monotonic()
         view.close(1.0)
-        print("closed after", time.monotonic() - started, flush=True)
+        print("closed", flush=True)
     """  # type: ignore[attr-defined]
     done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(program)], timeout=60, capture_output=True, text=True, check=True
+        [sys.executable, "-c", textwrap.dedent(program)], timeout=PATIENCE_S, capture_output=True, text=True, check=True
     )
-    assert float(done.stdout.split()[-1]) < 2.0
+    assert done.stdout == "closed\n"
 
 
 def test_a_viewer_that_dies_is_said_and_joined_again(
@@ -239,15 +218,15 @@ def test_a_viewer_that_dies_is_said_and_joined_again(
     port = server.port  # type: ignore[attr-defined]
     view = RerunView(ViewerSettings("native", port=port), DEVICE)
     view.start()
-    assert wait_for(lambda: view.state == "ok"), view.state
+    wait_for(lambda: view.state == "ok")
     server.kill()
-    assert wait_for(lambda: view.state != "ok")
-    assert feed(view, 1) < 0.05
+    wait_for(lambda: view.state != "ok")
+    feed(view, 1)
     again = rerun_sinks.Child(
         ["--serve-web", "--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(free_port())]
     )
     try:
-        assert wait_for(lambda: view.state == "ok"), view.state
+        wait_for(lambda: view.state == "ok")
         view.close()
     finally:
         again.end()
@@ -270,7 +249,7 @@ with socket.create_server(("127.0.0.1", port)) as server:
     monkeypatch.setattr(rerun_sinks, "viewer_program", lambda: program)
     view = RerunView(ViewerSettings("native", port=free_port()), DEVICE)
     view.start()
-    assert wait_for(lambda: view.state == rerun_sinks.CLOSED), view.state
+    wait_for(lambda: view.state == rerun_sinks.CLOSED)
     time.sleep(0.5)  # ten more tries
     assert view.state == rerun_sinks.CLOSED
     assert starts.read_text() == "started\n"
@@ -285,7 +264,7 @@ def test_the_page_takes_the_next_free_port_and_leaves_nothing_behind(monkeypatch
         busy = int(holder.getsockname()[1])
         view = RerunView(ViewerSettings("web", port=busy, web_port=free_port()), DEVICE)
         view.start()
-        assert wait_for(lambda: view.state == "ok"), view.state
+        wait_for(lambda: view.state == "ok")
         assert f"{busy}%2Fproxy" not in view.url
         assert view.url.startswith("http://127.0.0.1:")
         port = int(view.url.rsplit("%3A", 1)[1].split("%2F")[0])
@@ -302,14 +281,14 @@ def test_a_killed_daemon_takes_its_viewer_along() -> None:
         from monitor.publish.rerun_view import RerunView
         from monitor.publish.viewer import DeviceInfo, ViewerSettings
         RerunView(ViewerSettings("web", {port}, {web_port}), [DeviceInfo("d")]).start()
-        time.sleep(60.0)
+        time.sleep({FOREVER_S})
     """
     with subprocess.Popen([sys.executable, "-c", textwrap.dedent(program)]) as daemon:
         try:
-            assert wait_for(lambda: rerun_sinks.is_rerun(port))
+            wait_for(lambda: rerun_sinks.is_rerun(port))
         finally:
             daemon.kill()
-    assert wait_for(lambda: not rerun_sinks.listens(port), 5.0)
+    wait_for(lambda: not rerun_sinks.listens(port))
 
 
 def test_a_port_that_another_program_holds_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -319,7 +298,7 @@ def test_a_port_that_another_program_holds_is_said(monkeypatch: pytest.MonkeyPat
         port = int(holder.getsockname()[1])
         view = RerunView(ViewerSettings("native", port=port), DEVICE)
         view.start()
-        assert wait_for(lambda: "busy" in view.state), view.state
+        wait_for(lambda: "busy" in view.state)
         assert view.state == f"cannot listen on {port}: busy"
         view.close()
 
@@ -327,7 +306,7 @@ def test_a_port_that_another_program_holds_is_said(monkeypatch: pytest.MonkeyPat
 def test_a_file_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     view = RerunView(ViewerSettings(mode=str(tmp_path / "absent" / "run.rrd")), DEVICE)
     view.start()
-    assert wait_for(lambda: view.state.startswith("cannot write")), view.state
+    wait_for(lambda: view.state.startswith("cannot write"))
     view.close()
 
 
@@ -335,8 +314,8 @@ def test_without_rerun_the_service_goes_on(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setitem(sys.modules, "rerun", None)  # an import then fails as if it were not there
     view = RerunView(ViewerSettings("web"), DEVICE)
     view.start()
-    assert wait_for(lambda: view.state == MISSING), view.state
-    assert feed(view, 1) < 0.05
+    wait_for(lambda: view.state == MISSING)
+    feed(view, 1)
     view.close()
 
 

@@ -26,7 +26,8 @@ from monitor.publish.zenoh_in import ZenohIn
 from monitor.publish.zenoh_out import ZenohOut
 from monitor.settings import CONFIG_FOLDER, ZenohTable
 from tests.monitor.publish import made
-from tests.monitor.publish.zenoh_world import eventually, free_endpoint
+from tests.support.ports import free_endpoint
+from tests.support.waiting import PATIENCE_S, wait_for
 
 SECURE = CONFIG_FOLDER / "secure"
 PASSWORD = "correct horse"
@@ -124,7 +125,7 @@ def daemon(file: Path) -> Iterator[ZenohOut]:
 
 def replies(file: Path, key: str) -> list[bytes]:
     with zenoh.open(configuration({"mode": "client"}, file)) as session:
-        return [bytes(reply.ok.payload) for reply in session.get(key, timeout=5.0) if reply.ok]
+        return [bytes(reply.ok.payload) for reply in session.get(key, timeout=PATIENCE_S) if reply.ok]
 
 
 def heard(arriving: ZenohIn, so_far: set[str]) -> set[str]:
@@ -136,7 +137,7 @@ def refusal(file: Path) -> str:
     """What a watcher says who does not get in; nothing reaches it."""
     with contextlib.closing(ZenohIn("imu/**", file=file)) as arriving:
         arriving.start()
-        said = eventually(lambda: ": " in arriving.state and arriving.state)
+        said = wait_for(lambda: ": " in arriving.state and arriving.state)
         assert arriving.take(0.0) == []
     assert said.count("\n") == 0
     return str(said)
@@ -147,23 +148,23 @@ def refusal(file: Path) -> str:
 
 def test_who_has_the_right_certificate_watches_and_commands(by_certificate: World) -> None:
     with daemon(by_certificate.file("daemon.json5")) as out:
-        eventually(lambda: out.state == "ok")
+        wait_for(lambda: out.state == "ok")
         for who in ("reader", "operator"):
             with contextlib.closing(ZenohIn("imu/**", file=by_certificate.certified(who))) as arriving:
                 arriving.start()
                 so_far: set[str] = set()
-                eventually(lambda a=arriving, s=so_far: heard(a, s) >= {"imu/nose/status", "imu/nose/alive"})
+                wait_for(lambda a=arriving, s=so_far: heard(a, s) >= {"imu/nose/status", "imu/nose/alive"})
                 assert arriving.state == "ok"
         operator = by_certificate.certified("operator")
-        assert eventually(lambda: replies(operator, "imu/nose/command/reset")) == [b'"done"']
+        assert wait_for(lambda: replies(operator, "imu/nose/command/reset")) == [b'"done"']
 
 
 @pytest.mark.parametrize("key", ["imu/nose/command/reset", "imu/*/command/*", "imu/**", "**"])
 def test_a_reader_is_refused_commands(by_certificate: World, key: str) -> None:
     with daemon(by_certificate.file("daemon.json5")) as out:
-        eventually(lambda: out.state == "ok")
+        wait_for(lambda: out.state == "ok")
         operator = by_certificate.certified("operator")
-        eventually(lambda: replies(operator, "imu/nose/command/reset"))
+        wait_for(lambda: replies(operator, "imu/nose/command/reset"))
         assert replies(by_certificate.certified("reader"), key) == []
         assert out.commands.empty()
 
@@ -182,7 +183,7 @@ def test_a_reader_cannot_publish(by_certificate: World) -> None:
             nose.put("imu/nose/status", b"true")
             return "imu/nose/status" in heard(arriving, so_far)
 
-        eventually(publish)
+        wait_for(publish)
         for _ in range(5):
             publish()
         assert so_far == {"imu/nose/status"}
@@ -204,7 +205,7 @@ def test_the_wrong_certificate_is_refused_and_told(by_certificate: World, swaps:
     assert why in said
     assert said.startswith(json.loads(configuration({}, file).get_json("connect/endpoints"))[0])
     with daemon(file) as out:  # the daemon's status says the same
-        eventually(lambda: why in out.state)
+        wait_for(lambda: why in out.state)
 
 
 # --- user and password
@@ -212,13 +213,13 @@ def test_the_wrong_certificate_is_refused_and_told(by_certificate: World, swaps:
 
 def test_who_knows_the_password_watches_and_commands_by_its_right(by_password: World) -> None:
     with daemon(by_password.user("nose", USERS["nose"])) as out:
-        eventually(lambda: out.state == "ok")
+        wait_for(lambda: out.state == "ok")
         reader, operator = (by_password.user(who, USERS[who]) for who in ("reader", "operator"))
         with contextlib.closing(ZenohIn("imu/**", file=reader)) as arriving:
             arriving.start()
             so_far: set[str] = set()
-            eventually(lambda: "imu/nose/status" in heard(arriving, so_far))
-        assert eventually(lambda: replies(operator, "imu/nose/command/reset")) == [b'"done"']
+            wait_for(lambda: "imu/nose/status" in heard(arriving, so_far))
+        assert wait_for(lambda: replies(operator, "imu/nose/command/reset")) == [b'"done"']
         assert replies(reader, "imu/nose/command/reset") == []
 
 
@@ -231,9 +232,9 @@ def test_the_wrong_password_is_refused_and_not_repeated(by_password: World, user
 
 def test_the_past_is_told_to_those_who_get_in_alone(by_certificate: World) -> None:
     with daemon(by_certificate.file("daemon.json5")) as out:
-        eventually(lambda: out.state == "ok")
+        wait_for(lambda: out.state == "ok")
         operator = by_certificate.certified("operator")
-        eventually(lambda: replies(operator, "imu/nose/command/reset"))
+        wait_for(lambda: replies(operator, "imu/nose/command/reset"))
         with pytest.raises(NotReady, match="nothing is kept of nose"):  # the daemon's own word
             ask(None, "nose", "", file=by_certificate.certified("reader"))
         with pytest.raises(LinkUnavailable, match="not signed by its authority"):
@@ -253,7 +254,7 @@ def test_samples_of_another_daemon_come_through_the_link_with_a_certificate(by_c
                 nose.put("imu/nose/samples", b"batch")
                 return link.read(0.1)
 
-            assert eventually(come)[0].data == b"batch"
+            assert wait_for(come)[0].data == b"batch"
     finally:
         link.close()
 

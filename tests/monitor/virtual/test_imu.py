@@ -2,7 +2,6 @@
 
 import os
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from drivers.driver import Driver
 from drivers.errors import ConfigError
 from monitor.settings import CONFIG_FOLDER, VirtualTable
 from monitor.virtual import VirtualImu
+from tests.support.waiting import PATIENCE_S, wait_for
 
 pytest.importorskip("tty", reason="pseudo-terminals need a POSIX system")
 
@@ -37,14 +37,11 @@ class Rig:
     def __exit__(self, *exc):
         self.imu.stop()
         self.driver.stop()
-        self.thread.join(5.0)
+        self.thread.join(PATIENCE_S)
         assert not self.thread.is_alive()
 
-    def wait(self, condition, seconds=8.0):
-        until = time.monotonic() + seconds
-        while not condition():
-            assert time.monotonic() < until, (self.driver.state, self.driver.text, self.driver.counts)
-            time.sleep(0.005)
+    def wait(self, condition):
+        wait_for(condition, lambda: (self.driver.state, self.driver.text, self.driver.counts))
 
     def kinds(self):
         return [event.kind for event in self.driver.take_events()]
@@ -72,7 +69,8 @@ def test_a_pulled_cable_and_back():
         rig.wait(lambda: rig.driver.state == "lost")
         assert not rig.imu.port.path.exists()
         before = rig.driver.counts.received
-        time.sleep(0.5)
+        dropped = rig.imu.truth.dropped
+        rig.wait(lambda: rig.imu.truth.dropped >= dropped + 50)  # half a second at 100 Hz
         assert rig.driver.counts.received == before
         rig.imu.plug()
         rig.wait(lambda: rig.driver.state == "running")

@@ -1,0 +1,43 @@
+"""zenoh sessions and routers in the test process, on loopback, that no other process finds."""
+
+import contextlib
+import json
+from typing import Any
+
+import zenoh
+
+DROP_WAIT = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
+"""zenoh drops a message that has met a full queue for 1 ms. On a busy machine the thread that empties the queue may not
+run that soon, so tests that count messages wait longer."""
+PATIENT_US = 5_000_000
+
+
+def session_config(
+    mode: str = "client", listen: tuple[str, ...] | list[str] = (), connect: tuple[str, ...] | list[str] = ()
+) -> zenoh.Config:
+    """Return the configuration of a session that neither scouts nor listens beyond the given endpoints."""
+    config = zenoh.Config()
+    keys: dict[str, Any] = {
+        "mode": mode,
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect),
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        DROP_WAIT: PATIENT_US,
+    }
+    for key, value in keys.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def session(
+    mode: str = "client", listen: tuple[str, ...] | list[str] = (), connect: tuple[str, ...] | list[str] = ()
+) -> contextlib.AbstractContextManager[Any]:
+    """Open a session that neither scouts nor listens beyond the given endpoints."""
+    opened: contextlib.AbstractContextManager[Any] = zenoh.open(session_config(mode, listen, connect))
+    return opened
+
+
+def router(endpoint: str) -> contextlib.AbstractContextManager[Any]:
+    """Open a router that listens on ``endpoint``."""
+    return session(mode="router", listen=[endpoint])
