@@ -1,7 +1,6 @@
 """Adapters: what a station says, as zenoh messages, in the viewer, as log lines, in the terminal. None waits."""
 
-import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Final
 
 import structlog
@@ -25,8 +24,6 @@ from monitor.publish.zenoh_out import ZenohOut
 from monitor.station import Output
 
 if TYPE_CHECKING:
-    from rich.live import Live
-
     from monitor.publish.rerun_view import RerunView
 
 PREFIX: Final = "imu"
@@ -195,11 +192,19 @@ class LogOutput(Output):
 
 
 class TableOutput(Output):
-    """Results as the table in the terminal, drawn once a second: the one that ``watch`` shows of other processes."""
+    """Results for the table in the terminal, the same table that ``watch`` shows of other processes.
 
-    def __init__(self, board: Board, live: "Live | None" = None) -> None:
+    Parameters
+    ----------
+    board : Board
+        Content of the table.
+    redraw : callable, optional
+        Called once a second for each device; asks another thread to draw the table.
+    """
+
+    def __init__(self, board: Board, redraw: Callable[[], None] | None = None) -> None:
         self.board = board
-        self._live = live
+        self._redraw = redraw
         self._latest: dict[str, tuple[float, Estimate]] = {}
         self._gaps: dict[str, tuple[float, ModelGap]] = {}
 
@@ -227,8 +232,8 @@ class TableOutput(Output):
             self.board.take(topics.COEFFICIENTS.key(PREFIX, device), message.coefficients(device, at_s, estimate))
         if device in self._gaps:
             self.board.take(topics.GAP.key(PREFIX, device), message.gap(device, *self._gaps.pop(device)))
-        if self._live is not None:
-            self._live.update(self.board.table(time.monotonic()), refresh=True)
+        if self._redraw is not None:
+            self._redraw()
 
     def gone(self, device: str) -> None:
         """No row."""

@@ -34,6 +34,7 @@ from monitor.logs import LEVEL
 from monitor.metrics import MetricsOutput
 from monitor.outputs import HistoryOutput, TableOutput, ViewerOutput, ZenohOutput
 from monitor.publish import history_message, message
+from monitor.publish.queued_writer import QueuedWriter
 from monitor.publish.viewer import DeviceInfo, ViewerSettings
 from monitor.publish.zenoh_out import Command, ZenohOut
 from monitor.recorder import Recorder, origin
@@ -67,6 +68,7 @@ class Service:
         more: further outputs, e.g. the table in the terminal
         reconciler: runs ``command/reconcile``
         unit: where systemd is told how it goes
+        writers: text outputs by name, such as "terminal" and "log"; their states are part of the status
     Raises:
         ConfigError: a simulated sensor or a model in force that cannot be
     """
@@ -77,8 +79,10 @@ class Service:
         more: Sequence[Output] = (),
         reconciler: Reconciler | None = None,
         unit: Unit | None = None,
+        writers: Mapping[str, QueuedWriter] | None = None,
     ) -> None:
         self.config = config
+        self._writers = dict(writers or {})
         self._unit = unit or Unit()
         self._started_s = time.monotonic()
         self._reconciler = reconciler or Reconciler()
@@ -184,7 +188,7 @@ class Service:
             states["metrics"] = self.metrics.state
         if self.hooks.hooks:
             states["hook"] = self.hooks.state
-        return states
+        return states | {name: writer.state for name, writer in self._writers.items()}
 
     def _rebuild(self, stations: Sequence[Station]) -> None:
         """Windows from the recording, as soon as that can be computed."""

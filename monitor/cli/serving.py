@@ -1,13 +1,17 @@
-"""The service in a terminal: its table or log lines, its log, and the signals that end it."""
+"""The service in a terminal: its table or log lines, its log, and the signals that end it.
+
+Table and log are written by threads (``QueuedWriter``), so that a terminal or pipe that nobody reads delays neither
+samples nor the end of the process.
+"""
 
 import contextlib
 import io
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TextIO, cast
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TextIO, cast
 
 from drivers.errors import ConfigError
 from drivers.masked import masked
@@ -15,41 +19,89 @@ from drivers.masked import masked
 if TYPE_CHECKING:
     from collections.abc import MutableMapping
 
+    from monitor.publish.queued_writer import QueuedWriter
     from monitor.settings import Config
+
+STDOUT: Final = "standard output"
+STDERR: Final = "standard error"
 
 
 def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
     """Run the service: a table where there is a terminal, else log lines; the last table once more at the end.
 
-    ``viewer`` goes before the configuration's.
+    Parameters
+    ----------
+    config : Config
+        What to run.
+    seconds : float or None
+        Duration in seconds; None runs until a signal or the end of all replays.
+    viewer : str or None
+        Viewer mode that replaces the mode of the configuration.
+
+    Raises
+    ------
+    ConfigError
+        The viewer mode or a device cannot be used.
+    OSError
+        The run ended by itself, and the final table could not be written to a file or pipe.
     """
-    import time
-    from contextlib import nullcontext
+    import threading
 
     import structlog
     from rich.console import Console
-    from rich.live import Live
 
     from monitor.outputs import LogOutput, TableOutput
-    from monitor.publish.terminal import Board
-    from monitor.service import Service
+    from monitor.publish.queued_writer import QueuedWriter
+    from monitor.publish.terminal import Board, LiveTable
+    from monitor.service import STATUS_S, Service
     from monitor.systemd import Unit
 
     unit = Unit.of(os.environ)
     config = _with_viewer(config, viewer)
-    _log_as(config)
-    for line in config.warnings:
-        structlog.get_logger("imu-monitor").warning(line)
-    console, board = Console(), Board()
-    live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
-    shown = [TableOutput(board, live)] if live else [TableOutput(board), LogOutput()]
-    service = Service(config, shown, unit=unit)
-    # in a terminal it means that the terminal is closed
-    on_signals(service.stop, service.stop if live else service.reload)
-    with live or nullcontext():
-        service.run(seconds)
-    if live is not None or seconds is not None:
-        console.print(board.table(time.monotonic()))
+    console, board, asked = Console(file=sys.stdout), Board(), threading.Event()
+    table, terminal = LiveTable(console), console.is_terminal
+    screen = QueuedWriter(sys.stdout, STDOUT, table.render, STATUS_S if terminal else None, tell=_warn)
+    writers = {"terminal": screen} if terminal else {}
+    shared = terminal and _same_file(sys.stdout, sys.stderr)
+    if not shared:
+        writers["log"] = QueuedWriter(sys.stderr, STDERR, tell=_warn)
+    with _stderr_through(screen if shared else writers["log"]):
+        _log_as(config)
+        for line in config.warnings:
+            structlog.get_logger("imu-monitor").warning(line)
+        if not shared:
+            screen.start()
+        try:
+            outputs = [TableOutput(board, screen.redraw)] if terminal else [TableOutput(board), LogOutput()]
+            service = Service(config, outputs, unit=unit, writers=writers)
+
+            def stop() -> None:
+                asked.set()
+                service.stop()
+
+            # in a terminal it means that the terminal is closed
+            on_signals(stop, stop if terminal else service.reload)
+            table.board = board
+            service.run(seconds)
+        finally:
+            unread = not screen.close()
+        lost = _lost(screen, unread)
+        if lost is not None and not terminal and asked.is_set():
+            structlog.get_logger("imu-monitor").warning("the final table was not written", error=str(lost))
+    if lost is not None and not terminal and not asked.is_set():
+        raise lost
+
+
+def _lost(screen: "QueuedWriter", unread: bool) -> Exception | None:
+    """Return why the final table is not on standard output, or None if it is."""
+    from monitor.publish.queued_writer import CLOSE_S
+
+    if unread:
+        return TimeoutError(f"{STDOUT}: the final table was not written, because nobody read it for {CLOSE_S:g} s")
+    error = screen.error
+    if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
+        return OSError(f"{STDOUT}: the final table could not be written: {error.strerror}")
+    return error
 
 
 def view(
@@ -60,6 +112,7 @@ def view(
 
     from monitor import settings
     from monitor.publish.fleet import FleetView, detail_key
+    from monitor.publish.queued_writer import QueuedWriter
     from monitor.publish.rerun_view import RerunView
     from monitor.publish.viewer import DeviceInfo, ViewerSettings
     from monitor.publish.zenoh_in import ZenohIn
@@ -73,10 +126,15 @@ def view(
     rerun = RerunView(ViewerSettings(mode=mode), [DeviceInfo(key, "over zenoh") for key in keys], fleet=True)
     stop = threading.Event()
     on_signals(stop.set)
-    with contextlib.closing(arriving), contextlib.closing(rerun):
+
+    def say(text: str) -> None:
+        print(text, file=_Lines(), flush=True)
+
+    log = QueuedWriter(sys.stderr, STDERR, tell=say)
+    with _stderr_through(log), contextlib.closing(arriving), contextlib.closing(rerun):
         arriving.start()
         rerun.start()
-        FleetView(arriving, rerun, keys).run(stop, lambda said: print(said, file=_Lines(), flush=True), seconds)
+        FleetView(arriving, rerun, keys).run(stop, say, seconds)
 
 
 def with_history(config: "Config", history_s: float | None) -> "Config":
@@ -106,6 +164,38 @@ def _with_viewer(config: "Config", viewer: str | None) -> "Config":
     except ConfigError as error:
         raise ConfigError(f"--viewer: {error}") from None
     return dataclasses.replace(config, viewer=msgspec.structs.replace(config.viewer, mode=mode))
+
+
+@contextlib.contextmanager
+def _stderr_through(writer: "QueuedWriter") -> Iterator[None]:
+    """Start a writer and put it in place of standard error, for log lines, warnings and tracebacks of threads.
+
+    If the writer is still blocked at the end, standard error is given up, so that the process can end.
+    """
+    from monitor.publish.queued_writer import QueuedLines, can_write, descriptor_of, detach
+
+    stream = sys.stderr
+    with contextlib.redirect_stderr(QueuedLines(writer, stream is not None and stream.isatty())):
+        writer.start()
+        try:
+            yield
+        finally:
+            if not writer.close() or not can_write(descriptor_of(stream)):
+                detach(stream)
+
+
+def _same_file(one: TextIO | None, other: TextIO | None) -> bool:
+    """Return True if two streams write to the same terminal, pipe or file."""
+    from monitor.publish.queued_writer import descriptor_of
+
+    descriptors = descriptor_of(one), descriptor_of(other)
+    return None not in descriptors and os.path.sameopenfile(*cast("tuple[int, int]", descriptors))
+
+
+def _warn(text: str) -> None:
+    import structlog
+
+    structlog.get_logger("imu-monitor").warning("log", text=text)
 
 
 class _Lines(io.TextIOBase):

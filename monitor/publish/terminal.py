@@ -7,6 +7,7 @@ A state has a word and a sign beside its colour. Numbers stand in the field's un
 """
 
 import contextlib
+import copy
 import threading
 import time
 from collections import Counter, OrderedDict, deque
@@ -14,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Final
+from typing import Final, TextIO, cast
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.live import Live
@@ -28,6 +29,7 @@ from monitor.publish import heard, units
 from monitor.publish.heard import Heard
 from monitor.publish.message import measured_axes
 from monitor.publish.panels import duration
+from monitor.publish.queued_writer import QueuedWriter
 from monitor.publish.units import Kind
 from monitor.publish.zenoh_in import KEYEXPR, ZenohIn
 
@@ -38,6 +40,7 @@ FORGET_S: Final = 600.0
 KEY_LENGTH: Final = 200
 QUIET_S: Final = 5.0
 """Connected for so long without a word of anyone: said, as access control refuses without saying so."""
+STDOUT: Final = "standard output"
 PLAIN_S: Final = 1.0
 """Between two tables where output is no terminal."""
 EVENTS: Final = 5
@@ -124,7 +127,7 @@ class Board:
     def table(self, now_s: float) -> RenderableType:
         """All of it, at one moment."""
         with self._lock:
-            devices = self._sorted(now_s)
+            devices = [copy.copy(one) for one in self._sorted(now_s)]  # drawn later, while messages arrive
             parts: list[RenderableType] = [self._summary(devices, now_s)]
             if devices:
                 parts.append(Fleet(devices, now_s))
@@ -250,6 +253,60 @@ def fleet_table(devices: Sequence[Heard], now_s: float, layout: Layout) -> Table
     return table
 
 
+class LiveTable:
+    """Draws the table of a board as text for a ``QueuedWriter``: again and again on a terminal, else once at the end.
+
+    ``render`` is called by the thread of the writer only. The rich console is used to format text; it writes nothing
+    itself.
+
+    Parameters
+    ----------
+    console : Console
+        Width, height and colours of the destination.
+    board : Board or None
+        Content. While it is None, only lines are written.
+    """
+
+    def __init__(self, console: Console, board: Board | None = None) -> None:
+        self.board = board
+        self._console = console
+        self._live: Live | None = None
+        self._ended = False
+
+    def render(self, lines: Sequence[str], last: bool) -> str:
+        """Return control codes and text that put the lines above the table and redraw the table below them.
+
+        Parameters
+        ----------
+        lines : sequence of str
+            Lines of the log, with colours as ANSI codes.
+        last : bool
+            True to show the cursor again and leave the final table.
+        """
+        with self._console.capture() as captured:
+            if self.board is not None and self._live is None and self._console.is_terminal and not last:
+                live = Live(
+                    console=self._console,
+                    auto_refresh=False,
+                    transient=True,
+                    redirect_stdout=False,
+                    redirect_stderr=False,
+                )
+                live.start()
+                self._live = live
+            if lines:
+                self._console.print(Text.from_ansi("".join(lines)))
+            if not last and self._live is not None and self.board is not None:
+                self._live.update(self.board.table(time.monotonic()), refresh=True)
+            if last and not self._ended:
+                self._ended = True
+                if self._live is not None:
+                    self._live.stop()
+                if self.board is not None:
+                    self._console.print(self.board.table(time.monotonic()))
+        return captured.get()
+
+
 def watch(
     keyexpr: str = KEYEXPR,
     connect: Sequence[str] = (),
@@ -260,8 +317,11 @@ def watch(
 ) -> None:
     """Show the table until ``stop`` or Ctrl-C; with ``once_s`` listen for so long and print it once.
 
+    A thread writes the table, so that a terminal or pipe that nobody reads neither delays messages nor the end.
+
     Raises:
         ConfigError: zenoh refuses the key expression, an endpoint or the ``file`` with certificates and passwords
+        OSError: standard output cannot be written
     """
     stop, console = stop or threading.Event(), console or Console()
     board = Board()
@@ -269,25 +329,33 @@ def watch(
         arriving.start()
         if once_s is not None:
             stop.wait(once_s)
-            console.print(_newest(board, arriving))
+            _take(board, arriving)
+            with QueuedWriter(cast("TextIO", console.file), STDOUT, LiveTable(console, board).render) as out:
+                out.finish(stop)
         elif console.is_terminal:
-            with Live(console=console, auto_refresh=False) as live:
-                while not stop.wait(REFRESH_S):
-                    live.update(_newest(board, arriving), refresh=True)
+            with QueuedWriter(
+                cast("TextIO", console.file), STDOUT, LiveTable(console, board).render, REFRESH_S
+            ) as screen:
+                while not stop.wait(REFRESH_S) and screen.error is None:
+                    _take(board, arriving)
+                    screen.redraw()
         else:
-            while not stop.wait(PLAIN_S):
-                console.print(_newest(board, arriving))
+            with QueuedWriter(cast("TextIO", console.file), STDOUT, limit=1) as out:  # at most one table waits
+                while not stop.wait(PLAIN_S) and out.error is None:
+                    _take(board, arriving)
+                    with console.capture() as captured:
+                        console.print(board.table(time.monotonic()))
+                    out.put(captured.get())
 
 
-def _newest(board: Board, arriving: ZenohIn) -> RenderableType:
-    """The table with all that has come until now."""
+def _take(board: Board, arriving: ZenohIn) -> None:
+    """Pass all messages that have arrived to the board."""
     for message in arriving.take(0.0):
         if message.payload is None:
             board.alive(message.key, message.there)
         else:
             board.take(message.key, message.payload)
     board.note = note(board, arriving)
-    return board.table(time.monotonic())
 
 
 def note(board: Board, arriving: ZenohIn) -> str:
