@@ -26,9 +26,10 @@ from typing import Final
 
 import numpy as np
 
-from drivers.line import LEARN_S, Line, made_rate
+from drivers.line import LEARN_S, LEARN_SAMPLES, Line, made_rate
 from drivers.order import BACK, NEAR, NS, Repeats, Telling, steady_order
 from drivers.quantities import RATE_HZ
+from drivers.rate_check import RateCheck
 from drivers.sample import NO_TICK, Counter, Event, Floats, Given, Ints, SampleBlock, Timing, block
 
 CATCH_UP_S: Final = 3.0
@@ -41,6 +42,9 @@ LONG_S: Final = 3600.0
 """Given times that go on by more than this at one step are told as an event too."""
 FASTEST_HZ: Final = 32_000.0
 """No inertial sensor is read faster: where a rate is not known or cannot be, no more samples are missing."""
+UNCHECKED_S: Final = 30.0
+UNCHECKED_SAMPLES: Final = (2 * LEARN_SAMPLES, round(LEARN_S * FASTEST_HZ))
+"""Times that show no rate after so long and the first number of samples, or after the second, will never show one."""
 LONGEST_GAP: Final = 10**10
 """Samples, 116 days at 1 kHz: given times that go on by more were set anew, and count as so many missing."""
 FAR_S: Final = 4.6e9
@@ -72,11 +76,18 @@ class SampleClock:
     Args:
         timing: what the wire format carries
         rate_hz: nominal rate; None = find it from the data
+        arrivals_are_timed: False if arrival times say nothing about the device's rate: bytes are read from a file, or a
+            simulated sensor runs at another speed
     """
 
-    def __init__(self, timing: Timing, rate_hz: float | None) -> None:
+    def __init__(self, timing: Timing, rate_hz: float | None, arrivals_are_timed: bool = True) -> None:
         self._timing = timing
         self._nominal_hz = rate_hz
+        self._check = None if rate_hz is None else RateCheck(rate_hz)
+        self._arrivals_are_timed = arrivals_are_timed
+        self._stamped = 0  # samples
+        self._stamped_s = 0.0  # from the first to the newest, by the times they came with
+        self._ended = self._resumed = False
         self.repeated = 0
         """Rows kept out, as they had come before."""
         self.late = 0
@@ -93,6 +104,8 @@ class SampleClock:
         self._delay: _Delay | None = None
         self._tick: int | None = None  # last counter value, unwrapped
         self._tick_step = _Step()
+        self._device_line = Line()  # device clock on index, where a tick is a known time
+        self._device_s = self._device_index = 0.0
         self._went_back = False
         self._given_steps: deque[float] = deque(maxlen=STEPS_KEPT)  # s
         self._stuck = 0
@@ -101,6 +114,7 @@ class SampleClock:
 
     def resume(self, before: Before) -> None:
         """Go on from the last sample that was recorded before a restart of the program: what came since is missing."""
+        self._resumed = True
         self._earlier_hz = self._nominal_hz or before.rate_hz
         self._last_t_ns = self._arrived_ns = before.t_ns
         self._origin_ns = before.t_ns
@@ -120,8 +134,11 @@ class SampleClock:
     def rate_hz(self) -> float | None:
         """Samples a second: nominal where stated, else found from the data and made better with them.
 
-        None at first, and while the data give a rate outside the supported range.
+        None at first, and while the data give a rate outside the supported range. A nominal rate that the sample times
+        contradict gives way to the measured one, see ``drivers.rate_check``.
         """
+        if self._check is not None:
+            return self._check.rate_hz
         if self._nominal_hz or not self._line.settled():
             return self._nominal_hz or self._earlier_hz
         measured = self._line.rate_hz()
@@ -131,6 +148,33 @@ class SampleClock:
     def measured_hz(self) -> float | None:
         """Samples a second by the host's clock, without rounding; None until known."""
         return self._line.rate_hz() if self._line.settled() else None
+
+    @property
+    def contradicted_hz(self) -> float | None:
+        """Measured rate in Hz that contradicts the nominal one; None if they agree, or there is none to compare."""
+        return self._check.measured_hz if self._check is not None and self._check.contradicted else None
+
+    @property
+    def unchecked(self) -> bool:
+        """True if samples have come, and the nominal rate has not been compared with theirs yet but will be."""
+        if self._check is None or self._check.measured_hz is not None or self._ended:
+            return False
+        if not self._stamped:
+            return self._resumed
+        few, many = UNCHECKED_SAMPLES
+        if self._stamped > many or (self._stamped > few and self._stamped_s > UNCHECKED_S):
+            return False
+        return self._arrivals_are_timed or isinstance(self._timing, Given) or self._device_line.count > 0
+
+    def end(self) -> None:
+        """Compare the rates with what there is, as no more samples will come."""
+        if self._check is None or self._ended:
+            return
+        self._ended = True
+        line = self._line if isinstance(self._timing, Given) else self._device_line
+        found = line.measured(final=True) if self._check.measured_hz is None else None
+        if found is not None:
+            self._check.update(*found)
 
     def take_events(self, ended: bool = False) -> list[Event]:
         """What the clock found since the last call; all of it if no more samples will come."""
@@ -146,7 +190,17 @@ class SampleClock:
             self._origin_ns = int(samples.t_ns[0])
         self._telling.tell_due(int(samples.t_ns[-1]))
         kept = self._in_order(self._without_repeats(samples))
-        return self._stamp(kept) if kept is not None else []
+        stamped = self._stamp(kept) if kept is not None else []
+        self._stamped += sum(len(one) for one in stamped)
+        self._stamped_s = self._seconds(int(samples.t_ns[-1]))
+        if self._check is not None and (found := self._rate_line().measured()) is not None:
+            self._check.update(*found)
+        return stamped
+
+    def _rate_line(self) -> Line:
+        """The line that shows the device's rate: on its own clock where there is one; an empty one where none does."""
+        timed = self._arrivals_are_timed or isinstance(self._timing, Given)
+        return self._line if timed and not self._device_line.count else self._device_line
 
     def _stamp(self, samples: SampleBlock) -> list[SampleBlock]:
         if isinstance(self._timing, Given):
@@ -324,6 +378,7 @@ class SampleClock:
         elif self._ran_ahead(missing, steps, counter, arrived_ns):
             ahead = int(steps.max())
             moved = f"back by {counter.modulus - ahead}" if 2 * ahead > counter.modulus else f"on by {ahead}"
+            self._device_line = Line()
             text = f"counter went {moved} ticks within {elapsed_s:.3f} s"
             self._event("clock_jumped", int(samples.t_ns[0]), text)
             at = int(np.argmax(steps))
@@ -334,7 +389,15 @@ class SampleClock:
         if first:
             missing[0] = max(samples.lost, unseen)
         self._paused = False
+        if counter.tick_s is not None:
+            self._follow_device(float(steps.sum()) * counter.tick_s, len(samples) + int(missing.sum()))
         return missing
+
+    def _follow_device(self, seconds: float, samples: int) -> None:
+        """Go on by so many seconds of the device's clock and so many samples, missing ones included."""
+        self._device_s += seconds
+        self._device_index += samples
+        self._device_line.add(self._device_index, self._device_s)
 
     def _hidden_turns(self, steps: Ints, size: float | None, counter: Counter, arrived_ns: int) -> int:
         """Whole turns of a short counter, hidden in a pause of the link or in a delay that was never made good."""

@@ -1,6 +1,6 @@
 """The steady rate behind arrival times: a line through (sample index, time), and the rates sensors are made with."""
 
-from math import exp
+from math import exp, inf, sqrt
 from typing import Final
 
 import numpy as np
@@ -12,6 +12,11 @@ LEARN_SAMPLES: Final = 20
 """A rate is known from the data after both."""
 KEEP_LEAST: Final = 0.9
 """Slow sensors and long blocks: the line rests on ten points or more however far apart they are."""
+MIN_POINTS: Final = 5
+"""Fewer points about a line do not show how far they scatter."""
+SCATTER: Final = 2.0
+"""The points scatter by the delays that the line has not followed; those that it has followed are taken to be as large.
+Empirical: of simulated stalls, bursts and slowly varying delays, only the latter pass it, in the first seconds."""
 SNAP: Final = 0.002
 """A measured rate this near to a rate that sensors are made with is taken to be that rate; crystals and RC
 oscillators further off are taken at their word."""
@@ -31,7 +36,7 @@ class Line:
         self.count = 0
         self._x0 = self._t0 = 0.0  # newest point
         self._first_x = self._first_t = 0.0
-        self._w = self._mx = self._mt = self._sxx = self._sxt = 0.0
+        self._w = self._mx = self._mt = self._sxx = self._sxt = self._stt = 0.0
 
     def add(self, index: float, t_s: float, nominal_hz: float | None = None) -> None:
         """One more (index, arrival) pair; the nominal rate stands in for a slope until there is one."""
@@ -45,12 +50,14 @@ class Line:
         self._mt -= dt
         self._x0, self._t0 = index, t_s
         self._w, self._sxx, self._sxt = self._w * keep + 1.0, self._sxx * keep, self._sxt * keep
+        self._stt *= keep
         gain = 1.0 / self._w
         ex, et = -self._mx, -self._mt
         self._mx += gain * ex
         self._mt += gain * et
         self._sxx += (1.0 - gain) * ex * ex
         self._sxt += (1.0 - gain) * ex * et
+        self._stt += (1.0 - gain) * et * et
         self.count += 1
 
     def span_s(self) -> float:
@@ -60,6 +67,28 @@ class Line:
     def settled(self) -> bool:
         """Whether the slope rests on enough to tell a hole from jitter."""
         return self._x0 - self._first_x >= LEARN_SAMPLES and self.span_s() >= LEARN_S
+
+    def measured(self, final: bool = False) -> tuple[float, float] | None:
+        """Return the rate that the points alone show, and how far it may be off.
+
+        Parameters
+        ----------
+        final : bool
+            True if no more points will come: then LEARN_SAMPLES are enough, however short the time.
+
+        Returns
+        -------
+        tuple of float, or None
+            Rate in Hz and the relative error that is plausible. None until the points show a rate. Delays whose
+            standard deviation is s change the slope by at most s/S, where S is the standard deviation of the times
+            (Cauchy-Schwarz inequality). For the delays that are left about the line, s/S = √(1/r² − 1), r being the
+            correlation of time and index.
+        """
+        enough = self._x0 - self._first_x >= LEARN_SAMPLES - 1 if final else self.settled() and self.count >= MIN_POINTS
+        if not enough or not self._sxt > 0.0:
+            return None
+        r2 = self._sxt * self._sxt / (self._sxx * self._stt) if self._stt > 0.0 else 0.0
+        return self._sxx / self._sxt, SCATTER * sqrt(max(1.0 / r2 - 1.0, 0.0)) if r2 > 0.0 else inf
 
     def period_s(self) -> float | None:
         """Seconds a sample; None until two pairs have come."""

@@ -35,7 +35,7 @@ from monitor.health import Health
 from monitor.limits import Limits, model_of
 from monitor.recorder import Recorder, Tail
 from monitor.ring import RingBuffer
-from monitor.settings import Device
+from monitor.settings import Device, VirtualTable
 from monitor.wall import EASE, WallClock
 
 RING_SECONDS: Final = 10.0
@@ -51,8 +51,6 @@ CHOOSING_SHARE: Final = 0.02
 TOTAL_EVERY_S: Final = 0.1
 TOTAL_SHARE: Final = 0.005
 """Of a processor, that total and Hadamard deviations may take for a device."""
-OFF_NOMINAL: Final = 0.02
-"""A measured rate further than this from the configured one is said."""
 UNTIMED_KEPT: Final = 100
 """Events that wait for the first sample's time; the oldest are dropped."""
 SET_S: Final = 1.0
@@ -125,7 +123,7 @@ class Station:
         rate = device.rate_hz or 1000.0
         low, high = RING_SAMPLES
         self.ring = RingBuffer(int(min(max(rate * RING_SECONDS, low), high)))
-        self.clock = SampleClock(decoder.timing, device.rate_hz)
+        self.clock = SampleClock(decoder.timing, device.rate_hz, _arrivals_are_timed(device, link))
         self._recorder = recorder
         keep = None if recorder is None else self._keep
         self.driver = Driver(device.name, link, decoder, self.clock, self._push, device.axes, device.silence_s, keep)
@@ -153,6 +151,7 @@ class Station:
         self._tail: Tail | None = None  # of the recording, that the window is rebuilt from first
         self._next_s = dict.fromkeys(("refit", "publish", "samples", "total", "thermal"), 0.0)
         self._refitted = False  # a refit since the last publication
+        self._doubts = (False, False)  # of the configured rate: it is contradicted, it has not been checked yet
         self._newest_ns: int | None = None  # of the samples that were taken
         self._taken_ns = 0  # host monotonic, when the newest was taken
 
@@ -261,9 +260,7 @@ class Station:
     def report(self, outputs: Sequence[Output], states: dict[str, str], memory_bytes: int) -> Health:
         """Tell the outputs how the device does, and ease its wall clock."""
         self._follow_host(outputs)
-        rate_hz = self.clock.rate_hz
-        if rate_hz is not None and self._tail is None:
-            self.chain.relabel(rate_hz)
+        self._relabel()
         if self._recorder is not None:
             self._recorder.know(self.name, self._known())
         health = self.health(states, memory_bytes)
@@ -449,14 +446,16 @@ class Station:
     def _publish_estimate(self, outputs: Sequence[Output], now_s: float, drain: bool) -> bool:
         # at every sample the course follows by itself: a look before that is published would take its samples away
         every_s = self.device.refit_s or self.device.publish_s
+        self._follow_rate(drain)
         estimator = self.chain.estimator
         if estimator is not None and self.chain.advanced and (self._due("refit", every_s, now_s) or drain):
             fitted = self._ready.fit.is_set()
             self.chain.advanced = not fitted  # a curve alone is fitted as soon as that can be
             try:
-                self.latest = estimator.get(fitted=fitted)
+                latest = estimator.get(fitted=fitted)
             except NotReady:
                 return False
+            self.latest = latest.without_coefficients() if any(self._doubts) else latest
             self._refitted = True
         if self.latest is None or not self._refitted:
             return False
@@ -466,9 +465,25 @@ class Station:
         for output in outputs:
             output.estimate(self.name, self.unix_s(self.latest.t_ns), self.latest)
         if self.chain.in_force is not None:
-            self._publish_gap(outputs, self.chain.in_force.look(self.latest))
+            look = self.chain.in_force.look(self.latest)
+            self._publish_gap(outputs, replace(look, axes={}) if any(self._doubts) else look)
         self._tell(outputs, self._limits.update(self.latest))
         return True
+
+    def _follow_rate(self, drain: bool) -> None:
+        """Withhold the coefficients while the configured rate is contradicted, or has not been checked yet."""
+        if drain:
+            self.clock.end()
+        doubts = (self.clock.contradicted_hz is not None, self.clock.unchecked)
+        if doubts != self._doubts:
+            self._doubts = doubts
+            self._relabel()
+            self.chain.advanced = True  # the newest estimate is to be made anew
+
+    def _relabel(self) -> None:
+        rate_hz = self.clock.rate_hz
+        if rate_hz is not None and self._tail is None:
+            self.chain.relabel(rate_hz)
 
     def _publish_gap(self, outputs: Sequence[Output], look: ModelGap) -> None:
         events = self._agreement.update(look)
@@ -523,14 +538,22 @@ class Station:
             return "the window is being rebuilt from the recording; no sample is lost"
         if not self._ready.fit.is_set() and self.driver.state == "running":
             return "first start: compiling the estimator; no coefficients yet, no sample is lost"
-        nominal, measured = self.device.rate_hz, self.clock.measured_hz
+        lacking = self._lacking_text() if self.driver.state in ("running", "ended") else ""
         if self.driver.text or self.driver.state != "running":
-            return self.driver.text
-        if self.chain.refused:
-            return self.chain.refused
-        if nominal and measured and abs(measured / nominal - 1.0) > OFF_NOMINAL:
-            return f"samples come at {measured:.4g} Hz, configured are {nominal:g} Hz"
-        return self.driver.late_hint or self._wall_text()
+            return f"{self.driver.text.rstrip('.')}; {lacking}" if lacking else self.driver.text
+        return lacking or self.driver.late_hint or self._wall_text()
+
+    def _lacking_text(self) -> str:
+        """Return why there are no coefficients; empty if they are there or will come."""
+        measured_hz = self.clock.contradicted_hz
+        if measured_hz is not None:
+            return (
+                f"measured rate {measured_hz:.4g} Hz differs from the configured {self.device.rate_hz:g} Hz; "
+                "coefficients are withheld: correct `rate` or remove it"
+            )
+        if self.chain.estimator is None and self.published and self.clock.rate_hz is None:
+            return "no estimate: the times of the samples do not show a rate; set `rate`"
+        return self.chain.refused
 
     def _wall_text(self) -> str:
         behind_s = 0.0 if self.driver.times_are_unix else self._wall.behind_ns / 1e9
@@ -538,3 +561,10 @@ class Station:
             return ""
         where = "behind" if behind_s > 0.0 else "ahead of"
         return f"times are {abs(behind_s):.6g} s {where} the host's clock, which was set"
+
+
+def _arrivals_are_timed(device: Device, link: Link) -> bool:
+    """Return True if arrival times show the device's rate, and not how fast a file is read or a sensor simulated."""
+    simulated = isinstance(device.link, VirtualTable) and device.link.speed != 1.0
+    captured = isinstance(link, ReplayLink) and link.epoch == "monotonic"
+    return not simulated and not captured

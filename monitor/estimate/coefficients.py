@@ -15,7 +15,7 @@ LETTERS: Final = ("Q", "N", "B", "K", "R")
 class Status(IntEnum):
     """What a coefficient's number is worth; a number without a status is not published."""
 
-    UNESTIMATED = 0  # too few data yet: value, lo and hi are NaN
+    UNESTIMATED = 0  # too few data yet, or withheld: value, lo and hi are NaN
     UPPER_BOUND = 1  # the data only bound it: value NaN, lo 0, hi the one-sided 95 % bound
     ESTIMATED = 2  # value with its two-sided 95 % interval
 

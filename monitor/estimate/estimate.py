@@ -1,13 +1,13 @@
 """All that one look at the estimate gives."""
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
-from monitor.estimate.coefficients import Coefficients
+from monitor.estimate.coefficients import Coefficients, Status
 from monitor.estimate.curve import AllanCurve
 
 
@@ -40,3 +40,15 @@ class Estimate:
     k_or_r: NDArray[np.bool_]  # [6] the window drifts, and does not tell whether by random walk or by a ramp
     recent: AllanCurve | None = None  # the same τ, each over a span of its own, see window.quick_spans
     course: Course | None = None  # since the look before, where a fit at every sample is wanted
+
+    def without_coefficients(self) -> "Estimate":
+        """Return the curve alone: every coefficient is unestimated, and nothing is fitted."""
+        shape = self.coefficients.status.shape
+        nothing = np.full(shape, np.nan)
+        return replace(
+            self,
+            fitted=np.full_like(self.fitted, np.nan),
+            coefficients=Coefficients(nothing, nothing, nothing, np.full(shape, Status.UNESTIMATED, np.int8)),
+            k_or_r=np.zeros_like(self.k_or_r),
+            course=None,
+        )

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.clock import SampleClock
+from drivers.clock import Before, SampleClock
 from drivers.line import FORGET_S, Line, made_rate
-from drivers.sample import Arrival, Counter, Given, block
+from drivers.sample import NO_TICK, Arrival, Counter, Given, block
 
 NS = 1e9
 T0 = 1e5  # s, where the host's clock stands
@@ -530,3 +530,109 @@ def test_the_line_of_exact_points_is_exact():
 )
 def test_rates_that_sensors_are_made_with(measured, made):
     assert made_rate(measured) == made
+
+
+# --- a configured rate beside the measured one
+
+
+def stall(t, seed=0):
+    """Arrival through a host that now and then does nothing for up to a second."""
+    draw = np.random.default_rng(seed)
+    arrived = t + draw.uniform(0.0, 0.005, t.size)
+    at = t[0]
+    while at < t[-1]:
+        at += draw.exponential(5.0)
+        until = at + draw.uniform(0.0, 1.0)
+        arrived[(arrived > at) & (arrived < until)] = until
+    return np.maximum.accumulate(arrived)
+
+
+@pytest.mark.parametrize("tick_s", [1e-3, 1e-6])
+def test_a_device_clock_contradicts_the_rate_however_its_samples_arrive(tick_s):
+    ticks = np.rint(np.arange(600) / 100.0 / tick_s).astype(np.int64)
+    for arrived in (T0 + np.arange(600) / 5000.0, jitter(T0 + np.arange(600) / 100.0)):
+        wrong, right = (SampleClock(Counter(1 << 32, tick_s), rate) for rate in (200.0, 100.0))
+        seen = []
+        for i in range(0, 600, 5):
+            for clock in (wrong, right):
+                feed(clock, arrived[i : i + 5], ticks[i : i + 5])
+            seen.append((wrong.unchecked, wrong.contradicted_hz is not None))
+            assert right.contradicted_hz is None
+        # at no sample is the rate believed: not checked yet, then contradicted
+        assert all(unchecked != contradicted for unchecked, contradicted in seen)
+        assert wrong.contradicted_hz == pytest.approx(100.0, rel=1e-3)
+        assert (wrong.rate_hz, right.rate_hz) == (100.0, 100.0)
+        assert not right.unchecked
+
+
+def test_a_tick_too_coarse_for_single_steps_contradicts_nothing():
+    ticks = np.floor(np.arange(4160) / 416.0 / 1e-3).astype(np.int64)  # steps of 2 and 3
+    clock = SampleClock(Counter(1 << 16, 1e-3), 416.0)
+    feed(clock, jitter(T0 + np.arange(4160) / 416.0), ticks)
+    assert not clock.unchecked
+    assert (clock.rate_hz, clock.contradicted_hz) == (416.0, None)
+
+
+@pytest.mark.parametrize("arrive", [jitter, burst, stall])
+@pytest.mark.parametrize("seed", range(5))
+def test_jitter_of_arrivals_contradicts_no_rate_that_is_nearly_right(arrive, seed):
+    taken = T0 + np.arange(3000) / 100.0
+    clock = SampleClock(Arrival(), 100.2)
+    arrived = arrive(taken) if arrive is burst else arrive(taken, seed=seed)
+    for a in range(0, 3000, 10):
+        feed(clock, arrived[a : a + 10])
+        assert clock.contradicted_hz is None
+    assert not clock.unchecked
+    assert clock.rate_hz == 100.2
+
+
+@pytest.mark.parametrize("arrive", [jitter, burst, stall])
+def test_arrivals_contradict_a_rate_that_is_far_off(arrive):
+    clock = SampleClock(Arrival(), 200.0)
+    feed(clock, arrive(T0 + np.arange(3000) / 100.0))
+    assert clock.contradicted_hz == pytest.approx(100.0, rel=0.02)
+
+
+def test_how_fast_a_file_is_read_contradicts_nothing():
+    clock = SampleClock(Arrival(), 100.0, arrivals_are_timed=False)
+    feed(clock, T0 + np.arange(6000) / 2000.0)
+    assert not clock.unchecked
+    assert (clock.rate_hz, clock.contradicted_hz) == (100.0, None)
+
+
+def test_given_times_contradict_a_rate_also_where_there_are_few():
+    times_ns = np.arange(150) * 10_000_000
+    clock = SampleClock(Given(), 200.0)
+    clock.stamp(block(times_ns, varied(150)))
+    assert clock.unchecked
+    assert clock.contradicted_hz is None
+    clock.end()
+    assert not clock.unchecked
+    assert clock.contradicted_hz == pytest.approx(100.0)
+
+
+def test_times_that_never_show_a_rate_leave_the_configured_one():
+    clock = SampleClock(Given(), 100.0)
+    for i in range(17):
+        assert clock.unchecked == (i > 0)
+        clock.stamp(block(np.zeros(4000, np.int64), varied(4000) + i))
+    assert not clock.unchecked
+    assert (clock.rate_hz, clock.contradicted_hz) == (100.0, None)
+
+
+def test_a_jump_of_given_times_does_not_begin_the_check_anew():
+    clock = SampleClock(Given(), 200.0)
+    times_ns = np.arange(600) * 10_000_000
+    for a in range(0, 600, 20):
+        clock.stamp(block(times_ns[a : a + 20].copy(), varied(20) + a))
+    assert clock.contradicted_hz == pytest.approx(100.0)
+    clock.stamp(block(times_ns[:20] - 10**12, varied(20)))
+    assert not clock.unchecked
+    assert clock.contradicted_hz == pytest.approx(100.0)
+
+
+def test_after_a_restart_the_rate_is_checked_before_it_is_believed():
+    clock = SampleClock(Arrival(), 200.0)
+    assert not clock.unchecked
+    clock.resume(Before(round(T0 * NS), NO_TICK, 200.0, None))
+    assert clock.unchecked

@@ -15,6 +15,9 @@ from drivers.recording import save_samples
 from drivers.sample import Event
 from monitor import service as service_module
 from monitor import settings
+from monitor.estimate.coefficients import Status
+from monitor.estimate.estimate import Estimate
+from monitor.estimate.model_gap import ModelGap
 from monitor.health import Health
 from monitor.history import past
 from monitor.history.store import FILE, reading
@@ -178,6 +181,97 @@ record = false
     assert kept.start_s.tolist() == [0]
     assert kept.counts[:, 0].tolist() == [n]
     assert all(first_s <= event.t_s <= last_s for event in kept.events)
+
+
+class Estimates(Output):
+    """Estimates, and how many events there were of each kind."""
+
+    def __init__(self) -> None:
+        self.all: list[Estimate] = []
+        self.kinds: set[str] = set()
+        self.gaps: list[ModelGap] = []
+        self.health_text = ""
+
+    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
+        self.all.append(estimate)
+
+    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
+        self.gaps.append(gap)
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        self.kinds.add(event.kind)
+
+    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+        self.health_text = health.text
+
+
+@pytest.mark.parametrize("rate_hz", [100.0, 200.0])
+def test_a_rate_that_contradicts_a_recording_publishes_no_coefficient(tmp_path: Path, rate_hz: float) -> None:
+    values = np.random.default_rng(1).standard_normal((6000, 6)) * 1e-2
+    save_samples(tmp_path / "r.npz", np.arange(6000) / 100.0, values)
+    path = tmp_path / "config.toml"
+    path.write_text(
+        f"""
+[[device]]
+name = "d"
+rate = {rate_hz}
+window = "1min"
+model = "consumer-mems"
+driver = {{ link = "replay", path = "r.npz", speed = 20 }}
+[[device.limit]]
+axes = "gz"
+letter = "N"
+above = 1e-5
+hold = "1s"
+[zenoh]
+mode = "none"
+[viewer]
+mode = "none"
+[storage]
+folder = "kept"
+record = false
+"""
+    )
+    told, board = Estimates(), Board()
+    Service(settings.load(path), [told, TableOutput(board)]).run(60.0)
+    with reading(tmp_path / "kept" / FILE) as reader:
+        kept = past.read(reader, "d", Span(-math.inf, math.inf), step_s=60)
+    (known,) = board.devices(time.monotonic())
+    assert known.noise is not None
+    published = {Status(one) for estimate in told.all for one in estimate.coefficients.status.ravel().tolist()}
+    assert told.all[-1].rate_hz == 100.0
+    if rate_hz == 100.0:
+        assert Status.ESTIMATED in published
+        assert told.kinds >= {"limit_crossed", "model_disagrees"}
+        assert np.isfinite(kept.column("gz.N").last).any()
+        assert Status.ESTIMATED in known.noise.coefficients.status
+    else:
+        assert published == {Status.UNESTIMATED}
+        assert not told.kinds & {"limit_crossed", "model_disagrees"}
+        assert all(look.axes == {} for look in told.gaps)
+        assert not np.isfinite(kept.column("gz.N").last).any()
+        assert set(known.noise.coefficients.status.ravel().tolist()) == {Status.UNESTIMATED}
+        assert known.status is not None
+        assert known.status.text == told.health_text
+        assert told.health_text.endswith(
+            "the end of the file; measured rate 100 Hz differs from the configured 200 Hz; coefficients are withheld: "
+            "correct `rate` or remove it"
+        )
+
+
+def test_a_recording_that_shows_no_rate_says_so(tmp_path: Path) -> None:
+    save_samples(tmp_path / "r.npz", np.arange(50) / 100.0, np.ones((50, 6)))
+    told = Estimates()
+    path = tmp_path / "config.toml"
+    path.write_text(
+        '[[device]]\nname = "d"\ndriver = { link = "replay", path = "r.npz" }\n'
+        '[zenoh]\nmode = "none"\n[viewer]\nmode = "none"\n'
+    )
+    service = Service(settings.load(path), [told])
+    service.run(60.0)
+    assert service.stations[0].published == 50
+    assert told.all == []
+    assert told.health_text.endswith("; no estimate: the times of the samples do not show a rate; set `rate`")
 
 
 def test_kernels_that_cannot_be_kept_hold_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

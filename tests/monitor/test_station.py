@@ -14,7 +14,9 @@ from drivers.errors import ConfigError
 from drivers.links import replay_link
 from drivers.links.loopback_link import LoopbackLink
 from drivers.sample import block, join
+from monitor import settings
 from monitor.chain import Ready
+from monitor.estimate.coefficients import Status
 from monitor.settings import Device
 from monitor.station import Station
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -102,7 +104,7 @@ class Rig:
             self.ready.all.set()
         self.station = Station(device, self.link, decoder, self.wake, self.ready)
         self.caught = Caught()
-        self.sent = 0
+        self.sent = self.stamped = 0
         self.link.open()
 
     def bring(self, n, lost=0, scale=1.0):
@@ -344,7 +346,109 @@ def test_a_rate_off_the_configured_one_is_said():
     for i in range(400):
         rig.station.clock.stamp(block(np.array([10**12 + i * 20_000_000]), np.zeros((1, 6))))
     rig.station.driver.state, rig.station.driver.text = "running", ""
-    assert rig.station.health({}, 0).text == "samples come at 50 Hz, configured are 100 Hz"
+    said = (
+        "measured rate 50 Hz differs from the configured 100 Hz; coefficients are withheld: correct `rate` or remove it"
+    )
+    assert rig.station.health({}, 0).text == said
+    rig.station.driver.state, rig.station.driver.text = "ended", "x.csv: the end of the file."
+    assert rig.station.health({}, 0).text == f"x.csv: the end of the file; {said}"
+
+
+def stamp(rig, n, rate_hz, rng):
+    """The clock sees what the reader would have: samples that arrive with jitter of up to 20 ms."""
+    at, rig.stamped = rig.stamped, rig.stamped + n
+    arrived_s = (at + np.arange(n)) / rate_hz + rng.uniform(0.0, 0.02, n)
+    for t_ns in np.maximum.accumulate(10**12 + np.rint(arrived_s * 1e9).astype(np.int64)):
+        rig.station.clock.stamp(block(np.array([t_ns]), np.zeros((1, 6))))
+
+
+def statuses(estimate):
+    return set(estimate.coefficients.status.ravel().tolist())
+
+
+def test_nothing_is_estimated_by_a_rate_that_the_device_contradicts(tmp_path):
+    lines = text.Settings(columns=("gx", "gy", "gz", "ax", "ay", "az"))
+    rig, rng = Rig(rate=200.0, decoder=text.build(lines), model=model_file(tmp_path)), np.random.default_rng(1)
+    for i in range(20):
+        stamp(rig, 50, 100.0, rng)
+        rig.bring(50)
+        rig.work(1000.0 + i)
+    rig.station.report([rig.caught], {}, 0)
+    rig.work(1100.0, drain=True)
+    estimates = [estimate for _, estimate in rig.caught.estimates]
+    assert len(estimates) > 10
+    assert set().union(*map(statuses, estimates)) == {Status.UNESTIMATED}
+    last = estimates[-1]
+    assert not np.isfinite(last.fitted).any()
+    # the curve is there, at averaging times by the measured rate
+    assert last.rate_hz == pytest.approx(100.0, rel=0.01)
+    assert last.curve.tau_s == pytest.approx(last.curve.factors / last.rate_hz)
+    assert np.isfinite(last.curve.avar[0]).all()
+    assert [gap.axes for _, gap in rig.caught.gaps] == [{}] * len(rig.caught.gaps)
+    assert len(rig.caught.gaps) > 10
+    assert rig.caught.events == []
+
+
+def test_a_rate_that_is_nearly_right_is_estimated_by():
+    lines = text.Settings(columns=("gx", "gy", "gz", "ax", "ay", "az"))
+    rig, rng = Rig(rate=100.2, decoder=text.build(lines)), np.random.default_rng(1)
+    for i in range(20):
+        stamp(rig, 50, 100.0, rng)
+        rig.bring(50)
+        rig.work(1000.0 + i)
+    _, last = rig.caught.estimates[-1]
+    assert Status.ESTIMATED in statuses(last)
+    assert last.rate_hz == 100.2
+    rig.station.driver.state, rig.station.driver.text = "running", ""
+    assert rig.station.health({}, 0).text == ""
+
+
+def test_a_rate_within_an_oscillator_s_tolerance_gives_way_to_the_measured_one():
+    lines = text.Settings(columns=("gx", "gy", "gz", "ax", "ay", "az"))
+    rig, rng = Rig(rate=100.0, decoder=text.build(lines)), np.random.default_rng(1)
+    for i in range(80):
+        stamp(rig, 50, 98.8, rng)
+        rig.bring(50)
+        rig.work(1000.0 + i)
+        rig.station.report([rig.caught], {}, 0)
+    _, last = rig.caught.estimates[-1]
+    assert Status.ESTIMATED in statuses(last)
+    assert last.rate_hz == pytest.approx(98.8, rel=2e-3)
+
+
+def test_coefficients_wait_until_the_rate_is_checked_and_come_back_when_it_is_right_again():
+    lines = text.Settings(columns=("gx", "gy", "gz", "ax", "ay", "az"))
+    rig, rng = Rig(rate=100.0, decoder=text.build(lines)), np.random.default_rng(1)
+    stamp(rig, 100, 100.0, rng)
+    rig.bring(1000)
+    rig.work(1000.0)
+    assert statuses(rig.caught.estimates[-1][1]) == {Status.UNESTIMATED}
+    stamp(rig, 200, 100.0, rng)
+    rig.work(1001.0)  # no new sample, but the rate is known to be right
+    assert Status.ESTIMATED in statuses(rig.caught.estimates[-1][1])
+
+
+def test_captured_bytes_and_fast_simulations_have_no_times_of_arrival(tmp_path):
+    capture = tmp_path / "x.bin"
+    capture.write_bytes(b"")
+    link = replay_link.build(replay_link.Settings(path=str(capture)))
+    lines = text.build(text.Settings(columns=("gx", "gy", "gz", "ax", "ay", "az")))
+    rig = Rig(rate=100.0, decoder=lines, link=link, ready=Ready())
+    link.close()
+    stamp(rig, 600, 5000.0, np.random.default_rng(1))
+    assert not rig.station.clock.unchecked
+    assert rig.station.clock.contradicted_hz is None
+    config = tmp_path / "config.toml"
+    config.write_text(
+        '[[device]]\nname = "d"\nrate = 100.0\n[device.driver]\nlink = "virtual"\ndecoder = "text"\nspeed = 30\n'
+        '[device.driver.decoder_options]\ncolumns = ["gx", "gy", "gz"]\n'
+    )
+    (device,) = settings.load(config).devices
+    station = Station(device, LoopbackLink(), lines, threading.Event(), Ready())
+    for i in range(9000):
+        station.clock.stamp(block(np.array([10**12 + i * 333_333]), np.zeros((1, 6))))
+    assert not station.clock.unchecked
+    assert station.clock.contradicted_hz is None
 
 
 def test_a_replay_has_ended_when_its_samples_are_fitted():
@@ -375,6 +479,8 @@ def test_samples_whose_rate_cannot_be_told_go_on():
     rig.work(1000.0)
     assert sum(map(len, rig.caught.blocks)) == 40_000
     assert rig.caught.estimates == []
+    rig.station.driver.state, rig.station.driver.text = "running", ""
+    assert rig.station.health({}, 0).text == "no estimate: the times of the samples do not show a rate; set `rate`"
 
 
 def model_file(folder):
