@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TextIO
 
 import pytest
+from tests.monitor.publish.zenoh_world import eventually
 
 from monitor.publish import queued_writer
 from monitor.publish.queued_writer import QueuedLines, QueuedWriter
-from tests.monitor.publish.zenoh_world import eventually
 
 
 class Pipe:
