@@ -15,6 +15,13 @@ from monitor.topics import ENDPOINT
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Port = Annotated[int, msgspec.Meta(ge=0, le=65535)]
 Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+ZenohKey = Annotated[
+    str,
+    msgspec.Meta(
+        pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$",
+        description='a zenoh key such as "site/alarms", without * $ ? # and with text between slashes',
+    ),
+]
 
 
 class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -109,7 +116,7 @@ class ZenohTable(_Table, frozen=True, kw_only=True):
     """These two are None where a zenoh file is named and they are not given beside it: then the file's hold."""
     connect: tuple[str, ...] = ()
     config: Path | None = None
-    prefix: Annotated[str, msgspec.Meta(pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$")] = "imu"
+    prefix: ZenohKey = "imu"
 
 
 class ViewerTable(_Table, frozen=True, kw_only=True):
@@ -149,7 +156,7 @@ class HookTable(_Table, frozen=True, kw_only=True):
     """Names; none: all."""
     command: list[str] = []
     """A program's path and its arguments, never a shell's line; the event comes as JSON on standard input."""
-    key: Annotated[str, msgspec.Meta(pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$")] | None = None
+    key: ZenohKey | None = None
     """Of zenoh, where the event is put as JSON."""
     timeout: Positive | str = "30s"
     """After which the command is killed, with all that it started."""

@@ -18,7 +18,7 @@ is the mean of the gyro's three sensors, not measured when their status shows an
 """
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import ClassVar, Final, Literal
 
 import numpy as np
@@ -233,11 +233,16 @@ PADDING: Final = (b"", b"\0", b"\0\0", b"\0\0\0")
 
 def build(settings: Settings) -> Decoder:
     """A decoder with these settings; ConfigError for an unknown identifier or a missing rate."""
+    if wrong := list(_problems(settings)):
+        raise ConfigError(*wrong)
+    return Stim300Decoder(settings)
+
+
+def _problems(settings: Settings) -> Iterator[str]:
     if settings.identifier != "auto" and settings.identifier not in IDENTIFIERS:
         known = ", ".join(f"0x{identifier:02X}" for identifier in sorted(IDENTIFIERS))
-        raise ConfigError(f"identifier {settings.identifier}: the STIM300 has {known}")
-    if "increment" in (settings.gyro_output, settings.accelerometer_output) and not settings.rate:
-        raise ConfigError('an output of "increment" needs rate, the sample rate in Hz')
+        yield f"identifier: {settings.identifier}; possible are auto, {known}"
     if settings.rate is not None and not settings.rate > 0.0:
-        raise ConfigError(f"rate {settings.rate}: must be above 0 Hz")
-    return Stim300Decoder(settings)
+        yield f"rate: {settings.rate:g} Hz; it is above 0"
+    elif "increment" in (settings.gyro_output, settings.accelerometer_output) and not settings.rate:
+        yield 'rate: missing; an output of "increment" needs the sample rate in Hz'

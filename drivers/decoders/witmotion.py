@@ -218,7 +218,7 @@ def match_bluetooth(buffer: bytes, at: int) -> int:
 
 def build(settings: Settings) -> Decoder:
     """A decoder with these settings; ConfigError for a range that is none."""
-    for name in ("accelerometer_range", "gyro_range"):
-        if not getattr(settings, name) > 0.0:
-            raise ConfigError(f"{name} {getattr(settings, name)}: must be above 0")
+    ranges = (("accelerometer_range", settings.accelerometer_range, "g"), ("gyro_range", settings.gyro_range, "°/s"))
+    if wrong := [f"{key}: {value:g} {unit}; it is above 0" for key, value, unit in ranges if not value > 0.0]:
+        raise ConfigError(*wrong)
     return WitmotionDecoder(settings)

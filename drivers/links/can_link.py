@@ -29,7 +29,7 @@ import msgspec
 
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
-from drivers.plugin import nearest
+from drivers.plugin import possible
 from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk
 
 if TYPE_CHECKING:
@@ -301,6 +301,6 @@ def build(settings: Settings) -> Link:
     from can.interfaces import VALID_INTERFACES
 
     if settings.interface not in VALID_INTERFACES:
-        known = tuple(sorted(VALID_INTERFACES))
-        raise ConfigError(f'no interface "{settings.interface}" in python-can{nearest(settings.interface, known)}')
+        known = sorted(VALID_INTERFACES)
+        raise ConfigError(f'interface: "{settings.interface}"{possible(settings.interface, known)}')
     return CanLink(settings)

@@ -18,12 +18,13 @@ import importlib.util
 import os
 import threading
 import time
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.masked import masked
-from drivers.plugin import nearest
+from drivers.plugin import possible
 from drivers.sample import Chunk
 
 if TYPE_CHECKING:
@@ -187,24 +188,23 @@ def build(settings: Settings) -> Link:
 
     Raises ``ConfigError`` for a URL scheme, stop bits or a timeout that cannot be.
     """
-    if not settings.port:
-        raise ConfigError('port is empty; it is a port ("/dev/ttyUSB0") or a URL ("socket://host:port")')
-    if settings.baudrate <= 0:
-        raise ConfigError(f"baudrate = {settings.baudrate}; it is above 0")
-    if settings.stopbits not in STOP_BITS:
-        raise ConfigError(f"stopbits = {settings.stopbits}; known are 1, 1.5, 2")
-    if not 0.0 < settings.read_timeout <= LONGEST_READ_TIMEOUT_S:
-        raise ConfigError(
-            f"read_timeout = {settings.read_timeout}; it is above 0 and at most {LONGEST_READ_TIMEOUT_S} s"
-        )
-    _check_scheme(settings.port)
+    if wrong := list(_problems(settings)):
+        raise ConfigError(*wrong)
     return SerialLink(settings)
 
 
-def _check_scheme(port: str) -> None:
-    scheme, found, _ = port.partition("://")
-    if found and scheme.lower() not in SCHEMES and not _handler(scheme.lower()):
-        raise ConfigError(f'port "{port}": unknown kind of URL "{scheme}"{nearest(scheme, SCHEMES)}')
+def _problems(settings: Settings) -> Iterator[str]:
+    scheme, found, _ = settings.port.partition("://")
+    if not settings.port:
+        yield 'port: empty; it is a port ("/dev/ttyUSB0") or a URL ("socket://host:port")'
+    elif found and scheme.lower() not in SCHEMES and not _handler(scheme.lower()):
+        yield f'port: "{settings.port}" has an unknown kind of URL "{scheme}"{possible(scheme, SCHEMES)}'
+    if settings.baudrate <= 0:
+        yield f"baudrate: {settings.baudrate}; it is above 0"
+    if settings.stopbits not in STOP_BITS:
+        yield f"stopbits: {settings.stopbits:g}; possible are 1, 1.5, 2"
+    if not 0.0 < settings.read_timeout <= LONGEST_READ_TIMEOUT_S:
+        yield f"read_timeout: {settings.read_timeout:g} s; it is above 0 and at most {LONGEST_READ_TIMEOUT_S} s"
 
 
 def _handler(scheme: str) -> bool:
