@@ -1,7 +1,10 @@
 """Everything wrong with a file is told, each with its key and what would be right; what is shipped is right."""
 
+import itertools
 import json
+import re
 import tomllib
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -10,10 +13,11 @@ import pytest
 import drivers.decoders
 import drivers.links
 from drivers import plugin
+from drivers.decoders.dbc.settings import SignalSettings
 from drivers.decoders.vectornav_ascii import VectornavAsciiDecoder
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
-from drivers.links import serial_link
+from monitor.configuration_check import check
 from monitor.estimate.window import MAX_LENGTH, MIN_LENGTH
 from monitor.settings import (
     CONFIG_FOLDER,
@@ -30,7 +34,7 @@ from monitor.settings import (
     seconds,
     viewer_mode,
 )
-from monitor.tables import HookTable, LimitTable, MetricsTable
+from monitor.tables import FaultsTable, FileTable, HookTable, LimitTable, MetricsTable, StorageTable
 
 DRIVER = 'driver = { link = "serial", port = "/dev/null", decoder = "vectornav_ascii" }'
 
@@ -535,30 +539,160 @@ def test_examples_are_right(path):
     assert config is not None or lines
 
 
-def test_the_printed_defaults_are_the_defaults():
-    table = tomllib.loads((CONFIG_FOLDER / "defaults.toml").read_text("utf-8"))
-    text = (CONFIG_FOLDER / "defaults.toml").read_text("utf-8")
-    driver = table["device"][0]["driver"]
-    for kind, keys in (
-        (DeviceTable, table["device"][0]),
-        (serial_link.Settings, driver),
-        (ZenohTable, table["zenoh"]),
-        (ViewerTable, table["viewer"]),
-        (LimitTable, {}),
-        (HookTable, {}),
-        (MetricsTable, table["metrics"]),
-        (LogTable, table["log"]),
-    ):
-        for field in msgspec.structs.fields(kind):
-            default = field.default if field.default is not msgspec.NODEFAULT else None
-            if field.encode_name in keys:
-                value = keys[field.encode_name]
-                if default is not None:
-                    assert (tuple(value) if isinstance(default, tuple) else value) == default, field.name
-            else:  # no default: told as a comment
-                name = field.encode_name
-                assert f"\n# {name} = " in text or f"\n# [[device.{name}]]" in text, name
-    config, lines = read(CONFIG_FOLDER / "defaults.toml")
+HEADER = re.compile(r"(# )?(\[\[?)([\w.]+)\]\]? *(.*)")
+KEY = re.compile(r"(# )?(\w+) = (.*)")
+NOTHING = (None, "", (), [], {})
+"""Defaults that say nothing: the printed file has an example instead."""
+
+
+@dataclass
+class Printed:
+    """One table of the printed defaults."""
+
+    name: str  # "device.driver"
+    about: str  # what its header's comment says
+    commented: bool
+    keys: dict[str, object]
+    lines: list[str]  # without the marks of a comment
+
+
+def printed():
+    tables = [Printed("", "", False, {}, [])]
+    for line in (CONFIG_FOLDER / "defaults.toml").read_text("utf-8").splitlines():
+        if found := HEADER.fullmatch(line):
+            tables.append(Printed(found[3], found[4], found[1] is not None, {}, [line.removeprefix("# ")]))
+        elif found := KEY.fullmatch(line):
+            tables[-1].keys |= tomllib.loads(f"{found[2]} = {found[3]}")
+            tables[-1].lines.append(line.removeprefix("# "))
+            assert re.search(r" # \S.+", found[3]), f"no comment: {line}"
+    return tables
+
+
+def driver_of(link):
+    (table,) = [one for one in printed() if one.name == "device.driver" and one.keys["link"] == link]
+    return table
+
+
+def options_of(decoder):
+    """The tables of a decoder's options."""
+    tables = printed()
+    said = f'decoder = "{decoder}"'
+    (first,) = [i for i, one in enumerate(tables) if one.name == "device.driver.decoder_options" and said in one.about]
+    behind = itertools.takewhile(lambda one: one.name.startswith("device.driver.decoder_options."), tables[first + 1 :])
+    return [tables[first], *behind]
+
+
+def stands_whole(table, kind, own=()):
+    """Every key stands there, with its default where that says something; and no key that there is not."""
+    fields = {field.encode_name: field for field in msgspec.structs.fields(kind) if field.encode_name not in own}
+    assert table.keys.keys() - set(own) == fields.keys()
+    for name, field in fields.items():
+        default = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+        if field.required:
+            assert any(line.startswith(f"{name} = ") and "# no default; " in line for line in table.lines), name
+        elif default not in NOTHING:
+            value = table.keys[name]
+            assert (tuple(value) if isinstance(default, tuple) else value) == default, name
+
+
+TABLES = {
+    "device": (DeviceTable, ("driver", "axes", "limit")),
+    "device.limit": (LimitTable, ()),
+    "device.driver.faults": (FaultsTable, ()),
+    "device.driver.decoder_options.signals.gz": (SignalSettings, ()),
+    "zenoh": (ZenohTable, ()),
+    "viewer": (ViewerTable, ()),
+    "storage": (StorageTable, ()),
+    "hook": (HookTable, ()),
+    "metrics": (MetricsTable, ()),
+    "log": (LogTable, ()),
+}
+LINKS = sorted({*plugin.names(drivers.links, "_link"), "virtual"} - {"loopback"})
+WITH_KEYS = [
+    name
+    for name in plugin.names(drivers.decoders)
+    if msgspec.structs.fields(plugin.load(drivers.decoders, name).Settings)
+]
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_the_printed_defaults_have_every_key_of_a_table(name):
+    (table,) = [one for one in printed() if one.name == name]
+    kind, own = TABLES[name]
+    stands_whole(table, kind, own)
+
+
+@pytest.mark.parametrize("link", LINKS)
+def test_the_printed_defaults_have_every_key_of_every_link(link):
+    kind = VirtualTable if link == "virtual" else plugin.load(drivers.links, link, "_link").Settings
+    table = driver_of(link)
+    keys = dict(table.keys)
+    if link == "virtual":
+        table.keys = {**keys, "faults": {}}  # a table of its own
+        stands_whole(table, kind, ("link", "decoder", "faults"))
+    else:
+        stands_whole(table, kind, ("link", "decoder"))
+    assert {"link", "decoder"} <= keys.keys()
+
+
+@pytest.mark.parametrize("decoder", WITH_KEYS)
+def test_the_printed_defaults_have_every_key_of_every_decoder(decoder):
+    first, *others = options_of(decoder)
+    first.keys |= {one.name.split(".")[3]: one.keys for one in others}
+    first.lines += [f"{one.name.split('.')[3]} = # {one.about.removeprefix('# ')}" for one in others]
+    stands_whole(first, plugin.load(drivers.decoders, decoder).Settings)
+
+
+def test_the_printed_defaults_have_every_table():
+    names = {one.name.split(".")[0] for one in printed()} - {""}
+    assert names == {field.encode_name for field in msgspec.structs.fields(FileTable)}
+    assert set(TABLES) - {one.name for one in printed()} == set()
+    says_so = "ros2_imu and samples (messages) have no keys" in (CONFIG_FOLDER / "defaults.toml").read_text("utf-8")
+    assert set(plugin.names(drivers.decoders)) - set(WITH_KEYS) == {"ros2_imu", "samples"}
+    assert says_so
+
+
+def checks_well(folder, text):
+    """The lines of a table that is commented out are right where the mark of a comment is taken away."""
+    (folder / "recording.csv").write_text("t,gz\n0.00,0.1\n0.01,0.2\n")
+    (folder / "zenoh.json5").write_text("{}")
+    (folder / "my.toml").write_text(f'[[device]]\nname = "a"\nmodel = "consumer-mems"\n{text}\n', "utf-8")
+    config, lines = check(folder / "my.toml")
+    assert lines == []
+    assert config is not None
+
+
+@pytest.mark.parametrize("link", LINKS)
+def test_the_printed_table_of_a_link_passes_the_check(tmp_path, link):
+    lines = driver_of(link).lines
+    if driver_of(link).keys["decoder"] == "dbc":
+        lines += [line for one in options_of("dbc") for line in one.lines if not line.startswith("valid = ")]
+    if link == "virtual":
+        lines += [line for one in printed() if one.name == "device.driver.faults" for line in one.lines]
+    checks_well(tmp_path, "\n".join(lines))
+
+
+@pytest.mark.parametrize("decoder", WITH_KEYS)
+def test_the_printed_table_of_a_decoder_passes_the_check(tmp_path, decoder):
+    # no shipped database that has a counter has such a signal too
+    lines = [line for one in options_of(decoder) for line in one.lines if not line.startswith("valid = ")]
+    driver = f'[device.driver]\nlink = "virtual"\ndecoder = "{decoder}"\n'
+    checks_well(tmp_path, driver + "\n".join(lines))
+
+
+@pytest.mark.parametrize("name", ["device.limit", "hook"])
+def test_the_printed_tables_that_may_stand_several_times_pass_the_check(tmp_path, name):
+    (program,) = re.findall(r'command = \["([^"]+)"', (CONFIG_FOLDER / "defaults.toml").read_text("utf-8"))
+    (table,) = [one for one in printed() if one.name == name]
+    (tmp_path / "tell").write_text("#!/bin/sh\n")
+    (tmp_path / "tell").chmod(0o755)
+    text = "\n".join(table.lines).replace(program, "./tell").replace('"bench-1"', '"a"')
+    text = "\n".join(line for line in text.splitlines() if not line.startswith("times_model"))  # instead of above
+    checks_well(tmp_path, f"{DRIVER}\n{text}")
+
+
+def test_the_printed_defaults_pass_the_check():
+    config, lines = check(CONFIG_FOLDER / "defaults.toml")
     assert lines == []
     assert config is not None
     assert config.devices[0].axes == AxisMap()
