@@ -259,12 +259,16 @@ def axis_map(table: dict[str, str]) -> AxisMap:
         ConfigError: an axis that is none of AXES, or of the other kind
     """
     source, sign = list(range(6)), [1.0] * 6
+    wrong = []
     for axis, word in table.items():
         bare = word.lstrip("+-")
         if axis not in AXES or bare not in AXES or axis[0] != bare[0] or len(word) - len(bare) > 1:
-            raise ConfigError(
+            wrong.append(
                 f'{axis} = "{word}"; both are one of {" ".join(AXES)} and of one kind, the right one with or without -'
             )
+            continue
         source[AXES.index(axis)] = AXES.index(bare)
         sign[AXES.index(axis)] = -1.0 if word.startswith("-") else 1.0
+    if wrong:
+        raise ConfigError(*wrong)
     return AxisMap(tuple(source), tuple(sign))

@@ -38,7 +38,24 @@ def in_one_line(text: str) -> str:
 
 
 class ConfigError(ImuError, ValueError):
-    """What was asked for is wrong: names the file, key or line, and what would be right."""
+    """What was asked for is wrong: names the file, key or line, and what would be right.
+
+    Parameters
+    ----------
+    *lines
+        One line for each mistake, if several were found at once.
+
+    >>> str(ConfigError("rate: missing", "window: missing"))
+    'rate: missing; window: missing'
+    """
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """One line for each mistake."""
+        return tuple(in_one_line(str(line)) for line in self.args)
+
+    def __str__(self) -> str:
+        return in_one_line("; ".join(self.lines))
 
 
 class LinkError(ImuError, OSError):

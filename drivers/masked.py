@@ -9,7 +9,7 @@ import re
 from typing import Final
 
 HIDDEN: Final = "***"
-# One character of the scheme is enough. To search for all of it from every letter would take quadratic time in long words.
+# One character of the scheme is enough. A search for all of it from every letter would take quadratic time.
 _USER: Final = re.compile(r"([a-z0-9+.-]:?//?[^/\s:@\"']*):[^/\s@\"']+@", re.IGNORECASE)
 _WORD: Final = re.compile(
     r"""(["']?\b\w*(?:password|passwd|passphrase|secret|token|private_key_base64)["']?\s*[:=]\s*)"""

@@ -3,7 +3,7 @@
 import importlib
 import pkgutil
 from collections.abc import Sequence
-from difflib import get_close_matches
+from difflib import SequenceMatcher, get_close_matches
 from types import ModuleType
 from typing import Annotated
 
@@ -24,10 +24,10 @@ def names(package: ModuleType, suffix: str = "") -> tuple[str, ...]:
 
 
 def load(package: ModuleType, name: str, suffix: str = "") -> ModuleType:
-    """The module of one member; ConfigError with the nearest name when there is none."""
+    """The module of one member; ConfigError with all names, the nearest first, when there is none."""
     known = names(package, suffix)
     if name not in known:
-        raise ConfigError(f'unknown name "{name}"{nearest(name, known)}')
+        raise ConfigError(f'unknown name "{name}"{possible(name, known)}')
     return importlib.import_module(f"{package.__name__}.{name}{suffix}")
 
 
@@ -35,3 +35,13 @@ def nearest(word: str, known: Sequence[str]) -> str:
     """The end of an error line about an unknown word: the nearest known one, or all of them."""
     close = get_close_matches(word, known, n=1, cutoff=0.5)
     return f'; did you mean "{close[0]}"?' if close else f"; known are {', '.join(known)}"
+
+
+def possible(word: str, known: Sequence[str]) -> str:
+    """Return the end of an error line about a word that is none of ``known``: all of them, the nearest first.
+
+    >>> possible("serail", ("can", "serial"))
+    '; possible are serial, can'
+    """
+    near = {one: SequenceMatcher(None, word.lower(), one.lower()).ratio() for one in known}
+    return f"; possible are {', '.join(sorted(known, key=lambda one: -near[one]))}"

@@ -5,11 +5,11 @@ of these entries checks the number against one of the quantities below, so that 
 value that overflows, divides by zero or asks for more memory than exists. The ranges are wider than any sensor or use
 that is known, and narrow enough that products, squares and quotients of the numbers stay finite.
 
-A field of a settings struct names its quantity in its type: ``Annotated[float, RATE_HZ.meta]``. ``check_fields`` finds
-the quantity there and checks a value that msgspec has converted to that type.
+A field of a settings struct names its quantity in its type: ``Annotated[float, RATE_HZ.meta]``. ``out_of_range``
+finds the quantity there and checks a value that msgspec has converted to that type.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any, Final, TypeVar
@@ -77,7 +77,7 @@ class Quantity:
 
     @property
     def meta(self) -> msgspec.Meta:
-        """Annotation of a field of this quantity, for ``check_fields``."""
+        """Annotation of a field of this quantity, for ``out_of_range``."""
         return msgspec.Meta(extra={"quantity": self})
 
 
@@ -151,8 +151,8 @@ FIT_NUMBER: Final = Quantity("", 0.0, 1e30, signed=True)
 TEMPERATURE_C: Final = Quantity("°C", -273.15, 2_000.0)
 
 
-def check_fields(value: Any, kind: Any, place: str = "") -> None:
-    """Check every number in a value against the quantities named in its type.
+def out_of_range(value: Any, kind: Any) -> Iterator[tuple[str, str]]:
+    """Find the numbers in a value that are outside the range of the quantity named in its type.
 
     Parameters
     ----------
@@ -160,50 +160,55 @@ def check_fields(value: Any, kind: Any, place: str = "") -> None:
         What ``msgspec.convert`` made of a key for the type ``kind``.
     kind
         The type of a field of a struct; unions, containers and structs are searched.
-    place
-        Name of the key, for messages.
 
-    Raises
+    Yields
     ------
-    ConfigError
-        A number is outside the supported range of its quantity. The text begins with the place in the value.
+    tuple of str
+        Place in the value, such as ".gx", "[2]" or "", and a text with the number and the supported range.
     """
-    _check(value, inspect.type_info(kind), place)
+    yield from _out_of_range(value, inspect.type_info(kind), "")
+
+
+def range_problems(settings: msgspec.Struct) -> Iterator[str]:
+    """Yield a line for each number of a struct outside its range; it begins with the name of the key."""
+    for field in msgspec.structs.fields(settings):
+        for place, text in out_of_range(getattr(settings, field.name), field.type):
+            yield f"{field.encode_name}{place}: {text}"
 
 
 def check_settings(settings: msgspec.Struct) -> None:
-    """Check every number of a struct, as ``check_fields`` does for one field.
+    """Check every number of a struct against the quantities named in the types of its fields.
 
     Raises
     ------
     ConfigError
-        A number is outside the supported range. The text begins with the name of its key.
+        Numbers are outside the supported ranges, one line for each. A line begins with the name of the key.
     """
-    for field in msgspec.structs.fields(settings):
-        check_fields(getattr(settings, field.name), field.type, field.encode_name)
+    if wrong := list(range_problems(settings)):
+        raise ConfigError(*wrong)
 
 
-def _check(value: Any, info: inspect.Type, place: str) -> None:
+def _out_of_range(value: Any, info: inspect.Type, place: str) -> Iterator[tuple[str, str]]:
     if isinstance(info, inspect.Metadata):
         quantity = (info.extra or {}).get("quantity")
         if isinstance(quantity, Quantity) and isinstance(value, int | float) and not isinstance(value, bool):
             try:
                 quantity.check(value)
             except ConfigError as error:
-                raise ConfigError(f"{place}: {error}" if place else str(error)) from None
-        _check(value, info.type, place)
+                yield place, str(error)
+        yield from _out_of_range(value, info.type, place)
     elif isinstance(info, inspect.UnionType):
         for one in info.types:
-            _check(value, one, place)
+            yield from _out_of_range(value, one, place)
     elif isinstance(info, inspect.CollectionType) and isinstance(value, list | tuple | frozenset | set):
-        for one in value:
-            _check(one, info.item_type, place)
+        for i, one in enumerate(value):
+            yield from _out_of_range(one, info.item_type, f"{place}[{i}]")
     elif isinstance(info, inspect.DictType) and isinstance(value, Mapping):
         for key, one in value.items():
-            _check(one, info.value_type, f"{place}.{key}".lstrip("."))
+            yield from _out_of_range(one, info.value_type, f"{place}.{key}")
     elif isinstance(info, inspect.StructType) and isinstance(value, info.cls):
         for field in info.fields:
-            _check(getattr(value, field.name), field.type, f"{place}.{field.encode_name}".lstrip("."))
+            yield from _out_of_range(getattr(value, field.name), field.type, f"{place}.{field.encode_name}")
 
 
 def _amount(value: float, unit: str) -> str:

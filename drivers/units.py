@@ -3,7 +3,7 @@
 Each table maps a spelling to the factor that turns a number in that unit into rad/s, m/s², s; a
 temperature also has an offset. Spellings are those of data sheets, DBC files and plots; case matters
 (``mg`` is not ``Mg``), blanks around a name do not. A name that no table holds is a ``ConfigError``
-that names it and the nearest known one, or all.
+that names it and all that are known, the nearest first.
 """
 
 import math
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Final, TypeVar
 
 from drivers.errors import ConfigError
-from drivers.plugin import nearest
+from drivers.plugin import possible
 
 G0: Final = 9.80665
 """m/s²; standard acceleration of free fall, exact by definition (CGPM 1901)."""
@@ -120,5 +120,5 @@ def _look_up(table: Mapping[str, T], unit: str, quantity: str) -> T:
     # Unicode holds the micro sign twice; keyboards and fonts give either
     name = unit.strip().replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
     if name not in table:
-        raise ConfigError(f'unknown unit of {quantity} "{unit}"{nearest(name, tuple(table))}')
+        raise ConfigError(f'"{unit}" is no unit of {quantity}{possible(name, tuple(table))}')
     return table[name]

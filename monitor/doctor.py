@@ -26,11 +26,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from drivers.errors import ConfigError
 from drivers.links.can_link import missing_package
 from drivers.links.replay_link import ReplayLink
-from monitor import settings
-from monitor.limits import model_of
+from monitor.configuration_check import check
 from monitor.settings import Config, Storage
 
 Mark = Literal["well", "doubt", "wrong"]
@@ -91,13 +89,8 @@ def examine(path: Path | None = None) -> list[Finding]:
 
 def read(path: Path) -> tuple[Config | None, list[Finding]]:
     """The configuration, and all that is wrong with it."""
-    config, wrong = settings.read(path)
-    for one in config.devices if config else ():
-        try:
-            model_of(one)
-        except ConfigError as error:
-            wrong.append(f"{path}: {error}")
-    if wrong or config is None:
+    config, wrong = check(path)
+    if config is None:
         return None, [Finding("wrong", "configuration", line) for line in wrong]
     count = len(config.devices)
     return config, [Finding("well", "configuration", f"{path}: {count} device{'' if count == 1 else 's'}")]
@@ -308,6 +301,7 @@ def bytes_a_day(config: Config) -> float | None:
     """What all devices together will fill of the disk; None where the rate of one is not configured.
 
     >>> import dataclasses
+    >>> from monitor import settings
     >>> one = settings.load(settings.CONFIG_FOLDER / "demo.toml")
     >>> kept = Storage(Path("kept"))
     >>> bytes_a_day(dataclasses.replace(one, storage=kept)) == one.devices[0].rate_hz * DAY_S * SAMPLE_BYTES

@@ -120,7 +120,7 @@ def model_of(device: Device) -> NoiseModel | None:
     try:
         bounds(device.limits, model)
     except ConfigError as error:
-        raise ConfigError(f"device {device.name}: {error}") from None
+        raise ConfigError(*(f"device {device.name}: {line}" for line in error.lines)) from None
     return model
 
 
@@ -131,22 +131,25 @@ def bounds(limits: Sequence[Limit], model: NoiseModel | None) -> list[Bound]:
         ConfigError: relative to a model that does not have the letter on the axis
     """
     known = {} if model is None else from_model(model).axes
-    found = []
+    found, wrong = [], []
     for limit in limits:
         for axis in limit.axes:
             if limit.times_model is not None:
                 term = known.get(axis, {}).get(limit.letter)
                 if term is None:
-                    raise ConfigError(
+                    wrong.append(
                         f"limit of {limit.letter}: times_model = {limit.times_model:g}, but the model in force has "
                         f"no {limit.letter} on {axis}; name the axes that have one, or write above"
                     )
+                    continue
                 upper = limit.times_model * term.value
                 found.append(Bound(axis, limit.letter, upper, True, limit.hold_s, limit.times_model))
             if limit.above is not None:
                 found.append(Bound(axis, limit.letter, limit.above, True, limit.hold_s))
             if limit.below is not None:
                 found.append(Bound(axis, limit.letter, limit.below, False, limit.hold_s))
+    if wrong:
+        raise ConfigError(*wrong)
     return found
 
 

@@ -1,8 +1,9 @@
 """TOML -> typed settings. Reading opens nothing; everything wrong with a file is found, not only the first thing.
 
-Every key has a default but a device's ``name`` and ``driver``. An unknown key is an error that names the nearest
-known one. Links and decoders bring their own keys: their modules' ``Settings`` are filled from ``[device.driver]``
-and ``[device.driver.decoder_options]``. Relative paths are relative to the configuration file.
+An unknown key is an error that names the nearest known one. Links and decoders bring their own keys: their modules'
+``Settings`` are filled from ``[device.driver]`` and ``[device.driver.decoder_options]``. Their ``build`` reports all
+mistakes in one ``ConfigError``, a line each that begins with the key. Relative paths are relative to the configuration
+file.
 """
 
 import dataclasses
@@ -12,7 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from types import ModuleType
+from typing import Any, Final, Generic, Literal, TypeVar
 
 import msgspec
 
@@ -22,11 +24,12 @@ from drivers import plugin, small_file
 from drivers.decoders.base import Addressed, Decoder
 from drivers.driver import AxisMap, axis_map
 from drivers.errors import ConfigError, in_one_line
-from drivers.links.base import Filtering, Link, LinkSettings
-from drivers.quantities import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ, check_fields
+from drivers.links.base import Filtering, Link
+from drivers.quantities import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ
 from drivers.sample import AXES, KINDS
 from drivers.zenoh_session import configuration, plain, secret_files
 from monitor import permissions, toml
+from monitor.table_values import WRONG, convert, neutral, shown
 from monitor.tables import (
     DeviceTable,
     FaultsTable,
@@ -65,6 +68,7 @@ __all__ = [
 ]
 
 T = TypeVar("T", bound=msgspec.Struct)
+T_co = TypeVar("T_co", bound=msgspec.Struct, covariant=True)
 
 CONFIG_FOLDER: Final = Path(__file__).resolve().parent.parent / "config"
 """The data package beside this one: example configurations, models, DBC files."""
@@ -169,6 +173,42 @@ class Config:
     warnings: tuple[str, ...] = ()  # a line each: what is not wrong, but should not stay
 
 
+@dataclass(frozen=True, slots=True)
+class ModelUse:
+    """What of a device is to be checked against model files, even if other keys of its table are wrong."""
+
+    device: str
+    model: Path | None  # the model in force
+    limits: tuple[Limit, ...]
+    virtual: VirtualTable | None  # None: the device is not simulated
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """All that reading a configuration found, with mistakes in it or without."""
+
+    config: Config | None  # None: something is wrong
+    wrong: list[str]  # a line each, beginning with the file
+    models: tuple[ModelUse, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Filled(Generic[T_co]):
+    """A table with its values; keys that are wrong or missing have their defaults, or an empty value."""
+
+    table: T_co
+    wrong: frozenset[str] = frozenset()  # places of wrong values: "tau[1]", "signals.gz"
+
+    def sound(self, *keys: str) -> bool:
+        """Return True if nothing is wrong with these keys."""
+        return self.wrong.isdisjoint(keys) and not any(re.split(r"[.\[]", place)[0] in keys for place in self.wrong)
+
+    def follows(self, line: str) -> bool:
+        """Return True if a line is about a value that is known to be wrong: "key: text" about key or a part of it."""
+        place = line.partition(": ")[0]
+        return any(one == place or one.startswith((f"{place}.", f"{place}[")) for one in self.wrong)
+
+
 def load(path: Path) -> Config:
     """The configuration in a file.
 
@@ -184,31 +224,42 @@ def load(path: Path) -> Config:
 
 def read(path: Path) -> tuple[Config | None, list[str]]:
     """The configuration, or None and all that is wrong with the file, a line each."""
+    reading = examine(path)
+    return reading.config, reading.wrong
+
+
+def examine(path: Path) -> Reading:
+    """Read a configuration file and find all that is wrong with it; opens nothing."""
     try:
         text = small_file.read(path).decode("utf-8")
     except FileNotFoundError:
-        return None, [f"{path}: no such file; imu-monitor check --print-defaults prints one to start from"]
+        return Reading(None, [f"{path}: no such file; imu-monitor check --print-defaults prints one to start from"])
     except (OSError, UnicodeDecodeError) as error:
-        return None, [f"{path}: cannot be read: {error}"]
+        return Reading(None, [f"{path}: cannot be read: {error}"])
     try:
         table = toml.tables(text)
     except ConfigError as error:
-        return None, [f"{path}: {error}"]
+        return Reading(None, [f"{path}: {error}"])
     reader = _Reader(path.resolve().parent)
     config = reader.config(table)
     reader.trust(path)
     if config is None or reader.wrong:
-        return None, [in_one_line(f"{path}: {line}") for line in reader.wrong]
+        return Reading(None, [in_one_line(f"{path}: {line}") for line in reader.wrong], tuple(reader.models))
     warnings = tuple(f"{path}: {line}" for line in reader.warnings)
-    return replace(config, path=path, table=table, warnings=warnings), []
+    return Reading(replace(config, path=path, table=table, warnings=warnings), [], tuple(reader.models))
 
 
 class _Reader:
-    """Fills settings from tables and collects what is wrong."""
+    """Fills settings from tables and collects what is wrong.
+
+    A wrong key does not hide another: checks go on with the default in its place, and what they find is discarded if
+    anything is wrong. A check of several keys is left out if one of them is wrong by itself.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.wrong: list[str] = []
         self.warnings: list[str] = []
+        self.models: list[ModelUse] = []
         self._folder = folder
 
     def trust(self, path: Path) -> None:
@@ -219,61 +270,62 @@ class _Reader:
             self.warnings.append(line)
 
     def config(self, table: Mapping[str, Any]) -> Config | None:
-        file = self.fill(FileTable, table, "")
-        if file is None:
-            return None
-        if not file.device:
+        filled = self.fill(FileTable, table, "")
+        file = filled.table
+        if not file.device and filled.sound("device"):
             self.wrong.append("device: there is none; add [[device]] with name and driver")
         devices = [self.device(entry, f"device[{i}]") for i, entry in enumerate(file.device)]
         names = [entry.get("name") for entry in file.device]
         for name in sorted({str(n) for n in names if names.count(n) > 1 and n is not None}):
-            self.wrong.append(f'device: {names.count(name)} devices are named "{name}"; names must be unique')
-        unsaid = dict.fromkeys({"mode", "listen"} - file.zenoh.keys()) if "config" in file.zenoh else {}
-        zenoh = self.fill(ZenohTable, {**unsaid, **file.zenoh}, "zenoh")
+            count = [str(n) for n in names].count(name)
+            self.wrong.append(f'device: {count} devices are named "{name}"; names must be unique')
+        zenoh = self._zenoh(file.zenoh)
         viewer = self.fill(ViewerTable, file.viewer, "viewer")
-        log = self.fill(LogTable, file.log, "log")
-        if viewer is not None:
-            self._try("viewer.mode", viewer_mode, viewer.mode)
-            self._try("viewer.memory", viewer_memory, viewer.memory)
-        if zenoh is not None:
-            self._reachable(zenoh)
+        log = self.fill(LogTable, file.log, "log").table
+        if viewer.sound("mode"):
+            self._try("viewer.mode", viewer_mode, viewer.table.mode)
+        if viewer.sound("memory"):
+            self._try("viewer.memory", viewer_memory, viewer.table.memory)
         storage = self._storage(file.storage)
-        hooks = self._hooks(file.hook, [str(name) for name in names], zenoh is not None and zenoh.mode == "none")
+        hooks = self._hooks(file.hook, [str(name) for name in names], zenoh.mode == "none")
         metrics = self._metrics(file.metrics)
-        history_s = self._shown_history(viewer, storage)
-        if zenoh is None or viewer is None or log is None:
+        keeps_history = storage is not None and storage.history
+        history_s = self._shown_history(viewer, keeps_history or not filled.sound("storage"))
+        if self.wrong:
             return None
-        viewer = msgspec.structs.replace(viewer, history=history_s)
-        if viewer.mode.endswith(".rrd"):
-            path = self._folder / small_file.path(viewer.mode)
-            viewer = msgspec.structs.replace(viewer, mode=str(path))
+        shown = msgspec.structs.replace(viewer.table, history=history_s)
+        if shown.mode.endswith(".rrd"):
+            shown = msgspec.structs.replace(shown, mode=str(self._folder / small_file.path(shown.mode)))
         known = tuple(device for device in devices if device is not None)
-        return Config(known, zenoh, viewer, log, storage, hooks, metrics)
+        return Config(known, zenoh, shown, log, storage, hooks, metrics)
 
-    def _shown_history(self, viewer: ViewerTable | None, storage: Storage | None) -> float | None:
+    def _shown_history(self, viewer: _Filled[ViewerTable], kept: bool) -> float | None:
         """s of it that the viewer opens on."""
-        if viewer is None or viewer.history is None:
+        if viewer.table.history is None:
             return None
-        if storage is None or not storage.history:
+        if not kept:
             self.wrong.append("viewer.history: none is kept; [storage] folder says where it would be")
-        found: float | None = self._try("viewer.history", seconds, viewer.history)
+        found: float | None = self._try("viewer.history", seconds, viewer.table.history)
         return found
 
     def _limits(self, tables: list[dict[str, Any]], has_model: bool, at: str) -> tuple[Limit, ...]:
-        filled = [(self.fill(LimitTable, one, f"{at}[{i}]"), f"{at}[{i}]") for i, one in enumerate(tables)]
         limits = []
-        for table, here in filled:
-            if table is None:
-                continue
-            axes = self._try(f"{here}.axes", _axes, table.axes)
-            hold_s = self._try(f"{here}.hold", seconds, table.hold)
-            if self._bounds(table, has_model, here) and axes and hold_s:
+        for i, one in enumerate(tables):
+            here = f"{at}[{i}]"
+            filled = self.fill(LimitTable, one, here)
+            table = filled.table
+            axes = self._try(f"{here}.axes", _axes, table.axes) if filled.sound("axes") else None
+            hold_s = self._try(f"{here}.hold", seconds, table.hold) if filled.sound("hold") else None
+            bounded = self._bounds(filled, has_model, here)
+            if bounded and axes and hold_s and filled.sound("letter"):
                 limits.append(Limit(axes, table.letter, table.above, table.below, table.times_model, hold_s))
         return tuple(limits)
 
-    def _bounds(self, table: LimitTable, has_model: bool, at: str) -> bool:
+    def _bounds(self, filled: _Filled[LimitTable], has_model: bool, at: str) -> bool:
         """Whether the bounds of a limit fit each other."""
-        before = len(self.wrong)
+        if not filled.sound("above", "below", "times_model"):
+            return False
+        before, table = len(self.wrong), filled.table
         if table.above is None and table.below is None and table.times_model is None:
             self.wrong.append(f"{at}: no bound; add above, below or times_model")
         if table.above is not None and table.times_model is not None:
@@ -288,26 +340,27 @@ class _Reader:
         hooks = []
         for i, one in enumerate(tables):
             at = f"hook[{i}]"
-            table = self.fill(HookTable, one, at)
-            timeout_s = None if table is None else self._try(f"{at}.timeout", seconds, table.timeout)
-            if table is None or timeout_s is None:
-                continue
+            filled = self.fill(HookTable, one, at)
+            table = filled.table
+            timeout_s = self._try(f"{at}.timeout", seconds, table.timeout) if filled.sound("timeout") else None
             for key, said, known in (("on", table.on, (*KINDS, "*")), ("devices", table.devices, devices)):
                 for word in (word for word in said if word not in known):
-                    self.wrong.append(f'{at}.{key}: unknown "{word}"{plugin.nearest(word, known)}')
-            if not table.on:
+                    self.wrong.append(f'{at}.{key}: "{word}"{plugin.possible(word, known)}')
+            if not table.on and filled.sound("on"):
                 self.wrong.append(f'{at}.on: empty; write kinds of events, or ["*"]')
-            if not table.command and table.key is None:
+            if not table.command and table.key is None and filled.sound("command", "key"):
                 self.wrong.append(f"{at}: nothing to do; add command or key")
             if table.key is not None and no_zenoh:
                 self.wrong.append(f'{at}.key: zenoh.mode is "none", so nothing can be put there')
             command = self._try(f"{at}.command", _command, table.command, self._folder)
-            hooks.append(Hook(frozenset(table.on), frozenset(table.devices), command or (), table.key, timeout_s))
+            hooks.append(
+                Hook(frozenset(table.on), frozenset(table.devices), command or (), table.key, timeout_s or 0.0)
+            )
         return tuple(hooks)
 
     def _metrics(self, keys: Mapping[str, Any]) -> Metrics | None:
-        table = self.fill(MetricsTable, keys, "metrics")
-        if table is None or table.listen is None:
+        table = self.fill(MetricsTable, keys, "metrics").table
+        if table.listen is None:
             return None
         match = LISTEN.fullmatch(table.listen)
         if match is None or int(match[2]) == 0 or not PORT.supports(int(match[2])):
@@ -317,29 +370,35 @@ class _Reader:
 
     def _storage(self, keys: Mapping[str, Any]) -> Storage | None:
         """None where nothing is to be kept, or a key is wrong."""
-        table = self.fill(StorageTable, keys, "storage")
-        if table is None:
-            return None
-        segment_s = self._try("storage.segment", seconds, table.segment)
-        keep_s = self._try("storage.keep", seconds, table.keep)
-        if table.folder is None or segment_s is None or keep_s is None:
-            return None
-        if not SEGMENT_S[0] <= segment_s <= SEGMENT_S[1]:
+        filled = self.fill(StorageTable, keys, "storage")
+        table = filled.table
+        segment_s = self._try("storage.segment", seconds, table.segment) if filled.sound("segment") else None
+        keep_s = self._try("storage.keep", seconds, table.keep) if filled.sound("keep") else None
+        if segment_s is not None and not SEGMENT_S[0] <= segment_s <= SEGMENT_S[1]:
             self.wrong.append(f"storage.segment: {segment_s:g} s; possible are 10 s to 1 d")
-        if keep_s < segment_s:
+        if segment_s is not None and keep_s is not None and keep_s < segment_s:
             self.wrong.append(f"storage.keep: {keep_s:g} s is shorter than a segment of {segment_s:g} s")
-        return Storage(table.folder, table.record, table.raw, segment_s, keep_s, table.disk_share, table.history)
+        if table.folder is None:
+            return None
+        return Storage(
+            table.folder, table.record, table.raw, segment_s or 0.0, keep_s or 0.0, table.disk_share, table.history
+        )
 
-    def _reachable(self, zenoh: ZenohTable) -> None:
-        """Whether the session could ever open."""
+    def _zenoh(self, keys: Mapping[str, Any]) -> ZenohTable:
+        """The table, and whether the session could ever open."""
+        unsaid = dict.fromkeys({"mode", "listen"} - keys.keys()) if "config" in keys else {}
+        filled = self.fill(ZenohTable, {**unsaid, **keys}, "zenoh")
+        zenoh = filled.table
         for key, endpoints in (("listen", zenoh.listen or ()), ("connect", zenoh.connect)):
             for endpoint in endpoints:
                 if not IS_ENDPOINT.fullmatch(endpoint):
                     self.wrong.append(f'zenoh.{key}: "{endpoint}" is no endpoint; write "{ENDPOINT}"')
         if zenoh.config is not None and zenoh.mode != "none":
             self._zenoh_file(zenoh.config)
-        if zenoh.mode == "client" and not zenoh.connect and zenoh.config is None:
+        alone = not zenoh.connect and zenoh.config is None
+        if zenoh.mode == "client" and alone and filled.sound("connect", "config"):
             self.wrong.append('zenoh.connect: empty, but a client needs a router, e.g. ["tcp/127.0.0.1:7447"]')
+        return zenoh
 
     def _zenoh_file(self, path: Path) -> None:
         """Whether zenoh takes it, and who else may change it or read the secrets in it."""
@@ -354,123 +413,150 @@ class _Reader:
                 self.warnings.append(f"zenoh.config: {file.name}: {line}")
 
     def device(self, table: Mapping[str, Any], at: str) -> Device | None:
-        entry = self.fill(DeviceTable, table, at)
-        if entry is None:
-            return None
-        if not DEVICE_NAME.fullmatch(entry.name):
-            self.wrong.append(f'{at}.name: "{entry.name}"; letters, digits, - and _ are possible')
-        at = f"device {entry.name}"
-        window_s = self._try(f"{at}: window", seconds, entry.window)
-        refit_s = self._try(f"{at}: refit", period, entry.refit, "every sample")
-        publish_s = self._try(f"{at}: publish", period, entry.publish, "every block")
+        filled = self.fill(DeviceTable, table, at)
+        entry = filled.table
+        if filled.sound("name"):
+            if not DEVICE_NAME.fullmatch(entry.name):
+                self.wrong.append(f'{at}.name: "{entry.name}"; letters, digits, - and _ are possible')
+            at = f"device {entry.name}"
+        rate = entry.rate if filled.sound("rate") else None
+        window_s = self._try(f"{at}: window", seconds, entry.window) if filled.sound("window") else None
+        refit_s = self._try(f"{at}: refit", period, entry.refit, "every sample") if filled.sound("refit") else None
+        publish_s = (
+            self._try(f"{at}: publish", period, entry.publish, "every block") if filled.sound("publish") else None
+        )
         axes = self._try(f"{at}: axes", axis_map, entry.axes)
-        link, decoder = self.driver(entry.driver, f"{at}: driver")
-        if window_s is None or refit_s is None or publish_s is None or axes is None or link is None or decoder is None:
-            return None
-        self._try(f"{at}: window", _possible_window, window_s, entry.rate)
-        thermal_s = self._try(f"{at}: thermal_interval", _thermal_interval, entry.thermal_interval, entry.rate)
-        model = None if entry.model is None else self._try(f"{at}: model", model_path, entry.model, self._folder)
+        link, decoder, silence_s = None, None, 0.0
+        if filled.sound("driver"):
+            link, decoder, silence_s = self.driver(entry.driver, f"{at}: driver")
         tau = entry.tau if isinstance(entry.tau, str) else tuple(entry.tau)
-        self._try(f"{at}: tau", _possible_tau, tau, window_s, entry.rate)
-        limits = self._limits(entry.limit, entry.model is not None, f"{at}: limit")
-        silence_s = float(entry.driver.get("silence", LinkSettings().silence))
+        if window_s is not None and filled.sound("rate"):
+            self._try(f"{at}: window", _possible_window, window_s, rate)
+            if filled.sound("tau"):
+                self._try(f"{at}: tau", _possible_tau, tau, window_s, rate)
+        thermal_s = None
+        if filled.sound("thermal_interval"):
+            thermal_s = self._try(f"{at}: thermal_interval", _thermal_interval, entry.thermal_interval, rate)
+        model = None if entry.model is None else self._try(f"{at}: model", model_path, entry.model, self._folder)
+        limits = self._limits(entry.limit, entry.model is not None or not filled.sound("model"), f"{at}: limit")
+        virtual = link if isinstance(link, VirtualTable) else None
+        self.models.append(ModelUse(at, model, limits, virtual))
+        if link is None or decoder is None:
+            return None
         return Device(
-            entry.name, entry.rate, window_s, tau, refit_s, publish_s, link, decoder, axes, silence_s,
-            entry.motion == "leave out", entry.alarms_per_day, entry.restart, model,
+            entry.name, rate, window_s or 0.0, tau, refit_s or 0.0, publish_s or 0.0, link, decoder,
+            axes or AxisMap(), silence_s, entry.motion == "leave out", entry.alarms_per_day, entry.restart, model,
             entry.reconcile_folder, thermal_s, entry.compensate, limits,
         )  # fmt: skip
 
-    def driver(self, table: Mapping[str, Any], at: str) -> tuple[Link | VirtualTable | None, Decoder | None]:
+    def driver(self, table: Mapping[str, Any], at: str) -> tuple[Link | VirtualTable | None, Decoder | None, float]:
+        """Link, decoder and ``silence`` in s; without a link or decoder where it is unknown or wrong."""
         keys = dict(table)
         link_name = keys.pop("link", None)
         decoder_name = keys.pop("decoder", "")
         options = keys.pop("decoder_options", {})
         known = sorted({*plugin.names(drivers.links, "_link"), "virtual"} - {"loopback"})
         if link_name not in known:
-            said = "missing" if link_name is None else f'unknown link "{link_name}"'
-            self.wrong.append(f"{at}.link: {said}{plugin.nearest(str(link_name), known)}")
-            return None, None
-        if link_name == "virtual":
-            link: Link | VirtualTable | None = self._virtual(keys, at)
-            carrier, default = "", "vectornav_binary"
-        else:
-            module = plugin.load(drivers.links, link_name, "_link")
-            settings = self.fill(module.Settings, keys, at)
-            built: Link | None = None if settings is None else self._try(at, module.build, settings)
-            link, carrier = built, built.carrier if built else ""
-            default = (
-                module.DEFAULT_DECODER if built is None else getattr(built, "default_decoder", module.DEFAULT_DECODER)
-            )
-        decoder = self.decoder(decoder_name or default, options, at)
-        if decoder is not None and carrier and decoder.carrier != carrier:
+            said = "missing" if link_name is None else shown(link_name)
+            self.wrong.append(f"{at}.link: {said}{plugin.possible(str(link_name or ''), known)}")
+            if decoder_name:
+                self.decoder(decoder_name, options, at)
+            return None, None, 0.0
+        link, silence_s, carrier, default = self._link(link_name, keys, at)
+        decoder, decodes = self.decoder(decoder_name or default, options, at)
+        if carrier and decodes and decodes != carrier:
             fitting = ", ".join(_decoders_of(carrier))
             name = decoder_name or default
-            self.wrong.append(
-                f"{at}.decoder: {name} reads {decoder.carrier}, link {link_name} brings {carrier}: {fitting}"
-            )
+            self.wrong.append(f"{at}.decoder: {name} reads {decodes}, link {link_name} brings {carrier}: {fitting}")
         _narrow(link, decoder)
-        return link, decoder
+        return link, decoder, silence_s
 
-    def _virtual(self, keys: Mapping[str, Any], at: str) -> VirtualTable | None:
+    def _link(self, name: str, keys: Mapping[str, Any], at: str) -> tuple[Link | VirtualTable | None, float, str, str]:
+        """Link, its ``silence`` in s, what it carries ("": anything), and its default decoder."""
+        if name == "virtual":
+            table = self._virtual(keys, at)
+            return table, table.silence, "", "vectornav_binary"
+        module = plugin.load(drivers.links, name, "_link")
+        filled = self.fill(module.Settings, keys, at)
+        link: Link | None = self._build(module, filled, at)
+        if link is None:
+            return None, 0.0, _carrier_of(module), module.DEFAULT_DECODER
+        default = getattr(link, "default_decoder", module.DEFAULT_DECODER)
+        return link, filled.table.silence, link.carrier, default
+
+    def _virtual(self, keys: Mapping[str, Any], at: str) -> VirtualTable:
         named = dict(keys)
         faults = self._faults(named.pop("faults", {}), f"{at}.faults")
-        table = self.fill(VirtualTable, named, at)
-        path = None if table is None else self._try(f"{at}.model", model_path, table.model, self._folder)
-        if table is None or faults is None or path is None:
-            return None
-        return msgspec.structs.replace(table, model=str(path), faults=faults)
+        table = self.fill(VirtualTable, named, at).table
+        path = self._try(f"{at}.model", model_path, table.model, self._folder)
+        return msgspec.structs.replace(table, model="" if path is None else str(path), faults=faults)
 
-    def _faults(self, keys: Any, at: str) -> FaultsTable | None:
+    def _faults(self, keys: Any, at: str) -> FaultsTable:
         if not isinstance(keys, dict):
-            self.wrong.append(f"{at}: expected a table")
-            return None
-        table = self.fill(FaultsTable, keys, at)
-        if table is not None and table.lost + table.repeated + table.flipped + table.cut > 1.0:
+            self.wrong.append(f"{at}: expected a table, got {shown(keys)}")
+            return FaultsTable()
+        table = self.fill(FaultsTable, keys, at).table
+        if table.lost + table.repeated + table.flipped + table.cut > 1.0:
             self.wrong.append(
                 f"{at}: lost, repeated, flipped and cut are shares of all samples: their sum is at most 1"
             )
-            return None
         return table
 
-    def decoder(self, name: Any, options: Any, at: str) -> Decoder | None:
-        if not isinstance(name, str):
-            self.wrong.append(f"{at}.decoder: expected a name in quotes, got {name!r}")
-            return None
-        if not name:
-            self.wrong.append(f"{at}.decoder: missing; known are {', '.join(plugin.names(drivers.decoders))}")
-            return None
-        module = self._try(f"{at}.decoder", plugin.load, drivers.decoders, name)
-        if module is None:
-            return None
+    def decoder(self, name: Any, options: Any, at: str) -> tuple[Decoder | None, str]:
+        """The decoder, and what it reads ("": unknown); None where it is unknown or its options are wrong."""
+        known = plugin.names(drivers.decoders)
+        if not name or name not in known:
+            said = shown(name) if name else "missing"
+            self.wrong.append(f"{at}.decoder: {said}{plugin.possible(str(name), known)}")
+            return None, ""
+        module = plugin.load(drivers.decoders, name)
         if not isinstance(options, dict):
-            self.wrong.append(f"{at}.decoder_options: expected a table")
-            return None
-        settings = self.fill(module.Settings, options, f"{at}.decoder_options")
-        decoder: Decoder | None = (
-            None if settings is None else self._try(f"{at}.decoder_options", module.build, settings)
-        )
-        return decoder
+            self.wrong.append(f"{at}.decoder_options: expected a table, got {shown(options)}")
+            return None, _carrier_of(module)
+        filled = self.fill(module.Settings, options, f"{at}.decoder_options")
+        return self._build(module, filled, f"{at}.decoder_options"), _carrier_of(module)
 
-    def fill(self, kind: type[T], table: Mapping[str, Any], at: str) -> T | None:
+    def _build(self, module: Any, filled: _Filled[Any], at: str) -> Any:
+        """The link or decoder of a module; None where its settings are wrong, which the module knows best."""
+        try:
+            built = module.build(filled.table)
+        except ConfigError as error:
+            keys = {field.encode_name for field in msgspec.structs.fields(filled.table)}
+            for line in (line for line in error.lines if not filled.follows(line)):
+                dot = "." if re.split(r"[.\[:]", line)[0] in keys else ": "
+                self.wrong.append(f"{at}{dot}{line}")
+            return None
+        return None if filled.wrong else built
+
+    def fill(self, kind: type[T], table: Mapping[str, Any], at: str) -> _Filled[T]:
         """A struct from a table, each key on its own, so that every wrong one is told."""
-        before = len(self.wrong)
         dot = f"{at}." if at else ""
         fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
         values: dict[str, Any] = {}
+        wrong: list[str] = []
         for key, value in table.items():
             if key not in fields:
+                wrong.append(key)
                 self.wrong.append(f"{dot}{key}: unknown key{plugin.nearest(key, tuple(fields))}")
                 continue
-            try:
-                converted = msgspec.convert(value, fields[key].type, dec_hook=self._path)
-                check_fields(converted, fields[key].type)
-                values[fields[key].name] = self._beside(converted, fields[key].type)
-            except (msgspec.ValidationError, ValueError) as error:
-                self.wrong.append(f"{dot}{key}: {error}")
+            converted, problems = convert(value, fields[key].type, self._path)
+            if not problems:
+                try:
+                    converted = self._beside(converted, fields[key].type)
+                except ValueError as error:
+                    converted, problems = WRONG, [("", str(error))]
+            for place, text in problems:
+                wrong.append(f"{key}{place}")
+                self.wrong.append(f"{dot}{key}{place}: {text}")
+            if converted is not WRONG:
+                values[fields[key].name] = converted
         for key, field in fields.items():
             if field.required and key not in table:
+                wrong.append(key)
                 self.wrong.append(f"{dot}{key}: missing")
-        return kind(**values) if len(self.wrong) == before else None
+            if field.required and field.name not in values:
+                values[field.name] = neutral(field.type)
+        return _Filled(kind(**values), frozenset(wrong))
 
     def _beside(self, value: Any, kind: Any) -> Any:
         """Files are looked for beside the configuration file, see ``drivers.plugin``."""
@@ -487,13 +573,13 @@ class _Reader:
     def _path(self, kind: type, value: Any) -> Any:
         if kind is Path and isinstance(value, str):
             return self._folder / small_file.path(value)
-        raise ValueError(f"expected a path in quotes, got {value!r}")
+        raise ValueError("not a path")
 
     def _try(self, at: str, function: Any, *arguments: Any) -> Any:
         try:
             return function(*arguments)
         except ConfigError as error:
-            self.wrong.append(f"{at}: {error}")
+            self.wrong += [f"{at}: {line}" for line in error.lines]
             return None
 
 
@@ -585,7 +671,7 @@ def viewer_mode(mode: str) -> str:
     modes = ("auto", "native", "web", "none")
     if mode in modes or mode.endswith(".rrd"):
         return mode
-    raise ConfigError(f'"{mode}"; possible are {", ".join(modes)} or a file ending in .rrd')
+    raise ConfigError(f'"{mode}"{plugin.possible(mode, modes)}, or a file ending in .rrd')
 
 
 def _shortened(value: object) -> str:
@@ -645,7 +731,7 @@ def _axes(pattern: str) -> tuple[str, ...]:
     """
     if pattern in (*AXES, "g*", "a*", "*"):
         return tuple(axis for axis in AXES if fnmatch(axis, pattern))
-    raise ConfigError(f'"{pattern}"; possible are {", ".join(AXES)}, g*, a*, *')
+    raise ConfigError(f'"{pattern}"{plugin.possible(pattern, (*AXES, "g*", "a*", "*"))}')
 
 
 def _command(words: list[str], folder: Path) -> tuple[str, ...]:
@@ -671,10 +757,11 @@ def _narrow(link: object, decoder: object) -> None:
 
 
 def _decoders_of(carrier: str) -> list[str]:
-    fitting: list[str] = []
-    for name in plugin.names(drivers.decoders):
-        module = plugin.load(drivers.decoders, name)
-        kinds = [member for member in vars(module).values() if isinstance(member, type)]
-        if any(kind.__module__ == module.__name__ and getattr(kind, "carrier", "") == carrier for kind in kinds):
-            fitting.append(name)
-    return fitting
+    modules = [(name, plugin.load(drivers.decoders, name)) for name in plugin.names(drivers.decoders)]
+    return [name for name, module in modules if _carrier_of(module) == carrier]
+
+
+def _carrier_of(module: ModuleType) -> str:
+    """What a link module brings, or a decoder module reads; "" where its settings decide."""
+    kinds = [one for one in vars(module).values() if isinstance(one, type) and one.__module__ == module.__name__]
+    return next((str(kind.carrier) for kind in kinds if hasattr(kind, "carrier")), "")

@@ -17,6 +17,13 @@ Coefficient = Annotated[float, quantities.COEFFICIENT.meta]
 Duration = Annotated[float, quantities.DURATION_S.meta]
 Port = Annotated[int, quantities.PORT.meta]
 Share = Annotated[float, quantities.SHARE.meta]
+ZenohKey = Annotated[
+    str,
+    msgspec.Meta(
+        pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$",
+        description='a zenoh key such as "site/alarms", without * $ ? # and with text between slashes',
+    ),
+]
 
 
 class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -111,7 +118,7 @@ class ZenohTable(_Table, frozen=True, kw_only=True):
     """These two are None where a zenoh file is named and they are not given beside it: then the file's hold."""
     connect: tuple[str, ...] = ()
     config: Path | None = None
-    prefix: Annotated[str, msgspec.Meta(pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$")] = "imu"
+    prefix: ZenohKey = "imu"
 
 
 class ViewerTable(_Table, frozen=True, kw_only=True):
@@ -151,7 +158,7 @@ class HookTable(_Table, frozen=True, kw_only=True):
     """Names; none: all."""
     command: list[str] = []
     """A program's path and its arguments, never a shell's line; the event comes as JSON on standard input."""
-    key: Annotated[str, msgspec.Meta(pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$")] | None = None
+    key: ZenohKey | None = None
     """Of zenoh, where the event is put as JSON."""
     timeout: Duration | str = "30s"
     """After which the command is killed, with all that it started."""

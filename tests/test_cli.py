@@ -102,7 +102,7 @@ def test_linear_algebra_keeps_to_one_thread_unless_told() -> None:
 WRONG_FILES = {
     "unknown key": (VIRTUAL + "windw = 10.0\n", 'windw: unknown key; did you mean "window"?'),
     "unknown table": (VIRTUAL + '[zeno]\nmode = "peer"\n', 'zeno: unknown key; did you mean "zenoh"?'),
-    "wrong type": (VIRTUAL + 'rate = "fast"\n', "device[0].rate: Expected `float | null`, got `str`"),
+    "wrong type": (VIRTUAL + 'rate = "fast"\n', "device[0].rate: expected a number above 0, or nothing"),
     "infinite rate": (VIRTUAL + "rate = inf\n", "inf Hz"),
     "one name twice": (VIRTUAL + VIRTUAL, '2 devices are named "bench-1"; names must be unique'),
     "name with a slash": (VIRTUAL.replace("bench-1", "a/b"), '"a/b"; letters, digits, - and _ are possible'),
@@ -111,11 +111,17 @@ WRONG_FILES = {
     "no device": ("", "there is none; add [[device]]"),
     "not TOML": ("[[device\nname =", "not TOML: "),
     "not text": (b"\xff\xfe\x00", "cannot be read: "),
-    "unknown protocol": (DEVICE + 'driver = { link = "virtual", decoder = "stim30" }\n', 'did you mean "stim300"?'),
-    "protocol by number": (DEVICE + 'driver = { link = "virtual", decoder = 3 }\n', "driver.decoder: expected a name"),
-    "unknown link": (DEVICE + 'driver = { link = "seral" }\n', 'unknown link "seral"; did you mean "serial"?'),
-    "no link": (DEVICE + "driver = {}\n", "driver.link: missing; known are can, replay, serial, virtual, zenoh"),
-    "no protocol": (DEVICE + 'driver = { link = "serial", port = "/dev/x" }\n', "driver.decoder: missing; known are"),
+    "unknown protocol": (
+        DEVICE + 'driver = { link = "virtual", decoder = "stim30" }\n',
+        '"stim30"; possible are stim300',
+    ),
+    "protocol by number": (DEVICE + 'driver = { link = "virtual", decoder = 3 }\n', "driver.decoder: 3; possible are"),
+    "unknown link": (DEVICE + 'driver = { link = "seral" }\n', 'driver.link: "seral"; possible are serial, '),
+    "no link": (DEVICE + "driver = {}\n", "driver.link: missing; possible are can, replay, serial, virtual, zenoh"),
+    "no protocol": (
+        DEVICE + 'driver = { link = "serial", port = "/dev/x" }\n',
+        "driver.decoder: missing; possible are",
+    ),
     "no port": (DEVICE + 'driver = { link = "serial", decoder = "stim300" }\n', "driver.port: missing"),
     "protocol that does not fit": (
         DEVICE + 'driver = { link = "serial", port = "x", decoder = "ros2_imu" }\n',
@@ -150,7 +156,7 @@ WRONG_FILES = {
     "window too long": (VIRTUAL + 'rate = 100.0\nwindow = "2d"\n', "are 17280000 samples; possible are 100 to"),
     "window too long at any rate": (VIRTUAL + 'window = "1e9 s"\n', "1e+09 s; at most 3.456e+06 s"),
     "unknown grid of tau": (VIRTUAL + 'tau = "octav"\n', "device[0].tau: "),
-    "negative tau": (VIRTUAL + "tau = [-1.0]\n", "device[0].tau: "),
+    "negative tau": (VIRTUAL + "tau = [-1.0]\n", "device[0].tau[0]: expected a number above 0"),
     "empty tau": (VIRTUAL + "tau = []\n", "tau: none of [] s lies between one sample and 1800 s, half the window"),
     "tau beyond the window": (VIRTUAL + "window = 10.0\ntau = [1000.0]\n", "tau: none of [1000.0] s lies between"),
     "tau below a sample": (VIRTUAL + "rate = 100.0\ntau = [0.001]\n", "tau: none of [0.001] s lies between"),
@@ -159,7 +165,7 @@ WRONG_FILES = {
     "unknown axis": (VIRTUAL + 'axes = { gz = "-gw" }\n', 'gz = "-gw"; both are one of gx gy gz ax ay az'),
     "bad viewer": (
         VIRTUAL + '[viewer]\nmode = "nativ"\n',
-        'viewer.mode: "nativ"; possible are auto, native, web, none',
+        'viewer.mode: "nativ"; possible are native, auto, none, web, or a file ending in .rrd',
     ),
     "bad port": (VIRTUAL + "[viewer]\nport = 99999\n", "viewer.port: 99999 is outside the supported range 0 to 65535"),
     "bad size": (VIRTUAL + '[viewer]\nmemory = "lots"\n', 'viewer.memory: "lots" is no size; write "256MiB"'),
@@ -211,6 +217,38 @@ def test_check_reads_the_model_of_a_simulated_device_too(call: Call) -> None:
         said = call(command, "c.toml")
         assert said.status == 2
         assert "model.toml" in said.only_line()
+
+
+def test_check_tells_what_is_wrong_with_models_beside_all_else(call: Call) -> None:
+    Path("model.toml").write_text("sample_rate = 100.0\n[gz.angle_random_walk]\nM = 1.0\n")
+    limits = "".join(f'[[device.limit]]\naxes = "gz"\nletter = "{letter}"\ntimes_model = 2.0\n' for letter in "RK")
+    effects = '["gz.sinusoidal:amplitude=1,frequency=60", "gz"]'
+    Path("c.toml").write_text(
+        f'[[device]]\nname = "a"\nwindw = 1\n'
+        f'driver = {{ link = "virtual", model = "model.toml", effect = {effects} }}\n'
+        f'[[device]]\nname = "b"\nmodel = "consumer-mems"\ndriver = {{ link = "sereal" }}\n{limits}'
+        f'[[device]]\nname = "c"\nmodel = "model.toml"\n'
+        f'driver = {{ link = "virtual", seed = -1, effect = {effects} }}\n[log]\nlevel = "loud"\n'
+    )
+    said = call("check", "c.toml")
+    assert said.status == 2
+    begins = [
+        "device[0].windw: unknown key",
+        'device b: driver.link: "sereal"; possible are serial, ',
+        "device c: driver.seed: ",
+        'log.level: "loud"; possible are ',
+        'device a: "gz" is no effect',
+        "device a: ",  # and the file of the model
+        "device b: limit of R: times_model = 2, but the model in force has no R on gz",
+        "device c: ",
+        'device c: "gz" is no effect',
+        'device c: effect "gz.sinusoidal:amplitude=1,frequency=60": ',
+    ]
+    lines = said.err.splitlines()
+    assert len(lines) == len(begins), lines
+    for line, begin in zip(lines, begins, strict=True):
+        assert line.startswith(f"c.toml: {begin}"), line
+    assert sum("model.toml: " in line for line in lines) == 2
 
 
 def test_check_reads_the_effects_of_a_simulated_device_too(call: Call) -> None:
@@ -271,7 +309,7 @@ WRONG_ARGUMENTS = {
     "findings nowhere": (("doctor", "--json", "nowhere/x.json"), "--json: nowhere/x.json: cannot be written"),
     "missing file": (("run", "nowhere.toml"), "nowhere.toml: no such file"),
     "folder for a file": (("run", "."), ".: cannot be read"),
-    "bad viewer": (("demo", "--viewer", "nativ"), '--viewer: "nativ"; possible are auto, native, web, none'),
+    "bad viewer": (("demo", "--viewer", "nativ"), '--viewer: "nativ"; possible are native, auto, '),
     "bad seconds": (("demo", "--seconds", "soon"), "Invalid value for '--seconds'"),
     "no seconds": (("demo", "--seconds", "0"), "Invalid value for '--seconds'"),
     "bad endpoint": (("watch", "--connect", "7450"), 'connect "7450": no endpoint; write e.g. tcp/127.0.0.1:7450'),

@@ -18,7 +18,7 @@ is the mean of the gyro's three sensors, not measured when their status shows an
 """
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
@@ -35,7 +35,7 @@ from drivers.decoders.base import (
     quantize,
 )
 from drivers.errors import ConfigError
-from drivers.quantities import RATE_HZ, check_settings
+from drivers.quantities import RATE_HZ, range_problems
 from drivers.sample import Chunk, Counter, Floats, Ints, SampleBlock, Timing
 from drivers.units import DEGREE, G0
 
@@ -234,10 +234,15 @@ PADDING: Final = (b"", b"\0", b"\0\0", b"\0\0\0")
 
 def build(settings: Settings) -> Decoder:
     """A decoder with these settings; ConfigError for an unknown identifier or a missing rate."""
-    check_settings(settings)
+    if wrong := list(_problems(settings)):
+        raise ConfigError(*wrong)
+    return Stim300Decoder(settings)
+
+
+def _problems(settings: Settings) -> Iterator[str]:
+    yield from range_problems(settings)
     if settings.identifier != "auto" and settings.identifier not in IDENTIFIERS:
         known = ", ".join(f"0x{identifier:02X}" for identifier in sorted(IDENTIFIERS))
-        raise ConfigError(f"identifier {settings.identifier}: the STIM300 has {known}")
-    if "increment" in (settings.gyro_output, settings.accelerometer_output) and not settings.rate:
-        raise ConfigError('an output of "increment" needs rate, the sample rate in Hz')
-    return Stim300Decoder(settings)
+        yield f"identifier: {settings.identifier}; possible are auto, {known}"
+    if "increment" in (settings.gyro_output, settings.accelerometer_output) and settings.rate is None:
+        yield 'rate: missing; an output of "increment" needs the sample rate in Hz'

@@ -11,7 +11,7 @@ The first line after the link was opened is most often cut in front, and a cut n
 ``first_line = "keep"``. ``encode`` therefore puts a line end before a block's first line.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated, ClassVar, Final, Literal
 
 import msgspec
@@ -27,8 +27,8 @@ from drivers.decoders.base import (
     xor,
 )
 from drivers.errors import ConfigError
-from drivers.plugin import nearest
-from drivers.quantities import COUNTER_MODULUS, HEADER_LINES, SCALE, check_settings
+from drivers.plugin import possible
+from drivers.quantities import COUNTER_MODULUS, HEADER_LINES, SCALE, range_problems
 from drivers.sample import AXES, NO_TICK, Arrival, Chunk, Counter, Floats, SampleBlock, Timing
 
 LONGEST: Final = 4096
@@ -298,18 +298,36 @@ def _timing(settings: Settings, tick: int) -> Timing:
 
 
 def build(settings: Settings) -> Decoder:
-    """A decoder with these settings; ConfigError names the key that is wrong."""
-    given = [name for name in settings.columns if name != SKIP]
-    for name in (*given, *settings.scale):
-        if name not in COLUMNS:
-            raise ConfigError(f'unknown column "{name}"{nearest(name, COLUMNS)}')
-    if len(given) != len(set(given)):
-        raise ConfigError("columns: a name stands there twice")
-    if not set(given) & set(AXES):
-        raise ConfigError(f"columns: none of {', '.join(AXES)} is there")
-    if {"t", "counter"} <= set(given):
-        raise ConfigError('columns: give one of t and counter, and "-" for the other')
-    check_settings(settings)
-    if not settings.delimiter or not settings.delimiter.isascii() or set(settings.delimiter) & set("\r\n"):
-        raise ConfigError(f"delimiter {settings.delimiter!r}: must be auto, or ASCII text within a line")
+    """A decoder with these settings; ConfigError names each key that is wrong."""
+    if wrong := list(_problems(settings)):
+        raise ConfigError(*wrong)
     return TextDecoder(settings)
+
+
+def _problems(settings: Settings) -> Iterator[str]:
+    given = [name for name in settings.columns if name != SKIP]
+    for name in given:
+        if name not in COLUMNS:
+            yield f'columns: unknown column "{name}"{possible(name, COLUMNS)}'
+    if len(given) != len(set(given)):
+        yield "columns: a name stands there twice"
+    if not set(given) & set(AXES):
+        yield f"columns: none of {', '.join(AXES)} is there"
+    if {"t", "counter"} <= set(given):
+        yield 'columns: give one of t and counter, and "-" for the other'
+    for name in settings.scale:
+        if name not in COLUMNS:
+            yield f"scale.{name}: unknown column{possible(name, COLUMNS)}"
+    for key, look_up, axis in (
+        ("gyro_unit", units.rate_factor, "gx"),
+        ("accel_unit", units.acceleration_factor, "ax"),
+        ("temperature_unit", units.temperature_scale, "temperature"),
+    ):
+        try:
+            look_up(getattr(settings, key))
+        except ConfigError as error:
+            counts = f"for raw counts name one of these units, and the size of a count in scale: {axis} = 0.0305"
+            yield f"{key}: {error}; {counts}"
+    if not settings.delimiter or not settings.delimiter.isascii() or set(settings.delimiter) & set("\r\n"):
+        yield f"delimiter: {settings.delimiter!r}; it is auto, or ASCII text within a line"
+    yield from range_problems(settings)

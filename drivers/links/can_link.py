@@ -29,7 +29,7 @@ import msgspec
 
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
-from drivers.plugin import nearest
+from drivers.plugin import possible
 from drivers.quantities import BIT_RATE, check_settings
 from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk
 
@@ -304,6 +304,6 @@ def build(settings: Settings) -> Link:
 
     check_settings(settings)
     if settings.interface not in VALID_INTERFACES:
-        known = tuple(sorted(VALID_INTERFACES))
-        raise ConfigError(f'no interface "{settings.interface}" in python-can{nearest(settings.interface, known)}')
+        known = sorted(VALID_INTERFACES)
+        raise ConfigError(f'interface: "{settings.interface}"{possible(settings.interface, known)}')
     return CanLink(settings)

@@ -32,8 +32,8 @@ from typing import IO, TYPE_CHECKING, Annotated, Any, BinaryIO, Final, Literal, 
 from drivers import small_file
 from drivers.errors import ConfigError, LinkEnded, LinkLost, LinkUnavailable, RecordingError
 from drivers.links.base import Carrier, Link, LinkSettings
-from drivers.plugin import FilePath, nearest
-from drivers.quantities import BYTE_RATE, RATE_HZ, REPLAY_SPEED, check_settings
+from drivers.plugin import FilePath, possible
+from drivers.quantities import BYTE_RATE, RATE_HZ, REPLAY_SPEED, range_problems
 from drivers.recording import FORMATS, Recording, iter_blocks, load_samples, segment
 from drivers.recording.table import T_LIMIT_S
 from drivers.sample import EXTENDED_ID, Chunk
@@ -70,6 +70,9 @@ DAMAGE: Final = (
     EOFError, LookupError, OverflowError, zlib.error, gzip.BadGzipFile, struct.error, binascii.Error, csv.Error,
 )  # fmt: skip
 """What readers raise at a place where a file is cut or damaged, beside ValueError."""
+
+PACES: Final = {"recorded": 1.0, "max": float("inf")}
+"""Words for ``speed``: file seconds a second."""
 
 Kind = Literal["recording", "log", "capture", "raw"]
 Timed = tuple[float, Chunk]
@@ -451,7 +454,7 @@ def _raw_carrier(path: Path) -> Carrier:
     for one in known:
         if one == carrier:
             return one
-    raise ConfigError(f'path "{path}": carries "{carrier}", where {", ".join(known)} are known')
+    raise ConfigError(f'path: "{path}" carries "{carrier}", where {", ".join(known)} are known')
 
 
 # --- captured bytes ------------------------------------------------------------------------------
@@ -485,6 +488,8 @@ def _bytes_paced(stream: IO[bytes], bytes_per_second: float) -> Iterator[Timed]:
 def _kind(path: Path) -> Kind:
     """What the path holds, by its suffix and, for CSV, its header. Raises ConfigError for neither."""
     suffix = _plain_suffix(path)
+    if path == Path():
+        raise ConfigError("path: empty; it is a recording, a CAN log, captured bytes, or a folder of segments")
     if suffix in CAN_LOGS:
         return "log"
     if suffix in CAPTURES:
@@ -500,7 +505,7 @@ def _kind(path: Path) -> Kind:
     if suffix in FORMATS:
         return "recording"
     known = (*FORMATS, *CAN_LOGS, *CAPTURES)
-    raise ConfigError(f'path "{path}": nothing to replay by its suffix{nearest(suffix, known)}')
+    raise ConfigError(f'path: "{path}" is nothing to replay by its suffix{possible(suffix, known)}')
 
 
 def _plain_suffix(path: Path) -> str:
@@ -535,14 +540,22 @@ def build(settings: Settings) -> Link:
 
     Raises ``ConfigError`` for a speed that is none, and for a file that is nothing to replay.
     """
-    return ReplayLink(settings, _kind(small_file.path(settings.path)), _pace(settings))
+    wrong = list(_problems(settings))
+    try:
+        kind = _kind(small_file.path(settings.path))
+    except ConfigError as error:
+        wrong = [*error.lines, *wrong]
+    if wrong:
+        raise ConfigError(*wrong)
+    return ReplayLink(settings, kind, _pace(settings.speed))
 
 
-def _pace(settings: Settings) -> float:
-    """File seconds a second."""
-    check_settings(settings)
-    words = {"recorded": 1.0, "max": float("inf")}
-    speed = settings.speed
-    if isinstance(speed, str) and speed not in words:
-        raise ConfigError(f'speed = "{speed}"; known are "recorded", "max", or a factor without quotes')
-    return words[speed] if isinstance(speed, str) else speed
+def _problems(settings: Settings) -> Iterator[str]:
+    yield from range_problems(settings)
+    if isinstance(settings.speed, str) and settings.speed not in PACES:
+        yield f'speed: "{settings.speed}"; possible are recorded, max, or a factor without quotes'
+
+
+def _pace(speed: str | float) -> float:
+    """Return the seconds of the file that pass in a second; 0 for an unknown word."""
+    return PACES.get(speed, 0.0) if isinstance(speed, str) else speed

@@ -18,13 +18,14 @@ import importlib.util
 import os
 import threading
 import time
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.masked import masked
-from drivers.plugin import nearest
-from drivers.quantities import BIT_RATE, READ_TIMEOUT_S, check_settings
+from drivers.plugin import possible
+from drivers.quantities import BIT_RATE, READ_TIMEOUT_S, range_problems
 from drivers.sample import Chunk
 
 if TYPE_CHECKING:
@@ -186,19 +187,20 @@ def build(settings: Settings) -> Link:
 
     Raises ``ConfigError`` for a URL scheme or stop bits that do not exist, and for a number outside its range.
     """
-    if not settings.port:
-        raise ConfigError('port is empty; it is a port ("/dev/ttyUSB0") or a URL ("socket://host:port")')
-    check_settings(settings)
-    if settings.stopbits not in STOP_BITS:
-        raise ConfigError(f"stopbits = {settings.stopbits}; known are 1, 1.5, 2")
-    _check_scheme(settings.port)
+    if wrong := list(_problems(settings)):
+        raise ConfigError(*wrong)
     return SerialLink(settings)
 
 
-def _check_scheme(port: str) -> None:
-    scheme, found, _ = port.partition("://")
-    if found and scheme.lower() not in SCHEMES and not _handler(scheme.lower()):
-        raise ConfigError(f'port "{port}": unknown kind of URL "{scheme}"{nearest(scheme, SCHEMES)}')
+def _problems(settings: Settings) -> Iterator[str]:
+    scheme, found, _ = settings.port.partition("://")
+    if not settings.port:
+        yield 'port: empty; it is a port ("/dev/ttyUSB0") or a URL ("socket://host:port")'
+    elif found and scheme.lower() not in SCHEMES and not _handler(scheme.lower()):
+        yield f'port: "{settings.port}" has an unknown kind of URL "{scheme}"{possible(scheme, SCHEMES)}'
+    if settings.stopbits not in STOP_BITS:
+        yield f"stopbits: {settings.stopbits:g}; possible are 1, 1.5, 2"
+    yield from range_problems(settings)
 
 
 def _handler(scheme: str) -> bool:

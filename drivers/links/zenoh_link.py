@@ -193,12 +193,15 @@ def build(settings: Settings) -> Link:
     """
     import zenoh
 
+    wrong = []
     try:
         zenoh.KeyExpr(settings.key)
     except zenoh.ZError as error:
-        raise ConfigError(f'key "{settings.key}": {plain(error)}') from error
+        wrong.append(f'key: "{settings.key}": {plain(error)}')
     try:
         _configuration(settings)
     except zenoh.ZError as error:
-        raise ConfigError(f"zenoh settings: {plain(error)}") from error
+        wrong.append(f"zenoh settings: {plain(error)}")
+    if wrong:
+        raise ConfigError(*wrong)
     return ZenohLink(settings)

@@ -104,23 +104,14 @@ def check(
 ) -> None:
     """Read the file and say all that is wrong with it; opens nothing."""
     from monitor import settings
-    from monitor.limits import model_of
-    from monitor.virtual import Sensor
+    from monitor.configuration_check import check as check_configuration
 
     if print_defaults:
         typer.echo((settings.CONFIG_FOLDER / "defaults.toml").read_text("utf-8"), nl=False)
         return
     if config is None:
         raise ConfigError("CONFIG.toml is missing; --print-defaults prints one to start from")
-    found, wrong = settings.read(config)
-    for device in found.devices if found else ():
-        try:
-            model_of(device)
-            if isinstance(device.link, settings.VirtualTable):
-                Sensor(device.link, device.decoder, device.name)
-        except ConfigError as error:
-            at = f"device {device.name}: "
-            wrong.append(f"{config}: {at}{str(error).removeprefix(at)}")
+    found, wrong = check_configuration(config)
     for line in (*wrong, *(f"warning: {line}" for line in (found.warnings if found else ()))):
         typer.echo(line, err=True)
     if wrong:

@@ -29,6 +29,43 @@ WARM_UP_S: Final = 300.0
 _log = structlog.get_logger("imu-monitor")
 
 
+def check_sensor(table: VirtualTable) -> None:
+    """Check the model and the effects of a simulated sensor; simulates nothing.
+
+    Parameters
+    ----------
+    table
+        Its settings; without a model if ``model`` is empty.
+
+    Raises
+    ------
+    ConfigError
+        With one line for each effect or model that cannot be.
+    """
+    wrong: list[str] = []
+    coming = []
+    for text in table.effect:
+        try:
+            coming += [(text, axis, effect) for axis, effect in effects_of(text)]
+        except ConfigError as error:
+            wrong += error.lines
+    try:
+        stream = None
+        if table.model:
+            model = read_model(Path(table.model))
+            stream = model.stream(model.sample_rate_hz or DEFAULT_RATE_HZ, table.seed)
+    except ConfigError as error:
+        wrong += error.lines
+    for text, axis, effect in coming:
+        try:
+            if stream is not None:
+                stream.add(axis, effect)
+        except ConfigError as error:
+            wrong += [f'effect "{text}": {line}' for line in error.lines]
+    if wrong:
+        raise ConfigError(*wrong)
+
+
 class Sensor:
     """One simulated sensor.
 

@@ -49,8 +49,8 @@ def test_an_error_inside_a_plugin_is_not_hidden(package):
         load(package, "broken", "_link")
 
 
-def test_unknown_name_gets_the_nearest(package):
-    with pytest.raises(ConfigError, match='unknown name "seriel"; did you mean "serial"'):
+def test_unknown_name_gets_all_names_the_nearest_first(package):
+    with pytest.raises(ConfigError, match='unknown name "seriel"; possible are serial, broken, can'):
         load(package, "seriel", "_link")
 
 

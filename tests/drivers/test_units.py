@@ -44,7 +44,7 @@ def test_both_micro_signs_and_blanks_are_understood() -> None:
 @pytest.mark.parametrize(
     ("look_up", "unit", "words"),
     [
-        (units.rate_factor, "deg/sek", ("angular rate", '"deg/sek"', '"deg/sec"')),
+        (units.rate_factor, "deg/sek", ("angular rate", '"deg/sek"', "possible are deg/sec, deg/s, ")),
         (units.rate_factor, "furlong", ('"furlong"', "rad/s", "deg/s")),
         (units.acceleration_factor, "G", ('"G"', "m/s²", "mg")),
         (units.temperature_scale, "Réaumur", ('"Réaumur"', "°C", "K")),

@@ -4,7 +4,8 @@ The file is read once, with cantools. Every name is looked up, every unit is kno
 its message, or a ``ConfigError`` says in one line which does not and what would be right.
 """
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from math import isfinite
 from pathlib import Path
 from typing import Any, Final
@@ -16,8 +17,8 @@ from drivers.decoders.dbc.bits import Bits
 from drivers.decoders.dbc.join import COLUMNS, Column, Message
 from drivers.decoders.dbc.settings import Settings, SignalSettings
 from drivers.errors import ConfigError
-from drivers.plugin import nearest
-from drivers.quantities import check_settings
+from drivers.plugin import nearest, possible
+from drivers.quantities import range_problems
 from drivers.sample import AXES
 
 TEMPERATURE: Final = "temperature"
@@ -32,12 +33,15 @@ class Database:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._path = _locate(settings.file)
-        self._messages: dict[str, Any] = {m.name: m for m in _load(self._path).messages}
+        self._wrong = list(_problems(settings))
         self._used: dict[str, Message] = {}
         self._timing: Timing = Arrival()
-        _check(settings)
-        self._look_up()
+        with self._collecting():
+            self._path = _locate(settings.file)
+            self._messages: dict[str, Any] = {m.name: m for m in _load(self._path).messages}
+            self._look_up()
+        if self._wrong:
+            raise ConfigError(*self._wrong)
 
     def messages(self) -> list[Message]:
         """The messages that hold what the settings ask for; one that is only a counter comes first."""
@@ -47,17 +51,33 @@ class Database:
         """How the samples get their time."""
         return self._timing
 
+    @contextlib.contextmanager
+    def _collecting(self) -> Iterator[None]:
+        """Go on after a mistake, so that every one is told."""
+        try:
+            yield
+        except ConfigError as error:
+            self._wrong += error.lines
+
     def _look_up(self) -> None:
         s = self._settings
         for axis, entry in s.signals.items():
-            self._add_axis(axis, _signal_settings(entry))
+            with self._collecting():
+                self._add_axis(axis, _signal_settings(axis, entry))
         if s.valid:
-            message, signal = self._find("valid", s.valid)
-            self._use(message, signal).valid = self._bits(message, signal)
-        for message, signal in self._counters() if s.counter else ():
+            with self._collecting():
+                message, signal = self._find("valid", s.valid)
+                self._use(message, signal).valid = self._bits(message, signal)
+        if s.counter:
+            with self._collecting():
+                self._add_counter()
+
+    def _add_counter(self) -> None:
+        s = self._settings
+        for message, signal in self._counters():
             if signal.is_float or signal.length > LONGEST_COUNTER:
                 raise ConfigError(
-                    f'counter "{s.counter}": a counter is a whole number of at most {LONGEST_COUNTER} bits'
+                    f'counter: "{s.counter}"; a counter is a whole number of at most {LONGEST_COUNTER} bits'
                 )
             self._use(message, signal).counter = self._bits(message, signal)
             self._timing = Counter(1 << int(signal.length), s.tick)
@@ -72,7 +92,7 @@ class Database:
 
     def _add_axis(self, axis: str, entry: SignalSettings) -> None:
         if axis not in COLUMNS:
-            raise ConfigError(f'signals: unknown axis "{axis}"{nearest(axis, COLUMNS)}')
+            raise ConfigError(f"signals.{axis}: unknown axis{possible(axis, COLUMNS)}")
         message, signal = self._find(f"signals.{axis}", entry.signal)
         factor, offset = self._to_si(axis, entry, signal)
         column = Column(COLUMNS.index(axis), self._bits(message, signal), factor, offset)
@@ -87,15 +107,19 @@ class Database:
                 look_up = units.rate_factor if axis.startswith("g") else units.acceleration_factor
                 factor, offset = look_up(unit), 0.0
         except ConfigError as error:
-            where = "" if entry.unit else f' (from {self._path.name}); say which it is: unit = "…"'
-            raise ConfigError(f"signals.{axis}: {error}{where}") from error
+            where = "" if entry.unit else f" (the unit in {self._path.name})"
+            counts = f'{axis} = {{ signal = "{entry.signal}", unit = "…", factor = 0.0305 }}'
+            raise ConfigError(
+                f"signals.{axis}: {error}{where}; name the unit, and for raw counts the size of a count: {counts}"
+            ) from error
         return factor * entry.factor, offset * entry.factor
 
     def _find(self, key: str, name: str) -> tuple[Any, Any]:
         """The DBC's message and signal of "Message.Signal"."""
         message_name, dot, signal_name = name.partition(".")
         if not dot:
-            raise ConfigError(f'{key} = "{name}": it is "Message.Signal"')
+            hint = ', or with join = "counter" a bare name' if key == "counter" else ""
+            raise ConfigError(f'{key}: "{name}"; it is "Message.Signal"{hint}')
         message = self._messages.get(message_name)
         if message is None:
             known = nearest(message_name, tuple(self._messages))
@@ -166,17 +190,18 @@ def _ends(start: int, length: int, big_endian: bool) -> tuple[int, int]:
     return first, first + length - 1
 
 
-def _check(settings: Settings) -> None:
+def _problems(settings: Settings) -> Iterator[str]:
+    """What is wrong whatever the database holds."""
     if not settings.signals:
-        raise ConfigError('signals is empty; it maps axes to signals: gz = "Message.Signal"')
-    if not set(settings.signals) - {TEMPERATURE}:
-        raise ConfigError(f"signals: no axis but temperature; axes are {', '.join(AXES)}")
+        yield 'signals: empty; it maps axes to signals: gz = "Message.Signal"'
+    elif set(settings.signals) == {TEMPERATURE}:
+        yield f"signals: no axis but temperature; axes are {', '.join(AXES)}"
     if settings.join == "counter" and not settings.counter:
-        raise ConfigError('join = "counter" needs counter = "Message.Signal"')
-    check_settings(settings)
+        yield 'counter: missing; join = "counter" needs counter = "Message.Signal"'
+    yield from range_problems(settings)
 
 
-def _signal_settings(entry: str | SignalSettings) -> SignalSettings:
+def _signal_settings(axis: str, entry: str | SignalSettings) -> SignalSettings:
     if isinstance(entry, SignalSettings):
         return entry
     if entry.startswith("-"):
@@ -193,7 +218,7 @@ def _locate(file: str) -> Path:
     shipped: Mapping[str, Path] = {p.stem: p for p in sorted(SHIPPED.glob("*.dbc"))}
     stem = name.removesuffix(".dbc")
     if stem not in shipped:
-        raise ConfigError(f'file = "{file}": no such file, and none shipped{nearest(stem, tuple(shipped))}')
+        raise ConfigError(f'file: "{file}": no such file, and none shipped{nearest(stem, tuple(shipped))}')
     return shipped[stem]
 
 
@@ -207,9 +232,9 @@ def _load(path: Path) -> Any:
             return cantools.database.load_file(path, strict=False)
         return cantools.database.load_string(_text(path), "dbc", strict=False)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+        raise ConfigError(f"file: {path}: cannot be read: {error.strerror}") from error
     except (cantools.Error, ValueError, LookupError) as error:
-        raise ConfigError(f"{path}: no CAN database: {' '.join(str(error).split())[:200]}") from error
+        raise ConfigError(f"file: {path}: no CAN database: {' '.join(str(error).split())[:200]}") from error
 
 
 def _text(path: Path) -> str:

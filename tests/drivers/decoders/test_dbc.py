@@ -552,7 +552,7 @@ DECODERS = [build("j1939_imu", SAE, partial=True)]
         ("canmod_gps", {"gz": "ImuData.AccelerationZ"}, {}, "angular rate"),
         ("canmod_gps", {"gz": {"signal": "ImuData.AngularRateZ", "unit": "deg/d"}}, {}, "deg/d"),
         ("canmod_gps", {"gz": {"signal": "ImuData.AngularRateZ", "factor": 0.0}}, {}, "factor"),
-        ("canmod_gps", {}, {}, "signals is empty"),
+        ("canmod_gps", {}, {}, "signals: empty"),
         ("xsens_mti", {"temperature": "Temperature.SensorTemperature"}, {}, "temperature"),
         ("canmod_gps", CANMOD, {"valid": "ImuData.Valid"}, "valid"),
         ("canmod_gps", CANMOD, {"join": "counter"}, "needs counter"),

@@ -172,13 +172,15 @@ def test_a_counter() -> None:
     ("settings", "words"),
     [
         ({"gyro_unit": "deg/sek"}, ('"deg/sek"', "deg/s")),
+        ({"gyro_unit": "LSB"}, ("gyro_unit: ", "rad/s, ", "deg/s", "for raw counts", "scale: gx = 0.0305")),
+        ({"accel_unit": "counts"}, ("accel_unit: ", "m/s², ", "for raw counts", "scale: ax = 0.0305")),
         ({"accel_unit": "furlong"}, ('"furlong"', "m/s²", "mg")),
         ({"columns": (*SIX, "temperature"), "temperature_unit": "Re"}, ('"Re"', "°C")),
-        ({"columns": ("gx", "temprature")}, ('"temprature"', '"temperature"')),
+        ({"columns": ("gx", "temprature")}, ('"temprature"', "possible are temperature, ")),
         ({"columns": ("gx", "gx")}, ("twice",)),
         ({"columns": ("-", "temperature")}, ("gx", "az")),
         ({"columns": ("gx", "t", "counter")}, ("one of t and counter",)),
-        ({"scale": {"gw": 2.0}}, ('"gw"',)),
+        ({"scale": {"gw": 2.0}}, ("scale.gw", "possible are gx, ")),
         ({"scale": {"gx": 0.0}}, ("gx", "0")),
         ({"delimiter": ""}, ("delimiter",)),
         ({"counter_modulus": 1}, ("counter_modulus",)),
@@ -189,3 +191,11 @@ def test_wrong_settings_say_what_is_right(settings: dict[str, object], words: tu
         build(Settings(**{"columns": SIX, **settings}))
     assert all(word in str(caught.value) for word in words), caught.value
     assert "\n" not in str(caught.value)
+
+
+def test_all_wrong_settings_are_told_at_once() -> None:
+    settings = Settings(columns=("gx", "gx", "qz"), gyro_unit="LSB", scale={"gw": 1.0, "gx": 0.0}, delimiter="")
+    with pytest.raises(ConfigError) as caught:
+        build(settings)
+    keys = [line.partition(": ")[0] for line in caught.value.lines]
+    assert keys == ["columns", "columns", "scale.gw", "scale.gx", "gyro_unit", "delimiter"]
