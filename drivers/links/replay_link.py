@@ -225,7 +225,11 @@ def _log(path: Path, channel: str | None) -> _Source:
         return _Source(_from_start(_csv_frames(stream, channel)), stream.close)
     import can
 
-    reader = _blf(path) if _plain_suffix(path) == ".blf" else can.LogReader(path)
+    if _plain_suffix(path) == ".blf":
+        reader: can.io.MessageReader = _blf(path)
+    else:
+        small_file.check_regular(path)  # python-can opens it itself
+        reader = can.LogReader(path)
     return _Source(_from_start(_log_frames(iter(reader), channel)), reader.stop)
 
 
@@ -419,9 +423,12 @@ def _header(path: Path) -> str:
 
 
 def _binary(path: Path) -> IO[bytes]:
-    if path.suffix.lower() == ".gz":
-        return cast("IO[bytes]", gzip.open(path, "rb"))
-    return path.open("rb")
+    file = small_file.open_regular(path)
+    if path.suffix.lower() != ".gz":
+        return file
+    unzipped = gzip.GzipFile(fileobj=file, mode="rb")
+    unzipped.myfileobj = file  # closed with it
+    return cast("IO[bytes]", unzipped)
 
 
 def _text(path: Path) -> IO[str]:
@@ -433,7 +440,21 @@ def build(settings: Settings) -> Link:
 
     Raises ``ConfigError`` for a speed that is none, and for a file that is nothing to replay.
     """
-    return ReplayLink(settings, _kind(small_file.path(settings.path)), _pace(settings))
+    path = small_file.path(settings.path)
+    _check_path(path)
+    return ReplayLink(settings, _kind(path), _pace(settings))
+
+
+def _check_path(path: Path) -> None:
+    """Raise ConfigError for something that is neither a file nor a folder; one that is not there may come."""
+    if path.is_dir():
+        return
+    try:
+        small_file.check_regular(path)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise ConfigError(f'path "{path}": {error.strerror or error}') from error
 
 
 def _pace(settings: Settings) -> float:

@@ -29,6 +29,7 @@ from drivers.recording.formats import FORMATS, format_of, is_recording
 from drivers.recording.saving import save_samples, writing
 from drivers.recording.table import EXAMPLE_HEADER, T_LIMIT_S, Table
 from drivers.sample import AXES, Floats, SampleBlock, block
+from drivers.small_file import check_regular
 
 __all__ = ["FORMATS", "Recording", "is_recording", "iter_blocks", "load_samples", "save_samples", "writing"]
 
@@ -65,7 +66,7 @@ def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None 
     try:
         found = _load_folder(path, rate_hz, last_s) if path.is_dir() else _load_file(path, rate_hz)
     except OSError as error:
-        raise RecordingError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
+        raise RecordingError(_why(path, error)) from error
     return found if last_s is None else _end(found, last_s)
 
 
@@ -79,10 +80,18 @@ def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]
         yield block(_times_ns(recording, part), recording.values[part], recording.temperature_c[part])
 
 
+def _why(path: Path, error: RecordingError | OSError) -> str:
+    """Why a file cannot be read, in one line that names it."""
+    if isinstance(error, RecordingError):
+        return str(error)
+    return f"{error.filename or path}: cannot be read: {error.strerror or error}"
+
+
 # --- from columns to a recording -----------------------------------------------------------------
 
 
 def _load_file(path: Path, rate_hz: float | None) -> Recording:
+    check_regular(path)
     if path.stat().st_size == 0:
         raise RecordingError(f"{path}: the file is empty; a recording has columns {EXAMPLE_HEADER}")
     return _assemble(path, format_of(path).read(path), rate_hz)
@@ -183,7 +192,7 @@ def _times_ns(recording: Recording, part: slice) -> NDArray[np.int64]:
 
 def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Recording:
     """Segments in the order of their names; one that cannot be read is left out, with a note."""
-    segments = sorted(p for p in path.iterdir() if is_recording(p) and p.name[0] != "." and p.is_file())
+    segments = sorted(p for p in path.iterdir() if is_recording(p) and p.name[0] != ".")
     if not segments:
         raise RecordingError(f"{path}: no recordings in this folder; known are {' '.join(FORMATS)}")
     parts: list[Recording] = []  # newest first
@@ -192,8 +201,8 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
     for segment in reversed(segments):
         try:
             part = _load_file(segment, rate_hz)
-        except RecordingError as error:
-            notes.append(f"A segment was left out: {error}.")
+        except (RecordingError, OSError) as error:
+            notes.append(f"A segment was left out: {_why(segment, error)}.")
             continue
         parts.append(part)
         taken += part.values.nbytes + 2 * part.temperature_c.nbytes

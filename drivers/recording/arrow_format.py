@@ -3,6 +3,7 @@
 An Arrow file is read up to a cut, batch by batch; Parquet cannot be, since its index stands at the end.
 """
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 from drivers.errors import ConfigError, RecordingError
 from drivers.recording.table import BATCH_ROWS, PART, Append, Table, chosen_columns
 from drivers.sample import Floats
+from drivers.small_file import open_regular
 
 OWN: Final = b"imu-monitor"
 """Key of the metadata by which a segment of the daemon's recordings is known."""
@@ -41,10 +43,11 @@ def read_parquet(path: Path) -> Table:
     from pyarrow import parquet
 
     notes: list[str] = []
+    opened = open_regular(path)
     try:
-        with parquet.ParquetFile(path) as file:
+        with opened, parquet.ParquetFile(opened) as file:
             chosen = chosen_columns(path, file.schema_arrow.names, notes)
-            _check_rows(path, file.metadata.num_rows, path.stat().st_size)
+            _check_rows(path, file.metadata.num_rows, os.fstat(opened.fileno()).st_size)
             table = file.read(columns=list(chosen.values()))
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise RecordingError(
@@ -58,7 +61,8 @@ def read_ipc(path: Path) -> Table:
     """Arrow IPC up to a cut. A file is a stream after one magic word, so both are read as streams."""
     pa = library(path)
     notes: list[str] = []
-    data = path.read_bytes()
+    with open_regular(path) as file:
+        data = file.read()
     is_file = data.startswith(ARROW_MAGIC)
     try:
         reader = pa.ipc.open_stream(pa.py_buffer(data).slice(len(ARROW_MAGIC) if is_file else 0))

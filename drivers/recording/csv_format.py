@@ -14,13 +14,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import BinaryIO, Final, TextIO
+from typing import IO, Final, TextIO
 
 import numpy as np
 
 from drivers.errors import RecordingError
 from drivers.recording.table import BATCH_ROWS, EXAMPLE_HEADER, Append, Columns, Table, chosen_columns
 from drivers.sample import Floats
+from drivers.small_file import open_regular
 
 READ_BYTES: Final = 1 << 22
 GZIP_BYTES: Final = 1 << 16  # what a damaged gzip file may lose before the damage
@@ -44,7 +45,7 @@ def read_csv(path: Path) -> Table:
     """Plain or gzip text up to a cut; RecordingError when most lines are no samples."""
     notes: list[str] = []
     bad = _BadLines()
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         texts = _whole_lines(_unzipped(file, notes), notes)
         text = next(texts, None)
         if text is None:
@@ -67,7 +68,7 @@ def read_csv(path: Path) -> Table:
     return Table({name: rows[:, i] for i, name in enumerate(chosen)}, None, notes)
 
 
-def _unzipped(file: BinaryIO, notes: list[str]) -> Iterator[bytes]:
+def _unzipped(file: IO[bytes], notes: list[str]) -> Iterator[bytes]:
     """The text of a plain or gzip file, by its first bytes and not by its name, up to a cut or damage."""
     zipped = file.read(2) == GZIP_MAGIC
     file.seek(0)

@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
 from tokenize import TokenError
-from typing import IO, Any, BinaryIO, Final, cast
+from typing import IO, Any, Final, cast
 
 import numpy as np
 from numpy.lib.npyio import NpzFile
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from drivers.errors import RecordingError
 from drivers.recording.table import Append, Columns, Table, chosen_columns
 from drivers.sample import Floats
+from drivers.small_file import open_regular
 
 LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # PKWARE APPNOTE 4.3.7
 LOCAL_MAGIC: Final = b"PK\3\4"
@@ -44,7 +45,7 @@ NPY: Final = re.compile(
 def read_npz(path: Path) -> Table:
     """Only the arrays that mean something are read, the whole ones and up to a cut."""
     notes: list[str] = []
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         if file.read(len(LOCAL_MAGIC)) != LOCAL_MAGIC:
             raise RecordingError(f"{path}: is no .npz file (a zip archive with one array a column)")
         file.seek(0)
@@ -52,7 +53,8 @@ def read_npz(path: Path) -> Table:
             file.seek(0)
             with _opened(path, file) as archive:
                 return _npz_table(path, archive, None, notes)
-    arrays, cut = _recovered(path.read_bytes())
+        file.seek(0)
+        arrays, cut = _recovered(file.read())
     if not arrays:
         raise RecordingError(f"{path}: is damaged or cut off before its first number")
     at = f" inside {cut}" if cut else ""
@@ -60,9 +62,9 @@ def read_npz(path: Path) -> Table:
     return _npz_table(path, arrays, cut, notes)
 
 
-def _opened(path: Path, file: BinaryIO) -> NpzFile:
+def _opened(path: Path, file: IO[bytes]) -> NpzFile:
     try:
-        return cast(NpzFile, np.load(file, allow_pickle=False))
+        return cast(NpzFile, np.load(cast(Any, file), allow_pickle=False))
     except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
         raise RecordingError(f"{path}: its index of arrays is damaged: {error}") from error
 

@@ -16,6 +16,7 @@ import typer
 from typer.exceptions import TyperException
 
 from drivers.errors import ConfigError, ImuError, NotReady, RecordingError
+from drivers.small_file import real_path
 from monitor.cli import doctor, drift, options, output, serving
 from monitor.cli import history as history_command
 
@@ -78,7 +79,7 @@ def run(
     """The daemon: every device in the file, until a signal."""
     from monitor import settings
 
-    found = serving.with_history(settings.load(config), options.duration("--history", history))
+    found = serving.with_history(settings.load(config, pipe=True), options.duration("--history", history))
     serving.serve(found, seconds, viewer)
 
 
@@ -99,7 +100,7 @@ def check(
         return
     if config is None:
         raise ConfigError("CONFIG.toml is missing; --print-defaults prints one to start from")
-    found, wrong = settings.read(config)
+    found, wrong = settings.read(config, pipe=True)
     for device in found.devices if found else ():
         try:
             model_of(device)
@@ -225,7 +226,7 @@ def simulate(
         raise ConfigError(f"--rate: {rate:g} Hz; it must be above 0")
     output.check_place("--json", json)
     for option, path in (("--json", json), ("--temperature-from", temperature_from)):
-        if path is not None and path.resolve() == out.resolve():
+        if path is not None and real_path(path) == real_path(out):
             raise ConfigError(f"{option}: {path} is what --out writes; another name is needed")
     noise = load(model, Path.cwd())
     request = simulation.Request(noise, out, length_s, seed, rate, temperature_from, truth, model)
