@@ -3,8 +3,8 @@
 The lock is ``flock`` on a file in the folder. The kernel releases it when its holder ends, in whatever way. The file is
 never deleted. It holds the process id and the host of the holder, for messages. Readers need no lock.
 
-``hold`` takes the lock, or checks that it is still held: whoever deletes or replaces the folder or the lock file takes
-the lock away with it. The descriptor is closed when another program is executed, so hooks and viewers do not inherit it.
+``hold`` takes the lock, or checks that it is still held: if the folder or the lock file is deleted or replaced, the
+lock is gone with it. The descriptor is closed when another program is executed, so hooks and viewers do not inherit it.
 """
 
 import contextlib

@@ -266,6 +266,8 @@ class Recorder:
         track = self._tracks.get((device, "samples"))
         if track is None:
             return None
+        if self._thread.ident is None:
+            self._hold_folder()  # from here on nobody else adds to what is found now
         paths = segment.segments(track.folder)
         while paths:
             path = paths[-1]
@@ -523,7 +525,9 @@ def _newest_in(track: _Track) -> _Newest | None:
                     return _Newest(last[0].t_ns)
             elif (piece := segment.newest(path)) is not None:
                 rows = piece.samples
-                return _Newest(int(rows.t_ns[-1]), int(rows.ticks[-1]), piece.state.rate)
+                span_s = int(rows.t_ns[-1] - rows.t_ns[0]) / 1e9
+                rate_hz = piece.state.rate or ((len(rows) - 1) / span_s if span_s > 0.0 else None)
+                return _Newest(int(rows.t_ns[-1]), int(rows.ticks[-1]), rate_hz)
     return None
 
 

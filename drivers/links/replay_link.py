@@ -27,7 +27,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, BinaryIO, Final, Literal, cast
+from typing import IO, TYPE_CHECKING, Any, BinaryIO, Final, Literal, cast
 
 from drivers import small_file
 from drivers.errors import ConfigError, LinkEnded, LinkLost, LinkUnavailable, RecordingError
@@ -226,7 +226,7 @@ def _log(path: Path, channel: str | None) -> _Source:
     import can
 
     if _plain_suffix(path) == ".blf":
-        reader: can.io.MessageReader = _blf(path)
+        reader: Any = _blf(path)
     else:
         small_file.check_regular(path)  # python-can opens it itself
         reader = can.LogReader(path)
@@ -426,7 +426,7 @@ def _binary(path: Path) -> IO[bytes]:
     file = small_file.open_regular(path)
     if path.suffix.lower() != ".gz":
         return file
-    unzipped = gzip.GzipFile(fileobj=file, mode="rb")
+    unzipped: Any = gzip.GzipFile(fileobj=file, mode="rb")
     unzipped.myfileobj = file  # closed with it
     return cast("IO[bytes]", unzipped)
 

@@ -3,14 +3,14 @@
 ``put`` and ``tell`` leave things on a bounded queue and return. The thread writes what has come in one transaction,
 then lets old rows be thinned, a little at a time. What cannot be written now (disk full, read-only, busy) stays on the
 queue and is tried again; when the queue is full, what comes is dropped and counted. A file of a newer version is left
-alone, and history goes on once it is out of the way. A file that is damaged or holds something else is renamed and a new
-one is begun, as often as ASIDE_AT_MOST such files are kept. Before each write and every CHECK_S the thread checks that
-the file is still the one that it wrote; if it was deleted, replaced or emptied, a new one is begun. ``state`` says all of
-that. On ``close`` what is left is written, once.
+alone, and history goes on once it is out of the way. A file that is damaged or holds something else is renamed and a
+new one is begun, as long as fewer than ASIDE_AT_MOST such files are kept. Before each write and every CHECK_S the
+thread checks that the file is still the one that it wrote. If it was deleted, replaced or emptied, a new one is begun.
+``state`` says all of that. On ``close`` what is left is written, once.
 
 One process at a time writes the history of a folder (``FolderLock``). While another one does, rows and events are
-discarded, since the other keeps its own; ``state`` says which process it is. When that process ends this one goes on,
-from the next row of each device that begins then: a row that began before is partly in the file already.
+discarded, since the other keeps its own; ``state`` says which process it is. When that process ends this one goes on.
+The first row of each device is discarded then: it began before, and is partly in the file already.
 """
 
 import contextlib
@@ -187,7 +187,7 @@ class Writer:
             self._end()
         if self._store is None:
             self._store = Store(self.path)
-        if change == DELETED or change == EMPTIED:
+        if change in (DELETED, EMPTIED):
             self._tell(f"{self.path} {change}; a new one was begun")
         elif change == REPLACED:
             self._tell(f"{self.path} {change}; results are added to that one")

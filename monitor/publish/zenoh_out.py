@@ -370,7 +370,8 @@ class _Twins:
         """Listen to what others publish as the status of a device; our own messages do not come."""
         import zenoh
 
-        key, ring = topics.STATUS.key(self._prefix, device), zenoh.handlers.RingChannel(1)
+        key = topics.STATUS.key(self._prefix, device)
+        ring: Any = zenoh.handlers.RingChannel(1)
         one = session.declare_subscriber(key, ring, allowed_origin=zenoh.Locality.REMOTE)
         self._subscribers = {**self._subscribers, device: one}
 

@@ -46,7 +46,10 @@ def test_each_kind_of_content_has_a_lock_of_its_own(tmp_path: Path) -> None:
 
 def test_a_holder_that_is_killed_gives_it_back_although_a_child_lives_on(tmp_path: Path) -> None:
     process = subprocess.Popen(
-        [sys.executable, "-c", HOLDER, str(tmp_path), "a.lock"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", HOLDER, str(tmp_path), "a.lock"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     )
     assert process.stdout is not None
     child = int(process.stdout.readline())
@@ -107,7 +110,7 @@ def test_a_lock_file_that_is_none_is_an_error_and_not_waited_for(kind: str, tmp_
         case _:
             path.symlink_to(tmp_path / "elsewhere")
     lock = FolderLock(tmp_path, "a.lock")
-    with pytest.raises(OSError, match="FIFO|directory|symbolic links"):
+    with pytest.raises(OSError, match=r"FIFO|directory|symbolic links"):
         lock.hold()
     assert not lock.held
     assert not (tmp_path / "elsewhere").exists()

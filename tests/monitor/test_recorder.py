@@ -410,7 +410,7 @@ def test_two_recorders_on_one_folder_lose_nothing_and_keep_nothing_twice(tmp_pat
     for one in (first, second):
         one.know("bench", State(RATE))
     first.start()
-    wait_for(lambda: (tmp_path / "recording.lock").exists())
+    wait_for((tmp_path / "recording.lock").exists)
     first.samples("bench", rows(0, 20), 0)
     wait_for(lambda: bool(segment.segments(tmp_path / "bench")))
     second.start()
