@@ -6,11 +6,12 @@ Nothing is opened here: the link, the daemon's results and ``watch`` each open t
 import contextlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.masked import masked
+from drivers.small_file import check_regular
 
 if TYPE_CHECKING:
     import zenoh
@@ -30,6 +31,22 @@ connection stays; an hour of a 1 kHz sensor in one batch would fit.
 """
 
 
+SECRET_FILES: Final = (
+    "transport/link/tls/listen_private_key",
+    "transport/link/tls/connect_private_key",
+    "transport/auth/usrpwd/dictionary_file",
+    "transport/auth/pubkey/private_key_file",
+)
+"""Keys of files that nobody else should read."""
+PUBLIC_FILES: Final = (
+    "transport/link/tls/root_ca_certificate",
+    "transport/link/tls/listen_certificate",
+    "transport/link/tls/connect_certificate",
+    "transport/auth/pubkey/public_key_file",
+    "transport/auth/pubkey/known_keys_file",
+)
+
+
 def configuration(
     own: Mapping[str, Any], file: str | Path | None = None, unsaid: Mapping[str, Any] = CLOSED
 ) -> "zenoh.Config":
@@ -41,7 +58,11 @@ def configuration(
     import zenoh
 
     defaults = zenoh.Config()
+    if file:
+        _check_file(Path(file))
     config = zenoh.Config.from_file(str(file)) if file else zenoh.Config()
+    for named in _named_files(config):
+        _check_file(named)
     for key, value in unsaid.items():
         if config.get_json(key) == defaults.get_json(key):
             config.insert_json5(key, json.dumps(value))
@@ -86,6 +107,22 @@ def endpoints(config: "zenoh.Config") -> tuple[str, ...]:
 
 def secret_files(config: "zenoh.Config") -> tuple[Path, ...]:
     """Files of this configuration that nobody else should read: private keys and lists of passwords."""
-    keys = [f"transport/link/tls/{side}_private_key" for side in ("listen", "connect")]
-    keys += ["transport/auth/usrpwd/dictionary_file", "transport/auth/pubkey/private_key_file"]
-    return tuple(Path(named) for key in keys if (named := json.loads(config.get_json(key))))
+    return _named_files(config, SECRET_FILES)
+
+
+def _named_files(config: "zenoh.Config", keys: Sequence[str] | None = None) -> tuple[Path, ...]:
+    """Files that a configuration names; those of ``keys`` alone, or all."""
+    found = (json.loads(config.get_json(key)) for key in keys or (*SECRET_FILES, *PUBLIC_FILES))
+    return tuple(Path(named) for named in found if named)
+
+
+def _check_file(path: Path) -> None:
+    """Raise ZError if something else than a regular file has this name: zenoh would wait for a FIFO without end."""
+    import zenoh
+
+    try:
+        check_regular(path)
+    except FileNotFoundError:
+        return  # zenoh says so itself
+    except OSError as error:
+        raise zenoh.ZError(f"{path}: {error.strerror or error}") from error

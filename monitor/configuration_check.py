@@ -15,20 +15,22 @@ from monitor.settings import Config, ModelUse, examine
 from monitor.virtual.sensor import check_sensor
 
 
-def check(path: Path) -> tuple[Config | None, list[str]]:
+def check(path: Path, *, pipe: bool = False) -> tuple[Config | None, list[str]]:
     """Return the configuration, or None and all that is wrong with it.
 
     Parameters
     ----------
     path
         Configuration file.
+    pipe
+        True if a pipe is read as well, see ``small_file.read``.
 
     Returns
     -------
     tuple
         The configuration, None if anything is wrong, and one line for each mistake, which begins with the file.
     """
-    reading = examine(path)
+    reading = examine(path, pipe=pipe)
     wrong = [*reading.wrong, *(f"{path}: {use.device}: {line}" for use in reading.models for line in _problems(use))]
     return None if wrong else reading.config, wrong
 

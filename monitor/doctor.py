@@ -26,9 +26,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, Literal
 
+from drivers import small_file
 from drivers.links.can_link import missing_package
 from drivers.links.replay_link import ReplayLink
 from monitor.configuration_check import check
+from monitor.folder_lock import HISTORY_LOCK, RECORDING_LOCK, holder
 from monitor.settings import Config, Storage
 
 Mark = Literal["well", "doubt", "wrong"]
@@ -89,7 +91,7 @@ def examine(path: Path | None = None) -> list[Finding]:
 
 def read(path: Path) -> tuple[Config | None, list[Finding]]:
     """The configuration, and all that is wrong with it."""
-    config, wrong = check(path)
+    config, wrong = check(path, pipe=True)
     if config is None:
         return None, [Finding("wrong", "configuration", line) for line in wrong]
     count = len(config.devices)
@@ -286,15 +288,25 @@ def storage(config: Config) -> list[Finding]:
     if (own.record or own.raw) and find_spec("pyarrow") is None:
         text = "samples are to be recorded, and pyarrow is not installed"
         found.append(Finding("wrong", "storage", text, 'pip install "imu-monitor[arrow]"'))
-    folder = next(one for one in (own.folder, *own.folder.parents) if one.exists())
+    folder = next(one for one in (own.folder, *own.folder.parents) if os.path.exists(one))
     try:
+        small_file.check_folder(folder)
         with tempfile.TemporaryFile(dir=folder):
             pass
         usage = shutil.disk_usage(folder)
     except OSError as error:
         text = f"{own.folder}: cannot be written: {error.strerror or error}"
         return [*found, Finding("wrong", "storage", text, f"make it, and have {_user(os.geteuid())} own it")]
+    found += in_use(own)
     return [*found, *room(own, bytes_a_day(config), usage.total, usage.free)]
+
+
+def in_use(own: Storage) -> list[Finding]:
+    """Whether another process records into the folder, or keeps its history there."""
+    wanted = {RECORDING_LOCK: own.record or own.raw, HISTORY_LOCK: own.history}
+    holders = sorted({held for name, on in wanted.items() if on and (held := holder(own.folder, name))})
+    do = "well if it is this service; else end it, or choose another folder: only one of them records"
+    return [Finding("doubt", "storage", f"{own.folder}: in use by {one}", do) for one in holders]
 
 
 def bytes_a_day(config: Config) -> float | None:
@@ -499,7 +511,7 @@ def _adjtimex() -> int | None:
 def _has_secret(path: Path) -> bool:
     """Whether a file reads as if it held a password; it is not said which."""
     try:
-        text = path.read_text("utf-8", errors="replace")
+        text = small_file.read(path).decode("utf-8", errors="replace")
     except OSError:
         return False
     return re.search(r"(?i)\b(password|secret|private_key_base64)\b[\"']?\s*[:=]", text) is not None

@@ -11,6 +11,7 @@ import stat
 from pathlib import Path
 
 from drivers.masked import has_secret
+from drivers.small_file import open_regular, real_path
 
 SECRET_BYTES = 1_000_000
 """A larger file is no configuration, and not looked through."""
@@ -18,7 +19,7 @@ SECRET_BYTES = 1_000_000
 
 def changeable(path: Path) -> str:
     """Why a file may not be trusted: anyone may write it, or put another in its place; "" where it may."""
-    real = path.resolve()
+    real = real_path(path)
     if _others(real, stat.S_IWOTH):
         return f"anyone on this machine may change it, and with it what the daemon runs: chmod o-w {real}"
     folder = real.parent
@@ -34,7 +35,7 @@ def exposed(path: Path, secret: bool | None = None) -> str:
         path: the file
         secret: whether it is one (a private key); None: as its text shows
     """
-    real = path.resolve()
+    real = real_path(path)
     if not _others(real, stat.S_IROTH) or not _reachable(real):
         return ""
     if has_secret(_text(real)) if secret is None else secret:
@@ -60,7 +61,7 @@ def _mode(path: Path) -> int:
 
 def _text(path: Path) -> str:
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return file.read(SECRET_BYTES).decode("utf-8", "replace")
     except OSError:
         return ""

@@ -24,6 +24,7 @@ from drivers.recording import FORMATS, iter_blocks, load_samples
 from drivers.recording import Recording as Samples
 from drivers.recording.saving import whole
 from drivers.sample import AXES
+from drivers.small_file import real_path
 from monitor.estimate.grid import with_temperature
 from monitor.noise.model import NoiseModel
 from monitor.reconcile import runs_report
@@ -137,9 +138,9 @@ def names(recordings: Sequence[Path]) -> dict[str, Path]:
     """
     found: dict[str, Path] = {}
     for path in recordings:
-        if path.resolve() in [other.resolve() for other in found.values()]:
+        if real_path(path) in [real_path(other) for other in found.values()]:
             raise ConfigError(f"{path}: is given twice; recordings that are compared must be different ones")
-        full = path.resolve().name
+        full = real_path(path).name
         suffix = next((one for one in FORMATS if full.lower().endswith(one)), "")
         stem = full[: len(full) - len(suffix)] or full
         possible = (stem, *(f"{stem}-{k}" for k in range(2, len(recordings) + 1)))
@@ -152,7 +153,7 @@ def _check_recordings(named: Mapping[str, Path], out: Path) -> None:
     for path in named.values():
         if not path.exists():
             raise RecordingError(f"{path}: cannot be read: there is no such file or folder")
-        if any((out / name).resolve() == path.resolve() for name in named):
+        if any(real_path(out / name) == real_path(path) for name in named):
             raise ConfigError(f"--out: {out}: {path} is a recording, and a report would be written into it")
 
 

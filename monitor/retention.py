@@ -25,7 +25,7 @@ def delete_old(folders: Sequence[Path], keep_s: float, segment_s: float) -> None
             by_name_s = segment.began_s(known[-1]) - segment.began_s(after)  # it ended where the next began
             by_number_s = (len(known) - 1 - at) * segment_s
             if min(by_name_s, by_number_s) > keep_s:
-                path.unlink(missing_ok=True)
+                _delete(path)
 
 
 def make_room(folder: Path, folders: Sequence[Path], share: float) -> str:
@@ -45,8 +45,14 @@ def make_room(folder: Path, folders: Sequence[Path], share: float) -> str:
                 f"{folder}: the disk is {100 * taken:.4g} % full, disk_share allows {100 * share:.4g} %, and no older "
                 f"segment is left to delete; recording stopped"
             )
-        olds.popleft().unlink(missing_ok=True)
+        _delete(olds.popleft())
     return ""
+
+
+def _delete(path: Path) -> None:
+    """Delete a file; a directory that has the name of a segment stays."""
+    if not path.is_dir() or path.is_symlink():
+        path.unlink(missing_ok=True)
 
 
 def taken_share(folder: Path) -> float:

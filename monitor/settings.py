@@ -209,33 +209,33 @@ class _Filled(Generic[T_co]):
         return any(one == place or one.startswith((f"{place}.", f"{place}[")) for one in self.wrong)
 
 
-def load(path: Path) -> Config:
-    """The configuration in a file.
+def load(path: Path, *, pipe: bool = False) -> Config:
+    """The configuration in a file; from a pipe too if ``pipe``, see ``small_file.read``.
 
     Raises:
         ConfigError: one line: the first thing that is wrong, and how many more there are
     """
-    config, wrong = read(path)
+    config, wrong = read(path, pipe=pipe)
     if config is None:
         more = f" (and {len(wrong) - 1} more: imu-monitor check {path})" if len(wrong) > 1 else ""
         raise ConfigError(wrong[0] + more)
     return config
 
 
-def read(path: Path) -> tuple[Config | None, list[str]]:
+def read(path: Path, *, pipe: bool = False) -> tuple[Config | None, list[str]]:
     """The configuration, or None and all that is wrong with the file, a line each."""
-    reading = examine(path)
+    reading = examine(path, pipe=pipe)
     return reading.config, reading.wrong
 
 
-def examine(path: Path) -> Reading:
+def examine(path: Path, *, pipe: bool = False) -> Reading:
     """Read a configuration file and find all that is wrong with it; opens nothing."""
     try:
-        text = small_file.read(path).decode("utf-8")
+        text = small_file.read(path, pipe=pipe).decode("utf-8")
     except FileNotFoundError:
         return Reading(None, [f"{path}: no such file; imu-monitor check --print-defaults prints one to start from"])
     except (OSError, UnicodeDecodeError) as error:
-        return Reading(None, [f"{path}: cannot be read: {error}"])
+        return Reading(None, [f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"])
     try:
         table = toml.tables(text)
     except ConfigError as error:
@@ -402,7 +402,7 @@ class _Reader:
 
     def _zenoh_file(self, path: Path) -> None:
         """Whether zenoh takes it, and who else may change it or read the secrets in it."""
-        if not small_file.is_file(path):
+        if not os.path.exists(path):
             self.wrong.append(f"zenoh.config: {path}: no such file")
             return
         if line := permissions.changeable(path):
@@ -592,8 +592,8 @@ def model_path(name: str, folder: Path) -> Path:
     models = CONFIG_FOLDER / "models"
     shipped = models / f"{name}.toml"
     path = shipped if small_file.is_file(shipped) else folder / small_file.path(name)
-    if small_file.is_file(path):
-        return path
+    if os.path.exists(path) and not path.is_dir():
+        return path  # whatever else it is, its reader says
     names = sorted(file.stem for file in models.glob("*.toml"))
     raise ConfigError(f'no model "{name}", neither a file nor one of those shipped{plugin.nearest(name, names)}')
 
@@ -609,7 +609,8 @@ def zenoh_file_secrets(path: Path) -> tuple[Path, ...]:
     try:
         return secret_files(configuration({}, path))
     except zenoh.ZError as error:
-        raise ConfigError(f"{path}: {plain(error)}") from error
+        text = plain(error)
+        raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from error
 
 
 def seconds(value: float | str) -> float:

@@ -96,13 +96,13 @@ def to_file(study: Study) -> bytes:
 
 
 def from_file(path: Path) -> dict[str, ThermalModel]:
-    """Models by axis.
+    """Models by axis; a pipe is read too.
 
     Raises:
         ConfigError: what is wrong with the file
     """
     try:
-        found = msgspec.json.decode(small_file.read(path), type=ModelFile)
+        found = msgspec.json.decode(small_file.read(path, pipe=True), type=ModelFile)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

@@ -526,9 +526,12 @@ def _header(path: Path) -> str:
 
 
 def _binary(path: Path) -> IO[bytes]:
-    if path.suffix.lower() == ".gz":
-        return cast("IO[bytes]", gzip.open(path, "rb"))
-    return path.open("rb")
+    file = small_file.open_regular(path)
+    if path.suffix.lower() != ".gz":
+        return file
+    unzipped: Any = gzip.GzipFile(fileobj=file, mode="rb")
+    unzipped.myfileobj = file  # closed with it
+    return cast("IO[bytes]", unzipped)
 
 
 def _text(path: Path) -> IO[str]:
@@ -540,14 +543,28 @@ def build(settings: Settings) -> Link:
 
     Raises ``ConfigError`` for a speed that is none, and for a file that is nothing to replay.
     """
+    path = small_file.path(settings.path)
     wrong = list(_problems(settings))
     try:
-        kind = _kind(small_file.path(settings.path))
+        _check_path(path)
+        kind = _kind(path)
     except ConfigError as error:
         wrong = [*error.lines, *wrong]
     if wrong:
         raise ConfigError(*wrong)
     return ReplayLink(settings, kind, _pace(settings.speed))
+
+
+def _check_path(path: Path) -> None:
+    """Raise ConfigError for something that is neither a file nor a folder; one that is not there may come."""
+    if path.is_dir():
+        return
+    try:
+        small_file.check_regular(path)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise ConfigError(f'path "{path}": {error.strerror or error}') from error
 
 
 def _problems(settings: Settings) -> Iterator[str]:

@@ -14,7 +14,6 @@ Time stamps are passed on as stored, with their jitter, gaps and steps back. Not
 sorted or filled here, no unit is guessed, and nothing is ever unpickled.
 """
 
-import stat
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -31,6 +30,7 @@ from drivers.recording.formats import FORMATS, format_of, is_recording
 from drivers.recording.saving import save_samples, writing
 from drivers.recording.table import EXAMPLE_HEADER, T_LIMIT_S, Table
 from drivers.sample import AXES, Floats, SampleBlock, block
+from drivers.small_file import check_regular
 
 __all__ = ["FORMATS", "Recording", "is_recording", "iter_blocks", "load_samples", "save_samples", "writing"]
 
@@ -71,7 +71,7 @@ def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None 
     try:
         found = _load_folder(path, rate_hz, last_s) if path.is_dir() else _load_file(path, rate_hz)
     except OSError as error:
-        raise RecordingError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
+        raise RecordingError(_why(path, error)) from error
     except MemoryError as error:
         raise ConfigError(f"{path}: does not fit into the memory that is free; read a part of it") from error
     return found if last_s is None else _end(found, last_s)
@@ -87,6 +87,13 @@ def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]
         yield block(_times_ns(recording, part), recording.values[part], recording.temperature_c[part])
 
 
+def _why(path: Path, error: RecordingError | OSError) -> str:
+    """Why a file cannot be read, in one line that names it."""
+    if isinstance(error, RecordingError):
+        return str(error)
+    return f"{error.filename or path}: cannot be read: {error.strerror or error}"
+
+
 # --- from columns to a recording -----------------------------------------------------------------
 
 
@@ -96,11 +103,9 @@ def _load_file(path: Path, rate_hz: float | None) -> Recording:
 
 
 def _check_content(path: Path) -> None:
-    """Raise an error for a file of no bytes, and for what is no file: a pipe or a device has no end."""
-    found = path.stat()
-    if not stat.S_ISREG(found.st_mode):
-        raise RecordingError(f"{path}: is a device or pipe, expected a file; copy what it gives into a file first")
-    if found.st_size:
+    """Raise an error for an empty file, and for a name that is not a regular file: a pipe or a device has no end."""
+    check_regular(path)
+    if path.stat().st_size:
         return
     if not is_recording(path):
         raise ConfigError(
@@ -218,7 +223,7 @@ def _times_ns(recording: Recording, part: slice) -> NDArray[np.int64]:
 
 def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Recording:
     """Segments in the order of their names; one that cannot be read is left out, with a note."""
-    segments = sorted(p for p in path.iterdir() if is_recording(p) and p.name[0] != "." and p.is_file())
+    segments = sorted(p for p in path.iterdir() if is_recording(p) and p.name[0] != ".")
     if not segments:
         raise RecordingError(f"{path}: no recordings in this folder; known are {' '.join(FORMATS)}")
     parts: list[Recording] = []  # newest first
@@ -229,8 +234,8 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
     for segment in reversed(segments):
         try:
             part = _load_file(segment, rate_hz)
-        except RecordingError as error:
-            notes.append(f"A segment was left out: {error}.")
+        except (RecordingError, OSError) as error:
+            notes.append(f"A segment was left out: {_why(segment, error)}.")
             continue
         parts.append(part)
         taken += part.values.nbytes + 2 * part.temperature_c.nbytes
@@ -250,7 +255,7 @@ def _check_folder(path: Path, segments: Sequence[Path], free: int | None) -> Non
         try:
             _check_content(segment)
             rows += format_of(segment).count_rows(segment)
-        except RecordingError:
+        except (RecordingError, OSError):
             continue  # left out, with a note, when it is read
         size_bytes += segment.stat().st_size
         room.ReadLimit(path, size_bytes, free).check_rows(rows)

@@ -5,6 +5,7 @@ numbers of rows and the types of the columns are checked against the limits of `
 are read.
 """
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ from drivers.recording import room
 from drivers.recording.arrow_messages import batch_sizes, buffer_count, check_buffers
 from drivers.recording.table import BATCH_ROWS, PART, Append, Table, check_width, chosen_columns, looks_like
 from drivers.sample import Floats
+from drivers.small_file import open_regular
 
 OWN: Final = b"imu-monitor"
 """Key of the metadata by which a segment of the daemon's recordings is known."""
@@ -62,22 +64,24 @@ def _parquet(path: Path) -> Iterator[Any]:
     pa = library(path)
     from pyarrow import parquet
 
-    with path.open("rb") as start:
-        start.seek(max(path.stat().st_size - len(PARQUET_END), 0))
-        index_bytes = int.from_bytes(start.read()[:4], "little")
-    if MAX_INDEX_BYTES < index_bytes < path.stat().st_size:
-        raise RecordingError(
-            f"{path}: its index of row groups and columns has {index_bytes} bytes, expected at most {MAX_INDEX_BYTES}; "
-            "write it again with fewer columns or larger row groups"
-        )
-    try:
-        with parquet.ParquetFile(path) as file:
-            yield file
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise RecordingError(
-            f"{path}: is no whole Parquet file ({_first_line(error)}); its index stands at the end, "
-            f"so one that is cut off cannot be read{looks_like(path)}"
-        ) from error
+    with open_regular(path) as file:
+        size_bytes = os.fstat(file.fileno()).st_size
+        file.seek(max(size_bytes - len(PARQUET_END), 0))
+        index_bytes = int.from_bytes(file.read()[:4], "little")
+        if MAX_INDEX_BYTES < index_bytes < size_bytes:
+            raise RecordingError(
+                f"{path}: its index of row groups and columns has {index_bytes} bytes, expected at most "
+                f"{MAX_INDEX_BYTES}; write it again with fewer columns or larger row groups"
+            )
+        file.seek(0)
+        try:
+            with parquet.ParquetFile(file) as opened:
+                yield opened
+        except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+            raise RecordingError(
+                f"{path}: is no whole Parquet file ({_first_line(error)}); its index stands at the end, "
+                f"so one that is cut off cannot be read{looks_like(path)}"
+            ) from error
 
 
 def _checked_parquet(path: Path, file: Any, notes: list[str]) -> tuple[dict[str, str], int]:
@@ -94,7 +98,7 @@ def _checked_parquet(path: Path, file: Any, notes: list[str]) -> tuple[dict[str,
 
 def count_rows_ipc(path: Path) -> int:
     """Return the number of rows of all batches up to a cut. Raises RecordingError and ConfigError as ``read_ipc``."""
-    with library(path).OSFile(str(path), "rb") as file:
+    with open_regular(path) as file:
         return _checked_ipc(path, _ipc_start(path), _ipc_schema(path, file), {})[1]
 
 
@@ -103,7 +107,7 @@ def read_ipc(path: Path) -> Table:
     pa = library(path)
     notes: list[str] = []
     start = _ipc_start(path)
-    with pa.OSFile(str(path), "rb") as file:
+    with open_regular(path) as file:
         schema = _ipc_schema(path, file)
         own = OWN in (schema.metadata or {})
         chosen = chosen_columns(path, [name for name in schema.names if not (own and name in BOOKKEEPING)], notes)
@@ -129,13 +133,13 @@ def read_ipc(path: Path) -> Table:
 
 def _ipc_start(path: Path) -> int:
     """Return where the stream begins: behind the magic word of a file."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         return len(ARROW_MAGIC) if file.read(len(ARROW_MAGIC)) == ARROW_MAGIC else 0
 
 
 def _has_end_mark(path: Path, is_file: bool) -> bool:
     mark = ARROW_MAGIC.rstrip(b"\0") if is_file else ARROW_END
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         file.seek(max(path.stat().st_size - len(mark), 0))
         return file.read() == mark
 
@@ -166,7 +170,7 @@ def _checked_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str])
     ]
     limit = room.limit_of(path)
     batches = rows = dictionaries = 0
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         for size in batch_sizes(file, start):
             if size.dictionary:
                 dictionaries += sum(size.buffers)

@@ -12,7 +12,7 @@ import os
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, BinaryIO, Final
+from typing import IO, Any, Final
 
 CONTINUATION: Final = 0xFFFFFFFF
 MAX_METADATA_BYTES: Final = 64_000_000
@@ -40,7 +40,7 @@ class BatchSize:
     dictionary: bool  # True for a dictionary
 
 
-def batch_sizes(file: BinaryIO, start: int = 0) -> Iterator[BatchSize]:
+def batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[BatchSize]:
     """Yield the stated sizes of the batches of a stream up to its end, a cut or damaged metadata.
 
     Parameters
@@ -130,7 +130,7 @@ def buffer_count(pa: Any, type_: Any) -> int | None:
     return 3 if any(is_type(type_) for is_type in variable) else 2
 
 
-def _batch_size(file: BinaryIO, batch: "_Table", body: int, body_bytes: int, dictionary: bool) -> BatchSize:
+def _batch_size(file: IO[bytes], batch: "_Table", body: int, body_bytes: int, dictionary: bool) -> BatchSize:
     rows = batch.number(BATCH_LENGTH, "q")
     packed = batch.has(BATCH_COMPRESSION)
     sizes = []

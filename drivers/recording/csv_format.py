@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import BinaryIO, Final, TextIO
+from typing import IO, Final, TextIO
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from drivers.recording.table import (
     looks_like,
 )
 from drivers.sample import AXES, Floats
+from drivers.small_file import open_regular
 
 READ_BYTES: Final = 1 << 20
 MAX_LINE_BYTES: Final = 1 << 20
@@ -74,7 +75,7 @@ def count_rows(path: Path) -> int:
     """
     limit = room.limit_of(path)
     lines = unpacked = 0
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         for text in _whole_lines(_unzipped(file, []), []):
             lines += text.count(b"\n")
             unpacked += len(text)
@@ -89,7 +90,7 @@ def read_csv(path: Path) -> Table:
     notes: list[str] = []
     bad = _BadLines()
     count_rows(path)
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         texts = _whole_lines(_unzipped(file, notes), notes)
         head = _head(path, texts)
         if head is None:
@@ -116,7 +117,7 @@ def _mostly_bad(path: Path, bad: _BadLines, rows: int) -> RecordingError:
     )
 
 
-def _unzipped(file: BinaryIO, notes: list[str]) -> Iterator[bytes]:
+def _unzipped(file: IO[bytes], notes: list[str]) -> Iterator[bytes]:
     """The text of a plain or gzip file, by its first bytes and not by its name, up to a cut or damage.
 
     The pieces have READ_BYTES at most.

@@ -21,7 +21,7 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from tempfile import TemporaryFile
 from tokenize import TokenError
-from typing import IO, Any, BinaryIO, Final, cast
+from typing import IO, Any, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from drivers.errors import RecordingError
 from drivers.recording import room
 from drivers.recording.table import ALIASES, COLUMNS, Append, Columns, Table, check_width, chosen_columns, looks_like
 from drivers.sample import Floats
+from drivers.small_file import open_regular
 
 LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # PKWARE APPNOTE 4.3.7
 LOCAL_MAGIC: Final = b"PK\3\4"
@@ -116,7 +117,7 @@ def read_npz(path: Path) -> Table:
     return _recovered_table(path, arrays, cut, notes)
 
 
-def _is_whole(path: Path, file: BinaryIO) -> bool:
+def _is_whole(path: Path, file: IO[bytes]) -> bool:
     """Return True for a zip archive with its index, False for one without; RecordingError for anything else."""
     if file.read(len(LOCAL_MAGIC)) != LOCAL_MAGIC:
         raise RecordingError(f"{path}: is no .npz file (a zip archive with one array a column){looks_like(path)}")
@@ -126,7 +127,7 @@ def _is_whole(path: Path, file: BinaryIO) -> bool:
     return whole
 
 
-def _opened(path: Path, file: BinaryIO) -> zipfile.ZipFile:
+def _opened(path: Path, file: IO[bytes]) -> zipfile.ZipFile:
     try:
         return zipfile.ZipFile(file)
     except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
@@ -273,7 +274,7 @@ def _recovered(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
     limit = room.limit_of(path)
     arrays: dict[str, NDArray[Any]] = {}
     unpacked = members = 0
-    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+    with open_regular(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
         at = data.find(LOCAL_MAGIC)
         while 0 <= at <= len(data) - LOCAL_HEADER.size:
             members += 1

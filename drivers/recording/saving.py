@@ -90,6 +90,8 @@ def whole(path: Path) -> Iterator[Path]:
         raise ConfigError(f"{path}: cannot be written: it is a folder")
     part = path.with_name(path.name + PART)
     try:
+        if part.exists() and not part.is_file():  # opening a FIFO would wait for its reader
+            part.unlink()
         part.touch()
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error

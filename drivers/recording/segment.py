@@ -10,6 +10,8 @@ A segment that grows is not compressed, so that a batch stands alone. One that h
 compressed batches, and takes the other's place whole or not at all.
 """
 
+import errno
+import mmap
 import os
 import re
 from collections import deque
@@ -30,6 +32,7 @@ from drivers.recording.arrow_messages import batch_sizes
 from drivers.recording.room import ROW_BYTES
 from drivers.recording.table import BATCH_ROWS, PART, T_LIMIT_S
 from drivers.sample import AXES, Chunk, SampleBlock, block, join, ns_to_seconds, seconds_to_ns
+from drivers.small_file import open_regular
 
 SUFFIX: Final = ".arrows"
 NAME: Final = re.compile(r"(\d{8})_[0-9TZ-]+\.arrows")
@@ -91,7 +94,8 @@ class SegmentWriter:
         self._schema = _schema(self._pa, origin)
         self._state = State()
         self._part = path.with_name(path.name + PART)
-        self._file: IO[bytes] = self._part.open("wb", buffering=0)
+        self._part.unlink(missing_ok=True)  # of a program that was killed
+        self._file: IO[bytes] = self._part.open("xb", buffering=0)
         self._writer = self._pa.ipc.new_stream(self._file, self._schema)
         self._whole = 0  # bytes that hold whole batches
 
@@ -107,13 +111,33 @@ class SegmentWriter:
         """Have the disk keep what was written, through a power cut too."""
         os.fdatasync(self._file.fileno())
 
+    def change(self) -> str:
+        """Say what another program has done to the file that is written; "" if nothing."""
+        try:
+            named = os.stat(self.path if self._whole else self._part, follow_symlinks=False)
+        except OSError:
+            return "was deleted or renamed"
+        own = os.fstat(self._file.fileno())
+        if not os.path.samestat(named, own):
+            return "was replaced by another file"
+        return "was cut or written by another program" if self._whole and own.st_size != self._whole else ""
+
+    def abandon(self) -> None:
+        """Close a file that another program has changed: one that is whole is ended, another stays as it is."""
+        try:
+            if os.fstat(self._file.fileno()).st_size == self._whole:
+                self._writer.close()
+        finally:
+            self._file.close()
+
     def close(self) -> None:
         """End the stream; what was written stays where even that fails."""
         try:
             self._writer.close()
         finally:
             self._file.close()
-            self._part.unlink(missing_ok=True)
+            if not self._whole:
+                self._part.unlink(missing_ok=True)
 
     def _write(self, batch: Any, meta: dict[bytes, bytes] | None) -> None:
         try:
@@ -124,6 +148,8 @@ class SegmentWriter:
             self._file.seek(self._whole)
             raise
         if not self._whole:
+            if os.path.lexists(self.path):
+                raise FileExistsError(errno.EEXIST, f"{self.path.name} is there already", str(self.path))
             os.rename(self._part, self.path)
             _keep_names(self.path.parent)
         self._whole = self._file.tell()
@@ -170,7 +196,7 @@ def number_of(path: Path) -> int:
 def origin(path: Path) -> Origin:
     """What a segment is of. RecordingError when it is none."""
     pa = library(path)
-    with _reading(path), pa.OSFile(str(path), "rb") as file:
+    with _reading(path), open_regular(path) as file:
         return _origin(path, pa.ipc.open_stream(file).schema)
 
 
@@ -251,12 +277,13 @@ def pack(path: Path) -> Iterator[None]:
     part = path.with_name(path.name + PART)
     options = pa.ipc.IpcWriteOptions(compression="zstd")
     try:
-        with pa.OSFile(str(part), "wb") as file, pa.ipc.new_stream(file, schema, options=options) as writer:
+        part.unlink(missing_ok=True)
+        with part.open("xb") as file, pa.ipc.new_stream(file, schema, options=options) as writer:
             for batch, meta in _joined(pa, schema, path, own.kind):
                 writer.write_batch(batch, custom_metadata=meta)
                 yield
-        with part.open("rb") as file:
-            os.fsync(file.fileno())
+        with open_regular(part) as written:
+            os.fsync(written.fileno())
         os.replace(part, path)
         _keep_names(path.parent)
     finally:
@@ -299,8 +326,8 @@ def _batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any
     ``mapped`` leaves rows that are not looked at on the disk.
     """
     pa = library(path)
-    with _reading(path), pa.memory_map(str(path)) if mapped else pa.OSFile(str(path), "rb") as file:
-        reader = pa.ipc.open_stream(file)
+    with _reading(path), open_regular(path) as file:
+        reader = pa.ipc.open_stream(_mapped(pa, file) if mapped else file)
         found = _origin(path, reader.schema)
         if found.kind != kind:
             raise RecordingError(f"{path}: a segment of {found.kind}, where one of {kind} is read")
@@ -317,13 +344,20 @@ def _batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any
 def _regular_batches(path: Path) -> int:
     """Number of batches before the first one whose stated size is not that of a batch of the daemon."""
     count = 0
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         for size in batch_sizes(file):
             large = max(size.rows * ROW_BYTES, sum(size.buffers), size.body_bytes) > MAX_BATCH_BYTES
             if large or size.dictionary:  # the daemon writes no dictionaries
                 break
             count += 1
     return count
+
+
+def _mapped(pa: Any, file: IO[bytes]) -> Any:
+    """The file in memory as far as it is looked at; an empty one cannot be mapped."""
+    if not os.fstat(file.fileno()).st_size:
+        return file
+    return pa.BufferReader(pa.py_buffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)))
 
 
 class _reading:  # noqa: N801 - reads as a word
@@ -336,6 +370,8 @@ class _reading:  # noqa: N801 - reads as a word
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> None:
         unread = UnicodeDecodeError | RecursionError | msgspec.DecodeError
+        if isinstance(error, OSError) and error.errno in (errno.EINVAL, errno.EISDIR):  # no regular file
+            raise RecordingError(f"{self._path}: {error.strerror}") from error
         nonsense = isinstance(error, OSError) and error.errno is None and not isinstance(error, ImuError)
         if nonsense or isinstance(error, library(self._path).ArrowException | unread):
             first = str(error).strip().partition("\n")[0]

@@ -10,6 +10,7 @@ from typing import Final
 from drivers.errors import RecordingError
 from drivers.recording import room
 from drivers.sample import AXES, Floats
+from drivers.small_file import open_regular
 
 COLUMNS: Final = ("t", *AXES, "temperature")
 """Columns that mean something, under the names they are written with."""
@@ -102,7 +103,7 @@ def looks_like(path: Path) -> str:
     Empty where the content is of the kind that the suffix says, or of no known kind.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             start = file.read(256)
     except OSError:
         return ""

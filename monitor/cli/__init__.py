@@ -19,6 +19,7 @@ from typer.exceptions import TyperException
 
 from drivers.errors import ConfigError, ImuError, NotReady, RecordingError, in_one_line
 from drivers.plugin import nearest
+from drivers.small_file import real_path
 from monitor.cli import doctor, drift, options, output, serving
 from monitor.cli import history as history_command
 
@@ -91,7 +92,7 @@ def run(
     """The daemon: every device in the file, until a signal."""
     from monitor import settings
 
-    found = serving.with_history(settings.load(config), options.duration("--history", history))
+    found = serving.with_history(settings.load(config, pipe=True), options.duration("--history", history))
     serving.serve(found, seconds, viewer)
 
 
@@ -111,7 +112,7 @@ def check(
         return
     if config is None:
         raise ConfigError("CONFIG.toml is missing; --print-defaults prints one to start from")
-    found, wrong = check_configuration(config)
+    found, wrong = check_configuration(config, pipe=True)
     for line in (*wrong, *(f"warning: {line}" for line in (found.warnings if found else ()))):
         typer.echo(line, err=True)
     if wrong:
@@ -225,7 +226,7 @@ def simulate(
     length_s = options.duration("--seconds", seconds)
     output.check_place("--json", json)
     for option, path in (("--json", json), ("--temperature-from", temperature_from)):
-        if path is not None and path.resolve() == out.resolve():
+        if path is not None and real_path(path) == real_path(out):
             raise ConfigError(f"{option}: {path} is what --out writes; another name is needed")
     noise = load(model, Path.cwd())
     request = simulation.Request(noise, out, length_s, seed, rate, temperature_from, truth, model)

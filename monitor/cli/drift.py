@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from drivers.errors import ConfigError
+from drivers.small_file import real_path
 from monitor.cli import options, output, serving
 
 
@@ -37,7 +38,7 @@ def compensate(
     for option, place in (("--out", out), ("--json", json), ("--plot", plot)):
         output.check_place(option, place)
     for option, place in (("--json", json), ("--plot", plot), ("RECORDING", recording)):
-        if place is not None and place.resolve() == out.resolve():
+        if place is not None and real_path(place) == real_path(out):
             raise ConfigError(f"{option}: {place} is what --out writes; another name is needed")
     serving.end_on_sigterm()
     last_s = options.duration("--last", last)

@@ -141,7 +141,7 @@ def _file(source: Path) -> Path:
         return source / FILE
     if source.name == FILE:
         return source
-    config = settings.load(source)
+    config = settings.load(source, pipe=True)
     if config.storage is None:
         raise ConfigError(f"{source}: keeps no history; [storage] folder is missing")
     return config.storage.folder / FILE

@@ -133,7 +133,7 @@ def noise(source: Path) -> "Noise":
     from monitor.noise.model import NoiseModel
 
     try:
-        text = sys.stdin.buffer.read() if source == Path("-") else small_file.read(source)
+        text = sys.stdin.buffer.read() if source == Path("-") else small_file.read(source, pipe=True)
         if text.lstrip().startswith(b"{"):
             return from_analysis(text, source.name)
         return from_model(NoiseModel.from_toml(text.decode()), source.name)

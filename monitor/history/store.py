@@ -12,7 +12,9 @@ full or read-only disk does comes through as ``sqlite3.Error``; a transaction is
 """
 
 import contextlib
+import errno
 import math
+import os
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,6 +25,7 @@ from typing import Any, Final
 import msgspec
 
 from drivers.errors import RecordingError
+from drivers.small_file import check_folder, check_regular
 from monitor.history.row import NUMBERS_AT_MOST, STATES, Row, merged, pack, unpack
 from monitor.history.times import Span
 
@@ -53,8 +56,19 @@ CREATE TABLE event (
 );
 CREATE INDEX event_time ON event (device, t);
 """
+TABLES: Final = frozenset({"device", "layout", "row", "event"})
+BESIDE: Final = ("-wal", "-shm", "-journal")
+"""Ends of the names of files that SQLite keeps beside a database."""
+DELETED: Final = "was deleted or renamed"
+REPLACED: Final = "was replaced by another file"
+EMPTIED: Final = "was emptied"
+CHANGED: Final = "was changed by another program"
 MOVE: Final = "move it away, and a new one is begun"
 _ROW: Final = "start, width, newest, layout, received, lost, bad, overflowed, state, numbers"
+
+
+_Stat = tuple[int, int, int, int]
+"""Device, inode, size and time of change of a file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +85,10 @@ class PastEvent:
     stands_for: int = 1  # events, itself and those of its kind that were thinned out before it
 
 
+class UnusableHistory(RecordingError):
+    """A file in place of a history that is damaged or holds something else."""
+
+
 class Store:
     """The writer. One thread is to use it.
 
@@ -83,15 +101,24 @@ class Store:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        check_folder(path.parent)
         path.parent.mkdir(parents=True, exist_ok=True)
+        _check_files(path)
+        path.touch()  # it has an identity before SQLite opens it
+        before = os.stat(path)
+        self._files = _stats(path)
         self._db = sqlite3.connect(path, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
         self._devices: dict[str, int] = {}
         self._layouts = _Layouts(self._db)
+        self._version = -1
         try:
             with _explained(path):
                 self._prepare()
+            if not os.path.samestat(before, os.stat(path)):
+                raise OSError(errno.EBUSY, "was replaced while it was being opened", str(path))
+            self._files, self._version = _stats(path), self._data_version()
         except BaseException:
-            self._db.close()
+            self.close()
             raise
 
     def _prepare(self) -> None:
@@ -114,6 +141,7 @@ class Store:
                 self._put(self._device(device), row)
             for device, event in events:
                 self._put_event(self._device(device), event)
+        self._files = _stats(self.path)
 
     def thin(self, now_s: float, at_most: int = 100) -> int:
         """Let rows be old: merge up to so many buckets, and say how many were; 0 = nothing is due."""
@@ -127,10 +155,37 @@ class Store:
                     limit_s = (age_from_s - age_s) // wider_s * wider_s
                     while done < at_most and self._merge_oldest(device, width_s, wider_s, limit_s):
                         done += 1
+        if done:
+            self._files = _stats(self.path)
         return done
 
+    def change(self) -> str:
+        """Say what another program has done to the file since this store used it last; "" if nothing.
+
+        SQLite itself notices none of it: it would go on writing to a file that has no name any more.
+        """
+        now = _stats(self.path)
+        if now == self._files:
+            return ""
+        (before, _), (file, _) = self._files, now
+        if file is None:
+            return DELETED
+        if before is None or file[:2] != before[:2]:
+            return REPLACED
+        return CHANGED if file[2] else EMPTIED
+
     def close(self) -> None:
-        """What was added stays; without a reader the file is left in one piece."""
+        """What was added stays; without a reader the file is left in one piece.
+
+        SQLite leaves the log of a file that lost its name, and would bring the log into one that was written over.
+        """
+        before, now = self._files[0], _stats(self.path)[0]
+        if before is not None and (now is None or now[:2] != before[:2]):
+            with contextlib.suppress(sqlite3.Error):  # a full disk: the log stays, and nothing of it is lost
+                self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+        elif now != before and not self._committed_by_others():
+            with contextlib.suppress(OSError):  # there is no log
+                os.truncate(f"{self.path}-wal", 0)
         self._db.close()
 
     # --- rows
@@ -252,10 +307,30 @@ class Store:
             self._devices[name] = int(found)
         return self._devices[name]
 
+    def _renumber(self) -> None:
+        """Forget the numbers of devices and layouts if another connection has changed the file."""
+        version = self._data_version()
+        if version != self._version:
+            self._version = version
+            self._devices.clear()
+            self._layouts.forget()
+
+    def _committed_by_others(self) -> bool:
+        """Whether another connection of SQLite has changed the file; False for one that was written over."""
+        try:
+            return self._data_version() != self._version
+        except sqlite3.Error:
+            return False
+
+    def _data_version(self) -> int:
+        """A number that changes with every commit of another connection."""
+        return int(self._db.execute("PRAGMA data_version").fetchone()[0])
+
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
         self._db.execute("BEGIN IMMEDIATE")
         try:
+            self._renumber()
             yield
             self._db.execute("COMMIT")
         except BaseException:
@@ -329,8 +404,13 @@ def reading(path: Path) -> Iterator[Reader]:
     Raises:
         RecordingError: there is none, or it cannot be read
     """
-    if not path.is_file():
-        raise RecordingError(f"{path}: no such file")
+    try:
+        os.stat(path)
+        _check_files(path)
+    except FileNotFoundError as error:
+        raise RecordingError(f"{path}: no such file") from error
+    except OSError as error:
+        raise RecordingError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
     try:
         with _explained(path), contextlib.closing(_opened(path)) as db:
             if not check(db, path):
@@ -368,8 +448,12 @@ def check(db: sqlite3.Connection, path: Path) -> bool:
     if application != APPLICATION:
         (tables,) = db.execute("SELECT count(*) FROM sqlite_master").fetchone()
         if tables or version or application:
-            raise RecordingError(f"{path}: an SQLite file, but not a history of imu-monitor")
-    return bool(application == APPLICATION)
+            raise UnusableHistory(f"{path}: an SQLite file, but not a history of imu-monitor")
+        return False
+    tables = {name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    if missing := sorted(TABLES - tables):
+        raise UnusableHistory(f"{path}: damaged: it has no table {', '.join(missing)}; {MOVE}")
+    return True
 
 
 class _Layouts:
@@ -428,6 +512,27 @@ def _opened(path: Path) -> sqlite3.Connection:
     raise AssertionError("one of them was the last")
 
 
+def _stats(path: Path) -> tuple[_Stat | None, _Stat | None]:
+    """What the file and its log look like; None for one that is not there, and for an empty log."""
+    found: list[_Stat | None] = []
+    for one in (path, Path(f"{path}-wal")):
+        try:
+            seen = os.stat(one)
+        except OSError:
+            found.append(None)
+        else:
+            found.append((seen.st_dev, seen.st_ino, seen.st_size, seen.st_mtime_ns))
+    file, log = found
+    return file, log if log is not None and log[2] else None
+
+
+def _check_files(path: Path) -> None:
+    """Raise OSError if the file or one that SQLite keeps beside it is there and is not a regular file."""
+    for end in ("", *BESIDE):
+        with contextlib.suppress(FileNotFoundError):
+            check_regular(Path(f"{path}{end}"))
+
+
 @contextlib.contextmanager
 def _explained(path: Path) -> Iterator[None]:
     """What is wrong with the file itself, in a line; what may pass (busy, full, read-only) as it is."""
@@ -438,9 +543,9 @@ def _explained(path: Path) -> Iterator[None]:
     except RecordingError as error:
         if str(error).startswith(str(path)):
             raise
-        raise RecordingError(f"{path}: damaged: {error}; {MOVE}") from error
+        raise UnusableHistory(f"{path}: damaged: {error}; {MOVE}") from error
     except (sqlite3.DatabaseError, msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: damaged: {error}; {MOVE}") from error
+        raise UnusableHistory(f"{path}: damaged: {error}; {MOVE}") from error
 
 
 def _bound(t_s: float) -> float:

@@ -31,6 +31,7 @@ from urllib.parse import quote
 import rerun as rr
 import rerun_cli  # type: ignore[import-untyped]
 
+from drivers.small_file import check_regular
 from monitor.publish.viewer import ViewerClosed, ViewerSettings, ViewerTrouble
 
 LOOPBACK: Final = "127.0.0.1"
@@ -110,6 +111,7 @@ class Output:
     url: str = ""  # of the page, or of the Rerun server
     child: Child | None = None
     port: int | None = None  # of the Rerun server; None for a file
+    note: str = ""  # which ports were busy, and what is used in their place
 
     def check(self) -> None:
         """ViewerTrouble when nobody looks any more, ViewerClosed when that was someone's wish."""
@@ -218,6 +220,8 @@ def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[
 
 def _open_file(path: Path, recording_id: str) -> Output:
     try:
+        if path.exists():
+            check_regular(path)  # opening a FIFO would wait for its reader
         with path.open("wb"):
             pass
     except OSError as error:
@@ -256,6 +260,8 @@ def _open_web(settings: ViewerSettings, recording_id: str, given_up: Callable[[]
     ])  # fmt: skip
     _wait_for(port, child, given_up)
     output = _connected(port, recording_id, child=child)
+    moved = {settings.port: port, settings.web_port: web_port}
+    output.note = ", ".join(f"port {old} is busy: {new} is used" for old, new in moved.items() if old != new)
     output.url = f"http://{LOOPBACK}:{web_port}/?url={quote(server_url(port), safe='')}"
     if has_desktop():
         webbrowser.open(output.url)

@@ -278,7 +278,7 @@ class RerunView:
             self._fleet,
         )
         scene.show([(d.name, d.about) for d in devices])
-        self._phase = "ok"
+        self._phase = f"ok, but {output.note}" if output.note else "ok"
 
     def _begin(self, scene: "Scene", device: str) -> None:
         """What was, before what comes."""

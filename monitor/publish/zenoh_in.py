@@ -286,7 +286,8 @@ def listeners(connect: Sequence[str], file: Path | None) -> dict[str, "zenoh.Con
     try:
         theirs = endpoints(configuration({}, file))
     except zenoh.ZError as error:
-        raise ConfigError(f"{file}: {plain(error)}") from error
+        text = plain(error)
+        raise ConfigError(text if text.startswith(str(file)) else f"{file}: {text}") from error
     unsaid = {**CLOSED, "transport/link/rx/max_message_size": MESSAGE_BYTES}
     found = {}
     for endpoint in dict.fromkeys(connect or theirs or (topics.ENDPOINT,)):

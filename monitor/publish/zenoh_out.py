@@ -19,6 +19,7 @@ import queue
 import re
 import socket
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -38,6 +39,8 @@ RETRY_S: Final = 2.0
 QUERIES_WAITING: Final = 64
 LOOK_S: Final = 3.0
 """Between two looks why a router does not let us in."""
+TWIN_S: Final = 10.0
+"""After the last status that another program published under our key, this is said."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +80,7 @@ class ZenohOut:
         self._publishers: dict[str, zenoh.Publisher | AdvancedPublisher] = {}
         self._tokens: dict[str, Any] = {}
         self._queryables: dict[str, list[Any]] = {}
+        self._twins = _Twins(settings.prefix)
         self._declaring = threading.Lock()  # the opener declares all devices, the loop those that come or go
         self._showing = threading.Lock()  # the opener and the loop both show who is alive
         self._opener = threading.Thread(target=self._keep_open, name="zenoh open", daemon=True)
@@ -87,11 +91,14 @@ class ZenohOut:
     def state(self) -> str:
         """``ok``, or what is wrong: for the status."""
         session = self._session
-        if self._unsent or session is None or not self._connect:
+        if self._unsent or session is None:
             return self._unsent or self._said
-        if alone(session):
+        if self._connect and alone(session):
             return f"{self._why or 'nobody at ' + masked(', '.join(self._connect))}; trying again"
-        return self._said
+        twins = self._twins.found(time.monotonic())
+        if not twins:
+            return self._said
+        return f"{self._said}{'; ' if self._said != 'ok' else ', but '}{twins}"
 
     def start(self) -> None:
         """Open in a thread of its own: a router that is not there must not hold up the samples."""
@@ -152,7 +159,7 @@ class ZenohOut:
             keys = {topic.key(self.settings.prefix, device) for topic in topics.TOPICS}
             gone = [self._publishers[key] for key in keys & self._publishers.keys()]
             self._publishers = {key: one for key, one in self._publishers.items() if key not in keys}
-            for one in [*gone, *self._queryables.pop(device, [])]:
+            for one in [*gone, *self._queryables.pop(device, []), *self._twins.remove(device)]:
                 one.undeclare()
 
     def close(self) -> None:
@@ -193,6 +200,7 @@ class ZenohOut:
         """Close the session, which ends the threads that take from it."""
         session, self._session = self._session, None
         self._publishers, self._queryables = {}, {}
+        self._twins.clear()
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
         with self._showing:
@@ -215,6 +223,7 @@ class ZenohOut:
         published = {topic: key for topic, key in keys.items() if topic.when not in ("presence", "query")}
         new = {key: self._publisher(session, topic, key) for topic, key in published.items()}
         self._declare_commands(session, device)
+        self._twins.add(session, device)
         if self._recall is not None:
             self._declare_history(session, device, self._recall)
         self._publishers = {**self._publishers, **new}
@@ -339,6 +348,54 @@ class ZenohOut:
                 self.commands.put_nowait(command)
             except queue.Full:
                 command.refuse("busy: too many commands wait")
+
+
+class _Twins:
+    """Other sessions that publish the status of a device under our key.
+
+    Whoever subscribes would get both mixed, and a command would reach both.
+
+    Parameters
+    ----------
+    prefix
+        Prefix of the keys.
+    """
+
+    def __init__(self, prefix: str) -> None:
+        self._prefix = prefix
+        self._subscribers: dict[str, Any] = {}
+        self._heard_s: dict[str, float] = {}
+
+    def add(self, session: "zenoh.Session", device: str) -> None:
+        """Listen to what others publish as the status of a device; our own messages do not come."""
+        import zenoh
+
+        key = topics.STATUS.key(self._prefix, device)
+        ring: Any = zenoh.handlers.RingChannel(1)
+        one = session.declare_subscriber(key, ring, allowed_origin=zenoh.Locality.REMOTE)
+        self._subscribers = {**self._subscribers, device: one}
+
+    def remove(self, device: str) -> list[Any]:
+        """Forget a device; returns what is to be undeclared."""
+        self._heard_s.pop(device, None)
+        gone = [one for name, one in self._subscribers.items() if name == device]
+        self._subscribers = {name: one for name, one in self._subscribers.items() if name != device}
+        return gone
+
+    def clear(self) -> None:
+        """Forget all; they go with their session."""
+        self._subscribers, self._heard_s = {}, {}
+
+    def found(self, now_s: float) -> str:
+        """Return one line if another program published a device's status within the last TWIN_S; else ""."""
+        for device, one in self._subscribers.items():
+            with contextlib.suppress(*_zenoh_errors()):  # the session is being closed
+                if one.handler.try_recv() is not None:
+                    self._heard_s[device] = now_s
+        keys = [f"{self._prefix}/{one}" for one, at_s in self._heard_s.items() if now_s - at_s < TWIN_S]
+        if not keys:
+            return ""
+        return f"another program publishes {', '.join(sorted(keys))} too; change a device's name, or zenoh.prefix"
 
 
 def _answers(query: Any, key: str) -> tuple[Callable[[bytes], None], Callable[[str], None]]:

@@ -1,1 +1,4 @@
-"""Attack suite: inputs made to exhaust memory or processor time, or to make a command fail without saying why."""
+"""Attack suite: hostile files, absurd numbers, shared resources and foreign environments.
+
+Cheap cases run with all tests, the others with ``pytest tests/attacks -m attack``.
+"""

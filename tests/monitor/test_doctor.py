@@ -22,6 +22,7 @@ from monitor import doctor, settings
 from monitor.catalogue import read_model
 from monitor.compiled import cache_folder
 from monitor.doctor import SAMPLE_BYTES, Finding, bytes_a_day, examine, room, satisfies, worst
+from monitor.folder_lock import HISTORY_LOCK, RECORDING_LOCK, FolderLock
 from monitor.recorder import origin
 from monitor.settings import CONFIG_FOLDER, Storage
 from tests.support.waiting import PATIENCE_S
@@ -368,3 +369,23 @@ def test_json_alone_goes_to_standard_output(tmp_path: Path) -> None:
     refused = run(tmp_path, "--json", "nowhere/x.json")
     assert (refused.returncode, refused.stdout) == (2, "")
     assert refused.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", [RECORDING_LOCK, HISTORY_LOCK])
+def test_a_folder_that_another_process_uses_is_found(name: str, tmp_path: Path) -> None:
+    text = VIRTUAL + QUIET + f'[storage]\nfolder = "{tmp_path / "kept"}"\n'
+    assert not [one for one in of(examined(tmp_path, text), "storage") if "in use" in one.text]
+    lock = FolderLock(tmp_path / "kept", name)
+    assert lock.hold() == ""
+    (found,) = [one for one in of(examined(tmp_path, text), "storage") if "in use" in one.text]
+    assert found.mark == "doubt"
+    assert found.text == f"{tmp_path / 'kept'}: in use by process {os.getpid()}"
+    assert "choose another folder" in found.do
+    lock.release()
+
+
+def test_a_fifo_in_place_of_the_folder_is_found(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "kept")
+    text = VIRTUAL + QUIET + f'[storage]\nfolder = "{tmp_path / "kept"}"\n'
+    found = [one for one in of(examined(tmp_path, text), "storage") if one.mark == "wrong"]
+    assert "is a FIFO, not a folder" in found[-1].text

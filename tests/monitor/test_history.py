@@ -168,4 +168,5 @@ def test_a_damaged_history_is_said_in_the_status_and_to_who_asks(asked: tuple[Se
     assert "damaged" in json.loads(bytes(reply.err.payload))["error"]
     service.history.tell("bench-1", PastEvent(T0, "moved", "once more"))
     wait_for(lambda: "damaged" in service.states()["history"])
-    assert path.read_bytes() == b"no more" * 1000
+    (aside,) = path.parent.glob(f"{FILE}.aside-*Z")
+    assert aside.read_bytes() == b"no more" * 1000

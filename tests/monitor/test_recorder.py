@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 import threading
 import time
 from pathlib import Path
@@ -394,3 +395,247 @@ def test_files_that_are_no_segments_are_passed_over(tmp_path: Path) -> None:
     after._resume(after._recorder.tail("bench"))
     after.rebuild()
     assert after.chain.estimator.filled == 3000
+
+
+# --- other programs in the same folder
+
+
+def rows_of_all(folder: Path) -> tuple[np.ndarray, int]:
+    """Counts of all rows, and the samples that are said to be lost between them; the first loss does not count."""
+    pieces = written(folder)
+    return join([piece.samples for piece in pieces]).ticks, sum(piece.samples.lost for piece in pieces[1:])
+
+
+def test_two_recorders_on_one_folder_lose_nothing_and_keep_nothing_twice(tmp_path: Path) -> None:
+    """Both receive the same samples; the times of the second are 3 ms late."""
+    first, second = (Recorder(Storage(tmp_path, segment_s=10.0), [SAMPLES]) for _ in range(2))
+    for one in (first, second):
+        one.know("bench", State(RATE))
+    first.start()
+    wait_for((tmp_path / "recording.lock").exists)
+    first.samples("bench", rows(0, 20), 0)
+    wait_for(lambda: bool(segment.segments(tmp_path / "bench")))
+    second.start()
+    wait_for(lambda: "in use" in second.state)
+    assert second.state == (
+        f"{tmp_path}: in use by process {os.getpid()}; nothing is recorded here until it ends; "
+        "end it, or choose another folder in [storage]"
+    )
+    given = 20
+    for at in range(20, 4000, 20):
+        first.samples("bench", rows(at, 20), 0)
+        second.samples("bench", rows(at, 20), 3_000_000)
+        given = at + 20
+    first.close()
+    first_has, _ = rows_of_all(tmp_path / "bench")
+    assert first_has.tolist() == list(range(given))
+    for at in range(given, given + 2000, 20):
+        second.samples("bench", rows(at, 20), 3_000_000)
+    wait_for(lambda: second.state == "ok")
+    second.close()
+    ticks, lost = rows_of_all(tmp_path / "bench")
+    assert ticks.tolist() == list(range(given + 2000))
+    assert lost == 0
+    assert [one.kind for one in second.take()] == ["recording_stopped", "recording_back"]
+    assert first.state == second.state == "ok"
+
+
+def test_a_second_recorder_without_counts_goes_on_by_time_and_says_what_is_missing(tmp_path: Path) -> None:
+    def uncounted(first: int, n: int) -> SampleBlock:
+        one = rows(first, n)
+        return block(one.t_ns.copy(), one.values.copy(), one.temperature_c.copy())
+
+    first, second = (Recorder(Storage(tmp_path), [SAMPLES]) for _ in range(2))
+    first.know("bench", State(RATE))
+    first.start()
+    first.samples("bench", uncounted(0, 100), 0)
+    wait_for(lambda: bool(segment.segments(tmp_path / "bench")))
+    second.start()
+    wait_for(lambda: "in use" in second.state)
+    second.samples("bench", uncounted(50, 50), 0)  # these are in the recording
+    second.samples("bench", uncounted(105, 50), 0)
+    first.close()
+    wait_for(lambda: second.state == "ok")
+    second.close()
+    pieces = written(tmp_path / "bench")
+    times = (join([piece.samples for piece in pieces]).t_ns - START_NS + 1000) // 10_000_000
+    assert times.tolist() == [*range(100), *range(105, 155)]
+    assert sum(piece.samples.lost for piece in pieces) == 5
+
+
+def test_a_second_recorder_deletes_nothing(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(room.retention, "taken_share", lambda _: 0.1)
+    first = Recorder(Storage(tmp_path), [SAMPLES])
+    first.start()
+    first.samples("bench", rows(0, 100), 0)
+    wait_for(lambda: bool(segment.segments(tmp_path / "bench")))
+    for i in range(2, 8):
+        (tmp_path / "bench" / segment.segment_name(i, 1.0e9)).write_bytes(b"old")
+    (tmp_path / "bench" / "00000099_x.arrows.part").write_bytes(b"of the first")
+    monkeypatch.setattr(room.retention, "taken_share", lambda _: 0.99)
+    monkeypatch.setattr(first, "_tidy", lambda: None)
+    before = sorted(path.name for path in tmp_path.rglob("*"))
+    second = Recorder(Storage(tmp_path, keep_s=10.0, segment_s=10.0), [SAMPLES])
+    second.start()
+    second.samples("bench", rows(0, 100), 0)
+    wait_for(lambda: "in use" in second.state)
+    rounds = second._excluded_s
+    wait_for(lambda: second._excluded_s != rounds)
+    second.close()
+    assert sorted(path.name for path in tmp_path.rglob("*")) == before
+    first.close()
+
+
+def test_raw_bytes_of_two_recorders_are_kept_once(tmp_path: Path) -> None:
+    of = Origin("bench", "raw", carrier="frames", decoder="dbc")
+    given = [Chunk(bytes([i]), START_NS + i, address=i) for i in range(100)]
+    first, second = (Recorder(Storage(tmp_path), [of]) for _ in range(2))
+    first.start()
+    first.chunks("bench", given[:60], 0)
+    wait_for(lambda: bool(segment.segments(tmp_path / "bench" / "raw")))
+    second.start()
+    wait_for(lambda: "in use" in second.state)
+    second.chunks("bench", given[30:], 0)
+    first.close()
+    wait_for(lambda: second.state == "ok")
+    second.close()
+    back = [one for path in segment.segments(tmp_path / "bench" / "raw") for one in segment.read_chunks(path)]
+    assert [one.address for one in back] == list(range(100))
+
+
+def delete(path: Path) -> None:
+    path.unlink()
+
+
+def rename(path: Path) -> None:
+    path.rename(path.with_name("elsewhere.arrows"))
+
+
+def cut(path: Path) -> None:
+    os.truncate(path, 1000)
+
+
+def append(path: Path) -> None:
+    with path.open("ab") as file:
+        file.write(b"mine")
+
+
+def put_another(path: Path) -> None:
+    other = path.with_name("other")
+    other.write_bytes(b"mine")
+    other.rename(path)
+
+
+def remove_folder(path: Path) -> None:
+    shutil.rmtree(path.parent.parent)
+
+
+def rename_folder(path: Path) -> None:
+    path.parent.parent.rename(path.parent.parent.with_name("away"))
+
+
+@pytest.mark.parametrize("tamper", [delete, rename, cut, append, put_another, remove_folder, rename_folder])
+def test_a_file_that_is_changed_while_it_is_written_is_noticed_and_another_begun(tmp_path: Path, tamper) -> None:
+    folder = tmp_path / "store" / "bench"
+    keeper = Recorder(Storage(tmp_path / "store"), [SAMPLES])
+    keeper.start()
+    keeper.samples("bench", rows(0, 100), 0)
+    wait_for(lambda: bool(segment.segments(folder)))
+    (path,) = segment.segments(folder)
+    tamper(path)
+    wait_for(lambda: "ok, but" in keeper.state)
+    assert f"{path} was " in keeper.state
+    assert "with 100 rows in it; a new one is begun" in keeper.state
+    assert [one.kind for one in keeper.take()] == ["recording_stopped", "recording_back"]
+    keeper.samples("bench", rows(100, 100), 0)
+    wait_for(lambda: any(one != path and one.stat().st_size > 9000 for one in segment.segments(folder)))
+    keeper.close()
+    newest = segment.segments(folder)[-1]
+    np.testing.assert_array_equal(
+        join([piece.samples for piece in segment.read_samples(newest)]).ticks, np.arange(100, 200)
+    )
+    match tamper.__name__:
+        case "put_another":
+            assert path.read_bytes() == b"mine"
+        case "cut":
+            assert path.stat().st_size == 1000
+        case "append":
+            assert path.read_bytes().endswith(b"mine")
+        case "rename" | "rename_folder":
+            (old,) = tmp_path.rglob("elsewhere.arrows" if tamper is rename else f"away/*/{path.name}")
+            assert len(load_samples(old)) == 100
+            assert not load_samples(old).notes  # it was ended
+
+
+def test_the_folder_of_one_device_can_go_while_another_is_recorded(tmp_path: Path) -> None:
+    keeper = Recorder(Storage(tmp_path), [SAMPLES, Origin("other", "samples")])
+    keeper.start()
+    for at in range(0, 300, 100):
+        keeper.samples("bench", rows(at, 100), 0)
+        keeper.samples("other", rows(at, 100), 0)
+        if at == 0:
+            wait_for(lambda: len(list(tmp_path.rglob("*.arrows"))) == 2)
+            shutil.rmtree(tmp_path / "bench")
+            wait_for(lambda: "was deleted" in keeper.state)
+    keeper.close()
+    assert rows_of_all(tmp_path / "other")[0].tolist() == list(range(300))
+    assert rows_of_all(tmp_path / "bench")[0].tolist() == list(range(100, 300))
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("kind", ["fifo", "directory", "loop"])
+def test_what_is_no_file_in_place_of_segments_is_passed_over(tmp_path: Path, kind: str) -> None:
+    keeper = Recorder(Storage(tmp_path), [SAMPLES])
+    keeper.start()
+    keeper.samples("bench", rows(0, 100), 0)
+    wait_for(lambda: bool(segment.segments(tmp_path / "bench")))
+    keeper.close()
+    for name in (segment.segment_name(1, 1.0e9), segment.segment_name(7, 1.7e9)):
+        path = tmp_path / "bench" / name
+        match kind:
+            case "fifo":
+                os.mkfifo(path)
+            case "directory":
+                path.mkdir()
+            case _:
+                path.symlink_to(path.name)
+    again = Recorder(Storage(tmp_path, keep_s=1.0, segment_s=1.0), [SAMPLES])
+    tail = again.tail("bench")
+    assert tail is not None
+    assert tail.newest.samples.ticks[-1] == 99
+    assert len(list(tail.pieces(10.0))) == 1
+    again.start()
+    again.samples("bench", rows(100, 100), 0)
+    wait_for(lambda: segment.number_of(segment.segments(tmp_path / "bench")[-1]) == 8)
+    again.close()
+    assert again.state == "ok"
+
+
+def test_something_else_in_place_of_the_folder_is_said_until_it_is_gone(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "store")
+    keeper = Recorder(Storage(tmp_path / "store"), [SAMPLES])
+    keeper.start()
+    keeper.samples("bench", rows(0, 100), 0)
+    said = f"{tmp_path / 'store'}: is a FIFO, not a folder; recording stopped, trying again"
+    wait_for(lambda: keeper.state == said)
+    (tmp_path / "store").unlink()
+    wait_for(lambda: keeper.state == "ok")
+    keeper.close()
+    assert rows_of_all(tmp_path / "store" / "bench")[0].tolist() == list(range(100))
+
+
+def test_a_folder_that_cannot_be_used_costs_only_what_has_no_room_in_memory(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(room, "QUEUE_BYTES", 500 * room.SAMPLE_BYTES)
+    (tmp_path / "store").write_text("in the way")
+    keeper = Recorder(Storage(tmp_path / "store"), [SAMPLES])
+    keeper.start()
+    wait_for(lambda: "is a file, not a folder" in keeper.state)
+    for at in range(0, 1000, 100):
+        keeper.samples("bench", rows(at, 100), 0)
+    (tmp_path / "store").unlink()
+    wait_for(lambda: keeper.state.startswith("ok"))
+    keeper.close()
+    assert keeper.missed == 500
+    assert keeper.state == "ok, but 500 rows are not in the recording: the disk was too slow or full"
+    (piece,) = written(tmp_path / "store" / "bench")
+    assert (piece.samples.lost, piece.samples.ticks[0]) == (500, 500)

@@ -263,3 +263,17 @@ def test_a_device_that_is_gone_has_no_row() -> None:
         console.print(board.table(0.0))
     assert "second was moved" in captured.get()
     assert "first" not in captured.get()
+
+
+@pytest.mark.timeout(60)
+def test_a_fifo_in_place_of_the_file_is_not_waited_for_and_another_folder_needs_a_restart(tmp_path: Path) -> None:
+    before = device("a") + QUIET + '[storage]\nfolder = "one"\n'
+    change = changed(tmp_path, before, before.replace('"one"', '"two"'))
+    assert change.restart == ("storage",)
+    assert change.config.storage is not None
+    assert change.config.storage.folder == tmp_path / "one"
+    path = tmp_path / "c.toml"
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(ConfigError, match=r"c.toml: cannot be read: is a FIFO, not a regular file"):
+        reload.change(change.config, {"a": None})

@@ -18,7 +18,9 @@ import numpy as np
 import pytest
 
 from drivers.recording import save_samples
-from tests.monitor.publish.zenoh_world import eventually, free_endpoint, router, session
+from tests.support.ports import free_endpoint
+from tests.support.waiting import wait_for
+from tests.support.zenoh_sessions import router, session
 
 PROGRAM = [sys.executable, "-m", "monitor.cli"]
 START_S = 60.0
@@ -96,7 +98,7 @@ class Daemon:
             return bool(right(self.outputs.get(output, "")))
 
         try:
-            eventually(said, START_S)
+            wait_for(said)
         except AssertionError:
             raise AssertionError(f"{output}: {self.outputs}, received {self.counts}") from None
         return self.outputs[output]
@@ -110,7 +112,7 @@ class Daemon:
             self.listen()
             return all(count >= before[topic] + 3 for topic, count in self.counts.items())
 
-        eventually(more, START_S)
+        wait_for(more)
 
 
 @contextlib.contextmanager
@@ -256,7 +258,7 @@ def test_a_terminal_that_is_read_again_goes_on(tmp_path: Path, frozen: str) -> N
             screen.read()
             state = one.says("terminal", lambda state: state.startswith("ok"))
             assert re.fullmatch(r"ok, but [\d,]+ frames? dropped", state)
-            eventually(lambda: screen.data.count("● running".encode()) > 2, START_S)
+            wait_for(lambda: screen.data.count("● running".encode()) > 2)
             one.goes_on()
             assert ended(one.process, signal.SIGINT) == 0
         text = screen.all()
@@ -275,7 +277,7 @@ def test_log_lines_go_above_the_table_or_where_standard_error_goes(tmp_path: Pat
         screen.read()
         with daemon(tmp_path, screen.writing, log, source) as one:
             one.says("terminal", lambda state: state == "ok")
-            eventually(lambda: "● running".encode() in screen.data, START_S)
+            wait_for(lambda: "● running".encode() in screen.data)
             assert ended(one.process, signal.SIGTERM) == 0
         text = screen.all()
     written = (tmp_path / "log").read_bytes()
@@ -297,7 +299,7 @@ def test_a_second_interrupt_ends_at_once_on_a_frozen_terminal(tmp_path: Path) ->
     with frozen_terminal("unread") as screen, daemon(tmp_path, *2 * [screen.writing], SLOW_TO_STOP) as one:
         one.says("terminal", lambda state: state.startswith("blocked"))
         one.process.send_signal(signal.SIGINT)
-        eventually((tmp_path / "stopping").exists, START_S)
+        wait_for((tmp_path / "stopping").exists)
         assert ended(one.process, signal.SIGINT) == -signal.SIGINT
 
 
@@ -408,7 +410,7 @@ def test_watch_ends_although_nobody_reads_it(place: str) -> None:
         out = stack.enter_context(frozen_terminal("unread") if place == "terminal" else unread_pipe())
         command = [*PROGRAM, "watch", "--connect", endpoint, *more]
         process = stack.enter_context(program(command, out.writing, subprocess.DEVNULL))
-        eventually(lambda: waits_for_reader(process.pid), START_S)
+        wait_for(lambda: waits_for_reader(process.pid))
         assert ended(process, signal.SIGTERM) == 0
 
 
@@ -420,11 +422,11 @@ def test_watch_goes_on_when_it_is_read_again(tmp_path: Path) -> None:
         process = stack.enter_context(
             program([*PROGRAM, "watch", "--connect", endpoint], screen.writing, subprocess.DEVNULL)
         )
-        eventually(lambda: waits_for_reader(process.pid), START_S)
+        wait_for(lambda: waits_for_reader(process.pid))
         screen.read()
-        eventually(lambda: screen.data.count(b"imu-monitor") > 2, START_S)
+        wait_for(lambda: screen.data.count(b"imu-monitor") > 2)
         assert ended(process, signal.SIGTERM) == 0
-        eventually(lambda: b"\x1b[?25h" in screen.data)
+        wait_for(lambda: b"\x1b[?25h" in screen.data)
 
 
 def test_view_ends_although_nobody_reads_its_log() -> None:
@@ -432,5 +434,5 @@ def test_view_ends_although_nobody_reads_its_log() -> None:
     with unread_pipe() as log:
         command = [*PROGRAM, "view", "--connect", endpoint, "--viewer", "none"]
         with program(command, subprocess.DEVNULL, log.writing) as process:
-            eventually(lambda: waits_for_reader(process.pid), START_S)
+            wait_for(lambda: waits_for_reader(process.pid))
             assert ended(process, signal.SIGTERM) == 0

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TextIO
 
 import pytest
-from tests.monitor.publish.zenoh_world import eventually
 
 from monitor.publish import queued_writer
 from monitor.publish.queued_writer import QueuedLines, QueuedWriter
+from tests.support.waiting import wait_for
 
 
 class Pipe:
@@ -68,13 +68,13 @@ def test_a_blocked_pipe_loses_the_oldest_lines_and_says_how_many(pipe: Pipe) -> 
     writer = QueuedWriter(pipe.stream, "the pipe", limit=40, tell=told.append)
     writer.start()
     writer.put("in the write call\n")
-    eventually(lambda: writer.state.startswith("blocked for 0 s: nobody reads the pipe"))
+    wait_for(lambda: writer.state.startswith("blocked for 0 s: nobody reads the pipe"))
     for i in range(10):
         writer.put(f"{i:09}\n")  # 10 characters each: 4 remain
     assert writer.state.endswith("; 6 log lines dropped")
     assert told == []
     pipe.read(filled)
-    eventually(lambda: writer.state == "ok, but 6 log lines dropped")
+    wait_for(lambda: writer.state == "ok, but 6 log lines dropped")
     assert pipe.read(58).decode() == "in the write call\n000000006\n000000007\n000000008\n000000009\n"
     assert writer.close()
     assert told == ["6 log lines were dropped because nobody read the pipe"]
@@ -85,11 +85,11 @@ def test_a_pipe_that_stays_blocked_is_given_up(pipe: Pipe) -> None:
     writer = QueuedWriter(pipe.stream, "the pipe")
     writer.start()
     writer.put("never read\n")
-    eventually(lambda: writer.state.startswith("blocked"))
+    wait_for(lambda: writer.state.startswith("blocked"))
     assert not writer.close(0.1)
     os.write(pipe.stream.fileno(), bytes(1 << 20))  # what the interpreter may write at exit does not block
     pipe.read(filled)  # ends the thread
-    eventually(lambda: writer.close(0.0))
+    wait_for(lambda: writer.close(0.0))
 
 
 def test_a_non_blocking_descriptor_loses_nothing(pipe: Pipe) -> None:
@@ -100,7 +100,7 @@ def test_a_non_blocking_descriptor_loses_nothing(pipe: Pipe) -> None:
     writer = QueuedWriter(pipe.stream, "the pipe")
     writer.start()
     writer.put(text)
-    eventually(lambda: writer.state.startswith("blocked"))
+    wait_for(lambda: writer.state.startswith("blocked"))
     pipe.read(filled)
     assert pipe.read(len(text)).decode() == text
     assert writer.close()
@@ -114,11 +114,11 @@ def test_a_full_disk_is_reported_and_counted() -> None:
         writer = QueuedWriter(full, "the log", tell=told.append)
         writer.start()
         writer.put("one\n")
-        eventually(lambda: writer.state == "the log cannot be written: No space left on device; 1 log line dropped")
+        wait_for(lambda: writer.state == "the log cannot be written: No space left on device; 1 log line dropped")
         free, busy = os.pipe()
         os.dup2(busy, full.fileno())  # there is space again
         writer.put("two\n")
-        eventually(lambda: told)
+        wait_for(lambda: told)
         assert os.read(free, 100) == b"two\n"
         assert told == ["1 log line was dropped because the log could not be written: No space left on device"]
         assert writer.state == "ok, but 1 log line dropped"
@@ -133,7 +133,7 @@ def test_the_report_of_lost_lines_is_the_last_line(pipe: Pipe) -> None:
     writer = QueuedWriter(pipe.stream, "the pipe", limit=100, tell=lambda text: writer.put(f"{text}\n"))
     writer.start()
     writer.put("a\n")
-    eventually(lambda: writer.state.startswith("blocked"))
+    wait_for(lambda: writer.state.startswith("blocked"))
     for _ in range(60):
         writer.put("b\n")  # 2 characters each: 50 remain
     closing = threading.Thread(target=writer.close, args=(60.0,))
@@ -157,7 +157,7 @@ def test_an_error_in_drawing_neither_ends_the_thread_nor_loses_lines(pipe: Pipe)
     writer.start()
     writer.put("one\n")
     assert pipe.read(4) == b"one\n"
-    eventually(lambda: writer.state.startswith("the pipe cannot be written: RuntimeError: no table; "))
+    wait_for(lambda: writer.state.startswith("the pipe cannot be written: RuntimeError: no table; "))
     broken.clear()
     assert pipe.read(6) == b"frame\n"
     assert writer.close()
@@ -170,7 +170,7 @@ def test_frames_are_drawn_again_and_counted_while_nobody_reads(pipe: Pipe) -> No
     writer = QueuedWriter(pipe.stream, "the pipe", lambda _lines, last: "last\n" if last else "f\n", period_s=0.05)
     filled = pipe.fill()
     writer.start()
-    eventually(lambda: "frames dropped" in writer.state)
+    wait_for(lambda: "frames dropped" in writer.state)
     assert writer.state.startswith("blocked for ")
     pipe.read(filled)
     assert pipe.read(4) == b"f\nf\n"
