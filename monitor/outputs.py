@@ -84,9 +84,11 @@ class ViewerOutput(Output):
         """``recorded``: devices whose times are not the host's."""
         self._view = view
         self._recorded = recorded
+        self._sampled_s: dict[str, float] = {}  # Unix time of the newest published sample
 
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         """Raw samples."""
+        self._sampled_s[device] = (int(samples.t_ns[-1]) + offset_ns) / 1e9
         self._view.samples(device, (samples.t_ns + offset_ns) / 1e9, samples.values, samples.temperature_c)
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
@@ -115,8 +117,11 @@ class ViewerOutput(Output):
 
     def health(self, device: str, unix_s: float, health: Health) -> None:
         """The health panel. A line at today's date would put all that a recording of last year holds out of sight."""
-        if device in self._recorded and not health.received and health.uptime_s < OPENING_S:
-            return
+        if device in self._recorded:
+            sampled_s = self._sampled_s.get(device)
+            if sampled_s is None and health.uptime_s < OPENING_S:
+                return
+            unix_s = unix_s if sampled_s is None else sampled_s
         self._view.health(device, unix_s, health)
 
 
@@ -129,10 +134,12 @@ class HistoryOutput(Output):
         self._writer = writer
         self._recorded = recorded
         self._minutes: dict[str, Minutes] = {}
+        self._sampled_s: dict[str, float] = {}  # Unix time of the newest published sample
 
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         """Their temperature."""
         unix_s = (int(samples.t_ns[-1]) + offset_ns) / 1e9
+        self._sampled_s[device] = unix_s
         self._writer.put(device, self._of(device).temperature(unix_s, samples.temperature_c))
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
@@ -149,15 +156,18 @@ class HistoryOutput(Output):
         self._writer.tell(device, told)
 
     def health(self, device: str, unix_s: float, health: Health) -> None:
-        """Counts and state. Before a recording of last year has begun, it is not today that anything happens."""
-        if device in self._recorded and not health.received:
-            return
+        """Counts and state. A recording has no other time than that of its samples, and none before the first."""
+        if device in self._recorded:
+            if device not in self._sampled_s:
+                return
+            unix_s = self._sampled_s[device]
         self.received[device] = health.received
         self._writer.put(device, self._of(device).health(unix_s, health))
 
     def gone(self, device: str) -> None:
         """A device that was taken out: its minute is as full as it will be."""
         self.received.pop(device, None)
+        self._sampled_s.pop(device, None)
         minutes = self._minutes.pop(device, None)
         if minutes is not None:
             self._writer.put(device, minutes.end())

@@ -18,6 +18,7 @@ from drivers.recording import FORMATS, Recording, is_recording, iter_blocks, loa
 from drivers.recording.csv_format import READ_BYTES
 from drivers.recording.saving import whole
 from drivers.sample import AXES, join
+from tests.support.recordings import recordings
 
 SUFFIXES = tuple(FORMATS)
 TEXTS = (".csv", ".csv.gz")
@@ -713,9 +714,7 @@ class TestRealRecordings:
 
     @pytest.fixture
     def folder(self):
-        if "IMU_MONITOR_DATA" not in os.environ:
-            pytest.skip("IMU_MONITOR_DATA does not point to the recordings")
-        return Path(os.environ["IMU_MONITOR_DATA"])
+        return recordings()
 
     def test_all_load(self, folder):
         files = sorted([*folder.glob("*/*.npz"), *folder.glob("lego-hub-temp/*.csv")])
