@@ -250,7 +250,7 @@ class ZenohOut:
         own = self.settings
         keys = {
             "mode": own.mode,
-            "listen/endpoints": None if own.mode == "client" else listen,
+            "listen/endpoints": [] if own.mode == "client" else listen,  # a client listens nowhere
             "connect/endpoints": own.connect or None,
         }
         unsaid = {**CLOSED, "listen/endpoints": [topics.ENDPOINT], "timestamping/enabled": True}

@@ -12,14 +12,12 @@ import errno
 import os
 import random
 import resource
-import select
 import signal
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-import tty
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,6 +32,7 @@ from monitor.health import Health
 from monitor.service import Service
 from monitor.station import Output, Station
 from tests.support.ports import free_endpoint, free_port
+from tests.support.terminal import LineTerminal
 from tests.support.waiting import PATIENCE_S, wait_for
 
 RATE: Final = 200
@@ -132,13 +131,10 @@ class Board:
     def __init__(self, folder: Path) -> None:
         self.port = folder / "tty"
         self.sent = 0
-        self.dropped = 0  # lines that found no port, or no room in it
-        self._begun = b""  # rest of a line that is half in the port
         self.spoil: Callable[[bytes], bytes] = lambda data: data
-        self._master = -1
+        self._terminal = LineTerminal(self.port)
         self._plugging = threading.Lock()
         self._closing = threading.Event()
-        self.plug()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
@@ -151,22 +147,11 @@ class Board:
 
     def plug(self) -> None:
         with self._plugging:
-            self._master, slave = os.openpty()
-            tty.setraw(self._master)
-            tty.setraw(slave)
-            os.set_blocking(self._master, False)
-            self.port.unlink(missing_ok=True)
-            self.port.symlink_to(os.ttyname(slave))
-            os.close(slave)
+            self._terminal.plug()
 
     def pull(self) -> None:
         with self._plugging:
-            self.port.unlink(missing_ok=True)
-            if self._master >= 0:
-                os.close(self._master)
-            self._master = -1
-            self.dropped += bool(self._begun)
-            self._begun = b""
+            self._terminal.pull()
 
     def rest(self) -> None:
         """Print nothing any more."""
@@ -181,19 +166,14 @@ class Board:
             self.sent = due
             self._write(self.spoil(data))
 
+    @property
+    def dropped(self) -> int:
+        """Lines that found no port, or no room in it."""
+        return self._terminal.dropped
+
     def _write(self, data: bytes) -> None:
-        data, half = self._begun + data, bool(self._begun)
         with self._plugging:
-            while data and self._master >= 0 and select.select([], [self._master], [], 0.005)[1]:
-                try:
-                    n = os.write(self._master, data)
-                except (BlockingIOError, OSError):
-                    break
-                half = not data[:n].endswith(b"\n")
-                data = data[n:]
-        end = data.find(b"\n") + 1 if half else 0
-        self._begun = data[:end]
-        self.dropped += data.count(b"\n", end)
+            self._terminal.write(data)
 
 
 def _line(count: int, values: Any) -> bytes:

@@ -10,14 +10,12 @@ read, and each row's count must follow from the one before by what it says was l
 import argparse
 import contextlib
 import os
-import select
 import sqlite3
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-import tty
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +26,7 @@ from drivers.recording import load_samples, segment
 from drivers.sample import Floats, Ints
 from monitor.history.store import reading
 from monitor.history.times import Span
+from tests.support.terminal import LineTerminal
 from tests.support.waiting import PATIENCE_S, wait_for
 
 RATE = 1000
@@ -59,12 +58,7 @@ class Sensor:
 
     def __init__(self, folder: Path) -> None:
         self.port = folder / "tty"
-        self._master, slave = os.openpty()
-        tty.setraw(self._master)
-        tty.setraw(slave)
-        os.set_blocking(self._master, False)
-        self.port.symlink_to(os.ttyname(slave))
-        os.close(slave)
+        self._terminal = LineTerminal(self.port)
         self.device = os.readlink(self.port)
         self.sent = 0  # counts that have been given to the wire
         self.still = threading.Lock()  # nothing is sent while it is held
@@ -75,7 +69,7 @@ class Sensor:
     def close(self) -> None:
         self._closing.set()
         self._thread.join()
-        os.close(self._master)
+        self._terminal.pull()
 
     def _run(self) -> None:
         rng = np.random.default_rng(0)
@@ -88,15 +82,8 @@ class Sensor:
                     ",".join([str(self.sent + i), *(f"{value:.6f}" for value in row)]) + "\n"
                     for i, row in enumerate(values)
                 ]
-                self._write("".join(lines).encode())
+                self._terminal.write("".join(lines).encode())
                 self.sent = due
-
-    def _write(self, data: bytes) -> None:
-        while data and select.select([], [self._master], [], 0.005)[1]:
-            try:
-                data = data[os.write(self._master, data) :]
-            except BlockingIOError:
-                return
 
 
 @dataclass(frozen=True)

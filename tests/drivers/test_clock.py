@@ -1,8 +1,6 @@
 """Sample times and missing samples from counters, arrivals and given times, in scenarios where the truth is known."""
 
-import os
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +8,7 @@ import pytest
 from drivers.clock import Before, SampleClock
 from drivers.line import FORGET_S, Line, made_rate
 from drivers.sample import NO_TICK, Arrival, Counter, Given, block
+from tests.support.recordings import recordings
 
 NS = 1e9
 T0 = 1e5  # s, where the host's clock stands
@@ -486,9 +485,7 @@ def test_events_of_a_kind_are_at_most_one_a_second():
     "name", ["mpu6050-hosttime/static-11min", "phone/gyro-a", "px4-bench/bench-69s", "robot-arm/mpu9150"]
 )
 def test_recordings_of_real_sensors_hold_no_repeats(name):
-    if "IMU_MONITOR_DATA" not in os.environ:
-        pytest.skip("IMU_MONITOR_DATA does not point to the recordings")
-    data = np.load(Path(os.environ["IMU_MONITOR_DATA"]) / f"{name}.npz")
+    data = np.load(recordings() / f"{name}.npz")
     values = np.stack([data[axis] for axis in ("gx", "gy", "gz") * 2], axis=1).astype(np.float64)
     clock = SampleClock(Given(), None)
     out = stamp_given(clock, data["t"], values, 500)
@@ -502,9 +499,7 @@ def test_recordings_of_real_sensors_hold_no_repeats(name):
     [("mpu6050-hosttime/static-11min", 0), ("phone/gyro-a", 0), ("car-phone-can/minute", 0), ("can-car/drive-a", 120)],
 )
 def test_recordings_with_host_times_have_no_invented_holes(name, most):
-    if "IMU_MONITOR_DATA" not in os.environ:
-        pytest.skip("IMU_MONITOR_DATA does not point to the recordings")
-    t = np.load(Path(os.environ["IMU_MONITOR_DATA"]) / f"{name}.npz")["t"]
+    t = np.load(recordings() / f"{name}.npz")["t"]
     t_ns = np.rint(t * NS).astype(np.int64)
     for nominal in (None, (len(t) - 1) / (t[-1] - t[0])):
         clock = SampleClock(Given(), nominal)

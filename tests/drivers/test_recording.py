@@ -34,6 +34,7 @@ from drivers.recording.arrow_messages import batch_sizes, buffer_count, check_bu
 from drivers.recording.csv_format import MAX_LINE_BYTES, READ_BYTES
 from drivers.recording.saving import whole
 from drivers.sample import AXES, join
+from tests.support.recordings import recordings
 
 SUFFIXES = tuple(FORMATS)
 TEXTS = (".csv", ".csv.gz")
@@ -1001,9 +1002,7 @@ class TestRealRecordings:
 
     @pytest.fixture
     def folder(self):
-        if "IMU_MONITOR_DATA" not in os.environ:
-            pytest.skip("IMU_MONITOR_DATA does not point to the recordings")
-        return Path(os.environ["IMU_MONITOR_DATA"])
+        return recordings()
 
     def test_all_load(self, folder):
         files = sorted([*folder.glob("*/*.npz"), *folder.glob("lego-hub-temp/*.csv")])

@@ -5,7 +5,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import pytest
 
 from tests.fleet.namespaces import INSIDE, pair
 from tests.support.ports import free_port
-from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.waiting import PATIENCE_S, stays_true, wait_for
 
 LOOPBACK = ("127.0.0.1", "::1", "::ffff:127.0.0.1")
 CONFIG = """
@@ -84,16 +83,14 @@ def test_every_socket_of_the_daemon_and_its_viewer_is_on_loopback(tmp_path: Path
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
     with daemon(tmp_path / "a.toml") as process:
         wait_for(lambda: len({name for name, _ in listening(process)}) > 1)
-        time.sleep(1.0)
-        sockets = listening(process)
-    assert {address for _, address in sockets} <= set(LOOPBACK)
-    assert any(name.startswith("rerun") for name, _ in sockets)
+        wait_for(lambda: any(name.startswith("rerun") for name, _ in listening(process)), "a socket of the viewer")
+        assert stays_true(lambda: {address for _, address in listening(process)} <= set(LOOPBACK), 1.0)
 
 
 def test_a_scan_from_another_namespace_finds_nothing(tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
     with pair() as namespaces:
-        beside = namespaces.python(namespaces.inside, "-c", OPEN.replace("input()", "import time; time.sleep(600)"))
+        beside = namespaces.python(namespaces.inside, "-c", OPEN.replace("input()", "import time; time.sleep(86_400)"))
         try:
             assert beside.stdout is not None
             assert beside.stdout.readline() == "up\n"

@@ -7,19 +7,10 @@ import numpy as np
 import pytest
 
 from drivers.recording import load_samples
-from monitor.cli import main
+from tests.support.program import exit_status
 
 RATE_HZ = 100.0
 SIGMA = 1e-3
-
-
-def run(*arguments: object) -> int:
-    """Exit status, as the program gives it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", ["imu-monitor", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-    return int(end.value.code or 0)
 
 
 def write(path: Path, seconds: float = 300.0, turn: float = 0.0, **more: np.ndarray) -> Path:
@@ -37,7 +28,7 @@ def write(path: Path, seconds: float = 300.0, turn: float = 0.0, **more: np.ndar
 def test_the_recording_comes_out_without_its_drift(tmp_path, capsys):
     recording, out = write(tmp_path / "a.npz", turn=0.5), tmp_path / "out.csv"
     plot, told = tmp_path / "a.png", tmp_path / "a.json"
-    assert run("compensate", recording, "--out", out, "--json", told, "--plot", plot) == 0
+    assert exit_status("compensate", recording, "--out", out, "--json", told, "--plot", plot) == 0
     text = capsys.readouterr().out
     assert "adaptive; judged on" in text
     assert "→" in text
@@ -62,7 +53,7 @@ def test_the_recording_comes_out_without_its_drift(tmp_path, capsys):
 @pytest.mark.parametrize("method", ["fixed", "ar", "emd", "wavelet"])
 def test_every_method_is_judged_on_the_same_stretch(tmp_path, capsys, method):
     recording, out = write(tmp_path / "a.npz"), tmp_path / "out.npz"
-    assert run("compensate", recording, "--out", out, "--method", method, "--json", "-") == 0
+    assert exit_status("compensate", recording, "--out", out, "--method", method, "--json", "-") == 0
     found = json.loads(capsys.readouterr().out)
     assert found["judged"] == pytest.approx(2.0 * found["learned"], rel=0.05)
     for one in found["axes"].values():
@@ -71,7 +62,7 @@ def test_every_method_is_judged_on_the_same_stretch(tmp_path, capsys, method):
 
 def test_the_order_can_be_given(tmp_path, capsys):
     recording = write(tmp_path / "a.npz")
-    assert run("compensate", recording, "--out", tmp_path / "out.npz", "--order", "2,1", "--json", "-") == 0
+    assert exit_status("compensate", recording, "--out", tmp_path / "out.npz", "--order", "2,1", "--json", "-") == 0
     model = json.loads(capsys.readouterr().out)["axes"]["gz"]["model"]
     assert model["order"] == [2, 1]
     for name in ("phi1", "phi2", "theta1"):
@@ -83,7 +74,7 @@ def test_missing_samples_stay_missing_and_temperature_stays(tmp_path):
     with np.load(recording) as whole:
         kept = {name: np.delete(whole[name], np.s_[20_000:20_050]) for name in whole}
     np.savez(recording, **kept)
-    assert run("compensate", recording, "--out", tmp_path / "out.npz") == 0
+    assert exit_status("compensate", recording, "--out", tmp_path / "out.npz") == 0
     found = load_samples(tmp_path / "out.npz")
     assert len(found) == 29_950
     np.testing.assert_allclose(found.t_s, kept["t"], atol=2e-3)
@@ -105,10 +96,10 @@ def test_what_is_wrong_is_one_line_and_nothing_is_written(tmp_path, capsys):
         ([recording, "--plot", tmp_path / "a.pdf"], 2, "ending in .png"),
         ([recording, "--json", out], 2, "is what --out writes"),
     ):
-        assert run("compensate", *arguments, "--out", out) == status
+        assert exit_status("compensate", *arguments, "--out", out) == status
         err = capsys.readouterr().err
         assert said in err
         assert err.count("\n") == 1
         assert not out.exists()
-    assert run("compensate", recording, "--out", recording) == 2
+    assert exit_status("compensate", recording, "--out", recording) == 2
     assert "is what --out writes" in capsys.readouterr().err

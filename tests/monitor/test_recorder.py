@@ -246,8 +246,8 @@ def test_a_disk_that_others_have_filled_stops_the_recording(tmp_path: Path, monk
     keeper = Recorder(Storage(tmp_path), [SAMPLES])
     keeper.start()
     keeper.samples("bench", rows(0, 10), 0)
-    keeper.samples("bench", rows(10, 10), 0)
     wait_for(lambda: "95 % full" in keeper.state)
+    keeper.samples("bench", rows(10, 10), 0)  # waits until there is room
     monkeypatch.setattr(room.retention, "taken_share", lambda _: 0.5)
     wait_for(lambda: keeper.state == "ok")
     keeper.close(PATIENCE_S)

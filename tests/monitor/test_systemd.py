@@ -59,6 +59,7 @@ def address(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 def test_what_is_said_arrives_by_a_path_and_by_an_abstract_name(address: str) -> None:
     with Listening(address) as systemd:
         unit = Unit(address, 9.0)
+        begun_s = time.monotonic() - 1e-6  # the stamp is cut to microseconds
         unit.status("1 device;\nall well")
         unit.status("1 device; all well")
         unit.ready()
@@ -72,7 +73,7 @@ def test_what_is_said_arrives_by_a_path_and_by_an_abstract_name(address: str) ->
         "STOPPING=1",
     ]
     (stamp,) = [int(line.partition("=")[2]) for line in said if line.startswith("MONOTONIC_USEC=")]
-    assert 0 <= time.monotonic() - stamp / 1e6 < 60.0
+    assert begun_s <= stamp / 1e6 <= time.monotonic()
 
 
 def test_signs_of_life_come_three_in_the_time_allowed_and_end_with_a_stuck_reader(tmp_path: Path) -> None:

@@ -7,19 +7,10 @@ import numpy as np
 import pytest
 
 from monitor import thermal
-from monitor.cli import main
 from tests.monitor.drift.made import COEFFICIENT, late, weather
+from tests.support.program import exit_status
 
 HOURS = 36
-
-
-def run(*arguments: object) -> int:
-    """Exit status, as the program gives it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", ["imu-monitor", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-    return int(end.value.code or 0)
 
 
 def write(path: Path, seed: int, lag_h: float = 2.0, offset: float = 0.0) -> Path:
@@ -35,7 +26,7 @@ def write(path: Path, seed: int, lag_h: float = 2.0, offset: float = 0.0) -> Pat
 def test_fit_then_predict_another_start(tmp_path, capsys):
     first, second = write(tmp_path / "a.npz", 1), write(tmp_path / "b.npz", 2, offset=1e-4)
     model, plot, out = tmp_path / "m.json", tmp_path / "a.png", tmp_path / "out.json"
-    assert run("thermal", "fit", first, "--interval", "1h", "--out", model, "--plot", plot, "--json", out) == 0
+    assert exit_status("thermal", "fit", first, "--interval", "1h", "--out", model, "--plot", plot, "--json", out) == 0
     assert "difference 1" in capsys.readouterr().out
     found = json.loads(out.read_bytes())
     assert found["schema"] == "imu-monitor/thermal-fit/1"
@@ -44,7 +35,7 @@ def test_fit_then_predict_another_start(tmp_path, capsys):
     assert gz["time_constants"][0] == pytest.approx(7200.0, rel=0.3)
     assert gz["equation"]["a"][0] == pytest.approx(-np.exp(-found["interval"] / gz["time_constants"][0]))
     assert plot.read_bytes().startswith(b"\x89PNG")
-    assert run("thermal", "predict", second, "--model", model, "--json", out, "--plot", plot) == 0
+    assert exit_status("thermal", "predict", second, "--model", model, "--json", out, "--plot", plot) == 0
     found = json.loads(out.read_bytes())
     assert found["schema"] == "imu-monitor/thermal-predict/1"
     judged = found["axes"]["gz"]
@@ -72,7 +63,7 @@ def test_hardly_moved_is_no_answer_and_says_so(tmp_path, capsys):
     rng = np.random.default_rng(4)
     np.savez(path, fs=1.0, gz=1e-5 * rng.standard_normal(n), temp=25.0 + 0.01 * rng.standard_normal(n))
     out = tmp_path / "out.json"
-    assert run("thermal", "fit", path, "--json", out) == 3
+    assert exit_status("thermal", "fit", path, "--json", out) == 3
     assert "temperature hardly moved" in capsys.readouterr().err
     assert "temperature hardly moved" in json.loads(out.read_bytes())["refused"]["gz"]
 
@@ -80,7 +71,7 @@ def test_hardly_moved_is_no_answer_and_says_so(tmp_path, capsys):
 def test_no_temperature_is_said(tmp_path, capsys):
     path = tmp_path / "none.npz"
     np.savez(path, fs=1.0, gz=np.arange(100.0))
-    assert run("thermal", "fit", path) == 2
+    assert exit_status("thermal", "fit", path) == 2
     assert "no temperature in it" in capsys.readouterr().err
 
 
@@ -108,12 +99,12 @@ def test_a_model_file_that_is_wrong_says_where(tmp_path, capsys, change, says):
     change(model)
     path = tmp_path / "wrong.json"
     path.write_text(json.dumps(model))
-    assert run("thermal", "predict", tmp_path / "a.npz", "--model", path) == 2
+    assert exit_status("thermal", "predict", tmp_path / "a.npz", "--model", path) == 2
     err = capsys.readouterr().err
     assert says in err
     assert err.count("\n") == 1
 
 
 def test_no_model_file(tmp_path, capsys):
-    assert run("thermal", "predict", write(tmp_path / "a.npz", 3), "--model", tmp_path / "nowhere.json") == 2
+    assert exit_status("thermal", "predict", write(tmp_path / "a.npz", 3), "--model", tmp_path / "nowhere.json") == 2
     assert "nowhere.json: cannot be read" in capsys.readouterr().err

@@ -43,3 +43,16 @@ def wait_for(
             raise AssertionError(f"waited {patience_s:g} s for {what() if callable(what) else what}")
         time.sleep(POLL_S)
     return found
+
+
+def stays_true(condition: Callable[[], object], seconds: float = 0.5) -> bool:
+    """Return True if ``condition`` is true now and at every look during the next ``seconds``.
+
+    This is for a check that something does not happen. A slow machine can only make it less strict.
+    """
+    end_s = time.monotonic() + seconds
+    while condition():
+        if time.monotonic() > end_s:
+            return True
+        time.sleep(POLL_S)
+    return False

@@ -22,12 +22,12 @@ CONFIG = """
 name = "loose"
 rate = 100.0
 window = 10.0
-driver = { link = "virtual" }
+driver = { link = "virtual", silence = 0.0 }
 [[device]]
 name = "firm"
 rate = 100.0
 window = 10.0
-driver = { link = "virtual", seed = 2 }
+driver = { link = "virtual", seed = 2, silence = 0.0 }
 [zenoh]
 mode = "none"
 [viewer]

@@ -30,7 +30,7 @@ HEALTHY = """
 [[device]]
 name = "healthy"
 rate = 100.0
-driver = { link = "virtual" }
+driver = { link = "virtual", silence = 0.0 }
 """
 SERIAL = """
 [[device]]

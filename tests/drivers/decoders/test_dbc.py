@@ -1,6 +1,5 @@
 """DBC: cantools as the independent judge of every bit, golden frames, joining, and real recordings."""
 
-import os
 import struct
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from drivers.errors import ConfigError, LinkEnded
 from drivers.links import replay_link
 from drivers.sample import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, SampleBlock, block, join
 from drivers.units import DEGREE, G0
+from tests.support.recordings import recordings
 
 CANMOD = {f"g{c}": f"ImuData.AngularRate{c.upper()}" for c in "xyz"} | {
     f"a{c}": f"ImuData.Acceleration{c.upper()}" for c in "xyz"
@@ -591,9 +591,7 @@ def test_multiplexed_signals_are_refused(tmp_path: Path) -> None:
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["can-boat/moored-5min", "can-car/drive-a", "can-car/drive-b"])
 def test_recorded_frames_give_the_recorded_samples(name: str) -> None:
-    if not os.environ.get("IMU_MONITOR_DATA"):
-        pytest.skip("IMU_MONITOR_DATA does not say where the recordings are")
-    folder = Path(os.environ["IMU_MONITOR_DATA"])
+    folder = recordings()
     recorded = np.load(folder / f"{name}.npz")
     expected = np.column_stack([recorded[axis] for axis in AXES])
     path = str(folder / f"{name}-frames.csv.gz")

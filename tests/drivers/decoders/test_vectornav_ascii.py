@@ -2,8 +2,6 @@
 
 import binascii
 import gzip
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +9,7 @@ import pytest
 from drivers.decoders.base import xor
 from drivers.decoders.vectornav_ascii import Settings, build
 from drivers.sample import Chunk, SampleBlock, join
+from tests.support.recordings import recordings
 
 IMU = (
     b"$VNIMU,-00.0350,+00.4222,-00.6643,-00.015,+00.019,+09.948,+00.002066,-00.008442,-00.044656,+20.7,+084.322*66\r\n"
@@ -125,13 +124,11 @@ def test_encode_prints_as_the_device_does() -> None:
 
 @pytest.mark.data
 def test_a_recorded_stream_gives_what_it_was_read_as() -> None:
-    folder = os.environ.get("IMU_MONITOR_DATA")
-    if not folder:
-        pytest.skip("IMU_MONITOR_DATA is not set")
-    wire = gzip.decompress((Path(folder) / "vn100-serial" / "vnymr-sentences.txt.gz").read_bytes())
+    folder = recordings()
+    wire = gzip.decompress((folder / "vn100-serial" / "vnymr-sentences.txt.gz").read_bytes())
     decoder = build(Settings())
     got = join([b for i in range(0, len(wire), 4096) for b in decoder.feed([Chunk(wire[i : i + 4096], i)])])
-    with np.load(Path(folder) / "vn100-serial" / "static-12min.npz") as known:
+    with np.load(folder / "vn100-serial" / "static-12min.npz") as known:
         expected = np.column_stack([known[axis] for axis in ("gx", "gy", "gz", "ax", "ay", "az")])
     assert len(got) == 30_178
     np.testing.assert_allclose(got.values, expected, rtol=1e-6, atol=1e-9)

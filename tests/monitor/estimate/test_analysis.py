@@ -1,37 +1,24 @@
 """A whole recording: its grid in time, its rate, and what is said about both."""
 
-import os
 import re
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from drivers.errors import ConfigError, NotReady
-from drivers.sample import block
 from monitor.estimate.analysis import FEWEST, analyze, events_of
 from monitor.estimate.batch import overlapping
 from monitor.estimate.coefficients import Status
 from monitor.estimate.grid import LONGEST_HOLE, on_grid
-
-
-def white(n, seed=0):
-    return 1e-3 * np.random.default_rng(seed).standard_normal((n, 6)) + 9.81
-
-
-def recording(t_s, values=None, rows=1000):
-    t_ns = np.rint(np.asarray(t_s) * 1e9).astype(np.int64)
-    values = white(len(t_ns)) if values is None else values
-    edges = range(0, len(t_ns), rows)
-    return [block(t_ns[a : a + rows].copy(), values[a : a + rows].copy()) for a in edges]
+from tests.support.recordings import recorded_blocks, recordings, white
 
 
 @pytest.mark.parametrize("rate", [100.0, None])
 @pytest.mark.parametrize("rows", [17, 1000, 10**6])
 def test_a_steady_recording(rate, rows):
     values = white(6000)
-    found = analyze(recording(np.arange(6000) / 100, values, rows), rate)
+    found = analyze(recorded_blocks(np.arange(6000) / 100, values, rows), rate)
     assert found.notes == ()
     assert found.seconds == 60.0
     estimate = found.estimate
@@ -47,7 +34,7 @@ def test_holes_stay_in_their_places(rate, rows):
     index = np.arange(8000)
     kept = ~((index >= 3000) & (index < 3123) | (index == 5000))
     values = white(8000)
-    grid, found, notes = on_grid(recording(index[kept] / 100, values[kept], rows), rate)
+    grid, found, notes = on_grid(recorded_blocks(index[kept] / 100, values[kept], rows), rate)
     assert found == 100.0
     assert notes == ["124 samples are missing in 2 places; terms that touch them are left out"]
     expected = np.where(kept[:, None], values, np.nan)
@@ -57,7 +44,7 @@ def test_holes_stay_in_their_places(rate, rows):
 def test_a_very_long_pause_is_not_counted_among_the_short_holes():
     index = np.concatenate([np.arange(3000), 3000 + 2 * LONGEST_HOLE + np.arange(3000)])
     index = np.delete(index, [1000, 1001, 1002])
-    _, _, notes = on_grid(recording(index / 100, white(5997)), 100.0)
+    _, _, notes = on_grid(recorded_blocks(index / 100, white(5997)), 100.0)
     assert "3 samples are missing in 1 place; terms that touch them are left out" in notes
 
 
@@ -65,7 +52,7 @@ def test_a_very_long_pause_costs_no_memory_and_no_term_reaches_across():
     t = np.concatenate([np.arange(3000) / 100, 30.0 + 2 * LONGEST_HOLE / 100 + np.arange(3000) / 100])
     values = white(6000)
     values[3000:] += 1.0  # a step that would show in every term across
-    found = analyze(recording(t, values), 100.0)
+    found = analyze(recorded_blocks(t, values), 100.0)
     assert any("too long to keep in place" in note for note in found.notes)
     assert found.estimate.curve.n == 6001
     assert np.nanmax(found.estimate.curve.avar) < 2e-6
@@ -74,32 +61,32 @@ def test_a_very_long_pause_costs_no_memory_and_no_term_reaches_across():
 @pytest.mark.parametrize("jump_s", [-40.0, 5 * 3600.0])
 def test_a_jump_of_the_times_does_not_spoil_the_rate(jump_s):
     t = np.concatenate([np.arange(5000) / 100, 50.0 + jump_s + np.arange(5000) / 100])
-    found = analyze(recording(t), None)
+    found = analyze(recorded_blocks(t), None)
     assert found.estimate.rate_hz == 100.0
     assert any("time went" in note for note in found.notes)
 
 
 def test_times_that_jitter_are_no_holes():
     t = np.arange(8000) / 100 + 0.001 * np.random.default_rng(1).standard_normal(8000)
-    found = analyze(recording(t), None)
+    found = analyze(recorded_blocks(t), None)
     assert (found.estimate.rate_hz, found.estimate.curve.n) == (100.0, 8000)
 
 
 @pytest.mark.parametrize("n", [1, 2, FEWEST - 1])
 def test_too_short_is_an_answer(n):
     with pytest.raises(NotReady):
-        analyze(recording(np.arange(n) / 100), None)
+        analyze(recorded_blocks(np.arange(n) / 100), None)
     with pytest.raises(NotReady, match="at least 50"):
-        analyze(recording(np.arange(n) / 100), 100.0)
+        analyze(recorded_blocks(np.arange(n) / 100), 100.0)
 
 
 def test_times_that_stand_still_ask_for_the_rate():
     with pytest.raises(NotReady, match="--rate"):
-        analyze(recording(np.zeros(500)), None)
+        analyze(recorded_blocks(np.zeros(500)), None)
 
 
 def test_a_list_of_tau():
-    blocks = recording(np.arange(6000) / 100)
+    blocks = recorded_blocks(np.arange(6000) / 100)
     assert analyze(blocks, 100.0, (0.1, 1.0)).estimate.curve.tau_s.tolist() == [0.1, 1.0]
     with pytest.raises(ConfigError):
         analyze(blocks, 100.0, (100.0,))
@@ -108,7 +95,7 @@ def test_a_list_of_tau():
 def test_an_absent_axis_is_unestimated_and_warns_nobody():
     values = white(6000)
     values[:, 3:] = np.nan
-    found = analyze(recording(np.arange(6000) / 100, values), None, notes=["of the file"])
+    found = analyze(recorded_blocks(np.arange(6000) / 100, values), None, notes=["of the file"])
     assert found.notes == ("of the file",)
     assert (found.estimate.coefficients.status[:, 3:] == Status.UNESTIMATED).all()
     assert (found.estimate.coefficients.status[1, :3] == Status.ESTIMATED).all()
@@ -127,11 +114,9 @@ def test_an_absent_axis_is_unestimated_and_warns_nobody():
     ],
 )
 def test_recordings_of_real_sensors(name, rate):
-    if "IMU_MONITOR_DATA" not in os.environ:
-        pytest.skip("IMU_MONITOR_DATA does not point to the recordings")
     from drivers.recording import iter_blocks, load_samples
 
-    loaded = load_samples(Path(os.environ["IMU_MONITOR_DATA"]) / name)
+    loaded = load_samples(recordings() / name)
     blocks = list(iter_blocks(loaded))
     found = analyze(blocks, None, notes=loaded.notes)
     assert found.estimate.rate_hz == pytest.approx(rate, rel=0.01)
@@ -141,13 +126,13 @@ def test_recordings_of_real_sensors(name, rate):
 
 
 def test_too_few_averaging_times_for_a_fit_are_said():
-    found = analyze(recording(np.arange(6000) / 100), 100.0, (0.1, 1.0, 10.0))
+    found = analyze(recorded_blocks(np.arange(6000) / 100), 100.0, (0.1, 1.0, 10.0))
     assert found.notes == ("3 averaging times are too few to fit five terms; at least 5 are needed",)
     assert (found.estimate.coefficients.status == Status.UNESTIMATED).all()
 
 
 def test_times_that_contradict_the_stated_rate_are_said():
-    found = analyze(recording(np.arange(6000) / 50), 100.0)
+    found = analyze(recorded_blocks(np.arange(6000) / 50), 100.0)
     assert "the rate used is 100 Hz, but the times step by 0.02 s, 50 Hz" in found.notes
 
 
@@ -162,7 +147,7 @@ def moved(n=12_000):
 
 
 def test_motion_is_told_and_left_in_unless_it_is_to_be_struck_out():
-    blocks = recording(np.arange(12_000) / 100, moved())
+    blocks = recorded_blocks(np.arange(12_000) / 100, moved())
     left = analyze(blocks, 100.0)
     assert left.motions == ()
     assert not any("moved" in note for note in left.notes)  # asked only by events_of
@@ -183,13 +168,13 @@ def test_motion_is_told_and_left_in_unless_it_is_to_be_struck_out():
 
 def test_motion_is_no_change_of_noise():
     values = moved(30_000)
-    assert events_of(analyze(recording(np.arange(30_000) / 100, values), 100.0)).changes == ()
+    assert events_of(analyze(recorded_blocks(np.arange(30_000) / 100, values), 100.0)).changes == ()
 
 
 def test_changes_are_told_with_time_and_size():
     values = white(60_000)
     values[40_000:, 2] += 1.5e-3 * np.random.default_rng(9).standard_normal(20_000)
-    found = events_of(analyze(recording(np.arange(60_000) / 100, values), 100.0, notes=["of the file"]))
+    found = events_of(analyze(recorded_blocks(np.arange(60_000) / 100, values), 100.0, notes=["of the file"]))
     [change] = found.changes
     assert (change.kind, change.axis) == ("noise_changed", 2)
     assert change.since == pytest.approx(40_000, abs=50)
@@ -203,11 +188,11 @@ def test_a_sensor_that_never_rests_is_an_answer():
     rng = np.random.default_rng(0)
     values = np.cumsum(rng.standard_normal((120, 6)), axis=0)
     with pytest.raises(NotReady, match=r"\d+ samples at rest; at least 50 are needed"):
-        analyze(recording(np.arange(120) / 100, values), 100.0, rest=True)
+        analyze(recorded_blocks(np.arange(120) / 100, values), 100.0, rest=True)
 
 
 def test_axes_side_by_side_give_the_same():
-    blocks = recording(np.arange(6000) / 100)
+    blocks = recorded_blocks(np.arange(6000) / 100)
     with ThreadPoolExecutor(2) as pool:
         side_by_side = analyze(blocks, 100.0, each=pool.map)
     assert np.array_equal(side_by_side.estimate.curve.avar, analyze(blocks, 100.0).estimate.curve.avar)

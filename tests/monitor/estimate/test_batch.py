@@ -1,11 +1,8 @@
 """The whole-recording curve against published numbers and against allantools."""
 
 import csv
-import gzip
-import os
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
-from pathlib import Path
 
 import allantools
 import numpy as np
@@ -13,28 +10,7 @@ import pytest
 
 from drivers.errors import ConfigError
 from monitor.estimate.batch import BLOCK, LANES, cluster_sizes, overlapping, overlapping_axis, slope
-
-
-@pytest.fixture
-def reference() -> Path:
-    if "IMU_MONITOR_DATA" not in os.environ:
-        pytest.skip("IMU_MONITOR_DATA does not point to the recordings")
-    return Path(os.environ["IMU_MONITOR_DATA"]) / "reference"
-
-
-def nist_1000():
-    """The 1000 points of NIST SP 1065, 12.4: a prime-modulus generator."""
-    n, points = 1234567890, []
-    for _ in range(1000):
-        points.append(n / 2147483647)
-        n = 16807 * n % 2147483647
-    return np.array(points)
-
-
-def columns(path: Path, *names: str):
-    with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as stream:
-        rows = list(csv.DictReader(stream))
-    return [np.array([float(row[name]) for row in rows]) for name in names]
+from tests.support.allan_references import columns, nist_1000
 
 
 def deviations(y, factors):

@@ -1,25 +1,11 @@
 """A recording's grid in time, its rate, and what is said about times that are not what they should be."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from drivers.errors import NotReady
-from drivers.sample import block
 from monitor.estimate.grid import LONGEST_HOLE, NOTES, on_grid
-
-
-def white(n, seed=0):
-    return 1e-3 * np.random.default_rng(seed).standard_normal((n, 6)) + 9.81
-
-
-def recording(t_s, values=None, rows=1000):
-    t_ns = np.rint(np.asarray(t_s) * 1e9).astype(np.int64)
-    values = white(len(t_ns)) if values is None else values
-    edges = range(0, len(t_ns), rows)
-    return [block(t_ns[a : a + rows].copy(), values[a : a + rows].copy()) for a in edges]
+from tests.support.recordings import recorded_blocks, recordings, white
 
 
 @pytest.mark.parametrize("rate", [100.0, None])
@@ -28,7 +14,7 @@ def test_holes_stay_in_their_places(rate, rows):
     index = np.arange(8000)
     kept = ~((index >= 3000) & (index < 3123) | (index == 5000))
     values = white(8000)
-    grid, found, notes = on_grid(recording(index[kept] / 100, values[kept], rows), rate)
+    grid, found, notes = on_grid(recorded_blocks(index[kept] / 100, values[kept], rows), rate)
     assert found == 100.0
     assert notes == ["124 samples are missing in 2 places; terms that touch them are left out"]
     assert np.array_equal(grid, np.where(kept[:, None], values, np.nan), equal_nan=True)
@@ -36,7 +22,7 @@ def test_holes_stay_in_their_places(rate, rows):
 
 def test_a_very_long_pause_is_one_missing_sample():
     index = np.concatenate([np.arange(3000), 3000 + 2 * LONGEST_HOLE + np.arange(3000)])
-    grid, _, notes = on_grid(recording(index / 100), 100.0)
+    grid, _, notes = on_grid(recorded_blocks(index / 100), 100.0)
     assert len(grid) == 6001
     assert any("too long to keep in place" in note for note in notes)
 
@@ -45,7 +31,7 @@ def test_a_very_long_pause_is_one_missing_sample():
 def test_a_repeated_row_does_not_enter(rows):
     values = white(6000)
     sent = np.insert(np.arange(6000), 4000, 3990 + np.arange(10))
-    grid, rate, notes = on_grid(recording(sent / 100, values[sent], rows), None)
+    grid, rate, notes = on_grid(recorded_blocks(sent / 100, values[sent], rows), None)
     assert rate == 100.0
     assert np.array_equal(grid, values)
     assert notes == ["10 rows repeat others, time and values; left out"]
@@ -54,7 +40,7 @@ def test_a_repeated_row_does_not_enter(rows):
 def test_rows_out_of_order_are_put_in_order():
     values = white(6000)
     sent = np.insert(np.delete(np.arange(6000), 2500), 2502, 2500)
-    grid, _, notes = on_grid(recording(sent / 100, values[sent]), None)
+    grid, _, notes = on_grid(recorded_blocks(sent / 100, values[sent]), None)
     assert np.array_equal(grid, values)
     assert notes == ["rows that came out of order: 1; put in order"]
 
@@ -63,14 +49,14 @@ def test_more_than_ten_notes_are_counted():
     t = np.arange(40000) / 100
     for i in range(44):
         t[800 * (i + 1) :] += (-1) ** i * 4000.0
-    _, _, notes = on_grid(recording(t), 100.0)
+    _, _, notes = on_grid(recorded_blocks(t), 100.0)
     of_clock = [note for note in notes if note.startswith("time went")]
     assert len(of_clock) == NOTES
     assert notes[NOTES] == "and 34 more notes on the times"
 
 
 def test_steady_times_that_contradict_the_stated_rate():
-    _, rate, notes = on_grid(recording(np.arange(6000) / 50), 100.0)
+    _, rate, notes = on_grid(recorded_blocks(np.arange(6000) / 50), 100.0)
     assert rate == 100.0
     assert "the rate used is 100 Hz, but the times step by 0.02 s, 50 Hz" in notes
 
@@ -78,16 +64,16 @@ def test_steady_times_that_contradict_the_stated_rate():
 def test_unsteady_times_that_contradict_the_stated_rate():
     """A host that stamps in bursts: only the mean tells."""
     t = np.ceil(np.arange(20000) / 99.32 / 0.043) * 0.043 + np.tile([0.0, 0.001, 0.002, 0.003], 5000)
-    _, _, notes = on_grid(recording(np.sort(t)), 80.0)
+    _, _, notes = on_grid(recorded_blocks(np.sort(t)), 80.0)
     assert any(note.startswith("the rate used is 80 Hz, but by the times 99.3") for note in notes)
-    assert not any("rate used" in note for note in on_grid(recording(np.sort(t)), 99.4)[2])
+    assert not any("rate used" in note for note in on_grid(recorded_blocks(np.sort(t)), 99.4)[2])
 
 
 @pytest.mark.parametrize(("off", "told"), [(0.001, False), (0.003, True), (0.006, True)])
 @pytest.mark.parametrize("jitter_s", [0.0, 5e-4])
 def test_a_stated_rate_is_contradicted_from_a_fifth_of_a_percent_on(off, told, jitter_s):
     t = np.arange(17000) / (250.0 * (1.0 - off)) + jitter_s * np.random.default_rng(2).random(17000)
-    _, rate, notes = on_grid(recording(t), 250.0)
+    _, rate, notes = on_grid(recorded_blocks(t), 250.0)
     assert rate == 250.0
     [*said] = [float(note.split("by the times ")[1].split()[0]) for note in notes if "by the times" in note]
     steps = [note for note in notes if "times step by" in note]
@@ -101,20 +87,20 @@ def test_short_or_jittery_times_accuse_no_rate(seed):
     rng = np.random.default_rng(seed)
     t = np.arange(600) / 100 + 0.04 * rng.random(600)
     t[-1] += 0.03
-    _, _, notes = on_grid(recording(np.sort(t)), 100.0)
+    _, _, notes = on_grid(recorded_blocks(np.sort(t)), 100.0)
     assert not any("rate used" in note for note in notes)
 
 
 @pytest.mark.parametrize(("unit_s", "said"), [(1.0, "1"), (0.5, "0.5"), (1.0 / 3.0, "0.333"), (10.0, "10")])
 def test_a_coarse_resolution_of_times_is_told(unit_s, said):
     t = np.floor(np.arange(8000) / 5.0 / unit_s + 1e-9) * unit_s
-    _, _, notes = on_grid(recording(t), None)
+    _, _, notes = on_grid(recorded_blocks(t), None)
     assert notes == [f"times have a resolution of {said} s; samples are taken to be even"]
 
 
 def test_uneven_times_without_a_unit_are_told_as_such():
     t = np.cumsum(np.random.default_rng(3).exponential(0.01, 8000))
-    _, _, notes = on_grid(recording(t), None)
+    _, _, notes = on_grid(recorded_blocks(t), None)
     assert any(note.startswith("times step unevenly: by 0.0") for note in notes)
 
 
@@ -125,7 +111,7 @@ def test_both_counts_of_missing_and_late_are_told():
     for since in range(85, len(t) - 20, 100):
         t[since : since + 10] += 0.009
     values = white(len(t))
-    grid, rate, notes = on_grid(recording(t, values), None)
+    grid, rate, notes = on_grid(recorded_blocks(t, values), None)
     assert rate == 100.0
     assert np.flatnonzero(np.isnan(grid[:, 0])) == pytest.approx([8089, 9780, 29_187], abs=10)
     late, missing = notes
@@ -139,7 +125,7 @@ def test_values_as_coarse_as_their_noise_are_told_by_kind_and_size():
     values[:, :3] = np.round(values[:, :3] / 1e-3) * 1e-3
     values[:, 4] = np.round(values[:, 4] / 4e-4) * 4e-4
     values[:, 5] = np.round(values[:, 5] / 2e-3) * 2e-3
-    gyros, az = on_grid(recording(np.arange(20_000) / 100, values), None)[2]
+    gyros, az = on_grid(recorded_blocks(np.arange(20_000) / 100, values), None)[2]
     size, times = gyros.removesuffix(" the noise from sample to sample: quantization shapes the shortest τ").split(
         "), "
     )
@@ -157,7 +143,7 @@ def test_stale_rows_are_told_and_kept(fraction, step):
     held = np.flatnonzero(np.random.default_rng(1).random(20000) < fraction)
     for row in held[held > 0]:
         values[row] = values[row - 1]
-    grid, _, notes = on_grid(recording(np.arange(20000) / 100, values), None)
+    grid, _, notes = on_grid(recorded_blocks(np.arange(20000) / 100, values), None)
     assert np.array_equal(grid, values)
     (note,) = [one for one in notes if "in steps of" not in one]
     assert note.endswith("the sensor updates slower than it is read; they are kept")
@@ -166,16 +152,14 @@ def test_stale_rows_are_told_and_kept(fraction, step):
 
 def test_times_that_stand_still_ask_for_the_rate():
     with pytest.raises(NotReady, match="--rate"):
-        on_grid(recording(np.zeros(500)), None)
+        on_grid(recorded_blocks(np.zeros(500)), None)
 
 
 @pytest.mark.data
 def test_a_boat_s_bus_adapter_is_late_and_loses_five():
-    if "IMU_MONITOR_DATA" not in os.environ:
-        pytest.skip("IMU_MONITOR_DATA does not point to the recordings")
     from drivers.recording import iter_blocks, load_samples
 
-    blocks = list(iter_blocks(load_samples(Path(os.environ["IMU_MONITOR_DATA"]) / "can-boat/moored-5min.npz")))
+    blocks = list(iter_blocks(load_samples(recordings() / "can-boat/moored-5min.npz")))
     grid, _, notes = on_grid(blocks, None)
     assert "5 samples are missing in 5 places; terms that touch them are left out" in notes
     at_s = np.flatnonzero(np.isnan(grid[:, 0])) / 100
@@ -197,11 +181,9 @@ def test_a_boat_s_bus_adapter_is_late_and_loses_five():
     ],
 )
 def test_recordings_of_real_sensors(name, rate):
-    if "IMU_MONITOR_DATA" not in os.environ:
-        pytest.skip("IMU_MONITOR_DATA does not point to the recordings")
     from drivers.recording import iter_blocks, load_samples
 
-    blocks = list(iter_blocks(load_samples(Path(os.environ["IMU_MONITOR_DATA"]) / f"{name}.npz")))
+    blocks = list(iter_blocks(load_samples(recordings() / f"{name}.npz")))
     received = sum(len(one) for one in blocks)
     grid, found, notes = on_grid(blocks, None)
     assert found == pytest.approx(rate, rel=0.01)

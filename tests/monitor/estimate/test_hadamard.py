@@ -1,10 +1,5 @@
 """Overlapping Hadamard variance: published numbers, allantools, plain sums, simulation."""
 
-import csv
-import gzip
-import os
-from pathlib import Path
-
 import allantools
 import numpy as np
 import pytest
@@ -16,28 +11,7 @@ from monitor.estimate.hadamard import hadamard, hadamard_curve, moments
 from monitor.estimate.moments import autocovariance
 from monitor.estimate.total import moments as total_moments
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
-
-
-@pytest.fixture
-def reference() -> Path:
-    if "IMU_MONITOR_DATA" not in os.environ:
-        pytest.skip("IMU_MONITOR_DATA does not point to the recordings")
-    return Path(os.environ["IMU_MONITOR_DATA"]) / "reference"
-
-
-def columns(path: Path, *names: str):
-    with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as stream:
-        rows = list(csv.DictReader(stream))
-    return [np.array([float(row[name]) for row in rows]) for name in names]
-
-
-def nist_1000():
-    """The 1000 points of NIST SP 1065, 12.4: a prime-modulus generator."""
-    n, points = 1234567890, []
-    for _ in range(1000):
-        points.append(n / 2147483647)
-        n = 16807 * n % 2147483647
-    return np.array(points)
+from tests.support.allan_references import columns, nist_1000
 
 
 def test_thousand_points_of_nist_sp_1065():

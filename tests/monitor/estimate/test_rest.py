@@ -1,8 +1,6 @@
 """Motion, knocks and handling are found; noise, vibration, coarse resolution and outliers are not motion."""
 
-import os
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +8,7 @@ import pytest
 from drivers.sample import AXES, block
 from monitor.estimate.rest import BLOCK_S, Rest, block_size, find
 from monitor.estimate.rest_kernel import AFTER, LEARNED
+from tests.support.recordings import recordings
 
 RATE = 100.0
 NOISE = np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2])
@@ -267,9 +266,7 @@ def test_a_constant_that_begins_to_toggle_is_no_motion():
 
 
 def recording(name):
-    if "IMU_MONITOR_DATA" not in os.environ:
-        pytest.skip("IMU_MONITOR_DATA does not point to the recordings")
-    data = np.load(Path(os.environ["IMU_MONITOR_DATA"]) / f"{name}.npz")
+    data = np.load(recordings() / f"{name}.npz")
     absent = np.full(len(data["gx"]), np.nan)
     values = np.stack([data[axis] if axis in data.files else absent for axis in AXES], axis=1)
     return values.astype(np.float64), float(data["fs"])

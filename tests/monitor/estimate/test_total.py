@@ -1,8 +1,6 @@
 """Total variance: published numbers, allantools, plain sums of the reflected rate, simulation."""
 
 import csv
-import os
-from pathlib import Path
 
 import allantools
 import numpy as np
@@ -14,22 +12,7 @@ from monitor.estimate import moments as moments_module
 from monitor.estimate.batch import overlapping
 from monitor.estimate.total import MIN_SHARE, moments, octaves, total, total_curve
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
-
-
-@pytest.fixture
-def reference() -> Path:
-    if "IMU_MONITOR_DATA" not in os.environ:
-        pytest.skip("IMU_MONITOR_DATA does not point to the recordings")
-    return Path(os.environ["IMU_MONITOR_DATA"]) / "reference"
-
-
-def nist_1000():
-    """The 1000 points of NIST SP 1065, 12.4: a prime-modulus generator."""
-    n, points = 1234567890, []
-    for _ in range(1000):
-        points.append(n / 2147483647)
-        n = 16807 * n % 2147483647
-    return np.array(points)
+from tests.support.allan_references import nist_1000
 
 
 def reflected(rate, m):

@@ -1,14 +1,12 @@
 """The 1/f filter against 1/f itself."""
 
-import os
-from pathlib import Path
-
 import allantools
 import numpy as np
 import pytest
 
 from monitor.noise.effects import bias_instability
 from monitor.noise.effects.bias_instability import BiasInstability
+from tests.support.recordings import recordings
 
 
 def response(frequency: np.ndarray) -> np.ndarray:
@@ -44,9 +42,7 @@ def test_sampled_allan_variance_joins_the_continuous_one():
 
 @pytest.mark.data
 def test_someone_elses_pink_noise_has_the_stated_shape():
-    if "IMU_MONITOR_DATA" not in os.environ:
-        pytest.skip("IMU_MONITOR_DATA does not point to the recordings")
-    file = Path(os.environ["IMU_MONITOR_DATA"]) / "reference" / "pink-frequency.csv"
+    file = recordings() / "reference" / "pink-frequency.csv"
     rate = np.loadtxt(file, delimiter=",", skiprows=1)[:, 1]
     # 10 000 samples: σ to 1 % at m = 1, 5 % at 64. Beyond 100 samples that record is no longer 1/f: its own curve
     # falls, to a third at a thousand, where ours stays flat

@@ -36,7 +36,7 @@ def test_the_keys_of_devices_in_detail() -> None:
     assert detail_key("nose", "imu/nose") == "imu/nose"
 
 
-def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path) -> None:
+def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     endpoint, path = free_endpoint(), tmp_path / "fleet.rrd"
     stop, told = threading.Event(), []
     viewer = RerunView(ViewerSettings(mode=str(path)), [DeviceInfo("imu/nose", "over zenoh")], fleet=True)
@@ -48,6 +48,11 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path) -
         contextlib.closing(viewer),
     ):
         fleet = FleetView(arriving, viewer, ["imu/nose"])
+        take, draw = fleet.take, fleet.draw
+        taken: set[str] = set()
+        drawn: list[float] = []
+        monkeypatch.setattr(fleet, "take", lambda one: take(one) or taken.add(one.key))
+        monkeypatch.setattr(fleet, "draw", lambda wall_s, now_s: draw(wall_s, now_s) or drawn.append(now_s))
         looking = threading.Thread(target=fleet.run, args=(stop, told.append))
         out.start()
         arriving.start()
@@ -56,18 +61,23 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path) -
         wait_for(lambda: out.state == arriving.state == viewer.state == "ok")
         t_s, values, temperature_c = made.samples(1.76e9, 0.1)
         rows = block((t_s * 1e9).astype("int64"), values, temperature_c)
-        begun_s = time.monotonic()
-        while time.monotonic() - begun_s < 3.0:
+
+        def publish() -> None:
             for device in ("nose", "tail"):
                 out.alive(device, True)
                 out.put(topics.STATUS, device, message.status(device, time.time(), made.health()))
                 out.put(topics.COEFFICIENTS, device, message.coefficients(device, 1.76e9, made.estimate()))
                 out.put(topics.ALLAN, device, message.allan(device, 1.76e9, made.estimate()))
                 out.put(topics.SAMPLES, device, pack(device, 10, rows))
-            time.sleep(0.2)
+            stop.wait(0.2)
+
+        topics_shown = ("samples", "coefficients", "allan", "status")
+        wait_for(lambda: publish() or taken >= {f"imu/nose/{topic}" for topic in topics_shown} | {"imu/tail/status"})
+        publish()  # an Allan curve that comes before any coefficients is not drawn
         out.put(topics.EVENT, "tail", message.event("tail", 1.76e9, 5, Event("moved", 0, "gz moved", "gz"), None))
-        wait_for(lambda: len(fleet.board.devices(time.monotonic())) == 2)
-        time.sleep(1.5)
+        wait_for(lambda: "imu/tail/event" in taken and len(fleet.board.devices(time.monotonic())) == 2)
+        tables = len(drawn)
+        wait_for(lambda: len(drawn) >= tables + 2, "two more tables")
         stop.set()
         looking.join(PATIENCE_S)
     entities = read(path)

@@ -6,7 +6,6 @@ import socket
 import subprocess
 import sys
 import textwrap
-import time
 import warnings
 from collections.abc import Iterator
 from itertools import count
@@ -21,7 +20,7 @@ from monitor.publish.rerun_view import MISSING, RerunView
 from monitor.publish.viewer import DeviceInfo, ViewerSettings
 from tests.monitor.publish import made
 from tests.support.ports import free_port
-from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
+from tests.support.waiting import FOREVER_S, PATIENCE_S, stays_true, wait_for
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
@@ -250,8 +249,7 @@ with socket.create_server(("127.0.0.1", port)) as server:
     view = RerunView(ViewerSettings("native", port=free_port()), DEVICE)
     view.start()
     wait_for(lambda: view.state == rerun_sinks.CLOSED)
-    time.sleep(0.5)  # ten more tries
-    assert view.state == rerun_sinks.CLOSED
+    assert stays_true(lambda: view.state == rerun_sinks.CLOSED)  # for the time of ten more tries
     assert starts.read_text() == "started\n"
     view.close()
 
