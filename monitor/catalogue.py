@@ -21,7 +21,7 @@ def read_model(path: Path) -> NoiseModel:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from error
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
+        raise ConfigError(*(f"{path}: {line}" for line in error.lines)) from error
 
 
 def load(name: str, folder: Path) -> NoiseModel:

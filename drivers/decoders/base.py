@@ -1,9 +1,10 @@
 """What a decoder is, and the work that all of them share. Pure: bytes in, samples out.
 
 A decoder module ``drivers/decoders/<protocol>.py`` holds ``Settings`` (a msgspec struct: the keys of
-``[device.driver.decoder_options]``) and ``build(settings) -> Decoder``. ``feed`` raises nothing on bad
-bytes: a frame that fails its check costs itself, is counted in ``bad``, and shows up as ``lost`` of the
-block that follows it, so that its place in time stays empty.
+``[device.driver.decoder_options]``, all of which stand in ``config/defaults.toml``) and ``build(settings) -> Decoder``.
+``build`` raises one ``ConfigError`` with a line for each mistake, which begins with the key: "scale.gx: ...". ``feed``
+raises nothing on bad bytes: a frame that fails its check costs itself, is counted in ``bad``, and shows up as ``lost``
+of the block that follows it, so that its place in time stays empty.
 """
 
 from collections import deque

@@ -326,8 +326,8 @@ def _problems(settings: Settings) -> Iterator[str]:
         try:
             look_up(getattr(settings, key))
         except ConfigError as error:
-            counts = f"for raw counts name one of these units, and the size of a count in scale: {axis} = 0.0305"
-            yield f"{key}: {error}; {counts}"
+            counts = f"name one of these units, and the size of a count: scale = {{ {axis} = 0.0305 }}"
+            yield f"{key}: {error}; for raw counts {counts}"
     if not settings.delimiter or not settings.delimiter.isascii() or set(settings.delimiter) & set("\r\n"):
         yield f"delimiter: {settings.delimiter!r}; it is auto, or ASCII text within a line"
     yield from range_problems(settings)

@@ -2,7 +2,8 @@
 
 A link module ``drivers/links/<name>_link.py`` holds ``Settings`` (a msgspec struct: the link's own keys
 in ``[device.driver]``), ``build(settings) -> Link`` and ``DEFAULT_DECODER`` (a decoder's name, or ""
-where the user must choose). Nothing is opened before ``open``.
+where the user must choose). Nothing is opened before ``open``. ``build`` raises one ``ConfigError`` with a line for
+each mistake in the settings; the line begins with the key: "speed: ...". Every key stands in ``config/defaults.toml``.
 """
 
 from collections.abc import Sequence

@@ -30,23 +30,27 @@ Placed = tuple[tuple[str, ...], tuple[Effect, ...]]  # axes, their effects
 
 
 def read(text: str) -> tuple[list[Placed], float | None, Temperature | None]:
-    """Effects, sample rate in Hz and temperature of a model file's text; ConfigError says what is wrong in one line."""
+    """Effects, sample rate in Hz and temperature of a model file's text; ConfigError has a line for each mistake."""
     tables = toml.tables(text)
+    wrong: list[str] = []
     rate_hz = tables.pop("sample_rate", None)
     if rate_hz is not None:
-        if isinstance(rate_hz, bool) or not isinstance(rate_hz, int | float):
-            raise ConfigError(f"sample_rate must be a number of Hz, is {rate_hz!r}")
-        with placed("sample_rate"):
-            RATE_HZ.check(rate_hz)
-    temperature = tables.pop("temperature", None)
-    effects: list[Placed] = [
-        (WILDCARDS.get(axis, (axis,)), tuple(_effects(axis, given))) for axis, given in tables.items()
-    ]
-    return (
-        effects,
-        None if rate_hz is None else float(rate_hz),
-        None if temperature is None else Temperature.from_table(temperature),
-    )
+        with _collecting(wrong):
+            if isinstance(rate_hz, bool) or not isinstance(rate_hz, int | float):
+                raise ConfigError(f"sample_rate must be a number of Hz, is {rate_hz!r}")
+            with placed("sample_rate"):
+                RATE_HZ.check(rate_hz)
+    temperature = None
+    with _collecting(wrong):
+        given = tables.pop("temperature", None)
+        temperature = None if given is None else Temperature.from_table(given)
+    effects: list[Placed] = []
+    for axis, given in tables.items():
+        with _collecting(wrong):
+            effects.append((WILDCARDS.get(axis, (axis,)), tuple(_effects(axis, given, wrong))))
+    if wrong:
+        raise ConfigError(*wrong)
+    return effects, None if rate_hz is None else float(rate_hz), temperature
 
 
 def write(model: "NoiseModel") -> str:
@@ -85,6 +89,15 @@ def placed(place: str) -> Iterator[None]:
         raise ConfigError(f"{place}: {str(error).removeprefix(place.rpartition('.')[2] + ': ')}") from error
 
 
+@contextlib.contextmanager
+def _collecting(wrong: list[str]) -> Iterator[None]:
+    """Note a mistake and go on, so that every one is told."""
+    try:
+        yield
+    except ConfigError as error:
+        wrong += error.lines
+
+
 def _said(axis: str, effect: Effect) -> str:
     kind = 0 if axis in GYROS else 1
     unit = {name: pair[kind] for name, pair in units(type(effect)).items()}
@@ -111,7 +124,7 @@ def _assignments(table: Any) -> Iterator[str]:
             yield f"{name} = {value if isinstance(value, int) else float(value)!r}"
 
 
-def _effects(axis: str, effects: Any) -> Iterator[Effect]:
+def _effects(axis: str, effects: Any, wrong: list[str]) -> Iterator[Effect]:
     if axis not in KNOWN:
         what = "axis" if isinstance(effects, dict) else "key"
         raise ConfigError(f'unknown {what} "{axis}"{nearest(axis, (*KNOWN, *KEYS))}')
@@ -119,21 +132,22 @@ def _effects(axis: str, effects: Any) -> Iterator[Effect]:
         raise ConfigError(f"{axis} must be a table of effects, such as [{axis}.angle_random_walk]")
     for name, given in effects.items():
         if name not in EFFECTS:
-            raise ConfigError(f'{axis}: unknown effect "{name}"{nearest(name, tuple(EFFECTS))}')
+            wrong.append(f'{axis}: unknown effect "{name}"{nearest(name, tuple(EFFECTS))}')
+            continue
         for parameters in given if isinstance(given, list) else [given]:
-            yield _effect(f"{axis}.{name}", EFFECTS[name], parameters)
+            with _collecting(wrong):
+                yield _effect(f"{axis}.{name}", EFFECTS[name], parameters)
 
 
 def _effect(place: str, effect: type[Effect], parameters: Any) -> Effect:
     known = tuple(units(effect))
     if not isinstance(parameters, dict):
         raise ConfigError(f"{place} must be a table with {', '.join(known)}")
-    for name in parameters:
-        if name not in known:
-            raise ConfigError(f'{place}: unknown parameter "{name}"{nearest(name, known)}')
-    for name in required(effect):
-        if name not in parameters:
-            raise ConfigError(f"{place}: {name} is missing")
+    wrong = [f'{place}: unknown parameter "{name}"{nearest(name, known)}' for name in parameters if name not in known]
+    # a misspelt parameter is missing, too, which needs no second line
+    wrong = wrong or [f"{place}: {name} is missing" for name in required(effect) if name not in parameters]
+    if wrong:
+        raise ConfigError(*wrong)
     with placed(place):
         return effect(**parameters)
     raise AssertionError  # the context manager never swallows

@@ -172,8 +172,8 @@ def test_a_counter() -> None:
     ("settings", "words"),
     [
         ({"gyro_unit": "deg/sek"}, ('"deg/sek"', "deg/s")),
-        ({"gyro_unit": "LSB"}, ("gyro_unit: ", "rad/s, ", "deg/s", "for raw counts", "scale: gx = 0.0305")),
-        ({"accel_unit": "counts"}, ("accel_unit: ", "m/s², ", "for raw counts", "scale: ax = 0.0305")),
+        ({"gyro_unit": "LSB"}, ("gyro_unit: ", "rad/s, ", "deg/s", "for raw counts", "scale = { gx = 0.0305 }")),
+        ({"accel_unit": "counts"}, ("accel_unit: ", "m/s², ", "for raw counts", "scale = { ax = 0.0305 }")),
         ({"accel_unit": "furlong"}, ('"furlong"', "m/s²", "mg")),
         ({"columns": (*SIX, "temperature"), "temperature_unit": "Re"}, ('"Re"', "°C")),
         ({"columns": ("gx", "temprature")}, ('"temprature"', "possible are temperature, ")),

@@ -177,3 +177,36 @@ def test_avar_and_psd_are_sums_over_an_axis():
     np.testing.assert_allclose(model.avar("gx", tau, 0.1), 1.0 / tau + 3.0 / tau**2)
     assert model.avar("gy", tau, 0.1).tolist() == [0.0, 0.0]
     assert model.psd("gx", np.array([5.0]), 0.1)[0] == pytest.approx(1.0 + 40.0)
+
+
+def test_all_mistakes_of_a_model_file_are_told_at_once() -> None:
+    text = """
+sample_rate = -1.0
+[temperature]
+mena = 20.0
+[gq.bias]
+value = 1.0
+[gx.angle_random_walk]
+M = 1.0
+[gy.angel_random_walk]
+N = 1.0
+[gz.bias]
+value = "large"
+[gz.narrowband]
+sigma = 1e-3
+"""
+    with pytest.raises(ConfigError) as caught:
+        NoiseModel.from_toml(text)
+    begins = [
+        "sample_rate must be a positive number",
+        "temperature: ",
+        'unknown axis "gq"',
+        'gx.angle_random_walk: unknown parameter "M"',
+        'gy: unknown effect "angel_random_walk"; did you mean "angle_random_walk"',
+        "gz.bias: ",
+        "gz.narrowband: frequency is missing",
+        "gz.narrowband: bandwidth is missing",
+    ]
+    assert len(caught.value.lines) == len(begins), caught.value.lines
+    for line, begin in zip(caught.value.lines, begins, strict=True):
+        assert line.startswith(begin), line
