@@ -1224,3 +1224,73 @@ def test_history_of_a_running_daemon(call: Call, histories: Path, tmp_path: Path
     assert (told["axes"], told["start"]) == (kept["axes"], kept["start"])
     assert nothing.status == 3
     assert "nothing in that time" in nothing.only_line()
+
+
+# --- errors that nobody foresaw
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "line"),
+    [
+        (
+            ZeroDivisionError("division\nby zero"),
+            1,
+            "internal error: ZeroDivisionError: division by zero; please report",
+        ),
+        (KeyError("gx"), 1, "internal error: KeyError: 'gx'; please report it with the output of the same command"),
+        (ValueError("x" * 9000), 1, " …; please report it"),
+        (RecursionError("too deep"), 1, "internal error: RecursionError: too deep"),
+        (MemoryError("Unable to allocate 233. GiB"), 1, "not enough memory (Unable to allocate 233. GiB); read less"),
+        (MemoryError(), 1, "not enough memory; read less at once"),
+        (PermissionError(13, "Permission denied", "a.csv"), 1, "Permission denied: 'a.csv'"),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_an_unexpected_error_is_one_line(
+    error: Exception, status: int, line: str, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("monitor.offline.make", fail)
+    done = call("analyze", "a.csv")
+    assert line in done.only_line()
+    assert len(done.err) < 1000
+    assert done.status == status
+    for arguments in (("--debug", "analyze", "a.csv"), ("analyze", "a.csv", "--debug")):
+        done = call(*arguments)
+        assert done.status == status
+        assert done.err.startswith("Traceback (most recent call last):")
+        assert line in done.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            ("export", "m.toml"),
+            "Missing option '--format' (kalibr|gyroparams|kalman): For which tool. See imu-monitor exp",
+        ),
+        (("simulate", "m.toml", "--seconds", "1"), "Missing option '--out' (FILE): What to write: .csv, .csv.gz, .npz"),
+        (("simulate", "m.toml"), "Missing option '--seconds' (S): Length in seconds"),
+        (("compensate", "a.csv"), "Missing option '--out' (FILE): The recording without drift"),
+        (("reconcile", "a.csv"), "Missing option '--out' (DIR): Folder for the report"),
+        (("thermal", "predict", "a.csv"), "Missing option '--model' (MODEL.json): What thermal fit wrote."),
+        (("analyze",), "Missing argument 'RECORDING': File, or folder of segments. See imu-monitor analyze --help"),
+        (("analyze", "a.csv", "--rte", "1"), "No such option: --rte of imu-monitor analyze; did you mean --rate?"),
+        (
+            ("analyze", "a.csv", "--xyz"),
+            "No such option: --xyz of imu-monitor analyze; known are --rate, --last, --tau,",
+        ),
+        (("thermal", "fitt", "a.csv"), "Did you mean 'fit'?"),
+        (("quux",), "known are demo, run, check, "),
+        ((), "Missing command; known are demo, run, check, "),
+        (("thermal",), "Missing command; known are fit, predict"),
+    ],
+)
+def test_what_is_missing_or_unknown_is_named_with_what_is_possible(
+    arguments: tuple[str, ...], words: str, call: Call
+) -> None:
+    done = call(*arguments)
+    assert words in done.only_line()
+    assert done.status == 2
