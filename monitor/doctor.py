@@ -431,7 +431,9 @@ def packages(module_path: Sequence[str]) -> list[Finding]:
         if folder == own:
             break
         for name in PACKAGES:
-            foreign = next((one for one in (folder / name, folder / f"{name}.py") if one.exists()), None)
+            # a folder without __init__.py is a namespace package, and gives way to a package that is found later
+            places = (folder / name / "__init__.py", folder / f"{name}.py")
+            foreign = next((one for one in places if one.is_file()), None)
             if foreign is not None:
                 text = (
                     f"{foreign}: is found before the program's own package {name}; imu-monitor uses its own, a script "

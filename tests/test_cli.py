@@ -129,11 +129,11 @@ WRONG_FILES = {
     ),
     "negative silence": (
         DEVICE + 'driver = { link = "virtual", silence = -1.0 }\n',
-        "driver.silence: -1 s is outside the supported range 1 ms to 36525 d, or 0",
+        "silence: -1 s is outside",
     ),
     "negative seed": (
         DEVICE + 'driver = { link = "virtual", seed = -1 }\n',
-        "driver.seed: -1 is outside the supported range 0 to ",
+        "seed: -1 is outside",
     ),
     "unknown model": (
         DEVICE + 'driver = { link = "virtual", model = "x" }\n',
@@ -314,22 +314,25 @@ WRONG_ARGUMENTS = {
     "no seconds": (("demo", "--seconds", "0"), "Invalid value for '--seconds'"),
     "bad endpoint": (("watch", "--connect", "7450"), 'connect "7450": no endpoint; write e.g. tcp/127.0.0.1:7450'),
     "bad key": (("watch", "##", "--connect", "tcp/127.0.0.1:9"), 'key expression "##"'),
-    "bad rate": (("analyze", "x.csv", "--rate", "-1"), "--rate: -1 Hz; it must be above 0"),
+    "bad rate": (("analyze", "x.csv", "--rate", "-1"), "--rate: -1 Hz is outside the supported range"),
     "no rate": (("analyze", "x.csv", "--rate", "nan"), "--rate"),
     "bad tau": (("analyze", "x.csv", "--tau", "octav"), '--tau: "octav"; possible are octave, decade10, or seconds'),
-    "negative tau": (("analyze", "x.csv", "--tau", "1,-2"), "every averaging time must be above 0 s"),
+    "negative tau": (("analyze", "x.csv", "--tau", "1,-2"), "--tau: -2 s is outside the supported range"),
     "bad picture": (("analyze", "x.csv", "--plot", "x.pdf"), "--plot: x.pdf: a name ending in .png or .html is needed"),
     "bad window": (
         ("analyze", "x.csv", "--window", "soon"),
         '--window: "soon" is no duration; write seconds, or "90s"',
     ),
     "no window": (("analyze", "x.csv", "--window", "0"), '--window: "0" is no duration'),
-    "infinite rate": (("analyze", "x.csv", "--rate", "inf"), "--rate: inf Hz; it must be above 0"),
+    "infinite rate": (("analyze", "x.csv", "--rate", "inf"), "--rate: inf Hz is outside the supported range"),
     "no format": (("export", "x.toml"), "Missing option '--format'"),
     "unknown format": (("export", MODEL, "--format", "gtsam"), 'unknown format "gtsam"; possible are kalibr,'),
     "no source": (("export", "x.toml", "--format", "kalibr"), "x.toml: cannot be read: No such file or directory"),
     "folder for a source": (("export", ".", "--format", "kalibr"), ".: cannot be read: Is a directory"),
-    "deflation": (("export", MODEL, "--format", "kalibr", "--inflation", "0.5"), "inflation 0.5; it must be 1 or more"),
+    "deflation": (
+        ("export", MODEL, "--format", "kalibr", "--inflation", "0.5"),
+        "--inflation: 0.5 is outside the supported range",
+    ),
     "other's option": (
         ("export", MODEL, "--format", "kalibr", "--dt", "0.01"),
         "--dt: belongs to --format kalman, not kalibr",
@@ -342,7 +345,7 @@ WRONG_ARGUMENTS = {
         ("export", MODEL, "--format", "kalman", "--rostopic", "/imu"),
         "--rostopic: belongs to --format kalibr, not kalman",
     ),
-    "no time step": (("export", MODEL, "--format", "kalman", "--dt", "0"), "kalman needs a time step above 0 s"),
+    "no time step": (("export", MODEL, "--format", "kalman", "--dt", "0"), "--dt: 0 s is outside the supported range"),
     "nowhere to write": (
         ("export", MODEL, "--format", "kalibr", "--out", "nowhere/x.yaml"),
         "--out: nowhere/x.yaml: cannot be written",
@@ -356,8 +359,8 @@ WRONG_ARGUMENTS = {
     "nearest model": (simulating("consumer-mem"), 'did you mean "consumer-mems"?'),
     "no length": (simulating("consumer-mems", "--seconds", "0"), '--seconds: "0" is no duration'),
     "length in words": (simulating("consumer-mems", "--seconds", "soon"), '--seconds: "soon" is no duration'),
-    "no rate of samples": (simulating("consumer-mems", "--rate", "0"), "--rate: 0 Hz; it must be above 0"),
-    "negative seed": (simulating("consumer-mems", "--seed", "-1"), "Invalid value for '--seed'"),
+    "no rate of samples": (simulating("consumer-mems", "--rate", "0"), "--rate: 0 Hz is outside the supported range"),
+    "negative seed": (simulating("consumer-mems", "--seed", "-1"), "--seed: -1 is outside the supported range"),
     "nothing to write": (("simulate", "consumer-mems", "--seconds", "1"), "Missing option '--out'"),
     "unknown form": (simulating("consumer-mems", "--out", "x.mat"), "x.mat: not the suffix of a recording"),
     "nowhere to write it": (simulating("consumer-mems", "--out", "nowhere/x.csv"), "there is no folder nowhere"),
@@ -369,9 +372,9 @@ WRONG_ARGUMENTS = {
     ),
     "nowhere to leave it": (("reconcile", "x.csv"), "Missing option '--out'"),
     "nothing to compare": (("reconcile", "--out", "x"), "Missing argument 'RECORDING"),
-    "no rate to compare at": (comparing("--rate", "0"), "--rate: 0 Hz; it must be above 0"),
-    "infinite rate to compare at": (comparing("--rate", "inf"), "--rate: inf Hz; it must be above 0"),
-    "negative seed to compare by": (comparing("--seed", "-1"), "Invalid value for '--seed'"),
+    "no rate to compare at": (comparing("--rate", "0"), "--rate: 0 Hz is outside the supported range"),
+    "infinite rate to compare at": (comparing("--rate", "inf"), "--rate: inf Hz is outside the supported range"),
+    "negative seed to compare by": (comparing("--seed", "-1"), "--seed: -1 is outside the supported range"),
     "no model to compare with": (comparing("--model", "nothing.toml"), 'no model "nothing.toml", neither a file nor'),
     "nearest model to compare with": (comparing("--model", "consumer-mem"), 'did you mean "consumer-mems"?'),
     "nowhere to say what differs": (comparing("--json", "nowhere/x.json"), "--json: nowhere/x.json: cannot be"),
@@ -1259,3 +1262,73 @@ def test_history_of_a_running_daemon(call: Call, histories: Path, tmp_path: Path
     assert (told["axes"], told["start"]) == (kept["axes"], kept["start"])
     assert nothing.status == 3
     assert "nothing in that time" in nothing.only_line()
+
+
+# --- errors that nobody foresaw
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "line"),
+    [
+        (
+            ZeroDivisionError("division\nby zero"),
+            1,
+            "internal error: ZeroDivisionError: division by zero; please report",
+        ),
+        (KeyError("gx"), 1, "internal error: KeyError: 'gx'; please report it with the output of the same command"),
+        (ValueError("x" * 9000), 1, " …; please report it"),
+        (RecursionError("too deep"), 1, "internal error: RecursionError: too deep"),
+        (MemoryError("Unable to allocate 233. GiB"), 1, "not enough memory (Unable to allocate 233. GiB); read less"),
+        (MemoryError(), 1, "not enough memory; read less at once"),
+        (PermissionError(13, "Permission denied", "a.csv"), 1, "Permission denied: 'a.csv'"),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_an_unexpected_error_is_one_line(
+    error: Exception, status: int, line: str, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("monitor.offline.make", fail)
+    done = call("analyze", "a.csv")
+    assert line in done.only_line()
+    assert len(done.err) < 1000
+    assert done.status == status
+    for arguments in (("--debug", "analyze", "a.csv"), ("analyze", "a.csv", "--debug")):
+        done = call(*arguments)
+        assert done.status == status
+        assert done.err.startswith("Traceback (most recent call last):")
+        assert line in done.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            ("export", "m.toml"),
+            "Missing option '--format' (kalibr|gyroparams|kalman): For which tool. See imu-monitor exp",
+        ),
+        (("simulate", "m.toml", "--seconds", "1"), "Missing option '--out' (FILE): What to write: .csv, .csv.gz, .npz"),
+        (("simulate", "m.toml"), "Missing option '--seconds' (S): Length in seconds"),
+        (("compensate", "a.csv"), "Missing option '--out' (FILE): The recording without drift"),
+        (("reconcile", "a.csv"), "Missing option '--out' (DIR): Folder for the report"),
+        (("thermal", "predict", "a.csv"), "Missing option '--model' (MODEL.json): What thermal fit wrote."),
+        (("analyze",), "Missing argument 'RECORDING': File, or folder of segments. See imu-monitor analyze --help"),
+        (("analyze", "a.csv", "--rte", "1"), "No such option: --rte of imu-monitor analyze; did you mean --rate?"),
+        (
+            ("analyze", "a.csv", "--xyz"),
+            "No such option: --xyz of imu-monitor analyze; known are --rate, --last, --tau,",
+        ),
+        (("thermal", "fitt", "a.csv"), "Did you mean 'fit'?"),
+        (("quux",), "known are demo, run, check, "),
+        ((), "Missing command; known are demo, run, check, "),
+        (("thermal",), "Missing command; known are fit, predict"),
+    ],
+)
+def test_what_is_missing_or_unknown_is_named_with_what_is_possible(
+    arguments: tuple[str, ...], words: str, call: Call
+) -> None:
+    done = call(*arguments)
+    assert words in done.only_line()
+    assert done.status == 2

@@ -124,9 +124,8 @@ def _assemble(path: Path, table: Table, rate_hz: float | None) -> Recording:
     t_s, rows = _usable_times(path, table.columns.get("t"), rate, notes)
     if t_s is None and rate is None:
         why = next((f" ({note.rstrip('.')})" for note in notes if note.startswith("fs ")), "")
-        raise ConfigError(
-            f"{path}: has neither t nor a usable fs{why}, so its rate is not known; give it with --rate HZ"
-        )
+        fs = f"a usable fs{why}" if why else "fs"
+        raise ConfigError(f"{path}: has neither t nor {fs}, so its rate is not known; give it with --rate HZ")
     axes = tuple(a for a in AXES if a in table.columns)
     values = np.full((n, len(AXES)), np.nan)
     for axis in axes:

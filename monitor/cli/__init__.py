@@ -10,6 +10,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, NoReturn
@@ -18,7 +19,6 @@ import typer
 from typer.exceptions import TyperException
 
 from drivers.errors import ConfigError, ImuError, NotReady, RecordingError, in_one_line
-from drivers.plugin import nearest
 from drivers.small_file import real_path
 from monitor.cli import doctor, drift, options, output, serving
 from monitor.cli import history as history_command
@@ -480,15 +480,17 @@ def _usage(error: TyperException) -> str:
     text, context = error.format_message(), getattr(error, "ctx", None)
     if isinstance(error, typer.BadParameter) and error.param is not None and not error.message:
         option: Any = error.param
-        name = option.opts[0] if option.param_type_name == "option" else ""
-        text = f"missing {option.param_type_name} {name} {option.metavar or ''}".replace("  ", " ")
-        return f"{text}: {option.help or ''} See {context.command_path} --help" if context else text
+        what = f" ({option.metavar})" if option.metavar and option.param_type_name == "option" else ""
+        where = f" See {context.command_path} --help" if context else ""
+        return f"{text.rstrip('.')}{what}: {option.help or ''}{where}"
     if context is None:
         return text
     unknown = getattr(error, "option_name", None)
     if unknown is not None and text.startswith("No such option"):
-        known = sorted({name for option in context.command.params for name in option.opts if name.startswith("--")})
-        return f'no option "{unknown}" of {context.command_path}{nearest(unknown, known)}'
+        known = {name.lstrip("-"): name for option in context.command.params for name in option.opts if name[0] == "-"}
+        near = get_close_matches(unknown.lstrip("-"), known, n=1)
+        hint = f"did you mean {known[near[0]]}?" if near else f"known are {', '.join(known.values())}"
+        return f"No such option: {unknown} of {context.command_path}; {hint}"
     commands: Mapping[str, object] = getattr(context.command, "commands", {})
     if commands and "Did you mean" not in text:
         return f"{text.rstrip('.')}; known are {', '.join(commands)}"

@@ -92,7 +92,7 @@ def test_what_is_wrong_is_one_line_and_nothing_is_written(tmp_path, capsys):
         ([tmp_path / "none.npz"], 2, "none.npz"),
         ([tmp_path / "b.npz"], 2, "no gyro axis in it"),
         ([tmp_path / "c.npz"], 3, "never at rest"),
-        ([recording, "--rate", "-1"], 2, "it must be above 0"),
+        ([recording, "--rate", "-1"], 2, "is outside the supported range"),
         ([recording, "--plot", tmp_path / "a.pdf"], 2, "ending in .png"),
         ([recording, "--json", out], 2, "is what --out writes"),
     ):

@@ -168,7 +168,7 @@ def test_progress_rises_to_the_whole(tmp_path: Path) -> None:
     ("model", "seconds", "words"),
     [
         (NoiseModel(sample_rate_hz=100.0), 1.0, "m: names no axis"),
-        (MODEL, 1e-9, "1e-09 s at 50 Hz hold no sample"),
+        (MODEL, 1e-9, "1e-09 s at 50 Hz: 0 samples is outside the supported range"),
         (
             NoiseModel.from_toml("[gz.sinusoidal]\namplitude = 1.0\nfrequency = 30.0\n"),
             1.0,

@@ -267,10 +267,10 @@ def test_the_shipped_model_goes_into_every_format(form: str) -> None:
     ("form", "inflation", "options", "says"),
     [
         ("yaml", 1.0, {}, 'unknown format "yaml"; possible are kalibr, gyroparams, kalman'),
-        ("kalibr", 0.5, {}, "inflation 0.5; it must be 1 or more"),
-        ("kalibr", math.nan, {}, "inflation nan"),
-        ("kalman", 1.0, {"dt_s": 0.0}, "time step above 0"),
-        ("kalman", 1.0, {"correlation_time_s": -1.0}, "correlation time -1 s"),
+        ("kalibr", 0.5, {}, "inflation: 0.5 is outside the supported range"),
+        ("kalibr", math.nan, {}, "inflation: nan"),
+        ("kalman", 1.0, {"dt_s": 0.0}, "a time step of 1 µs"),
+        ("kalman", 1.0, {"correlation_time_s": -1.0}, "correlation time: -1 s"),
     ],
 )
 def test_a_wrong_request_is_said(form: str, inflation: float, options: dict[str, float], says: str) -> None:
