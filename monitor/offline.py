@@ -76,8 +76,8 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Results:
         return _make(request, tell)
     except MemoryError as error:
         raise ConfigError(
-            f"{request.recording}: the analysis needs more memory than is free; take the end alone with --last, or split "
-            "the recording"
+            f"{request.recording}: the analysis needs more memory than is free; take the end alone with --last, or "
+            "split the recording"
         ) from error
 
 
