@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.errors import NotReady
+from drivers.errors import ConfigError, NotReady
 from drivers.recording import iter_blocks, load_samples
 from drivers.sample import AXES, Ints, SampleBlock
 from monitor.estimate.analysis import Analysis, analyze, events_of
@@ -69,9 +69,19 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Results:
     """Read and analyse.
 
     Raises:
-        RecordingError, ConfigError: no recording; or a τ, rate or window that it does not allow
+        RecordingError, ConfigError: no recording; a τ, rate or window that it does not allow; or not enough memory
         TooShort: too few samples for any answer
     """
+    try:
+        return _make(request, tell)
+    except MemoryError as error:
+        raise ConfigError(
+            f"{request.recording}: the analysis needs more memory than is free; take the end alone with --last, or "
+            "split the recording"
+        ) from error
+
+
+def _make(request: Request, tell: Tell) -> Results:
     tell("reading", None)
     found = load_samples(request.recording, request.rate_hz, request.last_s)
     blocks = list(iter_blocks(found))

@@ -27,7 +27,7 @@ BOOKKEEPING: Final = ("ticks", "lost")
 SLACK_BYTES: Final = 1 << 20
 """Of a compressed buffer above what its rows need."""
 MAX_DICTIONARY_BYTES: Final = 64_000_000
-MAX_INDEX_BYTES: Final = 20_000_000
+MAX_INDEX_BYTES: Final = 10_000_000
 """Of a Parquet file. pyarrow needs about ten times as much memory for it."""
 PARQUET_END: Final = b"\0\0\0\0PAR1"  # behind the index, with its length in the zeros
 ARROW_MAGIC: Final = b"ARROW1\0\0"

@@ -97,7 +97,7 @@ def read_csv(path: Path) -> Table:
             what = notes[-1] if notes else "It has no line at all."
             raise RecordingError(f"{path}: has not one whole line, expected {EXAMPLE_HEADER}. {what}")
         names = _header(path, head)
-        chosen = chosen_columns(path, names, notes, f"line {head.number}, read as the header, has ")
+        chosen = chosen_columns(path, names, notes, f" in line {head.number}")
         use = [names.index(name) for name in chosen.values()]
         parts = list(_parsed(path, head, texts, names, use, bad))
     rows = np.concatenate(parts) if parts else np.empty((0, len(use)))

@@ -161,11 +161,6 @@ def _checked_rows(path: Path, archive: zipfile.ZipFile, chosen: Mapping[str, str
 
 def _check_size(path: Path, limit: room.ReadLimit, member: zipfile.ZipInfo, key: str, header: _Header) -> None:
     """Raise RecordingError if the member cannot hold the values that the header of its array states."""
-    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise RecordingError(
-            f"{path}: {key} is packed by method {member.compress_type} of zip, expected stored or deflated, as NumPy "
-            "writes them"
-        )
     ratio = 1 if member.compress_type == zipfile.ZIP_STORED else MAX_DEFLATE_RATIO
     packed = min(member.compress_size, limit.size_bytes)
     held = min(member.file_size, ratio * packed) - header.size_bytes
@@ -178,6 +173,11 @@ def _check_size(path: Path, limit: room.ReadLimit, member: zipfile.ZipInfo, key:
 
 def _header(path: Path, archive: zipfile.ZipFile, key: str) -> _Header:
     """Return the header of an array without reading its data."""
+    method = _member(archive, key).compress_type
+    if method not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # zipfile unpacks others without a bound
+        raise RecordingError(
+            f"{path}: {key} is packed by method {method} of zip, expected stored or deflated, as NumPy writes them"
+        )
     with _errors(path, key), archive.open(_member(archive, key)) as member:
         start = member.read(len(NPY_MAGIC) + 4)
         version, size_bytes = start[len(NPY_MAGIC) : len(NPY_MAGIC) + 2], 2

@@ -34,7 +34,7 @@ ROW_BYTES: Final = 64
 MIN_ROW_LIMIT: Final = 20_000_000
 MAX_ROWS_PER_BYTE: Final = 8
 """Rows of measured values need more than one bit each, in every format."""
-MIN_UNPACKED_LIMIT_BYTES: Final = 4_000_000_000
+MIN_UNPACKED_LIMIT_BYTES: Final = 2_000_000_000
 MAX_UNPACKING_RATIO: Final = 100
 MAX_COLUMNS: Final = 10_000
 

@@ -58,7 +58,7 @@ def check_width(path: Path, columns: int) -> None:
 def chosen_columns(path: Path, names: Sequence[str], notes: list[str], where: str = "") -> dict[str, str]:
     """Known column -> its name in the file. The rest goes into a note; no axis at all is an error.
 
-    ``where`` says where the names stand, such as "line 3, read as the header, has ".
+    ``where`` says where the names stand, such as " in line 3".
     """
     check_width(path, len(names))
     known = {*COLUMNS, *ALIASES}
@@ -71,7 +71,7 @@ def chosen_columns(path: Path, names: Sequence[str], notes: list[str], where: st
             chosen.setdefault(name, alias)
     if not any(axis in chosen for axis in AXES):
         raise RecordingError(
-            f"{path}: {where}no axis among its columns ({listed(names)}); "
+            f"{path}: no axis among its columns ({listed(names)}){where}; "
             f"a recording has some of {' '.join(AXES)}, in rad/s and m/s²{looks_like(path)}"
         )
     used = {*chosen.values(), "fs"}

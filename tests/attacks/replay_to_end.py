@@ -1,5 +1,6 @@
 """Replay the file that is named on the command line to its end: one line of error and status 2 if it is not whole."""
 
+import logging
 import sys
 
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable
@@ -8,6 +9,7 @@ from drivers.links.replay_link import Settings, build
 
 def main() -> None:
     """Read until the link ends."""
+    logging.getLogger("can").addHandler(logging.NullHandler())  # as the daemon, which keeps these lines for its log
     link = build(Settings(path=sys.argv[1], speed="max"))
     try:
         link.open()

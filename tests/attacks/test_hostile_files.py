@@ -91,10 +91,10 @@ COSTLY: Final[Sequence[Case]] = (
     (hostile.gz_line_without_end, ".csv.gz", "Line 2 is longer"),
     (hostile.gz_noise_then_rows_without_end, ".csv.gz", MEMORY_OR_ROWS),
     (hostile.gz_blank_lines, ".csv.gz", MEMORY_OR_ROWS),
-    (hostile.gz_long_lines, ".csv.gz", "unpacks to more than 4.0 GB"),
+    (hostile.gz_long_lines, ".csv.gz", "unpacks to more than 2.0 GB"),
     (hostile.gz_empty_members, ".csv.gz", "gzip members in a row are empty"),
     (hostile.gz_in_gz, ".csv.gz", "is no CSV text"),
-    (hostile.npz_sizes_claim, ".npz", f"{MEMORY_OR_ROWS}|its data hold"),
+    (hostile.npz_sizes_claim, ".npz", f"{MEMORY_OR_ROWS}|its data hold|is damaged"),
     (hostile.npz_two_dimensions, ".npz", "a column has one dimension"),
     (hostile.npz_long_strings, ".npz", "not numbers"),
     (hostile.npz_nested, ".npz", "no array in the format .npy"),
@@ -127,6 +127,7 @@ def check_analyze(tmp_path: Path, generate: hostile.Generator, suffix: str, why:
     check_refused(run_limited(tmp_path, "monitor.cli", "analyze", str(path), "--rate", "100"), path, why)
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize(("generate", "suffix", "why"), CHEAP, ids=case_id)
 def test_analyze_refuses_in_one_line(tmp_path: Path, generate: hostile.Generator, suffix: str, why: str) -> None:
     check_analyze(tmp_path, generate, suffix, why)
@@ -171,7 +172,7 @@ LOGS: Final[Sequence[Case]] = (
     (hostile.log_blank_lines, ".log.gz", "8000000 bytes hold no CAN frame"),
     (hostile.log_blank_lines, ".trc.gz", "8000000 bytes hold no CAN frame"),
     (hostile.blf_container, ".blf", "a container unpacks to more than"),
-    (hostile.blf_gz_object, ".blf.gz", "an object has 3221225520 bytes"),
+    (hostile.blf_gz_object, ".blf.gz", "an object has 3221225472 bytes"),
     (hostile.npz_zeros, ".npz", MEMORY_OR_ROWS),
     (hostile.gz_rows_without_end, ".csv.gz", MEMORY_OR_ROWS),
 )  # fmt: skip

@@ -112,3 +112,12 @@ def test_a_drawing_has_the_changes_marked(recording: Path, name: str, start: byt
         page = path.read_text("utf-8")
         assert "gx angle random walk rose by" in page
         assert "<!-- change -->" in page  # the mark in the drawing
+
+
+def test_an_analysis_beyond_the_memory_is_one_line(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_args: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(offline, "analyze", fail)
+    with pytest.raises(ConfigError, match=r"x\.npz: the analysis needs more memory than is free; take the end alone"):
+        make(Request(recording))
