@@ -62,7 +62,7 @@ class Results:
     hadamard: HadamardCurve | None = None
     dynamic: Dynamic | None = None
     lacking: str = ""  # why there are no dynamic curves, where they were wanted
-    warmth: WithoutTemperature | None = None  # the coefficients without what temperature explains, where it moved
+    warmth: WithoutTemperature | None = None  # what temperature explains, where it explains any axis
 
 
 def make(request: Request, tell: Tell = lambda _what, _share: None) -> Results:
@@ -101,7 +101,11 @@ def _make(request: Request, tell: Tell) -> Results:
         found_all = events.result()
         without = warmth.result()
         said = [] if without is None else notes_without(without)
-        found_all = replace(found_all, notes=(*found_all.notes, *said, *([lacking] if lacking else [])))
+        found_all = replace(
+            found_all,
+            notes=(*found_all.notes, *said, *([lacking] if lacking else [])),
+            axes_of_temperature=() if without is None else without.axes_of_temperature,
+        )
         return Results(found_all, total, hadamard, courses, lacking, without)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
@@ -123,7 +127,7 @@ def draw(results: Results, path: Path, title: str) -> None:
     else:
         from monitor.publish.plot import allan_plot
 
-        allan_plot(result.estimate, path, title, beside, results.dynamic, marks)
+        allan_plot(result.estimate, path, title, beside, results.dynamic, marks, result.axes_of_temperature)
 
 
 def _without_temperature(

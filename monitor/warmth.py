@@ -1,16 +1,17 @@
-"""How much of a recording's drift was temperature: K and R once what temperature explains of the bias is taken out.
+"""Axes whose slow variation is temperature, and K and R after removing what temperature explains of the bias.
 
-Comes in: an analysis and the temperature on its grid. The bias of each axis is fitted to temperature as ``thermal fit``
-does it, and what the model makes of temperature alone is taken from the samples, drawn smoothly through the middles of
-the intervals, as steps or corners would be noise of their own. Then curve and coefficients are made again. Axes whose
-bias temperature does not explain stay as they are and are not named.
+The input is an analysis and the temperature on its grid. Each axis is tested for a dependence of its bias on
+temperature against a null hypothesis of correlated noise (``drift.temperature_dependence``), whatever the status of its
+coefficients. The bias of a dependent axis is fitted to temperature as ``thermal fit`` does. The modelled bias is drawn
+smoothly through the middles of the intervals, because steps and corners would be noise of their own, and subtracted
+from the samples. Curve and coefficients are then computed again. Axes without a significant dependence stay as they are
+and are not named.
 
-A model may take some of a random walk along, as two slow courses are alike by chance: it is chosen with that in mind
-(AICc, what it leaves being correlated), and a share of a few percent says nothing.
+A model can follow a part of a random walk by chance, so a share of a few percent of K or R means nothing.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -20,7 +21,8 @@ from drivers.sample import AXES, Floats
 from monitor.drift.means import interval_means
 from monitor.drift.model import predicted
 from monitor.drift.study import nice_interval
-from monitor.drift.thermal import LEAST_C, fitted
+from monitor.drift.temperature_dependence import TemperatureDependence, find_dependence
+from monitor.drift.thermal import LEAST_C, check, fitted
 from monitor.estimate.analysis import Analysis, refitted
 from monitor.estimate.batch import EachAxis
 from monitor.estimate.coefficients import LETTERS, Coefficients, Status
@@ -30,12 +32,18 @@ SLOW: Final = ("K", "R")
 
 @dataclass(frozen=True, slots=True)
 class WithoutTemperature:
-    """The coefficients with temperature taken out of the bias."""
+    """The dependence of each axis on temperature, and the coefficients with temperature taken out of the bias."""
 
     models: Mapping[str, str]  # axis -> form of its model; axes that temperature explains something of
     before: Coefficients
     coefficients: Coefficients
     k_or_r: tuple[bool, ...]  # [6] as in ``Estimate``
+    dependences: Mapping[str, TemperatureDependence] = field(default_factory=dict)  # significant ones, by axis
+
+    @property
+    def axes_of_temperature(self) -> tuple[str, ...]:
+        """Axes of which temperature explains most of the slow variance."""
+        return tuple(axis for axis, one in self.dependences.items() if one.explains_most)
 
     def share(self, letter: str, axis: str) -> float | None:
         """Of the letter's variance that was temperature: 1 − after²/before², at least; None where it was not there.
@@ -63,25 +71,34 @@ def moved(temperatures_c: Floats) -> bool:
 
 
 def without_temperature(result: Analysis, temperature_c: Floats, each: EachAxis = map) -> WithoutTemperature | None:
-    """The same analysis with temperature [n] in °C taken out; None where it explains nothing of any axis."""
+    """Return the same analysis with temperature [n] in °C taken out, or None if no axis depends on temperature."""
     rate_hz = result.estimate.rate_hz
     interval_s = nice_interval(len(result.values) / rate_hz, rate_hz)
-    values, models = result.values.copy(), {}
+    values, models, dependences = result.values, dict[str, str](), dict[str, TemperatureDependence]()
     for at, axis in enumerate(AXES):
-        means = interval_means(values[:, at], temperature_c, rate_hz, interval_s)
+        means = interval_means(result.values[:, at], temperature_c, rate_hz, interval_s)
         try:
-            model = fitted(means).model
+            check(means)
         except NotReady:
             continue
+        dependence = find_dependence(means)
+        if dependence is None:
+            continue
+        dependences[axis] = dependence
+        model = fitted(means).model
         if model.shape.memory or model.shape.powers:
+            values = values.copy() if values is result.values else values
             course = predicted(model, means.temperature_c, began=True).bias
             values[:, at] -= drawn(course, round(means.interval_s * rate_hz), len(values))
             models[axis] = model.shape.name
-    if not models:
+    if not dependences:
         return None
-    fit = refitted(result, values, each)
-    k_or_r = tuple(bool(one) for one in fit.k_or_r)
-    return WithoutTemperature(models, result.estimate.coefficients, fit.coefficients, k_or_r)
+    before, k_or_r = result.estimate.coefficients, result.estimate.k_or_r
+    after = before
+    if models:
+        fit = refitted(result, values, each)
+        after, k_or_r = fit.coefficients, fit.k_or_r
+    return WithoutTemperature(models, before, after, tuple(bool(one) for one in k_or_r), dependences)
 
 
 def drawn(course: Floats, length: int, n: int) -> Floats:

@@ -57,6 +57,6 @@ def print_analysis(result: "Analysis") -> None:
     console = Console()
     estimate = result.estimate
     console.print(f"{estimate.curve.n} samples at {estimate.rate_hz:g} Hz, {result.seconds:.6g} s")
-    console.print(analysis_table(estimate))
+    console.print(analysis_table(estimate, result.axes_of_temperature))
     for note in result.notes:
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)

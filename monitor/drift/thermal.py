@@ -27,6 +27,7 @@ from drivers.sample import Floats
 from monitor.drift.heat import Shape, responses, solved
 from monitor.drift.means import Means
 from monitor.drift.model import ThermalModel, covariance, slopes, whole
+from monitor.drift.temperature_dependence import find_hysteresis
 
 FEWEST: Final = 12
 """Intervals that anything can be said of."""
@@ -80,10 +81,12 @@ class ThermalFit:
     model: ThermalModel
     candidates: tuple[Candidate, ...]  # the one that was taken, and the others by their AICc
     both_ways: bool  # temperature rose and fell
-    hysteresis: float | None  # largest difference of rising and falling at one temperature; None if it went one way
     explained: float  # share of the variance of the means
     aicc: float  # of the model; only differences between fits of the same means say anything
     step: float = 0.0  # of the offset, where one was asked for: after it less before
+    hysteresis: float | None = None  # largest difference between heating and cooling at one temperature, rad/s or m/s²;
+    # 0 if noise explains the difference; None if temperature went one way, or if the test was not made
+    hysteresis_p: float | None = None  # p-value of no difference between heating and cooling
 
 
 T = TypeVar("T")
@@ -92,12 +95,16 @@ Pieces = Generator[None, None, T]
 
 
 def fitted(means: Means) -> ThermalFit:
-    """Choose and fit.
+    """Choose and fit a model, and test whether heating and cooling differ.
 
     Raises:
         NotReady: too few intervals, or temperature hardly moved
     """
-    return finished(fitting(means))
+    found = finished(fitting(means))
+    loop = find_hysteresis(means) if found.both_ways else None
+    if loop is None:
+        return found
+    return replace(found, hysteresis=loop.size if loop.significant else 0.0, hysteresis_p=loop.p_value)
 
 
 def finished(pieces: Pieces[T]) -> T:
@@ -119,7 +126,7 @@ def fitting(means: Means, since: int | None = None, lags: bool = False) -> Piece
     Raises:
         NotReady: too few intervals, or temperature hardly moved; with the first piece
     """
-    _check(means)
+    check(means)
     excess, reference_c = _excess(means)
     both_ways = _both_ways(means.temperature_c)
     tried = []
@@ -141,8 +148,7 @@ def fitting(means: Means, since: int | None = None, lags: bool = False) -> Piece
     known = means.known
     left = means.bias[known] - (best.columns @ best.sizes)[known]
     explained = 1.0 - float(np.var(left) / np.var(means.bias[known]))
-    loop = _loop(means.temperature_c, best.columns @ best.sizes) if model.shape.memory else 0.0
-    return ThermalFit(model, candidates, both_ways, loop if both_ways else None, explained, best.aicc, best.step)
+    return ThermalFit(model, candidates, both_ways, explained, best.aicc, best.step)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +163,8 @@ class _Tried:
     step: float
 
 
-def _check(means: Means) -> None:
+def check(means: Means) -> None:
+    """Raise NotReady if the means are too few, or if temperature or bias hardly moved."""
     count = int(means.known.sum())
     if count < FEWEST:
         raise NotReady(
@@ -330,17 +337,3 @@ def _model(means: Means, excess: Floats, reference_c: float, one: _Tried) -> The
     rows = np.hstack([one.columns, slopes(model, excess, one.sizes)])
     x, _, _ = whitened(rows, np.zeros(excess.size), means.known, one.phi)
     return replace(model, covariance=covariance(x, one.sigma))
-
-
-def _loop(temperature_c: Floats, bias: Floats) -> float:
-    """Largest difference of the modelled bias between rising and falling, at one temperature."""
-    warmth = whole(temperature_c)
-    rising = np.gradient(warmth) > 0.0
-    edges = np.linspace(warmth.min(), warmth.max(), 9)
-    place = np.clip(np.searchsorted(edges, warmth) - 1, 0, 7)
-    worst = 0.0
-    for at in range(8):
-        up, down = bias[(place == at) & rising], bias[(place == at) & ~rising]
-        if up.size and down.size:
-            worst = max(worst, abs(float(up.mean() - down.mean())))
-    return worst

@@ -48,6 +48,7 @@ class Analysis:
     motions: tuple[Motion, ...] = ()
     changes: tuple[Change, ...] = ()
     struck: bool = False  # moving stretches are missing in ``values``
+    axes_of_temperature: tuple[str, ...] = ()  # temperature explains most of their slow variance
 
 
 def analyze(

@@ -44,6 +44,7 @@ class Noise:
     source: str  # where the numbers come from, for the head of the file
     left_out: tuple[str, ...] = ()  # effects without a letter, "gz.sinusoidal"
     measured: bool = False  # from a recording: what is absent was not seen
+    warnings: tuple[str, ...] = ()  # sentences for the head of the file, ASCII
 
     def of(self, kind: str, letter: str) -> dict[str, Term]:
         """One letter on the axes of a kind that have it."""
@@ -79,8 +80,13 @@ class _Coefficient(msgspec.Struct):
     status: str
 
 
+class _Temperature(msgspec.Struct):
+    share: float
+
+
 class _Axis(msgspec.Struct):
     coefficients: dict[str, _Coefficient]
+    temperature: _Temperature | None = None
 
 
 class _Analysis(msgspec.Struct):
@@ -113,7 +119,13 @@ def from_analysis(text: bytes | str, source: str = "analysis of a recording") ->
                 axes.setdefault(axis, {})[letter] = Term(one.value)
             elif one.status == "upper_bound" and one.hi is not None:
                 axes.setdefault(axis, {})[letter] = Term(one.hi, bound=True)
-    return Noise(axes, found.rate, source, measured=True)
+    warnings = tuple(
+        f"{axis} follows its temperature, which explains {math.floor(100.0 * mark.share):d} % of its slow variance: "
+        f"B and K of {axis} describe temperature as well as noise"
+        for axis in axes
+        if (mark := found.axes[axis].temperature) is not None
+    )
+    return Noise(axes, found.rate, source, measured=True, warnings=warnings)
 
 
 def lacking(noise: Noise, text: str) -> ImuError:
@@ -125,7 +137,11 @@ def head(noise: Noise, inflation: float, mark: str) -> list[str]:
     """Comments: where the numbers come from, and what was done to them."""
     source = noise.source.encode("ascii", "replace").decode()
     done = "none" if inflation == 1.0 else f"N, B and K are {inflation:g} times those of the source"
-    return [f"{mark} source: {source}", f"{mark} inflation: {done}"]
+    return [
+        f"{mark} source: {source}",
+        f"{mark} inflation: {done}",
+        *(f"{mark} WARNING: {one}" for one in noise.warnings),
+    ]
 
 
 def tail(noise: Noise, used: Collection[str], mark: str) -> list[str]:

@@ -220,6 +220,7 @@ def analysis(
             **({"hadamard": _beside(hadamard.tau_s, hadamard.hvar, hadamard.lo, hadamard.hi, i)} if hadamard else {}),
             "coefficients": coefficient_table(estimate.coefficients, i, bool(estimate.k_or_r[i])),
             "bandwidth": _number(result.bandwidth_hz[i]),
+            **({"temperature": _dependence(warmth, axis)} if axis in result.axes_of_temperature and warmth else {}),
             **({"without_temperature": _without(warmth, axis)} if warmth and axis in warmth.models else {}),
         }
     payload = {
@@ -266,6 +267,18 @@ def _beside(tau_s: Floats, variance: Floats, lo: Floats, hi: Floats, axis: int) 
     """Another deviation of one axis."""
     columns = {"deviation": np.sqrt(variance), "lo": lo, "hi": hi}
     return {"tau": _list(tau_s), **{name: _list(column[:, axis]) for name, column in columns.items()}}
+
+
+def _dependence(warmth: WithoutTemperature, axis: str) -> dict[str, Any]:
+    """The mark of an axis of whose slow variance temperature explains most."""
+    one = warmth.dependences[axis]
+    return {
+        "share": one.share,
+        "p_value": one.p_value,
+        "form": one.form,
+        "one_way": one.one_way,
+        "interval": one.interval_s,
+    }
 
 
 def _without(warmth: WithoutTemperature, axis: str) -> dict[str, Any]:

@@ -5,7 +5,7 @@ a table of the coefficients below, and, where dynamic curves were made, those be
 matplotlib is imported when a plot is asked for, and draws without a screen.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -23,8 +23,11 @@ from monitor.publish.units import (
     COEFFICIENT_NAMES,
     COEFFICIENT_UNITS,
     KINDS,
+    TEMPERATURE_MARK,
+    TEMPERATURE_MEANS,
     Kind,
     axes_of,
+    marked,
     measured_axes,
     reading,
 )
@@ -48,6 +51,7 @@ def allan_plot(
     others: Sequence[Beside] = (),
     dynamic: Dynamic | None = None,
     marks: Sequence[Mark] = (),
+    axes_of_temperature: Collection[str] = (),
 ) -> None:
     """Write the picture; the ending of ``path`` says the format.
 
@@ -58,6 +62,7 @@ def allan_plot(
         others: other deviations, such as total and Hadamard
         dynamic: dynamic curves of the same recording, drawn below
         marks: changes, on their time axis
+        axes_of_temperature: axes that are marked, as temperature explains most of their slow variance
     Raises:
         ConfigError: matplotlib is missing or the file cannot be written
     """
@@ -73,7 +78,7 @@ def allan_plot(
     rows = [INCHES[1]] if dynamic is None else [INCHES[1], below]
     parts = figure.subfigures(len(rows), len(kinds), squeeze=False, height_ratios=rows)
     for column, kind in enumerate(kinds):
-        _static(parts[0, column], estimate, kind, others)
+        _static(parts[0, column], estimate, kind, others, axes_of_temperature)
         if dynamic is not None:
             dynamic_panels(parts[1, column], dynamic, kind, marks)
     figure.suptitle("\n".join([*([title] if title else []), summary(estimate)]), fontsize=12)
@@ -107,20 +112,26 @@ def k_or_r(estimate: Estimate, letter: str, axis: str) -> bool:
     )
 
 
-def _static(part: "SubFigure", estimate: Estimate, kind: Kind, others: Sequence[Beside]) -> None:
+def _static(
+    part: "SubFigure",
+    estimate: Estimate,
+    kind: Kind,
+    others: Sequence[Beside],
+    axes_of_temperature: Collection[str],
+) -> None:
     """Allan plot and table of one kind."""
     curves, table = part.subplots(2, 1, height_ratios=[3.6, 1.75])
     allan_panel(curves, estimate, kind, others)
-    _table(table, estimate, kind)
+    _table(table, estimate, kind, axes_of_temperature)
 
 
-def _table(axes: "Axes", estimate: Estimate, kind: Kind) -> None:
+def _table(axes: "Axes", estimate: Estimate, kind: Kind, axes_of_temperature: Collection[str]) -> None:
     """The coefficients of one kind: value, and its interval in small print."""
     axes.axis("off")
     columns = (0.0, 0.46, 0.65, 0.84)
     rows = np.linspace(0.97, 0.19, len(LETTERS) + 1)
     for axis, x, colour in zip(axes_of(kind), columns[1:], COLOURS, strict=True):
-        axes.text(x, rows[0], axis, color=colour, fontweight="bold", va="center")
+        axes.text(x, rows[0], marked(axis, axes_of_temperature), color=colour, fontweight="bold", va="center")
     for letter, y in zip(LETTERS, rows[1:], strict=True):
         unit = COEFFICIENT_UNITS[kind][letter].name
         axes.text(columns[0], y, f"{letter}  {COEFFICIENT_NAMES[kind][letter]}, {unit}", va="center", fontsize=9.5)
@@ -129,6 +140,7 @@ def _table(axes: "Axes", estimate: Estimate, kind: Kind) -> None:
             axes.text(x, y + 0.02, cell.value, va="center", fontsize=9.5)
             small = "K or R" if k_or_r(estimate, letter, axis) else cell.interval
             axes.text(x, y - 0.05, small, va="center", fontsize=6.5, color=GREY)
-    axes.text(columns[0], 0.03, EXPLAINED, va="center", fontsize=7.5, color=GREY)
+    temperature = f";  {TEMPERATURE_MARK} {TEMPERATURE_MEANS}" if axes_of_temperature else ""
+    axes.text(columns[0], 0.03, EXPLAINED + temperature, va="center", fontsize=7.5, color=GREY)
     axes.text(columns[0], -0.04, READING, va="center", fontsize=7.5, color=GREY)
     axes.set(xlim=(0, 1), ylim=(-0.06, 1))

@@ -8,7 +8,7 @@ matplotlib and Jinja2 are imported when a report is asked for.
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -26,8 +26,11 @@ from monitor.publish.panels import duration
 from monitor.publish.units import (
     COEFFICIENT_NAMES,
     KIND_NAMES,
+    TEMPERATURE_MARK,
+    TEMPERATURE_MEANS,
     Kind,
     axes_of,
+    marked,
     number,
     reading,
     unit_of,
@@ -73,7 +76,7 @@ class Part:
     """What the page shows of one kind of sensor."""
 
     name: str
-    axes: tuple[tuple[str, str], ...]  # name and colour
+    axes: tuple[tuple[str, str], ...]  # name with its mark, and colour
     rows: tuple[Row, ...]
     allan: str  # SVG
     dynamic: str  # SVG, or "" where there are no dynamic curves
@@ -124,7 +127,11 @@ def html(
         title=title or "Recording",
         facts=facts(analysis),
         notes=analysis.notes,
-        parts=[_part(estimate, kind, others, dynamic, marks) for kind in plot.kinds_of(estimate)],
+        parts=[
+            _part(estimate, kind, others, dynamic, marks, analysis.axes_of_temperature)
+            for kind in plot.kinds_of(estimate)
+        ],
+        temperature=f"{TEMPERATURE_MARK} {TEMPERATURE_MEANS}." if analysis.axes_of_temperature else "",
         reading=READING,
         window="" if dynamic is None else duration(dynamic.window_s),
     )
@@ -162,17 +169,27 @@ def _cell(estimate: Estimate, letter: str, axis: str) -> Cell:
 
 
 def _part(
-    estimate: Estimate, kind: Kind, others: Sequence[Beside], dynamic: Dynamic | None, marks: Sequence[Mark]
+    estimate: Estimate,
+    kind: Kind,
+    others: Sequence[Beside],
+    dynamic: Dynamic | None,
+    marks: Sequence[Mark],
+    axes_of_temperature: Collection[str],
 ) -> Part:
     import matplotlib
 
     # a path remembers the threshold from when it was made
     with matplotlib.rc_context({"path.simplify_threshold": SIMPLER_PX}):
-        return _drawn(estimate, kind, others, dynamic, marks)
+        return _drawn(estimate, kind, others, dynamic, marks, axes_of_temperature)
 
 
 def _drawn(
-    estimate: Estimate, kind: Kind, others: Sequence[Beside], dynamic: Dynamic | None, marks: Sequence[Mark]
+    estimate: Estimate,
+    kind: Kind,
+    others: Sequence[Beside],
+    dynamic: Dynamic | None,
+    marks: Sequence[Mark],
+    axes_of_temperature: Collection[str],
 ) -> Part:
     from matplotlib.figure import Figure
 
@@ -183,7 +200,8 @@ def _drawn(
         figure = Figure(figsize=(WIDE_INCHES, height_inches(dynamic, kind)), layout="constrained")
         dynamic_panels(figure, dynamic, kind, marks)
         surface = _svg(figure, f"{kind}-dynamic")
-    tints = tuple(zip(axes_of(kind), COLOURS, strict=True))
+    names = (marked(axis, axes_of_temperature) for axis in axes_of(kind))
+    tints = tuple(zip(names, COLOURS, strict=True))
     return Part(KIND_NAMES[kind], tints, table(estimate, kind), _svg(curves, f"{kind}-allan"), surface)
 
 

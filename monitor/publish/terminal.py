@@ -11,7 +11,7 @@ import copy
 import threading
 import time
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -485,25 +485,38 @@ def _clock_time(unix_s: float) -> str:
         return f"{unix_s:g} s"
 
 
-def analysis_table(estimate: Estimate) -> RenderableType:
-    """Coefficients of every measured axis with their intervals, for ``analyze``."""
+def analysis_table(estimate: Estimate, axes_of_temperature: Collection[str] = ()) -> RenderableType:
+    """Coefficients of every measured axis with their intervals, for ``analyze``.
+
+    Axes of which temperature explains most of the slow variance are marked.
+    """
     axes = tuple(axis for _, axis in measured_axes(estimate))
     either = tuple(axis for i, axis in measured_axes(estimate) if estimate.k_or_r[i])
-    return Group(*_detail(heard.Noise(estimate.coefficients, axes, None), either))
+    return Group(*_detail(heard.Noise(estimate.coefficients, axes, None), either, axes_of_temperature))
 
 
-def _detail(noise: heard.Noise, either: Sequence[str] = ()) -> list[RenderableType]:
+def _detail(
+    noise: heard.Noise, either: Sequence[str] = (), axes_of_temperature: Collection[str] = ()
+) -> list[RenderableType]:
     """Axis by letter with intervals, a table a kind of sensor; ``either``: axes whose drift is K or R."""
     seen = "" if noise.seen_s is None else f"last {duration(noise.seen_s)}; "
     known = f"; {K_OR_R}: one of them" if either else ""
+    known += f"; {units.TEMPERATURE_MARK} {units.TEMPERATURE_MEANS}" if axes_of_temperature else ""
     parts: list[RenderableType] = [Text(f"{seen}[95 % interval]; ≤ bound; {NONE} too few data yet{known}", style="dim")]
     for kind in units.KINDS:
         if set(units.axes_of(kind)) & set(noise.axes):
-            parts.append(Fitting(detail_table(noise, kind, False, either), detail_table(noise, kind, True, either)))
+            wide, narrow = (detail_table(noise, kind, each, either, axes_of_temperature) for each in (False, True))
+            parts.append(Fitting(wide, narrow))
     return parts
 
 
-def detail_table(noise: heard.Noise, kind: Kind, stacked: bool, either: Sequence[str] = ()) -> Table:
+def detail_table(
+    noise: heard.Noise,
+    kind: Kind,
+    stacked: bool,
+    either: Sequence[str] = (),
+    axes_of_temperature: Collection[str] = (),
+) -> Table:
     """The five coefficients of the axes of one kind, intervals beside the values or below them."""
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
     table.add_column(units.KIND_NAMES[kind] if not stacked else kind, no_wrap=True)
@@ -513,7 +526,7 @@ def detail_table(noise: heard.Noise, kind: Kind, stacked: bool, either: Sequence
         if axis in noise.axes:
             between = "\n" if stacked else " "
             cells = [_interval(noise, letter, axis, between, axis in either) for letter in LETTERS]
-            table.add_row(Text(axis, style="bold"), *cells)
+            table.add_row(Text(units.marked(axis, axes_of_temperature), style="bold"), *cells)
     return table
 
 

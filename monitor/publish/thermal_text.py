@@ -1,5 +1,6 @@
 """Thermal models and what they expect, as tables of the terminal and as JSON."""
 
+import math
 from typing import Any, Final
 
 import msgspec
@@ -16,12 +17,14 @@ from monitor.drift.thermal import ThermalFit
 from monitor.publish.panels import duration
 from monitor.publish.units import DEVIATION_UNITS, kind_of, reading
 from monitor.warmth import SLOW, WithoutTemperature
+from monitor.words import amount
 
 FIT_SCHEMA: Final = "imu-monitor/thermal-fit/1"
 PREDICT_SCHEMA: Final = "imu-monitor/thermal-predict/1"
 ONE_WAY: Final = (
     "temperature only rose, or only fell: how late its effect is, and whether there is hysteresis, cannot be told"
 )
+DRIFT_WITH_TIME: Final = "temperature only rose or only fell, so a drift with time by itself can look the same"
 
 
 def tell(study: Study, console: Console) -> None:
@@ -33,12 +36,13 @@ def tell(study: Study, console: Console) -> None:
             rows.add_row(axis, *_fit_row(axis, one))
         console.print(Padding(rows, (1, 0)))
         console.print(
-            "loop: largest difference of rising and falling. leaves: rms of the means less the model. validated: the "
-            "same on parts of the record predicted from the others (over that of a cubic).",
+            "loop: largest difference between heating and cooling, where noise does not explain it. leaves: rms of the "
+            "means less the model. validated: the same on parts of the record predicted from the others (over that of "
+            "a cubic).",
             style="dim",
         )
     one_way = [axis for axis, one in study.fits.items() if not one.both_ways]
-    notes = (*study.notes, ONE_WAY) if one_way else study.notes
+    notes = (*study.notes, *notes_on_hysteresis(study), *([ONE_WAY] if one_way else []))
     _tell_rest(study.refused, notes, console)
 
 
@@ -55,18 +59,37 @@ def tell_outlook(outlook: Outlook, console: Console) -> None:
 
 
 def notes_without(found: WithoutTemperature) -> list[str]:
-    """A sentence for each axis whose drift was temperature for a part that matters."""
+    """Return a sentence for each axis of whose slow variation temperature explains most, or of K or R a clear part."""
     notes = []
-    for axis, model in found.models.items():
-        said = [
+    for axis, one in found.dependences.items():
+        fallen = [
             f"{letter} falls from {before.value} to {after.value} {after.unit} ({100.0 * share:.0f} % of its variance)"
             for letter in SLOW
             if found.matters(letter, axis) and (share := found.share(letter, axis)) is not None
             for before, after in [(reading(found.before, letter, axis), reading(found.coefficients, letter, axis))]
         ]
-        if said:
-            notes.append(f"{axis} follows its temperature ({model}): without that, {' and '.join(said)}")
+        without = f"without temperature ({found.models.get(axis, '')}), {' and '.join(fallen)}" if fallen else ""
+        if one.explains_most:
+            share_text = f"{math.floor(100.0 * one.share):d} %"
+            notes.append(
+                f"{axis} follows its temperature: a {one.form} explains {share_text} of the variance of means of "
+                f"{duration(one.interval_s)}, so Q N B K R describe temperature as well as noise"
+                f"{'; ' + without if without else ''}; imu-monitor thermal fit models it"
+                f"{'' if not one.one_way else f' ({DRIFT_WITH_TIME})'}"
+            )
+        elif without:
+            notes.append(f"{axis} follows its temperature in part: {without}")
     return notes
+
+
+def notes_on_hysteresis(study: Study) -> list[str]:
+    """Return a sentence for each axis on which heating and cooling differ by more than noise explains."""
+    return [
+        f"{axis}: at one temperature the bias differs between heating and cooling by up to "
+        f"{amount(axis, one.hysteresis)} (hysteresis or a lag, p = {one.hysteresis_p:.1g})"
+        for axis, one in study.fits.items()
+        if one.hysteresis and one.hysteresis_p is not None
+    ]
 
 
 def study_json(study: Study) -> bytes:
@@ -82,6 +105,7 @@ def study_json(study: Study) -> bytes:
             "equation": model.equation,
             "slope": model.slope,
             "hysteresis": one.hysteresis,
+            "hysteresis_p": one.hysteresis_p,
             "both_directions": one.both_ways,
             "explained": one.explained,
             "phi": model.phi,

@@ -1,6 +1,8 @@
 """Coefficients as people read them: one cell of a table, in the field's unit; and the units, of ``monitor.units``."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -34,16 +36,22 @@ __all__ = [
     "KIND_NAMES",
     "MICRO_G",
     "SAMPLE_UNITS",
+    "TEMPERATURE_MARK",
+    "TEMPERATURE_MEANS",
     "Kind",
     "Reading",
     "Unit",
     "axes_of",
     "kind_of",
+    "marked",
     "measured_axes",
     "number",
     "reading",
     "unit_of",
 ]
+
+TEMPERATURE_MARK: Final = "†"
+TEMPERATURE_MEANS: Final = "its slow part is temperature"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +75,15 @@ def reading(coefficients: Coefficients, letter: str, axis: str, digits: int = 3)
             return Reading(f"≤ {number(hi, digits)}", "", unit.name)
         case Status.UNESTIMATED:
             return Reading("—", "", unit.name)
+
+
+def marked(axis: str, axes_of_temperature: Collection[str]) -> str:
+    """Return the name of an axis, with TEMPERATURE_MARK if its slow part is temperature.
+
+    >>> marked("gy", ("gy", "gz")), marked("gx", ("gy", "gz"))
+    ('gy †', 'gx')
+    """
+    return f"{axis} {TEMPERATURE_MARK}" if axis in axes_of_temperature else axis
 
 
 def measured_axes(avar: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> tuple[str, ...]:

@@ -8,9 +8,13 @@ import pytest
 
 from drivers.errors import ConfigError, RecordingError
 from drivers.recording import save_samples
-from monitor import offline
+from monitor import export, offline, thermal
+from monitor.estimate.coefficients import LETTERS, Status
 from monitor.offline import Request, TooShort, make
 from monitor.publish import message
+from monitor.publish.thermal_text import notes_on_hysteresis
+from monitor.words import MILLI_G
+from tests.monitor.drift.cycles import cycle, loop, opening
 
 RATE_HZ = 100.0
 
@@ -64,9 +68,63 @@ def test_drift_that_was_temperature_is_told(tmp_path: Path) -> None:
     written = json.loads(message.analysis(results.analysis, warmth=results.warmth))
     gz = written["axes"]["gz"]["without_temperature"]
     assert set(gz) == {"model", "coefficients", "share"}
+    assert written["axes"]["gz"]["temperature"]["share"] > 0.9
+    assert "temperature" not in written["axes"]["gx"]
     assert gz["share"]["K"] > 0.9
     assert gz["coefficients"]["K"]["hi"] < written["axes"]["gz"]["coefficients"]["K"]["lo"]
     assert "without_temperature" not in written["axes"]["gx"]
+
+
+@pytest.mark.parametrize("shape", ["ramp", "sine", "steps", "heating"])
+def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k(tmp_path: Path, shape: str) -> None:
+    """gy is a cubic in temperature over 3 °/s, gz linear, gx and ax walk by themselves, az has a loop."""
+    rate_hz, seconds = 5.0, 9000.0
+    n = round(rate_hz * seconds)
+    rng = np.random.default_rng(6)
+    temperature_c = cycle(shape, n)
+    x = (temperature_c + 18.0) / 92.0
+    values = np.array([2e-4, 2e-4, 2e-4, 2e-3, 2e-3, 2e-3]) * rng.standard_normal((n, 6))
+    values[:, 0] += 3e-6 / rate_hz**0.5 * rng.standard_normal(n).cumsum()
+    values[:, 3] += 3e-5 / rate_hz**0.5 * rng.standard_normal(n).cumsum()
+    cubic = 4.0 * (x - 0.5) ** 3 + 0.5 * x + 0.4 * (x - 0.5) ** 2
+    values[:, 1] += np.radians(3.0) * cubic / np.ptp(cubic)
+    values[:, 2] += np.radians(0.5) * x
+    values[:, 5] += 9.8 + 0.05 * x
+    if shape != "heating":
+        values[:, 5] += 12.0 * MILLI_G * loop("loop", x) / opening(loop("loop", x), x)
+    path = tmp_path / "chamber.npz"
+    save_samples(path, np.arange(n) / rate_hz, values, temperature_c)
+    results = make(Request(path))
+    assert results.analysis.axes_of_temperature == ("gy", "gz", "az")
+    named = [one.split()[0] for one in results.analysis.notes if "follows its temperature" in one]
+    assert named == ["gy", "gz", "az"]
+    if shape == "ramp":  # the case in which nothing was said of gy
+        assert results.analysis.estimate.coefficients.status[LETTERS.index("K"), 1] != Status.ESTIMATED
+    written = message.analysis(results.analysis, warmth=results.warmth)
+    marks = {axis: one.get("temperature") for axis, one in json.loads(written)["axes"].items()}
+    assert [axis for axis, one in marks.items() if one] == ["gy", "gz", "az"]
+    assert set(marks["gy"]) == {"share", "p_value", "form", "one_way", "interval"}
+    assert marks["gy"]["share"] > 0.95
+    assert marks["gy"]["one_way"] == (shape == "heating")
+    warnings = export.from_analysis(written).warnings
+    assert [one.split()[0] for one in warnings] == ["gy", "gz", "az"]
+    study = thermal.fit(path)
+    if shape != "heating":
+        assert study.fits["az"].hysteresis == pytest.approx(12.0 * MILLI_G, rel=0.15)
+        assert [study.fits[axis].hysteresis for axis in ("gx", "gy", "gz", "ax", "ay")] == [0.0] * 5
+        (note,) = notes_on_hysteresis(study)
+        assert note.startswith("az: at one temperature the bias differs between heating and cooling by up to 1")
+        assert " mg (hysteresis or a lag, p = " in note
+    else:
+        assert notes_on_hysteresis(study) == []
+    if shape == "ramp":
+        pytest.importorskip("matplotlib")
+        pytest.importorskip("jinja2")
+        offline.draw(results, tmp_path / "x.html", "chamber")
+        page = (tmp_path / "x.html").read_text("utf-8")
+        assert "gy †" in page
+        assert "gx †" not in page
+        assert "† its slow part is temperature" in page
 
 
 def test_listed_tau_are_those_of_every_curve_as_far_as_they_are_possible(recording: Path) -> None:

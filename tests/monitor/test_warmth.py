@@ -42,8 +42,11 @@ def test_what_was_temperature_is_gone_and_the_rest_stays(warm):
     assert found.coefficients.value[k, 1] == pytest.approx(3e-6, rel=0.4)
     assert not found.matters("K", "gy")
     assert found.coefficients.value[1, 0] == pytest.approx(N, rel=0.03)  # N is as it was
+    assert "gy" not in found.dependences
+    assert found.axes_of_temperature == ("gx",)
     (note,) = notes_without(found)
-    assert note.startswith("gx follows its temperature (polynomial 1): without that, K falls from ")
+    assert note.startswith("gx follows its temperature: a cubic explains ")
+    assert "without temperature (polynomial 1), K falls from " in note
 
 
 def test_temperature_that_explains_nothing_takes_nothing(warm):

@@ -282,3 +282,21 @@ def test_a_wrong_request_is_said(form: str, inflation: float, options: dict[str,
 def test_what_is_no_analysis_is_refused(text: str | bytes) -> None:
     with pytest.raises(ConfigError):
         export.from_analysis(text)
+
+
+@pytest.mark.parametrize("form", ["kalibr", "gyroparams", "kalman"])
+def test_an_axis_whose_slow_part_is_temperature_is_warned_of(form: str) -> None:
+    one = {"value": 1e-4, "lo": 9e-5, "hi": 1.1e-4, "status": "estimated"}
+    axis = {"coefficients": dict.fromkeys("NBK", one)}
+    axes: dict[str, Any] = dict.fromkeys(("gx", "gy", "gz", "ax", "ay", "az"), axis)
+    old = json.dumps({"schema": "imu-monitor/analyze/1", "rate": 100.0, "axes": axes})
+    assert "WARNING" not in export.export(export.from_analysis(old), form)
+    axes["gy"] = {**axis, "temperature": {"share": 0.987, "p_value": 1e-9, "form": "cubic", "later": 1}}
+    new = json.dumps({"schema": "imu-monitor/analyze/1", "rate": 100.0, "axes": axes})
+    made = export.export(export.from_analysis(new), form)
+    mark = "%" if form == "gyroparams" else "#"
+    [line] = [line for line in made.splitlines() if "WARNING" in line]
+    assert line == (
+        f"{mark} WARNING: gy follows its temperature, which explains 98 % of its slow variance: "
+        "B and K of gy describe temperature as well as noise"
+    )

@@ -237,6 +237,17 @@ def test_k_or_r_is_marked_on_the_axes_that_have_it() -> None:
     assert "K or R" not in console.export_text()
 
 
+def test_axes_whose_slow_part_is_temperature_are_marked() -> None:
+    console = Console(width=160, file=io.StringIO(), record=True)
+    console.print(terminal.analysis_table(made.estimate(seconds=1000.0), ("gy",)))
+    text = console.export_text()
+    assert "; † its slow part is temperature\n" in text
+    assert row(text, "gy").startswith("gy †")
+    assert "†" not in row(text, "gz")
+    console.print(terminal.analysis_table(made.estimate(seconds=1000.0)))
+    assert "†" not in console.export_text()
+
+
 def test_a_gyroscope_alone_has_no_accelerometer_columns(board: Board) -> None:
     whole = made.estimate()
     whole.curve.avar[:, 3:] = float("nan")
