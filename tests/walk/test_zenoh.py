@@ -16,7 +16,7 @@ from monitor import topics
 from tests.support.ports import free_endpoint
 from tests.support.recordings import recordings
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import DROP_WAIT, PATIENT_US
+from tests.support.zenoh_sessions import patient_file
 from tests.support.zenoh_sessions import router as zenoh_router
 from tests.walk.rig import Cable, running
 
@@ -125,16 +125,13 @@ class Listener:
 
 
 def test_a_client_behind_a_router_receives_every_key(tmp_path: Path, router: str) -> None:
-    patient = tmp_path / "patient.json5"
-    *tables, key = DROP_WAIT.split("/")
-    patient.write_text("".join(f"{{{table}:" for table in tables) + f"{{{key}:{PATIENT_US}}}" + "}" * len(tables))
     config = f"""[[device]]
 name = "bench-1"
 rate = 100.0
 model = "consumer-mems"
 driver = {{ link = "virtual" }}
 [zenoh]
-config = "{patient}"
+config = "{patient_file(tmp_path)}"
 mode = "peer"
 listen = ["{free_endpoint()}"]
 connect = ["{router}"]
