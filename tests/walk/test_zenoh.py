@@ -49,9 +49,19 @@ mode = "none"
 """
     with running(tmp_path, config) as run:
         counts = run.station("run1").driver.counts
-        command = [sys.executable, "-m", "tests.walk.publisher", str(path), "lab/run1", router, "40000"]
-        subprocess.run(command, check=True, timeout=PATIENCE_S)
-        wait_for(lambda: counts.received == 1_000_000, "the last sample")
+        station = run.station("run1")
+        rows = min(20_000, station.ring.capacity // 2)
+        command = [sys.executable, "-m", "tests.walk.publisher", str(path), "lab/run1", router, str(rows)]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, text=True) as publisher:
+            assert publisher.stdin is not None
+            for allowed in range(rows, 1_000_000 + rows, rows):
+                publisher.stdin.write("\n")
+                publisher.stdin.flush()
+                # all but the part of a block that is still to come
+                wanted = min(allowed - allowed % 1000, 1_000_000)
+                wait_for(lambda wanted=wanted: station.published >= wanted, "the samples")  # type: ignore[misc]
+            publisher.stdin.close()
+            assert publisher.wait(PATIENCE_S) == 0
     assert (counts.received, counts.bad, counts.lost, run.station("run1").ring.overflowed) == (1_000_000, 0, 0, 0)
     curve = run.caught.estimates["run1"].curve
     shared = [(i, table[int(m)]) for i, m in enumerate(curve.factors) if int(m) in table]
