@@ -14,6 +14,8 @@ from tests.support.waiting import PATIENCE_S
 WORKERS_PER_CORE: Final = 2
 """Tests wait more than they compute, so two workers for each core keep the processor busy."""
 MAX_WORKERS: Final = 8
+LONG_FOLDERS: Final = {"blind", "fleet", "fuzz", "walk"}
+"""End-to-end, fault, network and fuzzing tests, and blind trials of the reconciliation."""
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -30,6 +32,14 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     if reporter is not None and not hasattr(session.config, "workerinput"):
         reporter.write_line("compiling kernels, or loading them from the cache")
     compile_kernels()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of ``LONG_FOLDERS`` as long, before the tests are selected by their markers."""
+    for item in items:
+        if LONG_FOLDERS & {folder.name for folder in item.path.relative_to(item.config.rootpath).parents}:
+            item.add_marker("long")
 
 
 def pytest_unconfigure() -> None:

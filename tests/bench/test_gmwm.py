@@ -7,6 +7,8 @@ from scipy.signal import lfilter
 from drivers.sample import Floats
 from tests.bench import gmwm
 
+pytestmark = pytest.mark.long
+
 N = 1 << 14
 SCALES = gmwm.dyadic(N)
 

@@ -90,6 +90,7 @@ def test_a_level_wrong_by_three_percent_would_be_seen(name):
     assert standard_errors(name, 1.03 * records(name)).max() > 5.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", STATED)
 def test_simulated_spectrum_is_the_stated_one(name):
     # the Hann window keeps a walk's steep spectrum out of the higher frequencies; the lowest bins feel

@@ -131,6 +131,7 @@ def test_what_it_is_there_for_is_seen(name):
     assert found.gain > before.gain + 10.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_runs_of_one_model_stay_under_their_null(name):
     gains = np.array([one[name].gain for one in findings(1000, RUNS)])

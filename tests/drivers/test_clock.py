@@ -79,6 +79,7 @@ def ticks_of(index, kind, rate):
 @pytest.mark.parametrize("nominal", [True, False])
 @pytest.mark.parametrize(("kind", "rate"), COUNTERS)
 class TestCounter:
+    @pytest.mark.long
     @pytest.mark.parametrize("holes", [[], [(5, 3)], [(300, 1), (400, 10), (402, 1)], [(900, 300)]])
     @pytest.mark.parametrize("arrive", [burst, jitter])
     def test_missing_samples_are_exact(self, kind, rate, nominal, holes, arrive):

@@ -11,7 +11,7 @@ from typing import Final, TypeVar
 
 T = TypeVar("T")
 
-PATIENCE_S: Final = 120.0 * float(os.environ.get("IMU_MONITOR_TEST_PATIENCE", "1"))
+PATIENCE_S: Final = 300.0 * float(os.environ.get("IMU_MONITOR_TEST_PATIENCE", "1"))
 """Deadline of every wait in a test, in seconds. It is far beyond the time that any condition takes."""
 FOREVER_S: Final = 86_400.0
 """Timeout for a call that must return early. A call that waits for it runs into the time limit of its test."""

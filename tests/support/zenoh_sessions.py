@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -28,6 +29,14 @@ def session_config(
     for key, value in keys.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def patient_file(folder: Path) -> Path:
+    """Write a zenoh file for a program under test, in which a full queue is waited for as in ``session_config``."""
+    *tables, key = DROP_WAIT.split("/")
+    path = folder / "patient.json5"
+    path.write_text("".join(f"{{{table}:" for table in tables) + f"{{{key}:{PATIENT_US}}}" + "}" * len(tables))
+    return path
 
 
 def session(

@@ -1,33 +1,36 @@
-"""A process that publishes a recording over zenoh: python -m tests.walk.publisher FILE.npz KEY ENDPOINT RATE."""
+"""A process that publishes a recording over zenoh: python -m tests.walk.publisher FILE.npz KEY ENDPOINT ROWS.
+
+It publishes ROWS rows for each line on its standard input, so that a reader on a loaded machine can keep up. It ends
+with its standard input.
+"""
 
 import sys
-import time
 from pathlib import Path
 
 import zenoh
 
 from drivers.recording import iter_blocks, load_samples
 from drivers.sample_message import pack
+from tests.support.waiting import wait_for
+from tests.support.zenoh_sessions import session
+
+BLOCK_ROWS = 1000
 
 
 def main() -> None:
-    path, key, endpoint, rows_per_second = Path(sys.argv[1]), sys.argv[2], sys.argv[3], float(sys.argv[4])
-    config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("connect/endpoints", f'["{endpoint}"]')
-    with zenoh.open(config) as session:
-        publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
-        while not publisher.matching_status.matching:
-            time.sleep(0.05)
-        begun, sent = time.monotonic(), 0
-        for samples in iter_blocks(load_samples(path), 1000):
+    path, key, endpoint, rows = Path(sys.argv[1]), sys.argv[2], sys.argv[3], int(sys.argv[4])
+    with session(connect=[endpoint]) as opened:
+        publisher = opened.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+        wait_for(lambda: publisher.matching_status.matching, "a subscriber")
+        sent = allowed = 0
+        for samples in iter_blocks(load_samples(path), BLOCK_ROWS):
+            while sent + len(samples) > allowed:
+                if not sys.stdin.readline():
+                    return
+                allowed += rows
             sent += len(samples)
             publisher.put(pack("run1", sent, samples))
-            early = begun + sent / rows_per_second - time.monotonic()
-            if early > 0.0:
-                time.sleep(early)
-        time.sleep(0.5)
+        sys.stdin.read()
 
 
 if __name__ == "__main__":

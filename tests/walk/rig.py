@@ -129,12 +129,11 @@ class Cable:
             view = view[os.write(self.master, view) :]
 
 
-def paced(send: Callable[[bytes], None], frames: list[bytes], per_second: float, burst: int = 40) -> float:
-    """Send frames in bursts at that rate; returns the seconds it took."""
+def paced(send: Callable[[bytes], None], frames: list[bytes], per_second: float, burst: int = 40) -> None:
+    """Send frames in bursts at that rate, or as fast as the machine can."""
     begun = time.monotonic()
     for start in range(0, len(frames), burst):
         early = begun + start / per_second - time.monotonic()
         if early > 0.0:
             time.sleep(early)
         send(b"".join(frames[start : start + burst]))
-    return time.monotonic() - begun

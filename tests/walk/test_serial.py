@@ -37,10 +37,9 @@ def test_every_sentence_of_a_real_sensor_is_accounted_for(tmp_path: Path) -> Non
     with running(tmp_path, CONFIG.format(port=cable.port)) as run:
         station = run.station("vn100")
         wait_for(lambda: station.driver.link._port is not None, "the port")
-        took = paced(cable.write, lines, 40.0 * SPEED)
+        paced(cable.write, lines, 40.0 * SPEED)
         counts = station.driver.counts
         wait_for(lambda: counts.received + counts.bad + counts.lost >= len(lines), "the last sentence")
-    assert took < len(lines) / 40.0 / 50.0
     assert (counts.received, counts.bad, counts.lost) == (len(lines), 0, 0)
     np.testing.assert_array_equal(run.caught.values("vn100"), parsed)
     curve = run.caught.estimates["vn100"].curve

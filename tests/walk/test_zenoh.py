@@ -16,7 +16,7 @@ from monitor import topics
 from tests.support.ports import free_endpoint
 from tests.support.recordings import recordings
 from tests.support.waiting import PATIENCE_S, wait_for
-from tests.support.zenoh_sessions import DROP_WAIT, PATIENT_US
+from tests.support.zenoh_sessions import patient_file
 from tests.support.zenoh_sessions import router as zenoh_router
 from tests.walk.rig import Cable, running
 
@@ -49,9 +49,19 @@ mode = "none"
 """
     with running(tmp_path, config) as run:
         counts = run.station("run1").driver.counts
-        command = [sys.executable, "-m", "tests.walk.publisher", str(path), "lab/run1", router, "40000"]
-        subprocess.run(command, check=True, timeout=PATIENCE_S)
-        wait_for(lambda: counts.received == 1_000_000, "the last sample")
+        station = run.station("run1")
+        rows = min(20_000, station.ring.capacity // 2)
+        command = [sys.executable, "-m", "tests.walk.publisher", str(path), "lab/run1", router, str(rows)]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, text=True) as publisher:
+            assert publisher.stdin is not None
+            for allowed in range(rows, 1_000_000 + rows, rows):
+                publisher.stdin.write("\n")
+                publisher.stdin.flush()
+                # all but the part of a block that is still to come
+                wanted = min(allowed - allowed % 1000, 1_000_000)
+                wait_for(lambda wanted=wanted: station.published >= wanted, "the samples")  # type: ignore[misc]
+            publisher.stdin.close()
+            assert publisher.wait(PATIENCE_S) == 0
     assert (counts.received, counts.bad, counts.lost, run.station("run1").ring.overflowed) == (1_000_000, 0, 0, 0)
     curve = run.caught.estimates["run1"].curve
     shared = [(i, table[int(m)]) for i, m in enumerate(curve.factors) if int(m) in table]
@@ -125,16 +135,13 @@ class Listener:
 
 
 def test_a_client_behind_a_router_receives_every_key(tmp_path: Path, router: str) -> None:
-    patient = tmp_path / "patient.json5"
-    *tables, key = DROP_WAIT.split("/")
-    patient.write_text("".join(f"{{{table}:" for table in tables) + f"{{{key}:{PATIENT_US}}}" + "}" * len(tables))
     config = f"""[[device]]
 name = "bench-1"
 rate = 100.0
 model = "consumer-mems"
 driver = {{ link = "virtual" }}
 [zenoh]
-config = "{patient}"
+config = "{patient_file(tmp_path)}"
 mode = "peer"
 listen = ["{free_endpoint()}"]
 connect = ["{router}"]

@@ -70,6 +70,7 @@ def test_white_noise_that_is_known_is_told_from_the_drift():
     assert found.spread == pytest.approx(1.0, rel=0.4)
 
 
+@pytest.mark.long
 def test_intervals_hold_the_truth():
     """60 drifts, 3 coefficients: fewer than 51 inside would come by chance once in 2000 at 95 %."""
     inside = np.zeros(3)

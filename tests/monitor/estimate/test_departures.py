@@ -152,6 +152,7 @@ def low_passed(rng, n):
     return lfilter(*butter(2, 0.3), rng.standard_normal((n + 100, 6)), axis=0)[100:]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "noise",
     [

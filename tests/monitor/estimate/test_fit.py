@@ -126,6 +126,7 @@ def test_errors_are_near_the_cramer_rao_limit():
     assert (error < 1.35 * limit).all(), error / limit
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("absent", ["Q", "B", "K"])
 def test_a_term_that_is_not_there_seldom_enters(absent):
     looked, _ = fits(tuple(source for source in MIX if not hasattr(source, absent)))

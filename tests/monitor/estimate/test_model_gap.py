@@ -47,6 +47,7 @@ def simulated(model: NoiseModel, n: int, seed: int) -> Estimate:
     return estimate(model.simulate(n, RATE, seed))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "effects",
     [

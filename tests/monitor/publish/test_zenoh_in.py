@@ -12,6 +12,7 @@ import textwrap
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import zenoh
@@ -26,7 +27,7 @@ from monitor.settings import ZenohTable
 from tests.monitor.publish import made
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, stays_true, wait_for
-from tests.support.zenoh_sessions import router, session
+from tests.support.zenoh_sessions import patient_file, router, session
 
 
 @pytest.fixture
@@ -149,12 +150,12 @@ def test_a_daemon_that_is_a_peer_is_heard_through_a_router(endpoint: str) -> Non
         wait_for(both)
 
 
-def test_two_ways_to_the_same_daemon_bring_each_message_once() -> None:
-    first, second = free_endpoint(), free_endpoint()
+def test_two_ways_to_the_same_daemon_bring_each_message_once(tmp_path: Path) -> None:
+    first, second, patient = free_endpoint(), free_endpoint(), patient_file(tmp_path)
     with (
         session(mode="router", listen=[first]),
         session(mode="router", listen=[second], connect=[first]),
-        contextlib.closing(ZenohOut(ZenohTable(mode="client", connect=(first,)), ["a"])) as out,
+        contextlib.closing(ZenohOut(ZenohTable(config=patient, mode="client", connect=(first,)), ["a"])) as out,
         listening("imu/**", first, second) as (arriving, got),
     ):
         out.start()

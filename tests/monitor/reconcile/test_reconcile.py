@@ -41,6 +41,8 @@ from tests.monitor.reconcile.axes import (
     white,
 )
 
+pytestmark = pytest.mark.long
+
 n = 60_000
 
 

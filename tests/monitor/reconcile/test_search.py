@@ -30,6 +30,8 @@ from tests.monitor.reconcile.axes import (
     white,
 )
 
+pytestmark = pytest.mark.long
+
 n = 40_000
 MODEL = (WHITE, WALK)
 SIGMA = N * RATE_HZ**0.5
