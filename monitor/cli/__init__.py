@@ -6,10 +6,11 @@ finished, but the data do not support an answer. Heavy libraries are imported by
 
 import contextlib
 import os
+import re
 import signal
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, MutableMapping, Sequence
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
@@ -408,6 +409,7 @@ def main() -> None:
     ``--debug``, before or behind the name of the command, prints the traceback of an error before its line.
     """
     arguments, debug = split_debug(sys.argv[1:])
+    _ignore_impossible_width(os.environ)
     try:
         # without its own error pages, typer hands an Exit's status back
         status = app(args=arguments, prog_name="imu-monitor", standalone_mode=False)
@@ -424,6 +426,13 @@ def main() -> None:
     if status == INTERRUPTED:  # Ctrl-C, of which typer makes an Exit
         _fail("interrupted", INTERRUPTED)
     sys.exit(status)
+
+
+def _ignore_impossible_width(environment: MutableMapping[str, str]) -> None:
+    """Drop sizes of a terminal in which nothing can be printed: a table of no columns would be empty."""
+    for name in ("COLUMNS", "LINES"):
+        if not re.fullmatch(r"0*[1-9][0-9]{0,4}", environment.get(name, "")):
+            environment.pop(name, None)
 
 
 def split_debug(arguments: Sequence[str]) -> tuple[list[str], bool]:

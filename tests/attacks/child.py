@@ -18,7 +18,7 @@ from types import FrameType
 from typing import Any, Final
 
 MEMORY_BYTES: Final = 4 * 1024**3
-CASE_S: Final = 120.0
+CASE_S: Final = 300.0
 """Bound on the time of one command, generous for a loaded machine."""
 
 

@@ -42,9 +42,6 @@ ALL: Final = (
 FEW: Final = ("0", "-1", "1e-300", "1e300", "nan", "", "9" * 5000)
 DURATIONS: Final = ("1e300d", "0s", "-1h", "1e-300ms", "h", "9" * 400 + "d", "1 fortnight")
 NUMERIC_METAVARS: Final = ("S", "HZ", "N", "F", "T", "P,Q", "octave|decade10|S,S,…")
-WAYS: Final = pytest.mark.parametrize(
-    "values", [FEW, pytest.param(ALL + DURATIONS, marks=pytest.mark.attack)], ids=["few", "all"]
-)
 ALLOWED: Final = (0, 2, 3)
 
 
@@ -122,12 +119,27 @@ def test_every_kind_of_numeric_option_is_found() -> None:
         assert expected in found
 
 
-@WAYS
-def test_options(values: Sequence[str], arguments: dict[tuple[str, ...], list[str]], tmp_path: Path) -> None:
-    cases = [
-        [*command, *arguments[command], option, value] for command, option in numeric_options() for value in values
-    ]
-    for one in run_in_child(cases, tmp_path):
+def test_options(arguments: dict[tuple[str, ...], list[str]], tmp_path: Path) -> None:
+    try_options(tuple(arguments), FEW, arguments, tmp_path)
+
+
+@pytest.mark.attack
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("command", sorted({path for path, _ in numeric_options()}), ids=" ".join)
+def test_all_options(command: tuple[str, ...], arguments: dict[tuple[str, ...], list[str]], tmp_path: Path) -> None:
+    try_options((command,), ALL + DURATIONS, arguments, tmp_path)
+
+
+def try_options(
+    chosen: Sequence[tuple[str, ...]],
+    values: Sequence[str],
+    arguments: dict[tuple[str, ...], list[str]],
+    folder: Path,
+) -> None:
+    options = [(command, option) for command, option in numeric_options() if command in chosen]
+    assert options
+    cases = [[*command, *arguments[command], option, value] for command, option in options for value in values]
+    for one in run_in_child(cases, folder):
         check_one(one)
 
 
