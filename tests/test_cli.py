@@ -328,7 +328,7 @@ WRONG_ARGUMENTS = {
     "no format": (("export", "x.toml"), "Missing option '--format'"),
     "unknown format": (("export", MODEL, "--format", "gtsam"), 'unknown format "gtsam"; possible are kalibr,'),
     "no source": (("export", "x.toml", "--format", "kalibr"), "x.toml: cannot be read: No such file or directory"),
-    "folder for a source": (("export", ".", "--format", "kalibr"), ".: cannot be read: Is a directory"),
+    "folder for a source": (("export", ".", "--format", "kalibr"), ".: cannot be read: is a directory"),
     "deflation": (
         ("export", MODEL, "--format", "kalibr", "--inflation", "0.5"),
         "--inflation: 0.5 is outside the supported range",

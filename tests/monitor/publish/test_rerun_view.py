@@ -262,7 +262,7 @@ def test_the_page_takes_the_next_free_port_and_leaves_nothing_behind(monkeypatch
         busy = int(holder.getsockname()[1])
         view = RerunView(ViewerSettings("web", port=busy, web_port=free_port()), DEVICE)
         view.start()
-        wait_for(lambda: view.state == "ok")
+        wait_for(lambda: f"ok, but port {busy} is busy: " in view.state, lambda: view.state)
         assert f"{busy}%2Fproxy" not in view.url
         assert view.url.startswith("http://127.0.0.1:")
         port = int(view.url.rsplit("%3A", 1)[1].split("%2F")[0])
