@@ -198,9 +198,12 @@ def _steady(watcher: Watcher, running: list[Process], routing: list[Process], se
     lo = _loopback_bytes()
     watcher.until(lambda: time.monotonic() - begun_s > seconds, "the measurement")
     took_s = time.monotonic() - begun_s
-    lo, seen = _loopback_bytes() - lo, dict(watcher.states())
+    lo = _loopback_bytes() - lo
     cpu = [(after.cpu_s() - b) / took_s for after, b in zip((*running, *routing), before, strict=True)]
     memory = sorted(p.memory_bytes() for p in running)
+    # on a busy machine a daemon may have been silent for a moment
+    watcher.until(lambda: watcher.states()["running"] == n, "all to run after the measurement")
+    seen = dict(watcher.states())
     return {
         "seen": seen,
         "payload bytes/s of a device": {topic: round(size / took_s / n, 1) for topic, size in watcher.bytes.items()},

@@ -119,6 +119,10 @@ class Rig:
 
     def work(self, now_s, drain=False):
         self.station.work([self.caught], now_s, drain)
+        # samples come far faster than a sensor's, and a model of drift is found while a second of them would come
+        for thread in threading.enumerate():
+            if thread.name == self.station.chain.identifier._name:
+                thread.join(PATIENCE_S)
 
 
 def test_drained_everything_is_out_and_the_estimate_covers_it():

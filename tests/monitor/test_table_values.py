@@ -66,7 +66,7 @@ def test_every_wrong_element_is_told_and_the_others_are_kept() -> None:
     assert problems == [
         (".gy", "expected text in quotes, or a table, got 3"),
         (".gz.unti", 'unknown key; did you mean "unit"?'),
-        (".gz.factor", 'expected a number, got "two"'),
+        (".gz.factor", 'expected a number from ±1e-15 to ±1e+15, got "two"'),
         (".ax.signal", "missing"),
     ]
     assert convert(["gx", 3, "gy"], tuple[str, ...], path_hook) == (
