@@ -269,7 +269,7 @@ WRONG_ARGUMENTS = {
     "missing file": (("run", "nowhere.toml"), "nowhere.toml: no such file"),
     "folder for a file": (("run", "."), ".: cannot be read"),
     "bad viewer": (("demo", "--viewer", "nativ"), '--viewer: "nativ"; possible are auto, native, web, none'),
-    "bad seconds": (("demo", "--seconds", "soon"), "--seconds: 0 s is outside the supported range"),
+    "bad seconds": (("demo", "--seconds", "soon"), "Invalid value for '--seconds'"),
     "no seconds": (("demo", "--seconds", "0"), "--seconds: 0 s is outside the supported range"),
     "bad endpoint": (("watch", "--connect", "7450"), 'connect "7450": no endpoint; write e.g. tcp/127.0.0.1:7450'),
     "bad key": (("watch", "##", "--connect", "tcp/127.0.0.1:9"), 'key expression "##"'),
