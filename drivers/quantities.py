@@ -85,6 +85,8 @@ class Quantity:
 
 RATE_HZ: Final = Quantity("Hz", 1e-3, 1e6)
 """Sample rate: from a sample in a quarter of an hour to far above the fastest vibration sensors (some 30 kHz)."""
+EFFECT_FREQUENCY_HZ: Final = Quantity("Hz", 1e-12, 1e6, zero=True)
+"""Frequency of a line or of random events in a noise model; 0: none."""
 UPDATE_RATE_HZ: Final = Quantity("Hz", 1e-6, 1e6)
 """Rate of results."""
 DURATION_S: Final = Quantity("s", 1e-6, 36_525.0 * DAY_S)
@@ -131,6 +133,8 @@ ALARMS_PER_DAY: Final = Quantity("a day", 1e-6, 1e4, zero=True)
 REPLAY_SPEED: Final = Quantity("times", 1e-3, 1e6)
 """Speed over real time."""
 SIMULATION_SPEED: Final = Quantity("times", 1e-3, 1e4)
+RATE_RATIO: Final = Quantity("", 1e-3, 1e3)
+"""True sample rate over the stated one."""
 CLOCK_RATIO: Final = Quantity("", 0.5, 2.0)
 INFLATION: Final = Quantity("", 1.0, 1e6)
 SCALE: Final = Quantity("", 1e-15, 1e15, signed=True)

@@ -17,16 +17,20 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from math import ceil, inf, isfinite
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.plugin import nearest
-from drivers.quantities import PARAMETER
+from drivers.quantities import DELAY_S, EFFECT_FREQUENCY_HZ, PARAMETER
 from drivers.sample import AXES, Floats
 from monitor.noise.spectrum import Spectrum
 
+QUANTITIES: Final = {"s": DELAY_S, "Hz": EFFECT_FREQUENCY_HZ, "1/s": EFFECT_FREQUENCY_HZ}
+"""Unit of a parameter -> its quantity; PARAMETER for all others."""
+MOST_EVENTS: Final = 1000.0
+"""Random events in a sample at the most, on average; each takes time and memory."""
 GYROS, ACCELEROMETERS = AXES[:3], AXES[3:]
 
 
@@ -199,6 +203,15 @@ def below_nyquist(effect: Effect, parameter: str, rate_hz: float) -> None:
         )
 
 
+def check_event_rate(effect: Effect, events_hz: float, rate_hz: float) -> None:
+    """ConfigError when random events come more often than can be simulated."""
+    if events_hz > MOST_EVENTS * rate_hz:
+        raise ConfigError(
+            f"{effect.name}: {events_hz:g} events a second at {rate_hz:g} Hz; at most {MOST_EVENTS:g} in a sample are "
+            "possible"
+        )
+
+
 def first_sample(time_s: float, rate_hz: float) -> int:
     """Index of the first sample at or after a time; a millionth of a sample is rounding."""
     return ceil(time_s * rate_hz - 1e-6)
@@ -217,8 +230,9 @@ def _check(effect: str, name: str, value: Any, allows: Mapping[str, Any]) -> Non
         raise ConfigError(f"{effect}: {name} must not be negative, is {value!r}")
     if value == 0.0 and allows["positive"]:
         raise ConfigError(f"{effect}: {name} must be above zero, is {value!r}")
-    if not PARAMETER.supports(value):
-        raise ConfigError(f"{effect}: {name} must be {PARAMETER.range_text()} in SI units, is {value!r}")
+    quantity = QUANTITIES.get(allows["units"][0], PARAMETER)
+    if not quantity.supports(value):
+        raise ConfigError(f"{effect}: {name} must be {quantity.range_text()}, is {value!r}")
     if value > allows["most"]:
         raise ConfigError(f"{effect}: {name} must be at most {allows['most']:g}, is {value!r}")
     if allows["whole"] and value != int(value):

@@ -200,6 +200,8 @@ def test_a_file_that_cannot_be_written(tmp_path: Path) -> None:
 @needs_rerun
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
 def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from monitor.publish import rerun_sinks
+
     monkeypatch.setattr(rerun_sinks, "check_regular", lambda path: None)  # a device stands for the full disk here
     (tmp_path / "live.rrd").symlink_to("/dev/full")
     with healthy(tmp_path, f'[viewer]\nmode = "{tmp_path}/live.rrd"\n' + NO_ZENOH) as run:

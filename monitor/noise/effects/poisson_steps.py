@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Block, Series, Source, parameter
+from monitor.noise.effect import Block, Series, Source, check_event_rate, parameter
 from monitor.noise.effects.rate_random_walk import RateRandomWalk
 from monitor.noise.events import Events
 
@@ -40,6 +40,10 @@ class PoissonSteps(Source):
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
         """That of rate random walk, K² = λh²."""
         return self._walk.psd(f_hz, tau0_s)
+
+    def check_rate(self, rate_hz: float) -> None:
+        """Steps must not be more than can be simulated."""
+        check_event_rate(self, self.rate, rate_hz)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Jumps":
         """Starts at zero."""

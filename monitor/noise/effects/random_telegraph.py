@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.noise import correlated
-from monitor.noise.effect import Block, Series, Source, parameter
+from monitor.noise.effect import Block, Series, Source, check_event_rate, parameter
 from monitor.noise.events import Events
 
 
@@ -37,6 +37,10 @@ class RandomTelegraph(Source):
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
         """That of exponentially correlated noise, σ = a/2, T_c = T/2."""
         return correlated.psd(0.5 * self.amplitude, 2.0 / self.dwell_time, f_hz, tau0_s)
+
+    def check_rate(self, rate_hz: float) -> None:
+        """Flips must not be more than can be simulated."""
+        check_event_rate(self, 1.0 / self.dwell_time, rate_hz)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_TwoLevels":
         """A stationary series: either level first, and the rest of a dwell, which is as long as a whole one."""

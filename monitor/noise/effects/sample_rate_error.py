@@ -5,6 +5,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from drivers.errors import ConfigError
+from drivers.quantities import RATE_RATIO
 from drivers.sample import Floats
 from monitor.noise.effect import Running, Transform, parameter
 from monitor.noise.spectrum import Spectrum
@@ -27,6 +29,11 @@ class SampleRateError(Transform):
 
     name: ClassVar[str] = "sample_rate_error"
     means: ClassVar[str] = "The clock is off: what happens at one frequency is seen at another."
+
+    def check_rate(self, rate_hz: float) -> None:
+        """The true rate must not be far from every rate that is supported."""
+        if not RATE_RATIO.supports(self.ratio):
+            raise ConfigError(f"{self.name}: ratio must be {RATE_RATIO.range_text()}, is {self.ratio!r}")
 
     def reshape(self, spectrum: Spectrum) -> Spectrum:
         """As it is: samples do not change, and ``restated`` relabels them once all transforms have acted."""
