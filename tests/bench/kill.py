@@ -75,7 +75,9 @@ class Sensor:
         rng = np.random.default_rng(0)
         begun = time.monotonic()
         while not self._closing.wait(0.01):
+            asked = time.monotonic()
             with self.still:
+                begun += time.monotonic() - asked  # the sensor's clock stands still too
                 due = int((time.monotonic() - begun) * RATE)
                 values = 1e-3 * rng.standard_normal((due - self.sent, 6))
                 lines = [
@@ -126,9 +128,11 @@ class Bench:
 
         def killed() -> bool:
             nonlocal opened
+            if opened is None and self.has_port(process.pid):
+                opened = self.sensor.sent
+            if not true(process.pid):
+                return False
             with self.sensor.still:
-                if opened is None and self.has_port(process.pid):
-                    opened = self.sensor.sent
                 if not true(process.pid):
                     return False
                 process.kill()
