@@ -318,6 +318,7 @@ def _problems(settings: Settings) -> Iterator[str]:
     for name in settings.scale:
         if name not in COLUMNS:
             yield f"scale.{name}: unknown column{possible(name, COLUMNS)}"
+    yield from range_problems(settings)
     for key, look_up, axis in (
         ("gyro_unit", units.rate_factor, "gx"),
         ("accel_unit", units.acceleration_factor, "ax"),
@@ -330,4 +331,3 @@ def _problems(settings: Settings) -> Iterator[str]:
             yield f"{key}: {error}; for raw counts {counts}"
     if not settings.delimiter or not settings.delimiter.isascii() or set(settings.delimiter) & set("\r\n"):
         yield f"delimiter: {settings.delimiter!r}; it is auto, or ASCII text within a line"
-    yield from range_problems(settings)

@@ -198,7 +198,7 @@ sigma = 1e-3
     with pytest.raises(ConfigError) as caught:
         NoiseModel.from_toml(text)
     begins = [
-        "sample_rate must be a positive number",
+        "sample_rate: -1 Hz is outside the supported range",
         "temperature: ",
         'unknown axis "gq"',
         'gx.angle_random_walk: unknown parameter "M"',
