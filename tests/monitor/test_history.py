@@ -89,7 +89,8 @@ def kept(folder: Path, step_s: int | None = 60) -> Past:
 
 def test_what_was_published_is_kept_and_a_second_run_adds_to_it(tmp_path: Path, recording: Path) -> None:
     told = Told()
-    service = Service(config(tmp_path, recording), [told])
+    # slow enough that each minute of the recording lasts seconds, in which a loaded machine publishes something
+    service = Service(config(tmp_path, recording, speed=20.0), [told])
     service.run(PATIENCE_S)
     assert service.states()["history"] == "ok"
     found = kept(tmp_path)
@@ -118,7 +119,7 @@ def test_what_was_published_is_kept_and_a_second_run_adds_to_it(tmp_path: Path, 
 def asked(tmp_path: Path, recording: Path) -> Iterator[tuple[Service, Any]]:
     """A service that runs on for a while, and a session beside it."""
     endpoint = free_endpoint()
-    Service(config(tmp_path, recording)).run(PATIENCE_S)
+    Service(config(tmp_path, recording, speed=20.0)).run(PATIENCE_S)
     service = Service(config(tmp_path, recording, f'listen = ["{endpoint}"]', 1.0))
     thread = threading.Thread(target=service.run, args=(FOREVER_S,))
     thread.start()

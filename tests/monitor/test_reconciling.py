@@ -89,6 +89,7 @@ def test_the_model_has_the_line_and_not_the_step(compared: tuple[Path, str]) -> 
     assert model.effects["gz"][:2] == KNOWN.effects["gz"]
 
 
+@pytest.mark.long
 def test_every_recording_has_its_own_report(compared: tuple[Path, str]) -> None:
     folder = compared[0]
     assert sorted(path.name for path in folder.iterdir()) == sorted([*FILES, "run1", "run2", "run3"])

@@ -131,6 +131,12 @@ def running(path: Path, *outputs: Output) -> Iterator[Service]:
         assert not thread.is_alive()
 
 
+def tokens(listener: Any) -> set[str]:
+    """Keys of all devices that are alive."""
+    replies = listener.liveliness().get("imu/*/alive", timeout=PATIENCE_S)
+    return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+
+
 def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow", reason="pyarrow is not installed")
     endpoint, path, gone = free_endpoint(), tmp_path / "c.toml", Gone()
@@ -154,12 +160,8 @@ def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None
             heard.clear()
             wait_for(lambda: {"stays", "comes", "changes"} <= heard.keys())
             assert "goes" not in heard
-            tokens = {
-                str(reply.ok.key_expr)
-                for reply in listener.liveliness().get("imu/*/alive", timeout=PATIENCE_S)
-                if reply.ok is not None
-            }
-            assert tokens == {f"imu/{name}/alive" for name in ("stays", "comes", "changes")}
+            alive = {f"imu/{name}/alive" for name in ("stays", "comes", "changes")}
+            wait_for(lambda: tokens(listener) == alive, lambda: f"{alive}, there are {tokens(listener)}")
             assert not [one for one in listener.get("imu/goes/command/reset", timeout=PATIENCE_S) if one.ok is not None]
         new = {station.name: station for station in service.stations}
         assert new["stays"] is stations["stays"]

@@ -50,6 +50,7 @@ def test_an_analogue_filter_is_that_of_a_much_faster_digital_one(cutoff_hz):
     assert measured / stated == pytest.approx(np.full(4, (measured / stated).mean()), rel=0.04)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
 @pytest.mark.parametrize("cutoff_hz", [3.0, 10.0, 33.0])
 def test_n_survives_any_bandwidth(order, cutoff_hz):

@@ -42,6 +42,7 @@ def fit(y, regressors=NONE, start=(1.0, 1.0), constant=0.0):
     return maximise(np.ones(n - 1), found, BASES, np.full(n - 1, constant), np.array(start))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_value_and_maximum_are_those_of_a_dense_gaussian(seed):
     y = drawn(seed)
@@ -54,6 +55,7 @@ def test_value_and_maximum_are_those_of_a_dense_gaussian(seed):
     assert found.variance == pytest.approx(found.theta @ BASES)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(2))
 def test_regressors_are_fitted_together_with_variances(seed):
     y = drawn(seed, beta=BETA)
