@@ -166,7 +166,8 @@ def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None
         new = {station.name: station for station in service.stations}
         assert new["stays"] is stations["stays"]
         assert (new["stays"].ring, new["stays"].chain.estimator) == (ring, estimator)
-        assert new["stays"].driver.counts.lost == 0
+        # a simulated sensor on a busy machine drops what it has no time to send; nothing else may be missing
+        assert new["stays"].driver.counts.lost <= service.virtual["stays"].truth.dropped
         assert new["changes"] is not stations["changes"]
         # what was recorded of it is in its window again
         wait_for(lambda: ("changes", "window_rebuilt") in gone.events)
