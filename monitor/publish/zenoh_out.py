@@ -239,7 +239,7 @@ class ZenohOut:
     def _configuration(self, listen: tuple[str, ...] | None) -> "zenoh.Config":
         """Our keys, over the file's where there is one, over those of a closed session."""
         own = self.settings
-        keys = {
+        keys: dict[str, object] = {
             "mode": own.mode,
             "listen/endpoints": [] if own.mode == "client" else listen,  # a client listens nowhere
             "connect/endpoints": own.connect or None,

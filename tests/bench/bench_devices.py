@@ -73,7 +73,7 @@ def run(devices: int, read_timeout_s: float, seconds: float, folder: Path) -> Ou
     heard = Heard()
     try:
         with subscriber(daemon.port) as session, session.declare_subscriber("imu/**", heard.take):
-            wait_for(lambda: len(heard.status) == devices, PATIENCE_S, "the first status")
+            wait_for(lambda: len(heard.status) == devices, "the first status", PATIENCE_S)
             sensors.go()
             time.sleep(WARM_UP_S)
             load, begun_s, cpu_s, before = Load(), time.monotonic(), daemon.cpu_s(), heard.messages

@@ -70,7 +70,7 @@ class Sensors:
 
     def wait(self, timeout_s: float) -> dict[str, Any]:
         """Counts of the whole run, once all is written; the pseudo-terminals stay open."""
-        wait_for((self.folder / "sent.json").exists, timeout_s, "the last frame")
+        wait_for((self.folder / "sent.json").exists, "the last frame", timeout_s)
         sent: dict[str, Any] = json.loads((self.folder / "sent.json").read_text())
         return sent
 
@@ -96,7 +96,7 @@ class Daemon:
         path.write_text("".join(DEVICE.format(i=i, **same) for i in range(devices)) + REST.format(port=self.port))
         self._process = subprocess.Popen([sys.executable, "-c", DAEMON, "run", str(path)])
         self.process = psutil.Process(self._process.pid)
-        wait_for(lambda: self._open_ports() >= devices, PATIENCE_S, "the daemon to open its ports")
+        wait_for(lambda: self._open_ports() >= devices, "the daemon to open its ports", PATIENCE_S)
 
     def cpu_s(self) -> float:
         """Processor seconds so far."""
