@@ -211,6 +211,18 @@ def test_a_busy_port_is_left_and_said(endpoint: str) -> None:
             wait_for(comes)
 
 
+@pytest.mark.parametrize("listen", [None, ("tcp/127.0.0.1:1",)])
+def test_a_client_listens_nowhere(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch, listen: tuple[str, ...] | None
+) -> None:
+    """It opens although the default port is busy and the given one is not to be had."""
+    with socket.create_server(("127.0.0.1", 0)) as busy, router(endpoint):
+        monkeypatch.setattr(topics, "ENDPOINT", f"tcp/127.0.0.1:{busy.getsockname()[1]}")
+        with started(mode="client", listen=listen, connect=(endpoint,)) as out:
+            wait_for(lambda: out.state != "not open yet")
+            assert out.state == "ok"
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="reads the kernel's table of sockets")
 def test_it_listens_on_loopback_only(endpoint: str) -> None:
     port = f":{int(endpoint.rsplit(':', 1)[1]):04X}"
