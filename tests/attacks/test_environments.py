@@ -76,7 +76,14 @@ def one_line(done: "subprocess.CompletedProcess[str]", status: int) -> str:
 
 # --- foreign packages
 
-FORMS: Final = ("packages", "modules", "namespaces", "sitecustomize")
+ON_DEMAND: Final = pytest.mark.attack
+"""A process takes about a second: few are started by default."""
+FORMS: Final = (
+    "packages",
+    "sitecustomize",
+    pytest.param("modules", marks=ON_DEMAND),
+    pytest.param("namespaces", marks=ON_DEMAND),
+)
 
 
 def foreign(folder: Path, form: str) -> Path:
@@ -105,7 +112,9 @@ def test_foreign_packages_come_first_on_the_module_path(form: str, run: Run, tmp
     assert "1 device, nothing wrong" in done.stdout
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(
+    "form", ["modules", *(pytest.param(one, marks=ON_DEMAND) for one in ("packages", "namespaces"))]
+)
 def test_foreign_packages_in_the_current_folder(form: str, tmp_path: Path) -> None:
     """``-m`` puts the current folder first."""
     path = foreign(tmp_path / "ros", form)
@@ -185,12 +194,12 @@ ENVIRONMENTS: Final[dict[str, dict[str, str | None]]] = {
     "absurd threads": {"OMP_NUM_THREADS": "-1", "OPENBLAS_NUM_THREADS": "many"},
     "no PATH": {"PATH": ""},
 }
-COMPILED_ANEW: Final = ("Numba's cache cannot be written", "no assertions")
+BY_DEFAULT: Final = ("no HOME", "C locale without UTF-8", "warnings are errors", "no columns")
 
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=pytest.mark.attack if name in COMPILED_ANEW else ()) for name in ENVIRONMENTS],
+    [pytest.param(name, marks=() if name in BY_DEFAULT else ON_DEMAND) for name in ENVIRONMENTS],
 )
 def test_variables(name: str, run: Run, recording: Path) -> None:
     """The table of ``analyze`` has letters that ASCII lacks, and nothing goes to standard error."""
@@ -209,6 +218,7 @@ def test_variables_of_other_commands(name: str, arguments: tuple[str, ...], run:
     assert done.stderr.count("\n") == (1 if done.returncode == 2 else 0), done.stderr
 
 
+@ON_DEMAND
 def test_a_home_that_cannot_be_written(run: Run, recording: Path, tmp_path: Path) -> None:
     home = tmp_path / "home"
     home.mkdir(mode=0o500)
@@ -233,6 +243,7 @@ def test_the_current_folder_is_gone(script: Path, recording: Path, tmp_path: Pat
             assert "the current folder is gone" in one_line(done, status)
 
 
+@ON_DEMAND
 @pytest.mark.skipif(not REGULAR_USER, reason="nothing is forbidden to root")
 def test_the_current_folder_cannot_be_read(run: Run, recording: Path, tmp_path: Path) -> None:
     folder = tmp_path / "closed"
@@ -240,6 +251,7 @@ def test_the_current_folder_cannot_be_read(run: Run, recording: Path, tmp_path: 
     well(run("analyze", str(recording), cwd=folder))
 
 
+@ON_DEMAND
 def test_a_path_with_spaces_and_letters_beyond_ascii(run: Run, recording: Path, tmp_path: Path) -> None:
     folder = tmp_path / "Prüfstand Nr. 1 – 測定"
     folder.mkdir()
@@ -258,7 +270,7 @@ def test_a_file_name_that_is_no_text(run: Run, recording: Path, tmp_path: Path) 
 CLOSED: Final = {"input": "<&-", "output": ">&-", "errors": "2>&-", "all": "<&- >&- 2>&-"}
 
 
-@pytest.mark.parametrize("streams", CLOSED)
+@pytest.mark.parametrize("streams", ["all", *(pytest.param(one, marks=ON_DEMAND) for one in CLOSED if one != "all")])
 @pytest.mark.parametrize("wrong", [False, True])
 def test_closed_streams(streams: str, wrong: bool, script: Path, recording: Path, tmp_path: Path) -> None:
     """A closed output is an error of its own where there is something to print, and files stay whole."""
@@ -285,12 +297,13 @@ def test_closed_streams(streams: str, wrong: bool, script: Path, recording: Path
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
 def test_output_to_a_full_disk(run: Run, recording: Path) -> None:
-    for arguments in (("analyze", str(recording)), ("check", DEMO), ("analyze", str(recording), "--json", "-")):
+    for arguments in (("analyze", str(recording)), ("check", DEMO)):
         with open("/dev/full", "w", encoding="ascii") as full:
             done = run(*arguments, capture_output=False, stdout=full, stderr=subprocess.PIPE)
         assert "No space left on device" in one_line(done, 1)
 
 
+@ON_DEMAND
 def test_a_reader_that_leaves_hears_nothing(script: Path, recording: Path, tmp_path: Path) -> None:
     words = " ".join(f"'{word}'" for word in (sys.executable, str(script), "analyze", str(recording)))
     done = subprocess.run(

@@ -330,3 +330,11 @@ def test_impossible_arguments(rate, alarms):
 def test_samples_of_another_shape():
     with pytest.raises(ValueError, match="expected is"):
         ChangeDetector(100.0).update(np.zeros((3, 5)))
+
+
+@pytest.mark.parametrize(("rate_hz", "alarms_per_day"), [(1e6, 1e-6), (1e-3, 1e4), (1e9, 1e-6)])
+def test_thresholds_are_finite_at_the_ends_of_what_is_supported(rate_hz: float, alarms_per_day: float) -> None:
+    """The share of false alarms for one look is far below the distance of 1 from the next smaller double."""
+    levels = ChangeDetector(rate_hz, alarms_per_day)._state.levels
+    assert np.isfinite(levels).all()
+    assert levels[2] > 2.0  # standard deviations

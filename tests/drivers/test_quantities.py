@@ -1,0 +1,69 @@
+"""Every number that enters the program is checked against a range."""
+
+import math
+from typing import Annotated
+
+import msgspec
+import pytest
+
+from drivers import quantities
+from drivers.errors import ConfigError
+from drivers.quantities import RATE_HZ, SCALE, SEED, SILENCE_S, Quantity, check_settings, out_of_range
+
+ALL = {name: one for name, one in vars(quantities).items() if isinstance(one, Quantity)}
+
+
+class Inner(msgspec.Struct):
+    factor: Annotated[float, SCALE.meta] = 1.0
+
+
+class Outer(msgspec.Struct):
+    rate: Annotated[float, RATE_HZ.meta] | str | None = None
+    tau: list[Annotated[float, RATE_HZ.meta]] = []
+    signals: dict[str, str | Inner] = {}
+    seed: Annotated[int, SEED.meta] = 1
+    flag: bool | Annotated[float, RATE_HZ.meta] = True
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_both_ends_are_supported_and_what_is_beyond_is_not(name: str) -> None:
+    one = ALL[name]
+    assert one.low <= one.high
+    for value in (one.low, one.high, *([0] if one.zero else []), *([-one.high] if one.signed else [])):
+        assert one.check(value) == value
+    beyond = (math.nan, math.inf, -math.inf, 2.0 * one.high + 1.0, 10**400, *([] if one.signed else [one.low - 1e4]))
+    for value in beyond:
+        with pytest.raises(ConfigError, match="is outside the supported range"):
+            one.check(value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        (Outer(rate=1e300), "rate: 1e+300 Hz is outside the supported range 0.001 Hz to 1 MHz"),
+        (Outer(tau=[1.0, math.nan]), "tau[1]: nan Hz is outside"),
+        (Outer(signals={"gx": "a", "gy": Inner(0.0)}), "signals.gy.factor: 0 is outside"),
+        (Outer(seed=-1), "seed: -1 is outside"),
+    ],
+)
+def test_a_number_anywhere_in_settings_is_found(settings: Outer, text: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        check_settings(settings)
+    assert str(caught.value).startswith(text)
+
+
+def test_what_is_no_number_passes() -> None:
+    check_settings(Outer(rate="auto", signals={"gx": "Message.Signal"}, flag=False))
+    assert list(out_of_range(None, Annotated[float, RATE_HZ.meta] | None)) == []
+
+
+def test_every_number_outside_its_range_is_found() -> None:
+    with pytest.raises(ConfigError) as caught:
+        check_settings(Outer(rate=0.0, tau=[1.0, -1.0], seed=-1))
+    assert [line.partition(": ")[0] for line in caught.value.lines] == ["rate", "tau[1]", "seed"]
+
+
+def test_zero_has_a_meaning_of_its_own() -> None:
+    assert SILENCE_S.check(0.0) == 0.0
+    with pytest.raises(ConfigError, match="1 µs is outside the supported range 1 ms to 36525 d, or 0"):
+        SILENCE_S.check(1e-6)
