@@ -1,6 +1,7 @@
 """Start of the test session: kernels, number of parallel workers, and threads that must end with their test."""
 
 import os
+import signal
 import threading
 from collections.abc import Iterator
 from typing import Final
@@ -22,6 +23,15 @@ LONG_FOLDERS: Final = {"blind", "fleet", "fuzz", "walk"}
 def pytest_xdist_auto_num_workers() -> int:
     """Return the number of workers for ``-n auto``."""
     return min(WORKERS_PER_CORE * (os.cpu_count() or 1), MAX_WORKERS)
+
+
+def pytest_configure() -> None:
+    """Receive SIGINT even if the shell that started pytest in the background ignores it.
+
+    Programs that tests start inherit an ignored signal, and could not be interrupted.
+    """
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

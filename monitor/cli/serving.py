@@ -5,6 +5,7 @@ samples nor the end of the process.
 """
 
 import contextlib
+import errno
 import io
 import os
 import signal
@@ -99,6 +100,8 @@ def _lost(screen: "QueuedWriter", unread: bool) -> Exception | None:
     if unread:
         return TimeoutError(f"{STDOUT}: the final table was not written, because nobody read it for {CLOSE_S:g} s")
     error = screen.error
+    if isinstance(error, OSError) and error.errno == errno.EBADF:
+        return None  # standard output was closed before the start, so nobody wants the table
     if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
         return OSError(f"{STDOUT}: the final table could not be written: {error.strerror}")
     return error

@@ -119,7 +119,9 @@ class Rig:
 
     def work(self, now_s, drain=False):
         self.station.work([self.caught], now_s, drain)
-        # samples come far faster than a sensor's, and a model of drift is found while a second of them would come
+
+    def finish_models(self):
+        """Wait for the thread that finds a model of drift: samples come far faster here than those of a sensor."""
         for thread in threading.enumerate():
             if thread.name == self.station.chain.identifier._name:
                 thread.join(PATIENCE_S)
@@ -677,6 +679,7 @@ def test_a_step_of_the_bias_is_an_event_of_its_time():
             values[:, 1] += 0.02
             rig.station._push(block(at * 10_000_000, values, np.full(1000, 20.0), at))
         rig.work(1000.0 + i, drain=i == 59)
+        rig.finish_models()
     told = [event for _, event in rig.caught.events if event.kind == "drift_unexplained" and "stepped" in event.text]
     assert [event.axis for event in told] == ["gy"]
     assert told[0].what["bias"]["size"] == pytest.approx(0.02, rel=0.05)
