@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Final
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from tests.support.kernels import compile_kernels
 from tests.support.ports import release_claims
@@ -17,6 +18,10 @@ WORKERS_PER_CORE: Final = 2
 MAX_WORKERS: Final = 8
 LONG_FOLDERS: Final = {"blind", "fleet", "fuzz", "walk"}
 """End-to-end, fault, network and fuzzing tests, and blind trials of the reconciliation."""
+
+# Hypothesis limits each example to 200 ms, and the generation of its input, by the clock on the wall.
+settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any machine")
 
 
 @pytest.hookimpl(optionalhook=True)
