@@ -30,13 +30,15 @@ PIECE: Final = 512
 """Samples estimated before it is asked whether the noise has changed: a fast replay brings thousands at once."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Ready:
-    """Which kernels are compiled, see ``estimator.warm_up``."""
+    """Which kernels are compiled, see ``monitor.kernels``."""
 
     window: Flag = field(default_factory=Flag)
     fit: Flag = field(default_factory=Flag)
     all: Flag = field(default_factory=Flag)
+    progress: str = ""
+    """What is being compiled, one line for people; empty if nothing is."""
 
 
 class Chain:

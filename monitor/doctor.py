@@ -444,14 +444,18 @@ def packages(module_path: Sequence[str]) -> list[Finding]:
 
 
 def kernels() -> list[Finding]:
-    """Whether compiled kernels are kept from start to start."""
+    """Whether kernels are compiled, and kept from start to start."""
     from monitor.compiled import cache_folder
+    from monitor.kernels import SERVICE, is_warm
 
     folder = cache_folder()
     if folder is None:
         text = "no folder for compiled kernels can be written: every start compiles them anew, for a minute or two"
         return [Finding("doubt", "kernels", text, "set NUMBA_CACHE_DIR to a folder of the service's user")]
-    return [Finding("well", "kernels", f"kept in {folder}")]
+    if not is_warm(SERVICE):
+        text = f"not compiled yet for this version on this machine, in {folder}: the next start takes longer, once"
+        return [Finding("doubt", "kernels", text, "imu-monitor warm-up, as the user of the service")]
+    return [Finding("well", "kernels", f"compiled and kept in {folder}")]
 
 
 def clock() -> list[Finding]:

@@ -17,10 +17,8 @@ import structlog
 from drivers.errors import ConfigError, NotReady, RecordingError
 from drivers.links.replay_link import ReplayLink
 from drivers.recording.segment import Origin
-from monitor import reload
+from monitor import kernels, reload
 from monitor.chain import Ready
-from monitor.drift import compensator, heat
-from monitor.estimate.estimator import warm_up
 from monitor.health import Health, sentence
 from monitor.history import past
 from monitor.history.past import Past
@@ -225,20 +223,29 @@ class Service:
 
     def _warm_up(self) -> None:
         """Beside the loop, so that a first start's compilation holds up neither samples nor status."""
+        begun_s = time.monotonic()
+        flags = {kernels.WINDOW: self._ready.window, kernels.FIT: self._ready.fit}
         try:
-            for kernel in warm_up():
-                if kernel == "all":
-                    heat.warm_up()
-                    compensator.warm_up()
-                getattr(self._ready, kernel).set()
-                self._wake.set()
+            for part in kernels.prepare(kernels.SERVICE, self._tell_progress):
+                if part in flags:
+                    flags[part].set()
+                    self._wake.set()
+            if self._ready.progress:
+                _log.info("kernels are compiled and kept for the next start", seconds=round(time.monotonic() - begun_s))
         except OSError as error:
             _log.warning("compiled kernels cannot be kept, the next start will be slow again", error=str(error))
         finally:
+            self._ready.progress = ""
             # what has failed is compiled by the loop, or ends it; without this it would wait for ever
-            for kernels in (self._ready.window, self._ready.fit, self._ready.all):
-                kernels.set()
+            for flag in (self._ready.window, self._ready.fit, self._ready.all):
+                flag.set()
             self._wake.set()
+
+    def _tell_progress(self, progress: kernels.Progress) -> None:
+        if not self._ready.progress:
+            _log.info("compiling kernels, as none are kept for this version on this machine")
+        self._ready.progress = f"{progress} {progress.bar}"
+        self._wake.set()
 
     def _built(self, device: Device) -> tuple[Station, VirtualImu | None]:
         """A device, and the sensor where it is simulated; nothing of it is open."""

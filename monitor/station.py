@@ -536,8 +536,11 @@ class Station:
     def _text(self) -> str:
         if self._tail is not None and self._ready.all.is_set() and self.driver.state == "running":
             return "the window is being rebuilt from the recording; no sample is lost"
+        if self._ready.progress and self.driver.state == "running":
+            lacking = "" if self._ready.fit.is_set() else "no coefficients yet, "
+            return f"{self._ready.progress}; {lacking}no sample is lost"
         if not self._ready.fit.is_set() and self.driver.state == "running":
-            return "first start: compiling the estimator; no coefficients yet, no sample is lost"
+            return "compiling the estimator; no coefficients yet, no sample is lost"
         lacking = self._lacking_text() if self.driver.state in ("running", "ended") else ""
         if self.driver.text or self.driver.state != "running":
             return f"{self.driver.text.rstrip('.')}; {lacking}" if lacking else self.driver.text

@@ -21,7 +21,7 @@ from typer.exceptions import TyperException
 
 from drivers.errors import ConfigError, ImuError, NotReady, RecordingError, in_one_line
 from drivers.small_file import real_path
-from monitor.cli import doctor, drift, options, output, serving
+from monitor.cli import doctor, drift, options, output, serving, warm_up
 from monitor.cli import history as history_command
 
 # before NumPy is imported: matrices are small here and threads of our own share the work, where more would only spin
@@ -123,6 +123,7 @@ def check(
 
 
 app.command()(doctor.doctor)
+app.command()(warm_up.warm_up)
 
 
 @app.command()
@@ -187,6 +188,7 @@ def analyze(
     wanted = offline.Request(recording, rate, options.tau(tau), window_s, rest, bool(json or plot), last_s)
     try:
         with output.progress() as tell:
+            output.prepare_kernels(tell)
             results = offline.make(wanted, tell)
     except offline.TooShort as error:
         if json is not None:
@@ -274,6 +276,7 @@ def reconcile(
     serving.end_on_sigterm()
     try:
         with output.progress() as tell:
+            output.prepare_kernels(tell)
             if several:
                 every = reconciling.RunsRequest(tuple(recordings), tested, out, seed, rate, last_s)
                 runs = reconciling.make_runs(every, tell)

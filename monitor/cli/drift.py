@@ -44,6 +44,7 @@ def compensate(
     last_s = options.duration("--last", last)
     wanted = compensating.Request(recording, out, method, rate, options.order(order), last_s)
     with output.progress() as tell:
+        output.prepare_kernels(tell)
         result = compensating.make(wanted, tell)
     if json is not None:
         output.write("--json", json, text.to_json(result) + b"\n")

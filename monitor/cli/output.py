@@ -48,6 +48,17 @@ def progress() -> Iterator[Tell]:
         yield lambda what, share: bar.update(task, description=what, total=share and 1.0, completed=share or 0.0)
 
 
+def prepare_kernels(tell: Tell) -> None:
+    """Compile the kernels that analyses of recordings need, by all processors, if they are not kept on disk yet."""
+    from monitor import kernels
+
+    for group in kernels.GROUPS:
+        if not kernels.is_warm(group):
+            with contextlib.suppress(OSError):  # they cannot be kept: each is compiled when it is called
+                for _ in kernels.prepare(group, lambda progress: tell(str(progress), progress.share)):
+                    pass
+
+
 def print_analysis(result: "Analysis") -> None:
     """Samples, coefficients and notes."""
     from rich.console import Console

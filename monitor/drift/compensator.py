@@ -233,14 +233,6 @@ class Compensator:
         )
 
 
-def warm_up() -> None:
-    """Have the kernels compiled, or loaded from the disk cache: those of every sample and those of identification."""
-    rng, one = np.random.default_rng(0), Compensator(100.0)
-    one.update(1e-3 * rng.standard_normal((6000, len(AXES))))
-    one.adopt(0, identify(*one.window(0), [(2, 1)]))
-    one.update(np.zeros((1, len(AXES))), lost=1)
-
-
 def _state(rate_hz: float, adapts: bool) -> State:
     each = memories(rate_hz)
     table, first = gains(each)

@@ -97,11 +97,6 @@ def lagged(x, p):  # type: ignore[no-untyped-def]
     return out
 
 
-def warm_up() -> None:
-    """Have the kernel compiled, or loaded from the disk cache."""
-    lagged(np.zeros(2), 0.5)
-
-
 def solved(columns: Floats, y: Floats) -> Floats:
     """Sizes [terms] by least squares, columns scaled so that units do not matter."""
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)

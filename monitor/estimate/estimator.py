@@ -10,14 +10,14 @@ N within half a minute.
 """
 
 from collections import deque
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import NotReady
-from drivers.sample import Floats, Ints, SampleBlock, block
+from drivers.sample import Floats, Ints, SampleBlock
 from monitor.estimate.bandwidth import LowPass, contradicted, power, searching, with_bandwidth
 from monitor.estimate.batch import TauGrid, cluster_sizes
 from monitor.estimate.curve import AllanCurve
@@ -30,7 +30,6 @@ from monitor.estimate.refit import Refit
 from monitor.estimate.slow import SlowStatistics
 from monitor.estimate.total import TotalCurve
 from monitor.estimate.uncertainty import AxisTables, Spans, Table, intervals
-from monitor.estimate.watch import Watch
 from monitor.estimate.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_spans
 
 SETTLING: Final = 10
@@ -242,22 +241,3 @@ class Estimator:
     def _curve(self, avar: Floats, terms: Ints, edf: Floats, n: int) -> AllanCurve:
         lo, hi = intervals(avar, edf)
         return AllanCurve(self._factors / self.rate_hz, self._factors, avar, terms, edf, lo, hi, n)
-
-
-def warm_up() -> Iterator[str]:
-    """Have the kernels compiled, or loaded from the disk cache; yields "window", "fit" and "all" as each is ready.
-
-    "window" gives a curve, "fit" its coefficients; the rest are those of motion and change, of total and Hadamard
-    deviations, and of a fit at every sample. Many seconds at the very first start on a machine, milliseconds later.
-    """
-    estimator, samples = Estimator(100.0, 1.0), block(np.arange(100, dtype=np.int64), np.zeros((100, 6)))
-    estimator.update(samples)
-    yield "window"
-    estimator.get()
-    yield "fit"
-    Watch(100.0).update(samples)
-    estimator.restart(0, 10)
-    while estimator.step() is None:  # a round of the slow statistics
-        pass
-    Estimator(100.0, 1.0, every_sample=True).update(samples)
-    yield "all"

@@ -35,9 +35,10 @@ said("NumPy and SciPy")
 import numba
 said("Numba")
 from drivers.sample import block
-from monitor.estimate.estimator import Estimator, warm_up
+from monitor import kernels
+from monitor.estimate.estimator import Estimator
 said("drivers and monitor.estimate")
-for _ in warm_up():
+for _ in kernels.prepare(kernels.SERVICE, print, processes=0):
     pass
 said("compiled kernels")
 estimator = Estimator(rate_hz, window_s)

@@ -3,7 +3,7 @@
 import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +13,7 @@ from structlog.testing import capture_logs
 
 from drivers.recording import save_samples
 from drivers.sample import Event
-from monitor import service as service_module
-from monitor import settings
+from monitor import kernels, settings
 from monitor.estimate.coefficients import Status
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.model_gap import ModelGap
@@ -118,13 +117,13 @@ class Times(Output):
 def test_a_recording_that_waits_for_kernels_leaves_nothing_outside_of_its_own_times(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    n, compiled, warm_up = 2000, threading.Event(), service_module.warm_up
+    n, compiled, prepare = 2000, threading.Event(), kernels.prepare
 
-    def held_back() -> Iterator[str]:
+    def held_back(group: kernels.Group, tell: Callable[[kernels.Progress], None]) -> Iterator[str]:
         compiled.wait(120.0)
-        yield from warm_up()
+        yield from prepare(group, tell)
 
-    monkeypatch.setattr(service_module, "warm_up", held_back)
+    monkeypatch.setattr(kernels, "prepare", held_back)
     t_s = np.arange(n) / 100.0
     values = np.random.default_rng(1).standard_normal((n, 6)) * 1e-3
     name = {"csv": "r.csv", "npz": "r.npz", "folder": "r"}[kind]
@@ -275,11 +274,11 @@ def test_a_recording_that_shows_no_rate_says_so(tmp_path: Path) -> None:
 
 
 def test_kernels_that_cannot_be_kept_hold_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full_disk() -> Iterator[str]:
-        yield "window"
+    def full_disk(_group: kernels.Group, _tell: Callable[[kernels.Progress], None]) -> Iterator[str]:
+        yield kernels.WINDOW
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(service_module, "warm_up", full_disk)
+    monkeypatch.setattr(kernels, "prepare", full_disk)
     save_samples(tmp_path / "short.npz", np.arange(500) / 100.0, np.random.default_rng(1).standard_normal((500, 6)))
     service = Service(config(tmp_path, 'link = "replay", path = "short.npz", speed = "max"', 'mode = "none"'))
     with capture_logs() as logs:

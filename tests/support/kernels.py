@@ -5,13 +5,19 @@ disk. The kernels are compiled in the process that starts the tests, before any 
 workers of pytest-xdist and the processes that tests start then load them from the cache.
 """
 
-from monitor.drift import compensator, heat
-from monitor.estimate.estimator import warm_up
+from collections.abc import Callable
+
+from monitor import kernels
 
 
-def compile_kernels() -> None:
-    """Compile the kernels that a running service needs, or load them from the cache on disk."""
-    for _ in warm_up():
-        pass
-    heat.warm_up()
-    compensator.warm_up()
+def compile_kernels(say: Callable[[str], None]) -> None:
+    """Compile the kernels that a running service and the analysis need, or load them from the cache on disk.
+
+    Parameters
+    ----------
+    say
+        Called with a line for each part that is being compiled.
+    """
+    for group in kernels.GROUPS:
+        for _ in kernels.prepare(group, lambda progress: say(str(progress))):
+            pass
