@@ -117,7 +117,5 @@ def kept_in(text: str) -> str:
 
 def test_the_command_says_where_kernels_cannot_be_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiled, "cache_folder", lambda: None)
-    with pytest.raises(
-        ConfigError, match="no cache folder can be written; set NUMBA_CACHE_DIR"
-    ):
+    with pytest.raises(ConfigError, match="no cache folder can be written; set NUMBA_CACHE_DIR"):
         warm_up()
