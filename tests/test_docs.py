@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
 ARCHITECTURE = ROOT / "docs" / "architecture.md"
 SIMULATOR = ROOT / "docs" / "simulator.md"
-PAGES = sorted([README, ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted([README, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 PRINTED_BY = "tcp/127.0.0.1:7450"
 
@@ -43,7 +43,13 @@ PRINTED_BY = "tcp/127.0.0.1:7450"
 def options(command: str) -> set[str]:
     """All that a command takes, or its own commands do."""
     each = [COMMANDS[command], *getattr(COMMANDS[command], "commands", {}).values()]
-    return {option for one in each for parameter in one.params for option in parameter.opts if option.startswith("--")}
+    return {
+        option
+        for one in each
+        for parameter in one.params
+        for option in parameter.opts
+        if option.startswith("--") and not getattr(parameter, "hidden", False)
+    }
 
 
 def title(page: Path) -> str:
@@ -103,13 +109,13 @@ def test_the_configurations_show_every_link() -> None:
 def test_every_command_is_one(page: Path) -> None:
     for text in code(page):
         for line in text.splitlines():
-            for word, rest in re.findall(r"\bimu-monitor ([a-z]\w*)(.*)", line):
+            for word, rest in re.findall(r"\bimu-monitor ([a-z][\w-]*)(.*)", line):
                 assert word in COMMANDS, line
                 assert set(re.findall(r"--[a-z-]+", rest)) <= options(word), line
 
 
 def test_the_table_has_every_command_and_its_options() -> None:
-    rows = re.findall(r"^\| `imu-monitor (\w+)[^`]*` \|(.*)", section(README, "Commands"), re.M)
+    rows = re.findall(r"^\| `imu-monitor ([\w-]+)[^`]*` \|(.*)", section(README, "Commands"), re.M)
     assert [name for name, _ in rows] == list(COMMANDS)
     everywhere = {"--help", "--seconds", "--viewer"}
     for name, row in rows:
