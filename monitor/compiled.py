@@ -23,7 +23,7 @@ R = TypeVar("R")
 
 ROOT: Final = Path(__file__).parents[1]
 NAME: Final = re.compile(r"\w+")
-IMPORTS: Final = re.compile(r"^from (monitor[\w.]*) import (?:\(([^)]*)\)|(.*))", re.MULTILINE)
+IMPORTS: Final = re.compile(r"^ *from (monitor[\w.]*) import (?:\(([^)]*)\)|(.*))", re.MULTILINE)
 
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:

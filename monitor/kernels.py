@@ -30,7 +30,6 @@ from monitor.compiled import cache_folder, stamp
 from monitor.drift import heat
 from monitor.drift.arma import identify
 from monitor.drift.compensator import Compensator
-from monitor.estimate.analysis import analyze
 from monitor.estimate.estimator import Estimator
 from monitor.estimate.watch import Watch
 
@@ -309,7 +308,22 @@ def _call_temperature_lag() -> None:
 
 
 def _call_analysis() -> None:
+    from monitor.estimate.analysis import analyze  # the service does not need it
+
     analyze([_samples(100)], 100.0)
+
+
+def _call_reconciliation() -> None:
+    from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
+    from monitor.noise.model import NoiseModel
+    from monitor.reconcile.reconcile import Recording, reconcile  # the service does not need it
+
+    model = NoiseModel({"gz": (AngleRandomWalk(N=1e-4), BiasInstability(B=3e-5), RateRandomWalk(K=1e-6))})
+    series, rng = model.simulate(4200, 10.0, 1)[:, 2], np.random.default_rng(1)
+    size = float(np.std(series))
+    series += 4.0 * size * (rng.integers(0, 2, 42).repeat(100) + (np.arange(4200) > 2100))
+    series[::500] += 20.0 * size
+    reconcile(Recording({"gz": series}, 10.0, np.linspace(20.0, 30.0, 4200)), model, seed=1)
 
 
 WINDOW: Final = "Allan deviation"
@@ -328,6 +342,8 @@ SERVICE: Final = Group(
     ),
 )
 """What the running service needs; what it needs first comes first."""
-COMMANDS: Final = Group("commands", (Part("analysis of recordings", _call_analysis),))
-"""What only commands on recordings need."""
+COMMANDS: Final = Group(
+    "commands", (Part("analysis of recordings", _call_analysis), Part("reconciliation", _call_reconciliation))
+)
+"""What only commands on recordings need. A few kernels of rare cases are compiled when they are called."""
 GROUPS: Final = (SERVICE, COMMANDS)
