@@ -50,6 +50,7 @@ def test_the_recording_comes_out_without_its_drift(tmp_path, capsys):
     assert plot.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["fixed", "ar", "emd", "wavelet"])
 def test_every_method_is_judged_on_the_same_stretch(tmp_path, capsys, method):
     recording, out = write(tmp_path / "a.npz"), tmp_path / "out.npz"

@@ -67,6 +67,7 @@ def stepped():
     return fed(live, *day(14, 2, STEP, AT_H)), live.take_events()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("edges", [[1, 2, 59, 61, 1000, 3001], range(0, 5040, 7)], ids=["few", "many"])
 def test_how_samples_are_cut_makes_no_difference(edges):
     values, warmth = day(14, 2, STEP, AT_H)

@@ -14,6 +14,7 @@ def noisy(truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return z, z[: N // 2]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", VARIANTS)
 def test_noise_at_rest_falls_and_holes_stay(name):
     z, learned = noisy(np.zeros(N))
@@ -25,6 +26,7 @@ def test_noise_at_rest_falls_and_holes_stay(name):
     assert left.std() < 0.75
 
 
+@pytest.mark.long
 def test_motion_is_halved_by_an_autoregression_and_kept_by_modes():
     t = np.arange(N) / 100.0
     truth = np.where(t > 200.0, 30.0 * np.sin(np.pi * t), 0.0)

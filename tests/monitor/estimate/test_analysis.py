@@ -101,6 +101,7 @@ def test_an_absent_axis_is_unestimated_and_warns_nobody():
     assert (found.estimate.coefficients.status[1, :3] == Status.ESTIMATED).all()
 
 
+@pytest.mark.long
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("name", "rate"),

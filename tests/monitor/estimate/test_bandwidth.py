@@ -70,6 +70,7 @@ def test_white_noise_and_lines_have_no_bandwidth():
     assert np.isnan(analyzed(line).bandwidth_hz).all()
 
 
+@pytest.mark.long
 def test_the_live_estimate_finds_it_too():
     values = filtered(2, 20.0, 120_000)
     estimator = Estimator(RATE_HZ, 1200.0)

@@ -256,6 +256,7 @@ def scatter(kind, n, records, seed):
             yield NoiseModel(dict.fromkeys(("gx", "gy", "gz", "ax", "ay", "az"), (source,))).simulate(n, 1.0, seed + k)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("poles", [1, 2])
 @pytest.mark.parametrize("kind", ["white", "flicker", "walk"])
 def test_degrees_of_freedom_are_those_of_simulated_records(kind, poles):

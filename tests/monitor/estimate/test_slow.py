@@ -43,6 +43,7 @@ def check(slow, window, values):
             np.testing.assert_allclose(getattr(curve, field), getattr(expected, field), rtol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("factors", [cluster_sizes(300, 1.0), np.array([3, 150])])
 @pytest.mark.parametrize("samples", [180, 300, 301, 1000])
 def test_equals_the_batch_on_the_window(samples, factors):

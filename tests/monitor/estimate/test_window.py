@@ -553,6 +553,7 @@ def test_the_slope_of_an_axis_that_began_anew_is_that_of_its_own_samples():
 # --- for ever
 
 
+@pytest.mark.long
 def test_ten_million_samples_with_gaps_and_a_transient_leave_no_trace():
     """The same program runs 10⁹; see docs/benchmarks.md."""
     assert long_run.run(10, lambda line: None) < 1e-9

@@ -73,6 +73,7 @@ HIDDEN = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", HIDDEN)
 def test_what_was_hidden_is_named(name):
     found = looked(noise(2) + HIDDEN[name], temperature_c=warmth(n))
