@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ import pytest
 from drivers.recording import save_samples
 from drivers.sample import AXES
 from monitor.catalogue import read_model
-from monitor.cli import main
+from monitor.cli import main, report_failed_thread
 from monitor.settings import CONFIG_FOLDER, load
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
@@ -1310,6 +1311,22 @@ def test_an_unexpected_error_is_one_line(
         assert done.status == status
         assert done.err.startswith("Traceback (most recent call last):")
         assert line in done.err
+
+
+@pytest.mark.parametrize("debug", [False, True])
+def test_a_thread_that_fails_is_one_line(
+    debug: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail() -> None:
+        raise ZeroDivisionError("division by zero")
+
+    monkeypatch.setattr(threading, "excepthook", partial(report_failed_thread, debug))
+    thread = threading.Thread(target=fail, name="warm-up")
+    thread.start()
+    thread.join()
+    *before, line = capsys.readouterr().err.splitlines()
+    assert line.startswith('imu-monitor: thread "warm-up" ended: internal error: ZeroDivisionError: division by zero;')
+    assert bool(before) == debug
 
 
 @pytest.mark.parametrize(

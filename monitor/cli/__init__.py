@@ -9,6 +9,7 @@ import os
 import re
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Mapping, MutableMapping, Sequence
 from difflib import get_close_matches
@@ -412,6 +413,7 @@ def main() -> None:
     ``--debug``, before or behind the name of the command, prints the traceback of an error before its line.
     """
     arguments, debug = split_debug(sys.argv[1:])
+    threading.excepthook = partial(report_failed_thread, debug)
     _ignore_impossible_width(os.environ)
     try:
         # without its own error pages, typer hands an Exit's status back
@@ -429,6 +431,18 @@ def main() -> None:
     if status == INTERRUPTED:  # Ctrl-C, of which typer makes an Exit
         _fail("interrupted", INTERRUPTED)
     sys.exit(status)
+
+
+def report_failed_thread(debug: bool, failed: threading.ExceptHookArgs) -> None:
+    """Say in one line on standard error why a thread ended; with ``debug`` also its traceback."""
+    error = failed.exc_value
+    if not isinstance(error, Exception) or sys.stderr is None:
+        return
+    with contextlib.suppress(OSError, ValueError):
+        if debug:
+            traceback.print_exception(error)
+        thread = "a thread" if failed.thread is None else f'thread "{failed.thread.name}"'
+        print(f"imu-monitor: {thread} ended: {explain(error)[0]}", file=sys.stderr, flush=True)  # noqa: T201
 
 
 def _ignore_impossible_width(environment: MutableMapping[str, str]) -> None:

@@ -12,6 +12,7 @@ joined by a window, anything else is trouble; a page moves on to the next free p
 
 import contextlib
 import ctypes
+import fcntl
 import http.client
 import os
 import re
@@ -32,6 +33,7 @@ import rerun as rr
 import rerun_cli  # type: ignore[import-untyped]
 
 from drivers.small_file import check_regular
+from monitor.folder_lock import NO_LOCKS
 from monitor.publish.viewer import ViewerClosed, ViewerSettings, ViewerTrouble
 
 LOOPBACK: Final = "127.0.0.1"
@@ -112,6 +114,7 @@ class Output:
     child: Child | None = None
     port: int | None = None  # of the Rerun server; None for a file
     note: str = ""  # which ports were busy, and what is used in their place
+    lock: IO[bytes] | None = None  # of a file: open while it is written, so that no other process writes it
 
     def check(self) -> None:
         """ViewerTrouble when nobody looks any more, ViewerClosed when that was someone's wish."""
@@ -140,6 +143,8 @@ class Output:
             self.child.end()
         if self.port is None:
             self.stream.disconnect()
+        if self.lock is not None:
+            self.lock.close()
 
 
 def viewer_program() -> Path:
@@ -222,14 +227,22 @@ def _open_file(path: Path, recording_id: str) -> Output:
     try:
         if path.exists():
             check_regular(path)  # opening a FIFO would wait for its reader
-        with path.open("wb"):
-            pass
+        lock = path.open("ab")
     except OSError as error:
         raise ViewerTrouble(f"cannot write {path}: {error.strerror}") from error
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released by the system when this process ends
+    except BlockingIOError:
+        lock.close()
+        raise ViewerTrouble(f"{path}: another process writes this file; name another one") from None
+    except OSError as error:  # a file system without locks
+        if error.errno not in NO_LOCKS:
+            lock.close()
+            raise ViewerTrouble(f"cannot lock {path}: {error.strerror}") from error
     stream = _stream(recording_id)
     # A footer would keep a line about every chunk in memory for as long as the daemon runs.
     stream.set_sinks(rr.FileSink(path, write_footer=False))
-    return Output(stream, flush_every_s=1.0)
+    return Output(stream, flush_every_s=1.0, lock=lock)
 
 
 def _open_native(settings: ViewerSettings, recording_id: str, given_up: Callable[[], bool]) -> Output:

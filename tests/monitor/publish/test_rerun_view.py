@@ -1,5 +1,6 @@
 """The live view: what reaches a recording, and that no viewer can harm the service."""
 
+import fcntl
 import shutil
 import signal
 import socket
@@ -306,6 +307,20 @@ def test_a_file_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     view.start()
     wait_for(lambda: view.state.startswith("cannot write"))
     view.close()
+
+
+def test_a_file_that_another_process_writes_is_left_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    path.write_bytes(b"written before")
+    with path.open("ab") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        view = RerunView(ViewerSettings(mode=str(path)), DEVICE)
+        view.start()
+        wait_for(lambda: "another process writes this file" in view.state)
+        assert path.read_bytes() == b"written before"
+    wait_for(lambda: view.state == "ok")
+    view.close()
+    assert path.read_bytes().startswith(b"RRF")
 
 
 def test_without_rerun_the_service_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
