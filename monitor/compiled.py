@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar, cast
 
 import numba
-from numba import _dynfunc
+from numba import _dynfunc, types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.registry import CPUDispatcher
@@ -87,8 +87,12 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         self.intermediate = Intermediate(function, options | {"no_cpython_wrapper": True})
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Compile for a call from another kernel; Numba asks this when it infers the types of that kernel."""
-        return self.intermediate.get_call_template(args, kws)
+        """Compile for a call from another kernel; Numba asks this when it infers the types of that kernel.
+
+        A constant argument does not count as a type of its own, so that the function is compiled once for all of them.
+        """
+        kws = {name: types.unliteral(one) for name, one in kws.items()}
+        return self.intermediate.get_call_template([types.unliteral(one) for one in args], kws)
 
     def get_overload(self, sig: Any) -> Any:
         """Return what ``get_call_template`` compiled; Numba asks this when it lowers the calling kernel."""

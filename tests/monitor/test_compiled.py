@@ -59,7 +59,7 @@ def test_cached_code_is_stale_when_what_it_calls_has_changed(tmp_path):
 def test_the_stamp_of_a_kernel_covers_the_files_it_calls():
     imported = [package for package, *_ in IMPORTS.findall(Path(inspect.getfile(fit_kernel)).read_text())]
     assert imported.count("monitor.estimate.verdict") == 1
-    assert fit_kernel.fit_axes._cache._cache_file._source_stamp[1] == stamp(Path(inspect.getfile(fit_kernel)))
+    assert fit_kernel.fit_axis._cache._cache_file._source_stamp[1] == stamp(Path(inspect.getfile(fit_kernel)))
 
 
 @compiled
@@ -86,6 +86,19 @@ def test_machine_code_is_generated_only_for_the_kernel_that_python_calls():
     assert not engine.is_symbol_defined(part.fndesc.llvm_cpython_wrapper_name)
     assert _add(values, 1.0) == 11.0  # from Python it is compiled as a kernel of its own
     assert len(_add.signatures) == 1
+
+
+def test_an_inner_function_is_compiled_once_for_all_constant_arguments():
+    @compiled
+    def scale(x, factor, negative):
+        return -factor * x if negative else factor * x
+
+    @compiled
+    def outer(x, factor):
+        return scale(x, 2, False) + scale(x, 3, True) + scale(x, factor, x > 0.0)
+
+    assert outer(1.0, 5) == 2.0 - 3.0 - 5.0
+    assert len(scale.intermediate.signatures) == 1
 
 
 def test_intermediate_code_refuses_a_call_from_python():
