@@ -148,9 +148,13 @@ class Compensator:
         Until a bias is known, and where a sample is missing, a gyro's rate comes out as it came in.
         """
         if lost:
-            _gap(lost, self._state)
+            for axis in range(GYROS):
+                coast(self._state.bank[axis], self._state.ages[axis], lost)
             self.came += lost
         out = np.array(values, dtype=np.float64)
+        # always contiguous and read-only, as each layout and access flag would be compiled anew
+        values = np.ascontiguousarray(values, np.float64).view()
+        values.flags.writeable = False
         # after a hole, verdicts on all blocks that waited come at once, and each may end an interval
         taught = np.empty((len(values) // self.interval + 2 + SLOTS, 1 + 6 * GYROS))
         filled = _advance(values, self.came, self.size, self._state, out, taught)
@@ -192,9 +196,9 @@ class Compensator:
         row = self._state.row[axis]
         count = row[sage_husa.COUNT]
         sage_husa.adopt(row, model)
-        sage_husa.again(row, *self._remembered(axis), _least(axis, self._state))
+        sage_husa.again(row, *self._remembered(axis), _least(self._state.rest.open, axis))
         row[sage_husa.COUNT] = count  # each interval once
-        _renew(axis, self._state)
+        _renew(axis, self._state.row, self._state.bias, self._state.bank)
 
     def identify(self) -> None:
         """Models of all axes that are due."""
@@ -268,18 +272,28 @@ def _advance(values, index, size, s, out, taught):  # type: ignore[no-untyped-de
         end = min(n, (number + 1) * size - index)
         verdicts = rest_kernel.advance(values[i:end], index + i, size, s.rest, s.verdicts[0], s.verdicts[1], s.episodes)
         for v in range(verdicts[0]):
-            filled = _judged(s.verdicts[0, v], s.verdicts[1, v] > 0, s, taught, filled)
+            filled += _judged(s.verdicts[0, v], s.verdicts[1, v] > 0, s, taught[filled])
         slot = number % SLOTS
         if s.waiting[slot, 0, NUMBER] != number:
-            s.waiting[slot, :, NUMBER] = number
-            s.waiting[slot, :, COUNT:] = 0.0
-            s.sums[slot] = 0.0
+            _begin_block(number, s.waiting[slot], s.sums[slot])
         for a in range(GYROS):
             _take_out(values[i:end, a], a, s.sums[slot, a], s, keep, out[i:end, a])
         for a in range(len(AXES)):
             _add(values[i:end, a], s.waiting[slot, a])
         i = end
     return filled
+
+
+@compiled
+def _begin_block(number, waiting, sums):  # type: ignore[no-untyped-def]
+    """A slot is for another block now."""
+    for a in range(len(AXES)):
+        waiting[a, NUMBER] = number
+        for column in range(COUNT, SQUARES + 1):
+            waiting[a, column] = 0.0
+    for a in range(GYROS):
+        for j in range(sums.shape[1]):
+            sums[a, j, 0] = sums[a, j, 1] = 0.0
 
 
 @compiled
@@ -314,26 +328,28 @@ def _add(values, sums):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _judged(number, moves, s, taught, filled):  # type: ignore[no-untyped-def]
-    """A verdict has become final: the interval learns from the block; one that is over is told."""
+def _judged(number, moves, s, taught):  # type: ignore[no-untyped-def]
+    """A verdict has become final: the interval learns from the block; one that is over is told. Returns whether."""
     interval = number // BLOCKS
-    if s.current[0] >= 0 and interval > s.current[0]:
-        _over(s, taught[filled])
-        filled += 1
+    over = s.current[0] >= 0 and interval > s.current[0]
+    if over:
+        _over(s, taught)
         for _ in range(min(interval - s.current[0] - 1, LONGEST_GAP)):
             for a in range(GYROS):
                 _forward(a, s)
     s.current[0] = interval
     slot = number % SLOTS
     if moves or s.waiting[slot, 0, NUMBER] != number or _loud(s.waiting[slot]):
-        return filled
+        return over
     for a in range(GYROS):
         count = s.waiting[slot, a, COUNT]
         if count > 0.0:
             s.means[a, number % BLOCKS] = s.waiting[slot, a, ORIGIN] + s.waiting[slot, a, SUM] / count
             s.samples[a] += count
-            s.followed[a] += s.sums[slot, a]
-    return filled
+            for j in range(s.followed.shape[1]):
+                s.followed[a, j, 0] += s.sums[slot, a, j, 0]
+                s.followed[a, j, 1] += s.sums[slot, a, j, 1]
+    return over
 
 
 @compiled
@@ -358,13 +374,14 @@ def _over(s, taught):  # type: ignore[no-untyped-def]
     for a in range(GYROS):
         told = taught[1 + 6 * a : 7 + 6 * a]
         known = s.bias[a] == s.bias[a]
-        told[:] = np.nan
+        for column in range(6):
+            told[column] = np.nan
         told[EXPECTED], told[BECAME] = s.bias[a], sage_husa.NOT_SEEN
         if known:
             told[DRIFT_ERROR] = np.sqrt(sage_husa.drift(s.row[a])[1])
         count, mean, scatter = _mean(s.means[a])
         if count >= ENOUGH:
-            variance, became = sage_husa.measure(s.row[a], mean, scatter, _least(a, s))
+            variance, became = sage_husa.measure(s.row[a], mean, scatter, _least(s.rest.open, a))
             told[MEAN], told[ERROR], told[BECAME], told[SCATTER] = mean, np.sqrt(variance), became, scatter
             if known and became == sage_husa.USED:
                 s.learned[a] += 1
@@ -372,7 +389,11 @@ def _over(s, taught):  # type: ignore[no-untyped-def]
         else:
             sage_husa.not_seen(s.row[a])
         _forward(a, s)
-    s.means[:], s.followed[:], s.samples[:] = np.nan, 0.0, 0.0
+        for b in range(BLOCKS):
+            s.means[a, b] = np.nan
+        for j in range(s.followed.shape[1]):
+            s.followed[a, j, 0] = s.followed[a, j, 1] = 0.0
+        s.samples[a] = 0.0
 
 
 @compiled
@@ -388,9 +409,9 @@ def _mean(means):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _least(axis, s):  # type: ignore[no-untyped-def]
-    """Variance of an interval's mean that rounding may hide."""
-    return s.rest.open[axis, rest_kernel.STEP] ** 2 / 12.0 / BLOCKS + rest_kernel.NOTHING
+def _least(blocks, axis):  # type: ignore[no-untyped-def]
+    """Variance of an interval's mean that rounding may hide; ``blocks`` is ``rest_kernel.State.open``."""
+    return blocks[axis, rest_kernel.STEP] ** 2 / 12.0 / BLOCKS + rest_kernel.NOTHING
 
 
 @compiled
@@ -398,20 +419,13 @@ def _forward(axis, s):  # type: ignore[no-untyped-def]
     """To the next interval, once a level is confirmed."""
     if s.row[axis, sage_husa.COUNT] >= sage_husa.CONFIRMED:
         sage_husa.forward(s.row[axis])
-        _renew(axis, s)
+        _renew(axis, s.row, s.bias, s.bank)
 
 
 @compiled
-def _renew(axis, s):  # type: ignore[no-untyped-def]
+def _renew(axis, rows, biases, banks):  # type: ignore[no-untyped-def]
     """What is expected of the drift is what is taken out from now on; what filters follow moves with it."""
-    now = sage_husa.drift(s.row[axis])[0]
-    before = s.bias[axis] if s.bias[axis] == s.bias[axis] else 0.0
-    shift(s.bank[axis], now - before)
-    s.bias[axis] = now
-
-
-@compiled
-def _gap(lost, s):  # type: ignore[no-untyped-def]
-    """So many samples are missing."""
-    for a in range(GYROS):
-        coast(s.bank[a], s.ages[a], lost)
+    now = sage_husa.drift(rows[axis])[0]
+    before = biases[axis] if biases[axis] == biases[axis] else 0.0
+    shift(banks[axis], now - before)
+    biases[axis] = now

@@ -158,7 +158,7 @@ def measure(row, z, scatter, least):  # type: ignore[no-untyped-def]
 @compiled
 def _correct(row, e):  # type: ignore[no-untyped-def]
     """K ε, and (I − K H) P."""
-    h = row[P : P + 3] + row[P + 6 : P + 9]  # H P
+    h = row[P] + row[P + 6], row[P + 1] + row[P + 7], row[P + 2] + row[P + 8]  # H P
     total = h[0] + h[2] + row[R]
     for i in range(3):
         row[X + i] += h[i] / total * e

@@ -215,7 +215,7 @@ def _pair(s: State, axis: int, j: int, sum1: float, count1: float, sum2: float, 
         _confirm(s, axis, mean, now)
     elif fill == 2 and s.step[axis, 0] < 0.0 and s.alarm[axis, KIND] == 0.0:
         _seek_step(s, axis, j, mean, d, now)
-    s.ring[axis, j, 0] = s.ring[axis, j, 1]
+    s.ring[axis, j, 0, 0], s.ring[axis, j, 0, 1] = s.ring[axis, j, 1, 0], s.ring[axis, j, 1, 1]
     s.ring[axis, j, 1, 0], s.ring[axis, j, 1, 1] = mean, d
     s.fill[axis, j] = min(fill + 1, 2)
 
@@ -235,13 +235,30 @@ def _gather(band: Floats, unit: Floats, seeds: Floats, axis: int, j: int, z2: fl
     first[int(one[SEEDED])] = z2
     one[SEEDED] += 1.0
     if one[SEEDED] == SEED:
-        scale = np.median(first) / MEDIAN
+        scale = _median_of_seeds(first) / MEDIAN
         if scale == 0.0:
-            scale = np.mean(first)  # steps of resolution larger than the noise
+            for value in first:
+                scale += value
+            scale /= SEED  # steps of resolution larger than the noise
         if scale == 0.0:
             one[SEEDED] = 0.0  # an axis that shows nothing has no noise that could change
         one[LIMIT] = CLIP * scale
-        one[N], one[S] = SEED, np.minimum(first, one[LIMIT]).sum()
+        one[N], one[S] = SEED, 0.0
+        for value in first:
+            one[S] += min(value, one[LIMIT])
+
+
+@compiled
+def _median_of_seeds(first: Floats) -> float:
+    """Return the value that half of the others do not exceed, by counting."""
+    for value in first:
+        below, equal = 0, 0
+        for other in first:
+            below += other < value
+            equal += other == value
+        if below <= SEED // 2 < below + equal:
+            return value
+    return 0.0
 
 
 @compiled
@@ -363,7 +380,7 @@ def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis
 def _suspect_burst(s: State, axis: int, now: int) -> None:
     """Too many extremes: an alarm once the reference is known."""
     if s.burst[axis, 1] - s.born[axis] >= s.levels[LEARN_SAMPLES]:
-        _alarm(s, axis, BURST, 0, s.burst[axis, 1], s.burst[axis, 0], now)
+        _alarm(s, axis, BURST, np.int64(0), s.burst[axis, 1], s.burst[axis, 0], now)
 
 
 @compiled
@@ -444,5 +461,8 @@ def _remember(s: State, tick: int) -> None:
         tick >>= 1
         level += 1
     slot = (tick >> 1) % SLOTS
-    s.snap[level, slot] = s.cum
+    for axis in range(AXES):
+        for j in range(s.cum.shape[1]):
+            for i in range(UNIT_EXTREME + 1):
+                s.snap[level, slot, axis, j, i] = s.cum[axis, j, i]
     s.snap_at[level, slot] = s.clock[TOTAL]

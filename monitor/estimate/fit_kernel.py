@@ -45,15 +45,6 @@ WHITE: Final = PAIRS.index((N, N))
 
 
 @compiled
-def fit_axes(  # type: ignore[no-untyped-def]
-    known, avar, terms, slope, slopes, thresholds, full, warm, answer, gains
-):
-    """Fit all axes: ``avar``, ``terms`` and ``slopes`` [axes, m], ``slope`` [axes] or NaN."""
-    for axis in range(avar.shape[0]):
-        fit_axis(axis, known, avar, terms, slope[axis], slopes, thresholds, full, warm, answer, gains)
-
-
-@compiled
 def fit_axis(  # type: ignore[no-untyped-def]
     axis, known, avar, terms, slope, slopes, thresholds, full, warm, answer, gains
 ):
@@ -63,29 +54,26 @@ def fit_axis(  # type: ignore[no-untyped-def]
     straight = slope == slope
     flat = known.flat if straight else known.columns
     rows = _levels(known, curve, terms[axis], slope, slopes[axis], level, stretch)
-    gains.used[axis] = 0
+    gains.used[axis, 0] = gains.used[axis, 1] = 0
     gains.either[axis] = False
     gains.straight[axis] = straight
     if rows.size < MIN_ROWS:
-        answer.entered[axis] = False
-        answer.status[axis] = 0
+        for a in range(5):
+            answer.entered[axis, a], answer.status[axis, a] = False, 0
         return
     theta, entered, status = answer.theta[axis], answer.entered[axis], answer.status[axis]
     lo, hi = answer.lo[axis], answer.hi[axis]
     variance, weighted, normal, right = np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5)
-    first, free = _fit_terms(
-        curve, level, rows, stretch, flat, known, full, warm, variance, weighted, normal, right, theta
-    )
-    lo[:] = np.nan
-    hi[:] = np.nan
-    status[:] = 0
-    scatter, limit = _misfit(level, rows[first:], theta, flat, variance)
-    if full and scatter > limit:
-        # covariances of noises that are not those of the curve draw a fit away from all of its points
+    while True:
         first, free = _fit_terms(
-            curve, level, rows, stretch, flat, known, False, warm, variance, weighted, normal, right, theta
+            curve, level, rows, stretch, flat, known, full, warm, variance, weighted, normal, right, theta
         )
         scatter, limit = _misfit(level, rows[first:], theta, flat, variance)
+        if not full or scatter <= limit:
+            break
+        full = False  # covariances of noises that are not those of the curve draw a fit away from all of its points
+    for a in range(5):
+        lo[a], hi[a], status[a] = np.nan, np.nan, 0
     misfit = scatter if scatter > limit else 1.0
     found, c0, enters = judge(
         level, rows[first:], stretch, known.covariance, weighted, normal, thresholds, straight, misfit,

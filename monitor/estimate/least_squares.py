@@ -84,8 +84,10 @@ def weigh(rows, theta, covariance, stretch, columns, blind, full, variance, weig
 @compiled
 def normal_equations(level, rows, columns, weighted, normal, right):  # type: ignore[no-untyped-def]
     """Xᵀ V⁻¹ X and Xᵀ V⁻¹ y; a column of zeros is a term that is not asked for, and comes out as zero."""
-    normal[:] = 0.0
-    right[:] = 0.0
+    for a in range(5):
+        right[a] = 0.0
+        for b in range(a + 1):
+            normal[a, b] = 0.0
     for i in rows:
         for a in range(5):
             right[a] += weighted[i, a] * level[i]
@@ -127,7 +129,8 @@ def solve_nonnegative(normal, right, free, theta):  # type: ignore[no-untyped-de
 def solve(normal, right, subset, solution):  # type: ignore[no-untyped-def]
     """Cholesky on the columns of a subset, each scaled to one; False when they cannot be told apart."""
     factor = np.zeros((5, 5))
-    solution[:] = 0.0
+    for a in range(5):
+        solution[a] = 0.0
     for a in range(5):
         if not subset >> a & 1:
             continue
@@ -175,9 +178,9 @@ def invert(normal, subset, inverse):  # type: ignore[no-untyped-def]
     """Inverse [NOISES, NOISES] on the terms of a subset, zero elsewhere; False where they cannot be told apart."""
     unit, solution = np.empty(5), np.empty(5)
     for a in range(NOISES):
-        unit[:] = 0.0
-        unit[a] = 1.0
-        solution[:] = 0.0
+        for b in range(5):
+            unit[b] = 1.0 if b == a else 0.0
+            solution[b] = 0.0
         if subset >> a & 1 and not solve(normal, unit, subset, solution):
             return False
         for b in range(NOISES):

@@ -7,6 +7,9 @@ enter or leave, a coefficient has moved by a fifth and by more than its scatter,
 the window has grown by a tenth, or half of it has passed. In between weights are stale by less than that, which adds
 2 % to the error of a coefficient at most: it depends on the weights in second order.
 
+The kernel returns where an axis needs new gains, and ``fit_axis`` is called from here: it is seldom needed, and would
+otherwise be compiled a second time as a part of the kernel.
+
 Comes in: samples. Goes out: the course of Q N B K R, a row a sample; what is not estimated is NaN there.
 Intervals are for who looks: ``Estimator.get``.
 """
@@ -18,6 +21,7 @@ from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
 from monitor.compiled import compiled
+from monitor.estimate.coefficients import Status
 from monitor.estimate.fit import THRESHOLDS_WATCHED, TO_SI, Design, known
 from monitor.estimate.fit_kernel import fit_axis
 from monitor.estimate.least_squares import Q, R, invert, present, solve_nonnegative
@@ -59,6 +63,7 @@ class Refit:
     def __init__(self, window: AllanWindow, rows: int, tables: AxisTables) -> None:
         self._window, self._rows, self._tables = window, rows, tables
         self._curve, self._terms, self._slopes = np.zeros((3, AXES, rows))
+        self._slope = np.zeros(AXES)
         self._ages = np.zeros(AXES, np.int64)
         self.reset()
 
@@ -92,15 +97,27 @@ class Refit:
 
     def _advance(self, design: Design, values: Floats, lengths: Ints, course: Floats) -> None:
         self._window.stage(values)
+        to_si = design.rate_hz**TO_SI
         done = 0
         while done < len(values):
-            until = min(len(values) - done, self._lookup(design, lengths))
-            _follow(
-                self._window.parts(), done, until, lengths, tuple(self._known), THRESHOLDS_WATCHED,
-                design.rate_hz**TO_SI,
-                self._answer, self._gains, self._ages, self._curve, self._terms, self._slopes, course,
+            until = done + min(len(values) - done, self._lookup(design, lengths))
+            while done < until:
+                done, due = _follow(
+                    self._window.parts(), done, until, lengths, to_si, self._answer, self._gains, self._ages,
+                    self._curve, self._terms, self._slope, self._slopes, course,
+                )  # fmt: skip
+                if due:
+                    self._fit([axis for axis in range(AXES) if due >> axis & 1], to_si, course[done - 1])
+
+    def _fit(self, axes: list[int], to_si: Floats, coefficients: Floats) -> None:
+        """Fit some axes to ``_curve``, and write what is estimated into ``coefficients`` [5, 6]."""
+        for axis in axes:
+            fit_axis(
+                axis, self._known[axis], self._curve, self._terms, float(self._slope[axis]), self._slopes,
+                THRESHOLDS_WATCHED, False, True, self._answer, self._gains,
             )  # fmt: skip
-            done += until
+        size = np.sqrt(np.maximum(self._answer.theta[axes], 0.0)) * to_si
+        coefficients[:, axes] = np.where(self._answer.status[axes] == Status.ESTIMATED, size, np.nan).T
 
     def _lookup(self, design: Design, lengths: Ints) -> int:
         """Find the table of every axis; for how many samples these last."""
@@ -125,20 +142,25 @@ class Refit:
 
 @compiled
 def _follow(  # type: ignore[no-untyped-def]
-    parts, start, n, lengths, knowns, thresholds, to_si, answer, gains, ages, curve, terms, slopes, course
+    parts, start, end, lengths, to_si, answer, gains, ages, curve, terms, slope, slopes, course
 ):
-    """Advance by n staged samples from row ``start``, and fit after each into that row of ``course``."""
+    """Advance by staged samples from row ``start``, each with its coefficients into that row of ``course``.
+
+    Stop at row ``end``, or after a row at which axes are to be fitted to ``curve``. Return the row after the last, and
+    those axes as a set of bits.
+    """
     ints, floats, missing, taus, window = parts
     state, factors, _, counts, phase = cut_ints(ints, taus)
     scaling, _, sums, rest, _ = cut_floats(floats, taus)
-    m = knowns[0].whole.size
-    right, slope, held = np.empty((AXES, 5)), np.empty(AXES), np.empty(AXES, np.bool_)
+    m = curve.shape[1]
+    right, held = np.empty((AXES, 5)), np.empty(AXES, np.bool_)
     units, inverse = np.empty((AXES, m)), np.empty((AXES, m))
     for axis in range(AXES):
         for i in range(m):
             units[axis, i] = 2.0 * (factors[i] * scaling[axis]) ** 2
             inverse[axis, i] = 1.0 / (units[axis, i] * terms[axis, i])
-    for row in range(start, start + n):
+    for row in range(start, end):
+        due = 0
         advance(ints, floats, missing, taus, row, 1)
         filled = min(state[TOTAL], window)
         for axis in range(AXES):
@@ -164,11 +186,14 @@ def _follow(  # type: ignore[no-untyped-def]
                     curve[axis, i] = total * inverse[axis, i] if total > counts[at] else 0.0
                     bend = mean_bend(phase, missing, state[NEWEST], lengths[axis], factors[i], axis)
                     slopes[axis, i] = bend / scaling[axis]
-                fit_axis(axis, knowns[axis], curve, terms, slope[axis], slopes, thresholds, False, True, answer, gains)
+                due |= 1 << axis
                 ages[axis] = 0
             for a in range(5):
                 estimated = answer.status[axis, a] == 2
                 course[row, a, axis] = np.sqrt(max(answer.theta[axis, a], 0.0)) * to_si[a] if estimated else np.nan
+        if due > 0:
+            return row + 1, due
+    return end, 0
 
 
 @compiled

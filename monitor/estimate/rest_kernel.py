@@ -159,8 +159,9 @@ def _close(size: int, s: State, blocks: Ints, moving: Ints, episodes: Floats, fi
     """The open block is complete: measure, judge, learn, let go of the one before."""
     number = s.place[OPEN]
     follows = s.place[HELD] == number - 1
-    now = np.full((2, AXES), nan)
+    now = np.empty((2, AXES))
     for a in range(AXES):
+        now[LOG_VARIANCE, a] = now[MEAN, a] = nan
         if 2.0 * s.open[a, COUNT] >= size and s.open[a, COUNT] >= FEWEST:
             _measure(a, s, now)
     moves = _judge(now, follows, size, s)
@@ -173,7 +174,8 @@ def _close(size: int, s: State, blocks: Ints, moving: Ints, episodes: Floats, fi
     s.place[HELD], s.place[HELD_MOVES] = number, s.place[QUIET_RUN] <= AFTER
     if s.place[BEGAN] >= 0 and s.place[QUIET_RUN] == APART:
         _end(s, episodes, filled)
-    s.open[:, COUNT] = 0.0
+    for a in range(AXES):
+        s.open[a, COUNT] = 0.0
 
 
 @compiled
@@ -193,7 +195,9 @@ def _measure(a: int, s: State, now: Floats) -> None:
     floor = log(floor + NOTHING)
     if s.ordered[LOG_VARIANCE, a, 0] < floor:  # the step was not known when these were learned
         for ring in (s.ordered, s.ring, s.recent):
-            ring[LOG_VARIANCE, a] = np.maximum(ring[LOG_VARIANCE, a], floor)
+            for k in range(LEARNED):
+                if ring[LOG_VARIANCE, a, k] < floor:
+                    ring[LOG_VARIANCE, a, k] = floor
 
 
 # --- judging
@@ -233,7 +237,8 @@ def _judge(now: Floats, follows: bool, size: int, s: State) -> bool:
     if off and not loud and s.place[STILL] >= (SPUN if rotates else SETTLED):
         _take_over(now, s)
         if rotates:
-            s.shifted[:] = 0.0
+            for a in range(AXES):
+                s.shifted[a] = 0.0
         off = False
     return loud or off
 
@@ -252,8 +257,9 @@ def _take_over(now: Floats, s: State) -> None:
         n = min(s.seen[a], LEARNED)
         if now[MEAN, a] == now[MEAN, a] and n > 0:
             shift = now[MEAN, a] - _quantile(s.ordered[MEAN, a], n, 0.5)
-            s.ordered[MEAN, a] += shift
-            s.ring[MEAN, a] += shift
+            for k in range(LEARNED):
+                s.ordered[MEAN, a, k] += shift
+                s.ring[MEAN, a, k] += shift
             s.shifted[a] += shift
     s.place[TURNED] = 1
 
@@ -264,32 +270,36 @@ def _take_over(now: Floats, s: State) -> None:
 @compiled
 def _learn(now: Floats, moves: bool, number: int, size: int, s: State) -> None:
     """The block enters the reference if it is at rest; the reference is replaced where it has proved wrong."""
-    s.recent[:, :, s.place[RECENT] % LEARNED] = now
+    newest = s.place[RECENT] % LEARNED
     s.place[RECENT] += 1
     quieter = measured = 0
     for a in range(AXES):
+        s.recent[LOG_VARIANCE, a, newest], s.recent[MEAN, a, newest] = now[LOG_VARIANCE, a], now[MEAN, a]
         n = min(s.seen[a], LEARNED)
         if now[MEAN, a] != now[MEAN, a]:
             continue
         measured += 1
         quieter += n >= LEAST and now[LOG_VARIANCE, a] < _quantile(s.ordered[LOG_VARIANCE, a], n, 0.25) - QUIETER
         if not moves:
-            _insert(a, now, s)
+            _insert(a, now[LOG_VARIANCE, a], now[MEAN, a], s)
     s.place[QUIET] = s.place[QUIET] + 1 if measured and 2 * quieter >= measured else 0
+    blocks = 0
     if s.place[QUIET] == LEAST:
-        _begin_anew(LEAST, s)
+        blocks = LEAST
         s.place[QUIET] = 0
     lasted = number - s.place[BEGAN] + 1
     if moves and lasted >= LEARNED and lasted % LOOK_EVERY == 0 and _steady(size, s):
-        _begin_anew(LEARNED, s)
+        blocks = LEARNED
+    if blocks > 0:
+        _begin_anew(blocks, s)
 
 
 @compiled
-def _insert(a: int, now: Floats, s: State) -> None:
+def _insert(a: int, log_variance: float, mean: float, s: State) -> None:
     """One more value in both rings of an axis; the oldest leaves."""
     at, n = s.seen[a] % LEARNED, min(s.seen[a], LEARNED)
     for kind in range(2):
-        value, ordered = now[kind, a], s.ordered[kind, a]
+        value, ordered = log_variance if kind == LOG_VARIANCE else mean, s.ordered[kind, a]
         place = n
         if n == LEARNED:
             place = _rank(ordered, n, s.ring[kind, a, at])
@@ -322,42 +332,76 @@ def _rank(ordered: Floats, n: int, value: float) -> int:
 @compiled
 def _begin_anew(blocks: int, s: State) -> None:
     """The reference is made of the last blocks and nothing else."""
-    s.seen[:] = 0
-    s.shifted[:] = 0.0
-    s.ring[:] = nan
-    s.ordered[:] = nan
-    now = np.empty((2, AXES))
+    for a in range(AXES):
+        s.seen[a], s.shifted[a] = 0, 0.0
+        for kind in range(2):
+            for k in range(LEARNED):
+                s.ring[kind, a, k] = s.ordered[kind, a, k] = nan
     for back in range(blocks, 0, -1):
-        now[:] = s.recent[:, :, (s.place[RECENT] - back) % LEARNED]
+        k = (s.place[RECENT] - back) % LEARNED
         for a in range(AXES):
-            if now[MEAN, a] == now[MEAN, a]:
-                _insert(a, now, s)
+            if s.recent[MEAN, a, k] == s.recent[MEAN, a, k]:
+                _insert(a, s.recent[LOG_VARIANCE, a, k], s.recent[MEAN, a, k], s)
 
 
 @compiled
 def _steady(size: int, s: State) -> bool:
     """Whether the last LEARNED blocks are one steady state: both halves agree, nothing bursts, no mean wanders."""
-    half = LEARNED // 2
-    order = (s.place[RECENT] + np.arange(LEARNED)) % LEARNED  # oldest first
+    half, ordered = LEARNED // 2, np.empty(LEARNED)
     for a in range(AXES):
-        loudness, mean = s.recent[LOG_VARIANCE, a][order], s.recent[MEAN, a][order]
-        if np.isnan(mean).all():
+        n = _sort_recent(s, MEAN, a, 0, LEARNED, ordered)
+        if n == 0:
             continue
-        if np.isnan(mean).sum() > LEARNED // 10:
+        if LEARNED - n > LEARNED // 10:
             return False
-        if abs(np.nanmedian(loudness[:half]) - np.nanmedian(loudness[half:])) > 0.5 * LOUDER:
+        scatter = 0.5 * (_interpolate(ordered, n, 0.75) - _interpolate(ordered, n, 0.25)) / SIGMA_OF_QUARTER
+        n = _sort_recent(s, LOG_VARIANCE, a, 0, LEARNED, ordered)
+        middle = _median(ordered, n)
+        louder = 0
+        for k in range(n):
+            louder += ordered[k] > middle + 2.0 * LOUDER
+        if louder > LEARNED // 50:
             return False
-        middle = np.nanmedian(loudness)
-        if (loudness > middle + 2.0 * LOUDER).sum() > LEARNED // 50:
-            return False
-        step = s.open[a, STEP]
-        scatter = 0.5 * (np.nanquantile(mean, 0.75) - np.nanquantile(mean, 0.25)) / SIGMA_OF_QUARTER
-        explained = exp(0.5 * middle) / sqrt(size) + step
+        explained = exp(0.5 * middle) / sqrt(size) + s.open[a, STEP]
         if scatter > WANDER * explained:
             return False
-        if abs(np.nanmedian(mean[:half]) - np.nanmedian(mean[half:])) > WANDER * explained:
-            return False
+        for kind in range(2):
+            early = _median(ordered, _sort_recent(s, kind, a, 0, half, ordered))
+            late = _median(ordered, _sort_recent(s, kind, a, half, LEARNED, ordered))
+            if abs(early - late) > (0.5 * LOUDER if kind == LOG_VARIANCE else WANDER * explained):
+                return False
     return True
+
+
+@compiled
+def _sort_recent(s: State, kind: int, a: int, begin: int, end: int, ordered: Floats) -> int:
+    """Sort the values that are not NaN of the recent blocks begin ≤ k < end, oldest first; return how many."""
+    n = 0
+    for k in range(begin, end):
+        value = s.recent[kind, a, (s.place[RECENT] + k) % LEARNED]
+        if value == value:
+            place = n
+            while place > 0 and ordered[place - 1] > value:
+                ordered[place] = ordered[place - 1]
+                place -= 1
+            ordered[place] = value
+            n += 1
+    return n
+
+
+@compiled
+def _median(ordered: Floats, n: int) -> float:
+    """Return the median of the first n of a sorted array; NaN if there are none."""
+    return 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2]) if n > 0 else nan
+
+
+@compiled
+def _interpolate(ordered: Floats, n: int, p: float) -> float:
+    """Return the quantile of the first n ≥ 1 of a sorted array, interpolated linearly between ranks."""
+    rank = (n - 1) * p
+    lower = int(rank)
+    share = rank - lower
+    return ordered[lower] * (1.0 - share) + ordered[min(lower + 1, n - 1)] * share
 
 
 @compiled
@@ -381,7 +425,8 @@ def _remember(now: Floats, number: int, s: State) -> None:
     """A moving block: the episode goes on, or begins, and its peaks grow."""
     if s.place[BEGAN] < 0:
         s.place[BEGAN], s.place[TURNED] = number, 0
-        s.peaks[:] = 0.0
+        for a in range(AXES):
+            s.peaks[0, a] = s.peaks[1, a] = 0.0
     s.place[LATEST] = number
     for a in range(AXES):
         n = min(s.seen[a], LEARNED)
@@ -405,7 +450,10 @@ def _emit(s: State, blocks: Ints, moving: Ints, filled: Ints) -> None:
 
 @compiled
 def _end(s: State, episodes: Floats, filled: Ints) -> None:
-    axis = np.argmax(s.peaks[1])
+    axis = 0
+    for a in range(1, AXES):
+        if s.peaks[1, a] > s.peaks[1, axis]:
+            axis = a
     episode = episodes[filled[1]]
     episode[FIRST], episode[LAST] = s.place[BEGAN], s.place[LATEST]
     episode[CHANGED], episode[AXIS], episode[PEAK] = s.place[TURNED], axis, s.peaks[0, axis]

@@ -224,16 +224,15 @@ def add_total(phase, missing, first, n, m, begin, end, sums, terms):  # type: ig
     while i < end:
         stop = end
         before, behind = 1, 1
-        mirror[:] = 0
         if i < m:
             before = -1
-            mirror += 2 * phase[first, : sums.size]
             stop = min(stop, m)
         if i > n - m:
             behind = -1
-            mirror += 2 * phase[last, : sums.size]
         else:
             stop = min(stop, n - m + 1)
+        for lane in range(sums.size):
+            mirror[lane] = (1 - before) * phase[first, lane] + (1 - behind) * phase[last, lane]
         left, right = (first + abs(i - m)) % places, (first + min(i + m, 2 * n - m - i)) % places
         _add_run(phase, missing, left, (first + i) % places, right, before, behind, first, last, mirror,
                  stop - i, sums, terms)  # fmt: skip

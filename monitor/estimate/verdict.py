@@ -111,13 +111,15 @@ def judge(  # type: ignore[no-untyped-def]
     Returns û, its variance if its term were absent, and from where on a term that is out comes in.
     """
     terms = NOISES if straight else 5
-    gain, estimate, enters = np.zeros((5, rows.size)), np.zeros(5), np.full(NOISES, np.inf)
+    gain, estimate, enters, absent = np.zeros((5, rows.size)), np.zeros(5), np.empty(NOISES), np.empty(NOISES)
     for a in range(terms):
         if not _row_of(a, rows, weighted, normal, stretch, gain[a]):
             entered[a] = False
             continue
         estimate[a] = _estimate(gain[a], level, rows, stretch)
-    forms = _variance_forms(np.arange(terms), gain, rows, theta, covariance)
+    forms = _variance_forms(0, terms, gain, rows, theta, covariance)
+    for a in range(NOISES):
+        enters[a], absent[a] = np.inf, misfit * forms[a, 0]
     for a in range(terms):
         c0, c1, c2 = misfit * forms[a, 0], misfit * forms[a, 1], forms[a, 2]
         if c0 <= 0.0 and c2 <= 0.0:  # there was no solution
@@ -142,7 +144,7 @@ def judge(  # type: ignore[no-untyped-def]
             status[a] = 1
             lo[a] = 0.0
             hi[a] = interval_end(max(estimate[a], 0.0), c0, c1, c2, skewness, -BOUND)
-    return estimate, misfit * forms[:NOISES, 0], enters
+    return estimate, absent, enters
 
 
 @compiled
@@ -154,17 +156,18 @@ def sharpen(  # type: ignore[no-untyped-def]
     Weights for an absent term look where none of it is: on the few long τ that K would fill, say, they leave so little
     that its own scatter drowns it, and the bound is far off or infinite.
     """
-    supposed, scratch, weights = theta.copy(), np.empty(level.size), np.empty((level.size, 5))
+    supposed, scratch, weights = np.empty(5), np.empty(level.size), np.empty((level.size, 5))
     normal, right, gain = np.empty((5, 5)), np.empty(5), np.empty((1, rows.size))
     for a in range(NOISES):
         if status[a] != 1 or c0[a] <= 0.0:
             continue
-        supposed[:] = theta
+        for b in range(5):
+            supposed[b] = theta[b]
         supposed[a] = max(found[a], 0.0) + JUST_SEEN * np.sqrt(c0[a])
         weigh(rows, supposed, covariance, stretch, columns, scratch, False, scratch, weights)
         normal_equations(level, rows, columns, weights, normal, right)
         if _row_of(a, rows, weights, normal, stretch, gain[0]):
-            c = _variance_forms(np.array([a]), gain, rows, theta, covariance)[0]
+            c = _variance_forms(a, a + 1, gain, rows, theta, covariance)[0]
             estimate = max(_estimate(gain[0], level, rows, stretch), 0.0)
             skewness = 2.0 * np.sqrt(c[2])
             hi[a] = interval_end(estimate, misfit * c[0], misfit * c[1], c[2], skewness, -BOUND)
@@ -195,13 +198,13 @@ def _row_of(a, rows, weighted, normal, stretch, gain):  # type: ignore[no-untype
 
 
 @compiled
-def _variance_forms(terms, gain, rows, theta, covariance):  # type: ignore[no-untyped-def]
-    """c0 c1 c2 [terms, 3] of each û = g σ²: its variance if its own θ were t is c0 + c1 t + c2 t².
+def _variance_forms(first, end, gain, rows, theta, covariance):  # type: ignore[no-untyped-def]
+    """c0 c1 c2 [end - first, 3] of û = g σ² of each term from ``first``: its variance is c0 + c1 t + c2 t² if θ were t.
 
     One walk over the pairs of τ for all terms; of those the ramp, which has no noise, only has c0.
     """
     q, n, b, k = max(theta[0], 0.0), theta[1], theta[2], theta[3]
-    forms, bent, own = np.zeros((terms.size, 3)), np.zeros(5), np.zeros(5)
+    forms, bent, own = np.zeros((end - first, 3)), np.zeros(5), np.zeros(5)
     for i in range(rows.size):
         for j in range(i + 1):
             c = covariance[rows[i], rows[j]]
@@ -213,8 +216,8 @@ def _variance_forms(terms, gain, rows, theta, covariance):  # type: ignore[no-un
             others = n * (n * c[4] + b * c[5] + k * c[6]) + b * (n * c[5] + b * c[7] + k * c[8])
             others += k * (n * c[6] + b * c[8] + k * c[9])  # without Q
             twice = 1.0 if i == j else 2.0
-            for index in range(terms.size):
-                a = terms[index]
+            for index in range(end - first):
+                a = first + index
                 weight = twice * gain[index, i] * gain[index, j]
                 if a == Q:
                     absent = others
@@ -259,7 +262,9 @@ def freeze(  # type: ignore[no-untyped-def]
         return  # a τ between others without a term: only a gap nearly as long as the window makes that
     low, high = gains.low[axis], gains.high[axis]
     theta, entered, status = answer.theta[axis], answer.entered[axis], answer.status[axis]
-    gains.normal[axis] = normal
+    for a in range(5):
+        for b in range(5):
+            gains.normal[axis, a, b] = normal[a, b]
     if not invert(normal, 2**NOISES - 1, gains.whole[axis]) or not invert(normal, present(theta), gains.inverse[axis]):
         return
     for a in range(NOISES):

@@ -44,10 +44,10 @@ from monitor.estimate.window_kernel import (
     Parts,
     advance,
     bends,
-    cut_floats,
-    cut_ints,
     forget,
     thirds,
+    view_floats,
+    view_ints,
 )
 
 MIN_LENGTH: Final = 100
@@ -116,14 +116,14 @@ class AllanWindow:
         self.spans = spans.astype(np.int64)
         self._taus = int(factors.size)
         self._scale = phase_scale(int(factors.max()))
-        # few arrays for all, as the interpreter takes 50 ns to hand one to the kernel; see cut_ints, cut_floats
+        # few arrays for all, as the interpreter takes 50 ns to hand one to the kernel; see view_ints, view_floats
         taus, places = self._taus, length + 1 + RUN
         self._ints = _aligned(LANES + -(-2 * taus // LINE) * LINE + taus * LANES + places * LANES, np.int64)
         self._floats = _aligned((2 + 2 * RUN + 2 * taus + STAGE) * LANES, np.float64)
         self._missing = np.zeros(places * LANES, np.int32)
-        self._state, rows_m, rows_span, terms, self._phase = cut_ints(self._ints, taus)
+        self._state, rows_m, rows_span, terms, self._phase = view_ints(self._ints, taus)
         rows_m[:], rows_span[:] = self.factors, self.spans
-        self._scaling, _, sums, rest, stage = cut_floats(self._floats, taus)
+        self._scaling, _, sums, rest, stage = view_floats(self._floats, taus)
         self._terms = terms.reshape(taus, LANES)
         self._sums, self._rest = sums.reshape(taus, LANES), rest.reshape(taus, LANES)
         self._stage = stage[: STAGE * AXES].reshape(STAGE, AXES)

@@ -35,23 +35,21 @@ BEND_POINTS: Final = 64
 class Parts(NamedTuple):
     """The window's arrays, for compiled code."""
 
-    ints: Ints  # see cut_ints
-    floats: Floats  # see cut_floats
+    ints: Ints  # see view_ints
+    floats: Floats  # see view_floats
     missing: NDArray[np.int32]
     taus: int
     length: int
 
 
-@compiled
-def cut_ints(ints: Ints, taus: int) -> tuple[Ints, Ints, Ints, Ints, Ints]:
+def view_ints(ints: Ints, taus: int) -> tuple[Ints, Ints, Ints, Ints, Ints]:
     """State, factors [m], spans [m], terms [m · LANES], phase [places · LANES]."""
     spans, terms = LANES + taus, LANES + (2 * taus + LINE - 1) // LINE * LINE
     phase = terms + taus * LANES
     return ints[:LANES], ints[LANES:spans], ints[spans : spans + taus], ints[terms:phase], ints[phase:]
 
 
-@compiled
-def cut_floats(floats: Floats, taus: int) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+def view_floats(floats: Floats, taus: int) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Parts of the workspace.
 
     Scale and rounding not yet in phase [2 · LANES], two scratches for a run, sums and what their roundings left
@@ -60,6 +58,10 @@ def cut_floats(floats: Floats, taus: int) -> tuple[Floats, Floats, Floats, Float
     scratch, sums = 2 * LANES, (2 + 2 * RUN) * LANES
     rest, stage = sums + taus * LANES, sums + 2 * taus * LANES
     return floats[:scratch], floats[scratch:sums], floats[sums:rest], floats[rest:stage], floats[stage:]
+
+
+cut_ints, cut_floats = compiled(view_ints), compiled(view_floats)
+"""The same for kernels."""
 
 
 @compiled

@@ -1,13 +1,17 @@
 """Kernels are compiled where nothing can be kept on disk, too; what is kept is not taken when it is stale."""
 
+import gc
 import inspect
 import subprocess
 import sys
 import textwrap
 from pathlib import Path
 
+import numpy as np
+import pytest
+
 import monitor.compiled
-from monitor.compiled import IMPORTS, stamp
+from monitor.compiled import IMPORTS, compiled, stamp
 from monitor.estimate import fit_kernel
 from tests.support.waiting import PATIENCE_S
 
@@ -55,4 +59,70 @@ def test_cached_code_is_stale_when_what_it_calls_has_changed(tmp_path):
 def test_the_stamp_of_a_kernel_covers_the_files_it_calls():
     imported = [package for package, *_ in IMPORTS.findall(Path(inspect.getfile(fit_kernel)).read_text())]
     assert imported.count("monitor.estimate.verdict") == 1
-    assert fit_kernel.fit_axes._cache._cache_file._source_stamp[1] == stamp(Path(inspect.getfile(fit_kernel)))
+    assert fit_kernel.fit_axis._cache._cache_file._source_stamp[1] == stamp(Path(inspect.getfile(fit_kernel)))
+
+
+@compiled
+def _add(values, total):  # type: ignore[no-untyped-def]
+    for value in values:
+        total += value
+    return total
+
+
+@compiled
+def _add_twice(values):  # type: ignore[no-untyped-def]
+    return _add(values, _add(values, 0.0))
+
+
+def test_machine_code_is_generated_only_for_the_kernel_that_python_calls():
+    values = np.arange(5.0)
+    assert _add_twice(values) == 20.0
+    assert len(_add_twice.signatures) == 1
+    assert not _add.signatures
+    assert len(_add.intermediate.signatures) == 1
+    (whole,), (part,) = _add_twice.overloads.values(), _add.intermediate.overloads.values()
+    engine = whole.library.codegen._engine
+    assert engine.is_symbol_defined(whole.fndesc.llvm_cpython_wrapper_name)
+    assert not engine.is_symbol_defined(part.fndesc.llvm_cpython_wrapper_name)
+    assert _add(values, 1.0) == 11.0  # from Python it is compiled as a kernel of its own
+    assert len(_add.signatures) == 1
+
+
+def test_an_inner_function_is_compiled_once_for_all_constant_arguments():
+    @compiled
+    def scale(x, factor, negative):
+        return -factor * x if negative else factor * x
+
+    @compiled
+    def outer(x, factor):
+        return scale(x, 2, False) + scale(x, 3, True) + scale(x, factor, x > 0.0)
+
+    assert outer(1.0, 5) == 2.0 - 3.0 - 5.0
+    assert len(scale.intermediate.signatures) == 1
+
+
+def test_intermediate_code_refuses_a_call_from_python():
+    with pytest.raises(TypeError, match="_add is intermediate code"):
+        _add.intermediate(np.arange(5.0), 0.0)
+
+
+def test_an_exception_in_an_inner_function_reaches_python():
+    @compiled
+    def fill(target, source):
+        target[:] = source
+
+    @compiled
+    def outer(target, source):
+        fill(target, source)
+
+    with pytest.raises(ValueError, match="cannot assign slice of shape"):
+        outer(np.zeros(3), np.zeros(4))
+
+
+def test_the_garbage_collector_runs_again_after_a_compilation():
+    @compiled
+    def half(x):
+        return 0.5 * x
+
+    assert half(3.0) == 1.5
+    assert gc.isenabled()
