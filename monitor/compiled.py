@@ -10,13 +10,23 @@ import contextlib
 import inspect
 import os
 import re
+import sys
 from collections.abc import Callable
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar, cast
 
-import numba
+_masked = "scipy" not in sys.modules
+if _masked:
+    # Numba imports scipy.linalg if it is installed: 17 MB that no kernel here uses
+    sys.modules["scipy"] = None  # type: ignore[assignment]
+try:
+    import numba
+    import numba.np.arraymath
+finally:
+    if _masked:
+        del sys.modules["scipy"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
