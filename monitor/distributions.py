@@ -208,7 +208,7 @@ def student_quantile(df: int, probability: float) -> float:
     Parameters
     ----------
     df : degrees of freedom, 1 or more.
-    probability : from 0.95 to 0.999.
+    probability : from 0.975 to 0.999.
 
     >>> f"{student_quantile(1, 0.975):.4f} {student_quantile(30, 0.975):.4f}"
     '12.7062 2.0423'
