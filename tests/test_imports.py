@@ -186,7 +186,7 @@ def test_offline_commands_need_no_scipy(tmp_path: Path) -> None:
         ("thermal", "predict", "warm.npz", "--model", "model.json"),
         ("compensate", "warm.npz", "--out", "compensated.npz"),
         ("compensate", "warm.npz", "--out", "ar.npz", "--method", "ar"),
-        ("export", "result.json", "--format", "kalibr", "--out", "imu.yaml"),
+        ("export", CONFIG_FOLDER / "models" / "consumer-mems.toml", "--format", "kalibr", "--out", "imu.yaml"),
     ):
         assert call(tmp_path, *arguments, absent=absent) == (0, ""), arguments
         assert not loaded(tmp_path) & OPTIONAL
