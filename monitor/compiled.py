@@ -17,17 +17,26 @@ import gc
 import inspect
 import os
 import re
+import sys
 from collections.abc import Callable, Iterator
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar, cast
 
-import numba
-from numba import _dynfunc, types
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler
-from numba.core.registry import CPUDispatcher
+_masked = "scipy" not in sys.modules
+if _masked:
+    # Numba imports scipy.linalg if it is installed: 17 MB that no kernel here uses
+    sys.modules["scipy"] = None  # type: ignore[assignment]
+try:
+    import numba.np.arraymath
+    from numba import _dynfunc, types
+    from numba.core.codegen import JITCodeLibrary
+    from numba.core.compiler import Compiler
+    from numba.core.registry import CPUDispatcher
+finally:
+    if _masked:
+        del sys.modules["scipy"]
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -9,10 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from drivers.errors import ConfigError
-from monitor.catalogue import read_model
-from monitor.limits import bounds
 from monitor.settings import Config, ModelUse, examine
-from monitor.virtual.sensor import check_sensor
 
 
 def check(path: Path, *, pipe: bool = False) -> tuple[Config | None, list[str]]:
@@ -36,13 +33,19 @@ def check(path: Path, *, pipe: bool = False) -> tuple[Config | None, list[str]]:
 
 
 def _problems(use: ModelUse) -> Iterator[str]:
+    # each of them is imported where the configuration has it: most have neither
     try:
         if use.model is not None:
+            from monitor.catalogue import read_model
+            from monitor.limits import bounds
+
             bounds(use.limits, read_model(use.model))
     except ConfigError as error:
         yield from error.lines
     try:
         if use.virtual is not None:
+            from monitor.virtual.sensor import check_sensor
+
             check_sensor(use.virtual)
     except ConfigError as error:
         yield from error.lines

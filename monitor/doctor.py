@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from drivers import small_file
+from drivers.extras import missing_packages
 from drivers.links.can_link import missing_package
 from drivers.links.replay_link import ReplayLink
 from monitor.configuration_check import check
@@ -79,7 +80,7 @@ def examine(path: Path | None = None) -> list[Finding]:
         return found
     for one in config.table["device"]:
         found += device(str(one["name"]), one["driver"])
-    found += [*zenoh(config), *viewer(config), *storage(config), *metrics(config)]
+    found += [*zenoh(config), *viewer(config), *storage(config), *metrics(config), *reconcile(config)]
     for hook in config.hooks:
         if hook.command:
             found += permissions(Path(hook.command[0]), f"hook {Path(hook.command[0]).name}", secret=False)
@@ -277,6 +278,15 @@ def metrics(config: Config) -> list[Finding]:
         text = f"{own.host}: whoever reaches this machine may read the numbers"
         found.append(Finding("doubt", "metrics", text, "listen on 127.0.0.1, and let a local agent forward them"))
     return found
+
+
+def reconcile(config: Config) -> list[Finding]:
+    """Whether ``command/reconcile`` can be answered, if a folder is configured for its reports."""
+    missing = missing_packages("reconcile")
+    if not missing or not any(one.reconcile_folder for one in config.devices):
+        return []
+    text = f"reconcile_folder is set, and {' and '.join(missing)} is not installed: command/reconcile will be refused"
+    return [Finding("doubt", "reconcile", text, 'pip install "imu-monitor[reconcile]"')]
 
 
 def storage(config: Config) -> list[Finding]:

@@ -25,6 +25,7 @@ import numba
 import numpy as np
 from llvmlite import binding
 
+from drivers.extras import missing_packages
 from drivers.sample import SampleBlock, block
 from monitor.compiled import cache_folder, stamp
 from monitor.drift import heat
@@ -258,7 +259,8 @@ def _compiled_by(child: "subprocess.Popen[str]", part: Part) -> bool:
 def _stamp_file(folder: Path, group: Group) -> Path:
     """Return the place of the stamp of a group; its name changes with all that the machine code depends on."""
     machine = [binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()]
-    everything = [stamp(Path(__file__)), numba.__version__, sys.version, *machine]
+    parts = [part.name for part in group.parts]
+    everything = [*parts, stamp(Path(__file__)), numba.__version__, sys.version, *machine]
     return folder / f"{group.name}-{sha256(' '.join(everything).encode()).hexdigest()[:16]}.warm"
 
 
@@ -342,8 +344,8 @@ SERVICE: Final = Group(
     ),
 )
 """What the running service needs; what it needs first comes first."""
-COMMANDS: Final = Group(
-    "commands", (Part("analysis of recordings", _call_analysis), Part("reconciliation", _call_reconciliation))
-)
+_ANALYSIS: Final = Part("analysis of recordings", _call_analysis)
+_RECONCILIATION: Final = Part("reconciliation", _call_reconciliation)
+COMMANDS: Final = Group("commands", (_ANALYSIS,) if missing_packages("reconcile") else (_ANALYSIS, _RECONCILIATION))
 """What only commands on recordings need. A few kernels of rare cases are compiled when they are called."""
 GROUPS: Final = (SERVICE, COMMANDS)

@@ -29,7 +29,6 @@ from monitor.history.writer import Writer
 from monitor.hooks import Hooks
 from monitor.live_reconcile import Job, Reconciler
 from monitor.logs import LEVEL
-from monitor.metrics import MetricsOutput
 from monitor.outputs import HistoryOutput, TableOutput, ViewerOutput, ZenohOutput
 from monitor.publish import history_message, message
 from monitor.publish.queued_writer import QueuedWriter
@@ -40,10 +39,11 @@ from monitor.reload import Change
 from monitor.settings import Config, Device, Storage, VirtualTable
 from monitor.station import Output, Station
 from monitor.systemd import Unit
-from monitor.virtual import VirtualImu
 
 if TYPE_CHECKING:
+    from monitor.metrics import MetricsOutput
     from monitor.publish.rerun_view import RerunView
+    from monitor.virtual import VirtualImu
 
 IDLE_S: Final = 0.05
 PACE_S: Final = 0.02
@@ -101,7 +101,7 @@ class Service:
         self._page = ""  # where the viewer's page is, as it was said last
         self.hooks = Hooks(config.hooks, self.zenoh.put_on)
         self.outputs: list[Output] = [ZenohOutput(self.zenoh), self.hooks, *more]
-        self.metrics = None if config.metrics is None else MetricsOutput(config.metrics)
+        self.metrics = _metrics(config)
         if self.metrics is not None:
             self.outputs.append(self.metrics)
         if self.view is not None:
@@ -247,15 +247,17 @@ class Service:
         self._ready.progress = f"{progress} {progress.bar}"
         self._wake.set()
 
-    def _built(self, device: Device) -> tuple[Station, VirtualImu | None]:
+    def _built(self, device: Device) -> "tuple[Station, VirtualImu | None]":
         """A device, and the sensor where it is simulated; nothing of it is open."""
         link, imu = device.link, None
         if isinstance(link, VirtualTable):
+            from monitor.virtual import VirtualImu
+
             imu = VirtualImu(link, device.decoder, device.name)
             link = imu.link
         return Station(device, link, device.decoder, self._wake, self._ready, self.recorder), imu
 
-    def _take_on(self, station: Station, imu: VirtualImu | None) -> None:
+    def _take_on(self, station: Station, imu: "VirtualImu | None") -> None:
         self.stations = [*self.stations, station]
         if station.driver.times_are_unix:
             self._recorded.add(station.name)
@@ -278,7 +280,7 @@ class Service:
         if self._unit.told_ready:
             self._unit.ready()
 
-    def _apply(self, change: Change, built: Sequence[tuple[Station, VirtualImu | None]]) -> None:
+    def _apply(self, change: Change, built: "Sequence[tuple[Station, VirtualImu | None]]") -> None:
         leaving = [station for station in self.stations if station.name in change.removed]
         for station in leaving:
             station.stop()  # all at once: each may take a moment
@@ -298,7 +300,7 @@ class Service:
         for station, imu in built:
             self._add(station, imu)
 
-    def _add(self, station: Station, imu: VirtualImu | None) -> None:
+    def _add(self, station: Station, imu: "VirtualImu | None") -> None:
         """Start a device while the others run."""
         self.zenoh.add(station.name)
         if self.recorder is not None:
@@ -481,6 +483,14 @@ def _history(config: Config) -> Writer | None:
     if config.storage is None or not config.storage.history:
         return None
     return Writer(config.storage.folder / FILE, time.time)
+
+
+def _metrics(config: Config) -> "MetricsOutput | None":
+    if config.metrics is None:
+        return None
+    from monitor.metrics import MetricsOutput  # with http.server
+
+    return MetricsOutput(config.metrics)
 
 
 def _viewer(config: Config, recall: Callable[[str], Past | None]) -> "RerunView | None":

@@ -107,12 +107,32 @@ def drawn(course: Floats, length: int, n: int) -> Floats:
     >>> drawn(np.array([1.0, 3.0, 5.0]), 2, 6).tolist()
     [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
     """
-    from scipy.interpolate import CubicSpline  # costly to load, and the service never draws
-
-    middle = (np.arange(course.size) + 0.5) * length - 0.5
-    smooth = CubicSpline(middle, course, bc_type="natural")
-    at = np.arange(n, dtype=np.float64)
-    inside = np.clip(at, middle[0], middle[-1])
-    slope = np.where(at < middle[0], smooth(middle[0], 1), smooth(middle[-1], 1))
-    made = smooth(inside) + slope * (at - inside)
+    bend = _natural_spline(course)
+    at = (np.arange(n) + 0.5) / length - 0.5  # in intervals, 0 = middle of the first
+    left = np.clip(at.astype(np.int64), 0, course.size - 2)
+    right = left + 1
+    t = np.clip(at, 0.0, course.size - 1.0) - left
+    made = (1.0 - t) * course[left] + t * course[right]
+    made += ((1.0 - t) ** 3 - (1.0 - t)) / 6.0 * bend[left] + (t**3 - t) / 6.0 * bend[right]
+    first = course[1] - course[0] - bend[1] / 6.0
+    last = course[-1] - course[-2] + bend[-2] / 6.0
+    made += first * np.minimum(at, 0.0) + last * np.maximum(at - (course.size - 1.0), 0.0)
     return np.asarray(made - made.mean())
+
+
+def _natural_spline(y: Floats) -> Floats:
+    """Return the second derivatives of the natural cubic spline through y [n ≥ 2] at steps of one.
+
+    de Boor, A Practical Guide to Splines, 1978, chapter IV: the system of M is tridiagonal, (1, 4, 1) / 6.
+
+    >>> _natural_spline(np.array([0.0, 1.0, 0.0])).tolist()
+    [0.0, -3.0, 0.0]
+    """
+    bend, right = np.zeros(y.size), 6.0 * np.diff(y, 2)
+    diagonal = np.full(right.size, 4.0)
+    for i in range(1, right.size):
+        diagonal[i] -= 1.0 / diagonal[i - 1]
+        right[i] -= right[i - 1] / diagonal[i - 1]
+    for i in reversed(range(right.size)):
+        bend[i + 1] = (right[i] - bend[i + 2]) / diagonal[i]
+    return bend

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import msgspec
 
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
+from drivers.extras import check_extra
 from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.plugin import possible
 from drivers.quantities import BIT_RATE, check_settings
@@ -298,11 +299,13 @@ def _plain(error: Exception) -> str:
 def build(settings: Settings) -> Link:
     """The link of these settings; opens nothing.
 
-    Raises ``ConfigError`` for an interface that python-can does not know, and for a number outside its range.
+    Raises ``ConfigError`` for an interface that python-can does not know, for a number outside its range, and where
+    python-can is not installed.
     """
+    check_settings(settings)
+    check_extra("can", "a CAN bus")
     from can.interfaces import VALID_INTERFACES
 
-    check_settings(settings)
     if settings.interface not in VALID_INTERFACES:
         known = sorted(VALID_INTERFACES)
         raise ConfigError(f'interface: "{settings.interface}"{possible(settings.interface, known)}')

@@ -31,6 +31,7 @@ from typing import IO, TYPE_CHECKING, Annotated, Any, BinaryIO, Final, Literal, 
 
 from drivers import small_file
 from drivers.errors import ConfigError, LinkEnded, LinkLost, LinkUnavailable, RecordingError
+from drivers.extras import check_extra
 from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.plugin import FilePath, possible
 from drivers.quantities import BYTE_RATE, RATE_HZ, REPLAY_SPEED, range_problems
@@ -548,6 +549,8 @@ def build(settings: Settings) -> Link:
     try:
         _check_path(path)
         kind = _kind(path)
+        if kind == "log":
+            check_extra("can", "a CAN log")
     except ConfigError as error:
         wrong = [*error.lines, *wrong]
     if wrong:

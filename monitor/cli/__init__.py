@@ -21,6 +21,7 @@ import typer
 from typer.exceptions import TyperException
 
 from drivers.errors import ConfigError, ImuError, NotReady, RecordingError, in_one_line
+from drivers.extras import check_extra
 from drivers.small_file import real_path
 from monitor.cli import doctor, drift, options, output, serving, warm_up
 from monitor.cli import history as history_command
@@ -263,6 +264,7 @@ def reconcile(
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
 ) -> None:
     """Where recording and model disagree, which effect is missing, and what is left once it is added."""
+    check_extra("reconcile", "reconcile")
     from rich.console import Console
 
     from monitor import reconciling

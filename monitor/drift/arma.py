@@ -18,11 +18,11 @@ from math import atanh, exp, log, pi, sqrt, tanh
 from typing import Final
 
 import numpy as np
-from scipy.optimize import minimize
 
 from drivers.errors import NotReady
 from drivers.sample import Floats
 from monitor.compiled import compiled
+from monitor.minimization import minimize_bfgs
 
 Order = tuple[int, int]
 Triple = tuple[float, float, float]
@@ -174,9 +174,9 @@ def _fitted(z: Floats, white: float, order: Order) -> _Tried:
     best, at = tried[0][0], starts[tried[0][1]]
     if free:
         for _, i in tried[:2]:
-            found = minimize(loss, starts[i], method="BFGS", options={"gtol": 1e-4 * count**0.5})
-            if found.fun < best:
-                best, at = float(found.fun), found.x
+            least, place = minimize_bfgs(loss, starts[i], 1e-4 * count**0.5)
+            if least < best:
+                best, at = least, place
     return 2.0 * best + (free + 2) * log(count), order, at
 
 
@@ -254,7 +254,7 @@ def _tops(z: Floats, white: float, order: Order, u: Floats) -> list[Floats]:
     found = [u]
     if sum(order) == MOST:
         for start in _starts(white, order):
-            one = minimize(lambda u: -_likelihood(z, white, order, u), start, method="BFGS", options={"gtol": 0.1}).x
+            _, one = minimize_bfgs(lambda u: -_likelihood(z, white, order, u), start, 0.1)
             if all(np.abs(np.tanh(one[:MOST]) - np.tanh(other[:MOST])).max() > APART for other in found):
                 found.append(one)
     best = max(_likelihood(z, white, order, one) for one in found)
@@ -314,7 +314,5 @@ def _profile(z: Floats, white: float, order: Order, which: int, value: float, ne
 
     if not near.size:
         return _likelihood(z, white, order, full(near)), near
-    found = minimize(
-        lambda free: -_likelihood(z, white, order, full(free)), near, method="BFGS", options={"gtol": 1e-2}
-    )
-    return -float(found.fun), found.x
+    least, place = minimize_bfgs(lambda free: -_likelihood(z, white, order, full(free)), near, 1e-2)
+    return -least, place

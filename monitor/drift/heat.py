@@ -16,7 +16,6 @@ along the chord between their ends, as a power would run away.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import lstsq
 
 from drivers.sample import Floats
 from monitor.compiled import compiled
@@ -100,7 +99,7 @@ def lagged(x, p):  # type: ignore[no-untyped-def]
 def solved(columns: Floats, y: Floats) -> Floats:
     """Sizes [terms] by least squares, columns scaled so that units do not matter."""
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    found = lstsq(columns / scale, y, cond=1e-10, lapack_driver="gelsy")[0]
+    found = np.linalg.lstsq(columns / scale, y, rcond=1e-10)[0]
     return np.asarray(found / scale)
 
 

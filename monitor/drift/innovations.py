@@ -7,12 +7,11 @@ passes next to never the model does not, whatever the noise was estimated as sin
 from collections import deque
 from typing import Final
 
-from scipy.stats import chi2
-
 INTERVALS: Final = 64
 CHANCE: Final = 1e-8
 """Of a look that chance passes the limit; looks overlap."""
-LIMIT: Final = float(chi2.isf(CHANCE, INTERVALS) / INTERVALS)
+LIMIT: Final = 2.327393746165351
+"""The quantile of χ² with INTERVALS degrees of freedom that CHANCE exceeds, over INTERVALS."""
 AGAIN: Final = 1.3
 """Below this the model holds again."""
 

@@ -13,9 +13,9 @@ what came after, takes what lies between.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import stdtrit
 
 from drivers.sample import Floats
+from monitor.distributions import student_quantile
 from monitor.drift.heat import Shape, responses
 from monitor.drift.means import Means
 from monitor.drift.model import STEP, ThermalModel, bent, covariance, derivatives, expected, whole
@@ -81,7 +81,7 @@ class Recursion:
         sizes = np.concatenate([model.sizes, model.start])
         own = sizes.size
         bends = bent(model.shape, rows[:, own:], sizes)
-        wide = float(stdtrit(self.free, 0.975))
+        wide = student_quantile(self.free, 0.975)
         both = []
         for measured in (None, np.array([self._bias, np.nan])):
             bias, variance = expected(model, excess, rows[:, :own], sizes, bends, measured)

@@ -25,10 +25,9 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from scipy.linalg import solve_triangular, toeplitz
-from scipy.special import betainc
 
 from drivers.sample import Floats
+from monitor.distributions import incomplete_beta
 from monitor.drift.heat import lagged
 from monitor.drift.means import Means
 from monitor.drift.model import whole
@@ -292,7 +291,8 @@ def _regression(y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray) 
     diagonal = np.abs(triangles[:, np.arange(terms), np.arange(terms)])
     likelihood = -0.5 * (free * np.log(left) + log_determinants) - np.log(np.maximum(diagonal, 1e-300)).sum(axis=1)
     unexplained = left / (left + gained)
-    p_values = betainc(0.5 * free, 0.5 * (terms - at), unexplained)  # of F = gained / (terms - at) / (left / free)
+    # of F = gained / (terms - at) / (left / free)
+    p_values = incomplete_beta(0.5 * free, 0.5 * (terms - at), unexplained)
     best = int(likelihood.argmax())
     plausible = likelihood >= likelihood[best] - PLAUSIBLE
     sizes = np.linalg.solve(triangles[best, :terms, :terms], triangles[best, :terms, terms])
@@ -348,15 +348,21 @@ def _whitener(known: np.ndarray, ratio: float, correlation: float) -> tuple[Floa
     else:
         row = np.zeros(n - 1)
         row[:2] = (2.0 / 3.0, 1.0 / 6.0)
-    walk = toeplitz(row)[at[0] : at[-1], at[0] : at[-1]]
+    walk = _toeplitz(row)[at[0] : at[-1], at[0] : at[-1]]
     firsts = at[:-1] - at[0]
     walk = np.add.reduceat(np.add.reduceat(walk, firsts, axis=0), firsts, axis=1)
     white = np.zeros(at.size - 1)
     white[:2] = (2.0, -1.0)
-    covariance = ratio * walk + toeplitz(white)
+    covariance = ratio * walk + _toeplitz(white)
     lower = np.linalg.cholesky(covariance)
     differences = np.diff(np.eye(at.size), axis=0)
-    return solve_triangular(lower, differences, lower=True), 2.0 * float(np.log(np.diag(lower)).sum())
+    return np.linalg.solve(lower, differences), 2.0 * float(np.log(np.diag(lower)).sum())
+
+
+def _toeplitz(row: Floats) -> Floats:
+    """Return the symmetric matrix [n, n] of the row [n]: each diagonal has one value."""
+    at = np.arange(row.size)
+    return np.asarray(row[np.abs(at[:, None] - at)])
 
 
 def _opening(bias: Floats, x: Floats, direction: Floats) -> float:

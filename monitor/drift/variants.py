@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
-from scipy.linalg import solve_discrete_are, solve_toeplitz
 
 from drivers.errors import ConfigError, NotReady
 from drivers.sample import Floats
@@ -23,6 +22,7 @@ PIECE, OVERLAP = 16_384, 4_096
 AT_ONCE: Final = 2
 """Lag by which the autocorrelation of a noise mode has fallen below 1/e."""
 WAVELET: Final = "db4"
+MOST_DOUBLINGS: Final = 60
 DEEPEST: Final = 8
 """Levels of a wavelet decomposition."""
 SIGMA_OF_MAD: Final = 0.6745
@@ -82,7 +82,8 @@ def _autoregression(x: Floats) -> tuple[Floats, float]:
     covariance = np.array([float(x[: n - k] @ x[k:]) / n for k in range(most + 1)])
     best = (np.inf, np.zeros(1), float(covariance[0]))
     for p in range(1, most + 1):
-        phi = solve_toeplitz(covariance[:p], covariance[1 : p + 1])
+        lag = np.abs(np.subtract.outer(np.arange(p), np.arange(p)))
+        phi = np.linalg.solve(covariance[lag], covariance[1 : p + 1])
         left = max(float(covariance[0] - phi @ covariance[1 : p + 1]), 1e-300)
         best = min(best, (n * np.log(left) + p * np.log(n), phi, left), key=lambda one: one[0])
     return best[1], best[2]
@@ -93,11 +94,30 @@ def _filtered(x: Floats, phi: Floats, new: float, measuring: float) -> Floats:
     p = phi.size
     step = np.zeros((p, p))
     step[0], step[1:, :-1] = phi, np.eye(p - 1)
-    look, noise = np.zeros((1, p)), np.zeros((p, p))
-    look[0, 0], noise[0, 0] = 1.0, new
     unit = max(measuring, 1e-300)
-    before = solve_discrete_are(step.T, look.T, noise / unit, np.eye(1))
+    before = _steady_covariance(step, new / unit)
     return np.asarray(_run(x, phi, before[:, 0] / (before[0, 0] + 1.0)))
+
+
+def _steady_covariance(step: Floats, new: float) -> Floats:
+    """Return the steady covariance of a Kalman filter's prediction.
+
+    The state's step [p, p] is given, ``new`` is the variance that its first element gains, and the first element is
+    measured with a variance of one. The structure-preserving doubling algorithm (Chu, Fan, Lin & Wang, Int. J. Control
+    77, 2004) converges quadratically.
+    """
+    p = step.shape[0]
+    a, g, h = step.T.copy(), np.zeros((p, p)), np.zeros((p, p))
+    g[0, 0], h[0, 0] = 1.0, new
+    for _ in range(MOST_DOUBLINGS):
+        inner = np.linalg.solve(np.eye(p) + g @ h, np.hstack([a, g]))
+        more = a.T @ h @ inner[:, :p]
+        g = g + a @ inner[:, p:] @ a.T
+        a = a @ inner[:, :p]
+        h = h + more
+        if np.abs(more).max() <= np.finfo(float).eps * np.abs(h).max():
+            break
+    return h
 
 
 @compiled

@@ -26,6 +26,7 @@ from monitor.estimate.coefficients import Status
 from monitor.estimate.fit import Design, Fit, Looks, fit_columns, replaced
 from monitor.estimate.least_squares import N, Q
 from monitor.estimate.uncertainty import Table
+from monitor.minimization import golden_section
 
 Kind = Literal["digital", "sampled"]
 FAMILIES: Final[tuple[tuple[Kind, int], ...]] = tuple(
@@ -39,6 +40,10 @@ REFINED: Final = 3
 """Families, of those nearest on the grid, whose cutoff is sought to the end."""
 PIECE: Final = 8
 """Cutoffs tried in one piece of a search."""
+REFINEMENT_PIECE: Final = 10
+"""Cutoffs between those of the grid that are tried in one piece; each needs a spectrum of its own."""
+CUTOFF_TOLERANCE: Final = 1e-4
+"""Of the logarithm of a cutoff, at the end of a search."""
 ALIASES: Final = 8
 AGREES: Final = 2.0
 """Variance about the fit over that of noise, up to which a filter explains a curve."""
@@ -184,8 +189,6 @@ def sought(design: Design, table: Table, looks: Looks, power: Floats) -> LowPass
 
 def searching(design: Design, table: Table, looks: Looks, power: Floats) -> Generator[None, None, LowPass | None]:
     """``sought`` in pieces of a few milliseconds, for who must not be kept waiting."""
-    from scipy.optimize import minimize_scalar  # 25 MB that only such a sensor needs
-
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
     grids: list[list[float]] = []
     for kind, order in FAMILIES:
@@ -205,11 +208,25 @@ def searching(design: Design, table: Table, looks: Looks, power: Floats) -> Gene
             column = LowPass(kind, order, float(np.exp(log_cutoff))).avar(design.factors)
             return float(fit_columns(_with(design, column), table, looks).scatter[0])
 
-        best = minimize_scalar(of, bounds=(float(ends[0]), float(ends[1])), method="bounded", options={"xatol": 1e-4})
-        found.append((float(best.fun), LowPass(kind, order, float(np.exp(best.x)))))
+        least, log_cutoff = yield from in_pieces(golden_section(of, float(ends[0]), float(ends[1]), CUTOFF_TOLERANCE))
+        found.append((least, LowPass(kind, order, float(np.exp(log_cutoff)))))
         yield
     least, low_pass = min(found, key=lambda one: one[0])
     return low_pass if least < AGREES and seen(low_pass, power) else None
+
+
+def in_pieces(search: Generator[None, None, tuple[float, float]]) -> Generator[None, None, tuple[float, float]]:
+    """Run a search, and yield after each REFINEMENT_PIECE of its steps."""
+    steps = 0
+    while True:
+        try:
+            next(search)
+        except StopIteration as end:
+            found: tuple[float, float] = end.value
+            return found
+        steps += 1
+        if steps % REFINEMENT_PIECE == 0:
+            yield
 
 
 def _with(design: Design, column: Floats) -> Design:

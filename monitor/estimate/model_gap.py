@@ -26,9 +26,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from scipy.special import ndtri
 
 from drivers.sample import AXES, Floats, Ints
+from monitor.distributions import normal_quantile
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Estimate
 from monitor.estimate.uncertainty import NOISES, PAIRS, AxisTables, K, Table
@@ -255,4 +255,4 @@ def limit(share: float, numbers: int) -> float:
     >>> f"{limit(0.05, 1):.3f} {limit(0.01, 6 * 14):.3f}"
     '1.960 3.847'
     """
-    return float(-ndtri(-0.5 * np.expm1(np.log1p(-share) / numbers)))
+    return -normal_quantile(float(-0.5 * np.expm1(np.log1p(-share) / numbers)))

@@ -17,7 +17,6 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from scipy.special import xlogy
 
 from drivers.sample import Floats, Ints
 from monitor.estimate.fit import TO_SI
@@ -71,7 +70,8 @@ def spread(
 def autocovariance(t: Floats) -> Floats:
     """Generalised autocovariance of phase [4, …] of Q N B K at lags t in samples: discrete sums of white noise."""
     t = np.abs(t)
-    return np.stack([np.where(t == 0.0, 1.0, 0.0), -0.5 * t, xlogy(t * t, t) / (2.0 * np.pi), (t * t - 1.0) * t / 12.0])
+    flicker = t * t * np.log(np.where(t == 0.0, 1.0, t)) / (2.0 * np.pi)
+    return np.stack([np.where(t == 0.0, 1.0, 0.0), -0.5 * t, flicker, (t * t - 1.0) * t / 12.0])
 
 
 def nodes(begin: int, end: int, kinks: Iterable[int]) -> tuple[Floats, Floats]:

@@ -22,10 +22,10 @@ from functools import cache
 from typing import Final
 
 import numpy as np
-from scipy.special import chdtri
 
 from drivers.sample import AXES, Floats, Ints
 from monitor.compiled import compiled
+from monitor.distributions import chi2_quantile
 from monitor.noise.effects.bias_instability import BiasInstability
 
 Q, N, B, K, R = range(5)
@@ -191,7 +191,7 @@ def intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Flo
     """
     tail = (1.0 - probability) / 2.0
     safe = np.where(edf > 0.0, edf, np.nan)
-    low, high = chdtri(safe, 1.0 - tail), chdtri(safe, tail)
+    low, high = chi2_quantile(safe, tail), chi2_quantile(safe, 1.0 - tail)
     # a fraction of one degree of freedom bounds nothing from above, not even a sum of zeros
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         lo, hi = np.sqrt(avar * safe / high), np.sqrt(avar * safe / low)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from drivers.sample import block
 from monitor.estimate.analysis import analyze
@@ -70,3 +71,14 @@ def test_the_course_has_neither_steps_nor_corners():
     np.testing.assert_allclose(course[:1000] - course[:1000].mean(), want, atol=0.03)
     assert np.abs(np.diff(course, 2)).max() < 3.0 * np.abs(np.diff(want, 2)).max()
     assert np.ptp(np.diff(course[996:])) < 1e-12  # straight beyond the last middle
+
+
+@pytest.mark.parametrize(("count", "length", "n"), [(2, 5, 10), (3, 4, 13), (72, 101, 7272), (500, 7, 3503)])
+def test_the_course_is_a_natural_spline(count: int, length: int, n: int) -> None:
+    course = np.random.default_rng(count).standard_normal(count)
+    middle = (np.arange(count) + 0.5) * length - 0.5
+    spline = CubicSpline(middle, course, bc_type="natural")
+    at = np.arange(n, dtype=np.float64)
+    inside = np.clip(at, middle[0], middle[-1])
+    expected = spline(inside) + np.where(at < middle[0], spline(middle[0], 1), spline(middle[-1], 1)) * (at - inside)
+    assert drawn(course, length, n) == pytest.approx(expected - expected.mean(), abs=1e-12)

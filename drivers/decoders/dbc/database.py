@@ -17,6 +17,7 @@ from drivers.decoders.dbc.bits import Bits
 from drivers.decoders.dbc.join import COLUMNS, Column, Message
 from drivers.decoders.dbc.settings import Settings, SignalSettings
 from drivers.errors import ConfigError
+from drivers.extras import check_extra
 from drivers.plugin import nearest, possible
 from drivers.quantities import range_problems
 from drivers.sample import AXES
@@ -224,6 +225,7 @@ def _locate(file: str) -> Path:
 
 def _load(path: Path) -> Any:
     """The database, read leniently: other people's files overlap signals that nobody asks for."""
+    check_extra("can", "a CAN database")
     import cantools
 
     try:

@@ -1,7 +1,7 @@
 """The sensor's own low-pass."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -45,21 +45,8 @@ class BandwidthLimit(Transform):
 
         return spectrum.filtered(gain)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_LowPass":
+    def start(self, rate_hz: float, rng: np.random.Generator) -> Running:
         """Settled at the first sample."""
-        from scipy.signal import butter  # half a second that only such a sensor needs
+        from monitor.noise.low_pass import LowPass, butterworth  # with Numba, which only samples need
 
-        return _LowPass(butter(int(self.order), self.cutoff, fs=rate_hz, output="sos"))
-
-
-class _LowPass(Running):
-    def __init__(self, sections: Any) -> None:
-        self._sections = sections
-        self._state: Any = None
-
-    def apply(self, values: Floats) -> None:
-        from scipy.signal import sosfilt, sosfilt_zi
-
-        if self._state is None:
-            self._state = sosfilt_zi(self._sections) * values[0]
-        values[:], self._state = sosfilt(self._sections, values, zi=self._state)
+        return LowPass(butterworth(int(self.order), self.cutoff, rate_hz))

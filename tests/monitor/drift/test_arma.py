@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 from scipy.signal import lfilter
 
 from drivers.errors import NotReady
+from monitor.drift import arma
 from monitor.drift.arma import Arma, identify, innovations
 
 TRUE = ((1.2, -0.5), -0.4)
@@ -98,3 +100,20 @@ def test_too_few_and_all_the_same_are_refused():
 
 def test_green():
     assert Arma((0.5, 0.3), -0.2, 1.0).green == (1.0, pytest.approx(0.3))
+
+
+@pytest.mark.parametrize("white", [0.0, 0.5])
+def test_parameters_and_intervals_are_those_that_scipy_finds(monkeypatch, white):
+    z = drawn(600, 4) + white**0.5 * np.random.default_rng(5).standard_normal(600)
+    found = identify(z, white, intervals=True)
+
+    def by_scipy(function, start, gradient_tolerance):
+        result = minimize(function, start, method="BFGS", options={"gtol": gradient_tolerance})
+        return float(result.fun), result.x
+
+    monkeypatch.setattr(arma, "minimize_bfgs", by_scipy)
+    expected = identify(z, white, intervals=True)
+    assert found.order == expected.order
+    assert found.bic == pytest.approx(expected.bic, abs=1e-5)
+    assert (*found.phi, found.theta) == pytest.approx((*expected.phi, expected.theta), abs=1e-4)
+    assert (*found.lo, *found.hi) == pytest.approx((*expected.lo, *expected.hi), abs=1e-3, nan_ok=True)

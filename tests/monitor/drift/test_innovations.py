@@ -1,8 +1,10 @@
 """The test of innovations: how often chance passes it, and what does."""
 
 import numpy as np
+import pytest
+from scipy.stats import chi2
 
-from monitor.drift.innovations import INTERVALS, LIMIT, Innovations
+from monitor.drift.innovations import CHANCE, INTERVALS, LIMIT, Innovations
 
 
 def test_chance_passes_next_to_never():
@@ -26,3 +28,7 @@ def test_twice_the_noise_is_told_once_and_again_when_it_comes_back():
     assert alarms(2.0, 400) == 1
     one.forget()
     assert alarms(1.0, INTERVALS - 1) == 0
+
+
+def test_the_limit_is_a_quantile_of_chi2():
+    assert pytest.approx(chi2.isf(CHANCE, INTERVALS) / INTERVALS, rel=1e-12) == LIMIT

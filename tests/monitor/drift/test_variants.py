@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_are
 
 from drivers.errors import NotReady
+from monitor.drift import variants
 from monitor.drift.variants import PIECE, VARIANTS, compensated
 
 N = 40_000
@@ -47,3 +49,20 @@ def test_pieces_fade_into_each_other():
 def test_too_little_rest_is_refused():
     with pytest.raises(NotReady, match="100 are needed"):
         compensated(np.zeros(1000), np.zeros(50), VARIANTS["ar"])
+
+
+@pytest.mark.parametrize("order", range(1, 9))
+@pytest.mark.parametrize("new", [1e-8, 1e-2, 1.0, 1e4])
+def test_the_steady_covariance_solves_the_riccati_equation(order, new):
+    rng = np.random.default_rng(order)
+    step = np.eye(order, k=-1)
+    step[0] = -np.poly(rng.uniform(-0.95, 0.95, order))[1:]
+    p = variants._steady_covariance(step, new)
+    gain = p[:, 0] / (1.0 + p[0, 0])
+    noise = np.zeros((order, order))
+    noise[0, 0] = new
+    again = step @ (p - np.outer(gain, p[0])) @ step.T + noise
+    assert p == pytest.approx(again, rel=1e-12, abs=1e-12 * np.abs(p).max())
+    # SciPy's own residual grows to 1e-5 for high orders and little noise
+    expected = solve_discrete_are(step.T, np.eye(order)[:, :1], noise, np.eye(1))
+    assert p == pytest.approx(expected, rel=1e-2, abs=1e-2 * np.abs(p).max())

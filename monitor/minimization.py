@@ -1,0 +1,136 @@
+"""Minimise a function of one or of a few variables.
+
+``minimize_bfgs`` follows Nocedal & Wright, Numerical Optimization, 2006, algorithm 6.1: forward differences for the
+gradient, a line search for the Wolfe conditions by bisection, and the BFGS update of the inverse of the Hessian.
+``golden_section`` searches an interval (Kiefer, Proc. Am. Math. Soc. 4, 1953).
+"""
+
+from collections.abc import Callable, Generator
+from math import ceil, inf, log, sqrt
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+DIFFERENCE: Final = 2.0**-26
+"""Relative step of a forward difference: the root of the rounding error."""
+DECREASE: Final = 1e-4
+CURVATURE: Final = 0.9
+"""Constants of the Wolfe conditions."""
+MAX_BISECTIONS: Final = 40
+MAX_ITERATIONS_PER_VARIABLE: Final = 200
+GOLDEN: Final = (sqrt(5.0) - 1.0) / 2.0
+
+
+def minimize_bfgs(
+    function: Callable[[Floats], float], start: Floats, gradient_tolerance: float
+) -> tuple[float, Floats]:
+    """Return the value and the place of a local minimum.
+
+    Parameters
+    ----------
+    function : of [n] variables, smooth.
+    start : [n]
+    gradient_tolerance : the search ends where no component of the gradient is larger, or no step makes it less.
+    """
+    x, value = np.array(start, np.float64), function(start)
+    slope, inverse = _gradient(function, x, value), np.eye(x.size)
+    for iteration in range(MAX_ITERATIONS_PER_VARIABLE * x.size):
+        if not np.abs(slope).max() > gradient_tolerance:
+            break
+        direction = -inverse @ slope
+        if not slope @ direction < 0.0:
+            inverse, direction = np.eye(x.size), -slope
+        # the first direction has the size of the gradient, which says nothing of the distance
+        first = 1.0 if iteration else min(1.0, 1.0 / float(np.linalg.norm(slope)))
+        found = _line_search(function, x, value, slope, direction, first)
+        if found is None:
+            break
+        step, less, new = found
+        moved, change = step * direction, new - slope
+        x, value, slope = x + moved, less, new
+        scale = float(moved @ change)
+        if scale > 0.0:
+            if iteration == 0:
+                inverse *= scale / float(change @ change)
+            left = np.eye(x.size) - np.outer(moved, change) / scale
+            inverse = left @ inverse @ left.T + np.outer(moved, moved) / scale
+    return value, x
+
+
+def _line_search(
+    function: Callable[[Floats], float], x: Floats, value: float, slope: Floats, direction: Floats, step: float
+) -> tuple[float, float, Floats] | None:
+    """Return step, value and gradient at a point that fulfils the Wolfe conditions, or else the best point with less.
+
+    None if no step makes the function less.
+    """
+    falling = float(slope @ direction)
+    low, high = 0.0, inf
+    best: tuple[float, float, Floats] | None = None
+    for _ in range(MAX_BISECTIONS):
+        there = x + step * direction
+        less = function(there)
+        if not less <= value + DECREASE * step * falling:
+            high = step
+        else:
+            new = _gradient(function, there, less)
+            if less < value and (best is None or less < best[1]):
+                best = step, less, new
+            if float(new @ direction) >= CURVATURE * falling:
+                return best
+            low = step
+        if high - low <= DIFFERENCE * high * 1e-3:
+            break
+        step = 0.5 * (low + high) if high < inf else 2.0 * step
+    return best
+
+
+def _gradient(function: Callable[[Floats], float], x: Floats, value: float) -> Floats:
+    """Return the gradient [n] by forward differences, beside the value at x."""
+    found = np.empty(x.size)
+    for i in range(x.size):
+        beside = x.copy()
+        beside[i] += DIFFERENCE * max(1.0, abs(float(x[i])))
+        found[i] = (function(beside) - value) / (beside[i] - x[i])
+    return found
+
+
+def golden_section(
+    function: Callable[[float], float], low: float, high: float, tolerance: float
+) -> Generator[None, None, tuple[float, float]]:
+    """Return the value and the place of a minimum in an interval; yields after each call of the function.
+
+    Parameters
+    ----------
+    function : with one minimum between low and high.
+    tolerance : the place is known to so much.
+
+    >>> def run(search):
+    ...     while True:
+    ...         try:
+    ...             next(search)
+    ...         except StopIteration as end:
+    ...             return end.value
+    >>> value, place = run(golden_section(lambda x: (x - 1.0) ** 2 + 2.0, 0.0, 3.0, 1e-6))
+    >>> round(value, 9), round(place, 5)
+    (2.0, 1.0)
+    """
+    left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+    at_left = function(left)
+    yield
+    at_right = function(right)
+    yield
+    for _ in range(max(ceil(log(tolerance / (high - low)) / log(GOLDEN)), 0)):
+        if at_left <= at_right:
+            high, right, at_right = right, left, at_left
+            left = high - GOLDEN * (high - low)
+            at_left = function(left)
+        else:
+            low, left, at_left = left, right, at_right
+            right = low + GOLDEN * (high - low)
+            at_right = function(right)
+        yield
+    return min((at_left, left), (at_right, right))
