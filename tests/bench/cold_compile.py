@@ -54,17 +54,14 @@ class Recorder(event.Listener):
 
 
 def stages() -> Iterator[str]:
-    """Yield the name of each stage of the service's warm-up after it has been compiled."""
-    from monitor.drift import compensator, heat
-    from monitor.estimate import estimator
+    """Yield the name of each part after it has been compiled by this process."""
+    from monitor import kernels
 
     yield "imports"
-    for stage in estimator.warm_up():
-        yield f"estimator, {stage}"
-    heat.warm_up()
-    yield "thermal model"
-    compensator.warm_up()
-    yield "compensator"
+    for group in kernels.GROUPS:
+        for part in group.parts:
+            part.prepare()
+            yield part.name
 
 
 def main() -> None:
