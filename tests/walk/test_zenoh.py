@@ -157,6 +157,7 @@ mode = "none"
     with running(tmp_path, config) as run:
         imu = run.service.virtual["bench-1"]
         wait_for(lambda: listener.hears(lambda: "imu/bench-1/coefficients" in listener.heard), "coefficients")
+        wait_for(lambda: listener.hears(lambda: listener.alive), "the token")
         assert listener.alive == [("imu/bench-1/alive", True)]
         imu.unplug()
         wait_for(lambda: listener.hears(lambda: len(listener.alive) == 2), "the token to go")
