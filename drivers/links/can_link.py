@@ -50,6 +50,8 @@ SLICE_S: Final = 0.1
 HOST_STAMPED: Final = ("socketcan", "virtual", "udp_multicast")
 """Interfaces whose time stamps are the host's system clock when the frame came in."""
 OLDEST_S: Final = 1.0
+CLOCK_PAIRS: Final = 3
+"""Readings of both clocks, of which the closest counts."""
 PROBE_S: Final = 2.0
 SAY_BUS_OFF: Final = ("socketcan", "virtual", "udp_multicast")
 """Interfaces whose error frames have SocketCAN's classes in their identifier."""
@@ -220,14 +222,15 @@ class CanLink:
 
     def _chunk(self, message: "can.Message") -> Chunk:
         address = message.arbitration_id | (EXTENDED_ID if message.is_extended_id else 0)
-        return Chunk(bytes(message.data), time.monotonic_ns() - self._age_ns(message), address)
+        return Chunk(bytes(message.data), self._arrival_ns(message), address)
 
-    def _age_ns(self, message: "can.Message") -> int:
-        """How long ago the frame came in, as far as the interface's stamp can be believed."""
+    def _arrival_ns(self, message: "can.Message") -> int:
+        """Return the host's monotonic time at which the frame came in, or the present if its stamp is implausible."""
+        now_ns = time.monotonic_ns()
         if self._settings.interface not in HOST_STAMPED:
-            return 0
-        age_s = time.time() - message.timestamp
-        return int(age_s * 1e9) if 0.0 <= age_s <= OLDEST_S else 0
+            return now_ns
+        age_ns = now_ns + _unix_minus_monotonic_ns() - round(message.timestamp * 1e9)
+        return now_ns - age_ns if 0 <= age_ns <= OLDEST_S * 1e9 else now_ns
 
     def _note_error(self, message: "can.Message") -> None:
         self.error_frames += 1
@@ -252,6 +255,18 @@ def missing_package(interface: str) -> str:
     if not module or importlib.util.find_spec(module) is not None:
         return ""
     return f'CAN interface {interface} needs the package {package}: pip install "{requirement}"'
+
+
+def _unix_minus_monotonic_ns() -> int:
+    """Return the difference of the host's two clocks in nanoseconds.
+
+    On a loaded machine the thread may be interrupted between the two readings, so the closest of a few pairs counts.
+    """
+    pairs = []
+    for _ in range(CLOCK_PAIRS):
+        before_ns, unix_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        pairs.append((after_ns - before_ns, unix_ns - (before_ns + after_ns) // 2))
+    return min(pairs)[1]
 
 
 def _probe(s: Settings) -> None:

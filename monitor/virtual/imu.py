@@ -7,6 +7,7 @@ reader: what finds no room is dropped, and its counter shows it. ``unplug`` and 
 
 import threading
 import time
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -43,6 +44,8 @@ class VirtualImu:
     def __init__(self, table: VirtualTable, decoder: Decoder, name: str = "virtual") -> None:
         self.name = name
         self.truth = Truth()
+        self.now_s: Callable[[], float] = time.monotonic
+        """Clock that the sensor runs by, in seconds. It may be replaced before ``start``."""
         self._sensor = Sensor(table, decoder, name)
         self.rate_hz = self._sensor.rate_hz * table.speed
         """As the sensor states it; its clock may be off."""
@@ -83,10 +86,10 @@ class VirtualImu:
 
     def _run(self) -> None:
         self._sensor.switch_on()
-        begun_s, made = time.monotonic(), 0
+        begun_s, made = self.now_s(), 0
         step_s = max(STEP_S, 0.5 / self._pace_hz)  # a slow sensor is not looked at more often than twice a sample
         while not self._stop.wait(step_s + self._held_s()):
-            due = int((time.monotonic() - begun_s) * self._pace_hz)
+            due = int((self.now_s() - begun_s) * self._pace_hz)
             late = due - made - int(BEHIND_S * self._pace_hz)
             if late > 0:  # the machine slept: the sensor ran on meanwhile
                 made += late

@@ -189,11 +189,13 @@ def test_unknown_keys_are_refused(module: ModuleType) -> None:
 
 
 def test_what_is_sent_is_read(rig: Rig) -> None:
+    begun_ns = time.monotonic_ns()
     rig.link.open()
     chunks = receive(rig)
     assert DATA in b"".join(c.data for c in chunks)
     if rig.link.epoch == "monotonic":
-        assert all(0 <= time.monotonic_ns() - c.t_ns < 5e9 for c in chunks)
+        # a link that converts a stamp of Unix time may be off by what the scheduler takes between two clocks
+        assert all(begun_ns - 20e6 <= c.t_ns <= time.monotonic_ns() for c in chunks)
 
 
 def test_opens_and_closes_twice_without_harm(rig: Rig) -> None:

@@ -19,9 +19,9 @@ from monitor import settings, thermal
 from monitor.catalogue import read_model
 from monitor.history import store
 from monitor.publish.zenoh_in import listeners
+from tests.support.waiting import PATIENCE_S
 
 IMU_MONITOR = [sys.executable, "-m", "monitor.cli"]
-DEADLINE_S = 120.0
 KINDS = {
     "fifo": "is a FIFO",
     "socket": "is a socket",
@@ -64,7 +64,6 @@ def one_line(error: BaseException) -> str:
     return text
 
 
-@pytest.mark.timeout(60)
 def test_open_regular_says_what_it_is(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "name"
     make(kind, path)
@@ -85,7 +84,6 @@ def test_a_name_with_a_nul_character_is_an_os_error() -> None:
         small_file.open_regular(Path("a\0b"))
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("suffix", [".csv", ".csv.gz", ".npz", ".parquet", ".arrow", ".arrows"])
 def test_a_recording(kind: str, suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"a{suffix}"
@@ -96,7 +94,6 @@ def test_a_recording(kind: str, suffix: str, tmp_path: Path) -> None:
     assert said in one_line(error.value)
 
 
-@pytest.mark.timeout(60)
 def test_a_recording_in_a_folder_is_left_out_with_a_note(kind: str, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("t,gx\n0.0,1.0\n0.1,2.0\n")
     make(kind, tmp_path / "b.csv")
@@ -106,7 +103,6 @@ def test_a_recording_in_a_folder_is_left_out_with_a_note(kind: str, tmp_path: Pa
     assert KINDS[kind] in note
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("read", [segment.origin, segment.newest, lambda path: list(segment.read_samples(path))])
 def test_a_segment(kind: str, read: Callable[[Path], object], tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
@@ -116,7 +112,6 @@ def test_a_segment(kind: str, read: Callable[[Path], object], tmp_path: Path) ->
         read(path)
 
 
-@pytest.mark.timeout(60)
 def test_a_part_file_in_the_way_of_a_new_one(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.csv.part")
     with saving.whole(tmp_path / "a.csv") as part:
@@ -128,7 +123,6 @@ def test_a_part_file_in_the_way_of_a_new_one(tmp_path: Path) -> None:
     segment.SegmentWriter(path, segment.Origin("a", "samples")).close()
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize(
     ("name", "read"),
     [
@@ -149,7 +143,6 @@ def test_a_file_of_settings(kind: str, name: str, read: Callable[[Path], object]
     assert str(tmp_path) in one_line(error.value)
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("kind", ["socket", "device", "directory", "loop", "dangling"])
 def test_a_thermal_model(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "name"
@@ -158,7 +151,6 @@ def test_a_thermal_model(kind: str, tmp_path: Path) -> None:
         thermal.from_file(path)
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("suffix", [".csv", ".bin", ".log", ".blf", ".asc", ".csv.gz"])
 @pytest.mark.parametrize("kind", ["fifo", "socket", "device", "loop"])
 def test_what_is_replayed(kind: str, suffix: str, tmp_path: Path) -> None:
@@ -168,7 +160,6 @@ def test_what_is_replayed(kind: str, suffix: str, tmp_path: Path) -> None:
         replay_link.build(replay_link.Settings(path=str(path)))
 
 
-@pytest.mark.timeout(60)
 def test_a_segment_of_raw_bytes_that_is_replayed(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     os.mkfifo(tmp_path / segment.segment_name(1, 1.7e9))
@@ -177,7 +168,6 @@ def test_a_segment_of_raw_bytes_that_is_replayed(tmp_path: Path) -> None:
         link.open()
 
 
-@pytest.mark.timeout(60)
 def test_a_file_that_a_zenoh_file_names(tmp_path: Path) -> None:
     import zenoh
 
@@ -188,7 +178,6 @@ def test_a_file_that_a_zenoh_file_names(tmp_path: Path) -> None:
         configuration({}, file)
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("suffix", [".dbc", ".kcd"])
 def test_a_can_database(kind: str, suffix: str, tmp_path: Path) -> None:
     from drivers.decoders.dbc import database
@@ -199,7 +188,6 @@ def test_a_can_database(kind: str, suffix: str, tmp_path: Path) -> None:
         database._load(path)
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("end", ["", "-wal", "-shm", "-journal"])
 @pytest.mark.parametrize("kind", ["fifo", "socket", "device", "directory", "loop"])
 def test_a_history(kind: str, end: str, tmp_path: Path) -> None:
@@ -222,7 +210,7 @@ def read_history(folder: Path) -> Iterator[str]:
 
 def finished(arguments: list[str], **options: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(  # type: ignore[call-overload, no-any-return]
-        [*IMU_MONITOR, *arguments], capture_output=True, text=True, timeout=DEADLINE_S, check=False, **options
+        [*IMU_MONITOR, *arguments], capture_output=True, text=True, timeout=PATIENCE_S, check=False, **options
     )
 
 
@@ -256,7 +244,7 @@ def test_a_pipe_whose_writer_says_nothing_is_waited_for_until_a_signal(number: i
     try:
         writer = opened_for_writing(path)
         process.send_signal(number)
-        process.communicate(timeout=DEADLINE_S)
+        process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
         os.close(writer)
@@ -265,7 +253,7 @@ def test_a_pipe_whose_writer_says_nothing_is_waited_for_until_a_signal(number: i
 
 def opened_for_writing(path: Path) -> int:
     """A descriptor, once somebody reads."""
-    until_s = time.monotonic() + DEADLINE_S
+    until_s = time.monotonic() + PATIENCE_S
     while True:
         try:
             return os.open(path, os.O_WRONLY | os.O_NONBLOCK)

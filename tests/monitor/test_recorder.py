@@ -583,7 +583,6 @@ def test_the_folder_of_one_device_can_go_while_another_is_recorded(tmp_path: Pat
     assert rows_of_all(tmp_path / "bench")[0].tolist() == list(range(100, 300))
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("kind", ["fifo", "directory", "loop"])
 def test_what_is_no_file_in_place_of_segments_is_passed_over(tmp_path: Path, kind: str) -> None:
     keeper = Recorder(Storage(tmp_path), [SAMPLES])

@@ -268,7 +268,6 @@ def test_a_device_that_is_gone_has_no_row() -> None:
     assert "first" not in captured.get()
 
 
-@pytest.mark.timeout(60)
 def test_a_fifo_in_place_of_the_file_is_not_waited_for_and_another_folder_needs_a_restart(tmp_path: Path) -> None:
     before = device("a") + QUIET + '[storage]\nfolder = "one"\n'
     change = changed(tmp_path, before, before.replace('"one"', '"two"'))

@@ -120,7 +120,7 @@ def test_a_recording_that_waits_for_kernels_leaves_nothing_outside_of_its_own_ti
     n, compiled, prepare = 2000, threading.Event(), kernels.prepare
 
     def held_back(group: kernels.Group, tell: Callable[[kernels.Progress], None]) -> Iterator[str]:
-        compiled.wait(120.0)
+        compiled.wait(PATIENCE_S)
         yield from prepare(group, tell)
 
     monkeypatch.setattr(kernels, "prepare", held_back)
@@ -153,16 +153,16 @@ record = false
     told = Times()
     service = Service(settings.load(path), [told])
     recording.rename(away)
-    thread = threading.Thread(target=service.run, args=(120.0,))
+    thread = threading.Thread(target=service.run, args=(PATIENCE_S,))
     thread.start()
     try:
-        assert wait_for(lambda: told.count(received=False) >= 2, 60.0)  # there is no recording yet
+        assert wait_for(lambda: told.count(received=False) >= 2)  # there is no recording yet
         away.rename(recording)
-        assert wait_for(lambda: told.count(received=True) >= 2, 60.0)  # its samples wait in the ring
+        assert wait_for(lambda: told.count(received=True) >= 2)  # its samples wait in the ring
         assert service.stations[0].published == 0
     finally:
         compiled.set()
-        thread.join(120.0)
+        thread.join(PATIENCE_S)
     assert not thread.is_alive()
     assert service.stations[0].published == n
     first_s, last_s = 0.0, (n - 1) / 100.0

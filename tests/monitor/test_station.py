@@ -326,7 +326,7 @@ def test_overflow_is_counted_and_travels_as_loss():
 
 
 def test_through_the_reader_s_thread_to_the_end_of_a_replay():
-    rig = Rig()
+    rig, begun_s = Rig(), time.time()
     encoder = vectornav_binary.build(vectornav_binary.Settings())
     index = np.arange(400)
     made = block(index, np.random.default_rng(0).standard_normal((400, 6)), None, index * 10_000_000)
@@ -344,7 +344,7 @@ def test_through_the_reader_s_thread_to_the_end_of_a_replay():
     assert (rig.caught.healths[-1].state, rig.caught.healths[-1].memory_bytes) == ("ended", 7)
     assert rig.wake.is_set()
     # Unix time of samples stamped by the monotonic clock
-    assert rig.caught.estimates[-1][0] == pytest.approx(time.time(), abs=30.0)
+    assert begun_s - 5.0 <= rig.caught.estimates[-1][0] <= time.time() + 5.0
 
 
 def test_a_rate_off_the_configured_one_is_said():
@@ -765,11 +765,11 @@ def test_the_time_of_a_device_with_its_own_clock_goes_on_while_it_is_lost(monkey
 
 
 def test_before_its_first_sample_a_sensor_has_the_host_s_time():
-    rig = Rig()
+    rig, begun_s = Rig(), time.time()
     rig.station.report([rig.caught], {}, 0)
     rig.station.announce([rig.caught], "recording_stopped", "no room")
-    assert rig.caught.health_times == [pytest.approx(time.time(), abs=30.0)]
-    assert [at_s for at_s, _ in rig.caught.events] == [pytest.approx(time.time(), abs=30.0)]
+    (health_s,), ((event_s, _),) = rig.caught.health_times, rig.caught.events
+    assert begun_s - 1.0 <= health_s <= event_s <= time.time() + 1.0
 
 
 def test_slow_statistics_of_a_rebuilt_window_have_its_time(tmp_path):

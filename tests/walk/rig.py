@@ -70,10 +70,12 @@ class Caught(Output):
 
 
 class Running:
-    """A service in a thread."""
+    """A service in a thread; ``prepare`` is called before it starts."""
 
-    def __init__(self, path: Path, caught: Caught) -> None:
+    def __init__(self, path: Path, caught: Caught, prepare: Callable[[Service], None] | None = None) -> None:
         self.service = Service(settings.load(path))
+        if prepare is not None:
+            prepare(self.service)
         self.caught = caught
         self.service.outputs.append(self.caught)
         self._thread = threading.Thread(target=self.service.run)
@@ -92,10 +94,12 @@ class Running:
 
 
 @contextmanager
-def running(folder: Path, text: str, caught: Caught | None = None) -> Iterator[Running]:
+def running(
+    folder: Path, text: str, caught: Caught | None = None, prepare: Callable[[Service], None] | None = None
+) -> Iterator[Running]:
     path = folder / "config.toml"
     path.write_text(text)
-    service = Running(path, caught or Caught())
+    service = Running(path, caught or Caught(), prepare)
     try:
         yield service
     finally:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import msgspec
+import pytest
 from structlog.testing import capture_logs
 
 from drivers.decoders import samples
@@ -10,10 +11,10 @@ from drivers.sample import Event
 from monitor.demo import demo
 from monitor.service import Service
 from monitor.settings import VirtualTable
+from tests.support.paced_sensor import follow_reader
 from tests.support.waiting import PATIENCE_S
 from tests.walk.rig import Caught
 
-RATE_HZ = 100.0
 SPEED = 20.0
 AT_S = 80.0
 VIBRATION = "gz.sinusoidal:amplitude=4e-3,frequency=17"
@@ -23,14 +24,10 @@ class Watching(Caught):
     """Ends the service at the first change."""
 
     service: Service | None = None
-    told_s = 0.0  # of the sensor's time
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         super().event(device, unix_s, received, event)
         if event.kind == "noise_changed" and self.service is not None:
-            # samples that found no room in the terminal on a loaded machine count too
-            counts = self.service.stations[0].driver.counts
-            self.told_s = (received + counts.lost + counts.bad) / RATE_HZ
             self.service.stop()
 
 
@@ -38,7 +35,7 @@ def test_an_effect_that_comes_is_announced_on_its_axis() -> None:
     config = demo(effects=[VIBRATION], effect_at_s=AT_S)
     (device,) = config.devices
     assert isinstance(device.link, VirtualTable)
-    # messages have their own times and wait for their reader; a terminal would drop samples on a loaded machine
+    # messages carry the sensor's own time, so that an event tells when it is by the sensor's clock
     decoder = samples.build(samples.Settings())
     fast = replace(device, link=msgspec.structs.replace(device.link, speed=SPEED), decoder=decoder)
     quiet = msgspec.structs.replace(config.zenoh, mode="none"), msgspec.structs.replace(config.viewer, mode="none")
@@ -46,6 +43,7 @@ def test_an_effect_that_comes_is_announced_on_its_axis() -> None:
     caught = Watching()
     caught.service = service
     service.outputs.append(caught)
+    follow_reader(service.virtual["demo"], service.stations[0].driver)
     with capture_logs() as lines:
         service.run(PATIENCE_S)
     added = [line for line in lines if line["event"] == "effect added"]
@@ -55,5 +53,10 @@ def test_an_effect_that_comes_is_announced_on_its_axis() -> None:
     changes = [event for _, event in caught.events if event.kind == "noise_changed"]
     assert [event.axis for event in changes] == ["gz"]
     (change,) = changes
-    assert AT_S <= caught.told_s <= AT_S + 40.0
+    first_ns = int(caught.blocks["demo"][0].t_ns[0])
+    assert AT_S <= (change.t_ns - first_ns) / 1e9 <= AT_S + 40.0
+    assert change.since_ns is not None
+    assert (change.since_ns - first_ns) / 1e9 == pytest.approx(AT_S, abs=2.0)
+    counts = service.stations[0].driver.counts
+    assert (counts.lost, counts.bad) == (0, 0)
     assert "gz" in change.text

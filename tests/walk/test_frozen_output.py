@@ -19,14 +19,10 @@ import pytest
 
 from drivers.recording import save_samples
 from tests.support.ports import free_endpoint
-from tests.support.waiting import wait_for
+from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.zenoh_sessions import router, session
 
 PROGRAM = [sys.executable, "-m", "monitor.cli"]
-START_S = 60.0
-"""For a process on a loaded machine to compile nothing, but import everything and publish."""
-END_S = 30.0
-"""After a signal; a process that waits for a reader never ends."""
 CONFIG = """
 [[device]]
 name = "bench"
@@ -139,13 +135,13 @@ def program(
         yield process
     finally:
         process.kill()
-        process.wait(10.0)
+        process.wait(PATIENCE_S)
 
 
 def ended(process: "subprocess.Popen[bytes]", number: int) -> int:
     """Exit status after a signal."""
     process.send_signal(number)
-    return process.wait(END_S)
+    return process.wait(PATIENCE_S)
 
 
 class Place:
@@ -180,7 +176,7 @@ class Place:
     def all(self) -> bytes:
         """Everything, after the process has ended."""
         self.close_writer()
-        self._thread.join(END_S)
+        self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive()
         return self.data
 
@@ -192,7 +188,7 @@ class Place:
     def close(self) -> None:
         self.close_writer()
         if self._thread.ident is not None:
-            self._thread.join(END_S)
+            self._thread.join(PATIENCE_S)
         os.close(self._reading)
 
 
@@ -289,7 +285,7 @@ def test_a_closed_output_stops_nothing(tmp_path: Path, number: int) -> None:
     (tmp_path / "config.toml").write_text(CONFIG.format(endpoint=free_endpoint()))
     command = ["sh", "-c", f'exec "$@" {number}>&-', "sh", *PROGRAM, "run", "config.toml", "--seconds", "2"]
     with program(command, subprocess.PIPE, subprocess.PIPE, tmp_path) as process:
-        out, said = process.communicate(timeout=START_S)
+        out, said = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, said
     assert (b"imu-monitor  1 device" in out) == (number == 2)
     assert b"Traceback" not in said
@@ -361,7 +357,7 @@ def test_the_final_table_is_written_whatever_ended_the_run(tmp_path: Path, endin
             until(process, b"state=running")
             process.send_signal(getattr(signal, ending))
         said = process.stderr.read()
-        assert process.wait(START_S) == 0, said
+        assert process.wait(PATIENCE_S) == 0, said
         process.stderr.close()
     os.close(out)
     table = (tmp_path / "out").read_bytes() if place == "file" else os.read(reading, 65536)
@@ -391,7 +387,7 @@ def test_a_final_table_that_is_lost_is_an_error_where_nobody_asked_to_end(tmp_pa
         else:
             out = stack.enter_context(unread_pipe()).writing
         process = stack.enter_context(program([*PROGRAM, "run", "config.toml"], out, subprocess.PIPE, tmp_path))
-        _, said = process.communicate(timeout=START_S)
+        _, said = process.communicate(timeout=PATIENCE_S)
         status = process.returncode
     assert status == 1
     why = "could not be written: No space left on device" if place == "full disk" else "was not written, because nobody"

@@ -82,7 +82,7 @@ with zenoh.open(config) as session:
     print("ready", flush=True)
     for line in sys.stdin:
         for verb in line.split():
-            for reply in session.get(f"imu/bench-1/command/{verb}", timeout=5.0):
+            for reply in session.get(f"imu/bench-1/command/{verb}", timeout=float(sys.argv[2])):
                 answer = reply.ok or reply.err
                 print("reply", bytes(answer.payload).hex(), str(answer.encoding), flush=True)
         for sample in iter(alive.try_recv, None):
@@ -98,7 +98,10 @@ class Listener:
 
     def __init__(self, endpoint: str) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-c", LISTENER, endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", LISTENER, endpoint, str(PATIENCE_S)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
         )
         assert self._process.stdout is not None
         assert self._process.stdout.readline() == "ready\n"
@@ -139,7 +142,7 @@ def test_a_client_behind_a_router_receives_every_key(tmp_path: Path, router: str
 name = "bench-1"
 rate = 100.0
 model = "consumer-mems"
-driver = {{ link = "virtual" }}
+driver = {{ link = "virtual", silence = 300.0 }}  # the loss of the cable is noticed at once
 [zenoh]
 config = "{patient_file(tmp_path)}"
 mode = "peer"
@@ -154,6 +157,7 @@ mode = "none"
     with running(tmp_path, config) as run:
         imu = run.service.virtual["bench-1"]
         wait_for(lambda: listener.hears(lambda: "imu/bench-1/coefficients" in listener.heard), "coefficients")
+        wait_for(lambda: listener.hears(lambda: listener.alive), "the token")
         assert listener.alive == [("imu/bench-1/alive", True)]
         imu.unplug()
         wait_for(lambda: listener.hears(lambda: len(listener.alive) == 2), "the token to go")

@@ -11,7 +11,7 @@ import pytest
 
 from monitor.publish import queued_writer
 from monitor.publish.queued_writer import QueuedLines, QueuedWriter
-from tests.support.waiting import wait_for
+from tests.support.waiting import PATIENCE_S, wait_for
 
 
 class Pipe:
@@ -139,7 +139,7 @@ def test_the_report_of_lost_lines_is_the_last_line(pipe: Pipe) -> None:
     closing = threading.Thread(target=writer.close, args=(60.0,))
     closing.start()
     pipe.read(filled)
-    closing.join(60.0)
+    closing.join(PATIENCE_S)
     expected = "a\n" + 50 * "b\n" + "10 log lines were dropped because nobody read the pipe\n"
     assert pipe.read(len(expected)).decode() == expected
 

@@ -167,7 +167,12 @@ def test_two_ways_to_the_same_daemon_bring_each_message_once(tmp_path: Path) -> 
         for payload in sent:
             out.put(topics.EVENT, "a", payload)
         wait_for(lambda: keys(arriving, got) and got[-1].payload == sent[-1])
-        assert stays_true(lambda: keys(arriving, got) and [one.payload for one in got] == sent, 0.3)
+
+        def each_once() -> bool:
+            keys(arriving, got)
+            return [one.payload for one in got if one.payload != b"ready"] == sent  # some of these come late
+
+        assert stays_true(each_once, 0.3)
 
 
 def test_who_comes_late_gets_the_last_values_and_events(endpoint: str) -> None:

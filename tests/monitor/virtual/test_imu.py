@@ -1,5 +1,6 @@
 """The simulated sensor through an ordinary serial link: every sample it made is received or known to be missing."""
 
+import math
 import os
 import threading
 
@@ -12,6 +13,7 @@ from drivers.driver import Driver
 from drivers.errors import ConfigError
 from monitor.settings import CONFIG_FOLDER, VirtualTable
 from monitor.virtual import VirtualImu
+from tests.support.paced_sensor import follow_reader, is_open
 from tests.support.waiting import PATIENCE_S, wait_for
 
 pytest.importorskip("tty", reason="pseudo-terminals need a POSIX system")
@@ -20,18 +22,27 @@ MODEL = str(CONFIG_FOLDER / "models" / "consumer-mems.toml")
 
 
 class Rig:
-    def __init__(self, module=vectornav_binary, speed=1.0):
+    """A sensor and its driver; the sensor begins to live once the driver's link is open.
+
+    It makes no more than ``allowed`` samples, and waits for its reader while the cable is in.
+    """
+
+    def __init__(self, module=vectornav_binary, speed=1.0, allowed=math.inf):
         decoder = module.build(module.Settings())
         self.imu = VirtualImu(VirtualTable(model=MODEL, seed=3, speed=speed), decoder)
         self.blocks = []
         self.driver = Driver(
             "v", self.imu.link, decoder, SampleClock(decoder.timing, self.imu.rate_hz), self.blocks.append
         )
+        self.allowed = allowed
         self.thread = threading.Thread(target=self.driver.run, daemon=True)
 
     def __enter__(self):
-        self.imu.start()
+        follow_reader(self.imu, self.driver, lambda: self.allowed)
+        self.imu.plug()
         self.thread.start()
+        self.wait(lambda: is_open(self.imu))
+        self.imu.start()
         return self
 
     def __exit__(self, *exc):
@@ -49,12 +60,10 @@ class Rig:
 
 @pytest.mark.parametrize("module", [vectornav_binary, stim300, xsens_mtdata2], ids=lambda m: m.__name__)
 def test_what_it_sends_is_received(module):
-    with Rig(module) as rig:
-        rig.wait(lambda: rig.driver.counts.received >= 100)
-    counts = rig.driver.counts
-    made = rig.imu.truth.sent + rig.imu.truth.dropped
-    # what stood in the terminal before the port was opened, and after it was closed, nobody counted
-    assert 0 <= made - counts.received - counts.lost - counts.bad <= 60
+    with Rig(module, allowed=100) as rig:
+        rig.wait(lambda: rig.imu.truth.made == rig.driver.counts.received == 100)
+    counts, truth = rig.driver.counts, rig.imu.truth
+    assert (truth.sent, truth.dropped) == (100, 0)
     assert (counts.lost, counts.bad) == (0, 0)
     values = np.concatenate([one.values for one in rig.blocks])
     assert np.isfinite(values).all()
@@ -63,24 +72,24 @@ def test_what_it_sends_is_received(module):
 
 
 def test_a_pulled_cable_and_back():
-    with Rig() as rig:
-        rig.wait(lambda: rig.driver.counts.received >= 50)
+    with Rig(allowed=50) as rig:
+        counts, truth = rig.driver.counts, rig.imu.truth
+        rig.wait(lambda: truth.made == counts.received == 50)  # nothing is on the way when the cable is pulled
         rig.imu.unplug()
         rig.wait(lambda: rig.driver.state == "lost")
         assert not rig.imu.port.path.exists()
-        before = rig.driver.counts.received
-        dropped = rig.imu.truth.dropped
-        rig.wait(lambda: rig.imu.truth.dropped >= dropped + 50)  # half a second at 100 Hz
-        assert rig.driver.counts.received == before
+        rig.allowed = 100
+        rig.wait(lambda: truth.dropped == 50)  # half a second at 100 Hz
+        assert counts.received == 50
         rig.imu.plug()
+        rig.allowed = 150
         rig.wait(lambda: rig.driver.state == "running")
-        rig.wait(lambda: rig.driver.counts.received >= before + 50)
+        rig.wait(lambda: truth.made == 150 and counts.received == 100)
         kinds = rig.kinds()
-    counts = rig.driver.counts
     assert kinds.count("link_lost") == kinds.count("link_back") == 1
     assert "samples_lost" in kinds
-    assert counts.lost >= 40  # half a second at 100 Hz, told by the sensor's counter
-    assert 0 <= rig.imu.truth.sent + rig.imu.truth.dropped - counts.received - counts.lost - counts.bad <= 60
+    assert (counts.lost, counts.bad) == (50, 0)  # told by the sensor's counter
+    assert truth.sent == 100
 
 
 def test_nobody_reads_and_the_sensor_goes_on():
