@@ -69,9 +69,8 @@ def healthy(folder: Path, text: str) -> Iterator[Running]:
     missing = number[-1] - number[0] + 1 - number.size
     # the simulated sensor drops what a reader does not fetch in time on a loaded machine; nothing else may be missing
     assert missing <= run.service.virtual["healthy"].truth.dropped
-    # the clock may take a hole of seconds after such a delay for a jump of the counter, and says so
-    jumped = any(event.kind == "clock_jumped" for device, event in run.caught.events if device == "healthy")
-    assert counts.lost + counts.bad == missing or (jumped and counts.lost + counts.bad < missing)
+    assert counts.lost + counts.bad == missing
+    assert not any(event.kind == "clock_jumped" for device, event in run.caught.events if device == "healthy")
     assert run.station("healthy").ring.overflowed == 0
 
 
