@@ -1,7 +1,7 @@
 """A daemon that is killed at random moments beside a sensor of a kilohertz: what it promises to keep is kept.
 
-docs/recording.md promises that a crash costs at most half a second of samples and what was on its way. Both sides of the
-comparison are counted in samples: the counts that the sensor had sent, and the batches and rows that are on the disk.
+docs/recording.md promises that a crash costs at most half a second of samples and what was on its way. Both sides of
+the comparison are counted in samples: the counts that the sensor had sent, and the batches and rows on the disk.
 A loaded machine delays single batches and kills, so the medians are compared, with a factor of four.
 """
 
