@@ -7,8 +7,10 @@ host's scheduler does not become jitter of the samples.
 
 Missing samples are known from a counter exactly; without one from rejected frames (the decoder says so), from
 the pause while a link was closed, and from a sudden delay: one that is caught up within CATCH_UP_S was a late
-scheduler, one that stays is a hole. The same delay tells the whole turns that a short counter hides. A counter that
-ran further than the host's clock allows began anew: then arrival decides. ``lost`` of each block that goes out counts
+scheduler, one that stays is a hole. The same delay tells the whole turns that a short counter hides. A sample may be
+read late but never early. A step of the counter is therefore a hole if that many samples fit between the earliest time
+at which the last sample can have been taken (``drivers.arrival_bound``) and the arrival. A longer step is a jump of the
+counter: then arrival decides. ``lost`` of each block that goes out counts
 all samples missing just before it, rejected frames included.
 
 A row that repeats another, with the same counter or given time and the same values, is kept out and told; with other
@@ -26,6 +28,7 @@ from typing import Final
 
 import numpy as np
 
+from drivers.arrival_bound import ArrivalBound
 from drivers.line import LEARN_S, LEARN_SAMPLES, Line, made_rate
 from drivers.order import BACK, NEAR, NS, Repeats, Telling, steady_order
 from drivers.quantities import RATE_HZ
@@ -38,6 +41,8 @@ HOLE_MIN_S: Final = 0.05
 """One pause in the arrivals longer than both, and not made good within CATCH_UP_S: samples are missing."""
 JUMP_S: Final = 1.0
 """A device counter that runs ahead of the host's clock by more than this at one step has jumped."""
+PERIOD_TOLERANCE: Final = 0.05
+"""Relative error of the sample period that is plausible when the missing samples of a hole are compared with a time."""
 LONG_S: Final = 3600.0
 """Given times that go on by more than this at one step are told as an event too."""
 FASTEST_HZ: Final = 32_000.0
@@ -110,6 +115,8 @@ class SampleClock:
         self._given_steps: deque[float] = deque(maxlen=STEPS_KEPT)  # s
         self._stuck = 0
         self._paused = False
+        self._bound = ArrivalBound()
+        self._idle_ns: int | None = None  # the link held no data at this time
         self._earlier_hz: float | None = None  # rate before a restart of the program, until the line knows better
 
     def resume(self, before: Before) -> None:
@@ -118,6 +125,7 @@ class SampleClock:
         self._earlier_hz = self._nominal_hz or before.rate_hz
         self._last_t_ns = self._arrived_ns = before.t_ns
         self._origin_ns = before.t_ns
+        self._bound.start(0.0)
         if isinstance(self._timing, Given):
             self._line.add(self._index, 0.0, self._earlier_hz)
         if before.tick != NO_TICK and before.tick_step is not None:
@@ -184,10 +192,20 @@ class SampleClock:
         """The link was closed: what the next sample's arrival shows to be missing is a hole."""
         self._paused = True
 
+    def link_idle(self, t_ns: int) -> None:
+        """Note that the link held no unread data at a host time: what arrives later was sent later.
+
+        Only the time before the first sample is used. It tells how long the first samples may have waited.
+        """
+        self._idle_ns = t_ns
+
     def stamp(self, samples: SampleBlock) -> list[SampleBlock]:
         """The samples with their times, cut where some are missing."""
         if self._origin_ns is None:
             self._origin_ns = int(samples.t_ns[0])
+            if self._idle_ns is not None:
+                # one period before the first sample, which was not taken earlier than the link was idle
+                self._bound.start(min(self._seconds(self._idle_ns), 0.0) - 1.0 / (self._nominal_hz or FASTEST_HZ))
         self._telling.tell_due(int(samples.t_ns[-1]))
         kept = self._in_order(self._without_repeats(samples))
         stamped = self._stamp(kept) if kept is not None else []
@@ -440,20 +458,32 @@ class SampleClock:
         return np.where(waited >= STUCK_SAMPLES, waited, 0)
 
     def _ran_ahead(self, missing: Ints, steps: Ints, counter: Counter, arrived_ns: int) -> bool:
-        """Whether so many samples cannot be missing, as the time for them has not passed on the host."""
-        period_s = self._line.period_s() or (1.0 / self._earlier_hz if self._earlier_hz else None)
+        """Return True if more samples are missing than can have been sent in the time that passed on the host.
+
+        The time begins when the last sample was taken at the earliest. Its arrival does not count, as it may have
+        waited in a buffer until the reading process got processor time.
+        """
+        period_s = self._bound.period_s or self._certain_period_s()
         lost = float(missing.sum(dtype=np.float64))
         if period_s is not None:
-            lasted_s = lost * max(period_s, 1.0 / FASTEST_HZ)
+            lasted_s = lost * max((1.0 - PERIOD_TOLERANCE) * period_s, 1.0 / FASTEST_HZ)
         elif counter.tick_s is not None:
             lasted_s = max(float(steps.sum(dtype=np.float64)) * counter.tick_s, lost / FASTEST_HZ)
         elif 2 * int(steps.max()) > counter.modulus:  # half a turn on is more likely a step back
             return True
         else:
             lasted_s = lost / FASTEST_HZ
-        # samples may wait in buffers before the host sees them, but none arrives before it was taken
-        known_s = self._line.at(self._index) if self._line.count else self._seconds(self._arrived_ns or arrived_ns)
-        return lasted_s > max(self._seconds(arrived_ns) - known_s, 0.0) + JUMP_S
+        arrived_s = self._seconds(arrived_ns)
+        taken_s = self._bound.newest_s
+        return lasted_s > max(arrived_s - (arrived_s if taken_s is None else taken_s), 0.0) + JUMP_S
+
+    def _certain_period_s(self) -> float | None:
+        """Sample period in s that late readings have not distorted; the configured one until the arrivals show it."""
+        found = self._line.measured() if self._bound.settled else None
+        if found is not None and found[1] < PERIOD_TOLERANCE:
+            return 1.0 / found[0]
+        rate_hz = None if self._bound.period_s else self._nominal_hz or self._earlier_hz
+        return 1.0 / rate_hz if rate_hz else None
 
     def _arrival_gaps(self, samples: SampleBlock) -> Ints:
         """Missing samples before each row [n]: rejected frames, a pause of the link, a delay never caught up."""
@@ -507,12 +537,14 @@ class SampleClock:
 
     def _place(self, samples: SampleBlock, missing: Ints) -> list[SampleBlock]:
         index = self._index + np.cumsum(missing + 1)
+        passed = float(index[-1]) - self._index
         self._index = float(index[-1])
         self._arrived_ns = int(samples.t_ns[-1])
         arrived_s = self._seconds(self._arrived_ns)
         if self._delay is None:  # what may be a hole must not bend the line
             # within a chunk the last sample waited least
             self._line.add(self._index, arrived_s, self._nominal_hz)
+        self._bound.update(passed, arrived_s, self._certain_period_s())
         period_s = self._line.period_s() or 1.0 / NS  # the first samples of an unknown rate: in order at least
         # no sample is newer than its arrival, but for the scatter of the line
         newest_s = min(self._line.at(self._index), arrived_s + JUMP_S)

@@ -136,7 +136,10 @@ class Driver:
             received = self.counts.received
             self.turns += 1
             try:
+                opening_ns = time.monotonic_ns()
                 self.link.open()
+                if not self.times_are_unix:
+                    self.clock.link_idle(opening_ns)
                 self._heard_s = time.monotonic()
                 while not self._stop.is_set():
                     self.step()
@@ -156,9 +159,12 @@ class Driver:
     def step(self) -> None:
         """One read and all that follows from it."""
         self.turns += 1
+        asked_ns = time.monotonic_ns()
         chunks = self.link.read(READ_TIMEOUT_S)
         self._tell_lost()
         if chunks is None:
+            if not self.times_are_unix:
+                self.clock.link_idle(asked_ns)
             self._watch_silence()
             return
         self._heard_s = time.monotonic()

@@ -95,6 +95,7 @@ class Kill:
     lived_s: float
     rows: int  # that this daemon recorded
     missing_s: float  # of what had come by then, not in the recording
+    batches_s: tuple[float, ...] = ()  # length of each batch of the newest segment, in s of samples
 
 
 class Bench:
@@ -148,17 +149,25 @@ class Bench:
         after = self.ticks()
         rows = len(after) - len(before)
         known = int(after[-1]) + 1 if rows else opened
-        return Kill(lived_s, rows, 0.0 if known is None else max(sent - known, 0) / RATE)
+        missing_s = 0.0 if known is None else max(sent - known, 0) / RATE
+        return Kill(lived_s, rows, missing_s, self._batches_s() if rows else ())
 
-    def recorded(self, rows: int) -> Callable[[int], bool]:
-        """Return a condition: so many more rows are recorded, and at most the last second of the sensor is missing."""
-        before = len(self.ticks())
+    def after(self, condition: Callable[[int], bool], wait_s: float) -> Callable[[int], bool]:
+        """Return a condition: so many seconds have passed since another condition became true."""
+        since_s: float | None = None
 
-        def true(_: int) -> bool:
-            ticks = self.ticks()
-            return len(ticks) >= before + rows and self.sensor.sent - int(ticks[-1]) - 1 <= RATE
+        def true(pid: int) -> bool:
+            nonlocal since_s
+            if since_s is None and condition(pid):
+                since_s = time.monotonic()
+            return since_s is not None and time.monotonic() >= since_s + wait_s
 
         return true
+
+    def recorded(self, rows: int) -> Callable[[int], bool]:
+        """Return a condition: so many more rows are recorded."""
+        before = len(self.ticks())
+        return lambda _: len(self.ticks()) >= before + rows
 
     def live(self, until: Callable[[], bool]) -> int:
         """Start, stop in order (SIGTERM) once ``until`` holds; the exit status."""
@@ -181,6 +190,11 @@ class Bench:
         wrong = np.flatnonzero(np.diff(counts) != missing[1:] + 1)
         assert not wrong.size, f"{counts[wrong[0]]} is followed by {counts[wrong[0] + 1]}, lost {missing[wrong[0] + 1]}"
         return counts
+
+    def _batches_s(self) -> tuple[float, ...]:
+        """Seconds of samples in each batch of the newest segment, which stands as it was written."""
+        newest = segment.segments(self.folder / "bench")[-1]
+        return tuple(len(piece.samples) / RATE for piece in segment.read_samples(newest))
 
     def check_files(self) -> None:
         """Every file with the commands' own reader, and the raw ones."""

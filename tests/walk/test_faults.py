@@ -69,9 +69,8 @@ def healthy(folder: Path, text: str) -> Iterator[Running]:
     missing = number[-1] - number[0] + 1 - number.size
     # the simulated sensor drops what a reader does not fetch in time on a loaded machine; nothing else may be missing
     assert missing <= run.service.virtual["healthy"].truth.dropped
-    # the clock may take a hole of seconds after such a delay for a jump of the counter, and says so
-    jumped = any(event.kind == "clock_jumped" for device, event in run.caught.events if device == "healthy")
-    assert counts.lost + counts.bad == missing or (jumped and counts.lost + counts.bad < missing)
+    assert counts.lost + counts.bad == missing
+    assert not any(event.kind == "clock_jumped" for device, event in run.caught.events if device == "healthy")
     assert run.station("healthy").ring.overflowed == 0
 
 
@@ -373,7 +372,10 @@ def test_a_link_that_goes_silent_and_comes_back(tmp_path: Path) -> None:
         wait_for(back, "lines after the silence")
         wait_for(lambda: run.caught.healths["board"].state == "running", "the state")
         kinds = [event.kind for device, event in run.caught.events if device == "board"]
-        assert kinds.count("link_lost") == kinds.count("link_back") == 1
+        told = [kind for kind in kinds if kind in ("link_lost", "link_back")]
+        # a loaded machine may take longer than the silence until here, and the link is silent once more
+        assert told[:2] == ["link_lost", "link_back"]
+        assert told == ["link_lost", "link_back"] * (len(told) // 2) + ["link_lost"] * (len(told) % 2)
 
 
 def clean(run: Running, cable: Cable) -> None:
