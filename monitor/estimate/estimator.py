@@ -20,6 +20,7 @@ from drivers.errors import NotReady
 from drivers.sample import Floats, Ints, SampleBlock, block
 from monitor.estimate.bandwidth import LowPass, contradicted, power, searching, with_bandwidth
 from monitor.estimate.batch import TauGrid, cluster_sizes
+from monitor.estimate.change import ChangeDetector
 from monitor.estimate.curve import AllanCurve
 from monitor.estimate.estimate import Course, Estimate
 from monitor.estimate.estimate import joined as joined_courses
@@ -256,6 +257,7 @@ def warm_up() -> Iterator[str]:
     estimator.get()
     yield "fit"
     Watch(100.0).update(samples)
+    ChangeDetector(100.0).restart()
     estimator.restart(0, 10)
     while estimator.step() is None:  # a round of the slow statistics
         pass
