@@ -90,8 +90,10 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
     ``intermediate.signatures`` those for which it has become a part of other kernels.
     """
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        options = {"nopython": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+    def __init__(self, function: Callable[..., Any], inline: bool) -> None:
+        options: dict[str, bool | str] = {
+            "nopython": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "forceinline": inline,
+        }  # fmt: skip
         super().__init__(function, targetoptions=options)
         self.intermediate = Intermediate(function, options | {"no_cpython_wrapper": True})
 
@@ -127,7 +129,19 @@ def _no_garbage_collection() -> Iterator[None]:
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """Compile in nopython mode. No fast-math: compensated sums must keep their order."""
-    kernel = Kernel(function)
+    return _cached(Kernel(function, inline=False), function)
+
+
+def inlined(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile as ``compiled`` does, and make LLVM copy the function into every kernel that calls it.
+
+    For the body of an inner loop that LLVM alone holds for too long to copy.
+    """
+    return _cached(Kernel(function, inline=True), function)
+
+
+def _cached(kernel: Kernel, function: Callable[P, R]) -> Callable[P, R]:
+    """Have machine code of a kernel kept on disk, if there is a folder for it."""
     with contextlib.suppress(RuntimeError):  # no folder for it
         kernel.enable_caching()
         kept = cast("Any", kernel)._cache._cache_file  # noqa: SLF001

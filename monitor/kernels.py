@@ -31,6 +31,7 @@ from monitor.compiled import cache_folder, stamp
 from monitor.drift import heat
 from monitor.drift.arma import identify
 from monitor.drift.compensator import Compensator
+from monitor.estimate.change import ChangeDetector
 from monitor.estimate.estimator import Estimator
 from monitor.estimate.watch import Watch
 
@@ -284,6 +285,7 @@ def _call_motion_detection() -> None:
 
 def _call_change_detection() -> None:
     Watch(100.0).update(_samples(100))
+    ChangeDetector(100.0).restart()
 
 
 def _call_compensation() -> None:
@@ -291,6 +293,7 @@ def _call_compensation() -> None:
     compensator.update(1e-3 * np.random.default_rng(0).standard_normal((6000, 6)))
     compensator.adopt(0, identify(*compensator.window(0), [(2, 1)]))
     compensator.update(np.zeros((1, 6)), lost=1)
+    _ = compensator.error
 
 
 def _call_slow_statistics() -> None:

@@ -151,7 +151,7 @@ class Compensator:
             for axis in range(GYROS):
                 coast(self._state.bank[axis], self._state.ages[axis], lost)
             self.came += lost
-        out = np.array(values, dtype=np.float64)
+        out = np.array(values, dtype=np.float64, order="C")
         # always contiguous and read-only, as each layout and access flag would be compiled anew
         values = np.ascontiguousarray(values, np.float64).view()
         values.flags.writeable = False
@@ -270,7 +270,9 @@ def _advance(values, index, size, s, out, taught):  # type: ignore[no-untyped-de
     while i < n:
         number = (index + i) // size
         end = min(n, (number + 1) * size - index)
-        verdicts = rest_kernel.advance(values[i:end], index + i, size, s.rest, s.verdicts[0], s.verdicts[1], s.episodes)
+        verdicts = rest_kernel.advance(
+            values[i:end], index + i, size, False, s.rest, s.verdicts[0], s.verdicts[1], s.episodes
+        )
         for v in range(verdicts[0]):
             filled += _judged(s.verdicts[0, v], s.verdicts[1, v] > 0, s, taught[filled])
         slot = number % SLOTS

@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import Floats, Ints
-from monitor.compiled import compiled
+from monitor.compiled import compiled, inlined
 
 LONGEST_S: Final = 10.0
 """Memory of the slowest filter."""
@@ -86,7 +86,7 @@ def _gains(q, rows):  # type: ignore[no-untyped-def]
     return out
 
 
-@compiled
+@inlined
 def follow(z, bank, ages, table, first, sums, feedback, keep):  # type: ignore[no-untyped-def]
     """One sample of one axis.
 

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
 from monitor.estimate.coefficients import Coefficients, Status
-from monitor.estimate.fit_kernel import WHITE, fit_axis
+from monitor.estimate.fit_kernel import WHITE, fit_axes
 from monitor.estimate.least_squares import N, R
 from monitor.estimate.uncertainty import NOISES, Table
 from monitor.estimate.verdict import Known, answer, gains
@@ -171,8 +171,7 @@ def _fit(design: Design, table: Table, looks: Looks, shared: Known, full: bool, 
     curves, counts = np.ascontiguousarray(avar.T), np.ascontiguousarray(terms.T, np.float64)
     slope, slopes = looks.slope / design.rate_hz, np.ascontiguousarray(looks.slopes.T) / design.rate_hz
     thresholds, warm = THRESHOLDS_ONCE if before is None else THRESHOLDS_WATCHED, start is not None
-    for axis in range(axes):
-        fit_axis(axis, shared, curves, counts, float(slope[axis]), slopes, thresholds, full, warm, found, frozen)
+    fit_axes(0, axes, shared, curves, counts, slope, slopes, thresholds, full, warm, found, frozen)
     to_si = design.rate_hz**TO_SI
     value = np.where(found.status == Status.ESTIMATED, np.sqrt(np.maximum(found.theta, 0.0)), np.nan)
     coefficients = Coefficients((value * to_si).T, (found.lo * to_si).T, (found.hi * to_si).T, found.status.T)

@@ -45,6 +45,15 @@ WHITE: Final = PAIRS.index((N, N))
 
 
 @compiled
+def fit_axes(  # type: ignore[no-untyped-def]
+    first, end, known, avar, terms, slope, slopes, thresholds, full, warm, answer, gains
+):
+    """Fit the axes first ≤ axis < end: ``avar``, ``terms`` and ``slopes`` [axes, m], ``slope`` [axes] or NaN."""
+    for axis in range(first, end):
+        fit_axis(axis, known, avar, terms, slope[axis], slopes, thresholds, full, warm, answer, gains)
+
+
+@compiled
 def fit_axis(  # type: ignore[no-untyped-def]
     axis, known, avar, terms, slope, slopes, thresholds, full, warm, answer, gains
 ):

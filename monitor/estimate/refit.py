@@ -7,7 +7,7 @@ enter or leave, a coefficient has moved by a fifth and by more than its scatter,
 the window has grown by a tenth, or half of it has passed. In between weights are stale by less than that, which adds
 2 % to the error of a coefficient at most: it depends on the weights in second order.
 
-The kernel returns where an axis needs new gains, and ``fit_axis`` is called from here: it is seldom needed, and would
+The kernel returns where an axis needs new gains, and ``fit_axes`` is called from here: it is seldom needed, and would
 otherwise be compiled a second time as a part of the kernel.
 
 Comes in: samples. Goes out: the course of Q N B K R, a row a sample; what is not estimated is NaN there.
@@ -23,7 +23,7 @@ from drivers.sample import Floats, Ints
 from monitor.compiled import compiled
 from monitor.estimate.coefficients import Status
 from monitor.estimate.fit import THRESHOLDS_WATCHED, TO_SI, Design, known
-from monitor.estimate.fit_kernel import fit_axis
+from monitor.estimate.fit_kernel import fit_axes
 from monitor.estimate.least_squares import Q, R, invert, present, solve_nonnegative
 from monitor.estimate.uncertainty import FOR_EVER, NOISES, AxisTables, Table
 from monitor.estimate.verdict import NUMBERS, Answer, Gains, Known, answer, gains
@@ -112,8 +112,8 @@ class Refit:
     def _fit(self, axes: list[int], to_si: Floats, coefficients: Floats) -> None:
         """Fit some axes to ``_curve``, and write what is estimated into ``coefficients`` [5, 6]."""
         for axis in axes:
-            fit_axis(
-                axis, self._known[axis], self._curve, self._terms, float(self._slope[axis]), self._slopes,
+            fit_axes(
+                axis, axis + 1, self._known[axis], self._curve, self._terms, self._slope, self._slopes,
                 THRESHOLDS_WATCHED, False, True, self._answer, self._gains,
             )  # fmt: skip
         size = np.sqrt(np.maximum(self._answer.theta[axes], 0.0)) * to_si

@@ -29,7 +29,6 @@ from monitor.estimate.rest_kernel import (
     LAST,
     PEAK,
     advance,
-    finish,
     state,
 )
 from monitor.words import amount
@@ -98,13 +97,15 @@ class Rest:
         self._held.append((first, samples))
         self._index = first + len(samples)
         blocks, moving, episodes = _room(len(samples), self._size)
-        filled = advance(samples.values, first, self._size, self._state, blocks, moving, episodes)
+        filled = advance(samples.values, first, self._size, False, self._state, blocks, moving, episodes)
         return self._let_go(blocks[: filled[0]], moving[: filled[0]], episodes[: filled[1]])
 
     def flush(self) -> list[SampleBlock]:
         """What is held back, judged as if the stream ended here; an open stretch ends too."""
         blocks, moving, episodes = _room(0, self._size)
-        filled = finish(self._size, self._state, blocks, moving, episodes)
+        filled = advance(
+            _read_only(np.empty((0, len(AXES)))), 0, self._size, True, self._state, blocks, moving, episodes
+        )
         return self._let_go(blocks[: filled[0]], moving[: filled[0]], episodes[: filled[1]])
 
     def take(self) -> list[Motion]:
@@ -135,9 +136,7 @@ def find(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], list[Motion
     size = block_size(rate_hz)
     known = state()
     blocks, moving, episodes = _room(len(values), size)
-    filled = advance(values, 0, size, known, blocks, moving, episodes)
-    rest = finish(size, known, blocks[filled[0] :], moving[filled[0] :], episodes[filled[1] :])
-    verdicts, stretches = filled + rest
+    verdicts, stretches = advance(_read_only(values), 0, size, True, known, blocks, moving, episodes)
     mask = np.repeat(moving[:verdicts].astype(bool), size)[: len(values)]
     return mask, [_motion(episode, size, rate_hz) for episode in episodes[:stretches]]
 
@@ -145,6 +144,13 @@ def find(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], list[Motion
 def block_size(rate_hz: float) -> int:
     """Samples of a block."""
     return max(round(BLOCK_S * rate_hz), FEWEST)
+
+
+def _read_only(values: Floats) -> Floats:
+    """Return the samples as those of a ``SampleBlock`` are: other layouts and access flags would be compiled anew."""
+    view = np.ascontiguousarray(values, np.float64).view()
+    view.flags.writeable = False
+    return view
 
 
 def _room(rows: int, size: int) -> tuple[Ints, Ints, Floats]:

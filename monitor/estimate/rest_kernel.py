@@ -103,13 +103,17 @@ def state() -> State:
 
 
 @compiled
-def advance(values: Floats, first: int, size: int, s: State, blocks: Ints, moving: Ints, episodes: Floats) -> Ints:
+def advance(
+    values: Floats, first: int, size: int, ends: bool, s: State, blocks: Ints, moving: Ints, episodes: Floats
+) -> Ints:
     """Take consecutive rows in; verdicts and episodes that became final go out.
 
     Args:
         values: [n, 6] in SI, NaN = missing
         first: index of the first row, missing samples counted
         size: samples a block
+        ends: True if the stream ends after these rows: the open block is judged, what is held back goes out, and an
+            open episode ends
         blocks, moving: [≥ n/size + 2] filled: number of a block, and whether it moves
         episodes: [≥ n/size + 2, 5] filled: first and last moving block, whether the orientation changed, axis and size
             of the peak
@@ -139,18 +143,12 @@ def advance(values: Floats, first: int, size: int, s: State, blocks: Ints, movin
             s.open[a, SQUARES] += off * off
             s.open[a, LOW] = min(s.open[a, LOW], value)
             s.open[a, HIGH] = max(s.open[a, HIGH], value)
-    return filled
-
-
-@compiled
-def finish(size: int, s: State, blocks: Ints, moving: Ints, episodes: Floats) -> Ints:
-    """The end of the stream: the open block is judged, what is held back goes out, an open episode ends."""
-    filled = np.zeros(2, np.int64)
-    _close(size, s, blocks, moving, episodes, filled)
-    _emit(s, blocks, moving, filled)
-    s.place[HELD] = -1
-    if s.place[BEGAN] >= 0:
-        _end(s, episodes, filled)
+    if ends:
+        _close(size, s, blocks, moving, episodes, filled)
+        _emit(s, blocks, moving, filled)
+        s.place[HELD] = -1
+        if s.place[BEGAN] >= 0:
+            _end(s, episodes, filled)
     return filled
 
 

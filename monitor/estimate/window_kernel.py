@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
-from monitor.compiled import compiled
+from monitor.compiled import compiled, inlined
 
 AXES: Final = 6
 LANES: Final = 8
@@ -285,7 +285,7 @@ def forget(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, ax
         sums[own], rest[own], terms[own] = total, left, count
 
 
-@compiled
+@inlined
 def level(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> int:
     """Mean of the newest samples of an axis, in its integers: near enough to its mean that differences fit in 64 bits.
 
@@ -297,7 +297,7 @@ def level(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: in
     return (phase[last] - phase[first]) // present if present > 0 else NEVER
 
 
-@compiled
+@inlined
 def thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> float:
     """Slope of the last n samples by their thirds, in units of the integers; NaN where too many are missing."""
     third, places = n // 3, phase.size // LANES

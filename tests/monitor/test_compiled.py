@@ -59,7 +59,7 @@ def test_cached_code_is_stale_when_what_it_calls_has_changed(tmp_path):
 def test_the_stamp_of_a_kernel_covers_the_files_it_calls():
     imported = [package for package, *_ in IMPORTS.findall(Path(inspect.getfile(fit_kernel)).read_text())]
     assert imported.count("monitor.estimate.verdict") == 1
-    assert fit_kernel.fit_axis._cache._cache_file._source_stamp[1] == stamp(Path(inspect.getfile(fit_kernel)))
+    assert fit_kernel.fit_axes._cache._cache_file._source_stamp[1] == stamp(Path(inspect.getfile(fit_kernel)))
 
 
 @compiled

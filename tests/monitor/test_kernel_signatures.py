@@ -1,0 +1,84 @@
+"""The warm-up compiles every kernel that the service calls, and each of them once."""
+
+import json
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+import monitor.compiled
+from tests.support.waiting import PATIENCE_S
+
+PROGRAM = """
+    import json, sys
+
+    import numpy as np
+
+    from drivers.sample import block
+    from monitor import kernels
+    from monitor.compiled import Kernel
+    from monitor.drift import heat
+    from monitor.drift.compensator import Compensator
+    from monitor.estimate.estimator import Estimator
+    from monitor.estimate.watch import Watch
+
+
+    def compiled():
+        found = {
+            f"{one.__module__}.{one.__name__}": one
+            for module in list(sys.modules.values())
+            for one in vars(module).values()
+            if module.__name__.startswith("monitor.") and isinstance(one, Kernel)
+        }
+        return {name: (len(one.signatures), len(one.intermediate.signatures)) for name, one in found.items()}
+
+
+    for part in kernels.SERVICE.parts:
+        part.prepare()
+    before = compiled()
+
+    rng = np.random.default_rng(1)
+    values = 1e-3 * rng.standard_normal((12_000, 6))
+    values[6000:6400, 0] += np.sin(np.arange(400) / 20)  # motion
+    values[9000:, 1] *= 3.0  # a change of noise
+    watch = Watch(100.0, leave_out=True)
+    estimators = [Estimator(100.0, 60.0), Estimator(100.0, 60.0, every_sample=True)]
+    gyro = Compensator(100.0)
+    for start in range(0, len(values), 50):
+        samples = block(np.arange(start, start + 50), values[start : start + 50])
+        gyro.update(samples.values, lost=3 if start == 5000 else 0)
+        gyro.update(np.asfortranarray(values[start : start + 50]))
+        for still in watch.update(samples):
+            for one in estimators:
+                one.update(still)
+                if start % 1000 == 0:
+                    one.get()
+        if start == 8000:
+            gyro.identify()
+    watch.flush()
+    found = watch.take_events()
+    for one in estimators:
+        one.restart(2, 1000)
+        while one.step() is None:
+            pass
+    gyro.error
+    heat.lagged(values[:, 0].copy(), 0.5)
+    print(json.dumps([before, compiled(), len(found)]))
+"""
+
+
+@pytest.mark.long
+def test_after_the_warm_up_nothing_more_is_compiled_and_each_kernel_has_one_signature(tmp_path: Path) -> None:
+    root = Path(monitor.compiled.__file__).parents[1]
+    command = [sys.executable, "-c", textwrap.dedent(PROGRAM)]
+    cold = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}  # else inner functions would not be compiled at all
+    done = subprocess.run(command, cwd=root, env=cold, timeout=PATIENCE_S, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    before, after, found = json.loads(done.stdout)
+    assert found, "the samples must lead through what follows motion and changes"
+    assert {name: counts for name, counts in after.items() if counts != before.get(name)} == {}
+    assert {name: counts for name, counts in after.items() if max(counts) > 1} == {}
+    assert after["monitor.estimate.window_kernel.advance"] == [1, 1]
