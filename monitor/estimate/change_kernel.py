@@ -257,7 +257,7 @@ def _median_of_seeds(first: Floats) -> float:
             below += other < value
             equal += other == value
         if below <= SEED // 2 < below + equal:
-            return value
+            return float(value)
     return 0.0
 
 
@@ -384,7 +384,7 @@ def _suspect_burst(s: State, axis: int, now: int) -> None:
 
 
 @compiled
-def _alarm(s: State, axis: int, kind: float, j: int, since: float, evidence: float, now: int) -> None:
+def _alarm(s: State, axis: int, kind: float, j: int | np.int64, since: float, evidence: float, now: int) -> None:
     """Note the first alarm; the verdict waits for as long again as it took to raise it, within limits."""
     alarm = s.alarm[axis]
     if alarm[KIND] != 0.0 and not (alarm[FOUND] == now and evidence > alarm[EVIDENCE]):

@@ -30,7 +30,7 @@ class Compilation:
 
 
 @dataclass
-class Recorder(event.Listener):
+class Recorder(event.Listener):  # type: ignore[misc]
     """Records each compilation with its processor time, less that of the functions compiled for it."""
 
     done: list[Compilation] = field(default_factory=list)
