@@ -39,6 +39,7 @@ class ArrivalBound:
         self.period_s: float | None = None
         """Sample period in s of the host's clock, as of the last samples that were read without delay."""
         self._clock_s: float | None = None  # goes on by one period a sample; newest sample = this + least delay
+        self._uncounted = 0.0  # samples that came before a period was known
         self._start_delay_s = inf  # of the start, where it is older than the first arrival
         self._delay_s = self._previous_delay_s = inf  # least delay of an arrival after the clock, in two windows
         self._window_s = self._total_s = 0.0  # length of the current window so far, and of all
@@ -73,7 +74,10 @@ class ArrivalBound:
         period_s : float or None
             Sample period in s that the arrivals show now; None if they do not show it.
         """
-        step_s = samples * (self.period_s or period_s or 0.0)
+        self._uncounted += samples
+        step_s = 0.0
+        if period := self.period_s or period_s:
+            step_s, self._uncounted = self._uncounted * period, 0.0
         if self._clock_s is None:
             self.start(arrived_s - step_s)
         assert self._clock_s is not None

@@ -43,6 +43,8 @@ JUMP_S: Final = 1.0
 """A device counter that runs ahead of the host's clock by more than this at one step has jumped."""
 PERIOD_TOLERANCE: Final = 0.05
 """Relative error of the sample period that is plausible when the missing samples of a hole are compared with a time."""
+RESUME_LATE_S: Final = 10.0
+"""The last sample recorded before a restart was read at most this late: an assumption."""
 LONG_S: Final = 3600.0
 """Given times that go on by more than this at one step are told as an event too."""
 FASTEST_HZ: Final = 32_000.0
@@ -125,7 +127,7 @@ class SampleClock:
         self._earlier_hz = self._nominal_hz or before.rate_hz
         self._last_t_ns = self._arrived_ns = before.t_ns
         self._origin_ns = before.t_ns
-        self._bound.start(0.0)
+        self._bound.start(-RESUME_LATE_S)
         if isinstance(self._timing, Given):
             self._line.add(self._index, 0.0, self._earlier_hz)
         if before.tick != NO_TICK and before.tick_step is not None:

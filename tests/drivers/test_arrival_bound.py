@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.arrival_bound import SETTLED_S, WINDOW_S, ArrivalBound
-from drivers.clock import SampleClock
+from drivers.clock import Before, SampleClock
 from drivers.sample import Counter, SampleBlock, block
 
 NS = 1e9
@@ -183,6 +183,20 @@ def test_a_device_that_begins_late_has_jumps_told_from_its_first_samples_on() ->
     for i in range(100):
         stamp(clock, 60.05 + i / 100, [i], ticks_of(np.array([i + 1000 * (i >= 50)]), WITH_TIME, 100.0))
     assert len(told(clock)) == 1
+
+
+@pytest.mark.parametrize("counter", [WITH_TIME, SAMPLES])
+@pytest.mark.parametrize(("away", "jumps"), [(800, 0), (10_000, 1)])
+def test_the_last_sample_before_a_restart_may_have_been_read_late(counter: Counter, away: int, jumps: int) -> None:
+    """It was taken at 2.5 s and read at 6 s; after the restart the first sample comes at 10.5 s."""
+    last = np.array([250])
+    step = 1.0 if counter.tick_s is None else 1e4
+    clock = SampleClock(counter, 100.0)
+    clock.resume(Before(round((BEGUN_S + 6.0) * NS), int(ticks_of(last, counter, 100.0)[0]), 100.0, step))
+    out = stamp(clock, 10.5, [1], ticks_of(last + away, counter, 100.0))
+    assert len(told(clock)) == jumps
+    if not jumps:
+        assert counts(out) == (1, away - 1)
 
 
 def test_the_bound_forgets_a_period_that_was_wrong() -> None:
