@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar, cast
 
 import numba
-from numba import _dynfunc, types
+from numba import _dynfunc, types  # type: ignore[attr-defined]
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.registry import CPUDispatcher
@@ -37,7 +37,7 @@ NAME: Final = re.compile(r"\w+")
 IMPORTS: Final = re.compile(r"^from (monitor[\w.]*) import (?:\(([^)]*)\)|(.*))", re.MULTILINE)
 
 
-class IntermediateLibrary(JITCodeLibrary):  # type: ignore[misc]
+class IntermediateLibrary(JITCodeLibrary):
     """LLVM module that is only linked into others: neither optimised as a whole nor translated to machine code."""
 
     def _optimize_final_module(self) -> None: ...
@@ -46,14 +46,16 @@ class IntermediateLibrary(JITCodeLibrary):  # type: ignore[misc]
         self._finalized = True
 
 
-class IntermediateCompiler(Compiler):  # type: ignore[misc]
+class IntermediateCompiler(Compiler):
     """Compiles a function to an ``IntermediateLibrary``."""
 
     def __init__(  # type: ignore[no-untyped-def]
         self, typing_context, target_context, library, args, return_type, flags, local_types
     ) -> None:
-        library = IntermediateLibrary(target_context.codegen(), "intermediate")
-        super().__init__(typing_context, target_context, library, args, return_type, flags, local_types)
+        library = IntermediateLibrary(target_context.codegen(), "intermediate")  # type: ignore[no-untyped-call]
+        super().__init__(  # type: ignore[no-untyped-call]
+            typing_context, target_context, library, args, return_type, flags, local_types
+        )
         self.state.targetctx.get_executable = _without_machine_code  # a copy of the context, for this compilation only
 
 
@@ -63,7 +65,7 @@ def _without_machine_code(library: Any, description: Any, environment: Any) -> A
     return _dynfunc.make_function(description.lookup_module(), description.qualname, "", 0, environment, (library,))
 
 
-class Intermediate(CPUDispatcher):  # type: ignore[misc]
+class Intermediate(CPUDispatcher):
     """Compiles a function for calls from other kernels."""
 
     def __init__(self, function: Callable[..., Any], options: dict[str, bool | str]) -> None:
@@ -74,7 +76,7 @@ class Intermediate(CPUDispatcher):  # type: ignore[misc]
         raise TypeError(f"{self.py_func.__name__} is intermediate code, which only other kernels can call")
 
 
-class Kernel(CPUDispatcher):  # type: ignore[misc]
+class Kernel(CPUDispatcher):
     """Function that is compiled at its first call from Python, or as a part of the kernel that calls it.
 
     ``signatures`` lists the argument types that it has been compiled for to be called from Python,
@@ -93,8 +95,9 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
 
         A constant argument does not count as a type of its own, so that the function is compiled once for all of them.
         """
-        kws = {name: types.unliteral(one) for name, one in kws.items()}
-        return self.intermediate.get_call_template([types.unliteral(one) for one in args], kws)
+        unliteral = cast("Any", types).unliteral
+        named = {name: unliteral(one) for name, one in kws.items()}
+        return self.intermediate.get_call_template([unliteral(one) for one in args], named)
 
     def get_overload(self, sig: Any) -> Any:
         """Return what ``get_call_template`` compiled; Numba asks this when it lowers the calling kernel."""

@@ -257,7 +257,7 @@ def _median_of_seeds(first: Floats) -> float:
             below += other < value
             equal += other == value
         if below <= SEED // 2 < below + equal:
-            return value
+            return float(value)
     return 0.0
 
 
@@ -380,7 +380,7 @@ def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis
 def _suspect_burst(s: State, axis: int, now: int) -> None:
     """Too many extremes: an alarm once the reference is known."""
     if s.burst[axis, 1] - s.born[axis] >= s.levels[LEARN_SAMPLES]:
-        _alarm(s, axis, BURST, np.int64(0), s.burst[axis, 1], s.burst[axis, 0], now)
+        _alarm(s, axis, BURST, 0, s.burst[axis, 1], s.burst[axis, 0], now)
 
 
 @compiled

@@ -399,7 +399,7 @@ def _interpolate(ordered: Floats, n: int, p: float) -> float:
     rank = (n - 1) * p
     lower = int(rank)
     share = rank - lower
-    return ordered[lower] * (1.0 - share) + ordered[min(lower + 1, n - 1)] * share
+    return float(ordered[lower] * (1.0 - share) + ordered[min(lower + 1, n - 1)] * share)
 
 
 @compiled

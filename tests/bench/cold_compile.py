@@ -73,9 +73,10 @@ def main() -> None:
     parser.add_argument("--functions", action="store_true", help="list each compilation")
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = folder
+        os.environ["NUMBA_CACHE_DIR"] = folder
+        setattr(config, "CACHE_DIR", folder)  # noqa: B010
         recorder = Recorder()
-        event.register("numba:compile", recorder)
+        event.register("numba:compile", recorder)  # type: ignore[no-untyped-call]
         print("processor time until ready")
         for stage in stages():
             print(f"  {time.process_time():6.2f} s  {stage}", flush=True)
