@@ -380,11 +380,11 @@ def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis
 def _suspect_burst(s: State, axis: int, now: int) -> None:
     """Too many extremes: an alarm once the reference is known."""
     if s.burst[axis, 1] - s.born[axis] >= s.levels[LEARN_SAMPLES]:
-        _alarm(s, axis, BURST, np.int64(0), s.burst[axis, 1], s.burst[axis, 0], now)
+        _alarm(s, axis, BURST, 0, s.burst[axis, 1], s.burst[axis, 0], now)
 
 
 @compiled
-def _alarm(s: State, axis: int, kind: float, j: int | np.int64, since: float, evidence: float, now: int) -> None:
+def _alarm(s: State, axis: int, kind: float, j: int, since: float, evidence: float, now: int) -> None:
     """Note the first alarm; the verdict waits for as long again as it took to raise it, within limits."""
     alarm = s.alarm[axis]
     if alarm[KIND] != 0.0 and not (alarm[FOUND] == now and evidence > alarm[EVIDENCE]):

@@ -70,7 +70,8 @@ def main() -> None:
     parser.add_argument("--functions", action="store_true", help="list each compilation")
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = folder
+        os.environ["NUMBA_CACHE_DIR"] = folder
+        config.CACHE_DIR = folder
         recorder = Recorder()
         event.register("numba:compile", recorder)
         print("processor time until ready")
