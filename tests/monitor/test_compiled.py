@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import monitor.compiled
-from monitor.compiled import IMPORTS, compiled, stamp
+from monitor.compiled import IMPORTS, Kernel, compiled, stamp
 from monitor.estimate import fit_kernel
 from tests.support.waiting import PATIENCE_S
 
@@ -62,30 +62,28 @@ def test_the_stamp_of_a_kernel_covers_the_files_it_calls():
     assert fit_kernel.fit_axes._cache._cache_file._source_stamp[1] == stamp(Path(inspect.getfile(fit_kernel)))
 
 
-@compiled
-def _add(values, total):  # type: ignore[no-untyped-def]
-    for value in values:
-        total += value
-    return total
-
-
-@compiled
-def _add_twice(values):  # type: ignore[no-untyped-def]
-    return _add(values, _add(values, 0.0))
-
-
 def test_machine_code_is_generated_only_for_the_kernel_that_python_calls():
-    values = np.arange(5.0)
-    assert _add_twice(values) == 20.0
-    assert len(_add_twice.signatures) == 1
-    assert not _add.signatures
-    assert len(_add.intermediate.signatures) == 1
-    (whole,), (part,) = _add_twice.overloads.values(), _add.intermediate.overloads.values()
+    def sum_from(values, total):
+        for value in values:
+            total += value
+        return total
+
+    add = Kernel(sum_from, inline=False)  # without the cache on disk, from which only the outer kernel would be loaded
+
+    def sum_twice(values):
+        return add(values, add(values, 0.0))
+
+    add_twice, values = Kernel(sum_twice, inline=False), np.arange(5.0)
+    assert add_twice(values) == 20.0
+    assert len(add_twice.signatures) == 1
+    assert not add.signatures
+    assert len(add.intermediate.signatures) == 1
+    (whole,), (part,) = add_twice.overloads.values(), add.intermediate.overloads.values()
     engine = whole.library.codegen._engine
     assert engine.is_symbol_defined(whole.fndesc.llvm_cpython_wrapper_name)
     assert not engine.is_symbol_defined(part.fndesc.llvm_cpython_wrapper_name)
-    assert _add(values, 1.0) == 11.0  # from Python it is compiled as a kernel of its own
-    assert len(_add.signatures) == 1
+    assert add(values, 1.0) == 11.0  # from Python it is compiled as a kernel of its own
+    assert len(add.signatures) == 1
 
 
 def test_an_inner_function_is_compiled_once_for_all_constant_arguments():
@@ -102,8 +100,12 @@ def test_an_inner_function_is_compiled_once_for_all_constant_arguments():
 
 
 def test_intermediate_code_refuses_a_call_from_python():
-    with pytest.raises(TypeError, match="_add is intermediate code"):
-        _add.intermediate(np.arange(5.0), 0.0)
+    @compiled
+    def half(x):
+        return 0.5 * x
+
+    with pytest.raises(TypeError, match="half is intermediate code"):
+        half.intermediate(3.0)
 
 
 def test_an_exception_in_an_inner_function_reaches_python():
