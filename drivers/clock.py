@@ -517,22 +517,31 @@ class SampleClock:
         if period_s is None or not self._line.settled():
             return 0
         least_s = max(least * period_s, HOLE_MIN_S)
-        behind_s = self._seconds(arrived_ns) - self._line.at(self._index + counted)
+        index, arrived_s = self._index + counted, self._seconds(arrived_ns)
+        behind_s = arrived_s - self._line.at(index)
         if self._delay is None:
             pause_s = (arrived_ns - self._arrived_ns) / NS - counted * period_s
             if pause_s > least_s and behind_s > least_s:
-                self._delay = _Delay(arrived_ns, behind_s)
+                self._delay = _Delay(arrived_ns, behind_s, Line())
+                self._delay.line.add(index, arrived_s, self._nominal_hz)
             return 0
-        self._delay = _Delay(self._delay.since_ns, min(self._delay.least_s, behind_s))
-        if self._delay.least_s < least_s:  # made good: the host was late
+        delay = self._delay
+        delay.least_s = min(delay.least_s, behind_s)
+        delay.line.add(index, arrived_s, self._nominal_hz)
+        if delay.least_s < least_s:  # made good: the host was late
             self._delay = None
             return 0
-        if arrived_ns - self._delay.since_ns < CATCH_UP_S * NS:
+        if arrived_ns - delay.since_ns < CATCH_UP_S * NS:
             return 0
-        hole = min(round(self._delay.least_s / max(period_s, 1.0 / FASTEST_HZ)), LONGEST_GAP)
+        hole = min(round(delay.least_s / max(period_s, 1.0 / FASTEST_HZ)), LONGEST_GAP)
+        delay.line.move(hole)
         rest_s = behind_s - hole * period_s
-        # another delay may have begun meanwhile
-        self._delay = _Delay(arrived_ns, rest_s) if rest_s > least_s else None
+        if _is_slower(delay.line, period_s):  # the delay grows because the period is wrong, not because samples are lost
+            self._line, self._delay = delay.line, None
+        elif rest_s > least_s:  # another delay may have begun meanwhile
+            delay.since_ns, delay.least_s = arrived_ns, rest_s
+        else:
+            self._delay = None
         return hole
 
     # --- times on the line
@@ -565,10 +574,11 @@ class SampleClock:
         self._telling.tell(kind, t_ns, text, n)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Delay:
-    since_ns: int  # arrival that was suddenly late
+    since_ns: int  # arrival that was suddenly late, or at which a hole was told last
     least_s: float  # the least any arrival since was behind the line
+    line: Line  # through all arrivals since the first that was suddenly late
 
 
 class _Step:
@@ -601,6 +611,12 @@ class _Step:
     def _near(self, steps: Ints) -> Ints:
         usual = self.usual()
         return steps[:0] if usual is None else steps[np.abs(steps / usual - 1.0) < NEAR]
+
+
+def _is_slower(line: Line, period_s: float) -> bool:
+    """Return True if the points of a line surely show a longer period than ``period_s``."""
+    found = line.measured()
+    return found is not None and found[0] * period_s < 1.0 - found[1]
 
 
 def _usual(steps: Ints) -> float | None:

@@ -60,6 +60,11 @@ class Line:
         self._stt += (1.0 - gain) * et * et
         self.count += 1
 
+    def move(self, samples: float) -> None:
+        """Move all points by a number of samples, as that many are known to be missing before the first."""
+        self._x0 += samples
+        self._first_x += samples
+
     def span_s(self) -> float:
         """Seconds from the first pair to the newest."""
         return self._t0 - self._first_t

@@ -139,12 +139,14 @@ class Output:
 
     def close(self) -> None:
         """End the viewer that was started here; a file is complete afterwards."""
-        if self.child is not None:
-            self.child.end()
-        if self.port is None:
-            self.stream.disconnect()
-        if self.lock is not None:
-            self.lock.close()
+        try:
+            if self.child is not None:
+                self.child.end()
+            if self.port is None:
+                self.stream.disconnect()
+        finally:
+            if self.lock is not None:
+                self.lock.close()
 
 
 def viewer_program() -> Path:
@@ -239,9 +241,13 @@ def _open_file(path: Path, recording_id: str) -> Output:
         if error.errno not in NO_LOCKS:
             lock.close()
             raise ViewerTrouble(f"cannot lock {path}: {error.strerror}") from error
-    stream = _stream(recording_id)
-    # A footer would keep a line about every chunk in memory for as long as the daemon runs.
-    stream.set_sinks(rr.FileSink(path, write_footer=False))
+    try:
+        stream = _stream(recording_id)
+        # A footer would keep a line about every chunk in memory for as long as the daemon runs.
+        stream.set_sinks(rr.FileSink(path, write_footer=False))
+    except BaseException:
+        lock.close()
+        raise
     return Output(stream, flush_every_s=1.0, lock=lock)
 
 

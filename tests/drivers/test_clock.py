@@ -632,3 +632,34 @@ def test_after_a_restart_the_rate_is_checked_before_it_is_believed():
     assert not clock.unchecked
     clock.resume(Before(round(T0 * NS), NO_TICK, 200.0, None))
     assert clock.unchecked
+
+
+@pytest.mark.parametrize("longest_stall_s", [0.3, 0.6, 1.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wrong_period_after_garbage_makes_no_losses_without_end(seed, longest_stall_s):
+    """Rejected lines count as samples, more than the device can have sent; then good ones come in fits and starts."""
+    rng = np.random.default_rng(seed)
+    clock = SampleClock(Arrival(), 100.0)
+    told = 0
+
+    def feed_at(arrived_s, n, rejected=0):
+        t_ns = np.full(n, round((T0 + arrived_s) * NS), np.int64)
+        return lost(clock.stamp(block(t_ns, varied(n), lost=rejected)))
+
+    def stream(begun_s, ended_s):
+        arrived_s, sent, missing = begun_s, 0, 0
+        while arrived_s < ended_s:
+            arrived_s += rng.uniform(0.1, 1.0) * longest_stall_s
+            due = int((arrived_s - begun_s) * 100.0)
+            missing += feed_at(arrived_s, due - sent) if due > sent else 0
+            sent = due
+        return missing
+
+    told += feed_at(0.0, 50)
+    told += stream(0.3, 2.8)
+    told += feed_at(3.8, 50, rejected=446)
+    assert told == 446
+    settling = stream(3.8, 20.0)
+    assert settling < 1.5 * 100.0 * longest_stall_s  # the delays of the first seconds
+    assert stream(20.0, 120.0) < 3 * 100.0 * longest_stall_s
+    assert clock.measured_hz == pytest.approx(100.0, rel=0.01)
