@@ -536,7 +536,7 @@ class SampleClock:
         hole = min(round(delay.least_s / max(period_s, 1.0 / FASTEST_HZ)), LONGEST_GAP)
         delay.line.move(hole)
         rest_s = behind_s - hole * period_s
-        if _is_slower(delay.line, period_s):  # the delay grows because the period is wrong, not because samples are lost
+        if _is_slower(delay.line, period_s):  # the delay grows because the period is wrong
             self._line, self._delay = delay.line, None
         elif rest_s > least_s:  # another delay may have begun meanwhile
             delay.since_ns, delay.least_s = arrived_ns, rest_s

@@ -114,7 +114,7 @@ def test_a_history_of_a_newer_version_is_left_where_it_is(tmp_path: Path, monkey
         assert path.read_bytes() == data
         assert not aside(path)
         path.rename(tmp_path / "newer")
-        wait_for(lambda: writer.written == 10 and writer.state == "ok", lambda: f"{writer.written} rows, {writer.state}")
+        wait_for(lambda: writer.written == 10 and writer.state == "ok", lambda: (writer.written, writer.state))
 
 
 def replace(path: Path, data: bytes) -> None:
