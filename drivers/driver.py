@@ -14,11 +14,11 @@ from typing import Final, Literal
 
 import numpy as np
 
-from drivers.clock import SampleClock
 from drivers.decoders.base import CountingLate, Decoder
 from drivers.errors import ConfigError, LinkEnded, LinkError, LinkLost
 from drivers.links.base import Link
 from drivers.sample import AXES, Chunk, Event, Given, SampleBlock, block
+from drivers.timing.sample_clock import SampleClock
 
 READ_TIMEOUT_S: Final = 0.2
 FIRST_PAUSE_S: Final = 0.1

@@ -10,8 +10,8 @@ import math
 from collections.abc import Mapping
 from typing import Final, TypeVar
 
+from drivers.discovery import possible
 from drivers.errors import ConfigError
-from drivers.plugin import possible
 
 G0: Final = 9.80665
 """m/s²; standard acceleration of free fall, exact by definition (CGPM 1901)."""

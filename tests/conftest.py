@@ -16,7 +16,7 @@ from tests.support.waiting import PATIENCE_S
 WORKERS_PER_CORE: Final = 2
 """Tests wait more than they compute, so two workers for each core keep the processor busy."""
 MAX_WORKERS: Final = 8
-LONG_FOLDERS: Final = {"bench", "blind", "fleet", "fuzz", "walk"}
+LONG_FOLDERS: Final = {"experiments", "system"}
 """End-to-end, fault, network and fuzzing tests, blind trials of the reconciliation, and tests of the benchmarks."""
 
 # Hypothesis limits each example to 200 ms, and the generation of its input, by the clock on the wall.

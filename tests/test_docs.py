@@ -15,19 +15,20 @@ import pytest
 import typer
 
 import drivers.decoders
-from drivers import plugin
-from drivers.recording import FORMATS
+from drivers import discovery
+from drivers.recordings import FORMATS
 from drivers.sample import KINDS, block
-from drivers.sample_message import pack
-from monitor import settings, topics
-from monitor.catalogue import read_model
+from drivers.zenoh.sample_message import pack
 from monitor.cli import app
+from monitor.common import topics
+from monitor.noise.catalogue import read_model
 from monitor.noise.model import NoiseModel
-from monitor.publish import message
-from monitor.publish.rerun_sinks import server_url
-from monitor.publish.zenoh_out import ZenohOut
-from monitor.settings import ZenohTable
-from tests.monitor.publish.made import estimate
+from monitor.publishing.messages import encoding
+from monitor.publishing.rerun.sinks import server_url
+from monitor.publishing.zenoh.publisher import ZenohOut
+from monitor.settings import loading
+from monitor.settings.loading import ZenohTable
+from tests.monitor.publishing.made import estimate
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
 
@@ -84,7 +85,7 @@ def first_cells(text: str) -> list[str]:
 def test_every_configuration_is_one(toml: str, tmp_path: Path) -> None:
     (tmp_path / "recording.csv").write_text("t,gz\n0.00,0.1\n0.01,0.2\n")
     (tmp_path / "page.toml").write_text(toml)
-    assert settings.read(tmp_path / "page.toml")[1] == []
+    assert loading.read(tmp_path / "page.toml")[1] == []
 
 
 @pytest.mark.parametrize("toml", [t for page in PAGES for t in fences(page, "toml") if "angle_random_walk]" in t])
@@ -123,7 +124,7 @@ def test_the_table_has_every_command_and_its_options() -> None:
 
 
 def test_the_viewers_address_is_the_one_it_listens_on() -> None:
-    own = settings.ViewerTable()
+    own = loading.ViewerTable()
     page = f"http://127.0.0.1:{own.web_port}/?url={quote(server_url(own.port), safe='')}"
     assert f"`{page}`" in README.read_text("utf-8")
     assert f"-L {own.web_port}:127.0.0.1:{own.web_port} -L {own.port}:127.0.0.1:{own.port}" in README.read_text("utf-8")
@@ -155,7 +156,7 @@ def test_the_kinds_of_events_are_those_that_a_hook_may_wait_for() -> None:
 
 
 def test_the_protocols_are_those_that_are_decoded() -> None:
-    assert sorted(first_cells(section(README, "Protocols"))) == sorted(plugin.names(drivers.decoders))
+    assert sorted(first_cells(section(README, "Protocols"))) == sorted(discovery.names(drivers.decoders))
 
 
 def test_every_kind_of_recording_is_named() -> None:
@@ -255,7 +256,7 @@ def test_a_subscriber_as_printed_prints_what_is_published(page: Path, word: str)
     assert PRINTED_BY in program
     rows = block(np.arange(2) * 10_000_000, np.tile([0.1, 0.2, 0.3, 0.0, 0.0, 9.81], (2, 1)))
     results = [
-        (topics.COEFFICIENTS, message.coefficients("bench-1", 1.76e9, estimate())),
+        (topics.COEFFICIENTS, encoding.coefficients("bench-1", 1.76e9, estimate())),
         (topics.SAMPLES, pack("bench-1", 2, rows)),
     ]
     zenoh = ZenohOut(ZenohTable(listen=(endpoint,)), ["bench-1"])

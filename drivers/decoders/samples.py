@@ -1,6 +1,6 @@
 """Samples of another imu-monitor, or of anything that publishes the same map: one message a batch.
 
-The layout is in ``drivers.sample_message``. The message brings Unix times and says how many samples its
+The layout is in ``drivers.zenoh.sample_message``. The message brings Unix times and says how many samples its
 publisher has had since its start: a jump of that count beyond the batch's own rows is a lost message, and
 its rows are ``lost`` before the batch. A count that goes back is a publisher started anew, and no loss.
 """
@@ -14,7 +14,7 @@ import numpy as np
 from drivers.decoders.base import QUIET_FRAMES, Decoder, DecoderSettings, Given, Rows, Timing
 from drivers.errors import DecodeError
 from drivers.sample import Chunk, SampleBlock
-from drivers.sample_message import pack, unpack
+from drivers.zenoh.sample_message import pack, unpack
 
 LONGEST_GAP: Final = 1_000_000_000
 """Samples; a larger jump of the count, eleven days at 1 kHz, is another count, not a loss."""

@@ -26,8 +26,8 @@ from drivers.decoders.base import (
     one_chunk_each,
     xor,
 )
+from drivers.discovery import possible
 from drivers.errors import ConfigError
-from drivers.plugin import possible
 from drivers.quantities import COUNTER_MODULUS, HEADER_LINES, SCALE, range_problems
 from drivers.sample import AXES, NO_TICK, Arrival, Chunk, Counter, Floats, SampleBlock, Timing
 

@@ -27,10 +27,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import msgspec
 
+from drivers.discovery import possible
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.extras import check_extra
 from drivers.links.base import Carrier, Link, LinkSettings
-from drivers.plugin import possible
 from drivers.quantities import BIT_RATE, check_settings
 from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk
 

@@ -2,7 +2,7 @@
 
 What the file is decides what the link carries:
 
-- recordings (``drivers.recording``: CSV, .npz, Parquet, Arrow, a folder) travel as messages for the decoder
+- recordings (``drivers.recordings``: CSV, .npz, Parquet, Arrow, a folder) travel as messages for the decoder
   ``samples``;
 - CAN logs (.asc .blf .log .trc, CSV of python-can, CSV with ``t``, ``id_hex``, ``data_hex``) travel as frames;
 - captured bytes (.bin .raw .txt, also with .gz) travel as bytes;
@@ -29,16 +29,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated, Any, BinaryIO, Final, Literal, cast
 
-from drivers import small_file
+from drivers import file_access
+from drivers.discovery import FilePath, possible
 from drivers.errors import ConfigError, LinkEnded, LinkLost, LinkUnavailable, RecordingError
 from drivers.extras import check_extra
 from drivers.links.base import Carrier, Link, LinkSettings
-from drivers.plugin import FilePath, possible
 from drivers.quantities import BYTE_RATE, RATE_HZ, REPLAY_SPEED, range_problems
-from drivers.recording import FORMATS, Recording, iter_blocks, load_samples, segment
-from drivers.recording.table import T_LIMIT_S
+from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples, segment
+from drivers.recordings.table import T_LIMIT_S
 from drivers.sample import EXTENDED_ID, Chunk
-from drivers.sample_message import pack
+from drivers.zenoh.sample_message import pack
 
 if TYPE_CHECKING:
     import can
@@ -112,7 +112,7 @@ class ReplayLink:
 
     def __init__(self, settings: Settings, kind: Kind, pace: float) -> None:
         self._settings = settings
-        self._path = small_file.path(settings.path)
+        self._path = file_access.path(settings.path)
         self._kind: Kind = kind
         self._pace = pace  # file seconds a second; inf = no waiting
         self.carrier: Carrier = _raw_carrier(self._path) if kind == "raw" else CARRIERS[kind]
@@ -527,7 +527,7 @@ def _header(path: Path) -> str:
 
 
 def _binary(path: Path) -> IO[bytes]:
-    file = small_file.open_regular(path)
+    file = file_access.open_regular(path)
     if path.suffix.lower() != ".gz":
         return file
     unzipped: Any = gzip.GzipFile(fileobj=file, mode="rb")
@@ -544,7 +544,7 @@ def build(settings: Settings) -> Link:
 
     Raises ``ConfigError`` for a speed that is none, and for a file that is nothing to replay.
     """
-    path = small_file.path(settings.path)
+    path = file_access.path(settings.path)
     wrong = list(_problems(settings))
     try:
         _check_path(path)
@@ -563,7 +563,7 @@ def _check_path(path: Path) -> None:
     if path.is_dir():
         return
     try:
-        small_file.check_regular(path)
+        file_access.check_regular(path)
     except FileNotFoundError:
         return
     except OSError as error:

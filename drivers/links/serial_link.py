@@ -21,10 +21,10 @@ import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
+from drivers.credential_masking import masked
+from drivers.discovery import possible
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
-from drivers.masked import masked
-from drivers.plugin import possible
 from drivers.quantities import BIT_RATE, READ_TIMEOUT_S, range_problems
 from drivers.sample import Chunk
 

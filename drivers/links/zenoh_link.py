@@ -21,13 +21,13 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import msgspec
 
+from drivers.credential_masking import masked
+from drivers.discovery import FilePath
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
-from drivers.masked import masked
-from drivers.plugin import FilePath
 from drivers.sample import Chunk
-from drivers.zenoh_refusal import refused
-from drivers.zenoh_session import CLOSED, configuration, endpoints, plain
+from drivers.zenoh.connection_errors import refused
+from drivers.zenoh.session import CLOSED, configuration, endpoints, plain
 
 if TYPE_CHECKING:
     import zenoh

@@ -22,8 +22,8 @@ from typer.exceptions import TyperException
 
 from drivers.errors import ConfigError, ImuError, NotReady, RecordingError, in_one_line
 from drivers.extras import check_extra
-from drivers.small_file import real_path
-from monitor.cli import doctor, drift, options, output, serving, warm_up
+from drivers.file_access import real_path
+from monitor.cli import doctor, drift, options, output, terminal_session, warm_up
 from monitor.cli import history as history_command
 
 # before NumPy is imported: matrices are small here and threads of our own share the work, where more would only spin
@@ -78,9 +78,11 @@ def demo(
     viewer: Viewer = None,
 ) -> None:
     """The whole service on a simulated MEMS IMU that speaks a real wire format over a pseudo-terminal."""
-    from monitor.demo import demo as configuration
+    from monitor.simulator.demo import demo as configuration
 
-    serving.serve(configuration(sensor, effect or (), options.duration("--effect-at", effect_at)), seconds, viewer)
+    terminal_session.serve(
+        configuration(sensor, effect or (), options.duration("--effect-at", effect_at)), seconds, viewer
+    )
 
 
 @app.command()
@@ -93,10 +95,10 @@ def run(
     ] = None,
 ) -> None:
     """The daemon: every device in the file, until a signal."""
-    from monitor import settings
+    from monitor.settings import loading
 
-    found = serving.with_history(settings.load(config, pipe=True), options.duration("--history", history))
-    serving.serve(found, seconds, viewer)
+    found = terminal_session.with_history(loading.load(config, pipe=True), options.duration("--history", history))
+    terminal_session.serve(found, seconds, viewer)
 
 
 @app.command()
@@ -107,11 +109,11 @@ def check(
     ] = False,
 ) -> None:
     """Read the file and say all that is wrong with it; opens nothing."""
-    from monitor import settings
-    from monitor.configuration_check import check as check_configuration
+    from monitor.commands.check import check as check_configuration
+    from monitor.settings import loading
 
     if print_defaults:
-        typer.echo((settings.CONFIG_FOLDER / "defaults.toml").read_text("utf-8"), nl=False)
+        typer.echo((loading.CONFIG_FOLDER / "defaults.toml").read_text("utf-8"), nl=False)
         return
     if config is None:
         raise ConfigError("CONFIG.toml is missing; --print-defaults prints one to start from")
@@ -140,10 +142,10 @@ def watch(
 
     from rich.console import Console
 
-    from monitor.publish.terminal import watch as show
+    from monitor.publishing.terminal.live_table import watch as show
 
     stop = threading.Event()
-    serving.on_signals(stop.set)
+    terminal_session.on_signals(stop.set)
     show(keyexpr, connect or (), stop, Console(), seconds, zenoh)
 
 
@@ -159,7 +161,7 @@ def view(
     seconds: options.Seconds = None,
 ) -> None:
     """One viewer for any number of daemons, from zenoh alone: a table of all, chosen devices in detail."""
-    serving.view(keyexpr, connect or (), zenoh, detail or (), viewer or "auto", seconds)
+    terminal_session.view(keyexpr, connect or (), zenoh, detail or (), viewer or "auto", seconds)
 
 
 @app.command()
@@ -180,8 +182,8 @@ def analyze(
     ] = None,
 ) -> None:
     """Allan deviation of a recording, with Q, N, B, K, R and their intervals; motion and changes in it."""
-    from monitor import offline
-    from monitor.publish import message
+    from monitor.commands import analyze as offline
+    from monitor.publishing.messages import encoding
 
     if plot is not None and plot.suffix not in (".png", ".html"):
         raise ConfigError(f"--plot: {plot}: a name ending in .png or .html is needed")
@@ -194,10 +196,10 @@ def analyze(
             results = offline.make(wanted, tell)
     except offline.TooShort as error:
         if json is not None:
-            output.write("--json", json, message.no_analysis(str(error), error.samples) + b"\n")
+            output.write("--json", json, encoding.no_analysis(str(error), error.samples) + b"\n")
         raise
     if json is not None:
-        payload = message.analysis(results.analysis, results.total, results.hadamard, results.dynamic, results.warmth)
+        payload = encoding.analysis(results.analysis, results.total, results.hadamard, results.dynamic, results.warmth)
         output.write("--json", json, payload + b"\n")
     if plot is not None:
         offline.draw(results, plot, recording.name)
@@ -225,8 +227,8 @@ def simulate(
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
 ) -> None:
     """A recording from a model, of any length; it appears whole or not at all."""
-    from monitor import simulate as simulation
-    from monitor.catalogue import load
+    from monitor.commands import simulate as simulation
+    from monitor.noise.catalogue import load
 
     length_s = options.duration("--seconds", seconds)
     output.check_place("--json", json)
@@ -235,7 +237,7 @@ def simulate(
             raise ConfigError(f"{option}: {path} is what --out writes; another name is needed")
     noise = load(model, Path.cwd())
     request = simulation.Request(noise, out, length_s, seed, rate, temperature_from, truth, model)
-    serving.end_on_sigterm()
+    terminal_session.end_on_sigterm()
     with output.progress() as tell:
         result = simulation.make(request, tell)
     if json is not None:
@@ -267,23 +269,24 @@ def reconcile(
     check_extra("reconcile", "reconcile")
     from rich.console import Console
 
-    from monitor import reconciling
-    from monitor.catalogue import load
-    from monitor.publish import reconcile_text as text
-    from monitor.reconcile import report, runs_report
+    from monitor.commands import reconcile as reconciling
+    from monitor.noise.catalogue import load
+    from monitor.publishing.terminal import reconcile_text as text
+    from monitor.reconcile import report
+    from monitor.reconcile.several_recordings import comparison_report
 
     last_s = options.duration("--last", last)
     output.check_place("--json", json)
     tested = None if model is None else load(model, Path.cwd())
     several = len(recordings) > 1
-    serving.end_on_sigterm()
+    terminal_session.end_on_sigterm()
     try:
         with output.progress() as tell:
             output.prepare_kernels(tell)
             if several:
                 every = reconciling.RunsRequest(tuple(recordings), tested, out, seed, rate, last_s)
                 runs = reconciling.make_runs(every, tell)
-                data, show = runs_report.to_json(runs), partial(text.tell_runs, runs)
+                data, show = comparison_report.to_json(runs), partial(text.tell_runs, runs)
             else:
                 one = reconciling.make(reconciling.Request(recordings[0], tested, out, seed, rate, last_s=last_s), tell)
                 data, show = report.to_json(one), partial(text.tell, one)
@@ -325,8 +328,8 @@ def thermal_fit(
     """Fit the bias of each axis as a function of temperature and its past."""
     from rich.console import Console
 
-    from monitor import thermal
-    from monitor.publish import thermal_text as text
+    from monitor.commands import thermal
+    from monitor.publishing.terminal import thermal_text as text
 
     _check_thermal(json, plot)
     output.check_place("--out", out)
@@ -339,7 +342,7 @@ def thermal_fit(
     if out is not None:
         output.write("--out", out, thermal.to_file(study) + b"\n")
     if plot is not None:
-        from monitor.publish.thermal_plot import study_plot
+        from monitor.publishing.plots.thermal_plot import study_plot
 
         study_plot(study, plot)
     if Path("-") not in (json, out):
@@ -358,8 +361,8 @@ def thermal_predict(
     """What a model expects of another recording's bias, and how far off it is."""
     from rich.console import Console
 
-    from monitor import thermal
-    from monitor.publish import thermal_text as text
+    from monitor.commands import thermal
+    from monitor.publishing.terminal import thermal_text as text
 
     _check_thermal(json, plot)
     outlook = thermal.predict(recording, thermal.from_file(model), rate, options.duration("--last", last))
@@ -368,7 +371,7 @@ def thermal_predict(
     if not outlook.judged:
         raise NotReady("; ".join(f"{axis}: {why}" for axis, why in outlook.refused.items()))
     if plot is not None:
-        from monitor.publish.thermal_plot import outlook_plot
+        from monitor.publishing.plots.thermal_plot import outlook_plot
 
         outlook_plot(outlook, plot)
     if json != Path("-"):
@@ -396,7 +399,7 @@ def export(
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where to write; else standard output.")] = None,
 ) -> None:
     """Noise parameters for other tools: Kalibr's imu.yaml, MATLAB's gyroparams, a Kalman filter's F and Q."""
-    from monitor import export as exports
+    from monitor.publishing import exporters as exports
 
     keys = {"dt_s": dt, "correlation_time_s": correlation_time, "rostopic": rostopic}
     belong = {"dt_s": "kalman", "correlation_time_s": "kalman", "rostopic": "kalibr"}

@@ -21,7 +21,7 @@ def doctor(
     """Look at this machine and a configuration before they are left alone; opens no device."""
     import msgspec
 
-    from monitor import doctor as checks
+    from monitor.commands import doctor as checks
 
     output.check_place("--json", json)
     findings = checks.examine(config)

@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from drivers.errors import ConfigError
-from drivers.small_file import real_path
-from monitor.cli import options, output, serving
+from drivers.file_access import real_path
+from monitor.cli import options, output, terminal_session
 
 
 def compensate(
@@ -30,8 +30,8 @@ def compensate(
     """A recording without the drift of its gyros: what the daemon does live, and others to compare with."""
     from rich.console import Console
 
-    from monitor import compensating
-    from monitor.publish import compensate_text as text
+    from monitor.commands import compensate as compensating
+    from monitor.publishing.terminal import compensate_text as text
 
     if plot is not None and plot.suffix != ".png":
         raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
@@ -40,7 +40,7 @@ def compensate(
     for option, place in (("--json", json), ("--plot", plot), ("RECORDING", recording)):
         if place is not None and real_path(place) == real_path(out):
             raise ConfigError(f"{option}: {place} is what --out writes; another name is needed")
-    serving.end_on_sigterm()
+    terminal_session.end_on_sigterm()
     last_s = options.duration("--last", last)
     wanted = compensating.Request(recording, out, method, rate, options.order(order), last_s)
     with output.progress() as tell:
@@ -49,7 +49,7 @@ def compensate(
     if json is not None:
         output.write("--json", json, text.to_json(result) + b"\n")
     if plot is not None:
-        from monitor.publish.compensate_plot import compensate_plot
+        from monitor.publishing.plots.compensate_plot import compensate_plot
 
         compensate_plot(result, plot)
     if json != Path("-"):

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from drivers.credential_masking import masked
 from drivers.errors import ConfigError
-from drivers.masked import masked
 from monitor.cli import options, output
 
 if TYPE_CHECKING:
-    from monitor.history.past import Past
-    from monitor.history.question import Question
-    from monitor.history.times import Span
+    from monitor.history.query import Question
+    from monitor.history.reading import Past
+    from monitor.history.time_ranges import Span
 
 ROWS: Final = 24
 """Of one axis over time, on a terminal."""
@@ -47,11 +47,11 @@ def history(
     from rich.console import Console
 
     from drivers.sample import AXES
-    from monitor.estimate.coefficients import LETTERS
-    from monitor.history.past import step as width_of
-    from monitor.history.question import WHAT, Question
-    from monitor.history.times import length
-    from monitor.publish import history_text
+    from monitor.estimation.fit.coefficients import LETTERS
+    from monitor.history.query import WHAT, Question
+    from monitor.history.reading import step as width_of
+    from monitor.history.time_ranges import length
+    from monitor.publishing.terminal import history_text
 
     if axis is not None and axis not in AXES:
         raise ConfigError(f'--axis: "{axis}"; possible are {", ".join(AXES)}')
@@ -77,7 +77,7 @@ def history(
 
 def _check_places(json: Path | None, out: Path | None, plot: Path | None) -> None:
     """Files that cannot be written, before anything is asked."""
-    from drivers.recording.formats import format_of
+    from drivers.recordings.formats import format_of
 
     if plot is not None and plot.suffix != ".png":
         raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
@@ -89,7 +89,8 @@ def _check_places(json: Path | None, out: Path | None, plot: Path | None) -> Non
 
 def _save(past: "Past", asked: "Question", json: Path | None, out: Path | None, plot: Path | None) -> None:
     """The same in files."""
-    from monitor.publish import history_file, history_message
+    from monitor.publishing.messages import history as history_message
+    from monitor.publishing.reports import history_file
 
     if json is not None:
         newest_s = float(past.end_s[-1]) if len(past) else past.span.end_s
@@ -98,15 +99,15 @@ def _save(past: "Past", asked: "Question", json: Path | None, out: Path | None, 
     if out is not None:
         history_file.save(past, out)
     if plot is not None:
-        from monitor.publish.history_plot import history_plot
+        from monitor.publishing.plots.history_plot import history_plot
 
         history_plot(past, plot, asked.axes)
 
 
 def _from_file(source: Path | None, name: str | None) -> Get:
     """Answers from a file, that a daemon may be writing to."""
-    from monitor.history import past
-    from monitor.history.store import reading
+    from monitor.history import reading as past
+    from monitor.history.sqlite_store import reading
 
     if source is None:
         raise ConfigError("CONFIG.toml or a folder is missing; or --connect ENDPOINT for a running daemon")
@@ -123,7 +124,7 @@ def _from_file(source: Path | None, name: str | None) -> Get:
 
 def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> Get:
     """Answers over zenoh."""
-    from monitor.publish.history_ask import ask
+    from monitor.publishing.zenoh.history_query import ask
 
     def get(asked: "Question") -> "Past":
         found = {one.device: one for one in ask(endpoint, name or "*", asked.parameters(), prefix, file)}
@@ -134,14 +135,14 @@ def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str
 
 def _file(source: Path) -> Path:
     """The file of a configuration, or of a folder."""
-    from monitor import settings
-    from monitor.history.store import FILE
+    from monitor.history.sqlite_store import FILE
+    from monitor.settings import loading
 
     if source.is_dir():
         return source / FILE
     if source.name == FILE:
         return source
-    config = settings.load(source, pipe=True)
+    config = loading.load(source, pipe=True)
     if config.storage is None:
         raise ConfigError(f"{source}: keeps no history; [storage] folder is missing")
     return config.storage.folder / FILE
@@ -149,8 +150,8 @@ def _file(source: Path) -> Path:
 
 def _one(name: str | None, there: list[str], where: str) -> str:
     """The device that is meant."""
+    from drivers.discovery import nearest
     from drivers.errors import NotReady
-    from drivers.plugin import nearest
 
     if not there:
         raise NotReady(f"{where}: nothing is kept yet")
@@ -165,7 +166,7 @@ def _one(name: str | None, there: list[str], where: str) -> str:
 
 def _span(since: str | None, until: str | None) -> "Span | None":
     """None where neither is said."""
-    from monitor.history.times import Span, moment
+    from monitor.history.time_ranges import Span, moment
 
     if since is None and until is None:
         return None

@@ -20,9 +20,9 @@ from drivers.quantities import (
 )
 
 if TYPE_CHECKING:
-    from monitor.drift.arma import Order
-    from monitor.estimate.batch import TauGrid
-    from monitor.export import Noise
+    from monitor.drift.compensation.arma import Order
+    from monitor.estimation.allan.batch import TauGrid
+    from monitor.publishing.exporters import Noise
 
 MOST_AVERAGING_TIMES: Final = 1000
 
@@ -106,7 +106,7 @@ def duration(option: str, text: None) -> None: ...
 def duration(option: str, text: str | None) -> float | None: ...
 def duration(option: str, text: str | None) -> float | None:
     """Seconds, from a number of them or "30min", "1h"."""
-    from monitor.settings import seconds
+    from monitor.settings.loading import seconds
 
     try:
         return None if text is None else seconds(text)
@@ -116,7 +116,7 @@ def duration(option: str, text: str | None) -> float | None:
 
 def order(text: str | None) -> "Order | None":
     """p and q of an ARMA model."""
-    from monitor.drift.arma import ORDERS
+    from monitor.drift.compensation.arma import ORDERS
 
     if text is None:
         return None
@@ -128,12 +128,12 @@ def order(text: str | None) -> "Order | None":
 
 def noise(source: Path) -> "Noise":
     """What is known of each axis; JSON begins with a brace, as no model does."""
-    from drivers import small_file
-    from monitor.export import from_analysis, from_model
+    from drivers import file_access
     from monitor.noise.model import NoiseModel
+    from monitor.publishing.exporters import from_analysis, from_model
 
     try:
-        text = sys.stdin.buffer.read() if source == Path("-") else small_file.read(source, pipe=True)
+        text = sys.stdin.buffer.read() if source == Path("-") else file_access.read(source, pipe=True)
         if text.lstrip().startswith(b"{"):
             return from_analysis(text, source.name)
         return from_model(NoiseModel.from_toml(text.decode()), source.name)

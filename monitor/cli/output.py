@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from drivers.errors import ConfigError
 
 if TYPE_CHECKING:
-    from monitor.estimate.analysis import Analysis
+    from monitor.estimation.analysis import Analysis
 
 Tell = Callable[[str, float | None], None]
 """Told what is being done, and the share that is done where that is known."""
@@ -50,12 +50,12 @@ def progress() -> Iterator[Tell]:
 
 def prepare_kernels(tell: Tell) -> None:
     """Compile the kernels that analyses of recordings need, by all processors, if they are not kept on disk yet."""
-    from monitor import kernels
+    from monitor.daemon import kernel_compilation
 
-    for group in kernels.GROUPS:
-        if not kernels.is_warm(group):
+    for group in kernel_compilation.GROUPS:
+        if not kernel_compilation.is_warm(group):
             with contextlib.suppress(OSError):  # they cannot be kept: each is compiled when it is called
-                for _ in kernels.prepare(group, lambda progress: tell(str(progress), progress.share)):
+                for _ in kernel_compilation.prepare(group, lambda progress: tell(str(progress), progress.share)):
                     pass
 
 
@@ -63,7 +63,7 @@ def print_analysis(result: "Analysis") -> None:
     """Samples, coefficients and notes."""
     from rich.console import Console
 
-    from monitor.publish.terminal import analysis_table
+    from monitor.publishing.terminal.live_table import analysis_table
 
     console = Console()
     estimate = result.estimate

@@ -12,28 +12,28 @@ from monitor.cli import output
 
 def warm_up(from_stdin: Annotated[bool, typer.Option("--from-stdin", hidden=True)] = False) -> None:
     """Compile the numerical kernels and keep them on disk, so that the next start is quick; then end."""
-    from monitor import kernels
-    from monitor.compiled import cache_folder
+    from monitor.common.compiled import cache_folder
+    from monitor.daemon import kernel_compilation
 
     if from_stdin:
-        kernels.compile_from_stdin(sys.stdin, sys.stdout)
+        kernel_compilation.compile_from_stdin(sys.stdin, sys.stdout)
     folder = cache_folder()
     if folder is None:
         raise ConfigError(
             "compiled kernels cannot be kept, because no cache folder can be written; set NUMBA_CACHE_DIR to a folder "
             "that can"
         )
-    cold = [group for group in kernels.GROUPS if not kernels.is_warm(group)]
+    cold = [group for group in kernel_compilation.GROUPS if not kernel_compilation.is_warm(group)]
     begun_s = time.monotonic()
     with output.progress() as show:
 
-        def tell(progress: kernels.Progress) -> None:
+        def tell(progress: kernel_compilation.Progress) -> None:
             show(str(progress), progress.share)
             if not sys.stderr.isatty():
                 typer.echo(progress, err=True)
 
         for group in cold:
-            for _ in kernels.prepare(group, tell):
+            for _ in kernel_compilation.prepare(group, tell):
                 pass
     parts = sum(len(group.parts) for group in cold)
     done = f"compiled {parts} parts in {time.monotonic() - begun_s:.0f} s" if cold else "nothing to compile"

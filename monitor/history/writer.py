@@ -27,9 +27,9 @@ from typing import Final
 import structlog
 
 from drivers.errors import RecordingError
-from monitor.folder_lock import HISTORY_LOCK, FolderLock
-from monitor.history.row import Row
-from monitor.history.store import BESIDE, DELETED, EMPTIED, MOVE, REPLACED, PastEvent, Store, UnusableHistory
+from monitor.common.folder_lock import HISTORY_LOCK, FolderLock
+from monitor.history.bucket import Row
+from monitor.history.sqlite_store import BESIDE, DELETED, EMPTIED, MOVE, REPLACED, PastEvent, Store, UnusableHistory
 
 WAITING_AT_MOST: Final = 4096
 """Rows and events: with one device three days of a full disk, some 12 MB."""

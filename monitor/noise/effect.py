@@ -21,8 +21,8 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
+from drivers.discovery import nearest
 from drivers.errors import ConfigError
-from drivers.plugin import nearest
 from drivers.quantities import DELAY_S, EFFECT_FREQUENCY_HZ, PARAMETER
 from drivers.sample import AXES, Floats
 from monitor.noise.spectrum import Spectrum

@@ -3,7 +3,7 @@
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.compiled import compiled
+from monitor.common.compiled import compiled
 from monitor.noise.effect import Running
 
 

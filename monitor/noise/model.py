@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drivers.discovery import nearest
 from drivers.errors import ConfigError
-from drivers.plugin import nearest
 from drivers.sample import AXES, Floats
 from monitor.noise import model_file
 from monitor.noise.effect import Effect, Leak, Source, Transform
@@ -27,7 +27,7 @@ from monitor.noise.spectrum import Spectrum, nothing, unknown
 from monitor.noise.temperature import Temperature
 
 if TYPE_CHECKING:
-    from monitor.noise.stream import ModelStream
+    from monitor.noise.simulation import ModelStream
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +176,7 @@ class NoiseModel:
             ConfigError: a frequency at or above half the sample rate, a source axis without effects, a noise step
                 without noise, no temperature where one is needed
         """
-        from monitor.noise.stream import ModelStream
+        from monitor.noise.simulation import ModelStream
 
         return ModelStream(self, rate_hz, seed, temperature_c)
 

@@ -10,14 +10,14 @@ from collections.abc import Iterator
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Final
 
+from drivers.discovery import nearest
 from drivers.errors import ConfigError
-from drivers.plugin import nearest
 from drivers.quantities import RATE_HZ
 from drivers.sample import AXES
-from monitor import toml
 from monitor.noise.effect import GYROS, Effect, required, units
 from monitor.noise.effects import EFFECTS
 from monitor.noise.temperature import UNITS, Temperature
+from monitor.settings import toml_text
 
 if TYPE_CHECKING:
     from monitor.noise.model import NoiseModel
@@ -31,7 +31,7 @@ Placed = tuple[tuple[str, ...], tuple[Effect, ...]]  # axes, their effects
 
 def read(text: str) -> tuple[list[Placed], float | None, Temperature | None]:
     """Effects, sample rate in Hz and temperature of a model file's text; ConfigError has a line for each mistake."""
-    tables = toml.tables(text)
+    tables = toml_text.tables(text)
     wrong: list[str] = []
     rate_hz = tables.pop("sample_rate", None)
     if rate_hz is not None:

@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
+from drivers.discovery import nearest
 from drivers.errors import ConfigError
-from drivers.plugin import nearest
 from drivers.quantities import DURATION_S, TEMPERATURE_C
 from drivers.sample import Floats
 from monitor.noise.effect import Block, Series

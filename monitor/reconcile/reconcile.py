@@ -25,18 +25,18 @@ from monitor.noise.effects import (
     SampleRateError,
 )
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.axis import Axis, Courses, Effects
-from monitor.reconcile.candidates import PRICE
-from monitor.reconcile.clock import PRICE as CLOCK_PRICE
-from monitor.reconcile.clock import Clock, restated, wrong_clock
-from monitor.reconcile.describe import described
-from monitor.reconcile.gap import Findings, Null, look, nulls
-from monitor.reconcile.hypothesis import believed
-from monitor.reconcile.lenses import sight
-from monitor.reconcile.prepare import FEWEST, prepared, without_sources
-from monitor.reconcile.reconciliation import AxisResult, Reconciliation, Score, Step, Verdict, Where
-from monitor.reconcile.search import Search, search
-from monitor.reconcile.terms import resized
+from monitor.reconcile.description import described
+from monitor.reconcile.diagnostics.diagnostics import sight
+from monitor.reconcile.diagnostics.gap import Findings, Null, look, nulls
+from monitor.reconcile.likelihood.effect_terms import resized
+from monitor.reconcile.likelihood.hypothesis import believed
+from monitor.reconcile.preparation.axis import Axis, Courses, Effects
+from monitor.reconcile.preparation.prepare import FEWEST, prepared, without_sources
+from monitor.reconcile.preparation.sample_rate_test import PRICE as CLOCK_PRICE
+from monitor.reconcile.preparation.sample_rate_test import Clock, restated, wrong_clock
+from monitor.reconcile.result import AxisResult, Reconciliation, Score, Step, Verdict, Where
+from monitor.reconcile.search.candidates import PRICE
+from monitor.reconcile.search.search import Search, search
 
 RUNS: Final = 6
 """Simulated recordings behind a null: of six axes, 36 gains a lens."""

@@ -15,7 +15,7 @@ from typing import Any, Final
 import msgspec
 
 from drivers.sample import AXES
-from monitor.reconcile.reconciliation import AxisResult, Bounds, Reconciliation, Score, Step, Where
+from monitor.reconcile.result import AxisResult, Bounds, Reconciliation, Score, Step, Where
 
 SCHEMA: Final = "imu-monitor/reconcile/1"
 _ENCODER: Final = msgspec.json.Encoder()

@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from drivers import decoders, plugin
+from drivers import decoders, discovery
 from drivers.decoders.base import Decoder
 
 DEGREE = math.pi / 180.0
@@ -113,7 +113,7 @@ LISTED = (
     Example("samples", {}, 1e-15, 1e-14, 1e-14),
 )
 
-NAMES = plugin.names(decoders)
+NAMES = discovery.names(decoders)
 EXAMPLES = tuple(e for e in LISTED if e.name in NAMES) + tuple(
     Example(name) for name in NAMES if name not in {e.name for e in LISTED}
 )

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from monitor.reconcile.bins import series, transform
-from monitor.reconcile.gap import look, nulls
-from monitor.reconcile.lenses import LENSES, Finding, Sight
+from monitor.reconcile.diagnostics.diagnostics import LENSES, Finding, Sight
+from monitor.reconcile.diagnostics.gap import look, nulls
+from monitor.reconcile.preparation.cosine_bins import series, transform
 from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, N, axes, correlated, seen, time_s, walk, warmth, white
 
 NAMES = sorted(LENSES)

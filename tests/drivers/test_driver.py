@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from drivers import driver as driver_module
-from drivers.clock import SampleClock
 from drivers.decoders import dbc, stim300, text, vectornav_binary
 from drivers.decoders import samples as samples_decoder
 from drivers.driver import UNDECODED_BYTES, AxisMap, Driver, axis_map
 from drivers.errors import ConfigError
 from drivers.links.loopback_link import LoopbackLink
 from drivers.sample import NO_TICK, Chunk, block
-from drivers.sample_message import pack
+from drivers.timing.sample_clock import SampleClock
+from drivers.zenoh.sample_message import pack
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
 RATE = 100.0

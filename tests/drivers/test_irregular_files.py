@@ -10,15 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from drivers import small_file
+from drivers import file_access
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.links import replay_link
-from drivers.recording import load_samples, saving, segment
-from drivers.zenoh_session import configuration
-from monitor import settings, thermal
-from monitor.catalogue import read_model
-from monitor.history import store
-from monitor.publish.zenoh_in import listeners
+from drivers.recordings import load_samples, segment, writing
+from drivers.zenoh.session import configuration
+from monitor.commands import thermal
+from monitor.history import sqlite_store
+from monitor.noise.catalogue import read_model
+from monitor.publishing.zenoh.subscriber import listeners
+from monitor.settings import loading
 from tests.support.waiting import PATIENCE_S
 
 IMU_MONITOR = [sys.executable, "-m", "monitor.cli"]
@@ -67,21 +68,21 @@ def one_line(error: BaseException) -> str:
 def test_open_regular_says_what_it_is(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "name"
     make(kind, path)
-    for read in (small_file.read, small_file.open_regular, small_file.check_regular):
+    for read in (file_access.read, file_access.open_regular, file_access.check_regular):
         with pytest.raises(OSError, match=KINDS[kind]):
             read(path)
 
 
 def test_a_descriptor_is_not_inherited(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"1")
-    with small_file.open_regular(tmp_path / "a") as file:
+    with file_access.open_regular(tmp_path / "a") as file:
         assert not os.get_inheritable(file.fileno())
         assert file.read() == b"1"
 
 
 def test_a_name_with_a_nul_character_is_an_os_error() -> None:
     with pytest.raises(OSError, match="null byte"):
-        small_file.open_regular(Path("a\0b"))
+        file_access.open_regular(Path("a\0b"))
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".csv.gz", ".npz", ".parquet", ".arrow", ".arrows"])
@@ -114,7 +115,7 @@ def test_a_segment(kind: str, read: Callable[[Path], object], tmp_path: Path) ->
 
 def test_a_part_file_in_the_way_of_a_new_one(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.csv.part")
-    with saving.whole(tmp_path / "a.csv") as part:
+    with writing.whole(tmp_path / "a.csv") as part:
         part.write_text("x")
     assert (tmp_path / "a.csv").read_text() == "x"
     pytest.importorskip("pyarrow")
@@ -126,9 +127,9 @@ def test_a_part_file_in_the_way_of_a_new_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "read"),
     [
-        ("configuration", settings.load),
+        ("configuration", loading.load),
         ("model", read_model),
-        ("model name", lambda path: settings.model_path(str(path), path.parent)),
+        ("model name", lambda path: loading.model_path(str(path), path.parent)),
         ("zenoh file", lambda path: listeners((), path)),
     ],
 )
@@ -192,16 +193,19 @@ def test_a_can_database(kind: str, suffix: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["fifo", "socket", "device", "directory", "loop"])
 def test_a_history(kind: str, end: str, tmp_path: Path) -> None:
     if end:
-        store.Store(tmp_path / store.FILE).close()
-    path = tmp_path / f"{store.FILE}{end}"
+        sqlite_store.Store(tmp_path / sqlite_store.FILE).close()
+    path = tmp_path / f"{sqlite_store.FILE}{end}"
     make(kind, path)
-    for look in (lambda: store.Store(tmp_path / store.FILE).close(), lambda: list(read_history(tmp_path))):
+    for look in (
+        lambda: sqlite_store.Store(tmp_path / sqlite_store.FILE).close(),
+        lambda: list(read_history(tmp_path)),
+    ):
         with pytest.raises((RecordingError, OSError), match=KINDS[kind]):
             look()
 
 
 def read_history(folder: Path) -> Iterator[str]:
-    with store.reading(folder / store.FILE) as reader:
+    with sqlite_store.reading(folder / sqlite_store.FILE) as reader:
         yield from reader.devices()
 
 
@@ -225,10 +229,10 @@ def test_a_socket_or_device_on_the_command_line_is_status_2_and_one_line(command
 
 
 def test_a_configuration_and_a_model_from_a_pipe(tmp_path: Path) -> None:
-    text = (settings.CONFIG_FOLDER / "demo.toml").read_text()
+    text = (loading.CONFIG_FOLDER / "demo.toml").read_text()
     done = finished(["check", "/dev/stdin"], input=text)
     assert (done.returncode, done.stderr) == (0, "")
-    model = (settings.CONFIG_FOLDER / "models" / "consumer-mems.toml").read_text()
+    model = (loading.CONFIG_FOLDER / "models" / "consumer-mems.toml").read_text()
     for name in ("/dev/stdin", "-"):
         done = finished(["export", name, "--format", "kalibr"], input=model)
         assert (done.returncode, done.stderr) == (0, "")

@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.recording import save_samples
+from drivers.recordings import save_samples
 from drivers.sample import Event, SampleBlock
-from monitor import settings
-from monitor.catalogue import read_model
-from monitor.estimate.estimate import Estimate
-from monitor.history import past
-from monitor.history.past import Past
-from monitor.history.store import FILE, PastEvent, reading
-from monitor.history.times import Span, said
-from monitor.publish import history_message
-from monitor.service import Service
-from monitor.settings import CONFIG_FOLDER
-from monitor.station import Output
+from monitor.daemon.device_worker import Output
+from monitor.daemon.service import Service
+from monitor.estimation.estimate import Estimate
+from monitor.history import reading as past
+from monitor.history.reading import Past
+from monitor.history.sqlite_store import FILE, PastEvent, reading
+from monitor.history.time_ranges import Span, said
+from monitor.noise.catalogue import read_model
+from monitor.publishing.messages import history
+from monitor.settings import loading
+from monitor.settings.loading import CONFIG_FOLDER
 from tests.support.ports import free_endpoint
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 from tests.support.zenoh_sessions import session
@@ -76,10 +76,10 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def config(folder: Path, recording: Path, zenoh: str = 'mode = "none"', speed: float = 100.0) -> settings.Config:
+def config(folder: Path, recording: Path, zenoh: str = 'mode = "none"', speed: float = 100.0) -> loading.Config:
     path = folder / "config.toml"
     path.write_text(CONFIG.format(recording=recording, zenoh=zenoh, speed=speed))
-    return settings.load(path)
+    return loading.load(path)
 
 
 def kept(folder: Path, step_s: int | None = 60) -> Past:
@@ -142,7 +142,7 @@ def test_a_query_over_zenoh_honours_its_time(asked: tuple[Service, Any]) -> None
         if reply.ok is None:
             return json.loads(bytes(reply.err.payload))["error"]
         assert (str(reply.ok.key_expr), str(reply.ok.encoding)) == ("imu/bench-1/history", "application/json")
-        return history_message.read(bytes(reply.ok.payload))
+        return history.read(bytes(reply.ok.payload))
 
     whole = answer("step=1m")
     minutes = whole.start_s.tolist()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-import monitor.compiled
+import monitor.common.compiled
 from tests.support.waiting import PATIENCE_S
 
 PROGRAM = """
@@ -72,7 +72,7 @@ PROGRAM = """
 
 @pytest.mark.long
 def test_after_the_warm_up_nothing_more_is_compiled_and_each_kernel_has_one_signature(tmp_path: Path) -> None:
-    root = Path(monitor.compiled.__file__).parents[1]
+    root = Path(monitor.common.compiled.__file__).parents[1]
     command = [sys.executable, "-c", textwrap.dedent(PROGRAM)]
     cold = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}  # else inner functions would not be compiled at all
     done = subprocess.run(command, cwd=root, env=cold, timeout=PATIENCE_S, capture_output=True, text=True, check=False)
@@ -81,4 +81,4 @@ def test_after_the_warm_up_nothing_more_is_compiled_and_each_kernel_has_one_sign
     assert found, "the samples must lead through what follows motion and changes"
     assert {name: counts for name, counts in after.items() if counts != before.get(name)} == {}
     assert {name: counts for name, counts in after.items() if max(counts) > 1} == {}
-    assert after["monitor.estimate.window_kernel.advance"] == [1, 1]
+    assert after["monitor.estimation.allan.window_kernel.advance"] == [1, 1]

@@ -7,7 +7,7 @@ workers of pytest-xdist and the processes that tests start then load them from t
 
 from collections.abc import Callable
 
-from monitor import kernels
+from monitor.daemon import kernel_compilation
 
 
 def compile_kernels(say: Callable[[str], None]) -> None:
@@ -18,6 +18,6 @@ def compile_kernels(say: Callable[[str], None]) -> None:
     say
         Called with a line for each part that is being compiled.
     """
-    for group in kernels.GROUPS:
-        for _ in kernels.prepare(group, lambda progress: say(str(progress))):
+    for group in kernel_compilation.GROUPS:
+        for _ in kernel_compilation.prepare(group, lambda progress: say(str(progress))):
             pass

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from typing import Final
 
 from drivers.driver import Driver
-from monitor.virtual import VirtualImu
-from monitor.virtual.pty_port import PtyPort
-from monitor.virtual.zenoh_port import ZenohPort
+from monitor.simulator import VirtualImu
+from monitor.simulator.pty_port import PtyPort
+from monitor.simulator.zenoh_port import ZenohPort
 
 AHEAD: Final = 32
 """Samples that the sensor may be ahead of its reader. A pseudo-terminal holds them in every wire format."""

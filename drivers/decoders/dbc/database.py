@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import drivers
-from drivers import small_file, units
+from drivers import file_access, units
 from drivers.decoders.base import Arrival, Counter, Timing
 from drivers.decoders.dbc.bits import Bits
 from drivers.decoders.dbc.join import COLUMNS, Column, Message
 from drivers.decoders.dbc.settings import Settings, SignalSettings
+from drivers.discovery import nearest, possible
 from drivers.errors import ConfigError
 from drivers.extras import check_extra
-from drivers.plugin import nearest, possible
 from drivers.quantities import range_problems
 from drivers.sample import AXES
 
@@ -212,9 +212,9 @@ def _signal_settings(axis: str, entry: str | SignalSettings) -> SignalSettings:
 
 def _locate(file: str) -> Path:
     """The path itself, or that of a shipped database."""
-    path = small_file.path(file)
+    path = file_access.path(file)
     name = file.removeprefix(SHIPPED_PREFIX)
-    if name == file and (small_file.is_file(path) or len(path.parts) != 1):
+    if name == file and (file_access.is_file(path) or len(path.parts) != 1):
         return path
     shipped: Mapping[str, Path] = {p.stem: p for p in sorted(SHIPPED.glob("*.dbc"))}
     stem = name.removesuffix(".dbc")
@@ -230,7 +230,7 @@ def _load(path: Path) -> Any:
 
     try:
         if path.suffix.lower() != ".dbc":
-            small_file.read(path)  # to know that it is one: what follows opens it anew
+            file_access.read(path)  # to know that it is one: what follows opens it anew
             return cantools.database.load_file(path, strict=False)
         return cantools.database.load_string(_text(path), "dbc", strict=False)
     except OSError as error:
@@ -241,7 +241,7 @@ def _load(path: Path) -> Any:
 
 def _text(path: Path) -> str:
     """DBC editors write the code page of Windows, others UTF-8; degree signs tell them apart."""
-    data = small_file.read(path)
+    data = file_access.read(path)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from drivers.decoders.base import DecoderSettings
-from drivers.plugin import FileOrName
+from drivers.discovery import FileOrName
 from drivers.quantities import DELAY_S, SCALE, SOURCE_ADDRESS, TICK_S
 
 

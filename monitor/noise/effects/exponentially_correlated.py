@@ -6,8 +6,8 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.compiled import compiled
-from monitor.noise import correlated
+from monitor.common.compiled import compiled
+from monitor.noise import gauss_markov
 from monitor.noise.effect import Block, Series, Source, parameter
 
 
@@ -31,11 +31,11 @@ class ExponentiallyCorrelated(Source):
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """The closed form above."""
-        return correlated.avar(self.sigma, 1.0 / self.correlation_time, tau_s, tau0_s)
+        return gauss_markov.avar(self.sigma, 1.0 / self.correlation_time, tau_s, tau0_s)
 
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
         """The closed form above."""
-        return correlated.psd(self.sigma, 1.0 / self.correlation_time, f_hz, tau0_s)
+        return gauss_markov.psd(self.sigma, 1.0 / self.correlation_time, f_hz, tau0_s)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_GaussMarkov":
         """A stationary series."""

@@ -7,8 +7,8 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.compiled import compiled
-from monitor.noise import correlated
+from monitor.common.compiled import compiled
+from monitor.noise import gauss_markov
 from monitor.noise.effect import Block, Series, Source, below_nyquist, parameter
 from monitor.noise.spectrum import Spectrum
 
@@ -44,11 +44,11 @@ class Narrowband(Source):
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """The closed form of ``correlated`` with a turning φ."""
-        return correlated.avar(self.sigma, self._decay, tau_s, tau0_s)
+        return gauss_markov.avar(self.sigma, self._decay, tau_s, tau0_s)
 
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
         """σ²τ0 Re{(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²)}."""
-        return correlated.psd(self.sigma, self._decay, f_hz, tau0_s)
+        return gauss_markov.psd(self.sigma, self._decay, f_hz, tau0_s)
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """With its peak, for the integral to find."""

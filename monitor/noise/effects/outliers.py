@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.noise.effect import Block, Series, Source, parameter
-from monitor.noise.events import Events
+from monitor.noise.random_events import Events
 
 
 @dataclass(frozen=True, slots=True)

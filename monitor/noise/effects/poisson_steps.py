@@ -9,7 +9,7 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.noise.effect import Block, Series, Source, check_event_rate, parameter
 from monitor.noise.effects.rate_random_walk import RateRandomWalk
-from monitor.noise.events import Events
+from monitor.noise.random_events import Events
 
 
 @dataclass(frozen=True, slots=True)

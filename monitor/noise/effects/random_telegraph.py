@@ -7,9 +7,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise import correlated
+from monitor.noise import gauss_markov
 from monitor.noise.effect import Block, Series, Source, check_event_rate, parameter
-from monitor.noise.events import Events
+from monitor.noise.random_events import Events
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,11 +32,11 @@ class RandomTelegraph(Source):
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """That of exponentially correlated noise, σ = a/2, T_c = T/2."""
-        return correlated.avar(0.5 * self.amplitude, 2.0 / self.dwell_time, tau_s, tau0_s)
+        return gauss_markov.avar(0.5 * self.amplitude, 2.0 / self.dwell_time, tau_s, tau0_s)
 
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
         """That of exponentially correlated noise, σ = a/2, T_c = T/2."""
-        return correlated.psd(0.5 * self.amplitude, 2.0 / self.dwell_time, f_hz, tau0_s)
+        return gauss_markov.psd(0.5 * self.amplitude, 2.0 / self.dwell_time, f_hz, tau0_s)
 
     def check_rate(self, rate_hz: float) -> None:
         """Flips must not be more than can be simulated."""

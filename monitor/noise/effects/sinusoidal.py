@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.compiled import compiled
+from monitor.common.compiled import compiled
 from monitor.noise.effect import Block, Series, Source, below_nyquist, parameter
 from monitor.noise.spectrum import Spectrum, allan_of_line
 

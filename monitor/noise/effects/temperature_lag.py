@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.compiled import compiled
+from monitor.common.compiled import compiled
 from monitor.noise.effect import Block, Series, Source, parameter
 
 

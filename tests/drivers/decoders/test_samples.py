@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from drivers.decoders import samples
 from drivers.decoders.base import QUIET_FRAMES
 from drivers.sample import Chunk, Given, block, join
-from drivers.sample_message import pack
+from drivers.zenoh.sample_message import pack
 
 
 def message(count: int, n: int = 10, lost: int = 0, bad_rows: tuple[int, ...] = ()) -> Chunk:

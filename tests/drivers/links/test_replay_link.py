@@ -13,7 +13,7 @@ from drivers.decoders import samples
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable
 from drivers.links import replay_link
 from drivers.links.base import Link
-from drivers.recording import load_samples
+from drivers.recordings import load_samples
 from drivers.sample import EXTENDED_ID, Chunk, join
 
 FRAMES = [(0x9, False, bytes(range(8))), (0x0CF02AE2, True, b"\x00\x7d\x00\x7d\x00\x7d\x00\x05")] * 20

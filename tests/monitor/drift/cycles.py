@@ -6,7 +6,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from drivers.sample import Floats
-from monitor.drift.means import Means
+from monitor.drift.thermal.interval_means import Means
 
 COLDEST_C: Final = -18.0
 HOTTEST_C: Final = 74.0

@@ -3,7 +3,7 @@
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.drift.means import Means
+from monitor.drift.thermal.interval_means import Means
 
 HOUR_S = 3600.0
 COEFFICIENT = 2e-5  # rad/s per °C

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from monitor.history import store as stores
-from monitor.history.row import Row
-from monitor.history.store import PastEvent, Store
+from monitor.history import sqlite_store as stores
+from monitor.history.bucket import Row
+from monitor.history.sqlite_store import PastEvent, Store
 
 T0 = 1_760_400_000  # a multiple of all widths
 NAMES = ("gz.N", "rate")

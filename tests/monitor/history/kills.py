@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from monitor.history.row import Row
-from monitor.history.store import reading
-from monitor.history.times import Span
+from monitor.history.bucket import Row
+from monitor.history.sqlite_store import reading
+from monitor.history.time_ranges import Span
 from tests.monitor.history.killed import T0, row_of
 
 ALL = Span(float("-inf"), float("inf"))

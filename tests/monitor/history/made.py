@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from monitor.history.row import Row
+from monitor.history.bucket import Row
 
 NAMES = ("gz.N", "gz.sigma.1", "rate")
 

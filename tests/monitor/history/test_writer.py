@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from monitor.history import writer as writers
-from monitor.history.store import APPLICATION, BESIDE, VERSION, PastEvent, Store, reading
+from monitor.history.sqlite_store import APPLICATION, BESIDE, VERSION, PastEvent, Store, reading
 from monitor.history.writer import Writer
 from tests.monitor.history.kills import ALL
 from tests.monitor.history.made import row
@@ -269,7 +269,7 @@ def test_a_queue_that_is_full_drops_and_counts(tmp_path: Path, monkeypatch: pyte
 
 def test_a_file_that_is_held_by_another_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(writers, "RETRY_S", 0.05)
-    monkeypatch.setattr("monitor.history.store.BUSY_S", 0.05)
+    monkeypatch.setattr("monitor.history.sqlite_store.BUSY_S", 0.05)
     path = tmp_path / "h.sqlite"
     Store(path).close()
     with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as other, started(path) as writer:

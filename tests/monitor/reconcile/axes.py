@@ -10,11 +10,11 @@ from drivers.sample import AXES, Floats
 from monitor.noise.effect import Effect
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, BiasInstability, RateRandomWalk
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.axis import Axis, Courses
-from monitor.reconcile.gap import Null
-from monitor.reconcile.hypothesis import believed
-from monitor.reconcile.lenses import LENSES, Sight, sight
-from monitor.reconcile.prepare import prepared
+from monitor.reconcile.diagnostics.diagnostics import LENSES, Sight, sight
+from monitor.reconcile.diagnostics.gap import Null
+from monitor.reconcile.likelihood.hypothesis import believed
+from monitor.reconcile.preparation.axis import Axis, Courses
+from monitor.reconcile.preparation.prepare import prepared
 from monitor.reconcile.reconcile import Recording
 
 RATE_HZ = 100.0

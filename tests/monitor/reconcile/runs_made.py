@@ -6,8 +6,8 @@ from dataclasses import replace
 from monitor.noise.effect import Effect
 from monitor.noise.effects import EFFECTS, Sinusoidal
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.reconciliation import AxisResult, Bounds, Look, RunnerUp, Score, Step, Verdict, Where
-from monitor.reconcile.runs import Run
+from monitor.reconcile.result import AxisResult, Bounds, Look, RunnerUp, Score, Step, Verdict, Where
+from monitor.reconcile.several_recordings.comparison import Run
 from tests.monitor.reconcile import samples
 
 LENS = Score("lines", Where(frequency=(17.0, 18.0)), 1.2, 2.0, 4.0)

@@ -11,17 +11,7 @@ import numpy as np
 from drivers.sample import AXES, Floats
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk, Sinusoidal
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.reconciliation import (
-    AxisResult,
-    Bounds,
-    Look,
-    Reconciliation,
-    RunnerUp,
-    Score,
-    Step,
-    View,
-    Where,
-)
+from monitor.reconcile.result import AxisResult, Bounds, Look, Reconciliation, RunnerUp, Score, Step, View, Where
 
 RATE_HZ, SECONDS = 100.0, 3600.0
 N, B, K = 1.5e-4, 4.0e-5, 1.5e-6  # rad/√s, rad/s, rad/s/√s

@@ -22,8 +22,8 @@ from monitor.noise.effects import (
     TemperatureBias,
 )
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.axis import Courses
-from monitor.reconcile.prepare import FEWEST
+from monitor.reconcile.preparation.axis import Courses
+from monitor.reconcile.preparation.prepare import FEWEST
 from monitor.reconcile.reconcile import Recording, effects_of, five_terms, overall, reconcile, smooth, usable
 from monitor.reconcile.report import to_json
 from tests.monitor.reconcile.axes import (

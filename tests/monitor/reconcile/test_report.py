@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from monitor.reconcile.reconciliation import AxisResult, Bounds, Look, Reconciliation, Score, Step, Where
 from monitor.reconcile.report import to_json
+from monitor.reconcile.result import AxisResult, Bounds, Look, Reconciliation, Score, Step, Where
 from tests.monitor.reconcile import samples
 
 

@@ -1,0 +1,1 @@
+"""Time stamps: sample clock, arrival regression, duplicate and late rows, rate check."""

@@ -1,0 +1,1 @@
+"""zenoh sessions, connection errors and the sample message."""

@@ -1,0 +1,268 @@
+"""The service in a terminal: its table or log lines, its log, and the signals that end it.
+
+Table and log are written by threads (``QueuedWriter``), so that a terminal or pipe that nobody reads delays neither
+samples nor the end of the process.
+"""
+
+import contextlib
+import errno
+import io
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TextIO, cast
+
+from drivers.credential_masking import masked
+from drivers.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import MutableMapping
+
+    from monitor.publishing.terminal.queued_writer import QueuedWriter
+    from monitor.settings.loading import Config
+
+STDOUT: Final = "standard output"
+STDERR: Final = "standard error"
+
+
+def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
+    """Run the service: a table where there is a terminal, else log lines; the last table once more at the end.
+
+    Parameters
+    ----------
+    config : Config
+        What to run.
+    seconds : float or None
+        Duration in seconds; None runs until a signal or the end of all replays.
+    viewer : str or None
+        Viewer mode that replaces the mode of the configuration.
+
+    Raises
+    ------
+    ConfigError
+        The viewer mode or a device cannot be used.
+    OSError
+        The run ended by itself, and the final table could not be written to a file or pipe.
+    """
+    import threading
+
+    import structlog
+    from rich.console import Console
+
+    from monitor.daemon.operations.systemd import Unit
+    from monitor.daemon.outputs import LogOutput, TableOutput
+    from monitor.daemon.service import STATUS_S, Service
+    from monitor.publishing.terminal.live_table import Board, LiveTable
+    from monitor.publishing.terminal.queued_writer import QueuedWriter
+
+    unit = Unit.of(os.environ)
+    config = _with_viewer(config, viewer)
+    console, board, asked = Console(file=sys.stdout), Board(), threading.Event()
+    table, terminal = LiveTable(console), console.is_terminal
+    screen = QueuedWriter(sys.stdout, STDOUT, table.render, STATUS_S if terminal else None, tell=_warn)
+    writers = {"terminal": screen} if terminal else {}
+    shared = terminal and _same_file(sys.stdout, sys.stderr)
+    if not shared:
+        writers["log"] = QueuedWriter(sys.stderr, STDERR, tell=_warn)
+    with _stderr_through(screen if shared else writers["log"]):
+        _log_as(config)
+        for line in config.warnings:
+            structlog.get_logger("imu-monitor").warning(line)
+        if not shared:
+            screen.start()
+        try:
+            outputs = [TableOutput(board, screen.redraw)] if terminal else [TableOutput(board), LogOutput()]
+            service = Service(config, outputs, unit=unit, writers=writers)
+
+            def stop() -> None:
+                asked.set()
+                service.stop()
+
+            # in a terminal it means that the terminal is closed
+            on_signals(stop, stop if terminal else service.reload)
+            table.board = board
+            service.run(seconds)
+        finally:
+            unread = not screen.close()
+        lost = _lost(screen, unread)
+        if lost is not None and not terminal and asked.is_set():
+            structlog.get_logger("imu-monitor").warning("the final table was not written", error=str(lost))
+    if lost is not None and not terminal and not asked.is_set():
+        raise lost
+
+
+def _lost(screen: "QueuedWriter", unread: bool) -> Exception | None:
+    """Return why the final table is not on standard output, or None if it is."""
+    from monitor.publishing.terminal.queued_writer import CLOSE_S
+
+    if unread:
+        return TimeoutError(f"{STDOUT}: the final table was not written, because nobody read it for {CLOSE_S:g} s")
+    error = screen.error
+    if isinstance(error, OSError) and error.errno == errno.EBADF:
+        return None  # standard output was closed before the start, so nobody wants the table
+    if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
+        return OSError(f"{STDOUT}: the final table could not be written: {error.strerror}")
+    return error
+
+
+def view(
+    keyexpr: str, connect: Sequence[str], file: Path | None, detail: Sequence[str], mode: str, seconds: float | None
+) -> None:
+    """The viewer of a fleet, until a signal; where its page is, and what is wrong, a line each on standard error."""
+    import threading
+
+    from monitor.publishing.rerun.fleet import FleetView, detail_key
+    from monitor.publishing.rerun.view import RerunView
+    from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
+    from monitor.publishing.terminal.queued_writer import QueuedWriter
+    from monitor.publishing.zenoh.subscriber import ZenohIn
+    from monitor.settings import loading
+
+    try:
+        loading.viewer_mode(mode)
+    except ConfigError as error:
+        raise ConfigError(f"--viewer: {error}") from None
+    keys = tuple(dict.fromkeys(detail_key(device, keyexpr) for device in detail))
+    arriving = ZenohIn(keyexpr, connect, file, keys)
+    rerun = RerunView(ViewerSettings(mode=mode), [DeviceInfo(key, "over zenoh") for key in keys], fleet=True)
+    stop = threading.Event()
+    on_signals(stop.set)
+
+    def say(text: str) -> None:
+        print(text, file=_Lines(), flush=True)
+
+    log = QueuedWriter(sys.stderr, STDERR, tell=say)
+    with _stderr_through(log), contextlib.closing(arriving), contextlib.closing(rerun):
+        arriving.start()
+        rerun.start()
+        FleetView(arriving, rerun, keys).run(stop, say, seconds)
+
+
+def with_history(config: "Config", history_s: float | None) -> "Config":
+    """A configuration whose live view opens on so much of what is kept; None: as it says itself."""
+    import dataclasses
+
+    import msgspec
+
+    if history_s is None:
+        return config
+    if config.storage is None or not config.storage.history:
+        raise ConfigError("--history: none is kept; [storage] folder says where it would be")
+    return dataclasses.replace(config, viewer=msgspec.structs.replace(config.viewer, history=history_s))
+
+
+def _with_viewer(config: "Config", viewer: str | None) -> "Config":
+    import dataclasses
+
+    import msgspec
+
+    from monitor.settings import loading
+
+    if viewer is None:
+        return config
+    try:
+        mode = loading.viewer_mode(viewer)
+    except ConfigError as error:
+        raise ConfigError(f"--viewer: {error}") from None
+    return dataclasses.replace(config, viewer=msgspec.structs.replace(config.viewer, mode=mode))
+
+
+@contextlib.contextmanager
+def _stderr_through(writer: "QueuedWriter") -> Iterator[None]:
+    """Start a writer and put it in place of standard error, for log lines, warnings and tracebacks of threads.
+
+    If the writer is still blocked at the end, standard error is given up, so that the process can end.
+    """
+    from monitor.publishing.terminal.queued_writer import QueuedLines, can_write, descriptor_of, detach
+
+    stream = sys.stderr
+    with contextlib.redirect_stderr(QueuedLines(writer, stream is not None and stream.isatty())):
+        writer.start()
+        try:
+            yield
+        finally:
+            if not writer.close() or not can_write(descriptor_of(stream)):
+                detach(stream)
+
+
+def _same_file(one: TextIO | None, other: TextIO | None) -> bool:
+    """Return True if two streams write to the same terminal, pipe or file."""
+    from monitor.publishing.terminal.queued_writer import descriptor_of
+
+    descriptors = descriptor_of(one), descriptor_of(other)
+    return None not in descriptors and os.path.sameopenfile(*cast("tuple[int, int]", descriptors))
+
+
+def _warn(text: str) -> None:
+    import structlog
+
+    structlog.get_logger("imu-monitor").warning("log", text=text)
+
+
+class _Lines(io.TextIOBase):
+    """Standard error as the log's place: a line that cannot be written (disk full, reader gone) is dropped."""
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            sys.stderr.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            sys.stderr.flush()
+
+
+def _log_as(config: "Config") -> None:
+    """Structured lines on standard error."""
+    import logging
+
+    import structlog
+
+    from monitor.daemon.operations.log_level import LEVEL
+
+    json = config.log.format == "json"
+    LEVEL.name = config.log.level
+    structlog.configure(
+        processors=[
+            LEVEL,
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            _without_secrets,
+            structlog.processors.JSONRenderer() if json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
+        ],
+        wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG),
+        logger_factory=structlog.PrintLoggerFactory(cast("TextIO", _Lines())),
+        cache_logger_on_first_use=True,
+    )
+
+
+def _without_secrets(_logger: Any, _method: str, line: "MutableMapping[str, Any]") -> "MutableMapping[str, Any]":
+    """Every text of a log line, whatever brought it there."""
+    return {key: masked(value) if isinstance(value, str) else value for key, value in line.items()}
+
+
+def on_signals(stop: Callable[[], None], hung_up: Callable[[], None] | None = None) -> None:
+    """First SIGINT or SIGTERM: stop in order. A second SIGINT ends at once. SIGHUP: what it means here, if anything."""
+    import threading
+
+    def first(number: int, _frame: Any) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        # in a thread of its own: the main one may hold the lock of the very event that stop sets
+        threading.Thread(target=stop, name="stop", daemon=True).start()
+
+    signal.signal(signal.SIGINT, first)
+    signal.signal(signal.SIGTERM, first)
+    if hung_up is not None:
+        call = hung_up  # in a thread, as above
+        signal.signal(signal.SIGHUP, lambda *_: threading.Thread(target=call, name="hung up", daemon=True).start())
+
+
+def end_on_sigterm() -> None:
+    """SIGTERM ends work as Ctrl-C does: what is half written is removed."""
+
+    def ended(_number: int, _frame: Any) -> NoReturn:
+        sys.exit(128 + signal.SIGTERM)
+
+    signal.signal(signal.SIGTERM, ended)

@@ -1,0 +1,1 @@
+"""The work of each command on recordings and configurations: ``analyze``, ``simulate``, ``reconcile`` and others."""

@@ -1,0 +1,582 @@
+"""Looks at a machine and a configuration before the service is left alone with them: findings, and what to do.
+
+Each check returns findings and raises nothing: what cannot be found out here says so. No device is opened. What is done
+beside looking: a listening port is bound for a moment, a router is connected to and left, an empty file is made in the
+folder of recordings and removed.
+
+Disk a day, in bytes: rate · 86400 · SAMPLE_BYTES for each device that is recorded, and RAW_BYTES more a sample where
+raw bytes are kept. SAMPLE_BYTES is what a packed segment of six axes, temperature and counter takes of noise that fills
+a 32-bit float; coarser sensors take less. The results of years are small beside that and not counted.
+"""
+
+import ctypes
+import errno
+import os
+import re
+import shutil
+import socket
+import stat
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from drivers import file_access
+from drivers.extras import missing_packages
+from drivers.links.can_link import missing_package
+from drivers.links.replay_link import ReplayLink
+from monitor.commands.check import check
+from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, holder
+from monitor.settings.loading import Config, Storage
+
+Mark = Literal["well", "doubt", "wrong"]
+
+SAMPLE_BYTES: Final = 35.0
+"""Of a sample in a packed segment: 32.5 to 33.3 of a sensor that fills a float, 17 to 23 of one that comes in steps."""
+RAW_BYTES: Final = 60.0
+"""Of a sample's frame as it came, about: protocols differ."""
+DAY_S: Final = 86400.0
+CONNECT_S: Final = 2.0
+TIME_ERROR: Final = 5
+"""What adjtimex(2) returns while nothing keeps the clock."""
+CAN_TYPE: Final = "280"
+"""ARPHRD_CAN, in /sys/class/net/NAME/type."""
+LAST_PORT: Final = 65535
+UNIT: Final = "imu-monitor.daemon.service"
+PACKAGE: Final = "imu-monitor"
+PACKAGES: Final = ("monitor", "drivers")
+"""Of the program; the names are common ones."""
+PROJECT: Final = Path(__file__).resolve().parents[2] / "pyproject.toml"
+TCP: Final = re.compile(r"(?:tcp|tls)/\[?([^\]]+?)\]?:(\d+)(?:[?#].*)?")
+REQUIREMENT: Final = re.compile(r"([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*\(?([^;)]*)\)?\s*(?:;(.*))?")
+LOOPBACK: Final = ("127.", "::1", "localhost")
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at."""
+
+    mark: Mark
+    about: str
+    text: str
+    do: str = ""  # what to do, where there is something
+
+
+def examine(path: Path | None = None) -> list[Finding]:
+    """The machine, and the configuration where one is named."""
+    found = [*libraries(), *packages(sys.path), *kernels(), *clock(), *unit()]
+    if path is None:
+        return found
+    config, wrong = read(path)
+    found = [*wrong, *found]
+    if path.is_file():
+        found += permissions(path)
+    if config is None:
+        return found
+    for one in config.table["device"]:
+        found += device(str(one["name"]), one["driver"])
+    found += [*zenoh(config), *viewer(config), *storage(config), *metrics(config), *reconcile(config)]
+    for hook in config.hooks:
+        if hook.command:
+            found += permissions(Path(hook.command[0]), f"hook {Path(hook.command[0]).name}", secret=False)
+    return found
+
+
+# --- the configuration
+
+
+def read(path: Path) -> tuple[Config | None, list[Finding]]:
+    """The configuration, and all that is wrong with it."""
+    config, wrong = check(path, pipe=True)
+    if config is None:
+        return None, [Finding("wrong", "configuration", line) for line in wrong]
+    count = len(config.devices)
+    return config, [Finding("well", "configuration", f"{path}: {count} device{'' if count == 1 else 's'}")]
+
+
+def permissions(path: Path, about: str = "permissions", secret: bool = True) -> list[Finding]:
+    """Who may write a file that this service obeys, and read one that may hold ``secret`` words."""
+    try:
+        seen = path.stat()
+    except OSError as error:
+        return [Finding("wrong", about, f"{path}: {error.strerror or error}")]
+    mode = stat.S_IMODE(seen.st_mode)
+    if mode & stat.S_IWOTH:
+        text = f"{path}: everyone may write it, and so have commands run as the service's user"
+        return [Finding("wrong", about, text, f"chmod o-w {path}")]
+    if seen.st_uid not in (0, os.geteuid()):
+        text = f"{path}: belongs to another user ({_user(seen.st_uid)}), who may change what the service does"
+        return [Finding("doubt", about, text, f"chown root {path}")]
+    if mode & stat.S_IWGRP:
+        text = f"{path}: the group {_group(seen.st_gid)} may write it"
+        return [Finding("doubt", about, text, f"chmod g-w {path}")]
+    if secret and mode & stat.S_IROTH and _has_secret(path):
+        text = f"{path}: everyone may read the password in it"
+        return [Finding("wrong", about, text, f"chmod o-r {path}")]
+    return [Finding("well", about, f"{path}: {mode:04o}, owner {_user(seen.st_uid)}")]
+
+
+# --- devices
+
+
+def device(name: str, driver: Mapping[str, Any]) -> list[Finding]:
+    """What a device is reached by; nothing is opened."""
+    about = f"device {name}"
+    match driver.get("link"):
+        case "serial":
+            return serial_port(about, str(driver.get("port")))
+        case "can":
+            return can_interface(about, str(driver.get("interface", "socketcan")), str(driver.get("channel", "can0")))
+        case "zenoh":
+            endpoints = driver.get("connect", [])
+            return [one for endpoint in endpoints for one in reachable(about, str(endpoint))]
+        case other:
+            return [Finding("well", about, f"link {other}: nothing to look for on this machine")]
+
+
+def serial_port(about: str, port: str) -> list[Finding]:
+    """Is it there, may we read it, does another program hold it."""
+    if "://" in port:
+        return [Finding("well", about, f"{port}: a port of the network or a pattern, not tried from here")]
+    path = Path(port)
+    if not path.exists():
+        there = sorted(str(one) for kind in ("ttyUSB*", "ttyACM*", "ttyAMA*") for one in Path("/dev").glob(kind))
+        text = f"{port}: there is no such port; there are {', '.join(there) or 'none that look like a sensor'}"
+        return [Finding("wrong", about, text, "plug it in, or name another one; dmesg says what was plugged in last")]
+    seen = path.stat()
+    if not stat.S_ISCHR(seen.st_mode):
+        return [Finding("wrong", about, f"{port}: is no serial port")]
+    if not os.access(path, os.R_OK | os.W_OK):
+        group = _group(seen.st_gid)
+        text = f"{port}: {_user(os.geteuid())} may not read and write it; its group {group} may"
+        return [Finding("wrong", about, text, f"sudo usermod -aG {group} {_user(os.geteuid())}, and log in again")]
+    holders = list(holding(path))
+    if holders:
+        text = f"{port}: held by {', '.join(holders)}"
+        return [Finding("doubt", about, text, "if that is not the service itself, end it: a port has one reader")]
+    return [Finding("well", about, f"{port}: there, may be read, held by no program that can be seen from here")]
+
+
+def holding(port: Path) -> Iterator[str]:
+    """Programs that have a port open, as far as this user can see them."""
+    wanted = port.resolve()
+    for process in Path("/proc").glob("[0-9]*"):
+        if process.name == str(os.getpid()):
+            continue
+        try:
+            open_files = {os.readlink(one) for one in (process / "fd").iterdir()}
+            if str(wanted) in open_files:
+                yield f"{(process / 'comm').read_text().strip()} (pid {process.name})"
+        except OSError:  # another user's, or ended
+            continue
+
+
+def can_interface(about: str, interface: str, channel: str, sysfs: Path = Path("/sys/class/net")) -> list[Finding]:
+    """Is the package there that the interface needs; does the kernel have the bus, and is it up."""
+    if missing := missing_package(interface):
+        text, _, command = missing.partition(": ")
+        return [Finding("wrong", about, text, command)]
+    if interface != "socketcan":
+        return [Finding("well", about, f"{interface} {channel}: not tried, only its own driver could tell")]
+    if not hasattr(socket, "AF_CAN"):
+        return [Finding("wrong", about, "this system has no socketcan", "use another interface of python-can")]
+    network = sysfs / channel
+    up = f"sudo ip link set {channel} up type can bitrate 500000, with the bus's own bit rate"
+    try:
+        kind, flags = (network / "type").read_text().strip(), int((network / "flags").read_text(), 16)
+    except OSError:
+        kinds = {one.name: _read(one / "type") for one in sysfs.glob("*")} if sysfs.is_dir() else {}
+        there = ", ".join(sorted(name for name, one in kinds.items() if one == CAN_TYPE)) or "none"
+        return [Finding("wrong", about, f"{channel}: there is no such interface; CAN interfaces are: {there}", up)]
+    if kind != CAN_TYPE:
+        return [Finding("wrong", about, f"{channel}: is no CAN interface", up)]
+    if not flags & 1:  # IFF_UP
+        return [Finding("wrong", about, f"{channel}: is down", up)]
+    return [Finding("well", about, f"{channel}: is up")]
+
+
+# --- outputs
+
+
+def zenoh(config: Config) -> list[Finding]:
+    """Ports to listen on, routers to reach, and the file with what else holds."""
+    own = config.zenoh
+    if own.mode == "none":
+        return []
+    found = [one for endpoint in own.listen or () if own.mode != "client" for one in free("zenoh", endpoint)]
+    found += [one for endpoint in own.connect for one in reachable("zenoh", endpoint)]
+    for endpoint in own.listen or ():
+        host = _host(endpoint)
+        if host and not host.startswith(LOOPBACK) and own.config is None:
+            text = f"{endpoint}: whoever reaches this machine may read all and command it"
+            found.append(Finding("doubt", "zenoh", text, "listen on 127.0.0.1, or use TLS and access control"))
+    if own.config is not None:
+        found += permissions(own.config, "zenoh file")
+    return found
+
+
+def free(about: str, endpoint: str) -> list[Finding]:
+    """Whether a port can be listened on: bound for a moment, and given back."""
+    match = TCP.fullmatch(endpoint)
+    if match is None:
+        return [Finding("well", about, f"{endpoint}: not tried, only TCP ports can be from here")]
+    if int(match[2]) > LAST_PORT:
+        return [Finding("wrong", about, f"{endpoint}: cannot be listened on: ports end at {LAST_PORT}")]
+    try:
+        family = socket.AF_INET6 if ":" in match[1] else socket.AF_INET
+        with socket.create_server((match[1], int(match[2])), family=family):
+            return [Finding("well", about, f"{endpoint}: free to listen on")]
+    except (OSError, UnicodeError) as error:
+        if getattr(error, "errno", None) == errno.EADDRINUSE:
+            text = f"{endpoint}: another program listens there"
+            return [Finding("doubt", about, text, "well if it is this service; else end it or name another port")]
+        why = getattr(error, "strerror", None) or error
+        return [Finding("wrong", about, f"{endpoint}: cannot be listened on: {why}")]
+
+
+def reachable(about: str, endpoint: str) -> list[Finding]:
+    """Whether somebody answers at an endpoint."""
+    match = TCP.fullmatch(endpoint)
+    if match is None:
+        return [Finding("well", about, f"{endpoint}: not tried, only TCP can be from here")]
+    if int(match[2]) > LAST_PORT:
+        return [Finding("wrong", about, f"{endpoint}: nobody answers: ports end at {LAST_PORT}")]
+    try:
+        with socket.create_connection((match[1], int(match[2])), timeout=CONNECT_S):
+            return [Finding("well", about, f"{endpoint}: somebody answers")]
+    except (OSError, UnicodeError) as error:
+        text = f"{endpoint}: nobody answers: {getattr(error, 'strerror', None) or error}"
+        return [Finding("doubt", about, text, "start it, or look at cables and firewalls; the service tries again")]
+
+
+def viewer(config: Config) -> list[Finding]:
+    """Whether there is one where one is wanted."""
+    if config.viewer.mode == "none":
+        return []
+    if find_spec("rerun") is None:
+        text = f'viewer.mode is "{config.viewer.mode}", and rerun-sdk is not installed: there will be no view'
+        return [Finding("doubt", "viewer", text, 'pip install "imu-monitor[viewer]", or mode = "none"')]
+    return [Finding("well", "viewer", f"rerun-sdk is there, mode {config.viewer.mode}")]
+
+
+def metrics(config: Config) -> list[Finding]:
+    """The library, the port, and who can reach it."""
+    own = config.metrics
+    if own is None:
+        return []
+    if find_spec("prometheus_client") is None:
+        text = "metrics.listen is set, and prometheus-client is not installed"
+        return [Finding("wrong", "metrics", text, 'pip install "imu-monitor[metrics]"')]
+    host = f"[{own.host}]" if ":" in own.host else own.host
+    found = free("metrics", f"tcp/{host}:{own.port}")
+    if not own.host.startswith(LOOPBACK):
+        text = f"{own.host}: whoever reaches this machine may read the numbers"
+        found.append(Finding("doubt", "metrics", text, "listen on 127.0.0.1, and let a local agent forward them"))
+    return found
+
+
+def reconcile(config: Config) -> list[Finding]:
+    """Whether ``command/reconcile`` can be answered, if a folder is configured for its reports."""
+    missing = missing_packages("reconcile")
+    if not missing or not any(one.reconcile_folder for one in config.devices):
+        return []
+    text = f"reconcile_folder is set, and {' and '.join(missing)} is not installed: command/reconcile will be refused"
+    return [Finding("doubt", "reconcile", text, 'pip install "imu-monitor[reconcile]"')]
+
+
+def storage(config: Config) -> list[Finding]:
+    """The library, the folder, and room for what is to be kept."""
+    own = config.storage
+    if own is None:
+        return [Finding("doubt", "storage", "nothing is kept: a restart begins with empty windows", "[storage] folder")]
+    found = []
+    if (own.record or own.raw) and find_spec("pyarrow") is None:
+        text = "samples are to be recorded, and pyarrow is not installed"
+        found.append(Finding("wrong", "storage", text, 'pip install "imu-monitor[arrow]"'))
+    folder = next(one for one in (own.folder, *own.folder.parents) if os.path.exists(one))
+    try:
+        file_access.check_folder(folder)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+        usage = shutil.disk_usage(folder)
+    except OSError as error:
+        text = f"{own.folder}: cannot be written: {error.strerror or error}"
+        return [*found, Finding("wrong", "storage", text, f"make it, and have {_user(os.geteuid())} own it")]
+    found += in_use(own)
+    return [*found, *room(own, bytes_a_day(config), usage.total, usage.free)]
+
+
+def in_use(own: Storage) -> list[Finding]:
+    """Whether another process records into the folder, or keeps its history there."""
+    wanted = {RECORDING_LOCK: own.record or own.raw, HISTORY_LOCK: own.history}
+    holders = sorted({held for name, on in wanted.items() if on and (held := holder(own.folder, name))})
+    do = "well if it is this service; else end it, or choose another folder: only one of them records"
+    return [Finding("doubt", "storage", f"{own.folder}: in use by {one}", do) for one in holders]
+
+
+def bytes_a_day(config: Config) -> float | None:
+    """What all devices together will fill of the disk; None where the rate of one is not configured.
+
+    >>> import dataclasses
+    >>> from monitor import settings
+    >>> one = settings.load(settings.CONFIG_FOLDER / "demo.toml")
+    >>> kept = Storage(Path("kept"))
+    >>> bytes_a_day(dataclasses.replace(one, storage=kept)) == one.devices[0].rate_hz * DAY_S * SAMPLE_BYTES
+    True
+    """
+    own = config.storage
+    if own is None:
+        return 0.0
+    each = SAMPLE_BYTES * own.record + RAW_BYTES * own.raw
+    rates = [one.rate_hz for one in config.devices if not isinstance(one.link, ReplayLink)]  # that is one already
+    known = [rate for rate in rates if rate is not None]
+    return None if len(known) < len(rates) else sum(known) * DAY_S * each
+
+
+def room(own: Storage, a_day: float | None, total: int, available: int) -> list[Finding]:
+    """Whether what is to be kept fits: ``total`` and ``available`` bytes of the disk."""
+    allowed = available - (1.0 - own.disk_share) * total
+    if a_day is None:
+        text = f"{own.folder}: {_gb(available)} free; what a day takes is not known, as rates are found from the data"
+        return [Finding("doubt", "storage", text, "add rate to every device")]
+    wanted, days = a_day * own.keep_s / DAY_S, max(allowed, 0.0) / a_day if a_day else float("inf")
+    text = f"{own.folder}: {_gb(available)} free, about {_gb(a_day)} a day, {_gb(wanted)} in all that is to be kept"
+    if allowed <= 0.0 or days < 1.0:
+        do = "free some room, or record on another disk"
+        return [Finding("wrong", "storage", f"{text}: not room for a day below disk_share", do)]
+    if wanted > allowed:
+        do = "a larger disk, or a shorter keep"
+        return [Finding("doubt", "storage", f"{text}: the oldest will be deleted after about {days:.0f} days", do)]
+    return [Finding("well", "storage", text)]
+
+
+# --- the machine
+
+
+def libraries() -> list[Finding]:
+    """Each library against what this version was made for."""
+    wanted = list(requirements())
+    if not wanted:
+        return [Finding("doubt", "libraries", "cannot tell which versions are required: the package is not installed")]
+    wrong, count = [], 0
+    for name, versions, optional in wanted:
+        try:
+            there = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            if not optional:
+                wrong.append(Finding("wrong", "libraries", f"{name} is missing", f'pip install "{name}{versions}"'))
+            continue
+        count += 1
+        if not satisfies(there, versions):
+            text = f"{name} {there} is installed, {versions} is required"
+            wrong.append(Finding("wrong", "libraries", text, f'pip install "{name}{versions}"'))
+    return wrong or [Finding("well", "libraries", f"Python {sys.version.split()[0]}, {count} libraries as required")]
+
+
+def requirements() -> Iterator[tuple[str, str, bool]]:
+    """Name, versions and whether it is optional, of every library but those of tests."""
+    try:
+        lines = metadata.requires(PACKAGE) or []
+    except metadata.PackageNotFoundError:
+        lines = list(_of_project())
+    for line in lines:
+        match = REQUIREMENT.fullmatch(line.strip())
+        if match is None or match[1] == PACKAGE:
+            continue
+        extra = re.search(r"extra\s*==\s*['\"](\w+)['\"]", match[3] or "")
+        if extra is None or extra[1] not in ("test", "all"):
+            yield match[1], match[2].replace(" ", ""), extra is not None
+
+
+def _of_project() -> Iterator[str]:
+    """The same lines, of a checkout that is not installed."""
+    import tomllib
+
+    try:
+        project = tomllib.loads(PROJECT.read_text("utf-8"))["project"]
+    except (OSError, tomllib.TOMLDecodeError, KeyError):
+        return
+    yield from project["dependencies"]
+    for extra, lines in project["optional-dependencies"].items():
+        yield from (f"{line}; extra == '{extra}'" for line in lines)
+
+
+def satisfies(version: str, wanted: str) -> bool:
+    """Whether a version is within bounds like ``>=0.41,<0.42``; a bound of another kind is not judged.
+
+    >>> satisfies("0.41.2", ">=0.41,<0.42"), satisfies("0.42.0", ">=0.41,<0.42"), satisfies("2.0rc1", ">=1.9")
+    (True, False, True)
+    """
+    compare: dict[str, Callable[[list[int], list[int]], bool]] = {
+        ">=": lambda a, b: a >= b,
+        "<=": lambda a, b: a <= b,
+        ">": lambda a, b: a > b,
+        "<": lambda a, b: a < b,
+        "==": lambda a, b: a == b,
+    }
+    for bound in filter(None, wanted.split(",")):
+        match = re.fullmatch(r"(>=|<=|==|>|<)\s*([\d.]+)", bound)
+        if match is not None and not compare[match[1]](*_same_length(_numbers(version), _numbers(match[2]))):
+            return False
+    return True
+
+
+def packages(module_path: Sequence[str]) -> list[Finding]:
+    """Report foreign packages and modules that have the name of one of the program's packages and are found first.
+
+    Parameters
+    ----------
+    module_path
+        Folders in the order in which Python searches them, as ``sys.path``.
+    """
+    own = Path(__file__).resolve().parents[2]
+    found = []
+    for entry in module_path:
+        folder = Path(entry or os.curdir).resolve()
+        if folder == own:
+            break
+        for name in PACKAGES:
+            # a folder without __init__.py is a namespace package, and gives way to a package that is found later
+            places = (folder / name / "__init__.py", folder / f"{name}.py")
+            foreign = next((one for one in places if one.is_file()), None)
+            if foreign is not None:
+                text = (
+                    f"{foreign}: is found before the program's own package {name}; imu-monitor uses its own, a script "
+                    f"that imports {name} does not"
+                )
+                found.append(Finding("doubt", "packages", text, f"remove {folder} from PYTHONPATH for such scripts"))
+    return found or [Finding("well", "packages", f"{' and '.join(PACKAGES)} are the program's own, in {own}")]
+
+
+def kernels() -> list[Finding]:
+    """Whether kernels are compiled, and kept from start to start."""
+    from monitor.common.compiled import cache_folder
+    from monitor.daemon.kernel_compilation import SERVICE, is_warm
+
+    folder = cache_folder()
+    if folder is None:
+        text = "no folder for compiled kernels can be written: every start compiles them anew, for a minute or two"
+        return [Finding("doubt", "kernels", text, "set NUMBA_CACHE_DIR to a folder of the service's user")]
+    if not is_warm(SERVICE):
+        text = f"not compiled yet for this version on this machine, in {folder}: the next start takes longer, once"
+        return [Finding("doubt", "kernels", text, "imu-monitor warm-up, as the user of the service")]
+    return [Finding("well", "kernels", f"compiled and kept in {folder}")]
+
+
+def clock() -> list[Finding]:
+    """Whether something keeps the host's clock: results carry its time."""
+    state = _adjtimex()
+    if state is None:
+        return [Finding("doubt", "clock", "cannot tell whether it is synchronised: the system does not say")]
+    if state == TIME_ERROR:
+        text = "not synchronised: the times of results and recordings will drift, or jump when it is set"
+        return [Finding("doubt", "clock", text, "timedatectl set-ntp true, or install chrony")]
+    return [Finding("well", "clock", "synchronised")]
+
+
+def unit() -> list[Finding]:
+    """The service under systemd, where it is installed there."""
+    if shutil.which("systemctl") is None or not Path("/run/systemd/system").is_dir():
+        return []
+    command = ["systemctl", "show", UNIT, "--property=LoadState,ActiveState,SubState,NRestarts,UnitFileState"]
+    try:
+        said = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=False).stdout
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return [Finding("doubt", "systemd", f"cannot tell: {error}")]
+    return unit_state(dict(line.split("=", 1) for line in said.splitlines() if "=" in line))
+
+
+def unit_state(seen: Mapping[str, str]) -> list[Finding]:
+    """What ``systemctl show`` says of the unit; nothing where there is none.
+
+    >>> unit_state({"LoadState": "not-found"})
+    []
+    """
+    if seen.get("LoadState") != "loaded":
+        return []
+    active, restarts = seen.get("ActiveState", ""), seen.get("NRestarts", "0")
+    text = f"{UNIT}: {active} ({seen.get('SubState', '')}), {restarts} restarts, {seen.get('UnitFileState', '')}"
+    if active == "failed":
+        return [Finding("wrong", "systemd", text, f"journalctl -u {UNIT} -e says why")]
+    if active == "active" and restarts == "0" and seen.get("UnitFileState") == "enabled":
+        return [Finding("well", "systemd", text)]
+    if active == "active" and restarts == "0":
+        return [Finding("doubt", "systemd", text, f"systemctl enable {UNIT}: else it is not started with the machine")]
+    return [Finding("doubt", "systemd", text, f"journalctl -u {UNIT} -e; systemctl enable --now {UNIT}")]
+
+
+# --- what these share
+
+
+def _adjtimex() -> int | None:
+    """State of the kernel's clock; None where it cannot be asked."""
+    try:
+        library = ctypes.CDLL(None, use_errno=True)
+        question = ctypes.create_string_buffer(512)  # modes = 0: nothing is set
+        state = int(library.adjtimex(question))
+    except (OSError, AttributeError, TypeError):
+        return None
+    return state if state >= 0 else None
+
+
+def _has_secret(path: Path) -> bool:
+    """Whether a file reads as if it held a password; it is not said which."""
+    try:
+        text = file_access.read(path).decode("utf-8", errors="replace")
+    except OSError:
+        return False
+    return re.search(r"(?i)\b(password|secret|private_key_base64)\b[\"']?\s*[:=]", text) is not None
+
+
+def _numbers(version: str) -> list[int]:
+    return [int(part) for part in re.match(r"[\d.]*", version)[0].split(".") if part]  # type: ignore[index]
+
+
+def _same_length(a: list[int], b: list[int]) -> tuple[list[int], list[int]]:
+    length = max(len(a), len(b))
+    return a + [0] * (length - len(a)), b + [0] * (length - len(b))
+
+
+def _host(endpoint: str) -> str:
+    match = TCP.fullmatch(endpoint)
+    return match[1] if match else ""
+
+
+def _gb(amount: float) -> str:
+    return f"{amount / 1e9:.3g} GB"
+
+
+def _user(uid: int) -> str:
+    import pwd
+
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
+
+
+def _group(gid: int) -> str:
+    import grp
+
+    try:
+        return grp.getgrgid(gid).gr_name
+    except KeyError:
+        return str(gid)
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text().strip()
+    except OSError:
+        return ""
+
+
+def worst(findings: Iterable[Finding]) -> Mark:
+    """The worst mark of all."""
+    marks = {one.mark for one in findings}
+    return "wrong" if "wrong" in marks else "doubt" if "doubt" in marks else "well"

@@ -1,0 +1,186 @@
+"""``thermal fit`` and ``thermal predict`` on files: a recording in, models of its axes or what they expect out.
+
+An axis that cannot be answered says why and holds up no other. The model file is JSON; ``predict`` reads what ``fit``
+wrote.
+"""
+
+from collections.abc import Mapping
+from itertools import chain
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from drivers import file_access
+from drivers.errors import ConfigError, NotReady
+from drivers.quantities import DURATION_S, FIT_NUMBER
+from drivers.recordings import iter_blocks, load_samples
+from drivers.sample import AXES, Floats
+from monitor.drift.thermal.interval_means import Means, interval_means
+from monitor.drift.thermal.thermal_fit import fitted
+from monitor.drift.thermal.thermal_model import ThermalModel
+from monitor.drift.thermal.thermal_response import Shape
+from monitor.drift.thermal.thermal_study import Outlook, Study, judge, nice_interval
+from monitor.estimation.regular_grid import with_temperature
+
+SCHEMA: Final = "imu-monitor/thermal-model/1"
+
+
+class AxisRow(msgspec.Struct):
+    """One axis in a model file."""
+
+    powers: int
+    time_constants: list[float]
+    reference: float
+    sizes: list[float]
+    start: list[float]
+    phi: float
+    sigma: float
+    covariance: list[list[float]]
+    temperature: tuple[float, float]
+    equation: dict[str, list[float] | float] | None = None
+    """For other readers; not read back."""
+
+
+class ModelFile(msgspec.Struct):
+    """A model file."""
+
+    schema: str
+    interval: float
+    axes: dict[str, AxisRow]
+
+
+def fit(
+    recording: Path, interval_s: float | None = None, rate_hz: float | None = None, last_s: float | None = None
+) -> Study:
+    """Means and models of every axis; with ``last_s`` of the recording's end alone.
+
+    Raises:
+        RecordingError, ConfigError: no recording, or none with temperature
+    """
+    values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
+    means = _means(values, temperature_c, rate, interval_s or nice_interval(temperature_c.size / rate, rate))
+    interval = next(iter(means.values())).interval_s  # of whole samples
+    fits, refused = {}, {}
+    for axis, one in means.items():
+        try:
+            fits[axis] = fitted(one)
+        except NotReady as error:
+            refused[axis] = str(error)
+    return Study(recording.name, interval, means, fits, refused, notes)
+
+
+def predict(
+    recording: Path, models: Mapping[str, ThermalModel], rate_hz: float | None = None, last_s: float | None = None
+) -> Outlook:
+    """What models of an earlier recording expect of this one."""
+    values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
+    interval = next(iter(models.values())).interval_s
+    means = _means(values, temperature_c, rate, interval)
+    judged, refused = {}, {}
+    for axis, one in means.items():
+        if axis not in models:
+            refused[axis] = "the model says nothing of it"
+        elif one.known.sum() < 2:
+            refused[axis] = f"fewer than two intervals of {interval:g} s"
+        else:
+            judged[axis] = judge(models[axis], one)
+    return Outlook(recording.name, interval, means, judged, refused, notes)
+
+
+def to_file(study: Study) -> bytes:
+    """The model file of all axes that were fitted."""
+    rows = {axis: _row(one.model) for axis, one in study.fits.items()}
+    return msgspec.json.format(msgspec.json.encode(ModelFile(SCHEMA, study.interval_s, rows)), indent=1)
+
+
+def from_file(path: Path) -> dict[str, ThermalModel]:
+    """Models by axis; a pipe is read too.
+
+    Raises:
+        ConfigError: what is wrong with the file
+    """
+    try:
+        found = msgspec.json.decode(file_access.read(path, pipe=True), type=ModelFile)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ConfigError(f"{path}: no thermal model: {error}") from error
+    if found.schema != SCHEMA:
+        raise ConfigError(f'{path}: schema "{found.schema}"; "{SCHEMA}" is read')
+    if not found.axes:
+        raise ConfigError(f"{path}: no axis in it")
+    try:
+        DURATION_S.check(found.interval)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: interval: {error}") from None
+    return {axis: _model(path, axis, row, found.interval) for axis, row in found.axes.items()}
+
+
+def _row(model: ThermalModel) -> AxisRow:
+    return AxisRow(
+        powers=model.shape.powers,
+        time_constants=list(model.shape.constants_s),
+        reference=model.reference_c,
+        sizes=model.sizes.tolist(),
+        start=model.start.tolist(),
+        phi=model.phi,
+        sigma=model.sigma,
+        covariance=model.covariance.tolist(),
+        temperature=(model.lowest_c, model.highest_c),
+        equation=model.equation,
+    )
+
+
+def _model(path: Path, axis: str, row: AxisRow, interval_s: float) -> ThermalModel:
+    k = len(row.time_constants)
+    terms = 1 + row.powers + k
+    size = terms + 2 * k
+    square = len(row.covariance) == size and all(len(one) == size for one in row.covariance)
+    numbers = (row.reference, row.phi, row.sigma, *row.temperature, *row.sizes, *row.start, *chain(*row.covariance))
+    wrong = [
+        (axis in AXES, f"no such axis; possible are {', '.join(AXES)}"),
+        (row.powers >= 0, f"powers: {row.powers}; it must be 0 or more"),
+        (all(map(DURATION_S.supports, row.time_constants)), f"time_constants: each must be {DURATION_S.range_text()}"),
+        (all(map(FIT_NUMBER.supports, numbers)), f"a number is outside the supported range {FIT_NUMBER.range_text()}"),
+        (len(row.sizes) == terms, f"sizes: {len(row.sizes)} of them; {terms} are needed"),
+        (len(row.start) == k, f"start: {len(row.start)} of them; {k} are needed"),
+        (row.temperature[0] < row.temperature[1], "temperature: the coldest and the warmest of the fit are needed"),
+        (0.0 <= row.phi < 1.0, f"phi: {row.phi:g}; it must be from 0 to below 1"),
+        (square, f"covariance: {size} rows and columns are needed"),
+    ]
+    for right, text in wrong:
+        if not right:
+            raise ConfigError(f"{path}: axes.{axis}: {text}")
+    return ThermalModel(
+        shape=Shape(row.powers, tuple(row.time_constants)),
+        interval_s=interval_s,
+        reference_c=row.reference,
+        sizes=np.array(row.sizes),
+        start=np.array(row.start),
+        phi=row.phi,
+        sigma=row.sigma,
+        covariance=np.array(row.covariance, dtype=np.float64),
+        lowest_c=row.temperature[0],
+        highest_c=row.temperature[1],
+    )
+
+
+def _read(
+    recording: Path, rate_hz: float | None, last_s: float | None
+) -> tuple[Floats, Floats, float, tuple[str, ...]]:
+    """Values [n, 6], temperature [n], rate and notes."""
+    found = load_samples(recording, rate_hz, last_s)
+    values, temperature_c, rate, notes = with_temperature(list(iter_blocks(found)), found.rate_hz)
+    if not np.isfinite(temperature_c).any():
+        raise ConfigError(f"{recording}: no temperature in it; a column temp or temperature, in °C, is needed")
+    return values, temperature_c, rate, (*found.notes, *notes)
+
+
+def _means(values: Floats, temperature_c: Floats, rate_hz: float, interval_s: float) -> dict[str, Means]:
+    return {
+        axis: interval_means(values[:, at], temperature_c, rate_hz, interval_s)
+        for at, axis in enumerate(AXES)
+        if np.isfinite(values[:, at]).any()
+    }

@@ -1,0 +1,1 @@
+"""Shared by all packages: units, compiled kernels, zenoh topics, distributions, minimization, locks."""

@@ -1,0 +1,169 @@
+"""Advisory lock on a storage folder, so that one process at a time writes recordings there, and one the history.
+
+The lock is ``flock`` on a file in the folder. The kernel releases it when its holder ends, in whatever way. The file is
+never deleted. It holds the process id and the host of the holder, for messages. Readers need no lock.
+
+``hold`` takes the lock, or checks that it is still held: if the folder or the lock file is deleted or replaced, the
+lock is gone with it. The descriptor is closed when another program is executed, so hooks and viewers do not inherit it.
+"""
+
+import contextlib
+import errno
+import fcntl
+import os
+import socket
+import stat
+import time
+from pathlib import Path
+from typing import Final
+
+from drivers.file_access import KINDS, check_folder
+
+RECORDING_LOCK: Final = "recording.lock"
+HISTORY_LOCK: Final = "history.lock"
+NO_LOCKS: Final = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL)
+"""What ``flock`` says on a file system without locks."""
+SECOND_TRY_S: Final = 0.05
+"""``doctor`` holds the lock for a moment while it looks who does."""
+HOLDER_BYTES: Final = 300
+
+
+class FolderLock:
+    """Lock on one kind of content of a folder.
+
+    Parameters
+    ----------
+    folder
+        The folder. ``hold`` makes it if there is none.
+    name
+        Name of the lock file in it.
+    """
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self.folder = folder
+        self.path = folder / name
+        self.warning = ""
+        """One line if the file system has no locks; the folder is used without one then."""
+        self._descriptor: int | None = None
+
+    def hold(self) -> str:
+        """Take the lock, or check that it is still held. Does not wait for its holder.
+
+        Returns
+        -------
+        str
+            "" if the lock is held; else one line that says which process holds it.
+
+        Raises
+        ------
+        OSError
+            The folder or the lock file cannot be made or opened.
+        """
+        if self._descriptor is not None:
+            if self._in_place(self._descriptor):
+                return ""
+            self.release()
+        check_folder(self.folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        descriptor = _opened(self.path)
+        try:
+            free = self._lock(descriptor)
+            if free and self._in_place(descriptor):
+                _write_holder(descriptor)
+                self._descriptor = descriptor
+                return ""
+            return f"{self.folder}: in use by {_holder(descriptor)}"
+        finally:
+            if self._descriptor != descriptor:
+                os.close(descriptor)
+
+    @property
+    def held(self) -> bool:
+        """True if the lock was held at the last call of ``hold``."""
+        return self._descriptor is not None
+
+    def release(self) -> None:
+        """Give the lock back; the file stays."""
+        descriptor, self._descriptor = self._descriptor, None
+        if descriptor is not None:
+            os.close(descriptor)
+
+    def _in_place(self, descriptor: int) -> bool:
+        """Return True if the lock file still has its name in the folder."""
+        try:
+            return os.path.samestat(os.stat(self.path, follow_symlinks=False), os.fstat(descriptor))
+        except OSError:
+            return False
+
+    def _lock(self, descriptor: int) -> bool:
+        self.warning = ""
+        for wait_s in (SECOND_TRY_S, 0.0):
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                time.sleep(wait_s)
+            except OSError as error:
+                if error.errno not in NO_LOCKS:
+                    raise
+                self.warning = (
+                    f"{self.folder}: this file system has no locks ({error.strerror}); make sure that no other "
+                    f"imu-monitor uses the folder"
+                )
+                return True
+            else:
+                return True
+        return False
+
+
+def holder(folder: Path, name: str) -> str:
+    """Return who holds the lock of a folder; "" if nobody does, or it cannot be found out.
+
+    Parameters
+    ----------
+    folder
+        The folder.
+    name
+        Name of the lock file in it; it is not made.
+    """
+    try:
+        descriptor = os.open(folder / name, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except OSError:
+        return ""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return _holder(descriptor)
+    except OSError:
+        return ""
+    else:
+        return ""
+    finally:
+        os.close(descriptor)
+
+
+def _opened(path: Path) -> int:
+    # NFS locks only what is open for writing; a FIFO would be waited for without O_NONBLOCK
+    flags = os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW
+    descriptor = os.open(path, flags, 0o644)
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(descriptor)
+        kind = KINDS.get(stat.S_IFMT(mode), "something else")
+        raise OSError(errno.EINVAL, f"{path.name} in it is {kind}, not a regular file", str(path))
+    return descriptor
+
+
+def _write_holder(descriptor: int) -> None:
+    # a disk that is full keeps no name: the lock holds all the same, and its holder stays unnamed
+    with contextlib.suppress(OSError):
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, f"{os.getpid()} {socket.gethostname()}\n".encode(errors="replace"), 0)
+
+
+def _holder(descriptor: int) -> str:
+    """Name the holder by what it wrote into the file."""
+    words = os.pread(descriptor, HOLDER_BYTES, 0).decode(errors="replace").split()
+    if len(words) != 2 or not words[0].isdecimal():
+        return "another process"
+    host = "" if words[1] == socket.gethostname() else f" on {words[1]}"
+    return f"process {words[0]}{host}"

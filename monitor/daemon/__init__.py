@@ -1,0 +1,1 @@
+"""The service: device workers, pipeline, outputs, restart and reload."""

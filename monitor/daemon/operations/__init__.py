@@ -1,0 +1,1 @@
+"""Unattended operation: limits, hooks, metrics, systemd and the reconcile command of a running service."""

@@ -1,0 +1,1 @@
+"""Recordings that the service writes, and how long they are kept."""

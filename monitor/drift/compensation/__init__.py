@@ -1,0 +1,1 @@
+"""Compensation of gyro drift while the carrier may move."""

@@ -1,0 +1,1 @@
+"""Bias against temperature: model, fit, online update and prediction."""

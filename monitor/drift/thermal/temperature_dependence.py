@@ -1,0 +1,387 @@
+"""Test whether the slow part of a bias depends on temperature, and whether heating and cooling differ.
+
+A random walk correlates with a temperature ramp by chance, so ordinary regression would name axes that do not depend
+on temperature. Both tests are therefore generalised least squares under a null hypothesis of correlated noise: white
+noise of the interval means plus a random walk whose increments may be correlated themselves (a smooth drift). The
+ratio of the two and the correlation of the increments are not known. An F test is made for every pair on a grid, and
+the least significant result counts among the pairs whose restricted likelihood (Harville, J. Am. Stat. Assoc. 72,
+1977) is within PLAUSIBLE of the best. The measured rates of false statements are in docs/thermal.md.
+
+``find_dependence`` tests a cubic polynomial in temperature, alone and with each description of hysteresis.
+``find_hysteresis`` tests the descriptions of hysteresis beside a polynomial of order 5. The descriptions are:
+
+- differences between heating and cooling that vanish at the ends of the temperature range;
+- first-order lags, for heat that reaches the sensor late;
+- play operators, whose sum is the Prandtl-Ishlinskii model of rate-independent hysteresis (Visintin, Differential
+  Models of Hysteresis, 1994, chapter III).
+
+Where temperature rose and fell, a constant drift with time belongs to the null hypothesis. Where it went one way, such
+a drift cannot be told from a dependence on temperature, and ``one_way`` is True.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+
+from drivers.sample import Floats
+from monitor.common.distributions import incomplete_beta
+from monitor.drift.thermal.interval_means import Means
+from monitor.drift.thermal.thermal_model import whole
+from monitor.drift.thermal.thermal_response import lagged
+
+SIGNIFICANCE: Final = 0.01
+"""Largest p-value of a dependence or a hysteresis that is reported, after Bonferroni's correction."""
+MOST: Final = 0.5
+"""Share of the variance of the means from which on temperature explains most of it."""
+MAX_MEANS: Final = 150
+"""More means than this are averaged in groups: the cost of the test grows with their cube."""
+MIN_FREE: Final = 4
+"""Degrees of freedom that a regression must leave."""
+PLAUSIBLE: Final = 2.0
+"""Difference of the logarithm of the restricted likelihood."""
+WALK_RATIOS: Final = (0.0, *np.geomspace(1e-3, 1e3, 9).tolist())
+"""Variance that the random walk gains in an interval over the white variance of a mean."""
+INCREMENT_CORRELATIONS: Final = (0.0, 0.5, 0.8, 0.95)
+"""Of successive increments of the random walk."""
+REVERSAL: Final = 0.05
+"""Share of the temperature range by which temperature must return to have changed its direction."""
+NOISE_REVERSAL: Final = 3.0
+"""Standard errors of a mean of temperature, likewise."""
+LAG_INTERVALS: Final = (1.0, 2.5, 6.0, 15.0)
+"""Time constants of the lags, in intervals."""
+PLAY_WIDTHS: Final = (0.05, 0.1, 0.2, 0.35)
+"""Half widths of the play operators, as shares of the temperature range."""
+LOOP_POWERS: Final = 4
+"""Terms of the difference between heating and cooling."""
+FOLDS: Final = 6
+"""Parts of the means for cross-validation; successive means belong to different parts."""
+DEPENDENT: Final = 1e-4
+"""A regressor of which less than this share is new is left out."""
+CURVE: Final = 3
+HYSTERESIS_CURVE: Final = 5
+"""Orders of the polynomial in temperature."""
+
+
+@dataclass(frozen=True, slots=True)
+class TemperatureDependence:
+    """The part of an axis' slow variation that temperature explains."""
+
+    share: float  # of the variance of the interval means, cross-validated
+    p_value: float  # of no dependence
+    form: str  # "cubic", or "cubic with hysteresis"
+    one_way: bool  # True if temperature only rose or only fell
+    interval_s: float
+
+    @property
+    def explains_most(self) -> bool:
+        """True if the greater part of the slow variance is temperature."""
+        return self.share >= MOST
+
+
+@dataclass(frozen=True, slots=True)
+class Hysteresis:
+    """The difference between heating and cooling."""
+
+    size: float  # largest difference of the bias at one temperature, a drift in between included; rad/s or m/s²
+    p_value: float  # of no difference
+
+    @property
+    def significant(self) -> bool:
+        """True if noise does not explain the difference."""
+        return self.p_value < SIGNIFICANCE
+
+
+@dataclass(frozen=True, slots=True)
+class _Regression:
+    p_value: float  # the largest among the plausible noise models
+    likelihood: float  # logarithm, of the most likely noise model; comparable between regressions of the same means
+    smooth: Floats  # [m] the known means less their estimated white noise
+    noise: tuple[float, float]  # ratio and correlation of the most likely noise model
+
+
+def heating_direction(temperature_c: Floats) -> Floats:
+    """Return +1 where temperature last rose and -1 where it last fell, 0 everywhere if it did neither.
+
+    A reversal counts if it exceeds REVERSAL of the range and NOISE_REVERSAL standard errors of a mean.
+
+    Parameters
+    ----------
+    temperature_c : [n] °C, without missing values.
+
+    >>> heating_direction(np.array([0.0, 1.0, 2.0, 2.0, 1.0, 0.0])).tolist()
+    [1.0, 1.0, 1.0, -1.0, -1.0, -1.0]
+    """
+    noise = float(np.median(np.abs(np.diff(temperature_c, 2)))) / 6.0**0.5 / 0.6745 if temperature_c.size > 2 else 0.0
+    threshold = max(REVERSAL * float(np.ptp(temperature_c)), NOISE_REVERSAL * noise)
+    direction = np.zeros(temperature_c.size)
+    highest = lowest = 0
+    now = 0.0
+    for at, value in enumerate(temperature_c.tolist()):
+        if value > temperature_c[highest]:
+            highest = at
+        if value < temperature_c[lowest]:
+            lowest = at
+        if now >= 0.0 and temperature_c[highest] - value > threshold:
+            now, lowest = -1.0, at
+            direction[highest + 1 : at] = now
+        elif now <= 0.0 and value - temperature_c[lowest] > threshold:
+            now, highest = 1.0, at
+            direction[lowest + 1 : at] = now
+        direction[at] = now
+    moved = np.flatnonzero(direction)
+    if moved.size:
+        direction[: moved[0]] = direction[moved[0]]
+    return direction
+
+
+def find_dependence(means: Means) -> TemperatureDependence | None:
+    """Test whether the bias depends on temperature.
+
+    Parameters
+    ----------
+    means : interval means of bias (rad/s or m/s²) and temperature, of which temperature moved.
+
+    Returns
+    -------
+    The dependence with the largest share among the significant ones, or None if noise explains the bias.
+    """
+    pooled = _pooled(means)
+    known, y = pooled.known, pooled.bias
+    x, direction = _scaled(pooled)
+    one_way = not _turned(direction)
+    curve = _polynomial(x, CURVE)
+    regressors = {"cubic": [curve]}
+    if not one_way:
+        regressors["cubic with hysteresis"] = [np.hstack([curve, each]) for each in _loops(x, direction).values()]
+    nuisance = np.zeros((x.size, 0)) if one_way else _time(x.size)
+    count = sum(len(each) for each in regressors.values())
+    found: TemperatureDependence | None = None
+    for form, candidates in regressors.items():
+        for columns in candidates:
+            tested = _regression(y, nuisance, columns, known)
+            if tested is None:
+                continue
+            p_value = min(count * tested.p_value, 1.0)
+            if p_value >= SIGNIFICANCE:
+                continue
+            share = _validated_share(y, nuisance, columns, known, tested.noise)
+            if found is None or share > found.share + 0.01:  # the simpler form has precedence
+                found = TemperatureDependence(share, p_value, form, one_way, means.interval_s)
+    return found
+
+
+def find_hysteresis(means: Means) -> Hysteresis | None:
+    """Test whether the bias differs between heating and cooling at the same temperature.
+
+    Parameters
+    ----------
+    means : interval means of bias (rad/s or m/s²) and temperature, of which temperature moved.
+
+    Returns
+    -------
+    The size and its p-value, or None if temperature went one way or the means are too few.
+    """
+    pooled = _pooled(means)
+    x, direction = _scaled(pooled)
+    if not _turned(direction):
+        return None
+    curve, loops = _polynomial(x, HYSTERESIS_CURVE), _loops(x, direction)
+    drifting = np.hstack([_time(x.size), curve])
+    # one lag or one play operator leaves more degrees of freedom than a sum of four, which counts with few means
+    parts = [loops[name][:, [at]] for name in ("lag", "play") for at in range(loops[name].shape[1])]
+    tests = [_regression(pooled.bias, drifting, each, pooled.known) for each in (*loops.values(), *parts)]
+    p_values = [one.p_value for one in tests if one is not None]
+    # within one cycle a drift and a loop are nearly collinear, so the size is that of a fit without a drift
+    fits = [_regression(pooled.bias, curve, each, pooled.known) for each in (*loops.values(), *parts)]
+    best = max((one for one in fits if one is not None), key=lambda one: one.likelihood, default=None)
+    if not p_values or best is None:
+        return None
+    size = _opening(best.smooth, x[pooled.known], direction[pooled.known])
+    return Hysteresis(size, min(len(p_values) * min(p_values), 1.0))
+
+
+def _pooled(means: Means) -> Means:
+    """Return the means, averaged in groups if there are more than MAX_MEANS."""
+    group = -(-means.bias.size // MAX_MEANS)
+    if group == 1:
+        return means
+    count = means.bias.size // group
+    known = means.known[: count * group].reshape(count, group)
+    rows = (np.where(known, part[: count * group].reshape(count, group), 0.0) for part in (means.bias, means.error))
+    bias, error = (part.sum(axis=1) for part in rows)
+    there = np.maximum(known.sum(axis=1), 1)
+    enough = 2 * known.sum(axis=1) >= group
+    temperature_c = whole(means.temperature_c)[: count * group].reshape(count, group).mean(axis=1)
+    return Means(
+        group * means.interval_s,
+        np.where(enough, bias / there, np.nan),
+        error / there**1.5,
+        temperature_c,
+    )
+
+
+def _scaled(means: Means) -> tuple[Floats, Floats]:
+    """Return temperature scaled to -1 … 1, and its direction."""
+    temperature_c = whole(means.temperature_c)
+    lowest, swing = float(temperature_c.min()), float(np.ptp(temperature_c))
+    return 2.0 * (temperature_c - lowest) / swing - 1.0, heating_direction(temperature_c)
+
+
+def _turned(direction: Floats) -> bool:
+    """Return True if temperature rose and fell for three means or more each."""
+    return min(int((direction > 0.0).sum()), int((direction < 0.0).sum())) >= 3
+
+
+def _polynomial(x: Floats, order: int) -> Floats:
+    return np.stack([x**power for power in range(1, order + 1)], axis=1)
+
+
+def _time(n: int) -> Floats:
+    return np.linspace(-1.0, 1.0, n)[:, None]
+
+
+def _loops(x: Floats, direction: Floats) -> Mapping[str, Floats]:
+    """Return the regressors [n, k] of each description of hysteresis."""
+    return {
+        "direction": np.stack([direction * (1.0 - x**2) * x**power for power in range(LOOP_POWERS)], axis=1),
+        "lag": np.stack([lagged(x, float(np.exp(-1.0 / constant))) - x for constant in LAG_INTERVALS], axis=1),
+        "play": np.stack([_play(x, 2.0 * width) - x for width in PLAY_WIDTHS], axis=1),
+    }
+
+
+def _play(x: Floats, half_width: float) -> Floats:
+    """Return the play operator: an output that is dragged along by x at a distance of half_width.
+
+    >>> _play(np.array([0.0, 1.0, 0.0, -1.0]), 0.25).tolist()
+    [0.0, 0.75, 0.25, -0.75]
+    """
+    out = np.empty(x.size)
+    level = float(x[0])
+    for at, value in enumerate(x.tolist()):
+        level = min(max(level, value - half_width), value + half_width)
+        out[at] = level
+    return out
+
+
+def _regression(y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray) -> _Regression | None:
+    """Return the F test of the tested regressors beside the nuisance ones, or None if the means are too few."""
+    if int(known.sum()) <= MIN_FREE + 1:
+        return None
+    whiteners, log_determinants = _whiteners(known.tobytes())
+    own = nuisance.shape[1]
+    columns = np.hstack([nuisance, tested])[known]
+    columns = columns - columns.mean(axis=0)
+    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    _, r = np.linalg.qr(columns / scale)
+    new = np.flatnonzero(np.abs(np.diag(r)) > DEPENDENT)
+    q, _ = np.linalg.qr((columns / scale)[:, new])
+    at = int((new < own).sum())
+    count, terms = whiteners.shape[1], new.size
+    free = count - terms
+    if free < MIN_FREE or terms == at:
+        return None
+    values = y[known] - y[known].mean()
+    triangles = np.asarray(np.linalg.qr(whiteners @ np.column_stack([q, values]), mode="r"))
+    gained = (triangles[:, at:terms, terms] ** 2).sum(axis=1)
+    floor = np.finfo(float).eps ** 2 * float(values @ values)
+    left = np.maximum(triangles[:, terms, terms] ** 2, max(floor, 1e-300))
+    diagonal = np.abs(triangles[:, np.arange(terms), np.arange(terms)])
+    likelihood = -0.5 * (free * np.log(left) + log_determinants) - np.log(np.maximum(diagonal, 1e-300)).sum(axis=1)
+    unexplained = left / (left + gained)
+    # of F = gained / (terms - at) / (left / free)
+    p_values = incomplete_beta(0.5 * free, 0.5 * (terms - at), unexplained)
+    best = int(likelihood.argmax())
+    plausible = likelihood >= likelihood[best] - PLAUSIBLE
+    sizes = np.linalg.solve(triangles[best, :terms, :terms], triangles[best, :terms, terms])
+    white = whiteners[best].T @ (whiteners[best] @ (values - q @ sizes))
+    full = float((-0.5 * (count * np.log(left) + log_determinants)).max())
+    return _Regression(float(p_values[plausible].max()), full, values - white, _noise_models()[best])
+
+
+def _validated_share(
+    y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray, noise: tuple[float, float]
+) -> float:
+    """Return the share of the variance of the means that regressors predict which were fitted to the other means."""
+    columns = np.hstack([nuisance, tested])[known]
+    columns = columns - columns.mean(axis=0)
+    columns /= np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    values = y[known] - y[known].mean()
+    whitener, _ = _whitener(known, *noise)
+    precision = whitener.T @ whitener
+    left = np.empty(values.size)
+    for fold in range(FOLDS):
+        out = np.arange(values.size) % FOLDS == fold
+        beside = precision[np.ix_(~out, out)]
+        marginal = precision[np.ix_(~out, ~out)] - beside @ np.linalg.solve(precision[np.ix_(out, out)], beside.T)
+        others = columns[~out]
+        sizes = np.linalg.lstsq(others.T @ marginal @ others, others.T @ marginal @ values[~out], rcond=1e-12)[0]
+        rest = values - columns[:, nuisance.shape[1] :] @ sizes[nuisance.shape[1] :]
+        left[out] = rest[out] - rest[~out].mean()
+    return 1.0 - float(np.mean(left**2) / np.var(values))
+
+
+def _noise_models() -> list[tuple[float, float]]:
+    """Return ratio and correlation of each noise model; without a random walk there is no correlation."""
+    return [(ratio, one) for ratio in WALK_RATIOS for one in (INCREMENT_CORRELATIONS if ratio else (0.0,))]
+
+
+@lru_cache(maxsize=4)
+def _whiteners(known: bytes) -> tuple[Floats, Floats]:
+    """Return a whitening matrix [g, m - 1, m] of the m known means and its log determinant [g], by noise model."""
+    there = np.frombuffer(known, np.bool_)
+    made = [_whitener(there, *one) for one in _noise_models()]
+    return np.stack([each for each, _ in made]), np.array([each for _, each in made])
+
+
+def _whitener(known: np.ndarray, ratio: float, correlation: float) -> tuple[Floats, float]:
+    """Return the matrix [m - 1, m] that makes differences of the m known means white, and the log determinant.
+
+    The covariance of the differences of successive means is that of white noise, tridiagonal (-1, 2, -1), plus that of
+    the walk. A random walk averaged over intervals has increments of variance 2/3 and covariance 1/6.
+    """
+    n, at = known.size, np.flatnonzero(known)
+    if correlation:
+        row = (1.0 - correlation) / (1.0 + correlation) * correlation ** np.arange(n - 1)
+    else:
+        row = np.zeros(n - 1)
+        row[:2] = (2.0 / 3.0, 1.0 / 6.0)
+    walk = _toeplitz(np.asarray(row))[at[0] : at[-1], at[0] : at[-1]]
+    firsts = at[:-1] - at[0]
+    walk = np.add.reduceat(np.add.reduceat(walk, firsts, axis=0), firsts, axis=1)
+    white = np.zeros(at.size - 1)
+    white[:2] = (2.0, -1.0)
+    covariance = ratio * walk + _toeplitz(white)
+    lower = np.linalg.cholesky(covariance)
+    differences = np.diff(np.eye(at.size), axis=0)
+    return np.linalg.solve(lower, differences), 2.0 * float(np.log(np.diag(lower)).sum())
+
+
+def _toeplitz(row: Floats) -> Floats:
+    """Return the symmetric matrix [n, n] of the row [n]: each diagonal has one value."""
+    at = np.arange(row.size)
+    return np.asarray(row[np.abs(at[:, None] - at)])
+
+
+def _opening(bias: Floats, x: Floats, direction: Floats) -> float:
+    """Return the largest difference between the legs of heating and those of cooling at one temperature."""
+    grid = np.linspace(-0.95, 0.95, 39)
+    legs: dict[float, list[Floats]] = {1.0: [], -1.0: []}
+    for leg in np.split(np.arange(x.size), np.flatnonzero(np.diff(direction)) + 1):
+        order = leg[np.argsort(x[leg], kind="stable")]
+        if order.size > 1:
+            inside = (grid >= x[order[0]]) & (grid <= x[order[-1]])
+            legs[float(direction[leg[0]])].append(np.where(inside, np.interp(grid, x[order], bias[order]), np.nan))
+    rising, falling = (_mean_of_legs(each, grid.size) for each in (legs[1.0], legs[-1.0]))
+    apart = np.abs(rising - falling)
+    return float(np.nanmax(apart)) if np.isfinite(apart).any() else 0.0
+
+
+def _mean_of_legs(legs: list[Floats], n: int) -> Floats:
+    """Return the mean [n] of the legs that reach each temperature, NaN where none does."""
+    rows = np.array(legs).reshape(len(legs), n)
+    there = np.isfinite(rows)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(there, rows, 0.0).sum(axis=0) / there.sum(axis=0))

@@ -1,0 +1,138 @@
+"""Axes whose slow variation is temperature, and K and R after removing what temperature explains of the bias.
+
+The input is an analysis and the temperature on its grid. Each axis is tested for a dependence of its bias on
+temperature against a null hypothesis of correlated noise (``drift.temperature_dependence``), whatever the status of its
+coefficients. The bias of a dependent axis is fitted to temperature as ``thermal fit`` does. The modelled bias is drawn
+smoothly through the middles of the intervals, because steps and corners would be noise of their own, and subtracted
+from the samples. Curve and coefficients are then computed again. Axes without a significant dependence stay as they are
+and are not named.
+
+A model can follow a part of a random walk by chance, so a share of a few percent of K or R means nothing.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from drivers.errors import NotReady
+from drivers.sample import AXES, Floats
+from monitor.drift.thermal.interval_means import interval_means
+from monitor.drift.thermal.temperature_dependence import TemperatureDependence, find_dependence
+from monitor.drift.thermal.thermal_fit import LEAST_C, check, fitted
+from monitor.drift.thermal.thermal_model import predicted
+from monitor.drift.thermal.thermal_study import nice_interval
+from monitor.estimation.allan.batch import EachAxis
+from monitor.estimation.analysis import Analysis, refitted
+from monitor.estimation.fit.coefficients import LETTERS, Coefficients, Status
+
+SLOW: Final = ("K", "R")
+
+
+@dataclass(frozen=True, slots=True)
+class WithoutTemperature:
+    """The dependence of each axis on temperature, and the coefficients with temperature taken out of the bias."""
+
+    models: Mapping[str, str]  # axis -> form of its model; axes that temperature explains something of
+    before: Coefficients
+    coefficients: Coefficients
+    k_or_r: tuple[bool, ...]  # [6] as in ``Estimate``
+    dependences: Mapping[str, TemperatureDependence] = field(default_factory=dict)  # significant ones, by axis
+
+    @property
+    def axes_of_temperature(self) -> tuple[str, ...]:
+        """Axes of which temperature explains most of the slow variance."""
+        return tuple(axis for axis, one in self.dependences.items() if one.explains_most)
+
+    def share(self, letter: str, axis: str) -> float | None:
+        """Of the letter's variance that was temperature: 1 − after²/before², at least; None where it was not there.
+
+        Where the rest is only bounded, the bound stands for it.
+        """
+        at = LETTERS.index(letter), AXES.index(axis)
+        if self.before.status[at] != Status.ESTIMATED or self.coefficients.status[at] == Status.UNESTIMATED:
+            return None
+        bounded = self.coefficients.status[at] == Status.UPPER_BOUND
+        after = float((self.coefficients.hi if bounded else self.coefficients.value)[at])
+        return max(1.0 - (after / float(self.before.value[at])) ** 2, 0.0)
+
+    def matters(self, letter: str, axis: str) -> bool:
+        """Whether the letter is another one: what is left lies below its interval before."""
+        at = LETTERS.index(letter), AXES.index(axis)
+        return self.share(letter, axis) is not None and bool(self.coefficients.hi[at] < self.before.lo[at])
+
+
+def moved(temperatures_c: Floats) -> bool:
+    """Whether temperature [n] is there and moved enough for a question."""
+    return (
+        bool(np.isfinite(temperatures_c).any()) and float(np.ptp(temperatures_c[np.isfinite(temperatures_c)])) > LEAST_C
+    )
+
+
+def without_temperature(result: Analysis, temperature_c: Floats, each: EachAxis = map) -> WithoutTemperature | None:
+    """Return the same analysis with temperature [n] in °C taken out, or None if no axis depends on temperature."""
+    rate_hz = result.estimate.rate_hz
+    interval_s = nice_interval(len(result.values) / rate_hz, rate_hz)
+    values, models, dependences = result.values, dict[str, str](), dict[str, TemperatureDependence]()
+    for at, axis in enumerate(AXES):
+        means = interval_means(result.values[:, at], temperature_c, rate_hz, interval_s)
+        try:
+            check(means)
+        except NotReady:
+            continue
+        dependence = find_dependence(means)
+        if dependence is None:
+            continue
+        dependences[axis] = dependence
+        model = fitted(means).model
+        if model.shape.memory or model.shape.powers:
+            values = values.copy() if values is result.values else values
+            course = predicted(model, means.temperature_c, began=True).bias
+            values[:, at] -= drawn(course, round(means.interval_s * rate_hz), len(values))
+            models[axis] = model.shape.name
+    if not dependences:
+        return None
+    before, k_or_r = result.estimate.coefficients, result.estimate.k_or_r
+    after = before
+    if models:
+        fit = refitted(result, values, each)
+        after, k_or_r = fit.coefficients, fit.k_or_r
+    return WithoutTemperature(models, before, after, tuple(bool(one) for one in k_or_r), dependences)
+
+
+def drawn(course: Floats, length: int, n: int) -> Floats:
+    """Values of intervals of so many samples as a smooth course of n samples, about zero; straight beyond the ends.
+
+    >>> drawn(np.array([1.0, 3.0, 5.0]), 2, 6).tolist()
+    [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
+    """
+    bend = _natural_spline(course)
+    at = (np.arange(n) + 0.5) / length - 0.5  # in intervals, 0 = middle of the first
+    left = np.clip(at.astype(np.int64), 0, course.size - 2)
+    right = left + 1
+    t = np.clip(at, 0.0, course.size - 1.0) - left
+    made = (1.0 - t) * course[left] + t * course[right]
+    made += ((1.0 - t) ** 3 - (1.0 - t)) / 6.0 * bend[left] + (t**3 - t) / 6.0 * bend[right]
+    first = course[1] - course[0] - bend[1] / 6.0
+    last = course[-1] - course[-2] + bend[-2] / 6.0
+    made += first * np.minimum(at, 0.0) + last * np.maximum(at - (course.size - 1.0), 0.0)
+    return np.asarray(made - made.mean())
+
+
+def _natural_spline(y: Floats) -> Floats:
+    """Return the second derivatives of the natural cubic spline through y [n ≥ 2] at steps of one.
+
+    de Boor, A Practical Guide to Splines, 1978, chapter IV: the system of M is tridiagonal, (1, 4, 1) / 6.
+
+    >>> _natural_spline(np.array([0.0, 1.0, 0.0])).tolist()
+    [0.0, -3.0, 0.0]
+    """
+    bend, right = np.zeros(y.size), 6.0 * np.diff(y, 2)
+    diagonal = np.full(right.size, 4.0)
+    for i in range(1, right.size):
+        diagonal[i] -= 1.0 / diagonal[i - 1]
+        right[i] -= right[i - 1] / diagonal[i - 1]
+    for i in reversed(range(right.size)):
+        bend[i + 1] = (right[i] - bend[i + 2]) / diagonal[i]
+    return bend

@@ -1,0 +1,1 @@
+"""Allan, total and Hadamard variance with covariance and degrees of freedom."""

@@ -1,0 +1,468 @@
+"""Compiled part of ``change``: Haar differences of every octave, their CUSUMs, and what verdicts are made of.
+
+Samples come in, missing ones as NaN in their places, and are worked off in ticks of 32; what comes out lies in
+``State``. An alarm that has waited its time stops the kernel, so that the verdict is made at the same sample however
+blocks are cut.
+
+- **Cascade.** A binary counter of block sums: octave j joins two blocks of m = 2^j samples to one difference
+  z = (mean − mean')/√2, whose mean square is the Allan variance at m; then hands their sum on. Differences of one
+  octave do not overlap and Haar functions of different octaves are orthogonal, so for white noise and random walk
+  all z are independent. Two additions a sample and axis, whatever the number of octaves.
+- **Evidence.** n, S: number and sum of the z² since the reference began, n₁, S₁ those since a suspected onset. The
+  likelihood ratio of "variance × r since then" against "no change", of what does not depend on the unknown variance
+  (the maximal invariant under scale), is
+  g = −(n/2) ln(1 − (1 − 1/r) S₁/S) − (n₁/2) ln r.
+  For a long reference it is Page's CUSUM ½[u(1 − 1/r) − ln r] summed; for a short one it has the reference's own
+  uncertainty in it, and its mean without a change is 1 for every onset, so that P(alarm within k looks) ≤ k e^−h
+  (Shiryaev–Roberts). The onset moves on whenever g ≤ 0.
+- **Not Gaussian, not independent.** z² is clipped at CLIP times the reference: (4σ)², which cuts 6e-5 of Gaussian
+  z² and lowers their mean by 2e-4, in reference and suspicion alike. g is divided by F, by how much sums of z² spread
+  more than Gaussian ones do, found by a second cascade of Haar differences over the z² themselves: tails, lines and
+  coarse steps have fewer degrees of freedom than terms.
+- **Steps** are sought where a pair of blocks is left of, and the next but one right of, a possible jump.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from drivers.sample import Floats, Ints
+from monitor.common.compiled import compiled
+
+AXES: Final = 6
+RATIOS: Final = np.array([1.2, 1.44, 2.25, 1 / 1.2, 1 / 1.44, 1 / 2.25])
+"""Variance after over before that each CUSUM is tuned to."""
+GAIN: Final = 1.0 - 1.0 / RATIOS
+HALF_LOG: Final = 0.5 * np.log(RATIOS)
+TICK: Final = 32
+"""Samples that are taken at a time: z² of the shortest octaves are summed that long, as logarithms cost."""
+SHORT: Final = 5
+"""Octaves that lie within a tick."""
+RAREST: Final = 1e-6
+"""Least share of extremes that is held for usual."""
+HUGE: Final = 1e150
+"""Whose square is no number any more: such samples count as missing."""
+CLIP: Final = 16.0
+EXTREME: Final = 36.0
+"""u beyond which a difference of two samples counts as an outlier: 6σ, 2e-9 of Gaussian ones."""
+MEDIAN: Final = 0.45494
+"""Median of χ² with one degree of freedom."""
+SEED: Final = 31
+"""First z² of a band, whose median sets where to clip, so that an outlier at the start does not count."""
+SETTLED: Final = 256
+"""z² after which the clip level is set for good."""
+LEARN: Final = 64
+"""Terms, times F², that a reference must have before it may accuse: F, so that they are as good as so many independent
+ones, and F again, so that F is known of sums much longer than what binds the terms together."""
+FEW: Final = 16
+"""Terms that a band must have to bound how far slow noise moves the mean."""
+PAIRS: Final = 8
+"""Pairs before a spread is believed."""
+FLANK: Final = 12.0
+"""u beyond which a pair beside a step is not at rest."""
+CONFIRM: Final = 2
+"""Pairs after a step that must stay at its height."""
+SLOTS: Final = 4
+NEVER: Final = 1 << 62
+
+N, S, LIMIT, SEEDED, F = range(5)
+UNIT_N, UNIT_S, UNIT_RAW, UNIT_INSIDE, UNIT_EXTREME = range(5)
+N1, S1, SINCE, G = range(4)
+HELD, FULL, SQUARES, COUNT, SPREAD = range(5)
+NOISE, BURST, STEP = 1.0, 2.0, 3.0
+KIND, WHERE, START, FOUND, EVIDENCE, DUE = range(6)
+BEFORE, AFTER, PLACE, SIGMA, LEFT = range(1, 6)
+TOTAL, NEXT_DUE = 0, 1
+H_NOISE, H_BURST, STEP_SIGMA, DWELL, LONGEST_DWELL, LEARN_SAMPLES = range(6)
+
+
+class State(NamedTuple):
+    """All that the detector remembers; A = 6 axes, J octaves. Sizes do not grow."""
+
+    levels: Floats  # [6] thresholds and times in samples, H_NOISE …
+    clock: Ints  # [2] samples since start; when the next verdict is due
+    born: Ints  # [A] sample at which the reference began
+    stage: Floats  # [A, TICK] samples of the tick under way
+    half: Floats  # [A, J, 2] sum and count of the block that waits for its partner
+    fill: Ints  # [A, J] whole pairs of blocks held for steps; −1: the one under way is not to be used
+    ring: Floats  # [A, J, 2, 2] the last two pairs: mean, difference of their blocks
+    seeds: Floats  # [A, J, SEED] first z²
+    band: Floats  # [A, J, 5] N, S, LIMIT, SEEDED, F
+    unit: Floats  # [A, J, 5] since the last look: count, clipped z², z², count inside the median, extremes
+    cum: Floats  # [A, J, 5] the same since start
+    cusum: Floats  # [A, J, 6, 4] n1, S1, sample of the suspected onset, evidence g
+    spread: Floats  # [A, J, L, 5] cascade over z²: held sum, whether, squared differences, pairs, spread
+    burst: Floats  # [A, 2] CUSUM of extremes and its last zero
+    alarm: Floats  # [A, 6] KIND 0 = none
+    step: Floats  # [A, 6] octave (−1 none), mean before, after, place, sigma, pairs left
+    snap: Floats  # [levels, SLOTS, A, J, 5] ``cum`` at times spaced as their age
+    snap_at: Ints  # [levels, SLOTS] those times
+
+
+def make_state(octaves: int) -> State:
+    """Nothing seen yet; thresholds are to be filled in."""
+    a, j = AXES, octaves
+    state = State(
+        np.zeros(6), np.array([0, NEVER], np.int64), np.zeros(a, np.int64),
+        np.zeros((a, TICK)), np.zeros((a, j, 2)), np.zeros((a, j), np.int64), np.zeros((a, j, 2, 2)),
+        np.zeros((a, j, SEED)),
+        np.zeros((a, j, 5)), np.zeros((a, j, 5)), np.zeros((a, j, 5)), np.zeros((a, j, RATIOS.size, 4)),
+        np.zeros((a, j, 12, 5)), np.zeros((a, 2)), np.zeros((a, 6)), np.zeros((a, 6)),
+        np.zeros((40, SLOTS, a, j, 5)), np.full((40, SLOTS), -1, np.int64),
+    )  # fmt: skip
+    state.step[:, 0] = -1.0
+    state.band[:, :, F] = 1.0
+    return state
+
+
+@compiled
+def advance(s: State, rows: Floats, first: int) -> int:
+    """Advance by rows [n, 6] from ``first`` on, up to a verdict that is due; returns the row after the last done."""
+    for row in range(first, len(rows)):
+        place = s.clock[TOTAL] % TICK
+        for axis in range(AXES):
+            s.stage[axis, place] = rows[row, axis]
+        s.clock[TOTAL] += 1
+        if place == TICK - 1:
+            now = s.clock[TOTAL]
+            for axis in range(AXES):
+                _tick(s, axis, now)
+            _remember(s, now // TICK)
+            if now >= s.clock[NEXT_DUE]:
+                return row + 1
+    return len(rows)
+
+
+@compiled
+def _tick(s: State, axis: int, now: int) -> None:
+    """TICK samples of one axis: the short octaves within them, then a carry through the longer ones."""
+    sums = s.stage[axis]
+    total, count = 0.0, 0.0
+    for i in range(TICK):
+        if np.abs(sums[i]) < HUGE:
+            total += sums[i]
+            count += 1.0
+        else:
+            sums[i] = np.nan
+    if _count_extremes(sums, s.band, s.cum, s.burst, axis, now) > s.levels[H_BURST]:
+        _suspect_burst(s, axis, now)
+    h = s.levels[H_NOISE]
+    for j in range(SHORT):
+        _differences(sums, s.band, s.unit, s.seeds, axis, j)
+        best = _look(s.unit, s.cum, s.band, s.spread, s.cusum, axis, j, now, h)
+        if best >= 0:
+            _suspect(s, axis, j, best, now)
+    place = now // TICK - 1
+    for j in range(SHORT, s.half.shape[1]):
+        if place & 1 == 0:
+            s.half[axis, j, 0], s.half[axis, j, 1] = total, count
+            return
+        place >>= 1
+        if s.fill[axis, j] >= 0:
+            _pair(s, axis, j, s.half[axis, j, 0], s.half[axis, j, 1], total, count, now)
+            best = _look(s.unit, s.cum, s.band, s.spread, s.cusum, axis, j, now, h)
+            if best >= 0:
+                _suspect(s, axis, j, best, now)
+        else:
+            s.fill[axis, j] = 0
+        total += s.half[axis, j, 0]
+        count += s.half[axis, j, 1]
+
+
+@compiled
+def _differences(sums: Floats, band: Floats, unit: Floats, seeds: Floats, axis: int, j: int) -> None:
+    """All pairs of sums of 2^j samples in a tick; leaves their sums in front. Indices, as views cost more than work."""
+    scale = 0.5 / (1 << j) ** 2
+    limit = band[axis, j, LIMIT]
+    inner, outer = limit * (MEDIAN / CLIP), limit * (EXTREME / CLIP)
+    seeded = band[axis, j, SEEDED] == SEED
+    n, clipped, raw, inside, extreme = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(TICK >> (j + 1)):
+        d = sums[2 * i + 1] - sums[2 * i]
+        sums[i] = sums[2 * i] + sums[2 * i + 1]
+        z2 = d * d * scale
+        if z2 == z2:
+            if not seeded:
+                _gather(band, unit, seeds, axis, j, z2)
+                continue
+            n += 1.0
+            clipped += min(z2, limit)
+            raw += z2
+            inside += z2 < inner
+            extreme += z2 > outer
+    unit[axis, j, UNIT_N] += n
+    unit[axis, j, UNIT_S] += clipped
+    unit[axis, j, UNIT_RAW] += raw
+    unit[axis, j, UNIT_INSIDE] += inside
+    unit[axis, j, UNIT_EXTREME] += extreme
+
+
+@compiled
+def _pair(s: State, axis: int, j: int, sum1: float, count1: float, sum2: float, count2: float, now: int) -> None:
+    """Two blocks of 2^j samples; none is used of which more than a sixteenth is missing."""
+    m = 1 << j
+    least = m - m // 16
+    fill = s.fill[axis, j]
+    if count1 < least or count2 < least:
+        s.fill[axis, j] = 0
+        return
+    d = sum2 / count2 - sum1 / count1
+    mean = (sum1 + sum2) / (count1 + count2)
+    # as if white: 1/count1 + 1/count2 in the place of 2/m
+    z2 = d * d * count1 * count2 / ((count1 + count2) * m)
+    _gather(s.band, s.unit, s.seeds, axis, j, z2)
+    if s.step[axis, 0] == j:
+        _confirm(s, axis, mean, now)
+    elif fill == 2 and s.step[axis, 0] < 0.0 and s.alarm[axis, KIND] == 0.0:
+        _seek_step(s, axis, j, mean, d, now)
+    s.ring[axis, j, 0, 0], s.ring[axis, j, 0, 1] = s.ring[axis, j, 1, 0], s.ring[axis, j, 1, 1]
+    s.ring[axis, j, 1, 0], s.ring[axis, j, 1, 1] = mean, d
+    s.fill[axis, j] = min(fill + 1, 2)
+
+
+@compiled
+def _gather(band: Floats, unit: Floats, seeds: Floats, axis: int, j: int, z2: float) -> None:
+    """One z² into the unit of its band, or among the first, which only tell where to clip."""
+    if band[axis, j, SEEDED] == SEED:
+        limit = band[axis, j, LIMIT]
+        unit[axis, j, UNIT_N] += 1.0
+        unit[axis, j, UNIT_S] += min(z2, limit)
+        unit[axis, j, UNIT_RAW] += z2
+        unit[axis, j, UNIT_INSIDE] += z2 < limit * (MEDIAN / CLIP)
+        unit[axis, j, UNIT_EXTREME] += z2 > limit * (EXTREME / CLIP)
+        return
+    first, one = seeds[axis, j], band[axis, j]
+    first[int(one[SEEDED])] = z2
+    one[SEEDED] += 1.0
+    if one[SEEDED] == SEED:
+        scale = _median_of_seeds(first) / MEDIAN
+        if scale == 0.0:
+            for value in first:
+                scale += value
+            scale /= SEED  # steps of resolution larger than the noise
+        if scale == 0.0:
+            one[SEEDED] = 0.0  # an axis that shows nothing has no noise that could change
+        one[LIMIT] = CLIP * scale
+        one[N], one[S] = SEED, 0.0
+        for value in first:
+            one[S] += min(value, one[LIMIT])
+
+
+@compiled
+def _median_of_seeds(first: Floats) -> float:
+    """Return the value that half of the others do not exceed, by counting."""
+    for value in first:
+        below, equal = 0, 0
+        for other in first:
+            below += other < value
+            equal += other == value
+        if below <= SEED // 2 < below + equal:
+            return float(value)
+    return 0.0
+
+
+@compiled
+def _look(
+    unit: Floats, cum: Floats, band: Floats, spread: Floats, cusum: Floats, axis: int, j: int, now: int, h: float
+) -> int:
+    """Take what was gathered into reference and CUSUMs of one band; returns the ratio that is beyond h, or −1."""
+    k, q = unit[axis, j, UNIT_N], unit[axis, j, UNIT_S]
+    if k == 0.0:
+        return -1
+    for i in range(UNIT_EXTREME + 1):
+        cum[axis, j, i] += unit[axis, j, i]
+        unit[axis, j, i] = 0.0
+    unsettled = band[axis, j, N] < SETTLED
+    band[axis, j, N] += k
+    band[axis, j, S] += q
+    if unsettled and band[axis, j, N] >= SETTLED:
+        band[axis, j, LIMIT] = CLIP * band[axis, j, S] / band[axis, j, N]
+    if k == max(1, TICK >> (j + 1)):
+        _feed_spread(spread, band, axis, j, q, k)
+    return _raise_cusums(cusum, band, axis, j, k, q, now, h)
+
+
+@compiled
+def _feed_spread(spread: Floats, band: Floats, axis: int, j: int, q: float, k: float) -> None:
+    """F: Haar differences of sums of z² over 1, 2, 4, … looks, squared, over those of independent Gaussian z.
+
+    Less their own standard deviation where that may be all there is to it. The largest of all lengths counts.
+    """
+    v = band[axis, j, S] / band[axis, j, N]
+    for level in range(spread.shape[2]):
+        if spread[axis, j, level, FULL] == 0.0:
+            spread[axis, j, level, HELD], spread[axis, j, level, FULL] = q, 1.0
+            return
+        held = spread[axis, j, level, HELD]
+        spread[axis, j, level, FULL] = 0.0
+        spread[axis, j, level, SQUARES] += (q - held) ** 2
+        spread[axis, j, level, COUNT] += 1.0
+        count = spread[axis, j, level, COUNT]
+        q += held
+        if count >= PAIRS and v > 0.0:
+            expected = 4.0 * k * (1 << level) * v * v * count
+            found, error = spread[axis, j, level, SQUARES] / expected, np.sqrt(3.0 / count)
+            if found < 1.0 + 2.0 * error:  # else clearly more than chance: taken whole
+                found /= 1.0 + error
+            spread[axis, j, level, SPREAD] = found
+            largest = 1.0
+            for other in range(spread.shape[2]):
+                largest = max(largest, spread[axis, j, other, SPREAD])
+            band[axis, j, F] = largest
+
+
+@compiled
+def _raise_cusums(
+    cusum: Floats, band: Floats, axis: int, j: int, k: float, q: float, now: int, threshold: float
+) -> int:
+    """The evidence g of each ratio, as in the module's head; returns the ratio of the largest beyond the threshold."""
+    n, total, spread = band[axis, j, N], band[axis, j, S], band[axis, j, F]
+    best, largest = -1, threshold
+    for i in range(RATIOS.size):
+        n1 = cusum[axis, j, i, N1] + k
+        s1 = cusum[axis, j, i, S1] + q
+        g = -1.0  # by Jensen, unless the mean since the onset lies on the ratio's side
+        if (s1 * n - total * n1) * GAIN[i] > 0.0:
+            g = (-0.5 * n * np.log(1.0 - GAIN[i] * s1 / total) - n1 * HALF_LOG[i]) / spread
+        if g <= 0.0:
+            n1, s1 = 0.0, 0.0
+            cusum[axis, j, i, SINCE] = now
+        elif g > largest:
+            best, largest = i, g
+        cusum[axis, j, i, N1], cusum[axis, j, i, S1], cusum[axis, j, i, G] = n1, s1, g
+    return best
+
+
+@compiled
+def _suspect(s: State, axis: int, j: int, i: int, now: int) -> None:
+    """A ratio is beyond its threshold: an alarm if the reference is known well enough."""
+    since = s.cusum[axis, j, i, SINCE]
+    enough = s.band[axis, j, N] - s.cusum[axis, j, i, N1] >= LEARN * s.band[axis, j, F] ** 2
+    if enough and since - s.born[axis] >= s.levels[LEARN_SAMPLES]:
+        _alarm(s, axis, NOISE, j, since, s.cusum[axis, j, i, G], now)
+    elif s.alarm[axis, KIND] == 0.0:
+        _relearn(s, axis, j)
+
+
+@compiled
+def _relearn(s: State, axis: int, j: int) -> None:
+    """What changed while a band was learned is no reference: begin it anew."""
+    s.band[axis, j] = 0.0
+    s.band[axis, j, F] = 1.0
+    s.spread[axis, j] = 0.0
+    s.unit[axis, j] = 0.0
+    s.cusum[axis, j] = 0.0
+
+
+@compiled
+def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis: int, now: int) -> float:
+    """CUSUM of Bernoulli trials: a share of extremes ten times the usual, at least 1 %; returns its height."""
+    outer = 2.0 * band[axis, 0, LIMIT] * (EXTREME / CLIP)  # (y − y')² is 2 z²
+    if band[axis, 0, SEEDED] != SEED or outer == 0.0:
+        return 0.0
+    k, extremes = 0.0, 0.0
+    for i in range(TICK // 2):
+        d = sums[2 * i + 1] - sums[2 * i]
+        if d == d:
+            k += 1.0
+            extremes += d * d > outer
+    usual = max((cum[axis, 0, UNIT_EXTREME] + 0.5) / (cum[axis, 0, UNIT_N] + 1.0), RAREST)
+    raised = max(10.0 * usual, 0.01)
+    if raised >= 1.0:
+        return 0.0
+    burst[axis, 0] += extremes * np.log(raised / usual) - k * raised
+    if burst[axis, 0] <= 0.0:
+        burst[axis, 0], burst[axis, 1] = 0.0, now
+    return float(burst[axis, 0])
+
+
+@compiled
+def _suspect_burst(s: State, axis: int, now: int) -> None:
+    """Too many extremes: an alarm once the reference is known."""
+    if s.burst[axis, 1] - s.born[axis] >= s.levels[LEARN_SAMPLES]:
+        _alarm(s, axis, BURST, 0, s.burst[axis, 1], s.burst[axis, 0], now)
+
+
+@compiled
+def _alarm(s: State, axis: int, kind: float, j: int, since: float, evidence: float, now: int) -> None:
+    """Note the first alarm; the verdict waits for as long again as it took to raise it, within limits."""
+    alarm = s.alarm[axis]
+    if alarm[KIND] != 0.0 and not (alarm[FOUND] == now and evidence > alarm[EVIDENCE]):
+        return
+    wait = np.ceil(min(max(now - since, s.levels[DWELL]), s.levels[LONGEST_DWELL]) / TICK) * TICK
+    alarm[KIND], alarm[WHERE], alarm[START], alarm[FOUND] = kind, j, since, now
+    alarm[EVIDENCE], alarm[DUE] = evidence, now + wait
+    s.step[axis, 0] = -1.0
+    set_due(s)
+
+
+@compiled
+def set_due(s: State) -> None:
+    """When the kernel is to stop for a verdict."""
+    s.clock[NEXT_DUE] = NEVER
+    for axis in range(AXES):
+        if s.alarm[axis, KIND] != 0.0:
+            s.clock[NEXT_DUE] = min(s.clock[NEXT_DUE], int(s.alarm[axis, DUE]))
+
+
+@compiled
+def _seek_step(s: State, axis: int, j: int, mean: float, d: float, now: int) -> None:
+    """Is the newest pair of blocks far from the one before the last, both at rest, and no slope through them?"""
+    ring = s.ring[axis, j]
+    height = mean - ring[0, 0]
+    band = s.band[axis, j]
+    if band[N] == 0.0 or j + 3 >= s.band.shape[1]:
+        return
+    v = band[S] / band[N]
+    square = height * height
+    if square <= s.levels[STEP_SIGMA] ** 2 * v * band[F]:
+        return
+    quiet = 2.0 * FLANK * v * band[F]
+    if d * d > quiet or ring[0, 1] ** 2 > quiet:
+        return
+    if now - s.born[axis] < s.levels[LEARN_SAMPLES]:
+        return
+    for above in range(j + 1, j + 4):
+        if s.band[axis, above, N] < FEW:
+            return
+        # what random walk and flicker do to means four blocks apart: 10/3 of 5.33, and less
+        v = max(v, 2.0 * s.band[axis, above, S] / s.band[axis, above, N])
+    sigma = np.abs(height) / np.sqrt(v * band[F])
+    straight = height - 2.0 * (d + ring[0, 1])  # less what the slopes on both sides explain
+    share = (ring[1, 0] - ring[0, 0]) / height  # of the pair between that lies after the step
+    if sigma <= s.levels[STEP_SIGMA] or straight * height < 0.5 * square or not -0.3 < share < 1.3:
+        return
+    step, m = s.step[axis], 1 << j
+    step[0], step[BEFORE], step[AFTER] = j, ring[0, 0], mean
+    step[PLACE] = now - 2.0 * m * (1.0 + min(max(share, 0.0), 1.0))
+    step[SIGMA], step[LEFT] = sigma, CONFIRM
+
+
+@compiled
+def _confirm(s: State, axis: int, mean: float, now: int) -> None:
+    """A step stays at its height, else it was none; found when it has."""
+    step = s.step[axis]
+    if np.abs(mean - step[AFTER]) > 0.5 * np.abs(step[AFTER] - step[BEFORE]):
+        step[0] = -1.0
+        return
+    step[LEFT] -= 1.0
+    if step[LEFT] == 0.0 and s.alarm[axis, KIND] == 0.0:
+        alarm = s.alarm[axis]
+        alarm[KIND], alarm[WHERE], alarm[START] = STEP, step[0], step[PLACE]
+        alarm[FOUND], alarm[EVIDENCE], alarm[DUE] = now, 0.5 * step[SIGMA] ** 2, now
+        set_due(s)
+
+
+@compiled
+def _remember(s: State, tick: int) -> None:
+    """Keep ``cum``: odd multiples of 2^k ticks in the slots of level k, so that spacing grows as age."""
+    level = 0
+    while tick & 1 == 0:
+        tick >>= 1
+        level += 1
+    slot = (tick >> 1) % SLOTS
+    for axis in range(AXES):
+        for j in range(s.cum.shape[1]):
+            for i in range(UNIT_EXTREME + 1):
+                s.snap[level, slot, axis, j, i] = s.cum[axis, j, i]
+    s.snap_at[level, slot] = s.clock[TOTAL]

@@ -1,0 +1,459 @@
+"""The compiled part of ``rest``: short blocks of samples, what is usual at rest, and the verdict on each block.
+
+A block holds two numbers an axis, the logarithm of its variance and its mean, both without the one sample furthest
+from the mean (an outlier is isolated, a knock rings). The reference is the median and the half-width between quartiles
+of both over the last LEARNED blocks at rest, exact by insertion into a sorted ring: up to a quarter of strange blocks
+in it does no harm, and drift within it widens the band it is judged by.
+
+Verdict: "moving" if the variance of any axis is loud or its mean is off. A new mean at which all axes hold still is a
+new orientation and taken over; what persists in a steady way replaces the reference; so does what is far quieter than
+all that was learned, as then the reference was learned in motion.
+
+Never called with samples out of order; which rows lie in which block is decided by their index alone, so that any cut
+of the stream gives the same verdicts.
+"""
+
+from math import exp, inf, log, nan, sqrt
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from drivers.sample import Floats, Ints
+from monitor.common.compiled import compiled
+
+AXES: Final = 6
+GYROS: Final = 3
+LEARNED: Final = 240
+"""Blocks at rest that the reference is made of, and blocks of steady unrest that make a new one: 60 s of 0.25 s."""
+LEAST: Final = 8
+"""Blocks at rest that make a first reference; its bands are twice as wide as later."""
+BAND: Final = 8.0
+"""Standard deviations (from quartiles) of a block's mean or log variance that are still rest."""
+LOUDER: Final = log(4.0)
+"""The variance must rise by this at the least: smaller changes are left to the detector of changes."""
+LOUDEST: Final = log(100.0)
+"""A greater rise is unrest however much the variance scattered: the reference had motion in it."""
+TOGETHER: Final = log(2.5)
+"""Mean rise over all axes at the least, where all together tell what none does alone."""
+TOGGLE: Final = 0.25
+"""Variance of toggling between two neighbouring levels, in steps²."""
+DRIFT: Final = 100.0
+"""Means are never at rest further away than this times what the noise within blocks explains."""
+QUIETER: Final = log(9.0)
+"""Most axes so far below the lower quartile for LEAST blocks: the reference was learned in motion."""
+SURE: Final = (0.1,) * 3 + (1.0,) * 3
+"""rad/s and m/s²: rms within a block, or change from block to block, that no MEMS sensor shows at rest. Judged by this
+only until there is a reference."""
+SETTLED: Final = 4
+"""Blocks without change at which another mean is a new orientation."""
+NEW_BIAS: Final = 0.035
+"""rad/s, 2 °/s: a gyro's mean may differ by this after handling (g-sensitivity, a bias step); more is rotation,"""
+SPUN: Final = 40
+"""unless held for so many blocks (10 s) without other signs of motion: the reference was learned in rotation."""
+AFTER: Final = 2
+"""Blocks after a moving one that are struck out too; one before."""
+APART: Final = 4
+"""Blocks at rest that end an episode."""
+LOOK_EVERY: Final = 20
+"""Blocks between looks whether an episode has become steady."""
+WANDER: Final = 4.0
+"""Times the scatter of means that the scatter within blocks explains: above, the means move."""
+SIGMA_OF_QUARTER: Final = 0.6745
+"""Upper quartile of the standard normal distribution."""
+NOTHING: Final = 1e-30
+"""Variance that a constant is given."""
+FEWEST: Final = 4
+"""Samples of a block, and half of its places, that must be there for a verdict."""
+
+OPEN, HELD, HELD_MOVES, QUIET_RUN, BEGAN, LATEST, STILL, QUIET, RECENT, TURNED = range(10)
+"""Of ``place``: the block being filled, the one whose verdict is held back (-1 = none) and that verdict, quiet blocks
+since the last moving one, first (-1 = none) and latest moving block of the open episode, blocks that held still, blocks
+quieter than the reference, blocks ever, whether the orientation changed in the episode."""
+FIRST, LAST, CHANGED, AXIS, PEAK = range(5)
+"""Columns of an episode: first and last moving block, whether the orientation changed, axis and size of the peak."""
+LOG_VARIANCE, MEAN = 0, 1
+COUNT, SHIFT, SUM, SQUARES, LOW, HIGH, BEFORE, STEP = range(8)
+"""Of ``open``: samples, the first of them, sums about it, extremes; the sample before; the smallest step ever seen."""
+
+
+class State(NamedTuple):
+    """All that is remembered; arrays only."""
+
+    place: Ints  # [10]
+    open: Floats  # [6, 8] the block being filled
+    seen: Ints  # [6] blocks at rest ever learned
+    shifted: Floats  # [6] what orientations taken over have added to the means, since the ring held nothing else
+    ring: Floats  # [2, 6, LEARNED] log variance and mean of blocks at rest, in order of coming
+    ordered: Floats  # [2, 6, LEARNED] the same, sorted
+    recent: Floats  # [2, 6, LEARNED] of all blocks
+    peaks: Floats  # [2, 6] of the open episode: largest excursion in SI, and over the noise
+
+
+def state() -> State:
+    """Nothing seen yet."""
+    place = np.zeros(10, np.int64)
+    place[[HELD, BEGAN]] = -1
+    place[QUIET_RUN] = APART
+    fresh = np.zeros((AXES, 8))
+    fresh[:, BEFORE] = np.nan
+    rings = [np.full((2, AXES, LEARNED), np.nan) for _ in range(3)]
+    return State(
+        place, fresh, np.zeros(AXES, np.int64), np.zeros(AXES), rings[0], rings[1], rings[2], np.zeros((2, AXES))
+    )
+
+
+@compiled
+def advance(
+    values: Floats, first: int, size: int, ends: bool, s: State, blocks: Ints, moving: Ints, episodes: Floats
+) -> Ints:
+    """Take consecutive rows in; verdicts and episodes that became final go out.
+
+    Args:
+        values: [n, 6] in SI, NaN = missing
+        first: index of the first row, missing samples counted
+        size: samples a block
+        ends: True if the stream ends after these rows: the open block is judged, what is held back goes out, and an
+            open episode ends
+        blocks, moving: [≥ n/size + 2] filled: number of a block, and whether it moves
+        episodes: [≥ n/size + 2, 5] filled: first and last moving block, whether the orientation changed, axis and size
+            of the peak
+    Returns:
+        How many verdicts and episodes were filled in.
+    """
+    filled = np.zeros(2, np.int64)
+    for i in range(values.shape[0]):
+        number = (first + i) // size
+        if number != s.place[OPEN]:
+            _close(size, s, blocks, moving, episodes, filled)
+            s.place[OPEN] = number
+        for a in range(AXES):
+            value = values[i, a]
+            if value != value:
+                continue
+            step = abs(value - s.open[a, BEFORE])
+            if step > 0.0 and (step < s.open[a, STEP] or s.open[a, STEP] == 0.0):
+                s.open[a, STEP] = step
+            s.open[a, BEFORE] = value
+            if s.open[a, COUNT] == 0.0:
+                s.open[a, SHIFT], s.open[a, SUM], s.open[a, SQUARES] = value, 0.0, 0.0
+                s.open[a, LOW], s.open[a, HIGH] = inf, -inf
+            off = value - s.open[a, SHIFT]
+            s.open[a, COUNT] += 1.0
+            s.open[a, SUM] += off
+            s.open[a, SQUARES] += off * off
+            s.open[a, LOW] = min(s.open[a, LOW], value)
+            s.open[a, HIGH] = max(s.open[a, HIGH], value)
+    if ends:
+        _close(size, s, blocks, moving, episodes, filled)
+        _emit(s, blocks, moving, filled)
+        s.place[HELD] = -1
+        if s.place[BEGAN] >= 0:
+            _end(s, episodes, filled)
+    return filled
+
+
+@compiled
+def _close(size: int, s: State, blocks: Ints, moving: Ints, episodes: Floats, filled: Ints) -> None:
+    """The open block is complete: measure, judge, learn, let go of the one before."""
+    number = s.place[OPEN]
+    follows = s.place[HELD] == number - 1
+    now = np.empty((2, AXES))
+    for a in range(AXES):
+        now[LOG_VARIANCE, a] = now[MEAN, a] = nan
+        if 2.0 * s.open[a, COUNT] >= size and s.open[a, COUNT] >= FEWEST:
+            _measure(a, s, now)
+    moves = _judge(now, follows, size, s)
+    if moves:
+        _remember(now, number, s)
+        s.place[HELD_MOVES] |= follows
+    _learn(now, moves, number, size, s)
+    _emit(s, blocks, moving, filled)
+    s.place[QUIET_RUN] = 0 if moves else min(s.place[QUIET_RUN] + 1, APART)
+    s.place[HELD], s.place[HELD_MOVES] = number, s.place[QUIET_RUN] <= AFTER
+    if s.place[BEGAN] >= 0 and s.place[QUIET_RUN] == APART:
+        _end(s, episodes, filled)
+    for a in range(AXES):
+        s.open[a, COUNT] = 0.0
+
+
+@compiled
+def _measure(a: int, s: State, now: Floats) -> None:
+    """Log variance and mean of one axis of the block, the sample furthest from the mean left out."""
+    n = s.open[a, COUNT]
+    mean = s.open[a, SUM] / n
+    square = s.open[a, SQUARES] - n * mean * mean
+    mean += s.open[a, SHIFT]
+    high, low = s.open[a, HIGH] - mean, s.open[a, LOW] - mean
+    furthest = high if high > -low else low
+    square = max(square - furthest * furthest * n / (n - 1.0), 0.0)
+    mean -= furthest / (n - 1.0)
+    floor = s.open[a, STEP] ** 2 / 12.0  # what rounding may hide
+    now[LOG_VARIANCE, a] = log(square / (n - 2.0) + floor + NOTHING)
+    now[MEAN, a] = mean
+    floor = log(floor + NOTHING)
+    if s.ordered[LOG_VARIANCE, a, 0] < floor:  # the step was not known when these were learned
+        for ring in (s.ordered, s.ring, s.recent):
+            for k in range(LEARNED):
+                if ring[LOG_VARIANCE, a, k] < floor:
+                    ring[LOG_VARIANCE, a, k] = floor
+
+
+# --- judging
+
+
+@compiled
+def _judge(now: Floats, follows: bool, size: int, s: State) -> bool:
+    """Whether the block moves; orientations are taken over, and references replaced, on the way."""
+    loud, off, rotates = False, False, False
+    still = follows
+    before = (s.place[RECENT] - 1) % LEARNED
+    judged, rises, excess = 0, 0.0, 0.0
+    for a in range(AXES):
+        if now[MEAN, a] != now[MEAN, a]:
+            continue
+        change = abs(now[MEAN, a] - s.recent[MEAN, a, before]) if follows else 0.0
+        n = min(s.seen[a], LEARNED)
+        if n < LEAST:
+            loud |= now[LOG_VARIANCE, a] > 2.0 * log(SURE[a]) or change > SURE[a]
+            continue
+        young = 1.0 + LEAST / n
+        step = s.open[a, STEP]
+        middle = _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)
+        # of the logarithm of χ² over its freedom, nearly
+        sigma = min(max(_scatter(s.ordered[LOG_VARIANCE, a], n), sqrt(2.0 / (size - 2.0))), LOUDEST / BAND)
+        loud |= exp(now[LOG_VARIANCE, a]) > exp(middle + young * max(LOUDER, BAND * sigma)) + step * step
+        rise = log(max(exp(now[LOG_VARIANCE, a]) - TOGGLE * step * step, NOTHING)) - middle
+        rise = min(max(rise, -LOUDEST), LOUDEST)
+        judged, rises, excess = judged + 1, rises + rise / young, excess + rise / sigma / young
+        band = young * _band(a, n, size, s) + step
+        far = now[MEAN, a] - _quantile(s.ordered[MEAN, a], n, 0.5)
+        off |= abs(far) > band
+        rotates |= a < GYROS and abs(far + s.shifted[a]) > max(band, NEW_BIAS)
+        still &= change < band
+    loud |= rises > TOGETHER * judged and excess > BAND * sqrt(judged)
+    s.place[STILL] = s.place[STILL] + 1 if still and not loud else 0
+    if off and not loud and s.place[STILL] >= (SPUN if rotates else SETTLED):
+        _take_over(now, s)
+        if rotates:
+            for a in range(AXES):
+                s.shifted[a] = 0.0
+        off = False
+    return loud or off
+
+
+@compiled
+def _band(a: int, n: int, size: int, s: State) -> float:
+    """Distance of a block's mean from the median of the means that is still rest."""
+    explained = exp(0.5 * _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)) / sqrt(size)
+    return BAND * min(max(_scatter(s.ordered[MEAN, a], n), explained), DRIFT / BAND * explained)
+
+
+@compiled
+def _take_over(now: Floats, s: State) -> None:
+    """The means at which all axes hold still are those of rest now; their scatter is what it was."""
+    for a in range(AXES):
+        n = min(s.seen[a], LEARNED)
+        if now[MEAN, a] == now[MEAN, a] and n > 0:
+            shift = now[MEAN, a] - _quantile(s.ordered[MEAN, a], n, 0.5)
+            for k in range(LEARNED):
+                s.ordered[MEAN, a, k] += shift
+                s.ring[MEAN, a, k] += shift
+            s.shifted[a] += shift
+    s.place[TURNED] = 1
+
+
+# --- learning
+
+
+@compiled
+def _learn(now: Floats, moves: bool, number: int, size: int, s: State) -> None:
+    """The block enters the reference if it is at rest; the reference is replaced where it has proved wrong."""
+    newest = s.place[RECENT] % LEARNED
+    s.place[RECENT] += 1
+    quieter = measured = 0
+    for a in range(AXES):
+        s.recent[LOG_VARIANCE, a, newest], s.recent[MEAN, a, newest] = now[LOG_VARIANCE, a], now[MEAN, a]
+        n = min(s.seen[a], LEARNED)
+        if now[MEAN, a] != now[MEAN, a]:
+            continue
+        measured += 1
+        quieter += n >= LEAST and now[LOG_VARIANCE, a] < _quantile(s.ordered[LOG_VARIANCE, a], n, 0.25) - QUIETER
+        if not moves:
+            _insert(a, now[LOG_VARIANCE, a], now[MEAN, a], s)
+    s.place[QUIET] = s.place[QUIET] + 1 if measured and 2 * quieter >= measured else 0
+    blocks = 0
+    if s.place[QUIET] == LEAST:
+        blocks = LEAST
+        s.place[QUIET] = 0
+    lasted = number - s.place[BEGAN] + 1
+    if moves and lasted >= LEARNED and lasted % LOOK_EVERY == 0 and _steady(size, s):
+        blocks = LEARNED
+    if blocks > 0:
+        _begin_anew(blocks, s)
+
+
+@compiled
+def _insert(a: int, log_variance: float, mean: float, s: State) -> None:
+    """One more value in both rings of an axis; the oldest leaves."""
+    at, n = s.seen[a] % LEARNED, min(s.seen[a], LEARNED)
+    for kind in range(2):
+        value, ordered = log_variance if kind == LOG_VARIANCE else mean, s.ordered[kind, a]
+        place = n
+        if n == LEARNED:
+            place = _rank(ordered, n, s.ring[kind, a, at])
+        while place > 0 and ordered[place - 1] > value:
+            ordered[place] = ordered[place - 1]
+            place -= 1
+        while place < n - 1 and ordered[place + 1] < value:
+            ordered[place] = ordered[place + 1]
+            place += 1
+        ordered[place] = value
+        s.ring[kind, a, at] = value
+    s.seen[a] += 1
+    if at == LEARNED - 1:
+        s.shifted[a] = 0.0
+
+
+@compiled
+def _rank(ordered: Floats, n: int, value: float) -> int:
+    """Where a value stands in a sorted ring."""
+    low, high = 0, n - 1
+    while low < high:
+        middle = (low + high) // 2
+        if ordered[middle] < value:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@compiled
+def _begin_anew(blocks: int, s: State) -> None:
+    """The reference is made of the last blocks and nothing else."""
+    for a in range(AXES):
+        s.seen[a], s.shifted[a] = 0, 0.0
+        for kind in range(2):
+            for k in range(LEARNED):
+                s.ring[kind, a, k] = s.ordered[kind, a, k] = nan
+    for back in range(blocks, 0, -1):
+        k = (s.place[RECENT] - back) % LEARNED
+        for a in range(AXES):
+            if s.recent[MEAN, a, k] == s.recent[MEAN, a, k]:
+                _insert(a, s.recent[LOG_VARIANCE, a, k], s.recent[MEAN, a, k], s)
+
+
+@compiled
+def _steady(size: int, s: State) -> bool:
+    """Whether the last LEARNED blocks are one steady state: both halves agree, nothing bursts, no mean wanders."""
+    half, ordered = LEARNED // 2, np.empty(LEARNED)
+    for a in range(AXES):
+        n = _sort_recent(s, MEAN, a, 0, LEARNED, ordered)
+        if n == 0:
+            continue
+        if LEARNED - n > LEARNED // 10:
+            return False
+        scatter = 0.5 * (_interpolate(ordered, n, 0.75) - _interpolate(ordered, n, 0.25)) / SIGMA_OF_QUARTER
+        n = _sort_recent(s, LOG_VARIANCE, a, 0, LEARNED, ordered)
+        middle = _median(ordered, n)
+        louder = 0
+        for k in range(n):
+            louder += ordered[k] > middle + 2.0 * LOUDER
+        if louder > LEARNED // 50:
+            return False
+        explained = exp(0.5 * middle) / sqrt(size) + s.open[a, STEP]
+        if scatter > WANDER * explained:
+            return False
+        for kind in range(2):
+            early = _median(ordered, _sort_recent(s, kind, a, 0, half, ordered))
+            late = _median(ordered, _sort_recent(s, kind, a, half, LEARNED, ordered))
+            if abs(early - late) > (0.5 * LOUDER if kind == LOG_VARIANCE else WANDER * explained):
+                return False
+    return True
+
+
+@compiled
+def _sort_recent(s: State, kind: int, a: int, begin: int, end: int, ordered: Floats) -> int:
+    """Sort the values that are not NaN of the recent blocks begin ≤ k < end, oldest first; return how many."""
+    n = 0
+    for k in range(begin, end):
+        value = s.recent[kind, a, (s.place[RECENT] + k) % LEARNED]
+        if value == value:
+            place = n
+            while place > 0 and ordered[place - 1] > value:
+                ordered[place] = ordered[place - 1]
+                place -= 1
+            ordered[place] = value
+            n += 1
+    return n
+
+
+@compiled
+def _median(ordered: Floats, n: int) -> float:
+    """Return the median of the first n of a sorted array; NaN if there are none."""
+    return 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2]) if n > 0 else nan
+
+
+@compiled
+def _interpolate(ordered: Floats, n: int, p: float) -> float:
+    """Return the quantile of the first n ≥ 1 of a sorted array, interpolated linearly between ranks."""
+    rank = (n - 1) * p
+    lower = int(rank)
+    share = rank - lower
+    return float(ordered[lower] * (1.0 - share) + ordered[min(lower + 1, n - 1)] * share)
+
+
+@compiled
+def _quantile(ordered: Floats, n: int, p: float) -> float:
+    """Of the first n of a sorted ring, nearest rank."""
+    return float(ordered[int(p * (n - 1) + 0.5)])
+
+
+@compiled
+def _scatter(ordered: Floats, n: int) -> float:
+    """Standard deviation by the wider half between quartiles."""
+    low, middle, high = _quantile(ordered, n, 0.25), _quantile(ordered, n, 0.5), _quantile(ordered, n, 0.75)
+    return max(high - middle, middle - low) / SIGMA_OF_QUARTER
+
+
+# --- giving out
+
+
+@compiled
+def _remember(now: Floats, number: int, s: State) -> None:
+    """A moving block: the episode goes on, or begins, and its peaks grow."""
+    if s.place[BEGAN] < 0:
+        s.place[BEGAN], s.place[TURNED] = number, 0
+        for a in range(AXES):
+            s.peaks[0, a] = s.peaks[1, a] = 0.0
+    s.place[LATEST] = number
+    for a in range(AXES):
+        n = min(s.seen[a], LEARNED)
+        if s.open[a, COUNT] == 0.0:
+            continue
+        learned = n >= LEAST
+        middle = _quantile(s.ordered[MEAN, a], n, 0.5) if learned else now[MEAN, a]
+        noise = exp(0.5 * _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)) if learned else SURE[a]
+        peak = max(s.open[a, HIGH] - middle, middle - s.open[a, LOW])
+        if peak > s.peaks[0, a]:
+            s.peaks[0, a] = peak
+        s.peaks[1, a] = max(s.peaks[1, a], peak / noise)
+
+
+@compiled
+def _emit(s: State, blocks: Ints, moving: Ints, filled: Ints) -> None:
+    if s.place[HELD] >= 0:
+        blocks[filled[0]], moving[filled[0]] = s.place[HELD], s.place[HELD_MOVES]
+        filled[0] += 1
+
+
+@compiled
+def _end(s: State, episodes: Floats, filled: Ints) -> None:
+    axis = 0
+    for a in range(1, AXES):
+        if s.peaks[1, a] > s.peaks[1, axis]:
+            axis = a
+    episode = episodes[filled[1]]
+    episode[FIRST], episode[LAST] = s.place[BEGAN], s.place[LATEST]
+    episode[CHANGED], episode[AXIS], episode[PEAK] = s.place[TURNED], axis, s.peaks[0, axis]
+    filled[1] += 1
+    s.place[BEGAN] = -1

@@ -1,0 +1,188 @@
+"""Small least-squares problems in compiled loops: at most five columns, non-negative, with the curve's own covariance.
+
+Arrays are the caller's; ``columns`` and ``weighted`` = V⁻¹ columns hold all τ, ``rows`` those in use. Written out in
+loops because that compiles several times faster than array expressions do.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from monitor.common.compiled import compiled
+from monitor.estimation.allan.uncertainty import NOISES
+
+SINGULAR: Final = 1e-9
+"""A pivot of the correlations below this is rounding."""
+
+Q, N, B, K, R = range(5)
+
+
+@compiled
+def variance_form(theta, c):  # type: ignore[no-untyped-def]
+    """Σ_ab θ_a θ_b C^ab of one entry of the table; a negative Q² stands for a band limit and adds none."""
+    q, n, b, k = max(theta[0], 0.0), theta[1], theta[2], theta[3]
+    return (
+        q * (q * c[0] + 2.0 * (n * c[1] + b * c[2] + k * c[3]))
+        + n * (n * c[4] + 2.0 * (b * c[5] + k * c[6]))
+        + b * (b * c[7] + 2.0 * k * c[8])
+        + k * k * c[9]
+    )
+
+
+@compiled
+def variances(rows, theta, covariance, stretch, variance):  # type: ignore[no-untyped-def]
+    """Var σ²_i of the model; ``stretch``: √ of how many terms a window without gaps has for each that is there."""
+    for i in rows:
+        variance[i] = variance_form(theta, covariance[i, i]) * stretch[i] * stretch[i]
+
+
+@compiled
+def whiten(rows, theta, covariance, stretch, columns, blind, variance, weighted):  # type: ignore[no-untyped-def]
+    """V⁻¹ columns by Cholesky of the correlations; False where they are no positive definite matrix."""
+    m = rows.size
+    factor = np.empty((m, m))
+    for k in range(m):
+        for j in range(k + 1):
+            i, h = rows[k], rows[j]
+            x = variance_form(theta, covariance[i, h]) * stretch[i] * stretch[h] + blind[i] * blind[h]
+            x /= np.sqrt(variance[i] * variance[h])
+            for c in range(j):
+                x -= factor[k, c] * factor[j, c]
+            if j < k:
+                factor[k, j] = x / factor[j, j]
+            elif x < SINGULAR:
+                return False
+            else:
+                factor[k, k] = np.sqrt(x)
+    for a in range(5):
+        for k in range(m):
+            x = columns[rows[k], a] / np.sqrt(variance[rows[k]])
+            for c in range(k):
+                x -= factor[k, c] * weighted[rows[c], a]
+            weighted[rows[k], a] = x / factor[k, k]
+        for k in range(m - 1, -1, -1):
+            x = weighted[rows[k], a]
+            for c in range(k + 1, m):
+                x -= factor[c, k] * weighted[rows[c], a]
+            weighted[rows[k], a] = x / factor[k, k]
+        for k in range(m):
+            weighted[rows[k], a] /= np.sqrt(variance[rows[k]])
+    return True
+
+
+@compiled
+def weigh(rows, theta, covariance, stretch, columns, blind, full, variance, weighted):  # type: ignore[no-untyped-def]
+    """``weighted`` = V⁻¹ columns with the model's own covariance V of the τ, and ``blind`` blindᵀ, or its diagonal."""
+    variances(rows, theta, covariance, stretch, variance)
+    if full and whiten(rows, theta, covariance, stretch, columns, blind, variance, weighted):
+        return
+    for i in rows:
+        for a in range(5):
+            weighted[i, a] = columns[i, a] / variance[i]
+
+
+@compiled
+def normal_equations(level, rows, columns, weighted, normal, right):  # type: ignore[no-untyped-def]
+    """Xᵀ V⁻¹ X and Xᵀ V⁻¹ y; a column of zeros is a term that is not asked for, and comes out as zero."""
+    for a in range(5):
+        right[a] = 0.0
+        for b in range(a + 1):
+            normal[a, b] = 0.0
+    for i in rows:
+        for a in range(5):
+            right[a] += weighted[i, a] * level[i]
+            for b in range(a + 1):
+                normal[a, b] += weighted[i, a] * columns[i, b]
+    for a in range(5):
+        if normal[a, a] == 0.0:
+            normal[a, a], right[a] = 1.0, -1.0
+        for b in range(a):
+            normal[b, a] = normal[a, b]
+
+
+@compiled
+def solve_nonnegative(normal, right, free, theta):  # type: ignore[no-untyped-def]
+    """Least squares with Q N B K not negative (Q may be, if free): the subset that meets Kuhn and Tucker.
+
+    Terms in the subset are positive, and none of those left out would lower the error by growing.
+    """
+    for subset in range(2**NOISES - 1, 0, -1):
+        if not solve(normal, right, subset, theta):
+            continue
+        allowed = True
+        for a in range(NOISES):
+            if subset >> a & 1:
+                allowed = allowed and (theta[a] >= 0.0 or (free and a == Q))
+            else:
+                pull = right[a]
+                for b in range(NOISES):
+                    pull -= normal[a, b] * theta[b]
+                allowed = allowed and pull <= 1e-9 * abs(right[a])
+        if allowed:
+            return
+    for a in range(5):
+        theta[a] = 0.0
+    theta[N] = right[N] / normal[N, N]
+
+
+@compiled
+def solve(normal, right, subset, solution):  # type: ignore[no-untyped-def]
+    """Cholesky on the columns of a subset, each scaled to one; False when they cannot be told apart."""
+    factor = np.zeros((5, 5))
+    for a in range(5):
+        solution[a] = 0.0
+    for a in range(5):
+        if not subset >> a & 1:
+            continue
+        y = right[a] / np.sqrt(normal[a, a])
+        for b in range(a + 1):
+            if not subset >> b & 1:
+                continue
+            x = normal[a, b] / np.sqrt(normal[a, a] * normal[b, b])
+            for c in range(b):
+                x -= factor[a, c] * factor[b, c]
+            if b < a:
+                factor[a, b] = x / factor[b, b]
+            elif x < 1e-12:
+                return False
+            else:
+                factor[a, a] = np.sqrt(x)
+        for c in range(a):
+            y -= factor[a, c] * solution[c]
+        solution[a] = y / factor[a, a]
+    for a in range(4, -1, -1):
+        if not subset >> a & 1:
+            continue
+        x = solution[a]
+        for c in range(a + 1, 5):
+            x -= factor[c, a] * solution[c]
+        solution[a] = x / factor[a, a]
+    for a in range(5):
+        if subset >> a & 1:
+            solution[a] /= np.sqrt(normal[a, a])
+    return True
+
+
+@compiled
+def present(theta):  # type: ignore[no-untyped-def]
+    """The subset of terms that are not zero."""
+    subset = 0
+    for a in range(NOISES):
+        if theta[a] != 0.0:
+            subset |= 1 << a
+    return subset
+
+
+@compiled
+def invert(normal, subset, inverse):  # type: ignore[no-untyped-def]
+    """Inverse [NOISES, NOISES] on the terms of a subset, zero elsewhere; False where they cannot be told apart."""
+    unit, solution = np.empty(5), np.empty(5)
+    for a in range(NOISES):
+        for b in range(5):
+            unit[b] = 1.0 if b == a else 0.0
+            solution[b] = 0.0
+        if subset >> a & 1 and not solve(normal, unit, subset, solution):
+            return False
+        for b in range(NOISES):
+            inverse[b, a] = solution[b]
+    return True

@@ -1,0 +1,110 @@
+"""What a query asks of a history: the parameters of a zenoh selector in, a ``Question`` out. Pure.
+
+``_time=[…]`` (absent: the last day), ``step=15min``, ``what=coefficients,deviations,status,events``, ``axis=gz,gx``,
+``letter=N,B``. Zenoh's own parameters, which begin with ``_``, are for zenoh; any other is a ConfigError.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from drivers.discovery import nearest
+from drivers.errors import ConfigError
+from drivers.sample import AXES
+from monitor.estimation.fit.coefficients import LETTERS
+from monitor.history.columns import HEALTH, TEMPERATURE
+from monitor.history.time_ranges import Span, length, zenoh_span
+
+COEFFICIENTS: Final = "coefficients"
+DEVIATIONS: Final = "deviations"
+STATUS: Final = "status"
+EVENTS: Final = "events"
+WHAT: Final = (COEFFICIENTS, DEVIATIONS, STATUS, EVENTS)
+UNASKED: Final = (COEFFICIENTS, STATUS, EVENTS)
+"""What is given where nothing is asked for: deviations would be more than all else together."""
+KEYS: Final = ("_time", "step", "what", "axis", "letter")
+LONGEST: Final = 1000
+"""Characters of all parameters together."""
+_PART: Final = re.compile(r"([^=;]+)(?:=((?:[\[\]][^\[\]]*[\[\]])|[^;]*))?(?:;|$)")
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What is asked for."""
+
+    span: Span | None = None  # None: the last day that there is
+    step_s: int | None = None
+    what: tuple[str, ...] = UNASKED
+    axes: tuple[str, ...] = AXES
+    letters: tuple[str, ...] = LETTERS
+
+    def wants(self, name: str) -> bool:
+        """Whether a number of ``numbers`` belongs to the answer.
+
+        >>> Question(axes=("gz",)).wants("gz.N.lo"), Question(axes=("gz",)).wants("gx.N"), Question().wants("rate")
+        (True, False, True)
+        """
+        axis, _, rest = name.partition(".")
+        if not rest:
+            return STATUS in self.what and name in (*HEALTH, *TEMPERATURE)
+        if axis not in self.axes:
+            return False
+        letter = rest.split(".")[0]
+        return DEVIATIONS in self.what if letter == "sigma" else COEFFICIENTS in self.what and letter in self.letters
+
+    def parameters(self) -> str:
+        """As a selector's parameters.
+
+        >>> Question(Span(0.0, float("inf"), end_in=False), 900, ("status",), ("gz",)).parameters()
+        '_time=[1970-01-01T00:00:00.000000Z..[;step=900s;what=status;axis=gz;letter=Q,N,B,K,R'
+        """
+        parts = {
+            "_time": "" if self.span is None else self.span.zenoh(),
+            "step": "" if self.step_s is None else f"{self.step_s}s",
+            "what": ",".join(self.what),
+            "axis": ",".join(self.axes),
+            "letter": ",".join(self.letters),
+        }
+        return ";".join(f"{key}={value}" for key, value in parts.items() if value)
+
+
+def question(parameters: str, now_s: float) -> Question:
+    """The question of a selector's parameters.
+
+    >>> question("_time=[now(-2h);30m];axis=gz;what=coefficients", 7200.0).span
+    Span(start_s=0.0, end_s=1800.0, start_in=True, end_in=True)
+
+    Raises:
+        ConfigError: one line
+    """
+    given = _split(parameters)
+    for key in given:
+        if key not in KEYS and not key.startswith("_"):
+            raise ConfigError(f'"{key[:40]}": unknown parameter{nearest(key, KEYS)}')
+    step_s = length(given["step"]) if given.get("step") else None
+    if step_s is not None and not 1.0 <= step_s <= 1e10:
+        raise ConfigError(f"step: {step_s:g} s; possible are 1 s and more")
+    return Question(
+        zenoh_span(given["_time"], now_s) if given.get("_time") else None,
+        None if step_s is None else int(step_s),
+        _listed("what", given.get("what", ""), WHAT) or UNASKED,
+        _listed("axis", given.get("axis", ""), AXES) or AXES,
+        _listed("letter", given.get("letter", ""), LETTERS) or LETTERS,
+    )
+
+
+def _split(parameters: str) -> Mapping[str, str]:
+    """Keys and values. A semicolon inside a time range's brackets is the range's; zenoh's own parser cuts there."""
+    if len(parameters) > LONGEST:
+        raise ConfigError(f"parameters of {len(parameters)} characters; at most {LONGEST}")
+    return {key.strip(): (value or "").strip() for key, value in _PART.findall(parameters)}
+
+
+def _listed(key: str, text: str, known: tuple[str, ...]) -> tuple[str, ...]:
+    """Words with commas, in the order in which they are known."""
+    words = [word.strip() for word in text.split(",") if word.strip()]
+    for word in words:
+        if word not in known:
+            raise ConfigError(f'{key}: "{word[:40]}"{nearest(word, known)}')
+    return tuple(one for one in known if one in words)

@@ -1,0 +1,59 @@
+"""A MATLAB script: ``gyroparams`` and ``accelparams`` for ``imuSensor``, a value an axis.
+
+Properties and units are those of MathWorks' reference pages. ``single-sided`` is MathWorks' word for white noise of
+σ = NoiseDensity·√rate a sample, which is N of IEEE Std 952; their default would be smaller by √2. ``BiasInstability``
+is the σ of the white noise that drives a filter; with ``fractalcoef`` (Kasdin, Proc. IEEE 83(5), 1995) the result has
+the spectrum B²/(2πf), which is B of IEEE Std 952; with the default filter, one pole at 0.5, it is no flicker at all.
+
+It is for simulation, so what the data only bound stays 0, with the bound in a comment.
+"""
+
+from typing import Final
+
+from monitor.publishing.exporters.noise import AXES_OF, Noise, head, number, tail, text
+
+POLES: Final = 500
+"""Of the 1/f filter, as in MathWorks' own example of the Allan variance."""
+
+
+def gyroparams(noise: Noise, inflation: float = 1.0) -> str:
+    """The script; see the module."""
+    lines = [
+        "% Noise of an IMU for imuSensor (Navigation Toolbox, or Sensor Fusion and Tracking Toolbox), R2023b or newer",
+        *head(noise, inflation, "%"),
+        "% single-sided: white noise of sigma = NoiseDensity*sqrt(rate) a sample, N of IEEE Std 952",
+        f"% fractalcoef({POLES}): 1/f noise down to about rate/{POLES}; more poles reach lower and take longer",
+    ]
+    made = []
+    for kind, maker, name, unit in (
+        ("gyro", "gyroparams", "Gyroscope", "rad/s"),
+        ("accel", "accelparams", "Accelerometer", "m/s^2"),
+    ):
+        if not set(AXES_OF[kind]) & noise.axes.keys():
+            continue
+        made.append(f", '{name}', {kind}")
+        lines += [
+            "",
+            f"{kind} = {maker}( ...",
+            _property(noise, kind, "N", "NoiseDensity", f"({unit})/sqrt(Hz)", inflation),
+            _property(noise, kind, "B", "BiasInstability", unit, inflation),
+            _property(noise, kind, "K", "RandomWalk", f"({unit})*sqrt(Hz)", inflation),
+            "    'NoiseType', 'single-sided', ...",
+            f"    'BiasInstabilityCoefficients', fractalcoef({POLES}));",
+        ]
+    rate = "" if noise.sample_rate_hz is None else f", 'SampleRate', {noise.sample_rate_hz!r}"
+    lines += ["", f"imu = imuSensor('accel-gyro'{rate}{''.join(made)});"]
+    return text([*lines, *tail(noise, "NBK", "%")])
+
+
+def _property(noise: Noise, kind: str, letter: str, name: str, unit: str, inflation: float) -> str:
+    """One property of three axes; what is not known is 0, and said."""
+    known, values, said = noise.of(kind, letter), [], ""
+    for axis in AXES_OF[kind]:
+        term = known.get(axis)
+        values.append("0" if term is None or term.bound else number(term.value * inflation))
+        if term is None:
+            said += f"; {axis} not known"
+        elif term.bound:
+            said += f"; {axis} only bounded, <= {term.value:.3g}"
+    return f"    '{name}', [{' '.join(values)}], ... % {letter}, {unit}{said}"

@@ -1,0 +1,48 @@
+"""Kalibr's ``imu.yaml``: continuous-time densities, one value for the three axes of a kind, that of the worst.
+
+Keys and units are those of Kalibr's wiki, "YAML formats" and "IMU Noise Model". Kalibr makes a sample's σ of a density
+by 1/√Δt, and a step of the bias by √Δt, as N and K of IEEE Std 952 want it. It refuses a zero, so a term that no axis
+shows is an error; a term that the axes only bound is the largest bound, and the comment says so.
+"""
+
+from drivers.errors import ConfigError
+from monitor.publishing.exporters.noise import EFFECT_OF, Noise, Term, head, lacking, number, tail, text
+
+ADVICE = (
+    "# Kalibr's wiki, IMU Noise Model: a sensor at rest at one temperature shows too little; for the",
+    "# lowest-cost sensors it may be necessary to raise these values by a factor of 10 or more (--inflation 10)",
+)
+
+
+def kalibr(noise: Noise, inflation: float = 1.0, rostopic: str = "/imu0") -> str:
+    """The file; see the module."""
+    if noise.sample_rate_hz is None:
+        raise ConfigError("kalibr needs an update_rate, and the model has no sample_rate")
+    lines = [
+        "# imu.yaml for Kalibr: continuous-time noise; one value for all axes of a kind, that of the worst axis",
+        *head(noise, inflation, "#"),
+        *ADVICE,
+        f"rostopic: {rostopic}",
+        f"update_rate: {noise.sample_rate_hz!r}  # Hz",
+    ]
+    for kind, word, white, walk in (
+        ("accel", "accelerometer", "m/s^2/sqrt(Hz)", "m/s^3/sqrt(Hz)"),
+        ("gyro", "gyroscope", "rad/s/sqrt(Hz)", "rad/s^2/sqrt(Hz)"),
+    ):
+        for letter, key, unit in (("N", "noise_density", white), ("K", "random_walk", walk)):
+            worst, said = _worst(noise, kind, letter)
+            lines += [f"# {letter}: {said}", f"{word}_{key}: {number(worst.value * inflation)}  # {unit}"]
+    return text([*lines, *tail(noise, "NK", "#")])
+
+
+def _worst(noise: Noise, kind: str, letter: str) -> tuple[Term, str]:
+    """The largest estimate of a kind, or the largest bound where there is no estimate; and a comment on it."""
+    known = noise.of(kind, letter)
+    if not known:
+        raise lacking(noise, f"kalibr needs {letter} ({EFFECT_OF[letter]}) above 0 on the {kind} axes, and none has it")
+    rank = {axis: (not term.bound, term.value) for axis, term in known.items()}
+    axis = max(rank, key=lambda one: rank[one])
+    listed = ", ".join(f"{one} {'<= ' if term.bound else ''}{term.value:.3g}" for one, term in known.items())
+    only = ", an UPPER BOUND: the data show no more" if known[axis].bound else ""
+    alike = len(known) > 1 and len(set(rank.values())) == 1
+    return known[axis], f"{'all axes alike' if alike else f'worst axis {axis}'}{only} ({listed})"

@@ -1,0 +1,101 @@
+"""A daemon's messages -> the results they were made of, so that one viewer can draw what another process measured.
+
+In come typed messages of ``monitor.publishing.messages.remote_device``, out go ``Estimate``, ``Health`` and ``Event`` as the daemon's own
+viewer gets them. What does not travel is absent here too: degrees of freedom and counts of terms are not known, the
+fitted curve is that of the five terms (IEEE Std 952) with the coefficients that were estimated. Pure.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from drivers.sample import AXES, Event, Floats
+from monitor.common.health import Health
+from monitor.estimation.allan.curve import AllanCurve
+from monitor.estimation.estimate import Estimate
+from monitor.estimation.fit.coefficients import LETTERS, Coefficients
+from monitor.publishing.messages import remote_device
+
+MOST_TAU: Final = 1000
+
+
+def estimate(allan: remote_device.AllanMessage, noise: remote_device.Noise) -> Estimate:
+    """What the daemon's viewer would draw; ValueError for curves that are none."""
+    tau_s = np.array(allan.tau)
+    m = tau_s.size
+    if not 0 < m <= MOST_TAU or not np.all(tau_s > 0) or not np.all(np.diff(tau_s) > 0) or not allan.rate > 0:
+        raise ValueError("averaging times must rise from above zero")
+    deviation, lo, hi = (np.full((m, len(AXES)), np.nan) for _ in range(3))
+    for axis, curve in allan.axes.items():
+        if axis in AXES:
+            for column, values in ((deviation, curve.deviation), (lo, curve.lo), (hi, curve.hi)):
+                column[:, AXES.index(axis)] = _column(values, m)
+    unknown = np.full((m, len(AXES)), np.nan)
+    return Estimate(
+        t_ns=round(allan.t * 1e9),
+        rate_hz=allan.rate,
+        window_s=allan.window,
+        samples=allan.samples,
+        curve=AllanCurve(
+            tau_s=tau_s,
+            factors=np.rint(tau_s * allan.rate).astype(np.int64),
+            avar=deviation**2,
+            terms=np.zeros((m, len(AXES)), np.int64),
+            edf=unknown,
+            lo=lo,
+            hi=hi,
+            n=round(allan.filled * allan.rate),
+        ),
+        fitted=fitted(tau_s, noise.coefficients),
+        coefficients=noise.coefficients,
+        k_or_r=np.array([axis in noise.either for axis in AXES]),
+    )
+
+
+def fitted(tau_s: Floats, coefficients: Coefficients) -> Floats:
+    """[m, 6] Allan variance of the terms that are estimated; NaN on axes that have none.
+
+    σ²(τ) = 3Q²/τ² + N²/τ + (2 ln 2/π)B² + K²τ/3 + R²τ²/2, IEEE Std 952-1997, Annex C.
+    """
+    flat = np.ones_like(tau_s)
+    terms = np.column_stack([3 / tau_s**2, 1 / tau_s, 2 * np.log(2) / np.pi * flat, tau_s / 3, tau_s**2 / 2])
+    total: Floats = terms @ np.nan_to_num(coefficients.value) ** 2
+    total[:, np.isnan(coefficients.value).all(axis=0)] = np.nan
+    return total
+
+
+def health(status: remote_device.StatusMessage) -> Health:
+    """As the daemon's viewer shows it."""
+    return Health(
+        state=remote_device.clean(status.state),
+        rate_hz=status.rate,
+        received=status.received,
+        lost=status.lost,
+        bad=status.bad,
+        overflowed=status.overflowed,
+        latency_p50_s=status.latency.p50,
+        latency_p99_s=status.latency.p99,
+        memory_bytes=status.memory,
+        outputs={remote_device.clean(name): remote_device.clean(said) for name, said in status.outputs.items()},
+        text=remote_device.clean(status.text),
+        uptime_s=status.uptime,
+    )
+
+
+def event(message: remote_device.EventMessage) -> Event:
+    """With what it changed, so that it is marked on the courses."""
+    axis = message.axis if message.axis in AXES else None
+    what = {
+        letter: {side: value for side, value in sizes.items() if isinstance(value, float | int)}
+        for letter, sizes in message.what.items()
+        if letter in LETTERS
+    }
+    return Event(
+        remote_device.clean(message.kind), round(message.t * 1e9), remote_device.clean(message.text), axis, what
+    )
+
+
+def _column(values: list[float | None], m: int) -> Floats:
+    if len(values) != m:
+        raise ValueError(f"{len(values)} values for {m} averaging times")
+    return np.array([np.nan if value is None else value for value in values])

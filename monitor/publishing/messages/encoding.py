@@ -1,0 +1,353 @@
+"""Results -> bytes: JSON, each payload with schema, device, time and sample count.
+
+NaN becomes null, as JSON has no word for it. ``t`` is the Unix time of the newest sample in s. In a status and in the
+answer to a reset it is null before the first sample of a recording, or of a device that stamps its samples itself.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+
+from drivers.credential_masking import masked
+from drivers.sample import AXES, Event, Floats
+from monitor.common import topics
+from monitor.common.health import Health
+from monitor.drift.thermal.live_thermal import ThermalLook
+from monitor.drift.thermal.recursive_least_squares import Band
+from monitor.drift.thermal.temperature_share import SLOW, WithoutTemperature
+from monitor.estimation.allan.curve import AllanCurve
+from monitor.estimation.allan.dynamic_allan import Dynamic
+from monitor.estimation.allan.hadamard import HadamardCurve
+from monitor.estimation.allan.total import TotalCurve
+from monitor.estimation.analysis import Analysis
+from monitor.estimation.detection.change_detection import Change
+from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.detection.motion_detection import Motion
+from monitor.estimation.estimate import Estimate
+from monitor.estimation.fit.coefficients import LETTERS, Coefficients, Status
+
+ANALYZE_SCHEMA: Final = "imu-monitor/analyze/1"
+_ENCODER: Final = msgspec.json.Encoder()
+
+
+def allan(device: str, unix_s: float, estimate: Estimate) -> bytes:
+    """``imu/<device>/allan``: deviation and its 95 % interval at each τ, axes that are measured.
+
+    ``recent``: the same over a span of its own for each τ, max(10 s, 16 τ).
+    """
+    tau = _list(estimate.curve.tau_s)
+    axes: dict[str, dict[str, Any]] = {axis: _curve(estimate.curve, i) for i, axis in measured_axes(estimate)}
+    if estimate.recent is not None:
+        for i, axis in measured_axes(estimate):
+            axes[axis]["recent"] = _curve(estimate.recent, i)
+    return _encode(topics.ALLAN, device, unix_s, estimate.samples, _window(estimate, tau=tau, axes=axes))
+
+
+def coefficients(device: str, unix_s: float, estimate: Estimate) -> bytes:
+    """``imu/<device>/coefficients``: Q N B K R of each measured axis with interval and status."""
+    axes = {
+        axis: coefficient_table(estimate.coefficients, i, bool(estimate.k_or_r[i]))
+        for i, axis in measured_axes(estimate)
+    }
+    return _encode(topics.COEFFICIENTS, device, unix_s, estimate.samples, _window(estimate, axes=axes))
+
+
+def gap(device: str, unix_s: float, look: ModelGap) -> bytes:
+    """``imu/<device>/gap``: deviations beside those of the model in force, axes that can be judged.
+
+    ``agrees`` is the verdict that stands (null: none yet), see ``agreement``: it changes later than ``gap`` passes.
+    """
+    axes = {
+        axis: {
+            "agrees": look.agrees.get(axis),
+            "gap": one.gap,
+            "where": {"tau": one.tau_s},
+            "ratio": one.ratio,
+            "null95": one.null95,
+            "threshold": one.threshold,
+            "measured": _list(one.measured),
+            "model": _list(one.model),
+            "z": _list(one.z),
+        }
+        for axis, one in look.axes.items()
+    }
+    filled_s = look.n / look.rate_hz
+    payload = {
+        "rate": look.rate_hz,
+        "window": look.window_s,
+        "filled": filled_s,
+        "tau": _list(look.tau_s),
+        "axes": axes,
+    }
+    return _encode(topics.GAP, device, unix_s, look.samples, payload)
+
+
+def thermal(device: str, unix_s: float, samples: int, look: ThermalLook) -> bytes:
+    """``imu/<device>/thermal``: the mean of an interval beside what was expected of it; ``t`` is its end.
+
+    ``multi_step`` knows temperature alone, ``one_step`` the bias before too; null where there is no model, and then
+    ``text`` says why.
+    """
+    axes = {
+        axis: {
+            "bias": _number(one.bias),
+            "error": _number(one.error),
+            "multi_step": _band(one.multi_step),
+            "one_step": _band(one.one_step),
+            "model": one.model or None,
+            "slope": _number(one.slope),
+            "text": one.text,
+        }
+        for axis, one in look.axes.items()
+    }
+    payload = {"interval": look.interval_s, "temperature": look.temperature_c, "axes": axes}
+    return _encode(topics.THERMAL, device, unix_s, samples, payload)
+
+
+def total(device: str, unix_s: float, samples: int, total: TotalCurve, hadamard: HadamardCurve) -> bytes:
+    """``imu/<device>/total``: total and Hadamard deviation, each with its own τ; axes that are measured."""
+    curves = {
+        "total": (total.tau_s, np.sqrt(total.tvar), total.lo, total.hi),
+        "hadamard": (hadamard.tau_s, np.sqrt(hadamard.hvar), hadamard.lo, hadamard.hi),
+    }
+    payload = {
+        name: {
+            "tau": _list(tau_s),
+            "axes": {
+                axis: {"deviation": _list(deviation[:, i]), "lo": _list(lo[:, i]), "hi": _list(hi[:, i])}
+                for i, axis in enumerate(AXES)
+                if np.isfinite(deviation[:, i]).any()
+            },
+        }
+        for name, (tau_s, deviation, lo, hi) in curves.items()
+    }
+    return _encode(topics.TOTAL, device, unix_s, samples, payload)
+
+
+def coefficient_table(all_axes: Coefficients, axis: int, k_or_r: bool = False) -> dict[str, dict[str, Any]]:
+    """One axis of the coefficients, a table a letter; also what ``analyze --json`` writes.
+
+    ``k_or_r``: one of these two is there, and which is not known: each has the other's letter in ``or``.
+    """
+    other = {"K": "R", "R": "K"} if k_or_r else {}
+    return {
+        letter: {
+            "value": _number(all_axes.value[row, axis]),
+            "lo": _number(all_axes.lo[row, axis]),
+            "hi": _number(all_axes.hi[row, axis]),
+            "status": Status(int(all_axes.status[row, axis])).name.lower(),
+            **({"or": other[letter]} if letter in other else {}),
+        }
+        for row, letter in enumerate(LETTERS)
+    }
+
+
+def event(device: str, unix_s: float, samples: int, what: Event, since_s: float | None) -> bytes:
+    """``imu/<device>/event``."""
+    payload = {
+        "kind": what.kind,
+        "axis": what.axis,
+        "what": what.what,
+        "since": since_s,
+        "sigma": what.sigma,
+        "text": masked(what.text),
+    }
+    return _encode(topics.EVENT, device, unix_s, samples, payload)
+
+
+def since_s(unix_s: float, what: Event) -> float | None:
+    """Unix time at which what is told at ``unix_s`` began; None where that is not known."""
+    return None if what.since_ns is None else unix_s - (what.t_ns - what.since_ns) / 1e9
+
+
+def status(device: str, unix_s: float | None, health: Health) -> bytes:
+    """``imu/<device>/status``."""
+    payload = {
+        "state": health.state,
+        "rate": health.rate_hz,
+        "received": health.received,
+        "lost": health.lost,
+        "bad": health.bad,
+        "overflowed": health.overflowed,
+        "latency": {"p50": health.latency_p50_s, "p99": health.latency_p99_s},
+        "memory": health.memory_bytes,
+        "outputs": {name: masked(said) for name, said in health.outputs.items()},
+        "uptime": health.uptime_s,
+        "repeated": health.repeated,
+        "late": health.late,
+        "moving": health.moving,
+        "moved": health.moved,
+        "crossed": health.crossed,
+        "text": masked(health.text),
+    }
+    return _encode(topics.STATUS, device, unix_s, health.received, payload)
+
+
+def reply(device: str, unix_s: float | None, samples: int, text: str) -> bytes:
+    """Answer of ``imu/<device>/command/<verb>``."""
+    return _encode(topics.RESET, device, unix_s, samples, {"text": text})
+
+
+def reconciled(
+    device: str, unix_s: float, samples: int, result: Mapping[str, Any], status: int, folder: str | None
+) -> bytes:
+    """Answer of ``imu/<device>/command/reconcile``: the report's own keys, and how it came about.
+
+    ``status`` is the command's exit status, ``folder`` where the whole report is kept, if it is.
+    """
+    own = {key: value for key, value in result.items() if key not in ("schema", "device", "t", "samples")}
+    return _encode(topics.RECONCILE, device, unix_s, samples, {**own, "exit": status, "folder": folder})
+
+
+def analysis(
+    result: Analysis,
+    total: TotalCurve | None = None,
+    hadamard: HadamardCurve | None = None,
+    dynamic: Dynamic | None = None,
+    warmth: WithoutTemperature | None = None,
+) -> bytes:
+    """``analyze --json``: schema imu-monitor/analyze/1, with those of the other curves that were made."""
+    estimate = result.estimate
+    rate_hz = estimate.rate_hz
+    tau = _list(estimate.curve.tau_s)
+    axes: dict[str, dict[str, Any]] = {}
+    for i, axis in measured_axes(estimate):
+        axes[axis] = {
+            "allan": {"tau": tau, **_curve(estimate.curve, i)},
+            **({"total": _beside(total.tau_s, total.tvar, total.lo, total.hi, i)} if total else {}),
+            **({"hadamard": _beside(hadamard.tau_s, hadamard.hvar, hadamard.lo, hadamard.hi, i)} if hadamard else {}),
+            "coefficients": coefficient_table(estimate.coefficients, i, bool(estimate.k_or_r[i])),
+            "bandwidth": _number(result.bandwidth_hz[i]),
+            **({"temperature": _dependence(warmth, axis)} if axis in result.axes_of_temperature and warmth else {}),
+            **({"without_temperature": _without(warmth, axis)} if warmth and axis in warmth.models else {}),
+        }
+    payload = {
+        "schema": ANALYZE_SCHEMA,
+        "rate": rate_hz,
+        "samples": estimate.samples,
+        "seconds": result.seconds,
+        "notes": result.notes,
+        "axes": axes,
+        "motions": [_motion(motion, rate_hz) for motion in result.motions],
+        "changes": [_change(change, rate_hz) for change in result.changes],
+    }
+    if dynamic is not None:
+        payload["dynamic"] = _dynamic(dynamic, measured_axes(estimate))
+    return _ENCODER.encode(payload)
+
+
+def no_analysis(why: str, samples: int) -> bytes:
+    """``analyze --json`` where the data do not support an answer."""
+    return _ENCODER.encode({"schema": ANALYZE_SCHEMA, "samples": samples, "notes": [why], "axes": {}})
+
+
+def _window(estimate: Estimate, **more: Any) -> dict[str, Any]:
+    filled_s = estimate.curve.n / estimate.rate_hz
+    return {"rate": estimate.rate_hz, "window": estimate.window_s, "filled": filled_s, **more}
+
+
+def _encode(topic: topics.Topic, device: str, unix_s: float | None, samples: int, payload: dict[str, Any]) -> bytes:
+    return _ENCODER.encode({"schema": topic.schema(), "device": device, "t": unix_s, "samples": samples, **payload})
+
+
+def measured_axes(estimate: Estimate) -> list[tuple[int, str]]:
+    """Column and name of each axis that has a curve."""
+    avar = estimate.curve.avar
+    return [(i, axis) for i, axis in enumerate(AXES) if not np.isnan(avar[:, i]).all()]
+
+
+def _curve(curve: AllanCurve, axis: int) -> dict[str, list[float]]:
+    columns = {"deviation": np.sqrt(curve.avar), "lo": curve.lo, "hi": curve.hi}
+    return {name: _list(column[:, axis]) for name, column in columns.items()}
+
+
+def _beside(tau_s: Floats, variance: Floats, lo: Floats, hi: Floats, axis: int) -> dict[str, list[float]]:
+    """Another deviation of one axis."""
+    columns = {"deviation": np.sqrt(variance), "lo": lo, "hi": hi}
+    return {"tau": _list(tau_s), **{name: _list(column[:, axis]) for name, column in columns.items()}}
+
+
+def _dependence(warmth: WithoutTemperature, axis: str) -> dict[str, Any]:
+    """The mark of an axis of whose slow variance temperature explains most."""
+    one = warmth.dependences[axis]
+    return {
+        "share": one.share,
+        "p_value": one.p_value,
+        "form": one.form,
+        "one_way": one.one_way,
+        "interval": one.interval_s,
+    }
+
+
+def _without(warmth: WithoutTemperature, axis: str) -> dict[str, Any]:
+    """K and R of an axis whose bias follows temperature, without that."""
+    i = AXES.index(axis)
+    table = coefficient_table(warmth.coefficients, i, warmth.k_or_r[i])
+    return {
+        "model": warmth.models[axis],
+        "coefficients": {letter: table[letter] for letter in SLOW},
+        "share": {letter: warmth.share(letter, axis) for letter in SLOW},
+    }
+
+
+def _motion(motion: Motion, rate_hz: float) -> dict[str, Any]:
+    return {
+        "kind": motion.kind,
+        "axis": motion.axis,
+        "t": motion.since / rate_hz,
+        "seconds": motion.seconds,
+        "peak": motion.peak,
+        "text": motion.text,
+    }
+
+
+def _change(change: Change, rate_hz: float) -> dict[str, Any]:
+    return {
+        "kind": change.kind,
+        "axis": AXES[change.axis],
+        "t": change.since / rate_hz,
+        "sigma": change.sigma,
+        "what": change.sides(),
+        "text": change.text,
+    }
+
+
+def _dynamic(dynamic: Dynamic, axes: Sequence[tuple[int, str]]) -> dict[str, Any]:
+    """Lists by time step; of deviations, in each a list by τ."""
+    return {
+        "window": dynamic.window_s,
+        "t": _list(dynamic.t_s),
+        "tau": _list(dynamic.tau_s),
+        "axes": {
+            axis: {
+                "deviation": _list(dynamic.deviation[:, :, i]),
+                "lo": _list(dynamic.lo[:, :, i]),
+                "hi": _list(dynamic.hi[:, :, i]),
+                "coefficients": {
+                    letter: {
+                        "value": _list(dynamic.value[:, row, i]),
+                        "lo": _list(dynamic.value_lo[:, row, i]),
+                        "hi": _list(dynamic.value_hi[:, row, i]),
+                        "status": [Status(one).name.lower() for one in dynamic.status[:, row, i].tolist()],
+                    }
+                    for row, letter in enumerate(LETTERS)
+                },
+            }
+            for i, axis in axes
+        },
+    }
+
+
+def _band(band: Band | None) -> dict[str, float] | None:
+    return None if band is None else {"bias": band.bias, "lo": band.lo, "hi": band.hi}
+
+
+def _number(value: float | np.float64) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _list(column: Floats) -> list[float]:
+    result: list[float] = column.tolist()
+    return result

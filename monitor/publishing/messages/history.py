@@ -1,0 +1,313 @@
+"""Past results -> JSON of ``imu/<device>/history`` and ``history --json``, and back, for whoever asks another daemon.
+
+Lists go by bucket. Of each number ``value`` is the last of its bucket, ``low`` and ``high`` are its extremes. A letter
+has the interval of that last value too, and its status: ``upper_bound`` where it was bounded and never estimated within
+the bucket. NaN becomes null. Seven digits are kept; nine are written, so that what is read is what was kept.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Final, Literal
+
+import msgspec
+import numpy as np
+
+from drivers.sample import AXES, Floats
+from monitor.common import topics
+from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.history.bucket import COUNTS, STATES, Singles
+from monitor.history.columns import HEALTH, TEMPERATURE
+from monitor.history.query import COEFFICIENTS, DEVIATIONS, EVENTS, STATUS, Question
+from monitor.history.reading import EVENTS as EVENTS_AT_MOST
+from monitor.history.reading import Course, Past
+from monitor.history.sqlite_store import PastEvent
+from monitor.history.time_ranges import Span
+
+POINTS_AT_MOST: Final = 1_000_000
+Numbers = list[float | None]
+State = Literal["ended", "running", "waiting", "lost"]
+_ENCODER: Final = msgspec.json.Encoder()
+_STATUSES: Final = {status: status.name.lower() for status in Status}
+
+
+class Number(msgspec.Struct, frozen=True, kw_only=True):
+    """One number over time."""
+
+    value: Numbers
+    low: Numbers
+    high: Numbers
+
+
+class Letter(Number, frozen=True, kw_only=True):
+    """One coefficient of one axis over time."""
+
+    lo: Numbers
+    hi: Numbers
+    n: list[int]
+    status: list[str]
+
+
+class Deviation(msgspec.Struct, frozen=True, kw_only=True):
+    """Of one axis: by bucket, in each by τ."""
+
+    value: list[Numbers]
+    low: list[Numbers]
+    high: list[Numbers]
+
+
+class Deviations(msgspec.Struct, frozen=True, kw_only=True):
+    """All axes."""
+
+    tau: list[float]
+    axes: dict[str, Deviation]
+
+
+class StatusCourse(msgspec.Struct, frozen=True, kw_only=True):
+    """How the device did."""
+
+    state: list[State]
+    received: list[int]
+    lost: list[int]
+    bad: list[int]
+    overflowed: list[int]
+    rate: Number | None = None
+    latency: Number | None = None
+    memory: Number | None = None
+    temperature: Number | None = None
+
+
+class EventOfPast(msgspec.Struct, frozen=True, kw_only=True):
+    """Something that happened."""
+
+    t: float
+    kind: str
+    text: str
+    axis: str | None = None
+    what: dict[str, dict[str, float | None]] = {}
+    since: float | None = None
+    sigma: float | None = None
+    stands_for: int = 1
+
+
+class HistoryMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """``imu/<device>/history``."""
+
+    schema: str
+    device: str
+    t: float
+    samples: int
+    from_: float = msgspec.field(name="from")
+    to: float
+    step: int
+    start: list[int]
+    width: list[int]
+    axes: dict[str, dict[str, Letter]] | None = None
+    deviations: Deviations | None = None
+    status: StatusCourse | None = None
+    events: list[EventOfPast] | None = None
+    events_in_all: int = 0
+
+
+def history(past: Past, asked: Question, unix_s: float, samples: int) -> bytes:
+    """The answer to a question: ``t`` and ``samples`` are of the newest sample and since the start, as everywhere."""
+    payload: dict[str, Any] = {
+        "schema": topics.HISTORY.schema(),
+        "device": past.device,
+        "t": unix_s,
+        "samples": samples,
+        "from": past.span.start_s,
+        "to": past.span.end_s,
+        "step": past.step_s,
+        "start": past.start_s.tolist(),
+        "width": past.width_s.tolist(),
+    }
+    if COEFFICIENTS in asked.what:
+        shown = [axis for axis in asked.axes if axis in past.axes()]
+        payload["axes"] = {axis: {letter: _letter(past, axis, letter) for letter in asked.letters} for axis in shown}
+    if DEVIATIONS in asked.what:
+        payload["deviations"] = _deviations(past, asked.axes)
+    if STATUS in asked.what:
+        payload["status"] = {
+            "state": [STATES[one] for one in past.state.tolist()],
+            **{name: past.counts[:, i].tolist() for i, name in enumerate(COUNTS)},
+            **{name: _number(past.column(name)) for name in (*HEALTH, *TEMPERATURE) if name in past.names},
+        }
+    if EVENTS in asked.what:
+        payload["events"] = [_event(one) for one in past.events]
+        payload["events_in_all"] = past.events_in_all
+    return _ENCODER.encode(payload)
+
+
+def read(payload: bytes) -> Past:
+    """What such a message says.
+
+    Raises:
+        ValueError: it is none
+    """
+    said = msgspec.json.decode(payload, type=HistoryMessage)
+    p = len(said.start)
+    if said.schema != topics.HISTORY.schema() or len(said.width) != p or p > POINTS_AT_MOST:
+        raise ValueError("not an answer of a history")
+    columns: dict[str, Course] = {}
+    for axis, letters in (said.axes or {}).items():
+        for letter, one in letters.items():
+            if axis in AXES and letter in LETTERS:
+                columns |= _letter_columns(f"{axis}.{letter}", one, p)
+    if said.deviations is not None:
+        columns |= _deviation_columns(said.deviations, p)
+    counts = np.zeros((p, len(COUNTS)), np.int64)
+    state = np.full(p, STATES.index("running"))
+    if said.status is not None:
+        counts = np.column_stack([_integers(getattr(said.status, name), p) for name in COUNTS]).reshape(p, len(COUNTS))
+        state = _integers([STATES.index(one) for one in said.status.state], p)
+        for name in (*HEALTH, *TEMPERATURE):
+            number = getattr(said.status, name)
+            if number is not None:
+                columns[name] = _course(number, p)
+    names = tuple(columns)
+    low, high, last = (
+        _singles([getattr(one, part) for one in columns.values()], p) for part in ("low", "high", "last")
+    )
+    return Past(
+        clean(said.device),
+        Span(said.from_, said.to),
+        said.step,
+        _integers(said.start, p),
+        _integers(said.width, p),
+        names,
+        np.array([one.n for one in columns.values()], np.int64).reshape(len(columns), p).T,
+        low,
+        high,
+        last,
+        counts,
+        state,
+        tuple(_read_event(one) for one in (said.events or [])[:EVENTS_AT_MOST]),
+        said.events_in_all,
+    )
+
+
+def _letter(past: Past, axis: str, letter: str) -> dict[str, Any]:
+    value, bound = past.column(f"{axis}.{letter}"), past.column(f"{axis}.{letter}.bound")
+    lo, hi = (past.column(f"{axis}.{letter}.{end}") for end in ("lo", "hi"))
+    estimated, bounded = value.n > 0, bound.n > 0
+    status = np.where(estimated, Status.ESTIMATED, np.where(bounded, Status.UPPER_BOUND, Status.UNESTIMATED))
+    only = bounded & ~estimated
+    return {
+        **_number(value),
+        "lo": _list(np.where(only, 0.0, lo.last)),
+        "hi": _list(np.where(only, bound.last, hi.last)),
+        "n": value.n.tolist(),
+        "status": [_STATUSES[Status(one)] for one in status.tolist()],
+    }
+
+
+def _letter_columns(name: str, one: Letter, p: int) -> dict[str, Course]:
+    """A letter's numbers, as they are kept."""
+    n = _integers(one.n, p)
+    value, lo, hi = _course(one, p), _floats(one.lo, p), _floats(one.hi, p)
+    if len(one.status) != p:
+        raise ValueError("lists of different lengths")
+    only = np.array([status == _STATUSES[Status.UPPER_BOUND] for status in one.status], np.bool_)
+    missing = np.full(p, np.nan)
+    return {
+        name: Course(n, value.low, value.high, value.last),
+        f"{name}.lo": _steady(np.where(only, missing, lo)),
+        f"{name}.hi": _steady(np.where(only, missing, hi)),
+        f"{name}.bound": _steady(np.where(only, hi, missing)),
+    }
+
+
+def _deviations(past: Past, axes: Sequence[str]) -> dict[str, Any]:
+    taus = past.taus()
+    found: dict[str, Any] = {}
+    for axis in axes:
+        columns = [past.column(f"{axis}.sigma.{tau}") for tau in taus]
+        if any(one.n.any() for one in columns):
+            found[axis] = {
+                name: [_list(row) for row in np.column_stack([getattr(one, part) for one in columns])]
+                for name, part in (("value", "last"), ("low", "low"), ("high", "high"))
+            }
+    return {"tau": [float(tau) for tau in taus], "axes": found}
+
+
+def _deviation_columns(said: Deviations, p: int) -> dict[str, Course]:
+    columns = {}
+    for axis, one in said.axes.items():
+        if axis not in AXES:
+            continue
+        value, low, high = (_table(part, p, len(said.tau)) for part in (one.value, one.low, one.high))
+        for i, tau in enumerate(said.tau):
+            columns[f"{axis}.sigma.{tau:g}"] = Course(np.isfinite(value[:, i]) * 1, low[:, i], high[:, i], value[:, i])
+    return columns
+
+
+def _number(course: Course) -> dict[str, Numbers]:
+    return {"value": _list(course.last), "low": _list(course.low), "high": _list(course.high)}
+
+
+def _course(number: Number, p: int) -> Course:
+    low, high, last = (_floats(one, p) for one in (number.low, number.high, number.value))
+    return Course((~np.isnan(last)).astype(np.int64), low, high, last)
+
+
+def _steady(last: Floats) -> Course:
+    return Course((~np.isnan(last)).astype(np.int64), last, last, last)
+
+
+def _event(event: PastEvent) -> dict[str, Any]:
+    return {
+        "t": event.t_s,
+        "kind": event.kind,
+        "axis": event.axis,
+        "what": event.what,
+        "since": event.since_s,
+        "sigma": event.sigma,
+        "text": event.text,
+        "stands_for": event.stands_for,
+    }
+
+
+def _read_event(said: EventOfPast) -> PastEvent:
+    what = {
+        name: {key: np.nan if one is None else one for key, one in sides.items()} for name, sides in said.what.items()
+    }
+    axis = said.axis if said.axis in AXES else None
+    return PastEvent(said.t, clean(said.kind), clean(said.text), axis, what, said.since, said.sigma, said.stands_for)
+
+
+def _list(column: Floats) -> Numbers:
+    """Nine digits: float32 comes back bit for bit."""
+    return [float(f"{one:.9g}") for one in column.tolist()]
+
+
+def _floats(numbers: Numbers, p: int) -> Floats:
+    found = np.array([np.nan if one is None else one for one in numbers], np.float64)
+    if found.shape != (p,):
+        raise ValueError("lists of different lengths")
+    return found
+
+
+def _table(rows: Sequence[Numbers], p: int, m: int) -> Floats:
+    if len(rows) != p:
+        raise ValueError("lists of different lengths")
+    return np.array([_floats(row, m) for row in rows]).reshape(p, m)
+
+
+def _singles(columns: Sequence[Floats], p: int) -> Singles:
+    """[p, k] of k columns."""
+    with np.errstate(over="ignore"):  # what no sensor says becomes infinite
+        return np.array(columns, np.float64).reshape(len(columns), p).T.astype(np.float32)
+
+
+def _integers(numbers: Sequence[int], p: int) -> "np.ndarray[tuple[int], np.dtype[np.int64]]":
+    try:
+        found = np.array(numbers, np.int64)
+    except OverflowError as error:
+        raise ValueError("a number beyond all bounds") from error
+    if found.shape != (p,):
+        raise ValueError("lists of different lengths")
+    return found
+
+
+def clean(text: str) -> str:
+    """Without control characters: it ends on a terminal."""
+    return "".join(one if one.isprintable() else " " for one in text)

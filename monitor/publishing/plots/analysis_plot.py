@@ -1,0 +1,146 @@
+"""One analysis as one picture, for ``imu-monitor analyze --plot FILE.png``.
+
+In comes an ``Estimate``, out goes a file: gyroscopes and accelerometers side by side, the Allan plot with the letters,
+a table of the coefficients below, and, where dynamic curves were made, those below that in the same file.
+matplotlib is imported when a plot is asked for, and draws without a screen.
+"""
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from drivers.errors import ConfigError
+from drivers.sample import AXES
+from monitor.estimation.allan.dynamic_allan import Dynamic
+from monitor.estimation.estimate import Estimate
+from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.publishing.coefficient_cells import (
+    COEFFICIENT_NAMES,
+    COEFFICIENT_UNITS,
+    KINDS,
+    TEMPERATURE_MARK,
+    TEMPERATURE_MEANS,
+    Kind,
+    axes_of,
+    marked,
+    measured_axes,
+    reading,
+)
+from monitor.publishing.plots.allan_figure import COLOURS, GREY, READING, Beside, allan_panel
+from monitor.publishing.plots.dynamic_figure import Mark, dynamic_panels, height_inches
+from monitor.publishing.rerun.panels import duration
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import SubFigure
+
+INCHES: Final = (7.2, 7.6)  # of one Allan panel with its table
+DPI: Final = 150
+MISSING: Final = 'matplotlib is not installed: pip install "imu-monitor[plot]"'
+EXPLAINED: Final = (
+    "small print: 95 % interval;  ≤ one-sided 95 % bound;  — too few data;  K or R: the data do not tell which"
+)
+
+
+def allan_plot(
+    estimate: Estimate,
+    path: Path,
+    title: str = "",
+    others: Sequence[Beside] = (),
+    dynamic: Dynamic | None = None,
+    marks: Sequence[Mark] = (),
+    axes_of_temperature: Collection[str] = (),
+) -> None:
+    """Write the picture; the ending of ``path`` says the format.
+
+    Args:
+        estimate: of the whole recording
+        path: file to write
+        title: above all
+        others: other deviations, such as total and Hadamard
+        dynamic: dynamic curves of the same recording, drawn below
+        marks: changes, on their time axis
+        axes_of_temperature: axes that are marked, as temperature explains most of their slow variance
+    Raises:
+        ConfigError: matplotlib is missing or the file cannot be written
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ConfigError(MISSING) from error
+    kinds = kinds_of(estimate)
+    below = max((height_inches(dynamic, kind) for kind in kinds), default=0.0) if dynamic is not None else 0.0
+    figure = Figure(figsize=(INCHES[0] * len(kinds), INCHES[1] + below), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    rows = [INCHES[1]] if dynamic is None else [INCHES[1], below]
+    parts = figure.subfigures(len(rows), len(kinds), squeeze=False, height_ratios=rows)
+    for column, kind in enumerate(kinds):
+        _static(parts[0, column], estimate, kind, others, axes_of_temperature)
+        if dynamic is not None:
+            dynamic_panels(parts[1, column], dynamic, kind, marks)
+    figure.suptitle("\n".join([*([title] if title else []), summary(estimate)]), fontsize=12)
+    try:
+        figure.savefig(path)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"cannot write the plot {path}: {error}") from error
+
+
+def kinds_of(estimate: Estimate) -> list[Kind]:
+    """The kinds that are measured; both where nothing is."""
+    present = set(measured_axes(estimate.curve.avar))
+    return [kind for kind in KINDS if set(axes_of(kind)) & present] or list(KINDS)
+
+
+def summary(estimate: Estimate) -> str:
+    """How much was recorded, in a line: samples, rate, duration, and what is missing."""
+    missing = estimate.curve.n - estimate.samples
+    gaps = f", {missing:,} missing" if missing > 0 else ""
+    seconds = duration(estimate.curve.n / estimate.rate_hz)
+    return f"{estimate.samples:,} samples at {estimate.rate_hz:.6g} Hz, {seconds}{gaps}"
+
+
+def k_or_r(estimate: Estimate, letter: str, axis: str) -> bool:
+    """Whether this is one of two terms of which the data show one, without telling which."""
+    i, drifts = AXES.index(axis), letter in ("K", "R")
+    return (
+        drifts
+        and bool(estimate.k_or_r[i])
+        and estimate.coefficients.status[LETTERS.index(letter), i] == Status.UPPER_BOUND
+    )
+
+
+def _static(
+    part: "SubFigure",
+    estimate: Estimate,
+    kind: Kind,
+    others: Sequence[Beside],
+    axes_of_temperature: Collection[str],
+) -> None:
+    """Allan plot and table of one kind."""
+    curves, table = part.subplots(2, 1, height_ratios=[3.6, 1.75])
+    allan_panel(curves, estimate, kind, others)
+    _table(table, estimate, kind, axes_of_temperature)
+
+
+def _table(axes: "Axes", estimate: Estimate, kind: Kind, axes_of_temperature: Collection[str]) -> None:
+    """The coefficients of one kind: value, and its interval in small print."""
+    axes.axis("off")
+    columns = (0.0, 0.46, 0.65, 0.84)
+    rows = np.linspace(0.97, 0.19, len(LETTERS) + 1)
+    for axis, x, colour in zip(axes_of(kind), columns[1:], COLOURS, strict=True):
+        axes.text(x, rows[0], marked(axis, axes_of_temperature), color=colour, fontweight="bold", va="center")
+    for letter, y in zip(LETTERS, rows[1:], strict=True):
+        unit = COEFFICIENT_UNITS[kind][letter].name
+        axes.text(columns[0], y, f"{letter}  {COEFFICIENT_NAMES[kind][letter]}, {unit}", va="center", fontsize=9.5)
+        for axis, x in zip(axes_of(kind), columns[1:], strict=True):
+            cell = reading(estimate.coefficients, letter, axis)
+            axes.text(x, y + 0.02, cell.value, va="center", fontsize=9.5)
+            small = "K or R" if k_or_r(estimate, letter, axis) else cell.interval
+            axes.text(x, y - 0.05, small, va="center", fontsize=6.5, color=GREY)
+    temperature = f";  {TEMPERATURE_MARK} {TEMPERATURE_MEANS}" if axes_of_temperature else ""
+    axes.text(columns[0], 0.03, EXPLAINED + temperature, va="center", fontsize=7.5, color=GREY)
+    axes.text(columns[0], -0.04, READING, va="center", fontsize=7.5, color=GREY)
+    axes.set(xlim=(0, 1), ylim=(-0.06, 1))

@@ -1,0 +1,89 @@
+"""Bias against temperature as a picture: over time, and one against the other, a row an axis.
+
+matplotlib is imported when a plot is asked for, and draws without a screen.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from drivers.errors import ConfigError
+from drivers.sample import AXES, Floats
+from monitor.drift.thermal.interval_means import Means
+from monitor.drift.thermal.thermal_model import Prediction, predicted
+from monitor.drift.thermal.thermal_study import Outlook, Study
+from monitor.publishing.coefficient_cells import DEVIATION_UNITS, kind_of
+from monitor.publishing.plots.allan_figure import COLOURS, GREY
+from monitor.publishing.plots.analysis_plot import DPI, MISSING
+from monitor.publishing.rerun.panels import duration
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+ROW_INCHES: Final = (11.0, 2.6)
+
+
+def study_plot(study: Study, path: Path) -> None:
+    """Means and the model that was fitted to them."""
+    rows = [
+        (
+            axis,
+            study.means[axis],
+            predicted(one.model, study.means[axis].temperature_c, began=True),
+            one.model.shape.name,
+        )
+        for axis, one in study.fits.items()
+    ]
+    _draw(rows, f"{study.recording}: bias and temperature, means of {duration(study.interval_s)}", path)
+
+
+def outlook_plot(outlook: Outlook, path: Path) -> None:
+    """Means and what models of another recording expect, their offset taken out."""
+    rows = []
+    for axis, one in outlook.judged.items():
+        band = Prediction(*(each + one.offset for each in (one.multi_step.bias, one.multi_step.lo, one.multi_step.hi)))
+        rows.append((axis, outlook.means[axis], band, "multi-step, offset out"))
+    _draw(rows, f"{outlook.recording}: expected from temperature, means of {duration(outlook.interval_s)}", path)
+
+
+def _draw(rows: list[tuple[str, Means, Prediction, str]], title: str, path: Path) -> None:
+    """Write the picture.
+
+    Raises:
+        ConfigError: matplotlib is missing or the file cannot be written
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ConfigError(MISSING) from error
+    figure = Figure(figsize=(ROW_INCHES[0], 0.6 + ROW_INCHES[1] * len(rows)), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels: Any = figure.subplots(len(rows), 2, squeeze=False, width_ratios=[2.4, 1.0])
+    for (over_time, against), (axis, means, model, name) in zip(panels, rows, strict=True):
+        unit, colour = DEVIATION_UNITS[kind_of(axis)], COLOURS[AXES.index(axis) % 3]
+        hours = (np.arange(means.bias.size) + 0.5) * means.interval_s / 3600.0
+        middle = float(np.nanmean(means.bias))
+        bias, expected, lo, hi, bars = (
+            unit.factor * each
+            for each in (means.bias - middle, model.bias - middle, model.lo - middle, model.hi - middle, means.error)
+        )
+        over_time.fill_between(hours, lo, hi, color=colour, alpha=0.15, lw=0, label="95 %")
+        over_time.errorbar(hours, bias, bars, fmt=".", ms=4, color=GREY, lw=0.8, label="means")
+        over_time.plot(hours, expected, color=colour, lw=1.4, label=name)
+        over_time.set_ylabel(f"{axis} less its mean, {unit.name}")
+        over_time.legend(loc="best", fontsize=7.5, frameon=False)
+        _against(against, means.temperature_c, bias, expected, colour)
+    panels[-1, 0].set_xlabel("time, h")
+    panels[-1, 1].set_xlabel("temperature, °C")
+    figure.suptitle(title, fontsize=12)
+    try:
+        figure.savefig(path)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"cannot write the plot {path}: {error}") from error
+
+
+def _against(panel: "Axes", temperature_c: Floats, bias: Floats, expected: Floats, colour: str) -> None:
+    panel.plot(temperature_c, bias, ".", ms=4, color=GREY)
+    panel.plot(temperature_c, expected, color=colour, lw=1.2)

@@ -1,0 +1,1 @@
+"""HTML reports, Rerun files and tables of results."""

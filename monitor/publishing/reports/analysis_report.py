@@ -1,0 +1,223 @@
+"""One analysis as one self-contained page, for ``imu-monitor analyze --plot FILE.html``.
+
+In comes an ``Analysis``, out goes a file that needs no network: the Allan plot of each kind of sensor as inline SVG,
+the table of coefficients in the field's units with intervals and words, what was recorded, the notes, and the dynamic
+curves where they were made. Surfaces over time are pictures inside the SVG, so that the page stays below a megabyte.
+matplotlib and Jinja2 are imported when a report is asked for.
+"""
+
+import io
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from drivers.errors import ConfigError
+from drivers.sample import AXES
+from monitor.estimation.allan.dynamic_allan import Dynamic
+from monitor.estimation.analysis import Analysis
+from monitor.estimation.estimate import Estimate
+from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.publishing.coefficient_cells import (
+    COEFFICIENT_NAMES,
+    KIND_NAMES,
+    TEMPERATURE_MARK,
+    TEMPERATURE_MEANS,
+    Kind,
+    axes_of,
+    marked,
+    number,
+    reading,
+    unit_of,
+)
+from monitor.publishing.plots import analysis_plot
+from monitor.publishing.plots.allan_figure import COLOURS, READING, Beside, allan_panel
+from monitor.publishing.plots.dynamic_figure import Mark, dynamic_panels, height_inches
+from monitor.publishing.rerun.panels import duration
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+TEMPLATE: Final = "report.html.j2"
+ALLAN_INCHES: Final = (7.2, 5.2)
+WIDE_INCHES: Final = 7.2
+PIXELS_DPI: Final = 80  # of surfaces and bands, which are pictures inside the drawing
+SIMPLER_PX: Final = 0.6  # corners of a line that are less than this beside it are left out
+MISSING: Final = 'matplotlib and Jinja2 are needed: pip install "imu-monitor[plot]"'
+WORDS: Final = {
+    Status.ESTIMATED: "",
+    Status.UPPER_BOUND: "upper bound",
+    Status.UNESTIMATED: "too few data",
+}
+K_OR_R: Final = "upper bound; K or R"
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One coefficient of one axis, as a person reads it."""
+
+    value: str  # "0.516 °/√h", "≤ 3.10 °/h", "—"
+    interval: str  # "0.512 … 0.520", or ""
+    word: str  # "upper bound", "too few data", or "" where it is estimated
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One letter of a table."""
+
+    letter: str
+    name: str
+    cells: tuple[Cell, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What the page shows of one kind of sensor."""
+
+    name: str
+    axes: tuple[tuple[str, str], ...]  # name with its mark, and colour
+    rows: tuple[Row, ...]
+    allan: str  # SVG
+    dynamic: str  # SVG, or "" where there are no dynamic curves
+
+
+def html_report(
+    analysis: Analysis,
+    path: Path,
+    title: str = "",
+    others: Sequence[Beside] = (),
+    dynamic: Dynamic | None = None,
+    marks: Sequence[Mark] = (),
+) -> None:
+    """Write the page; arguments as for ``plot.allan_plot``.
+
+    Raises:
+        ConfigError: matplotlib or Jinja2 is missing, or the file cannot be written
+    """
+    page = html(analysis, title, others, dynamic, marks)
+    try:
+        path.write_text(page, "utf-8")
+    except OSError as error:
+        raise ConfigError(f"cannot write the report {path}: {error}") from error
+
+
+def html(
+    analysis: Analysis,
+    title: str = "",
+    others: Sequence[Beside] = (),
+    dynamic: Dynamic | None = None,
+    marks: Sequence[Mark] = (),
+) -> str:
+    """The page as text."""
+    try:
+        import matplotlib.figure as _  # noqa: F401
+        from jinja2 import Environment, PackageLoader, StrictUndefined
+    except ImportError as error:
+        raise ConfigError(MISSING) from error
+    environment = Environment(
+        loader=PackageLoader("monitor.publishing"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    estimate = analysis.estimate
+    return environment.get_template(TEMPLATE).render(
+        title=title or "Recording",
+        facts=facts(analysis),
+        notes=analysis.notes,
+        parts=[
+            _part(estimate, kind, others, dynamic, marks, analysis.axes_of_temperature)
+            for kind in analysis_plot.kinds_of(estimate)
+        ],
+        temperature=f"{TEMPERATURE_MARK} {TEMPERATURE_MEANS}." if analysis.axes_of_temperature else "",
+        reading=READING,
+        window="" if dynamic is None else duration(dynamic.window_s),
+    )
+
+
+def facts(analysis: Analysis) -> tuple[tuple[str, str], ...]:
+    """What was recorded: name and value."""
+    estimate = analysis.estimate
+    missing = max(estimate.curve.n - estimate.samples, 0)
+    share = f" ({number(100.0 * missing / estimate.curve.n, 2)} %)" if missing else ""
+    return (
+        ("rate", f"{estimate.rate_hz:.6g} Hz"),
+        ("samples", f"{estimate.samples:,}"),
+        ("duration", duration(analysis.seconds)),
+        ("missing samples", f"{missing:,}{share}" if missing else "none"),
+        ("averaging times", f"{number(estimate.curve.tau_s[0])} … {number(estimate.curve.tau_s[-1])} s"),
+    )
+
+
+def table(estimate: Estimate, kind: Kind) -> tuple[Row, ...]:
+    """The coefficients of one kind."""
+    return tuple(
+        Row(letter, COEFFICIENT_NAMES[kind][letter], tuple(_cell(estimate, letter, axis) for axis in axes_of(kind)))
+        for letter in LETTERS
+    )
+
+
+def _cell(estimate: Estimate, letter: str, axis: str) -> Cell:
+    known = estimate.coefficients
+    status = Status(int(known.status[LETTERS.index(letter), AXES.index(axis)]))
+    one = reading(known, letter, axis)
+    value = one.value if status == Status.UNESTIMATED else f"{one.value} {unit_of(letter, axis).name}"
+    word = K_OR_R if analysis_plot.k_or_r(estimate, letter, axis) else WORDS[status]
+    return Cell(value, one.interval, word)
+
+
+def _part(
+    estimate: Estimate,
+    kind: Kind,
+    others: Sequence[Beside],
+    dynamic: Dynamic | None,
+    marks: Sequence[Mark],
+    axes_of_temperature: Collection[str],
+) -> Part:
+    import matplotlib
+
+    # a path remembers the threshold from when it was made
+    with matplotlib.rc_context({"path.simplify_threshold": SIMPLER_PX}):
+        return _drawn(estimate, kind, others, dynamic, marks, axes_of_temperature)
+
+
+def _drawn(
+    estimate: Estimate,
+    kind: Kind,
+    others: Sequence[Beside],
+    dynamic: Dynamic | None,
+    marks: Sequence[Mark],
+    axes_of_temperature: Collection[str],
+) -> Part:
+    from matplotlib.figure import Figure
+
+    curves = Figure(figsize=ALLAN_INCHES, layout="constrained")
+    allan_panel(curves.subplots(), estimate, kind, others)
+    surface = ""
+    if dynamic is not None:
+        figure = Figure(figsize=(WIDE_INCHES, height_inches(dynamic, kind)), layout="constrained")
+        dynamic_panels(figure, dynamic, kind, marks)
+        surface = _svg(figure, f"{kind}-dynamic")
+    names = (marked(axis, axes_of_temperature) for axis in axes_of(kind))
+    tints = tuple(zip(names, COLOURS, strict=True))
+    return Part(KIND_NAMES[kind], tints, table(estimate, kind), _svg(curves, f"{kind}-allan"), surface)
+
+
+def _svg(figure: "Figure", salt: str) -> str:
+    """The figure as an SVG element, with names that no other figure of the page uses; the same at every run."""
+    import matplotlib
+
+    text = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": salt}):
+        figure.savefig(
+            text, format="svg", dpi=PIXELS_DPI, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        )
+    element = text.getvalue()[text.getvalue().index("<svg") :]
+    # glyphs and clips are referred to by names that are unique in a figure only
+    element = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{salt}-", element)
+    # as wide as its column, not as its inches
+    return re.sub(
+        r'(<svg[^>]*?) width="[^"]*"', r"\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", element, count=1), count=1
+    )

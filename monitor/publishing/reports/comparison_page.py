@@ -1,0 +1,210 @@
+"""Several recordings of one sensor on one self-contained page: ``report.html`` above the reports of each.
+
+In comes a ``Comparison``, out goes text that needs no network: the verdict in a few sentences, a table of axes and
+recordings with links to the single reports, each common effect with the size that every recording gives it drawn beside
+the pooled one, and each effect of some recordings only, with what its absence means in the others. Jinja2 is imported
+when a page is asked for; the same comparison gives the same page.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from drivers.errors import ConfigError
+from drivers.sample import AXES
+from monitor.noise.effects import EFFECTS
+from monitor.publishing.plots.allan_figure import COLOURS, DARK
+from monitor.publishing.plots.ruler import Ruler
+from monitor.publishing.reports import comparison_sentences as runs_words
+from monitor.publishing.reports import reconcile_sentences as words
+from monitor.publishing.reports.reconcile_page import MISSING
+from monitor.publishing.rerun.panels import duration
+from monitor.reconcile.result import Bounds, Step
+from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, Seen
+
+TEMPLATE: Final = "reconcile_runs.html.j2"
+STRIP_PX: Final = (260.0, 22.0)
+MARGIN: Final = 0.06
+"""Of the span of all intervals, at either end of a strip."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """One recording of the table on top."""
+
+    name: str  # of its folder, too
+    verdict: str  # as in the JSON
+    word: str
+    length: str
+    samples: str
+    rate: str
+
+
+@dataclass(frozen=True, slots=True)
+class AxisRow:
+    """One axis in all recordings."""
+
+    axis: str
+    colour: str
+    cells: tuple[tuple[str, str, str], ...]  # verdict, its word, and what was found
+
+
+@dataclass(frozen=True, slots=True)
+class SizeRow:
+    """A recording's view of a common effect, or that of all."""
+
+    name: str
+    cells: tuple[str, ...]  # of each parameter
+    confidence: str
+    strip: str  # SVG
+
+
+@dataclass(frozen=True, slots=True)
+class CommonPart:
+    """What the page shows of one common effect."""
+
+    axis: str
+    colour: str
+    title: str
+    means: str
+    agreement: str
+    differ: bool
+    names: tuple[str, ...]  # of the parameters
+    drawn: str  # the parameter of the strips
+    rows: tuple[SizeRow, ...]  # recordings, and last all of them
+
+
+@dataclass(frozen=True, slots=True)
+class SingleRow:
+    """What the page shows of one effect of some recordings."""
+
+    axis: str
+    colour: str
+    kind: str
+    effect: str
+    parameters: str
+    runs: str
+    elsewhere: tuple[tuple[str, str, str, str], ...]  # recording, meaning as in the JSON and in words, and why
+
+
+def page(c: Comparison) -> str:
+    """The page as text.
+
+    Raises:
+        ConfigError: Jinja2 is missing
+    """
+    try:
+        from jinja2 import Environment, PackageLoader, StrictUndefined
+    except ImportError as error:
+        raise ConfigError(MISSING) from error
+    environment = Environment(
+        loader=PackageLoader("monitor.publishing"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(TEMPLATE).render(
+        title=f"{len(c.runs)} recordings of one sensor",
+        verdict=c.verdict,
+        word=words.VERDICTS[c.verdict],
+        summary=runs_words.summary(c),
+        recorded=_recorded(c),
+        rows=[_row(c, one) for one in c.axes.values()],
+        common=[_common(c, axis, seen) for axis, one in c.axes.items() for seen in one.common],
+        single=[_single(c, axis, seen) for axis, one in c.axes.items() for seen in one.single],
+        silent=c.silent,
+        model=str(c.model),
+    )
+
+
+def _recorded(c: Comparison) -> list[Recorded]:
+    return [
+        Recorded(
+            run.name,
+            run.result.verdict,
+            words.VERDICTS[run.result.verdict],
+            duration(run.result.seconds),
+            f"{run.result.samples:,}",
+            f"{run.result.rate_hz:.6g} Hz",
+        )
+        for run in c.runs
+    ]
+
+
+def _row(c: Comparison, one: AxisRuns) -> AxisRow:
+    cells = []
+    for run in c.runs:
+        result = one.results.get(run.name)
+        verdict = "" if result is None else result.verdict
+        cells.append((verdict, words.VERDICTS.get(verdict, ""), runs_words.cell(result)))
+    return AxisRow(one.axis, _colour(one.axis), tuple(cells))
+
+
+def _common(c: Comparison, axis: str, seen: Seen) -> CommonPart:
+    names = tuple(seen.parameters)
+    drawn = next((name for name, one in seen.parameters.items() if one.freedom), "")
+    intervals = [step.parameters[drawn] for step in seen.steps.values() if drawn in step.parameters]
+    ruler = _ruler(intervals)
+    every = [*seen.steps.items(), ("all together", seen.step())]
+    rows = tuple(
+        SizeRow(
+            name,
+            _cells(c, axis, step, names),
+            words.percent(step.confidence) if name in seen.steps else "",
+            "" if ruler is None else _strip(step.parameters.get(drawn), ruler, _colour(axis), name not in seen.steps),
+        )
+        for name, step in every
+    )
+    return CommonPart(
+        axis,
+        _colour(axis),
+        f"{seen.kind} {words.plain(seen.effect)}",
+        EFFECTS[seen.effect].means,
+        runs_words.agreement(seen),
+        seen.consistent is False,
+        tuple(words.plain(name) for name in names),
+        words.plain(drawn) if ruler else "",
+        rows,
+    )
+
+
+def _cells(c: Comparison, axis: str, step: Step, names: Sequence[str]) -> tuple[str, ...]:
+    known = {one.name: one.short for one in words.parameters(step, axis, c.baseline)}
+    return tuple(known.get(name, "—") for name in names)
+
+
+def _single(c: Comparison, axis: str, seen: Seen) -> SingleRow:
+    effect, _, parameters = runs_words.line(seen, axis, c.baseline).partition(": ")
+    elsewhere = tuple((a.run, a.meaning, runs_words.MEANINGS[a.meaning], a.because) for a in seen.absent)
+    return SingleRow(axis, _colour(axis), seen.kind, effect, parameters, ", ".join(seen.steps), elsewhere)
+
+
+def _ruler(intervals: Sequence[Bounds]) -> Ruler | None:
+    """A linear strip that holds all intervals."""
+    ends = [end for one in intervals for end in (one.lo, one.hi) if end is not None and np.isfinite(end)]
+    if not ends or not max(ends) > min(ends):
+        return None
+    low, high = min(ends), max(ends)
+    more = MARGIN * (high - low)
+    return Ruler(low - more, high + more, False, 0.0, STRIP_PX[0])
+
+
+def _strip(one: Bounds | None, ruler: Ruler, colour: str, whole: bool) -> str:
+    """An interval and its value; that of all recordings together is dark and a diamond."""
+    wide, middle = STRIP_PX[0], 0.5 * STRIP_PX[1]
+    parts = [f'<line x1="0" x2="{wide:g}" y1="{middle:g}" y2="{middle:g}" stroke="#eee"/>']
+    if one is not None and one.lo is not None and one.hi is not None and not isinstance(one.value, str):
+        lo, at, hi = (float(px) for px in ruler.at(np.array([one.lo, one.value, one.hi])))
+        tint = DARK if whole else colour
+        ends = f'x1="{lo:.1f}" x2="{hi:.1f}" y1="{middle:g}" y2="{middle:g}"'
+        parts.append(f'<line {ends} stroke="{tint}" stroke-width="2.5"/>')
+        diamond = f'<path d="M{at - 6:.1f} {middle:g}l6 -6l6 6l-6 6z" fill="{tint}"/>'
+        parts.append(diamond if whole else f'<circle cx="{at:.1f}" cy="{middle:g}" r="4.5" fill="{tint}"/>')
+    return f'<svg class="strip" viewBox="0 0 {wide:g} {STRIP_PX[1]:g}">{"".join(parts)}</svg>'
+
+
+def _colour(axis: str) -> str:
+    return COLOURS[AXES.index(axis) % 3]

@@ -1,0 +1,270 @@
+"""A reconciliation as a recording for Rerun: ``reconcile.rrd``, with its own layout.
+
+In comes a ``Reconciliation``, out goes a file. A tab an axis: on the left the steps in words and the gap of every lens
+over its threshold, on the right each logarithmic lens twice, beside the first model and after the steps. The timeline
+``step`` counts models: 0 is the one that was given or fitted first, 1 and on are those after each step, and the panels
+on the right of a pair follow it. Rerun has no logarithmic axes, so plots are drawn as strips by ``rerun_chart``.
+The stream is one of its own. Importing this module imports Rerun.
+
+Entities: ``/<axis>/steps``, ``/<axis>/gap/<lens>``, ``/<axis>/<lens>/before``, ``/<axis>/<lens>/after``, ``/overview``.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from drivers.errors import ConfigError
+from drivers.sample import AXES, Floats
+from monitor.publishing.plots import colours
+from monitor.publishing.plots.reconcile_chart import DOTS, Plot, height_of, plotted
+from monitor.publishing.reports import reconcile_sentences as words
+from monitor.publishing.rerun.allan_chart import FILL_STEPS, HEIGHT, WIDTH, Scale, band, clip, decades, grid, runs
+from monitor.publishing.rerun.panels import duration
+from monitor.reconcile.result import AxisResult, Look, Reconciliation
+
+APPLICATION: Final = "imu-monitor"
+TIMELINE: Final = "step"
+PICTURES: Final = 2  # lenses of an axis that are drawn, the first ones
+BAND: Final = colours.mixed(colours.FRAME, 0.55)
+KEY_X: Final = (8.6, 12.2, 15.4)  # of the names of the curves, above the box
+PLACE: Final = colours.TEMPERATURE  # orange, as on the page
+LINES: Final = (  # of the courses of gaps: more would fill their legend
+    (240, 98, 77),
+    (45, 190, 130),
+    (84, 160, 255),
+    (236, 180, 72),
+    (190, 130, 230),
+    (150, 160, 170),
+)
+
+
+def write_rrd(r: Reconciliation, path: Path) -> None:
+    """Write the recording.
+
+    Raises:
+        ConfigError: the file cannot be written
+    """
+    try:
+        path.open("wb").close()
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}") from error
+    stream = rr.RecordingStream(APPLICATION)
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    stream.save(path, default_blueprint=blueprint(r))
+    stream.log("overview", _markdown(overview(r)), static=True)
+    for axis in _axes(r):
+        _axis(stream, r, r.axes[axis])
+    stream.flush()
+    stream.disconnect()
+
+
+def blueprint(r: Reconciliation) -> rrb.Blueprint:
+    """A tab an axis, those with something to say first; the overview where there are several."""
+    axes = sorted(_axes(r), key=lambda axis: r.axes[axis].verdict == "agrees")
+    tabs: list[rrb.View | rrb.Container] = [_tab(r.axes[axis]) for axis in axes]
+    tabs.append(rrb.TextDocumentView(origin="/overview", contents="$origin", name="All axes"))
+    return rrb.Blueprint(
+        rrb.Tabs(*tabs, active_tab=0),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def overview(r: Reconciliation) -> str:
+    """The whole recording in a table."""
+    rows = []
+    for axis in _axes(r):
+        result = r.axes[axis]
+        did = "; ".join(f"{step.kind} {words.step_line(step, axis, r.baseline)}" for step in result.steps)
+        left = "; ".join(words.score(one, axis) for one in result.left_over)
+        rows.append(f"| **{axis}** | {words.VERDICTS[result.verdict]} | {did or '—'} | {left or '—'} |")
+    head = "| axis | verdict | added or retuned | left over |\n|:--|:--|:--|:--|"
+    recorded = f"{r.samples:,} samples at {r.rate_hz:.6g} Hz, {duration(r.seconds)}"
+    notes = [f"note: {note}" for note in r.notes]
+    return "\n\n".join(
+        [f"## {words.VERDICTS[r.verdict]}", words.summary(r), recorded, "\n".join([head, *rows]), *notes]
+    )
+
+
+def steps_text(r: Reconciliation, result: AxisResult) -> str:
+    """What was found on one axis."""
+    parts = [f"## {result.axis}: {words.VERDICTS[result.verdict]}", words.verdict_line(result)]
+    for count, step in enumerate(result.steps, start=1):
+        known = words.parameters(step, result.axis, r.baseline)
+        parts += [
+            "---",
+            f"**Step {count}: {step.kind} {words.plain(step.effect)}** ({words.percent(step.confidence)})",
+            "\n".join(f"- {words.plain(one.name)} **{one.short}**" for one in known),
+            f"{words.lens_name(step.found.lens)}, {words.place(step.found.where, result.axis)}: gap "
+            f"**{words.gap(step.before.gap)} → {words.gap(step.after.gap)}**, "
+            f"threshold {words.gap(step.after.threshold)}",
+            step.because,
+            words.why_not(step),
+        ]
+    if result.left_over:
+        parts += ["---", "**Left over**", *(f"- {words.score(one, result.axis)}" for one in result.left_over)]
+    return "\n\n".join(parts)
+
+
+def _axes(r: Reconciliation) -> list[str]:
+    return [axis for axis in AXES if axis in r.axes]
+
+
+def _looks(result: AxisResult) -> list[Look]:
+    """Beside the first model, then after each step; after the last, without the names that were withdrawn."""
+    return [result.start, *(step.look for step in result.steps[:-1]), *([result.end] if result.steps else [])]
+
+
+def _lenses(result: AxisResult) -> list[str]:
+    return [view.lens for view in result.start.views if view.log][:PICTURES]
+
+
+def _tab(result: AxisResult) -> rrb.Container:
+    axis, steps = result.axis, len(result.steps)
+    text = rrb.TextDocumentView(origin=f"/{axis}/steps", contents="$origin", name="What was found")
+    gaps = rrb.TimeSeriesView(
+        origin=f"/{axis}/gap",
+        contents="$origin/**",
+        name="Gap over its threshold, by step",
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
+    )
+    left = rrb.Vertical(text, gaps, row_shares=[5, 2]) if steps else text
+    rows = [
+        rrb.Horizontal(*(_picture(result, lens, when) for when in (("before", "after") if steps else ("before",))))
+        for lens in _lenses(result)
+    ]
+    name = f"{axis}: {words.VERDICTS[result.verdict]}"
+    return rrb.Horizontal(left, rrb.Vertical(*rows), column_shares=[3, 7], name=name)
+
+
+def _picture(result: AxisResult, lens: str, when: str) -> rrb.View:
+    what = words.lens_name(lens)
+    what = what[0].upper() + what[1:]
+    names = {"before": f"{what}: beside the first model", "after": f"{what}: after the steps"}
+    return rrb.Spatial2DView(
+        origin=f"/{result.axis}/{lens}/{when}",
+        contents="$origin/**",
+        name=names[when],
+        background=rrb.Background(color=colours.BACKGROUND),
+        visual_bounds=rrb.VisualBounds2D(x_range=[-1.7, WIDTH + 0.7], y_range=[-1.5, HEIGHT + 1.7]),
+    )
+
+
+def _axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult) -> None:
+    stream.log(f"{result.axis}/steps", _markdown(steps_text(r, result)), static=True)
+    for lens in _lenses(result):
+        _lens(stream, result, lens)
+    _gaps(stream, result)
+
+
+def _gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
+    """A course a lens, of those with the largest gaps, and the threshold, which is 1 for all."""
+    looks = [{score.lens: words.over_threshold(score) for score in look.scores} for look in _looks(result)]
+    path = f"{result.axis}/gap"
+    largest = sorted(looks[0], key=lambda lens: -max(look.get(lens, 0.0) for look in looks))
+    for lens, tint in zip(largest, LINES, strict=False):
+        line = rr.SeriesLines(colors=[tint], widths=[2.0], names=[words.lens_name(lens)])
+        stream.log(f"{path}/{lens}", line, static=True)
+        _course(stream, f"{path}/{lens}", [look.get(lens, np.nan) for look in looks])
+    line = rr.SeriesLines(colors=[colours.TEXT], widths=[1.0], names=["threshold"])
+    stream.log(f"{path}/threshold", line, static=True)
+    _course(stream, f"{path}/threshold", [1.0] * len(looks))
+
+
+def _course(stream: rr.RecordingStream, path: str, values: Sequence[float]) -> None:
+    steps = rr.TimeColumn(TIMELINE, sequence=range(len(values)))
+    stream.send_columns(path, [steps], rr.Scalars.columns(scalars=np.array(values)))
+
+
+def _lens(stream: rr.RecordingStream, result: AxisResult, lens: str) -> None:
+    """Both pictures of one lens, in one scale."""
+    axis = result.axis
+    views = [next((view for view in look.views if view.lens == lens), None) for look in _looks(result)]
+    plots = {step: plotted("", view, axis, None) for step, view in enumerate(views) if view is not None}
+    every = list(plots.values())
+    scale = Scale(decades(plot.x for plot in every), decades([np.array(height_of(every))]))
+    for when in ("before", "after") if result.steps else ("before",):
+        _grid(stream, f"{axis}/{lens}/{when}", scale, plots[0], axis)
+    stream.reset_time()
+    _curves(stream, f"{axis}/{lens}/before", scale, plots[0], axis, static=True)
+    _places(stream, f"{axis}/{lens}/before", scale, result, lens)
+    for step, plot in plots.items() if result.steps else ():
+        stream.set_time(TIMELINE, sequence=step)
+        _curves(stream, f"{axis}/{lens}/after", scale, plot, axis, static=False)
+
+
+def _curves(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot, axis: str, static: bool) -> None:
+    """Band, measured curve and what the model expects."""
+    # a band's end that is zero has no logarithm: it lies below the box
+    low, high = (scale.place(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
+    fill = rr.LineStrips2D(list(band(low, high)), colors=[BAND], radii=[WIDTH / FILL_STEPS / 2], draw_order=-20.0)
+    stream.log(f"{path}/band", fill, static=static)
+    colour, at = colours.AXIS_COLOURS[axis], _inside(scale.place(plot.x, plot.measured))
+    thin = rr.Radius.ui_points(0.8)
+    stream.log(
+        f"{path}/measured", rr.LineStrips2D(runs(at), colors=[colour], radii=thin, draw_order=5.0), static=static
+    )
+    if len(at) <= DOTS:
+        dots = rr.Points2D(at, colors=[colour], radii=rr.Radius.ui_points(3.0), draw_order=20.0)
+        stream.log(f"{path}/points", dots, static=static)
+    expected = runs(_inside(scale.place(plot.x, plot.expected)))
+    line = rr.LineStrips2D(expected, colors=[colours.TEXT], radii=rr.Radius.ui_points(1.0), draw_order=10.0)
+    stream.log(f"{path}/expected", line, static=static)
+
+
+def _places(stream: rr.RecordingStream, path: str, scale: Scale, result: AxisResult, lens: str) -> None:
+    """A frame round each place where this lens found what a step is about."""
+    view = next(view for view in result.start.views if view.lens == lens)
+    founds = [step.found for step in result.steps] + list(result.left_over)
+    marks = [plotted("", view, result.axis, found.where) for found in founds if found.lens == lens]
+    bounds = [mark.mark for mark in marks if mark.mark is not None]
+    if not bounds:
+        return
+    one = 10.0 ** np.array([scale.y[0], scale.y[0]], float)
+    ends = [np.clip(scale.place(np.array(bound), one)[:, 0], 0.0, WIDTH) for bound in bounds]
+    frames = [np.array([[a, 0], [b, 0], [b, HEIGHT], [a, HEIGHT], [a, 0]]) for a, b in ends]
+    strips = rr.LineStrips2D(frames, colors=[PLACE], radii=rr.Radius.ui_points(0.75), draw_order=-5.0)
+    stream.log(f"{path}/place", strips, static=True)
+
+
+def _grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot, axis: str) -> None:
+    """Frame, decade lines, labels and the key to the curves."""
+    lines = grid(scale)
+    for name, strips, colour, order in (
+        ("minor", lines.minor, colours.MINOR, -30.0),
+        ("major", lines.major, colours.MAJOR, -29.0),
+        ("frame", lines.frame, colours.FRAME, -10.0),
+    ):
+        strip = rr.LineStrips2D(strips, colors=[colour], radii=rr.Radius.ui_points(0.5), draw_order=order)
+        stream.log(f"{path}/grid/{name}", strip, static=True)
+    key = [("measured", colours.AXIS_COLOURS[axis]), ("model", colours.TEXT), ("95 %", BAND)]
+    at = [(x, -0.85, name) for x, (name, _) in zip(KEY_X, key, strict=True)]
+    strokes = [np.array([[x - 1.9, -0.42], [x - 1.2, -0.42]]) for x in KEY_X]
+    strip = rr.LineStrips2D(strokes, colors=[tint for _, tint in key], radii=rr.Radius.ui_points(2.0), draw_order=30.0)
+    stream.log(f"{path}/grid/key", strip, static=True)
+    labels = [*lines.ticks, (WIDTH / 2, HEIGHT + 0.85, plot.x_label), (2.4, -0.85, plot.y_label), *at]
+    points = rr.Points2D(
+        [(x, y) for x, y, _ in labels],
+        labels=[text for _, _, text in labels],
+        colors=[colours.TEXT],
+        radii=[0.0],
+        show_labels=True,
+    )
+    stream.log(f"{path}/grid/labels", points, static=True)
+
+
+def _inside(at: Floats) -> Floats:
+    """A curve that leaves the box runs along its edge."""
+    return np.column_stack([at[:, 0], clip(at[:, 1])])
+
+
+def _markdown(text: str) -> rr.TextDocument:
+    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)

@@ -1,0 +1,183 @@
+"""The texts of the viewer's panels, as Markdown: is it healthy, and what is its noise now.
+
+In come a ``Health`` or an ``Estimate``, out goes text; numbers stand in the field's units. Pure, so
+that what a person reads can be tested without a viewer.
+"""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from monitor.common.health import Health
+from monitor.drift.compensation.arma import Arma
+from monitor.drift.compensation.live_compensation import DriftLook
+from monitor.estimation.estimate import Estimate
+from monitor.estimation.fit.coefficients import LETTERS
+from monitor.publishing.coefficient_cells import (
+    COEFFICIENT_UNITS,
+    DEVIATION_UNITS,
+    KIND_NAMES,
+    KINDS,
+    Kind,
+    axes_of,
+    measured_axes,
+    number,
+    reading,
+)
+from monitor.publishing.messages import remote_device
+from monitor.publishing.messages.remote_device import Heard
+
+SHOWN: Final = ("gx", "gy", "gz")
+"""Axes whose white noise stands in the table of a fleet, in °/√h."""
+WORDS: Final = {
+    "running": "RUNNING",
+    "waiting": "WAITING for the device",
+    "lost": "LOST: the device is gone, trying again",
+    "ended": "ENDED: the recording is at its end",
+}
+
+
+def health_text(device: str, health: Health, about: str = "") -> str:
+    """The health panel of one device."""
+    lines = [f"## {WORDS.get(health.state, health.state)}"]
+    if health.text:
+        lines.append(f"**{health.text}**")
+    if health.crossed:
+        lines.append(f"beyond its limit: **{', '.join(health.crossed)}**")
+    rate = "rate not known yet" if health.rate_hz is None else f"{health.rate_hz:.2f} Hz"
+    lines.append(f"**{device}** {about}".rstrip() + f", **{rate}**")
+    lines.append(
+        f"received **{health.received:,}**, lost **{health.lost:,}**, bad **{health.bad:,}**, "
+        f"overflowed **{health.overflowed:,}**"
+    )
+    outputs = "".join(f", {name} **{state}**" for name, state in health.outputs.items())
+    lines.append(f"up **{duration(health.uptime_s)}**{outputs}")
+    lines.append(
+        f"latency **{_milliseconds(health.latency_p50_s)}** median, "
+        f"**{_milliseconds(health.latency_p99_s)}** at 99 %, memory **{health.memory_bytes / 1e6:.0f} MB**"
+    )
+    return "\n\n".join(line for line in lines if line)
+
+
+def overview_text(healths: Mapping[str, Health]) -> str:
+    """One line a device: the panel that a fleet opens on."""
+    rows = [
+        f"| **{name}** | {h.state} | {_rate(h)} | {h.received:,} | {h.lost:,} | {h.bad:,} | {h.text or 'all well'} |"
+        for name, h in healths.items()
+    ]
+    head = "| device | state | rate | received | lost | bad | |\n|:--|:--|--:|--:|--:|--:|:--|"
+    return "\n".join([head, *rows])
+
+
+def fleet_text(devices: Sequence[Heard], now_s: float, rows: int, note: str = "") -> str:
+    """One line a device, those in trouble first, at most ``rows`` of them; above it how many are in which state."""
+    counts = Counter(one.state(now_s) for one in devices)
+    states = ", ".join(f"**{count:,}** {_cell(state)}" for state, count in counts.most_common())
+    head = [f"**{len(devices):,}** device{'' if len(devices) == 1 else 's'}{': ' if states else ''}{states}"]
+    head[0] += f"; N in {COEFFICIENT_UNITS['gyro']['N'].name}" if devices else ""
+    head += [f"**{remote_device.clean(note)}**"] if note else []
+    table = [_fleet_row(one, now_s) for one in devices[:rows]]
+    if table:
+        columns = [*("device", "state", "rate", "received", "lost", "bad"), *(f"N {axis}" for axis in SHOWN), ""]
+        table = [f"| {' | '.join(columns)} |", "|:--|:--|" + "--:|" * (len(columns) - 3) + ":--|", *table]
+    left = [f"… and {len(devices) - rows:,} more with less trouble"] if len(devices) > rows else []
+    return "\n\n".join([*head, *(["\n".join(table)] if table else []), *left])
+
+
+def _fleet_row(one: Heard, now_s: float) -> str:
+    state, status = one.state(now_s), one.status
+    name = _cell(one.key)
+    word = f"**{state.upper()}**" if one.rank(now_s) == 0 else _cell(state)
+    noise = [
+        "" if one.noise is None else reading(one.noise.coefficients, "N", axis).value.replace("| ", "")
+        for axis in SHOWN
+    ]
+    if status is None:
+        return f"| **{name}** | {word} | | | | | {' | '.join(noise)} | nothing known yet |"
+    rate = "—" if status.rate is None else f"{status.rate:.2f} Hz"
+    trouble = _cell(one.trouble()) or ("nothing comes any more" if state in ("gone", "silent") else "")
+    counts = f"{status.received:,} | {status.lost:,} | {status.bad:,}"
+    return f"| **{name}** | {word} | {rate} | {counts} | {' | '.join(noise)} | {trouble} |"
+
+
+def _cell(text: str) -> str:
+    """Text of another process inside a table: it cannot end its cell, nor become a link or a picture."""
+    return re.sub(r"([\\`*_\[\]<>!|#])", r"\\\1", remote_device.clean(text))
+
+
+def noise_text(estimate: Estimate) -> str:
+    """The tables of Q N B K R, one a kind of sensor that the device has."""
+    present = measured_axes(estimate.curve.avar)
+    tables = [_noise_table(estimate, kind) for kind in KINDS if set(axes_of(kind)) & set(present)]
+    if not tables:
+        return "Too few samples yet."
+    seen_s = estimate.curve.n / estimate.rate_hz
+    head = f"Last **{duration(min(seen_s, estimate.window_s))}**, 95 % intervals; ≤ bound; — too few data"
+    return "\n\n".join([head, *tables])
+
+
+def drift_text(look: DriftLook) -> str:
+    """The models that the gyros' drift is expected by, and what is taken out now."""
+    unit = DEVIATION_UNITS["gyro"]
+    rows = ["| axis | drift now | model | φ₁ | φ₂ | θ₁ |", "|---|---|---|---|---|---|"]
+    for at, axis in enumerate(axes_of("gyro")):
+        expected, model = float(look.expected[at]), look.models[at]
+        if not math.isfinite(expected):
+            rows.append(f"| {axis} | not known yet | | | | |")
+            continue
+        now = f"{number(unit.factor * expected)} ± {number(1.96 * unit.factor * float(look.error[at]), 2)} {unit.name}"
+        if model is None:
+            rows.append(f"| {axis} | {now} | learning | | | |")
+            continue
+        parts = [
+            f"{x:.4f}" if there else "" for x, there in zip((*model.phi, model.theta), _entered(model), strict=True)
+        ]
+        rows.append(f"| {axis} | {now} | {model.name} | {' | '.join(parts)} |")
+    head = (
+        f"Learned at rest, from means of {duration(look.interval_s)}; what each of them brought anew is the innovation."
+    )
+    return "\n".join([head, "", *rows])
+
+
+def _entered(model: Arma) -> tuple[bool, bool, bool]:
+    return model.order[0] > 0, model.order[0] > 1, model.order[1] > 0
+
+
+def duration(seconds: float) -> str:
+    """A length of time in the two units that tell most.
+
+    >>> duration(3725.0), duration(0.5), duration(90.0)
+    ('1 h 02 min', '0.500 s', '1 min 30 s')
+    """
+    if seconds < 60:
+        return f"{number(seconds)} s" if seconds < 10 else f"{seconds:.0f} s"
+    whole = round(seconds)
+    days, hours, minutes = whole // 86400, whole // 3600 % 24, whole // 60 % 60
+    if days:
+        return f"{days} d {hours:02d} h"
+    if hours:
+        return f"{hours} h {minutes:02d} min"
+    return f"{minutes} min {whole % 60:02d} s"
+
+
+def _rate(health: Health) -> str:
+    return "—" if health.rate_hz is None else f"{health.rate_hz:.2f} Hz"
+
+
+def _milliseconds(seconds: float | None) -> str:
+    return "—" if seconds is None else f"{number(seconds * 1e3)} ms"
+
+
+def _noise_table(estimate: Estimate, kind: Kind) -> str:
+    axes = axes_of(kind)
+    lines = [f"| {KIND_NAMES[kind]} | {' | '.join(axes)} |", "|:--|" + "--:|" * len(axes)]
+    for letter in LETTERS:
+        unit = COEFFICIENT_UNITS[kind][letter].name
+        cells = [reading(estimate.coefficients, letter, axis) for axis in axes]
+        values = " | ".join(f"**{c.value}**" if c.value != "—" else "—" for c in cells)
+        lines.append(f"| **{letter}** {unit} | {values} |")
+        if any(c.interval for c in cells):
+            lines.append("| | " + " | ".join(c.interval for c in cells) + " |")
+    return "\n".join(lines)

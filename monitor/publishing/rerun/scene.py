@@ -1,0 +1,456 @@
+"""What the viewer shows: samples, estimates, events and health as entities of one Rerun stream.
+
+In come results as the service has them (SI), out go batches of columns and drawings under the paths that
+the README lists, on the timeline ``sample_time``. Every call may block in Rerun for as long as a viewer pleases:
+only the viewer's own thread is to call here. Importing this module imports Rerun (half a second).
+
+Numbers are shown in the field's units. ``/<device>/allan/<axis>`` is a drawing, so the same entity also
+carries tau, deviation, lo and hi in SI for whoever reads the recording with a program.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import rerun as rr
+
+from drivers.sample import AXES, Event, Floats
+from monitor.common.health import Health
+from monitor.drift.compensation.live_compensation import DriftLook
+from monitor.drift.thermal.live_thermal import ThermalLook
+from monitor.drift.thermal.online_thermal_model import AxisThermal
+from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.estimate import Estimate
+from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.history.reading import Past
+from monitor.history.time_ranges import said
+from monitor.publishing.coefficient_cells import (
+    COEFFICIENT_UNITS,
+    DEVIATION_UNITS,
+    KINDS,
+    SAMPLE_UNITS,
+    Kind,
+    axes_of,
+    kind_of,
+)
+from monitor.publishing.plots import colours
+from monitor.publishing.rerun import dynamic_surface, past_points
+from monitor.publishing.rerun.allan_chart import (
+    FILL_STEPS,
+    HEIGHT,
+    WIDTH,
+    Scale,
+    band,
+    dashes,
+    decades,
+    grid,
+    runs,
+    whiskers,
+)
+from monitor.publishing.rerun.allan_history import Surface
+from monitor.publishing.rerun.decimation import extremes, means
+from monitor.publishing.rerun.panels import drift_text, health_text, noise_text, overview_text
+
+TIMELINE: Final = "sample_time"
+TEMPERATURES_PER_S: Final = 5.0
+BETWEEN: Final = 20
+"""Points on the course of a coefficient from one estimate to the next, where it follows every sample."""
+Z95: Final = 1.959964
+PAST_EVENTS: Final = 200
+"""Of those before the view opened, the newest."""
+NARROW: Final = 1.5  # ends of an interval further than this factor from their value are not on the course
+LEVELS: Final = {
+    "link_lost": "ERROR",
+    "samples_lost": "WARN",
+    "noise_changed": "WARN",
+    "bias_stepped": "WARN",
+    "limit_crossed": "WARN",
+    "model_disagrees": "WARN",
+    "temperature_unexplained": "WARN",
+    "drift_unexplained": "WARN",
+    "clock_jumped": "WARN",
+}
+"""Event kind -> level of the line in the log; all others are INFO."""
+
+
+@dataclass
+class _Device:
+    """What has to be kept of one device between two drawings."""
+
+    about: str
+    scales: dict[Kind, Scale] = field(default_factory=dict)
+    gap: ModelGap | None = None  # the newest
+    surface: Surface = field(default_factory=Surface)
+
+
+class Scene:
+    """Draws on one stream. Not thread-safe; see the module about blocking."""
+
+    def __init__(
+        self, stream: rr.RecordingStream, devices: Sequence[tuple[str, str]] = (), fleet: bool = False
+    ) -> None:
+        """``devices``: name and a few words about each; ``fleet``: many more have only a row in the overview."""
+        self._fleet = fleet
+        self._stream = stream
+        self._devices = {name: _Device(about) for name, about in devices}
+        self._shown = set(self._devices)
+        self._healths: dict[str, Health] = {}
+
+    def show(self, devices: Sequence[tuple[str, str]]) -> None:
+        """From now on these devices; those that it knows go on as they are.
+
+        What still comes of one that is not among them any more is drawn.
+        """
+        self._shown = {name for name, _ in devices}
+        self._healths = {name: health for name, health in self._healths.items() if name in self._shown}
+        for name, about in devices:
+            self._devices.setdefault(name, _Device(about)).about = about
+        self.open()
+
+    def open(self) -> None:
+        """What does not change: names, colours and widths of the lines."""
+        for device in self._devices:
+            for axis in AXES:
+                self._style_axis(device, axis)
+            line = rr.SeriesLines(colors=[colours.TEMPERATURE], widths=[1.5], names=["temperature, °C"])
+            self._stream.log(f"{device}/temperature", line, static=True)
+            line = rr.SeriesLines(colors=[colours.mixed(colours.TEXT, 0.6)], widths=[1.0], names=["threshold"])
+            self._stream.log(f"{device}/gap/threshold", line, static=True)
+
+    def samples(self, device: str, wall_s: Floats, values: Floats, temperature_c: Floats) -> None:
+        """Raw samples since the last flush: [n], [n, 6] SI, [n] °C. At most 200 rows/s and axis are drawn."""
+        for i, axis in enumerate(AXES):
+            t, y = extremes(wall_s, values[:, i])
+            self._scalars(f"{device}/samples/{axis}", t, y * SAMPLE_UNITS[kind_of(axis)].factor)
+        self._scalars(f"{device}/temperature", *means(wall_s, temperature_c, TEMPERATURES_PER_S))
+
+    def estimate(self, device: str, wall_s: float, estimate: Estimate) -> None:
+        """The Allan plots and the table of one estimate, and the surface over time whenever it has grown."""
+        self._at(wall_s)
+        self._stream.log(f"{device}/coefficients", _markdown(noise_text(estimate)))
+        for kind in KINDS:
+            self._allan(device, kind, estimate)
+        surface = self._devices[device].surface
+        if surface.add(wall_s, estimate):
+            dynamic_surface.draw(self._stream, device, surface)
+
+    def courses(self, device: str, wall_s: Floats, estimates: Sequence[Estimate]) -> None:
+        """The course of every coefficient: a point an estimate, with its interval, and the samples between."""
+        looks = [_between(at_s, estimate) for at_s, estimate in zip(np.asarray(wall_s), estimates, strict=True)]
+        at = np.concatenate([times for times, _ in looks])
+        for row, letter in enumerate(LETTERS):
+            for column, axis in enumerate(AXES):
+                parts = []
+                for estimate, (_, value) in zip(estimates, looks, strict=True):
+                    between = np.full((len(value), 3), np.nan)
+                    between[:, 0] = value[:, row, column]
+                    between[-1] = _course(estimate, row, column)
+                    parts.append(between)
+                values = np.concatenate(parts)
+                if np.isfinite(values).any():
+                    factor = COEFFICIENT_UNITS[kind_of(axis)][letter].factor
+                    self._scalars(f"{device}/coefficients/{letter}/{axis}", at, values * factor)
+
+    def past(self, device: str, past: Past) -> None:
+        """What was before the view opened: courses of coefficients and temperature with their extremes, and events.
+
+        Where a bucket was left out, and behind the last one, a course has a gap: what comes is another stretch.
+        """
+        for letter in LETTERS:
+            for axis in past.axes():
+                course, lo, hi = (past.column(f"{axis}.{letter}{end}") for end in ("", ".lo", ".hi"))
+                if np.isfinite(course.last).any():
+                    at, values = past_points.points(past, course, lo.last, hi.last)
+                    factor = COEFFICIENT_UNITS[kind_of(axis)][letter].factor
+                    self._scalars(f"{device}/coefficients/{letter}/{axis}", at, values * factor)
+        temperature = past.column("temperature")
+        if np.isfinite(temperature.last).any():
+            at, values = past_points.points(past, temperature, temperature.last, temperature.last)
+            self._scalars(f"{device}/temperature", at, values[:, 0])
+        for event in past.events[-PAST_EVENTS:]:
+            text = f"{said(event.t_s)[:10]}: {event.text}"  # the line has only its time of the day
+            self.event(device, event.t_s, Event(event.kind, round(event.t_s * 1e9), text, event.axis, event.what))
+
+    def gaps(self, device: str, wall_s: Floats, looks: Sequence[ModelGap]) -> None:
+        """The course of the gap to the model in force: a line an axis, and the threshold that chance stays below.
+
+        The model's own curve is drawn with the next estimate.
+        """
+        self._devices[device].gap = looks[-1]
+        highest = [max((one.threshold for one in look.axes.values()), default=np.nan) for look in looks]
+        self._scalars(f"{device}/gap/threshold", wall_s, np.array(highest))
+        for axis in AXES:
+            gap = np.array([look.axes[axis].gap if axis in look.axes else np.nan for look in looks])
+            if np.isfinite(gap).any():
+                self._scalars(f"{device}/gap/{axis}", wall_s, gap)
+
+    def thermal(self, device: str, wall_s: Floats, looks: Sequence[ThermalLook]) -> None:
+        """The means of each axis, and what was expected of them with its interval."""
+        for axis in AXES:
+            rows = np.array([_thermal(look.axes.get(axis)) for look in looks])
+            if np.isfinite(rows).any():
+                self._scalars(f"{device}/thermal/{axis}", wall_s, rows * DEVIATION_UNITS[kind_of(axis)].factor)
+
+    def compensated(self, device: str, wall_s: Floats, values: Floats) -> None:
+        """Rates without drift since the last flush: [n], [n, 3] rad/s; thinned like the samples."""
+        for i, axis in enumerate(axes_of("gyro")):
+            t, y = extremes(wall_s, values[:, i])
+            self._scalars(f"{device}/compensated/{axis}", t, y * SAMPLE_UNITS["gyro"].factor)
+
+    def drift(self, device: str, wall_s: Floats, looks: Sequence[DriftLook]) -> None:
+        """Means at rest beside the drift that was expected, innovations, and the models."""
+        factor = DEVIATION_UNITS["gyro"].factor
+        for i, axis in enumerate(axes_of("gyro")):
+            rows = np.array([_drift(look, i) for look in looks])
+            if np.isfinite(rows).any():
+                self._scalars(f"{device}/drift/{axis}", wall_s, rows * factor)
+                new = np.array([look.innovation[i] for look in looks])
+                self._scalars(f"{device}/innovation/{axis}", wall_s, new)
+        self._at(float(wall_s[-1]))
+        self._stream.log(f"{device}/drift", _markdown(drift_text(looks[-1])))
+
+    def event(self, device: str, wall_s: float, event: Event) -> None:
+        """One line in the log of the device, and in that of the overview."""
+        self._at(wall_s)
+        level, at = LEVELS.get(event.kind, "INFO"), _clock_time(wall_s)
+        if self._fleet or len(self._shown) > 1:
+            self._stream.log("overview/events", rr.TextLog(f"{at}  {device}: {event.text}", level=level))
+        if device in self._devices:
+            self._stream.log(f"{device}/events", rr.TextLog(f"{at}  {event.text}", level=level))
+            self._mark(device, wall_s, event)
+
+    def health(self, device: str, wall_s: float, health: Health) -> None:
+        """The health panel of the device, and its row in the overview."""
+        self._at(wall_s)
+        if device in self._shown:
+            self._healths[device] = health
+        about = self._devices[device].about
+        self._stream.log(f"{device}/status", _markdown(health_text(device, health, about)))
+        if len(self._shown) > 1 and not self._fleet:
+            self._stream.log("overview", _markdown(overview_text(self._healths)))
+
+    def overview(self, wall_s: float, text: str) -> None:
+        """The table of a fleet."""
+        self._at(wall_s)
+        self._stream.log("overview", _markdown(text))
+
+    def _style_axis(self, device: str, axis: str) -> None:
+        colour = colours.AXIS_COLOURS[axis]
+        unit = SAMPLE_UNITS[kind_of(axis)].name
+        line = rr.SeriesLines(colors=[colour], widths=[1.0], names=[f"{axis}, {unit}"])
+        self._stream.log(f"{device}/samples/{axis}", line, static=True)
+        line = rr.SeriesLines(colors=[colour], widths=[1.5], names=[f"{axis}, σ from its model"])
+        self._stream.log(f"{device}/gap/{axis}", line, static=True)
+        dim = colours.mixed(colour, 0.45)
+        unit = DEVIATION_UNITS[kind_of(axis)].name
+        names = [f"{axis} bias, {unit}", f"{axis} expected", f"{axis} 95 % low", f"{axis} 95 % high"]
+        line = rr.SeriesLines(colors=[colour, colours.TEXT, dim, dim], widths=[2.0, 1.0, 0.75, 0.75], names=names)
+        self._stream.log(f"{device}/thermal/{axis}", line, static=True)
+        if kind_of(axis) == "gyro":
+            self._style_drift(device, axis)
+        for letter in LETTERS:
+            unit = COEFFICIENT_UNITS[kind_of(axis)][letter].name
+            names = [f"{axis}, {unit}", f"{axis} 95 % low", f"{axis} 95 % high"]
+            line = rr.SeriesLines(colors=[colour, dim, dim], widths=[2.0, 0.75, 0.75], names=names)
+            self._stream.log(f"{device}/coefficients/{letter}/{axis}", line, static=True)
+            mark = rr.SeriesPoints(colors=[colour], markers=["diamond"], marker_sizes=[7.0], names=[f"{axis} changed"])
+            self._stream.log(f"{device}/coefficients/{letter}/{axis}/changed", mark, static=True)
+
+    def _style_drift(self, device: str, axis: str) -> None:
+        colour = colours.AXIS_COLOURS[axis]
+        dim = colours.mixed(colour, 0.45)
+        unit = DEVIATION_UNITS["gyro"].name
+        names = [f"{axis} at rest, {unit}", f"{axis} expected", f"{axis} 95 % low", f"{axis} 95 % high"]
+        line = rr.SeriesLines(colors=[dim, colours.TEXT, colour, colour], widths=[0.75, 1.5, 1.0, 1.0], names=names)
+        self._stream.log(f"{device}/drift/{axis}", line, static=True)
+        line = rr.SeriesLines(colors=[colour], widths=[1.0], names=[f"{axis}, σ"])
+        self._stream.log(f"{device}/innovation/{axis}", line, static=True)
+        line = rr.SeriesLines(colors=[colour], widths=[1.0], names=[f"{axis}, {SAMPLE_UNITS['gyro'].name}"])
+        self._stream.log(f"{device}/compensated/{axis}", line, static=True)
+
+    def _mark(self, device: str, wall_s: float, event: Event) -> None:
+        """A change of a coefficient, on its course: a diamond at the size that it has now."""
+        if event.axis is None:
+            return
+        for letter, sizes in event.what.items():
+            if letter in LETTERS and "after" in sizes:
+                unit = COEFFICIENT_UNITS[kind_of(event.axis)][letter]
+                path = f"{device}/coefficients/{letter}/{event.axis}/changed"
+                self._scalars(path, np.array([wall_s]), np.array([sizes["after"]]) * unit.factor)
+
+    def _scalars(self, path: str, wall_s: Floats, values: Floats) -> None:
+        """``values`` [n] or [n, series] at ``wall_s`` [n] on the timeline."""
+        if wall_s.size:
+            time = rr.TimeColumn(TIMELINE, timestamp=_stamps(wall_s))
+            self._stream.send_columns(path, [time], rr.Scalars.columns(scalars=values))
+
+    def _at(self, wall_s: float) -> None:
+        self._stream.set_time(TIMELINE, timestamp=_stamps(np.array([wall_s]))[0])
+
+    def _allan(self, device: str, kind: Kind, estimate: Estimate) -> None:
+        gap = self._devices[device].gap
+        curves = [c for axis in axes_of(kind) if (c := _Curve.of(estimate, axis, gap)) is not None]
+        if not curves:
+            return
+        scale = Scale(decades(c.tau for c in curves), decades(part for c in curves for part in c.shown))
+        if self._devices[device].scales.get(kind) != scale:
+            self._devices[device].scales[kind] = scale
+            self._grid(f"{device}/allan/{kind}", kind, scale, [c.axis for c in curves])
+        for curve in curves:
+            self._curve(f"{device}/allan/{curve.axis}", scale, curve)
+
+    def _grid(self, path: str, kind: Kind, scale: Scale, axes: Sequence[str]) -> None:
+        """Frame, decade lines, tick labels and the legend."""
+        lines = grid(scale)
+        for name, strips, colour, order in (
+            ("minor", lines.minor, colours.MINOR, -30.0),
+            ("major", lines.major, colours.MAJOR, -29.0),
+            ("frame", lines.frame, colours.FRAME, -10.0),
+        ):
+            strip = rr.LineStrips2D(strips, colors=[colour], radii=rr.Radius.ui_points(0.5), draw_order=order)
+            self._stream.log(f"{path}/{name}", strip)
+        ticks = [(x, y, label) for x, y, label in lines.ticks]
+        unit = DEVIATION_UNITS[kind].name
+        ticks += [(WIDTH / 2, HEIGHT + 0.85, "averaging time τ, s"), (1.2, -0.85, f"σ(τ), {unit}")]
+        self._labels(f"{path}/ticks", ticks)
+        self._legend(path, axes)
+
+    def _legend(self, path: str, axes: Sequence[str]) -> None:
+        """A stroke of its colour and its name for every axis, above the right end of the box."""
+        ends = [(axis, WIDTH - 2.0 * (len(axes) - 1 - i) - 0.5) for i, axis in enumerate(axes)]
+        strokes = [np.array([[x - 1.15, -0.42], [x - 0.5, -0.42]]) for _, x in ends]
+        tints = [colours.AXIS_COLOURS[axis] for axis in axes]
+        lines = rr.LineStrips2D(strokes, colors=tints, radii=rr.Radius.ui_points(2.0), draw_order=30.0)
+        self._stream.log(f"{path}/legend/strokes", lines)
+        self._labels(f"{path}/legend", [(x, -0.85, axis) for axis, x in ends])
+
+    def _labels(self, path: str, labels: list[tuple[float, float, str]]) -> None:
+        points = rr.Points2D(
+            [(x, y) for x, y, _ in labels],
+            labels=[text for _, _, text in labels],
+            colors=[colours.TEXT],
+            radii=[0.0],
+            show_labels=True,
+        )
+        self._stream.log(path, points)
+
+    def _curve(self, path: str, scale: Scale, curve: "_Curve") -> None:
+        """Band, fitted line, intervals and measured points of one axis, and dashed the model in force."""
+        colour = colours.AXIS_COLOURS[curve.axis]
+        low, high = scale.place(curve.tau, curve.lo), scale.place(curve.tau, curve.hi)
+        fill = rr.LineStrips2D(
+            list(band(low, high)),
+            colors=[colours.mixed(colour, 0.22)],
+            radii=[WIDTH / FILL_STEPS / 2],
+            draw_order=-20.0,
+        )
+        self._stream.log(f"{path}/band", fill)
+        thin = rr.Radius.ui_points(0.75)
+        dim = colours.mixed(colour, 0.6)
+        strokes = rr.LineStrips2D(list(whiskers(low, high)), colors=[dim], radii=thin, draw_order=5.0)
+        self._stream.log(f"{path}/interval", strokes)
+        fitted = runs(scale.place(curve.tau, curve.fitted))
+        fit = rr.LineStrips2D(fitted, colors=[colour], radii=rr.Radius.ui_points(1.25), draw_order=10.0)
+        self._stream.log(f"{path}/fit", fit)
+        dashed = [stroke for run in runs(scale.place(curve.tau, curve.model)) for stroke in dashes(run)]
+        model = rr.LineStrips2D(dashed, colors=[colours.TEXT], radii=rr.Radius.ui_points(0.75), draw_order=15.0)
+        self._stream.log(f"{path}/model", model)
+        points = rr.Points2D(
+            scale.place(curve.tau, curve.deviation),
+            colors=[colour],
+            radii=rr.Radius.ui_points(3.0),
+            draw_order=20.0,
+        )
+        self._stream.log(path, points, rr.AnyValues(drop_untyped_nones=True, **curve.si))
+
+
+@dataclass(frozen=True)
+class _Curve:
+    """One axis of an Allan curve where it is measured, in the field's unit."""
+
+    axis: str
+    tau: Floats
+    deviation: Floats
+    lo: Floats
+    hi: Floats
+    fitted: Floats
+    model: Floats  # of the model in force; NaN where there is none
+    si: dict[str, Floats]
+
+    @property
+    def shown(self) -> tuple[Floats, ...]:
+        """What the plot's height must hold; an interval may leave it."""
+        return self.deviation, self.fitted, self.model
+
+    @classmethod
+    def of(cls, estimate: Estimate, axis: str, gap: ModelGap | None) -> "_Curve | None":
+        """None while the axis has not two points."""
+        curve, i = estimate.curve, AXES.index(axis)
+        rows = np.isfinite(curve.avar[:, i]) & (curve.avar[:, i] > 0)
+        if int(rows.sum()) < 2:
+            return None
+        deviation, fitted = (np.sqrt(a[rows, i]) for a in (curve.avar, estimate.fitted))
+        si = {"tau": curve.tau_s[rows], "deviation": deviation, "lo": curve.lo[rows, i], "hi": curve.hi[rows, i]}
+        model = np.full(fitted.shape, np.nan)
+        if gap is not None and axis in gap.axes and gap.axes[axis].model.shape == rows.shape:
+            model = gap.axes[axis].model[rows]
+        f = DEVIATION_UNITS[kind_of(axis)].factor
+        return cls(axis, si["tau"], deviation * f, si["lo"] * f, si["hi"] * f, fitted * f, model * f, si)
+
+
+def _between(wall_s: float, estimate: Estimate) -> tuple[Floats, Floats]:
+    """Times and coefficients [n, 5, 6] since the estimate before, where they follow every sample; the last is its own.
+
+    Thinned to BETWEEN points: the eye sees no more, and a viewer bears no more.
+    """
+    if estimate.course is None:
+        return np.array([wall_s]), np.full((1, 5, 6), np.nan)
+    step = -(-estimate.course.t_ns.size // BETWEEN)
+    rows = slice((estimate.course.t_ns.size - 1) % step, None, step)
+    before_s = (estimate.course.t_ns[-1] - estimate.course.t_ns[rows]) / 1e9
+    return wall_s - before_s, estimate.course.value[rows].copy()
+
+
+def _course(estimate: Estimate, row: int, column: int) -> tuple[float, float, float]:
+    """value, lo, hi of one estimated coefficient; a gap where their size would hide all that follows.
+
+    That are bounds, and the intervals of a device's first seconds.
+    """
+    c = estimate.coefficients
+    if c.status[row, column] != Status.ESTIMATED:
+        return np.nan, np.nan, np.nan
+    value, lo, hi = (float(part[row, column]) for part in (c.value, c.lo, c.hi))
+    return (value, lo, hi) if lo * NARROW > value and hi < value * NARROW else (value, np.nan, np.nan)
+
+
+def _thermal(one: AxisThermal | None) -> tuple[float, float, float, float]:
+    """bias, expected, lo, hi: those that an event is judged by."""
+    if one is None:
+        return np.nan, np.nan, np.nan, np.nan
+    band = one.one_step
+    return (one.bias, np.nan, np.nan, np.nan) if band is None else (one.bias, band.bias, band.lo, band.hi)
+
+
+def _drift(look: DriftLook, axis: int) -> tuple[float, float, float, float]:
+    """mean at rest, expected, lo, hi."""
+    expected, wide = float(look.expected[axis]), Z95 * float(look.error[axis])
+    return float(look.mean[axis]), expected, expected - wide, expected + wide
+
+
+def _stamps(wall_s: Floats) -> "np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]":
+    """Unix seconds as nanosecond stamps."""
+    return np.round(wall_s * 1e9).astype("datetime64[ns]")
+
+
+def _clock_time(wall_s: float) -> str:
+    """Time of the day in UTC, as the viewer's own time axes have it; its column of dates is too narrow to show one.
+
+    >>> _clock_time(1.76e9)
+    '08:53:20'
+    """
+    return str(np.datetime_as_string(_stamps(np.array([wall_s]))[0], "s")[-8:])
+
+
+def _markdown(text: str) -> rr.TextDocument:
+    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)

@@ -1,0 +1,131 @@
+"""What compensation did to a recording, as a table of the terminal and as JSON."""
+
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from rich.console import Console
+from rich.padding import Padding
+from rich.table import Table
+
+from monitor.drift.compensation.arma import Arma
+from monitor.drift.compensation.compensation_result import Axis, Result
+from monitor.drift.compensation.compensation_score import SPANS_S, AtRest
+from monitor.publishing.coefficient_cells import DEVIATION_UNITS, number
+from monitor.publishing.rerun.panels import duration
+
+SCHEMA: Final = "imu-monitor/compensate/1"
+UNIT: Final = DEVIATION_UNITS["gyro"]
+NAMES: Final = ("phi1", "phi2", "theta1")
+
+
+def tell(result: Result, console: Console) -> None:
+    """Print what was done."""
+    console.print(
+        f"{result.recording}: {result.samples} samples at {result.rate_hz:g} Hz, {result.method}; judged on "
+        f"{duration(result.judged_s)} at rest, after {duration(result.learned_s)}",
+        highlight=False,
+    )
+    rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
+    for head in ("axis", "drift", "rms, °/h", "worst minute", *(f"{span / 60.0:.0f} min" for span in SPANS_S)):
+        rows.add_column(head, no_wrap=head == "axis")
+    for axis, one in result.axes.items():
+        pairs = [(one.before.deviation, one.after.deviation), (one.before.worst_minute, one.after.worst_minute)]
+        pairs += list(zip(one.before.drift, one.after.drift, strict=True))
+        rows.add_row(axis, "—" if one.model is None else one.model.name, *(_pair(*pair) for pair in pairs))
+    console.print(Padding(rows, (1, 0)))
+    console.print(
+        "before → after, at rest; 1 min and more: rms of means over so long, by which heading would go wrong.",
+        style="dim",
+    )
+    for axis, one in result.axes.items():
+        if one.steps or one.left_out:
+            console.print(f"{axis}: {_unexplained(one, result.interval_s)}", highlight=False, soft_wrap=True)
+    for note in result.notes:
+        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"{result.out} written", highlight=False, soft_wrap=True)
+
+
+def to_json(result: Result) -> bytes:
+    """Everything; SI units."""
+    whole = {
+        "schema": SCHEMA,
+        "recording": result.recording,
+        "out": str(result.out),
+        "method": result.method,
+        "rate": result.rate_hz,
+        "samples": result.samples,
+        "interval": result.interval_s,
+        "learned": result.learned_s,
+        "judged": result.judged_s,
+        "axes": {axis: _axis(at, one, result) for at, (axis, one) in enumerate(result.axes.items())},
+        "notes": list(result.notes),
+    }
+    return msgspec.json.encode(whole, enc_hook=_plain)
+
+
+def _axis(at: int, one: Axis, result: Result) -> dict[str, Any]:
+    each = result.intervals
+    return {
+        "model": None if one.model is None else _model(one.model),
+        "before": _rest(one.before),
+        "after": _rest(one.after),
+        "left_out": one.left_out,
+        "steps": one.steps,
+        "intervals": {
+            "end": [i.end / result.rate_hz for i in each],
+            "bias": np.array([i.mean[at] for i in each]),
+            "expected": np.array([i.expected[at] for i in each]),
+            "error": np.array([i.known[at] for i in each]),
+            "innovation": np.array([i.innovation[at] for i in each]),
+        },
+    }
+
+
+def _model(model: Arma) -> dict[str, Any]:
+    values = (*model.phi, model.theta)
+    return {
+        "order": list(model.order),
+        **{
+            name: {"value": value, "lo": lo, "hi": hi}
+            for name, value, lo, hi in zip(NAMES, values, model.lo, model.hi, strict=True)
+            if np.isfinite(lo)
+        },
+        "variance": model.variance,
+        "white": model.white,
+        "mean": model.mean,
+    }
+
+
+def _rest(one: AtRest) -> dict[str, Any]:
+    return {
+        "deviation": one.deviation,
+        "worst_minute": _number(one.worst_minute),
+        "drift": {f"{span:g}": _number(x) for span, x in zip(SPANS_S, one.drift, strict=True)},
+        "allan": {"tau": one.tau_s, "deviation": one.allan},
+    }
+
+
+def _pair(before: float, after: float) -> str:
+    if not (np.isfinite(before) and np.isfinite(after)):
+        return "—"
+    return f"{number(UNIT.factor * before, 2)} → {number(UNIT.factor * after, 2)}"
+
+
+def _unexplained(one: Axis, interval_s: float) -> str:
+    parts = []
+    if one.left_out:
+        parts.append(f"{one.left_out} intervals of {interval_s:g} s left out, as no drift explains them")
+    if one.steps:
+        parts.append(f"{one.steps} step{'s' if one.steps > 1 else ''} of the bias")
+    return "; ".join(parts)
+
+
+def _number(x: float) -> float | None:
+    return float(x) if np.isfinite(x) else None
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return [_number(x) for x in value]
+    raise TypeError(f"{type(value).__name__} has no JSON")

@@ -1,0 +1,184 @@
+"""Past results for the terminal: what each coefficient was, the course of it, and what happened.
+
+In comes a ``Past``, out go tables in the field's units. A course is drawn in eight heights, of means; its extremes
+stand beside it, and where the device gave nothing it has a gap. Pure but for the console it prints on.
+"""
+
+import math
+from typing import Final
+
+import numpy as np
+from rich.console import Console
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from drivers.sample import Floats
+from monitor.history.bucket import COUNTS, STATES
+from monitor.history.reading import Course, Past
+from monitor.history.time_ranges import said
+from monitor.publishing.coefficient_cells import KIND_NAMES, KINDS, Kind, axes_of, number, unit_of
+
+LETTERS: Final = ("N", "B", "K")
+"""Of all axes; of one axis all five are shown."""
+HEIGHTS: Final = "▁▂▃▄▅▆▇█"
+GAP: Final = "·"
+WIDTH: Final = 32
+"""Characters of a course."""
+EVENTS: Final = 20
+NONE: Final = "—"
+UNITS: Final = ((86_400, "d"), (3600, "h"), (60, "min"), (1, "s"))
+
+
+def tell(past: Past, axes: tuple[str, ...], letters: tuple[str, ...], console: Console) -> None:
+    """Print the summary of a span: a line an axis and letter, then what happened."""
+    console.print(head(past), highlight=False, soft_wrap=True)
+    for kind in KINDS:
+        shown = [axis for axis in axes_of(kind) if axis in axes and axis in past.axes()]
+        if shown:
+            console.print(Padding(_summary(past, kind, shown, letters), (1, 0, 0, 0)))
+    for line in status_lines(past):
+        console.print(line, highlight=False)
+    tell_events(past, console)
+
+
+def tell_course(past: Past, axis: str, letters: tuple[str, ...], console: Console) -> None:
+    """Print one axis over time: a line a bucket, each letter with its extremes."""
+    table = _table()
+    table.add_column("UTC", no_wrap=True)
+    for letter in letters:
+        table.add_column(f"{letter} {unit_of(letter, axis).name}", justify="right", no_wrap=True)
+    for name in ("°C", "lost", "state"):
+        table.add_column(name, justify="right")
+    temperature = past.column("temperature")
+    for p in range(len(past)):
+        cells = [_cell(past, axis, letter, p) for letter in letters]
+        lost = int(past.counts[p, COUNTS.index("lost")])
+        table.add_row(
+            said(float(past.start_s[p]))[:16], *cells, number(float(temperature.last[p])), f"{lost:,}" if lost else "",
+            STATES[int(past.state[p])],
+        )  # fmt: skip
+    console.print(Padding(table, (1, 0, 0, 0)))
+
+
+def tell_events(past: Past, console: Console) -> None:
+    """Print the newest events."""
+    if not past.events:
+        return
+    shown = past.events[-EVENTS:]
+    more = past.events_in_all - len(shown)
+    console.print()
+    if more > 0:
+        console.print(f"… {more:,} earlier events", style="dim")
+    for event in shown:
+        times = f" (and {event.stands_for - 1:,} more before it)" if event.stands_for > 1 else ""
+        console.print(f"{said(event.t_s)}  {event.text}{times}", markup=False, highlight=False, soft_wrap=True)
+
+
+def head(past: Past) -> str:
+    """Device, span, rows, samples: one line."""
+    samples = int(past.counts[:, COUNTS.index("received")].sum())
+    if not len(past):
+        return f"{past.device}: no rows between {said(past.span.start_s)} and {said(past.span.end_s)} UTC"
+    widths = sorted({int(one) for one in past.width_s})
+    rows = (" and " if len(widths) < 3 else " to ").join(_width(one) for one in (*widths[:1], *widths[1:][-1:]))
+    return (
+        f"{past.device}: {said(float(past.start_s[0]))[:16]} to {said(float(past.end_s[-1]))[:16]} UTC, "
+        f"{len(past):,} rows of {rows}, {samples:,} samples"
+    )
+
+
+def status_lines(past: Past) -> list[str]:
+    """Temperature, losses, and how long the device was not running."""
+    lines = []
+    temperature = past.column("temperature")
+    if temperature.n.any():
+        low, high = np.nanmin(temperature.low), np.nanmax(temperature.high)
+        lines.append(f"temperature {number(float(low))} … {number(float(high))} °C")
+    counts = past.counts.sum(axis=0)
+    wrong = [f"{int(counts[i]):,} {name}" for i, name in enumerate(COUNTS) if i and counts[i]]
+    if wrong:
+        lines.append("samples " + ", ".join(wrong))
+    for state in ("waiting", "lost"):
+        at = past.state == STATES.index(state)
+        if at.any():
+            lines.append(f"{state} at some time in {int(at.sum()):,} of {len(past):,} rows")
+    return lines
+
+
+def sparkline(last: Floats, t_s: Floats, span: tuple[float, float], width: int = WIDTH) -> str:
+    """Values between two moments, in each character the mean of those of its time.
+
+    >>> steps = np.arange(8.0)
+    >>> sparkline(steps, 60.0 * steps, (0.0, 480.0), 8)
+    '▁▂▃▄▅▆▇█'
+    """
+    there = np.isfinite(last)
+    if not there.any() or span[1] <= span[0]:
+        return GAP * width
+    at = np.clip(((t_s - span[0]) / (span[1] - span[0]) * width).astype(np.int64), 0, width - 1)[there]
+    count = np.bincount(at, minlength=width)
+    means = np.bincount(at, last[there], width)[count > 0] / count[count > 0]
+    low, wide = means.min(), np.ptp(means)
+    heights = ((means - low) / wide if wide > 0.0 else np.full(means.size, 0.5)) * len(HEIGHTS)
+    marks = iter([HEIGHTS[min(int(one), len(HEIGHTS) - 1)] for one in heights])
+    return "".join(next(marks) if some else GAP for some in count)
+
+
+def _summary(past: Past, kind: Kind, axes: list[str], letters: tuple[str, ...]) -> Table:
+    table = _table()
+    table.add_column(KIND_NAMES[kind], no_wrap=True)
+    for name in ("first", "last", "lowest", "highest"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("course", no_wrap=True)
+    span = (float(past.start_s[0]), float(past.end_s[-1])) if len(past) else (0.0, 0.0)
+    middle_s = past.start_s + 0.5 * past.width_s
+    for axis in axes:
+        for letter in letters:
+            course, unit = past.column(f"{axis}.{letter}"), unit_of(letter, axis)
+            label = Text.assemble((f"{axis} {letter}", "bold"), f"  {unit.name}")
+            there = course.last[np.isfinite(course.last)]
+            if not there.size:
+                table.add_row(label, NONE, *_bound(past, axis, letter), "")
+                continue
+            numbers = [float(one) * unit.factor for one in (there[0], there[-1], *_ends(course))]
+            table.add_row(label, *(number(one) for one in numbers), sparkline(course.last, middle_s, span))
+    return table
+
+
+def _bound(past: Past, axis: str, letter: str) -> tuple[str, str, str]:
+    """Last and lowest of what was only ever bounded."""
+    bound, unit = past.column(f"{axis}.{letter}.bound"), unit_of(letter, axis)
+    there = bound.last[np.isfinite(bound.last)]
+    if not there.size:
+        return NONE, NONE, NONE
+    return f"≤ {number(float(there[-1]) * unit.factor)}", NONE, NONE
+
+
+def _cell(past: Past, axis: str, letter: str, p: int) -> str:
+    """A letter in one bucket: its last value and, where they differ, its extremes; or its bound."""
+    course, unit = past.column(f"{axis}.{letter}"), unit_of(letter, axis)
+    low, high, last = (float(part[p]) * unit.factor for part in (course.low, course.high, course.last))
+    if math.isfinite(last):
+        alike = number(low) == number(high)
+        return number(last) if alike else f"{number(last)} [{number(low)} … {number(high)}]"
+    bound = float(past.column(f"{axis}.{letter}.bound").last[p]) * unit.factor
+    return f"≤ {number(bound)}" if math.isfinite(bound) else NONE
+
+
+def _width(seconds: int) -> str:
+    """Of a bucket.
+
+    >>> _width(300), _width(21_600), _width(604_800)
+    ('5 min', '6 h', '7 d')
+    """
+    unit_s, unit = next((size, name) for size, name in UNITS if seconds % size == 0)
+    return f"{seconds // unit_s} {unit}"
+
+
+def _ends(course: Course) -> tuple[float, float]:
+    return float(np.nanmin(course.low)), float(np.nanmax(course.high))
+
+
+def _table() -> Table:
+    return Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")

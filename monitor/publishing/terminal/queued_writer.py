@@ -1,0 +1,298 @@
+"""Text output to a terminal, a pipe or a file by a thread of its own, so that no other thread waits for the reader.
+
+A write blocks while a terminal is stopped (Ctrl-S, a suspended remote shell) and while nobody reads a pipe, and it
+fails while a disk is full. ``QueuedWriter`` accepts lines on a bounded queue that drops its oldest lines, and can
+redraw a frame (a table) periodically. It counts what is lost and reports it in ``state``. ``QueuedWriter.close`` gives
+up after a deadline.
+
+The thread writes to the file descriptor and not to the Python stream. A blocked write to ``sys.stdout`` would hold the
+lock of the stream, and the interpreter aborts at exit when it cannot take this lock.
+"""
+
+import contextlib
+import errno
+import io
+import os
+import select
+import threading
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Final, TextIO
+
+from monitor.publishing.rerun.bounded_queue import Backlog
+
+QUEUE_CHARACTERS: Final = 256 * 1024
+"""Length of the queued text at most; some 2000 log lines."""
+CHUNK_BYTES: Final = 1024
+"""A single write call; small, so that a slow terminal is told from a blocked one."""
+BLOCKED_S: Final = 2.0
+"""A write that takes longer counts as blocked."""
+GATHER_S: Final = 0.05
+"""Delay before a frame is drawn, so that results published together appear in one frame."""
+IDLE_S: Final = 1.0
+CLOSE_S: Final = 2.0
+
+Render = Callable[[Sequence[str], bool], str]
+"""Return the text to write, given the queued lines and whether this is the last call."""
+
+
+class QueuedWriter:
+    """Thread that writes text to a stream which may block.
+
+    Parameters
+    ----------
+    stream : TextIO or None
+        Destination. A stream without a file descriptor is written directly. None discards the text.
+    place : str
+        Name of the destination in messages, such as "standard error".
+    render : callable, optional
+        Converts the queued lines to the text that is written. It runs in the thread. By default, lines are joined.
+    period_s : float, optional
+        Interval in seconds at which ``render`` is called even if no lines are queued. None: only when there are lines.
+    limit : int
+        Number of queued characters above which the oldest entries are dropped. One entry is always kept.
+    tell : callable, optional
+        Called in the thread with a sentence after lines were dropped, as soon as text can be written again.
+    """
+
+    def __init__(
+        self,
+        stream: TextIO | None,
+        place: str,
+        render: Render | None = None,
+        period_s: float | None = None,
+        limit: int = QUEUE_CHARACTERS,
+        tell: Callable[[str], None] | None = None,
+    ) -> None:
+        self.error: Exception | None = None  # of the last write or rendering; None after a successful one
+        self._stream = stream
+        self._descriptor = descriptor_of(stream)
+        self._place = place
+        self._render = render or (lambda lines, _last: "".join(lines))
+        self._period_s = period_s
+        self._tell = tell
+        self._queue: Backlog[str] = Backlog(limit)
+        self._lost_lines = 0  # taken from the queue but not written
+        self._told_lines = 0  # dropped lines that were reported through tell
+        self._lost_frames = 0
+        self._reason = ""  # why the newest lines were lost
+        self._write_since_s: float | None = None  # monotonic time at which the current write call began
+        self._closing = threading.Event()
+        self._given_up = False  # close() has waited in vain
+        self._thread = threading.Thread(target=self._run, name=f"writer of {place}", daemon=True)
+
+    def __enter__(self) -> "QueuedWriter":
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        self.close()
+        if kind is None and self.error is not None:
+            raise self.error
+
+    @property
+    def state(self) -> str:
+        """``ok``, or what is wrong and how much was dropped since the start: for the status of the devices."""
+        blocked_s = self._blocked_s()
+        frames = self._lost_frames + self._frames_in(blocked_s)
+        counts = ((frames, "frame"), (self._dropped_lines(), "log line"))
+        dropped = " and ".join(_count(count, name) for count, name in counts if count)
+        if blocked_s:
+            wrong = f"blocked for {blocked_s:.0f} s: nobody reads {self._place}"
+        elif (error := self.error) is not None:
+            wrong = f"{self._place} cannot be written: {_reason(error)}"
+        else:
+            return f"ok, but {dropped} dropped" if dropped else "ok"
+        return f"{wrong}; {dropped} dropped" if dropped else wrong
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def put(self, text: str) -> None:
+        """Queue whole lines; return at once."""
+        self._queue.push(text, len(text))
+
+    def redraw(self) -> None:
+        """Call ``render`` soon, without waiting for the end of the period."""
+        self._queue.wake()
+
+    def finish(self, stop: threading.Event) -> None:
+        """Write all that is queued; wait until it is written or ``stop`` is set."""
+        self._begin_closing()
+        while self._thread.is_alive() and not stop.is_set():
+            self._thread.join(0.1)
+
+    def close(self, timeout_s: float = CLOSE_S) -> bool:
+        """Write all that is queued, and end the thread.
+
+        If the destination is still blocked after the deadline, its descriptor is replaced with the null device, so that
+        the interpreter cannot block on it at exit.
+
+        Parameters
+        ----------
+        timeout_s : float
+            Seconds to wait for the reader.
+
+        Returns
+        -------
+        bool
+            True if everything was written or has failed; False if the destination was still blocked.
+        """
+        self._begin_closing()
+        if self._thread.is_alive() and not self._given_up:
+            self._thread.join(timeout_s)
+        self._given_up = self._thread.is_alive()
+        if self._given_up or not can_write(self._descriptor):
+            detach(self._stream)
+        return not self._given_up
+
+    # --- the thread
+
+    def _run(self) -> None:
+        while True:
+            closing = self._closing.is_set()  # read first: what was queued before close() is written
+            lines = self._queue.take(0.0 if closing else self._period_s or IDLE_S)
+            if self._period_s is not None and not closing:
+                self._closing.wait(GATHER_S)
+                lines += self._queue.take(0.0)
+            self._turn([line for line in lines if line], closing)
+            if closing:
+                if rest := self._queue.take(0.0):  # the report of dropped lines
+                    self._turn(rest, closing)
+                return
+
+    def _turn(self, lines: list[str], last: bool) -> None:
+        if not lines and not last and self._period_s is None:
+            return
+        dropped = self._dropped_lines()
+        text, failed = self._rendered(lines, last)
+        try:
+            self._write(text)
+        except (OSError, ValueError) as error:  # ValueError: the stream was closed
+            self._lost_lines += len(lines)
+            self._lost_frames += self._period_s is not None
+            self._reason = f"{self._place} could not be written: {_reason(error)}"
+            self.error = error
+        else:
+            self.error = failed
+            self._tell_dropped(dropped)
+        finally:
+            self._write_since_s = None
+
+    def _rendered(self, lines: list[str], last: bool) -> tuple[str, Exception | None]:
+        """Return the text, or the plain lines and the error if they cannot be rendered."""
+        try:
+            return self._render(lines, last), None
+        except Exception as error:  # noqa: BLE001 - a frame that cannot be drawn must not end the log; shown in state
+            self._lost_frames += 1
+            return "".join(lines), error
+
+    def _write(self, text: str) -> None:
+        if self._stream is None or not text:
+            return
+        self._write_since_s = time.monotonic()
+        if self._descriptor is None:
+            self._stream.write(text)
+            self._stream.flush()
+            return
+        left = memoryview(text.encode(self._stream.encoding or "utf-8", "replace"))
+        while left:
+            try:
+                left = left[os.write(self._descriptor, left[:CHUNK_BYTES]) :]
+            except BlockingIOError:  # another process has made the terminal non-blocking
+                can_write(self._descriptor, IDLE_S)
+                continue
+            if blocked_s := self._blocked_s():
+                self._lost_frames += self._frames_in(blocked_s)
+                self._reason = f"nobody read {self._place}"
+            self._write_since_s = time.monotonic()
+
+    def _tell_dropped(self, dropped: int) -> None:
+        """Report lines dropped before the newest batch; the queue was emptied since, so it has space for the report."""
+        count = dropped - self._told_lines
+        if count and self._tell is not None:
+            self._told_lines = dropped
+            were = "was" if count == 1 else "were"
+            self._tell(f"{_count(count, 'log line')} {were} dropped because {self._reason or 'the queue was full'}")
+
+    # --- counting
+
+    def _blocked_s(self) -> float:
+        """Return the duration of the current write call in seconds, or 0 if it is short."""
+        since_s = self._write_since_s
+        blocked_s = 0.0 if since_s is None else time.monotonic() - since_s
+        return blocked_s if blocked_s >= BLOCKED_S else 0.0
+
+    def _frames_in(self, blocked_s: float) -> int:
+        return 0 if self._period_s is None else int(blocked_s / self._period_s)
+
+    def _dropped_lines(self) -> int:
+        return self._queue.dropped + self._lost_lines
+
+    def _begin_closing(self) -> None:
+        self._closing.set()
+        self._queue.push("", 0)  # unlike wake(), this is not lost if the thread is not waiting yet
+
+
+class QueuedLines(io.TextIOBase):
+    """Text stream that passes whole lines to a ``QueuedWriter``; stands in for ``sys.stderr``."""
+
+    def __init__(self, writer: QueuedWriter, terminal: bool) -> None:
+        self._writer = writer
+        self._terminal = terminal
+        self._partial = ""
+        self._lock = threading.RLock()  # a warning from the garbage collector may enter again
+
+    def write(self, text: str) -> int:
+        """Queue the lines that are complete; return at once."""
+        with self._lock:
+            *lines, self._partial = (self._partial + text).split("\n")
+            if len(self._partial) > QUEUE_CHARACTERS:
+                lines, self._partial = [*lines, self._partial], ""
+        for line in lines:
+            self._writer.put(f"{line}\n")
+        return len(text)
+
+    def isatty(self) -> bool:
+        """Return True if the lines end on a terminal."""
+        return self._terminal
+
+
+def descriptor_of(stream: TextIO | None) -> int | None:
+    """Return the file descriptor of a stream, or None if it has none."""
+    try:
+        descriptor = -1 if stream is None else stream.fileno()
+    except (OSError, ValueError):
+        return None
+    return descriptor if descriptor >= 0 else None
+
+
+def detach(stream: TextIO | None) -> None:
+    """Point the descriptor of a stream to the null device, so that no later write to it can block."""
+    descriptor = descriptor_of(stream)
+    if descriptor is not None:
+        with contextlib.suppress(OSError), open(os.devnull, "wb") as null:  # no free descriptor: it stays as it is
+            os.dup2(null.fileno(), descriptor)
+
+
+def can_write(descriptor: int | None, timeout_s: float = 0.0) -> bool:
+    """Return True if a short write to the descriptor does not block."""
+    if descriptor is None:
+        return True
+    poll = select.poll()
+    poll.register(descriptor, select.POLLOUT)
+    return bool(poll.poll(1000.0 * timeout_s))
+
+
+def _count(count: int, name: str) -> str:
+    return f"{count:,} {name}{'' if count == 1 else 's'}"
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, OSError):
+        return error.strerror or errno.errorcode.get(error.errno or 0, str(error))
+    return f"{type(error).__name__}: {error}"

@@ -1,0 +1,205 @@
+"""Thermal models and what they expect, as tables of the terminal and as JSON."""
+
+import math
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from rich.console import Console
+from rich.padding import Padding
+from rich.table import Table
+
+from monitor.common.rates import amount
+from monitor.drift.thermal.interval_means import Means
+from monitor.drift.thermal.temperature_share import SLOW, WithoutTemperature
+from monitor.drift.thermal.thermal_fit import ThermalFit
+from monitor.drift.thermal.thermal_model import Prediction
+from monitor.drift.thermal.thermal_response import Shape
+from monitor.drift.thermal.thermal_study import Judged, Outlook, Study
+from monitor.publishing.coefficient_cells import DEVIATION_UNITS, kind_of, reading
+from monitor.publishing.rerun.panels import duration
+
+FIT_SCHEMA: Final = "imu-monitor/thermal-fit/1"
+PREDICT_SCHEMA: Final = "imu-monitor/thermal-predict/1"
+ONE_WAY: Final = (
+    "temperature only rose, or only fell: how late its effect is, and whether there is hysteresis, cannot be told"
+)
+DRIFT_WITH_TIME: Final = "temperature only rose or only fell, so a drift with time by itself can look the same"
+
+
+def tell(study: Study, console: Console) -> None:
+    """Print what was fitted."""
+    console.print(_head(study.recording, study.interval_s, study.means), highlight=False)
+    if study.fits:
+        rows = _table("axis", "model", "per °C", "late by", "loop", "leaves", "explains", "validated")
+        for axis, one in study.fits.items():
+            rows.add_row(axis, *_fit_row(axis, one))
+        console.print(Padding(rows, (1, 0)))
+        console.print(
+            "loop: largest difference between heating and cooling, where noise does not explain it. leaves: rms of the "
+            "means less the model. validated: the same on parts of the record predicted from the others (over that of "
+            "a cubic).",
+            style="dim",
+        )
+    one_way = [axis for axis, one in study.fits.items() if not one.both_ways]
+    notes = (*study.notes, *notes_on_hysteresis(study), *([ONE_WAY] if one_way else []))
+    _tell_rest(study.refused, notes, console)
+
+
+def tell_outlook(outlook: Outlook, console: Console) -> None:
+    """Print what models expect of a recording, and how far off they are."""
+    console.print(_head(outlook.recording, outlook.interval_s, outlook.means), highlight=False)
+    if outlook.judged:
+        rows = _table("axis", "rms alone", "multi-step", "offset out", "one-step", "offset", "within 95 %")
+        for axis, one in outlook.judged.items():
+            each = (one.rms_alone, one.rms, one.rms_moved, one.rms_one_step, one.offset)
+            rows.add_row(axis, *(_size(axis, x) for x in each), f"{100.0 * one.within:.0f} %")
+        console.print(Padding(rows, (1, 0)))
+    _tell_rest(outlook.refused, outlook.notes, console)
+
+
+def notes_without(found: WithoutTemperature) -> list[str]:
+    """Return a sentence for each axis of whose slow variation temperature explains most, or of K or R a clear part."""
+    notes = []
+    for axis, one in found.dependences.items():
+        fallen = [
+            f"{letter} falls from {before.value} to {after.value} {after.unit} ({100.0 * share:.0f} % of its variance)"
+            for letter in SLOW
+            if found.matters(letter, axis) and (share := found.share(letter, axis)) is not None
+            for before, after in [(reading(found.before, letter, axis), reading(found.coefficients, letter, axis))]
+        ]
+        without = f"without temperature ({found.models.get(axis, '')}), {' and '.join(fallen)}" if fallen else ""
+        if one.explains_most:
+            share_text = f"{math.floor(100.0 * one.share):d} %"
+            notes.append(
+                f"{axis} follows its temperature: a {one.form} explains {share_text} of the variance of means of "
+                f"{duration(one.interval_s)}, so Q N B K R describe temperature as well as noise"
+                f"{'; ' + without if without else ''}; imu-monitor thermal fit models it"
+                f"{'' if not one.one_way else f' ({DRIFT_WITH_TIME})'}"
+            )
+        elif without:
+            notes.append(f"{axis} follows its temperature in part: {without}")
+    return notes
+
+
+def notes_on_hysteresis(study: Study) -> list[str]:
+    """Return a sentence for each axis on which heating and cooling differ by more than noise explains."""
+    return [
+        f"{axis}: at one temperature the bias differs between heating and cooling by up to "
+        f"{amount(axis, one.hysteresis)} (hysteresis or a lag, p = {one.hysteresis_p:.1g})"
+        for axis, one in study.fits.items()
+        if one.hysteresis and one.hysteresis_p is not None
+    ]
+
+
+def study_json(study: Study) -> bytes:
+    """Everything that was fitted; SI units."""
+    axes: dict[str, Any] = {}
+    for axis, one in study.fits.items():
+        model = one.model
+        axes[axis] = {
+            "model": model.shape.name,
+            "reference": model.reference_c,
+            "sizes": model.sizes.tolist(),
+            "time_constants": list(model.shape.constants_s),
+            "equation": model.equation,
+            "slope": model.slope,
+            "hysteresis": one.hysteresis,
+            "hysteresis_p": one.hysteresis_p,
+            "both_directions": one.both_ways,
+            "explained": one.explained,
+            "phi": model.phi,
+            "candidates": [
+                {"model": each.shape.name, "aicc": each.aicc, "rms": each.rms, "validated": each.validated}
+                for each in one.candidates
+            ],
+            "temperature": study.means[axis].temperature_c,
+            "bias": study.means[axis].bias,
+            "error": study.means[axis].error,
+        }
+    return _json(FIT_SCHEMA, study.recording, study.interval_s, axes, study.refused, study.notes)
+
+
+def outlook_json(outlook: Outlook) -> bytes:
+    """What was expected and what came; SI units."""
+    axes = {axis: _judged(outlook.means[axis], one) for axis, one in outlook.judged.items()}
+    return _json(PREDICT_SCHEMA, outlook.recording, outlook.interval_s, axes, outlook.refused, outlook.notes)
+
+
+def _judged(means: Means, one: Judged) -> dict[str, Any]:
+    return {
+        "rms": one.rms,
+        "rms_offset_out": one.rms_moved,
+        "rms_one_step": one.rms_one_step,
+        "rms_alone": one.rms_alone,
+        "offset": one.offset,
+        "within": one.within,
+        "temperature": means.temperature_c,
+        "bias": means.bias,
+        "multi_step": _band(one.multi_step),
+        "one_step": _band(one.one_step),
+    }
+
+
+def _band(one: Prediction) -> dict[str, Any]:
+    return {"bias": one.bias, "lo": one.lo, "hi": one.hi}
+
+
+def _json(
+    schema: str, recording: str, interval_s: float, axes: dict[str, Any], refused: Any, notes: tuple[str, ...]
+) -> bytes:
+    whole = {
+        "schema": schema,
+        "recording": recording,
+        "interval": interval_s,
+        "axes": axes,
+        "refused": dict(refused),
+        "notes": list(notes),
+    }
+    return msgspec.json.encode(whole, enc_hook=_plain)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return [float(x) if np.isfinite(x) else None for x in value]
+    raise TypeError(f"{type(value).__name__} has no JSON")
+
+
+def _head(recording: str, interval_s: float, means: Any) -> str:
+    first: Means = next(iter(means.values()))
+    count = first.bias.size
+    warmth = first.temperature_c
+    span = f"{np.nanmin(warmth):.1f} … {np.nanmax(warmth):.1f} °C" if np.isfinite(warmth).any() else "no temperature"
+    return f"{recording}: {count} intervals of {duration(interval_s)}, {span}"
+
+
+def _fit_row(axis: str, one: ThermalFit) -> tuple[str, ...]:
+    model, best = one.model, one.candidates[0]
+    cubic = next((each.validated for each in one.candidates if each.shape == Shape(3, ())), None)
+    return (
+        model.shape.name,
+        _size(axis, model.slope) if model.shape != Shape(0, ()) else "—",
+        ", ".join(duration(each) for each in model.shape.constants_s) or "—",
+        "—" if not one.hysteresis else _size(axis, one.hysteresis),
+        _size(axis, best.rms),
+        f"{100.0 * one.explained:.0f} %",
+        _size(axis, best.validated) + (f" ({best.validated / cubic:.2g})" if cubic else ""),
+    )
+
+
+def _size(axis: str, si: float) -> str:
+    return DEVIATION_UNITS[kind_of(axis)].text(si)
+
+
+def _table(*heads: str) -> Table:
+    rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
+    for head in heads:
+        rows.add_column(head, no_wrap=head in ("axis", "model"))
+    return rows
+
+
+def _tell_rest(refused: Any, notes: tuple[str, ...], console: Console) -> None:
+    for axis, why in refused.items():
+        console.print(f"{axis}: {why}", highlight=False, soft_wrap=True)
+    for note in notes:
+        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,1 @@
+"""Diagnostics that compare a recording with a model, and their null distribution."""

@@ -1,0 +1,221 @@
+"""Pictures of an axis beside a model: what was measured, what the model expects, and the band that 95 of 100 simulated
+recordings stay in at each place, from the model's spectrum in closed form. A view is small: some hundred points.
+"""
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
+from scipy.special import chdtri, erfc
+
+from drivers.sample import Floats, Ints
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_axis
+from monitor.noise.spectrum import allan_of_density
+from monitor.reconcile.diagnostics.diagnostics import LAGS, Sight, noise_course
+from monitor.reconcile.preparation.cosine_bins import series
+from monitor.reconcile.result import View
+
+POINTS: Final = 240
+"""Of a spectrum."""
+BLOCKS: Final = 240
+"""Of a course over time."""
+DEGREES: Final = 24
+"""Intervals of temperature."""
+Z95: Final = 1.959964
+RATE: Final = {"g": "rad/s", "a": "m/s²"}
+DENSITY: Final = {"g": "(rad/s)²/Hz", "a": "(m/s²)²/Hz"}
+
+
+def views(seen: Sight) -> tuple[View, ...]:
+    """Of every lens that has one."""
+    made = [_psd(seen), _allan(seen), _level(seen), _variance(seen), _tails(seen), _autocorrelation(seen)]
+    if seen.axis.temperature_c is not None and np.ptp(seen.axis.temperature_c) > 0.0:
+        made.append(_temperature(seen))
+    return tuple(made)
+
+
+def _psd(seen: Sight) -> View:
+    bins, tau0_s = seen.axis.bins, 1.0 / seen.axis.rate_hz
+    variance, power = seen.likely.fitted.variance, seen.likely.fitted.residual
+    used = np.flatnonzero(seen.axis.heard)
+    # neighbours together, as many as make POINTS points even in the logarithm of frequency
+    f = np.log(bins.f_hz[used])
+    cell = np.floor((f - f[0]) / max(f[-1] - f[0], 1e-9) * POINTS)
+    first = np.flatnonzero(np.diff(cell, prepend=-1.0))
+    count = np.add.reduceat(bins.count[used], first)
+    expected = np.add.reduceat((bins.count * variance)[used], first) / count * tau0_s
+    measured = np.add.reduceat(power[used], first) / count * tau0_s
+    middle = np.exp(np.add.reduceat((bins.count * np.log(bins.f_hz))[used], first) / count)
+    lo, hi = _chi(count)
+    unit = DENSITY[seen.axis.name[0]]
+    return View(
+        "psd",
+        "frequency",
+        "Hz",
+        "spectral density",
+        unit,
+        True,
+        middle,
+        measured,
+        expected,
+        lo * expected,
+        hi * expected,
+    )
+
+
+def _allan(seen: Sight) -> View:
+    axis, tau0_s = seen.axis, 1.0 / seen.axis.rate_hz
+    m = cluster_sizes(axis.n, axis.rate_hz)
+    measured, _ = overlapping_axis(axis.y, m)
+    courses = axis.y - axis.y.mean() - series(axis.residual(seen.likely))
+    of_courses, _ = overlapping_axis(courses, m)
+    tau_s = np.asarray(m * tau0_s, np.float64)
+    density = _density(seen)
+    noise = allan_of_density(density, tau_s, tau0_s, ())
+    lo, hi = _chi(_freedom(seen, m))
+    expected = noise + of_courses
+    bounds = (np.sqrt(lo * noise + of_courses), np.sqrt(hi * noise + of_courses))
+    unit = RATE[axis.name[0]]
+    return View(
+        "allan",
+        "averaging time",
+        "s",
+        "Allan deviation",
+        unit,
+        True,
+        tau_s,
+        np.sqrt(measured),
+        np.sqrt(expected),
+        *bounds,
+    )
+
+
+def _density(seen: Sight) -> Callable[[Floats], Floats]:
+    bins = seen.axis.bins
+    x, y = np.log(bins.f_hz), np.log(seen.likely.fitted.variance / seen.axis.rate_hz)
+    return lambda f: np.asarray(np.exp(np.interp(np.log(f), x, y)))
+
+
+def _freedom(seen: Sight, m: Ints) -> Floats:
+    """Degrees of freedom of overlapping Allan variances: of Σ a_k Y_k², 2 E²/Var = (Σ a v)²/Σ (a v)².
+
+    a_k ∝ sin⁴(πfτ)/sin²(πfτ0); where a bin holds more than a turn of it, its mean 3/8 and mean square 35/128.
+    """
+    bins, variance = seen.axis.bins, seen.likely.fitted.variance
+    f, count = bins.f_hz, bins.count
+    width = count * 0.5 * seen.axis.rate_hz / seen.axis.n
+    found = np.empty(m.size)
+    for at, factor in enumerate(m.tolist()):
+        tau_s = factor / seen.axis.rate_hz
+        turning = width * tau_s > 0.5
+        square = np.sin(np.pi * f * tau_s) ** 2
+        first, second = np.where(turning, 0.375, square**2), np.where(turning, 35.0 / 128.0, square**4)
+        rest = variance / np.sin(np.pi * f / seen.axis.rate_hz) ** 2
+        found[at] = (count * first * rest).sum() ** 2 / (count * second * rest**2).sum()
+    return np.maximum(found, 1.0)
+
+
+def _level(seen: Sight) -> View:
+    axis = seen.axis
+    size = max(1, axis.n // BLOCKS)
+    courses = axis.y - axis.y.mean() - series(axis.residual(seen.likely))
+    measured, expected = _means(axis.y, size), _means(courses, size) + axis.y.mean()
+    t = np.asarray((np.arange(measured.size) + 0.5) * size / axis.rate_hz, np.float64)
+    bins = axis.bins
+    block = np.sinc(bins.f_hz * size / axis.rate_hz) ** 2
+    spread = Z95 * float(np.sqrt((bins.count * seen.likely.fitted.variance * block).sum() / axis.n))
+    unit = RATE[axis.name[0]]
+    return View("level", "time", "s", "level", unit, False, t, measured, expected, expected - spread, expected + spread)
+
+
+def _variance(seen: Sight) -> View:
+    axis = seen.axis
+    size = max(1, axis.n // BLOCKS)
+    course = noise_course(seen.likely.effects, axis.n, axis.rate_hz)
+    measured, expected = np.sqrt(_means((seen.fast * course) ** 2, size)), np.sqrt(_means(course**2, size))
+    t = np.asarray((np.arange(measured.size) + 0.5) * size / axis.rate_hz, np.float64)
+    lo, hi = np.sqrt(_chi(np.array([float(size)])))
+    return View(
+        "variance", "time", "s", "noise over its mean", "1", False, t, measured, expected, lo * expected, hi * expected
+    )
+
+
+def _tails(seen: Sight) -> View:
+    sizes = np.sort(np.abs(seen.fast))
+    n = sizes.size
+    x = np.linspace(0.5, max(float(sizes[-1]), 4.0), 80)
+    measured = 1.0 - np.searchsorted(sizes, x) / n
+    expected = erfc(x / 2.0**0.5)
+    spread = Z95 * np.sqrt(np.maximum(expected * (1.0 - expected), 0.0) / n)
+    least = 0.3 / n
+    return View(
+        "tails",
+        "distance",
+        "σ",
+        "share of samples beyond",
+        "1",
+        True,
+        x,
+        np.maximum(measured, least),
+        np.maximum(expected, least),
+        np.maximum(expected - spread, least),
+        np.maximum(expected + spread, 3.0 / n),
+    )
+
+
+def _autocorrelation(seen: Sight) -> View:
+    n = seen.white.size
+    size = next_fast_len(n + LAGS, real=True)
+    turned = rfft(seen.white, size)
+    measured = irfft(turned.real**2 + turned.imag**2, size)[1 : LAGS + 1] / n
+    lag_s = np.arange(1, LAGS + 1) / seen.axis.rate_hz
+    zero, band = np.zeros(LAGS), np.full(LAGS, Z95 / n**0.5)
+    return View("autocorrelation", "lag", "s", "autocorrelation", "1", False, lag_s, measured, zero, -band, band)
+
+
+def _temperature(seen: Sight) -> View:
+    axis = seen.axis
+    warmth = axis.temperature_c
+    assert warmth is not None
+    courses = axis.y - axis.y.mean() - series(axis.residual(seen.likely))
+    edges = np.linspace(float(warmth.min()), float(warmth.max()), DEGREES + 1)
+    of = np.clip(np.searchsorted(edges, warmth, "right") - 1, 0, DEGREES - 1)
+    count = np.bincount(of, minlength=DEGREES)
+    there = count > 0
+    mean = [np.bincount(of, weights=one, minlength=DEGREES)[there] / count[there] for one in (axis.y, courses)]
+    expected = mean[1] + axis.y.mean()
+    longest_s = count[there] / axis.rate_hz
+    bins = axis.bins
+    spread = np.array(
+        [
+            Z95
+            * float(np.sqrt((bins.count * seen.likely.fitted.variance * np.sinc(bins.f_hz * s) ** 2).sum() / axis.n))
+            for s in longest_s
+        ]
+    )
+    x = 0.5 * (edges[1:] + edges[:-1])[there]
+    unit = RATE[axis.name[0]]
+    return View(
+        "temperature",
+        "temperature",
+        "°C",
+        "level",
+        unit,
+        False,
+        x,
+        mean[0],
+        expected,
+        expected - spread,
+        expected + spread,
+    )
+
+
+def _means(values: Floats, size: int) -> Floats:
+    count = values.size // size
+    return np.asarray(values[: count * size].reshape(count, size).mean(axis=1))
+
+
+def _chi(freedom: Floats) -> tuple[Floats, Floats]:
+    """95 % band of a mean square over its expectation."""
+    return np.asarray(chdtri(freedom, 0.975) / freedom), np.asarray(chdtri(freedom, 0.025) / freedom)

@@ -1,0 +1,1 @@
+"""Likelihoods of effects on one axis."""

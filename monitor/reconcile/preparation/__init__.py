@@ -1,0 +1,1 @@
+"""Preparation of a recording: missing and wrong samples, value statistics, sample rate."""

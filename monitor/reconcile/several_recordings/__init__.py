@@ -1,0 +1,1 @@
+"""Comparison of several recordings of one sensor."""

@@ -1,0 +1,90 @@
+"""A comparison of several recordings as JSON for programs: schema imu-monitor/reconcile-runs/1.
+
+In comes a ``Comparison``, out go bytes; the same comparison gives the same bytes. Numbers are SI of their axis; what is
+not a finite number is null. Of each effect, ``parameters`` are pooled over the recordings that show it, each with the
+probability ``p`` that values as different as theirs are of one; ``consistent`` and ``p`` of the effect speak of its
+size. ``each`` has the recordings by themselves; all else of them is in their own ``report.json``, in ``folder``.
+"""
+
+from math import isfinite
+from typing import Any, Final
+
+import msgspec
+
+from monitor.reconcile.result import Bounds, Step
+from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, Run, Seen
+
+SCHEMA: Final = "imu-monitor/reconcile-runs/1"
+
+
+def to_json(c: Comparison) -> bytes:
+    """The report."""
+    return msgspec.json.encode({
+        "schema": SCHEMA,
+        "verdict": c.verdict,
+        "seed": int(c.seed),
+        "fitted_to": c.fitted_to,
+        "recordings": [
+            *(_run(run) for run in c.runs),
+            *({"name": name, "folder": name, "verdict": None, "why": why} for name, why in c.silent.items()),
+        ],
+        "axes": {axis: _axis(one) for axis, one in c.axes.items()},
+    })  # fmt: skip
+
+
+def _run(run: Run) -> dict[str, Any]:
+    return {
+        "name": run.name,
+        "folder": run.name,
+        "verdict": run.result.verdict,
+        "rate": _number(run.result.rate_hz),
+        "samples": int(run.result.samples),
+        "seconds": _number(run.result.seconds),
+    }
+
+
+def _axis(one: AxisRuns) -> dict[str, Any]:
+    return {
+        "verdicts": {run: result.verdict for run, result in one.results.items()},
+        "common": [_seen(seen) for seen in one.common],
+        "single": [
+            {
+                **_seen(seen),
+                "absent": [{"run": a.run, "meaning": a.meaning, "because": a.because} for a in seen.absent],
+            }
+            for seen in one.single
+        ],
+    }
+
+
+def _seen(seen: Seen) -> dict[str, Any]:
+    return {
+        "effect": seen.effect,
+        "kind": seen.kind,
+        "recordings": list(seen.steps),
+        "parameters": {
+            name: {**_bounds(one.bounds), **({} if one.p is None else {"p": _number(one.p)})}
+            for name, one in seen.parameters.items()
+        },
+        "consistent": seen.consistent,
+        "p": _number(seen.p),
+        "each": {run: _each(step) for run, step in seen.steps.items()},
+    }
+
+
+def _each(step: Step) -> dict[str, Any]:
+    return {
+        "parameters": {name: _bounds(one) for name, one in step.parameters.items()},
+        "confidence": _number(step.confidence),
+        "gap": {"before": _number(step.before.gap), "after": _number(step.after.gap)},
+    }
+
+
+def _bounds(one: Bounds) -> dict[str, Any]:
+    if isinstance(one.value, str):
+        return {"value": one.value}
+    return {"value": _number(one.value), "lo": _number(one.lo), "hi": _number(one.hi)}
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or not isfinite(value) else float(value)

@@ -1,0 +1,7 @@
+"""A simulated IMU that speaks a real wire format over a real link: model, encoder, faults, and the link's far end."""
+
+from monitor.simulator.scheduled_effects import effects_of
+from monitor.simulator.sensor import DEFAULT_RATE_HZ, ROOM_C, WARM_UP_C, WARM_UP_S, Sensor
+from monitor.simulator.virtual_imu import VirtualImu
+
+__all__ = ["DEFAULT_RATE_HZ", "ROOM_C", "WARM_UP_C", "WARM_UP_S", "Sensor", "VirtualImu", "effects_of"]

@@ -1,0 +1,66 @@
+"""A zenoh session of the sensor's own that publishes on loopback; the zenoh link connects to it and to nobody else."""
+
+import socket
+import threading
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+from drivers.errors import LinkUnavailable
+from drivers.links import zenoh_link
+from drivers.sample import Chunk
+from drivers.zenoh.session import configuration, plain
+
+if TYPE_CHECKING:
+    import zenoh
+
+KEY: Final = "imu-monitor/virtual/samples"
+
+
+class ZenohPort:
+    """A publisher that is there while it is plugged in."""
+
+    def __init__(self, silence_s: float) -> None:
+        self._endpoint = f"tcp/127.0.0.1:{_free_port()}"
+        self.link = zenoh_link.build(zenoh_link.Settings(key=KEY, connect=[self._endpoint], silence=silence_s))
+        self._session: zenoh.Session | None = None
+        self._publisher: Any = None
+        self._plugging = threading.Lock()
+
+    def plug(self) -> None:
+        """Open the session; ``LinkUnavailable`` when another program has taken its port."""
+        import zenoh
+
+        with self._plugging:
+            if self._session is not None:
+                return
+            try:
+                self._session = zenoh.open(configuration({"listen/endpoints": [self._endpoint]}))
+                self._publisher = self._session.declare_publisher(KEY)
+            except zenoh.ZError as error:
+                raise LinkUnavailable(f"simulated sensor at {self._endpoint}: {plain(error)}") from error
+
+    def unplug(self) -> None:
+        """Close the session."""
+        with self._plugging:
+            session, self._session = self._session, None
+            if session is not None:
+                session.close()  # type: ignore[no-untyped-call]
+
+    def send(self, chunks: Sequence[Chunk]) -> int:
+        """One message a chunk; zenoh drops what no reader takes in time."""
+        with self._plugging:
+            if self._session is None:
+                return 0
+            for chunk in chunks:
+                self._publisher.put(chunk.data, attachment=chunk.attachment or None)
+        return len(chunks)
+
+    def close(self) -> None:
+        """Close the session for good."""
+        self.unplug()
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port: int = server.getsockname()[1]
+        return port

@@ -1,7 +1,0 @@
-"""A simulated IMU that speaks a real wire format over a real link: model, encoder, faults, and the link's far end."""
-
-from monitor.virtual.effects import effects_of
-from monitor.virtual.imu import VirtualImu
-from monitor.virtual.sensor import DEFAULT_RATE_HZ, ROOM_C, WARM_UP_C, WARM_UP_S, Sensor
-
-__all__ = ["DEFAULT_RATE_HZ", "ROOM_C", "WARM_UP_C", "WARM_UP_S", "Sensor", "VirtualImu", "effects_of"]

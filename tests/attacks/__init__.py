@@ -1,4 +1,0 @@
-"""Attack suite: hostile files, absurd numbers, shared resources and foreign environments.
-
-Cheap cases run with all tests, the others with ``pytest tests/attacks -m attack``.
-"""

@@ -1,0 +1,30 @@
+"""Files that people write are read whole, and no more than a bounded part of anything else."""
+
+from pathlib import Path
+
+import pytest
+
+from drivers import file_access
+from drivers.errors import ConfigError
+from monitor.commands import thermal
+from monitor.noise.catalogue import read_model
+from monitor.settings import loading
+
+
+def test_all_of_a_file(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"1\r\n2")
+    assert file_access.read(tmp_path / "a") == b"1\r\n2"
+
+
+def test_what_is_too_large_is_one_line_for_every_reader(tmp_path: Path) -> None:
+    path = tmp_path / "big"
+    with path.open("wb") as file:
+        file.truncate(file_access.MOST_BYTES + 1)
+    with pytest.raises(OSError, match="more than 32 MB"):
+        file_access.read(path)
+    config, wrong = loading.read(path)
+    assert config is None
+    assert "more than 32 MB" in wrong[0]
+    for read in (read_model, thermal.from_file):
+        with pytest.raises(ConfigError, match="more than 32 MB"):
+            read(path)

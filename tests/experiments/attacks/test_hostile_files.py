@@ -1,0 +1,240 @@
+"""Hostile files end a command with one line and status 2, within bounds of memory and processor time.
+
+Each file is read by a command in a process of its own, with its address space and its processor time limited. The
+process writes down the largest memory that was resident. The cases that are cheap to generate run by default, the
+others with ``pytest tests/experiments/attacks -m attack``.
+"""
+
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pytest
+
+from tests.experiments.attacks import hostile_files as hostile
+
+ROOT: Final = Path(__file__).resolve().parents[3]
+MAX_RESIDENT_BYTES: Final = 500_000_000
+ADDRESS_SPACE_BYTES: Final = 4_000_000_000
+CPU_S: Final = 40
+"""Four times what is allowed on an idle machine."""
+
+LIMITED: Final = f"""
+import resource, runpy, sys
+resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]), int(sys.argv[2])))
+resource.setrlimit(resource.RLIMIT_CPU, ({CPU_S}, {CPU_S}))
+peak, sys.argv[:] = sys.argv[1], ["imu-monitor", *sys.argv[3:]]
+try:
+    runpy.run_module(sys.argv.pop(1), run_name="__main__", alter_sys=True)
+finally:
+    with open("/proc/self/status") as status, open(peak, "w") as file:
+        file.write(next(line for line in status if line.startswith("VmHWM")))
+"""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a limited process did."""
+
+    status: int
+    stdout: str
+    stderr: str
+    resident_bytes: int  # largest
+
+
+def run_limited(tmp_path: Path, module: str, *args: str, address_space_bytes: int = ADDRESS_SPACE_BYTES) -> Outcome:
+    """Run a module as a program in a limited process."""
+    peak = tmp_path / "peak"
+    command = [sys.executable, "-c", LIMITED, str(peak), str(address_space_bytes), module, *args]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=900, check=False)
+    resident = 1024 * int(peak.read_text().split()[1]) if peak.exists() else sys.maxsize
+    return Outcome(done.returncode, done.stdout, done.stderr, resident)
+
+
+def check_refused(outcome: Outcome, path: Path, why: str) -> None:
+    """Assert that a file was refused in one line that names it and says why."""
+    assert outcome.status == 2, outcome
+    assert outcome.stderr.count("\n") == 1, outcome.stderr
+    assert str(path) in outcome.stderr
+    assert re.search(why, outcome.stderr), outcome.stderr
+    assert outcome.stdout == ""
+    assert outcome.resident_bytes < MAX_RESIDENT_BYTES, outcome
+
+
+Case = tuple[hostile.Generator, str, str]
+"""A generator, the suffix of its file, and what the message says."""
+
+MEMORY_OR_ROWS: Final = "of memory would be needed|are no measured samples"
+CHEAP: Final[Sequence[Case]] = (
+    (hostile.csv_hundred_thousand_columns, ".csv", "100002 columns, expected at most 10000"),
+    (hostile.csv_line_without_end, ".csv", "Line 2 is longer than 1048576 bytes"),
+    (hostile.gz_header_without_end, ".csv.gz", "not one whole line.*Line 1 is longer"),
+    (hostile.gz_rows_without_end, ".csv.gz", MEMORY_OR_ROWS),
+    (hostile.gz_bad_lines, ".csv.gz", "lines are no samples"),
+    (hostile.npz_zeros, ".npz", MEMORY_OR_ROWS),
+    (hostile.npz_shape_claims, ".npz", MEMORY_OR_ROWS),
+    (hostile.npz_header_without_end, ".npz", "its header has 3221225472 bytes"),
+    (hostile.npz_objects, ".npz", "gx holds Python objects"),
+    (hostile.arrow_nulls, ".arrow", MEMORY_OR_ROWS),
+    (hostile.arrow_run_ends, ".arrows", "gx holds run_end_encoded"),
+    (hostile.folder_of_bombs, "", "none of 9 segments can be read|of memory would be needed"),
+)
+COSTLY: Final[Sequence[Case]] = (
+    (hostile.csv_header_without_end, ".csv", "Line 1 is longer"),
+    (hostile.csv_ten_million_columns, ".csv", "Line 1 is longer"),
+    (hostile.gz_comments_without_end, ".csv.gz", "no header line within its first|are no measured samples|of memory"),
+    (hostile.gz_line_without_end, ".csv.gz", "Line 2 is longer"),
+    (hostile.gz_noise_then_rows_without_end, ".csv.gz", MEMORY_OR_ROWS),
+    (hostile.gz_blank_lines, ".csv.gz", MEMORY_OR_ROWS),
+    (hostile.gz_long_lines, ".csv.gz", "unpacks to more than 2.0 GB"),
+    (hostile.gz_empty_members, ".csv.gz", "gzip members in a row are empty"),
+    (hostile.gz_in_gz, ".csv.gz", "is no CSV text"),
+    (hostile.npz_sizes_claim, ".npz", f"{MEMORY_OR_ROWS}|its data hold|is damaged"),
+    (hostile.npz_two_dimensions, ".npz", "a column has one dimension"),
+    (hostile.npz_long_strings, ".npz", "not numbers"),
+    (hostile.npz_nested, ".npz", "no array in the format .npy"),
+    (hostile.npz_members, ".npz", "its index of arrays is damaged"),
+    (hostile.npz_cut_zeros, ".npz", f"unpacks to more than|{MEMORY_OR_ROWS}"),
+    (hostile.npz_cut_members, ".npz", "expected at most 10000"),
+    (hostile.npz_bzip2, ".npz", f"packed by method 12|{MEMORY_OR_ROWS}"),
+    (hostile.parquet_nulls, ".parquet", MEMORY_OR_ROWS),
+    (hostile.parquet_equal_rows, ".parquet", MEMORY_OR_ROWS),
+    (hostile.parquet_columns, ".parquet", "its index of row groups and columns has"),
+    (hostile.parquet_long_strings, ".parquet", "gx holds dictionary"),
+    (hostile.arrow_nulls, ".arrows", MEMORY_OR_ROWS),
+    (hostile.arrow_zeros, ".arrow", MEMORY_OR_ROWS),
+    (hostile.arrow_zeros, ".arrows", MEMORY_OR_ROWS),
+    (hostile.arrow_buffer_claims, ".arrow", "batch 1 is no regular one"),
+    (hostile.arrow_columns, ".arrows", "100001 columns, expected at most 10000"),
+    (hostile.folder_of_fitting_parts, "", MEMORY_OR_ROWS),
+)
+
+
+def case_id(case: object) -> str | None:
+    """Return the name of a generator for the name of a test."""
+    return getattr(case, "__name__", None)
+
+
+def check_analyze(tmp_path: Path, generate: hostile.Generator, suffix: str, why: str) -> None:
+    """Assert that ``analyze`` refuses a generated file."""
+    path = tmp_path / f"hostile{suffix}"
+    generate(path)
+    check_refused(run_limited(tmp_path, "monitor.cli", "analyze", str(path), "--rate", "100"), path, why)
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(("generate", "suffix", "why"), CHEAP, ids=case_id)
+def test_analyze_refuses_in_one_line(tmp_path: Path, generate: hostile.Generator, suffix: str, why: str) -> None:
+    check_analyze(tmp_path, generate, suffix, why)
+
+
+@pytest.mark.attack
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(("generate", "suffix", "why"), COSTLY, ids=case_id)
+def test_analyze_refuses_costly_cases(tmp_path: Path, generate: hostile.Generator, suffix: str, why: str) -> None:
+    check_analyze(tmp_path, generate, suffix, why)
+
+
+@pytest.mark.attack
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    "command",
+    [("reconcile", "--out", "report"), ("compensate", "--out", "out.csv"), ("thermal", "fit", "--out", "model.json")],
+    ids=lambda command: command[0],
+)
+def test_other_commands_refuse_the_same(tmp_path: Path, command: tuple[str, ...]) -> None:
+    path = tmp_path / "hostile.csv.gz"
+    hostile.gz_rows_without_end(path)
+    *words, out = command
+    outcome = run_limited(tmp_path, "monitor.cli", *words, str(tmp_path / out), str(path), "--rate", "100")
+    check_refused(outcome, path, MEMORY_OR_ROWS)
+
+
+@pytest.mark.parametrize("generate", [hostile.arrow_other_column, hostile.npz_large_rate], ids=case_id)
+def test_what_is_not_read_costs_nothing(tmp_path: Path, generate: Callable[[Path], None]) -> None:
+    """A few samples beside a large column that is not needed: read, and too short for an answer."""
+    path = tmp_path / f"hostile{'.npz' if generate is hostile.npz_large_rate else '.arrows'}"
+    generate(path)
+    outcome = run_limited(tmp_path, "monitor.cli", "analyze", str(path), "--rate", "100")
+    assert outcome.status == 3, outcome
+    assert outcome.stderr.count("\n") == 1
+    assert outcome.resident_bytes < MAX_RESIDENT_BYTES
+
+
+LOGS: Final[Sequence[Case]] = (
+    *((hostile.log_line_without_end, f"{suffix}.gz", "a line is longer than") for suffix in hostile.LOG_STARTS),
+    (hostile.log_blank_lines, ".asc.gz", "8000000 bytes hold no CAN frame"),
+    (hostile.log_blank_lines, ".log.gz", "8000000 bytes hold no CAN frame"),
+    (hostile.log_blank_lines, ".trc.gz", "8000000 bytes hold no CAN frame"),
+    (hostile.blf_container, ".blf", "a container unpacks to more than"),
+    (hostile.blf_gz_object, ".blf.gz", "an object has 3221225472 bytes"),
+    (hostile.npz_zeros, ".npz", MEMORY_OR_ROWS),
+    (hostile.gz_rows_without_end, ".csv.gz", MEMORY_OR_ROWS),
+)  # fmt: skip
+
+
+@pytest.mark.attack
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(("generate", "suffix", "why"), LOGS, ids=lambda value: case_id(value) or None)
+def test_replay_refuses_in_one_line(tmp_path: Path, generate: hostile.Generator, suffix: str, why: str) -> None:
+    path = tmp_path / f"hostile{suffix}"
+    generate(path)
+    check_refused(run_limited(tmp_path, "tests.experiments.attacks.replay_to_end", str(path)), path, why)
+
+
+# --- valid recordings of the same shape ------------------------------------------------------------
+
+
+def npz_of_zeros(path: Path) -> None:
+    """Write 10^7 rows of six columns of zeros, about 470 kB."""
+    np.savez_compressed(path, **{axis: np.zeros(10**7) for axis in ("gx", "gy", "gz", "ax", "ay", "az")})
+
+
+def parquet_of_zeros(path: Path) -> None:
+    """Write 10^7 rows of six columns of zeros, some kilobytes."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    parquet.write_table(pa.table({axis: np.zeros(10**7) for axis in ("gx", "gy", "gz", "ax", "ay", "az")}), path)
+
+
+def gz_of_zeros(path: Path) -> None:
+    """Write 10^7 rows of six columns of zeros, 240 kB: a thousand to one."""
+    hostile_rows = hostile.gzip_of(b"gx,gy,gz,ax,ay,az\n", b"0,0,0,0,0,0\n", 120_000_000)
+    path.write_bytes(hostile_rows)
+
+
+def gz_of_steps(path: Path) -> None:
+    """Write more than 10^7 rows in coarse steps, of which the same second comes again and again."""
+    rng = np.random.default_rng(1)
+    rows = np.round(rng.normal(size=(200, 6))).astype(int)
+    block = "".join(",".join(f"{n * 0.0078125:g}" for n in row) + "\n" for row in rows)
+    path.write_bytes(hostile.gzip_of(b"gx,gy,gz,ax,ay,az\n", block.encode(), 10**7 // 200 * len(block)))
+
+
+@pytest.mark.attack
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    ("generate", "suffix"),
+    [(gz_of_zeros, ".csv.gz"), (gz_of_steps, ".csv.gz"), (npz_of_zeros, ".npz"), (parquet_of_zeros, ".parquet")],
+    ids=case_id,
+)
+def test_a_large_recording_that_compresses_well_is_read(
+    tmp_path: Path, generate: hostile.Generator, suffix: str
+) -> None:
+    path = tmp_path / f"valid{suffix}"
+    generate(path)
+    program = "import sys; from pathlib import Path; from drivers.recordings import load_samples; "
+    program += "found = load_samples(Path(sys.argv[1]), 100.0); print(len(found), *found.axes, *found.notes)"
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(path)], capture_output=True, text=True, cwd=ROOT, timeout=900, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    rows, *axes = done.stdout.split()
+    assert int(rows) >= 10**7
+    assert axes == ["gx", "gy", "gz", "ax", "ay", "az"]

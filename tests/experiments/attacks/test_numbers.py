@@ -1,0 +1,474 @@
+"""Absurd numbers in every numeric option, configuration key, model parameter and recording.
+
+Each is refused with exit status 2 and one line, or answered. There is no traceback, no warning on the terminal, and
+neither time nor memory without bound. The quick part takes a few values for every place; the marker ``attack`` selects
+all of them.
+"""
+
+import itertools
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any, Final, get_args, get_origin, get_type_hints
+
+import msgspec
+import numpy as np
+import pytest
+
+import drivers.decoders
+import drivers.links
+from drivers import discovery, quantities
+from drivers.errors import ConfigError, ImuError
+from drivers.quantities import Quantity
+from drivers.recordings import load_samples
+from drivers.sample import AXES
+from monitor import cli
+from monitor.commands.analyze import Request, make
+from monitor.noise.effects import EFFECTS
+from monitor.noise.model import NoiseModel
+from monitor.noise.temperature import UNITS as TEMPERATURE_KEYS
+from monitor.settings import loading, schema
+
+pytestmark = pytest.mark.timeout(900)
+ROOT: Final = Path(cli.__file__).resolve().parents[2]
+ALL: Final = (
+    *("0", "-1", "1e-300", "1e-9", "1e300", "nan", "inf", "-inf", "1e9", "1e12", str(1 << 63), "", "text"),
+    *("9" * 5000, "0x10", "1e400", "1_000", " 5", "1e-3", "1e6"),
+)
+"""Values that a careful user would not give, and two ends of supported ranges."""
+FEW: Final = ("-1", "1e-300", "1e300", "nan", "", "9" * 5000)
+DURATIONS: Final = ("1e300d", "0s", "-1h", "1e-300ms", "h", "9" * 400 + "d", "1 fortnight")
+NUMERIC_METAVARS: Final = ("S", "HZ", "N", "F", "T", "P,Q", "octave|decade10|S,S,…")
+ALLOWED: Final = (0, 2, 3)
+
+
+# --- options of commands
+
+
+def numeric_options() -> Iterator[tuple[tuple[str, ...], str]]:
+    """Command and option, of every option that takes a number or a duration."""
+    for path, callback in commands():
+        for name, kind in get_type_hints(callback, include_extras=True).items():
+            for info in option_infos(kind):
+                if {int, float} & set(leaves(kind)) or info.metavar in NUMERIC_METAVARS:
+                    # in Annotated, typer takes the first name for a default
+                    names = (info.default, *(info.param_decls or ()))
+                    long = [one for one in names if isinstance(one, str) and one.startswith("--")]
+                    yield path, long[0] if long else f"--{name.replace('_', '-')}"
+
+
+def commands() -> Iterator[tuple[tuple[str, ...], Callable[..., Any]]]:
+    groups = [((), cli.app), *(((one.name,), one.typer_instance) for one in cli.app.registered_groups)]
+    for path, app in groups:
+        for one in app.registered_commands:
+            assert one.callback is not None
+            yield (*path, one.name or one.callback.__name__), one.callback
+
+
+def option_infos(kind: Any) -> list[Any]:
+    """Typer's descriptions of a parameter that is an option."""
+    found = [one for one in getattr(kind, "__metadata__", ()) if type(one).__name__ == "OptionInfo"]
+    return found + [info for part in get_args(kind) if get_origin(kind) is not Annotated for info in option_infos(part)]
+
+
+def leaves(kind: Any) -> Iterator[Any]:
+    parts = get_args(kind)[:1] if get_origin(kind) is Annotated else get_args(kind)
+    if not parts:
+        yield kind
+    for part in parts:
+        yield from leaves(part)
+
+
+@pytest.fixture
+def arguments(tmp_path: Path) -> dict[tuple[str, ...], list[str]]:
+    """Valid arguments of each command, without the options."""
+    rng = np.random.default_rng(1)
+    recording, model = tmp_path / "r.npz", str(loading.CONFIG_FOLDER / "models" / "consumer-mems.toml")
+    warm = 25.0 + 5.0 * np.sin(np.arange(2000) / 200.0)
+    np.savez(recording, t=np.arange(2000) / 100.0, temperature=warm, **{a: rng.normal(size=2000) for a in AXES})  # type: ignore[arg-type]
+    config = tmp_path / "c.toml"
+    config.write_text('[[device]]\nname = "a"\ndriver = { link = "virtual" }\n[storage]\nfolder = "kept"\n')
+    out = ["--out", str(tmp_path / "out.npz")]
+    return {
+        ("demo",): [],
+        ("run",): [str(config)],
+        ("watch",): [],
+        ("view",): [],
+        ("analyze",): [str(recording)],
+        ("simulate",): [model, "--seconds", "1", *out],
+        ("reconcile",): [str(recording), "--out", str(tmp_path / "report")],
+        ("compensate",): [str(recording), *out],
+        ("history",): [str(tmp_path)],
+        ("export",): [model, "--format", "kalman"],
+        ("thermal", "fit"): [str(recording)],
+        ("thermal", "predict"): [str(recording), "--model", str(tmp_path / "absent.json")],
+    }
+
+
+def test_every_kind_of_numeric_option_is_found() -> None:
+    found = set(numeric_options())
+    for expected in (
+        (("analyze",), "--rate"), (("analyze",), "--tau"), (("simulate",), "--seed"), (("simulate",), "--seconds"),
+        (("run",), "--history"), (("export",), "--inflation"), (("export",), "--dt"),
+        (("thermal", "fit"), "--interval"),
+        (("history",), "--from"), (("compensate",), "--order"), (("watch",), "--seconds"), (("demo",), "--effect-at"),
+    ):  # fmt: skip
+        assert expected in found
+
+
+def test_options(arguments: dict[tuple[str, ...], list[str]], tmp_path: Path) -> None:
+    try_options(tuple(arguments), FEW, arguments, tmp_path)
+
+
+@pytest.mark.attack
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("command", sorted({path for path, _ in numeric_options()}), ids=" ".join)
+def test_all_options(command: tuple[str, ...], arguments: dict[tuple[str, ...], list[str]], tmp_path: Path) -> None:
+    try_options((command,), ALL + DURATIONS, arguments, tmp_path)
+
+
+def try_options(
+    chosen: Sequence[tuple[str, ...]],
+    values: Sequence[str],
+    arguments: dict[tuple[str, ...], list[str]],
+    folder: Path,
+) -> None:
+    options = [(command, option) for command, option in numeric_options() if command in chosen]
+    assert options
+    cases = [[*command, *arguments[command], option, value] for command, option in options for value in values]
+    for one in run_in_child(cases, folder):
+        check_one(one)
+
+
+def run_in_child(cases: list[list[str]], folder: Path) -> list[dict[str, Any]]:
+    """Run command lines in one child process, which has bounds on memory and on the time of each."""
+    given, results = folder / "cases.json", folder / "results.json"
+    given.write_text(json.dumps(cases))
+    program = [sys.executable, str(Path(__file__).with_name("child.py")), str(given), str(results)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(program, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stderr == ""
+    found: list[dict[str, Any]] = json.loads(results.read_text())
+    assert len(found) == len(cases)
+    return found
+
+
+def check_one(one: dict[str, Any]) -> None:
+    shown = [argument[:60] for argument in one["arguments"]]
+    assert one["escaped"] == "", (shown, one["escaped"])
+    assert one["warnings"] == [], shown
+    assert one["status"] in ALLOWED, (shown, one["err"])
+    assert "Traceback" not in one["err"], shown
+    assert "internal error" not in one["err"], (shown, one["err"])
+    assert one["err"].count("\n") == (1 if one["status"] else 0), (shown, one["err"])
+    assert len(one["err"]) < 3000, shown
+
+
+# --- keys of a configuration
+
+DEVICE: Final = '[[device]]\nname = "a"\nrate = 100.0\n{keys}\n[device.driver]\n{driver}\n'
+CAN: Final = 'file = "canmod_gps", signals = { gz = "ImuData.GyroZ" }'
+VIRTUAL: Final = 'link = "virtual"'
+TOML_VALUES: Final = (
+    *("0", "-1", "1e-300", "1e300", "nan", "inf", "-inf", "1e9", "1e12", str((1 << 63) - 1), str(1 << 63), "9" * 5000),
+    *('""', '"text"', '"1e300 Hz"', '"1e-300 Hz"', '"nan Hz"', '"1e300s"', '"1e-300s"', '"99999999999999999999d"'),
+    *(
+        '"' + "9" * 400 + '"',
+        '"99999999999999999999MiB"',
+        '"0MiB"',
+        '"1e9%"',
+        '"999%"',
+        '"h:99999"',
+        "true",
+        "[1e300]",
+    ),
+    *('["1e300"]', "{ a = 1e300 }", "1979-05-27"),
+)
+FEW_TOML: Final = ("-1", "1e-300", "1e300", "nan", '"1e300 Hz"', '"1e300s"')
+
+
+def key_cases() -> Iterator[tuple[str, type[msgspec.Struct], str]]:
+    """A text with {} for ``key = value``, the struct whose keys belong there, and a name."""
+    quiet = '[viewer]\nmode = "none"\n'
+    virtual = DEVICE.format(keys="", driver=VIRTUAL)
+    yield '[[device]]\nname = "a"\n{}\ndriver = { link = "virtual" }\n', schema.DeviceTable, "device"
+    limit = '[[device.limit]]\naxes = "gz"\nletter = "N"\n{}\n'
+    yield virtual + limit, schema.LimitTable, "limit"
+    yield virtual + "[device.driver.faults]\n{}\n", schema.FaultsTable, "faults"
+    yield DEVICE.format(keys="", driver=VIRTUAL + "\n{}"), schema.VirtualTable, "virtual"
+    for name, kind in (("viewer", schema.ViewerTable), ("metrics", schema.MetricsTable), ("log", schema.LogTable)):
+        yield virtual + f"[{name}]\n{{}}\n", kind, name
+    yield virtual + '[storage]\nfolder = "kept"\n{}\n', schema.StorageTable, "storage"
+    yield virtual + '[[hook]]\non = ["*"]\nkey = "a/b"\n{}\n', schema.HookTable, "hook"
+    yield virtual + quiet + "[zenoh]\n{}\n", schema.ZenohTable, "zenoh"
+    for name, driver in (
+        ("serial", 'link = "serial"\nport = "/dev/x"\ndecoder = "stim300"\n{}'),
+        (
+            "can",
+            'link = "can"\ndecoder = "dbc"\ndecoder_options = {{ {CAN} }}\n{{}}',
+        ),
+        ("replay", 'link = "replay"\npath = "r.npz"\n{}'),
+        ("zenoh", 'link = "zenoh"\nkey = "a/b"\n{}'),
+    ):
+        yield (
+            DEVICE.format(keys="", driver=driver),
+            discovery.load(drivers.links, name, "_link").Settings,
+            f"link {name}",
+        )
+    for name in discovery.names(drivers.decoders):
+        wanted = {"text": 'columns = ["gz"]\n', "dbc": 'file = "canmod_gps"\nsignals = { gz = "ImuData.GyroZ" }\n'}
+        driver = f'link = "virtual"\ndecoder = "{name}"\n[device.driver.decoder_options]\n{wanted.get(name, "")}{{}}'
+        yield DEVICE.format(keys="", driver=driver), discovery.load(drivers.decoders, name).Settings, f"decoder {name}"
+
+
+def numeric_keys(kind: type[msgspec.Struct]) -> list[str]:
+    """Keys that take a number, and keys whose text stands for one."""
+    found = []
+    for field in msgspec.structs.fields(kind):
+        worded = isinstance(field.default, str) and any(c.isdigit() for c in field.default)
+        if worded or field.encode_name == "listen" or {int, float} & set(leaves(field.type)):
+            found.append(field.encode_name)
+    return found
+
+
+def all_keys() -> list[tuple[str, str, str]]:
+    """Text with {}, key, name; a bool is an int to Python, but not to msgspec."""
+    return [(text, key, name) for text, kind, name in key_cases() for key in numeric_keys(kind)]
+
+
+def test_every_kind_of_numeric_key_is_found() -> None:
+    found = {(name, key) for _, key, name in all_keys()}
+    for expected in (
+        ("device", "rate"), ("device", "tau"), ("device", "refit"), ("device", "alarms_per_day"), ("limit", "hold"),
+        ("faults", "jitter"), ("virtual", "seed"), ("virtual", "silence"), ("viewer", "memory"), ("viewer", "port"),
+        ("storage", "keep"), ("hook", "timeout"), ("metrics", "listen"), ("link serial", "baudrate"),
+        ("link can", "bitrate"), ("link replay", "bytes_per_second"), ("decoder text", "scale"),
+        ("decoder dbc", "tick"),
+        ("decoder stim300", "rate"), ("decoder witmotion", "gyro_range"),
+    ):  # fmt: skip
+        assert expected in found
+
+
+@pytest.mark.parametrize("values", [FEW_TOML, pytest.param(TOML_VALUES, marks=pytest.mark.attack)], ids=["few", "all"])
+def test_configuration_keys(values: Sequence[str], tmp_path: Path) -> None:
+    path = tmp_path / "c.toml"
+    np.savez(tmp_path / "r.npz", fs=100.0, gz=np.zeros(10))
+    for (text, key, name), value in itertools.product(all_keys(), values):
+        for written in (value, f"{{ gz = {value} }}") if key in ("scale", "signals") else (value,):
+            path.write_text(text.replace("{}", f"{key} = {written}"))
+            path.chmod(0o600)
+            _, wrong = loading.read(path)
+            for line in wrong:
+                assert "\n" not in line
+                assert len(line) < 3000, (name, key, value[:60])
+
+
+@pytest.mark.attack
+def test_a_configuration_key_in_the_program(tmp_path: Path) -> None:
+    """``check`` goes further than reading: it builds the simulated sensors."""
+    cases = []
+    for i, ((text, key, _), value) in enumerate(itertools.product(all_keys(), FEW_TOML)):
+        path = tmp_path / f"{i}.toml"
+        path.write_text(text.replace("{}", f"{key} = {value}"))
+        path.chmod(0o600)
+        cases.append(["check", str(path)])
+    for one in run_in_child(cases, tmp_path):
+        assert (one["escaped"], one["warnings"]) == ("", []), one
+        assert one["status"] in (0, 2)
+        assert one["status"] == 0 or 1 <= one["err"].count("\n") <= 3, one
+
+
+def test_every_number_of_the_settings_names_its_quantity() -> None:
+    """A new key cannot be forgotten: its type names the range that is supported."""
+    lacking = []
+    for _, kind, name in key_cases():
+        for field in msgspec.structs.fields(kind):
+            for info in numbers(msgspec.inspect.type_info(field.type)):
+                if not isinstance((info or {}).get("quantity"), Quantity):
+                    lacking.append(f"{name}: {field.encode_name}")
+    # checked against a list of what exists, or passed on to a library as they are
+    assert sorted(set(lacking)) == ["decoder stim300: identifier", "link can: channel", "link serial: stopbits"]
+
+
+def numbers(info: Any, extra: dict[str, Any] | None = None) -> Iterator[dict[str, Any] | None]:
+    """``extra`` of every number within a type."""
+    if isinstance(info, msgspec.inspect.Metadata):
+        yield from numbers(info.type, info.extra)
+    elif isinstance(info, msgspec.inspect.IntType | msgspec.inspect.FloatType):
+        yield extra
+    elif isinstance(info, msgspec.inspect.UnionType):
+        for one in info.types:
+            yield from numbers(one)
+    elif isinstance(info, msgspec.inspect.CollectionType):
+        yield from numbers(info.item_type)
+    elif isinstance(info, msgspec.inspect.DictType):
+        yield from numbers(info.value_type)
+    elif isinstance(info, msgspec.inspect.StructType):
+        for field in info.fields:
+            yield from numbers(field.type)
+
+
+# --- parameters of models
+
+PARAMETERS: Final = (
+    *("0", "-1", "1e-300", "1e-30", "1e30", "1e300", "nan", "inf", "1e9", str((1 << 63) - 1), '"text"', "true"),
+)
+TEMPERATURE: Final = {"mean": "20.0", "swing": "1.0", "period": "60.0", "wander": "1.0", "wander_time": "60.0"}
+NOISE: Final = "[gz.angle_random_walk]\nN = 1e-3\n"
+OTHERS: Final = "[ax.bias]\nvalue = 1.0\n[temperature]\nmean = 20.0\n"
+
+
+def model_texts(values: Sequence[str]) -> Iterator[str]:
+    """Models in which one number is absurd."""
+    assert set(TEMPERATURE) == set(TEMPERATURE_KEYS)
+    for value in values:
+        yield f"sample_rate = {value}\n{NOISE}"
+        for key in TEMPERATURE:
+            yield f"sample_rate = 100.0\n{NOISE}[temperature]\n{assignments(TEMPERATURE | {key: value})}"
+        for effect in EFFECTS.values():
+            given = {f.name: example(f.name) for f in fields(effect)}  # type: ignore[arg-type]
+            for name in given:
+                around = OTHERS if effect.name == "angle_random_walk" else OTHERS + NOISE
+                yield f"sample_rate = 100.0\n{around}[gz.{effect.name}]\n{assignments(given | {name: value})}"
+
+
+def assignments(table: Mapping[str, str]) -> str:
+    return "".join(f"{name} = {value}\n" for name, value in table.items())
+
+
+def example(parameter: str) -> str:
+    return '"ax"' if parameter == "source" else "1.0"
+
+
+def test_model_parameters() -> None:
+    for text in model_texts(("1e300",)):
+        try_model(text)
+
+
+@pytest.mark.attack
+def test_all_model_parameters() -> None:
+    for text in model_texts(PARAMETERS):
+        try_model(text)
+
+
+def try_model(text: str) -> None:
+    """What is accepted is simulated, and its Allan variance worked out; a warning is an error here."""
+    try:
+        model = NoiseModel.from_toml(text)
+        rate_hz = model.sample_rate_hz or 100.0
+        series = model.stream(rate_hz, 1).draw(64)
+    except ConfigError:
+        return
+    assert series.shape == (64, 6), text
+    assert not np.isinf(series).any(), text
+    avar = model.avar("gz", np.array([1.0, 64.0]) / rate_hz, 1.0 / rate_hz)
+    assert not np.isinf(avar).any(), text
+
+
+# --- recordings
+
+FS: Final = (
+    0.0,
+    -1.0,
+    1e-300,
+    1e-9,
+    1e9,
+    1e12,
+    1e300,
+    np.nan,
+    np.inf,
+    np.longdouble("1e4000"),
+    np.float16(100),
+    1 << 62,
+)
+
+
+def columns(n: int = 400) -> dict[str, Any]:
+    return {axis: np.random.default_rng(1).normal(size=n) for axis in AXES}
+
+
+@pytest.mark.parametrize("fs", FS, ids=str)
+def test_stated_rate_of_a_recording(fs: Any, tmp_path: Path) -> None:
+    path = tmp_path / "r.npz"
+    np.savez(path, fs=fs, **columns())
+    answer_or_refuse(Request(path, others=True))
+
+
+@pytest.mark.parametrize("step_s", [1e-300, 1e-12, 1e-9, 1e-7, 1e-6, 1e-5, 15.0, 900.0, 1e4, 1e7])
+def test_time_stamps_of_a_recording(step_s: float, tmp_path: Path) -> None:
+    path = tmp_path / "r.npz"
+    np.savez(path, t=np.arange(400) * step_s, **columns())
+    answered = answer_or_refuse(Request(path, others=True))
+    assert answered == (1e-6 <= step_s <= 900.0), step_s
+
+
+@pytest.mark.parametrize(("far", "row"), [(-4.59e9, 198), (4.59e9, 0), (1e300, 399)])
+def test_one_outlying_time_stamp(far: float, row: int, tmp_path: Path) -> None:
+    try_outlier(1.7e9, row, far, tmp_path)
+
+
+@pytest.mark.attack
+def test_outlying_time_stamps_everywhere(tmp_path: Path) -> None:
+    far = (4.59e9, -4.59e9, 0.0, 1e18, 1e300, np.nan)
+    for t0, row, one in itertools.product((0.0, 1.7e9, -1e9), (0, 1, 200, 398, 399), far):
+        try_outlier(t0, row, one, tmp_path)
+
+
+def try_outlier(t0: float, row: int, far: float, tmp_path: Path) -> None:
+    path, t = tmp_path / "r.npz", t0 + np.arange(400) / 100.0
+    t[row] = far
+    np.savez(path, t=t, **columns())
+    answer_or_refuse(Request(path))
+    answer_or_refuse(Request(path, last_s=2.0))
+
+
+@pytest.mark.parametrize("value", [np.longdouble("1e4000"), np.longdouble("-1e4000"), np.longdouble("nan")])
+def test_a_column_of_long_doubles(value: Any, tmp_path: Path) -> None:
+    path, data = tmp_path / "r.npz", columns()
+    data["gx"] = data["gx"].astype(np.longdouble)
+    data["gx"][7] = value
+    np.savez(path, fs=100.0, **data)
+    found = load_samples(path)
+    assert np.isnan(found.values[7, 0])
+    assert np.isfinite(found.values[8, 0])
+    assert answer_or_refuse(Request(path))
+
+
+@pytest.mark.parametrize("value", [1e30, 1e155, 1e300, 1e-300, 5e-324, -1e307])
+@pytest.mark.attack
+def test_absurd_samples(value: float, tmp_path: Path) -> None:
+    path, data = tmp_path / "r.npz", columns()
+    data["gx"][100:110] = value
+    data["gz"] = data["gz"] * value
+    np.savez(path, fs=100.0, **data)
+    answer_or_refuse(Request(path, others=True))
+
+
+@pytest.mark.parametrize("last_s", [1e-6, 1e-3, 1e9])
+def test_a_short_or_endless_end_of_a_recording(last_s: float, tmp_path: Path) -> None:
+    path = tmp_path / "r.npz"
+    np.savez(path, t=np.arange(400) / 100.0, **columns())
+    assert len(load_samples(path, last_s=last_s)) == (400 if last_s > 1.0 else 1)
+
+
+@pytest.mark.parametrize("rate_hz", [quantities.RATE_HZ.low, 20e3, quantities.RATE_HZ.high])
+def test_every_supported_rate_is_answered(rate_hz: float, tmp_path: Path) -> None:
+    """Both ends of the range, and a sensor of vibration; slow sensors are above, by their time stamps."""
+    path = tmp_path / "r.npz"
+    np.savez(path, t=np.arange(2000) / rate_hz, **columns(2000))
+    found = make(Request(path, others=True, window_s=500.0 / rate_hz))
+    assert found.analysis.estimate.rate_hz == pytest.approx(rate_hz, rel=1e-3)
+
+
+def answer_or_refuse(request: Request) -> bool:
+    """Return True if there is an answer; a warning is an error here."""
+    try:
+        make(request)
+    except ImuError:
+        return False
+    return True

@@ -1,0 +1,327 @@
+"""Two of everything: daemons that share a folder, a port, a key or a sensor. The second says so in one line each."""
+
+import contextlib
+import importlib.util
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+
+from drivers.errors import LinkUnavailable
+from drivers.links import serial_link
+from drivers.recordings import load_samples, segment
+from drivers.sample import block
+from drivers.zenoh.sample_message import pack
+from drivers.zenoh.session import configuration
+from monitor.common import topics
+from monitor.daemon.operations.metrics import MetricsOutput
+from monitor.publishing.zenoh.publisher import ZenohOut
+from monitor.settings.loading import Metrics, ZenohTable
+from tests.experiments.benchmarks import faults
+
+IMU_MONITOR = [sys.executable, "-m", "monitor.cli"]
+DEADLINE_S = 150.0
+RATE = 100
+needs_rerun = pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun-sdk is not installed")
+
+
+def eventually(true: Callable[[], object], what: str) -> None:
+    until_s = time.monotonic() + DEADLINE_S
+    while not true():
+        assert time.monotonic() < until_s, f"not within {DEADLINE_S:g} s: {what}"
+        time.sleep(0.02)
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+# --- one storage folder
+
+
+class Publisher:
+    """A sensor that several daemons can listen to: samples over zenoh, each of which carries its number."""
+
+    def __init__(self) -> None:
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self.sent = 0
+        self._session = zenoh.open(configuration({"listen/endpoints": [self.endpoint]}))
+        self._publisher = self._session.declare_publisher("lab/imu", congestion_control=zenoh.CongestionControl.BLOCK)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._closing.set()
+        self._thread.join()
+        self._session.close()
+
+    def _run(self) -> None:
+        begun_ns = time.time_ns()
+        while not self._closing.wait(0.05):
+            due = (time.time_ns() - begun_ns) * RATE // 1_000_000_000
+            if due <= self.sent:
+                continue
+            index = np.arange(self.sent, due)
+            values = np.zeros((len(index), 6))
+            values[:, 0] = index * 1e-6
+            self.sent = due
+            self._publisher.put(pack("imu", due, block(begun_ns + index * (1_000_000_000 // RATE), values)))
+
+
+class Daemon:
+    """A daemon in a process of its own, with its log."""
+
+    def __init__(self, folder: Path, name: str, text: str) -> None:
+        config, self._log = folder / f"{name}.toml", folder / f"{name}.log"
+        config.write_text(text)
+        config.chmod(0o600)
+        with self._log.open("wb") as log:
+            self.process = subprocess.Popen([*IMU_MONITOR, "run", str(config)], stdout=log, stderr=log)
+        self.pid = self.process.pid
+
+    def says(self, *words: str) -> bool:
+        return any(all(word in line for word in words) for line in self.log().splitlines())
+
+    def log(self) -> str:
+        return self._log.read_text(errors="replace")
+
+    def end(self) -> int:
+        self.process.terminate()
+        return self.process.wait(60.0)
+
+
+@contextlib.contextmanager
+def daemons() -> Iterator[list[Daemon]]:
+    running: list[Daemon] = []
+    try:
+        yield running
+    finally:
+        for one in running:
+            one.process.kill()
+            one.process.wait()
+
+
+LISTENING = """
+[[device]]
+name = "imu"
+rate = {rate}
+window = "1min"
+driver = {{ link = "zenoh", key = "lab/imu", mode = "client", connect = ["{endpoint}"], decoder = "samples" }}
+[storage]
+folder = "{folder}"
+segment = "10s"
+[zenoh]
+mode = "none"
+[viewer]
+mode = "none"
+[log]
+format = "json"
+"""
+
+
+def numbers(folder: Path) -> list[int]:
+    """Numbers of all samples in the recording, in its order."""
+    pieces = [piece for path in segment.segments(folder) for piece in segment.read_samples(path)]
+    return [round(value * 1e6) for piece in pieces for value in piece.samples.values[:, 0]]
+
+
+def missing(folder: Path) -> int:
+    """Samples that are not in the recording; AssertionError for one kept twice, or missing without being counted."""
+    due, total = None, 0
+    for path in segment.segments(folder):
+        for piece in segment.read_samples(path):
+            found = [round(value * 1e6) for value in piece.samples.values[:, 0]]
+            if due is not None:
+                assert found[0] - due == piece.samples.lost, f"{path.name}: {found[0]} after {due - 1}"
+                total += piece.samples.lost
+            assert found == list(range(found[0], found[0] + len(found)))
+            due = found[-1] + 1
+    return total
+
+
+@pytest.mark.timeout(600)
+def test_two_daemons_on_one_folder_record_each_sample_once(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    folder, sensor = tmp_path / "store", Publisher()
+    text = LISTENING.format(rate=RATE, endpoint=sensor.endpoint, folder=folder)
+    try:
+        with daemons() as running:
+            first = Daemon(tmp_path, "first", text)
+            running.append(first)
+            eventually(lambda: segment.segments(folder / "imu"), "the first records")
+            second = Daemon(tmp_path, "second", text)
+            running.append(second)
+            held = f"{folder}: in use by process {first.pid}; "
+            eventually(lambda: second.says("recording_stopped", held, "choose another folder"), second.log())
+            eventually(lambda: second.says("history", held, "choose another folder"), second.log())
+
+            looked = subprocess.run(
+                [*IMU_MONITOR, "doctor", str(tmp_path / "second.toml"), "--json", "-"],
+                capture_output=True, text=True, timeout=DEADLINE_S, check=False,
+            )  # fmt: skip
+            assert f"{folder}: in use by process {first.pid}" in looked.stdout
+            live = subprocess.run(
+                [*IMU_MONITOR, "analyze", str(folder / "imu"), "--json", "-"],
+                capture_output=True, text=True, timeout=DEADLINE_S, check=False,
+            )  # fmt: skip
+            assert live.returncode in (0, 3), live.stderr
+
+            count = len(numbers(folder / "imu"))
+            eventually(lambda: len(numbers(folder / "imu")) > count + 3 * RATE, "the first records on")
+            first.process.send_signal(signal.SIGKILL)
+            first.process.wait()
+            had = numbers(folder / "imu")
+            eventually(lambda: second.says("recording_back", "recording goes on"), second.log())
+            eventually(lambda: len(numbers(folder / "imu")) > len(had) + 2 * RATE, "the second records")
+            assert second.end() == 0
+            assert "Traceback" not in first.log() + second.log()
+    finally:
+        sensor.close()
+    assert numbers(folder / "imu")[: len(had)] == had
+    assert missing(folder / "imu") == 0
+    assert not [note for note in load_samples(folder / "imu").notes if "left out" in note]
+
+
+# --- one endpoint, one key
+
+
+def opened(settings: ZenohTable) -> ZenohOut:
+    one = ZenohOut(settings, ["bench"])
+    one.start()
+    eventually(lambda: one.state.startswith("ok"), "the session")
+    return one
+
+
+def test_two_daemons_on_one_zenoh_port(tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with contextlib.closing(opened(ZenohTable(listen=(endpoint,)))) as first:
+        with contextlib.closing(opened(ZenohTable(listen=(endpoint,)))) as second:
+            assert second.state.startswith(f"ok, but {endpoint} is busy: listening on tcp/127.0.0.1:")
+        assert first.state == "ok"
+
+
+def test_two_daemons_with_one_prefix_and_the_same_device_name(tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with (
+        contextlib.closing(opened(ZenohTable(listen=(endpoint,)))) as first,
+        contextlib.closing(opened(ZenohTable(listen=(), connect=(endpoint,)))) as second,
+    ):
+        said = "another program publishes imu/bench too; change a device's name, or zenoh.prefix"
+
+        def both_say() -> bool:
+            first.put(topics.STATUS, "bench", b"{}")
+            second.put(topics.STATUS, "bench", b"{}")
+            return said in first.state and said in second.state
+
+        eventually(both_say, "both say it")
+        assert first.state == f"ok, but {said}"
+        with contextlib.closing(opened(ZenohTable(listen=(), connect=(endpoint,), prefix="lab"))) as other:
+            for _ in range(20):
+                first.put(topics.STATUS, "bench", b"{}")
+                other.put(topics.STATUS, "bench", b"{}")
+                assert other.state == "ok"
+        second.remove("bench")
+        assert "another program" not in second.state
+
+
+# --- one port of the metrics, one port of the viewer
+
+
+def test_two_daemons_on_one_metrics_port() -> None:
+    pytest.importorskip("prometheus_client")
+    port = free_port()
+    with contextlib.closing(MetricsOutput(Metrics("127.0.0.1", port))) as first:
+        first.start()
+        eventually(lambda: first.state == "ok", first.state)
+        with contextlib.closing(MetricsOutput(Metrics("127.0.0.1", port))) as second:
+            second.start()
+            eventually(lambda: second.state != "starting", second.state)
+            assert second.state == f"127.0.0.1:{port}: {os.strerror(98)}; trying again"
+            assert first.state == "ok"
+
+
+@needs_rerun
+@pytest.mark.attack
+@pytest.mark.timeout(600)
+def test_two_daemons_on_one_viewer_port() -> None:
+    from monitor.publishing.rerun.view import RerunView
+    from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
+
+    settings = ViewerSettings("web", free_port(), free_port())
+    with contextlib.closing(RerunView(settings, [DeviceInfo("a")])) as first:
+        first.start()
+        eventually(lambda: first.state == "ok", first.state)
+        with contextlib.closing(RerunView(settings, [DeviceInfo("b")])) as second:
+            second.start()
+            eventually(lambda: second.state.startswith("ok"), second.state)
+            assert f"ok, but port {settings.port} is busy: " in second.state
+            assert f"port {settings.web_port} is busy: " in second.state
+            assert first.state == "ok"
+
+
+# --- one sensor
+
+
+def test_two_daemons_on_one_serial_port(tmp_path: Path) -> None:
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    port = os.ttyname(slave)
+    try:
+        first, second = (serial_link.build(serial_link.Settings(port=port)) for _ in range(2))
+        first.open()
+        with contextlib.closing(first), pytest.raises(LinkUnavailable, match="held by another program; close it"):
+            second.open()
+        with contextlib.closing(second):
+            second.open()
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+@pytest.mark.attack
+@pytest.mark.timeout(900)
+def test_two_whole_services_on_one_serial_port_and_one_endpoint(tmp_path: Path) -> None:
+    outcome = faults.two_daemons(tmp_path, 1)
+    assert "held by another program" in outcome.said
+    assert "is busy" in outcome.said
+    assert (outcome.received, outcome.lost, outcome.bad) == (outcome.sent, 0, 0)
+
+
+@pytest.mark.attack
+@pytest.mark.timeout(900)
+def test_a_folder_that_four_daemons_share_keeps_each_sample_once(tmp_path: Path) -> None:
+    """Whoever holds it is killed, again and again."""
+    pytest.importorskip("pyarrow")
+    folder, sensor = tmp_path / "store", Publisher()
+    text = LISTENING.format(rate=RATE, endpoint=sensor.endpoint, folder=folder)
+    try:
+        with daemons() as running:
+            for i in range(4):
+                running.append(Daemon(tmp_path, f"daemon{i}", text))
+            alive = list(running)
+            while len(alive) > 1:
+                count = len(numbers(folder / "imu"))
+                eventually(lambda count=count: len(numbers(folder / "imu")) > count + 3 * RATE, "somebody records")
+                pid = int((folder / "recording.lock").read_text().split()[0])
+                (holder,) = [one for one in alive if one.pid == pid]
+                holder.process.kill()
+                holder.process.wait()
+                alive.remove(holder)
+            count = len(numbers(folder / "imu"))
+            eventually(lambda: len(numbers(folder / "imu")) > count + 3 * RATE, "the last records")
+            assert alive[0].end() == 0
+    finally:
+        sensor.close()
+    missing(folder / "imu")

@@ -1,0 +1,183 @@
+"""Samples a second of the simulator, beside a Python loop and plain NumPy, and how much of it is drawing numbers.
+
+    python -m tests.experiments.benchmarks.bench_simulate [--rounds 7] [--memory 1e9]
+
+All in one run and in turn, in processor seconds of one core; a sample is one of all six axes. The competitors:
+
+- a Python loop: white noise at once and a first-order Gauss–Markov drift sample by sample over rows of three axes,
+  which is how gnss-ins-sim's ``gyro_gen`` goes about it. That is two terms, not five.
+- plain NumPy: the five terms of a whole record at once, B by shaping white noise with the fast Fourier transform. It
+  needs the whole record in memory, so it has no stream.
+- drawing: the normal numbers that the terms need, and nothing else. What takes that long cannot be made quicker without
+  another generator.
+
+``--memory N`` draws N samples and prints the resident memory on the way; 1e9 takes some ten minutes.
+"""
+
+import argparse
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+import psutil
+
+from drivers.sample import AXES, Floats
+from monitor.noise.effect import Effect
+from monitor.noise.effects import (
+    AngleRandomWalk,
+    BiasInstability,
+    ExponentiallyCorrelated,
+    QuantizationNoise,
+    RandomTelegraph,
+    RateRamp,
+    RateRandomWalk,
+    Sinusoidal,
+)
+from monitor.noise.model import NoiseModel
+from tests.experiments.benchmarks.machine import Load, about, alternate, console, table
+
+RATE_HZ: Final = 100.0
+Q, N, B, K, R = 8e-6, 1.5e-4, 2e-4, 4e-5, 1e-7
+CORRELATION_S: Final = 100.0
+FIVE: Final[tuple[Effect, ...]] = (
+    QuantizationNoise(Q=Q),
+    AngleRandomWalk(N=N),
+    BiasInstability(B=B),
+    RateRandomWalk(K=K),
+    RateRamp(R=R),
+)
+THREE_MORE: Final[tuple[Effect, ...]] = (
+    ExponentiallyCorrelated(sigma=1e-4, correlation_time=CORRELATION_S),
+    Sinusoidal(amplitude=1e-4, frequency=17.3),
+    RandomTelegraph(amplitude=1e-4, dwell_time=20.0),
+)
+SAMPLES: Final = 1 << 18
+LOOPED: Final = 1 << 13
+BLOCK: Final = 10_000
+NORMALS: Final = {"five": 4, "eight": 5}
+"""Normal numbers a sample and axis: Q, N, B and K; with the correlated noise. Flips of the telegraph are rare."""
+
+
+def streamed(effects: tuple[Effect, ...], n: int) -> Callable[[], None]:
+    """A stream of six axes, in blocks."""
+    stream = NoiseModel(dict.fromkeys(AXES, effects)).stream(RATE_HZ, 1)
+    stream.draw(BLOCK)  # compiles
+
+    def work() -> None:
+        for _ in range(n // BLOCK):
+            stream.draw(BLOCK)
+
+    return work
+
+
+def drawing(normals: int, n: int) -> Callable[[], None]:
+    """Normal numbers only, into one small array."""
+    rng, room = np.random.default_rng(1), np.empty(2048)
+
+    def work() -> None:
+        for _ in range(n * normals * len(AXES) // room.size):
+            rng.standard_normal(out=room)
+
+    return work
+
+
+def looped(n: int) -> Callable[[], None]:
+    """White noise and a drift that a Python loop carries on, three axes at a time."""
+    rng = np.random.default_rng(1)
+    keep = 1.0 - 1.0 / (RATE_HZ * CORRELATION_S)
+    drive = B * np.sqrt(1.0 - np.exp(-2.0 / (RATE_HZ * CORRELATION_S)))
+
+    def triad() -> Floats:
+        white = N * np.sqrt(RATE_HZ) * rng.standard_normal((n, 3))
+        shocks = rng.standard_normal((n, 3))
+        drift = np.zeros((n, 3))
+        for i in range(1, n):
+            drift[i, :] = keep * drift[i - 1, :] + drive * shocks[i - 1, :]
+        return np.asarray(drift + white)
+
+    def work() -> None:
+        np.hstack([triad(), triad()])
+
+    return work
+
+
+def at_once(n: int) -> Callable[[], None]:
+    """The five terms of a whole record in plain NumPy."""
+    rng = np.random.default_rng(1)
+    f = np.fft.rfftfreq(n, 1.0 / RATE_HZ)
+    shape = np.zeros(f.size)
+    shape[1:] = B * np.sqrt(RATE_HZ / (2.0 * np.pi * f[1:]))
+
+    def work() -> None:
+        values = np.empty((n, len(AXES)))
+        for axis in range(len(AXES)):
+            values[:, axis] = np.diff(Q * rng.standard_normal(n + 1)) * RATE_HZ
+            values[:, axis] += N * np.sqrt(RATE_HZ) * rng.standard_normal(n)
+            values[:, axis] += np.fft.irfft(shape * np.fft.rfft(rng.standard_normal(n)), n)
+            values[:, axis] += np.cumsum(K / np.sqrt(RATE_HZ) * rng.standard_normal(n))
+            values[:, axis] += R / RATE_HZ * np.arange(n)
+
+    return work
+
+
+def speed(rounds: int) -> None:
+    """The table."""
+    load = Load()
+    whole = SAMPLES // BLOCK * BLOCK
+    works = {
+        "five": (streamed(FIVE, SAMPLES), whole),
+        "eight": (streamed(FIVE + THREE_MORE, SAMPLES), whole),
+        "draw five": (drawing(NORMALS["five"], SAMPLES), SAMPLES),
+        "draw eight": (drawing(NORMALS["eight"], SAMPLES), SAMPLES),
+        "at once": (at_once(SAMPLES), SAMPLES),
+        "looped": (looped(LOOPED), LOOPED),
+    }
+    took = alternate({name: work for name, (work, _) in works.items()}, rounds)
+    a_sample = {name: np.array(took[name]) / count for name, (_, count) in works.items()}
+    title = f"simulation of six axes on one core; median (best) of {rounds} rounds"
+    shown = table(title, "", "ns a sample", "million samples/s", "five terms streamed are")
+    names = {
+        "five": "five terms, streamed",
+        "eight": "and three more: correlated, line, telegraph",
+        "at once": "five terms, plain NumPy and FFT, whole record",
+        "looped": "two terms, Gauss–Markov in a Python loop",
+    }
+    for key, name in names.items():
+        median, best = a_sample[key]
+        times = f"{median / a_sample['five'][0]:.1f} times as quick"
+        million = f"{1e-6 / median:.3g} ({1e-6 / best:.3g})"
+        shown.add_row(name, f"{median * 1e9:.0f} ({best * 1e9:.0f})", million, times)
+    console.print(shown)
+    for key in ("five", "eight"):
+        share = a_sample[f"draw {key}"][0] / a_sample[key][0]
+        console.print(f"{names[key]}: {100.0 * share:.0f} % of the time is drawing normal numbers")
+    console.print(load.said() + "\n")
+
+
+def memory(samples: int) -> None:
+    """Resident memory while so many samples are drawn."""
+    stream = NoiseModel(dict.fromkeys(AXES, FIVE + THREE_MORE)).stream(RATE_HZ, 1)
+    process = psutil.Process()
+    shown = table(f"resident memory, five terms and three more, blocks of {BLOCK}", "samples drawn", "MB")
+    drawn = 0
+    for mark in np.unique(np.geomspace(BLOCK, samples, 6).astype(np.int64) // BLOCK * BLOCK):
+        while drawn < mark:
+            stream.draw(BLOCK)
+            drawn += BLOCK
+        shown.add_row(f"{drawn:,}", f"{process.memory_info().rss / 1e6:.1f}")
+    console.print(shown)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--memory", type=float, default=1e7, help="samples to draw for the table of memory")
+    given = parser.parse_args()
+    console.print(about())
+    speed(given.rounds)
+    memory(int(given.memory))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,209 @@
+"""Cost of the sliding window beside allantools' real-time class, of a refit, and of the first use.
+
+    python -m tests.experiments.benchmarks.bench_window [--rounds 15]
+
+The window holds six axes; ``allantools.realtime.oadev_realtime`` one axis and no window: it evicts nothing. Both get
+the same 20 cluster sizes, in logarithmic steps up to a quarter of the window, and are measured when every τ takes a
+term with each sample. allantools' list of phase is filled directly, as its own way there would take minutes.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+import numpy as np
+from allantools.realtime import oadev_realtime
+
+from drivers.sample import Floats, Ints, block
+from monitor.estimation.allan.window import AllanWindow
+from monitor.estimation.estimator import Estimator
+from tests.experiments.benchmarks.machine import Load, about, alternate, console, table
+
+LENGTHS: Final = (1_000, 3_600_000)
+TAUS: Final = 20
+AXES: Final = 6
+BLOCK: Final = 100
+CHUNK: Final = 10
+"""Samples that 10 ms of a serial port hold at 1 kHz."""
+A_CALL: Final = {"blocks": BLOCK, "chunks": CHUNK, "singles": 1}
+NOISE: Final = 1e-4
+FIRST_USE: Final = """
+import time
+start = time.perf_counter()
+import numpy as np
+from drivers.sample import block
+from monitor.estimate.estimator import Estimator
+imported = time.perf_counter()
+estimator = Estimator(100.0, 60.0)
+values = np.random.default_rng(0).standard_normal((1000, 6))
+estimator.update(block(np.arange(1000), values, np.full(1000, np.nan), np.arange(1000)))
+estimator.get()
+print(imported - start, time.perf_counter() - imported)
+"""
+
+
+def cluster_sizes(length: int) -> Ints:
+    """TAUS distinct cluster sizes, in steps as even in the logarithm as whole numbers allow."""
+    for steps in range(TAUS, 10 * TAUS):
+        sizes = np.unique(np.rint(np.geomspace(1, length // 4, steps)).astype(np.int64))
+        if sizes.size == TAUS:
+            return sizes
+    raise SystemExit(f"{length} samples have no room for {TAUS} cluster sizes")
+
+
+def made(n: int, seed: int = 1) -> Floats:
+    """White noise on all axes and gravity on az."""
+    return NOISE * np.random.default_rng(seed).standard_normal((n, AXES)) + [0.0, 0.0, 0.0, 0.0, 0.0, 9.81]
+
+
+def filled(length: int) -> AllanWindow:
+    """A window that evicts with each sample."""
+    window = AllanWindow(length, cluster_sizes(length))
+    for _ in range(-(-(length + BLOCK) // 100_000)):
+        window.update(made(min(100_000, length + BLOCK)))
+    return window
+
+
+def in_blocks(window: AllanWindow, values: Floats, size: int) -> Callable[[], None]:
+    """Advance by all values, ``size`` samples a call."""
+    blocks = [values[i : i + size] for i in range(0, len(values), size)]
+
+    def work() -> None:
+        for one in blocks:
+            window.update(one)
+
+    return work
+
+
+def peer(length: int, values: Floats) -> Callable[[], None]:
+    """allantools' class, advanced by one axis of the values."""
+    sizes = cluster_sizes(length)
+    rt = oadev_realtime(afs=sizes.tolist(), tau0=1.0)
+    rt.x = np.cumsum(np.resize(made(100_000)[:, 0], 2 * int(sizes[-1]) + 1)).tolist()
+    column = values[:, 0].tolist()
+
+    def work() -> None:
+        for y in column:
+            rt.add_frequency(y)
+
+    return work
+
+
+def window_costs(rounds: int) -> None:
+    """Cost a sample of both window lengths, and ratios to the peer."""
+    singles, many, few = made(2_000, 2), made(20_000, 3), made(400, 4)
+    load = Load()
+    works = {}
+    for length in LENGTHS:
+        window = filled(length)
+        works[f"{length} blocks"] = in_blocks(window, many, BLOCK)
+        works[f"{length} chunks"] = in_blocks(window, many, CHUNK)
+        works[f"{length} singles"] = in_blocks(window, singles, 1)
+        works[f"{length} peer"] = peer(length, few)
+    took = alternate(works, rounds)
+    shown = table(
+        f"a window of L samples, six axes, {TAUS} τ; median (best) of {rounds} rounds",
+        "samples a call", "L", "a sample", "ns a τ·axis", "allantools over this, a sample·axis",
+    )  # fmt: skip
+    medians: dict[tuple[str, int], float] = {}
+    for how, count in (("blocks", len(many)), ("chunks", len(many)), ("singles", len(singles))):
+        for length in LENGTHS:
+            median, best = (t / count for t in took[f"{length} {how}"])
+            theirs = took[f"{length} peer"][0] / len(few)
+            medians[how, length] = median
+            shown.add_row(
+                f"{A_CALL[how]}",
+                f"{length:,}",
+                f"{median * 1e6:.3f} ({best * 1e6:.3f}) µs",
+                f"{median * 1e9 / AXES / TAUS:.2f} ({best * 1e9 / AXES / TAUS:.2f})",
+                f"{theirs / (median / AXES):,.0f}",
+            )
+    for length in LENGTHS:
+        median, best = (t / len(few) for t in took[f"{length} peer"])
+        text = f"{median * 1e6:.1f} ({best * 1e6:.1f}) µs"
+        shown.add_row("allantools, one axis, no window", f"{length:,}", text, f"{median * 1e9 / TAUS:.0f}", "1")
+    console.print(shown)
+    short, long = LENGTHS
+    ratios = {how: medians[how, long] / medians[how, short] for how in ("blocks", "chunks", "singles")}
+    console.print("long window over short: " + ", ".join(f"{how} {ratio:.2f}" for how, ratio in ratios.items()))
+    console.print(load.said() + "\n")
+
+
+def refit_cost(rounds: int) -> None:
+    """``Estimator.get`` on a full and on a growing window."""
+    load = Load()
+    shown = table("a refit: curve, fit and intervals of six axes", "window", "τ", "median (best)")
+    for seconds, rate_hz in ((10.0, 100.0), (3600.0, 100.0), (3600.0, 1000.0)):
+        estimator = full_estimator(seconds, rate_hz)
+        estimator.get()  # the table of covariances of a full window is made once
+        median, best = alternate({"get": estimator.get}, 20 * rounds)["get"]  # type: ignore[dict-item]
+        taus = estimator.get().curve.factors.size
+        shown.add_row(f"full, {seconds:g} s at {rate_hz:g} Hz", f"{taus}", f"{median * 1e6:.0f} ({best * 1e6:.0f}) µs")
+    took = sorted(growing_refits())
+    text = f"{took[len(took) // 2] * 1e6:.0f} µs, 99 of 100 within {took[int(0.99 * len(took))] * 1e6:.0f} µs, "
+    shown.add_row("growing to 60 s, 1000 Hz, each 10 samples", "14", text + f"slowest {took[-1] * 1e3:.1f} ms")
+    console.print(shown)
+    console.print(load.said() + "\n")
+
+
+def full_estimator(seconds: float, rate_hz: float) -> Estimator:
+    """An estimator whose window is full."""
+    estimator = Estimator(rate_hz, seconds)
+    for start in range(0, round(seconds * rate_hz), 100_000):
+        n = min(100_000, round(seconds * rate_hz) - start)
+        estimator.update(block(np.arange(n), made(n), np.full(n, np.nan), np.arange(n)))
+    return estimator
+
+
+def growing_refits() -> list[float]:
+    """Seconds of each refit while a window of a minute fills, ten samples at a time."""
+    estimator, took = Estimator(1000.0, 60.0), []
+    values = made(60_000)
+    for start in range(0, len(values), CHUNK):
+        part = values[start : start + CHUNK]
+        estimator.update(block(np.arange(CHUNK), part, np.full(CHUNK, np.nan), np.arange(CHUNK)))
+        begun = time.perf_counter()
+        estimator.get()
+        took.append(time.perf_counter() - begun)
+    return took[1:]
+
+
+def first_use() -> None:
+    """Import and first answer of a new process, with an empty and with a filled cache of compiled code."""
+    load = Load()
+    shown = table("first use, in a process of its own", "compiled code", "imports", "first update and fit")
+    with TemporaryDirectory() as folder:
+        for state in ("not there yet", "on disk", "on disk, again"):
+            run = subprocess.run(
+                [sys.executable, "-c", FIRST_USE],
+                env=os.environ | {"NUMBA_CACHE_DIR": folder},
+                cwd=Path(__file__).parents[3],
+                check=True,
+                capture_output=True,
+                text=True,
+            )
+            imports, first = map(float, run.stdout.split())
+            shown.add_row(state, f"{imports:.2f} s", f"{first:.2f} s")
+    console.print(shown)
+    console.print(load.said() + "\n")
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=15)
+    rounds = parser.parse_args().rounds
+    console.print(about())
+    window_costs(rounds)
+    refit_cost(rounds)
+    first_use()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,267 @@
+"""How often the change detector errs, how soon it finds, and what it names: simulated years and onsets.
+
+    python -m tests.experiments.benchmarks.changes [rate false delays steps cost] [--years 0.3] [--repeats 120] [--seed 0]
+
+Every alarm counted is one of the real detector on real sample series; nothing is scaled but what says so. Intervals
+are 95 %: of counts by Poisson (Garwood), of shares by √(p(1 − p)/n). A delay is from the onset to the alarm; the event
+is handed out after as long again (256 samples at least), when it has been sized.
+"""
+
+import argparse
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Final
+
+import numpy as np
+from scipy.signal import lfilter
+from scipy.stats import chi2
+
+from drivers.sample import AXES, Floats
+from monitor.estimation.allan.batch import cluster_sizes
+from monitor.estimation.allan.window import AllanWindow
+from monitor.estimation.detection.change_detection import NOISE_SHARE, RATE_AT_ZERO, Change, ChangeDetector
+from monitor.noise.effects.angle_random_walk import AngleRandomWalk
+from monitor.noise.effects.bias_instability import BiasInstability
+from monitor.noise.effects.quantization_noise import QuantizationNoise
+from monitor.noise.effects.rate_random_walk import RateRandomWalk
+from monitor.noise.model import NoiseModel
+from tests.experiments.benchmarks.machine import Load, about, alternate, console, table
+
+WHITE: Final = 1.5e-4
+STEP_OF_OUTPUT: Final = np.deg2rad(0.05)
+PIECE: Final = 100_000
+RATE_HZ: Final = 100.0
+
+
+def mix(k: float = 1.5e-6) -> NoiseModel:
+    """Six equal axes of a MEMS gyro."""
+    sources = (
+        QuantizationNoise(Q=2e-6), AngleRandomWalk(N=WHITE), BiasInstability(B=4e-5), RateRandomWalk(K=k),
+    )  # fmt: skip
+    return NoiseModel(dict.fromkeys(AXES, sources))
+
+
+def white(rate_hz: float, seed: int) -> Callable[[int], Floats]:
+    """White noise of N = WHITE, the fastest honest series."""
+    rng = np.random.default_rng(seed)
+    return lambda n: WHITE * rate_hz**0.5 * rng.standard_normal((n, 6))
+
+
+def coarse(rate_hz: float, seed: int) -> Callable[[int], Floats]:
+    """The mix through an output of 0.05 °/s a bit; at 100 Hz a bit is 0.58 σ, at 10 Hz 1.8 σ."""
+    draw = mix().stream(rate_hz, seed).draw
+    return lambda n: np.asarray(np.round(draw(n) / STEP_OF_OUTPUT) * STEP_OF_OUTPUT)
+
+
+def poisson(count: int) -> tuple[float, float]:
+    """95 % interval of the mean of a count."""
+    low = 0.5 * float(chi2.ppf(0.025, 2 * count)) if count else 0.0
+    return low, 0.5 * float(chi2.ppf(0.975, 2 * count + 2))
+
+
+def constant(seed: int) -> None:
+    """Alarms of noise a z² at low thresholds, times e^h: the constant RATE_AT_ZERO."""
+    shown = table(
+        "white noise, six axes: alarms of noise at thresholds low enough to count",
+        "h",
+        "alarms",
+        "z²",
+        "alarms/z² · e^h",
+    )
+    for h in (8.0, 9.0, 10.0, 11.0, 12.0):
+        # a rate of 1 Hz only sets what is learned before an accusation: 64 terms
+        detector = ChangeDetector(1.0, 86_400.0 * 6 * RATE_AT_ZERO / (NOISE_SHARE * np.exp(h)))
+        draw, n = white(1.0, seed), 0
+        kinds: Counter[str] = Counter()
+        while n < 10_000_000:
+            detector.update(draw(PIECE))
+            n += PIECE
+            kinds.update(change.kind for change in detector.take())
+        count, scale = kinds["noise_changed"], np.exp(h) / (6 * n)
+        low, high = poisson(count)
+        shown.add_row(
+            f"{h:g}", f"{count}", f"{6 * n:.1e}", f"{count * scale:.3f} ({low * scale:.3f}–{high * scale:.3f})"
+        )
+    console.print(shown)
+
+
+def false_alarms(years: float, seed: int) -> None:
+    """Alarms on unchanging noise at the default rate and at ten times it."""
+    shown = table(
+        "unchanging noise, six axes", "noise", "simulated", "stated a day", "alarms", "a day", "kinds",
+    )  # fmt: skip
+    day = 86_400.0
+    cases: list[tuple[str, float, float, Callable[[int], Floats]]] = [
+        ("white, 10 Hz", 10.0, years * 365.25, white(10.0, seed)),
+        ("MEMS mix, 10 Hz", 10.0, years * 365.25 / 3, mix().stream(10.0, seed).draw),
+        ("mix at 0.05 °/s, 10 Hz", 10.0, years * 365.25 / 3, coarse(10.0, seed)),
+        ("MEMS mix, 100 Hz", 100.0, years * 365.25 / 30, mix().stream(100.0, seed).draw),
+    ]
+    for title, rate_hz, days, draw in cases:
+        detectors = [ChangeDetector(rate_hz, stated) for stated in (1 / 30, 1.0, 10.0)]
+        kinds: list[Counter[str]] = [Counter() for _ in detectors]
+        for _ in range(int(days * day * rate_hz / PIECE)):
+            values = draw(PIECE)
+            for detector, seen in zip(detectors, kinds, strict=True):
+                detector.update(values)
+                seen.update(change.kind for change in detector.take())
+        for stated, seen in zip((1 / 30, 1.0, 10.0), kinds, strict=True):
+            low, high = poisson(seen.total())
+            rate = f"{seen.total() / days:.3f} ({low / days:.3f}–{high / days:.3f})"
+            shown.add_row(title, f"{days:.1f} d", f"{stated:.3f}", f"{seen.total()}", rate, str(dict(seen)))
+    console.print(shown)
+
+
+def onsets() -> dict[str, tuple[float, float, Callable[[Floats, np.random.Generator], Floats]]]:
+    """Name -> seconds learned, seconds watched, what happens to samples [n, 6] of the mix after the onset."""
+    sigma = WHITE * RATE_HZ**0.5
+
+    def louder(factor: float) -> Callable[[Floats, np.random.Generator], Floats]:
+        extra = sigma * (factor**2 - 1.0) ** 0.5
+        return lambda values, rng: values + extra * rng.standard_normal(values.shape)
+
+    def resonance(values: Floats, rng: np.random.Generator) -> Floats:
+        # poles at 20 Hz, 1 Hz wide
+        r, angle = np.exp(-np.pi * 1.0 / RATE_HZ), 2.0 * np.pi * 20.0 / RATE_HZ
+        made = lfilter(
+            [1.0], [1.0, -2.0 * r * np.cos(angle), r * r], rng.standard_normal((len(values) + 1000, 6)), axis=0
+        )
+        return np.asarray(values + 0.5 * sigma * (made / made.std(0))[1000:])
+
+    def narrowed(values: Floats, rng: np.random.Generator) -> Floats:
+        # one pole at 15 Hz
+        p = np.exp(-2.0 * np.pi * 15.0 / RATE_HZ)
+        start = (p * values[0])[None]
+        return np.asarray(lfilter([1.0 - p], [1.0, -p], values, axis=0, zi=start)[0])
+
+    return {
+        "N × 1.5": (600.0, 120.0, louder(1.5)),
+        "N × 1.2": (600.0, 240.0, louder(1.2)),
+        "N × 1.1": (600.0, 600.0, louder(1.1)),
+        "resonance, σ/2 at 20 Hz": (600.0, 240.0, resonance),
+        "low-pass at 15 Hz": (600.0, 120.0, narrowed),
+    }
+
+
+def looked(first: Floats, second: Floats) -> Iterator[list[Change]]:
+    """What a detector finds on each axis that changes from one series to the other, first change only."""
+    detector = ChangeDetector(RATE_HZ)
+    detector.update(first)
+    early = {change.axis for change in detector.take()}
+    detector.update(second)
+    found = detector.take()
+    for axis in range(6):
+        if axis not in early:
+            yield [change for change in found if change.axis == axis][:1]
+
+
+def row(title: str, results: list[list[Change]], onset: int, rate_hz: float = RATE_HZ) -> tuple[str, ...]:
+    """Share found, delay, error of the onset, what was named."""
+    found = [one[0] for one in results if one and one[0].found > onset]
+    if not found:
+        return (title, f"0 of {len(results)}", "–", "–", "–")
+    delays = np.array([change.found - onset for change in found]) / rate_hz
+    errors = np.array([change.since - onset for change in found]) / rate_hz
+    names = Counter(
+        change.kind if change.kind != "noise_changed" else "".join(k for k in change.what if k != "rms")
+        for change in found
+    )
+    said = ", ".join(f"{name or 'nothing'} {count}" for name, count in names.most_common())
+    low, high = np.percentile(errors, [10, 90])
+    return (
+        title, f"{len(found)} of {len(results)}", f"{np.median(delays):.2f}, {np.percentile(delays, 90):.2f}",
+        f"{np.median(errors):+.2f} ({low:+.2f} … {high:+.2f})", said,
+    )  # fmt: skip
+
+
+def delays(repeats: int, seed: int) -> None:
+    """Delay, naming and onset of changes of the mix at 100 Hz, at the default rate of false alarms."""
+    shown = table(
+        "changes of the MEMS mix at 100 Hz, one false alarm in 30 days", "change", "found",
+        "delay s: median, 90 %", "onset error s: median (10–90 %)", "named",
+    )  # fmt: skip
+    for title, (before, after, change) in onsets().items():
+        results: list[list[Change]] = []
+        for k in range(-(-repeats // 6)):
+            values = mix().simulate(int((before + after) * RATE_HZ), RATE_HZ, seed + k)
+            cut = int(before * RATE_HZ)
+            results += looked(values[:cut], change(values[cut:], np.random.default_rng(seed + k)))
+        shown.add_row(*row(title, results, int(before * RATE_HZ)))
+    results = []
+    for k in range(-(-repeats // 24)):  # K × 3 wants days: the mix at 10 Hz, where K is the same
+        slow = ChangeDetector(10.0)
+        cut, n = 2 * 864_000, 864_000
+        slow.update(mix().simulate(cut, 10.0, seed + k))
+        early = {change.axis for change in slow.take()}
+        slow.update(mix(4.5e-6).simulate(n, 10.0, seed + 1000 + k))
+        found = [c for c in slow.take() if c.kind != "bias_stepped"]
+        results += [[c for c in found if c.axis == axis][:1] for axis in range(6) if axis not in early]
+    text = row("K × 3 after 2 days, 10 Hz", results, cut, 10.0)
+    shown.add_row(*text)
+    console.print(shown)
+
+
+def steps(repeats: int, seed: int) -> None:
+    """Steps of the bias in units of the white σ, after an hour."""
+    shown = table(
+        "steps of the bias, MEMS mix at 100 Hz, after an hour, watched for ten minutes", "height / σ", "found",
+        "delay s: median, 90 %", "onset error s: median (10–90 %)", "named",
+    )  # fmt: skip
+    for height in (10.0, 3.0, 1.0, 0.5, 0.2):
+        results: list[list[Change]] = []
+        for k in range(-(-repeats // 24)):
+            values = mix().simulate(420_000, RATE_HZ, seed + k)
+            cut = 360_007  # no border of blocks
+            values[cut:] += height * WHITE * RATE_HZ**0.5
+            results += looked(values[:cut], values[cut:])
+        shown.add_row(*row(f"{height:g}", results, 360_007))
+    console.print(shown)
+
+
+def cost() -> None:
+    """Beside AllanWindow in one run, blocks of 100 samples, processor time."""
+    values = white(RATE_HZ, 0)(100_000)
+    detector, window = ChangeDetector(RATE_HZ), AllanWindow(100_000, cluster_sizes(100_000, RATE_HZ))
+
+    def run(update: Callable[[Floats], None]) -> Callable[[], None]:
+        def work() -> None:
+            for start in range(0, len(values), 100):
+                update(values[start : start + 100])
+
+        return work
+
+    run(detector.update)(), run(window.update)()
+    load = Load()
+    took = alternate({"change": run(detector.update), "window": run(window.update)}, 7)
+    shown = table("cost, six axes, blocks of 100", "what", "ns a sample and axis: median (best)")
+    for name, (median, best) in took.items():
+        shown.add_row(name, f"{median / 6e5 * 1e9:.1f} ({best / 6e5 * 1e9:.1f})")
+    console.print(shown)
+    console.print(load.said())
+
+
+def main() -> None:
+    """Run the parts that are named, or all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("parts", nargs="*", default=["rate", "false", "delays", "steps", "cost"])
+    parser.add_argument("--years", type=float, default=0.3)
+    parser.add_argument("--repeats", type=int, default=120)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    console.print(about())
+    parts: dict[str, Callable[[], None]] = {
+        "rate": lambda: constant(given.seed),
+        "false": lambda: false_alarms(given.years, given.seed),
+        "delays": lambda: delays(given.repeats, given.seed),
+        "steps": lambda: steps(given.repeats, given.seed),
+        "cost": cost,
+    }
+    for part in given.parts:
+        begun = time.process_time()
+        parts[part]()
+        console.print(f"{part}: {time.process_time() - begun:.0f} s of one core\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+"""Time from the start of ``imu-monitor demo`` to its first results, with and without compiled kernels on disk.
+
+    python -m tests.experiments.benchmarks.cold_start [--load N] [--share F] [--rounds N]
+
+Each round starts the program twice, first with an empty folder for compiled kernels and then with the folder that the
+first start has filled. Another process listens over zenoh: ``curve`` is the first Allan deviation, ``coefficients`` the
+first estimated value, ``everything`` the first status after the last kernel. The times are those of the wall clock,
+from the start of the process. ``lost`` is what the simulated sensor or the service lost meanwhile.
+
+``--load`` starts as many busy processes beside it. ``--share`` stands for a smaller board: program and compilers run on
+one processor, with as many busy processes beside them as leave them about that share of it.
+"""
+
+import argparse
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from tests.experiments.benchmarks.machine import Load, about, console, table
+from tests.support.zenoh_sessions import session
+
+ROOT = Path(__file__).parents[3]
+HOST, PORT = "127.0.0.1", 7450
+PATIENCE_S = 900.0
+
+
+@contextlib.contextmanager
+def busy(processes: int, processors: set[int]) -> Iterator[None]:
+    """Keep processors busy by so many processes."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, processors)  # inherited by what is started
+    children = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(processes)]
+    try:
+        yield
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+        os.sched_setaffinity(0, before)
+
+
+def times(cache: Path) -> dict[str, float]:
+    """Start the program once; return the seconds until each result, and how many samples were lost."""
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
+    environment["NUMBA_CACHE_DIR"] = str(cache)
+    command = [sys.executable, "-P", str(ROOT / "imu_monitor.py"), "demo", "--viewer", "none"]
+    found: dict[str, float] = {}
+    with tempfile.TemporaryFile() as log:
+        began_s = time.monotonic()
+        program = subprocess.Popen(command, env=environment, stdout=log, stderr=log, cwd=ROOT)
+        try:
+            _wait_for(_listens, began_s)
+            with session(connect=[f"tcp/{HOST}:{PORT}"]) as opened:
+
+                def take(sample: Any) -> None:
+                    topic = str(sample.key_expr).rsplit("/", 1)[-1]
+                    _note(found, topic, sample.payload.to_bytes(), time.monotonic() - began_s)
+
+                subscriber = opened.declare_subscriber("imu/**", take)
+                _wait_for(lambda: "everything" in found, began_s)
+                subscriber.undeclare()
+        finally:
+            program.send_signal(signal.SIGTERM)
+            program.wait()
+    return found
+
+
+def _wait_for(condition: Callable[[], bool], began_s: float) -> None:
+    while not condition():
+        if time.monotonic() - began_s > PATIENCE_S:
+            raise TimeoutError(f"nothing after {PATIENCE_S:g} s")
+        time.sleep(0.02)
+
+
+def _listens() -> bool:
+    with contextlib.suppress(OSError), socket.create_connection((HOST, PORT), 1.0):
+        return True
+    return False
+
+
+def _note(found: dict[str, float], topic: str, payload: bytes, now_s: float) -> None:
+    if topic == "allan":
+        found.setdefault("curve", now_s)
+    elif topic == "coefficients":
+        axes = msgspec.json.decode(payload)["axes"].values()
+        if any(axis["N"]["status"] == "estimated" for axis in axes):
+            found.setdefault("coefficients", now_s)
+    elif topic == "status":
+        status = msgspec.json.decode(payload)
+        found["lost"] = float(status["lost"])
+        if status["state"] == "running" and "coefficients" in found and "compiling" not in status["text"]:
+            found.setdefault("everything", now_s)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--load", type=int, default=0, help="busy processes beside it")
+    parser.add_argument("--share", type=float, help="share of one processor, e.g. 0.25")
+    parser.add_argument("--rounds", type=int, default=3)
+    chosen = parser.parse_args()
+    processors, load = os.sched_getaffinity(0), chosen.load
+    if chosen.share is not None:
+        processors, load = {min(processors)}, round(1.0 / chosen.share) - 1
+    console.print(about())
+    meanwhile, rows = Load(), list[tuple[str, ...]]()
+    for _ in range(chosen.rounds):
+        with tempfile.TemporaryDirectory() as folder, busy(load, processors):
+            for kernels in ("cold", "warm"):
+                found = times(Path(folder))
+                rows.append((kernels, *(f"{found[name]:.1f}" for name in NAMES)))
+    shown = table("seconds after the start", "kernels", *NAMES)
+    for row in sorted(rows):
+        shown.add_row(*row)
+    console.print(shown)
+    console.print(meanwhile.said())
+
+
+NAMES = ("curve", "coefficients", "everything", "lost")
+
+if __name__ == "__main__":
+    main()

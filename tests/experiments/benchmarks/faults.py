@@ -1,0 +1,571 @@
+"""Faults, each injected for real beside a running service: what was lost, and what the status said, in one table.
+
+    python -m tests.experiments.benchmarks.faults [NAME…] --times 1000
+
+Most have a sensor of their own: a board on a pseudo-terminal that prints 200 lines a second, each with a count and a
+checksum, so that every line is known as received, lost or bad. ``tests/system/test_unattended.py`` runs the same ones.
+"""
+
+import argparse
+import contextlib
+import errno
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+from unittest import mock
+
+import numpy as np
+
+from drivers.recordings import segment
+from monitor.common.health import Health
+from monitor.daemon.device_worker import Output, Station
+from monitor.daemon.service import Service
+from monitor.settings import loading
+from tests.support.ports import free_endpoint, free_port
+from tests.support.terminal import LineTerminal
+from tests.support.waiting import PATIENCE_S, wait_for
+
+RATE: Final = 200
+DEVICE: Final = """
+[[device]]
+name = "board"
+rate = {rate}
+window = "1min"
+[device.driver]
+link = "serial"
+port = "{port}"
+decoder = "text"
+[device.driver.decoder_options]
+columns = ["counter", "gx", "gy", "gz", "ax", "ay", "az"]
+nmea = true
+"""
+CAN: Final = """
+[[device]]
+name = "board"
+rate = {rate}
+[device.driver]
+link = "can"
+interface = "virtual"
+channel = "{channel}"
+decoder = "dbc"
+[device.driver.decoder_options]
+file = "xsens_mti"
+counter = "SampleTime.SampleTimeFine"
+tick = 1e-4
+[device.driver.decoder_options.signals]
+gx = "RateOfTurn.RateX"
+gy = "RateOfTurn.RateY"
+gz = "RateOfTurn.RateZ"
+"""
+NO_ZENOH: Final = '[zenoh]\nmode = "none"\n'
+NO_VIEWER: Final = '[viewer]\nmode = "none"\n'
+ROUTER: Final = """
+import json, sys, time, zenoh
+config = zenoh.Config()
+for key, value in {"mode": "router", "scouting/multicast/enabled": False, "listen/endpoints": [sys.argv[1]]}.items():
+    config.insert_json5(key, json.dumps(value))
+with zenoh.open(config):
+    print("up", flush=True)
+    time.sleep(600)
+"""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a fault cost."""
+
+    injected: str
+    sent: int
+    received: int
+    lost: int
+    bad: int
+    said: str  # by the status, at its worst
+    note: str = ""
+    dropped: int = 0  # of those sent: found no port, or no room in it
+
+    @property
+    def accounted(self) -> bool:
+        """Whether every sample that was sent is known. Nobody sees those that are dropped at the end."""
+        return self.received + max(self.lost + self.bad, self.dropped) >= self.sent
+
+
+@dataclass
+class Said(Output):
+    """What the status said."""
+
+    healths: list[Health] = field(default_factory=list)
+    events: list[str] = field(default_factory=list)  # their sentences
+
+    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+        self.healths.append(health)
+
+    def event(self, device: str, unix_s: float, received: int, event: Any) -> None:
+        self.events.append(event.text)
+
+    def texts(self) -> set[str]:
+        """Every sentence so far: of the device, of its outputs, of events."""
+        found = {health.text for health in self.healths}
+        return found | set(self.events) | {text for health in self.healths for text in health.outputs.values()}
+
+    def wait(self, words: str) -> str:
+        """The first sentence with these words."""
+        return wait_for(lambda: next((text for text in self.texts() if words in text), ""), f'"{words}"')
+
+    def newest(self) -> Health | None:
+        return self.healths[-1] if self.healths else None
+
+
+class Board:
+    """Lines on a pseudo-terminal whose name stays the same; what goes wrong on the way is put between."""
+
+    def __init__(self, folder: Path) -> None:
+        self.port = folder / "tty"
+        self.sent = 0
+        self.spoil: Callable[[bytes], bytes] = lambda data: data
+        self._terminal = LineTerminal(self.port)
+        self._plugging = threading.Lock()
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def close(self) -> None:
+        self._closing.set()
+        self._thread.join()
+        self.pull()
+
+    def plug(self) -> None:
+        with self._plugging:
+            self._terminal.plug()
+
+    def pull(self) -> None:
+        with self._plugging:
+            self._terminal.pull()
+
+    def rest(self) -> None:
+        """Print nothing any more."""
+        self._closing.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        rng, begun = np.random.default_rng(1), time.monotonic()
+        while not self._closing.wait(0.01):
+            due = int((time.monotonic() - begun) * RATE)
+            data = b"".join(_line(self.sent + i, rng.standard_normal(6) * 1e-3) for i in range(due - self.sent))
+            self.sent = due
+            self._write(self.spoil(data))
+
+    @property
+    def dropped(self) -> int:
+        """Lines that found no port, or no room in it."""
+        return self._terminal.dropped
+
+    def _write(self, data: bytes) -> None:
+        with self._plugging:
+            self._terminal.write(data)
+
+
+def _line(count: int, values: Any) -> bytes:
+    fields = ",".join([str(count), *(f"{value:.6f}" for value in values)]).encode()
+    check = 0
+    for byte in fields:
+        check ^= byte
+    return b"$" + fields + b"*%02X\r\n" % check
+
+
+@dataclass
+class Rig:
+    """A board, a service that reads it, and what it says."""
+
+    folder: Path
+    board: Board
+    service: Service
+    said: Said
+
+    @property
+    def station(self) -> Station:
+        return self.service.stations[0]
+
+    def flows(self, more: int = 50) -> None:
+        """Samples come now."""
+        before = self.station.driver.counts.received
+        wait_for(lambda: self.station.driver.counts.received >= before + more, "samples")
+
+    def well(self) -> None:
+        """The status has nothing to say any more."""
+
+        def quiet() -> bool:
+            newest = self.said.newest()
+            return newest is not None and newest.state == "running" and not newest.text
+
+        wait_for(quiet, "a clean status")
+
+    def outcome(self, injected: str, said: str, note: str = "") -> Outcome:
+        """Once the board rests and all has come."""
+        self.flows()
+        self.board.rest()
+        counts, sent, dropped = self.station.driver.counts, self.board.sent, self.board.dropped
+        with contextlib.suppress(AssertionError):  # what never comes is in the outcome
+            wait_for(lambda: counts.received + max(counts.lost + counts.bad, dropped) >= sent, "the last line")
+        return Outcome(injected, sent, counts.received, counts.lost, counts.bad, said, note, dropped)
+
+
+@contextlib.contextmanager
+def running(folder: Path, more: str = NO_ZENOH + NO_VIEWER) -> Iterator[Rig]:
+    """The service beside the board, from before its first line on."""
+    board, said = Board(folder), Said()
+    path = folder / "faults.toml"
+    path.write_text(DEVICE.format(rate=RATE, port=board.port) + more)
+    service = Service(loading.load(path), [said])
+    thread = threading.Thread(target=service.run)
+    thread.start()
+    rig = Rig(folder, board, service, said)
+    try:
+        wait_for(lambda: getattr(rig.station.driver.link, "_port", None) is not None, "the port")
+        board.start()
+        rig.flows()
+        wait_for(lambda: said.healths and "compiling" not in said.healths[-1].text, "the kernels")
+        yield rig
+    finally:
+        service.stop()
+        thread.join(PATIENCE_S)
+        board.close()
+
+
+# --- the wire
+
+
+def cable(folder: Path, times: int) -> Outcome:
+    """Out and in, again and again."""
+    pauses = mock.patch.multiple("drivers.driver", FIRST_PAUSE_S=0.01, LONGEST_PAUSE_S=0.05)
+    with pauses, running(folder) as rig:
+        for _ in range(times):
+            rig.board.pull()
+            wait_for(lambda: rig.station.driver.state == "lost", "the loss")
+            rig.board.plug()
+            wait_for(lambda: rig.station.driver.state == "running", "samples after it")
+        said = rig.said.wait("the device is gone")
+        return rig.outcome(f"cable out and in, {times} times", said)
+
+
+def garbage(folder: Path, times: int) -> Outcome:
+    """Bursts of random bytes between and within the lines."""
+    rng = random.Random(1)
+    bursts = max(times // 5, 5)
+    with running(folder) as rig:
+        done = 0
+
+        def spoil(data: bytes) -> bytes:
+            nonlocal done
+            if done < bursts and data and rng.random() < 0.3:
+                done += 1
+                at = rng.randrange(len(data))
+                return data[:at] + rng.randbytes(rng.randrange(1, 400)) + data[at:]
+            return data
+
+        rig.board.spoil = spoil
+        wait_for(lambda: done >= bursts, "the bursts", 10.0 * PATIENCE_S)
+        rig.board.spoil = lambda data: data
+        return rig.outcome(f"{bursts} bursts of rubbish", _at_worst(rig))
+
+
+def half_baud(folder: Path, times: int) -> Outcome:
+    """What a port at half the baud rate makes of the bits, for two seconds."""
+    with running(folder) as rig:
+        rig.board.spoil = at_half_the_baud_rate
+        said = rig.said.wait("no sample in")
+        rig.board.spoil = lambda data: data
+        rig.well()
+        return rig.outcome("half the baud rate, until it is said", said)
+
+
+def at_half_the_baud_rate(data: bytes) -> bytes:
+    """Frames of ten bits, read with bits twice as long: start, eight bits, stop."""
+    line: list[int] = []
+    for byte in data:
+        line += [0, *((byte >> i) & 1 for i in range(8)), 1]
+    line += [1] * 20
+    read, at = bytearray(), 0
+    while at + 20 < len(line):
+        if line[at]:
+            at += 1
+            continue
+        bits = [line[min(at + 2 * i + 1, len(line) - 1)] for i in range(1, 9)]
+        read.append(sum(bit << i for i, bit in enumerate(bits)))
+        at += 19
+    return bytes(read)
+
+
+def two_daemons(folder: Path, times: int) -> Outcome:
+    """A second daemon on the same serial port and zenoh endpoint."""
+    both = f'[zenoh]\nlisten = ["{free_endpoint()}"]\n' + NO_VIEWER
+    with running(folder, both) as rig:
+        wait_for(lambda: rig.service.states()["zenoh"] == "ok", "the session")
+        said = Said()
+        second = Service(loading.load(folder / "faults.toml"), [said])
+        thread = threading.Thread(target=second.run)
+        thread.start()
+        try:
+            held = said.wait("held by another program")
+            busy = said.wait("is busy")
+            rig.flows()
+        finally:
+            second.stop()
+            thread.join(PATIENCE_S)
+        assert second.stations[0].driver.counts.received == 0
+        return rig.outcome("two daemons on one port", f"the second: {held}; {busy}")
+
+
+def no_descriptors(folder: Path, times: int) -> Outcome:
+    """No file can be opened any more, while the cable is put back."""
+    with running(folder) as rig:
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        rig.board.pull()
+        wait_for(lambda: rig.station.driver.state == "lost", "the loss")
+        rig.board.plug()
+        free = os.open(os.devnull, os.O_RDONLY)
+        os.close(free)
+        try:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (free, hard))  # the lowest that is free may not be taken
+            said = rig.said.wait(os.strerror(errno.EMFILE))
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        rig.well()
+        return rig.outcome("out of file descriptors while the cable is put back", said)
+
+
+# --- CAN
+
+
+def can_bus(folder: Path, times: int) -> Outcome:
+    """Error frames between the frames of a virtual bus, then bus-off."""
+    import can
+
+    channel = f"faults-{os.getpid()}"
+    path, said = folder / "faults.toml", Said()
+    path.write_text(CAN.format(rate=RATE, channel=channel) + NO_ZENOH + NO_VIEWER)
+    service = Service(loading.load(path), [said])
+    station = service.stations[0]
+    # python-can would sort a peer's error frames out by their identifier, as the kernel does not
+    station.driver.link.accept([])  # type: ignore[attr-defined]
+    thread = threading.Thread(target=service.run)
+    thread.start()
+    sent = 0
+
+    def send(samples: int, error: int = 0) -> None:
+        nonlocal sent
+        for _ in range(samples):
+            time.sleep(1.0 / RATE)
+            bus.send(
+                can.Message(arbitration_id=5, data=(sent * 10_000 // RATE).to_bytes(4, "big"), is_extended_id=False)
+            )
+            bus.send(can.Message(arbitration_id=50, data=bytes([0, sent % 200] * 3), is_extended_id=False))
+            sent += 1
+            if error and sent % 10 == 0:
+                bus.send(can.Message(is_error_frame=True, arbitration_id=error))
+
+    try:
+        with can.Bus(interface="virtual", channel=channel) as bus:
+            wait_for(lambda: getattr(station.driver.link, "_bus", None) is not None, "the bus")
+            send(RATE)
+            send(RATE, error=0x04)  # a controller's warning
+            bus.send(can.Message(is_error_frame=True, arbitration_id=0x40))
+            text = said.wait("bus off")
+            while station.driver.state != "running":
+                send(10)
+            send(RATE)
+            counts = station.driver.counts
+            wait_for(lambda: counts.received + counts.lost + counts.bad >= sent - 1, "the last sample")
+            injected = f"{RATE // 10} CAN error frames, then bus-off"
+            return Outcome(
+                injected, sent - 1, counts.received, counts.lost, counts.bad, text, "the last sample stays open"
+            )
+    finally:
+        service.stop()
+        thread.join(PATIENCE_S)
+
+
+# --- disk
+
+
+def full_disk(folder: Path, times: int) -> Outcome:
+    """The recording on a disk of half a megabyte."""
+    small = folder / "small"
+    small.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=512k", "tmpfs", str(small)], check=True, capture_output=True)
+    try:
+        ballast = small / "ballast"
+        with running(folder, _storage(small / "store")) as rig:
+            rig.flows()
+            with contextlib.suppress(OSError):
+                ballast.write_bytes(bytes(1_000_000))
+            said = rig.said.wait("No space left")
+            rig.flows()
+            ballast.unlink()
+            wait_for(lambda: rig.service.states()["recording"] == "ok", "the recording")
+            outcome = rig.outcome("disk full, then room again", said)
+        _check_recording(small / "store", outcome)
+        return outcome
+    finally:
+        subprocess.run(["umount", str(small)], check=True)
+
+
+def slow_disk(folder: Path, times: int) -> Outcome:
+    """Every batch takes two seconds to write."""
+    write = segment.SegmentWriter.samples
+
+    def slowly(writer: segment.SegmentWriter, *arguments: Any) -> None:
+        time.sleep(2.0)
+        write(writer, *arguments)
+
+    with (
+        mock.patch("drivers.recordings.segment.SegmentWriter.samples", slowly),
+        running(folder, _storage(folder / "store")) as rig,
+    ):
+        for _ in range(4):
+            rig.flows(RATE)
+        assert rig.service.recorder is not None
+        outcome = rig.outcome(
+            "every write takes 2 s", rig.service.recorder.state, "nothing is missing in the recording"
+        )
+    _check_recording(folder / "store", outcome)
+    return outcome
+
+
+def _storage(folder: Path) -> str:
+    return NO_ZENOH + NO_VIEWER + f'[storage]\nfolder = "{folder}"\ndisk_share = 1.0\nhistory = false\n'
+
+
+def _check_recording(store: Path, outcome: Outcome) -> None:
+    """All that was received is recorded, and what is missing in it is where it says."""
+    ticks = [piece.samples for path in segment.segments(store / "board") for piece in segment.read_samples(path)]
+    rows = sum(len(one) for one in ticks)
+    assert rows == outcome.received, f"{rows} rows of {outcome.received} received"
+
+
+# --- clock, network
+
+
+def clock_back(folder: Path, times: int) -> Outcome:
+    """The host's clock is set back an hour."""
+    true = time.time_ns
+    with running(folder, _storage(folder / "store")) as rig:
+        rig.flows()
+        with mock.patch("time.time_ns", side_effect=lambda: true() - 3600 * 10**9):
+            for _ in range(5):
+                rig.flows(RATE)
+            outcome = rig.outcome("clock set back an hour", rig.said.wait("ahead of the host's clock"))
+    times_s = np.concatenate(
+        [
+            piece.samples.t_ns / 1e9
+            for path in segment.segments(folder / "store" / "board")
+            for piece in segment.read_samples(path)
+        ]
+    )
+    steps = np.diff(times_s)
+    assert steps.min() >= 0.0, "times went back"
+    assert steps.max() < 0.5 + outcome.dropped / RATE, "a hole in the times"
+    _check_recording(folder / "store", outcome)
+    return outcome
+
+
+def router(folder: Path, times: int) -> Outcome:
+    """The router between daemon and subscriber is killed and started again."""
+    import json
+
+    import zenoh
+
+    endpoint = free_endpoint()
+    more = f'[zenoh]\nlisten = []\nconnect = ["{endpoint}"]\n' + NO_VIEWER
+    process = _router(endpoint)
+    heard: list[float] = []
+    config = zenoh.Config()
+    for key, value in {
+        "mode": "client", "scouting/multicast/enabled": False, "connect/endpoints": [endpoint]
+    }.items():  # fmt: skip
+        config.insert_json5(key, json.dumps(value))
+    try:
+        with running(folder, more) as rig, zenoh.open(config) as session:
+            session.declare_subscriber("imu/board/status", lambda _: heard.append(time.monotonic()))
+            wait_for(lambda: heard, "a status")
+            process.kill()
+            process.wait()
+            said = rig.said.wait("nobody at")
+            rig.flows()
+            process = _router(endpoint)
+            back = time.monotonic()
+            wait_for(lambda: heard[-1] > back, "a status after it")
+            note = f"heard again {heard[-1] - back:.1f} s after the router was back"
+            return rig.outcome("router killed and started again", said, note)
+    finally:
+        process.kill()
+        process.wait()
+
+
+def _router(endpoint: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", ROUTER, endpoint]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    with process.stdout:
+        assert process.stdout.readline().strip() == "up"
+    return process
+
+
+def viewer(folder: Path, times: int) -> Outcome:
+    """The viewer is frozen (SIGSTOP) for some seconds."""
+    more = NO_ZENOH + f'[viewer]\nmode = "web"\nport = {free_port()}\nweb_port = {free_port()}\n'
+    with running(folder, more) as rig:
+        assert rig.service.view is not None
+        wait_for(lambda: rig.service.states()["viewer"] == "ok", "the viewer")
+        child = rig.service.view._child
+        assert child is not None
+        os.kill(child.pid, signal.SIGSTOP)
+        said = rig.said.wait("stalled")
+        rig.flows(2 * RATE)
+        os.kill(child.pid, signal.SIGCONT)
+        wait_for(lambda: rig.service.states()["viewer"] == "ok", "the viewer again")
+        return rig.outcome("viewer frozen", f"viewer: {said}")
+
+
+def _at_worst(rig: Rig) -> str:
+    """The longest sentence, as trouble has more to say."""
+    texts = {health.text for health in rig.said.healths}
+    return max(texts, key=len, default="") or "nothing"
+
+
+FAULTS: Final = {
+    one.__name__: one
+    for one in (
+        cable, garbage, half_baud, can_bus, two_daemons, no_descriptors, full_disk, slow_disk, clock_back, router,
+        viewer,
+    )
+}  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(FAULTS))
+    parser.add_argument("--times", type=int, default=1000, help="of what is done again and again")
+    wanted = parser.parse_args()
+    print("| fault | sent | received | lost | bad | the status said |\n| --- | --- | --- | --- | --- | --- |")
+    for name in wanted.names or FAULTS:
+        with tempfile.TemporaryDirectory() as folder:
+            one = FAULTS[name](Path(folder), wanted.times)
+        said = one.said.replace(folder, "…")
+        note = f" ({one.note})" if one.note else ""
+        print(f"| {one.injected}{note} | {one.sent} | {one.received} | {one.lost} | {one.bad} | {said} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+"""Names that ``analyze`` gives by itself: the five-term fit and its notes, without a model to compare with.
+
+A coefficient that is estimated where the model has no such term is a name; so are a line and a resonance that the
+model has not, outliers, a low-pass, values in coarse steps, a bias that stepped and white noise of another level: each
+is what one of the notes says. Notes of a misfit name nothing. Of one axis each name is given once.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+import numpy as np
+
+from drivers.sample import AXES, Floats, block
+from monitor.estimation.analysis import CHUNK, Analysis, analyze
+from monitor.estimation.analysis_notes import FAR_SHARE, SAME
+from monitor.estimation.detection.change_detection import Change, ChangeDetector
+from monitor.estimation.detection.line_detection import Line, lines, outliers
+from monitor.estimation.detection.motion_detection import find
+from monitor.estimation.detection.resolution import coarse
+from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.noise.effects import Narrowband, Sinusoidal
+from monitor.noise.model import NoiseModel
+
+EFFECTS: Final = dict(
+    zip(
+        LETTERS,
+        ("quantization_noise", "angle_random_walk", "bias_instability", "rate_random_walk", "rate_ramp"),
+        strict=True,
+    )
+)
+SAID: Final = frozenset(
+    {
+        *EFFECTS.values(),
+        "sinusoidal",
+        "narrowband",
+        "outliers",
+        "bandwidth_limit",
+        "resolution",
+        "bias_step",
+        "noise_step",
+    }
+)
+"""All names that it can give."""
+
+
+def names(columns: Mapping[str, Floats], rate_hz: float, model: NoiseModel) -> set[tuple[str, str]]:
+    """(axis, effect) of what ``analyze`` says of a recording beyond a model.
+
+    Args:
+        columns: axis -> [n] SI; an axis that is not there is not judged
+        rate_hz: stated
+        model: whose terms and lines are no names
+    """
+    n = next(iter(columns.values())).size
+    values = np.stack([columns.get(axis, np.full(n, np.nan)) for axis in AXES], axis=1)
+    t_ns = np.rint(np.arange(n) * (1e9 / rate_hz)).astype(np.int64)
+    result = analyze([block(t_ns, values)], rate_hz)
+    said = (*_of_fit(result, model), *_of_events(result, model))
+    return {(axis, name) for axis, name in said if axis in columns}
+
+
+def _of_fit(result: Analysis, model: NoiseModel) -> Iterator[tuple[str, str]]:
+    has = {axis: {effect.name for effect in model.effects.get(axis, ())} for axis in AXES}
+    status = result.estimate.coefficients.status
+    for i, axis in enumerate(AXES):
+        for letter, effect in EFFECTS.items():
+            if status[LETTERS.index(letter), i] == Status.ESTIMATED and effect not in has[axis]:
+                yield axis, effect
+        if np.isfinite(result.bandwidth_hz[i]) and "bandwidth_limit" not in has[axis]:
+            yield axis, "bandwidth_limit"
+    for one in coarse(result.values):
+        yield AXES[one.axis], "resolution"
+
+
+def _of_events(result: Analysis, model: NoiseModel) -> Iterator[tuple[str, str]]:
+    """Of what ``events_of`` looks for, where it stands as numbers: each thing is sought once, as there."""
+    values, rate_hz = result.values, result.estimate.rate_hz
+    moving, _ = find(values, rate_hz)
+    for line in lines(values, moving, rate_hz, result.estimate.curve):
+        if not _expected(line, model):
+            yield AXES[line.axis], "narrowband" if line.wide else "sinusoidal"
+    for i in np.flatnonzero(outliers(values, moving) > FAR_SHARE).tolist():
+        yield AXES[i], "outliers"
+    detector = ChangeDetector(rate_hz)
+    for begin in range(0, len(values), CHUNK):
+        rows = slice(begin, begin + CHUNK)
+        detector.update(np.where(moving[rows, None], np.nan, values[rows]))
+    for change in detector.take():
+        name = _of_change(change)
+        if name:
+            yield AXES[change.axis], name
+
+
+def _of_change(change: Change) -> str | None:
+    """What a change is called; noise that changed elsewhere than in white noise has no name."""
+    if change.kind == "noise_changed":
+        return "noise_step" if "N" in change.what else None
+    return {"bias_stepped": "bias_step", "outlier_burst": "outliers"}[change.kind]
+
+
+def _expected(line: Line, model: NoiseModel) -> bool:
+    """Whether the model has a line or a resonance there."""
+    for effect in model.effects.get(AXES[line.axis], ()):
+        if isinstance(effect, Sinusoidal) and abs(line.frequency_hz / effect.frequency - 1.0) < SAME:
+            return True
+        if isinstance(effect, Narrowband) and abs(line.frequency_hz - effect.frequency) < 2.0 * effect.bandwidth:
+            return True
+    return False

@@ -1,0 +1,324 @@
+"""Many daemons, three routers and one watcher on this machine: who is seen, who is missed, traffic and processor.
+
+Each daemon is ``imu-monitor run`` in a process of its own, with a simulated sensor; two routers at the leaves, to which
+the daemons connect by turns, and one at the root, where the watcher is. Where it may, all of it runs in a network
+namespace of its own, so that the counters of ``lo`` are of nothing else.
+
+    python -m tests.experiments.benchmarks.fleet [--daemons 50] [--seconds 30] [--rate 10] [--publish "1 Hz"]
+    python -m tests.experiments.benchmarks.fleet --settings        bytes a second by topic, of one device at several settings
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import psutil
+import zenoh
+
+from drivers.zenoh.session import configuration
+from monitor.publishing.terminal.live_table import Board
+from monitor.publishing.zenoh.subscriber import ZenohIn
+from tests.support.ports import free_port
+
+PATIENCE_S: Final = 600.0
+TOGETHER: Final = 4
+"""Daemons that start at a time: importing is what they do most then."""
+INSIDE: Final = "IMU_MONITOR_BENCH_NAMESPACE"
+DAEMON: Final = """
+[[device]]
+name = "imu{i}"
+rate = {rate}
+window = "10min"
+refit = "{publish}"
+publish = "{publish}"
+driver = {{ link = "virtual", seed = {i}, model = "{model}" }}
+[zenoh]
+listen = []
+connect = ["{router}"]
+[viewer]
+mode = "none"
+[log]
+level = "error"
+"""
+MODEL: Final = """
+sample_rate = {rate}
+["g*".angle_random_walk]
+N = 1.5e-4
+["g*".bias_instability]
+B = 4.0e-5
+["a*".angle_random_walk]
+N = 6.0e-4
+"""
+SETTINGS: Final = ((10, "1 Hz"), (100, "1 Hz"), (100, "10 Hz"), (1000, "10 Hz"), (1000, "every block"))
+
+
+class Process:
+    """A child of the bench, and what it takes."""
+
+    def __init__(self, *arguments: str) -> None:
+        self._child = subprocess.Popen(
+            [sys.executable, *arguments], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+        )
+        self.seen = psutil.Process(self._child.pid)
+
+    def cpu_s(self) -> float:
+        """Processor seconds so far."""
+        t = self.seen.cpu_times()
+        return float(t.user + t.system)
+
+    def memory_bytes(self) -> int:
+        """Of its own: what it shares with others is not counted."""
+        return int(self.seen.memory_full_info().uss)
+
+    def end(self, number: int = signal.SIGTERM) -> None:
+        """Send the signal, and wait."""
+        if self._child.poll() is None:
+            self._child.send_signal(number)
+            try:
+                self._child.wait(20.0)
+            except subprocess.TimeoutExpired:
+                self._child.kill()
+                self._child.wait()
+        for pipe in (self._child.stdin, self._child.stderr):
+            assert pipe is not None
+            pipe.close()
+
+
+@contextlib.contextmanager
+def routers() -> Iterator[tuple[str, list[str], list[Process]]]:
+    """The root's endpoint, those of the two leaves, and their processes."""
+    root, *leaves = (f"tcp/127.0.0.1:{free_port()}" for _ in range(3))
+    processes = [Process("-m", "tests.experiments.benchmarks.fleet", "--router", root)]
+    processes += [Process("-m", "tests.experiments.benchmarks.fleet", "--router", leaf, root) for leaf in leaves]
+    try:
+        yield root, leaves, processes
+    finally:
+        for process in processes:
+            process.end()
+
+
+def route(endpoint: str, *above: str) -> None:
+    """A router in this process, until its input ends."""
+    own: dict[str, Any] = {"mode": "router", "listen/endpoints": [endpoint], "connect/endpoints": list(above)}
+    own["connect/timeout_ms"] = -1  # what is above may start later
+    own["transport/shared_memory/enabled"] = False  # on one machine longer messages would not pass the interface
+    with zenoh.open(configuration(own)):
+        while sys.stdin.readline():
+            pass
+
+
+def daemon(
+    folder: Path, router: str, i: int, rate: float, publish: str, window: str = "10min", more: str = ""
+) -> Process:
+    """``imu-monitor run`` of one device."""
+    path, model = folder / f"{i}.toml", folder / f"{i}.model.toml"
+    model.write_text(MODEL.format(rate=float(rate)))
+    path.write_text(DAEMON.format(i=i, rate=rate, publish=publish, router=router, model=model))
+    return Process("-m", "monitor.cli", "run", str(path))
+
+
+class Watcher:
+    """What ``watch`` has, and when each token went."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.arriving = ZenohIn("imu/**", [endpoint])
+        self.board = Board()
+        self.gone_s: dict[str, float] = {}
+        self.messages: Counter[str] = Counter()
+        self.bytes: Counter[str] = Counter()
+        self.arriving.start()
+
+    def take(self, wait_s: float = 0.05) -> None:
+        """What came."""
+        for message in self.arriving.take(wait_s):
+            topic = message.key.rpartition("/")[2]
+            self.messages[topic] += 1
+            self.bytes[topic] += len(message.payload or b"")
+            if message.payload is None:
+                self.board.alive(message.key, message.there)
+                if not message.there:
+                    self.gone_s[message.key] = time.monotonic()
+            else:
+                self.board.take(message.key, message.payload)
+
+    def until(self, true: Callable[[], bool], what: str) -> float:
+        """s until it is true."""
+        begun_s = time.monotonic()
+        while not true():
+            if time.monotonic() - begun_s > PATIENCE_S:
+                raise SystemExit(f"waited {PATIENCE_S:.0f} s for {what}")
+            self.take()
+        return time.monotonic() - begun_s
+
+    def states(self) -> Counter[str]:
+        """How many devices are in which state."""
+        now_s = time.monotonic()
+        return Counter(one.state(now_s) for one in self.board.devices(now_s))
+
+
+def fleet(daemons: int, rate: float, publish: str, seconds: float) -> dict[str, Any]:
+    """All of it, measured."""
+    with tempfile.TemporaryDirectory() as name, routers() as (root, leaves, routing), contextlib.ExitStack() as ending:
+        watcher = Watcher(root)
+        ending.callback(watcher.arriving.close)
+        running = []
+        begun_s = time.monotonic()
+        for i in range(daemons):
+            running.append(daemon(Path(name), leaves[i % 2], i, rate, publish))
+            ending.callback(running[-1].end)
+            if (i + 1) % TOGETHER == 0 or i + 1 == daemons:
+                watcher.until(lambda n=i + 1: watcher.states()["running"] == n, f"{i + 1} daemons")  # type: ignore[misc]
+        started_s = time.monotonic() - begun_s
+        found = {"daemons": daemons, "rate": rate, "publish": publish, "all running after s": round(started_s, 1)}
+        found |= _steady(watcher, running, routing, seconds)
+        found |= _killed(watcher, running[daemons // 2], f"imu/imu{daemons // 2}/alive")
+        return found
+
+
+def _steady(watcher: Watcher, running: list[Process], routing: list[Process], seconds: float) -> dict[str, Any]:
+    """Traffic and processor once all run; what a first minute takes to compile is over by then."""
+    watcher.until(lambda: watcher.states()["running"] == len(running), "all to run")
+    settle_s = time.monotonic() + 0.5 * seconds
+    watcher.until(lambda: time.monotonic() > settle_s, "quiet")
+    watcher.messages.clear()
+    watcher.bytes.clear()
+    n, mine = len(running), psutil.Process()
+    before, begun_s, own_s = [p.cpu_s() for p in (*running, *routing)], time.monotonic(), sum(mine.cpu_times()[:2])
+    lo = _loopback_bytes()
+    watcher.until(lambda: time.monotonic() - begun_s > seconds, "the measurement")
+    took_s = time.monotonic() - begun_s
+    lo = _loopback_bytes() - lo
+    cpu = [(after.cpu_s() - b) / took_s for after, b in zip((*running, *routing), before, strict=True)]
+    memory = sorted(p.memory_bytes() for p in running)
+    # on a busy machine a daemon may have been silent for a moment
+    watcher.until(lambda: watcher.states()["running"] == n, "all to run after the measurement")
+    seen = dict(watcher.states())
+    return {
+        "seen": seen,
+        "payload bytes/s of a device": {topic: round(size / took_s / n, 1) for topic, size in watcher.bytes.items()},
+        "messages/s of a device": {topic: round(count / took_s / n, 2) for topic, count in watcher.messages.items()},
+        "loopback bytes/s of a device, three hops": round(lo / took_s / n),
+        "loopback counts nothing else": bool(os.environ.get(INSIDE)),
+        "processor of a daemon, % of a core": {
+            "median": round(100 * sorted(cpu[:n])[n // 2], 2),
+            "most": round(100 * max(cpu[:n]), 2),
+        },
+        "processor of the routers, % of a core": [round(100 * one, 2) for one in cpu[n:]],
+        "processor of the watcher, % of a core": round(100 * (sum(mine.cpu_times()[:2]) - own_s) / took_s, 2),
+        "memory of a daemon, MB": {"median": round(memory[n // 2] / 1e6), "most": round(memory[-1] / 1e6)},
+        "memory of a router, MB": [round(p.memory_bytes() / 1e6) for p in routing],
+        "dropped": watcher.arriving.dropped,
+    }
+
+
+def _killed(watcher: Watcher, victim: Process, key: str) -> dict[str, Any]:
+    """SIGKILL to one: when its token goes, and when the table says so."""
+    watcher.take(0.0)
+    watcher.gone_s.clear()
+    before = watcher.states()["gone"]
+    killed_s = time.monotonic()
+    victim.seen.kill()
+    told_s = watcher.until(lambda: watcher.states()["gone"] > before, "the killed one to be missed")
+    return {
+        "killed": {"token gone after s": round(watcher.gone_s[key] - killed_s, 3), "shown after s": round(told_s, 3)}
+    }
+
+
+def settings(seconds: float) -> list[dict[str, Any]]:
+    """Payload bytes a second of one device by topic, everything subscribed to."""
+    rows = []
+    for rate, publish in SETTINGS:
+        with tempfile.TemporaryDirectory() as name, routers() as (root, leaves, _), contextlib.ExitStack() as ending:
+            process = daemon(Path(name), leaves[0], 0, rate, publish)
+            ending.callback(process.end)
+            own = {"mode": "client", "connect/endpoints": [root], "connect/timeout_ms": -1}
+            session: Any = ending.enter_context(zenoh.open(configuration(own)))
+            subscriber: Any = session.declare_subscriber("imu/**", zenoh.handlers.RingChannel(100_000))
+            channel = subscriber.handler
+            _wait_for_coefficients(channel)
+            time.sleep(seconds)
+            while channel.try_recv() is not None:
+                pass
+            size: Counter[str] = Counter()
+            lo, begun_s, cpu_s = _loopback_bytes(), time.monotonic(), process.cpu_s()
+            while time.monotonic() - begun_s < seconds:
+                sample = channel.try_recv()
+                if sample is None:
+                    time.sleep(0.002)
+                else:
+                    size[str(sample.key_expr).rpartition("/")[2]] += len(bytes(sample.payload))
+            took_s = time.monotonic() - begun_s
+            rows.append({
+                "rate": rate,
+                "publish": publish,
+                "payload bytes/s": {topic: round(n / took_s) for topic, n in sorted(size.items())},
+                "one hop with all headers, bytes/s": round((_loopback_bytes() - lo) / took_s / 3),
+                "processor, % of a core": round(100 * (process.cpu_s() - cpu_s) / took_s, 1),
+            })  # fmt: skip
+            print(json.dumps(rows[-1]), flush=True)
+    return rows
+
+
+def _wait_for_coefficients(channel: Any) -> None:
+    """Until kernels are there and the first fit is out."""
+    end_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end_s:
+        sample = channel.try_recv()
+        if sample is None:
+            time.sleep(0.05)
+        elif str(sample.key_expr).endswith("/coefficients"):
+            return
+    raise SystemExit("no coefficients came")
+
+
+def _loopback_bytes() -> int:
+    """Sent over ``lo`` since it is up."""
+    line = next(
+        line for line in Path("/proc/net/dev").read_text("ascii").splitlines() if line.strip().startswith("lo:")
+    )
+    return int(line.split(":")[1].split()[8])
+
+
+def _alone() -> None:
+    """Go on in a network namespace of its own, where that may be made."""
+    if os.environ.get(INSIDE) is not None or os.geteuid() != 0 or not shutil.which("unshare") or not shutil.which("ip"):
+        return
+    again = [sys.executable, "-m", "tests.experiments.benchmarks.fleet", *sys.argv[1:]]
+    line = 'ip link set lo up && exec "$@"'
+    os.environ[INSIDE] = "1"
+    os.execvp("unshare", ["unshare", "--net", "--", "sh", "-c", line, "sh", *again])
+
+
+def main() -> None:
+    """Measure, and print it as JSON."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--daemons", type=int, default=50)
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--rate", type=float, default=10.0)
+    parser.add_argument("--publish", default="1 Hz")
+    parser.add_argument("--settings", action="store_true")
+    parser.add_argument("--router", nargs="+", help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.router:
+        route(*asked.router)
+        return
+    _alone()
+    if asked.settings:
+        settings(asked.seconds)
+    else:
+        print(json.dumps(fleet(asked.daemons, asked.rate, asked.publish, asked.seconds), indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,213 @@
+"""History: what it costs an estimate, its size after years, how fast it is asked, what a hundred kills leave.
+
+    python -m tests.experiments.benchmarks.history [--years 5] [--kills 100] [--keep FILE]
+
+The years are those of one device of six axes, written as the daemon writes: a row a minute, all numbers that a window
+of an hour at 100 Hz gives, thinned as they age, one event every three hours. Their values wander, step and jump like a
+sensor's that is replaced, heated and knocked.
+"""
+
+import argparse
+import math
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from monitor.estimation.estimate import Estimate
+from monitor.history import reading as past
+from monitor.history.bucket import Row, pack
+from monitor.history.columns import HEALTH, TEMPERATURE, Numbers
+from monitor.history.minute_aggregation import Minutes
+from monitor.history.query import WHAT, Question
+from monitor.history.reading import Past
+from monitor.history.sqlite_store import PastEvent, Store, reading
+from monitor.history.time_ranges import Span
+from monitor.publishing.messages import history
+from tests.experiments.benchmarks.machine import Load
+from tests.monitor.history.kills import kill
+from tests.monitor.publishing.made import estimate
+
+T0 = 1_609_459_200  # 2021-01-01
+DAY_S, MINUTES, YEAR_D = 86_400, 1440, 365.25
+LOOKS = 600  # estimates a minute at 10 Hz
+DEVICE = "bench-1"
+QUESTIONS = (
+    ("last hour", 3600.0, Question()),
+    ("last day", 86_400.0, Question()),
+    ("last month", 30 * 86_400.0, Question()),
+    ("all, N of gz", math.inf, Question(what=("coefficients",), axes=("gz",), letters=("N",))),
+    ("all, coefficients and status", math.inf, Question()),
+    ("all, everything", math.inf, Question(what=WHAT)),
+)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--years", type=float, default=5.0)
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--keep", type=Path, help="where to leave the file of the years")
+    asked = parser.parse_args()
+    load = Load()
+    cost()
+    with tempfile.TemporaryDirectory() as folder:
+        path = asked.keep or Path(folder) / "years.sqlite"
+        if asked.years:
+            years(path, asked.years)
+            queries(path)
+        if asked.kills:
+            kills(Path(folder) / "kills.sqlite", asked.kills)
+    print(load.said())
+
+
+def cost() -> None:
+    """Of an estimate in the loop, and of a row in the writer's thread."""
+    looks = [estimate(seed=seed) for seed in range(50)]
+    minutes, rows = Minutes(), []
+    begun = time.perf_counter()
+    for i in range(20_000):
+        rows.append(minutes.estimate(T0 + 0.1 * i, looks[i % 50]))
+    each = (time.perf_counter() - begun) / 20_000
+    full = [row for row in rows if row is not None]
+    print(f"an estimate: {each * 1e6:.1f} µs in the loop; {len(full[0].names)} numbers")
+    packed = _timed(lambda: [pack(row) for row in full]) / len(full)
+    print(f"a row: {packed * 1e6:.0f} µs to pack, {np.mean([len(pack(row)) for row in full]):.0f} bytes")
+
+
+def years(path: Path, count: float) -> None:
+    """Write so many years, and say what they take."""
+    rng, course = np.random.default_rng(1), _Course(estimate())
+    store, begun, written = Store(path), time.perf_counter(), 0
+    days = round(count * YEAR_D)
+    largest = 0
+    for day in range(days):
+        rows = course.day(day, rng)
+        store.add([(DEVICE, row) for row in rows], [(DEVICE, one) for one in _events(day, rng)])
+        written += len(rows)
+        while store.thin(math.inf, 1000):
+            pass
+        if day % 30 == 0 or day == days - 1:
+            largest = max(largest, _size(path))
+            if day > 100 and day % 360 == 0:
+                print(f"  after {day} d: {_size(path) / 1e6:.1f} MB", flush=True)
+    store.close()
+    took = time.perf_counter() - begun
+    print(f"{count:g} years of one device: {_size(path) / 1e6:.1f} MB (with its log at most {largest / 1e6:.1f} MB)")
+    print(f"  {written:,} rows written and thinned, {took / written * 1e6:.0f} µs each")
+    with reading(path) as reader:
+        widths = [row.width_s for row in reader.rows(DEVICE, Span(-math.inf, math.inf))]
+        print("  rows: " + ", ".join(f"{widths.count(one):,} of {one} s" for one in sorted(set(widths))))
+        print(f"  events: {reader.events(DEVICE, Span(-math.inf, math.inf), 10**9)[1]:,}")
+
+
+def queries(path: Path) -> None:
+    """How long an answer takes, from the file to the message."""
+    with reading(path) as reader:
+        held = reader.held(DEVICE)
+    assert held is not None
+    for name, seconds, asked in QUESTIONS:
+        span = Span(held[1] - seconds, held[1])
+        read_s = _timed(lambda span=span, asked=asked: _read(path, span, asked))  # type: ignore[misc]
+        found = _read(path, span, asked)
+        said_s = _timed(lambda found=found, asked=asked: history.history(found, asked, 0.0, 0))  # type: ignore[misc]
+        size = len(history.history(found, asked, 0.0, 0))
+        print(
+            f"{name}: {len(found)} buckets of {found.step_s} s; {read_s * 1e3:.0f} ms to read, "
+            f"{said_s * 1e3:.0f} ms to write as {size / 1e3:.0f} kB"
+        )
+
+
+def kills(path: Path, count: int) -> None:
+    """Kill a writer at random moments; the check is in ``tests.monitor.history.kills``."""
+    left = kill(path, count, seed=1, within_s=0.2)
+    unsaid = sum(one.found > one.acknowledged for one in left)
+    print(
+        f"{count} kills: {left[-1].found:,} minutes, each in one row, sums and extremes exact; "
+        f"{unsaid} of the kills came after a commit and before it was said"
+    )
+
+
+class _Course:
+    """Rows of days: each number wanders around what a sensor has."""
+
+    def __init__(self, first: Estimate) -> None:
+        numbers = Numbers(first)
+        self.names = (*numbers.names, *HEALTH, *TEMPERATURE)
+        values = np.concatenate([numbers.of(first), [100.0, 0.02, 1.8e8, 25.0]])
+        self._centre = values
+        # wide for what a short window knows badly, narrow for rate and memory
+        self._spread = np.array([_spread(name) for name in self.names])
+
+    def day(self, day: int, rng: np.random.Generator) -> list[Row]:
+        """A day of minutes; now and then the device is away for some of them."""
+        t = (day * MINUTES + np.arange(MINUTES)) / MINUTES  # d
+        k = len(self.names)
+        wander = np.cumsum(rng.standard_normal((MINUTES, k)), axis=0) * 0.02
+        season = 0.05 * np.sin(2.0 * np.pi * t / YEAR_D)[:, None]
+        old = 0.25 if day > 900 else 0.0  # something has aged at a stroke
+        last = self._centre * np.exp(
+            self._spread * (season + 0.03 * wander + 0.01 * rng.standard_normal((MINUTES, k)) + old)
+        )
+        half = np.abs(self._spread * rng.standard_normal((2, MINUTES, k)) * 0.004)
+        knocked = rng.random(MINUTES) < 0.5 / MINUTES
+        half[1][knocked] += 0.5 * self._spread
+        low, high = (last * (1.0 - half[0])).astype(np.float32), (last * (1.0 + half[1])).astype(np.float32)
+        n = np.where(np.isfinite(self._centre), LOOKS, 0)
+        away = slice(700, 700 + int(rng.integers(0, 400))) if rng.random() < 0.02 else slice(0, 0)
+        there = np.ones(MINUTES, np.bool_)
+        there[away] = False
+        singles, day_s = last.astype(np.float32), T0 + day * DAY_S
+        rows = []
+        for i in np.flatnonzero(there).tolist():
+            start_s, lost = day_s + 60 * i, int(rng.poisson(0.02))
+            counts = (6000 - lost, lost, 0, 0)
+            rows.append(Row(start_s, 60, start_s + 59.9, self.names, n, low[i], high[i], singles[i], counts, 1))
+        return rows
+
+
+def _spread(name: str) -> float:
+    if name in HEALTH:
+        return 0.01
+    if name in TEMPERATURE:
+        return 1.5
+    return 2.0 if ".K" in name or ".R" in name else 1.0
+
+
+def _events(day: int, rng: np.random.Generator) -> list[PastEvent]:
+    kinds = ("moved", "samples_lost", "bias_stepped", "noise_changed")
+    found = []
+    for at in np.sort(rng.uniform(0.0, DAY_S, 8)).tolist():
+        kind, t_s = kinds[int(rng.choice(4, p=[0.6, 0.35, 0.03, 0.02]))], T0 + day * DAY_S + at
+        axis = "gz" if kind in ("bias_stepped", "noise_changed") else None
+        what = {"N": {"before": 1.5e-4, "after": 2.2e-4}} if kind == "noise_changed" else {}
+        text = f"{axis or 'device'}: {kind.replace('_', ' ')} by 47 %"
+        found.append(PastEvent(t_s, kind, text, axis, what, t_s - 5.0, float(rng.uniform(3.0, 12.0))))
+    return found
+
+
+def _read(path: Path, span: Span, asked: Question) -> Past:
+    with reading(path) as reader:
+        return past.read(reader, DEVICE, span, asked.wants, asked.step_s)
+
+
+def _timed(work: Callable[[], object]) -> float:
+    """The best of three, s."""
+    taken: list[float] = []
+    for _ in range(3):
+        begun = time.perf_counter()
+        work()
+        taken.append(time.perf_counter() - begun)
+    return min(taken)
+
+
+def _size(path: Path) -> int:
+    """With what stands beside it."""
+    return sum(os.stat(one).st_size for one in path.parent.glob(f"{path.name}*"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,38 @@
+"""What a scrape of ``[metrics]`` takes of a processor, and weighs: ``python -m tests.experiments.benchmarks.metrics``.
+
+Time of the processor, with that of the client that asks: it is the same on a loaded machine.
+"""
+
+import statistics
+import time
+import urllib.request
+
+from monitor.daemon.operations.metrics import MetricsOutput
+from monitor.settings.loading import Metrics
+from tests.monitor.publishing import made
+
+SCRAPES = 30
+
+
+def main() -> None:
+    """1, 16 and 100 devices."""
+    for devices in (1, 16, 100):
+        output = MetricsOutput(Metrics("127.0.0.1", 0))
+        for i in range(devices):
+            output.health(f"device-{i}", 0.0, made.health())
+            output.estimate(f"device-{i}", 0.0, made.estimate())
+        output.start()
+        while not output.port:
+            time.sleep(0.01)
+        took_s, size = [], 0
+        for _ in range(SCRAPES):
+            begun_s = time.process_time()
+            with urllib.request.urlopen(f"http://127.0.0.1:{output.port}/metrics") as answer:
+                size = len(answer.read())
+            took_s.append(time.process_time() - begun_s)
+        output.close()
+        print(f"{devices:4d} devices: {1e3 * statistics.median(took_s):6.1f} ms, {size / 1e3:7.1f} kB")
+
+
+if __name__ == "__main__":
+    main()

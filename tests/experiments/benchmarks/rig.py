@@ -1,0 +1,207 @@
+"""What the benchmarks of the whole service share: sensors in one process, the daemon in another, a subscriber here.
+
+``python -m tests.experiments.benchmarks.rig FOLDER DEVICES RATE SECONDS`` is the process of the sensors. It opens a pseudo-terminal for
+each, linked as FOLDER/tty<i>, encodes all frames beforehand, waits for a line on standard input, writes a frame
+to each device every 1/RATE s, and leaves in FOLDER how many it wrote to each and when (monotonic ns, as seen by every
+process of the machine). A pseudo-terminal that is full is waited for and counted: a port would have lost bytes.
+"""
+
+import contextlib
+import json
+import os
+import select
+import subprocess
+import sys
+import time
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import psutil
+import zenoh
+
+from drivers.decoders import vectornav_binary
+from drivers.sample import Ints, block
+from tests.support.ports import free_port
+from tests.support.waiting import wait_for
+
+PATIENCE_S: Final = 60.0
+DAEMON: Final = "from monitor.cli import main; main()"
+DEVICE: Final = """
+[[device]]
+name = "imu{i}"
+rate = {rate}
+window = "{window}"
+{more}
+[device.driver]
+link = "serial"
+port = "{folder}/tty{i}"
+read_timeout = {read_timeout}
+decoder = "vectornav_binary"
+"""
+REST: Final = """
+[zenoh]
+listen = ["tcp/127.0.0.1:{port}"]
+[viewer]
+mode = "none"
+[log]
+level = "error"
+"""
+
+
+class Sensors:
+    """The process that writes."""
+
+    def __init__(self, folder: Path, devices: int, rate_hz: int, seconds: float) -> None:
+        self.folder = folder
+        command = [
+            sys.executable,
+            "-m",
+            "tests.experiments.benchmarks.rig",
+            str(folder),
+            str(devices),
+            str(rate_hz),
+            str(seconds),
+        ]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert self._process.stdout is not None
+        if self._process.stdout.readline() != "ready\n":
+            raise SystemExit("the process of the sensors did not start")
+
+    def go(self) -> None:
+        """Begin to write."""
+        assert self._process.stdin is not None
+        self._process.stdin.write("go\n")
+        self._process.stdin.flush()
+
+    def wait(self, timeout_s: float) -> dict[str, Any]:
+        """Counts of the whole run, once all is written; the pseudo-terminals stay open."""
+        wait_for((self.folder / "sent.json").exists, "the last frame", timeout_s)
+        sent: dict[str, Any] = json.loads((self.folder / "sent.json").read_text())
+        return sent
+
+    def written_ns(self) -> Ints:
+        """When frame i was written, monotonic ns."""
+        times: Ints = np.load(self.folder / "written.npy")
+        return times
+
+    def close(self) -> None:
+        """Hang up."""
+        self._process.communicate("stop\n", timeout=PATIENCE_S)
+
+
+class Daemon:
+    """The service in a process of its own, as ``imu-monitor run`` starts it."""
+
+    def __init__(
+        self, folder: Path, devices: int, rate_hz: int, window: str, more: str = "", read_timeout: float = 0.01
+    ) -> None:
+        self.port = free_port()
+        path = folder / "config.toml"
+        same = {"rate": rate_hz, "window": window, "folder": folder, "more": more, "read_timeout": read_timeout}
+        path.write_text("".join(DEVICE.format(i=i, **same) for i in range(devices)) + REST.format(port=self.port))
+        self._process = subprocess.Popen([sys.executable, "-c", DAEMON, "run", str(path)])
+        self.process = psutil.Process(self._process.pid)
+        wait_for(lambda: self._open_ports() >= devices, "the daemon to open its ports")
+
+    def cpu_s(self) -> float:
+        """Processor seconds so far."""
+        t = self.process.cpu_times()
+        return float(t.user + t.system)
+
+    def close(self) -> None:
+        """SIGTERM, and its exit."""
+        self._process.terminate()
+        if self._process.wait(PATIENCE_S) != 0:
+            raise SystemExit(f"the daemon ended with status {self._process.returncode}")
+
+    def _open_ports(self) -> int:
+        if self._process.poll() is not None:
+            raise SystemExit(f"the daemon ended with status {self._process.returncode}")
+        found = 0
+        for number in os.listdir(f"/proc/{self.process.pid}/fd"):
+            with contextlib.suppress(FileNotFoundError):
+                found += os.readlink(f"/proc/{self.process.pid}/fd/{number}").startswith("/dev/pts/")
+        return found
+
+
+@contextlib.contextmanager
+def subscriber(port: int) -> Iterator[zenoh.Session]:
+    """A client of the daemon, in this process."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{port}"]')
+    with zenoh.open(config) as session:
+        yield session
+
+
+def frames_of(rate_hz: int, seconds: float) -> list[bytes]:
+    """Distinct frames of a resting sensor with noise; TimeStartup goes on by one period each."""
+    n = round(rate_hz * seconds)
+    values = 1e-3 * np.random.default_rng(1).standard_normal((n, 6)) + [0.0, 0.0, 0.0, 0.0, 0.0, 9.81]
+    at = np.arange(n, dtype=np.int64) * (1_000_000_000 // rate_hz)
+    decoder = vectornav_binary.VectornavBinaryDecoder(vectornav_binary.Settings())
+    return [chunk.data for chunk in decoder.encode(block(at, values, np.full(n, np.nan), at + 1_000_000))]
+
+
+def cables(folder: Path, devices: int) -> list[int]:
+    """Pseudo-terminals; the sensors' ends, which do not wait."""
+    masters = []
+    for i in range(devices):
+        master, slave = os.openpty()
+        tty.setraw(master)
+        tty.setraw(slave)
+        (folder / f"tty{i}").symlink_to(os.ttyname(slave))
+        os.set_blocking(master, False)
+        masters.append(master)  # the slave stays open too: opening and closing it must not hang up
+    return masters
+
+
+def write_all(masters: list[int], frames: list[bytes], rate_hz: int) -> tuple[Ints, int]:
+    """Each frame to each device at its time; when each was written to the last one, and how often one was full."""
+    written_ns, full = np.zeros(len(frames), np.int64), 0
+    begun_ns = time.monotonic_ns()
+    for i, frame in enumerate(frames):
+        early_ns = begun_ns + i * 1_000_000_000 // rate_hz - time.monotonic_ns()
+        if early_ns > 0:
+            time.sleep(early_ns / 1e9)
+        for master in masters:
+            full += _write(master, frame)
+        written_ns[i] = time.monotonic_ns()
+    return written_ns, full
+
+
+def _write(master: int, data: bytes) -> int:
+    """Write all; 1 when the terminal was full meanwhile."""
+    full = 0
+    while data:
+        try:
+            data = data[os.write(master, data) :]
+        except BlockingIOError:
+            full = 1
+            select.select([], [master], [])
+    return full
+
+
+def main() -> None:
+    """The process of the sensors."""
+    folder, devices, rate_hz, seconds = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
+    frames = frames_of(rate_hz, seconds)
+    masters = cables(folder, devices)
+    print("ready", flush=True)
+    if sys.stdin.readline() != "go\n":
+        return
+    written_ns, full = write_all(masters, frames, rate_hz)
+    np.save(folder / "written.npy", written_ns)
+    late_s = float(np.max((written_ns - written_ns[0]) / 1e9 - np.arange(len(frames)) / rate_hz))
+    result = {"each": len(frames), "full": full, "seconds": (written_ns[-1] - written_ns[0]) / 1e9, "latest": late_s}
+    (folder / "sent.part").write_text(json.dumps(result))
+    (folder / "sent.part").rename(folder / "sent.json")
+    sys.stdin.readline()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,235 @@
+"""A simulated month through the whole service, as fast as it goes: decoder, clock, window, watch, outputs, store.
+
+    python -m tests.experiments.benchmarks.soak --days 30 --rate 50 --plot docs/pictures/soak.png
+
+The sensor's frames are made and decoded as on a wire; one in 20 000 is lost, one in 20 000 has a flipped byte, and
+there is rubbish between two of 50 000. Memory, descriptors, threads and the store's size are taken every second of the
+run. At the end all sums must be exact: sent = received + lost + flipped, and the recording holds what was received.
+"""
+
+import argparse
+import dataclasses
+import os
+import tempfile
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+import psutil
+
+from drivers.decoders import vectornav_binary
+from drivers.driver import Counts
+from drivers.errors import LinkEnded, LinkLost
+from drivers.links.base import Carrier
+from drivers.recordings import segment
+from drivers.sample import Chunk, block
+from monitor.daemon.service import Service
+from monitor.history.sqlite_store import reading
+from monitor.history.time_ranges import Span
+from monitor.noise.catalogue import read_model
+from monitor.settings import loading
+
+ROWS: Final = 8192
+START_NS: Final = 1_760_000_000_000_000_000
+LOST: Final = 1 / 20_000
+FLIPPED: Final = 1 / 20_000
+RUBBISH: Final = 1 / 50_000
+CONFIG = """
+[[device]]
+name = "soak"
+rate = {rate}
+[device.driver]
+link = "virtual"
+decoder = "vectornav_binary"
+[zenoh]
+listen = ["tcp/127.0.0.1:0"]
+[viewer]
+mode = "none"
+[storage]
+folder = "{folder}"
+keep = "{keep}"
+"""
+
+
+@dataclass
+class Truth:
+    """What was put on the wire."""
+
+    sent: int = 0
+    lost: int = 0
+    flipped: int = 0
+    rubbish: int = 0
+
+
+class Wire:
+    """A link that brings a month of frames as fast as they are taken."""
+
+    carrier: Carrier = "bytes"
+    epoch: Literal["monotonic", "unix"] = "unix"
+    name = "a simulated wire"
+
+    def __init__(self, rate_hz: float, samples: int) -> None:
+        self.truth = Truth()
+        self._rate_hz = rate_hz
+        self._samples = samples
+        self._encoder = vectornav_binary.build(vectornav_binary.Settings())
+        self._stream = read_model(loading.CONFIG_FOLDER / "models" / "consumer-mems.toml").stream(rate_hz, 1)
+        self._rng = np.random.default_rng(1)
+        self._closed = threading.Event()
+
+    def open(self) -> None:
+        self._closed.clear()
+
+    def close(self) -> None:
+        self._closed.set()
+
+    def read(self, timeout_s: float) -> list[Chunk] | None:
+        if self._closed.is_set():
+            raise LinkLost("closed")
+        truth = self.truth
+        n = min(ROWS, self._samples - truth.sent)
+        if n == 0:
+            raise LinkEnded("the end of the month")
+        index = np.arange(truth.sent, truth.sent + n)
+        drawn = self._stream.draw_all(n)
+        t_ns = START_NS + np.rint(index * (1e9 / self._rate_hz)).astype(np.int64)
+        ticks = np.rint(index * (1e9 / self._rate_hz)).astype(np.int64)
+        samples = block(t_ns, drawn.values, 24.0 + 6.0 * np.sin(index * (2 * np.pi / 86400 / self._rate_hz)), ticks)
+        frames = [chunk.data for chunk in self._encoder.encode(samples)]
+        return [Chunk(self._hurt(frames, n), int(t_ns[-1]))]
+
+    def _hurt(self, frames: list[bytes], n: int) -> bytes:
+        """The frames with what goes wrong on the way; the first and the last stay, so that all can be counted."""
+        places = self._rng.random(n)
+        places[[0, -1]] = 1.0
+        for at in np.flatnonzero(places < LOST):
+            frames[at] = b""
+            self.truth.lost += 1
+        for at in np.flatnonzero((places >= LOST) & (places < LOST + FLIPPED)):
+            hurt = bytearray(frames[at])
+            hurt[12] ^= 0x10
+            frames[at] = bytes(hurt)
+            self.truth.flipped += 1
+        for at in np.flatnonzero((places >= LOST + FLIPPED) & (places < LOST + FLIPPED + RUBBISH)):
+            frames[at] += self._rng.bytes(40).replace(b"\xfa", b"\x00")
+            self.truth.rubbish += 1
+        self.truth.sent += n
+        return b"".join(frames)
+
+
+@dataclass
+class Course:
+    """What the process took, once a second."""
+
+    days: list[float] = field(default_factory=list)
+    rows: list[tuple[float, ...]] = field(default_factory=list)  # MB, descriptors, threads, MB of the store
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--days", type=float, default=30.0)
+    parser.add_argument("--rate", type=float, default=50.0)
+    parser.add_argument("--keep", default="30d", help="of the recording")
+    parser.add_argument("--plot", type=Path)
+    wanted = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "soak.toml"
+        path.write_text(CONFIG.format(rate=wanted.rate, folder=Path(folder) / "store", keep=wanted.keep))
+        wire = Wire(wanted.rate, round(wanted.days * 86400 * wanted.rate))
+        config = loading.load(path)
+        device = dataclasses.replace(config.devices[0], link=wire)
+        service = Service(dataclasses.replace(config, devices=(device,)))
+        course, begun = Course(), time.monotonic()
+        done = threading.Event()
+        watcher = threading.Thread(target=_watch, args=(service, wanted.rate, Path(folder) / "store", course, done))
+        watcher.start()
+        service.run()
+        done.set()
+        watcher.join()
+        took_s = time.monotonic() - begun
+        _tell(service, wire, course, took_s, Path(folder) / "store")
+        if wanted.plot is not None:
+            _draw(course, wanted.plot)
+
+
+def _watch(service: Service, rate_hz: float, store: Path, course: Course, done: threading.Event) -> None:
+    process = psutil.Process()
+    while not done.wait(1.0):
+        course.days.append(service.stations[0].driver.counts.received / rate_hz / 86400)
+        course.rows.append(
+            (process.memory_info().rss / 1e6, process.num_fds(), process.num_threads(), _size(store) / 1e6)
+        )
+
+
+def _size(folder: Path) -> int:
+    total = 0
+    for path in folder.rglob("*"):
+        try:
+            total += os.lstat(path).st_size
+        except FileNotFoundError:  # packed or deleted meanwhile
+            continue
+    return total
+
+
+def _tell(service: Service, wire: Wire, course: Course, took_s: float, store: Path) -> None:
+    counts, truth = service.stations[0].driver.counts, wire.truth
+    print(f"{truth.sent} samples in {took_s:.0f} s, {truth.sent / took_s:.0f} a second")
+    print(f"received {counts.received}, lost {counts.lost}, bad {counts.bad}; lost on the way {truth.lost},", end=" ")
+    print(f"flipped {truth.flipped}, rubbish {truth.rubbish}: {_sum(counts, truth)} of {truth.sent} sent")
+    assert _sum(counts, truth) == truth.sent
+    recorded = missing = 0
+    for path in segment.segments(store / "soak"):
+        for piece in segment.read_samples(path):
+            recorded += len(piece.samples)
+            missing += piece.samples.lost
+    print(f"recorded {recorded}, missing in the recording {missing}: sum {recorded + missing}")
+    with reading(store / "history.sqlite") as reader:
+        kept = list(reader.rows("soak", Span(-np.inf, np.inf)))
+        _, events = reader.events("soak", Span(-np.inf, np.inf), 1)
+    print(f"history: {len(kept)} rows of {', '.join(sorted({f'{row.width_s} s' for row in kept}))}, {events} events")
+    sums = [sum(row.counts[at] for row in kept) for at in range(3)]
+    print(f"received, lost and bad of all its rows: {sums}")
+    assert sums == [counts.received, counts.lost, counts.bad]
+    assert recorded == counts.received
+    early, late = _half(course, 0.1, 0.5), _half(course, 0.5, 1.0)
+    names = ("memory MB", "descriptors", "threads", "store MB")
+    for at, name in enumerate(names):
+        print(f"{name}: most before the half {early[at]:.1f}, after it {late[at]:.1f}")
+    estimator = service.stations[0].chain.estimator
+    print(f"the window holds {estimator.filled if estimator is not None else 0} samples")
+
+
+def _sum(counts: Counts, truth: Truth) -> int:
+    """A stretch of rubbish counts as a bad frame, too: nobody can tell that it never was one."""
+    assert truth.flipped <= counts.bad <= truth.flipped + truth.rubbish
+    return counts.received + counts.lost + truth.flipped
+
+
+def _half(course: Course, begin: float, end: float) -> tuple[float, ...]:
+    rows = course.rows[int(begin * len(course.rows)) : int(end * len(course.rows))]
+    return tuple(np.max(np.array(rows or [(np.nan,) * 4]), axis=0).tolist())
+
+
+def _draw(course: Course, path: Path) -> None:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(4, 1, sharex=True, figsize=(9, 8), constrained_layout=True)
+    titles = ("resident memory, MB", "open descriptors", "threads", "store on disk, MB")
+    for at, (axis, title) in enumerate(zip(axes, titles, strict=True)):
+        axis.plot(course.days, [row[at] for row in course.rows], color="#2a6f97", linewidth=1.2)
+        axis.set_ylim(bottom=0)
+        axis.set_ylabel(title)
+        axis.grid(alpha=0.3)
+    axes[-1].set_xlabel("simulated days")
+    axes[0].set_title("A simulated month through the whole service")
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    main()

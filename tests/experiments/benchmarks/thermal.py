@@ -1,0 +1,65 @@
+"""Bias that follows temperature late: what a model of one day expects of the next two, beside a cubic.
+
+    python -m tests.experiments.benchmarks.thermal [--seeds 200]
+
+72 h of means of the hour, drawn apart from the room under test: a daily swing of 3 °C with clouds, heat that is 0 to
+4 h late, noise of the means 2 to 10 % of the swing of the bias. 24 h to fit, 48 h to judge. Errors are rms of measured
+less expected over that of a third-order polynomial; the paper behind it has 0.654 multi-step.
+"""
+
+import argparse
+from collections import Counter
+
+import numpy as np
+
+from monitor.drift.thermal.thermal_fit import fitted
+from monitor.drift.thermal.thermal_model import predicted
+from tests.experiments.benchmarks.machine import console, table
+from tests.monitor.drift.made import hourly
+
+DAY = 24
+LAGS_H = (0.0, 1.0, 2.0, 4.0)
+NOISES = (0.02, 0.05, 0.1)
+
+
+def cell(lag_h: float, noise: float, seeds: int) -> tuple[str, ...]:
+    """One row of the table."""
+    ratios, inside, names = [], [], Counter[str]()
+    for seed in range(seeds):
+        means = hourly(seed, lag_h, noise)
+        model = fitted(means.upto(DAY)).model
+        multi = predicted(model, means.temperature_c, began=True)
+        one = predicted(model, means.temperature_c, means.bias, began=True)
+        cubic = np.polynomial.Polynomial.fit(means.temperature_c[:DAY], means.bias[:DAY], 3)(means.temperature_c)
+        of_cubic = np.sqrt(np.mean((means.bias - cubic)[DAY:] ** 2))
+        ratios.append([np.sqrt(np.mean((means.bias - each.bias)[DAY:] ** 2)) / of_cubic for each in (multi, one)])
+        inside.append(np.mean(((multi.lo < means.bias) & (means.bias < multi.hi))[DAY:]))
+        names["difference" if model.shape.memory else "polynomial"] += 1
+    multi_step, one_step = np.array(ratios).T
+    return (
+        f"{lag_h:g} h",
+        f"{100 * noise:.0f} %",
+        f"{np.median(multi_step):.3f}",
+        f"{np.quantile(multi_step, 0.9):.3f}",
+        f"{multi_step.max():.3f}",
+        f"{np.median(one_step):.3f}",
+        f"{100 * np.mean(inside):.1f} %",
+        f"{names['difference']} of {seeds}",
+    )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=200)
+    seeds = parser.parse_args().seeds
+    heads = ("noise", "multi-step, median", "90 %", "worst", "one-step", "inside 95 %", "difference equation")
+    made = table(f"Error over that of a cubic, {seeds} seeds a row", "late by", *heads)
+    for lag_h in LAGS_H:
+        for noise in NOISES:
+            made.add_row(*cell(lag_h, noise, seeds))
+    console.print(made)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+"""Do bias, degrees of freedom and intervals of total and Hadamard variance hold? Simulates records and counts.
+
+    python -m tests.experiments.benchmarks.total_edf --records 2000 --samples 4096
+
+For white noise, flicker, random walk, quantization and two mixtures it prints, at τ = T/8, T/4, T/2, 3T/4 and T, the
+mean of the corrected total variance over the Allan variance, its degrees of freedom as counted and as stated, and how
+often the 95 % interval holds the true deviation: with the noise known, and with the noise fitted to the same record
+(beyond T/2 that is why a curve has none). Then the same for the Hadamard variance up to T/3. Counting errors of a
+share p over n records are √(p(1 − p)/n), 0.5 % for 2000.
+"""
+
+import argparse
+from typing import Final
+
+import numpy as np
+
+from drivers.sample import Floats
+from monitor.estimation.allan.batch import cluster_sizes, overlapping, slope
+from monitor.estimation.allan.difference_moments import per_sample, spread
+from monitor.estimation.allan.hadamard import hadamard
+from monitor.estimation.allan.hadamard import moments as hadamard_moments
+from monitor.estimation.allan.total import moments as total_moments
+from monitor.estimation.allan.total import total
+from monitor.estimation.allan.uncertainty import table
+from monitor.estimation.fit.coefficient_fit import design, fit
+from monitor.noise.effect import Source
+from monitor.noise.effects.angle_random_walk import AngleRandomWalk
+from monitor.noise.effects.bias_instability import BiasInstability
+from monitor.noise.effects.quantization_noise import QuantizationNoise
+from monitor.noise.effects.rate_random_walk import RateRandomWalk
+
+SHARES: Final = (0.125, 0.25, 0.5, 0.75, 1.0)
+NOISES: Final[dict[str, tuple[float, float, float, float]]] = {  # Q N B K, τ0 = 1
+    "white": (0.0, 1.0, 0.0, 0.0),
+    "flicker": (0.0, 0.0, 1.0, 0.0),
+    "random walk": (0.0, 0.0, 0.0, 1.0),
+    "quantization": (1.0, 0.0, 0.0, 0.0),
+    "Q and N": (10.0, 1.0, 0.0, 0.0),
+    "N, B and K": (0.0, 1.0, 0.05, 0.001),
+}
+"""The last: flicker meets white noise at 900 samples, random walk flicker at 1700."""
+
+
+def records(coefficients: tuple[float, ...], n: int, count: int, rng: np.random.Generator) -> Floats:
+    """Simulated rates [n, count]."""
+    kinds: tuple[type[Source], ...] = (QuantizationNoise, AngleRandomWalk, BiasInstability, RateRandomWalk)
+    values = np.zeros((n, count))
+    for kind, letter, size in zip(kinds, "QNBK", coefficients, strict=True):
+        for column in range(count if size else 0):
+            values[:, column] += kind(**{letter: size}).start(1.0, rng).draw(n)
+    return values
+
+
+def fitted(values: Floats) -> Floats:
+    """θ [5, k] of the records themselves."""
+    factors = cluster_sizes(len(values), 1.0)
+    avar, terms = overlapping(values, factors)
+    return fit(design(factors, 1.0), table(len(values), factors), avar, terms, slope=slope(values)).theta
+
+
+Spread = tuple[Floats, Floats, Floats, Floats]
+
+
+def line(name: str, curves: tuple[Spread, Spread], truth: Floats) -> None:
+    """One noise: mean over truth, counted and stated edf, coverage with the noise known and fitted."""
+    variance, edf, _, _ = curves[0]
+    counted = 2.0 * variance.mean(axis=1) ** 2 / variance.var(axis=1)
+    cells = [
+        f"{mean / true:.3f}; {found:.3g} / {stated:.3g}"
+        for mean, true, found, stated in zip(variance.mean(axis=1), truth, counted, edf[:, 0], strict=True)
+    ]
+    for _, _, lo, hi in curves:
+        held = (lo <= np.sqrt(truth)[:, None]) & (np.sqrt(truth)[:, None] <= hi)
+        cells = [f"{cell}; {100 * share:.1f}" for cell, share in zip(cells, held.mean(axis=1), strict=True)]
+    print(f"| {name} | {' | '.join(cells)} |", flush=True)
+
+
+def main() -> None:
+    """Simulate, count, print two tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--records", type=int, default=2000)
+    parser.add_argument("--samples", type=int, default=4096)
+    parser.add_argument("--seed", type=int, default=1)
+    arguments = parser.parse_args()
+    n, rng = arguments.samples, np.random.default_rng(arguments.seed)
+    factors = np.array([min(round(share * n), n - 1) for share in SHARES])
+    thirds = np.array([n // 24, n // 12, n // 6, n // 4, n // 3])
+    own = [total_moments(n, int(m)) for m in factors]
+    other = [hadamard_moments(n, int(m)) for m in thirds]
+    print(
+        f"{arguments.records} records of {n} samples. Cells: mean over truth; edf counted / stated; % of intervals that"
+    )
+    print("hold the truth with the noise known; with the noise fitted.\n")
+    rows = []
+    print("| total variance | " + " | ".join(f"{share:g} T" for share in SHARES) + " |")
+    print("| --- " * (1 + len(SHARES)) + "|")
+    for name, coefficients in NOISES.items():
+        values = records(coefficients, n, arguments.records, rng)
+        theta = np.append(np.square(coefficients), 0.0)
+        known, found = np.repeat(theta[:, None], arguments.records, axis=1), per_sample(fitted(values), 1.0)
+        tvar, terms = total(values, factors)
+        totals = spread(own, known, tvar, terms), spread(own, found, tvar, terms)
+        line(name, totals, np.stack([one.allan for one in own]) @ theta)
+        hvar, terms = hadamard(values, thirds)
+        hadamards = spread(other, known, hvar, terms), spread(other, found, hvar, terms)
+        rows.append((name, hadamards, np.stack([one.mean for one in other]) @ theta))
+    print("\n| Hadamard variance | " + " | ".join(f"{m / n:.3f} T" for m in thirds) + " |")
+    print("| --- " * (1 + len(thirds)) + "|")
+    for row in rows:
+        line(*row)
+
+
+if __name__ == "__main__":
+    main()

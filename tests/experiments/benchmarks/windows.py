@@ -1,0 +1,289 @@
+"""Which window should weigh the squared second differences? Rectangle, one pole, two poles, Hann, a window per τ.
+
+    python -m tests.experiments.benchmarks.windows [--records 240] [--seed 1]
+
+All at equal effective length: the variance of σ² under white noise, at τ short beside the window, is that of
+the rectangle. Prints how fast each follows a step of N and forgets a burst, how much each scatters under white noise,
+flicker and random walk, what each costs, and what the five-term fit says of the curve while N is changing. The Hann
+window is computed plainly from the whole record; it has no cheap recursion, and stands here for comparison.
+"""
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.sample import AXES, Floats, Ints
+from monitor.estimation.allan.batch import cluster_sizes
+from monitor.estimation.allan.fading import FadingWindow
+from monitor.estimation.allan.uncertainty import table as covariances
+from monitor.estimation.allan.window import AllanWindow, quick_spans
+from monitor.estimation.fit.coefficient_fit import Fit, design, fit
+from monitor.estimation.fit.coefficients import Status
+from monitor.noise.effect import Source
+from monitor.noise.effects.angle_random_walk import AngleRandomWalk
+from monitor.noise.effects.bias_instability import BiasInstability
+from monitor.noise.effects.rate_random_walk import RateRandomWalk
+from monitor.noise.model import NoiseModel
+from tests.experiments.benchmarks.machine import about, alternate, console, table
+
+RATE_HZ: Final = 20.0
+WINDOW_S: Final = 3600.0
+LENGTH: Final = round(WINDOW_S * RATE_HZ)
+HANN: Final = 1.5
+"""Length of the Hann window over that of the rectangle of equal variance: (Σw)²/Σw² = 2/3 of its length."""
+N_TRUE, N_STEP, B_TRUE = 1.5e-4, 1.5, 4e-5
+LOOKS_S: Final = (-1.0, 30.0, 120.0, 600.0, 1800.0, 3600.0, 7200.0, 14_400.0)
+"""Fits, by the time since N changed."""
+KINDS: Final = ("rectangle", "one pole", "two poles", "Hann", "a window per τ")
+RESTARTED: Final = "rectangle, restarted"
+TAUS: Final = 17
+"""Of the table of costs."""
+
+Window = AllanWindow | FadingWindow
+Courses = dict[str, Floats]  # name: σ² [looks, m, 6]
+
+
+def windows(factors: Ints, length: int, rate_hz: float) -> dict[str, Window]:
+    """The recursive ones."""
+    return {
+        "rectangle": AllanWindow(length, factors),
+        "one pole": FadingWindow(factors, length, 1),
+        "two poles": FadingWindow(factors, length, 2),
+        "a window per τ": AllanWindow(length, factors, quick_spans(factors, rate_hz, length)),
+    }
+
+
+def course(window: Window, values: Floats, ends: Sequence[int]) -> Floats:
+    """σ² [looks, m, 6] after so many samples each."""
+    looks = []
+    for start, end in zip([0, *ends], ends, strict=False):
+        window.update(values[start:end])
+        looks.append(window.avar())
+    return np.array(looks)
+
+
+def hann(values: Floats, factors: Ints, length: int, ends: Sequence[int]) -> Floats:
+    """The same under Hann weights over the last 1.5 · length terms, by their definition."""
+    phase = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+    weights = np.sin(np.pi * (np.arange(round(HANN * length)) + 0.5) / round(HANN * length)) ** 2
+    looks = np.empty((len(ends), factors.size, values.shape[1]))
+    for i, m in enumerate(factors):
+        squares = (phase[2 * m :] - 2 * phase[m:-m] + phase[: -2 * m]) ** 2  # the last ends at sample 2m + its place
+        for k, end in enumerate(ends):
+            there = squares[max(0, end + 1 - 2 * m - weights.size) : end + 1 - 2 * m]
+            own = weights[weights.size - len(there) :]
+            looks[k, i] = own @ there / own.sum() / (2.0 * m * m)
+    return looks
+
+
+def courses(values: Floats, factors: Ints, length: int, rate_hz: float, ends: Sequence[int]) -> Courses:
+    """Every window's course over one record of six axes."""
+    found = {name: course(window, values, ends) for name, window in windows(factors, length, rate_hz).items()}
+    found["Hann"] = hann(values, factors, length, ends)
+    return {name: found[name] for name in KINDS}
+
+
+def changed(gain: Floats, rng: np.random.Generator) -> Floats:
+    """White noise twice: three axes as it is, and the same three times ``gain`` [n]."""
+    calm = rng.standard_normal((gain.size, 3))
+    return np.concatenate([calm, gain[:, None] * calm], axis=1) * N_TRUE
+
+
+def pairs(gain: Floats, factors: Ints, ends: Sequence[int], records: int, seed: int) -> tuple[Courses, Courses]:
+    """Courses of σ² without and with the change, [looks, m], averaged over records."""
+    sums: dict[str, Floats] = {}
+    rng = np.random.default_rng(seed)
+    for _ in range(-(-records // 3)):
+        for name, found in courses(changed(gain, rng), factors, LENGTH, RATE_HZ, ends).items():
+            sums[name] = sums.get(name, 0.0) + np.stack([found[..., :3].mean(2), found[..., 3:].mean(2)])
+    return {k: v[0] for k, v in sums.items()}, {k: v[1] for k, v in sums.items()}
+
+
+def step_table(records: int, seed: int) -> None:
+    """Seconds until a step of N shows to 50, 90 and 99 % in σ²."""
+    factors, since = np.array([1, 64, 512]), np.unique(np.round(np.geomspace(1.0, 4.0 * WINDOW_S, 160) * RATE_HZ))
+    before = 4 * LENGTH
+    ends = [before + int(s) for s in since]
+    gain = np.where(np.arange(ends[-1]) < before, 1.0, N_STEP)
+    calm, step = pairs(gain, factors, ends, records, seed)
+    shown = table(f"a step of N × {N_STEP}: seconds until so much of it shows in σ² (mean of {records} records)",
+                  "share, τ", *KINDS)  # fmt: skip
+    for i, m in enumerate(factors):
+        for wanted in (0.5, 0.9, 0.99):
+            reached = [crossing(since / RATE_HZ, step[name][:, i] / calm[name][:, i], wanted) for name in KINDS]
+            shown.add_row(f"{wanted:.0%} at {m / RATE_HZ:g} s", *(f"{t:.0f}" for t in reached))
+    console.print(shown)
+
+
+def crossing(t: Floats, ratio: Floats, wanted: float) -> float:
+    """When that share of the step in σ² is reached first, between looks by a straight line."""
+    share = (ratio - 1.0) / (N_STEP**2 - 1.0)
+    k = int(np.argmax(share >= wanted))
+    return float(t[0] if k == 0 else np.interp(wanted, share[k - 1 : k + 1], t[k - 1 : k + 1]))
+
+
+def burst_table(records: int, seed: int) -> None:
+    """Windows until one second of larger noise is less than 1 % of σ²."""
+    factors, since = np.array([1, 64]), np.arange(0.02, 10.0, 0.02)
+    before = 4 * LENGTH
+    ends = [before + round(RATE_HZ) + round(s * LENGTH) for s in since]
+    shown = table(f"a burst of 1 s: windows until it is within 1 % of σ² for good (mean of {records} records)",
+                  "burst, τ", *KINDS)  # fmt: skip
+    for height in (10.0, 100.0, 10_000.0):
+        gain = np.ones(ends[-1])
+        gain[before : before + round(RATE_HZ)] = height
+        calm, burst = pairs(gain, factors, ends, records, seed)
+        for i, m in enumerate(factors):
+            left = [since[_looks_until(burst[name][:, i] <= 1.01 * calm[name][:, i])] for name in KINDS]
+            shown.add_row(f"{height:,g} × the noise, {m / RATE_HZ:g} s", *(f"{t:.2f}" for t in left))
+    console.print(shown)
+
+
+def _looks_until(held: NDArray[np.bool_]) -> int:
+    """The first look from which on it holds; the last one must."""
+    return 0 if held.all() else int(np.flatnonzero(~held)[-1]) + 1
+
+
+def noises(n: int, records: int, seed: int, source: Source, rate_hz: float) -> Iterator[Floats]:
+    """Six records at a time of one kind of noise."""
+    for k in range(-(-records // len(AXES))):
+        yield NoiseModel(dict.fromkeys(AXES, (source,))).simulate(n, rate_hz, seed + k)
+
+
+def scatter_table(records: int, seed: int) -> None:
+    """Standard deviation of the Allan deviation at rest, in percent of it."""
+    length, factors = 4096, np.array([1, 16, 128, 512])
+    rate_hz = length / WINDOW_S
+    kinds = {"white": AngleRandomWalk(N=1e-4), "flicker": BiasInstability(B=1e-4), "walk": RateRandomWalk(K=1e-4)}
+    shown = table(f"standard deviation of the deviation at rest, % ({records} records; "
+                  f"itself known to {70.0 / np.sqrt(records):.1f} % of it)", "noise, τ", *KINDS)  # fmt: skip
+    for kind, source in kinds.items():
+        every: dict[str, list[Floats]] = {name: [] for name in KINDS}
+        for values in noises(6 * length, records, seed, source, rate_hz):
+            for name, found in courses(values, factors, length, rate_hz, [6 * length]).items():
+                every[name].append(np.sqrt(found[0]))
+        deviations = [np.concatenate(every[name], axis=1) for name in KINDS]
+        for i, m in enumerate(factors):
+            shown.add_row(f"{kind}, T/{length // m}", *(f"{100 * d[i].std() / d[i].mean():.1f}" for d in deviations))
+    console.print(shown)
+
+
+def cost_table(rounds: int, seed: int) -> None:
+    """Processor time a sample and bytes held, an hour at 100 Hz."""
+    length, factors = 360_000, 2 ** np.arange(TAUS)
+    values = N_TRUE * np.random.default_rng(seed).standard_normal((20_000, 6)) + 9.81
+    works: dict[str, Callable[[], None]] = {}
+    held = {}
+    for name, window in windows(factors, length, 100.0).items():
+        for _ in range(-(-(length + 1000) // len(values))):
+            window.update(values)
+        held[name] = bytes_of(window)
+        works[f"{name} blocks"] = advancing(window, values, 100)
+        works[f"{name} singles"] = advancing(window, values[:2000], 1)
+    took = alternate(works, rounds)
+    shown = table(f"cost: {TAUS} τ, six axes, window of {length:,} samples; median (best) of {rounds} rounds",
+                  "window", "ns a sample, 100 a call", "ns a sample, 1 a call", "kB held")  # fmt: skip
+    for name, size in held.items():
+        each = [[t * 1e9 / n for t in took[f"{name} {how}"]] for how, n in (("blocks", 20_000), ("singles", 2_000))]
+        shown.add_row(name, *(f"{median:.0f} ({best:.0f})" for median, best in each), f"{size / 1e3:,.0f}")
+    console.print(shown)
+    month = FadingWindow(2 ** np.arange(30), 30 * 86_400e3)
+    console.print(f"a month at 1 kHz, 30 τ, one pole: {bytes_of(month) / 1e3:,.0f} kB held\n")
+
+
+def bytes_of(window: Window) -> int:
+    """Memory of its arrays; most of the rectangle's are views of three."""
+    if isinstance(window, AllanWindow):
+        return window._ints.nbytes + window._floats.nbytes + window._missing.nbytes
+    return sum(array.nbytes for array in vars(window).values() if isinstance(array, np.ndarray))
+
+
+def advancing(window: Window, values: Floats, size: int) -> Callable[[], None]:
+    """Advance by all values, ``size`` samples a call."""
+    blocks = [values[i : i + size] for i in range(0, len(values), size)]
+
+    def work() -> None:
+        for one in blocks:
+            window.update(one)
+
+    return work
+
+
+def fit_table(records: int, seed: int) -> None:
+    """What the five-term fit says over each kind of curve while N changes; truth: N and B, nothing else."""
+    factors = cluster_sizes(LENGTH, RATE_HZ)
+    before = 4 * LENGTH
+    ends = [before + round(s * RATE_HZ) for s in LOOKS_S]
+    model = NoiseModel(dict.fromkeys(AXES, (BiasInstability(B=B_TRUE),)))
+    fits: dict[tuple[str, int], list[Fit]] = {}
+    for k in range(-(-records // len(AXES))):
+        white = np.random.default_rng([seed, k]).standard_normal((ends[-1], 6)) * N_TRUE * np.sqrt(RATE_HZ)
+        white[before:] *= N_STEP
+        values = white + model.simulate(ends[-1], RATE_HZ, seed + k)
+        for name, found in courses(values, factors, LENGTH, RATE_HZ, ends).items():
+            for look, avar in enumerate(found):
+                fits.setdefault((name, look), []).append(fitted(name, factors, avar))
+        for look, one in enumerate(restarted(values, factors, before, ends)):
+            fits.setdefault((RESTARTED, look), []).append(one)
+    names = (*KINDS, RESTARTED)
+    shown = table(f"the fit while N changes: N over its value now / % of axes with Q or K in / % whose B the interval "
+                  f"misses ({records} records)", f"since N × {N_STEP}", *names)  # fmt: skip
+    for look, since_s in enumerate(LOOKS_S):
+        truth = N_TRUE * (N_STEP if since_s > 0.0 else 1.0)
+        shown.add_row(
+            "at rest" if since_s < 0.0 else f"{since_s:g} s", *(said(fits[name, look], truth) for name in names)
+        )
+    console.print(shown)
+
+
+def fitted(name: str, factors: Ints, avar: Floats, length: int = LENGTH) -> Fit:
+    """The fit as if the curve were a rectangle's, each row of its own number of terms."""
+    whole = covariances(length, factors)
+    spans = quick_spans(factors, RATE_HZ, length) if name == "a window per τ" else np.full(factors.size, length)
+    terms = np.repeat(np.maximum(spans + 1 - 2 * factors, 0)[:, None], 6, axis=1)
+    return fit(design(factors, RATE_HZ), whole, avar, terms)
+
+
+def restarted(values: Floats, factors: Ints, before: int, ends: Sequence[int]) -> Iterator[Fit]:
+    """The rectangle, all before the change forgotten at the first look after it."""
+    window = AllanWindow(LENGTH, factors)
+    for look, (start, end) in enumerate(zip([0, *ends], ends, strict=False)):
+        if look == 1:
+            window.reset()
+            start = before
+        window.update(values[start:end])
+        yield fitted(RESTARTED, factors, window.avar(), window.n)
+
+
+def said(fits: Sequence[Fit], truth: float) -> str:
+    """One cell: N's ratio, false terms, B outside its interval."""
+    status = np.concatenate([f.coefficients.status for f in fits], axis=1)
+    theta = np.concatenate([f.theta for f in fits], axis=1)
+    lo, hi = (np.concatenate([getattr(f.coefficients, end) for f in fits], axis=1)[2] for end in ("lo", "hi"))
+    false = (status[[0, 3]] == Status.ESTIMATED).any(axis=0)
+    wrong = (lo > B_TRUE) | (hi < B_TRUE)
+    return f"{np.nanmedian(np.sqrt(theta[1])) / truth:.2f} / {100.0 * false.mean():.0f} / {100.0 * wrong.mean():.0f}"
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument(
+        "--records", type=int, default=240, help="of the fits; a tenth of the scatter's, 8 × the steps'"
+    )
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    console.print(about())
+    step_table(max(given.records // 8, 3), given.seed)
+    burst_table(max(given.records // 40, 3), given.seed)
+    scatter_table(10 * given.records, given.seed)
+    cost_table(given.rounds, given.seed)
+    fit_table(given.records, given.seed)
+
+
+if __name__ == "__main__":
+    main()

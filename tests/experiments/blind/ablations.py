@@ -1,0 +1,128 @@
+"""What each rule of ``reconcile`` is for: the blind set with one rule switched off at a time.
+
+    python -m tests.experiments.blind.ablations [--seeds 2] [--seconds 1200]
+
+Switched off are: the simulated null (each lens gets the 99 % point of χ² with one degree of freedom, as if it looked at
+one place once), the held-out halves (whatever is worth its price is taken), the joint refit (a candidate is fitted
+beside the model as it stands: no known size may move), and the names that are withdrawn at the end. Counted are names
+on recordings of a true model, hidden effects that are named, false names beside them, and foreign effects that get one.
+"""
+
+import argparse
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+from unittest.mock import patch
+
+from tests.experiments.blind.run import Job, run
+
+NULLS = 10
+HIDDEN = (
+    *("sinusoidal", "narrowband", "exponentially_correlated", "rate_ramp", "bias_step", "temperature_bias"),
+    *("outliers", "cross_axis"),
+)
+FOREIGN = ("foreign:chirp", "foreign:amplitude_modulated_line", "foreign:wandering_line", "foreign:pulse_train")
+
+
+@contextmanager
+def as_it_is() -> Iterator[None]:
+    """Nothing switched off."""
+    yield
+
+
+@contextmanager
+def without_null() -> Iterator[None]:
+    """Thresholds from a table instead of from simulated recordings."""
+    from monitor.reconcile import reconcile
+    from monitor.reconcile.diagnostics import gap
+
+    def table(simulated: Mapping[str, Sequence[Any]], _looks: int) -> dict[str, dict[str, gap.Null]]:
+        return {axis: {lens: gap.Null(1.92, 3.32) for lens in gap.LENSES} for axis in simulated}
+
+    with patch.object(reconcile, "nulls", table):
+        yield
+
+
+@contextmanager
+def without_proof() -> Iterator[None]:
+    """Nothing held out."""
+    from monitor.reconcile.search import search
+
+    def believed(*_arguments: object) -> Any:
+        return search.Proof(float("nan"), float("nan"), True, "not asked")
+
+    with patch.object(search, "proof", believed):
+        yield
+
+
+@contextmanager
+def without_refit() -> Iterator[None]:
+    """The model's own sizes stay whatever is added."""
+    from monitor.reconcile.likelihood import hypothesis
+    from monitor.reconcile.search import search, trials
+
+    def stiff(axis: Any, found: Sequence[Any], model: tuple[Any, ...]) -> Any:
+        held = frozenset(at for at, effect in enumerate(model) if type(effect) in hypothesis.NOISE)
+        return hypothesis.Hypothesis(model, axis.fit((*model, *found), held))
+
+    with patch.object(search, "settled", stiff), patch.object(trials, "settled", stiff):
+        yield
+
+
+@contextmanager
+def without_withdrawal() -> Iterator[None]:
+    """Names stay, whatever is left at their place."""
+    from monitor.reconcile.search import search
+
+    with patch.object(search, "upheld", lambda state, *_others: state.found):
+        yield
+
+
+VARIANTS: dict[str, Callable[[], Any]] = {
+    "as it is": as_it_is,
+    "without the simulated null": without_null,
+    "without held-out halves": without_proof,
+    "without the joint refit": without_refit,
+    "without withdrawn names": without_withdrawal,
+}
+
+
+def main() -> None:
+    """Run all variants and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--seconds", type=float, default=1200.0)
+    parser.add_argument("--only", nargs="*", choices=VARIANTS, default=list(VARIANTS))
+    asked = parser.parse_args()
+    heads = ("", "true models accused", "given a name", "hidden and named", "5 % off", "false names", "foreign named")
+    print("| " + " | ".join(heads) + " |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for name in asked.only:
+        print(f"| {name} | " + " | ".join(_counts(VARIANTS[name], asked.seeds, asked.seconds)) + " |", flush=True)
+
+
+def _counts(variant: Callable[[], Any], seeds: int, seconds: float) -> list[str]:
+    def job(name: str, seed: int) -> Job:
+        return Job(name, "plain", seed, seconds, axes=2)
+
+    with variant():
+        nulls = [run(job("null", seed), in_process=True) for seed in range(NULLS)]
+        hidden = [run(job(name, seed), in_process=True) for name in HIDDEN for seed in range(seeds)]
+        off = [
+            run(replace(job(name, seed), baseline="off"), in_process=True) for name in HIDDEN for seed in range(seeds)
+        ]
+        foreign = [run(job(name, seed), in_process=True) for name in FOREIGN for seed in range(seeds)]
+    named = [sum(not one.missed for one in group) for group in (hidden, off)]
+    return [
+        f"{sum(one.verdict != 'agrees' for one in nulls)} of {len(nulls)}",
+        f"{sum(bool(one.names) for one in nulls)} of {len(nulls)}",
+        f"{named[0]} of {len(hidden)}",
+        f"{named[1]} of {len(off)}",
+        f"{sum(len(one.false) for one in [*hidden, *off])}",
+        f"{sum(bool(one.false) for one in foreign)} of {len(foreign)}",
+    ]
+
+
+if __name__ == "__main__":
+    main()

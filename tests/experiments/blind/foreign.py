@@ -1,0 +1,119 @@
+"""Effects that no name of the vocabulary stands for: a report about them must say so, not give the nearest name.
+
+``SERIES`` add to the rate; ``LEVELS`` multiply the white noise. ``size`` is in units of the white noise of a sample,
+so that one number serves gyroscopes and accelerometers. ``HONEST`` lists names that are nevertheless right: two
+correlated noises may be found as two, and a bias that follows (T − T_r)² as a temperature bias whose quadratic
+coefficient is given.
+"""
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from tests.experiments.blind.processes import Clock, Floats, exponentially_correlated, shaped
+
+
+def chirp(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
+    """A line that sweeps from 4 to 20 Hz over the recording."""
+    seconds = clock.n / clock.rate_hz
+    phase = 2.0 * np.pi * (4.0 * clock.t_s + 8.0 * clock.t_s**2 / seconds)
+    return 0.25 * size * np.sin(phase + rng.uniform(0.0, 2.0 * np.pi))
+
+
+def power_law(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
+    """S ∝ f^−1.5, as strong as white noise at 3 Hz."""
+    floor = size**2 / clock.rate_hz
+    return shaped(clock, rng, lambda f: floor * (f / 3.0) ** -1.5)
+
+
+def amplitude_modulated_line(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
+    """A line of 11.7 Hz that swells and fades every 50 s."""
+    swell = 1.0 + 0.8 * np.sin(2.0 * np.pi * clock.t_s / 50.0)
+    return 0.15 * size * swell * np.sin(2.0 * np.pi * 11.7 * clock.t_s + rng.uniform(0.0, 2.0 * np.pi))
+
+
+def wandering_line(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
+    """A line of constant amplitude whose frequency wanders by 0.3 Hz about 13 Hz, over minutes: a motor."""
+    away_hz = exponentially_correlated(clock, rng, 0.3, 200.0)
+    phase = 2.0 * np.pi * np.cumsum(13.0 + away_hz) / clock.rate_hz
+    return 0.2 * size * np.sin(phase)
+
+
+def quadratic_temperature(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
+    """A bias that follows (T − mean)² and not T."""
+    if clock.temperature_c is None:
+        raise ValueError("quadratic_temperature needs a temperature")
+    away = clock.temperature_c - clock.temperature_c.mean()
+    square = away**2
+    square -= square.mean() + away * float(np.dot(square - square.mean(), away) / np.dot(away, away))
+    return np.asarray(0.4 * size * square / square.std())
+
+
+def quadratic_drift(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
+    """t², about the middle of the recording."""
+    t = 2.0 * clock.t_s * clock.rate_hz / clock.n - 1.0
+    return float(rng.choice((-1.0, 1.0))) * size * np.square(t)
+
+
+def pulse_train(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
+    """20 ms of every second: something else in the box is polled."""
+    return np.where(np.mod(clock.t_s + rng.uniform(0.0, 1.0), 1.0) < 0.02, 0.4 * size, 0.0)
+
+
+def two_correlated(clock: Clock, rng: np.random.Generator, size: float) -> Floats:
+    """Correlated noise of 0.5 s and of 40 s."""
+    fast, slow = (exponentially_correlated(clock, rng, 1.0, time_s) for time_s in (0.5, 40.0))
+    return 0.4 * size * (fast + slow)
+
+
+SERIES: Final[dict[str, Callable[[Clock, np.random.Generator, float], Floats]]] = {
+    function.__name__: function
+    for function in (
+        chirp,
+        power_law,
+        amplitude_modulated_line,
+        wandering_line,
+        quadratic_temperature,
+        quadratic_drift,
+        pulse_train,
+        two_correlated,
+    )
+}
+
+
+def breathing(clock: Clock, rng: np.random.Generator) -> Floats:
+    """The variance of the white noise rises and falls by 40 % in 300 s."""
+    return _breath(clock, rng, 0.4)
+
+
+def shallow_breathing(clock: Clock, rng: np.random.Generator) -> Floats:
+    """By 6 %."""
+    return _breath(clock, rng, 0.06)
+
+
+def _breath(clock: Clock, rng: np.random.Generator, depth: float) -> Floats:
+    return np.sqrt(1.0 + depth * np.sin(2.0 * np.pi * clock.t_s / 300.0 + rng.uniform(0.0, 2.0 * np.pi)))
+
+
+def bursts(clock: Clock, rng: np.random.Generator) -> Floats:
+    """Three times the noise for four seconds, about every five minutes."""
+    seconds = clock.n / clock.rate_hz
+    gain = np.ones(clock.n)
+    for begin_s in rng.uniform(0.0, seconds - 4.0, max(3, round(seconds / 300.0))):
+        gain[round(begin_s * clock.rate_hz) : round((begin_s + 4.0) * clock.rate_hz)] = 3.0
+    return gain
+
+
+def student_t(clock: Clock, rng: np.random.Generator) -> Floats:
+    """Student's t of 5 degrees of freedom with the variance of the Gaussian: √(3/χ²₅) in front of it."""
+    return np.sqrt(3.0 / rng.chisquare(5.0, clock.n))
+
+
+LEVELS: Final[dict[str, Callable[[Clock, np.random.Generator], Floats]]] = {
+    function.__name__: function for function in (breathing, shallow_breathing, bursts, student_t)
+}
+
+NAMES: Final = (*SERIES, *LEVELS)
+NEEDS_TEMPERATURE: Final = ("quadratic_temperature",)
+HONEST: Final = {"two_correlated": ("exponentially_correlated",), "quadratic_temperature": ("temperature_bias",)}

@@ -1,0 +1,290 @@
+"""Recordings and logs: every format of the folder, from bytes, cut and damaged, with lengths that lie.
+
+What comes out of a recording is numbers or NaN, as many in each column as there are times, and times that fit int64
+nanoseconds. A log gives chunks of possible sizes at possible times, or ends with the words of its link.
+"""
+
+import gzip
+import io
+import json
+import struct
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, Final
+from unittest import mock
+
+import numpy as np
+
+from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError
+from drivers.links.replay_link import Settings, build
+from drivers.recordings import FORMATS, iter_blocks, load_samples, memory_check, save_samples
+from tests.experiments.fuzz.checks import one_line
+from tests.experiments.fuzz.tape import Tape
+from tests.experiments.fuzz.target import Check, target
+
+LARGEST_NS: Final = 1 << 62
+ROOM: Final = Path("/dev/shm") if Path("/dev/shm").is_dir() else None
+RATE_HZ: Final = 100.0
+FREE_BYTES: Final = 100_000_000
+"""What readers are told to be free: a recording that a file only states is refused, one that is read stays small."""
+
+
+@cache
+def folder() -> Path:
+    """A folder of this process, in memory where there is one."""
+    kept = tempfile.TemporaryDirectory(dir=ROOM)
+    _KEPT.append(kept)
+    return Path(kept.name)
+
+
+_KEPT: Final[list[tempfile.TemporaryDirectory[str]]] = []
+
+
+def recorded(path: Path) -> None:
+    """Read a recording, and look at all of it."""
+    try:
+        with mock.patch.object(memory_check, "free_bytes", return_value=FREE_BYTES):
+            recording = load_samples(path, RATE_HZ)
+    except (RecordingError, ConfigError) as error:
+        one_line(error)
+        return
+    n = len(recording)
+    assert n >= 1
+    assert recording.values.shape == (n, 6)
+    assert recording.temperature_c.shape == (n,)
+    assert not np.isinf(recording.values).any()
+    assert not np.isinf(recording.temperature_c).any()
+    assert recording.rate_hz is None or 0.0 < recording.rate_hz < float("inf"), recording.rate_hz
+    if recording.t_s is not None:
+        assert recording.t_s.shape == (n,)
+        assert (np.abs(recording.t_s) * 1e9 < LARGEST_NS).all()
+    for note in recording.notes:
+        assert "\n" not in note, "a note of several lines"
+        assert len(note) < 2000, "an endless note"
+    rows = 0
+    for block in iter_blocks(recording, 4096):
+        rows += len(block)
+        assert (np.abs(block.t_ns) < LARGEST_NS).all()
+    assert rows == n
+
+
+def recording_check(suffix: str) -> Check:
+    """The target of one format: the file's bytes."""
+
+    def check(data: bytes) -> None:
+        path = folder() / f"a{suffix}"
+        path.write_bytes(data)
+        recorded(path)
+
+    return check
+
+
+def recording_seeds(suffix: str) -> Iterator[bytes]:
+    """What the project writes."""
+    rng = np.random.default_rng(7)
+    for n, axes in ((3, ("gz",)), (12, ("gx", "gy", "gz", "ax", "ay", "az"))):
+        path = folder() / f"seed{suffix}"
+        values = np.round(rng.normal(size=(n, 6)), 2)
+        save_samples(path, np.arange(n) * 0.01, values, np.full(n, 25.0), axes)
+        data = path.read_bytes()
+        yield data
+        yield data[: len(data) * 2 // 3]
+    if suffix == ".csv":
+        yield b't,gx,"az",temp\r\n0,1,,nan\r\n0.01,inf,"2",\r\n\r\n0.02,1e999,x,3\r\n0.03,1,2,3\r\n'
+    if suffix == ".npz":
+        packed = io.BytesIO()
+        np.savez(packed, fs=np.array(100), gz=np.arange(4.0), ax=np.arange(4, dtype=np.int16))
+        yield packed.getvalue()
+    if suffix in (".arrow", ".parquet", ".arrows"):
+        yield from _arrow_seeds(suffix)
+
+
+def _arrow_seeds(suffix: str) -> Iterator[bytes]:
+    """Other types, nulls, compression, dictionaries."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    table = pa.table(
+        {
+            "t": pa.array([0.0, 0.01, None, 0.03]),
+            "gz": pa.array([1, 2, None, 4], pa.int16()),
+            "ax": pa.array([1.0, 1.0, 1.0, 1.0], pa.float32()),
+            "word": pa.array(["a", "b", "a", None]).dictionary_encode(),
+        }
+    )
+    for how in ("lz4", "zstd", None):
+        sink = io.BytesIO()
+        if suffix == ".parquet":
+            parquet.write_table(table, sink, compression=how or "none")
+        else:
+            new = pa.ipc.new_file if suffix == ".arrow" else pa.ipc.new_stream
+            with new(sink, table.schema, options=pa.ipc.IpcWriteOptions(compression=how)) as writer:
+                writer.write_table(table)
+        yield sink.getvalue()
+
+
+SIZES: Final = {".csv": 2000, ".csv.gz": 2000}
+WORDS: Final = {
+    ".csv": ("t,gx,gy,gz\n", "temp", "nan", "inf", "1e999", "\r\n", '"', ",", "\0", "-9.3e9", "#", "1_0"),
+    ".npz": ("PK\3\4", "PK\1\2", "PK\5\6", "gz.npy", "t.npy", "fs.npy", "\x93NUMPY", "'<f8'", "(99999999999,)"),
+    ".parquet": ("PAR1", "gz", "t"),
+    ".arrow": ("ARROW1\0\0", b"\xff\xff\xff\xff"),
+    ".arrows": (b"\xff\xff\xff\xff", b"\0\0\0\0"),
+}  # fmt: skip
+
+for _suffix in FORMATS:
+    _name = f"recording-{_suffix[1:].replace('.', '-')}"
+    target(_name, partial(recording_seeds, _suffix), SIZES.get(_suffix, 6000), WORDS.get(_suffix, ()))(
+        recording_check(_suffix)
+    )
+
+
+@target(
+    "recording-npz-arrays",
+    [bytes([i, 1, 1, *b"\x08" * 20, *range(60)]) for i in range(6)],
+    1000,
+    ("'descr': '<f8', 'fortran_order': False, 'shape': (4,), }", "'|O'", "(9999999999,)", "('<f8', (3,))", "'<U9'"),
+)
+def npz_arrays(data: bytes) -> None:
+    """An archive that is whole, of arrays whose headers say anything."""
+    tape = Tape(data)
+    with zipfile.ZipFile(packed := io.BytesIO(), "w") as archive:
+        for name in ("t", "gz", "fs", "temperature")[: 1 + tape.byte() % 4]:
+            kind = tape.byte()
+            body = tape.piece() * (1 + tape.byte() % 16 * (kind & 1) * 100)
+            header = tape.piece() if kind & 2 else _header(tape).encode()
+            version = (1, 2, 3, 9)[kind >> 2 & 3 if kind & 16 else 0]
+            size = struct.pack("<H" if version == 1 else "<I", len(header))
+            how = zipfile.ZIP_DEFLATED if kind & 32 else zipfile.ZIP_STORED
+            archive.writestr(f"{name}.npy", b"\x93NUMPY" + bytes([version, 0]) + size + header + body, how)
+    whole = packed.getvalue()
+    path = folder() / "a.npz"
+    path.write_bytes(whole[: -22 if tape.byte() & 1 else None])
+    recorded(path)
+
+
+def _header(tape: Tape) -> str:
+    dtype = tape.choice(
+        ("'<f8'", "'<i2'", "'>f4'", "'|u1'", "'<f2'", "'|O'", "'<c16'", "'|b1'", "'<M8[s]'", "[('a', '<f8')]")
+    )
+    shape = tape.choice(
+        ("(4,)", "(7,)", "()", "(2, 2)", "(99999999999,)", "(300000000,)", "(-1,)", "(0,)", "(1 << 3,)")
+    )
+    return f"{{'descr': {dtype}, 'fortran_order': {tape.byte() % 2 == 1}, 'shape': {shape}, }}\n"
+
+
+# --- logs
+
+
+def replayed(path: Path, channel: str | None = None) -> None:
+    """Replay a file to its end."""
+    try:
+        link = build(Settings(path=str(path), speed="max", channel=channel))
+    except ConfigError as error:
+        one_line(error)
+        return
+    try:
+        with mock.patch.object(memory_check, "free_bytes", return_value=FREE_BYTES):
+            link.open()
+        for _ in range(1000):
+            for chunk in link.read(0.0) or []:
+                assert abs(chunk.t_ns) < LARGEST_NS, "a time beyond int64"
+                assert 0 <= chunk.address < 1 << 32, "no CAN identifier"
+                if link.carrier == "frames":
+                    assert len(chunk.data) <= 64, "no CAN frame is so long"
+    except (LinkUnavailable, LinkEnded) as error:
+        one_line(error)
+    finally:
+        link.close()
+
+
+def log_check(suffix: str) -> Check:
+    """The target of one kind of log."""
+
+    def check(data: bytes) -> None:
+        path = folder() / f"log{suffix}"
+        path.write_bytes(data)
+        replayed(path)
+
+    return check
+
+
+def log_seeds(suffix: str) -> Iterator[bytes]:
+    """What python-can writes."""
+    import can
+
+    for how in ({}, {"compression_level": 0}) if suffix == ".blf" else ({},):
+        path = folder() / f"seed-log{suffix}"
+        with can.Logger(path, **how) as log:
+            _log(log)
+        yield path.read_bytes()
+
+
+def _log(log: Any) -> None:
+    import can
+
+    for i in range(6):
+        identifier = 0x123 + (i << 20 if i % 2 else 0)
+        log(
+            can.Message(
+                1.7e9 + 0.01 * i,
+                identifier,
+                bool(i % 2),
+                channel=0,
+                is_rx=i != 3,
+                is_fd=i == 4,
+                data=bytes(range(i + 2)),
+            )
+        )
+
+
+LOG_WORDS: Final = {
+    ".asc": (
+        "date ",
+        "base hex timestamps absolute\n",
+        "Begin Triggerblock\n",
+        "CANFD",
+        "ErrorFrame",
+        " Rx d 8 ",
+        "1e999",
+    ),
+    ".log": ("(1700000000.01)", "can0 123#", "##1", "#R8", "1e999", "nan"),
+    ".trc": (";$FILEVERSION=2.1\n", ";$STARTTIME=43000.5\n", ";$COLUMNS=N,O,T,B,I,d,R,L,D\n", " DT ", "Rx", "1e999"),
+    ".csv": ("timestamp,arbitration_id,extended,remote,error,dlc,data\n", "0x123", "1e999", "nan", "AQI="),
+    ".blf": ("LOGG", "LOBJ", b"\xff\xff\xff\xff", b"\0\0\0\0", b"\x0a\0\0\0"),
+}
+
+for _suffix in (".asc", ".blf", ".log", ".trc", ".csv"):
+    target(f"log-{_suffix[1:]}", partial(log_seeds, _suffix), 2000, LOG_WORDS[_suffix])(log_check(_suffix))
+
+FRAMES: Final = b"t,id_hex,data_hex,bus,extended\n0.01,123,0102ff,0,0\n0.02,18F02980,01,1,1\n"
+
+
+@target("log-frames-csv", [FRAMES], 600, ("1e999", "nan", "-1", "0x", "ffffffffffffffffff", '"', "\r\n", "inf"))
+def log_frames(data: bytes) -> None:
+    """A CSV of frames, behind a header that is one."""
+    path = folder() / "frames.csv"
+    path.write_bytes(data if data[:1] == b"t" else b"t,id_hex,data_hex,bus,extended\n" + data)
+    replayed(path, "1" if data[-1:] == b"\n" else None)
+
+
+@target("log-gz", lambda: [gzip.compress(FRAMES, mtime=0)], 600)
+def log_zipped(data: bytes) -> None:
+    """Compressed frames, and compressed captured bytes."""
+    for name in ("frames.csv.gz", "a.bin.gz", "a.log.gz"):
+        path = folder() / name
+        path.write_bytes(data)
+        replayed(path)
+
+
+@target("log-recording", lambda: [json.dumps({"t": [0, 1, 2], "gz": [1, 2, 3]}).encode()], 400)
+def log_recording(data: bytes) -> None:
+    """A recording of any times, replayed as messages."""
+    tape = Tape(data)
+    rows = [",".join(repr(tape.wild()) for _ in range(2)) for _ in range(1 + tape.byte() % 40)]
+    path = folder() / "replayed.csv"
+    path.write_text("t,gz\n" + "\n".join(rows) + "\n")
+    replayed(path)

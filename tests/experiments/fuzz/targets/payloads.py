@@ -1,0 +1,247 @@
+"""What other processes send or leave: payloads on the bus, JSON files of other commands, words of a command line."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import fields
+from functools import cache
+from typing import Final
+
+import msgspec
+import numpy as np
+from rich.console import Console
+
+from drivers.errors import ConfigError, DecodeError, ImuError
+from drivers.zenoh.sample_message import pack, unpack
+from monitor.cli import options
+from monitor.commands import thermal
+from monitor.common import topics
+from monitor.publishing.exporters import FORMATS, export, from_analysis
+from monitor.publishing.terminal.live_table import Board
+from monitor.publishing.zenoh.subscriber import ZenohIn
+from monitor.settings import loading
+from monitor.simulator.scheduled_effects import effects_of
+from tests.experiments.fuzz.checks import one_line
+from tests.experiments.fuzz.tape import Tape
+from tests.experiments.fuzz.target import target
+from tests.experiments.fuzz.targets.decoders import message_of, samples_of
+from tests.experiments.fuzz.targets.files import folder
+from tests.experiments.fuzz.targets.settings import possible
+
+# --- messages of daemons
+
+LETTER: Final = {"status": "estimated", "value": 1e-4, "lo": 9e-5, "hi": 1.1e-4}
+HEADS: Final = {"device": "a", "t": 1.7e9, "samples": 100}
+MESSAGES: Final = {
+    topics.STATUS: {
+        "state": "running", "received": 100, "lost": 2, "bad": 1, "rate": 99.9, "overflowed": 0, "text": "",
+        "latency": {"p50": 1e-3, "p99": 2e-3}, "outputs": {"zenoh": "ok", "viewer": "stalled"},
+    },
+    topics.COEFFICIENTS: {
+        "axes": {a: {"N": LETTER, "R": {"status": "upper_bound", "hi": 1.0}} for a in ("gz", "ax")}, "rate": 100.0,
+        "window": 3600.0, "filled": 10.0,
+    },
+    topics.EVENT: {"kind": "noise_changed", "text": "gz rose", "axis": "gz", "what": {"N": {"before": 1.0}}},
+    topics.GAP: {"axes": {"gz": {"gap": 3.0, "where": {"tau": [0.1, 1.0]}, "agrees": False}}},
+}  # fmt: skip
+NAMES: Final = tuple(topic.name for topic in MESSAGES)
+WORDS: Final = (
+    '"schema"', '"imu-monitor/status/1"', '"axes"', '"gz"', "null", "true", "1e999", "-1", "1e308", '"\\u001b[2J"',
+    "[", "{", "\xff", "[" * 30, '"\\ud800"', '"text":', '"upper_bound"', '"unestimated"', '"outputs":{',
+)  # fmt: skip
+
+
+@cache
+def _payloads() -> tuple[bytes, ...]:
+    return tuple(msgspec.json.encode({"schema": topic.schema(), **HEADS, **m}) for topic, m in MESSAGES.items())
+
+
+def _messages() -> Iterator[bytes]:
+    for i, payload in enumerate(_payloads()):
+        yield bytes([i]) + payload
+        yield bytes([i]) + payload[:-1] + b',"x":' + b"[" * 1200
+
+
+def _taken(data: bytes) -> Board:
+    board = Board(lambda: 1.0)
+    name = NAMES[data[0] % len(NAMES)] if data else "status"
+    board.take(f"imu/a/{name}", data[1:])
+    return board
+
+
+@target("heard", _messages, 2000, WORDS)
+def heard(data: bytes) -> None:
+    """A message of a daemon: taken, or counted as malformed."""
+    board = _taken(data)
+    assert board.malformed in (0, 1)
+
+
+@target("board", _messages, 2000, WORDS)
+def board(data: bytes) -> None:
+    """The same, and then shown."""
+    console = Console(width=100, height=30, file=_Nowhere(), force_terminal=True)
+    console.print(_taken(data).table(2.0))
+
+
+class _Nowhere:
+    """A terminal that obeys what it should not."""
+
+    encoding = "utf-8"
+
+    def write(self, text: str) -> int:
+        assert "\x1b[2J" not in text, "a control character reached the terminal"
+        return len(text)
+
+    def flush(self) -> None:
+        """Nothing is kept."""
+
+
+@target("samples-message", lambda: [pack("a", 3, samples_of(bytes(range(24)), _Plain())), bytes(range(80))], 600)
+def samples_message(data: bytes) -> None:
+    """A map of samples: what is read is packed and read again as the same."""
+    if data[:1] < b"\x40":
+        data = message_of(Tape(data))
+    try:
+        batch = unpack(data)
+    except DecodeError as error:
+        one_line(error)
+        return
+    rows = batch.block
+    assert (np.abs(rows.t_ns) < 1 << 62).all()
+    if (np.diff(rows.t_ns) > 0).all():
+        again = unpack(pack(batch.device, batch.samples, rows)).block
+        assert np.array_equal(again.values, rows.values, equal_nan=True)
+        assert np.abs(again.t_ns - rows.t_ns).max() <= 1100, "times that came back as others"
+
+
+class _Plain:
+    timing = None
+
+
+# --- files of other commands
+
+
+def _analysis() -> Iterator[bytes]:
+    axes = {axis: {"allan": {"tau": [1.0]}, "coefficients": dict.fromkeys("QNBKR", LETTER)} for axis in ("gx", "az")}
+    yield msgspec.json.encode(
+        {"schema": "imu-monitor/analyze/1", "rate": 100.0, "samples": 9, "axes": axes, "notes": []}
+    )
+    yield b'{"x":' + b"[" * 2000
+
+
+@target("analysis", _analysis, 2500, (*WORDS, '"coefficients"', '"imu-monitor/analyze/1"'))
+def analysis(data: bytes) -> None:
+    """What ``analyze --json`` wrote, exported in every format."""
+    try:
+        noise = from_analysis(data)
+    except ConfigError as error:
+        one_line(error)
+        return
+    for form in FORMATS:
+        try:
+            text = export(noise, form)
+        except ImuError as error:
+            one_line(error)
+        else:
+            assert "nan" not in text.lower().replace("nanosec", ""), text
+
+
+def _thermal() -> Iterator[bytes]:
+    row = {
+        "powers": 1, "time_constants": [60.0], "reference": 25.0, "sizes": [0.0, 1e-5, 1e-6], "start": [0.1],
+        "phi": 0.5, "sigma": 1e-6, "covariance": np.eye(5).tolist(), "temperature": [20.0, 40.0],
+    }  # fmt: skip
+    yield msgspec.json.encode({"schema": thermal.SCHEMA, "interval": 10.0, "axes": {"gz": row}})
+    yield b'{"x":' + b"[" * 2000
+
+
+@target("thermal-model", _thermal, 2500, (*WORDS, '"covariance":[[1,2],[3]]', '"powers":', "[0.5]", "[[", "]]"))
+def thermal_model(data: bytes) -> None:
+    """A model file of ``thermal fit``."""
+    path = folder() / "thermal.json"
+    path.write_bytes(data)
+    try:
+        models = thermal.from_file(path)
+    except ConfigError as error:
+        one_line(error)
+        return
+    for model in models.values():
+        n = model.sizes.size
+        assert model.interval_s > 0.0
+        assert model.covariance.shape == (n + 2 * model.start.size,) * 2
+        assert np.isfinite(model.sizes).all()
+        assert np.isfinite(model.covariance).all()
+
+
+# --- words of a command line
+
+
+def _text(data: bytes) -> str:
+    return data.decode("utf-8", "surrogateescape")
+
+
+@target(
+    "effects",
+    (b"gz.sinusoidal:amplitude=1e-3,frequency=17", b"g*.bias:value=1", b"gz.g_sensitivity:source=ax,coefficient=1e-3"),
+    200,
+    ("gz.", "random_telegraph", ":", "=", ",", "nan", "inf", "1e999", "9" * 30, "1_0", '"', "\\", "\x7f", "\n"),
+)
+def effects(data: bytes) -> None:
+    """Effects as people write them."""
+    try:
+        found = effects_of(_text(data))
+    except ConfigError as error:
+        one_line(error)
+        return
+    assert found
+    for _, effect in found:
+        possible([getattr(effect, f.name) for f in fields(effect)])
+
+
+@target("duration", (b"30min", b"1.5 h", b"2d", b"1e3 s"), 40, ("ms", "e", ".", " ", "1e999", "-", "\0"))
+def duration(data: bytes) -> None:
+    """Durations: seconds above 0, or a line."""
+    try:
+        seconds = loading.seconds(_text(data))
+    except ConfigError as error:
+        one_line(error)
+        return
+    assert 0.0 < seconds < math.inf, seconds
+
+
+@target("rate", (b"10 Hz", b"0.5Hz", b"every sample"), 40, ("Hz", ".", "0", "1" * 320, "0." + "0" * 30))
+def rate(data: bytes) -> None:
+    """Rates: seconds between two, or a line."""
+    try:
+        seconds = loading.period(_text(data), "every sample")
+    except ConfigError as error:
+        one_line(error)
+        return
+    assert 0.0 <= seconds < math.inf, seconds
+
+
+@target(
+    "command-line", (b"octave", b"0.1,1,10", b"1,2", b"auto", b"a.rrd", b"1h"), 60, (",", "nan", "inf", "1e999", ".rrd")
+)
+def command_line(data: bytes) -> None:
+    """Arguments that are more than a word."""
+    text = _text(data)
+    for read in (options.tau, options.order, loading.viewer_mode, lambda word: options.duration("--window", word)):
+        try:
+            possible(read(text))
+        except ConfigError as error:
+            one_line(error)
+
+
+@target(
+    "listening",
+    (b"imu/**\0tcp/127.0.0.1:7450", b"*/a/status\0udp/h:1"),
+    80,
+    ("/**", "$*", "tcp/", "#iface=lo", "?", "[::1]:7450"),
+)
+def listening(data: bytes) -> None:
+    """Key expression and endpoint of ``watch``; nothing is opened."""
+    keyexpr, _, endpoint = _text(data).partition("\0")
+    try:
+        ZenohIn(keyexpr, (endpoint,))
+    except ConfigError as error:
+        one_line(error)

@@ -1,0 +1,327 @@
+"""Configuration files, model files and CAN databases.
+
+What comes out of a configuration is whole and possible: finite numbers within their ranges. What is wrong with it is
+told a line each, and never by an exception.
+"""
+
+import datetime
+import shutil
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from drivers.decoders import dbc
+from drivers.errors import ConfigError
+from drivers.sample import Chunk
+from monitor.noise import model_file
+from monitor.noise.catalogue import read_model
+from monitor.noise.model import NoiseModel
+from monitor.settings import loading
+from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS
+from tests.experiments.fuzz.checks import fed, one_line
+from tests.experiments.fuzz.tape import WILD, Tape
+from tests.experiments.fuzz.target import target
+from tests.experiments.fuzz.targets.decoders import SECOND_DATABASE, SECOND_SIGNALS
+from tests.experiments.fuzz.targets.files import folder
+
+CONFIG: Final = loading.CONFIG_FOLDER
+LINES_AT_MOST: Final = 2000
+
+
+@cache
+def room() -> Path:
+    """A folder with the files that configurations name."""
+    here = folder() / "config"
+    here.mkdir()
+    (here / "imu.dbc").write_text(CAN_DATABASE)
+    (here / "a.csv").write_text("t,gz\n0,1\n0.01,2\n")
+    shutil.copy(CONFIG / "models" / "bmi088.toml", here / "model.toml")
+    return here
+
+
+def examples() -> list[str]:
+    """The shipped configurations, and one with every room in it."""
+    shipped = [file.read_text("utf-8").replace('"j1939_imu"', '"imu.dbc"') for file in sorted(CONFIG.glob("*.toml"))]
+    return [*shipped, EVERYTHING]
+
+
+def texts() -> Iterator[bytes]:
+    """Those, and what nobody would write."""
+    yield from (text.encode() for text in examples())
+    yield b"a = " + b"[" * 2500
+    yield b"rate = " + b"9" * 4400
+
+
+EVERYTHING: Final = """
+[[device]]
+name = "a"
+rate = 100.0
+window = "30min"
+tau = [0.1, 1.0]
+refit = "every sample"
+publish = "2 Hz"
+model = "model.toml"
+thermal_interval = "off"
+[device.driver]
+link = "replay"
+path = "a.csv"
+speed = 10
+[device.axes]
+gz = "-gy"
+gy = "gz"
+[[device]]
+name = "b"
+[device.driver]
+link = "virtual"
+decoder = "dbc"
+effect = ["gz.bias:value=1"]
+[device.driver.decoder_options]
+file = "imu.dbc"
+signals = {gz = "RateOfTurn.gyrZ", ax = {signal = "Acceleration.accX", unit = "g", factor = 2.0}}
+[device.driver.faults]
+lost = 0.1
+[[device]]
+name = "c"
+driver = {link = "serial", port = "socket://127.0.0.1:1", decoder = "text", decoder_options = {columns = ["gx", "t"]}}
+[zenoh]
+mode = "client"
+connect = ["tcp/127.0.0.1:7447"]
+[storage]
+folder = "kept"
+segment = "10min"
+keep = 86400
+[log]
+level = "debug"
+"""
+
+
+def configured(text: bytes) -> None:
+    """Read a configuration, and look at all of it."""
+    path = room() / "a.toml"
+    path.write_bytes(text)
+    config, wrong = loading.read(path)
+    assert (config is None) == bool(wrong)
+    assert len(wrong) < LINES_AT_MOST
+    for line in wrong:
+        assert "\n" not in line, f"several lines: {line[:200]}"
+        assert len(line) < 5000
+    if config is None:
+        try:
+            loading.load(path)
+        except ConfigError as error:
+            one_line(error)
+        else:
+            raise AssertionError("a wrong file was loaded")
+        return
+    assert config.devices
+    for device in config.devices:
+        possible(device)
+        assert 0.0 < device.window_s < float("inf")
+        assert device.rate_hz is None or 0.0 < device.rate_hz < float("inf"), device.rate_hz
+        assert min(device.refit_s, device.publish_s, device.silence_s, device.alarms_per_day) >= 0.0
+        assert loading.DEVICE_NAME.fullmatch(device.name)
+    possible(config.storage)
+
+
+def possible(value: Any) -> None:
+    """No number that is none, in any field."""
+    if isinstance(value, float):
+        assert value == value, "not a number"
+        assert abs(value) < float("inf"), "infinite"
+    elif isinstance(value, tuple | list):
+        for one in value:
+            possible(one)
+    elif isinstance(value, Mapping):
+        for one in value.values():
+            possible(one)
+    elif isinstance(value, msgspec.Struct):
+        for name in value.__struct_fields__:
+            possible(getattr(value, name))
+    elif is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            possible(getattr(value, field.name))
+
+
+WORDS: Final = (
+    "[[device]]", "[device.driver]", "link = ", "[zenoh]", "[storage]", "[log]", "[viewer]", "= nan\n", "= inf\n",
+    '"1e999"', "1e400", "'''", '"""', "[[", "]]", "{", "}", "1979-05-27T07:32:00Z", "true", '"9e9d"', "\\u0000", "= -1",
+)  # fmt: skip
+
+
+@target("settings", texts, 4500, WORDS)
+def settings_text(data: bytes) -> None:
+    """Any text as a configuration."""
+    configured(data)
+
+
+@cache
+def tables() -> list[dict[str, Any]]:
+    return [tomllib.loads(text) for text in examples()]
+
+
+@target("settings-values", lambda: [bytes([i, *range(8 * k, 8 * k + 16)]) for i in range(7) for k in range(6)], 100)
+def settings_values(data: bytes) -> None:
+    """A shipped configuration with some of its values replaced by others, of any kind."""
+    tape = Tape(data)
+    table = _copy(tape.choice(tables()))
+    for _ in range(6):
+        if not tape:
+            break
+        at: Any = table
+        for _ in range(8):
+            keys = list(at) if isinstance(at, dict) else list(range(len(at)))
+            if not keys:
+                break
+            key = keys[tape.byte() % len(keys)]
+            if not isinstance(at[key], dict | list) or tape.byte() % 8 == 0:
+                at[key] = strange(tape)
+                break
+            at = at[key]
+        if tape.byte() % 4 == 0 and isinstance(at, dict):
+            at[tape.choice(KEYS)] = strange(tape)
+    configured(_toml(table).encode("utf-8", "surrogatepass"))
+
+
+KEYS: Final = (
+    "rate", "window", "tau", "refit", "publish", "alarms_per_day", "thermal_interval", "silence", "model", "axes",
+    "driver", "link", "port", "baudrate", "speed", "seed", "effect", "effect_at", "faults", "rate_hz", "decoder",
+    "bytes_per_second", "decoder_options", "columns", "scale", "counter_modulus", "signals", "tick", "source",
+    "segment", "keep", "disk_share", "config", "listen", "connect", "prefix", "memory", "mode", "name", "", "a.b", "ä",
+)  # fmt: skip
+
+
+def strange(tape: Tape) -> Any:
+    """A value that nobody would write."""
+    kind = tape.byte() % 12
+    if kind == 0:
+        return tape.choice(WILD)
+    if kind == 1:
+        return tape.choice((0, -1, 1, 1 << 31, 1 << 63, 10**400, -(10**30), 10**5000))
+    if kind == 2:
+        return tape.choice(
+            ("", "x", "1e999 s", "1e-320 Hz", "0.0 Hz", "nan", "every sample", "off", "\x1b[2J", "ü" * 300)
+        )
+    if kind == 3:
+        return [strange(tape) for _ in range(tape.byte() % 4)]
+    if kind == 4:
+        return {tape.choice(KEYS): strange(tape) for _ in range(tape.byte() % 3)}
+    if kind == 5:
+        return tape.byte() % 2 == 0
+    if kind == 6:
+        return tape.choice((datetime.date(1, 1, 1), datetime.datetime(9999, 1, 1), datetime.time(1, 2)))
+    if kind == 7:
+        return tape.choice(
+            ("replay", "serial", "can", "zenoh", "virtual", "loopback", "base", "dbc", "text", "stim300")
+        )
+    if kind == 8:
+        return tape.piece().decode("utf-8", "replace")[:50]
+    if kind == 9:
+        return tape.wild()
+    if kind == 10:
+        return tape.choice(("a.csv", "imu.dbc", "model.toml", "/nowhere", ".", "~nobody/x", "\0", "a.csv/x", "x" * 300))
+    return tape.int64()
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _copy(one) for key, one in value.items()}
+    return [_copy(one) for one in value] if isinstance(value, list) else value
+
+
+def _toml(table: Mapping[str, Any]) -> str:
+    return "".join(f"{_word(key)} = {_value(value)}\n" for key, value in table.items())
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return _word(value)
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_word(key)} = {_value(one)}" for key, one in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    if isinstance(value, datetime.date | datetime.time):
+        return value.isoformat()
+    if isinstance(value, int) and abs(value) > 10**4000:
+        return "9" * 5000
+    return repr(value)
+
+
+def _word(text: str) -> str:
+    return '"' + "".join(c if c.isalnum() and c.isascii() else f"\\U{ord(c):08X}" for c in text) + '"'
+
+
+# --- models
+
+
+@target(
+    "model",
+    lambda: [
+        *(file.read_bytes() for file in sorted((CONFIG / "models").glob("*.toml"))),
+        b"[gz.bias]\nvalue = 1" + b"0" * 400,
+        b"sample_rate = 1" + b"0" * 400,
+        b"gz = " + b"[" * 1200,
+    ],
+    2000,
+    (
+        "[gz.bias]",
+        '["g*".sinusoidal]',
+        "[[ax.",
+        "sample_rate = ",
+        "[temperature]",
+        "nan",
+        "inf",
+        "1e400",
+        "[" * 20,
+        "9" * 50,
+    ),
+)
+def model(data: bytes) -> None:
+    """A model file: what is read can be written, and read again as the same."""
+    path = folder() / "a-model.toml"
+    path.write_bytes(data)
+    try:
+        found = read_model(path)
+    except ConfigError as error:
+        one_line(error)
+        return
+    possible([value for _, effect in found for value in (getattr(effect, f.name) for f in fields(effect))])
+    model_file.table(found)
+    assert model_file.write(NoiseModel.from_toml(model_file.write(found))) == model_file.write(found)
+
+
+# --- CAN databases
+
+
+def _databases() -> Iterator[bytes]:
+    yield from (CAN_DATABASE.encode(), SECOND_DATABASE.encode())
+    yield (CONFIG / "dbc" / "xsens_mti.dbc").read_bytes()[:1500]
+
+
+@target(
+    "dbc",
+    _databases,
+    1500,
+    ("BO_ ", " SG_ ", "|", "@1+", "@0-", "(0,0)", "1e400", "nan", "SIG_VALTYPE_", "BA_ ", "M", "m0"),
+)
+def database(data: bytes) -> None:
+    """A CAN database: a decoder of it, or a line; what the decoder gives is sound."""
+    path = folder() / "a.dbc"
+    path.write_bytes(data)
+    signals = CAN_SIGNALS if b"RateOfTurn" in data else SECOND_SIGNALS
+    try:
+        decoder = dbc.build(msgspec.convert({"file": str(path), "signals": signals}, dbc.Settings))
+    except ConfigError as error:
+        one_line(error)
+        return
+    tail = data[-64:]
+    fed(
+        decoder,
+        [[Chunk(tail[: 8 + i % 2 * 56], 5, address & ~(1 << 30)) for i in range(3) for address in decoder.addresses]],
+    )

@@ -1,0 +1,182 @@
+"""A recording through all that ``analyze`` can make of it, and what is made only on demand."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.errors import ConfigError, RecordingError
+from drivers.recordings import save_samples
+from monitor.commands import analyze, thermal
+from monitor.commands.analyze import Request, TooShort, make
+from monitor.common.rates import MILLI_G
+from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.publishing import exporters
+from monitor.publishing.messages import encoding
+from monitor.publishing.terminal.thermal_text import notes_on_hysteresis
+from tests.monitor.drift.cycles import cycle, loop, opening
+
+RATE_HZ = 100.0
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """Two minutes of white noise; gx becomes noisier in the middle."""
+    path = tmp_path / "x.npz"
+    values = 1e-3 * np.random.default_rng(2).standard_normal((24_000, 6))
+    values[15_000:, 0] *= 2.0
+    save_samples(path, np.arange(len(values)) / RATE_HZ, values)
+    return path
+
+
+def test_only_what_is_wanted_is_made(recording: Path) -> None:
+    results = make(Request(recording))
+    assert results.total is results.hadamard is results.dynamic is results.warmth is None
+    assert results.lacking == ""
+    [change] = results.analysis.changes  # told in the notes, so always looked for
+    assert (change.axis, change.since) == (0, pytest.approx(15_000, abs=50))
+
+
+def test_all_of_it(recording: Path) -> None:
+    told: list[tuple[str, float | None]] = []
+    results = make(Request(recording, window_s=30.0, others=True), lambda what, share: told.append((what, share)))
+    assert results.total is not None
+    assert results.hadamard is not None
+    assert results.dynamic is not None
+    assert results.total.tau_s[-1] == 163.84
+    assert results.hadamard.tau_s[-1] == 40.96
+    n = results.dynamic.value[:, 1, 0]
+    assert n[-1] / n[0] == pytest.approx(2.0, rel=0.05)
+    assert [what for what, share in told if share is None] == [
+        "reading", "curve and fit", "motion and changes, total and Hadamard deviations"
+    ]  # fmt: skip
+    shares = [share for what, share in told if what == "dynamic curves"]
+    assert shares == sorted(shares)  # type: ignore[type-var]
+    assert shares[-1] == 1.0
+
+
+def test_drift_that_was_temperature_is_told(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    t = np.arange(43_200) / 2.0
+    warmth = 25.0 + 2.0 * np.sin(2.0 * np.pi * t / 7200.0) + 1.5 * np.sin(2.0 * np.pi * t / 3100.0)
+    values = 1e-4 * rng.standard_normal((t.size, 6))
+    values[:, 2] += 3e-5 * (warmth - 25.0)
+    save_samples(tmp_path / "warm.npz", t, values, warmth)
+    results = make(Request(tmp_path / "warm.npz"))
+    (note,) = (one for one in results.analysis.notes if "follows its temperature" in one)
+    assert note.startswith("gz follows its temperature")
+    written = json.loads(encoding.analysis(results.analysis, warmth=results.warmth))
+    gz = written["axes"]["gz"]["without_temperature"]
+    assert set(gz) == {"model", "coefficients", "share"}
+    assert written["axes"]["gz"]["temperature"]["share"] > 0.9
+    assert "temperature" not in written["axes"]["gx"]
+    assert gz["share"]["K"] > 0.9
+    assert gz["coefficients"]["K"]["hi"] < written["axes"]["gz"]["coefficients"]["K"]["lo"]
+    assert "without_temperature" not in written["axes"]["gx"]
+
+
+@pytest.mark.parametrize("shape", ["ramp", "sine", "steps", "heating"])
+def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k(tmp_path: Path, shape: str) -> None:
+    """gy is a cubic in temperature over 3 °/s, gz linear, gx and ax walk by themselves, az has a loop."""
+    rate_hz, seconds = 5.0, 9000.0
+    n = round(rate_hz * seconds)
+    rng = np.random.default_rng(6)
+    temperature_c = cycle(shape, n)
+    x = (temperature_c + 18.0) / 92.0
+    values = np.array([2e-4, 2e-4, 2e-4, 2e-3, 2e-3, 2e-3]) * rng.standard_normal((n, 6))
+    values[:, 0] += 3e-6 / rate_hz**0.5 * rng.standard_normal(n).cumsum()
+    values[:, 3] += 3e-5 / rate_hz**0.5 * rng.standard_normal(n).cumsum()
+    cubic = 4.0 * (x - 0.5) ** 3 + 0.5 * x + 0.4 * (x - 0.5) ** 2
+    values[:, 1] += np.radians(3.0) * cubic / np.ptp(cubic)
+    values[:, 2] += np.radians(0.5) * x
+    values[:, 5] += 9.8 + 0.05 * x
+    if shape != "heating":
+        values[:, 5] += 12.0 * MILLI_G * loop("loop", x) / opening(loop("loop", x), x)
+    path = tmp_path / "chamber.npz"
+    save_samples(path, np.arange(n) / rate_hz, values, temperature_c)
+    results = make(Request(path))
+    assert results.analysis.axes_of_temperature == ("gy", "gz", "az")
+    named = [one.split()[0] for one in results.analysis.notes if "follows its temperature" in one]
+    assert named == ["gy", "gz", "az"]
+    if shape == "ramp":  # the case in which nothing was said of gy
+        assert results.analysis.estimate.coefficients.status[LETTERS.index("K"), 1] != Status.ESTIMATED
+    written = encoding.analysis(results.analysis, warmth=results.warmth)
+    marks = {axis: one.get("temperature") for axis, one in json.loads(written)["axes"].items()}
+    assert [axis for axis, one in marks.items() if one] == ["gy", "gz", "az"]
+    assert set(marks["gy"]) == {"share", "p_value", "form", "one_way", "interval"}
+    assert marks["gy"]["share"] > 0.95
+    assert marks["gy"]["one_way"] == (shape == "heating")
+    warnings = exporters.from_analysis(written).warnings
+    assert [one.split()[0] for one in warnings] == ["gy", "gz", "az"]
+    study = thermal.fit(path)
+    if shape != "heating":
+        assert study.fits["az"].hysteresis == pytest.approx(12.0 * MILLI_G, rel=0.15)
+        assert [study.fits[axis].hysteresis for axis in ("gx", "gy", "gz", "ax", "ay")] == [0.0] * 5
+        (note,) = notes_on_hysteresis(study)
+        assert note.startswith("az: at one temperature the bias differs between heating and cooling by up to 1")
+        assert " mg (hysteresis or a lag, p = " in note
+    else:
+        assert notes_on_hysteresis(study) == []
+    if shape == "ramp":
+        pytest.importorskip("matplotlib")
+        pytest.importorskip("jinja2")
+        analyze.draw(results, tmp_path / "x.html", "chamber")
+        page = (tmp_path / "x.html").read_text("utf-8")
+        assert "gy †" in page
+        assert "gx †" not in page
+        assert "† its slow part is temperature" in page
+
+
+def test_listed_tau_are_those_of_every_curve_as_far_as_they_are_possible(recording: Path) -> None:
+    listed = (0.1, 0.2, 0.5, 1.0, 2.0, 100.0)
+    results = make(Request(recording, tau=listed, others=True))
+    assert results.total is not None
+    assert results.hadamard is not None
+    assert results.total.tau_s.tolist() == list(listed)
+    assert results.hadamard.tau_s.tolist() == list(listed[:-1])
+    assert make(Request(recording, tau=(100.0,), others=True)).hadamard is None
+
+
+def test_a_window_longer_than_the_recording_leaves_the_rest(recording: Path) -> None:
+    results = make(Request(recording, window_s=1000.0))
+    assert results.dynamic is None
+    assert results.lacking == "no dynamic curves: 240 s are recorded, less than the window of 1000 s"
+    assert results.analysis.notes[-1] == results.lacking
+
+
+def test_too_short_says_how_short(tmp_path: Path) -> None:
+    save_samples(tmp_path / "x.npz", np.arange(20) / RATE_HZ, np.zeros((20, 6)))
+    with pytest.raises(TooShort, match="20 samples; at least 50") as raised:
+        make(Request(tmp_path / "x.npz"))
+    assert raised.value.samples == 20
+
+
+def test_what_is_wrong_is_said(tmp_path: Path, recording: Path) -> None:
+    with pytest.raises(RecordingError):
+        make(Request(tmp_path / "nowhere.csv"))
+    with pytest.raises(ConfigError, match="window of 0"):
+        make(Request(recording, window_s=0.1))
+
+
+@pytest.mark.parametrize(("name", "start"), [("x.png", b"\x89PNG"), ("x.html", b"<!DOCTYPE html>")])
+def test_a_drawing_has_the_changes_marked(recording: Path, name: str, start: bytes) -> None:
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("jinja2")
+    results = make(Request(recording, window_s=30.0, others=True))
+    path = recording.with_name(name)
+    analyze.draw(results, path, "bench")
+    assert path.read_bytes().startswith(start)
+    if name == "x.html":
+        page = path.read_text("utf-8")
+        assert "gx angle random walk rose by" in page
+        assert "<!-- change -->" in page  # the mark in the drawing
+
+
+def test_an_analysis_beyond_the_memory_is_one_line(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_args: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(analyze, "analyze", fail)
+    with pytest.raises(ConfigError, match=r"x\.npz: the analysis needs more memory than is free; take the end alone"):
+        make(Request(recording))

@@ -1,0 +1,130 @@
+"""Kernels are compiled where nothing can be kept on disk, too; what is kept is not taken when it is stale."""
+
+import gc
+import inspect
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import monitor.common.compiled
+from monitor.common.compiled import IMPORTS, Kernel, compiled, stamp
+from monitor.estimation.fit import fit_kernel
+from tests.support.waiting import PATIENCE_S
+
+
+def test_without_a_place_for_the_cache() -> None:
+    program = """
+        from numba.core import caching
+        caching.CompileResultCacheImpl._locator_classes = []  # as of a read-only system and a user without a home
+        from monitor.compiled import compiled
+
+        @compiled
+        def twice(x):
+            return x + x
+
+        assert twice(21) == 42
+        assert twice.nopython_signatures
+    """
+    root = Path(monitor.common.compiled.__file__).parents[1]
+    subprocess.run([sys.executable, "-c", textwrap.dedent(program)], cwd=root, timeout=PATIENCE_S, check=True)
+
+
+def test_cached_code_is_stale_when_what_it_calls_has_changed(tmp_path):
+    files = {name: tmp_path / "monitor" / f"{name}.py" for name in "abcdef"}
+    files["a"].parent.mkdir()
+    files["a"].write_text("from monitor.b import called\n")
+    files["b"].write_text("import math\nfrom monitor.c import LIMIT\nfrom monitor.a import other\n")
+    files["c"].write_text("from monitor import e\nfrom monitor import (\n    f,\n)\nLIMIT = 1.0\n")
+    files["e"].write_text("x = 1\n")
+    files["f"].write_text("x = 1\n")
+    files["d"].write_text("x = 1\n")
+
+    def now():
+        stamp.cache_clear()
+        return stamp(files["a"], tmp_path)
+
+    before = now()
+    files["d"].write_text("x = 2\n")
+    assert now() == before
+    for name in "fec":  # modules that are imported by name, too
+        files[name].write_text("LIMIT = 2.0\n")
+        assert now() != before
+        before = now()
+
+
+def test_the_stamp_of_a_kernel_covers_the_files_it_calls():
+    imported = [package for package, *_ in IMPORTS.findall(Path(inspect.getfile(fit_kernel)).read_text())]
+    assert imported.count("monitor.estimation.fit.term_selection") == 1
+    assert fit_kernel.fit_axes._cache._cache_file._source_stamp[1] == stamp(Path(inspect.getfile(fit_kernel)))
+
+
+def test_machine_code_is_generated_only_for_the_kernel_that_python_calls():
+    def sum_from(values, total):
+        for value in values:
+            total += value
+        return total
+
+    add = Kernel(sum_from, inline=False)  # without the cache on disk, from which only the outer kernel would be loaded
+
+    def sum_twice(values):
+        return add(values, add(values, 0.0))
+
+    add_twice, values = Kernel(sum_twice, inline=False), np.arange(5.0)
+    assert add_twice(values) == 20.0
+    assert len(add_twice.signatures) == 1
+    assert not add.signatures
+    assert len(add.intermediate.signatures) == 1
+    (whole,), (part,) = add_twice.overloads.values(), add.intermediate.overloads.values()
+    engine = whole.library.codegen._engine
+    assert engine.is_symbol_defined(whole.fndesc.llvm_cpython_wrapper_name)
+    assert not engine.is_symbol_defined(part.fndesc.llvm_cpython_wrapper_name)
+    assert add(values, 1.0) == 11.0  # from Python it is compiled as a kernel of its own
+    assert len(add.signatures) == 1
+
+
+def test_an_inner_function_is_compiled_once_for_all_constant_arguments():
+    @compiled
+    def scale(x, factor, negative):
+        return -factor * x if negative else factor * x
+
+    @compiled
+    def outer(x, factor):
+        return scale(x, 2, False) + scale(x, 3, True) + scale(x, factor, x > 0.0)
+
+    assert outer(1.0, 5) == 2.0 - 3.0 - 5.0
+    assert len(scale.intermediate.signatures) == 1
+
+
+def test_intermediate_code_refuses_a_call_from_python():
+    @compiled
+    def half(x):
+        return 0.5 * x
+
+    with pytest.raises(TypeError, match="half is intermediate code"):
+        half.intermediate(3.0)
+
+
+def test_an_exception_in_an_inner_function_reaches_python():
+    @compiled
+    def fill(target, source):
+        target[:] = source
+
+    @compiled
+    def outer(target, source):
+        fill(target, source)
+
+    with pytest.raises(ValueError, match="cannot assign slice of shape"):
+        outer(np.zeros(3), np.zeros(4))
+
+
+def test_the_garbage_collector_runs_again_after_a_compilation():
+    @compiled
+    def half(x):
+        return 0.5 * x
+
+    assert half(3.0) == 1.5
+    assert gc.isenabled()

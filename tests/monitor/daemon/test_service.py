@@ -1,0 +1,311 @@
+"""What the service says of itself: where its page is, and nothing at a date that is not the samples'."""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+from structlog.testing import capture_logs
+
+from drivers.recordings import save_samples
+from drivers.sample import Event
+from monitor.common.health import Health
+from monitor.daemon import kernel_compilation
+from monitor.daemon.device_worker import Output
+from monitor.daemon.outputs import TableOutput
+from monitor.daemon.service import Service
+from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.estimate import Estimate
+from monitor.estimation.fit.coefficients import Status
+from monitor.history import reading as past
+from monitor.history.sqlite_store import FILE, reading
+from monitor.history.time_ranges import Span
+from monitor.publishing.terminal.live_table import Board
+from monitor.settings import loading
+
+pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+
+from tests.monitor.publishing.rerun.test_view import read
+from tests.support.ports import free_port
+from tests.support.waiting import PATIENCE_S, wait_for
+
+RECORDED_S = 1_600_000_000.0
+
+
+def config(folder: Path, driver: str, viewer: str) -> loading.Config:
+    path = folder / "config.toml"
+    device = f'[[device]]\nname = "d"\nrate = 100.0\ndriver = {{ {driver} }}\n'
+    path.write_text(f'{device}[zenoh]\nmode = "none"\n[viewer]\n{viewer}')
+    return loading.load(path)
+
+
+class Rounds(Output):
+    """Counts the rounds of the status."""
+
+    def __init__(self) -> None:
+        self.healths = 0
+
+    def health(self, device: str, unix_s: float, health: Health) -> None:
+        self.healths += 1
+
+
+def test_the_page_is_told_once_in_the_log_and_stands_above_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    viewer = f'mode = "auto"\nport = {free_port()}\nweb_port = {free_port()}\n'
+    board = Board()
+    rounds = Rounds()
+    service = Service(config(tmp_path, 'link = "virtual"', viewer), [TableOutput(board), rounds])
+    assert service.view is not None
+    thread = threading.Thread(target=service.run)
+    with capture_logs() as logs:
+        thread.start()
+        try:
+            wait_for(lambda: board.note != "")
+            url, note = service.view.url, board.note
+            before = rounds.healths
+            wait_for(lambda: rounds.healths >= before + 2, "two more rounds of the status")
+            with (console := Console(width=200)).capture() as captured:
+                console.print(board.table(time.monotonic()))
+        finally:
+            service.stop()
+            thread.join(PATIENCE_S)
+    assert not thread.is_alive()
+    assert url.startswith("http://127.0.0.1:")
+    assert note == f"viewer: {url}"
+    assert url in captured.get()
+    assert [line["url"] for line in logs if line["event"] == "viewer"] == [url]
+
+
+def test_a_recording_of_long_ago_leaves_nothing_at_todays_date(tmp_path: Path) -> None:
+    path = tmp_path / "view.rrd"
+    rows = [f"{RECORDED_S + i / 100:.2f},{0.1 * (-1) ** i}" for i in range(100)]
+    (tmp_path / "long-ago.csv").write_text("\n".join(["t,gz", *rows]))
+    service = Service(config(tmp_path, 'link = "replay", path = "long-ago.csv"', f'mode = "{path}"\n'))
+    service.run(PATIENCE_S)
+    assert service.stations[0].driver.state == "ended"
+    cells = read(path)
+    assert "ENDED" in str(cells["/d/status"])
+    times_s = [t / 1e9 for entity in cells.values() for t in entity.get("sample_time", []) if isinstance(t, int)]
+    assert RECORDED_S <= min(times_s) <= max(times_s) <= RECORDED_S + 1.0
+
+
+class Times(Output):
+    """The times that were said of a device."""
+
+    def __init__(self) -> None:
+        self.healths: list[tuple[float | None, Health]] = []
+        self.events: list[float] = []
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        self.events.append(unix_s)
+
+    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+        self.healths.append((unix_s, health))
+
+    def count(self, received: bool) -> int:
+        """Reports since, or before, the first sample was received."""
+        return sum(bool(health.received) == received for _, health in self.healths)
+
+
+@pytest.mark.parametrize("kind", ["csv", "npz", "folder"])
+def test_a_recording_that_waits_for_kernels_leaves_nothing_outside_of_its_own_times(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    n, compiled, prepare = 2000, threading.Event(), kernel_compilation.prepare
+
+    def held_back(
+        group: kernel_compilation.Group, tell: Callable[[kernel_compilation.Progress], None]
+    ) -> Iterator[str]:
+        compiled.wait(PATIENCE_S)
+        yield from prepare(group, tell)
+
+    monkeypatch.setattr(kernel_compilation, "prepare", held_back)
+    t_s = np.arange(n) / 100.0
+    values = np.random.default_rng(1).standard_normal((n, 6)) * 1e-3
+    name = {"csv": "r.csv", "npz": "r.npz", "folder": "r"}[kind]
+    recording, away = tmp_path / name, tmp_path / f"away-{name}"
+    if kind == "folder":
+        recording.mkdir()
+        for part in (slice(0, n // 2), slice(n // 2, n)):
+            save_samples(recording / f"{part.start:05d}.csv", t_s[part], values[part])
+    else:
+        save_samples(recording, t_s, values)
+    view = tmp_path / "view.rrd"
+    path = tmp_path / "config.toml"
+    path.write_text(
+        f"""
+[[device]]
+name = "night-run"
+driver = {{ link = "replay", path = "{name}", speed = 1000 }}
+[zenoh]
+mode = "none"
+[viewer]
+mode = "{view}"
+[storage]
+folder = "kept"
+record = false
+"""
+    )
+    told = Times()
+    service = Service(loading.load(path), [told])
+    recording.rename(away)
+    thread = threading.Thread(target=service.run, args=(PATIENCE_S,))
+    thread.start()
+    try:
+        assert wait_for(lambda: told.count(received=False) >= 2)  # there is no recording yet
+        away.rename(recording)
+        assert wait_for(lambda: told.count(received=True) >= 2)  # its samples wait in the ring
+        assert service.stations[0].published == 0
+    finally:
+        compiled.set()
+        thread.join(PATIENCE_S)
+    assert not thread.is_alive()
+    assert service.stations[0].published == n
+    first_s, last_s = 0.0, (n - 1) / 100.0
+    assert {unix_s for unix_s, health in told.healths if not health.received} == {None}
+    stamps = [unix_s for unix_s, health in told.healths if health.received]
+    assert all(unix_s is not None and first_s <= unix_s <= last_s for unix_s in stamps), stamps
+    assert stamps[-1] == last_s
+    assert all(first_s <= unix_s <= last_s for unix_s in told.events), told.events
+    cells = read(view)
+    assert "ENDED" in str(cells["/night-run/status"])
+    times_s = [t / 1e9 for entity in cells.values() for t in entity.get("sample_time", []) if isinstance(t, int)]
+    assert first_s <= min(times_s) <= max(times_s) <= last_s
+    with reading(tmp_path / "kept" / FILE) as reader:
+        kept = past.read(reader, "night-run", Span(-math.inf, math.inf), step_s=60)
+    assert kept.start_s.tolist() == [0]
+    assert kept.counts[:, 0].tolist() == [n]
+    assert all(first_s <= event.t_s <= last_s for event in kept.events)
+
+
+class Estimates(Output):
+    """Estimates, and how many events there were of each kind."""
+
+    def __init__(self) -> None:
+        self.all: list[Estimate] = []
+        self.kinds: set[str] = set()
+        self.gaps: list[ModelGap] = []
+        self.health_text = ""
+
+    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
+        self.all.append(estimate)
+
+    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
+        self.gaps.append(gap)
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        self.kinds.add(event.kind)
+
+    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+        self.health_text = health.text
+
+
+@pytest.mark.parametrize("rate_hz", [100.0, 200.0])
+def test_a_rate_that_contradicts_a_recording_publishes_no_coefficient(tmp_path: Path, rate_hz: float) -> None:
+    values = np.random.default_rng(1).standard_normal((6000, 6)) * 1e-2
+    save_samples(tmp_path / "r.npz", np.arange(6000) / 100.0, values)
+    path = tmp_path / "config.toml"
+    path.write_text(
+        f"""
+[[device]]
+name = "d"
+rate = {rate_hz}
+window = "1min"
+model = "consumer-mems"
+driver = {{ link = "replay", path = "r.npz", speed = 20 }}
+[[device.limit]]
+axes = "gz"
+letter = "N"
+above = 1e-5
+hold = "1s"
+[zenoh]
+mode = "none"
+[viewer]
+mode = "none"
+[storage]
+folder = "kept"
+record = false
+"""
+    )
+    told, board = Estimates(), Board()
+    Service(loading.load(path), [told, TableOutput(board)]).run(60.0)
+    with reading(tmp_path / "kept" / FILE) as reader:
+        kept = past.read(reader, "d", Span(-math.inf, math.inf), step_s=60)
+    (known,) = board.devices(time.monotonic())
+    assert known.noise is not None
+    published = {Status(one) for estimate in told.all for one in estimate.coefficients.status.ravel().tolist()}
+    assert told.all[-1].rate_hz == 100.0
+    if rate_hz == 100.0:
+        assert Status.ESTIMATED in published
+        assert told.kinds >= {"limit_crossed", "model_disagrees"}
+        assert np.isfinite(kept.column("gz.N").last).any()
+        assert Status.ESTIMATED in known.noise.coefficients.status
+    else:
+        assert published == {Status.UNESTIMATED}
+        assert not told.kinds & {"limit_crossed", "model_disagrees"}
+        assert all(look.axes == {} for look in told.gaps)
+        assert not np.isfinite(kept.column("gz.N").last).any()
+        assert set(known.noise.coefficients.status.ravel().tolist()) == {Status.UNESTIMATED}
+        assert known.status is not None
+        assert known.status.text == told.health_text
+        assert told.health_text.endswith(
+            "the end of the file; measured rate 100 Hz differs from the configured 200 Hz; coefficients are withheld: "
+            "correct `rate` or remove it"
+        )
+
+
+def test_a_recording_that_shows_no_rate_says_so(tmp_path: Path) -> None:
+    save_samples(tmp_path / "r.npz", np.arange(50) / 100.0, np.ones((50, 6)))
+    told = Estimates()
+    path = tmp_path / "config.toml"
+    path.write_text(
+        '[[device]]\nname = "d"\ndriver = { link = "replay", path = "r.npz" }\n'
+        '[zenoh]\nmode = "none"\n[viewer]\nmode = "none"\n'
+    )
+    service = Service(loading.load(path), [told])
+    service.run(60.0)
+    assert service.stations[0].published == 50
+    assert told.all == []
+    assert told.health_text.endswith("; no estimate: the times of the samples do not show a rate; set `rate`")
+
+
+def test_kernels_that_cannot_be_kept_hold_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full_disk(
+        _group: kernel_compilation.Group, _tell: Callable[[kernel_compilation.Progress], None]
+    ) -> Iterator[str]:
+        yield kernel_compilation.WINDOW
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(kernel_compilation, "prepare", full_disk)
+    save_samples(tmp_path / "short.npz", np.arange(500) / 100.0, np.random.default_rng(1).standard_normal((500, 6)))
+    service = Service(config(tmp_path, 'link = "replay", path = "short.npz", speed = "max"', 'mode = "none"'))
+    with capture_logs() as logs:
+        service.run(PATIENCE_S)
+    latest = service.stations[0].latest
+    assert latest is not None
+    assert latest.samples == 500
+    assert np.isfinite(latest.fitted[:, 2]).any()
+    assert ["No space left" in str(line.get("error")) for line in logs].count(True) == 1
+
+
+def test_a_replay_that_is_stopped_loses_nothing_it_has_counted(tmp_path: Path) -> None:
+    n = 1_000_000  # many times what the ring holds
+    save_samples(tmp_path / "long.npz", np.arange(n) / 100.0, np.random.default_rng(1).standard_normal((n, 6)))
+    service = Service(config(tmp_path, 'link = "replay", path = "long.npz", speed = "max"', 'mode = "none"'))
+    (station,) = service.stations
+    thread = threading.Thread(target=service.run)
+    thread.start()
+    wait_for(lambda: station.published > 0)
+    service.stop()
+    thread.join(PATIENCE_S)
+    assert not thread.is_alive()
+    assert station.driver.state != "ended"
+    assert station.ring.overflowed == 0
+    assert station.published == station.driver.counts.received < n

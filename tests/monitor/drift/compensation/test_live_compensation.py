@@ -1,0 +1,60 @@
+"""The compensation of a stream of blocks: times, looks and events."""
+
+import numpy as np
+import pytest
+
+from drivers.sample import block
+from monitor.drift.compensation.arma import Arma
+from monitor.drift.compensation.live_compensation import KIND, LiveCompensation
+
+RATE_HZ = 100.0
+SIGMA = 1e-3
+
+
+def fed(live: LiveCompensation, seconds: float, start_s: float = 0.0, scale: float = 1.0, lost: int = 0, seed: int = 0):
+    n = round(seconds * RATE_HZ)
+    t_ns = np.round((start_s + np.arange(n) / RATE_HZ) * 1e9).astype(np.int64)
+    values = 0.01 + scale * SIGMA * np.random.default_rng(seed).standard_normal((n, 6))
+    return live.update(block(t_ns, values, np.full(n, 21.0), np.arange(n), lost))
+
+
+def test_blocks_keep_what_is_not_a_rate():
+    live = LiveCompensation(RATE_HZ)
+    first, second = fed(live, 30.0), fed(live, 10.0, 31.0, lost=100)
+    assert (second.lost, len(second)) == (100, 1000)
+    assert (first.temperature_c == 21.0).all()
+    np.testing.assert_array_equal(first.ticks, np.arange(3000))
+    looks = live.take()
+    assert [look.t_ns for look in looks[:3]] == [990_000_000, 1_990_000_000, 2_990_000_000]
+    assert looks[-1].t_ns == 39_990_000_000
+    assert not live.take()
+    np.testing.assert_allclose(looks[-1].expected, 0.01, atol=3e-4)
+
+
+def test_noise_that_grows_is_an_event_with_its_times():
+    live = LiveCompensation(RATE_HZ)
+    fed(live, 100.0)
+    for axis in range(3):
+        live.adopt(axis, Arma((0.0, 0.0), 0.0, 0.0, mean=0.01, white=SIGMA**2 / 100.0, order=(0, 0), count=100))
+    fed(live, 100.0, 100.0)
+    assert not live.take_events()
+    fed(live, 300.0, 200.0, scale=1.9)
+    events = live.take_events()
+    assert {event.kind for event in events} == {KIND}
+    assert {event.axis for event in events} == {"gx", "gy", "gz"}
+    one = events[0]
+    assert 200.0 < one.t_ns / 1e9 < 350.0
+    assert one.since_ns is not None
+    assert "times as large as they should be" in one.text
+    assert one.what["innovation"]["mean_square"] == pytest.approx(one.sigma**2)
+
+
+def test_another_rate_begins_anew_and_nearly_the_same_does_not():
+    live = LiveCompensation(RATE_HZ)
+    fed(live, 20.0)
+    kept = live.compensator
+    live.relabel(101.0)
+    assert live.compensator is kept
+    live.relabel(200.0)
+    assert live.compensator is not kept
+    assert live.compensator.rate_hz == 200.0

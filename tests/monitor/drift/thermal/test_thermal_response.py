@@ -1,0 +1,49 @@
+"""Responses to temperature against the recursions that they stand for."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.signal import lfilter
+
+from monitor.drift.thermal.thermal_response import Shape, equation, lagged, responses, roots, solved
+
+T = np.random.default_rng(3).standard_normal(200).cumsum()
+
+
+def test_a_lag_is_scipys_filter():
+    p = 0.8
+    want, _ = lfilter([1.0 - p], [1.0, -p], T, zi=[p * T[0]])
+    np.testing.assert_allclose(lagged(T, p), want, rtol=1e-12)
+
+
+@given(
+    powers=st.integers(0, 1),
+    constants=st.lists(st.floats(0.3, 30.0), min_size=1, max_size=3, unique=True),
+    seed=st.integers(0, 1000),
+)
+def test_the_equation_makes_the_same_as_the_lags(powers, constants, seed):
+    """Y_n + a_1 Y_{n−1} + … = b_0 x_n + … + c, run forward from where the lags stand, gives what the lags give."""
+    shape = Shape(powers, tuple(constants))
+    sizes = np.random.default_rng(seed).standard_normal(1 + powers + len(constants))
+    y = responses(shape, T, 1.0) @ sizes
+    a, b, c = equation(shape, sizes, 1.0)
+    assert (a.size, b.size) == (len(constants), len(constants) + powers)
+    assert np.all(np.abs(np.roots(np.concatenate([[1.0], a]))) < 1.0)
+    k = len(constants)
+    for n in range(k, 60):
+        made = c + b @ T[n - np.arange(b.size)] - a @ y[n - 1 - np.arange(k)]
+        assert made == pytest.approx(y[n], rel=1e-7, abs=1e-7)
+
+
+def test_what_was_left_behind_dies_away_with_the_roots():
+    shape = Shape(0, (2.0, 9.0))
+    columns = responses(shape, T, 1.0, began=True)
+    assert columns.shape == (200, 5)
+    np.testing.assert_allclose(columns[1, -2:], roots(shape, 1.0))
+
+
+def test_sizes_do_not_depend_on_units():
+    columns = responses(Shape(3, (4.0,)), T, 1.0)
+    want = np.array([1e-3, 2e-5, -3e-6, 1e-9, 4e-5])
+    np.testing.assert_allclose(solved(columns, columns @ want), want, rtol=1e-6)

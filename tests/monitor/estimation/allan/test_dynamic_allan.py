@@ -1,0 +1,156 @@
+"""Dynamic curves: the same as one batch after another, and the experiment of the paper behind them."""
+
+import numpy as np
+import pytest
+
+from drivers.errors import ConfigError, NotReady
+from monitor.estimation.allan import batch
+from monitor.estimation.allan.dynamic_allan import MOST_STEPS, dynamic
+from monitor.estimation.allan.uncertainty import intervals, table
+from monitor.estimation.fit.coefficient_fit import design, fit
+from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.noise.effects import (
+    AngleRandomWalk,
+    BiasInstability,
+    QuantizationNoise,
+    RateRamp,
+    RateRandomWalk,
+)
+from monitor.noise.model import NoiseModel
+
+RATE_HZ = 100.0
+QUIET = {"Q": 2.0e-5, "N": 1.5e-4, "B": 4.0e-5, "K": 1.5e-6, "R": 0.0}
+LOUD = QUIET | {"N": 3.0e-4, "B": 1.2e-4, "K": 2.0e-5, "R": 2.0e-6}  # Q stays
+JUMP_S, END_S, WINDOW_S = 250.0, 600.0, 100.0
+
+
+def model(size: dict[str, float]) -> NoiseModel:
+    sources = (
+        QuantizationNoise(Q=size["Q"]),
+        AngleRandomWalk(N=size["N"]),
+        BiasInstability(B=size["B"]),
+        RateRandomWalk(K=size["K"]),
+        RateRamp(R=size["R"]),
+    )
+    return NoiseModel(dict.fromkeys(("gx", "gy", "gz", "ax", "ay", "az"), sources))
+
+
+def jumping(seed: int) -> np.ndarray:
+    """600 s at 100 Hz: at 250 s N doubles, B trebles, K grows thirteenfold, a ramp begins; Q does not change."""
+    before, after = round(JUMP_S * RATE_HZ), round((END_S - JUMP_S) * RATE_HZ)
+    quiet = model(QUIET).simulate(before, RATE_HZ, seed)
+    loud = model(LOUD).simulate(after, RATE_HZ, seed + 1000)
+    second = round(RATE_HZ)
+    level = quiet[-second:].mean(axis=0) - loud[:second].mean(axis=0)  # the bias goes on from where it was
+    return np.concatenate([quiet, loud + level])
+
+
+def test_every_step_is_a_batch_over_its_window() -> None:
+    values = jumping(1)[20_000:32_000]
+    values[:, 5] += 9.81
+    values[[500, 4321]] = np.nan
+    found = dynamic(values, RATE_HZ, 40.0, "octave", 7.0)
+    length, step = 4000, 700
+    factors = batch.cluster_sizes(length, RATE_HZ)
+    columns, covariances = design(factors, RATE_HZ), table(length, factors)
+    entered = np.zeros((5, 6), np.bool_)
+    assert found.t_s.tolist() == [(length + i * step) / RATE_HZ for i in range(found.t_s.size)]
+    assert found.t_s.size == 12
+    assert found.window_s == 40.0
+    for row, end in enumerate(range(length, 12_001, step)):
+        window = values[end - length : end]
+        avar, terms = batch.overlapping(window, factors)
+        slope, slopes = batch.slope(window) * RATE_HZ, batch.slopes(window, factors) * RATE_HZ
+        expected = fit(columns, covariances, avar, terms, entered, slope, slopes)
+        entered = expected.entered
+        lo, hi = intervals(avar, expected.edf)
+        assert found.deviation[row] == pytest.approx(np.sqrt(avar), rel=1e-9)
+        # the window takes the slopes of long τ from a grid of points, which the fit passes on
+        assert found.lo[row] == pytest.approx(lo, rel=5e-3, nan_ok=True)
+        assert found.hi[row] == pytest.approx(hi, rel=5e-3, nan_ok=True)
+        known = expected.coefficients
+        np.testing.assert_array_equal(found.status[row], known.status)
+        for mine, theirs in (
+            (found.value, known.value),
+            (found.value_lo, known.lo),
+            (found.value_hi, known.hi),
+        ):
+            np.testing.assert_allclose(mine[row], theirs, rtol=5e-3, atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def experiment() -> list:
+    return [dynamic(jumping(seed), RATE_HZ, WINDOW_S) for seed in range(4)]
+
+
+def test_of_a_jump_in_n_b_k_r_the_window_shows_it_and_q_stays(experiment: list) -> None:
+    """ "Dynamic extraction of random drift error coefficients of MEMS gyroscopes", its experiment, 24 axes."""
+    q, n = LETTERS.index("Q"), LETTERS.index("N")
+    t_s = experiment[0].t_s
+    before, after = t_s <= JUMP_S, t_s >= JUMP_S + WINDOW_S
+    values = np.concatenate([one.value for one in experiment], axis=2)  # [T, 5, 24]
+    assert values[before, n].mean() == pytest.approx(QUIET["N"], rel=0.01)
+    assert values[after, n].mean() == pytest.approx(LOUD["N"], rel=0.02)
+    # at every single step beyond one window N is nearer to its new size, and at none before the jump
+    half = np.sqrt(QUIET["N"] * LOUD["N"])
+    assert (values[before, n] < half).all()
+    assert (values[after, n] > half).all()
+    # midway old and new share the window: the variance is halfway
+    midway = values[np.argmin(abs(t_s - JUMP_S - WINDOW_S / 2)), n]
+    assert np.mean(midway**2) == pytest.approx((QUIET["N"] ** 2 + LOUD["N"] ** 2) / 2, rel=0.1)
+    quantization = np.nanmean(values[:, q], axis=1)
+    assert quantization == pytest.approx(np.full(t_s.size, QUIET["Q"]), rel=0.05)
+
+
+def test_the_longest_deviations_rise_by_flicker_and_walk(experiment: list) -> None:
+    t_s, tau_s = experiment[0].t_s, experiment[0].tau_s
+    at = int(np.argmin(abs(tau_s - 5.0)))
+    deviation = np.concatenate([one.deviation[:, at] for one in experiment], axis=1)
+    before, after = (np.sqrt(np.mean(deviation[rows] ** 2)) for rows in (t_s <= JUMP_S, t_s >= JUMP_S + WINDOW_S))
+    tau = tau_s[at : at + 1]
+    expected = [np.sqrt(model(size).avar("gx", tau, 1 / RATE_HZ)[0]) for size in (QUIET, LOUD)]
+    assert [before, after] == pytest.approx(expected, rel=0.15)
+    assert after > 1.8 * before
+
+
+def test_the_whole_recording_hides_what_the_window_shows(experiment: list) -> None:
+    """The mean of both variances, in which no time stands."""
+    values = jumping(0)
+    avar, _ = batch.overlapping(values, np.array([16]))
+    whole = np.sqrt(avar[0].mean())
+    at = int(np.argmin(abs(experiment[0].tau_s - 0.16)))
+    mine = experiment[0].deviation[:, at].mean(axis=1)
+    assert mine[0] < 0.8 * whole < 0.8 * mine[-1]
+
+
+def test_a_long_recording_is_shown_in_a_bounded_number_of_steps() -> None:
+    values = np.random.default_rng(3).standard_normal((200_000, 6))
+    shares: list[float] = []
+    found = dynamic(values, 10.0, 20.0, (0.1, 0.4, 1.6), step_s=1.0, progress=shares.append)
+    assert 0.9 * MOST_STEPS < found.t_s.size <= MOST_STEPS
+    assert np.diff(found.t_s) == pytest.approx(np.full(found.t_s.size - 1, found.t_s[1] - found.t_s[0]))
+    assert found.t_s[-1] > 20_000.0 - (found.t_s[1] - found.t_s[0])
+    assert shares == pytest.approx(np.arange(1, found.t_s.size + 1) / found.t_s.size)
+
+
+def test_an_axis_that_is_not_measured_says_nothing() -> None:
+    values = np.random.default_rng(4).standard_normal((2000, 6))
+    values[:, 3:] = np.nan
+    found = dynamic(values, 10.0, 100.0)
+    assert np.isnan(found.deviation[..., 3:]).all()
+    assert (found.status[..., 3:] == Status.UNESTIMATED).all()
+    assert (found.status[:, LETTERS.index("N"), :3] == Status.ESTIMATED).all()
+
+
+def test_a_recording_shorter_than_the_window_gives_no_answer() -> None:
+    with pytest.raises(NotReady, match=r"50 s are recorded, less than the window of 60 s"):
+        dynamic(np.zeros((500, 6)), 10.0, 60.0)
+
+
+@pytest.mark.parametrize(
+    ("window_s", "step_s", "says"),
+    [(5.0, None, r"window of 5 s: 50 samples at 10 Hz; possible are 10 to"), (20.0, 0.0, "step of 0 s")],
+)
+def test_what_is_impossible_is_a_wrong_request(window_s: float, step_s: float | None, says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        dynamic(np.zeros((500, 6)), 10.0, window_s, step_s=step_s)

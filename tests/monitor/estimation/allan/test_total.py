@@ -1,0 +1,202 @@
+"""Total variance: published numbers, allantools, plain sums of the reflected rate, simulation."""
+
+import csv
+
+import allantools
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from monitor.estimation.allan import difference_moments as moments_module
+from monitor.estimation.allan.batch import overlapping
+from monitor.estimation.allan.total import MIN_SHARE, moments, octaves, total, total_curve
+from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
+from tests.support.allan_references import nist_1000
+
+
+def reflected(rate, m):
+    """D_k(m) of the reflected rate for every k, NaN where a sample is missing: the definition, with no phase in it."""
+    n = len(rate)
+    longer = np.concatenate([rate[::-1], rate, rate[::-1]])
+    sums = np.convolve(longer, np.ones(m), "valid") / m
+    return np.array([sums[n + i] - sums[n + i - m] for i in range(1, n)])
+
+
+def differences(n, m):
+    """The weights [n - 1, n + 1] of all terms on phase, written out from x*."""
+    rows = np.zeros((n - 1, n + 1))
+    for i in range(1, n):
+        for place, weight in ((i - m, 1.0), (i, -2.0), (i + m, 1.0)):
+            if place < 0:
+                rows[i - 1, [0, -place]] += (2.0 * weight, -weight)
+            elif place > n:
+                rows[i - 1, [n, 2 * n - place]] += (2.0 * weight, -weight)
+            else:
+                rows[i - 1, place] += weight
+    return rows
+
+
+def test_thousand_points_of_nist_sp_1065():
+    found, terms = total(nist_1000()[:, None], np.array([1, 10, 100]))
+    assert np.sqrt(found[:, 0]) == pytest.approx([2.922319e-01, 9.134743e-02, 3.406530e-02], abs=5e-8)
+    assert terms.ravel().tolist() == [999, 999, 999]
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 100.0])
+@pytest.mark.parametrize("kind", ["float", "int", "float32"])
+def test_equals_allantools_up_to_the_longest_cluster(kind, rate_hz):
+    rng = np.random.default_rng(5)
+    y = 1e2 * rng.standard_normal(700) + np.cumsum(rng.standard_normal(700))
+    y = {"float": y, "int": np.rint(y).astype(np.int64), "float32": y.astype(np.float32)}[kind]
+    factors = np.array([1, 2, 3, 7, 100, 349, 350, 351, 352, 500, 698, 699])
+    found, _ = total(y[:, None], factors)
+    _, expected, _, _ = allantools.totdev(
+        y.astype(float) if kind == "float32" else y, rate=rate_hz, data_type="freq", taus=factors / rate_hz
+    )
+    assert np.sqrt(found[:, 0]) == pytest.approx(expected, rel=1e-10)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    n=st.integers(2, 60),
+    m=st.integers(1, 59),
+    holes=st.sets(st.integers(0, 59), max_size=5),
+    offset=st.sampled_from([0.0, 9.81, -300.0]),
+    scale=st.sampled_from([1e-4, 1.0, 1e3]),
+    seed=st.integers(0, 99),
+)
+def test_is_the_mean_over_the_reflected_rate_whatever_is_missing(n, m, holes, offset, scale, seed):
+    rate = np.random.default_rng(seed).standard_normal(n)
+    rate[[h for h in holes if h < n]] = np.nan
+    found, terms = total((offset + scale * rate)[:, None], np.array([m]))
+    squares = reflected(rate, m) ** 2 if m < n else np.array([])
+    whole = ~np.isnan(squares)
+    assert terms[0, 0] == whole.sum()
+    if whole.any():
+        assert found[0, 0] / scale**2 == pytest.approx(0.5 * squares[whole].mean(), rel=1e-8, abs=1e-18 * offset**2)
+    else:
+        assert np.isnan(found[0, 0])
+
+
+def test_columns_do_not_mix_and_the_input_is_left_alone():
+    values = np.random.default_rng(0).standard_normal((80, 3))
+    values[:, 1], values[10, 2], values[11, 2] = np.nan, np.inf, -np.inf
+    before = values.copy()
+    found, terms = total(values, np.array([1, 5, 79]))
+    assert np.array_equal(values, before, equal_nan=True)
+    assert np.isnan(found[:, 1]).all()
+    assert terms[:, 0].tolist() == [79, 79, 79]
+    for k in range(3):
+        alone, _ = total(values[:, [k]], np.array([1, 5, 79]))
+        np.testing.assert_allclose(found[:, [k]], alone, rtol=1e-12)
+
+
+# --- what it estimates
+
+
+def test_bias_is_the_published_one_up_to_half_the_record():
+    for share, m in ((8, 12_500), (4, 25_000), (2, 50_000)):
+        one = moments(100_000, m)
+        loss = (1.0 - one.mean / one.allan) * share
+        assert loss[:4] == pytest.approx([-4.0 / 3.0, 0.0, 0.481, 0.750], abs=1e-3)
+
+
+@pytest.mark.parametrize(("n", "m"), [(40, 1), (40, 7), (41, 20), (40, 29), (41, 40), (300, 37), (301, 290)])
+def test_moments_are_the_plain_sums_over_all_pairs_of_terms(n, m):
+    rows = differences(n, m)
+    lags = moments_module.autocovariance(np.subtract.outer(np.arange(n + 1.0), np.arange(n + 1.0)))
+    noise = np.stack([rows @ g @ rows.T for g in lags])
+    ramp = rows @ (0.5 * np.arange(n + 1.0) ** 2)
+    mean = np.append(noise.diagonal(axis1=1, axis2=2).mean(axis=1), np.mean(ramp**2)) / (2 * m * m)
+    one = moments(n, m)
+    np.testing.assert_allclose(one.mean, mean, rtol=1e-7)
+    theta = np.array([3.0, 1.0, 0.3, 1.0 / n**2, 1.0 / n**3])
+    together = np.tensordot(theta[:4], noise, 1)
+    variance = (2 * (together**2).sum() + 4 * theta[4] * ramp @ together @ ramp) / (2 * m * m * (n - 1)) ** 2
+    assert theta @ one.covariance @ theta == pytest.approx(variance, rel=1e-9 if n <= 256 else 0.02)
+
+
+@pytest.mark.parametrize("m", [3, 33, 80, 150, 350, 600, 699])
+def test_the_coarse_grid_of_a_long_record_is_good_to_a_few_percent(m):
+    n = 700
+    rows = differences(n, m)
+    lags = moments_module.autocovariance(np.subtract.outer(np.arange(n + 1.0), np.arange(n + 1.0)))
+    exact = [2.0 * ((rows @ g @ rows.T) ** 2).sum() / (2 * m * m * (n - 1.0)) ** 2 for g in lags]
+    np.testing.assert_allclose(moments(n, m).covariance.diagonal()[:4], exact, rtol=0.05)
+
+
+@pytest.mark.parametrize(("share", "stated"), [(8, (12.0, 9.14, 7.08)), (4, (6.0, 4.46, 3.36)), (2, (3.0, 2.12, 1.5))])
+def test_degrees_of_freedom_are_howe_s_up_to_half_the_record(share, stated):
+    one = moments(64_000, 64_000 // share)
+    edf = 2.0 * one.mean[1:4] ** 2 / one.covariance.diagonal()[1:4]
+    assert edf == pytest.approx(stated, rel=0.02)
+
+
+def test_a_ramp_alone_is_corrected_to_its_own_variance():
+    n, slope = 600, 0.01
+    theta = np.array([[0.0], [0.0], [0.0], [0.0], [slope**2]])
+    curve = total_curve(slope * np.arange(n)[:, None], 1.0, theta)
+    np.testing.assert_allclose(curve.tvar[:, 0], 0.5 * slope**2 * curve.factors**2, rtol=1e-9)
+    assert np.isnan(curve.edf).all()  # nothing in it varies
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 200.0])
+def test_intervals_hold_what_they_promise_up_to_half_the_record(rate_hz):
+    """χ² is a little wide at few degrees of freedom, 97 % at T/2; the counting error of 3000 records is 0.4 %."""
+    n, runs = 512, 3000
+    rng = np.random.default_rng(21)
+    theta = np.array([1e-4, 1.0, 0.02, 1e-3, 0.0])
+    sources = (
+        QuantizationNoise(Q=1e-2),
+        AngleRandomWalk(N=1.0),
+        BiasInstability(B=0.02**0.5),
+        RateRandomWalk(K=1e-3**0.5),
+    )
+    values = sum(np.stack([s.start(rate_hz, rng).draw(n) for _ in range(runs)], axis=1) for s in sources)
+    factors = np.array([64, 128, 256, 384])
+    curve = total_curve(values, rate_hz, np.repeat(theta[:, None], runs, axis=1), factors)
+    truth = sum(s.avar(factors / rate_hz, 1.0 / rate_hz) for s in sources)
+    np.testing.assert_allclose(curve.tvar.mean(axis=1), truth, rtol=0.1)
+    held = (curve.lo**2 <= truth[:, None]) & (truth[:, None] <= curve.hi**2)
+    assert (held[:3].mean(axis=1) > 0.944).all()
+    assert (held[:3].mean(axis=1) < 0.981).all()
+    assert np.isnan(curve.lo[3]).all()
+    assert np.isnan(curve.hi[3]).all()
+
+
+def test_the_shortest_cluster_is_allan_s_and_the_grid_ends_below_the_record():
+    values = np.random.default_rng(2).standard_normal((300, 6))
+    curve = total_curve(values, 50.0, np.tile([[0.0], [0.02], [0.0], [0.0], [0.0]], 6))
+    assert curve.factors.tolist() == [1, 2, 4, 8, 16, 32, 64, 128, 256]
+    np.testing.assert_allclose(curve.tau_s, curve.factors / 50.0)
+    np.testing.assert_allclose(curve.tvar[0], overlapping(values, np.array([1]))[0][0], rtol=1e-12)
+    assert octaves(256)[-1] == 256
+    assert octaves(255)[-1] == 128
+
+
+def test_without_known_noise_or_with_too_little_left_there_is_no_curve():
+    values = np.random.default_rng(3).standard_normal((400, 2))
+    values[200, 1] = np.nan
+    theta = np.array([[0.0, 0.0], [np.nan, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    curve = total_curve(values, 1.0, theta)
+    assert np.isnan(curve.tvar[:, 0]).all()
+    assert np.isnan(curve.hi[:, 0]).all()
+    enough = curve.terms[:, 1] >= MIN_SHARE * 399
+    assert enough.any()
+    assert not enough.all()
+    assert np.array_equal(np.isfinite(curve.tvar[:, 1]), enough)
+
+
+# --- published results on real data
+
+
+@pytest.mark.data
+def test_phase_dat_of_stable32(reference):
+    with (reference / "phase-dat.csv").open() as stream:
+        x = np.array([float(row["x"]) for row in csv.DictReader(stream)])
+    with (reference / "phase-dat-stable32-totdev.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    factors = np.array([int(float(row["m"])) for row in rows])
+    found, _ = total(np.diff(x)[:, None], factors)
+    assert np.sqrt(found[:, 0]) == pytest.approx([float(row["dev"]) for row in rows], rel=5e-5)

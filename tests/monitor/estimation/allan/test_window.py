@@ -1,0 +1,581 @@
+"""The sliding window equals the whole-recording curve of its last samples, at every position, whatever came before."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
+
+from drivers.errors import ConfigError
+from monitor.estimation.allan.batch import cluster_sizes, overlapping, slope, slopes
+from monitor.estimation.allan.window import FULL_SCALE, MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_spans
+from monitor.estimation.allan.window_kernel import STAGE, advance
+from tests.experiments.benchmarks import long_run
+
+FACTORS = np.array([1, 2, 3, 7, 16, 25, 50])
+LENGTH = 100
+GRAVITY = np.array([0.0, 0.0, 0.01, 0.0, 0.0, 9.81])
+
+
+def made(n, seed=0, noise=1e-4):
+    return noise * np.random.default_rng(seed).standard_normal((n, 6)) + GRAVITY
+
+
+def expected(values, length=LENGTH, factors=FACTORS):
+    return overlapping(values[-length:], factors)
+
+
+def expected_of_spans(window, values):
+    """Row by row, each over its own span."""
+    rows = [expected(values, span, np.array([m])) for m, span in zip(window.factors, window.spans, strict=True)]
+    return np.concatenate([avar for avar, _ in rows]), np.concatenate([terms for _, terms in rows])
+
+
+def check(window, values, rel=1e-9, largest=0.0):
+    """The window against the batch of the last samples of ``values``.
+
+    Where few terms remain, and those small, the unit of the integer phase shows: one each side of a second difference.
+    ``largest``: deviation ever held, of which the sums keep 2^-53.
+    """
+    if (window.spans == window.length).all():
+        avar, terms = expected(values, window.length, window.factors)
+    else:
+        avar, terms = expected_of_spans(window, values)
+    assert np.array_equal(window.terms(), terms)
+    found = window.avar()
+    assert np.array_equal(np.isnan(found), np.isnan(avar))
+    unit = 2.0 / window._scale[:6] / window.factors[:, None]
+    within = rel * avar + 2.0 * np.sqrt(avar / np.maximum(terms, 1)) * unit + unit**2 + (2.0**-50 * largest) ** 2
+    assert (np.isnan(avar) | (np.abs(found - avar) <= within)).all(), np.nanmax(np.abs(found - avar) / within)
+
+
+def assert_same(one, other):
+    """Bit for bit: how the samples were cut must not be seen."""
+    assert np.array_equal(one.avar(), other.avar(), equal_nan=True)
+    assert np.array_equal(one.terms(), other.terms())
+    assert (one.n, one.total) == (other.n, other.total)
+
+
+# --- one truth, whatever the cut
+
+
+def test_every_position_equals_the_batch():
+    values = made(700)
+    values[rng_rows(700, 12)] = np.nan
+    values[300:330, 2] = np.nan
+    window = AllanWindow(LENGTH, FACTORS)
+    for i in range(len(values)):
+        window.update(values[i : i + 1])
+        check(window, values[: i + 1])
+
+
+def rng_rows(n, k):
+    return np.random.default_rng(5).choice(n, k, replace=False)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    cuts=st.lists(st.integers(0, 700), max_size=12),
+    values=hnp.arrays(
+        np.float64,
+        (700, 6),
+        elements=st.floats(-70.0, 70.0, allow_nan=False, allow_subnormal=False),
+        fill=st.sampled_from([0.0, 9.81, float("nan")]),
+    ),
+    length=st.sampled_from([100, 101, 163, 164, 165, 300]),
+)
+def test_blocks_of_any_cut_equal_one_by_one(cuts, values, length):
+    factors = cluster_sizes(length, 1.0, "decade10")
+    whole, cut, single = (AllanWindow(length, factors) for _ in range(3))
+    whole.update(values)
+    edges = [0, *sorted(cuts), len(values)]
+    for a, b in pairwise(edges):
+        cut.update(values[a:b])
+    for row in values:
+        single.update(row[None])
+    assert np.array_equal(whole.terms(), single.terms())
+    assert np.array_equal(cut.terms(), single.terms())
+    for window in (whole, cut, single):
+        check(window, values, largest=70.0)
+    atol = (2.0**-50 * 70.0) ** 2
+    np.testing.assert_allclose(whole.avar(), single.avar(), rtol=1e-13, atol=atol)
+    np.testing.assert_allclose(cut.avar(), single.avar(), rtol=1e-13, atol=atol)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    holes=st.lists(st.tuples(st.integers(0, 800), st.integers(1, 160), st.integers(0, 6)), max_size=6),
+    length=st.integers(100, 260),
+)
+def test_missing_anywhere_on_one_axis_or_all(holes, length):
+    values = made(800, seed=length)
+    for at, n, axis in holes:
+        values[at : at + n, slice(None) if axis == 6 else axis] = np.nan
+    factors = cluster_sizes(length, 1.0)
+    window = AllanWindow(length, factors)
+    for start in range(0, len(values), 37):
+        window.update(values[start : start + 37])
+        check(window, values[: start + 37])
+
+
+# --- life
+
+
+def test_growing_full_and_reset():
+    values = made(260)
+    window = AllanWindow(LENGTH, FACTORS)
+    assert np.isnan(window.avar()).all()
+    assert not window.terms().any()
+    window.update(values[:60])
+    assert (window.n, window.total) == (60, 60)
+    check(window, values[:60])
+    assert np.isnan(window.avar()[-2:]).sum() == 6  # m = 50 needs a hundred
+    window.update(values[60:])
+    assert (window.n, window.total) == (100, 260)
+    window.reset()
+    assert (window.n, window.total) == (0, 0)
+    assert np.isnan(window.avar()).all()
+    window.update(values)
+    fresh = AllanWindow(LENGTH, FACTORS)
+    fresh.update(values)
+    assert_same(window, fresh)
+
+
+def test_an_empty_block_changes_nothing():
+    window = AllanWindow(LENGTH, FACTORS)
+    window.update(np.empty((0, 6)))
+    assert window.total == 0
+
+
+@pytest.mark.parametrize("n", [0, 1, 37, 64, 99, 100])
+def test_skipping_is_that_many_missing_rows(n):
+    values = made(500)
+    skipped, missing = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS)
+    for window in (skipped, missing):
+        window.update(values[:250])
+    skipped.skip(n)
+    missing.update(np.full((n, 6), np.nan))
+    assert_same(skipped, missing)
+    for window in (skipped, missing):
+        window.update(values[250:])
+    assert_same(skipped, missing)
+    check(skipped, values)
+
+
+def test_a_skip_longer_than_the_window_empties_it():
+    window, fresh = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS)
+    window.update(made(500))
+    window.skip(10**12)
+    for one in (window, fresh):
+        one.update(made(70, seed=3))
+    assert_same(window, fresh)
+
+
+def test_skips_in_pieces_cross_the_piece_length():
+    length = 9000
+    factors = np.array([1, 100, 4500])
+    values = made(20_000)
+    window = AllanWindow(length, factors)
+    window.update(values)
+    window.skip(8999)
+    window.update(values[:1])
+    check(window, np.concatenate([values, np.full((8999, 6), np.nan), values[:1]]))
+
+
+@pytest.mark.parametrize(
+    ("length", "factors"),
+    [
+        (MIN_LENGTH - 1, [1]),
+        (MAX_LENGTH + 1, [1]),
+        (100, []),
+        (100, [0, 1]),
+        (100, [1, 51]),
+        (100, [2, 2]),
+        (100, [4, 2]),
+    ],
+)
+def test_impossible_windows_are_refused(length, factors):
+    with pytest.raises(ConfigError):
+        AllanWindow(length, np.array(factors, np.int64))
+
+
+# --- forgetting all but the newest
+
+
+def broken(n, seed=0):
+    """Noise with single samples, an axis and a stretch of all axes missing."""
+    values = made(n, seed)
+    values[np.random.default_rng(seed + 1).choice(n, n // 60, replace=False)] = np.nan
+    values[n // 2 : n // 2 + 9, 3] = np.nan
+    values[n // 3 : n // 3 + 5] = np.nan
+    return values
+
+
+# --- a span for each row
+
+
+SPANNED = np.array([1, 1, 2, 7, 7, 3, 50, 16])
+SPANS = np.array([2, 300, 5, 14, 100, 163, 300, 299])
+
+
+def test_every_row_equals_the_batch_of_its_own_span_at_every_position():
+    values = broken(900)
+    window = AllanWindow(300, SPANNED, SPANS)
+    for i in range(len(values)):
+        window.update(values[i : i + 1])
+        check(window, values[: i + 1])
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    cuts=st.lists(st.integers(0, 700), max_size=12),
+    shares=st.lists(st.floats(0.0, 1.0), min_size=8, max_size=8),
+    holes=st.lists(st.tuples(st.integers(0, 690), st.integers(1, 80), st.integers(0, 6)), max_size=4),
+)
+def test_rows_of_any_span_and_blocks_of_any_cut(cuts, shares, holes):
+    values = made(700, seed=len(cuts))
+    for at, n, axis in holes:
+        values[at : at + n, slice(None) if axis == 6 else axis] = np.nan
+    spans = 2 * SPANNED + np.floor(np.array(shares) * (200 - 2 * SPANNED)).astype(np.int64)
+    cut, single = (AllanWindow(200, SPANNED, spans) for _ in range(2))
+    for a, b in pairwise([0, *sorted(cuts), len(values)]):
+        cut.update(values[a:b])
+    for row in values:
+        single.update(row[None])
+    assert np.array_equal(cut.terms(), single.terms())
+    np.testing.assert_allclose(cut.avar(), single.avar(), rtol=1e-13)
+    check(cut, values)
+
+
+def test_full_length_spans_are_the_plain_window():
+    values = broken(900)
+    plain, spanned = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS, np.full(FACTORS.size, LENGTH))
+    for window in (plain, spanned):
+        window.update(values)
+    assert_same(plain, spanned)
+
+
+def test_slope_and_length_are_those_of_the_whole_window():
+    values = made(900)
+    plain, spanned = AllanWindow(300, np.array([1, 2])), AllanWindow(300, np.array([1, 2]), np.array([10, 20]))
+    for window in (plain, spanned):
+        window.update(values)
+    assert spanned.n == 300
+    assert np.array_equal(plain.slope(), spanned.slope())
+
+
+def test_a_transient_leaves_each_row_after_its_own_span():
+    values = made(900)
+    values[600:603] += 1e6 * 1e-4
+    window = AllanWindow(300, np.array([1, 1]), np.array([20, 300]))
+    window.update(values[:623])
+    check(window, values[:623])
+    short, long = window.avar()[:, 0]
+    assert short < 1e-7 < 1.0 < long
+
+
+@pytest.mark.parametrize(
+    ("factors", "spans"),
+    [([1, 2], [10]), ([4], [7]), ([1], [101]), ([1], [0]), ([0], [10]), ([51], [102]), ([1, 2], [[10, 10]])],
+)
+def test_impossible_spans_are_refused(factors, spans):
+    with pytest.raises(ConfigError):
+        AllanWindow(100, np.array(factors), np.array(spans))
+
+
+@pytest.mark.parametrize(("length", "rate_hz"), [(100, 1.0), (100, 100.0), (360_000, 100.0), (3_600_000, 1000.0)])
+def test_quick_spans_fit_any_window(length, rate_hz):
+    factors = np.unique([*cluster_sizes(length, rate_hz), length // 2])
+    window = AllanWindow(length, factors, quick_spans(factors, rate_hz, length))
+    assert ((window.spans >= 16 * factors) | (window.spans == length)).all()
+    assert (window.spans >= min(10 * rate_hz, length)).all()
+
+
+# --- the kernel, called from other compiled code
+
+
+def test_staged_samples_can_be_taken_one_at_a_time():
+    values = broken(STAGE)
+    window, plain = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS)
+    for row in values:
+        plain.update(row[None])
+    window._stage[:] = values
+    for row in range(STAGE):
+        advance(window._ints, window._floats, window._missing, window._taus, row, 1)
+    assert_same(window, plain)
+    window._stage[:] = values[::-1]
+    advance(window._ints, window._floats, window._missing, window._taus, 100, 300)
+    plain.update(values[::-1][100:400])
+    assert_same(window, plain)
+
+
+# --- long runs, large values
+
+
+def test_ten_thousand_turns_of_phase_and_ring():
+    """Gravity alone turns the 64-bit phase every 3300 samples at the finest scale; the ring turns every 165."""
+    values = made(50_000, seed=8)
+    window = AllanWindow(LENGTH, FACTORS)
+    for turn in range(40):
+        window.update(values)
+        check(window, values[-(1000 + turn) :])
+    assert window.total == 2_000_000
+
+
+def test_full_scale_square_wave_at_the_longest_tau_does_not_overflow():
+    length = 4096
+    factors = cluster_sizes(length, 1.0)
+    m = int(factors[-1])
+    sign = np.where(np.arange(3 * length) // m % 2, 1.0, -1.0)[:, None]
+    values = sign * np.array(FULL_SCALE[:6])
+    window = AllanWindow(length, factors)
+    window.update(values)
+    check(window, values, rel=1e-12)
+
+
+@pytest.mark.parametrize("height", [1e-4 * 1e6, 400.0, 2000.0])
+@pytest.mark.parametrize("held", [1, 5, 400, 3000])
+def test_what_a_transient_added_is_taken_out_again(height, held):
+    """Held longer than the longest τ, and beyond full scale: then σ² at long τ is wrong while it is in there."""
+    length = 1000
+    values = made(9000, seed=11)
+    values[2000 : 2000 + held] += height
+    factors = cluster_sizes(length, 1.0)
+    window = AllanWindow(length, factors)
+    window.update(values[:2500])
+    assert window.avar()[0, 0] > 1e-5 or held > 1000
+    window.update(values[2500:])
+    check(window, values)
+
+
+@pytest.mark.parametrize("wrong", [1e6, 1e12, 1e300, np.inf, -np.inf])
+def test_impossible_values_do_not_stay(wrong):
+    values = made(1000)
+    values[200:203] = wrong
+    window = AllanWindow(LENGTH, FACTORS)
+    window.update(values[:250])
+    assert np.isfinite(window.avar()[0]).all()
+    window.update(values[250:])
+    check(window, values)
+
+
+@pytest.mark.parametrize("wrong", [1e300, np.inf, -np.inf])
+def test_what_phase_cannot_hold_counts_as_missing(wrong):
+    values, missing = made(150), made(150)
+    values[120, 4], missing[120, 4] = wrong, np.nan
+    window = AllanWindow(LENGTH, FACTORS)
+    window.update(values)
+    check(window, missing)
+
+
+def test_a_swing_beyond_twice_full_scale_recovers():
+    """±2000 m/s² for longer than the longest τ wraps the second difference: finite nonsense, then exact again."""
+    length = 4096
+    factors = cluster_sizes(length, 1.0)
+    values = made(40_000, seed=2)
+    values[8000:10_000] = 2000.0
+    values[10_000:12_000] = -2000.0
+    window = AllanWindow(length, factors)
+    window.update(values[:12_000])
+    assert np.isfinite(window.avar()).all()
+    window.update(values[12_000:])
+    check(window, values)
+
+
+# --- symmetries
+
+
+def test_an_offset_or_a_scale_changes_nothing_else():
+    values = made(3000)
+    plain, moved, larger = (AllanWindow(LENGTH, FACTORS) for _ in range(3))
+    plain.update(values)
+    moved.update(values + np.array([1.0, -2.0, 3.0, -20.0, 30.0, 100.0]))
+    larger.update(2.0 * values)
+    np.testing.assert_allclose(moved.avar(), plain.avar(), rtol=1e-9)
+    np.testing.assert_allclose(larger.avar(), 4.0 * plain.avar(), rtol=1e-9)
+
+
+def test_a_slope_adds_its_own_variance():
+    """A ramp alone gives σ² = R² τ²/2 (IEEE Std 952), at every position."""
+    slope = np.array([1e-3, -2e-3, 1e-5, 1e-2, 3e-3, -1e-3])
+    window = AllanWindow(LENGTH, FACTORS)
+    window.update(np.arange(5000)[:, None] * slope)
+    np.testing.assert_allclose(window.avar(), 0.5 * (FACTORS[:, None] * slope) ** 2, rtol=1e-9)
+
+
+def test_an_axis_that_is_never_measured():
+    values = made(500)
+    values[:, 4] = np.nan
+    window = AllanWindow(LENGTH, FACTORS)
+    window.update(values)
+    assert np.isnan(window.avar()[:, 4]).all()
+    assert not window.terms()[:, 4].any()
+    check(window, values)
+
+
+# --- arrays as they come
+
+
+@pytest.mark.parametrize("how", ["read-only", "fortran", "strided", "float32", "integers", "list"])
+def test_any_array_is_taken_by_the_one_compiled_version(how):
+    values = np.rint(made(300) * 1e4)
+    same = {
+        "read-only": values.copy(),
+        "fortran": np.asfortranarray(values),
+        "strided": np.repeat(values, 2, axis=0)[::2],
+        "float32": values.astype(np.float32),
+        "integers": values.astype(np.int32),
+        "list": values.tolist(),
+    }[how]
+    if how == "read-only":
+        same.flags.writeable = False
+    window, plain = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS)
+    plain.update(values)
+    versions = advance.signatures
+    window.update(same)
+    assert_same(window, plain)
+    assert advance.signatures == versions
+    assert how == "list" or same is not values
+
+
+def test_updating_leaves_the_caller_s_array_writable():
+    values = made(10)
+    AllanWindow(LENGTH, FACTORS).update(values)
+    assert values.flags.writeable
+
+
+@pytest.mark.parametrize("shape", [(10, 5), (10, 7), (6,), (10, 6, 1)])
+def test_a_wrong_shape_is_refused(shape):
+    with pytest.raises(ValueError, match=r"\[n, 6\]"):
+        AllanWindow(LENGTH, FACTORS).update(np.zeros(shape))
+
+
+# --- any order of calls
+
+
+class Calls(RuleBasedStateMachine):
+    """A window of several spans, beside the samples that it should hold: those of each axis, missing ones as NaN."""
+
+    def __init__(self):
+        super().__init__()
+        length = LENGTH + 30
+        self.window = AllanWindow(
+            length, np.array([1, 3, 1, 20, 65, 20]), np.array([length, 99, 40, length, length, 77])
+        )
+        self.held = np.empty((0, 6))
+        self.given = 0
+
+    @rule(n=st.integers(0, 200), holes=st.lists(st.tuples(st.integers(0, 199), st.integers(0, 5)), max_size=4))
+    def update(self, n, holes):
+        rows = made(n, self.given)
+        self.given += 1
+        for row, axis in holes:
+            if row < n:
+                rows[row, axis] = np.nan
+        self.window.update(rows)
+        self.held = np.concatenate([self.held, rows])[-self.window.length :]
+
+    @rule(n=st.integers(1, 3))
+    def update_one_by_one(self, n):
+        for _ in range(n):
+            self.update(1, [])
+
+    @rule(n=st.integers(0, LENGTH + 33))
+    def skip(self, n):
+        self.window.skip(n)
+        empty = n > self.window.length
+        self.held = np.concatenate([self.held[:0] if empty else self.held, np.full((0 if empty else n, 6), np.nan)])
+        self.held = self.held[-self.window.length :]
+
+    @rule(axis=st.integers(0, 5), n=st.integers(0, LENGTH + 33))
+    def forget(self, axis, n):
+        self.window.forget(axis, n)
+        self.held[: max(len(self.held) - n, 0), axis] = np.nan
+
+    @rule()
+    def reset(self):
+        self.window.reset()
+        self.held = self.held[:0]
+
+    @invariant()
+    def is_the_batch(self):
+        assert self.window.n == len(self.held)
+        check(self.window, self.held)
+        if len(self.held) >= 3:
+            np.testing.assert_allclose(self.window.slope(), slope(self.held), rtol=1e-6, atol=1e-12)
+            seen, true = self.window.slopes(), slopes(self.held, self.window.factors)
+            assert np.array_equal(np.isnan(seen), np.isnan(true))
+            whole = np.isfinite(self.held).all(axis=0)  # with a gap, each puts another mean in its place
+            np.testing.assert_allclose(seen[:, whole], true[:, whole], rtol=1e-5, atol=1e-12)
+
+
+def test_any_order_of_calls_leaves_the_batch_of_what_is_held():
+    run_state_machine_as_test(Calls, settings=settings(max_examples=60, stateful_step_count=20, deadline=None))
+
+
+# --- one axis begins anew
+
+
+@pytest.mark.parametrize("kept", [0, 1, 5, 90, LENGTH - 1])
+def test_forgetting_one_axis_makes_its_older_samples_missing(kept):
+    values = made(3 * LENGTH)
+    values[LENGTH : LENGTH + 7, 2] = np.nan
+    window, expected = AllanWindow(LENGTH, FACTORS), values[: 2 * LENGTH].copy()
+    window.update(expected)
+    window.forget(1, kept)
+    expected[: len(expected) - kept, 1] = np.nan
+    for n in (0, 3, 40, LENGTH):
+        window.update(values[len(expected) : len(expected) + n])
+        expected = np.concatenate([expected, values[len(expected) : len(expected) + n]])
+        avar, terms = overlapping(expected[-LENGTH:], FACTORS)
+        assert np.array_equal(window.terms(), terms)
+        assert window.avar()[terms > 0] == pytest.approx(avar[terms > 0], rel=1e-9)
+
+
+def test_the_slope_of_an_axis_that_began_anew_is_that_of_its_own_samples():
+    values = made(LENGTH) + 1e-3 * np.arange(LENGTH)[:, None]
+    window = AllanWindow(LENGTH, FACTORS)
+    window.update(values)
+    window.forget(4, 60)
+    lengths = np.full(6, LENGTH)
+    lengths[4] = 60
+    assert np.isnan(window.slope()[4])
+    assert window.slope(lengths)[4] == pytest.approx(slope(values[-60:])[4], rel=1e-6)
+    assert window.slope(lengths)[[0, 5]] == pytest.approx(slope(values)[[0, 5]], rel=1e-6)
+    expected = slopes(values[-60:], FACTORS)[:, 4]
+    there = np.isfinite(expected)
+    assert window.slopes(lengths)[there, 4] == pytest.approx(expected[there], rel=1e-6)
+
+
+# --- for ever
+
+
+@pytest.mark.long
+def test_ten_million_samples_with_gaps_and_a_transient_leave_no_trace():
+    """The same program runs 10⁹; see docs/benchmarks.md."""
+    assert long_run.run(10, lambda line: None) < 1e-9
+
+
+@pytest.mark.parametrize("gap", [(20, 3), (480, 5), (900, 6)])
+def test_a_small_gap_leaves_the_slope(gap):
+    n, (at, missing) = 1000, gap
+    factors = np.array([1, 4, 16, 64, 250])
+    values = 9.81 + 1e-2 * np.random.default_rng(7).standard_normal((n, 6)) + 1e-3 * np.arange(n)[:, None]
+    whole, window = AllanWindow(n, factors), AllanWindow(n, factors)
+    whole.update(values)
+    values[at : at + missing] = np.nan
+    window.update(values)
+    np.testing.assert_allclose(window.slope(), slope(values), rtol=1e-9)
+    np.testing.assert_allclose(window.slope(), whole.slope(), rtol=0.01)
+    # a missing sample stands for the level, here up to the whole ramp away
+    np.testing.assert_allclose(window.slopes()[3:], whole.slopes()[3:], rtol=0.05)
+    np.testing.assert_allclose(slopes(values, factors)[3:], whole.slopes()[3:], rtol=0.05)
+    values[:100] = np.nan
+    window.update(values)
+    assert np.isnan(window.slope()).all()
+    assert np.isnan(slope(values)).all()
+    assert np.isnan(window.slopes()).all()
+    assert np.isnan(slopes(values, factors)).all()

@@ -1,0 +1,115 @@
+"""The sensor's own low-pass: its columns, whether it is found, and that N and its interval survive it."""
+
+import numpy as np
+import pytest
+from scipy.signal import butter, sosfilt
+
+from drivers.sample import block
+from monitor.estimation.allan.batch import overlapping
+from monitor.estimation.analysis import analyze
+from monitor.estimation.estimator import Estimator
+from monitor.estimation.fit.bandwidth import LowPass, power, seen
+
+RATE_HZ = 100.0
+N = 1.5e-4
+
+
+def filtered(order, cutoff_hz, n, seed=1):
+    """White noise of N through a digital Butterworth low-pass, settled."""
+    sections = butter(order, cutoff_hz, fs=RATE_HZ, output="sos")
+    white = N * np.sqrt(RATE_HZ) * np.random.default_rng(seed).standard_normal((n + 5000, 6))
+    return sosfilt(sections, white, axis=0)[5000:]
+
+
+def analyzed(values):
+    return analyze([block(np.arange(len(values)) * 10_000_000, values)], RATE_HZ)
+
+
+def held(found):
+    c = found.estimate.coefficients
+    return int(((c.lo[1] <= N) & (c.hi[1] >= N)).sum())
+
+
+@pytest.mark.parametrize(("order", "cutoff_hz"), [(1, 10.0), (2, 30.0), (4, 5.0)])
+def test_a_column_is_the_allan_variance_of_filtered_noise(order, cutoff_hz):
+    factors = np.array([1, 2, 5, 16, 100, 1000])
+    values = filtered(order, cutoff_hz, 400_000)
+    measured = overlapping(values, factors)[0].mean(axis=1) / (N**2 * RATE_HZ)
+    stated = LowPass("digital", order, cutoff_hz / RATE_HZ).avar(factors)
+    assert measured[:4] == pytest.approx(stated[:4], rel=0.02)
+    assert measured == pytest.approx(stated, rel=0.12)
+
+
+@pytest.mark.parametrize("cutoff_hz", [3.0, 20.0])
+def test_an_analogue_filter_is_that_of_a_much_faster_digital_one(cutoff_hz):
+    sections = butter(2, cutoff_hz, fs=20 * RATE_HZ, output="sos")
+    fast = sosfilt(sections, np.random.default_rng(2).standard_normal((2_000_000, 6)), axis=0)[20_000:]
+    factors = np.array([1, 2, 8, 64])
+    measured = overlapping(fast[::20], factors)[0].mean(axis=1)
+    stated = LowPass("sampled", 2, cutoff_hz / RATE_HZ).avar(factors)
+    assert measured / stated == pytest.approx(np.full(4, (measured / stated).mean()), rel=0.04)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+@pytest.mark.parametrize("cutoff_hz", [3.0, 10.0, 33.0])
+def test_n_survives_any_bandwidth(order, cutoff_hz):
+    found = analyzed(filtered(order, cutoff_hz, 360_000, seed=order))
+    assert held(found) >= 4
+    assert found.estimate.coefficients.value[1] == pytest.approx(N, rel=0.03)
+    there = np.isfinite(found.bandwidth_hz)
+    assert there.sum() >= 4
+    # at a tenth of the noise an order is easily taken for its neighbour, with a cutoff a little off
+    assert found.bandwidth_hz[there] == pytest.approx(cutoff_hz, rel=0.3)
+
+
+def test_white_noise_and_lines_have_no_bandwidth():
+    white = N * 10.0 * np.random.default_rng(4).standard_normal((200_000, 6))
+    assert np.isnan(analyzed(white).bandwidth_hz).all()
+    line = white + 2e-3 * np.sin(2.0 * np.pi * 20.3 * np.arange(200_000) / RATE_HZ)[:, None]
+    assert np.isnan(analyzed(line).bandwidth_hz).all()
+
+
+@pytest.mark.long
+def test_the_live_estimate_finds_it_too():
+    values = filtered(2, 20.0, 120_000)
+    estimator = Estimator(RATE_HZ, 1200.0)
+    estimator.update(block(np.arange(len(values)) * 10_000_000, values))
+    before = estimator.get()
+    for _ in range(6 * 65):  # pieces of six searches
+        estimator.step()
+    after = estimator.get()
+    assert np.isnan(before.fitted[0]).any() or (before.fitted[0] != after.fitted[0]).any()
+    c = after.coefficients
+    assert ((c.lo[1] <= N) & (c.hi[1] >= N)).sum() >= 5
+    assert np.isfinite(after.fitted).all()
+    np.testing.assert_allclose(after.fitted[0], after.curve.avar[0], rtol=0.03)
+
+
+def test_what_does_not_fall_beyond_the_cutoff_is_no_filter():
+    # a strong wide resonance: the shortest τ lie low as behind a low-pass, and the spectrum does not end
+    rng = np.random.default_rng(3)
+    values = N * np.sqrt(RATE_HZ) * rng.standard_normal((200_000, 6))
+    sections = butter(2, [3.0, 5.0], "bandpass", fs=RATE_HZ, output="sos")
+    values += 20.0 * N * np.sqrt(RATE_HZ) * sosfilt(sections, rng.standard_normal((200_000, 6)), axis=0)
+    found = analyze([block(np.arange(len(values)) * 10_000_000, values)], RATE_HZ)
+    assert (found.fit.misfit > 1.0).all() or (found.fit.left_out > 0).all()
+    assert np.isnan(found.bandwidth_hz).all()
+
+
+def test_a_spectrum_is_asked_by_medians():
+    spectrum = power(filtered(2, 20.0, 100_000)[:, 0])
+    assert seen(LowPass("digital", 2, 0.2), spectrum)
+    assert not seen(LowPass("digital", 2, 0.05), spectrum)
+    assert not seen(LowPass("digital", 2, 0.001), spectrum)  # lower than any of its bins
+    spectrum[700:703] *= 1e6  # a line beyond the cutoff
+    assert seen(LowPass("digital", 2, 0.2), spectrum)
+    assert power(np.zeros(100)).size == 0
+    assert not seen(LowPass("digital", 2, 0.2), power(np.zeros(100)))
+
+
+def test_a_spectrum_is_that_of_the_samples_there_are():
+    there = filtered(2, 20.0, 100_000)[:, 0]
+    absent = np.full(100_000, np.nan)
+    assert np.median(power(np.concatenate([absent, there])) / power(there)) == pytest.approx(1.0, rel=0.2)
+    assert power(absent).size == 0

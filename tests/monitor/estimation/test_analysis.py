@@ -1,0 +1,199 @@
+"""A whole recording: its grid in time, its rate, and what is said about both."""
+
+import re
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from drivers.errors import ConfigError, NotReady
+from monitor.estimation.allan.batch import overlapping
+from monitor.estimation.analysis import FEWEST, analyze, events_of
+from monitor.estimation.fit.coefficients import Status
+from monitor.estimation.regular_grid import LONGEST_HOLE, on_grid
+from tests.support.recordings import recorded_blocks, recordings, white
+
+
+@pytest.mark.parametrize("rate", [100.0, None])
+@pytest.mark.parametrize("rows", [17, 1000, 10**6])
+def test_a_steady_recording(rate, rows):
+    values = white(6000)
+    found = analyze(recorded_blocks(np.arange(6000) / 100, values, rows), rate)
+    assert found.notes == ()
+    assert found.seconds == 60.0
+    estimate = found.estimate
+    assert (estimate.rate_hz, estimate.samples, estimate.window_s) == (100.0, 6000, 60.0)
+    assert estimate.curve.avar == pytest.approx(overlapping(values, estimate.curve.factors)[0])
+    assert (estimate.coefficients.status[1] == Status.ESTIMATED).all()
+    assert estimate.coefficients.value[1] == pytest.approx(1e-4, rel=0.1)
+
+
+@pytest.mark.parametrize("rate", [100.0, None])
+@pytest.mark.parametrize("rows", [17, 1000, 10**6])
+def test_holes_stay_in_their_places(rate, rows):
+    index = np.arange(8000)
+    kept = ~((index >= 3000) & (index < 3123) | (index == 5000))
+    values = white(8000)
+    grid, found, notes = on_grid(recorded_blocks(index[kept] / 100, values[kept], rows), rate)
+    assert found == 100.0
+    assert notes == ["124 samples are missing in 2 places; terms that touch them are left out"]
+    expected = np.where(kept[:, None], values, np.nan)
+    assert np.array_equal(grid, expected, equal_nan=True)
+
+
+def test_a_very_long_pause_is_not_counted_among_the_short_holes():
+    index = np.concatenate([np.arange(3000), 3000 + 2 * LONGEST_HOLE + np.arange(3000)])
+    index = np.delete(index, [1000, 1001, 1002])
+    _, _, notes = on_grid(recorded_blocks(index / 100, white(5997)), 100.0)
+    assert "3 samples are missing in 1 place; terms that touch them are left out" in notes
+
+
+def test_a_very_long_pause_costs_no_memory_and_no_term_reaches_across():
+    t = np.concatenate([np.arange(3000) / 100, 30.0 + 2 * LONGEST_HOLE / 100 + np.arange(3000) / 100])
+    values = white(6000)
+    values[3000:] += 1.0  # a step that would show in every term across
+    found = analyze(recorded_blocks(t, values), 100.0)
+    assert any("too long to keep in place" in note for note in found.notes)
+    assert found.estimate.curve.n == 6001
+    assert np.nanmax(found.estimate.curve.avar) < 2e-6
+
+
+@pytest.mark.parametrize("jump_s", [-40.0, 5 * 3600.0])
+def test_a_jump_of_the_times_does_not_spoil_the_rate(jump_s):
+    t = np.concatenate([np.arange(5000) / 100, 50.0 + jump_s + np.arange(5000) / 100])
+    found = analyze(recorded_blocks(t), None)
+    assert found.estimate.rate_hz == 100.0
+    assert any("time went" in note for note in found.notes)
+
+
+def test_times_that_jitter_are_no_holes():
+    t = np.arange(8000) / 100 + 0.001 * np.random.default_rng(1).standard_normal(8000)
+    found = analyze(recorded_blocks(t), None)
+    assert (found.estimate.rate_hz, found.estimate.curve.n) == (100.0, 8000)
+
+
+@pytest.mark.parametrize("n", [1, 2, FEWEST - 1])
+def test_too_short_is_an_answer(n):
+    with pytest.raises(NotReady):
+        analyze(recorded_blocks(np.arange(n) / 100), None)
+    with pytest.raises(NotReady, match="at least 50"):
+        analyze(recorded_blocks(np.arange(n) / 100), 100.0)
+
+
+def test_times_that_stand_still_ask_for_the_rate():
+    with pytest.raises(NotReady, match="--rate"):
+        analyze(recorded_blocks(np.zeros(500)), None)
+
+
+def test_a_list_of_tau():
+    blocks = recorded_blocks(np.arange(6000) / 100)
+    assert analyze(blocks, 100.0, (0.1, 1.0)).estimate.curve.tau_s.tolist() == [0.1, 1.0]
+    with pytest.raises(ConfigError):
+        analyze(blocks, 100.0, (100.0,))
+
+
+def test_an_absent_axis_is_unestimated_and_warns_nobody():
+    values = white(6000)
+    values[:, 3:] = np.nan
+    found = analyze(recorded_blocks(np.arange(6000) / 100, values), None, notes=["of the file"])
+    assert found.notes == ("of the file",)
+    assert (found.estimate.coefficients.status[:, 3:] == Status.UNESTIMATED).all()
+    assert (found.estimate.coefficients.status[1, :3] == Status.ESTIMATED).all()
+
+
+@pytest.mark.long
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "rate"),
+    [
+        ("mpu6050-hosttime/static-11min.npz", 99.32),
+        ("mpu6050-arduino/static-7min.npz", 100.0),
+        ("px4-bench/bench-69s.npz", 250.0),
+        ("vn100-serial/static-12min.npz", 40.0),
+        ("phone/gyro-a.npz", 5.0),
+        ("autopilot-3imu/imu1.npz", 50.0),
+    ],
+)
+def test_recordings_of_real_sensors(name, rate):
+    from drivers.recordings import iter_blocks, load_samples
+
+    loaded = load_samples(recordings() / name)
+    blocks = list(iter_blocks(loaded))
+    found = analyze(blocks, None, notes=loaded.notes)
+    assert found.estimate.rate_hz == pytest.approx(rate, rel=0.01)
+    received = sum(len(one) for one in blocks)
+    assert received <= found.estimate.curve.n <= 1.02 * received
+    assert (found.estimate.coefficients.status[1, :3] != Status.UNESTIMATED).all()
+
+
+def test_too_few_averaging_times_for_a_fit_are_said():
+    found = analyze(recorded_blocks(np.arange(6000) / 100), 100.0, (0.1, 1.0, 10.0))
+    assert found.notes == ("3 averaging times are too few to fit five terms; at least 5 are needed",)
+    assert (found.estimate.coefficients.status == Status.UNESTIMATED).all()
+
+
+def test_times_that_contradict_the_stated_rate_are_said():
+    found = analyze(recorded_blocks(np.arange(6000) / 50), 100.0)
+    assert "the rate used is 100 Hz, but the times step by 0.02 s, 50 Hz" in found.notes
+
+
+# --- what happened in it ---------------------------------------------------------------------------
+
+
+def moved(n=12_000):
+    """Two minutes at 100 Hz, turned by hand for three seconds in the middle."""
+    values = white(n)
+    values[6000:6300, 0] += np.sin(np.arange(300) / 20)
+    return values
+
+
+def test_motion_is_told_and_left_in_unless_it_is_to_be_struck_out():
+    blocks = recorded_blocks(np.arange(12_000) / 100, moved())
+    left = analyze(blocks, 100.0)
+    assert left.motions == ()
+    assert not any("moved" in note for note in left.notes)  # asked only by events_of
+    told = events_of(left)
+    [motion] = told.motions
+    assert 5900 <= motion.since < 6000
+    assert "the sensor moved once, 3 s in all: left in; --rest strikes it out" in told.notes
+    assert any(note.startswith(f"at {motion.since / 100:.1f} s: moved for 3.0 s: gx") for note in told.notes)
+    struck = events_of(analyze(blocks, 100.0, rest=True))
+    assert struck.motions == told.motions
+    assert sum("struck out" in note for note in struck.notes) == 1
+    assert np.isnan(struck.values[motion.since : motion.until]).all()
+    assert not np.isnan(struck.values[: motion.since]).any()
+    assert left.estimate.curve.avar[0, 0] > 1.5 * struck.estimate.curve.avar[0, 0]
+    assert struck.estimate.curve.avar[0] == pytest.approx(np.full(6, 1e-6), rel=0.1)
+    assert (struck.seconds, struck.estimate.curve.n) == (120.0, 12_000)
+
+
+def test_motion_is_no_change_of_noise():
+    values = moved(30_000)
+    assert events_of(analyze(recorded_blocks(np.arange(30_000) / 100, values), 100.0)).changes == ()
+
+
+def test_changes_are_told_with_time_and_size():
+    values = white(60_000)
+    values[40_000:, 2] += 1.5e-3 * np.random.default_rng(9).standard_normal(20_000)
+    found = events_of(analyze(recorded_blocks(np.arange(60_000) / 100, values), 100.0, notes=["of the file"]))
+    [change] = found.changes
+    assert (change.kind, change.axis) == ("noise_changed", 2)
+    assert change.since == pytest.approx(40_000, abs=50)
+    assert found.notes[0] == "of the file"
+    [note] = [one for one in found.notes if "angle random walk" in one]
+    assert re.fullmatch(r"at (399|400)\.\d s: gz angle random walk rose by [78]\d % \(\d+\.\d σ\)", note)
+    assert "one curve of the whole recording mixes before and after; --window S shows them apart" in found.notes
+
+
+def test_a_sensor_that_never_rests_is_an_answer():
+    rng = np.random.default_rng(0)
+    values = np.cumsum(rng.standard_normal((120, 6)), axis=0)
+    with pytest.raises(NotReady, match=r"\d+ samples at rest; at least 50 are needed"):
+        analyze(recorded_blocks(np.arange(120) / 100, values), 100.0, rest=True)
+
+
+def test_axes_side_by_side_give_the_same():
+    blocks = recorded_blocks(np.arange(6000) / 100)
+    with ThreadPoolExecutor(2) as pool:
+        side_by_side = analyze(blocks, 100.0, each=pool.map)
+    assert np.array_equal(side_by_side.estimate.curve.avar, analyze(blocks, 100.0).estimate.curve.avar)

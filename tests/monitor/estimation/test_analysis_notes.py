@@ -1,0 +1,193 @@
+"""Sentences about a fit, what explains it, and events."""
+
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from drivers.sample import AXES, block
+from monitor.estimation import analysis_notes
+from monitor.estimation.analysis import analyze
+from monitor.estimation.detection.change_detection import Change
+from monitor.estimation.detection.line_detection import Line, lines
+from monitor.estimation.detection.motion_detection import Motion
+from monitor.estimation.fit.bandwidth import LowPass
+from monitor.estimation.fit.coefficients import Status
+
+RATE_HZ = 100.0
+
+
+def analyzed(values):
+    t_ns = np.arange(len(values)) * 10_000_000
+    return analyze([block(t_ns, values)], RATE_HZ)
+
+
+def white(n, seed=1):
+    return 1e-3 * np.random.default_rng(seed).standard_normal((n, 6))
+
+
+def test_the_sensor_s_own_bandwidth_is_told_once_for_axes_alike():
+    axes = [None if i == 2 else LowPass("digital", 1, 0.249 + 0.001 * i) for i in range(6)]
+    curve, fit = departing()
+    [note] = analysis_notes.of_fit(curve, fit, axes, RATE_HZ)
+    assert note == (
+        "gx, gy, ax, ay, az: white noise ends below half the sample rate, as behind a first-order low-pass at about "
+        "25 Hz; N is the level below it"
+    )
+
+
+def test_a_line_is_told_with_the_averaging_times_that_it_spoils():
+    values = white(400_000)
+    values[:, 1] += 2e-3 * np.sin(2.0 * np.pi * 0.5 * np.arange(400_000) / RATE_HZ)
+    found = analyzed(values)
+    [note] = [one for one in found.notes if "departs" in one]
+    times, where = re.findall(r"scatter (\S+) times wider\), most at τ = (\S+) s", note)[0]
+    assert note.startswith("gy: ")
+    assert float(times) == pytest.approx(found.fit.misfit[1] ** 0.5, rel=0.1)
+    assert where == "0.64"  # a line's deviation peaks at 0.37 of its period, 2 s: sin⁴(πfτ)/(πfτ)²
+    assert found.fit.misfit[0] == 1.0
+    curve = found.estimate.curve
+    told = lines(values, np.zeros(len(values), bool), RATE_HZ, curve)
+    known = analysis_notes.explained(["first", *found.notes], curve, found.fit, told)
+    assert known[0] == "first"
+    [known] = [one for one in known if "departs" in one]
+    assert known == note.replace("vibration, motion or temperature may be why", "the line at 0.4999 Hz shows there")
+    assert analysis_notes.of_departures(told, np.zeros(6)) == ["a line at 0.4999 Hz: gy 0.11 °/s"]
+
+
+def departing(misfit=(1.0,) * 6, at=(2,) * 6, left_out=(0,) * 6, q=()):
+    """A white curve of eight τ; axes of a misfit depart at one of them; ``q``: axes that have a Q."""
+    factors = 2 ** np.arange(8)
+    fitted = np.repeat(1.0 / factors[:, None], 6, axis=1)
+    avar = fitted.copy()
+    for axis in range(6):
+        avar[at[axis], axis] *= 4.0 if misfit[axis] > 1.0 else 1.0
+    status = np.full((5, 6), Status.UPPER_BOUND)
+    status[0, list(q)] = Status.ESTIMATED
+    curve = SimpleNamespace(factors=factors, tau_s=factors / RATE_HZ, avar=avar)
+    fit = SimpleNamespace(
+        fitted=fitted, edf=np.full((8, 6), 1e3), misfit=np.array(misfit), left_out=np.array(left_out),
+        theta=np.ones((5, 6)), k_or_r=np.zeros(6, bool), coefficients=SimpleNamespace(status=status),
+    )  # fmt: skip
+    return curve, fit
+
+
+def line(axis, hz, amplitude=1.0, wide=False):
+    return Line(axis, hz, amplitude, 0.5, wide)
+
+
+def test_axes_that_depart_alike_share_a_note():
+    curve, fit = departing((9.0, 36.0, 1.0, 16.0, 4.0, 1.0), at=(2, 2, 2, 2, 6, 2))
+    text = "vibration, motion or temperature may be why; intervals are widened accordingly"
+    assert analysis_notes.of_misfit(curve, fit) == [
+        "gx, gy, ax: the curve departs from every sum of the five terms (scatter 3 to 6 times wider), most at "
+        f"τ = 0.04 s: {text}",
+        f"ay: the curve departs from every sum of the five terms (scatter 2 times wider), most at τ = 0.64 s: {text}",
+    ]
+
+
+def test_motion_left_in_is_one_note_that_points_to_rest():
+    curve, fit = departing((4.0, 4.0, 4.0, 9.0, 9.0, 9.0), at=(0, 1, 3, 5, 6, 7))
+    notes = analysis_notes.explained(analysis_notes.of_misfit(curve, fit), curve, fit, [line(0, 9.0)], moved=True)
+    assert notes == [
+        "gx, gy, gz, ax, ay, az: the curve departs from every sum of the five terms (scatter 2 to 3 times wider): the "
+        "sensor moved, which may be why; --rest strikes it out; intervals are widened accordingly"
+    ]
+    assert analysis_notes.explained(["other"], *departing(), [], moved=True) == ["other"]
+
+
+def test_a_line_is_blamed_only_where_it_shows():
+    """At τ = 0.04 s a line of 9 Hz is strongest; one of 0.05 Hz does not reach there, nor one of another axis."""
+    curve, fit = departing((4.0,) * 3 + (1.0,) * 3)
+    found = [line(0, 9.0), line(1, 9.03), line(2, 0.05, 0.1), line(3, 9.0)]
+    notes = analysis_notes.of_misfit(curve, fit, found)
+    assert [note.split(":")[0] for note in notes] == ["gx, gy", "gz"]
+    assert "the line at 9 Hz shows there" in notes[0]
+    assert "may be why" in notes[1]
+
+
+def test_what_is_left_out_is_one_note_with_the_line_that_is_told():
+    curve, fit = departing(left_out=(4, 3, 0, 0, 0, 1))
+    assert analysis_notes.of_misfit(curve, fit, [line(0, 9.0, wide=True), line(1, 9.0)]) == [
+        "gx, gy: the fit leaves out τ up to 0.08, 0.04 s, which no sum of the five terms follows: the resonance about "
+        "9 Hz shows there",
+        "az: the fit leaves out τ up to 0.01 s, which no sum of the five terms follows: the sensor's bandwidth or a "
+        "vibration shows there",
+    ]
+
+
+@pytest.mark.parametrize(("amplitude", "hz", "told"), [(1.0, 30.0, True), (0.2, 30.0, False), (1.0, 0.5, False)])
+def test_quantization_noise_that_may_be_a_line(amplitude, hz, told):
+    curve, fit = departing(q=(0, 2, 4))
+    found = [line(axis, hz, amplitude) for axis in (0, 1, 2)]
+    expected = [f"gx, gz: quantization noise may be the line at {hz:g} Hz"] if told else []
+    assert analysis_notes.explained([], curve, fit, found) == expected
+
+
+def test_a_drift_in_a_short_record_is_k_or_r():
+    values = white(30_000)
+    values[:, 2] += 1e-4 * np.arange(30_000) / 30_000
+    found = analyzed(values)
+    assert found.fit.k_or_r.tolist() == [False, False, True, False, False, False]
+    assert [one for one in found.notes if "K or R" in one] == [
+        "gz: K or R: the record drifts by more than Q, N and B make, and is too short to tell a ramp from "
+        "rate random walk"
+    ]
+
+
+def test_with_samples_missing_no_slope_tells_them_apart():
+    rng = np.random.default_rng(4)
+    values = white(100_000) + np.cumsum(3e-5 * rng.standard_normal((100_000, 6)), axis=0)
+    values[500:4000] = np.nan
+    found = analyzed(values)
+    [note] = [one for one in found.notes if "K or R" in one]  # one for all axes that have it
+    axes = ", ".join(np.array(AXES)[found.fit.k_or_r])
+    assert "gx, gy" in axes
+    assert note == f"{axes}: K or R: samples are missing, so that no slope tells a ramp from rate random walk"
+
+
+def motion(since):
+    return Motion("motion", since, since + 100, 0.5, "gx", 0.1, "moved for 0.5 s: gx up to 5.7 °/s")
+
+
+def change(kind="noise_changed"):
+    return Change(kind, 0, 100, 120, 8.04, {}, "gx noise changed")
+
+
+def test_many_events_are_counted_rather_than_listed():
+    notes = analysis_notes.of_motions([motion(100 * i) for i in range(14)], RATE_HZ, struck=True)
+    assert notes[0] == "the sensor moved 14 times, 7 s in all: struck out"
+    assert notes[1] == "at 0.0 s: moved for 0.5 s: gx up to 5.7 °/s"
+    assert notes[-1] == "and 4 more motions"
+    assert len(notes) == 1 + analysis_notes.MOST + 1
+    notes = analysis_notes.of_changes([change()] * 11, RATE_HZ)
+    assert notes[0] == "at 1.0 s: gx noise changed (8.0 σ)"
+    assert notes[-2] == "and 1 more changes"
+
+
+def test_outliers_alone_mix_no_before_and_after():
+    assert analysis_notes.of_changes([change("outlier_burst")], RATE_HZ) == ["at 1.0 s: gx noise changed (8.0 σ)"]
+
+
+def test_nothing_found_is_nothing_said():
+    quiet = analyzed(white(30_000))
+    assert quiet.notes == ()
+    assert analysis_notes.of_motions([], RATE_HZ, struck=False) == analysis_notes.of_changes([], RATE_HZ) == []
+
+
+def test_a_departure_ends_where_the_curve_comes_back():
+    measured = np.array([1.1, 2.0, 3.0, 1.1, 6.0, 1.0])[:, None]
+    curve = SimpleNamespace(avar=measured)
+    fit = SimpleNamespace(fitted=np.ones((6, 1)), edf=np.array([9e4, 100.0, 100.0, 100.0, 1.0, 10.0])[:, None])
+    assert analysis_notes._departure(curve, fit, 0) == (1, 2)  # the first is only many σ off, the fifth by chance
+
+
+def test_a_filter_that_is_not_known_is_told_too():
+    # a moving average of two: no Butterworth
+    white = 1e-3 * np.random.default_rng(8).standard_normal((200_001, 6))
+    values = 0.85 * white[1:] + 0.15 * white[:-1]
+    found = analyze([block(np.arange(len(values)) * 10_000_000, values)], RATE_HZ)
+    assert (found.fit.theta[0] < 0.0).any()
+    assert np.isnan(found.bandwidth_hz[found.fit.theta[0] < 0.0]).all()
+    assert any("lie below white noise" in note for note in found.notes)

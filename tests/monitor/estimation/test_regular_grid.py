@@ -1,0 +1,193 @@
+"""A recording's grid in time, its rate, and what is said about times that are not what they should be."""
+
+import numpy as np
+import pytest
+
+from drivers.errors import NotReady
+from monitor.estimation.regular_grid import LONGEST_HOLE, NOTES, on_grid
+from tests.support.recordings import recorded_blocks, recordings, white
+
+
+@pytest.mark.parametrize("rate", [100.0, None])
+@pytest.mark.parametrize("rows", [17, 1000, 10**6])
+def test_holes_stay_in_their_places(rate, rows):
+    index = np.arange(8000)
+    kept = ~((index >= 3000) & (index < 3123) | (index == 5000))
+    values = white(8000)
+    grid, found, notes = on_grid(recorded_blocks(index[kept] / 100, values[kept], rows), rate)
+    assert found == 100.0
+    assert notes == ["124 samples are missing in 2 places; terms that touch them are left out"]
+    assert np.array_equal(grid, np.where(kept[:, None], values, np.nan), equal_nan=True)
+
+
+def test_a_very_long_pause_is_one_missing_sample():
+    index = np.concatenate([np.arange(3000), 3000 + 2 * LONGEST_HOLE + np.arange(3000)])
+    grid, _, notes = on_grid(recorded_blocks(index / 100), 100.0)
+    assert len(grid) == 6001
+    assert any("too long to keep in place" in note for note in notes)
+
+
+@pytest.mark.parametrize("rows", [17, 1000, 10**6])
+def test_a_repeated_row_does_not_enter(rows):
+    values = white(6000)
+    sent = np.insert(np.arange(6000), 4000, 3990 + np.arange(10))
+    grid, rate, notes = on_grid(recorded_blocks(sent / 100, values[sent], rows), None)
+    assert rate == 100.0
+    assert np.array_equal(grid, values)
+    assert notes == ["10 rows repeat others, time and values; left out"]
+
+
+def test_rows_out_of_order_are_put_in_order():
+    values = white(6000)
+    sent = np.insert(np.delete(np.arange(6000), 2500), 2502, 2500)
+    grid, _, notes = on_grid(recorded_blocks(sent / 100, values[sent]), None)
+    assert np.array_equal(grid, values)
+    assert notes == ["rows that came out of order: 1; put in order"]
+
+
+def test_more_than_ten_notes_are_counted():
+    t = np.arange(40000) / 100
+    for i in range(44):
+        t[800 * (i + 1) :] += (-1) ** i * 4000.0
+    _, _, notes = on_grid(recorded_blocks(t), 100.0)
+    of_clock = [note for note in notes if note.startswith("time went")]
+    assert len(of_clock) == NOTES
+    assert notes[NOTES] == "and 34 more notes on the times"
+
+
+def test_steady_times_that_contradict_the_stated_rate():
+    _, rate, notes = on_grid(recorded_blocks(np.arange(6000) / 50), 100.0)
+    assert rate == 100.0
+    assert "the rate used is 100 Hz, but the times step by 0.02 s, 50 Hz" in notes
+
+
+def test_unsteady_times_that_contradict_the_stated_rate():
+    """A host that stamps in bursts: only the mean tells."""
+    t = np.ceil(np.arange(20000) / 99.32 / 0.043) * 0.043 + np.tile([0.0, 0.001, 0.002, 0.003], 5000)
+    _, _, notes = on_grid(recorded_blocks(np.sort(t)), 80.0)
+    assert any(note.startswith("the rate used is 80 Hz, but by the times 99.3") for note in notes)
+    assert not any("rate used" in note for note in on_grid(recorded_blocks(np.sort(t)), 99.4)[2])
+
+
+@pytest.mark.parametrize(("off", "told"), [(0.001, False), (0.003, True), (0.006, True)])
+@pytest.mark.parametrize("jitter_s", [0.0, 5e-4])
+def test_a_stated_rate_is_contradicted_from_a_fifth_of_a_percent_on(off, told, jitter_s):
+    t = np.arange(17000) / (250.0 * (1.0 - off)) + jitter_s * np.random.default_rng(2).random(17000)
+    _, rate, notes = on_grid(recorded_blocks(t), 250.0)
+    assert rate == 250.0
+    [*said] = [float(note.split("by the times ")[1].split()[0]) for note in notes if "by the times" in note]
+    steps = [note for note in notes if "times step by" in note]
+    assert bool(said or steps) == told
+    assert said == pytest.approx([250.0 * (1.0 - off)] * len(said), rel=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_short_or_jittery_times_accuse_no_rate(seed):
+    """Their mean is off by half a percent, and no better known."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(600) / 100 + 0.04 * rng.random(600)
+    t[-1] += 0.03
+    _, _, notes = on_grid(recorded_blocks(np.sort(t)), 100.0)
+    assert not any("rate used" in note for note in notes)
+
+
+@pytest.mark.parametrize(("unit_s", "said"), [(1.0, "1"), (0.5, "0.5"), (1.0 / 3.0, "0.333"), (10.0, "10")])
+def test_a_coarse_resolution_of_times_is_told(unit_s, said):
+    t = np.floor(np.arange(8000) / 5.0 / unit_s + 1e-9) * unit_s
+    _, _, notes = on_grid(recorded_blocks(t), None)
+    assert notes == [f"times have a resolution of {said} s; samples are taken to be even"]
+
+
+def test_uneven_times_without_a_unit_are_told_as_such():
+    t = np.cumsum(np.random.default_rng(3).exponential(0.01, 8000))
+    _, _, notes = on_grid(recorded_blocks(t), None)
+    assert any(note.startswith("times step unevenly: by 0.0") for note in notes)
+
+
+def test_both_counts_of_missing_and_late_are_told():
+    """A bus adapter that sends ten samples late by 0.9 periods each second, and loses three."""
+    index = np.delete(np.arange(30_000), [8089, 9780, 29_187])
+    t = index / 100
+    for since in range(85, len(t) - 20, 100):
+        t[since : since + 10] += 0.009
+    values = white(len(t))
+    grid, rate, notes = on_grid(recorded_blocks(t, values), None)
+    assert rate == 100.0
+    assert np.flatnonzero(np.isnan(grid[:, 0])) == pytest.approx([8089, 9780, 29_187], abs=10)
+    late, missing = notes
+    assert missing == "3 samples are missing in 3 places; terms that touch them are left out"
+    assert late.startswith("a sample came late by a period or more 29")
+    assert late.endswith("later ones made good for it, so that none is missing there")
+
+
+def test_values_as_coarse_as_their_noise_are_told_by_kind_and_size():
+    values = white(20_000) - 9.81
+    values[:, :3] = np.round(values[:, :3] / 1e-3) * 1e-3
+    values[:, 4] = np.round(values[:, 4] / 4e-4) * 4e-4
+    values[:, 5] = np.round(values[:, 5] / 2e-3) * 2e-3
+    gyros, az = on_grid(recorded_blocks(np.arange(20_000) / 100, values), None)[2]
+    size, times = gyros.removesuffix(" the noise from sample to sample: quantization shapes the shortest τ").split(
+        "), "
+    )
+    assert size == "values come in steps of 0.057 °/s (gx, gy, gz"
+    assert all(float(one) == pytest.approx(0.97, abs=0.05) for one in times.removesuffix(" times").split(" to "))
+    assert az.startswith("values come in steps of 0.2 mg (az), ")
+    assert float(az.split("(az), ")[1].split()[0]) == pytest.approx(1.9, abs=0.3)
+
+
+@pytest.mark.parametrize("fraction", [0.12, 0.5])
+@pytest.mark.parametrize("step", [1e-9, 2e-3])
+def test_stale_rows_are_told_and_kept(fraction, step):
+    """Also where neighbours are often equal by coarse resolution alone."""
+    values = np.round(white(20000) / step) * step
+    held = np.flatnonzero(np.random.default_rng(1).random(20000) < fraction)
+    for row in held[held > 0]:
+        values[row] = values[row - 1]
+    grid, _, notes = on_grid(recorded_blocks(np.arange(20000) / 100, values), None)
+    assert np.array_equal(grid, values)
+    (note,) = [one for one in notes if "in steps of" not in one]
+    assert note.endswith("the sensor updates slower than it is read; they are kept")
+    assert float(note.split()[0]) == pytest.approx(100 * fraction, rel=0.1)
+
+
+def test_times_that_stand_still_ask_for_the_rate():
+    with pytest.raises(NotReady, match="--rate"):
+        on_grid(recorded_blocks(np.zeros(500)), None)
+
+
+@pytest.mark.data
+def test_a_boat_s_bus_adapter_is_late_and_loses_five():
+    from drivers.recordings import iter_blocks, load_samples
+
+    blocks = list(iter_blocks(load_samples(recordings() / "can-boat/moored-5min.npz")))
+    grid, _, notes = on_grid(blocks, None)
+    assert "5 samples are missing in 5 places; terms that touch them are left out" in notes
+    at_s = np.flatnonzero(np.isnan(grid[:, 0])) / 100
+    assert at_s == pytest.approx([80.9, 97.8, 98.8, 101.8, 291.9], abs=0.4)  # its clock runs slow by 0.08 %
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "rate"),
+    [
+        ("mpu6050-hosttime/static-11min", 99.32),
+        ("px4-bench/bench-69s", 250.0),
+        ("phone/gyro-a", 5.0),
+        ("can-boat/moored-5min", 100.0),
+        ("can-car/drive-a", 101.3),
+        ("autopilot-3imu/imu1", 50.0),
+        ("robot-arm/mpu9150", 103.6),
+        ("robot-arm/mpu6500", 92.4),
+    ],
+)
+def test_recordings_of_real_sensors(name, rate):
+    from drivers.recordings import iter_blocks, load_samples
+
+    blocks = list(iter_blocks(load_samples(recordings() / f"{name}.npz")))
+    received = sum(len(one) for one in blocks)
+    grid, found, notes = on_grid(blocks, None)
+    assert found == pytest.approx(rate, rel=0.01)
+    assert received <= len(grid) <= 1.02 * received
+    assert not any("repeat" in note or "out of order" in note for note in notes), notes
+    _, _, notes = on_grid(blocks, 1.3 * rate)
+    assert any("rate used" in note for note in notes)

@@ -1,0 +1,51 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.errors import ConfigError
+from monitor.history.query import UNASKED, Question, question
+from monitor.history.time_ranges import Span
+
+NOW = 1_763_700_000.0
+
+
+def test_nothing_asked_is_the_last_day_without_deviations() -> None:
+    assert question("", NOW) == Question(None, None, UNASKED)
+
+
+def test_all_at_once_in_any_order_and_a_range_keeps_its_semicolon() -> None:
+    asked = question("letter=B,N;step=15min;_time=[now(-1h);30m];axis=gz;what=deviations,coefficients;_anyke", NOW)
+    expected = Question(Span(NOW - 3600.0, NOW - 1800.0), 900, ("coefficients", "deviations"), ("gz",), ("N", "B"))
+    assert asked == expected
+    wanted = [name for name in ("gz.N", "gz.B.bound", "gz.K", "gx.N", "gz.sigma.1", "rate") if asked.wants(name)]
+    assert wanted == ["gz.N", "gz.B.bound", "gz.sigma.1"]
+
+
+@pytest.mark.parametrize(
+    ("parameters", "says"),
+    [
+        ("axes=gz", 'did you mean "axis"'),
+        ("axis=gq", 'axis: "gq"'),
+        ("letter=X", 'letter: "X"'),
+        ("what=coefficient", 'did you mean "coefficients"'),
+        ("_time=yesterday", "_time"),
+        ("step=often", "no duration"),
+        ("step=0", "above 0"),
+        ("step=1u", "1 s and more"),
+        ("a" * 2000, "at most"),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_line(parameters: str, says: str) -> None:
+    with pytest.raises(ConfigError, match=says) as error:
+        question(parameters, NOW)
+    assert "\n" not in str(error.value)
+
+
+@given(st.text(max_size=200))
+def test_any_text_is_a_question_or_a_line(text: str) -> None:
+    said = ""
+    try:
+        question(text, NOW)
+    except ConfigError as error:
+        said = str(error)
+    assert len(said) < 1000

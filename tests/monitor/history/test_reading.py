@@ -1,0 +1,136 @@
+"""A span of history as a table, against the rows that went in."""
+
+import math
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.errors import NotReady
+from monitor.history import reading as past
+from monitor.history.bucket import Row
+from monitor.history.reading import Past
+from monitor.history.sqlite_store import PastEvent, Store, reading
+from monitor.history.time_ranges import Span
+from tests.monitor.history.made import NAMES, row, same, together
+
+T0 = 1_760_400_000
+DAY_S = 86_400
+
+
+def kept(path: Path, rows: list[Row], events: tuple[PastEvent, ...] = ()) -> None:
+    store = Store(path)
+    store.add([("a", one) for one in rows], [("a", one) for one in events])
+    while store.thin(math.inf):
+        pass
+    store.close()
+
+
+def read(path: Path, *arguments: object, **more: object) -> Past:
+    with reading(path) as reader:
+        return past.read(reader, "a", *arguments, **more)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Row]]:
+    """Two hundred days with gaps: all three widths, thinned."""
+    path = tmp_path_factory.mktemp("past") / "h.sqlite"
+    rng = np.random.default_rng(1)
+    minutes = np.unique(np.append(rng.integers(0, 200 * 1440, 600), 200 * 1440))
+    rows = [row(T0 + 60 * int(i), rng) for i in minutes]
+    kept(path, rows)
+    return path, rows
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    start_d=st.floats(0.0, 199.0),
+    days=st.floats(0.01, 200.0),
+    step_s=st.sampled_from([None, 60, 900, 7000, DAY_S]),
+    points=st.sampled_from([3, 50, 1000]),
+)
+def test_every_bucket_has_the_sums_and_extremes_of_its_rows(
+    long: tuple[Path, list[Row]], start_d: float, days: float, step_s: int | None, points: int
+) -> None:
+    path, rows = long
+    span = Span(T0 + start_d * DAY_S, T0 + (start_d + days) * DAY_S)
+    try:
+        found = read(path, span, step_s=step_s, points=points)
+    except NotReady:
+        assert not [one for one in rows if span.touches(one.start_s, one.end_s)]
+        return
+    assert len(found) <= 2 * points + 4
+    assert (found.width_s >= found.step_s).all()
+    assert (np.diff(found.end_s) > 0).all()
+    inner = range(1, len(found) - 1)  # at its ends a bucket has only what is in the span, to the width of old rows
+    for p in inner:
+        inside = [one for one in rows if found.start_s[p] <= one.start_s < found.end_s[p]]
+        for name in NAMES:
+            course = found.column(name)
+            numbers = (int(course.n[p]), *(float(part[p]) for part in (course.low, course.high, course.last)))
+            assert same(numbers, together(inside, name))
+        assert found.counts[p].tolist() == [sum(one.counts[i] for one in inside) for i in range(4)]
+    every = [one for one in rows if span.touches(one.start_s, one.end_s)]
+    assert int(found.counts[:, 0].sum()) >= sum(one.counts[0] for one in every)
+
+
+def test_nothing_asked_is_the_last_day(long: tuple[Path, list[Row]]) -> None:
+    path, rows = long
+    found = read(path, None)
+    assert found.end_s[-1] >= rows[-1].end_s
+    assert found.start_s[0] >= rows[-1].end_s - DAY_S - found.step_s
+    assert found.step_s == 300
+
+
+def test_numbers_that_are_not_wanted_are_not_there(long: tuple[Path, list[Row]]) -> None:
+    found = read(long[0], None, wanted=lambda name: name == "rate")
+    assert found.names == ("rate",)
+    assert np.isnan(found.column("gz.N").last).all()
+    assert found.column("gz.N").n.sum() == 0
+
+
+def test_where_there_is_nothing_it_is_said_with_what_there_is(long: tuple[Path, list[Row]]) -> None:
+    with pytest.raises(NotReady, match=r"nothing in that time; kept are 2025-10-15 00:\d\d"):
+        read(long[0], Span(T0 - 30 * DAY_S, T0 - 29 * DAY_S))
+    with reading(long[0]) as reader, pytest.raises(NotReady, match="nobody: no history yet"):
+        past.read(reader, "nobody", None)
+
+
+def test_all_of_time_is_asked_without_harm(long: tuple[Path, list[Row]]) -> None:
+    found = read(long[0], Span(-math.inf, math.inf))
+    assert int(found.counts[:, 1].sum()) == sum(one.counts[1] for one in long[1])
+    assert len(found) <= 1000
+
+
+def test_an_event_is_found_where_no_row_is(tmp_path: Path) -> None:
+    path = tmp_path / "h.sqlite"
+    event = PastEvent(T0 + 5 * 3600.0, "link_lost", "gone")
+    kept(path, [row(T0, np.random.default_rng(1))], (event,))
+    found = read(path, Span(T0 + 4 * 3600.0, T0 + 6 * 3600.0))
+    assert (len(found), found.events, found.events_in_all) == (0, (event,), 1)
+
+
+def test_a_table_is_read_while_rows_are_written(tmp_path: Path) -> None:
+    path, rng = tmp_path / "h.sqlite", np.random.default_rng(1)
+    kept(path, [row(T0, rng)])
+    done = threading.Event()
+
+    def write() -> None:
+        store = Store(path)
+        for i in range(1, 200):
+            store.add([("a", row(T0 + 60 * i, rng))])
+            store.thin(math.inf)
+        store.close()
+        done.set()
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    counts = []
+    while not done.is_set():
+        counts.append(len(read(path, None, step_s=60)))
+    thread.join()
+    assert counts == sorted(counts)
+    assert len(read(path, None, step_s=60)) == 200

@@ -1,0 +1,302 @@
+"""Exports: read back by what would read them, numbers against closed forms by hand."""
+
+import json
+import math
+import re
+import tomllib
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.optimize import minimize_scalar
+
+from drivers.errors import ConfigError, NotReady
+from monitor.noise.model import NoiseModel
+from monitor.publishing import exporters
+from monitor.publishing.exporters.kalman import MARKOV_PEAK, MARKOV_PEAK_AT, process_noise, transition
+from monitor.settings.loading import CONFIG_FOLDER
+
+MODEL = """
+sample_rate = 200.0
+["g*".quantization_noise]
+Q = 2.0e-6
+["g*".angle_random_walk]
+N = 1.0e-4
+[["gz".bias_instability]]
+B = 3.0e-5
+[["gz".bias_instability]]
+B = 4.0e-5
+["g*".rate_random_walk]
+K = 1.0e-6
+["a*".angle_random_walk]
+N = 1.0e-3
+["a*".rate_random_walk]
+K = 2.0e-5
+[az.bias]
+value = 9.8
+"""
+
+
+def noise(text: str = MODEL) -> exporters.Noise:
+    return exporters.from_model(NoiseModel.from_toml(text), "bench-1.toml")
+
+
+def analysed(status: str = "upper_bound") -> exporters.Noise:
+    """gx and gy as ``analyze --json`` writes them; K of gy estimated, of gx with this status."""
+
+    def one(value: float | None, hi: float | None, status: str) -> dict[str, Any]:
+        return {"value": value, "lo": None if value is None else value * 0.9, "hi": hi, "status": status}
+
+    axes = {
+        "gx": {"N": one(1e-4, 1.1e-4, "estimated"), "K": one(None, 9e-6 if status == "upper_bound" else None, status)},
+        "gy": {"N": one(2e-4, 2.1e-4, "estimated"), "K": one(3e-6, 4e-6, "estimated")},
+        "ax": {"N": one(1e-3, 1.1e-3, "estimated"), "K": one(None, 5e-5, "upper_bound")},
+    }
+    payload = {
+        "schema": "imu-monitor/analyze/1",
+        "rate": 100.0,
+        "samples": 1000,
+        "notes": [],
+        "axes": {axis: {"allan": {"tau": [0.01]}, "coefficients": terms} for axis, terms in axes.items()},
+    }
+    return exporters.from_analysis(json.dumps(payload), "bench-1.json")
+
+
+def yaml(text: str) -> dict[str, float | str]:
+    """``key: value  # comment`` lines, numbers as YAML 1.1 defines a float: with a point and a signed exponent."""
+    found: dict[str, float | str] = {}
+    for line in text.splitlines():
+        key, value = (
+            (part.strip() for part in line.split("#")[0].split(":", 1)) if line[:1] not in ("#", "") else ("", "")
+        )
+        if key:
+            is_float = re.fullmatch(r"[-+]?[0-9]+\.[0-9]*([eE][-+][0-9]+)?", value)
+            found[key] = float(value) if is_float else value
+    return found
+
+
+def test_effects_of_one_name_add_as_variances() -> None:
+    assert noise().axes["gz"]["B"].value == pytest.approx(5.0e-5)
+    assert "B" not in noise().axes["gx"]
+    assert noise().left_out == ("az.bias",)
+
+
+def test_kalibr_has_the_worst_axis_in_continuous_time_units() -> None:
+    louder = MODEL.replace("[az.bias]", "[[ay.angle_random_walk]]\nN = 2.0e-3\n[az.bias]")
+    text = exporters.export(noise(louder), "kalibr", 10.0, rostopic="/imu/data")
+    found = yaml(text)
+    assert found == {
+        "rostopic": "/imu/data",
+        "update_rate": 200.0,
+        "accelerometer_noise_density": pytest.approx(10 * math.sqrt(1e-3**2 + 2e-3**2), rel=1e-6),
+        "accelerometer_random_walk": pytest.approx(2.0e-4),
+        "gyroscope_noise_density": pytest.approx(1.0e-3),
+        "gyroscope_random_walk": pytest.approx(1.0e-5),
+    }
+    assert "worst axis ay (ax 0.001, ay 0.00224, az 0.001)" in text
+    assert "N, B and K are 10 times those of the source" in text
+    assert "source: bench-1.toml" in text
+    assert "not in this file: Q, B, az.bias" in text
+    assert text.isascii()
+
+
+def test_kalibr_density_is_that_of_the_samples() -> None:
+    """Kalibr makes σ of a sample by 1/√Δt: that of the white noise that the model simulates."""
+    model = NoiseModel.from_toml(MODEL.replace("Q = 2.0e-6", "Q = 0.0").replace("K = 1.0e-6", "K = 1.0e-9"))
+    density = yaml(exporters.export(exporters.from_model(model), "kalibr"))["gyroscope_noise_density"]
+    samples = model.simulate(200_000, 200.0, 1)[:, 0]
+    assert isinstance(density, float)
+    assert samples.std() == pytest.approx(density * math.sqrt(200.0), rel=0.01)
+
+
+def test_kalibr_takes_an_estimate_before_a_bound_and_says_a_bound() -> None:
+    text = exporters.export(analysed(), "kalibr")
+    found = yaml(text)
+    assert found["gyroscope_random_walk"] == pytest.approx(3e-6)
+    assert "# K: worst axis gy (gx <= 9e-06, gy 3e-06)" in text
+    assert found["accelerometer_random_walk"] == pytest.approx(5e-5)
+    assert "# K: worst axis ax, an UPPER BOUND: the data show no more (ax <= 5e-05)" in text
+    assert found["gyroscope_noise_density"] == pytest.approx(2e-4)
+
+
+def test_kalibr_refuses_what_it_would_read_as_zero() -> None:
+    with pytest.raises(ConfigError, match=r"kalibr needs K \(rate_random_walk\) above 0 on the gyro axes"):
+        exporters.export(noise(MODEL.replace("K = 1.0e-6", "K = 0.0")), "kalibr")
+    with pytest.raises(ConfigError, match="no sample_rate"):
+        exporters.export(noise(MODEL.replace("sample_rate = 200.0", "")), "kalibr")
+
+
+def test_a_recording_that_does_not_say_enough_is_no_answer() -> None:
+    empty = exporters.from_analysis('{"schema": "imu-monitor/analyze/1", "samples": 3, "notes": ["few"], "axes": {}}')
+    with pytest.raises(NotReady, match="a longer recording is needed"):
+        exporters.export(empty, "kalman")
+    without_accelerometers = exporters.Noise({"gx": analysed().axes["gx"]}, 100.0, "", measured=True)
+    with pytest.raises(NotReady, match="accel axes"):
+        exporters.export(without_accelerometers, "kalibr")
+
+
+def properties(text: str) -> dict[str, dict[str, Any]]:
+    """MATLAB's name-value pairs, a table a maker; continuation and comments as MATLAB reads them."""
+    joined = re.sub(r"\.\.\..*\n", " ", re.sub(r"^%.*\n", "", text, flags=re.M))
+    found: dict[str, dict[str, Any]] = {}
+    for variable, maker, body in re.findall(r"(\w+) = (\w+)\((.*)\);", joined):
+        pairs = re.findall(r"'(\w+)', (\[[^\]]*\]|'[^']*'|[\w.]+(?:\(\d+\))?)", body.removeprefix("'accel-gyro', "))
+        found[f"{variable}={maker}"] = {
+            name: [float(x) for x in value[1:-1].split()] if value.startswith("[") else value for name, value in pairs
+        }
+    return found
+
+
+def test_matlab_gets_a_value_an_axis_and_the_noise_type_of_n() -> None:
+    found = properties(exporters.export(noise(), "gyroparams", 2.0))
+    gyro, accel, imu = found["gyro=gyroparams"], found["accel=accelparams"], found["imu=imuSensor"]
+    assert gyro["NoiseDensity"] == pytest.approx([2e-4, 2e-4, 2e-4])
+    assert gyro["BiasInstability"] == pytest.approx([0.0, 0.0, 1e-4])
+    assert gyro["RandomWalk"] == pytest.approx([2e-6, 2e-6, 2e-6])
+    assert gyro["NoiseType"] == "'single-sided'"
+    assert gyro["BiasInstabilityCoefficients"] == "fractalcoef(500)"
+    assert accel["NoiseDensity"] == pytest.approx([2e-3, 2e-3, 2e-3])
+    assert accel["RandomWalk"] == pytest.approx([4e-5, 4e-5, 4e-5])
+    assert imu == {"SampleRate": "200.0", "Gyroscope": "gyro", "Accelerometer": "accel"}
+
+
+def test_matlab_never_simulates_a_bound() -> None:
+    text = exporters.export(analysed(), "gyroparams")
+    found = properties(text)
+    assert found["gyro=gyroparams"]["RandomWalk"] == pytest.approx([0.0, 3e-6, 0.0])
+    assert "% K, (rad/s)*sqrt(Hz); gx only bounded, <= 9e-06; gz not known" in text
+    assert text.isascii()
+
+
+def test_what_matlab_makes_of_bias_instability_is_flicker_of_that_b() -> None:
+    """White noise of that σ through 1/A(z), A of ``fractalcoef``: Kasdin's a_k = a_{k-1} (k - 3/2)/k."""
+    gyro = properties(exporters.export(noise(), "gyroparams"))["gyro=gyroparams"]
+    b, poles = gyro["BiasInstability"][2], int(gyro["BiasInstabilityCoefficients"][12:-1])
+    a = np.ones(poles + 1)
+    for k in range(1, poles + 1):
+        a[k] = a[k - 1] * (k - 1.5) / k
+    f = np.geomspace(2.0 / poles, 0.05, 20)  # cycles a sample
+    gain = 1.0 / np.abs(np.exp(-2j * np.pi * f[:, None] * np.arange(poles + 1)) @ a) ** 2
+    assert b**2 * gain == pytest.approx((5e-5) ** 2 / (2 * np.pi * f), rel=0.1)
+
+
+def test_kalman_blocks_by_hand() -> None:
+    text = exporters.export(noise(), "kalman")
+    found = tomllib.loads(text)
+    assert found["schema"] == "imu-monitor/kalman/1"
+    dt, n, k = 0.005, 1e-4, 1e-6
+    assert found["dt"] == dt
+    gx = found["gx"]
+    assert gx["states"] == ["angle", "bias_walk"]
+    assert gx["psd_white"] == pytest.approx(n**2)
+    assert gx["psd_walk"] == pytest.approx(k**2)
+    by_hand = [[n**2 * dt + k**2 * dt**3 / 3, k**2 * dt**2 / 2], [k**2 * dt**2 / 2, k**2 * dt]]
+    np.testing.assert_allclose(gx["Q"], by_hand, rtol=1e-9)
+    np.testing.assert_allclose(gx["F"], [[1, dt], [0, 1]])
+    gz = found["gz"]
+    assert gz["states"] == ["angle", "bias_walk", "bias_markov"]
+    assert gz["sigma_markov"] == pytest.approx(5e-5 * 0.66432 / 0.61801, rel=1e-4)
+    assert gz["correlation_time"] == pytest.approx(math.sqrt(3) * n / k / 1.89, rel=1e-6)
+    assert gz["psd_markov"] == pytest.approx(2 * gz["sigma_markov"] ** 2 / gz["correlation_time"], rel=1e-5)
+    assert found["az"]["states"][0] == "velocity"
+    assert "az.bias" in text
+
+
+@pytest.mark.parametrize("dt", [1e-3, 0.5, 30.0, 200.0])
+def test_discrete_noise_is_the_integral_of_the_continuous(dt: float) -> None:
+    """Van Loan, IEEE Trans. Automatic Control 23(3), 1978, with the model's matrices."""
+    n, k, sigma, time = 2e-4, 3e-6, 4e-5, 50.0
+    f = np.array([[0.0, 1.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1 / time]])
+    g = np.diag([n**2, k**2, 2 * sigma**2 / time])
+    whole = expm(np.block([[-f, g], [np.zeros((3, 3)), f.T]]) * dt)
+    phi = whole[3:, 3:].T
+    np.testing.assert_allclose(transition(dt, time), phi, rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(process_noise(dt, n, k, sigma, time), phi @ whole[:3, 3:], rtol=1e-8, atol=1e-20)
+
+
+@pytest.mark.parametrize("x", [0.0999, 0.1001])
+def test_series_and_closed_form_meet(x: float) -> None:
+    own = process_noise(x, 0.0, 0.0, 1.0, 1.0)[0, 0]
+    assert own == pytest.approx(2.0 * (x - 2 * (1 - math.exp(-x)) + (1 - math.exp(-2 * x)) / 2), rel=1e-10)
+
+
+def test_the_markov_process_peaks_where_it_is_said_to() -> None:
+    """Allan variance of exponentially correlated noise, IEEE Std 952, C.1.1.7: peak of the closed form."""
+
+    def deviation(log_tau: float) -> float:  # σ = T = 1
+        tau = math.exp(log_tau)
+        return -math.sqrt(2 / tau * (1 - (3 - 4 * math.exp(-tau) + math.exp(-2 * tau)) / (2 * tau)))
+
+    peak = minimize_scalar(deviation, bounds=(-1.0, 2.0), method="bounded")
+    assert math.exp(peak.x) == pytest.approx(MARKOV_PEAK_AT, rel=2e-3)
+    assert -peak.fun == pytest.approx(MARKOV_PEAK, rel=2e-3)
+
+
+def test_flicker_without_a_middle_needs_a_correlation_time() -> None:
+    text = "sample_rate = 10.0\n[gx.bias_instability]\nB = 1e-5"
+    without = exporters.export(noise(text), "kalman")
+    assert tomllib.loads(without)["gx"]["states"] == ["angle", "bias_walk"]
+    assert "# B is left out" in without
+    given = tomllib.loads(exporters.export(noise(text), "kalman", 3.0, dt_s=2.0, correlation_time_s=100.0))
+    assert given["inflation"] == 3.0
+    assert given["gx"]["correlation_time"] == 100.0
+    sigma = 3e-5 * math.sqrt(2 * math.log(2) / math.pi) / (0.437 * math.sqrt(2))
+    assert given["gx"]["Q"][2][2] == pytest.approx(sigma**2 * (1 - math.exp(-0.04)), rel=1e-6)
+
+
+def test_kalman_counts_a_bound_and_says_so() -> None:
+    text = exporters.export(analysed(), "kalman")
+    assert tomllib.loads(text)["gx"]["psd_walk"] == pytest.approx(9e-6**2)
+    assert "# an UPPER BOUND, the data show no more: K" in text
+    unseen = exporters.export(analysed("unestimated"), "kalman")
+    assert tomllib.loads(unseen)["gx"]["psd_walk"] == 0.0
+    assert "# not known, counted as 0: B, K" in unseen
+
+
+@pytest.mark.parametrize("form", list(exporters.FORMATS))
+def test_the_shipped_model_goes_into_every_format(form: str) -> None:
+    model = NoiseModel.from_toml((CONFIG_FOLDER / "models" / "consumer-mems.toml").read_text())
+    text = exporters.export(exporters.from_model(model, "consumer-mems.toml"), form)
+    assert text.isascii()
+    assert "consumer-mems.toml" in text
+    assert "inflation: none" in text
+
+
+@pytest.mark.parametrize(
+    ("form", "inflation", "options", "says"),
+    [
+        ("yaml", 1.0, {}, 'unknown format "yaml"; possible are kalibr, gyroparams, kalman'),
+        ("kalibr", 0.5, {}, "inflation: 0.5 is outside the supported range"),
+        ("kalibr", math.nan, {}, "inflation: nan"),
+        ("kalman", 1.0, {"dt_s": 0.0}, "a time step of 1 µs"),
+        ("kalman", 1.0, {"correlation_time_s": -1.0}, "correlation time: -1 s"),
+    ],
+)
+def test_a_wrong_request_is_said(form: str, inflation: float, options: dict[str, float], says: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(says)):
+        exporters.export(noise(), form, inflation, **options)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"schema": "imu-monitor/event/1", "axes": {}}', b"\xff\xfe"])
+def test_what_is_no_analysis_is_refused(text: str | bytes) -> None:
+    with pytest.raises(ConfigError):
+        exporters.from_analysis(text)
+
+
+@pytest.mark.parametrize("form", ["kalibr", "gyroparams", "kalman"])
+def test_an_axis_whose_slow_part_is_temperature_is_warned_of(form: str) -> None:
+    one = {"value": 1e-4, "lo": 9e-5, "hi": 1.1e-4, "status": "estimated"}
+    axis = {"coefficients": dict.fromkeys("NBK", one)}
+    axes: dict[str, Any] = dict.fromkeys(("gx", "gy", "gz", "ax", "ay", "az"), axis)
+    old = json.dumps({"schema": "imu-monitor/analyze/1", "rate": 100.0, "axes": axes})
+    assert "WARNING" not in exporters.export(exporters.from_analysis(old), form)
+    axes["gy"] = {**axis, "temperature": {"share": 0.987, "p_value": 1e-9, "form": "cubic", "later": 1}}
+    new = json.dumps({"schema": "imu-monitor/analyze/1", "rate": 100.0, "axes": axes})
+    made = exporters.export(exporters.from_analysis(new), form)
+    mark = "%" if form == "gyroparams" else "#"
+    [line] = [line for line in made.splitlines() if "WARNING" in line]
+    assert line == (
+        f"{mark} WARNING: gy follows its temperature, which explains 98 % of its slow variance: "
+        "B and K of gy describe temperature as well as noise"
+    )

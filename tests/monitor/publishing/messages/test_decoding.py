@@ -1,0 +1,68 @@
+"""Results that went through messages are those that went in, as far as they travel; what is no result is refused."""
+
+import json
+
+import numpy as np
+import pytest
+
+from drivers.sample import AXES, Event
+from monitor.common import topics
+from monitor.publishing.messages import decoding, encoding, remote_device
+from tests.monitor.publishing import made
+
+
+def through_messages(estimate: object, **changed: object) -> object:
+    allan = json.loads(encoding.allan("a", 1.76e9, estimate)) | changed  # type: ignore[arg-type]
+    noise = remote_device.noise(
+        remote_device.read(
+            remote_device.CoefficientsMessage, topics.COEFFICIENTS, encoding.coefficients("a", 1.76e9, estimate)
+        )  # type: ignore[arg-type]
+    )
+    return decoding.estimate(
+        remote_device.read(remote_device.AllanMessage, topics.ALLAN, json.dumps(allan).encode()), noise
+    )
+
+
+def test_an_estimate() -> None:
+    sent = made.estimate()
+    got = through_messages(sent)
+    for name in ("tau_s", "factors", "avar", "lo", "hi", "n"):
+        assert getattr(got.curve, name) == pytest.approx(getattr(sent.curve, name), rel=1e-9, nan_ok=True), name  # type: ignore[attr-defined]
+    for name in ("value", "lo", "hi", "status"):
+        assert getattr(got.coefficients, name) == pytest.approx(  # type: ignore[attr-defined]
+            getattr(sent.coefficients, name), rel=1e-9, nan_ok=True
+        ), name
+    assert (got.rate_hz, got.window_s, got.samples) == (sent.rate_hz, sent.window_s, sent.samples)  # type: ignore[attr-defined]
+    assert got.fitted == pytest.approx(sent.fitted, rel=0.02)  # type: ignore[attr-defined]
+
+
+def test_the_fitted_curve_is_that_of_the_standard() -> None:
+    """N alone: σ² = N²/τ; B alone: (2 ln 2/π) B²."""
+    coefficients = made.estimate().coefficients
+    coefficients.value[:] = np.nan
+    coefficients.value[1, 0] = 3.0
+    coefficients.value[2, 1] = 2.0
+    fitted = decoding.fitted(np.array([1.0, 9.0]), coefficients)
+    assert fitted[:, 0] == pytest.approx([9.0, 1.0])
+    assert fitted[:, 1] == pytest.approx([1.7651, 1.7651], rel=1e-4)
+    assert np.isnan(fitted[:, 2:]).all()
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"tau": []}, {"tau": [2.0, 1.0]}, {"tau": [-1.0, 1.0]}, {"tau": [1.0]}, {"rate": 0.0}, {"tau": [1.0] * 2000}],
+)
+def test_what_is_no_curve_is_refused(changed: dict[str, object]) -> None:
+    with pytest.raises(ValueError):  # noqa: PT011 - whatever it says, it is counted
+        through_messages(made.estimate(), **changed)
+
+
+def test_health_and_events() -> None:
+    sent = made.health(text="viewer is slow")
+    got = decoding.health(remote_device.status(encoding.status("a", 1.0, sent)))
+    assert got.text == "viewer is slow"
+    assert (got.received, got.uptime_s, got.memory_bytes) == (sent.received, sent.uptime_s, sent.memory_bytes)
+    happened = Event("noise_changed", 10**18, "gz rose", "gz", {"N": {"before": 1.0, "after": 2.0}})
+    read = decoding.event(remote_device.event(encoding.event("a", 1e9, 5, happened, None)))
+    assert (read.kind, read.axis, read.text, read.what) == ("noise_changed", "gz", "gz rose", happened.what)
+    assert read.axis in AXES

@@ -1,0 +1,312 @@
+"""The JSON on the wire, key by key as the README's table of keys says."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.sample import AXES, Event
+from monitor.common import topics
+from monitor.estimation.allan.dynamic_allan import dynamic
+from monitor.estimation.allan.hadamard import hadamard_curve
+from monitor.estimation.allan.total import total_curve
+from monitor.estimation.detection.change_detection import Change
+from monitor.estimation.detection.motion_detection import Motion
+from monitor.estimation.fit.coefficients import LETTERS
+from monitor.publishing.messages import encoding
+from tests.monitor.publishing import made
+
+UNIX_S = 1763700000.01
+
+
+def parsed(payload: bytes) -> dict[str, Any]:
+    def refuse(word: str) -> float:
+        raise AssertionError(f"{word} is not JSON")
+
+    found: dict[str, Any] = json.loads(payload, parse_constant=refuse)
+    return found
+
+
+def gyro_z_only() -> Any:
+    """An estimate of a device that measures gz alone, after ten minutes."""
+    whole = made.estimate(seconds=600.0)
+    for table in (whole.curve.avar, whole.curve.lo, whole.curve.hi):
+        table[:, [0, 1, 3, 4, 5]] = np.nan
+    return whole
+
+
+ALL = {
+    topics.ALLAN: encoding.allan("bench-1", UNIX_S, made.estimate()),
+    topics.COEFFICIENTS: encoding.coefficients("bench-1", UNIX_S, made.estimate()),
+    topics.TOTAL: encoding.total("bench-1", UNIX_S, 360_000, *made.slow_curves()),
+    topics.GAP: encoding.gap("bench-1", UNIX_S, made.look(gz=False, gx=True)),
+    topics.THERMAL: encoding.thermal("bench-1", UNIX_S, 360_000, made.thermal_look()),
+    topics.EVENT: encoding.event("bench-1", UNIX_S, 360_000, Event("link_back", 0, "back"), None),
+    topics.STATUS: encoding.status("bench-1", UNIX_S, made.health()),
+    topics.RESET: encoding.reply("bench-1", UNIX_S, 360_000, "the window is empty"),
+    topics.RECONCILE: encoding.reconciled("bench-1", UNIX_S, 360_000, {"schema": "x", "verdict": "agrees"}, 0, None),
+}
+
+
+@pytest.mark.parametrize("topic", ALL, ids=lambda topic: topic.name)
+def test_every_payload_says_what_whose_when_and_how_many(topic: topics.Topic) -> None:
+    found = parsed(ALL[topic])
+    assert list(found)[:4] == ["schema", "device", "t", "samples"]
+    assert found["schema"] == f"imu-monitor/{topic.name.rpartition('/')[2]}/1"
+    assert (found["device"], found["t"], found["samples"]) == ("bench-1", UNIX_S, 360_000)
+
+
+def test_every_json_topic_has_a_message() -> None:
+    # history's has a module of its own
+    assert {topic for topic in topics.TOPICS if topic.encoding == topics.JSON} - {topics.HISTORY} == set(ALL)
+
+
+def test_coefficients() -> None:
+    estimate = made.estimate()
+    found = parsed(ALL[topics.COEFFICIENTS])
+    assert found["window"] == 3600.0
+    assert found["rate"] == 100.0
+    assert list(found["axes"]) == list(AXES)
+    assert all(list(axis) == list(LETTERS) for axis in found["axes"].values())
+    n = found["axes"]["gz"]["N"]
+    at = LETTERS.index("N"), AXES.index("gz")
+    assert n == {
+        "value": estimate.coefficients.value[at],
+        "lo": estimate.coefficients.lo[at],
+        "hi": estimate.coefficients.hi[at],
+        "status": "estimated",
+    }
+    assert found["axes"]["gz"]["R"] == {"value": None, "lo": 0.0, "hi": 3e-9, "status": "upper_bound"}
+
+
+def test_total_and_hadamard_have_their_own_tau() -> None:
+    total, hadamard = made.slow_curves()
+    found = parsed(ALL[topics.TOTAL])
+    assert found["total"]["tau"] == total.tau_s.tolist()
+    assert found["hadamard"]["tau"] == hadamard.tau_s.tolist()
+    assert list(found["total"]["axes"]) == list(AXES)
+    gz = found["total"]["axes"]["gz"]
+    assert gz["deviation"] == np.sqrt(total.tvar[:, 2]).tolist()
+    assert gz["lo"][0] == total.lo[0, 2]
+    assert gz["hi"][-1] is None  # beyond half the window there is no interval
+
+
+def test_thermal() -> None:
+    found = parsed(ALL[topics.THERMAL])
+    assert (found["interval"], found["temperature"]) == (600.0, 25.5)
+    assert found["axes"] == {
+        "gz": {
+            "bias": 3e-4,
+            "error": 1e-6,
+            "multi_step": {"bias": 2e-4, "lo": 1e-4, "hi": 3e-4},
+            "one_step": {"bias": 2.2e-4, "lo": 1.8e-4, "hi": 2.6e-4},
+            "model": "polynomial 1",
+            "slope": 2e-5,
+            "text": "",
+        },
+        "az": {
+            "bias": 9.81,
+            "error": None,
+            "multi_step": None,
+            "one_step": None,
+            "model": None,
+            "slope": None,
+            "text": "temperature hardly moved",
+        },
+    }
+
+
+def test_gap() -> None:
+    look = made.look(made.estimate(seconds=600.0), scale=1.1, gz=False, gx=True)
+    found = parsed(encoding.gap("a", UNIX_S, look))
+    assert (found["rate"], found["window"], found["filled"]) == (100.0, 3600.0, 600.0)
+    assert found["tau"] == look.tau_s.tolist()
+    assert list(found["axes"]) == list(AXES)
+    gz = found["axes"]["gz"]
+    one = look.axes["gz"]
+    assert (gz["gap"], gz["threshold"], gz["null95"]) == (one.gap, one.threshold, one.null95)
+    assert gz["null95"] < gz["threshold"] < gz["gap"]
+    assert gz["ratio"] == pytest.approx(1 / 1.1, rel=0.02)
+    assert gz["where"] == {"tau": list(one.tau_s)}
+    assert gz["measured"] == one.measured.tolist()
+    assert gz["model"] == one.model.tolist()
+    assert len(gz["z"]) == len(found["tau"])
+    assert [found["axes"][axis]["agrees"] for axis in ("gx", "gy", "gz")] == [True, None, False]
+
+
+def test_where_a_model_knows_nothing_it_says_null() -> None:
+    look = made.look(made.estimate(seconds=600.0))
+    look.axes["gz"].z[0] = np.nan
+    assert parsed(encoding.gap("a", UNIX_S, look))["axes"]["gz"]["z"][0] is None
+
+
+def test_the_reports_own_words_are_kept_and_the_head_is_ours() -> None:
+    result = {"schema": "x", "samples": 5, "verdict": "explained", "axes": {"gz": {"steps": []}}}
+    found = parsed(encoding.reconciled("a", UNIX_S, 360_000, result, 3, "/reports/a"))
+    assert (found["schema"], found["samples"]) == ("imu-monitor/reconcile/1", 360_000)
+    assert (found["verdict"], found["axes"], found["exit"], found["folder"]) == (
+        "explained", {"gz": {"steps": []}}, 3, "/reports/a"
+    )  # fmt: skip
+
+
+def test_too_few_data_are_null_and_say_so() -> None:
+    found = parsed(encoding.coefficients("a", UNIX_S, made.estimate(seconds=600.0)))
+    assert found["axes"]["ax"]["R"] == {"value": None, "lo": None, "hi": None, "status": "unestimated"}
+
+
+def test_axes_that_are_not_measured_are_absent() -> None:
+    estimate = gyro_z_only()
+    assert list(parsed(encoding.coefficients("a", UNIX_S, estimate))["axes"]) == ["gz"]
+    assert list(parsed(encoding.allan("a", UNIX_S, estimate))["axes"]) == ["gz"]
+
+
+def test_allan() -> None:
+    estimate = gyro_z_only()
+    estimate.curve.avar[-1, 2] = estimate.curve.lo[-1, 2] = estimate.curve.hi[-1, 2] = np.nan
+    found = parsed(encoding.allan("a", UNIX_S, estimate))
+    assert found["tau"] == estimate.curve.tau_s.tolist()
+    assert set(found["axes"]["gz"]) == {"deviation", "lo", "hi"}
+    gz = found["axes"]["gz"]
+    assert gz["deviation"][:-1] == np.sqrt(estimate.curve.avar[:-1, 2]).tolist()
+    assert gz["deviation"][-1] is gz["lo"][-1] is gz["hi"][-1] is None
+    assert all(lo < d < hi for lo, d, hi in list(zip(gz["lo"], gz["deviation"], gz["hi"], strict=True))[:-1])
+
+
+def test_event() -> None:
+    what = Event(
+        "noise_changed",
+        5,
+        "gz angle random walk rose by 47 %",
+        axis="gz",
+        what={"N": {"before": 1.5e-4, "after": 2.2e-4}},
+        since_ns=1,
+        sigma=9.1,
+    )
+    found = parsed(encoding.event("bench-1", UNIX_S, 7, what, 1763699980.0))
+    assert {key: found[key] for key in list(found)[4:]} == {
+        "kind": "noise_changed",
+        "axis": "gz",
+        "what": {"N": {"before": 1.5e-4, "after": 2.2e-4}},
+        "since": 1763699980.0,
+        "sigma": 9.1,
+        "text": "gz angle random walk rose by 47 %",
+    }
+
+
+def test_status() -> None:
+    health = made.health(outputs={"zenoh": "ok", "viewer": "stalled"}, text="…", rate_hz=None, latency_p99_s=None)
+    found = parsed(encoding.status("bench-1", UNIX_S, health))
+    assert {key: found[key] for key in list(found)[4:]} == {
+        "state": "running",
+        "rate": None,
+        "received": 360_000,
+        "lost": 3,
+        "bad": 1,
+        "overflowed": 0,
+        "latency": {"p50": 0.0021, "p99": None},
+        "memory": 182_000_000,
+        "outputs": {"zenoh": "ok", "viewer": "stalled"},
+        "uptime": 3600.0,
+        "repeated": 0,
+        "late": 0,
+        "moving": False,
+        "moved": 0,
+        "crossed": [],
+        "text": "…",
+    }
+
+
+def test_reply() -> None:
+    assert parsed(ALL[topics.RESET])["text"] == "the window is empty"
+
+
+# --- analyze ---------------------------------------------------------------------------------------
+
+
+def analyzed(**more: Any) -> dict[str, Any]:
+    whole = made.estimate()
+    either = np.array([False, True, False, False, False, False])
+    result = replace(made.analysis(replace(whole, k_or_r=either), notes=("a note",)), **more)
+    theta = np.zeros((5, 6)) + made.true_coefficients() ** 2
+    values = 1e-3 * np.random.default_rng(1).standard_normal((3000, 6))
+    return parsed(
+        encoding.analysis(
+            result,
+            total_curve(values, 100.0, theta, np.array([1, 1000, 2900])),
+            hadamard_curve(values, 100.0, theta, np.array([1, 1000])),
+            dynamic(values, 100.0, 10.0, (0.01, 0.1, 0.2, 0.4, 1.0), step_s=5.0),
+        )
+    )
+
+
+def test_an_analysis_has_all_its_curves_beside_each_other() -> None:
+    found = analyzed()
+    assert list(found) == [
+        "schema", "rate", "samples", "seconds", "notes", "axes", "motions", "changes", "dynamic"
+    ]  # fmt: skip
+    gz = found["axes"]["gz"]
+    assert list(gz) == ["allan", "total", "hadamard", "coefficients", "bandwidth"]
+    for name, rows in (("allan", len(made.estimate().curve.tau_s)), ("total", 3), ("hadamard", 2)):
+        assert list(gz[name]) == ["tau", "deviation", "lo", "hi"]
+        assert {len(column) for column in gz[name].values()} == {rows}
+    assert gz["total"]["tau"] == [0.01, 10.0, 29.0]
+    assert gz["total"]["deviation"][2] > 0.0
+    assert gz["total"]["lo"][1] < gz["total"]["deviation"][1] < gz["total"]["hi"][1]
+    assert gz["total"]["lo"][2] is gz["total"]["hi"][2] is None  # beyond half the record
+
+
+def test_of_k_or_r_each_names_the_other() -> None:
+    axes = analyzed()["axes"]
+    assert [axes["gy"]["coefficients"][letter].get("or") for letter in LETTERS] == [None, None, None, "R", "K"]
+    assert not any("or" in one for one in axes["gz"]["coefficients"].values())
+
+
+def test_a_bandwidth_is_a_number_or_null() -> None:
+    shown = analyzed(bandwidth_hz=np.array([np.nan, 33.2, np.nan, np.nan, np.nan, np.nan]))["axes"]
+    assert (shown["gx"]["bandwidth"], shown["gy"]["bandwidth"]) == (None, 33.2)
+
+
+def test_motions_and_changes_are_told_with_their_times() -> None:
+    motion = Motion("knock", 250, 400, 0.5, "gx", 0.3, "knocked: gx up to 17 °/s")
+    noise = Change(
+        "noise_changed", 2, 25_000, 25_100, 9.1, {"N": (1.5e-4, 2.2e-4)}, "gz angle random walk rose by 47 %"
+    )
+    line = Change("noise_changed", 0, 30_000, 30_100, 12.0, {"band": (10.0, 20.0), "rms": (1e-3, 2e-3)}, "gx noise")
+    found = analyzed(motions=(motion,), changes=(noise, line))
+    assert found["motions"] == [
+        {"kind": "knock", "axis": "gx", "t": 2.5, "seconds": 0.5, "peak": 0.3, "text": "knocked: gx up to 17 °/s"}
+    ]
+    assert found["changes"][0] == {
+        "kind": "noise_changed",
+        "axis": "gz",
+        "t": 250.0,
+        "sigma": 9.1,
+        "what": {"N": {"before": 1.5e-4, "after": 2.2e-4}},
+        "text": "gz angle random walk rose by 47 %",
+    }
+    assert found["changes"][1]["what"] == {"band": {"from": 10.0, "to": 20.0}, "rms": {"before": 1e-3, "after": 2e-3}}
+
+
+def test_dynamic_curves_are_lists_by_time_step() -> None:
+    found = analyzed()["dynamic"]
+    assert (found["window"], found["t"]) == (10.0, [10.0, 15.0, 20.0, 25.0, 30.0])
+    assert found["tau"] == [0.01, 0.1, 0.2, 0.4, 1.0]
+    assert list(found["axes"]) == list(AXES)
+    gz = found["axes"]["gz"]
+    assert np.shape(gz["deviation"]) == np.shape(gz["lo"]) == np.shape(gz["hi"]) == (5, 5)
+    n = gz["coefficients"]["N"]
+    assert n["status"] == ["estimated"] * 5
+    assert all(lo < value < hi for lo, value, hi in zip(n["lo"], n["value"], n["hi"], strict=True))
+    assert n["value"] == pytest.approx([1e-4] * 5, rel=0.3)
+    assert [value is None for value in gz["coefficients"]["K"]["value"]] == [
+        status != "estimated" for status in gz["coefficients"]["K"]["status"]
+    ]
+
+
+def test_what_was_not_made_is_absent() -> None:
+    found = parsed(encoding.analysis(made.analysis()))
+    assert "dynamic" not in found
+    assert list(found["axes"]["gz"]) == ["allan", "coefficients", "bandwidth"]
+    assert found["motions"] == found["changes"] == []

@@ -1,0 +1,143 @@
+"""Messages read back: what ``message`` writes, and what anybody else may send."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from monitor.common import topics
+from monitor.publishing.messages import encoding, remote_device
+from monitor.publishing.messages.remote_device import Heard
+from tests.monitor.publishing import made
+
+
+def test_coefficients_come_back_as_they_were() -> None:
+    estimate = made.estimate(seconds=1000.0)
+    payload = encoding.coefficients("a", 1.0, estimate)
+    found = remote_device.noise(remote_device.read(remote_device.CoefficientsMessage, topics.COEFFICIENTS, payload))
+    for name in ("value", "lo", "hi", "status"):
+        np.testing.assert_array_equal(getattr(found.coefficients, name), getattr(estimate.coefficients, name))
+    assert found.axes == ("gx", "gy", "gz", "ax", "ay", "az")
+    assert found.seen_s == 1000.0
+
+
+def test_what_is_seen_is_what_the_window_holds() -> None:
+    """Not what came since the start: after a reset that is more."""
+    estimate = dataclasses.replace(made.estimate(seconds=1800.0), samples=10_000_000)
+    payload = encoding.coefficients("a", 1.0, estimate)
+    assert (
+        remote_device.noise(remote_device.read(remote_device.CoefficientsMessage, topics.COEFFICIENTS, payload)).seen_s
+        == 1800.0
+    )
+
+
+def test_what_a_newer_daemon_adds_is_passed_over() -> None:
+    payload = encoding.status("a", 1.0, made.health())[:-1] + b',"novelty":[1,{"x":null}]}'
+    assert remote_device.read(remote_device.StatusMessage, topics.STATUS, payload).received == 360_000
+    axes = b'{"gz":{"N":{"value":1e-4,"lo":1e-5,"hi":1e-3,"status":"estimated"},"Z":{"status":"new"}},"mx":{}}'
+    payload = b'{"schema":"imu-monitor/coefficients/1","samples":5,"axes":' + axes + b"}"
+    found = remote_device.noise(remote_device.read(remote_device.CoefficientsMessage, topics.COEFFICIENTS, payload))
+    assert found.axes == ("gz",)
+    assert found.coefficients.value[1, 2] == 1e-4
+
+
+def test_a_status_may_have_no_time_yet() -> None:
+    assert remote_device.status(encoding.status("a", None, made.health())).t is None
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"\xff\xfe",
+        b"{}",
+        encoding.status("a", 1.0, made.health()).replace(b"status/1", b"status/2"),
+        encoding.status("a", 1.0, made.health()).replace(b'"received":360000', b'"received":"many"'),
+        encoding.reply("a", 1.0, 5, "x"),
+    ],
+)
+def test_anything_else_is_a_value_error(payload: bytes) -> None:
+    with pytest.raises(ValueError):  # noqa: PT011 - the text is msgspec's
+        remote_device.read(remote_device.StatusMessage, topics.STATUS, payload)
+
+
+def test_a_status_word_of_a_coefficient_that_is_not_known() -> None:
+    payload = encoding.coefficients("a", 1.0, made.estimate()).replace(b'"estimated"', b'"guessed"')
+    with pytest.raises(ValueError, match="guessed"):
+        remote_device.noise(remote_device.read(remote_device.CoefficientsMessage, topics.COEFFICIENTS, payload))
+
+
+def device(**changed: object) -> Heard:
+    payload = encoding.status("a", 1.0, made.health(**changed))
+    return Heard("imu/a", 100.0, status=remote_device.read(remote_device.StatusMessage, topics.STATUS, payload))
+
+
+def test_a_device_that_speaks_is_what_it_says() -> None:
+    for state in ("running", "waiting", "lost", "ended"):
+        assert device(state=state).state(100.5) == state
+
+
+def test_silence() -> None:
+    one = device()
+    assert one.state(100.0 + remote_device.SILENT_S - 0.1) == "running"
+    assert one.state(100.0 + remote_device.SILENT_S + 0.1) == "silent"
+    one.there = True
+    assert one.state(100.0 + remote_device.SILENT_S + 0.1) == "silent"
+    one.there = False
+    assert one.state(100.0 + remote_device.GONE_S - 0.1) == "running"
+    assert one.state(100.0 + remote_device.GONE_S + 0.1) == "gone"
+
+
+def test_a_replay_that_has_ended_is_not_missed() -> None:
+    one = device(state="ended")
+    one.there = False
+    assert one.state(1e6) == "ended"
+
+
+def test_nothing_known_but_its_presence() -> None:
+    assert Heard("imu/a", 100.0, there=True).state(100.1) == "present"
+
+
+def test_ranks_and_words_of_trouble() -> None:
+    assert device(state="lost", text="no such port").rank(100.0) == 0
+    assert device(state="waiting").rank(100.0) == 1
+    assert device().rank(100.0) == 2
+    assert device(state="ended").rank(100.0) == 3
+    assert device().trouble() == ""
+    assert device(outputs={"zenoh": "off", "viewer": "ok"}).trouble() == ""
+    stalled = device(outputs={"zenoh": "ok", "viewer": "stalled"}, text="odd", overflowed=1200)
+    assert stalled.rank(100.0) == 1
+    assert stalled.trouble().startswith("odd; viewer: stalled; 1,200 samples overwritten")
+    elsewhere = device(outputs={"zenoh": "ok, but the port is busy"})
+    assert (elsewhere.rank(100.0), elsewhere.trouble()) == (2, "zenoh: ok, but the port is busy")
+
+
+def test_a_topic_of_two_parts_and_keys_that_are_none() -> None:
+    assert remote_device.split("a/b/c/command/reset") == ("a/b/c", topics.RESET)
+    assert remote_device.split("status") is None
+    assert remote_device.split("/status") is None
+    assert remote_device.split("imu/bench-1/statuses") is None
+
+
+def test_disagreement_with_a_model_is_trouble_and_ranks_before_what_runs_well() -> None:
+    status = remote_device.read(remote_device.StatusMessage, topics.STATUS, encoding.status("a", 1.0, made.health()))
+    payload = encoding.gap("a", 1.0, made.look(scale=1.2, gz=False, gx=True))
+    one = Heard("imu/a", 0.0, status)
+    assert one.rank(0.0) == 2
+    one.gap = remote_device.read(remote_device.GapMessage, topics.GAP, payload)
+    assert one.rank(0.0) == 1
+    found = one.gap.axes["gz"]
+    lo, hi = found.where.tau
+    assert one.trouble() == f"gz disagrees with its model: {found.gap:.3g} σ at τ {lo:.3g} to {hi:.3g} s"
+    one.gap = remote_device.read(remote_device.GapMessage, topics.GAP, encoding.gap("a", 1.0, made.look(gz=True)))
+    assert (one.rank(0.0), one.trouble()) == (2, "")
+
+
+def test_a_limit_that_is_passed_is_trouble() -> None:
+    one = device(crossed=("gz N",))
+    assert one.rank(100.0) == 1
+    assert one.trouble() == "beyond its limit: gz N"
+    many = device(crossed=tuple(f"gz {i}" for i in range(100)))
+    assert many.trouble() == "beyond its limit: gz 0, gz 1, gz 2, gz 3, gz 4, gz 5 and 94 more"

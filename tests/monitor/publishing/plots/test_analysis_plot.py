@@ -1,0 +1,207 @@
+"""The analysis as one picture."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.errors import ConfigError
+from monitor.estimation.allan.dynamic_allan import Dynamic, dynamic
+from monitor.estimation.fit.coefficients import Status
+from monitor.publishing.plots import allan_figure, analysis_plot, dynamic_figure
+from monitor.publishing.plots.allan_figure import Beside
+from monitor.publishing.plots.dynamic_figure import Mark
+from tests.monitor.publishing import made
+
+
+@pytest.fixture(scope="module")
+def changing() -> Dynamic:
+    """White noise that doubles halfway, on the gyroscopes."""
+    values = np.random.default_rng(1).standard_normal((6000, 6))
+    values[3000:, :3] *= 2.0
+    return dynamic(values, 10.0, 60.0, step_s=9.0)
+
+
+def pixels(path: Path) -> np.ndarray:
+    return pytest.importorskip("matplotlib.image").imread(path)
+
+
+def near(image: np.ndarray, colour: str) -> int:
+    """How many pixels have this colour."""
+    rgb = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    return int((np.abs(image[..., :3] - rgb).max(axis=-1) < 0.02).sum())
+
+
+def panel(kind: str = "gyro", **arguments: object):
+    figure = pytest.importorskip("matplotlib.figure").Figure()
+    axes = figure.subplots()
+    allan_figure.allan_panel(axes, arguments.pop("estimate", made.estimate()), kind, **arguments)
+    return axes
+
+
+def lettered(axes) -> dict[str, list[tuple[float, float]]]:
+    """Letter -> where it stands, in data units."""
+    found: dict[str, list[tuple[float, float]]] = {}
+    for text in axes.texts:
+        found.setdefault(text.get_text(), []).append(text.xy)
+    return found
+
+
+def test_both_kinds_side_by_side_in_all_colours(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    path = tmp_path / "plot.png"
+    analysis_plot.allan_plot(made.estimate(), path, title="bench-1")
+    image = pixels(path)
+    assert image.shape[1] == round(2 * analysis_plot.INCHES[0] * analysis_plot.DPI)
+    for half in (image[:, : image.shape[1] // 2], image[:, image.shape[1] // 2 :]):
+        assert all(near(half, colour) > 500 for colour in allan_figure.COLOURS)
+
+
+def test_a_gyroscope_alone_fills_the_picture(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    estimate = made.estimate()
+    estimate.curve.avar[:, [0, 1, 3, 4, 5]] = np.nan
+    path = tmp_path / "plot.png"
+    analysis_plot.allan_plot(estimate, path)
+    image = pixels(path)
+    assert image.shape[1] == round(analysis_plot.INCHES[0] * analysis_plot.DPI)
+    curves = image[: image.shape[0] // 2]
+    assert near(curves, allan_figure.COLOURS[2]) > 300
+    assert near(curves, allan_figure.COLOURS[0]) == 0
+
+
+def test_letters_stand_where_the_field_reads_them() -> None:
+    estimate = made.estimate()
+    gz = estimate.coefficients.value[:, 2]
+    alone = replace(estimate, curve=replace(estimate.curve, avar=estimate.curve.avar.copy()))
+    alone.curve.avar[:, :2] = np.nan
+    letters = lettered(panel(estimate=alone))
+    degrees_an_hour = np.degrees(1.0) * 3600.0
+    assert letters["N"] == [(1.0, pytest.approx(gz[1] * degrees_an_hour))]
+    assert letters["K"] == [(3.0, pytest.approx(gz[3] * degrees_an_hour))]
+    assert letters["Q"] == [(pytest.approx(3**0.5), pytest.approx(gz[0] * degrees_an_hour))]
+    ((at_s, floor),) = letters["B"]
+    assert floor == pytest.approx(gz[2] * 0.66432 * degrees_an_hour, rel=1e-4)
+    assert at_s == estimate.curve.tau_s[np.argmin(estimate.curve.avar[:, 2])]
+    assert "R" not in letters  # only bounded
+
+
+def test_rings_that_would_cover_each_other_share_a_letter() -> None:
+    estimate = made.estimate()
+    value = estimate.coefficients.value.copy()
+    value[1, :3] = [1.00e-4, 1.01e-4, 3.0e-4]
+    value[3, :3] = [1.0e-6, 2.0e-6, 4.0e-6]
+    letters = lettered(panel(estimate=replace(estimate, coefficients=replace(estimate.coefficients, value=value))))
+    assert len(letters["N"]) == 2
+    assert len(letters["K"]) == 3
+
+
+def test_asymptotes_have_the_slopes_of_their_letters() -> None:
+    axes = panel()
+    slopes = set()
+    for line in axes.lines:
+        x, y = line.get_data()
+        if line.get_alpha() == 0.4 and len(x) == 2:
+            slopes.add(round(float(np.log(y[1] / y[0]) / np.log(x[1] / x[0])), 6))
+    assert slopes == {-1.0, -0.5, 0.0, 0.5}
+
+
+def test_all_points_and_rings_are_inside_the_panel() -> None:
+    axes = panel("accel")
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    for line in axes.lines:
+        x, y = (np.asarray(part, float) for part in line.get_data())
+        if line.get_alpha() != 0.4 and x.size:
+            good = np.isfinite(y)
+            assert ((x >= left) & (x <= right) & (y >= bottom) & (y <= top))[good].all()
+
+
+def test_total_deviation_goes_on_where_the_allan_deviation_ends() -> None:
+    estimate = made.estimate()
+    longest = estimate.curve.tau_s[-1]
+    tau_s = longest * np.array([0.5, 1.0, 2.0, 4.0])
+    deviation = np.full((4, 6), 3.0e-5)
+    total = Beside("total", tau_s, deviation, 0.5 * deviation, np.full((4, 6), np.nan), only_beyond=True)
+    axes = panel(estimate=estimate, others=[total])
+    open_marks = [line.get_xdata() for line in axes.lines if line.get_markerfacecolor() == "white"]
+    beyond = [x.tolist() for x in open_marks if len(x)]
+    assert beyond == [(longest * np.array([2.0, 4.0])).tolist()] * 3
+    assert axes.get_xlim()[1] > 4.0 * longest
+    assert "total" in [text.get_text() for text in axes.get_legend().get_texts()]
+
+
+def test_the_summary_says_what_is_missing() -> None:
+    estimate = made.estimate()
+    assert analysis_plot.summary(estimate) == "360,000 samples at 100 Hz, 1 h 00 min"
+    assert analysis_plot.summary(replace(estimate, samples=359_000)).endswith("1 h 00 min, 1,000 missing")
+
+
+def test_k_or_r_is_said_of_bounds_only() -> None:
+    estimate = replace(made.estimate(seconds=1000.0), k_or_r=np.array([True, False] + [True] * 4))
+    assert analysis_plot.k_or_r(estimate, "K", "gx")
+    assert not analysis_plot.k_or_r(estimate, "K", "gy")
+    assert not analysis_plot.k_or_r(estimate, "N", "gx")
+    assert not analysis_plot.k_or_r(made.estimate(), "K", "gx")
+
+
+def test_dynamic_curves_stand_below_in_the_same_picture(tmp_path: Path, changing: Dynamic) -> None:
+    pytest.importorskip("matplotlib")
+    path = tmp_path / "plot.png"
+    estimate = made.estimate()
+    estimate.curve.avar[:, 3:] = np.nan
+    analysis_plot.allan_plot(estimate, path, "bench-1", dynamic=changing, marks=[Mark(300.0, "gz")])
+    image = pixels(path)
+    below = dynamic_figure.height_inches(changing, "gyro") * analysis_plot.DPI
+    assert image.shape[0] == pytest.approx(analysis_plot.INCHES[1] * analysis_plot.DPI + below, abs=2)
+    gyro = image[round(analysis_plot.INCHES[1] * analysis_plot.DPI) :, :, :3]
+    blue = (gyro[..., 2] - gyro[..., 0] > 0.3).any(axis=0)
+    red = (gyro[..., 0] - gyro[..., 2] > 0.3).any(axis=0)
+    assert blue.any()
+    assert red.any()
+
+
+def test_colours_are_of_the_deviation_over_its_median(changing: Dynamic) -> None:
+    relative = dynamic_figure.relative(changing)
+    assert np.nanmedian(relative, axis=0) == pytest.approx(np.ones(relative.shape[1:]))
+    assert relative[-1, 0, 0] / relative[0, 0, 0] == pytest.approx(2.0, rel=0.1)
+    assert relative[-1, 0, 5] / relative[0, 0, 5] == pytest.approx(1.0, rel=0.1)
+
+
+def test_only_coefficients_that_are_estimated_have_a_panel(changing: Dynamic) -> None:
+    status = np.full_like(changing.status, Status.UPPER_BOUND)
+    status[:, 1] = Status.ESTIMATED
+    assert dynamic_figure.letters(replace(changing, status=status), "gyro") == ("N",)
+    status[:2, 3, 1] = Status.ESTIMATED  # for a moment only
+    assert "K" not in dynamic_figure.letters(replace(changing, status=status), "gyro")
+    status[:20, 3, 1] = Status.ESTIMATED
+    assert "K" in dynamic_figure.letters(replace(changing, status=status), "gyro")
+
+
+def test_an_axis_without_data_has_no_surface(changing: Dynamic) -> None:
+    deviation = changing.deviation.copy()
+    deviation[:, :, 1] = np.nan
+    assert dynamic_figure.axes_shown(replace(changing, deviation=deviation), "gyro") == ("gx", "gz")
+
+
+def test_one_single_step_can_be_drawn() -> None:
+    figure = pytest.importorskip("matplotlib.figure").Figure()
+    once = dynamic(np.random.default_rng(2).standard_normal((600, 6)), 10.0, 60.0, (0.1,))
+    assert once.t_s.size == 1
+    dynamic_figure.dynamic_panels(figure, once, "gyro")
+    figure.draw_without_rendering()
+    low, high = figure.axes[0].get_xlim()
+    assert low < 60.0 < high
+
+
+def test_without_matplotlib_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ConfigError, match=r"pip install \"imu-monitor\[plot\]\""):
+        analysis_plot.allan_plot(made.estimate(), tmp_path / "plot.png")
+
+
+def test_a_folder_that_is_not_there_is_a_wrong_request(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    with pytest.raises(ConfigError, match="cannot write the plot"):
+        analysis_plot.allan_plot(made.estimate(), tmp_path / "absent" / "plot.png")

@@ -1,0 +1,98 @@
+"""Changes are marked on their own axis, in words that do not touch; panels hold the courses and most of their bands."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from drivers.sample import AXES
+from monitor.estimation.allan.dynamic_allan import Dynamic, dynamic
+from monitor.estimation.fit.coefficients import Status
+from monitor.publishing.plots.allan_figure import COLOURS, DARK
+from monitor.publishing.plots.dynamic_figure import APART, BANDS, Clock, Mark, _near, dynamic_panels, letters
+
+
+@pytest.fixture(scope="module")
+def white() -> Dynamic:
+    """White noise of ten minutes, windows of one."""
+    return dynamic(np.random.default_rng(1).standard_normal((6000, 6)), 10.0, 60.0, step_s=9.0)
+
+
+def panels(found: Dynamic, marks: list[Mark], kind: str = "gyro"):
+    figure = pytest.importorskip("matplotlib.figure").Figure(figsize=(7.2, 8.0), layout="constrained")
+    dynamic_panels(figure, found, kind, marks)
+    figure.draw_without_rendering()
+    count = 3 + len(letters(found, kind))
+    return figure.axes[:count]
+
+
+def lines_at(panel, colour: str) -> list[float]:
+    """Times of the vertical marks of a colour, s: the axis is in minutes."""
+    return [
+        60.0 * float(line.get_xdata()[0])
+        for line in panel.lines
+        if line.get_linestyle() == "--" and line.get_color() == colour
+    ]
+
+
+def test_a_change_is_marked_in_its_surface_and_through_the_courses(white: Dynamic) -> None:
+    gx, gy, gz, *courses = panels(white, [Mark(300.0, "gy"), Mark(240.0, "az")])
+    assert [lines_at(panel, DARK) for panel in (gx, gy, gz)] == [[], [300.0], []]
+    assert [[text.get_text() for text in panel.texts] for panel in (gx, gy, gz)] == [[], ["change"], []]
+    assert courses
+    assert all(lines_at(course, COLOURS[1]) == [300.0] for course in courses)
+    assert not any(lines_at(course, COLOURS[2]) for course in courses)  # az stands in the other figure
+    ax, ay, az, *_ = panels(white, [Mark(300.0, "gy"), Mark(240.0, "az")], "accel")
+    assert [lines_at(panel, DARK) for panel in (ax, ay, az)] == [[], [], [240.0]]
+
+
+def test_marks_outside_the_time_axis_are_not_drawn(white: Dynamic) -> None:
+    drawn = panels(white, [Mark(5.0, "gx"), Mark(5000.0, "gx")])
+    assert not any(panel.texts or lines_at(panel, DARK) for panel in drawn)
+    assert drawn[0].get_xlim() == pytest.approx((55.5 / 60.0, (float(white.t_s[-1]) + 4.5) / 60.0))
+
+
+def test_words_stay_inside_and_apart(white: Dynamic) -> None:
+    """However many changes there are, and at the very end."""
+    end = float(white.t_s[-1])
+    times = [60.0, 62.0, 200.0, 230.0, 231.0, 400.0, 470.0, end - 3.0, end]
+    gx, *_ = panels(white, [Mark(time, "gx") for time in times])
+    assert len(lines_at(gx, DARK)) == len(times)
+    counted = [text.get_text().split() for text in gx.texts]
+    assert sum(int(words[0]) if len(words) == 2 else 1 for words in counted) == len(times)
+    boxes = sorted((text.get_window_extent() for text in gx.texts), key=lambda box: box.x0)
+    assert all(before.x1 < after.x0 for before, after in pairwise(boxes))
+    inside = gx.get_window_extent()
+    assert all(inside.x0 <= box.x0 and box.x1 <= inside.x1 and box.y1 <= inside.y1 for box in boxes)
+
+
+def test_heaps_lie_apart_whatever_the_times() -> None:
+    times = np.random.default_rng(2).random(60) * 100.0
+    heaps = _near(times.tolist(), 8.0)
+    assert sorted(time for heap in heaps for time in heap) == sorted(times.tolist())
+    middles = [np.mean(heap) for heap in heaps]
+    assert len(heaps) > 3
+    assert (np.diff(middles) >= 8.0).all()
+    assert _near([], 1.0) == []
+    assert APART < 0.5
+
+
+def test_courses_hold_their_values_and_most_of_their_bands(white: Dynamic) -> None:
+    *_, n = panels(white, [])
+    gyros = [AXES.index(axis) for axis in ("gx", "gy", "gz")]
+    assert letters(white, "gyro")[-1] == "N"
+    estimated = white.status[:, 1, gyros] == Status.ESTIMATED
+    factor = np.degrees(1.0) * 60.0
+    low, high = n.get_ylim()
+    values = white.value[:, 1, gyros][estimated] * factor
+    assert low < values.min()
+    assert values.max() < high
+    ends = np.stack([white.value_lo[:, 1, gyros][estimated], white.value_hi[:, 1, gyros][estimated]]) * factor
+    assert ((ends >= low) & (ends <= high)).mean() > 2.0 * BANDS - 1.0
+
+
+@pytest.mark.parametrize(
+    ("span_s", "name"), [(599.0, "s"), (600.0, "min"), (10_800.0, "h"), (259_200.0, "d"), (1e9, "d")]
+)
+def test_the_time_axis_has_the_unit_of_its_span(span_s: float, name: str) -> None:
+    assert Clock.of(span_s).name == name

@@ -1,0 +1,161 @@
+"""The analysis as a page: complete in itself, small, and in words and units that people know."""
+
+import re
+import sys
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from drivers.errors import ConfigError
+from monitor.estimation.allan.dynamic_allan import Dynamic, dynamic
+from monitor.estimation.analysis import Analysis
+from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
+from monitor.noise.model import NoiseModel
+from monitor.publishing.plots.dynamic_figure import Mark
+from monitor.publishing.reports import analysis_report
+from tests.monitor.publishing import made
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("jinja2")
+
+
+def analysis(**changed: object) -> Analysis:
+    return made.analysis(replace(made.estimate(), **changed), notes=("3 samples < 4 & more",))
+
+
+@pytest.fixture(scope="module")
+def long() -> Dynamic:
+    """As many steps as there can be, and many letters in."""
+    sources = (
+        QuantizationNoise(Q=2e-4),
+        AngleRandomWalk(N=1.5e-4),
+        BiasInstability(B=3e-4),
+        RateRandomWalk(K=3e-4),
+    )
+    model = NoiseModel(dict.fromkeys(("gx", "gy", "gz", "ax", "ay", "az"), sources))
+    found = dynamic(model.simulate(12_400, 20.0, 1), 20.0, 500.0, step_s=1.0)
+    assert found.t_s.size == 121
+    return Dynamic(
+        np.linspace(500.0, 3000.0, 484), found.window_s, found.rate_hz, found.tau_s,
+        *(np.concatenate([part, part[::-1]] * 2) for part in (
+            found.deviation, found.lo, found.hi, found.value, found.value_lo, found.value_hi, found.status
+        )),
+    )  # fmt: skip
+
+
+class Page(HTMLParser):
+    """Text of the page by tag, and every address that it refers to."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.cells: list[str] = []
+        self.addresses: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.addresses += [value or "" for name, value in attrs if name in ("href", "src", "xlink:href")]
+        self.open.append(tag)
+        if tag == "td":
+            self.cells.append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag in self.open:
+            del self.open[len(self.open) - 1 - self.open[::-1].index(tag) :]
+
+    def handle_data(self, data: str) -> None:
+        if "td" in self.open:
+            self.cells[-1] = f"{self.cells[-1]} {data}".strip()
+
+
+def test_numbers_stand_with_unit_interval_or_word() -> None:
+    result = analysis()
+    page = Page(analysis_report.html(result, "bench-1"))
+    value, lo, hi = (part[1, 2] * np.degrees(1) * 60 for part in vars_of(result))
+    cells = [" ".join(cell.split()) for cell in page.cells]
+    assert f"{value:.3f} °/√h {lo:.3f} … {hi:.3f}" in cells
+    bound = result.estimate.coefficients.hi[4, 0] * np.degrees(1) * 3600**2
+    assert f"≤ {bound:.2f} °/h/h (upper bound)" in cells
+    assert len(cells) == 2 * 5 * 4
+
+
+def vars_of(result: Analysis) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    known = result.estimate.coefficients
+    return known.value, known.lo, known.hi
+
+
+def test_what_is_not_known_is_said_in_words() -> None:
+    few = made.analysis(seconds=200.0)
+    few.estimate.curve.avar[:, 3:] = np.nan
+    text = analysis_report.html(few)
+    assert text.count("(too few data)") == 3  # R, on three axes
+    assert "— <small>(too few data)</small>" in " ".join(text.split())
+    assert "<h2>Notes</h2>" not in text
+    drifting = replace(made.estimate(seconds=1000.0), k_or_r=np.array([True] + [False] * 5))
+    words = {cell.word for row in analysis_report.table(drifting, "gyro") for cell in row.cells[:1]}
+    assert words == {"", "upper bound; K or R", "too few data"}
+
+
+def test_the_facts_of_the_recording_are_on_the_page() -> None:
+    facts = dict(analysis_report.facts(analysis(samples=359_640)))
+    assert facts == {
+        "rate": "100 Hz",
+        "samples": "359,640",
+        "duration": "1 h 00 min",
+        "missing samples": "360 (0.10 %)",
+        "averaging times": "0.0100 … 655 s",
+    }
+    assert dict(analysis_report.facts(analysis()))["missing samples"] == "none"
+
+
+def test_the_page_is_complete_in_itself_and_below_a_megabyte(tmp_path: Path, long: Dynamic) -> None:
+    path = tmp_path / "report.html"
+    analysis_report.html_report(analysis(), path, "a <b> & c", dynamic=long, marks=[Mark(1500.0, "gz")])
+    text = path.read_text("utf-8")
+    assert path.stat().st_size < 1_000_000
+    page = Page(text)
+    assert all(address.startswith(("#", "data:image/png;base64,")) for address in page.addresses)
+    assert not re.search(r"<script|<link|@import|url\((?!#)", text)
+    assert "a &lt;b&gt; &amp; c" in text
+    assert "3 samples &lt; 4 &amp; more" in text
+    assert "in a window of 8 min 20 s" in text
+    names = re.findall(r'\bid="([^"]+)"', text)
+    assert len(names) == len(set(names))
+    referred = set(re.findall(r'(?:url\(#|href="#)([^")]+)', text))
+    assert referred <= set(names)
+    drawings = re.findall(r"<svg.*?</svg>", text, flags=re.S)
+    assert len(drawings) == 4
+    for drawing in drawings:
+        root = ElementTree.fromstring(drawing)
+        assert "viewBox" in root.attrib
+        assert not {"width", "height"} & root.attrib.keys()  # as wide as its column
+
+
+def test_a_recording_without_accelerometers_has_one_column() -> None:
+    result = analysis()
+    result.estimate.curve.avar[:, 3:] = np.nan
+    text = analysis_report.html(result)
+    assert text.count("<svg") == 1
+    assert "Accelerometers" not in text
+
+
+def test_the_same_analysis_gives_the_same_page() -> None:
+    result = analysis()
+    result.estimate.curve.avar[:, 3:] = np.nan
+    assert analysis_report.html(result, "x") == analysis_report.html(result, "x")
+
+
+@pytest.mark.parametrize("name", ["matplotlib.figure", "jinja2"])
+def test_without_its_libraries_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ConfigError, match=r"pip install \"imu-monitor\[plot\]\""):
+        analysis_report.html(analysis())
+
+
+def test_a_folder_that_is_not_there_is_a_wrong_request(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot write the report"):
+        analysis_report.html_report(analysis(), tmp_path / "absent" / "report.html")

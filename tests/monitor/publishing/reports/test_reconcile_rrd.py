@@ -1,0 +1,115 @@
+"""The recording for Rerun, read back: curves at their place, one set a step, the words, the layout."""
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.errors import ConfigError
+from tests.monitor.reconcile import samples
+
+pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+
+from monitor.publishing.reports import reconcile_rrd
+from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH
+
+
+def cells(path: Path) -> dict[str, list[object]]:
+    """Entity and component -> its rows; of entities on the timeline also ``<entity> step``."""
+    found: dict[str, list[object]] = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from rerun.chunk import RrdReader
+
+        for chunk in RrdReader(str(path)).stream():
+            batch = chunk.to_record_batch()
+            for name, column in zip(batch.schema.names, batch.columns, strict=True):
+                if ":" in name or name == "step":
+                    found.setdefault(f"{chunk.entity_path} {name}", []).extend(column.to_pylist())
+    return found
+
+
+@pytest.fixture(scope="module")
+def explained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[object]]:
+    path = tmp_path_factory.mktemp("rrd") / "reconcile.rrd"
+    reconcile_rrd.write_rrd(samples.explained(), path)
+    return cells(path)
+
+
+def test_the_curves_after_each_step_stand_on_the_timeline(explained: dict[str, list[object]]) -> None:
+    for lens in ("psd", "allan"):
+        for part in ("expected", "measured", "band"):
+            assert sorted(set(explained[f"/gz/{lens}/after/{part} step"])) == [0, 1, 2]
+            assert f"/gz/{lens}/before/{part} step" not in explained  # static
+            assert explained[f"/gz/{lens}/before/{part} LineStrips2D:strips"]
+    assert not any(name.startswith("/gx/psd/after") for name in explained)
+
+
+def test_a_curve_stands_in_the_decades_of_its_box(explained: dict[str, list[object]]) -> None:
+    (dots,) = explained["/gz/allan/before/points Points2D:positions"]
+    at = np.array(dots)
+    view = samples.explained().axes["gz"].start.views[1]
+    x = (np.log10(view.x) + 2.0) / 5.0 * WIDTH  # from 0.01 s to 1000 s
+    assert at[:, 0] == pytest.approx(x, abs=1e-4)
+    sigma = np.log10(view.measured * np.degrees(3600.0))
+    assert at[:, 1] == pytest.approx((3.0 - sigma) / 3.0 * HEIGHT, abs=1e-4)  # from 1 to 1000 °/h
+    for name, rows in explained.items():
+        if "LineStrips2D:strips" in name and "key" not in name:
+            y = np.concatenate([np.array(strip)[:, 1] for row in rows for strip in row])
+            assert y.min() > -1e-4, name
+            assert y.max() < HEIGHT + 1e-4, name
+
+
+def test_the_gap_of_each_lens_has_a_course_over_its_threshold(explained: dict[str, list[object]]) -> None:
+    assert np.ravel(explained["/gz/gap/psd Scalars:scalars"]) == pytest.approx([41.2 / 2.6, 4.6 / 2.6, 0.6 / 2.6])
+    assert np.ravel(explained["/gz/gap/threshold Scalars:scalars"]).tolist() == [1.0, 1.0, 1.0]
+
+
+def test_of_many_lenses_those_with_the_largest_gaps_have_a_course(tmp_path: Path) -> None:
+    made = samples.unexplained()
+    more = tuple(replace(made.axes["ax"].start.scores[0], lens=f"lens_{i}", gap=0.1 * i) for i in range(30))
+    start = replace(made.axes["ax"].start, scores=more)
+    reconcile_rrd.write_rrd(replace(made, axes={"ax": replace(made.axes["ax"], start=start)}), tmp_path / "a.rrd")
+    shown = {name.split()[0] for name in cells(tmp_path / "a.rrd") if name.startswith("/ax/gap/lens")}
+    assert shown == {f"/ax/gap/lens_{i}" for i in range(24, 30)}
+
+
+def test_the_steps_are_told_in_words(explained: dict[str, list[object]]) -> None:
+    (text,) = np.ravel(explained["/gz/steps TextDocument:text"])
+    for said in (
+        "**Step 1: added sinusoidal** (99.8 %)", "- amplitude **30.94 ± 0.54 °/h**", "gap **41.2 → 4.60**",
+        samples.explained().axes["gz"].steps[0].because, "**Step 2: retuned angle random walk**",
+    ):  # fmt: skip
+        assert said in text
+    (overview,) = np.ravel(explained["/overview TextDocument:text"])
+    assert "| **gx** | agrees | — | — |" in overview
+    assert "note: 12 missing samples" in overview
+
+
+def test_units_stand_beside_the_axes(explained: dict[str, list[object]]) -> None:
+    labels = np.ravel(explained["/gz/psd/before/grid/labels Points2D:labels"][0])
+    assert {"spectral density, (°/h)²/Hz", "frequency, Hz", "measured", "model", "95 %", "10"} <= set(labels)
+
+
+def test_what_is_left_over_is_framed_and_told(tmp_path: Path) -> None:
+    path = tmp_path / "a.rrd"
+    reconcile_rrd.write_rrd(samples.unexplained(), path)
+    found = cells(path)
+    ((frame,),) = found["/ax/psd/before/place LineStrips2D:strips"]
+    view = samples.unexplained().axes["ax"].start.views[0]
+    left, right = np.floor(np.log10(view.x[0])), np.ceil(np.log10(view.x[-1]))
+    ends = (np.log10([6.0, 11.0]) - left) / (right - left) * WIDTH
+    assert sorted({x for x, _ in frame}) == pytest.approx(ends.tolist(), abs=1e-4)
+    assert "**Left over**" in np.ravel(found["/ax/steps TextDocument:text"])[0]
+
+
+def test_axes_with_something_to_say_come_first() -> None:
+    names = [tab.name for tab in reconcile_rrd.blueprint(samples.explained()).root_container.contents]
+    assert names == ["gz: explained", *(f"{a}: agrees" for a in ("gx", "gy", "ax", "ay", "az")), "All axes"]
+
+
+def test_a_folder_that_is_not_there_is_a_wrong_request(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot write"):
+        reconcile_rrd.write_rrd(samples.agrees(), tmp_path / "absent" / "a.rrd")

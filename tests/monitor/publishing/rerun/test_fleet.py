@@ -1,0 +1,139 @@
+"""One viewer for many daemons: what reaches it of devices in detail and of all others, and hostile messages."""
+
+import contextlib
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from drivers.sample import Event, block
+from drivers.zenoh.sample_message import pack
+from monitor.common import topics
+from monitor.publishing.messages import encoding
+from monitor.publishing.rerun.fleet import FleetView, detail_key
+from monitor.publishing.rerun.panels import fleet_text
+from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
+from monitor.publishing.terminal.live_table import Board
+from monitor.publishing.zenoh.publisher import ZenohOut
+from monitor.publishing.zenoh.subscriber import Message, ZenohIn
+from monitor.settings.loading import ZenohTable
+from tests.monitor.publishing import made
+from tests.support.ports import free_endpoint
+from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.zenoh_sessions import router
+
+pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+
+from monitor.publishing.rerun.view import RerunView
+from tests.monitor.publishing.rerun.test_view import read
+
+
+def test_the_keys_of_devices_in_detail() -> None:
+    assert detail_key("nose", "**") == "nose"
+    assert detail_key("imu/nose", "imu/**") == "imu/nose"
+    assert detail_key("nose", "fleet/*/**") == "fleet/nose"
+    assert detail_key("nose", "imu/nose") == "imu/nose"
+
+
+def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    endpoint, path = free_endpoint(), tmp_path / "fleet.rrd"
+    stop, told = threading.Event(), []
+    viewer = RerunView(ViewerSettings(mode=str(path)), [DeviceInfo("imu/nose", "over zenoh")], fleet=True)
+    out = ZenohOut(ZenohTable(listen=(), connect=(endpoint,)), ["nose", "tail"])
+    with (
+        router(endpoint),
+        contextlib.closing(out),
+        contextlib.closing(ZenohIn("imu/**", [endpoint], None, ["imu/nose"])) as arriving,
+        contextlib.closing(viewer),
+    ):
+        fleet = FleetView(arriving, viewer, ["imu/nose"])
+        take, draw = fleet.take, fleet.draw
+        taken: set[str] = set()
+        drawn: list[float] = []
+        monkeypatch.setattr(fleet, "take", lambda one: take(one) or taken.add(one.key))
+        monkeypatch.setattr(fleet, "draw", lambda wall_s, now_s: draw(wall_s, now_s) or drawn.append(now_s))
+        looking = threading.Thread(target=fleet.run, args=(stop, told.append))
+        out.start()
+        arriving.start()
+        viewer.start()
+        looking.start()
+        wait_for(lambda: out.state == arriving.state == viewer.state == "ok")
+        t_s, values, temperature_c = made.samples(1.76e9, 0.1)
+        rows = block((t_s * 1e9).astype("int64"), values, temperature_c)
+
+        def publish() -> None:
+            for device in ("nose", "tail"):
+                out.alive(device, True)
+                out.put(topics.STATUS, device, encoding.status(device, time.time(), made.health()))
+                out.put(topics.COEFFICIENTS, device, encoding.coefficients(device, 1.76e9, made.estimate()))
+                out.put(topics.ALLAN, device, encoding.allan(device, 1.76e9, made.estimate()))
+                out.put(topics.SAMPLES, device, pack(device, 10, rows))
+            stop.wait(0.2)
+
+        topics_shown = ("samples", "coefficients", "allan", "status")
+        wait_for(lambda: publish() or taken >= {f"imu/nose/{topic}" for topic in topics_shown} | {"imu/tail/status"})
+        publish()  # an Allan curve that comes before any coefficients is not drawn
+        out.put(topics.EVENT, "tail", encoding.event("tail", 1.76e9, 5, Event("moved", 0, "gz moved", "gz"), None))
+        wait_for(lambda: "imu/tail/event" in taken and len(fleet.board.devices(time.monotonic())) == 2)
+        tables = len(drawn)
+        wait_for(lambda: len(drawn) >= tables + 2, "two more tables")
+        stop.set()
+        looking.join(PATIENCE_S)
+    entities = read(path)
+    assert {"/imu/nose/samples/gz", "/imu/nose/allan/gx", "/imu/nose/coefficients/N/gz", "/overview"} <= entities.keys()
+    assert not [name for name in entities if name.startswith("/imu/tail")]
+    table = str(entities["/overview"])
+    assert "imu/nose" in table
+    assert "imu/tail" in table
+    assert "imu/tail: gz moved" in str(entities["/overview/events"])
+    assert fleet.malformed == 0
+
+
+def test_a_status_without_a_time_has_a_row_and_is_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    viewer = RerunView(ViewerSettings(mode="none"), [DeviceInfo("imu/a")], fleet=True)
+    drawn: list[float] = []
+    monkeypatch.setattr(viewer, "health", lambda _device, wall_s, _health: drawn.append(wall_s))
+    fleet = FleetView(ZenohIn("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
+    fleet.take(Message("imu/a/status", encoding.status("a", None, made.health(state="waiting"))))
+    (known,) = fleet.board.devices(time.monotonic())
+    assert known.status is not None
+    assert known.status.state == "waiting"
+    assert drawn == []
+    fleet.take(Message("imu/a/status", encoding.status("a", 5.0, made.health())))
+    assert drawn == [5.0]
+    assert fleet.malformed == fleet.board.malformed == 0
+
+
+def test_hostile_messages_change_nothing_and_are_counted() -> None:
+    viewer = RerunView(ViewerSettings(mode="none"), [DeviceInfo("imu/a")], fleet=True)
+    fleet = FleetView(ZenohIn("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
+    fleet.take(Message("imu/a/coefficients", encoding.coefficients("a", 1.0, made.estimate())))
+    for key, payload in {
+        "imu/a/samples": b"\x81" * 10_000,
+        "imu/a/allan": b'{"schema":"imu-monitor/allan/1","tau":[1]}',
+        "imu/a/event": b"[" * 60_000,
+        "other": b"",
+    }.items():
+        fleet.take(Message(key, payload))
+    assert fleet.malformed == 3
+    assert [one.key for one in fleet.board.devices(time.monotonic())] == ["imu/a"]
+
+
+def test_the_table_has_trouble_first_and_texts_of_others_cannot_leave_their_cell() -> None:
+    board = Board(lambda: 10.0)
+    for device, changed in {
+        "well": {},
+        "bad": {"state": "lost", "text": "gone | <img src=x> [a](http://b)\n\n# head"},
+    }.items():
+        board.take(f"imu/{device}/status", encoding.status(device, 1.0, made.health(**changed)))
+        board.take(f"imu/{device}/coefficients", encoding.coefficients(device, 1.0, made.estimate()))
+    text = fleet_text(board.devices(10.0), 10.0, 40, "1 of 2 there")
+    lines = text.splitlines()
+    assert lines[0] == "**2** devices: **1** lost, **1** running; N in °/√h"
+    assert "**1 of 2 there**" in lines
+    table = [line for line in lines if line.startswith("|")]
+    assert table[2].startswith("| **imu/bad** | **LOST** |")
+    assert table[3].startswith("| **imu/well** | running | 99.98 Hz | 360,000 | 3 | 1 | 0.515 |")
+    assert r"gone \| \<img src=x\> \[a\](http://b)  \# head" in table[2]
+    assert "… and 1 more with less trouble" in fleet_text(board.devices(10.0), 10.0, 1)

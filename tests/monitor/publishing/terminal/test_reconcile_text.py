@@ -1,0 +1,98 @@
+"""The table on a terminal, at the widths that people have."""
+
+import io
+
+import pytest
+from rich.cells import cell_len
+from rich.console import Console
+
+from monitor.publishing.terminal.reconcile_text import tell, tell_runs
+from monitor.reconcile.result import Reconciliation
+from monitor.reconcile.several_recordings.comparison import Comparison, compare
+from tests.monitor.reconcile import samples
+from tests.monitor.reconcile.runs_made import line, run, step, with_axes
+
+
+def told(r: Reconciliation, width: int = 140) -> list[str]:
+    console = Console(width=width, file=io.StringIO(), record=True)
+    tell(r, console)
+    return console.export_text().splitlines()
+
+
+def joined(line: str) -> str:
+    return " ".join(line.split())
+
+
+def test_every_step_is_a_line_with_gap_and_confidence() -> None:
+    lines = told(samples.explained())
+    assert lines[0] == "360000 samples at 100 Hz, 1 h 00 min"
+    assert lines[1].startswith("● explained The model and the recording differ by more than chance on gz.")
+    (first,) = [line for line in lines if line.startswith("gz")]
+    said = "added sinusoidal: amplitude 30.94 ± 0.54 °/h, frequency 17.300012 ± 0.000100 Hz"
+    assert joined(first) == f"gz ● explained 41.2 → 4.60 99.8 % {said}"
+    second = lines[lines.index(first) + 1]
+    assert joined(second) == "8.70 → 0.70 > 99.9 % retuned angle random walk: N 0.6188 ± 0.0014 °/√h"
+    assert lines[-1] == "note: 12 missing samples <in 1 gap> & filled"
+
+
+def test_an_axis_that_agrees_tells_its_largest_gap() -> None:
+    lines = told(samples.agrees())
+    rows = [line for line in lines if line.split(" ")[0] in samples.agrees().axes]
+    assert len(rows) == 6
+    assert joined(rows[0]) == "gx ● agrees largest: level, t = 1200 … 1320 s: gap 1.10, threshold 2.50"
+
+
+def test_what_is_left_over_is_told() -> None:
+    text = "\n".join(told(samples.partly_explained()))
+    assert "◐ partly explained" in text
+    assert "left over: Allan deviation, τ = 0.01 … 0.64 s: gap 8.70, threshold 2.40" in text
+    text = "\n".join(told(samples.unexplained()))
+    assert "✖ unexplained" in text
+    assert "left over: spectrum, 6 … 11 Hz: gap 7.90, threshold 2.60" in text
+
+
+@pytest.mark.parametrize("width", [60, 80, 110])
+def test_long_lines_wrap_inside_their_column(width: int) -> None:
+    lines = told(samples.partly_explained(), width)
+    assert all(cell_len(line) <= width for line in lines if not line.startswith("note"))
+    words = " ".join(" ".join(lines).split())
+    for word in ("17.300012", "0.000100", "Hz", "left", "over:", "threshold"):
+        assert word in words
+
+
+def told_runs(c: Comparison, width: int = 140) -> list[str]:
+    console = Console(width=width, file=io.StringIO(), record=True)
+    tell_runs(c, console)
+    return console.export_text().splitlines()
+
+
+def runs() -> Comparison:
+    both = with_axes(run("warm", line(), step("bias_step", time=350.0, height=1e-3)), run("warm", axis="gx"))
+    return compare([run("cold", line(3e-4)), both], None, {"short": "200 samples"})
+
+
+def test_several_recordings_stand_beside_each_other() -> None:
+    lines = [joined(one) for one in told_runs(runs())]
+    assert lines[0] == (
+        "● explained 2 recordings beside the model. Common to all: sinusoidal (gz). In some only: bias step (gz, warm)."
+    )
+    at = lines.index("axis cold warm")
+    assert lines[at + 1 : at + 4] == ["gx not recorded ● agrees", "gz ● explained ● explained", "1 effect 2 effects"]
+    assert lines[-1] == "note: short is left out: 200 samples"
+
+
+def test_common_effects_say_whether_they_agree_and_single_ones_where_they_are() -> None:
+    lines = [joined(one) for one in told_runs(runs())]
+    common, single = lines.index("common to all"), lines.index("in some only")
+    assert lines[common + 1].startswith(
+        "gz added sinusoidal: amplitude 46 ± 30 °/h, frequency 17.30000 ± 0.00071 Hz; sizes differ"
+    )
+    assert lines[single + 1].endswith("; in warm")
+    assert lines[single + 2] == "not in cold: may differ: what happens once need not happen in another recording"
+
+
+@pytest.mark.parametrize("width", [60, 80])
+def test_long_lines_of_several_recordings_wrap(width: int) -> None:
+    lines = told_runs(runs(), width)
+    assert all(cell_len(line) <= width for line in lines if not line.startswith("note"))
+    assert "17.30000" in " ".join(" ".join(lines).split())

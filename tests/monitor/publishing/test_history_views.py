@@ -1,0 +1,160 @@
+"""Past results as tables, picture and files: what a person reads is what was kept."""
+
+import gzip
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from drivers.errors import ConfigError, NotReady
+from drivers.recordings.formats import FORMATS
+from drivers.sample import AXES
+from monitor.estimation.fit.coefficients import LETTERS
+from monitor.history.bucket import STATES, Row
+from monitor.history.reading import Past, table
+from monitor.history.sqlite_store import PastEvent
+from monitor.history.time_ranges import Span
+from monitor.publishing.coefficient_cells import unit_of
+from monitor.publishing.plots.history_plot import history_plot
+from monitor.publishing.reports import history_file
+from monitor.publishing.terminal import history_text
+
+T0 = 1_763_683_200  # a midnight
+RNG = np.random.default_rng(1)
+WHAT = {"N": {"before": 1e-4, "after": 2e-4}}
+EVENTS = (
+    PastEvent(T0 + 3600.0, "noise_changed", "gz noisier [not markup]", "gz", WHAT, T0, 9.0),
+    PastEvent(T0 + 7200.0, "link_lost", "gone", stands_for=4),
+)  # fmt: skip
+
+
+def made(buckets: int = 48, hole: slice = slice(20, 24), axes: tuple[str, ...] = ("gx", "gz", "az")) -> Past:
+    """Half hours: N of each axis with one high value, R bounded, a hole, lost samples."""
+    names = (*(f"{axis}.{letter}" for axis in axes for letter in ("N", "B")), *(f"{axis}.R.bound" for axis in axes))
+    names = (*names, *(f"{axis}.N.{end}" for axis in axes for end in ("lo", "hi")), "temperature", "gz.sigma.1")
+    rows = []
+    for i in np.delete(np.arange(buckets), hole).tolist():
+        last = (1e-4 * (1.0 + 0.01 * RNG.standard_normal(len(names)))).astype(np.float32)
+        last[names.index("temperature")] = 20.0 + i
+        high = last * (5.0 if i == 7 else 1.01)
+        n = np.full(len(names), 100)
+        counts = (180_000, 12 if i == 9 else 0, 0, 0)
+        state = STATES.index("lost" if i == 9 else "running")
+        low = last * np.float32(0.99)
+        rows.append(Row(T0 + 1800 * i, 1800, T0 + 1800.0 * i + 1799, names, n, low, high, last, counts, state))
+    return table("bench-1", Span(T0, T0 + 1800 * buckets), 1800, rows, EVENTS, 7)
+
+
+def printed(tell, *arguments: object, width: int = 110) -> str:
+    console = Console(width=width, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    with console.capture() as captured:
+        tell(*arguments, console)
+    console.file.close()
+    return captured.get()
+
+
+def test_the_summary_has_first_last_extremes_and_what_happened() -> None:
+    past = made()
+    text = printed(history_text.tell, past, AXES, ("N", "R"))
+    assert "bench-1: 2025-11-21 00:00 to 2025-11-22 00:00 UTC, 44 rows of 30 min, 7,920,000 samples" in text
+    n = past.column("gz.N")
+    unit = unit_of("N", "gz")
+    (line,) = [line for line in text.splitlines() if line.startswith("gz N")]
+    for number in (n.last[0], n.last[-1], n.low.min(), n.high.max()):
+        assert unit.text(number).split()[0] in line.split()
+    assert history_text.GAP in line
+    assert "≤" in next(line for line in text.splitlines() if line.startswith("az R"))
+    assert "temperature 19.8 … 135 °C" in text
+    assert "samples 12 lost" in text
+    assert "lost at some time in 1 of 44 rows" in text
+    assert "2025-11-21 01:00:00  gz noisier [not markup]" in text
+    assert "gone (and 3 more before it)" in text
+    assert "… 5 earlier events" in text
+
+
+def test_one_axis_over_time_has_a_line_a_bucket() -> None:
+    text = printed(history_text.tell_course, made(), "gz", LETTERS)
+    lines = [line for line in text.splitlines() if line.startswith("2025-11-21")]
+    assert len(lines) == 44
+    assert lines[7].split()[3].startswith(f"{1e-4 * unit_of('N', 'gz').factor:.1f}")
+    assert "…" in lines[7]
+    assert lines[9].split()[-2:] == ["12", "lost"]
+
+
+def test_a_span_of_events_alone_is_printed() -> None:
+    past = table("bench-1", Span(T0, T0 + 60.0), 60, [], EVENTS, 2)
+    text = printed(history_text.tell, past, AXES, LETTERS)
+    assert "no rows between 2025-11-21 00:00:00" in text
+    assert "gz noisier" in text
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_a_file_has_every_number_with_its_unit(tmp_path: Path, suffix: str) -> None:
+    past, path = made(), tmp_path / f"h{suffix}"
+    history_file.save(past, path)
+    columns = history_file.table(past)
+    assert {"t (Unix s)", "gz.N (rad/sqrt(s))", "gz.N high (rad/sqrt(s))", "az.R.bound (m/s^3)"} <= set(columns)
+    np.testing.assert_array_equal(columns["gz.N high (rad/sqrt(s))"], past.column("gz.N").high)
+    np.testing.assert_array_equal(columns["lost (samples)"], past.counts[:, 1])
+    found = read_back(path, suffix)
+    assert list(found) == list(columns)
+    for name, column in columns.items():
+        np.testing.assert_array_equal(found[name], column, name)
+
+
+def read_back(path: Path, suffix: str) -> dict[str, np.ndarray]:
+    """By the format's own library, as another program would."""
+    if suffix == ".npz":
+        with np.load(path) as data:
+            return dict(data)
+    if suffix in (".csv", ".csv.gz"):
+        rows = np.genfromtxt(path, delimiter=",", names=None, skip_header=1)
+        data = path.read_bytes()
+        text = (gzip.decompress(data) if suffix == ".csv.gz" else data).decode()
+        return dict(zip(text.splitlines()[0].split(","), rows.T, strict=True))
+    pyarrow = pytest.importorskip("pyarrow")
+    if suffix == ".parquet":
+        import pyarrow.parquet
+
+        arrow = pyarrow.parquet.read_table(path)
+    else:
+        import pyarrow.ipc
+
+        opened = pyarrow.ipc.open_stream(path) if suffix == ".arrows" else pyarrow.ipc.open_file(path)
+        arrow = opened.read_all()
+    return {name: arrow[name].to_numpy() for name in arrow.column_names}
+
+
+def test_a_suffix_that_is_none_is_said(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"known are \.csv"):
+        history_file.save(made(), tmp_path / "h.doc")
+
+
+@pytest.mark.parametrize("axes", [("gx", "gz", "az"), ("az",), ("gx",)], ids=str)
+def test_the_picture_is_drawn_of_any_axes(tmp_path: Path, axes: tuple[str, ...]) -> None:
+    pytest.importorskip("matplotlib")
+    from matplotlib.image import imread
+
+    path = tmp_path / "h.png"
+    history_plot(made(axes=axes), path)
+    picture = imread(path)
+    assert picture.shape[1] == (2220 if len(axes) == 3 else 1110)
+    assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 100
+
+
+def test_a_picture_of_one_row_and_of_nothing(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    history_plot(made(1, slice(0, 0)), tmp_path / "one.png")
+    with pytest.raises(NotReady):
+        history_plot(table("a", Span(T0, T0 + 60.0), 60, [], EVENTS, 2), tmp_path / "none.png")
+    with pytest.raises(ConfigError, match="cannot write"):
+        history_plot(made(), tmp_path / "nowhere" / "h.png")
+
+
+def test_a_course_keeps_its_gaps_and_a_steady_one_is_level() -> None:
+    nan = math.nan
+    t_s = np.arange(4.0)
+    assert history_text.sparkline(np.array([nan] * 4), t_s, (0.0, 4.0), 4) == "····"
+    assert history_text.sparkline(np.array([1.0, nan, 1.0, 1.0]), t_s, (0.0, 4.0), 4) == "▅·▅▅"

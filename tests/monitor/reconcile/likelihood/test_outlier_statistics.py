@@ -1,0 +1,112 @@
+"""Outliers are told from all else that has heavy tails, and their size and share are right."""
+
+import numpy as np
+import pytest
+
+from monitor.reconcile.likelihood.outlier_statistics import outliers
+
+N = 60_000
+
+
+def noise(seed=0, n=N):
+    return np.random.default_rng(seed).standard_normal(n)
+
+
+def contaminated(share, scale, seed=0, n=N):
+    rng = np.random.default_rng(seed)
+    which = rng.random(n) < share
+    return np.where(which, scale, 0.0) * rng.standard_normal(n) + rng.standard_normal(n), which
+
+
+@pytest.mark.parametrize(("share", "scale"), [(1e-3, 10.0), (0.01, 4.0), (0.1, 3.0), (2e-3, 1000.0)])
+@pytest.mark.parametrize("unit", [1e-4, 1.0])
+def test_outliers_show_share_and_scale(share, scale, unit):
+    w, which = contaminated(share, scale)
+    found = outliers(unit * w)
+    assert found.fraction.value == pytest.approx(share, rel=0.3)
+    assert found.scale.value == pytest.approx(scale * unit, rel=0.3)
+    assert found.noise == pytest.approx(unit, rel=0.02)
+    assert found.gain > 50.0
+    assert found.over_student > 10.0
+    assert found.vuong_z > 2.0
+    assert found.clustering_z < 3.5
+    assert found.misfit_z < 3.5
+    far = np.abs(w) > 6.0
+    assert np.array_equal(found.mask[far], far[far])
+    assert found.count == found.mask.sum() <= 1.3 * which.sum()
+
+
+def test_intervals_hold_the_truth():
+    inside = 0
+    for seed in range(40):
+        found = outliers(contaminated(4e-3, 5.0, seed)[0])
+        inside += (found.fraction.lo < 4e-3 < found.fraction.hi) + (found.scale.lo < 5.0 < found.scale.hi)
+    assert 68 <= inside <= 80  # of 80 at 95 %
+
+
+def test_a_gaussian_gains_little():
+    gains = [found.gain for found in (outliers(noise(seed)) for seed in range(30)) if found is not None]
+    assert len(gains) < 30
+    assert max(gains) < 10.0
+
+
+@pytest.mark.parametrize("freedom", [3, 6, 12])
+def test_noise_of_students_t_is_not_a_mixture(freedom):
+    found = outliers(np.random.default_rng(0).standard_t(freedom, 4 * N))
+    assert found.gain > 100.0
+    assert found.over_student < -5.0
+    assert found.vuong_z < -2.0
+    assert found.freedom == pytest.approx(freedom, rel=0.25)
+
+
+def test_laplacian_noise_fits_no_mixture():
+    assert outliers(np.random.default_rng(0).laplace(size=N)).misfit_z > 5.0
+
+
+def bursts():
+    w = noise()
+    for at in range(1000, N, 6000):
+        w[at : at + 40] *= 4.0
+    return w
+
+
+def evening():
+    return noise() * np.where(np.arange(N) > 0.8 * N, 1.8, 1.0)
+
+
+def breathing():
+    return noise() * np.exp(0.6 * np.sin(2.0 * np.pi * np.arange(N) / 9000.0))
+
+
+def jumps():
+    """What is left of a telegraph signal when local means are taken away."""
+    level = 12.0 * (np.cumsum(np.random.default_rng(5).random(N) < 1 / 600.0) % 2)
+    x = noise() + level
+    return x - np.convolve(x, np.ones(9) / 9.0, mode="same")
+
+
+@pytest.mark.parametrize("make", [bursts, evening, breathing, jumps])
+def test_what_keeps_together_is_no_outlier(make):
+    found = outliers(make())
+    assert found.gain > 20.0
+    assert found.clustering_z > 6.0
+
+
+def test_light_tails_have_no_outliers():
+    for w in (np.random.default_rng(0).random(N) - 0.5, noise() + np.where(noise(1) > 0.0, 2.0, -2.0)):
+        found = outliers(w)
+        assert found is None or found.gain < 5.0
+
+
+def test_missing_samples_are_passed_over():
+    w, _ = contaminated(0.01, 6.0)
+    with_holes = w.copy()
+    with_holes[::3] = np.nan
+    found = outliers(with_holes)
+    assert found.fraction.value == pytest.approx(0.01, rel=0.3)
+    assert not found.mask[::3].any()
+
+
+@pytest.mark.parametrize("w", [np.zeros(500), np.full(500, np.nan), np.arange(5.0)])
+def test_what_says_nothing_gives_nothing(w):
+    assert outliers(w) is None

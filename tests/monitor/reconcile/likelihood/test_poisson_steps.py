@@ -1,0 +1,100 @@
+"""Poisson steps' likelihood is a sum over all blocks that may have a jump, and a random walk is its limit."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+from monitor.reconcile.likelihood import poisson_steps
+from monitor.reconcile.likelihood.hidden_state import Rest, kalman, parts
+from monitor.reconcile.likelihood.poisson_steps import steps_or_walk
+from tests.monitor.reconcile.made import BLOCK_S, HOUR, TAU0_S, N, dense, jumps, walk, white
+
+RATE, HEIGHT = 0.05, 2.0  # of the short series, beside white noise of density one
+BLOCKS = 11
+
+
+def enumerated(means, covariance):
+    """Log-likelihood as the sum over all sets of blocks with a jump; jumps of one block are a Gaussian."""
+    chance = 1.0 - np.exp(-RATE * BLOCK_S)
+    variance = RATE * BLOCK_S * HEIGHT**2 / chance
+    terms = []
+    after = np.tri(means.size)  # level in row k after a jump in column j
+    shapes = []
+    for j in range(means.size):
+        seen = after[:, j].copy()
+        shape = np.outer(seen, seen)
+        shape[j, :] *= 0.5
+        shape[:, j] *= 0.5
+        shape[j, j] = 1.0 / 3.0
+        shapes.append(variance * shape)
+    for some in product((0, 1), repeat=means.size):
+        total = covariance + sum((s * shape for s, shape in zip(some, shapes, strict=True)), 0.0)
+        k = sum(some)
+        logs = np.linalg.slogdet(2.0 * np.pi * total)[1] + means @ np.linalg.solve(total, means)
+        terms.append(k * np.log(chance) + (means.size - k) * np.log(1.0 - chance) - 0.5 * logs)
+    return logsumexp(terms)
+
+
+def likelihood(means, rest, rate, height, start):
+    around = parts(rest, BLOCK_S, means.size * BLOCK_S)
+    return poisson_steps.log_likelihood(means, around, start, rate * BLOCK_S, height)
+
+
+@pytest.mark.parametrize("rest", [Rest(1.0), Rest(1.0, walk=0.02, correlated=((1.0, 30.0),))])
+def test_nearly_equals_the_sum_over_all_sets_of_jumps(rest):
+    off = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        covariance = dense(rest, BLOCKS, start=4.0)
+        level = HEIGHT * np.cumsum(rng.standard_normal(BLOCKS) * np.sqrt(rng.poisson(RATE * BLOCK_S, BLOCKS)))
+        means = np.linalg.cholesky(covariance) @ rng.standard_normal(BLOCKS) + level
+        off.append(likelihood(means, rest, RATE, HEIGHT, 4.0) - enumerated(means, covariance))
+    assert np.abs(off).max() < 0.1
+
+
+def test_many_small_jumps_are_a_random_walk():
+    K = 0.1
+    rng = np.random.default_rng(0)
+    means = np.linalg.cholesky(dense(Rest(1.0, walk=K * K), 300)) @ rng.standard_normal(300)
+    around = parts(Rest(1.0, walk=K * K), BLOCK_S, 300 * BLOCK_S)
+    gaussian = kalman(means, around.table, around.white, 9.0)
+    often = 20.0 / BLOCK_S
+    assert likelihood(means, Rest(1.0), often, K / often**0.5, 9.0) == pytest.approx(gaussian, abs=1e-4)
+
+
+@pytest.mark.parametrize("rest", [Rest(N * N), Rest(N * N, walk=(1e-6) ** 2), Rest(N * N, correlated=((2e-5, 50.0),))])
+def test_tells_jumps_from_a_walk(rest):
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        around = white(HOUR, rng) + walk(HOUR, rest.walk**0.5, rng)
+        assert steps_or_walk(around + jumps(HOUR, 0.005, 2e-4, rng), TAU0_S, rest, 1.4e-5).gain > 10.0
+        assert abs(steps_or_walk(around + walk(HOUR, 1.4e-5, rng), TAU0_S, rest, 1.4e-5).gain) < 3.0
+
+
+def test_parameters_lie_in_their_intervals_and_jumps_are_counted():
+    inside, counted = [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        found = steps_or_walk(white(HOUR, rng) + jumps(HOUR, 0.01, 3e-4, rng), TAU0_S, Rest(N * N), 2e-5)
+        for name, true in (("rate", 0.01), ("height", 3e-4)):
+            inside.append(found.first[name].lo < true < found.first[name].hi)
+            assert found.first[name].hi / found.first[name].lo < 5.0
+        counted.append(found.events)
+    assert np.mean(inside) > 0.8
+    assert np.mean(counted) == pytest.approx(36.0, rel=0.2)
+
+
+def test_walk_gets_its_own_size():
+    rng = np.random.default_rng(3)
+    found = steps_or_walk(white(HOUR, rng) + walk(HOUR, 1e-5, rng), TAU0_S, Rest(N * N), 2e-5).second["K"]
+    assert found.lo < 1e-5 < found.hi < 1.6 * found.lo
+
+
+def test_known_walk_is_not_counted_twice():
+    rng = np.random.default_rng(4)
+    y = white(HOUR, rng) + walk(HOUR, 1e-5, rng) + jumps(HOUR, 0.005, 4e-4, rng)
+    found = steps_or_walk(y, TAU0_S, Rest(N * N, walk=1e-10), 3e-5)
+    assert found.gain > 10.0
+    assert found.first["height"].lo < 4e-4 < found.first["height"].hi

@@ -1,0 +1,164 @@
+"""Steps of the noise are found where they are; what is no step shows as what it is; steady noise shows nothing."""
+
+import numpy as np
+import pytest
+
+from monitor.reconcile.likelihood.variance_history import tiles, variance_course
+
+N = 60_000
+TAU0 = 0.01
+T = TAU0 * np.arange(N)
+
+
+def noise(seed=0):
+    return np.random.default_rng(seed).standard_normal(N)
+
+
+@pytest.mark.parametrize("at", [2_000, 33_333, 59_000])
+@pytest.mark.parametrize("ratio", [0.7, 1.5])
+@pytest.mark.parametrize("unit", [1e-4, 1.0])
+def test_a_step_of_the_noise_shows_time_and_ratio(at, ratio, unit):
+    w = unit * noise()
+    w[at:] *= ratio
+    step = variance_course(w, TAU0).step
+    assert step.time.value == pytest.approx(at * TAU0, abs=0.6)
+    assert step.ratio.value == pytest.approx(ratio, rel=0.08)
+    assert step.time.lo <= step.time.value <= step.time.hi
+    assert step.gain > 50.0
+
+
+def test_the_gain_is_the_likelihood_ratio_of_the_best_time():
+    w = noise()[:700]
+    w[300:] *= 1.4
+
+    def like(part):
+        return -0.5 * part.size * np.log(np.mean(part**2))
+
+    gains = [like(w[:k]) + like(w[k:]) - like(w) for k in range(16, 685)]
+    step = variance_course(w, TAU0).step
+    assert step.gain == pytest.approx(max(gains), rel=1e-9)
+    assert step.time.value == pytest.approx(TAU0 * (16 + int(np.argmax(gains))))
+
+
+def test_intervals_hold_the_truth():
+    inside = 0
+    for seed in range(60):
+        w = noise(seed)
+        w[20_000:] *= 1.1
+        step = variance_course(w, TAU0).step
+        inside += (step.time.lo <= 200.0 <= step.time.hi) + (step.ratio.lo <= 1.1 <= step.ratio.hi)
+    assert 106 <= inside <= 120  # of 120 at 95 %
+
+
+def test_one_step_leaves_nothing_and_several_are_told_one_after_the_other():
+    w = noise()
+    w[20_000:] *= 1.3
+    assert [one.gain > 12.0 for one in variance_course(w, TAU0).changes] == [True, False]
+    w[45_000:] *= 0.8
+    changes = variance_course(w, TAU0).changes
+    assert sorted(one.time.value for one in changes[:2]) == pytest.approx([200.0, 450.0], abs=3.0)
+    assert changes[2].gain < 12.0
+
+
+@pytest.mark.parametrize("frequency", [0.007, 0.11, 0.6])
+def test_breathing_noise_is_periodic_before_it_is_a_step(frequency):
+    found = variance_course(noise() * np.exp(0.15 * np.sin(2.0 * np.pi * frequency * T)), TAU0)
+    assert found.periodic.frequency == pytest.approx(frequency, rel=0.02)
+    assert found.periodic.depth == pytest.approx(0.15, rel=0.3)
+    assert found.periodic.gain > 50.0
+    assert found.periodic.gain > found.step.gain + 20.0
+
+
+def test_a_trend_gains_more_than_a_step():
+    found = variance_course(noise() * np.linspace(0.8, 1.2, N), TAU0)
+    assert found.trend > found.step.gain + 20.0
+
+
+def test_wandering_noise_gains_more_than_one_step():
+    walk = np.repeat(np.random.default_rng(1).standard_normal(N // 500), 500)
+    found = variance_course(noise() * np.exp(0.2 * walk), TAU0)
+    assert found.wander > 100.0
+    assert found.wander > found.step.gain + 50.0
+
+
+def test_steady_noise_gains_little():
+    courses = [variance_course(noise(seed), TAU0) for seed in range(30)]
+    assert max(one.step.gain for one in courses) < 12.0
+    assert max(one.trend for one in courses) < 9.0
+    assert max(one.periodic.gain for one in courses) < 18.0
+    assert max(one.wander for one in courses) < 9.0
+
+
+def test_the_energies_are_those_of_the_blocks():
+    w = noise()
+    found = variance_course(w, TAU0)
+    length = round(found.block_s / TAU0)
+    assert found.energy[7] == pytest.approx(np.mean(w[7 * length : 8 * length] ** 2))
+
+
+def within(pair, value):
+    return pair[0] <= value <= pair[1]
+
+
+def test_a_line_that_comes_and_goes_is_found_in_time_and_frequency():
+    w = noise() + np.where((T > 200.0) & (T < 330.0), 0.3, 0.0) * np.sin(2.0 * np.pi * 31.4 * T)
+    found = tiles(w, TAU0)
+    assert found.gain > 50.0
+    assert found.ratio > 2.0
+    assert within(found.frequency, 31.4)
+    assert within((200.0 - 25.0, 330.0 + 25.0), sum(found.time) / 2.0)
+    assert found.row_gain > 50.0
+
+
+def test_a_burst_of_all_frequencies_is_found_in_time():
+    w = noise()
+    w[41_000:41_100] *= 3.0
+    found = tiles(w, TAU0)
+    assert found.gain > 30.0
+    assert within(found.time, 410.5)
+
+
+def test_a_pause_is_found_too():
+    w = noise()
+    w[30_000:34_000] *= 0.7
+    found = tiles(w, TAU0)
+    assert found.ratio < 0.8
+    assert found.gain > 30.0
+
+
+@pytest.mark.parametrize(
+    "add",
+    [
+        0.4 * np.sin(2.0 * np.pi * 17.0 * T) * (1.0 + 0.9 * np.sin(2.0 * np.pi * T / 61.0)),
+        0.3 * np.sin(2.0 * np.pi * (5.0 * T + 0.5 * 20.0 / T[-1] * T**2)),
+    ],
+    ids=["modulated line", "chirp"],
+)
+def test_lines_that_do_not_stay_as_they_are_make_a_row_uneven(add):
+    found = tiles(noise() + add, TAU0)
+    assert found.row_gain > 20.0
+
+
+@pytest.mark.parametrize("amplitude", [0.0, 0.5, 3.0])
+def test_steady_noise_and_steady_lines_gain_little(amplitude):
+    found = [tiles(noise(seed) + amplitude * np.sin(2.0 * np.pi * 17.0 * T + seed), TAU0) for seed in range(10)]
+    assert max(one.gain for one in found) < 20.0
+    assert max(one.row_gain for one in found) < 18.0
+
+
+def test_the_unit_makes_no_difference():
+    one, other = tiles(noise(), TAU0), tiles(1e-4 * noise(), TAU0)
+    assert one.gain == pytest.approx(other.gain)
+    assert one.time == other.time
+
+
+@pytest.mark.parametrize("look", [variance_course, tiles])
+def test_too_few_samples_are_refused(look):
+    with pytest.raises(ValueError, match="samples are too few"):
+        look(noise()[:200], TAU0)
+
+
+def test_short_recordings_have_short_pieces_only():
+    found = tiles(noise()[:5_000], TAU0)
+    assert found.seconds == (2.56, 2.56)
+    assert found.gain < 15.0

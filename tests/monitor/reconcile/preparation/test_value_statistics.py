@@ -1,0 +1,189 @@
+"""Grids, ends and repeats are told where they are, with their sizes, and nowhere else."""
+
+import numpy as np
+import pytest
+
+from monitor.reconcile.preparation.value_statistics import clipped, levels, repeats
+
+N = 30_000
+DEGREE = np.pi / 180.0
+
+
+def noise(seed=0, n=N):
+    return np.random.default_rng(seed).standard_normal(n)
+
+
+def held(x, share, seed=1):
+    toss = np.random.default_rng(seed).random(x.size) < share
+    toss[0] = False
+    return x[np.maximum.accumulate(np.where(toss, 0, np.arange(x.size)))], toss
+
+
+def as_float32(x):
+    return x.astype(np.float32).astype(float)
+
+
+@pytest.mark.parametrize("step", [1.37e-5, 2.1e-3, 0.07, 0.61, 1.9])
+@pytest.mark.parametrize("scale", [1.5e-3, 1.0, 400.0])
+def test_values_on_a_grid_show_its_step(step, scale):
+    found = levels(scale * step * np.rint((noise() + 3.3) / step))
+    assert found.step.value == pytest.approx(scale * step, rel=1e-9)
+    assert found.step.lo <= scale * step <= found.step.hi * (1.0 + 1e-12)
+    assert abs(found.offset) < 1e-6 * scale * step
+    assert found.gain > 1e4
+
+
+@pytest.mark.parametrize("step", [1.3e-3, 0.07, 0.61])
+def test_a_grid_survives_float32_and_nine_digits(step):
+    y = 1e-3 * step * np.rint((noise() + 3.3) / step)
+    for written in (as_float32(y), np.array([float(f"{x:.9g}") for x in y])):
+        assert levels(written).step.value == pytest.approx(1e-3 * step, rel=1e-4)
+
+
+def test_a_grid_off_zero_shows_where_it_stands():
+    found = levels(0.25 * np.rint(noise() / 0.25) + 9.81)
+    assert found.offset == pytest.approx(9.81 - 39 * 0.25, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        lambda x: x,
+        as_float32,
+        lambda x: as_float32(x + 9.81),
+        lambda x: x.round(4),
+        lambda x: (x + 9.81).round(3),
+        lambda x: np.array([float(f"{v:.5g}") for v in x]),
+        lambda x: DEGREE * x.round(3),
+        lambda x: as_float32(DEGREE * x.round(3)),
+        lambda x: 9.80665 * (x + 1.0).round(3),
+    ],
+    ids=["float64", "float32", "float32 of g", "decimals", "decimals of g", "digits", "degrees", "float32 deg", "g"],
+)
+def test_what_numbers_and_texts_have_of_themselves_is_no_grid(written):
+    assert levels(written(noise())) is None
+
+
+def test_decimals_as_coarse_as_the_noise_are_a_grid_whoever_wrote_them():
+    assert levels(noise().round(0)).step.value == pytest.approx(1.0)
+    assert levels(0.01 * noise().round(0)).coarse > 0.5
+
+
+def test_one_value_off_the_grid_is_enough():
+    y = 0.1 * np.rint(noise() / 0.1)
+    y[777] += 0.031
+    assert levels(y) is None
+
+
+@pytest.mark.parametrize("y", [np.zeros(0), np.full(100, np.nan), np.ones(5000), np.arange(9.0)])
+def test_what_says_nothing_gives_nothing(y):
+    assert levels(y) is None
+    assert clipped(y) is None
+    assert repeats(y) is None
+
+
+def test_missing_samples_are_passed_over():
+    y = held(np.clip(noise(), -2.5, 2.5), 0.02)[0]
+    y[noise(3) > 1.0] = np.nan
+    assert clipped(y).limit.value == 2.5
+    assert repeats(y, limit=2.5).fraction.value == pytest.approx(0.02, rel=0.3)
+    assert levels(0.1 * np.rint(y / 0.1)).step.value == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("limit", [0.5, 1.5, 3.0])
+@pytest.mark.parametrize("mean", [0.0, -0.4])
+def test_clipped_noise_shows_its_limit(limit, mean):
+    x = noise() + mean
+    found = clipped(np.clip(x, -limit, limit))
+    assert found.limit.lo <= limit <= found.limit.hi
+    assert found.count == np.count_nonzero(np.abs(x) >= limit)
+    assert found.upper
+    assert found.lower
+    assert found.symmetric
+    assert found.gain > 50.0
+
+
+def test_one_end_alone_and_an_end_that_is_passed_elsewhere():
+    x = noise()
+    one = clipped(np.clip(x + 2.0, -3.5, 3.5))
+    assert (one.upper, one.lower, one.symmetric) == (True, False, True)
+    passed = clipped(np.minimum(x, 2.0))
+    assert (passed.upper, passed.lower, passed.symmetric) == (True, False, False)
+
+
+@pytest.mark.parametrize("step", [0.1, 0.4])
+def test_clipped_and_stepped_noise_shows_its_limit_to_half_a_step(step):
+    found = clipped(step * np.rint(np.clip(noise(n=360_000), -1.9, 1.9) / step), step)
+    assert found.limit.lo <= 1.9 <= found.limit.hi
+    assert found.gain > 50.0
+
+
+def line(n=N):
+    return 8.0 * np.sin(2.0 * np.pi * 0.173 * np.arange(n))
+
+
+@pytest.mark.parametrize(
+    "x",
+    [
+        noise(),
+        noise() + np.cumsum(0.02 * noise(1)),
+        0.3 * noise() + line(),
+        np.random.default_rng(2).standard_t(4, N),
+        noise() * np.where(np.arange(N) < N // 2, 1.0, 3.0),
+        np.convolve(noise(), [0.3, 0.5, 0.3], mode="same"),
+        held(noise(), 0.3)[0],
+    ],
+    ids=["white", "walk", "line", "t", "step", "coloured", "held"],
+)
+@pytest.mark.parametrize("step", [0.0, 0.05, 0.5])
+def test_what_is_not_clipped_is_not_called_clipped(x, step):
+    found = clipped(step * np.rint(x / step) if step else x, step)
+    assert found is None or found.gain < 8.0
+
+
+@pytest.mark.parametrize("share", [5e-4, 0.02, 0.4])
+def test_repeats_of_continuous_values_are_each_known(share):
+    y, which = held(noise(), share)
+    found = repeats(y)
+    assert np.array_equal(found.mask, which)
+    assert found.fraction.lo <= share <= found.fraction.hi
+    assert found.gain > 20.0
+
+
+@pytest.mark.parametrize("step", [1e-3, 0.1, 0.7])
+def test_repeats_of_stepped_values_are_counted(step):
+    y = step * np.rint(held(noise(n=200_000), 0.05)[0] / step)
+    found = repeats(y, step)
+    assert found.fraction.value == pytest.approx(0.05, rel=0.15)
+    assert found.fraction.lo < found.fraction.value < found.fraction.hi
+    assert not found.mask.any()
+    assert found.gain > 50.0
+
+
+def test_clipped_samples_are_no_repeats():
+    y = np.clip(noise(), -1.0, 1.0)
+    assert np.count_nonzero(np.diff(y) == 0.0) > 1000
+    assert repeats(y, limit=1.0) is None
+
+
+@pytest.mark.parametrize(
+    "x",
+    [
+        noise(),
+        np.convolve(noise(), [0.2, 0.6, 0.2], mode="same"),
+        np.random.default_rng(2).standard_t(4, N),
+        noise() * np.where(np.arange(N) < N // 2, 1.0, 3.0),
+        np.where(noise(4) > 2.0, 9.0, 1.0) * noise(),
+        noise() + line(),
+    ],
+    ids=["white", "coloured", "t", "step", "outliers", "line"],
+)
+@pytest.mark.parametrize("step", [0.0, 0.01, 0.3, 0.9, 3.0])
+def test_what_is_not_held_is_not_called_held(x, step):
+    found = repeats(step * np.rint(x / step) if step else x, step)
+    assert found is None or found.gain < 8.0
+
+
+def test_repeats_of_a_grid_that_was_not_told_are_not_taken_for_known_ones():
+    found = repeats(0.05 * np.rint(noise() / 0.05))
+    assert found is None or (found.gain < 8.0 and not found.mask.any())

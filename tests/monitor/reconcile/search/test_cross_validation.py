@@ -1,0 +1,148 @@
+"""A step is kept where what one half taught holds in the other, and is not where it was there by chance."""
+
+import numpy as np
+import pytest
+
+from monitor.noise.effects import (
+    AngleRandomWalk,
+    BiasStep,
+    CrossAxis,
+    ExponentiallyCorrelated,
+    Narrowband,
+    NoiseStep,
+    Outliers,
+    RateRamp,
+    Resolution,
+    Sinusoidal,
+    TemperatureBias,
+)
+from monitor.reconcile.diagnostics.diagnostics import line_peaks, sight
+from monitor.reconcile.diagnostics.gap import Null
+from monitor.reconcile.likelihood.hypothesis import believed, settled
+from monitor.reconcile.preparation.prepare import again
+from monitor.reconcile.search.cross_validation import proof
+from tests.monitor.reconcile.axes import WALK, WHITE, N, axes, axis, correlated, ringing, time_s, walk, warmth, white
+
+n = 24_000
+MODEL = (WHITE, WALK)
+NULL = Null(7.0, 15.0)
+HALF = time_s(n) < 120.0
+
+
+def noise(seed=0):
+    rng = np.random.default_rng(seed)
+    return white(n, rng) + walk(n, rng)
+
+
+def proven(one, effect, lens, model=MODEL):
+    before, after = believed(one, model), settled(one, (effect,), model)
+    return proof(one, before, after, after.effects[-1], lens, NULL, np.random.default_rng(0))
+
+
+LINE = 3e-4 * np.sin(2 * np.pi * 17.3 * time_s(n))
+RINGING = ringing(n, np.random.default_rng(1), 5e-4, 17.3, 1.0)
+SLOW = correlated(n, np.random.default_rng(2), 5e-4, 0.3)
+OTHER = correlated(n, np.random.default_rng(3), 1e-2, 1.0)
+REAL = {
+    "line": (LINE, Sinusoidal(amplitude=1.0, frequency=17.3, phase=0.0), "lines"),
+    "resonance": (RINGING, Narrowband(sigma=1e-4, frequency=17.3, bandwidth=1.0), "psd"),
+    "correlated": (SLOW, ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.3), "psd"),
+    "slope": (1e-5 * time_s(n), RateRamp(R=1.0), "level"),
+    "temperature": (2e-4 * (warmth(n) - 25.0), TemperatureBias(coefficient=1.0, reference=25.0), "temperature"),
+    "leak": (0.05 * OTHER, CrossAxis(source="gx", coefficient=1.0), "other_axes"),
+}
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_what_is_there_in_both_halves_is_kept(name):
+    hidden, effect, lens = REAL[name]
+    one = axes({"gx": OTHER, "gz": noise() + hidden}, {"gx": (), "gz": MODEL}, warmth(n))["gz"]
+    found = proven(one, effect, lens)
+    assert found.reason == ""
+    assert found.kept
+    assert found.after < 0.7 * found.before
+    assert found.before**2 / 2.0 > 20.0
+
+
+BY_CHANCE = {
+    "resonance": (RINGING, Narrowband(sigma=1e-4, frequency=17.3, bandwidth=1.0), "psd"),
+    "correlated": (SLOW, ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.3), "psd"),
+    "leak": (0.05 * OTHER * np.where(HALF, 1.0, -0.6), CrossAxis(source="gx", coefficient=1.0), "other_axes"),
+    "temperature": (
+        4e-4 * (warmth(n) - 25.0) * np.where(HALF, 1.0, -0.6),
+        TemperatureBias(coefficient=1.0, reference=25.0),
+        "temperature",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BY_CHANCE)
+def test_what_one_half_contradicts_is_not_kept(name):
+    hidden, effect, lens = BY_CHANCE[name]
+    hidden = hidden * HALF if lens == "psd" else hidden
+    one = axes({"gx": OTHER, "gz": noise() + hidden}, {"gx": (), "gz": MODEL}, warmth(n))["gz"]
+    before, after = believed(one, MODEL), settled(one, (effect,), MODEL)
+    # on the data that chose it, it is worth its name
+    assert after.likely.log_likelihood - before.likely.log_likelihood > 20.0
+    found = proof(one, before, after, effect, lens, NULL, np.random.default_rng(0))
+    assert not found.kept
+
+
+def test_a_line_picked_on_the_data_has_nothing_to_show_elsewhere():
+    """The strongest line of pure noise gains its dozen nats; halves of that decide nothing, and the reason says so."""
+    one = axis(noise(4))
+    view = sight(one, believed(one, MODEL).likely)
+    gain, f_hz = line_peaks(view.white, one.rate_hz, 1)[0]
+    assert gain > 7.0
+    found = proven(one, Sinusoidal(amplitude=1.0, frequency=f_hz, phase=0.0), "lines")
+    assert found.reason or not found.kept
+    assert np.isnan(found.before) == bool(found.reason)
+
+
+def test_another_size_of_a_known_noise():
+    one = axis(1.2 * noise(5))
+    before = believed(one, MODEL)
+    after = settled(one, (), MODEL)
+    assert after.freed >= 1
+    found = proof(one, before, after, None, "psd", NULL, np.random.default_rng(0))
+    assert found.kept
+    assert found.after < 0.2 * found.before
+
+
+@pytest.mark.parametrize(
+    ("effect", "model"),
+    [(NoiseStep(time=60.0, ratio=2.0), (AngleRandomWalk(N=N),)), (BiasStep(time=30.0, height=1.0), MODEL)],
+)
+def test_what_happens_once_has_no_other_half(effect, model):
+    course = np.where(time_s(n) < 60.0, 1.0, 2.0) if isinstance(effect, NoiseStep) else 1.0
+    y = noise(6) * course + 4e-3 * (time_s(n) >= 30.0) * isinstance(effect, BiasStep)
+    found = proven(axis(y), effect, "variance" if isinstance(effect, NoiseStep) else "level", model)
+    assert found.reason
+    assert found.kept
+    assert np.isnan([found.before, found.after]).all()
+
+
+def test_too_faint_for_a_half_is_told():
+    one = axis(noise(7) + 4e-5 * np.sin(2 * np.pi * 17.3 * time_s(n)))
+    found = proven(one, Sinusoidal(amplitude=1.0, frequency=17.3, phase=0.0), "lines")
+    assert "half" in found.reason
+
+
+@pytest.mark.parametrize("kind", ["outliers", "resolution"])
+def test_single_samples_are_looked_at_in_each_half(kind):
+    rng = np.random.default_rng(8)
+    y = noise(8)
+    if kind == "outliers":
+        y = y + (rng.random(n) < 2e-3) * 1e-2 * rng.standard_normal(n)
+        effect, lens = Outliers(fraction=2e-3, scale=1e-2), "tails"
+    else:
+        y = 6e-4 * np.rint(y / 6e-4)
+        effect, lens = Resolution(step=6e-4), "values"
+    plain = axis(y, MODEL)
+    one = again(plain, (*MODEL, effect), rng)
+    before = settled(plain, (), MODEL)
+    after = settled(one, (effect,), MODEL)
+    found = proof(one, before, after, effect, lens, NULL, rng)
+    assert found.kept
+    assert found.reason == ""
+    assert found.after < 0.5 * found.before

@@ -1,0 +1,136 @@
+"""Of two effects with one spectrum, the one that made the data is named: both ways, three pairs."""
+
+import numpy as np
+import pytest
+
+from monitor.noise.effects import (
+    BiasInstability,
+    BiasStep,
+    ExponentiallyCorrelated,
+    PoissonSteps,
+    RandomTelegraph,
+    RateRandomWalk,
+)
+from monitor.reconcile.likelihood.hypothesis import settled
+from monitor.reconcile.search.non_gaussian_alternatives import _rest, poisson, telegraph
+from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, axis, correlated, time_s, walk, white
+
+n = 60_000
+MODEL = (WHITE, WALK)
+
+
+def noise(rng):
+    return white(n, rng) + walk(n, rng)
+
+
+def two_levels(rng, amplitude, dwell_s):
+    flips = np.cumsum(rng.poisson(1.0 / (RATE_HZ * dwell_s), n))
+    return 0.5 * amplitude * (1.0 - 2.0 * (flips % 2))
+
+
+def jumps(rng, rate, height):
+    count = rng.poisson(rate / RATE_HZ, n)
+    return height * np.cumsum(np.sqrt(count) * rng.standard_normal(n))
+
+
+def found_as_noise(y):
+    """After a search has found correlated noise."""
+    one = axis(y)
+    effects = (*MODEL, ExponentiallyCorrelated(sigma=3e-4, correlation_time=5.0))
+    return one, settled(one, effects[2:], effects[:2])
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_telegraph_is_no_correlated_noise(seed):
+    rng = np.random.default_rng(seed)
+    one, state = found_as_noise(noise(rng) + two_levels(rng, 6e-4, 10.0))
+    twin = telegraph(one, state, 2)
+    assert twin.gain > 5.0
+    effect = twin.found[-1]
+    assert isinstance(effect, RandomTelegraph)
+    assert not any(isinstance(one, ExponentiallyCorrelated) for one in twin.found)
+    assert effect.amplitude == pytest.approx(6e-4, rel=0.1)
+    assert effect.dwell_time == pytest.approx(10.0, rel=0.5)
+    assert 40 < twin.events < 90  # 60 are expected
+    bounds = twin.bounds["amplitude"]
+    assert bounds.lo < effect.amplitude < bounds.hi
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_correlated_noise_is_no_telegraph(seed):
+    rng = np.random.default_rng(seed)
+    one, state = found_as_noise(noise(rng) + correlated(n, rng, 3e-4, 5.0))
+    assert telegraph(one, state, 2).gain < -5.0
+
+
+def test_nothing_is_asked_where_there_is_no_white_noise():
+    rng = np.random.default_rng(2)
+    one = axis(noise(rng) + correlated(n, rng, 3e-4, 5.0))
+    state = settled(one, (ExponentiallyCorrelated(sigma=3e-4, correlation_time=5.0),), (WALK,))
+    assert telegraph(one, state, 1) is None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_poisson_steps_are_no_random_walk(seed):
+    rng = np.random.default_rng(seed)
+    y = noise(rng) + jumps(rng, 0.05, 5e-4)
+    one = axis(y)
+    state = settled(one, (), MODEL)
+    assert 1 in state.likely.noises  # a stronger walk stands in for the steps
+    twin = poisson(one, state)
+    assert twin.gain > 5.0
+    effect = twin.found[-1]
+    assert isinstance(effect, PoissonSteps)
+    assert WALK not in twin.found  # the model has it, and keeps its size
+    assert effect.rate == pytest.approx(0.05, rel=0.7)
+    assert effect.height == pytest.approx(5e-4, rel=0.5)
+    assert 12 < twin.events < 60  # 30 are expected, some too small to see
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_random_walk_is_no_poisson_steps(seed):
+    rng = np.random.default_rng(seed)
+    one = axis(noise(rng) + walk(n, rng, 1e-4))
+    state = settled(one, (), MODEL)
+    assert state.effects[1].K > 10 * WALK.K
+    assert poisson(one, state).gain < 0.0
+
+
+def test_a_random_walk_that_the_model_has_not():
+    rng = np.random.default_rng(5)
+    y = white(n, rng) + walk(n, rng, 1e-4)
+    one = axis(y)
+    state = settled(one, (RateRandomWalk(K=1e-5),), (WHITE,))
+    assert poisson(one, state).gain < 0.0
+    stepped = axis(white(n, rng) + jumps(rng, 0.05, 5e-4))
+    twin = poisson(stepped, settled(stepped, (RateRandomWalk(K=1e-5),), (WHITE,)))
+    assert twin.gain > 5.0
+    assert not any(isinstance(effect, RateRandomWalk) for effect in twin.found)
+
+
+def test_the_noise_around_has_the_spectrum_of_its_effects():
+    effects = (
+        WHITE,
+        RateRandomWalk(K=2e-3),
+        PoissonSteps(rate=0.2, height=3e-3),
+        RandomTelegraph(amplitude=0.2, dwell_time=8.0),
+        ExponentiallyCorrelated(sigma=0.1, correlation_time=20.0),
+        BiasInstability(B=1e-2),
+    )
+    f_hz = np.geomspace(1e-3, 0.3, 20)  # far below the rate
+    for without in (None, 3):
+        rest = _rest(effects, without)
+        turn = 2.0 * np.pi * f_hz
+        density = rest.white + rest.walk / turn**2 + rest.flicker / turn
+        density += sum(2.0 * s**2 * t / (1.0 + (turn * t) ** 2) for s, t in rest.correlated)
+        expected = sum(one.psd(f_hz, 1.0 / RATE_HZ) for at, one in enumerate(effects) if at != without)
+        np.testing.assert_allclose(density, expected, rtol=2e-3)
+
+
+def test_a_model_that_is_right_is_not_asked():
+    one = axis(noise(np.random.default_rng(6)))
+    assert poisson(one, settled(one, (), MODEL)) is None
+    step = noise(np.random.default_rng(7)) + 5e-4 * (time_s(n) > 200.0)
+    stepped = axis(step)
+    state = settled(stepped, (BiasStep(time=200.0, height=1.0),), MODEL)
+    assert poisson(stepped, state).gain < 0.0  # one step is a step

@@ -1,0 +1,105 @@
+"""What the absence of an effect means: every meaning, and that "contradiction" is said only where data contradict."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from monitor.reconcile.likelihood.effect_terms import ONCE
+from monitor.reconcile.result import Bounds, Reconciliation, Score, Step, Where
+from monitor.reconcile.several_recordings.absence import Absence, Shown, absence
+from monitor.reconcile.several_recordings.comparison import Run
+from tests.monitor.reconcile.runs_made import LENS, line, run, step
+
+
+def shown(one: Step, gap: float = 30.0, seconds: float = 600.0) -> Shown:
+    return Shown(one, run("one", one).result.axes["gz"], gap, seconds)
+
+
+def said(one: Shown, other: Run) -> Absence:
+    return absence(one, other.name, other.result)
+
+
+def seen_through(score: Score, seconds: float = 600.0) -> Reconciliation:
+    """An axis that agrees, with one lens."""
+    agreeing = run("two", seconds=seconds).result
+    gz = agreeing.axes["gz"]
+    seen = replace(gz.end, scores=(score,))
+    return replace(agreeing, axes={"gz": replace(gz, start=seen, end=seen)})
+
+
+def test_what_would_have_been_seen_contradicts() -> None:
+    found = said(shown(line()), run("two"))
+    assert found.meaning == "contradiction"
+    assert found.because == (
+        "at the size seen elsewhere, its 600 s would show a gap of about 30.0 (lines), and the threshold of 4.0 "
+        "is not passed"
+    )
+
+
+@pytest.mark.parametrize(("seconds", "meaning"), [(600.0, "contradiction"), (15.0, "too_faint")])
+def test_a_short_recording_shows_less(seconds: float, meaning: str) -> None:
+    """Gaps grow with the square root of the length: of 30 in 600 s, 4.7 is left in 15 s."""
+    assert said(shown(line()), run("two", seconds=seconds)).meaning == meaning
+
+
+@pytest.mark.parametrize(("gap", "meaning"), [(4.5, "too_faint"), (6.5, "too_faint"), (7.5, "contradiction")])
+def test_chance_is_left_room(gap: float, meaning: str) -> None:
+    """A threshold of 4, and two deviations of two gaps that scatter by one each."""
+    assert said(shown(line(), gap), run("two")).meaning == meaning
+
+
+@pytest.mark.parametrize("effect", sorted(ONCE))
+def test_what_happens_once_may_differ(effect: str) -> None:
+    given: dict[str, dict[str, Any]] = {
+        "bias_step": {"time": 9.0, "height": 1.0},
+        "noise_step": {"time": 9.0, "ratio": 2.0},
+    }
+    one = step(effect, **given.get(effect, {"amplitude": 1.0, "time_constant": 9.0}))
+    assert said(shown(one), run("two")).meaning == "may_differ"
+
+
+def test_a_rival_name_is_told_only_where_one_was_the_others_runner_up() -> None:
+    telegraph: dict[str, Any] = {"amplitude": 1e-4, "dwell_time": 9.0}
+    rival = run("two", step("random_telegraph", rivals=["exponentially_correlated"], **telegraph))
+    one = shown(step("exponentially_correlated", sigma=1e-4, correlation_time=5.0))
+    found = said(one, rival)
+    assert found.meaning == "other_name"
+    assert "random_telegraph" in found.because
+    assert said(one, run("two", step("random_telegraph", **telegraph))).meaning == "contradiction"
+
+
+def test_what_is_left_over_through_the_same_lens_is_no_contradiction() -> None:
+    left = replace(LENS, gap=9.0)
+    assert said(shown(line()), run("two", left=[left])).meaning == "unnamed"
+    assert said(shown(line()), run("two", left=[replace(left, lens="tails")])).meaning == "contradiction"
+
+
+def test_a_leak_needs_its_source() -> None:
+    one = shown(step("cross_axis", source=Bounds("gx"), coefficient=0.1))
+    assert said(one, run("two")).meaning == "too_faint"
+    both = run("two").result
+    with_source = replace(both, axes={**both.axes, "gx": run("two", axis="gx").result.axes["gx"]})
+    assert absence(one, "two", with_source).meaning == "may_differ"
+
+
+@pytest.mark.parametrize(
+    ("swing", "meaning"), [((20.0, 30.0), "contradiction"), ((24.0, 25.0), "too_faint"), (None, "too_faint")]
+)
+def test_a_temperature_effect_needs_temperature_that_changes(swing: tuple[float, float] | None, meaning: str) -> None:
+    warm = Score("temperature", Where(temperature=(20.0, 30.0)), 30.0, 2.0, 4.0)
+    one = replace(step("temperature_bias", coefficient=1e-3, reference=Bounds(25.0)), found=warm)
+    other = seen_through(replace(warm, where=Where(temperature=swing), gap=1.0))
+    assert absence(shown(one), "two", other).meaning == meaning
+
+
+def test_a_ramp_fades_faster_with_the_length() -> None:
+    ramp = shown(step("rate_ramp", R=1e-6), gap=30.0)
+    assert said(ramp, run("two", seconds=200.0)).meaning == "too_faint"
+    assert said(shown(line(), 30.0), run("two", seconds=200.0)).meaning == "contradiction"
+
+
+def test_nothing_is_said_without_the_lens_or_the_axis() -> None:
+    assert absence(shown(line()), "two", seen_through(replace(LENS, lens="psd"))).meaning == "may_differ"
+    assert said(shown(line()), run("two", axis="gx")).because == "gz is not in it"
+    assert said(shown(line(), gap=0.0), run("two")).meaning == "may_differ"

@@ -1,0 +1,173 @@
+"""What several recordings show together: matched by name and place, pooled, and what only some show."""
+
+from dataclasses import replace
+
+import pytest
+
+from monitor.noise.effects import AngleRandomWalk, BandwidthLimit, BiasStep, Sinusoidal, TemperatureBias
+from monitor.reconcile.result import Bounds
+from monitor.reconcile.several_recordings.comparison import AxisRuns, Run, Seen, compare
+from tests.monitor.reconcile import samples
+from tests.monitor.reconcile.runs_made import LENS, around, known_lines, line, run, step, with_axes
+
+
+def gz(*runs: Run) -> AxisRuns:
+    return compare(runs).axes["gz"]
+
+
+def only(found: tuple[Seen, ...]) -> Seen:
+    (one,) = found
+    return one
+
+
+def test_a_line_of_every_recording_is_common_and_pooled() -> None:
+    c = compare([run("a", line(1.50e-4)), run("b", line(1.52e-4)), run("c", line(1.48e-4, 17.302))])
+    seen = only(c.axes["gz"].common)
+    assert c.axes["gz"].single == ()
+    assert list(seen.steps) == ["a", "b", "c"]
+    amplitude = seen.parameters["amplitude"].bounds
+    assert amplitude.value == pytest.approx(1.50e-4)
+    assert amplitude.hi == pytest.approx(1.50e-4 + 3e-6 / 3**0.5)
+    assert "phase" not in seen.parameters  # of no meaning in another recording
+    # two of them are 2 µrad/s from the mean, the deviation of each is 3 µrad/s / 1.96
+    assert seen.parameters["amplitude"].chi2 == pytest.approx(2 * (2 / (3 / 1.959964)) ** 2)
+    assert seen.p == seen.parameters["amplitude"].p
+    assert seen.consistent is True
+
+
+def test_sizes_that_differ_are_common_and_not_consistent() -> None:
+    seen = only(gz(run("a", line(1.5e-4)), run("b", line(2.5e-4))).common)
+    assert seen.consistent is False
+    assert seen.p is not None
+    assert seen.p < 1e-6
+
+
+def test_sizes_that_agree_are_consistent_wherever_the_line_moved() -> None:
+    seen = only(gz(run("a", line(1.50e-4)), run("b", line(1.51e-4, 17.35))).common)
+    assert seen.consistent is True
+    moved = seen.parameters["frequency"].p
+    assert moved is not None
+    assert moved < 0.001  # it is told, but is no size
+
+
+def test_one_recordings_own_effect_is_single_with_its_absence_elsewhere() -> None:
+    own = step("bias_step", time=around(350.0, 0.1), height=around(1e-3, 1e-4))
+    axis = gz(run("a", line()), run("b", line(), own), run("c", line()))
+    assert only(axis.common).effect == "sinusoidal"
+    seen = only(axis.single)
+    assert (seen.effect, list(seen.steps)) == ("bias_step", ["b"])
+    assert [(one.run, one.meaning) for one in seen.absent] == [("a", "may_differ"), ("c", "may_differ")]
+    assert seen.consistent is None
+
+
+def test_steps_at_other_times_are_two() -> None:
+    first, second = (step("bias_step", time=t, height=1e-3) for t in (100.0, 400.0))
+    axis = gz(run("a", first), run("b", second))
+    assert axis.common == ()
+    assert [list(seen.steps) for seen in axis.single] == [["a"], ["b"]]
+
+
+def test_two_lines_are_matched_one_by_one_to_the_nearest() -> None:
+    axis = gz(run("a", line(1e-4, 17.30), line(3e-4, 17.36)), run("b", line(3e-4, 17.37), line(1e-4, 17.31)))
+    assert axis.single == ()
+    assert [round(float(one.parameters["amplitude"].bounds.value), 6) for one in axis.common] == [1e-4, 3e-4]
+    assert all(one.consistent for one in axis.common)
+
+
+def test_names_that_differ_are_two() -> None:
+    narrow = step("narrowband", sigma=1e-4, frequency=17.3, bandwidth=0.5)
+    axis = gz(run("a", line()), run("b", narrow))
+    assert axis.common == ()
+    assert [seen.effect for seen in axis.single] == ["sinusoidal", "narrowband"]
+
+
+def test_an_axis_of_one_recording_has_nothing_in_common() -> None:
+    both = with_axes(run("a", line()), run("a", line(), axis="gx"))
+    c = compare([both, run("b", line())])
+    assert list(c.axes) == ["gx", "gz"]
+    assert only(c.axes["gx"].single).absent == ()
+    assert only(c.axes["gz"].common).effect == "sinusoidal"
+
+
+def test_common_is_what_all_recordings_with_the_axis_show() -> None:
+    c = compare([run("a", line()), run("b", line()), run("c", axis="gx")])
+    assert only(c.axes["gz"].common).steps.keys() == {"a", "b"}
+
+
+def test_the_model_has_the_common_effects_and_no_other() -> None:
+    own = step("bias_step", time=350.0, height=1e-3)
+    more = step("angle_random_walk", kind="retuned", N=around(1.8e-4, 1e-6))
+    most = step("angle_random_walk", kind="retuned", N=around(1.84e-4, 1e-6))
+    c = compare([run("a", line(1.50e-4), more), run("b", line(1.51e-4), most, own)])
+    effects = c.model.effects["gz"]
+    assert [effect.name for effect in effects] == [
+        "angle_random_walk", "bias_instability", "rate_random_walk", "sinusoidal",
+    ]  # fmt: skip
+    white, tone = effects[0], effects[-1]
+    assert isinstance(white, AngleRandomWalk)
+    assert pytest.approx(1.82e-4) == white.N
+    assert isinstance(tone, Sinusoidal)
+    assert tone.amplitude == pytest.approx(1.505e-4)
+    assert tone.phase is None  # drawn anew in every recording
+    assert not any(isinstance(effect, BiasStep) for effect in effects)
+    assert c.model.sample_rate_hz == samples.RATE_HZ
+
+
+def test_of_several_lines_in_the_model_the_retuned_one_is_replaced() -> None:
+    known = [Sinusoidal(amplitude=1e-4, frequency=f) for f in (10.0, 17.3)]
+    retuned = step("sinusoidal", kind="retuned", amplitude=around(2e-4, 1e-6))
+    runs = []
+    for name in "ab":
+        one = known_lines(known, run(name))
+        effects = {"gz": (*one.result.baseline.effects["gz"][:-1], Sinusoidal(amplitude=2e-4, frequency=17.3))}
+        axes = {"gz": replace(one.result.axes["gz"], steps=(retuned,), verdict="explained")}
+        model = replace(one.result.model, effects=effects)
+        runs.append(replace(one, result=replace(one.result, axes=axes, model=model, verdict="explained")))
+    c = compare(runs)
+    lines = [effect for effect in c.model.effects["gz"] if isinstance(effect, Sinusoidal)]
+    assert [(one.frequency, round(one.amplitude, 6)) for one in lines] == [(10.0, 1e-4), (17.3, 2e-4)]
+
+
+def test_what_has_no_interval_stays_as_the_first_recording_has_it() -> None:
+    low_pass = step("bandwidth_limit", cutoff=around(20.0, 0.1), order=Bounds(2))
+    c = compare([run("a", low_pass), run("b", low_pass)])
+    found = c.model.effects["gz"][-1]
+    assert found == BandwidthLimit(cutoff=20.0, order=2)
+    assert only(c.axes["gz"].common).consistent is True  # by its cutoff, as it has no size
+
+
+def test_a_curved_temperature_effect_is_pooled_at_one_reference() -> None:
+    """The same curve, 2e-4 (T − 20) + 1e-5 (T − 20)², told at 20 °C and at 30 °C."""
+    curve = around(1e-5, 1e-7)
+    first = step("temperature_bias", coefficient=around(2e-4, 4e-6), quadratic=curve, reference=Bounds(20.0))
+    second = step("temperature_bias", coefficient=around(4e-4, 4e-6), quadratic=curve, reference=Bounds(30.0))
+    c = compare([run("a", first), run("b", second)])
+    seen = only(c.axes["gz"].common)
+    assert seen.consistent is True
+    found = c.model.effects["gz"][-1]
+    assert isinstance(found, TemperatureBias)
+    assert (found.coefficient, found.quadratic, found.reference) == pytest.approx((2e-4, 1e-5, 20.0))
+
+
+def test_a_retuned_term_is_a_contradiction_only_if_its_size_is_another() -> None:
+    """However large the gap that was closed in the same round: 1 % off with an interval of 2 % is nothing."""
+    for size, half, meaning in ((1.01, 0.02, "too_faint"), (1.2, 0.02, "contradiction")):
+        retuned = step("angle_random_walk", kind="retuned", N=around(size * samples.N, half * samples.N))
+        seen = only(gz(run("a", retuned), run("b")).single)
+        assert [one.meaning for one in seen.absent] == [meaning]
+
+
+def test_a_clock_is_one_for_all_axes() -> None:
+    slow = step("sample_rate_error", ratio=around(1.01, 1e-4))
+    c = compare([run("a", slow, axis="gx"), run("b", slow, axis="gz")])
+    assert only(c.axes["gx"].common).steps.keys() == {"a", "b"}
+    assert c.axes["gz"].common == c.axes["gz"].single == ()
+    assert [(axis, effect.name) for axis, effect in c.model if effect.name == slow.effect] == [("gx", slow.effect)]
+
+
+def test_the_verdict_is_that_of_all() -> None:
+    left = replace(LENS, gap=9.0)
+    assert compare([run("a"), run("b")]).verdict == "agrees"
+    assert compare([run("a"), run("b", line())]).verdict == "explained"
+    assert compare([run("a"), run("b", left=[left])]).verdict == "unexplained"
+    assert compare([run("a", line()), run("b", left=[left])]).verdict == "partly_explained"

@@ -1,0 +1,56 @@
+"""The report of several recordings for programs: its keys, numbers that JSON has, the same bytes every time."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+from monitor.reconcile.result import Bounds
+from monitor.reconcile.several_recordings.comparison import Comparison, compare
+from monitor.reconcile.several_recordings.comparison_report import to_json
+from tests.monitor.reconcile.runs_made import line, run, step
+
+
+def made() -> Comparison:
+    leak = step("cross_axis", source=Bounds("gx"), coefficient=Bounds(0.1))
+    return compare([run("a", line()), run("b", line(), leak)], None, {"c": "too short"})
+
+
+def written(c: Comparison) -> dict[str, Any]:
+    return dict(json.loads(to_json(c)))
+
+
+def test_keys_are_those_of_the_schema() -> None:
+    report = written(made())
+    assert {name: report[name] for name in ("schema", "verdict", "seed", "fitted_to")} == {
+        "schema": "imu-monitor/reconcile-runs/1", "verdict": "explained", "seed": 7, "fitted_to": None,
+    }  # fmt: skip
+    assert report["recordings"] == [
+        {"name": "a", "folder": "a", "verdict": "explained", "rate": 100.0, "samples": 360_000, "seconds": 600.0},
+        {"name": "b", "folder": "b", "verdict": "explained", "rate": 100.0, "samples": 360_000, "seconds": 600.0},
+        {"name": "c", "folder": "c", "verdict": None, "why": "too short"},
+    ]
+    axis = report["axes"]["gz"]
+    assert axis["verdicts"] == {"a": "explained", "b": "explained"}
+    (common,) = axis["common"]
+    assert common["recordings"] == ["a", "b"]
+    assert common["consistent"] is True
+    assert common["p"] == common["parameters"]["amplitude"]["p"] == 1.0
+    assert common["each"]["a"]["parameters"]["phase"] == {"value": 1.0, "lo": 0.9, "hi": 1.1}
+    assert common["each"]["a"]["gap"] == {"before": 30.0, "after": 1.2}
+
+
+def test_what_is_not_known_is_null_or_absent() -> None:
+    (single,) = written(made())["axes"]["gz"]["single"]
+    assert single["parameters"] == {"source": {"value": "gx"}, "coefficient": {"value": 0.1, "lo": None, "hi": None}}
+    assert (single["consistent"], single["p"]) == (None, None)
+    assert single["absent"] == [{"run": "a", "meaning": "too_faint", "because": "gx is not in it"}]
+
+
+def test_what_is_no_number_is_null() -> None:
+    wrong = replace(line(), confidence=float("nan"))
+    (single,) = written(compare([run("a", wrong), run("b")]))["axes"]["gz"]["single"]
+    assert single["each"]["a"]["confidence"] is None
+
+
+def test_the_same_comparison_gives_the_same_bytes() -> None:
+    assert to_json(made()) == to_json(made())

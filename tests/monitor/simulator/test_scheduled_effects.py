@@ -1,0 +1,50 @@
+"""Effects in one line: what can be written, and what is said of what cannot."""
+
+import pytest
+
+from drivers.errors import ConfigError
+from drivers.sample import AXES
+from monitor.noise.effects import EFFECTS
+from monitor.simulator import effects_of
+
+
+def test_one_axis_or_all_of_a_kind() -> None:
+    sinusoidal = EFFECTS["sinusoidal"](amplitude=1e-3, frequency=17.0)
+    assert effects_of("gz.sinusoidal:amplitude=1e-3,frequency=17") == [("gz", sinusoidal)]
+    assert effects_of(" gz.sinusoidal : frequency = 17 , amplitude = 1e-3 ") == [("gz", sinusoidal)]
+    assert effects_of("a*.sinusoidal:amplitude=1e-3,frequency=17") == [(axis, sinusoidal) for axis in AXES[3:]]
+
+
+def test_an_axis_as_a_parameter() -> None:
+    ((axis, effect),) = effects_of("gz.g_sensitivity:source=ax,coefficient=1e-4")
+    assert (axis, effect) == ("gz", EFFECTS["g_sensitivity"](source="ax", coefficient=1e-4))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "is no effect; write axis.effect:parameter=value"),
+        ("gz", "is no effect"),
+        ("gz.sinusoidal", "is no effect"),
+        ("gz:sinusoidal", "is no effect"),
+        ("gy.sinusodal:amplitude=1,frequency=2", 'did you mean "sinusoidal"?'),
+        ("gw.sinusoidal:amplitude=1,frequency=2", 'unknown axis "gw"'),
+        ("gz.sinusoidal:amplitud=1,frequency=2", 'did you mean "amplitude"?'),
+        ("gz.sinusoidal:amplitude=1", "frequency is missing"),
+        ("gz.sinusoidal:", "amplitude is missing"),
+        ("gz.sinusoidal:amplitude=1,amplitude=2", "amplitude occurs twice"),
+        ("gz.sinusoidal:amplitude", '"amplitude" is no parameter; write name=value'),
+        ("gz.sinusoidal:amplitude=,frequency=2", "is no parameter"),
+        ("gz.sinusoidal:amplitude=-1,frequency=2", "amplitude"),
+        ("gz.sinusoidal:amplitude=nan,frequency=2", "amplitude"),
+        ("gz.sinusoidal:amplitude=much,frequency=2", "amplitude"),
+        ('g"z.sinusoidal:amplitude=1,frequency=2', "unknown axis"),
+        ("gz.sinu\\soidal:amplitude=1", "unknown effect"),
+    ],
+)
+def test_what_is_wrong_is_one_line(text: str, words: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        effects_of(text)
+    line = str(caught.value)
+    assert words in line
+    assert "\n" not in line

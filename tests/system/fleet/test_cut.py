@@ -1,0 +1,91 @@
+"""A network that is cut in two and healed: daemon and watcher, each in its own namespace, find each other again."""
+
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+from tests.support.waiting import PATIENCE_S, wait_for
+from tests.system.fleet.namespaces import INSIDE, pair
+
+CONFIG = f"""
+[[device]]
+name = "nose"
+rate = 100.0
+driver = {{ link = "virtual" }}
+[zenoh]
+listen = ["tcp/{INSIDE}:7450"]
+[viewer]
+mode = "none"
+"""
+WATCH = """
+import contextlib, sys, time
+from monitor.publish.terminal import Board, note
+from monitor.publish.zenoh_in import ZenohIn
+
+board = Board()
+with contextlib.closing(ZenohIn("imu/**", [sys.argv[1]])) as arriving:
+    arriving.start()
+    while True:
+        for message in arriving.take(0.2):
+            if message.payload is None:
+                board.alive(message.key, message.there)
+            else:
+                board.take(message.key, message.payload)
+        now_s = time.monotonic()
+        states = [one.state(now_s) for one in board.devices(now_s)] or ["nobody"]
+        received = [one.status.received for one in board.devices(now_s) if one.status] or [0]
+        print(states[0], received[0], arriving.state, flush=True)
+"""
+
+
+def test_daemon_and_watcher_find_each_other_again(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text(CONFIG)
+    with pair() as namespaces:
+        daemon = namespaces.python(namespaces.inside, "-m", "monitor.cli", "run", str(path))
+        watcher = namespaces.python(namespaces.outside, "-c", WATCH, f"tcp/{INSIDE}:7450")
+        newest = [""]
+
+        def listen() -> None:
+            assert watcher.stdout is not None
+            for line in watcher.stdout:
+                newest[0] = line
+
+        def drain() -> None:
+            assert daemon.stdout is not None
+            for _ in daemon.stdout:
+                pass
+
+        readers = [threading.Thread(target=listen), threading.Thread(target=drain)]
+        for reader in readers:
+            reader.start()
+        try:
+            wait_for(lambda: newest[0].startswith("running"))
+            before = int(newest[0].split()[1])
+            namespaces.cable("down")
+            wait_for(lambda: newest[0].startswith(("silent", "gone")))
+            cut_s = time.monotonic()
+            # zenoh's lease is 10 s: after it the session is given up on both sides
+            wait_for(lambda: time.monotonic() > cut_s + 12.0, "the end of the lease")
+            namespaces.cable("up")
+            # the samples of the cut are among those that were received
+            wait_for(lambda: newest[0].startswith("running") and int(newest[0].split()[1]) > before + 1000)
+            wait_for(lambda: newest[0].rstrip().endswith("ok"))
+        finally:
+            _end(daemon, watcher)
+            for reader in readers:
+                reader.join(PATIENCE_S)
+            for pipe in (daemon.stdout, daemon.stderr, watcher.stdout, watcher.stderr):
+                assert pipe is not None
+                pipe.close()
+
+
+def _end(*children: "subprocess.Popen[str]") -> None:
+    for child in children:
+        child.terminate()
+        try:
+            child.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()

@@ -1,0 +1,143 @@
+"""What the walks share: a service in this process with its results caught."""
+
+import os
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from drivers.sample import Event, SampleBlock, join
+from monitor.common.health import Health
+from monitor.daemon.device_worker import Output, Station
+from monitor.daemon.service import Service
+from monitor.drift.compensation.live_compensation import DriftLook
+from monitor.drift.thermal.live_thermal import ThermalLook
+from monitor.estimation.allan.hadamard import HadamardCurve
+from monitor.estimation.allan.total import TotalCurve
+from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.estimate import Estimate
+from monitor.settings import loading
+from tests.support.waiting import PATIENCE_S
+
+
+class Caught(Output):
+    """An output that keeps everything."""
+
+    def __init__(self) -> None:
+        self.blocks: dict[str, list[SampleBlock]] = {}
+        self.estimates: dict[str, Estimate] = {}
+        self.totals: dict[str, tuple[TotalCurve, HadamardCurve]] = {}
+        self.gaps: dict[str, ModelGap] = {}
+        self.thermals: dict[str, list[ThermalLook]] = {}
+        self.rates: dict[str, list[SampleBlock]] = {}
+        self.drifts: dict[str, list[DriftLook]] = {}
+        self.events: list[tuple[str, Event]] = []
+        self.healths: dict[str, Health] = {}
+
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        self.blocks.setdefault(device, []).append(samples)
+
+    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
+        self.estimates[device] = estimate
+
+    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
+        self.gaps[device] = gap
+
+    def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
+        self.thermals.setdefault(device, []).append(look)
+
+    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+        self.rates.setdefault(device, []).append(samples)
+
+    def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
+        self.drifts.setdefault(device, []).append(look)
+
+    def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
+        self.totals[device] = (total, hadamard)
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        self.events.append((device, event))
+
+    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+        self.healths[device] = health
+
+    def values(self, device: str) -> np.ndarray:
+        return join(self.blocks[device]).values
+
+
+class Running:
+    """A service in a thread; ``prepare`` is called before it starts."""
+
+    def __init__(self, path: Path, caught: Caught, prepare: Callable[[Service], None] | None = None) -> None:
+        self.service = Service(loading.load(path))
+        if prepare is not None:
+            prepare(self.service)
+        self.caught = caught
+        self.service.outputs.append(self.caught)
+        self._thread = threading.Thread(target=self.service.run)
+        self._thread.start()
+
+    def station(self, name: str) -> Station:
+        return next(station for station in self.service.stations if station.name == name)
+
+    def stop(self) -> None:
+        self.service.stop()
+        self.join()
+
+    def join(self) -> None:
+        self._thread.join(PATIENCE_S)
+        assert not self._thread.is_alive(), "the service did not stop in time"
+
+
+@contextmanager
+def running(
+    folder: Path, text: str, caught: Caught | None = None, prepare: Callable[[Service], None] | None = None
+) -> Iterator[Running]:
+    path = folder / "config.toml"
+    path.write_text(text)
+    service = Running(path, caught or Caught(), prepare)
+    try:
+        yield service
+    finally:
+        service.stop()
+
+
+class Cable:
+    """A pseudo-terminal whose name stays the same while it is pulled out and put back."""
+
+    def __init__(self, folder: Path) -> None:
+        self.port = folder / "tty"
+        self.master = -1
+        self.plug()
+
+    def plug(self) -> None:
+        self.master, slave = os.openpty()
+        tty.setraw(self.master)
+        tty.setraw(slave)
+        self.port.unlink(missing_ok=True)
+        self.port.symlink_to(os.ttyname(slave))
+        os.close(slave)
+
+    def pull(self) -> None:
+        self.port.unlink(missing_ok=True)
+        os.close(self.master)
+        self.master = -1
+
+    def write(self, data: bytes) -> None:
+        view = memoryview(data)
+        while view:
+            view = view[os.write(self.master, view) :]
+
+
+def paced(send: Callable[[bytes], None], frames: list[bytes], per_second: float, burst: int = 40) -> None:
+    """Send frames in bursts at that rate, or as fast as the machine can."""
+    begun = time.monotonic()
+    for start in range(0, len(frames), burst):
+        early = begun + start / per_second - time.monotonic()
+        if early > 0.0:
+            time.sleep(early)
+        send(b"".join(frames[start : start + burst]))

@@ -1,0 +1,62 @@
+"""The demo's sensor takes on an effect while it runs: the sensor's log says so, and the service finds it by itself."""
+
+from dataclasses import replace
+
+import msgspec
+import pytest
+from structlog.testing import capture_logs
+
+from drivers.decoders import samples
+from drivers.sample import Event
+from monitor.daemon.service import Service
+from monitor.settings.loading import VirtualTable
+from monitor.simulator.demo import demo
+from tests.support.paced_sensor import follow_reader
+from tests.support.waiting import PATIENCE_S
+from tests.system.rig import Caught
+
+SPEED = 20.0
+AT_S = 80.0
+VIBRATION = "gz.sinusoidal:amplitude=4e-3,frequency=17"
+
+
+class Watching(Caught):
+    """Ends the service at the first change."""
+
+    service: Service | None = None
+
+    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        super().event(device, unix_s, received, event)
+        if event.kind == "noise_changed" and self.service is not None:
+            self.service.stop()
+
+
+def test_an_effect_that_comes_is_announced_on_its_axis() -> None:
+    config = demo(effects=[VIBRATION], effect_at_s=AT_S)
+    (device,) = config.devices
+    assert isinstance(device.link, VirtualTable)
+    # messages carry the sensor's own time, so that an event tells when it is by the sensor's clock
+    decoder = samples.build(samples.Settings())
+    fast = replace(device, link=msgspec.structs.replace(device.link, speed=SPEED), decoder=decoder)
+    quiet = msgspec.structs.replace(config.zenoh, mode="none"), msgspec.structs.replace(config.viewer, mode="none")
+    service = Service(replace(config, devices=(fast,), zenoh=quiet[0], viewer=quiet[1]))
+    caught = Watching()
+    caught.service = service
+    service.outputs.append(caught)
+    follow_reader(service.virtual["demo"], service.stations[0].driver)
+    with capture_logs() as lines:
+        service.run(PATIENCE_S)
+    added = [line for line in lines if line["event"] == "effect added"]
+    assert [(line["device"], line["axis"], line["effect"], line["at_s"]) for line in added] == [
+        ("demo", "gz", VIBRATION, AT_S)
+    ]
+    changes = [event for _, event in caught.events if event.kind == "noise_changed"]
+    assert [event.axis for event in changes] == ["gz"]
+    (change,) = changes
+    first_ns = int(caught.blocks["demo"][0].t_ns[0])
+    assert AT_S <= (change.t_ns - first_ns) / 1e9 <= AT_S + 40.0
+    assert change.since_ns is not None
+    assert (change.since_ns - first_ns) / 1e9 == pytest.approx(AT_S, abs=2.0)
+    counts = service.stations[0].driver.counts
+    assert (counts.lost, counts.bad) == (0, 0)
+    assert "gz" in change.text

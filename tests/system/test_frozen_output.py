@@ -1,0 +1,434 @@
+"""Processes whose terminal is frozen, whose log nobody reads or whose disk is full go on measuring, and end in time."""
+
+import contextlib
+import json
+import os
+import platform
+import re
+import signal
+import subprocess
+import sys
+import termios
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.recordings import save_samples
+from tests.support.ports import free_endpoint
+from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.zenoh_sessions import router, session
+
+PROGRAM = [sys.executable, "-m", "monitor.cli"]
+CONFIG = """
+[[device]]
+name = "bench"
+rate = 100.0
+driver = {{ link = "virtual" }}
+[zenoh]
+connect = ["{endpoint}"]
+[viewer]
+mode = "none"
+"""
+REPLAY = """
+[[device]]
+name = "bench"
+rate = 100.0
+driver = { link = "replay", path = "short.npz", speed = "max" }
+[zenoh]
+mode = "none"
+[viewer]
+mode = "none"
+"""
+MANY_LINES = """
+import structlog
+from monitor.cli import main
+from monitor.service import Service
+run = Service.run
+def run_after_many_lines(self, seconds=None):
+    for number in range(1000):
+        structlog.get_logger("imu-monitor").warning("filler", number=number, text="no " * 333)
+    run(self, seconds)
+Service.run = run_after_many_lines
+main()
+"""
+SLOW_TO_STOP = """
+import sys, time
+from pathlib import Path
+from monitor.cli import main
+from monitor.service import Service
+def drain(self):
+    Path(sys.argv[2]).with_name("stopping").touch()
+    time.sleep(600.0)
+Service._drain = drain
+main()
+"""
+
+
+class Daemon:
+    """A daemon in a process of its own, and what it publishes."""
+
+    def __init__(self, process: "subprocess.Popen[bytes]", subscriber: Any) -> None:
+        self.process = process
+        self._subscriber = subscriber
+        self.counts = {"samples": 0, "coefficients": 0, "status": 0}
+        self.outputs: dict[str, str] = {}  # of the newest status
+
+    def listen(self) -> None:
+        """Take all messages that have arrived."""
+        while (message := self._subscriber.try_recv()) is not None:
+            topic = str(message.key_expr).rpartition("/")[2]
+            if topic in self.counts:
+                self.counts[topic] += 1
+            if topic == "status":
+                self.outputs = json.loads(message.payload.to_bytes())["outputs"]
+
+    def says(self, output: str, right: Callable[[str], Any]) -> str:
+        """Wait until the status says so of an output."""
+
+        def said() -> bool:
+            self.listen()
+            return bool(right(self.outputs.get(output, "")))
+
+        try:
+            wait_for(said)
+        except AssertionError:
+            raise AssertionError(f"{output}: {self.outputs}, received {self.counts}") from None
+        return self.outputs[output]
+
+    def goes_on(self) -> None:
+        """Wait for more samples, coefficients and states."""
+        self.listen()
+        before = dict(self.counts)
+
+        def more() -> bool:
+            self.listen()
+            return all(count >= before[topic] + 3 for topic, count in self.counts.items())
+
+        wait_for(more)
+
+
+@contextlib.contextmanager
+def daemon(folder: Path, stdout: int, stderr: int, source: str | None = None) -> Iterator[Daemon]:
+    endpoint = free_endpoint()
+    path = folder / "config.toml"
+    path.write_text(CONFIG.format(endpoint=endpoint))
+    command = PROGRAM if source is None else [sys.executable, "-c", source]
+    with router(endpoint), session(connect=[endpoint]) as client:
+        subscriber = client.declare_subscriber("imu/**")
+        with program([*command, "run", str(path)], stdout, stderr) as process:
+            yield Daemon(process, subscriber)
+
+
+@contextlib.contextmanager
+def program(
+    command: list[str], stdout: int, stderr: int, folder: Path | None = None
+) -> Iterator["subprocess.Popen[bytes]"]:
+    environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": "120", "LINES": "40", "PYTHONPATH": os.getcwd()}
+    process = subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr, cwd=folder, env=environment
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait(PATIENCE_S)
+
+
+def ended(process: "subprocess.Popen[bytes]", number: int) -> int:
+    """Exit status after a signal."""
+    process.send_signal(number)
+    return process.wait(PATIENCE_S)
+
+
+class Place:
+    """A terminal or pipe that nobody reads until ``read``.
+
+    Parameters
+    ----------
+    reading : int
+        Descriptor that is read.
+    writing : int
+        Descriptor for the process; it is closed with ``close_writer``.
+    thaw : callable, optional
+        Called before reading begins.
+    """
+
+    def __init__(self, reading: int, writing: int, thaw: Callable[[int], None] = lambda _descriptor: None) -> None:
+        self.writing = writing
+        self.data = b""
+        self._reading = reading
+        self._thaw = thaw
+        self._thread = threading.Thread(target=self._read, daemon=True)
+
+    def read(self) -> None:
+        self._thaw(self.writing)
+        self._thread.start()
+
+    def _read(self) -> None:
+        with contextlib.suppress(OSError):  # EIO: no process has the terminal open
+            while data := os.read(self._reading, 65536):
+                self.data += data
+
+    def all(self) -> bytes:
+        """Everything, after the process has ended."""
+        self.close_writer()
+        self._thread.join(PATIENCE_S)
+        assert not self._thread.is_alive()
+        return self.data
+
+    def close_writer(self) -> None:
+        if self.writing >= 0:
+            os.close(self.writing)
+            self.writing = -1
+
+    def close(self) -> None:
+        self.close_writer()
+        if self._thread.ident is not None:
+            self._thread.join(PATIENCE_S)
+        os.close(self._reading)
+
+
+def fill(descriptor: int) -> None:
+    """Write until a write would block."""
+    os.set_blocking(descriptor, False)
+    for length in (1000, 1):  # to the last byte
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                os.write(descriptor, b"\n" * length)
+    os.set_blocking(descriptor, True)
+
+
+def frozen_terminal(how: str) -> contextlib.closing[Place]:
+    """A terminal that nobody reads ("unread"), or that Ctrl-S has stopped ("stopped")."""
+    master, slave = os.openpty()
+    if how == "unread":
+        fill(slave)
+        return contextlib.closing(Place(master, slave))
+    termios.tcflow(slave, termios.TCOOFF)
+    return contextlib.closing(Place(master, slave, lambda descriptor: termios.tcflow(descriptor, termios.TCOON)))
+
+
+def unread_pipe() -> contextlib.closing[Place]:
+    reading, writing = os.pipe()
+    fill(writing)
+    return contextlib.closing(Place(reading, writing))
+
+
+def waits_for_reader(pid: int) -> bool:
+    """Return True if a thread of the process is in a write to standard output or standard error."""
+    number = {"x86_64": 1, "aarch64": 64}.get(platform.machine())
+    if number is None:
+        pytest.skip("the number of the system call is not known here")
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # the thread has ended
+            try:
+                call = (task / "syscall").read_text().split()
+            except PermissionError:
+                pytest.skip("system calls of another process are not shown here")
+            if call[0] == str(number) and int(call[1], 16) in (1, 2):
+                return True
+    return False
+
+
+# --- run
+
+
+@pytest.mark.parametrize(("frozen", "number"), [("unread", signal.SIGTERM), ("stopped", signal.SIGINT)])
+def test_a_frozen_terminal_stops_neither_the_results_nor_the_end(tmp_path: Path, frozen: str, number: int) -> None:
+    with frozen_terminal(frozen) as screen, daemon(tmp_path, screen.writing, screen.writing) as one:
+        one.says("terminal", lambda state: state.startswith("blocked for ") and "frames dropped" in state)
+        assert one.outputs.keys() == {"zenoh", "terminal"}
+        one.goes_on()
+        assert ended(one.process, number) == 0
+
+
+@pytest.mark.parametrize("frozen", ["unread", "stopped"])
+def test_a_terminal_that_is_read_again_goes_on(tmp_path: Path, frozen: str) -> None:
+    with frozen_terminal(frozen) as screen:
+        with daemon(tmp_path, screen.writing, screen.writing) as one:
+            one.says("terminal", lambda state: "frames dropped" in state)
+            screen.read()
+            state = one.says("terminal", lambda state: state.startswith("ok"))
+            assert re.fullmatch(r"ok, but [\d,]+ frames? dropped", state)
+            wait_for(lambda: screen.data.count("● running".encode()) > 2)
+            one.goes_on()
+            assert ended(one.process, signal.SIGINT) == 0
+        text = screen.all()
+    hidden, shown = text.index(b"\x1b[?25l"), text.index(b"\x1b[?25h")
+    assert hidden < shown
+    assert "● running".encode() in text[hidden:shown]
+    assert b"imu-monitor" in text[shown:]  # the final table stays
+    assert re.search(rb"bench\b", text[shown:])
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_log_lines_go_above_the_table_or_where_standard_error_goes(tmp_path: Path, shared: bool) -> None:
+    source = MANY_LINES.replace("range(1000)", "range(3)")
+    with open(tmp_path / "log", "wb") as file, frozen_terminal("stopped") as screen:
+        log = screen.writing if shared else file.fileno()
+        screen.read()
+        with daemon(tmp_path, screen.writing, log, source) as one:
+            one.says("terminal", lambda state: state == "ok")
+            wait_for(lambda: "● running".encode() in screen.data)
+            assert ended(one.process, signal.SIGTERM) == 0
+        text = screen.all()
+    written = (tmp_path / "log").read_bytes()
+    assert (text.count(b"filler"), written.count(b"filler")) == ((3, 0) if shared else (0, 3))
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_a_closed_output_stops_nothing(tmp_path: Path, number: int) -> None:
+    (tmp_path / "config.toml").write_text(CONFIG.format(endpoint=free_endpoint()))
+    command = ["sh", "-c", f'exec "$@" {number}>&-', "sh", *PROGRAM, "run", "config.toml", "--seconds", "2"]
+    with program(command, subprocess.PIPE, subprocess.PIPE, tmp_path) as process:
+        out, said = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, said
+    assert (b"imu-monitor  1 device" in out) == (number == 2)
+    assert b"Traceback" not in said
+
+
+def test_a_second_interrupt_ends_at_once_on_a_frozen_terminal(tmp_path: Path) -> None:
+    with frozen_terminal("unread") as screen, daemon(tmp_path, *2 * [screen.writing], SLOW_TO_STOP) as one:
+        one.says("terminal", lambda state: state.startswith("blocked"))
+        one.process.send_signal(signal.SIGINT)
+        wait_for((tmp_path / "stopping").exists)
+        assert ended(one.process, signal.SIGINT) == -signal.SIGINT
+
+
+def test_a_log_that_nobody_reads_stops_neither_the_results_nor_the_end(tmp_path: Path) -> None:
+    with unread_pipe() as log, daemon(tmp_path, subprocess.DEVNULL, log.writing) as one:
+        one.says("log", lambda state: re.fullmatch(r"blocked for \d+ s: nobody reads standard error", state))
+        assert one.outputs.keys() == {"zenoh", "log"}
+        one.goes_on()
+        assert ended(one.process, signal.SIGTERM) == 0
+
+
+def test_a_log_that_is_read_again_says_how_many_lines_are_missing(tmp_path: Path) -> None:
+    with unread_pipe() as log, daemon(tmp_path, subprocess.DEVNULL, log.writing, MANY_LINES) as one:
+        one.says("log", lambda state: state.startswith("blocked") and "log lines dropped" in state)
+        one.goes_on()
+        log.read()
+        state = one.says("log", lambda state: state.startswith("ok"))
+        assert ended(one.process, signal.SIGTERM) == 0
+        text = log.all().decode()
+    found = re.search(r"([\d,]+) log lines were dropped because nobody read standard error", text)
+    assert found is not None
+    assert state == f"ok, but {found[1]} log lines dropped"
+    assert text.count("filler") + int(found[1].replace(",", "")) == 1000
+    assert "state=running" in text
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+def test_a_full_disk_behind_table_and_log_stops_neither_the_results_nor_the_end(tmp_path: Path) -> None:
+    with open("/dev/full", "wb") as full, daemon(tmp_path, full.fileno(), full.fileno()) as one:
+        one.says("log", lambda state: re.match(r"standard error cannot be written: No space left .*; \d+ log", state))
+        one.goes_on()
+        assert ended(one.process, signal.SIGTERM) == 0
+
+
+# --- the final table
+
+
+@pytest.mark.parametrize(
+    ("ending", "place"),
+    [
+        ("seconds", "file"),
+        ("end of the replay", "file"),
+        ("SIGTERM", "file"),
+        ("SIGINT", "file"),
+        ("end of the replay", "pipe"),
+        ("SIGTERM", "pipe"),
+    ],
+)
+def test_the_final_table_is_written_whatever_ended_the_run(tmp_path: Path, ending: str, place: str) -> None:
+    values = np.random.default_rng(1).standard_normal((500, 6))
+    save_samples(tmp_path / "short.npz", np.arange(500) / 100.0, values)
+    text = REPLAY if ending == "end of the replay" else CONFIG.format(endpoint=free_endpoint())
+    (tmp_path / "config.toml").write_text(text)
+    more = ["--seconds", "3"] if ending == "seconds" else []
+    reading, out = os.pipe() if place == "pipe" else (-1, os.open(tmp_path / "out", os.O_RDWR | os.O_CREAT))
+    with program([*PROGRAM, "run", "config.toml", *more], out, subprocess.PIPE, tmp_path) as process:
+        assert process.stderr is not None
+        if ending.startswith("SIG"):
+            until(process, b"state=running")
+            process.send_signal(getattr(signal, ending))
+        said = process.stderr.read()
+        assert process.wait(PATIENCE_S) == 0, said
+        process.stderr.close()
+    os.close(out)
+    table = (tmp_path / "out").read_bytes() if place == "file" else os.read(reading, 65536)
+    if place == "pipe":
+        os.close(reading)
+    assert table.count(b"imu-monitor  1 device") == 1
+    assert re.search(rb"^bench +", table, re.MULTILINE)
+    assert b"\x1b" not in table
+
+
+def until(process: "subprocess.Popen[bytes]", words: bytes) -> None:
+    """Read standard error up to a line with these words."""
+    assert process.stderr is not None
+    assert any(words in line for line in process.stderr)
+
+
+@pytest.mark.parametrize("place", ["full disk", "unread pipe"])
+def test_a_final_table_that_is_lost_is_an_error_where_nobody_asked_to_end(tmp_path: Path, place: str) -> None:
+    values = np.random.default_rng(1).standard_normal((500, 6))
+    save_samples(tmp_path / "short.npz", np.arange(500) / 100.0, values)
+    (tmp_path / "config.toml").write_text(REPLAY)
+    if place == "full disk" and not Path("/dev/full").exists():
+        pytest.skip("there is no /dev/full here")
+    with contextlib.ExitStack() as stack:
+        if place == "full disk":
+            out = stack.enter_context(open("/dev/full", "wb")).fileno()
+        else:
+            out = stack.enter_context(unread_pipe()).writing
+        process = stack.enter_context(program([*PROGRAM, "run", "config.toml"], out, subprocess.PIPE, tmp_path))
+        _, said = process.communicate(timeout=PATIENCE_S)
+        status = process.returncode
+    assert status == 1
+    why = "could not be written: No space left on device" if place == "full disk" else "was not written, because nobody"
+    assert said.decode().splitlines()[-1].startswith(f"imu-monitor: standard output: the final table {why}")
+
+
+# --- watch and view
+
+
+@pytest.mark.parametrize("place", ["terminal", "pipe", "pipe, once"])
+def test_watch_ends_although_nobody_reads_it(place: str) -> None:
+    endpoint = free_endpoint()
+    more = ["--seconds", "1"] if place == "pipe, once" else []
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(router(endpoint))
+        out = stack.enter_context(frozen_terminal("unread") if place == "terminal" else unread_pipe())
+        command = [*PROGRAM, "watch", "--connect", endpoint, *more]
+        process = stack.enter_context(program(command, out.writing, subprocess.DEVNULL))
+        wait_for(lambda: waits_for_reader(process.pid))
+        assert ended(process, signal.SIGTERM) == 0
+
+
+def test_watch_goes_on_when_it_is_read_again(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(router(endpoint))
+        screen = stack.enter_context(frozen_terminal("unread"))
+        process = stack.enter_context(
+            program([*PROGRAM, "watch", "--connect", endpoint], screen.writing, subprocess.DEVNULL)
+        )
+        wait_for(lambda: waits_for_reader(process.pid))
+        screen.read()
+        wait_for(lambda: screen.data.count(b"imu-monitor") > 2)
+        assert ended(process, signal.SIGTERM) == 0
+        wait_for(lambda: b"\x1b[?25h" in screen.data)
+
+
+def test_view_ends_although_nobody_reads_its_log() -> None:
+    endpoint = free_endpoint()  # nobody is there, which is said on standard error
+    with unread_pipe() as log:
+        command = [*PROGRAM, "view", "--connect", endpoint, "--viewer", "none"]
+        with program(command, subprocess.DEVNULL, log.writing) as process:
+            wait_for(lambda: waits_for_reader(process.pid))
+            assert ended(process, signal.SIGTERM) == 0

@@ -1,0 +1,220 @@
+"""Samples in over zenoh from another process, and every key out to another process through a router."""
+
+import csv
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from drivers.zenoh.sample_message import unpack
+from monitor.common import topics
+from tests.support.ports import free_endpoint
+from tests.support.recordings import recordings
+from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.zenoh_sessions import patient_file
+from tests.support.zenoh_sessions import router as zenoh_router
+from tests.system.rig import Cable, running
+
+
+@pytest.fixture
+def router() -> Iterator[str]:
+    endpoint = free_endpoint()
+    with zenoh_router(endpoint):
+        yield endpoint
+
+
+@pytest.mark.data
+def test_a_recording_from_another_process_gives_the_authors_table(tmp_path: Path, router: str) -> None:
+    folder = recordings()
+    path = folder / "adis16405" / "run1.npz"
+    with (folder / "reference" / "avar-package-allan-tables.csv").open() as file:
+        wanted = ("adis", "Gyroscope", "X")
+        rows = [row for row in csv.DictReader(file) if (row["key"], row["type"], row["axis"]) == wanted]
+    table = {round(float(row["tau_as_listed_s"]) * 100): np.radians(float(row["adev"])) for row in rows}
+    config = f"""[[device]]
+name = "run1"
+rate = 100.0
+window = 10000.0
+restart = false  # the whole recording is compared
+driver = {{ link = "zenoh", key = "lab/run1", mode = "client", connect = ["{router}"], silence = 30.0 }}
+[zenoh]
+mode = "none"
+[viewer]
+mode = "none"
+"""
+    with running(tmp_path, config) as run:
+        counts = run.station("run1").driver.counts
+        station = run.station("run1")
+        rows = min(20_000, station.ring.capacity // 2)
+        command = [sys.executable, "-m", "tests.system.publisher", str(path), "lab/run1", router, str(rows)]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, text=True) as publisher:
+            assert publisher.stdin is not None
+            for allowed in range(rows, 1_000_000 + rows, rows):
+                publisher.stdin.write("\n")
+                publisher.stdin.flush()
+                # all but the part of a block that is still to come
+                wanted = min(allowed - allowed % 1000, 1_000_000)
+                wait_for(lambda wanted=wanted: station.published >= wanted, "the samples")  # type: ignore[misc]
+            publisher.stdin.close()
+            assert publisher.wait(PATIENCE_S) == 0
+    assert (counts.received, counts.bad, counts.lost, run.station("run1").ring.overflowed) == (1_000_000, 0, 0, 0)
+    curve = run.caught.estimates["run1"].curve
+    shared = [(i, table[int(m)]) for i, m in enumerate(curve.factors) if int(m) in table]
+    assert len(shared) >= 15
+    places, want = map(list, zip(*shared, strict=True))
+    np.testing.assert_allclose(np.sqrt(curve.avar[places, 0]), want, rtol=1e-5)
+
+
+LISTENER = """
+import sys, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("scouting/multicast/enabled", "false")
+config.insert_json5("connect/endpoints", f'["{sys.argv[1]}"]')
+with zenoh.open(config) as session:
+    data = session.declare_subscriber("imu/**", zenoh.handlers.FifoChannel(10000))
+    alive = session.liveliness().declare_subscriber("imu/**", zenoh.handlers.FifoChannel(100), history=True)
+    print("ready", flush=True)
+    for line in sys.stdin:
+        for verb in line.split():
+            for reply in session.get(f"imu/bench-1/command/{verb}", timeout=float(sys.argv[2])):
+                answer = reply.ok or reply.err
+                print("reply", bytes(answer.payload).hex(), str(answer.encoding), flush=True)
+        for sample in iter(alive.try_recv, None):
+            print("alive", sample.key_expr, sample.kind == zenoh.SampleKind.PUT, flush=True)
+        for sample in iter(data.try_recv, None):
+            print("data", sample.key_expr, sample.encoding, bytes(sample.payload).hex(), flush=True)
+        print("done", flush=True)
+"""
+
+
+class Listener:
+    """A zenoh client in a process of its own."""
+
+    def __init__(self, endpoint: str) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", LISTENER, endpoint, str(PATIENCE_S)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self._process.stdout is not None
+        assert self._process.stdout.readline() == "ready\n"
+        self.heard: dict[str, list[tuple[str, bytes]]] = {}
+        self.alive: list[tuple[str, bool]] = []
+        self.replies: list[tuple[str, Any]] = []
+
+    def poll(self, *verbs: str) -> None:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(" ".join(verbs) + "\n")
+        self._process.stdin.flush()
+        for line in self._process.stdout:
+            word, *rest = line.split()
+            if word == "done":
+                return
+            if word == "alive":
+                self.alive.append((rest[0], rest[1] == "True"))
+            elif word == "reply":
+                self.replies.append((rest[1], msgspec.json.decode(bytes.fromhex(rest[0]))))
+            else:
+                self.heard.setdefault(rest[0], []).append((rest[1], bytes.fromhex(rest[2])))
+
+    def hears(self, condition: Any) -> bool:
+        self.poll()
+        return bool(condition())
+
+    def close(self) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        assert self._process.wait(PATIENCE_S) == 0
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+
+
+def test_a_client_behind_a_router_receives_every_key(tmp_path: Path, router: str) -> None:
+    config = f"""[[device]]
+name = "bench-1"
+rate = 100.0
+model = "consumer-mems"
+driver = {{ link = "virtual", silence = 300.0 }}  # the loss of the cable is noticed at once
+[zenoh]
+config = "{patient_file(tmp_path)}"
+mode = "peer"
+listen = ["{free_endpoint()}"]
+connect = ["{router}"]
+[viewer]
+mode = "none"
+"""
+    wanted = [t for t in topics.TOPICS if t.when in ("batches", "publish", "event", "1 Hz")]
+    keys = {topic.key("imu", "bench-1") for topic in wanted}
+    listener = Listener(router)
+    with running(tmp_path, config) as run:
+        imu = run.service.virtual["bench-1"]
+        wait_for(lambda: listener.hears(lambda: "imu/bench-1/coefficients" in listener.heard), "coefficients")
+        wait_for(lambda: listener.hears(lambda: listener.alive), "the token")
+        assert listener.alive == [("imu/bench-1/alive", True)]
+        imu.unplug()
+        wait_for(lambda: listener.hears(lambda: len(listener.alive) == 2), "the token to go")
+        imu.plug()
+        wait_for(lambda: listener.hears(lambda: len(listener.alive) == 3), "the token to come back")
+        assert listener.alive[1:] == [("imu/bench-1/alive", False), ("imu/bench-1/alive", True)]
+        wait_for(lambda: listener.hears(lambda: len(events(listener)) >= 2), "both events")
+        listener.poll("reset", "jump")
+        wait_for(lambda: listener.hears(lambda: keys <= set(listener.heard)), "every key")
+    listener.poll()
+    listener.close()
+    assert set(listener.heard) == keys
+    for topic in wanted:
+        for encoding, payload in listener.heard[topic.key("imu", "bench-1")]:
+            assert encoding == topic.encoding
+            if topic.encoding == topics.JSON:
+                content = msgspec.json.decode(payload)
+                assert content["schema"] == topic.schema()
+                assert content["device"] == "bench-1"
+                assert content["t"] > 1.7e9
+                assert content["samples"] >= 0
+    batches = [unpack(payload) for _, payload in listener.heard["imu/bench-1/samples"]]
+    # those before the first were sent before zenoh had joined the three sessions
+    assert sum(len(batch.block) for batch in batches[1:]) == batches[-1].samples - batches[0].samples
+    assert batches[-1].samples == run.station("bench-1").driver.counts.received
+    assert {"link_lost", "link_back"} <= set(events(listener))
+    (ok_encoding, ok), (error_encoding, error) = listener.replies
+    assert ok_encoding == error_encoding == topics.JSON
+    assert ok["device"] == "bench-1"
+    assert "reset" in error["error"]
+
+
+def events(listener: Listener) -> list[str]:
+    return [msgspec.json.decode(payload)["kind"] for _, payload in listener.heard.get("imu/bench-1/event", [])]
+
+
+def test_a_pulled_cable_costs_what_it_costs(tmp_path: Path) -> None:
+    """Bytes stop in the middle of a frame; the half frame is forgotten, the next frame counts."""
+    cable = Cable(tmp_path)
+    config = f"""[[device]]
+name = "board"
+rate = 100.0
+driver = {{ link = "serial", port = "{cable.port}", decoder = "text", decoder_options = {{ columns = ["gx"] }} }}
+[zenoh]
+mode = "none"
+[viewer]
+mode = "none"
+"""
+    with running(tmp_path, config) as run:
+        station = run.station("board")
+        wait_for(lambda: station.driver.link._port is not None, "the port")
+        cable.write(b"0.1\n0.2\n0.3\n0.")
+        wait_for(lambda: station.driver.counts.received == 2, "two whole lines behind the first")
+        cable.pull()
+        wait_for(lambda: station.driver.state == "lost", "the loss")
+        cable.plug()
+        wait_for(lambda: station.driver.link._port is not None, "the port again")
+        cable.write(b"4\n0.5\n0.6\n")
+        wait_for(lambda: station.driver.counts.received == 4, "two more lines")
+    assert run.caught.values("board")[:, 0].tolist() == [0.2, 0.3, 0.5, 0.6]
