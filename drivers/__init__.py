@@ -1,1 +1,1 @@
-"""Wire to numbers: links move bytes, decoders turn them into samples, a clock gives each its time."""
+"""Sensor drivers: links that move bytes, decoders that turn bytes into samples, and clocks that time each sample."""

@@ -1,4 +1,4 @@
-"""Finds the members of a folder of plug-ins by listing it, imports one when asked for, and types its file keys."""
+"""Discovery of plug-in modules: list the modules of a package, import one by name, suggest names for unknown ones."""
 
 import importlib
 import pkgutil
@@ -12,19 +12,47 @@ import msgspec
 from drivers.errors import ConfigError
 
 FilePath = Annotated[str, msgspec.Meta(extra={"file": "exists"})]
-"""A key that names a file which must be there; relative ones are meant beside the configuration file."""
+"""Settings key that names an existing file. A relative path is relative to the folder of the configuration file."""
 FileOrName = Annotated[str, msgspec.Meta(extra={"file": "or name"})]
-"""A key that names a file beside the configuration file, or something that is shipped."""
+"""Settings key that names a file in the folder of the configuration file, or something shipped with the program."""
 
 
 def names(package: ModuleType, suffix: str = "") -> tuple[str, ...]:
-    """Names of the members of ``package``, sorted, without their suffix; ``base`` is none of them."""
+    """Return the sorted names of the modules of a package that end with a suffix.
+
+    Parameters
+    ----------
+    package
+        Package that holds the modules.
+    suffix
+        End of the module names, such as "_link". It is removed from the returned names.
+
+    Returns
+    -------
+    tuple of str
+        Sorted names. A module called ``base`` is left out.
+    """
     found = (module.name for module in pkgutil.iter_modules(package.__path__))
     return tuple(sorted(n.removesuffix(suffix) for n in found if n != "base" and n.endswith(suffix)))
 
 
 def load(package: ModuleType, name: str, suffix: str = "") -> ModuleType:
-    """The module of one member; ConfigError with all names, the nearest first, when there is none."""
+    """Import one module of a package.
+
+    Parameters
+    ----------
+    package
+        Package that holds the module.
+    name
+        Name of the module without its suffix.
+    suffix
+        End of the module name, such as "_link".
+
+    Raises
+    ------
+    ConfigError
+        There is no such module. The text lists all names, the most similar one first.
+    """
     known = names(package, suffix)
     if name not in known:
         raise ConfigError(f'unknown name "{name}"{possible(name, known)}')
@@ -32,13 +60,33 @@ def load(package: ModuleType, name: str, suffix: str = "") -> ModuleType:
 
 
 def nearest(word: str, known: Sequence[str]) -> str:
-    """The end of an error line about an unknown word: the nearest known one, or all of them."""
+    """Return the end of an error message about an unknown word.
+
+    Parameters
+    ----------
+    word
+        The unknown word.
+    known
+        All known words.
+
+    Returns
+    -------
+    str
+        A question that suggests the most similar known word, or a list of all known words if none is similar.
+    """
     close = get_close_matches(word, known, n=1, cutoff=0.5)
     return f'; did you mean "{close[0]}"?' if close else f"; known are {', '.join(known)}"
 
 
 def possible(word: str, known: Sequence[str]) -> str:
-    """Return the end of an error line about a word that is none of ``known``: all of them, the nearest first.
+    """Return the end of an error message about an unknown word: a list of all known words, the most similar one first.
+
+    Parameters
+    ----------
+    word
+        The unknown word.
+    known
+        All known words.
 
     >>> possible("serail", ("can", "serial"))
     '; possible are serial, can'

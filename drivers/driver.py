@@ -1,8 +1,9 @@
-"""One device's reader: bytes from its link to samples with times, for ever.
+"""Driver of one device: reads bytes from its link, decodes them and gives each sample its time.
 
-``Driver.step`` is the corridor: read, feed, stamp, push; it decides nothing. ``Driver.run`` keeps it going in a
-thread of its own: a link that cannot be opened, is lost or falls silent is closed, reported, and opened again with
-growing pauses until the driver is stopped or a replay has ended. Nothing that happens to one device reaches another.
+``Driver.step`` performs one pass: read, decode, time-stamp, pass on. ``Driver.run`` repeats it in a thread of its own.
+If a link cannot be opened, is lost or falls silent, the driver closes it and reports an event. It then opens the link
+again after pauses of growing length, until the driver is stopped or a replay has ended. A fault of one device does not
+affect the others.
 """
 
 import threading
@@ -21,27 +22,35 @@ from drivers.sample import AXES, Chunk, Event, Given, SampleBlock, block
 from drivers.timing.sample_clock import SampleClock
 
 READ_TIMEOUT_S: Final = 0.2
-FIRST_PAUSE_S: Final = 0.1
-LONGEST_PAUSE_S: Final = 5.0
+"""Longest wait of one read for the first byte."""
+MIN_RETRY_PAUSE_S: Final = 0.1
+"""Pause before the first attempt to open a lost link again. The pause doubles with each attempt."""
+MAX_RETRY_PAUSE_S: Final = 5.0
+"""Longest pause between two attempts to open a link."""
 UNDECODED_BYTES: Final = 2000
-"""So many bytes without one sample: probably the wrong baud rate or decoder, and said so."""
-MUTE_S: Final = 3.0
-"""A running device whose bytes hold no sample for so long, and for ten sample periods, is lost."""
-EVENTS_KEPT: Final = 1000
-TELL_EVERY_S: Final = 1.0
+"""Received bytes without a sample after which the status names the probable cause, a wrong baud rate or decoder."""
+MIN_UNDECODED_S: Final = 3.0
+"""A running device is lost if its bytes hold no sample for this time and for ten sample periods."""
+MAX_QUEUED_EVENTS: Final = 1000
+"""Events kept until they are taken. Older ones are dropped."""
+LOSS_REPORT_INTERVAL_S: Final = 1.0
+"""Shortest time between two events about lost samples."""
 
 State = Literal["waiting", "running", "lost", "ended"]
 
 
 @dataclass(frozen=True, slots=True)
 class AxisMap:
-    """Which measured axis goes where: column i of the output is sign[i] · column source[i] of the decoder's."""
+    """Mapping of the axes of the sensor to the axes of the output, according to how the sensor is mounted.
+
+    Column i of the output is sign[i] times column source[i] of the decoded samples.
+    """
 
     source: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
     sign: tuple[float, ...] = (1.0,) * 6
 
     def apply(self, samples: SampleBlock) -> SampleBlock:
-        """The samples on the axes of the configuration."""
+        """Return the samples on the axes of the configuration."""
         if self == AxisMap():
             return samples
         values = samples.values[:, self.source] * np.array(self.sign)
@@ -50,24 +59,35 @@ class AxisMap:
 
 @dataclass(slots=True)
 class Counts:
-    """Samples of one device since its start; received + bad + lost = sent."""
+    """Numbers of samples of one device since the start: received + bad + lost = sent."""
 
     received: int = 0
     bad: int = 0
     lost: int = 0
-    late: int = 0  # of the lost: left out by the decoder because some of their frames came too late
+    late: int = 0  # part of the lost samples: the decoder left them out because frames arrived too late
 
 
 class Driver:
-    """Reads one device.
+    """Reader of one device.
 
-    Args:
-        name: the device's name in the configuration
-        link, decoder, clock: what it is read with
-        axes: the mounting
-        push: takes each stamped block; must not block
-        silence_s: the link is opened anew after so long without a byte; 0 = never
-        keep: takes the bytes as they came, too; must not block
+    Parameters
+    ----------
+    name
+        Name of the device in the configuration.
+    link
+        Source of the bytes.
+    decoder
+        Decoder of the wire format.
+    clock
+        Sample clock, which gives each sample its time.
+    push
+        Called with each block of samples after it has been time-stamped. It must not block.
+    axes
+        Mapping of the axes according to the mounting. None if the axes are not changed.
+    silence_s
+        Time without a byte in s after which the link is opened again; 0 = never.
+    keep
+        Called with the received chunks before they are decoded, to record the raw bytes. It must not block.
     """
 
     def __init__(
@@ -88,50 +108,51 @@ class Driver:
         self.counts = Counts()
         self.state: State = "waiting"
         self.text = f"waiting for {link.name}"
-        self.turns = 0  # how often it has read, with or without bytes, or tried to open: stands still when it is stuck
+        self.turns = 0  # number of reads and attempts to open; it does not increase while the driver is blocked
         self.times_are_unix = link.epoch == "unix" or isinstance(decoder.timing, Given)
         self.first_t_ns: int | None = None
-        """Time of the first sample since the start; None until it has come."""
+        """Time of the first sample since the start; None before the first sample."""
         self._push = push
         self._keep = keep
         self._axes = axes or AxisMap()
         self._silence_s = silence_s
-        self._events: deque[Event] = deque(maxlen=EVENTS_KEPT)
+        self._events: deque[Event] = deque(maxlen=MAX_QUEUED_EVENTS)
         self._stop = threading.Event()
-        self._undecoded = 0
+        self._undecoded_bytes = 0
         self._counts_late = decoder if isinstance(decoder, CountingLate) else None
-        self._placed = 0  # samples left out by the decoder whose places have been told as lost
-        self._heard_s = 0.0
-        self._sampled_s = 0.0
+        self._left_out_reported = 0  # samples left out by the decoder that have been reported as gaps
+        self._last_data_s = 0.0
+        self._last_sample_s = 0.0
         self._newest_t_ns = 0
-        self._untold = self._holes = 0  # samples missing, and in how many places, since that was told
-        self._told_s = -TELL_EVERY_S
+        self._unreported_samples = self._unreported_gaps = 0  # missing samples and gaps since the last report
+        self._last_report_s = -LOSS_REPORT_INTERVAL_S
 
     @property
     def late_hint(self) -> str:
-        """By how much frames of one sample come too late and what to do; "" if none has for a while."""
+        """Delay of the late frames of a sample and how to correct it; "" if no frame has been late for a while."""
         return self._counts_late.late_hint if self._counts_late else ""
 
     def take_events(self) -> list[Event]:
-        """Events since the last call, oldest first."""
+        """Return the events since the last call, oldest first."""
         return [self._events.popleft() for _ in range(len(self._events))]
 
     def stop(self) -> None:
-        """Ask ``run`` to end; a waiting read is ended too."""
+        """Ask ``run`` to end. A read that is waiting is ended, too."""
         self._stop.set()
         self.link.close()
 
     def run(self) -> None:
-        """Read until stopped; to be called in the device's own thread."""
+        """Read until the driver is stopped. This method is called in a thread of the device."""
         try:
             self._run()
         except Exception as error:
-            # a bug: the thread dies loudly, and the status does not go on saying that all is well
+            # a bug: the thread ends with the exception, and the status shows the fault
             self.state, self.text = "lost", f"reading ended by a fault of the program: {error!r}"
             raise
 
     def _run(self) -> None:
-        pause_s = FIRST_PAUSE_S
+        """Open the link and read from it. Repeat both after an error until the driver is stopped or a replay ends."""
+        pause_s = MIN_RETRY_PAUSE_S
         while not self._stop.is_set():
             received = self.counts.received
             self.turns += 1
@@ -140,7 +161,7 @@ class Driver:
                 self.link.open()
                 if not self.times_are_unix:
                     self.clock.link_idle(opening_ns)
-                self._heard_s = time.monotonic()
+                self._last_data_s = time.monotonic()
                 while not self._stop.is_set():
                     self.step()
             except LinkEnded as error:
@@ -149,15 +170,15 @@ class Driver:
                 return
             except LinkError as error:
                 if not self._stop.is_set():
-                    self._gone(error)
+                    self._handle_link_error(error)
             if self.counts.received > received:
-                pause_s = FIRST_PAUSE_S
+                pause_s = MIN_RETRY_PAUSE_S
             self._stop.wait(pause_s)
-            pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
+            pause_s = min(2.0 * pause_s, MAX_RETRY_PAUSE_S)
         self.link.close()
 
     def step(self) -> None:
-        """One read and all that follows from it."""
+        """Read once, and decode, time-stamp and pass on the samples."""
         self.turns += 1
         asked_ns = time.monotonic_ns()
         chunks = self.link.read(READ_TIMEOUT_S)
@@ -165,104 +186,118 @@ class Driver:
         if chunks is None:
             if not self.times_are_unix:
                 self.clock.link_idle(asked_ns)
-            self._watch_silence()
+            self._check_silence()
             return
-        self._heard_s = time.monotonic()
+        self._last_data_s = time.monotonic()
         if self._keep is not None:
             self._keep(chunks)
         samples = self.decoder.feed(chunks)
         if not samples:
-            self._watch_undecoded(sum(len(chunk.data) for chunk in chunks))
+            self._check_undecoded(sum(len(chunk.data) for chunk in chunks))
             return
-        self._sampled_s, self._undecoded = self._heard_s, 0
+        self._last_sample_s, self._undecoded_bytes = self._last_data_s, 0
         for one in samples:
-            # a decoder's hole is of samples it left out, or of messages that a sender counted and nobody received
-            left_out = min(one.lost, self._left_out() - self._placed)
-            self._placed += left_out
+            # missing samples were left out by the decoder, or were sent in messages that did not arrive
+            left_out = min(one.lost, self._left_out() - self._left_out_reported)
+            self._left_out_reported += left_out
             for stamped in self.clock.stamp(one):
                 self._count(stamped, left_out)
                 self._push(self._axes.apply(stamped))
-                left_out = 0  # they stood before the first row
+                left_out = 0  # they are missing before the first row
         self._count_left_out()
         self._tell_lost()
         self._events.extend(self.clock.take_events())
         if self.state != "running":
-            self._back()
+            self._handle_recovery()
 
     def _left_out(self) -> int:
-        """Samples that the decoder has left out, bad or late."""
+        """Return the number of samples that the decoder has left out because they were bad or late."""
         return self.decoder.bad + (self._counts_late.late if self._counts_late else 0)
 
     def _count_left_out(self) -> None:
+        """Update the counts of bad and late samples."""
         self.counts.bad = self.decoder.bad
         if self._counts_late:
             self.counts.lost += self._counts_late.late - self.counts.late
             self.counts.late = self._counts_late.late
 
     def _count(self, stamped: SampleBlock, left_out: int) -> None:
+        """Count the samples of a block and those missing before it, apart from samples that the decoder left out."""
         if self.first_t_ns is None:
             self.first_t_ns = int(stamped.t_ns[0])
         self.counts.received += len(stamped)
         self._newest_t_ns = int(stamped.t_ns[-1])
         if stamped.lost:
             self.counts.lost += max(0, stamped.lost - left_out)
-            self._untold += stamped.lost
-            self._holes += 1
+            self._unreported_samples += stamped.lost
+            self._unreported_gaps += 1
 
     def _tell_lost(self) -> None:
-        """One event a second at most: a bad line must not drown all else."""
-        if not self._untold or time.monotonic() - self._told_s < TELL_EVERY_S:
+        """Report missing samples, at most once a second, so that a bad line does not hide other events."""
+        if not self._unreported_samples or time.monotonic() - self._last_report_s < LOSS_REPORT_INTERVAL_S:
             return
-        places = "" if self._holes == 1 else f" in {self._holes} places"
-        self._event("samples_lost", f"{self._untold} samples missing{places}")
-        self._untold = self._holes = 0
-        self._told_s = time.monotonic()
+        places = "" if self._unreported_gaps == 1 else f" in {self._unreported_gaps} places"
+        self._event("samples_lost", f"{self._unreported_samples} samples missing{places}")
+        self._unreported_samples = self._unreported_gaps = 0
+        self._last_report_s = time.monotonic()
 
-    def _watch_silence(self) -> None:
-        silent_s = time.monotonic() - self._heard_s
+    def _check_silence(self) -> None:
+        """Raise LinkLost if the link has been silent for longer than the limit."""
+        silent_s = time.monotonic() - self._last_data_s
         if self._silence_s and silent_s > self._silence_s:
             raise LinkLost(f"{self.link.name} silent for {silent_s:.1f} s")
 
-    def _watch_undecoded(self, size: int) -> None:
+    def _check_undecoded(self, size: int) -> None:
+        """Report a device whose bytes hold no samples."""
         self._count_left_out()
-        self._undecoded += size
-        mute_s = self._heard_s - self._sampled_s
-        patience_s = max(MUTE_S, 10.0 / (self.clock.rate_hz or 10.0))
-        if self._undecoded < UNDECODED_BYTES or (self.state == "running" and mute_s < patience_s):
+        self._undecoded_bytes += size
+        mute_s = self._last_data_s - self._last_sample_s
+        patience_s = max(MIN_UNDECODED_S, 10.0 / (self.clock.rate_hz or 10.0))
+        if self._undecoded_bytes < UNDECODED_BYTES or (self.state == "running" and mute_s < patience_s):
             return
         why = self.decoder.hint or "wrong baud rate, or another protocol than the configured one"
-        self.text = f"{self.link.name}: {self._undecoded} bytes and no sample in them; {why}"
+        self.text = f"{self.link.name}: {self._undecoded_bytes} bytes and no sample in them; {why}"
         if self.state == "running":
             self._event("link_lost", self.text)
             self.state = "lost"
             self.clock.pause()
 
-    def _back(self) -> None:
+    def _handle_recovery(self) -> None:
+        """Report that samples arrive again."""
         if self.state == "lost":
             self._event("link_back", f"{self.link.name} is back")
         self.state, self.text = "running", ""
 
-    def _gone(self, error: LinkError) -> None:
+    def _handle_link_error(self, error: LinkError) -> None:
+        """Report a lost link, close it and reset the decoder."""
         if self.state == "running":
             self._event("link_lost", str(error))
             self.state = "lost"
         self.text = f"{error}; trying again"
         self.link.close()
         self.decoder.reset()
-        self._placed = self._left_out()
+        self._left_out_reported = self._left_out()
         self.clock.pause()
 
     def _event(self, kind: str, text: str) -> None:
-        # the host's clock at the moment, in the epoch of the samples
+        """Queue an event."""
+        # the present time in the epoch of the samples
         t_ns = self._newest_t_ns if self.times_are_unix else time.monotonic_ns()
         self._events.append(Event(kind, t_ns, text))
 
 
 def axis_map(table: dict[str, str]) -> AxisMap:
-    """The map of ``[device.axes]``, e.g. ``{"gz": "-gy"}``: output axis <- signed measured axis.
+    """Return the axis map of the table ``[device.axes]``, for example ``{"gz": "-gy"}``.
 
-    Raises:
-        ConfigError: an axis that is none of AXES, or of the other kind
+    Parameters
+    ----------
+    table
+        Signed axis of the sensor for each axis of the output.
+
+    Raises
+    ------
+    ConfigError
+        An axis is not one of AXES, or an axis of a gyroscope is mapped to one of an accelerometer or the reverse.
     """
     source, sign = list(range(6)), [1.0] * 6
     wrong = []

@@ -1,34 +1,37 @@
-"""The error tree of the project. A class is the matching builtin too, where there is one.
+"""Exception classes of the project. Each class also inherits from the matching built-in exception if there is one.
 
     ImuError
       ConfigError(ValueError)        only while starting; the service refuses to start
       LinkError(OSError)
-        LinkUnavailable              cannot open: no port, no library, no permission; retried
-        LinkLost                     was open, is gone; retried with back-off
-        LinkEnded                    a replay has given all it had; not retried
-      DecodeError(ValueError)        from one frame only; ``feed`` counts it and goes on
-      RecordingError(ValueError)     a file that is not a recording, or an empty one
-      NotReady                       too few samples for an answer
+        LinkUnavailable              cannot be opened (no port, library or permission); opening is retried
+        LinkLost                     was open and failed; opening is retried with growing pauses
+        LinkEnded                    the replayed source has ended; not retried
+      DecodeError(ValueError)        concerns one frame; ``feed`` counts it and continues
+      RecordingError(ValueError)     the file is not a recording, or it is empty
+      NotReady                       too few samples for a result
 
-Vendor exceptions are turned into these at the link, with ``from``. Any other exception out of a
-pure room is a bug.
+Links turn exceptions of vendor libraries into these classes, with ``from``. Any other exception from a module that does
+no I/O is a bug.
 """
 
 from typing import Final
 
 LONGEST: Final = 2000
-"""Characters of an error's text; it may quote what somebody sent."""
+"""Maximum length of the text of an error in characters. The text may quote received data."""
 
 
 class ImuError(Exception):
-    """Root of all that this project raises on purpose; its text is one line that a terminal can be given."""
+    """Base class of all exceptions that this project raises on purpose.
+
+    The text is one line without control characters.
+    """
 
     def __str__(self) -> str:
         return in_one_line(super().__str__())
 
 
 def in_one_line(text: str) -> str:
-    """The text without line ends and control characters, and not endless.
+    """Return the text in one line without control characters, cut after LONGEST characters.
 
     >>> in_one_line("no key \\x1b[2J\\nhere")
     'no key  [2J here'
@@ -38,12 +41,12 @@ def in_one_line(text: str) -> str:
 
 
 class ConfigError(ImuError, ValueError):
-    """What was asked for is wrong: names the file, key or line, and what would be right.
+    """An invalid setting or option. The text names the file, key or line, and the values that would be valid.
 
     Parameters
     ----------
     *lines
-        One line for each mistake, if several were found at once.
+        One line for each mistake.
 
     >>> str(ConfigError("rate: missing", "window: missing"))
     'rate: missing; window: missing'
@@ -51,7 +54,7 @@ class ConfigError(ImuError, ValueError):
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """One line for each mistake."""
+        """Lines of the message, one for each mistake."""
         return tuple(in_one_line(str(line)) for line in self.args)
 
     def __str__(self) -> str:
@@ -59,23 +62,23 @@ class ConfigError(ImuError, ValueError):
 
 
 class LinkError(ImuError, OSError):
-    """A link cannot do its work."""
+    """Base class of the errors of a link."""
 
 
 class LinkUnavailable(LinkError):
-    """The link cannot be opened now; it will be tried again."""
+    """The link cannot be opened now. Opening is tried again."""
 
 
 class LinkLost(LinkError):
-    """The link was open and is gone; it will be opened again."""
+    """An open link has failed. It is opened again."""
 
 
 class LinkEnded(LinkError):
-    """A replayed source has come to its end."""
+    """The end of a replayed source has been reached."""
 
 
 class DecodeError(ImuError, ValueError):
-    """One frame does not follow its format."""
+    """A frame violates its format."""
 
 
 class RecordingError(ImuError, ValueError):
@@ -83,4 +86,4 @@ class RecordingError(ImuError, ValueError):
 
 
 class NotReady(ImuError):
-    """Too few samples for an answer."""
+    """There are too few samples for a result."""

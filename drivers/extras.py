@@ -1,4 +1,4 @@
-"""Packages that only an extra of the installation brings: are they there, and how to install them."""
+"""Optional packages: check that the packages of an installation extra are installed, and say how to install them."""
 
 import importlib.util
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ EXTRAS: Final[Mapping[str, Mapping[str, str]]] = {
     "can": {"can": "python-can", "cantools": "cantools"},
     "reconcile": {"scipy": "SciPy"},
 }
-"""Extra -> module -> name of its package."""
+"""Map from an extra to its modules, and from each module to the name of its package."""
 
 
 def missing_packages(extra: str) -> tuple[str, ...]:
@@ -19,12 +19,19 @@ def missing_packages(extra: str) -> tuple[str, ...]:
 
 
 def check_extra(extra: str, user: str) -> None:
-    """Raise ConfigError if a package of an extra is not installed.
+    """Check that all packages of an extra are installed.
 
     Parameters
     ----------
-    extra : key of EXTRAS.
-    user : what needs the packages, as the subject of the message.
+    extra
+        Key of EXTRAS.
+    user
+        Feature that needs the packages, as the subject of the message.
+
+    Raises
+    ------
+    ConfigError
+        A package is missing. The text says how to install it.
     """
     if missing := missing_packages(extra):
         raise ConfigError(f'{user} needs {" and ".join(missing)}: pip install "imu-monitor[{extra}]"')

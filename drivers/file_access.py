@@ -1,7 +1,7 @@
-"""Opening files by a name from a configuration, a folder or the command line.
+"""Safe opening and reading of files whose names come from a configuration, a folder or the command line.
 
-``open_regular`` opens regular files only. A FIFO, a socket, a device or a directory in place of a file is refused with
-one line, and opening never waits. ``read`` reads a small file whole: a configuration, a model, a CAN database.
+``open_regular`` opens regular files only. It refuses a FIFO, a socket, a device or a directory with a one-line error,
+and it never blocks. ``read`` reads a whole small file, such as a configuration, a model or a CAN database.
 """
 
 import errno
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import IO, Final
 
 MOST_BYTES: Final = 32_000_000
-"""The largest CAN databases of whole vehicles have some megabytes."""
+"""Maximum size of a file that ``read`` accepts. The largest CAN databases of whole vehicles have some megabytes."""
 KINDS: Final = {
     stat.S_IFIFO: "a FIFO",
     stat.S_IFSOCK: "a socket",
@@ -19,25 +19,29 @@ KINDS: Final = {
     stat.S_IFCHR: "a character device",
     stat.S_IFBLK: "a block device",
 }
+"""Names of the kinds of files that are not regular, for error messages."""
 
 
 def path(name: str) -> Path:
-    """What people write for a file; ``~`` is somebody's home, where there is such a person."""
+    """Return the path for a name as users write it.
+
+    A leading ``~`` is replaced by the home folder if the user exists.
+    """
     return Path(os.path.expanduser(name))
 
 
 def real_path(path: Path) -> Path:
-    """Return the absolute path with symbolic links followed. A loop of links stays as it is, where pathlib raises."""
+    """Return the absolute path with symbolic links followed. A loop of links is kept, where pathlib raises."""
     return Path(os.path.realpath(path))
 
 
 def is_file(path: Path) -> bool:
-    """Whether it is there; false too for a name that no file can have, where pathlib raises for some."""
+    """Return True if the path is an existing file. Return False for an invalid name, where pathlib may raise."""
     return os.path.isfile(path)
 
 
 def open_regular(path: Path) -> IO[bytes]:
-    """Open a regular file for reading; symbolic links are followed.
+    """Open a regular file for reading. Symbolic links are followed.
 
     Parameters
     ----------
@@ -52,10 +56,10 @@ def open_regular(path: Path) -> IO[bytes]:
     Raises
     ------
     OSError
-        The file cannot be opened, or is not a regular file. ``strerror`` says which, without the path.
+        The file cannot be opened, or it is not a regular file. ``strerror`` gives the reason without the path.
     """
-    check_regular(path)  # before anything is opened: opening a device may do something
-    # the file may have been replaced since: without blocking, and checked again
+    check_regular(path)  # check before opening, since opening a device may have side effects
+    # the file may have been replaced since: open without blocking, and check again
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
     try:
         _check_mode(path, os.fstat(descriptor).st_mode)
@@ -68,12 +72,12 @@ def open_regular(path: Path) -> IO[bytes]:
 def check_regular(path: Path) -> None:
     """Check that a name belongs to a regular file, for libraries that open a file themselves.
 
-    Nothing is opened: closing another descriptor of a file would drop the locks that SQLite holds on it.
+    The file is not opened. Closing another descriptor of a file would drop the locks that SQLite holds on it.
 
     Raises
     ------
     OSError
-        There is no such file, or it is not a regular file. ``strerror`` says which, without the path.
+        There is no such file, or it is not a regular file. ``strerror`` gives the reason without the path.
     """
     try:
         mode = os.stat(path).st_mode
@@ -83,12 +87,12 @@ def check_regular(path: Path) -> None:
 
 
 def check_folder(path: Path) -> None:
-    """Check that nothing but a folder has this name; that nothing has it is fine.
+    """Check that a name belongs to a folder or to nothing.
 
     Raises
     ------
     OSError
-        Something else has this name. ``strerror`` says what, without the path.
+        Something else has this name. ``strerror`` says what it is, without the path.
     """
     try:
         mode = os.stat(path).st_mode
@@ -100,15 +104,20 @@ def check_folder(path: Path) -> None:
 
 
 def read(path: Path, *, pipe: bool = False) -> bytes:
-    """Read a small file whole.
+    """Read a whole small file.
 
     Parameters
     ----------
     path
         Name of the file.
     pipe
-        True if a pipe is read as well, for a name given on the command line: ``/dev/stdin`` or ``<(command)``. Opening
-        and reading a pipe wait for its writer.
+        True if a pipe may be read as well, for a name given on the command line: ``/dev/stdin`` or ``<(command)``.
+        Opening and reading a pipe wait for its writer.
+
+    Returns
+    -------
+    bytes
+        Content of the file.
 
     Raises
     ------
@@ -123,13 +132,15 @@ def read(path: Path, *, pipe: bool = False) -> bytes:
 
 
 def _is_fifo(path: Path) -> bool:
+    """Return True if the path is a FIFO."""
     try:
         return stat.S_ISFIFO(os.stat(path).st_mode)
-    except (OSError, ValueError):  # the reader says what is wrong
+    except (OSError, ValueError):  # reading the file reports the error
         return False
 
 
 def _check_mode(path: Path, mode: int) -> None:
+    """Raise OSError if the mode is not that of a regular file."""
     if not stat.S_ISREG(mode):
         kind = KINDS.get(stat.S_IFMT(mode), "something else")
         number = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL

@@ -1,7 +1,7 @@
-"""What travels: a ``Chunk`` from a link, a ``SampleBlock`` from a decoder on, an ``Event`` beside them.
+"""Data types that modules exchange: ``Chunk`` (received bytes), ``SampleBlock`` (decoded samples) and ``Event``.
 
-SI throughout: rad/s, m/s², °C. One word per clock: ``t_ns`` is the host's monotonic clock in
-nanoseconds, or Unix time where the source brings its own times; ``ticks`` is the device's counter.
+All values are in SI units: rad/s and m/s². Temperatures are in °C. ``t_ns`` is the monotonic clock of the host in
+nanoseconds. If the source brings its own times, ``t_ns`` is Unix time instead. ``ticks`` is the counter of the device.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,40 +19,40 @@ AXES: Final = ("gx", "gy", "gz", "ax", "ay", "az")
 """Axis order of every array with six columns: gyroscopes in rad/s, accelerometers in m/s²."""
 
 NO_TICK: Final = -1
-"""``ticks`` of a sample whose frame carried no counter."""
+"""Value of ``ticks`` for a sample whose frame carried no counter."""
 
 EXTENDED_ID: Final = 1 << 31
-"""Flag of a CAN address: a 29-bit identifier."""
+"""Flag of a CAN address with a 29-bit identifier."""
 
 ANY_SOURCE: Final = 1 << 30
-"""Flag of a CAN address to listen for: J1939, only its parameter group counts, not who sends it."""
+"""Flag of a CAN address to receive. Only the J1939 parameter group has to match, whatever the source address is."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Bytes as they came."""
+    """Bytes as a link received them, with their arrival time."""
 
     data: bytes
-    t_ns: int  # host monotonic at receipt, or Unix time where the link replays recorded times
+    t_ns: int  # host monotonic time of arrival, or Unix time if the link replays recorded times
     address: int = 0  # CAN identifier; bit 31 set for 29-bit identifiers
-    attachment: bytes = b""  # what the transport carried beside the payload (zenoh)
+    attachment: bytes = b""  # data that the transport sent along with the payload (zenoh)
 
 
 @dataclass(frozen=True, slots=True)
 class SampleBlock:
-    """Consecutive samples of one device, n ≥ 1; ``lost`` samples are missing just before the first."""
+    """Consecutive samples of one device, n ≥ 1. ``lost`` samples are missing just before the first one."""
 
     t_ns: Ints  # [n]
     values: Floats  # [n, 6] in AXES order, rad/s and m/s²; NaN = not measured
     temperature_c: Floats  # [n] °C; NaN = not measured
-    ticks: Ints  # [n] device counter as on the wire; NO_TICK = none
+    ticks: Ints  # [n] device counter as transmitted; NO_TICK = none
     lost: int = 0
 
     def __len__(self) -> int:
         return int(self.t_ns.size)
 
     def __getitem__(self, rows: slice) -> "SampleBlock":
-        """Rows of the block; ``lost`` stays with the first row."""
+        """Return some rows of the block. ``lost`` is kept only if the first row is among them."""
         first = rows.indices(len(self))[0]
         return SampleBlock(
             self.t_ns[rows],
@@ -70,7 +70,21 @@ def block(
     ticks: Ints | None = None,
     lost: int = 0,
 ) -> SampleBlock:
-    """A block with read-only arrays; temperature and counter are absent unless given."""
+    """Return a ``SampleBlock`` and make its arrays read-only.
+
+    Parameters
+    ----------
+    t_ns
+        [n] int64, times in ns.
+    values
+        [n, 6] float64 in the order of AXES, rad/s and m/s². NaN means not measured.
+    temperature_c
+        [n] float64 in °C, NaN means not measured. None if no temperature was measured.
+    ticks
+        [n] int64, counter of the device. None if there is no counter.
+    lost
+        Number of samples that are missing just before the first one.
+    """
     n = int(t_ns.size)
     temperature_c = np.full(n, np.nan) if temperature_c is None else temperature_c
     ticks = np.full(n, NO_TICK, np.int64) if ticks is None else ticks
@@ -81,12 +95,16 @@ def block(
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """No counter on the wire: a sample's time is regressed from when its bytes arrived."""
+    """Timing of a wire format without a counter: sample times are estimated from arrival times by regression."""
 
 
 @dataclass(frozen=True, slots=True)
 class Counter:
-    """The frame carries a counter. ``tick_s``: seconds a tick, or None where it counts samples."""
+    """Timing of a wire format whose frames carry a counter.
+
+    ``modulus`` is the number of counts after which the counter starts again at 0. ``tick_s`` is the length of one count
+    in seconds, or None if the counter counts samples.
+    """
 
     modulus: int
     tick_s: float | None = None
@@ -94,7 +112,7 @@ class Counter:
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """The payload carries Unix times; ``Chunk.t_ns`` is not used."""
+    """Timing of a wire format whose payload carries Unix times. ``Chunk.t_ns`` is not used."""
 
 
 Timing = Arrival | Counter | Given
@@ -119,14 +137,14 @@ KINDS: Final = (
     "recording_stopped",
     "recording_back",
 )
-"""Of an ``Event``: what a hook may wait for."""
+"""Allowed values of ``Event.kind``. A hook can be configured for each of them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something happened to a device: what, when, how large, how sure."""
+    """Something that happened to a device, with its kind, time, size and significance."""
 
-    kind: str  # of KINDS
+    kind: str  # one of KINDS
     t_ns: int
     text: str
     axis: str | None = None
@@ -136,7 +154,7 @@ class Event:
 
 
 def join(blocks: Sequence[SampleBlock]) -> SampleBlock:
-    """One block of several; ``lost`` of all is summed at the front."""
+    """Concatenate blocks into one. The ``lost`` counts of all blocks are added up before the first sample."""
     return block(
         np.concatenate([b.t_ns for b in blocks]),
         np.concatenate([b.values for b in blocks]),
@@ -147,13 +165,17 @@ def join(blocks: Sequence[SampleBlock]) -> SampleBlock:
 
 
 def unbroken(blocks: Sequence[SampleBlock]) -> list[SampleBlock]:
-    """The same samples in as few blocks as can be: a new one only where samples are missing."""
+    """Join blocks between which no samples are missing. A new block begins only where samples are missing."""
     edges = [*(i for i, one in enumerate(blocks) if i == 0 or one.lost), len(blocks)]
     return [blocks[a] if b - a == 1 else join(blocks[a:b]) for a, b in pairwise(edges)]
 
 
 def seconds_to_ns(seconds: Floats) -> Ints:
-    """Whole nanoseconds; the integer part is kept apart, so nothing is lost beyond the float's own 0.24 µs."""
+    """Convert seconds [n] to whole nanoseconds [n].
+
+    Integer part and fraction are converted separately. The only error is the resolution of a float64 of Unix seconds,
+    0.24 µs.
+    """
     whole = np.floor(seconds)
     fraction = np.rint((seconds - whole) * 1e9)
     result: Ints = whole.astype(np.int64) * 1_000_000_000 + fraction.astype(np.int64)
@@ -161,7 +183,7 @@ def seconds_to_ns(seconds: Floats) -> Ints:
 
 
 def ns_to_seconds(t_ns: Ints) -> Floats:
-    """A float64 of Unix seconds holds 0.24 µs."""
+    """Convert nanoseconds [n] to seconds [n]. A float64 of Unix seconds has a resolution of 0.24 µs."""
     whole, rest = np.divmod(t_ns, 1_000_000_000)
     result: Floats = whole + rest * 1e-9
     return result

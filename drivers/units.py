@@ -1,9 +1,9 @@
-"""Names of units that people write in settings and CAN databases -> factors to SI.
+"""Conversion factors from unit names to SI, for units in settings and CAN databases.
 
-Each table maps a spelling to the factor that turns a number in that unit into rad/s, m/s², s; a
-temperature also has an offset. Spellings are those of data sheets, DBC files and plots; case matters
-(``mg`` is not ``Mg``), blanks around a name do not. A name that no table holds is a ``ConfigError``
-that names it and all that are known, the nearest first.
+Each table maps the spelling of a unit to the factor that converts a number in that unit to rad/s, m/s² or s. A
+temperature unit also has an offset. The spellings are those of data sheets, DBC files and plots. Case matters, since
+``mg`` is not ``Mg``. Blanks around a name are ignored. An unknown name raises a ``ConfigError`` that lists all known
+names, the most similar one first.
 """
 
 import math
@@ -14,11 +14,11 @@ from drivers.discovery import possible
 from drivers.errors import ConfigError
 
 G0: Final = 9.80665
-"""m/s²; standard acceleration of free fall, exact by definition (CGPM 1901)."""
+"""Standard acceleration of free fall in m/s², exact by definition (CGPM 1901)."""
 DEGREE: Final = math.pi / 180.0
-"""rad."""
+"""One degree in rad."""
 KELVIN_OFFSET: Final = -273.15
-"""°C at 0 K, exact by definition of the degree Celsius."""
+"""Temperature of 0 K in °C, exact by definition of the degree Celsius."""
 
 RATE: Final[Mapping[str, float]] = {
     "rad/s": 1.0,
@@ -36,7 +36,7 @@ RATE: Final[Mapping[str, float]] = {
     "deg/hr": DEGREE / 3600.0,
     "°/h": DEGREE / 3600.0,
 }
-"""Angular rate: unit -> rad/s."""
+"""Factor from each unit of angular rate to rad/s."""
 
 ACCELERATION: Final[Mapping[str, float]] = {
     "m/s²": 1.0,
@@ -51,7 +51,7 @@ ACCELERATION: Final[Mapping[str, float]] = {
     "µg": 1e-6 * G0,
     "ug": 1e-6 * G0,
 }
-"""Acceleration: unit -> m/s²."""
+"""Factor from each unit of acceleration to m/s²."""
 
 TEMPERATURE: Final[Mapping[str, tuple[float, float]]] = {
     "°C": (1.0, 0.0),
@@ -65,7 +65,7 @@ TEMPERATURE: Final[Mapping[str, tuple[float, float]]] = {
     "degF": (5.0 / 9.0, -160.0 / 9.0),
     "F": (5.0 / 9.0, -160.0 / 9.0),
 }
-"""Temperature: unit -> (factor, offset), °C = factor · number + offset."""
+"""Factor and offset of each unit of temperature: °C = factor · number + offset."""
 
 TIME: Final[Mapping[str, float]] = {
     "s": 1.0,
@@ -75,14 +75,21 @@ TIME: Final[Mapping[str, float]] = {
     "us": 1e-6,
     "ns": 1e-9,
 }
-"""Time: unit -> s."""
+"""Factor from each unit of time to s."""
 
 T = TypeVar("T")
 
 
 def rate_factor(unit: str) -> float:
-    """rad/s in one ``unit`` of angular rate.
+    """Return the factor from a unit of angular rate to rad/s.
 
+    Raises
+    ------
+    ConfigError
+        The unit is unknown.
+
+    Examples
+    --------
     >>> round(rate_factor("deg/s"), 6)
     0.017453
     """
@@ -90,8 +97,15 @@ def rate_factor(unit: str) -> float:
 
 
 def acceleration_factor(unit: str) -> float:
-    """m/s² in one ``unit`` of acceleration.
+    """Return the factor from a unit of acceleration to m/s².
 
+    Raises
+    ------
+    ConfigError
+        The unit is unknown.
+
+    Examples
+    --------
     >>> acceleration_factor("g")
     9.80665
     """
@@ -99,8 +113,15 @@ def acceleration_factor(unit: str) -> float:
 
 
 def temperature_scale(unit: str) -> tuple[float, float]:
-    """(factor, offset) of a ``unit`` of temperature: °C = factor · number + offset.
+    """Return factor and offset of a unit of temperature: °C = factor · number + offset.
 
+    Raises
+    ------
+    ConfigError
+        The unit is unknown.
+
+    Examples
+    --------
     >>> temperature_scale("K")
     (1.0, -273.15)
     """
@@ -108,8 +129,15 @@ def temperature_scale(unit: str) -> tuple[float, float]:
 
 
 def time_factor(unit: str) -> float:
-    """Seconds in one ``unit`` of time.
+    """Return the factor from a unit of time to s.
 
+    Raises
+    ------
+    ConfigError
+        The unit is unknown.
+
+    Examples
+    --------
     >>> time_factor("ms")
     0.001
     """
@@ -117,7 +145,8 @@ def time_factor(unit: str) -> float:
 
 
 def _look_up(table: Mapping[str, T], unit: str, quantity: str) -> T:
-    # Unicode holds the micro sign twice; keyboards and fonts give either
+    """Return the entry of a unit. Raise ConfigError if the table does not contain the unit."""
+    # Unicode has two characters for the prefix micro, and keyboards and fonts produce either of them
     name = unit.strip().replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
     if name not in table:
         raise ConfigError(f'"{unit}" is no unit of {quantity}{possible(name, tuple(table))}')

@@ -1,11 +1,12 @@
 """Sizes of the messages of an Arrow IPC stream, read before any data are unpacked.
 
-A record batch states its number of rows, and a compressed buffer its unpacked size. pyarrow allocates what they state,
-and cannot be given a limit. ``batch_sizes`` therefore reads the metadata of each message itself: the framing, the few
+A record batch states its number of rows, and a compressed buffer its unpacked size. pyarrow allocates the stated sizes
+and does not accept a limit. ``batch_sizes`` therefore reads the metadata of each message itself: the framing, the few
 fields of the flatbuffer that give sizes, and the first eight bytes of each compressed buffer. It reads no data.
 
-Sources: the Arrow columnar format, "Encapsulated message format" and "Compression", https://arrow.apache.org/docs/format;
-format/Message.fbs and Schema.fbs for the numbers of the fields; the FlatBuffers internals for tables and vectors.
+Sources: the Arrow columnar format, "Encapsulated message format" and "Compression",
+https://arrow.apache.org/docs/format; format/Message.fbs and Schema.fbs for the numbers of the fields; the FlatBuffers
+internals for tables and vectors.
 """
 
 import os
@@ -16,7 +17,7 @@ from typing import IO, Any, Final
 
 CONTINUATION: Final = 0xFFFFFFFF
 MAX_METADATA_BYTES: Final = 64_000_000
-"""Of one message; a schema of 10 000 columns needs some 2 MB."""
+"""Maximum size of the metadata of one message. A schema of 10 000 columns needs about 2 MB."""
 SCHEMA: Final = 1  # values of MessageHeader
 DICTIONARY_BATCH: Final = 2
 RECORD_BATCH: Final = 3
@@ -41,7 +42,7 @@ class BatchSize:
 
 
 def batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[BatchSize]:
-    """Yield the stated sizes of the batches of a stream up to its end, a cut or damaged metadata.
+    """Yield the stated sizes of the batches of a stream, up to its end, a truncation or damaged metadata.
 
     Parameters
     ----------
@@ -53,7 +54,7 @@ def batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[BatchSize]:
     Yields
     ------
     BatchSize
-        Of each record batch and dictionary, in the order of the file.
+        Size of each record batch and dictionary, in the order of the file.
     """
     end = file.seek(0, os.SEEK_END)
     at = start
@@ -61,7 +62,7 @@ def batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[BatchSize]:
         file.seek(at)
         mark, size = struct.unpack("<II", file.read(8))
         at += 8
-        if mark != CONTINUATION:  # streams before Arrow 0.15 have no such mark
+        if mark != CONTINUATION:  # streams written before Arrow 0.15 lack this mark
             size, at = mark, at - 4
         if not 0 < size <= MAX_METADATA_BYTES or at + size > end:
             return
@@ -93,15 +94,15 @@ def check_buffers(size: BatchSize, counts: Sequence[int | None], slack_bytes: in
     size
         Stated size of the batch.
     counts
-        Number of buffers of each column in the order of the schema; negative if the column is not read, None if the
-        number is unknown. The buffers behind an unknown number are all checked.
+        Number of buffers of each column in the order of the schema. It is negative if the column is not read, and None
+        if the number is unknown. All buffers after an unknown number are checked.
     slack_bytes
-        Allowed above eight bytes per row.
+        Size allowed in addition to eight bytes per row.
 
     Returns
     -------
     str
-        What is wrong, empty if nothing is.
+        Description of the error, "" if there is none.
     """
     most = 8 * size.rows + slack_bytes
     at = 0
@@ -131,6 +132,7 @@ def buffer_count(pa: Any, type_: Any) -> int | None:
 
 
 def _batch_size(file: IO[bytes], batch: "_Table", body: int, body_bytes: int, dictionary: bool) -> BatchSize:
+    """Return the stated size of a batch whose body begins at the offset ``body`` of the file."""
     rows = batch.number(BATCH_LENGTH, "q")
     packed = batch.has(BATCH_COMPRESSION)
     sizes = []
@@ -139,36 +141,41 @@ def _batch_size(file: IO[bytes], batch: "_Table", body: int, body_bytes: int, di
         if packed and length >= 8 and 0 <= offset <= body_bytes - 8:
             file.seek(body + offset)
             (stated,) = struct.unpack("<q", file.read(8))
-            unpacked = length if stated == -1 else stated  # -1: stored as it is
+            unpacked = length if stated == -1 else stated  # -1: stored without compression
         sizes.append(max(unpacked, 0))
     return BatchSize(max(rows, 0), body_bytes, tuple(sizes), dictionary)
 
 
 @dataclass(frozen=True, slots=True)
 class _Table:
-    """A table of a flatbuffer. Raises struct.error or LookupError for what lies outside of the buffer."""
+    """Table of a flatbuffer. It raises struct.error or LookupError for offsets outside of the buffer."""
 
     data: bytes
     at: int
 
     @classmethod
     def root(cls, data: bytes) -> "_Table":
+        """Return the root table of a flatbuffer."""
         return cls(data, struct.unpack_from("<I", data)[0])
 
     def has(self, field: int) -> bool:
+        """Return True if the table contains a field."""
         return self._field(field) != 0
 
     def number(self, field: int, form: str) -> int:
+        """Return a number; 0 if the field is absent. ``form`` is its struct format."""
         at = self._field(field)
         return int(_unpack(f"<{form}", self.data, at)) if at else 0
 
     def table(self, field: int) -> "_Table":
+        """Return a table that this table refers to."""
         at = self._field(field)
         if not at:
             raise LookupError(field)
         return _Table(self.data, at + _unpack("<I", self.data, at))
 
     def structs(self, field: int, form: struct.Struct) -> Iterator[tuple[Any, ...]]:
+        """Yield the unpacked structs of a vector; nothing if the field is absent."""
         at = self._field(field)
         if not at:
             return iter(())
@@ -179,7 +186,7 @@ class _Table:
         return form.iter_unpack(self.data[at + 4 : at + 4 + count * form.size])
 
     def _field(self, field: int) -> int:
-        """Offset of a field, 0 where it is absent."""
+        """Return the offset of a field; 0 if the field is absent."""
         entries = self.at - _unpack("<i", self.data, self.at)
         place = 4 + 2 * field
         if entries < 0 or place >= _unpack("<H", self.data, entries):
@@ -189,6 +196,7 @@ class _Table:
 
 
 def _unpack(form: str, data: bytes, at: int) -> int:
+    """Unpack one number at an offset."""
     if at < 0:
         raise LookupError(at)
     return int(struct.unpack_from(form, data, at)[0])

@@ -1,4 +1,4 @@
-"""The formats of recordings by suffix: how each is read and written."""
+"""Table of the recording formats by file suffix, with their readers and writers."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ from drivers.recordings.table import Table, Writer, looks_like
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """One format."""
+    """Functions that read, write and measure files of one format."""
 
     read: Callable[[Path], Table]
     writer: Writer
     count_rows: Callable[[Path], int]
-    """Rows of a file, without reading its samples; raises what ``read`` raises."""
+    """Return the number of rows of a file without reading its samples. It raises the same exceptions as ``read``."""
 
 
 FORMATS: Final[Mapping[str, Format]] = {
@@ -40,11 +40,17 @@ FORMATS: Final[Mapping[str, Format]] = {
     ".feather": Format(read_ipc, ipc_file_writer, count_rows_ipc),
     ".arrows": Format(read_ipc, ipc_stream_writer, count_rows_ipc),
 }
-"""Suffixes of recordings, how each is read and written."""
+"""Suffixes of recordings, with the format of each."""
 
 
 def format_of(path: Path) -> Format:
-    """The format of the path's suffix; ConfigError for one that is none."""
+    """Return the format for the suffix of a path.
+
+    Raises
+    ------
+    ConfigError
+        The suffix is not that of a recording.
+    """
     suffix = _suffix(path)
     if not suffix:
         raise ConfigError(f"{path}: not the suffix of a recording; known are {' '.join(FORMATS)}{looks_like(path)}")
@@ -52,10 +58,11 @@ def format_of(path: Path) -> Format:
 
 
 def is_recording(path: Path) -> bool:
-    """Whether the path's suffix is that of a recording; the file itself is not looked at."""
+    """Return True if the suffix of a path is that of a recording. The file itself is not opened."""
     return _suffix(path) in FORMATS
 
 
 def _suffix(path: Path) -> str:
+    """Return the suffix of a path if it is one of FORMATS, otherwise ""."""
     name = path.name.lower()
     return next((suffix for suffix in FORMATS if name.endswith(suffix)), "")

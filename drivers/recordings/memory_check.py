@@ -1,8 +1,8 @@
-"""Limits on what a reader takes into memory, and the memory that is available.
+"""Limits on what a reader takes into memory, and the available memory.
 
-A reader checks the size of a recording before it allocates memory for the samples. The kernel ends a process that takes
-more memory than there is, and perhaps the daemon beside it. A compressed file of a few megabytes can hold gigabytes, so
-the size of the file alone says little.
+A reader checks the size of a recording before it allocates memory for the samples. If a process takes more memory than
+there is, the kernel ends the process and possibly the daemon on the same machine. A compressed file of a few megabytes
+can hold gigabytes, so the size of the file alone is not sufficient.
 
 Four limits apply. The memory limit depends on the machine. The other three are constants, documented in
 docs/recording.md:
@@ -28,9 +28,9 @@ OWN_CGROUPS: Final = Path("/proc/self/cgroup")
 STATM: Final = Path("/proc/self/statm")
 
 COPIES: Final = 3.0
-"""Copies of the samples that an analysis holds at once, at least."""
+"""Minimum number of copies of the samples that an analysis holds at once."""
 ROW_BYTES: Final = 64
-"""One sample in memory: time, six axes and temperature as float64."""
+"""Size of one sample in memory: time, six axes and temperature as float64."""
 MIN_ROW_LIMIT: Final = 20_000_000
 MAX_ROWS_PER_BYTE: Final = 8
 """Rows of measured values need more than one bit each, in every format."""
@@ -50,7 +50,7 @@ class ReadLimit:
     size_bytes
         Size on disk.
     free
-        Available memory in bytes, None if the system does not say.
+        Available memory in bytes. None if the system does not state it.
     """
 
     path: Path
@@ -63,7 +63,7 @@ class ReadLimit:
         Raises
         ------
         RecordingError
-            The file is too small to hold so many measured samples.
+            The file is too small to hold this number of measured samples.
         ConfigError
             The samples do not fit into the available memory.
         """
@@ -75,7 +75,7 @@ class ReadLimit:
         check(self.path, rows * ROW_BYTES, self.free)
 
     def check_unpacked(self, unpacked_bytes: int) -> None:
-        """Check how much has been unpacked so far.
+        """Check the number of bytes that have been unpacked so far.
 
         Raises
         ------
@@ -91,37 +91,50 @@ class ReadLimit:
 
 
 def limit_of(path: Path) -> ReadLimit:
-    """Return the limits on a file, with the memory that is available now. Raises OSError if there is no such file."""
+    """Return the limits on a file, with the memory that is available now.
+
+    Raises
+    ------
+    OSError
+        There is no such file.
+    """
     return ReadLimit(path, path.stat().st_size, free_bytes())
 
 
 def free_bytes() -> int | None:
-    """Return the memory that this process can still take, in bytes.
+    """Return the memory that is available to this process in bytes.
 
-    This is the least of the available memory of the system, of its control groups (container or service limits) and of
-    the limits of the process (``ulimit -v``, ``ulimit -d``). None if the system states none of them.
+    This is the minimum of the available memory of the system, of its control groups (container or service limits) and
+    of the limits of the process (``ulimit -v``, ``ulimit -d``). None if the system states none of them.
     """
     known = [n for n in (system_bytes(), cgroup_bytes(), process_bytes()) if n is not None]
     return max(min(known), 0) if known else None
 
 
 def system_bytes(meminfo: Path = MEMINFO) -> int | None:
-    """Return the available memory of the system in bytes; None where the system does not say."""
+    """Return the available memory of the system in bytes; None if the system does not state it."""
     found = _fields(meminfo, ":").get("MemAvailable")
     return None if found is None else 1024 * found
 
 
 def cgroup_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> int | None:
-    """Return the least memory in bytes that the control groups of this process leave it; None without a limit.
+    """Return the memory that the control groups of this process leave available, in bytes; None without a limit.
 
     Page cache counts as available, since the kernel drops it when the group reaches its limit.
+
+    Parameters
+    ----------
+    own
+        File that lists the control groups of the process.
+    root
+        Folder of the control group file system.
     """
     left = [n for folder in _cgroup_folders(own, root) if (n := _left_in_cgroup(folder)) is not None]
     return min(left) if left else None
 
 
 def process_bytes(statm: Path = STATM) -> int | None:
-    """Return the address space and data in bytes that the limits of the process leave it; None without a limit."""
+    """Return the bytes of address space and data that the limits of the process leave; None without a limit."""
     try:
         pages = [int(n) for n in statm.read_text().split()]
     except (OSError, ValueError):
@@ -134,7 +147,16 @@ def process_bytes(statm: Path = STATM) -> int | None:
 
 
 def check(path: Path, needed_bytes: int, free: int | None) -> None:
-    """Check samples of so many bytes against the memory that was available before.
+    """Check the size of samples against the available memory.
+
+    Parameters
+    ----------
+    path
+        File or folder that the message names.
+    needed_bytes
+        Size of the samples in bytes.
+    free
+        Available memory in bytes; None if it is unknown.
 
     Raises
     ------
@@ -167,7 +189,7 @@ def _cgroup_folders(own: Path, root: Path) -> Iterator[Path]:
 
 
 def _left_in_cgroup(folder: Path) -> int | None:
-    """Return the bytes that one control group leaves; version 2 first, then version 1."""
+    """Return the bytes that one control group leaves available. Version 2 is tried first, then version 1."""
     for limit, usage, prefix in (
         ("memory.max", "memory.current", ""),
         ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_"),
@@ -182,7 +204,7 @@ def _left_in_cgroup(folder: Path) -> int | None:
 
 
 def _fields(path: Path, separator: str) -> dict[str, int]:
-    """Return the whole numbers of a file of ``name value`` lines; those that cannot be read are absent."""
+    """Return the whole numbers of a file of ``name value`` lines. Unreadable numbers are left out."""
     found: dict[str, int] = {}
     try:
         lines = path.read_text().splitlines()

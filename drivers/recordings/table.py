@@ -1,4 +1,7 @@
-"""What a reader of one format gives (known columns by name, the file's own rate, notes), and what a writer takes."""
+"""Types that readers and writers of recordings share, and the choice of columns by their names.
+
+A reader returns a ``Table``: the known columns by name, the rate that the file states, and notes.
+"""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -13,41 +16,60 @@ from drivers.recordings import memory_check
 from drivers.sample import AXES, Floats
 
 COLUMNS: Final = ("t", *AXES, "temperature")
-"""Columns that mean something, under the names they are written with."""
+"""Names of the known columns."""
 
 ALIASES: Final = {"temp": "temperature"}
+"""Other names under which files may contain a known column."""
 
 EXAMPLE_HEADER: Final = "t,gx,gy,gz,ax,ay,az"
+"""Header line that error messages show as an example."""
 
-BATCH_ROWS: Final = 1 << 16  # rows written at a time; a cut Arrow file loses at most so many
+BATCH_ROWS: Final = 1 << 16
+"""Number of rows written at a time. A truncated Arrow file loses at most this many."""
 
 T_LIMIT_S: Final = 4.6e9
-"""The difference of two is within int64 nanoseconds, 9.22e9 s; what is beyond is not in seconds."""
+"""Largest absolute time in s. The difference of two times fits into int64 nanoseconds, 9.22e9 s.
+
+A larger number is not a time in seconds.
+"""
 
 PART: Final = ".part"
-"""End of a file's name while it is being written."""
+"""Suffix that is appended to a file name while the file is being written."""
 
 Columns = Mapping[str, Floats]
-"""Columns as float64 [n], all equally long, under their names in COLUMNS."""
+"""Columns as float64 arrays [n] of equal length, by their names in COLUMNS."""
 
 Append = Callable[[Columns], None]
-"""Takes the next rows of a file that is being written."""
+"""Function that appends rows to a file that is being written."""
 
 Writer = Callable[[Path, Sequence[str]], AbstractContextManager[Append]]
-"""Begins a file with columns of these names; it is whole once the context has been left."""
+"""Function that begins a file with columns of these names. The file is complete when the context has been left."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Columns as float64 [n], under their names in COLUMNS, missing values as NaN."""
+    """Columns as float64 arrays [n], by their names in COLUMNS. Missing values are NaN."""
 
     columns: dict[str, Floats]
-    fs: float | None  # Hz, where the file states it
+    fs: float | None  # Hz; None if the file does not state it
     notes: list[str]
 
 
 def check_width(path: Path, columns: int) -> None:
-    """Raise RecordingError if a file has more columns than any recording."""
+    """Check the number of columns of a file.
+
+    Parameters
+    ----------
+    path
+        File that the message names.
+    columns
+        Number of columns.
+
+    Raises
+    ------
+    RecordingError
+        The file has more columns than any recording.
+    """
     if columns > memory_check.MAX_COLUMNS:
         raise RecordingError(
             f"{path}: has {columns} columns, expected at most {memory_check.MAX_COLUMNS}; keep those of the recording: "
@@ -56,9 +78,28 @@ def check_width(path: Path, columns: int) -> None:
 
 
 def chosen_columns(path: Path, names: Sequence[str], notes: list[str], where: str = "") -> dict[str, str]:
-    """Known column -> its name in the file. The rest goes into a note; no axis at all is an error.
+    """Choose the known columns of a file.
 
-    ``where`` says where the names stand, such as " in line 3".
+    Parameters
+    ----------
+    path
+        File that messages name.
+    names
+        Names of all columns in the file.
+    notes
+        List to which a note about unused columns is appended.
+    where
+        Place of the names in the file, such as " in line 3".
+
+    Returns
+    -------
+    dict
+        Name in the file for each known column.
+
+    Raises
+    ------
+    RecordingError
+        There is no axis among the columns, a known column occurs twice, or there are too many columns.
     """
     check_width(path, len(names))
     known = {*COLUMNS, *ALIASES}
@@ -94,13 +135,13 @@ CONTENTS: Final = (
     (b"\x89PNG", "a picture", ()),
     (b"%PDF", "a PDF document", ()),
 )
-"""First bytes of files, what they are, and the suffixes under which a reader expects them."""
+"""First bytes of files, what such a file is, and the suffixes under which a reader expects it."""
 
 
 def looks_like(path: Path) -> str:
-    """Return what the content of a file looks like and what to do, as the end of a message.
+    """Return the end of a message that says what the content of a file looks like and what to do.
 
-    Empty where the content is of the kind that the suffix says, or of no known kind.
+    The text is empty if the content matches the suffix, or if the kind of content is unknown.
     """
     try:
         with open_regular(path) as file:
@@ -120,7 +161,15 @@ def looks_like(path: Path) -> str:
 
 
 def listed(names: Sequence[str], most: int = 12) -> str:
-    """Names for a message: not too many, not too long, nothing that a terminal would obey."""
+    """Return names as a list for a message, shortened and without control characters.
+
+    Parameters
+    ----------
+    names
+        Names to list.
+    most
+        Maximum number of names to show.
+    """
     shown = [name[:40] if name.isprintable() else ascii(name[:40]) for name in names[:most]]
     more = [f"and {len(names) - most} more"] if len(names) > most else []
     return ", ".join(shown + more)

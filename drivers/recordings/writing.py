@@ -1,7 +1,7 @@
-"""Recordings out: rows are appended to a file that appears whole or not at all.
+"""Writing of recordings. Rows are appended to a file that appears complete or not at all.
 
-A file is written under another name and renamed once it is whole, so that a run that fails or is broken off (Ctrl-C)
-leaves nothing behind, and a file of that name stays as it was. Memory does not grow with the rows.
+A file is written under a temporary name and renamed when it is complete. If a run fails or is interrupted (Ctrl-C), it
+leaves no file behind, and an existing file of that name stays unchanged. Memory does not grow with the number of rows.
 """
 
 import os
@@ -19,23 +19,41 @@ from drivers.sample import AXES, Floats
 
 
 class AppendSamples(Protocol):
-    """Takes the next rows of a recording."""
+    """Function that appends rows to a recording."""
 
     def __call__(self, t_s: Floats, values: Floats, temperature_c: Floats | None = None) -> None:
-        """``t_s`` [n] s, ``values`` [n, 6] in AXES order, ``temperature_c`` [n] °C where that column is written."""
+        """Append rows.
+
+        Parameters
+        ----------
+        t_s
+            [n] float64, times in s.
+        values
+            [n, 6] float64 in the order of AXES, rad/s and m/s².
+        temperature_c
+            [n] float64 in °C. None if no temperature was measured.
+        """
 
 
 @contextmanager
 def writing(path: Path, axes: Sequence[str], temperature: bool) -> Iterator[AppendSamples]:
-    """Write a recording, some rows at a time, in the format of the path's suffix.
+    """Write a recording in blocks of rows, in the format of the path's suffix.
 
-    Args:
-        path: it appears when the context is left without an exception
-        axes: the columns to write, some of AXES
-        temperature: whether there is that column too
-    Raises:
-        ConfigError: a suffix or place that cannot be written
-        RecordingError: unfit axes; rows that do not fit each other, or without a time
+    Parameters
+    ----------
+    path
+        File to write. It appears when the context is left without an exception.
+    axes
+        Columns to write, some of AXES.
+    temperature
+        True if a temperature column is written.
+
+    Raises
+    ------
+    ConfigError
+        The suffix is unknown, or the file cannot be written there.
+    RecordingError
+        An axis is unknown, the arrays have different lengths, or a time is missing.
     """
     unknown = [axis for axis in axes if axis not in AXES]
     if unknown or not axes:
@@ -62,12 +80,27 @@ def save_samples(
     temperature_c: Floats | None = None,
     axes: Sequence[str] | None = None,
 ) -> None:
-    """Write a recording in the format of the path's suffix; float64 comes back bit for bit.
+    """Write a recording in the format of the path's suffix. Values of float64 are stored without loss.
 
-    ``t_s`` [n] s, ``values`` [n, 6] in AXES order, ``temperature_c`` [n] °C. ``axes`` names the columns
-    to write; by default those with at least one value. The file appears whole or not at all.
+    Parameters
+    ----------
+    path
+        File to write. It appears complete or not at all.
+    t_s
+        [n] float64, times in s.
+    values
+        [n, 6] float64 in the order of AXES, rad/s and m/s².
+    temperature_c
+        [n] float64 in °C. None if no temperature was measured.
+    axes
+        Columns to write. None for all axes with at least one value.
 
-    Raises ConfigError for a suffix or place that cannot be written, RecordingError for unfit arrays.
+    Raises
+    ------
+    ConfigError
+        The suffix is unknown, or the file cannot be written there.
+    RecordingError
+        The arrays have different lengths, an axis is unknown, or a time is missing.
     """
     _check(path, t_s, values, temperature_c)
     if axes is None:
@@ -79,14 +112,16 @@ def save_samples(
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A name to write to, renamed to ``path`` at the end and removed after any exception.
+    """Yield a temporary path that is renamed to ``path`` at the end, and removed after an exception.
 
-    Raises:
-        ConfigError: there is no such folder, a folder of that name, or no permission and whatever else forbids it
+    Raises
+    ------
+    ConfigError
+        The folder does not exist, ``path`` is a folder, or writing is not permitted.
     """
     if not path.parent.is_dir():
         raise ConfigError(f"{path}: cannot be written: there is no folder {path.parent}")
-    if path.is_dir():  # said before the work rather than after it
+    if path.is_dir():  # report this before the work rather than after it
         raise ConfigError(f"{path}: cannot be written: it is a folder")
     part = path.with_name(path.name + PART)
     try:
@@ -100,7 +135,7 @@ def whole(path: Path) -> Iterator[Path]:
         os.replace(part, path)
     except (IsADirectoryError, PermissionError) as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
-    except OSError as error:  # a full disk does not say of which file
+    except OSError as error:  # the error of a full disk does not name the file
         error.filename = error.filename or str(path)
         raise
     finally:
@@ -108,6 +143,7 @@ def whole(path: Path) -> Iterator[Path]:
 
 
 def _check(path: Path, t_s: Floats, values: Floats, temperature_c: Floats | None) -> None:
+    """Raise RecordingError if arrays have different lengths or a time is missing."""
     n = len(t_s)
     if n == 0 or values.shape != (n, len(AXES)):
         raise RecordingError(f"{path}: {n} times do not fit values of shape {values.shape}; need [n, 6], n ≥ 1")

@@ -1,1 +1,1 @@
-"""Time stamps: sample clock, arrival regression, duplicate and late rows, rate check."""
+"""Time-stamping of samples: sample clock, regression of arrival times, duplicate and late rows, and rate check."""

@@ -1,24 +1,28 @@
-"""Lower bound of the arrival times: when the newest sample of a device can have been taken at the earliest.
+"""Lower bound of sample times: the earliest time at which the newest sample of a device can have been taken.
 
-A sample can be read late but never early. It waits in the buffers of the system while the reading process gets no
-processor time, and then arrives in one burst with the samples after it. Its arrival time is therefore only an upper
-bound of the time at which it was taken. The earliest arrivals, compared with a clock that counts samples, bound the
-time from below (Moon, Skelly and Towsley, "Estimation and removal of clock skew from network delay measurements",
-1999). The bound is the minimum over the last WINDOW_S to twice WINDOW_S of steady reading, so that an error of the
-assumed sample period is forgotten. It holds as long as the reader was not late throughout that time.
-No I/O, no clock.
+A sample can be read late but never early. While the reading process gets no processor time, samples wait in the
+buffers of the system. They then arrive in one burst. The arrival time of a sample is therefore only an upper bound of
+the time at which it was taken. The earliest arrivals, compared with a clock that counts samples, bound the time from
+below (Moon, Skelly and Towsley, "Estimation and removal of clock skew from network delay measurements", 1999).
+
+The bound is the minimum over the last WINDOW_S to twice WINDOW_S of steady reading, so that an error of the assumed
+sample period is forgotten. The bound holds if at least one sample of that time was read without delay. The module does
+no I/O and reads no clock.
 """
 
 from math import inf
 from typing import Final
 
 WINDOW_S: Final = 60.0
-"""Length of each of the two windows of the minimum, in s."""
-LONGEST_STEP_S: Final = 1.0
-"""One arrival makes a window at most this much longer: a reader that slept for a minute has seen one delay only."""
+"""Length of each of the two windows of the minimum."""
+MAX_STEP_S: Final = 1.0
+"""Maximum time that one arrival adds to a window. A reader that slept for a minute has measured only one delay."""
 SETTLED_S: Final = 10.0
-"""Arrivals of a shorter time show no sample period: one late arrival among them changes it too much."""
-PROMPT_S: Final = 0.05
+"""Minimum time of arrivals that show a sample period.
+
+In a shorter time, one late arrival changes the period too much.
+"""
+MAX_PROMPT_DELAY_S: Final = 0.05
 """A sample that arrives within this time of the bound has not waited. Only then is a new sample period adopted."""
 
 
@@ -37,13 +41,13 @@ class ArrivalBound:
 
     def __init__(self) -> None:
         self.period_s: float | None = None
-        """Sample period in s of the host's clock, as of the last samples that were read without delay."""
-        self._clock_s: float | None = None  # goes on by one period a sample; newest sample = this + least delay
-        self._uncounted = 0.0  # samples that came before a period was known
-        self._start_delay_s = inf  # of the start, where it is older than the first arrival
-        self._delay_s = self._previous_delay_s = inf  # least delay of an arrival after the clock, in two windows
-        self._window_s = self._total_s = 0.0  # length of the current window so far, and of all
-        self._arrived_s = 0.0  # newest arrival
+        """Sample period in s by the clock of the host, from the last samples that were read without delay."""
+        self._clock_s: float | None = None  # advances by one period per sample; newest sample = this + minimum delay
+        self._uncounted = 0.0  # samples that arrived before a period was known
+        self._start_delay_s = inf  # delay of the start, if the start is older than the first arrival
+        self._delay_s = self._previous_delay_s = inf  # minimum delay of an arrival after the clock, in the two windows
+        self._window_s = self._total_s = 0.0  # length of the current window so far, and of all windows
+        self._arrived_s = 0.0  # time of the newest arrival
 
     @property
     def newest_s(self) -> float | None:
@@ -54,16 +58,16 @@ class ArrivalBound:
 
     @property
     def settled(self) -> bool:
-        """True if samples have arrived for SETTLED_S, pauses of the reader not counted."""
+        """True if samples have arrived for SETTLED_S. Pauses of the reader do not count."""
         return self._total_s >= SETTLED_S
 
     def start(self, taken_s: float) -> None:
-        """Begin with a sample, read before, that was not taken before ``taken_s``, in s."""
+        """Start the clock at a sample that was read earlier and was not taken before ``taken_s`` (in s)."""
         self._clock_s = self._arrived_s = taken_s
         self._start_delay_s = 0.0
 
     def update(self, samples: float, arrived_s: float, period_s: float | None) -> None:
-        """Go on to a newer sample.
+        """Advance the clock to a newer sample.
 
         Parameters
         ----------
@@ -83,9 +87,9 @@ class ArrivalBound:
         assert self._clock_s is not None
         self._clock_s += step_s
         delay_s = arrived_s - self._clock_s
-        # without a period the clock stands still, and earlier delays say nothing
+        # without a period the clock does not advance, and earlier delays are not comparable
         self._delay_s = delay_s if self.period_s is None else min(self._delay_s, delay_s)
-        passed_s = max(min(arrived_s - self._arrived_s, LONGEST_STEP_S), 0.0)
+        passed_s = max(min(arrived_s - self._arrived_s, MAX_STEP_S), 0.0)
         self._window_s += passed_s
         self._total_s += passed_s
         self._arrived_s = arrived_s
@@ -93,6 +97,6 @@ class ArrivalBound:
         if ended:
             self._previous_delay_s, self._delay_s, self._start_delay_s = self._delay_s, delay_s, inf
             self._window_s = 0.0
-        prompt = delay_s < min(self._delay_s, self._previous_delay_s) + PROMPT_S
+        prompt = delay_s < min(self._delay_s, self._previous_delay_s) + MAX_PROMPT_DELAY_S
         if period_s is not None and (prompt or ended):
             self.period_s = period_s
