@@ -1,1 +1,1 @@
-"""Decoders turn bytes into samples and back: one wire format a file, see ``base`` for what one is."""
+"""Decoders: each module converts one wire format to samples and back. ``base`` defines the interface."""

@@ -1,10 +1,12 @@
-"""What a decoder is, and the work that all of them share. Pure: bytes in, samples out.
+"""Interface of a decoder, and the functions that decoders share. Decoders convert bytes to samples and do no I/O.
 
-A decoder module ``drivers/decoders/<protocol>.py`` holds ``Settings`` (a msgspec struct: the keys of
-``[device.driver.decoder_options]``, all of which stand in ``config/defaults.toml``) and ``build(settings) -> Decoder``.
-``build`` raises one ``ConfigError`` with a line for each mistake, which begins with the key: "scale.gx: ...". ``feed``
-raises nothing on bad bytes: a frame that fails its check costs itself, is counted in ``bad``, and shows up as ``lost``
-of the block that follows it, so that its place in time stays empty.
+A decoder module ``drivers/decoders/<protocol>.py`` defines ``Settings`` and ``build(settings) -> Decoder``.
+``Settings`` is a msgspec struct with the keys of ``[device.driver.decoder_options]``, all of which are listed in
+``config/defaults.toml``. ``build`` raises one ``ConfigError`` with a line for each mistake. The line begins with the
+key: "scale.gx: ...".
+
+``feed`` never raises an exception for bad bytes. A frame that fails its check is left out and counted in ``bad``. The
+next block counts it in ``lost``, so that its place in time stays empty.
 """
 
 from collections import deque
@@ -17,82 +19,91 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.sample import NO_TICK, Chunk, Floats, Ints, SampleBlock, block
-from drivers.sample import Arrival as Arrival  # noqa: PLC0414 - decoders find it here
-from drivers.sample import Counter as Counter  # noqa: PLC0414 - decoders find it here
-from drivers.sample import Given as Given  # noqa: PLC0414 - decoders find it here
-from drivers.sample import Timing as Timing  # noqa: PLC0414 - decoders find it here
+from drivers.sample import Arrival as Arrival  # noqa: PLC0414 - re-exported for decoders
+from drivers.sample import Counter as Counter  # noqa: PLC0414 - re-exported for decoders
+from drivers.sample import Given as Given  # noqa: PLC0414 - re-exported for decoders
+from drivers.sample import Timing as Timing  # noqa: PLC0414 - re-exported for decoders
 
 GYRO_LIMIT: Final = 1000.0
-"""rad/s; no MEMS gyroscope turns this fast (the widest range sold is 4000 °/s = 70 rad/s)."""
+"""Largest plausible angular rate in rad/s. No MEMS gyroscope turns this fast (the widest range sold is 4000 °/s = 70
+rad/s).
+"""
 ACCEL_LIMIT: Final = 10_000.0
-"""m/s²; about 1000 g, above every inertial-grade MEMS range."""
+"""Largest plausible acceleration in m/s², about 1000 g. It is above every inertial-grade MEMS range."""
 LIMITS: Final = np.repeat([GYRO_LIMIT, ACCEL_LIMIT], 3)
-"""[6], in the order of ``AXES``."""
+"""Largest plausible values [6] in the order of ``AXES``."""
 TEMPERATURE_LIMITS_C: Final = (-100.0, 300.0)
+"""Lowest and highest plausible temperature."""
 
 
 class DecoderSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of every decoder's settings: unknown keys are errors."""
+    """Base class of the settings of decoders. Unknown keys are errors."""
 
 
 class Decoder(Protocol):
-    """One wire format: bytes <-> SampleBlock."""
+    """Interface of a decoder of one wire format, which converts between bytes and ``SampleBlock``."""
 
     carrier: ClassVar[str]  # see drivers.links.base.Carrier
 
     @property
     def timing(self) -> Timing:
-        """What the frames say about time; the same as long as the decoder lives."""
+        """Timing that the frames carry. It does not change during the life of the decoder."""
 
     @property
     def bad(self) -> int:
-        """Frames and samples rejected since the decoder was made."""
+        """Number of rejected frames and samples since the decoder was created."""
 
     @property
     def hint(self) -> str:
-        """Why frames are rejected, for the status line; "" while all is well."""
+        """Reason for rejected frames, for the status line; "" if there is none."""
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Samples completed by these chunks; ``t_ns`` is the arrival of the chunk that completed them."""
+        """Return the samples that these chunks complete.
+
+        ``t_ns`` is the arrival time of the chunk that completed a sample.
+        """
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """The wire's form of these samples, as a device would send it; counters from ``ticks``."""
+        """Return the samples in the wire format as a device would send them. Counters are taken from ``ticks``."""
 
     def reset(self) -> None:
-        """The link was opened anew: forget a half-received frame."""
+        """Forget an incomplete frame, because the link was opened again."""
 
 
 @runtime_checkable
 class Addressed(Protocol):
-    """A decoder that reads only chunks of certain addresses."""
+    """Interface of a decoder that reads only chunks with certain addresses."""
 
     @property
     def addresses(self) -> tuple[int, ...]:
-        """Addresses as of ``Chunk.address``."""
+        """Addresses to receive, in the form of ``Chunk.address``."""
 
 
 @runtime_checkable
 class CountingLate(Protocol):
-    """A decoder that joins several frames to one sample, and tells late frames from missing ones."""
+    """Interface of a decoder that joins several frames to one sample and distinguishes late frames from missing ones."""
 
     @property
     def late(self) -> int:
-        """Samples left out since the decoder was made because some of their frames came too late; not in ``bad``."""
+        """Number of samples left out because some of their frames arrived too late.
+
+        They are not included in ``bad``.
+        """
 
     @property
     def late_hint(self) -> str:
-        """By how much frames come too late and what to do, for the status; "" if none has for a while."""
+        """Delay of the late frames and the remedy, for the status; "" if no frame has been late for a while."""
 
 
 class Rows:
-    """Collects decoded rows in order and cuts them into blocks at the places where frames were bad."""
+    """Collector of decoded rows. It splits them into blocks where frames were rejected."""
 
     def __init__(self) -> None:
         self.bad = 0  # rejected frames and implausible rows so far
         self._missing = 0
 
     def reset(self) -> None:
-        """Forget bad frames that no sample followed."""
+        """Forget rejected frames that were not followed by a sample."""
         self._missing = 0
 
     def blocks(
@@ -104,17 +115,33 @@ class Rows:
         bad_before: Ints,
         bad_after: int = 0,
     ) -> list[SampleBlock]:
-        """Blocks of the plausible rows.
+        """Return the plausible rows as blocks.
 
-        ``bad_before[i]`` frames were rejected just before row i, ``bad_after`` behind the last one (they
-        count before the next call's first row). A row with an infinite or impossible value is dropped
-        and leaves an empty place; NaN means "not measured" and passes, but not on every axis.
+        A row with an infinite or implausible value is dropped and leaves an empty place. NaN means not measured and is
+        accepted unless all axes are NaN.
+
+        Parameters
+        ----------
+        t_ns
+            [n] int64, times in ns.
+        values
+            [n, 6] float64 in the order of AXES, rad/s and m/s².
+        temperature_c
+            [n] float64 in °C.
+        ticks
+            [n] int64, counter of the device; NO_TICK = none.
+        bad_before
+            [n] int64, number of frames that were rejected just before each row.
+        bad_after
+            Number of frames that were rejected after the last row. They count before the first row of the next call.
         """
         good = plausible(values)
-        if good.size and good.all() and not bad_before.any():  # as nearly always, and most chunks hold few frames
+        if (
+            good.size and good.all() and not bad_before.any()
+        ):  # fast path for nearly all calls, since most chunks hold few frames
             carried, self._missing = self._missing, bad_after
             self.bad += bad_after
-            return [block(t_ns, values, _possible(temperature_c), ticks, carried)]
+            return [block(t_ns, values, _valid_temperatures(temperature_c), ticks, carried)]
         kept = np.flatnonzero(good)
         # places lost before each kept row: rejected frames plus implausible rows since the last kept one
         places = np.cumsum(bad_before + ~good)
@@ -128,7 +155,7 @@ class Rows:
             return []
         missing[0] += carried
         self._missing += total - int(at_kept[-1])
-        temperature_c = _possible(temperature_c)
+        temperature_c = _valid_temperatures(temperature_c)
         cuts = np.flatnonzero(missing[1:]) + 1
         return [
             block(t_ns[rows], values[rows], temperature_c[rows], ticks[rows], int(missing[at]))
@@ -137,14 +164,18 @@ class Rows:
 
 
 def plausible(values: Floats) -> NDArray[np.bool_]:
-    """Rows [n] with at least one measured axis and none infinite or beyond what a MEMS IMU can show."""
+    """Return a mask [n] of plausible rows [n, 6].
+
+    A plausible row has at least one measured axis. None of its values is infinite or above the range of a MEMS IMU.
+    """
     size = np.abs(values)
     too_large: NDArray[np.bool_] = np.any(size > LIMITS, axis=1)
     absent: NDArray[np.bool_] = np.all(np.isnan(values), axis=1)
     return ~(too_large | absent)
 
 
-def _possible(temperature_c: Floats) -> Floats:
+def _valid_temperatures(temperature_c: Floats) -> Floats:
+    """Replace implausible temperatures by NaN."""
     low, high = TEMPERATURE_LIMITS_C
     return np.where((temperature_c >= low) & (temperature_c <= high), temperature_c, np.nan)
 
@@ -155,13 +186,13 @@ class Frames:
 
     data: list[bytes]
     t_ns: Ints  # [n] arrival of the chunk that completed each frame
-    bad_before: Ints  # [n] frames rejected just before each
-    at_once: NDArray[np.bool_]  # [n] whether no other byte stood between it and the frame before
+    bad_before: Ints  # [n] number of frames rejected just before each frame
+    at_once: NDArray[np.bool_]  # [n] True if the frame follows the previous one without other bytes
 
     def keep(self, rows: Sequence[int]) -> tuple["Frames", int]:
-        """Those frames alone, and how many were rejected behind the last of them.
+        """Return the frames of these rows, and the number of frames rejected after the last of them.
 
-        Rejected frames that stood before a frame left out count before the next kept one.
+        Frames that were rejected before a frame left out count before the next kept one.
         """
         if len(rows) == len(self.data):
             return self, 0
@@ -174,113 +205,124 @@ class Frames:
 
 
 NEED_MORE: Final = 0
+"""Result of a ``Match`` function if the buffer ends before the frame does."""
 REJECT: Final = -1
+"""Result of a ``Match`` function if there is no valid frame."""
 
 Match = Callable[[bytes, int], int]
-"""(buffer, offset of a sync) -> length of the valid frame there, NEED_MORE, or REJECT."""
+"""Function (buffer, offset of a sync) that returns the length of the valid frame there, NEED_MORE, or REJECT."""
 
 MUTE_BYTES: Final = 2000
-"""So many bytes without one valid frame are worth a hint; no supported frame is as long."""
+"""Bytes without a valid frame after which a hint is given. No supported frame is as long."""
 QUIET_FRAMES: Final = 1000
-"""After so many good frames a rejected one is no longer worth a hint."""
+"""Number of good frames after a rejected one until the hint about it ends."""
 
 
 class FrameBuffer:
-    """Finds frames in a byte stream that may be cut, damaged or joined late.
+    """Finder of frames in a byte stream that may be split anywhere, damaged, or joined in the middle.
 
-    ``sync`` is the fixed start of a frame (empty = any byte), ``match`` checks one candidate. A match may narrow
-    ``sync`` to the one byte that further frames begin with; it is wide again after MUTE_BYTES without a frame. After a
-    rejection the search goes on one byte further in the same bytes, as a sync may occur inside a payload. A hole
-    between two frames counts as the larger of: candidates rejected a frame's length apart, and whole frames that would
-    fit in it. What comes before the first frame (joined mid-stream) is not counted. Memory: never more than ``longest``
-    bytes are kept between feeds.
+    After a rejected candidate, the search continues one byte later in the same bytes, since a sync pattern may occur
+    inside a payload. The number of frames lost between two valid frames is the larger of two counts: rejected
+    candidates at least one frame length apart, and complete frames that fit between them. Bytes before the first frame
+    (joined in the middle of the stream) are not counted. At most ``longest`` bytes are kept between calls of ``feed``.
+
+    Parameters
+    ----------
+    sync
+        Fixed start of a frame; empty if a frame can start with any byte. ``match`` may narrow the attribute ``sync`` to
+        the first byte of all further frames. It is widened again after MUTE_BYTES without a frame.
+    match
+        Function that checks one candidate.
+    longest
+        Maximum length of a frame in bytes.
     """
 
     def __init__(self, sync: bytes, match: Match, longest: int) -> None:
-        self.sync = self._wide = sync
+        self.sync = self._initial_sync = sync
         self._match = match
         self._longest = longest
         self._buffer = b""
-        self._arrivals: deque[tuple[int, int]] = deque()  # (stream offset of a chunk's end, t_ns)
-        self._dropped = 0  # stream offset of the buffer's first byte
+        self._arrivals: deque[tuple[int, int]] = deque()  # (stream offset of the end of a chunk, t_ns)
+        self._buffer_offset = 0  # stream offset of the first byte in the buffer
         self.reset()
 
     def reset(self) -> None:
-        """Forget buffered bytes, being in step and what frames were found to begin with."""
-        self.sync = self._wide
-        self._dropped += len(self._buffer)
+        """Forget the buffered bytes, the synchronization, and the narrowed ``sync``."""
+        self.sync = self._initial_sync
+        self._buffer_offset += len(self._buffer)
         self._buffer = b""
         self._arrivals.clear()
-        self._in_step = False
+        self._synchronized = False
         self._frame_length = 0
-        self._hole = 0  # bytes skipped since the last frame
-        self._rejected = 0  # candidates rejected in the hole
-        self._last_rejected = -(1 << 62)  # stream offset
-        self._quiet = QUIET_FRAMES  # good frames since the last rejected one
+        self._skipped_bytes = 0  # bytes skipped since the last frame
+        self._rejected = 0  # candidates rejected since the last frame
+        self._last_rejected = -(1 << 62)  # stream offset of the last rejected candidate
+        self._frames_since_reject = QUIET_FRAMES  # number of good frames since the last rejected one
 
     @property
     def mute(self) -> bool:
-        """Whether bytes have been coming for a while without one valid frame."""
-        return self._hole >= MUTE_BYTES
+        """True if many bytes have arrived without a valid frame."""
+        return self._skipped_bytes >= MUTE_BYTES
 
     @property
     def hint(self) -> str:
-        """Why there are rejected frames, or none at all; "" while all is well."""
+        """Reason for rejected or missing frames; "" if there is none."""
         if self.mute:
-            return f"{self._hole} bytes without a valid frame: is the baud rate right, and the decoder?"
-        if self._quiet < QUIET_FRAMES:
+            return f"{self._skipped_bytes} bytes without a valid frame: is the baud rate right, and the decoder?"
+        if self._frames_since_reject < QUIET_FRAMES:
             return "frames fail their check: bytes are lost or damaged on the line"
         return ""
 
     def feed(self, chunks: Sequence[Chunk]) -> Frames:
-        """All frames that these chunks complete."""
+        """Return all frames that these chunks complete."""
         buffer, match, longest = self._join(chunks), self._match, self._longest
         found: list[bytes] = []
-        ends: list[int] = []  # offset in the buffer behind each frame
+        ends: list[int] = []  # offset in the buffer after each frame
         bad_before: list[int] = []
         at_once: list[bool] = []
         at = 0
         while True:
             start = buffer.find(self.sync, at)
-            if self.sync != self._wide:
-                mute = at + MUTE_BYTES - self._hole
+            if self.sync != self._initial_sync:
+                mute = at + MUTE_BYTES - self._skipped_bytes
                 if mute <= len(buffer) and not at <= start < mute:
-                    self._hole += mute - at
-                    at, self.sync = mute, self._wide
+                    self._skipped_bytes += mute - at
+                    at, self.sync = mute, self._initial_sync
                     continue
             if start < 0:
                 # the tail may be the first part of a sync
                 start = max(at, len(buffer) - len(self.sync) + 1)
-                self._hole += start - at
+                self._skipped_bytes += start - at
                 at = start
                 break
-            self._hole += start - at
+            self._skipped_bytes += start - at
             length = match(buffer, start)
             if length > 0:
                 at = start + length
                 found.append(buffer[start:at])
                 ends.append(at)
-                at_once.append(not self._hole)
-                bad_before.append(self._close_hole() if self._hole else 0)
+                at_once.append(not self._skipped_bytes)
+                bad_before.append(self._close_hole() if self._skipped_bytes else 0)
                 self._frame_length = length
-                self._in_step = True
+                self._synchronized = True
             elif length == NEED_MORE and len(buffer) - start < longest:
                 at = start
                 break
             else:
                 self._reject(start)
-                self._hole += 1
+                self._skipped_bytes += 1
                 at = start + 1
         frames = Frames(found, self._arrived(ends), np.array(bad_before, np.int64), np.array(at_once, np.bool_))
         self._buffer = buffer[at:]
-        self._dropped += at
-        while len(self._arrivals) > 1 and self._arrivals[0][0] <= self._dropped:
+        self._buffer_offset += at
+        while len(self._arrivals) > 1 and self._arrivals[0][0] <= self._buffer_offset:
             self._arrivals.popleft()
-        self._quiet += len(found)
+        self._frames_since_reject += len(found)
         return frames
 
     def _join(self, chunks: Sequence[Chunk]) -> bytes:
-        end = self._dropped + len(self._buffer)
+        """Append the data of chunks to the buffer, and note their arrival times."""
+        end = self._buffer_offset + len(self._buffer)
         for chunk in chunks:
             if chunk.data:
                 end += len(chunk.data)
@@ -288,47 +330,67 @@ class FrameBuffer:
         return b"".join((self._buffer, *[chunk.data for chunk in chunks]))
 
     def _reject(self, at: int) -> None:
-        offset = self._dropped + at
+        """Count a rejected candidate unless it lies within a frame length of the previous one."""
+        offset = self._buffer_offset + at
         if offset - self._last_rejected >= max(self._frame_length, 1):
             self._rejected += 1
             self._last_rejected = offset
 
     def _close_hole(self) -> int:
-        fitting = round(self._hole / self._frame_length) if self._frame_length else 0
-        count = max(self._rejected, fitting) if self._in_step else 0
-        self._hole = self._rejected = 0
+        """Return the number of frames lost since the last frame, and reset the counts."""
+        fitting = round(self._skipped_bytes / self._frame_length) if self._frame_length else 0
+        count = max(self._rejected, fitting) if self._synchronized else 0
+        self._skipped_bytes = self._rejected = 0
         self._last_rejected = -(1 << 62)
         if count:
-            self._quiet = 0
+            self._frames_since_reject = 0
         return count
 
     def _arrived(self, ends: list[int]) -> Ints:
-        """[n] arrival of the chunk that holds the byte before each end."""
+        """Return the arrival times [n] of the chunks that contain the last byte of each frame."""
         if not ends:
             return np.empty(0, np.int64)
         offsets, t_ns = np.array(self._arrivals, np.int64).T
-        arrived: Ints = t_ns[np.searchsorted(offsets, np.array(ends) + self._dropped)]
+        arrived: Ints = t_ns[np.searchsorted(offsets, np.array(ends) + self._buffer_offset)]
         return arrived
 
 
 def invalid(values: Floats) -> Floats:
-    """The values with NaN turned to infinity: for formats where every number sent is a measurement."""
+    """Replace NaN by infinity, for formats in which every number sent is a measurement."""
     return np.where(np.isnan(values), np.inf, values)
 
 
 def quantize(values: Floats, step: float, bits: int) -> Ints:
-    """Signed integers of so many bits, values / step rounded and clipped as sensors saturate; NaN gives 0."""
+    """Return values as signed integers, rounded and clipped like the output of a sensor. NaN becomes 0.
+
+    Parameters
+    ----------
+    values
+        float64 array in any unit.
+    step
+        Value of one count, in the same unit.
+    bits
+        Number of bits of the integers.
+    """
     top = 1 << (bits - 1)
     return np.clip(np.rint(np.nan_to_num(values / step, nan=0.0)), -top, top - 1).astype(np.int64)
 
 
 def one_chunk_each(frames: Sequence[bytes], t_ns: Ints) -> list[Chunk]:
-    """A chunk for every sample's bytes, arrived at that sample's time."""
+    """Return one chunk per sample.
+
+    Parameters
+    ----------
+    frames
+        Bytes of each sample.
+    t_ns
+        [n] int64, arrival times of the samples in ns.
+    """
     return [Chunk(data, t) for data, t in zip(frames, t_ns.tolist(), strict=True)]
 
 
 def xor(data: bytes) -> int:
-    """Exclusive or of all bytes, by folding one long integer in halves: 1 µs for a sentence.
+    """Return the exclusive or of all bytes. One long integer is folded in halves, which takes 1 µs for a sentence.
 
     >>> xor(b"VNRRG,8") == 0x4B
     True
@@ -342,14 +404,14 @@ def xor(data: bytes) -> int:
 
 
 class Unmeasured:
-    """Constant columns for formats that lack them."""
+    """Constant columns for formats that do not measure a quantity."""
 
     @staticmethod
     def temperature(n: int) -> Floats:
-        """[n] of NaN."""
+        """Return a column [n] of NaN."""
         return np.full(n, np.nan)
 
     @staticmethod
     def ticks(n: int) -> Ints:
-        """[n] of NO_TICK."""
+        """Return a column [n] of NO_TICK."""
         return np.full(n, NO_TICK, np.int64)

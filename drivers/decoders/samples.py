@@ -1,8 +1,9 @@
-"""Samples of another imu-monitor, or of anything that publishes the same map: one message a batch.
+"""Decoder of sample messages from another imu-monitor, or from any program that publishes the same map.
 
-The layout is in ``drivers.zenoh.sample_message``. The message brings Unix times and says how many samples its
-publisher has had since its start: a jump of that count beyond the batch's own rows is a lost message, and
-its rows are ``lost`` before the batch. A count that goes back is a publisher started anew, and no loss.
+The layout is defined in ``drivers.zenoh.sample_message``. A message contains Unix times and the number of samples that
+its publisher has received since its start. If this number increases by more than the rows of the message, messages have
+been lost. Their rows are counted as ``lost`` before the batch. If the number decreases, the publisher has been
+restarted and nothing is lost.
 """
 
 from collections.abc import Sequence
@@ -16,61 +17,62 @@ from drivers.errors import DecodeError
 from drivers.sample import Chunk, SampleBlock
 from drivers.zenoh.sample_message import pack, unpack
 
-LONGEST_GAP: Final = 1_000_000_000
-"""Samples; a larger jump of the count, eleven days at 1 kHz, is another count, not a loss."""
+MAX_GAP_SAMPLES: Final = 1_000_000_000
+"""Largest gap in samples. A larger jump of the count, eleven days at 1 kHz, indicates another count and not a loss."""
 
 
 class Settings(DecoderSettings, frozen=True):
-    """The message says all there is to know: no keys."""
+    """Settings of the decoder. There are no keys, since the message contains everything."""
 
 
 class SamplesDecoder:
-    """msgpack maps -> samples."""
+    """Decoder of msgpack maps to samples."""
 
     carrier: ClassVar[str] = "messages"
 
     def __init__(self) -> None:
         self.timing: Timing = Given()
-        self.bad = 0  # messages rejected and implausible rows
+        self.bad = 0  # rejected messages and implausible rows
         self.hint = ""
-        self._quiet = 0  # messages since the last rejected one
+        self._messages_since_reject = 0  # number of messages since the last rejected one
         self._rows = Rows()
         self._rejected = 0  # messages
-        self._received: int | None = None  # the publisher's count with its last message
+        self._received: int | None = None  # count of the publisher in its last message
         self._lost = 0  # rows missing before the next block
         self._encoded = 0
 
     def reset(self) -> None:
-        """Messages are whole: only the count of lost ones is begun anew."""
+        """Start the count of lost samples again. There are no incomplete messages."""
         self._received = None
         self._lost = 0
         self._rows.reset()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """The samples of each message; ``t_ns`` are the message's own Unix times."""
+        """Return the samples of each message. ``t_ns`` are the Unix times of the message."""
         found: list[SampleBlock] = []
         for chunk in chunks:
             try:
                 found += self._message(chunk.data)
-                self._quiet += 1
+                self._messages_since_reject += 1
             except DecodeError as error:
                 self._rejected += 1
                 self.hint = str(error)
-                self._quiet = 0
-        if self._quiet >= QUIET_FRAMES:
+                self._messages_since_reject = 0
+        if self._messages_since_reject >= QUIET_FRAMES:
             self.hint = ""
         self.bad = self._rejected + self._rows.bad
         return found
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """One message with these samples."""
+        """Return one message with these samples."""
         self._encoded += len(samples)
         return [Chunk(pack("encoded", self._encoded, samples), int(samples.t_ns[-1]))]
 
     def _message(self, data: bytes) -> list[SampleBlock]:
+        """Return the samples of one message, with the losses before it."""
         batch = unpack(data)
         rows = batch.block
-        self._lost = min(self._lost + rows.lost + self._skipped(batch.samples, len(rows)), LONGEST_GAP)
+        self._lost = min(self._lost + rows.lost + self._skipped(batch.samples, len(rows)), MAX_GAP_SAMPLES)
         blocks = self._rows.blocks(
             rows.t_ns, rows.values, rows.temperature_c, rows.ticks, np.zeros(len(rows), np.int64)
         )
@@ -80,12 +82,12 @@ class SamplesDecoder:
         return blocks
 
     def _skipped(self, received: int, rows: int) -> int:
-        """Samples of messages that did not arrive."""
+        """Return the number of samples in messages that did not arrive."""
         before, self._received = self._received, received
         missing = 0 if before is None else received - rows - before
-        return missing if 0 <= missing <= LONGEST_GAP else 0
+        return missing if 0 <= missing <= MAX_GAP_SAMPLES else 0
 
 
 def build(settings: Settings) -> Decoder:
-    """A decoder of samples messages."""
+    """Return a decoder of sample messages."""
     return SamplesDecoder()

@@ -1,1 +1,4 @@
-"""Links move bytes and know no IMU: one file each, see ``base`` for what one is."""
+"""Links: each module moves bytes of one kind of transport and does not interpret them.
+
+``base`` defines the interface.
+"""

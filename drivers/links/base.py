@@ -1,9 +1,10 @@
-"""What a link is: it moves bytes and knows no IMU.
+"""Interface of a link. A link moves bytes and does not interpret them.
 
-A link module ``drivers/links/<name>_link.py`` holds ``Settings`` (a msgspec struct: the link's own keys
-in ``[device.driver]``), ``build(settings) -> Link`` and ``DEFAULT_DECODER`` (a decoder's name, or ""
-where the user must choose). Nothing is opened before ``open``. ``build`` raises one ``ConfigError`` with a line for
-each mistake in the settings; the line begins with the key: "speed: ...". Every key stands in ``config/defaults.toml``.
+A link module ``drivers/links/<name>_link.py`` defines ``Settings``, ``build(settings) -> Link`` and
+``DEFAULT_DECODER``. ``Settings`` is a msgspec struct with the keys of the link in ``[device.driver]``.
+``DEFAULT_DECODER`` is the name of a decoder, or "" if the user must choose one. Nothing is opened before ``open`` is
+called. ``build`` raises one ``ConfigError`` with a line for each mistake in the settings. The line begins with the key:
+"speed: ...". Every key is listed in ``config/defaults.toml``.
 """
 
 from collections.abc import Sequence
@@ -15,40 +16,52 @@ from drivers.quantities import SILENCE_S
 from drivers.sample import Chunk
 
 Carrier = Literal["bytes", "frames", "messages"]
-"""bytes: a stream cut anywhere (serial); frames: one CAN frame a chunk; messages: one message a chunk."""
+"""Kind of data of a link: "bytes" is a stream without boundaries (serial). "frames" is one CAN frame per chunk.
+"messages" is one message per chunk.
+"""
 
 
 class LinkSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Keys that every link understands."""
+    """Keys that all links have."""
 
     silence: Annotated[float, SILENCE_S.meta] = 3.0
-    """Seconds without a byte after which the link is opened anew; 0 = never."""
+    """Time without a byte in s after which the link is opened again; 0 = never."""
 
 
 class Link(Protocol):
-    """Moves bytes from one place. ``read`` is called from one thread, ``close`` from any."""
+    """Interface of a link. ``read`` is called from one thread, ``close`` from any thread."""
 
     carrier: Carrier
     epoch: Literal["monotonic", "unix"]  # clock of Chunk.t_ns
-    name: str  # for people: "/dev/ttyUSB0 at 460800 baud"
+    name: str  # for messages: "/dev/ttyUSB0 at 460800 baud"
 
     def open(self) -> None:
-        """Open, or raise ``LinkUnavailable`` with what to do about it. Opening twice is harmless."""
+        """Open the link. If it is already open, do nothing.
+
+        Raises
+        ------
+        LinkUnavailable
+            The link cannot be opened. The text says what to do.
+        """
 
     def read(self, timeout_s: float) -> list[Chunk] | None:
-        """What has come, waiting up to ``timeout_s`` for the first of it; None when nothing came.
+        """Return the received chunks, after waiting up to ``timeout_s`` seconds for the first; None if nothing arrived.
 
-        Raises ``LinkLost`` when the other side is gone or the link was closed, ``LinkEnded`` at the end
-        of a replay.
+        Raises
+        ------
+        LinkLost
+            The other side is gone, or the link was closed.
+        LinkEnded
+            A replay has reached its end.
         """
 
     def close(self) -> None:
-        """Close; ends a waiting ``read``. Closing twice is harmless."""
+        """Close the link and end a waiting ``read``. If it is already closed, do nothing."""
 
 
 @runtime_checkable
 class Filtering(Protocol):
-    """A link that need not bring everything: told before ``open`` what its decoder wants."""
+    """Interface of a link that can filter by address."""
 
     def accept(self, addresses: Sequence[int]) -> None:
-        """Bring only chunks of these addresses."""
+        """Receive only chunks of these addresses. This is called before ``open``."""

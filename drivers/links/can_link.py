@@ -1,17 +1,17 @@
-"""CAN buses through python-can: one frame a chunk, as many as are there.
+"""CAN buses through python-can, one frame per chunk.
 
-Identifiers that the decoder names are filtered in the hardware or the kernel where the interface can,
-in python-can elsewhere. The first frame is waited for, what queued up behind it is drained with it.
+The identifiers that the decoder names are filtered in the hardware or the kernel if the interface supports it,
+otherwise in python-can. A read waits for the first frame, then takes all frames that are queued after it.
 
-``Chunk.t_ns`` is the host's monotonic clock at receipt. A reader that was held up finds many frames
-waiting, which must not all bear the time of its waking: interfaces that stamp a frame with the host's
-system clock as it arrives (``HOST_STAMPED``) tell each frame's age, which is taken off. The age is a
-difference over milliseconds, so a step of the system clock shifts at most the frames then waiting; an age
-outside 0 to 1 s is not believed. Other interfaces stamp with clocks of their own that drift against the
-host's: there the moment of reading counts, and its jitter is the regression's work.
+``Chunk.t_ns`` is the monotonic time of the host at arrival. A delayed reader finds many waiting frames, which must not
+all get the time of the read. Some interfaces stamp each frame on arrival with the system clock of the host
+(``HOST_STAMPED_INTERFACES``). For these, the age of each frame is subtracted from the present time. The age is a
+difference over milliseconds, so a step of the system clock affects at most the frames that wait at that moment. An age
+outside 0 to 1 s is ignored. Other interfaces stamp with clocks of their own, which drift against the host. For these,
+the time of the read is used, and the regression of the sample clock removes its jitter.
 
-A bus that goes off, an interface set down and an adapter unplugged are ``LinkLost``; other error frames
-and remote frames are counted and left aside. Nothing is sent, beyond what an adapter's own set-up needs.
+A bus-off state, an interface that is down and an unplugged adapter raise ``LinkLost``. Other error frames and remote
+frames are counted and ignored. Nothing is sent, apart from the set-up of an adapter.
 """
 
 import contextlib
@@ -39,22 +39,25 @@ if TYPE_CHECKING:
 
 DEFAULT_DECODER: Final = "dbc"
 BATCH: Final = 1000
-"""Frames; 65 ms of a fully loaded bus at 1 Mbit/s, so that no read is without end."""
-GAP_S: Final = 0.0005
-"""Wait for a frame behind another. Not 0: python-can, where it filters itself, then gives up at the first
-frame that nobody asked for, though wanted ones may stand behind it."""
-LINGER_S: Final = 0.01
-"""A read gives its frames at the latest so long after the first of them, however many go on coming."""
-SLICE_S: Final = 0.1
-"""Longest single wait on the bus: a closed link is noticed within it."""
-HOST_STAMPED: Final = ("socketcan", "virtual", "udp_multicast")
-"""Interfaces whose time stamps are the host's system clock when the frame came in."""
-OLDEST_S: Final = 1.0
+"""Maximum number of frames per read: 65 ms of a fully loaded bus at 1 Mbit/s."""
+NEXT_FRAME_WAIT_S: Final = 0.0005
+"""Wait for the next frame after a frame.
+
+The wait must not be 0. If python-can filters the frames itself, it would then stop at the first unwanted frame,
+although wanted frames may follow.
+"""
+MAX_READ_S: Final = 0.01
+"""A read returns its frames at the latest this long after the first one, even if more frames arrive."""
+MAX_WAIT_S: Final = 0.1
+"""Longest single wait on the bus, and therefore the longest time until a closed link is noticed."""
+HOST_STAMPED_INTERFACES: Final = ("socketcan", "virtual", "udp_multicast")
+"""Interfaces whose time stamps are the system clock of the host at arrival of the frame."""
+MAX_FRAME_AGE_S: Final = 1.0
 CLOCK_PAIRS: Final = 3
-"""Readings of both clocks, of which the closest counts."""
-PROBE_S: Final = 2.0
-SAY_BUS_OFF: Final = ("socketcan", "virtual", "udp_multicast")
-"""Interfaces whose error frames have SocketCAN's classes in their identifier."""
+"""Number of readings of both clocks, of which the closest pair is used."""
+PROBE_TIMEOUT_S: Final = 2.0
+BUS_OFF_INTERFACES: Final = ("socketcan", "virtual", "udp_multicast")
+"""Interfaces whose error frames contain the error classes of SocketCAN in their identifier."""
 PACKAGES: Final[Mapping[str, tuple[str, str, str]]] = {
     "udp_multicast": ("msgpack", "msgpack", "imu-monitor[multicast]"),
     "canalystii": ("canalystii", "canalystii", "python-can[canalystii]"),
@@ -66,7 +69,7 @@ PACKAGES: Final[Mapping[str, tuple[str, str, str]]] = {
 """Interfaces that need a package which neither this project nor python-can requires: module, package, what to install.
 
 pyserial, for slcan, robotell, seeedstudio and serial, is required by this project. socketcan, socketcand and virtual
-need no package. The other interfaces need a library of the adapter's maker.
+need no package. The other interfaces need a library of the adapter's manufacturer.
 """
 BUS_OFF: Final = 0x40
 """CAN_ERR_BUSOFF of linux/can/error.h, in the identifier of a socketcan error frame."""
@@ -79,16 +82,16 @@ class Settings(LinkSettings, frozen=True, kw_only=True):
     interface: str = "socketcan"
     channel: str | int = "can0"
     bitrate: Annotated[int, BIT_RATE.meta] | None = None
-    """bit/s; for socketcan it is set with the interface: ip link set can0 up type can bitrate 500000."""
+    """Bit rate in bit/s. For socketcan it is set with the interface: ip link set can0 up type can bitrate 500000."""
     fd: bool = False
     data_bitrate: Annotated[int, BIT_RATE.meta] | None = None
     receive_own_messages: bool = False
     options: dict[str, Any] = msgspec.field(default_factory=dict)
-    """Further keys of python-can's Bus for this interface."""
+    """Additional keys of python-can's Bus for this interface."""
 
 
 class CanLink:
-    """One CAN bus."""
+    """Link to one CAN bus."""
 
     carrier: Carrier = "frames"
     epoch: Literal["monotonic", "unix"] = "monotonic"
@@ -101,21 +104,21 @@ class CanLink:
         self._in_use = threading.Lock()  # held while the bus is read, opened or closed
         self.name = f"CAN {settings.interface} {settings.channel}"
         self.error_frames = 0
-        self.garbled = 0  # adapter answers that were no frame
+        self.garbled = 0  # answers of the adapter that were not frames
 
     def accept(self, addresses: Sequence[int]) -> None:
-        """Receive only these identifiers from the next ``open`` on; none given: all.
+        """Receive only these identifiers from the next ``open`` on. Without identifiers, receive all frames.
 
-        ``EXTENDED_ID`` marks 29-bit identifiers; with ``ANY_SOURCE`` only the J1939 parameter group of
-        the identifier counts.
+        ``EXTENDED_ID`` marks 29-bit identifiers. With ``ANY_SOURCE``, only the J1939 parameter group of the identifier
+        has to match.
         """
         self._filters = [_filter(address) for address in addresses] or None
 
     def open(self) -> None:
-        """Open the bus; ``LinkUnavailable`` says why it cannot be, and what to do."""
+        """Open the bus. Raise ``LinkUnavailable`` with the reason and the remedy if it cannot be opened."""
         import can
 
-        # python-can reports vendor libraries that are not there as warnings of its own
+        # python-can reports missing vendor libraries as warnings
         logging.getLogger("can").setLevel(logging.ERROR)
         with self._in_use:
             if self._bus is not None:
@@ -136,7 +139,7 @@ class CanLink:
                 can.CanError,
                 OSError,
                 ImportError,
-                # what python-can's own modules raise when a vendor's library or a key is missing
+                # exceptions of python-can's modules if a vendor library or a key is missing
                 NameError,
                 AttributeError,
                 TypeError,
@@ -148,12 +151,12 @@ class CanLink:
             self._closing.clear()
 
     def read(self, timeout_s: float) -> list[Chunk] | None:
-        """The frames that are there, waiting up to ``timeout_s`` for the first."""
+        """Return the received frames, after waiting up to ``timeout_s`` seconds for the first."""
         deadline = time.monotonic() + timeout_s
         with self._in_use:
             while self._bus is not None and not self._closing.is_set():
                 left = deadline - time.monotonic()
-                chunks = self._drain(min(max(left, 0.0), SLICE_S))
+                chunks = self._drain(min(max(left, 0.0), MAX_WAIT_S))
                 if chunks:
                     return chunks
                 if time.monotonic() >= deadline:
@@ -161,12 +164,13 @@ class CanLink:
         raise LinkLost(f"{self.name}: the link is closed")
 
     def close(self) -> None:
-        """Shut the bus down, once a waiting ``read`` has ended (within 0.1 s)."""
+        """Close the bus after a waiting ``read`` has ended (within 0.1 s)."""
         self._closing.set()
         with self._in_use:
             self._shut_down()
 
     def _keys(self) -> dict[str, Any]:
+        """Return the arguments for python-can's Bus."""
         s = self._settings
         keys: dict[str, Any] = {"receive_own_messages": s.receive_own_messages}
         if s.bitrate is not None:
@@ -178,11 +182,11 @@ class CanLink:
         return keys | s.options
 
     def _drain(self, wait_s: float) -> list[Chunk]:
-        """Frames that are there, the first of them waited for."""
+        """Return all received frames, after waiting up to ``wait_s`` seconds for the first."""
         chunks: list[Chunk] = []
         until = math.inf
         for _ in range(BATCH):
-            message = self._receive(GAP_S if chunks else wait_s)
+            message = self._receive(NEXT_FRAME_WAIT_S if chunks else wait_s)
             if message is None:
                 break
             if message.is_error_frame:
@@ -190,12 +194,13 @@ class CanLink:
             elif not message.is_remote_frame:
                 chunks.append(self._chunk(message))
             now = time.monotonic()
-            until = min(until, now + LINGER_S)
+            until = min(until, now + MAX_READ_S)
             if now >= until:
                 break
         return chunks
 
     def _receive(self, wait_s: float) -> "can.Message | None":
+        """Receive one frame; None if there is none. Raise LinkLost if the bus is gone."""
         import can
 
         bus = self._bus
@@ -206,8 +211,8 @@ class CanLink:
             except (can.CanOperationError, ValueError) as error:
                 if not isinstance(error, ValueError) and not isinstance(error.__cause__, ValueError):
                     raise
-                # a text adapter's line that is no frame; slcan keeps a line with bytes beyond ASCII in
-                # its buffer, where it would fail for ever, unless that is flushed
+                # A text adapter has sent a line that is not a frame. slcan keeps a line with non-ASCII bytes in its
+                # buffer, where it would fail again at every read unless the buffer is flushed.
                 self.garbled += 1
                 flush = getattr(bus, "flush", None)
                 if flush is not None:
@@ -217,40 +222,45 @@ class CanLink:
             self._shut_down()
             reason = error.__cause__ if isinstance(error.__cause__, Exception) else error
             raise LinkLost(
-                f"{self.name}: the bus is gone (interface down or adapter unplugged): {_plain(reason)}"
+                f"{self.name}: the bus is gone (interface down or adapter unplugged): {_one_line(reason)}"
             ) from error
 
     def _chunk(self, message: "can.Message") -> Chunk:
+        """Return a frame as a chunk."""
         address = message.arbitration_id | (EXTENDED_ID if message.is_extended_id else 0)
         return Chunk(bytes(message.data), self._arrival_ns(message), address)
 
     def _arrival_ns(self, message: "can.Message") -> int:
-        """Return the host's monotonic time at which the frame came in, or the present if its stamp is implausible."""
+        """Return the monotonic time of the host at which the frame arrived, or the present time if its stamp is
+        implausible.
+        """
         now_ns = time.monotonic_ns()
-        if self._settings.interface not in HOST_STAMPED:
+        if self._settings.interface not in HOST_STAMPED_INTERFACES:
             return now_ns
         age_ns = now_ns + _unix_minus_monotonic_ns() - round(message.timestamp * 1e9)
-        return now_ns - age_ns if 0 <= age_ns <= OLDEST_S * 1e9 else now_ns
+        return now_ns - age_ns if 0 <= age_ns <= MAX_FRAME_AGE_S * 1e9 else now_ns
 
     def _note_error(self, message: "can.Message") -> None:
+        """Count an error frame. Raise LinkLost if it reports bus-off."""
         self.error_frames += 1
-        if self._settings.interface in SAY_BUS_OFF and message.arbitration_id & BUS_OFF:
+        if self._settings.interface in BUS_OFF_INTERFACES and message.arbitration_id & BUS_OFF:
             self._shut_down()
             raise LinkLost(f"{self.name}: bus off; check the bit rate, the wiring and the terminators")
 
     def _shut_down(self) -> None:
+        """Close the bus if it is open."""
         import can
 
         bus, self._bus = self._bus, None
         if bus is None:
             return
-        # an unplugged adapter cannot be told to close its channel; it is gone all the same
+        # closing the channel of an unplugged adapter fails, but the adapter is gone anyway
         with contextlib.suppress(can.CanError, OSError):
             bus.shutdown()
 
 
 def missing_package(interface: str) -> str:
-    """Return which package an interface of python-can lacks and how to install it; "" if none is missing."""
+    """Return the package that an interface of python-can lacks and how to install it; "" if none is missing."""
     module, package, requirement = PACKAGES.get(interface, ("", "", ""))
     if not module or importlib.util.find_spec(module) is not None:
         return ""
@@ -258,9 +268,10 @@ def missing_package(interface: str) -> str:
 
 
 def _unix_minus_monotonic_ns() -> int:
-    """Return the difference of the host's two clocks in nanoseconds.
+    """Return the difference of the two clocks of the host in nanoseconds.
 
-    On a loaded machine the thread may be interrupted between the two readings, so the closest of a few pairs counts.
+    On a loaded machine the thread may be interrupted between the two readings. The closest of a few pairs is therefore
+    used.
     """
     pairs = []
     for _ in range(CLOCK_PAIRS):
@@ -270,24 +281,25 @@ def _unix_minus_monotonic_ns() -> int:
 
 
 def _probe(s: Settings) -> None:
-    """python-can tries a socketcand that is not there for 10 s: ask once whether anybody answers."""
+    """Check that a socketcand server answers. python-can would try to reach a missing one for 10 s."""
     if s.interface == "socketcand":
         host, port = str(s.options.get("host", "127.0.0.1")), int(s.options.get("port", 29536))
-        socket.create_connection((host, port), timeout=PROBE_S).close()
+        socket.create_connection((host, port), timeout=PROBE_TIMEOUT_S).close()
 
 
 def _filter(address: int) -> dict[str, Any]:
+    """Return the python-can filter for an address."""
     extended = bool(address & EXTENDED_ID)
     mask = ID_MASK if extended else 0x7FF
     if address & ANY_SOURCE:
-        # SAE J1939-21: below PDU format 240 the third byte is a destination, not part of the group
+        # SAE J1939-21: for a PDU format below 240 the third byte is the destination, not part of the group
         broadcast = (address >> 16 & 0xFF) >= 240
         mask = 0x03FF_FF00 if broadcast else 0x03FF_0000
     return {"can_id": address & mask, "can_mask": mask, "extended": extended}
 
 
 def _why_not_open(s: Settings, error: Exception) -> str:
-    """One line: what is wrong with the bus, and what would help."""
+    """Return one line with the reason why a bus cannot be opened, and the remedy."""
     import can
 
     name = f"CAN {s.interface} {s.channel}"
@@ -301,21 +313,24 @@ def _why_not_open(s: Settings, error: Exception) -> str:
     if number in (errno.EACCES, errno.EPERM):
         return f"{name}: no permission; for a serial adapter, add the user to the group dialout"
     if isinstance(error, ImportError | NameError | can.CanInterfaceNotImplementedError):
-        return f"{name}: the vendor's library or driver is not installed: {_plain(error)}"
+        return f"{name}: the vendor's library or driver is not installed: {_one_line(error)}"
     if isinstance(error, TypeError | ValueError | ArithmeticError):
-        return f"{name}: python-can refuses these settings: {_plain(error)}"
-    return f"{name}: cannot be opened: {_plain(error)}"
+        return f"{name}: python-can refuses these settings: {_one_line(error)}"
+    return f"{name}: cannot be opened: {_one_line(error)}"
 
 
-def _plain(error: Exception) -> str:
+def _one_line(error: Exception) -> str:
+    """Return the text of an error in one line."""
     return " ".join(str(error).split())
 
 
 def build(settings: Settings) -> Link:
-    """The link of these settings; opens nothing.
+    """Return the link of these settings without opening it.
 
-    Raises ``ConfigError`` for an interface that python-can does not know, for a number outside its range, and where
-    python-can is not installed.
+    Raises
+    ------
+    ConfigError
+        python-can does not know the interface or is not installed, or a number is out of range.
     """
     check_settings(settings)
     check_extra("can", "a CAN bus")

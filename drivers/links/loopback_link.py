@@ -1,9 +1,8 @@
-"""The in-memory twin of every link: what a test writes into it, a driver reads out of it.
+"""Loopback link: an in-memory link for tests. A test writes data into it, and a driver reads them from it.
 
-It keeps the contract of a real link (bytes, None on timeout, ``LinkLost``, ``LinkEnded``,
-``LinkUnavailable``) with no hardware, and lets the writer cause each of these from any thread: ``write``,
-``drop``, ``end``, and the flag ``absent``. What is written before ``open`` waits, as it would in a
-kernel's buffer.
+It behaves like a real link (bytes, None after a timeout, ``LinkLost``, ``LinkEnded``, ``LinkUnavailable``) without
+hardware. The writer can cause each of these from any thread with ``write``, ``drop``, ``end`` and the flag ``absent``.
+Data written before ``open`` wait in a buffer, like in the kernel.
 """
 
 import threading
@@ -25,13 +24,13 @@ class Settings(LinkSettings, frozen=True, kw_only=True):
 
 
 class LoopbackLink:
-    """A link whose other end is ``write``."""
+    """Link whose data come from ``write``."""
 
     def __init__(self, carrier: Carrier = "bytes", epoch: Literal["monotonic", "unix"] = "monotonic") -> None:
         self.carrier: Carrier = carrier
         self.epoch: Literal["monotonic", "unix"] = epoch
         self.name = "loopback"
-        self.absent = False  # True: opening fails, as with an unplugged device
+        self.absent = False  # True if opening shall fail, as with an unplugged device
         self._changed = threading.Condition()
         self._waiting: deque[Chunk] = deque()
         self._open = False
@@ -39,27 +38,27 @@ class LoopbackLink:
         self._ended = False
 
     def write(self, data: Chunk | bytes) -> None:
-        """Hand bytes (stamped now) or a whole chunk to the reader."""
+        """Pass bytes (time-stamped now) or a complete chunk to the reader."""
         chunk = data if isinstance(data, Chunk) else Chunk(data, time.monotonic_ns())
         with self._changed:
             self._waiting.append(chunk)
             self._changed.notify_all()
 
     def drop(self) -> None:
-        """Lose the peer: what is still unread is lost with it, and the next ``read`` says so."""
+        """Simulate a lost connection. Unread data are lost, and the next ``read`` raises ``LinkLost``."""
         with self._changed:
             self._dropped = True
             self._waiting.clear()
             self._changed.notify_all()
 
     def end(self) -> None:
-        """Nothing more will come: once all is read, ``read`` raises ``LinkEnded``."""
+        """End the data. After all data have been read, ``read`` raises ``LinkEnded``."""
         with self._changed:
             self._ended = True
             self._changed.notify_all()
 
     def open(self) -> None:
-        """Open, unless ``absent``; heals a ``drop``."""
+        """Open the link and clear a ``drop``. Raise LinkUnavailable if ``absent`` is True."""
         with self._changed:
             if self._open:
                 return
@@ -69,7 +68,7 @@ class LoopbackLink:
             self._dropped = False
 
     def read(self, timeout_s: float) -> list[Chunk] | None:
-        """All that was written since the last call; waits up to ``timeout_s`` for the first."""
+        """Return all chunks written since the last call, after waiting up to ``timeout_s`` seconds for the first."""
         with self._changed:
             self._changed.wait_for(self._something, timeout_s)
             if not self._open:
@@ -86,15 +85,16 @@ class LoopbackLink:
             return None
 
     def close(self) -> None:
-        """Close; ends a waiting ``read``."""
+        """Close the link and end a waiting ``read``."""
         with self._changed:
             self._open = False
             self._changed.notify_all()
 
     def _something(self) -> bool:
+        """Return True if ``read`` has a reason to return."""
         return bool(self._waiting) or self._dropped or self._ended or not self._open
 
 
 def build(settings: Settings) -> Link:
-    """A loopback link; its writer needs the object itself, so a configuration file has no use for it."""
+    """Return a loopback link. Its writer needs this object, so the link is of no use in a configuration file."""
     return LoopbackLink(settings.carrier)

@@ -1,19 +1,19 @@
-"""A file in place of a device: recordings, CAN logs and captured bytes, at their own pace or another.
+"""Replay of a file in place of a device: recordings, CAN logs and captured bytes, at their own pace or another.
 
-What the file is decides what the link carries:
+The kind of file determines what the link carries:
 
-- recordings (``drivers.recordings``: CSV, .npz, Parquet, Arrow, a folder) travel as messages for the decoder
-  ``samples``;
-- CAN logs (.asc .blf .log .trc, CSV of python-can, CSV with ``t``, ``id_hex``, ``data_hex``) travel as frames;
-- captured bytes (.bin .raw .txt, also with .gz) travel as bytes;
-- the raw bytes that the daemon kept (a folder of segments, or one of them) travel as what they came in as: bytes,
+- recordings (``drivers.recordings``: CSV, .npz, Parquet, Arrow, a folder) become messages for the decoder ``samples``;
+- CAN logs (.asc .blf .log .trc, CSV of python-can, CSV with ``t``, ``id_hex``, ``data_hex``) become frames;
+- captured bytes (.bin .raw .txt, also with .gz) become bytes;
+- raw bytes recorded by the daemon (a folder of segments, or one of them) become what they were received as: bytes,
   frames or messages.
 
-Recordings, logs and raw bytes keep their own times (``epoch`` unix). Bytes have none: with ``bytes_per_second`` each
-chunk gets the time at which that rate brings it, without it the time it was read.
+Recordings, logs and raw bytes keep their own times (``epoch`` is unix). Captured bytes have no times. With
+``bytes_per_second``, each chunk gets the time at which that rate delivers it. Otherwise it gets the time of the read.
 
-``read`` raises ``LinkEnded`` once all was given. A file cut off in the middle is given up to the cut, and
-the ending says so. ``build`` looks at a CSV's header, since the decoder must fit; all else waits for ``open``.
+``read`` raises ``LinkEnded`` after all data have been returned. A truncated file is replayed up to the cut, and the
+message at the end says so. ``build`` reads the header of a CSV file, since the decoder must match. All other content is
+read by ``open``.
 """
 
 import binascii
@@ -48,41 +48,46 @@ CAN_LOGS: Final = (".asc", ".blf", ".log", ".trc")
 CAPTURES: Final = (".bin", ".raw", ".txt")
 BATCH: Final = 1000
 BATCH_BYTES: Final = 1_000_000
-"""What a read gives at most, and a chunk more: so that none is without end, and none holds hours of a recording."""
-ROWS_AT_ONCE: Final = 4096
+"""A read returns at most BATCH chunks and at most one chunk more than this size. Each read therefore ends, and none
+holds hours of a recording.
+"""
+MAX_MESSAGE_ROWS: Final = 4096
 STEP_S: Final = 0.02
-"""Paced recordings and bytes come in pieces of this length, as from a device with a small buffer."""
+"""Paced recordings and bytes are delivered in pieces of this duration, as from a device with a small buffer."""
 CHUNK_BYTES: Final = 4096
 PYTHON_CAN_HEADER: Final = "timestamp,arbitration_id"
-LARGEST_STANDARD_ID: Final = 0x7FF
-LARGEST_ID: Final = 0x1FFF_FFFF
-LONGEST_FRAME: Final = 64  # bytes, of CAN FD
+MAX_STANDARD_ID: Final = 0x7FF
+MAX_EXTENDED_ID: Final = 0x1FFF_FFFF
+MAX_FRAME_BYTES: Final = 64  # of CAN FD
 READ_BYTES: Final = 1 << 20
 MAX_LINE_BYTES: Final = 1 << 20
 MAX_BYTES_WITHOUT_FRAME: Final = 8_000_000
-"""Text of a log that is read without finding a frame, such as comments; a reader needs seconds for it."""
+"""Maximum length of text in a log without a frame, such as comments. A reader needs seconds for this much text."""
 MAX_OBJECT_BYTES: Final = 64_000_000
-"""Of an object of a BLF log, packed or unpacked; Vector's tools write containers of some hundred kilobytes."""
+"""Maximum size of an object of a BLF log, packed or unpacked.
+
+Vector's tools write containers of some hundred kilobytes.
+"""
 MAX_OBJECTS_WITHOUT_FRAME_BYTES: Final = 256_000_000
 BLF_OBJECT: Final = b"LOBJ"
-BLF_SIZE: Final = slice(8, 12)  # of the object, little-endian, in its header
-BLF_HEADER: Final = 16
-DAMAGE: Final = (
+BLF_SIZE: Final = slice(8, 12)  # position of the object size in its header, little-endian
+BLF_HEADER_BYTES: Final = 16
+DAMAGE_ERRORS: Final = (
     EOFError, LookupError, OverflowError, zlib.error, gzip.BadGzipFile, struct.error, binascii.Error, csv.Error,
 )  # fmt: skip
-"""What readers raise at a place where a file is cut or damaged, beside ValueError."""
+"""Exceptions, in addition to ValueError, that readers raise where a file is truncated or damaged."""
 
 PACES: Final = {"recorded": 1.0, "max": float("inf")}
-"""Words for ``speed``: file seconds a second."""
+"""Values of ``speed`` that are words: seconds of the file per second."""
 
 Kind = Literal["recording", "log", "capture", "raw"]
 Timed = tuple[float, Chunk]
-"""Seconds from the start of the file, and what comes then."""
+"""Seconds since the start of the file, and the chunk that is due then."""
 CARRIERS: Final[dict[Kind, Carrier]] = {"recording": "messages", "log": "frames", "capture": "bytes"}
-"""What each kind carries; raw bytes say it themselves."""
+"""Carrier of each kind of file. Raw bytes state their carrier themselves."""
 
 DEFAULT_DECODERS: Final[dict[Kind, str]] = {"recording": DEFAULT_DECODER, "log": "dbc", "capture": "", "raw": ""}
-"""Decoder of each kind, where the settings name none; "" = they must."""
+"""Decoder of each kind of file if the settings name none; "" if the settings must name one."""
 
 
 class Settings(LinkSettings, frozen=True, kw_only=True):
@@ -90,31 +95,34 @@ class Settings(LinkSettings, frozen=True, kw_only=True):
 
     path: FilePath
     speed: str | Annotated[float, REPLAY_SPEED.meta] = "recorded"
-    """"recorded", "max", or a factor: 10 = ten times as fast."""
+    """Speed of the replay: "recorded", "max", or a factor (10 = ten times as fast)."""
     rate: Annotated[float, RATE_HZ.meta] | None = None
-    """Hz; for a recording with neither t nor fs."""
+    """Sample rate in Hz for a recording with neither t nor fs."""
     bytes_per_second: Annotated[float, BYTE_RATE.meta] | None = None
-    """Pace of captured bytes, a tenth of the baud rate; absent: as fast as they are read."""
+    """Pace of captured bytes, a tenth of the baud rate.
+
+    If it is absent, bytes are delivered as fast as they are read.
+    """
     channel: str | None = None
-    """Only frames of this channel of a CAN log."""
+    """Channel of a CAN log to replay. If it is absent, all channels are replayed."""
 
 
 @dataclass(slots=True)
 class _Source:
-    """An opened file: what it still has to give."""
+    """Open file with the chunks that remain to be delivered."""
 
     items: Iterator[Timed]
     close: Callable[[], object]
 
 
 class ReplayLink:
-    """One file, given once for each time it is opened."""
+    """Replay of one file, which starts from the beginning each time it is opened."""
 
     def __init__(self, settings: Settings, kind: Kind, pace: float) -> None:
         self._settings = settings
         self._path = file_access.path(settings.path)
         self._kind: Kind = kind
-        self._pace = pace  # file seconds a second; inf = no waiting
+        self._pace = pace  # seconds of the file per second; inf = no waiting
         self.carrier: Carrier = _raw_carrier(self._path) if kind == "raw" else CARRIERS[kind]
         self.epoch: Literal["monotonic", "unix"] = "monotonic" if kind == "capture" else "unix"
         self.default_decoder = DEFAULT_DECODERS[kind]
@@ -127,7 +135,7 @@ class ReplayLink:
         self._started_s = 0.0
 
     def open(self) -> None:
-        """Open the file at its start; ``LinkUnavailable`` when it is not there or not what it seemed."""
+        """Open the file at its start. Raise ``LinkUnavailable`` if it does not exist or cannot be replayed."""
         with self._in_use:
             if self._source is not None:
                 return
@@ -136,17 +144,17 @@ class ReplayLink:
                 self._source = self._open_source()
                 self._next = next(self._source.items, None)
             except OSError as error:
-                self._shut()
+                self._close_source()
                 why = error.strerror or " ".join(str(error).split())
                 raise LinkUnavailable(f"{self._path}: cannot be replayed: {why}") from error
-            except (*DAMAGE, ValueError, ConfigError, RecordingError) as error:
-                self._shut()
+            except (*DAMAGE_ERRORS, ValueError, ConfigError, RecordingError) as error:
+                self._close_source()
                 raise LinkUnavailable(f"{self._path}: cannot be replayed: {error}") from error
             self._started_s = time.monotonic()
             self._closing.clear()
 
     def read(self, timeout_s: float) -> list[Chunk] | None:
-        """What is due, waiting up to ``timeout_s`` for the first of it."""
+        """Return the chunks that are due, after waiting up to ``timeout_s`` seconds for the first."""
         deadline = time.monotonic() + timeout_s
         with self._in_use:
             while self._source is not None and not self._closing.is_set():
@@ -162,62 +170,65 @@ class ReplayLink:
         raise LinkLost(f"{self.name}: the link is closed")
 
     def close(self) -> None:
-        """Close the file; ends a waiting ``read``."""
+        """Close the file and end a waiting ``read``."""
         self._closing.set()
         with self._in_use:
-            self._shut()
+            self._close_source()
 
     def _take(self, now_s: float) -> list[Chunk]:
-        """All that is due by now."""
+        """Return all chunks that are due by now."""
         chunks: list[Chunk] = []
         size = 0
         while self._next is not None and self._due(self._next) <= now_s and len(chunks) < BATCH and size < BATCH_BYTES:
             chunks.append(self._next[1])
             size += len(self._next[1].data)
-            self._advance()
+            self._fetch_next()
         return chunks
 
     def _due(self, item: Timed) -> float:
+        """Return the monotonic time in s at which an item is due."""
         return self._started_s + item[0] / self._pace
 
-    def _advance(self) -> None:
-        """Fetch the next item; a file that is damaged from here on ends here."""
+    def _fetch_next(self) -> None:
+        """Fetch the next item. If the file is damaged from here on, the replay ends here."""
         assert self._source is not None
         try:
             self._next = next(self._source.items, None)
-        except (*DAMAGE, ValueError) as error:
+        except (*DAMAGE_ERRORS, ValueError) as error:
             self._next = None
             self.notes += (f"It is cut off or damaged there: {' '.join(str(error).split())}.",)
 
-    def _shut(self) -> None:
+    def _close_source(self) -> None:
+        """Close the file if it is open."""
         source, self._source = self._source, None
         self._next = None
         if source is not None:
             source.close()
 
     def _open_source(self) -> _Source:
+        """Open the file according to its kind."""
         if self._kind == "recording":
             recording = load_samples(self._path, self._settings.rate)
             self.notes = recording.notes
             return _Source(_messages(recording, self._rows(recording)), lambda: None)
         if self._kind == "raw":
             chunks = (chunk for path in _raw_segments(self._path) for chunk in segment.read_chunks(path))
-            return _Source(_from_start(chunks), lambda: None)
+            return _Source(_relative_times(chunks), lambda: None)
         if self._kind == "log":
             return _log(self._path, self._settings.channel)
         return _capture(self._path, self._settings.bytes_per_second)
 
     def _rows(self, recording: Recording) -> int:
-        """Rows a message: few where somebody waits for each, many where nobody does."""
+        """Return the number of rows per message: few for a paced replay, many without pacing."""
         t, n = recording.t_s, len(recording)
         if self._pace == float("inf") or n < 2:
-            return ROWS_AT_ONCE
+            return MAX_MESSAGE_ROWS
         rate = recording.rate_hz if t is None else (n - 1) / max(float(t[-1] - t[0]), 1e-9)
-        return min(max(1, round((rate or 1.0) * STEP_S * self._pace)), ROWS_AT_ONCE)
+        return min(max(1, round((rate or 1.0) * STEP_S * self._pace)), MAX_MESSAGE_ROWS)
 
 
 def _messages(recording: Recording, rows: int) -> Iterator[Timed]:
-    """Messages of ``rows`` samples, each due with its newest sample."""
+    """Yield messages of ``rows`` samples. Each message is due at the time of its newest sample."""
     given = 0
     start_ns: int | None = None
     for samples in iter_blocks(recording, rows):
@@ -231,50 +242,54 @@ def _messages(recording: Recording, rows: int) -> Iterator[Timed]:
 
 
 def _log(path: Path, channel: str | None) -> _Source:
+    """Open a CAN log."""
     if _plain_suffix(path) == ".csv" and not _header(path).startswith(PYTHON_CAN_HEADER):
-        lines = _Lines(_binary(path))
+        lines = _LineReader(_binary(path))
         stream = lines.text("")
-        return _Source(_from_start(_csv_frames(stream, channel, lines.found)), stream.close)
+        return _Source(_relative_times(_csv_frames(stream, channel, lines.found)), stream.close)
     if _plain_suffix(path) == ".blf":
         blf = _blf(path)
-        return _Source(_from_start(_log_frames(iter(blf), channel, lambda: None)), blf.stop)
+        return _Source(_relative_times(_log_frames(iter(blf), channel, lambda: None)), blf.stop)
     import can
 
     readers: dict[str, type[can.io.generic.TextIOMessageReader]] = {
         ".asc": can.ASCReader, ".log": can.CanutilsLogReader, ".trc": can.TRCReader, ".csv": can.CSVReader,
     }  # fmt: skip
-    lines = _Lines(_binary(path))
+    lines = _LineReader(_binary(path))
     stream = lines.text(None)
     try:
         reader = readers[_plain_suffix(path)](stream)
     except BaseException:
         stream.close()
         raise
-    return _Source(_from_start(_log_frames(iter(reader), channel, lines.found)), stream.close)
+    return _Source(_relative_times(_log_frames(iter(reader), channel, lines.found)), stream.close)
 
 
-class _Lines(io.RawIOBase):
-    """A file of lines. ValueError for a line without end, and for text without end that holds no frame."""
+class _LineReader(io.RawIOBase):
+    """Reader of a text file that limits the length of lines and of text without a frame.
+
+    It raises ValueError above a limit.
+    """
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._stream = stream
-        self._line = 0  # bytes since the last end of a line
+        self._line = 0  # bytes since the last line end
         self._idle = 0  # bytes since the last frame
 
     def text(self, newline: str | None) -> io.TextIOWrapper:
-        """The text of the file; its end closes the file."""
+        """Return the decoded text of the file. Closing it closes the file."""
         return io.TextIOWrapper(io.BufferedReader(self), "utf-8", newline=newline)
 
     def found(self) -> None:
-        """Take note that the text so far held a frame."""
+        """Note that the text so far contained a frame."""
         self._idle = 0
 
     def readable(self) -> bool:
-        """Return True, as this can be read."""
+        """Return True, since the stream can be read."""
         return True
 
     def readinto(self, buffer: Any, /) -> int:
-        """Read up to the length of ``buffer`` bytes into it, and return how many."""
+        """Read at most the length of ``buffer`` bytes into it, and return their number."""
         data = self._stream.read(min(len(buffer), CHUNK_BYTES))
         end = max(data.rfind(b"\n"), data.rfind(b"\r"))
         self._line = len(data) - end - 1 if end >= 0 else self._line + len(data)
@@ -293,13 +308,13 @@ class _Lines(io.RawIOBase):
 
 
 def _blf(path: Path) -> "can.BLFReader":
-    """python-can's own reader would leave the file open when it is none of its kind."""
+    """Open a BLF log. python-can's own reader would leave the file open if it is not a BLF log."""
     import can
     from can.io import blf
     from can.io.blf import BLFParseError
 
     class Reader(can.BLFReader):
-        """Not for ever at an object that says to end where it begins, and no object of gigabytes."""
+        """BLF reader that rejects objects of size zero, which python-can would read forever, and oversized objects."""
 
         def __iter__(self) -> "Generator[can.Message, None, None]":
             idle = 0  # bytes since the last frame
@@ -323,7 +338,7 @@ def _blf(path: Path) -> "can.BLFReader":
             self.stop()
 
         def _unpacked(self, container: bytes) -> bytes:
-            """The objects of a container, none of a packing that is unknown."""
+            """Return the objects of a container; none if the compression method is unknown."""
             method, _ = blf.LOG_CONTAINER_STRUCT.unpack_from(container)
             data = container[blf.LOG_CONTAINER_STRUCT.size :]
             if method == blf.NO_COMPRESSION:
@@ -340,14 +355,14 @@ def _blf(path: Path) -> "can.BLFReader":
             at = data.find(BLF_OBJECT)
             while at >= 0:
                 size = data[at + BLF_SIZE.start : at + BLF_SIZE.stop]
-                if len(size) == 4 and int.from_bytes(size, "little") < BLF_HEADER:
+                if len(size) == 4 and int.from_bytes(size, "little") < BLF_HEADER_BYTES:
                     raise BLFParseError("an object is shorter than its header")
                 at = data.find(BLF_OBJECT, at + 1)
             if len(self._tail) > MAX_OBJECT_BYTES:
                 raise BLFParseError(f"an object has more than {MAX_OBJECT_BYTES} bytes")
             yield from super()._parse_container(data)
 
-    stream = _Parts(_binary(path))
+    stream = _ChunkedReader(_binary(path))
     try:
         return Reader(cast("BinaryIO", stream))
     except (BLFParseError, struct.error) as error:
@@ -355,15 +370,15 @@ def _blf(path: Path) -> "can.BLFReader":
         raise ValueError(f"no BLF log: {error}") from error
 
 
-class _Parts:
-    """A file read in parts, so that a length of gigabytes that the file only claims makes no room for them."""
+class _ChunkedReader:
+    """Reader of a file in small parts. A false length of gigabytes in the file therefore allocates no such memory."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._stream = stream
         self.close = stream.close
 
     def read(self, size: int) -> bytes:
-        """So many bytes, fewer at the end."""
+        """Read ``size`` bytes, or fewer at the end of the file."""
         if size < 0:
             raise ValueError("an object is shorter than its header")
         parts = []
@@ -374,7 +389,10 @@ class _Parts:
 
 
 def _log_frames(messages: "Iterator[can.Message]", channel: str | None, found: Callable[[], None]) -> Iterator[Chunk]:
-    """Data frames of a log that python-can reads. ``found`` is called for each message, of another channel too."""
+    """Yield the data frames of a log that python-can reads.
+
+    ``found`` is called for each message, including those of other channels.
+    """
     from can.io.blf import BLFParseError
 
     while True:
@@ -393,9 +411,10 @@ def _log_frames(messages: "Iterator[can.Message]", channel: str | None, found: C
 
 
 def _csv_frames(stream: IO[str], channel: str | None, found: Callable[[], None]) -> Iterator[Chunk]:
-    """Data frames of a CSV with t (s), id_hex, data_hex and perhaps channel or bus, and extended (0 or 1).
+    """Yield the data frames of a CSV file.
 
-    ``found`` is called for each frame, of another channel too.
+    The columns are t (s), id_hex, data_hex, and optionally channel or bus, and extended (0 or 1). ``found`` is called
+    for each frame, including those of other channels.
     """
     rows = csv.reader(stream)
     columns = {name: i for i, name in enumerate(next(rows))}
@@ -409,21 +428,22 @@ def _csv_frames(stream: IO[str], channel: str | None, found: Callable[[], None])
         if channel is not None and (lane is None or row[lane] != channel):
             continue
         address = int(row[identifier], 16)
-        wide = address > LARGEST_STANDARD_ID if extended is None else row[extended] == "1"
+        wide = address > MAX_STANDARD_ID if extended is None else row[extended] == "1"
         flag = EXTENDED_ID if wide else 0
         yield _frame(bytes.fromhex(row[data]), float(row[t]), address | flag)
 
 
 def _frame(data: bytes, t_s: float, address: int) -> Chunk:
-    """A frame of a log; ValueError for one that no bus could carry, or at no time."""
+    """Return a frame of a log as a chunk. Raise ValueError if its identifier, length or time is invalid."""
     if not abs(t_s) < T_LIMIT_S:
         raise ValueError(f"{t_s:g} s is no time")
-    if not 0 <= address & ~EXTENDED_ID <= LARGEST_ID or address < 0 or len(data) > LONGEST_FRAME:
+    if not 0 <= address & ~EXTENDED_ID <= MAX_EXTENDED_ID or address < 0 or len(data) > MAX_FRAME_BYTES:
         raise ValueError(f"no CAN frame: identifier 0x{address & ~EXTENDED_ID:X}, {len(data)} bytes")
     return Chunk(data, round(t_s * 1e9), address)
 
 
-def _from_start(chunks: Iterator[Chunk]) -> Iterator[Timed]:
+def _relative_times(chunks: Iterator[Chunk]) -> Iterator[Timed]:
+    """Yield chunks with their time since the first chunk in s."""
     start_ns: int | None = None
     for chunk in chunks:
         start_ns = chunk.t_ns if start_ns is None else start_ns
@@ -434,12 +454,12 @@ def _from_start(chunks: Iterator[Chunk]) -> Iterator[Timed]:
 
 
 def _raw_segments(path: Path) -> list[Path]:
-    """Segments of raw bytes, oldest first: of a folder, or the one that is named."""
+    """Return the segments of raw bytes in a folder, oldest first, or the one segment that is named."""
     return segment.segments(path) if path.is_dir() else [path]
 
 
 def _is_raw(path: Path) -> bool:
-    """Whether the newest segment holds raw bytes; one that cannot be read says so when it is opened."""
+    """Return True if the newest segment holds raw bytes. An unreadable segment is reported when it is opened."""
     found = _raw_segments(path)
     if not found or not segment.NAME.fullmatch(found[-1].name):
         return False
@@ -450,6 +470,7 @@ def _is_raw(path: Path) -> bool:
 
 
 def _raw_carrier(path: Path) -> Carrier:
+    """Return the carrier of the newest segment. Raise ConfigError if it is unknown."""
     carrier = segment.origin(_raw_segments(path)[-1]).carrier
     known: tuple[Carrier, ...] = ("bytes", "frames", "messages")
     for one in known:
@@ -462,18 +483,21 @@ def _raw_carrier(path: Path) -> Carrier:
 
 
 def _capture(path: Path, bytes_per_second: float | None) -> _Source:
+    """Open a file of captured bytes."""
     stream = _binary(path)
     if bytes_per_second is None:
-        return _Source(_bytes_now(stream), stream.close)
-    return _Source(_bytes_paced(stream, bytes_per_second), stream.close)
+        return _Source(_unpaced_bytes(stream), stream.close)
+    return _Source(_paced_bytes(stream, bytes_per_second), stream.close)
 
 
-def _bytes_now(stream: IO[bytes]) -> Iterator[Timed]:
+def _unpaced_bytes(stream: IO[bytes]) -> Iterator[Timed]:
+    """Yield captured bytes as fast as they are read."""
     while data := stream.read(CHUNK_BYTES):
         yield 0.0, Chunk(data, time.monotonic_ns())
 
 
-def _bytes_paced(stream: IO[bytes], bytes_per_second: float) -> Iterator[Timed]:
+def _paced_bytes(stream: IO[bytes], bytes_per_second: float) -> Iterator[Timed]:
+    """Yield captured bytes at a given rate."""
     start_ns = time.monotonic_ns()
     size = min(max(1, round(bytes_per_second * STEP_S)), CHUNK_BYTES)
     given = 0
@@ -487,7 +511,7 @@ def _bytes_paced(stream: IO[bytes], bytes_per_second: float) -> Iterator[Timed]:
 
 
 def _kind(path: Path) -> Kind:
-    """What the path holds, by its suffix and, for CSV, its header. Raises ConfigError for neither."""
+    """Return the kind of a file by its suffix and, for CSV, its header. Raise ConfigError if it is unknown."""
     suffix = _plain_suffix(path)
     if path == Path():
         raise ConfigError("path: empty; it is a recording, a CAN log, captured bytes, or a folder of segments")
@@ -510,7 +534,7 @@ def _kind(path: Path) -> Kind:
 
 
 def _plain_suffix(path: Path) -> str:
-    """The last suffix, or the one before .gz."""
+    """Return the last suffix, or the suffix before .gz."""
     suffixes = [s.lower() for s in path.suffixes]
     if suffixes and suffixes[-1] == ".gz":
         suffixes.pop()
@@ -518,31 +542,36 @@ def _plain_suffix(path: Path) -> str:
 
 
 def _header(path: Path) -> str:
-    """First line of a text file; "" while there is none to read."""
+    """Return the first line of a text file; "" if it cannot be read."""
     try:
         with _text(path) as stream:
             return stream.readline(1000).strip()
-    except (OSError, UnicodeDecodeError, *DAMAGE):
-        return ""  # open, or the recording's reader, says what is wrong with it
+    except (OSError, UnicodeDecodeError, *DAMAGE_ERRORS):
+        return ""  # opening or reading the file reports the error
 
 
 def _binary(path: Path) -> IO[bytes]:
+    """Open a file for binary reading, decompressed if it ends in .gz."""
     file = file_access.open_regular(path)
     if path.suffix.lower() != ".gz":
         return file
     unzipped: Any = gzip.GzipFile(fileobj=file, mode="rb")
-    unzipped.myfileobj = file  # closed with it
+    unzipped.myfileobj = file  # closed together with the reader
     return cast("IO[bytes]", unzipped)
 
 
 def _text(path: Path) -> IO[str]:
+    """Open a file for text reading, decompressed if it ends in .gz."""
     return io.TextIOWrapper(_binary(path), "utf-8", newline="")
 
 
 def build(settings: Settings) -> Link:
-    """The link of these settings.
+    """Return the link of these settings without opening it.
 
-    Raises ``ConfigError`` for a speed that is none, and for a file that is nothing to replay.
+    Raises
+    ------
+    ConfigError
+        The speed is invalid, or the file cannot be replayed.
     """
     path = file_access.path(settings.path)
     wrong = list(_problems(settings))
@@ -559,7 +588,7 @@ def build(settings: Settings) -> Link:
 
 
 def _check_path(path: Path) -> None:
-    """Raise ConfigError for something that is neither a file nor a folder; one that is not there may come."""
+    """Raise ConfigError for a path that is neither a file nor a folder. A missing file may be created later."""
     if path.is_dir():
         return
     try:
@@ -571,11 +600,12 @@ def _check_path(path: Path) -> None:
 
 
 def _problems(settings: Settings) -> Iterator[str]:
+    """Yield a line for each mistake in the settings."""
     yield from range_problems(settings)
     if isinstance(settings.speed, str) and settings.speed not in PACES:
         yield f'speed: "{settings.speed}"; possible are recorded, max, or a factor without quotes'
 
 
 def _pace(speed: str | float) -> float:
-    """Return the seconds of the file that pass in a second; 0 for an unknown word."""
+    """Return the seconds of the file that pass per second; 0 for an unknown word."""
     return PACES.get(speed, 0.0) if isinstance(speed, str) else speed

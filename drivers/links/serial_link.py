@@ -1,15 +1,16 @@
-"""Serial ports, local or networked: any URL that pyserial knows.
+"""Serial ports, local or networked, by any URL that pyserial supports.
 
-Bytes come out as they arrived, cut anywhere. One thread waits for the first byte, lets others join it until
-a short time (``read_timeout``, 10 ms) has passed, and takes all that are there: that costs a tenth of waking up
-for every frame, and no byte waits longer than that. URL handlers without a file number wake up at every
-arrival instead, within the same time. ``close`` only raises a flag and ends the pending read; the port
-itself is closed once the reader has left it, as a file number closed under a waiting reader may by then
-belong to another file.
+Bytes are returned as they arrive, without regard to frames. The reader waits for the first byte, then for a short time
+(``read_timeout``, 10 ms) for more bytes, and takes all that have arrived. This needs a tenth of the processor time of a
+wake-up per frame, and no byte waits longer than this time. URL handlers without a file descriptor wake up at every
+arrival instead, within the same time.
 
-Outcomes of ``open``: the port, or ``LinkUnavailable`` that says what to do about it (absent: which
-ports there are; no permission; held by another program). Of ``read``: bytes, None, or ``LinkLost``
-when the device was unplugged or the other end hung up. Nothing is ever written to the device.
+``close`` sets a flag and ends a waiting read. The port itself is closed after the reader has left it. A descriptor that
+is closed while a reader waits on it could by then belong to another file.
+
+``open`` either succeeds or raises ``LinkUnavailable``, which says what to do: list of the existing ports, missing
+permission, or port in use by another program. ``read`` returns bytes or None, or raises ``LinkLost`` if the device was
+unplugged or the other end closed the connection. Nothing is ever written to the device.
 """
 
 import contextlib
@@ -33,17 +34,17 @@ if TYPE_CHECKING:
 
 DEFAULT_DECODER: Final = ""
 READ_SIZE: Final = 4096
-"""Bytes taken at once; more than 10 ms at 3 Mbit/s. Where they come faster, nothing is waited for."""
+"""Maximum number of bytes per read, more than 10 ms at 3 Mbit/s. At higher rates the reader does not wait."""
 STOP_BITS: Final = (1.0, 1.5, 2.0)
 SCHEMES: Final = ("socket", "rfc2217", "loop", "spy", "alt", "hwgrep", "cp2110")
-"""URL schemes that come with pyserial."""
+"""URL schemes that are part of pyserial."""
 
 
 class Settings(LinkSettings, frozen=True, kw_only=True):
     """Keys of a serial link."""
 
     port: str
-    """/dev/ttyUSB0, COM3, socket://host:port, rfc2217://host:port, hwgrep://REGEX."""
+    """Device or URL: /dev/ttyUSB0, COM3, socket://host:port, rfc2217://host:port, hwgrep://REGEX."""
     baudrate: Annotated[int, BIT_RATE.meta] = 115200
     bytesize: Literal[5, 6, 7, 8] = 8
     parity: Literal["N", "E", "O", "M", "S"] = "N"
@@ -51,13 +52,13 @@ class Settings(LinkSettings, frozen=True, kw_only=True):
     rtscts: bool = False
     xonxoff: bool = False
     exclusive: bool = True
-    """Keep every other program from reading the same port; where the system can."""
+    """True if other programs are prevented from reading the same port, where the system supports this."""
     read_timeout: Annotated[float, READ_TIMEOUT_S.meta] = 0.01
-    """Seconds that bytes may wait for more to join them; at most 0.1."""
+    """Time in s that bytes may wait for more bytes; at most 0.1."""
 
 
 class SerialLink:
-    """One serial port."""
+    """Link to one serial port."""
 
     carrier: Carrier = "bytes"
     epoch: Literal["monotonic", "unix"] = "monotonic"
@@ -65,13 +66,13 @@ class SerialLink:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._port: serial.SerialBase | None = None
-        self._plenty = False  # the last read brought so much that the next must not wait
+        self._buffer_filling = False  # True if the last read was so large that the next one must not wait
         self._closing = threading.Event()
         self._in_use = threading.Lock()  # held while the port is read, opened or closed
         self.name = f"{masked(settings.port)} at {settings.baudrate} baud"
 
     def open(self) -> None:
-        """Open the port; ``LinkUnavailable`` says why it cannot be, and what to do."""
+        """Open the port. Raise ``LinkUnavailable`` with the reason and the remedy if it cannot be opened."""
         import serial
 
         with self._in_use:
@@ -88,7 +89,7 @@ class SerialLink:
                     rtscts=s.rtscts,
                     xonxoff=s.xonxoff,
                     timeout=s.read_timeout,
-                    # URL handlers without a lock take the key and leave it aside
+                    # URL handlers without a lock ignore this key
                     **({"exclusive": True} if s.exclusive else {}),
                 )
             except (OSError, ValueError, NotImplementedError) as error:
@@ -96,7 +97,7 @@ class SerialLink:
             self._closing.clear()
 
     def read(self, timeout_s: float) -> list[Chunk] | None:
-        """Bytes that came, as one chunk; None after ``timeout_s`` without any."""
+        """Return the received bytes as one chunk; None if none arrive within ``timeout_s`` seconds."""
         deadline = time.monotonic() + timeout_s
         with self._in_use:
             port = self._port
@@ -109,18 +110,19 @@ class SerialLink:
         raise LinkLost(f"{masked(self._settings.port)}: the link is closed")
 
     def close(self) -> None:
-        """Close the port, once a waiting ``read`` has ended."""
+        """Close the port after a waiting ``read`` has ended."""
         self._closing.set()
         port = self._port
         cancel = getattr(port, "cancel_read", None)  # not every URL handler has it
         if cancel is not None:
-            # it fails when the reader dropped the port in this very moment: then nothing waits
+            # it fails if the reader has just closed the port; then no read is waiting
             with contextlib.suppress(OSError, TypeError):
                 cancel()
         with self._in_use:
             self._drop_port()
 
     def _read_some(self, port: "serial.SerialBase") -> bytes:
+        """Read the bytes that arrive within the read timeout. Raise LinkLost if the device is gone."""
         try:
             if not _has_file_number(port):
                 data: bytes = port.read(READ_SIZE)
@@ -128,34 +130,35 @@ class SerialLink:
             until_s = time.monotonic() + self._settings.read_timeout
             data = port.read(1)
             if data:
-                if not self._plenty:
+                if not self._buffer_filling:
                     self._closing.wait(max(0.0, until_s - time.monotonic()))
-                with contextlib.suppress(BlockingIOError):  # nothing has joined it
+                with contextlib.suppress(BlockingIOError):  # no more bytes have arrived
                     data += os.read(port.fileno(), READ_SIZE)
-            self._plenty = len(data) > READ_SIZE // 2
+            self._buffer_filling = len(data) > READ_SIZE // 2
         except OSError as error:
             self._drop_port()
             raise LinkLost(
                 f"{masked(self._settings.port)}: the device is gone (unplugged, switched off, or read by "
-                f"another program): {_plain(error)}"
+                f"another program): {_one_line(error)}"
             ) from error
         return data
 
     def _drop_port(self) -> None:
+        """Close the port if it is open."""
         port, self._port = self._port, None
         if port is not None:
             port.close()
 
 
 def _has_file_number(port: "serial.SerialBase") -> bool:
-    """Whether reading past pyserial is the same: its own POSIX port, which is open without blocking."""
+    """Return True if the port can be read by its file descriptor: it is pyserial's own non-blocking POSIX port."""
     import serial
 
     return os.name == "posix" and type(port).read is serial.Serial.read
 
 
 def _why_not_open(port: str, error: Exception) -> str:
-    """One line: what is wrong with the port, and what would help."""
+    """Return one line with the reason why a port cannot be opened, and the remedy."""
     number = getattr(error, "errno", None)
     if number == errno.ENOENT:
         return f"{port}: no such port; {_ports()}"
@@ -167,25 +170,29 @@ def _why_not_open(port: str, error: Exception) -> str:
         return f"{port}: no device behind this port; is it plugged in and switched on? {_ports()}"
     if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR):
         return f"{port}: not a serial port; {_ports()}"
-    return f"{port}: cannot be opened: {_plain(error)}"
+    return f"{port}: cannot be opened: {_one_line(error)}"
 
 
 def _ports() -> str:
-    """What ports there are, for people."""
+    """Return a list of the existing ports for a message."""
     from serial.tools import list_ports
 
     found = sorted(info.device for info in list_ports.comports())
     return f"ports here: {', '.join(found)}" if found else "this computer shows no serial port"
 
 
-def _plain(error: Exception) -> str:
+def _one_line(error: Exception) -> str:
+    """Return the text of an error in one line."""
     return " ".join(str(error).split())
 
 
 def build(settings: Settings) -> Link:
-    """The link of these settings; opens nothing.
+    """Return the link of these settings without opening it.
 
-    Raises ``ConfigError`` for a URL scheme or stop bits that do not exist, and for a number outside its range.
+    Raises
+    ------
+    ConfigError
+        The URL scheme is unknown, the number of stop bits is invalid, or a number is out of range.
     """
     if wrong := list(_problems(settings)):
         raise ConfigError(*wrong)
@@ -193,18 +200,19 @@ def build(settings: Settings) -> Link:
 
 
 def _problems(settings: Settings) -> Iterator[str]:
+    """Yield a line for each mistake in the settings."""
     scheme, found, _ = settings.port.partition("://")
     if not settings.port:
         yield 'port: empty; it is a port ("/dev/ttyUSB0") or a URL ("socket://host:port")'
-    elif found and scheme.lower() not in SCHEMES and not _handler(scheme.lower()):
+    elif found and scheme.lower() not in SCHEMES and not _has_handler(scheme.lower()):
         yield f'port: "{settings.port}" has an unknown kind of URL "{scheme}"{possible(scheme, SCHEMES)}'
     if settings.stopbits not in STOP_BITS:
         yield f"stopbits: {settings.stopbits:g}; possible are 1, 1.5, 2"
     yield from range_problems(settings)
 
 
-def _handler(scheme: str) -> bool:
-    """Whether pyserial, or a package that extends it, has a handler for this scheme."""
+def _has_handler(scheme: str) -> bool:
+    """Return True if pyserial, or a package that extends it, has a handler for this URL scheme."""
     import serial
 
     packages: Any = serial.protocol_handler_packages

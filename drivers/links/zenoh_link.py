@@ -1,16 +1,16 @@
-"""Messages of another system over zenoh: one message a chunk, with its attachment.
+"""Messages of another system over zenoh, one message per chunk with its attachment.
 
-The session is the link's own, and closed: no scouting, no listening, only the endpoints that the
-settings name. With one endpoint it is a client, which needs that to open: a router passes nothing on between two
-peers, and publishers mostly are peers. With several it is a peer, as a client would stay with the first that
-answers: it opens at once and zenoh itself goes on trying to connect in the background, so an absent publisher
-shows as silence, not as ``LinkLost``.
+The link has its own session, which is closed to others: it does not scout or listen, and it connects only to the
+endpoints of the settings. With one endpoint the session is a client, which needs that endpoint to open. A router does
+not forward data between two peers, and most publishers are peers. With several endpoints the session is a peer, since a
+client would stay with the first endpoint that answers. A peer opens at once, and zenoh keeps trying to connect in the
+background. A missing publisher therefore shows as silence and not as ``LinkLost``.
 
-zenoh fills a ring channel that overwrites its oldest when full (a decoder sees that in the sequence
-numbers). A thread of the link's own takes from it and stamps each message, as zenoh's channels cannot be
-waited on with a timeout; no Python callback is registered, since one that lives at exit hangs the
-process. Closing the session ends that thread, and with it a waiting ``read``. A program that ends without
-closing has it closed by ``atexit``: a thread that still waited in zenoh then would abort the process.
+zenoh writes to a ring channel, which overwrites its oldest message when it is full. A decoder detects this by the
+sequence numbers. A thread of the link takes the messages from the channel and time-stamps them, because zenoh's
+channels have no timeout. No Python callback is registered, since a callback that exists at exit blocks the process.
+Closing the session ends the thread and with it a waiting ``read``. If a program ends without closing the session,
+``atexit`` closes it. Otherwise a thread that still waits in zenoh would abort the process.
 """
 
 import atexit
@@ -33,28 +33,30 @@ if TYPE_CHECKING:
     import zenoh
 
 DEFAULT_DECODER: Final = "samples"
-RING_SIZE: Final = 4096
-"""Messages; four seconds at 1 kHz."""
+MAX_MESSAGES: Final = 4096
+"""Maximum number of messages that wait to be read: four seconds at 1 kHz."""
 WAITING_BYTES: Final = 128_000_000
-"""Of all that wait to be read: twice the longest message that a session takes in."""
+"""Maximum size of all messages that wait to be read: twice the longest message that a session accepts."""
 
 
 class Settings(LinkSettings, frozen=True, kw_only=True):
     """Keys of a zenoh link."""
 
     key: str
-    """Key expression: "imu/bench-1/samples", "0/imu/data/sensor_msgs::msg::dds_::Imu_/**"."""
+    """Key expression, such as "imu/bench-1/samples" or "0/imu/data/sensor_msgs::msg::dds_::Imu_/**"."""
     mode: Literal["peer", "client"] | None = None
-    """Absent: as the file says, else client where one endpoint is named, and peer where several are or none."""
+    """Mode of the session. If it is absent, the mode is that of the file. Without a mode in the file, the session is a
+    client for one endpoint and a peer otherwise.
+    """
     connect: list[str] = msgspec.field(default_factory=list)
-    """Endpoints, "tcp/127.0.0.1:7447"."""
+    """Endpoints to connect to, such as "tcp/127.0.0.1:7447"."""
     listen: list[str] = msgspec.field(default_factory=list)
     config: FilePath = ""
-    """A zenoh JSON5 file for all else (TLS, access control); the keys above win where they are given."""
+    """zenoh JSON5 file for all other settings (TLS, access control). The keys above take precedence."""
 
 
 class ZenohLink:
-    """One subscription in a session of its own."""
+    """Link to one subscription in a session of its own."""
 
     carrier: Carrier = "messages"
     epoch: Literal["monotonic", "unix"] = "monotonic"
@@ -65,13 +67,13 @@ class ZenohLink:
         self._opening = threading.Lock()
         self._changed = threading.Condition()
         self._waiting: deque[Chunk] = deque()
-        self._bytes = 0  # of all that wait
+        self._waiting_bytes = 0  # size of all waiting messages
         self._session: zenoh.Session | None = None
-        self._taker: threading.Thread | None = None
+        self._receiver: threading.Thread | None = None
         self._running = False
 
     def open(self) -> None:
-        """Open the session and subscribe; a client needs its router, a peer needs nobody."""
+        """Open the session and subscribe. A client needs its router, a peer needs no other party."""
         import zenoh
 
         with self._opening:
@@ -85,73 +87,75 @@ class ZenohLink:
                 raise LinkUnavailable(self._why_not_open(error)) from error
             self._session = session
             try:
-                channel: Any = zenoh.handlers.RingChannel(RING_SIZE)
+                channel: Any = zenoh.handlers.RingChannel(MAX_MESSAGES)
                 subscriber: Any = session.declare_subscriber(self._settings.key, channel)
             except zenoh.ZError as error:
                 self._close_session()
                 raise LinkUnavailable(f"{self.name}: cannot subscribe: {plain(error)}") from error
-            self._forget()
+            self._clear_waiting()
             self._running = True
-            self._taker = threading.Thread(
-                target=self._take, args=(subscriber,), name=f"{self.name} taker", daemon=True
+            self._receiver = threading.Thread(
+                target=self._receive, args=(subscriber,), name=f"{self.name} taker", daemon=True
             )
-            self._taker.start()
+            self._receiver.start()
             atexit.register(self.close)
 
     def read(self, timeout_s: float) -> list[Chunk] | None:
-        """Messages that came, waiting up to ``timeout_s`` for the first."""
+        """Return the received messages, after waiting up to ``timeout_s`` seconds for the first."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or not self._running, timeout_s)
             if self._waiting:
                 chunks = list(self._waiting)
-                self._forget()
+                self._clear_waiting()
                 return chunks
             if not self._running:
                 raise LinkLost(f"{self.name}: the session is closed")
             return None
 
     def close(self) -> None:
-        """Close the session; ends a waiting ``read``."""
+        """Close the session and end a waiting ``read``."""
         with self._opening:
             self._close_session()
 
-    def _take(self, subscriber: Any) -> None:
-        """Thread: ring channel -> stamped chunks, until the session is closed."""
+    def _receive(self, subscriber: Any) -> None:
+        """Move messages from the ring channel to the queue and time-stamp them, until the session is closed."""
         import zenoh
 
-        handler = subscriber.handler  # the subscriber itself cannot be undeclared while it waits
+        handler = subscriber.handler  # a subscriber cannot be undeclared while it waits
         try:
             while True:
                 sample = handler.recv()
                 chunk = _chunk(sample, time.monotonic_ns())
                 with self._changed:
-                    self._keep(chunk)
+                    self._enqueue(chunk)
                     self._changed.notify_all()
         except zenoh.ZError:
-            pass  # the channel was closed: by close(), or by a session that failed
+            pass  # the channel was closed by close(), or by a session that failed
         finally:
             with self._changed:
                 self._running = False
                 self._changed.notify_all()
 
-    def _forget(self) -> None:
+    def _clear_waiting(self) -> None:
+        """Discard the waiting messages."""
         self._waiting.clear()
-        self._bytes = 0
+        self._waiting_bytes = 0
 
-    def _keep(self, chunk: Chunk) -> None:
-        """The newest; the oldest give way."""
+    def _enqueue(self, chunk: Chunk) -> None:
+        """Queue the newest chunk and drop the oldest ones above the limits."""
         self._waiting.append(chunk)
-        self._bytes += len(chunk.data)
-        while len(self._waiting) > 1 and (self._bytes > WAITING_BYTES or len(self._waiting) > RING_SIZE):
-            self._bytes -= len(self._waiting.popleft().data)
+        self._waiting_bytes += len(chunk.data)
+        while len(self._waiting) > 1 and (self._waiting_bytes > WAITING_BYTES or len(self._waiting) > MAX_MESSAGES):
+            self._waiting_bytes -= len(self._waiting.popleft().data)
 
     def _close_session(self) -> None:
+        """Close the session and wait for the receiving thread."""
         atexit.unregister(self.close)
         session, self._session = self._session, None
-        taker, self._taker = self._taker, None
+        taker, self._receiver = self._receiver, None
         with self._changed:
             self._running = False
-            self._forget()
+            self._clear_waiting()
             self._changed.notify_all()
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
@@ -159,6 +163,7 @@ class ZenohLink:
             taker.join()
 
     def _why_not_open(self, error: Exception) -> str:
+        """Return one line with the reason why the session cannot be opened."""
         config = _configuration(self._settings)
         places = endpoints(config)
         nobody = (
@@ -170,11 +175,13 @@ class ZenohLink:
 
 
 def _chunk(sample: Any, t_ns: int) -> Chunk:
+    """Return a zenoh sample as a chunk."""
     attachment = sample.attachment
     return Chunk(bytes(sample.payload), t_ns, attachment=b"" if attachment is None else bytes(attachment))
 
 
 def _configuration(settings: Settings) -> "zenoh.Config":
+    """Return the configuration of the session."""
     own = {
         "mode": settings.mode,
         "connect/endpoints": settings.connect or None,
@@ -187,9 +194,12 @@ def _configuration(settings: Settings) -> "zenoh.Config":
 
 
 def build(settings: Settings) -> Link:
-    """The link of these settings; opens nothing.
+    """Return the link of these settings without opening it.
 
-    Raises ``ConfigError`` for a key expression, an endpoint or a configuration file that zenoh refuses.
+    Raises
+    ------
+    ConfigError
+        zenoh refuses a key expression, an endpoint or a configuration file.
     """
     import zenoh
 

@@ -1,17 +1,16 @@
-"""Recordings in and out: CSV (plain or gzip), .npz, Parquet and Arrow IPC, or a folder of segments.
+"""Reading and writing of recordings: CSV (plain or gzip), .npz, Parquet, Arrow IPC, or a folder of segments.
 
-In comes a path, out comes one ``Recording``: times, six axes, temperature, a stated rate, and notes
-that say in plain sentences what was found and what was done about it. Each format has one module
-that only finds columns (``Table``); what columns mean is decided once, here in ``_assemble``.
+``load_samples`` reads a path and returns a ``Recording``. It contains times, six axes, temperature, a stated rate, and
+notes. The notes describe in sentences what was found and how it was handled. Each format has a module that only finds
+columns (``Table``). ``_assemble`` gives the columns their meaning.
 
-Outcomes: a ``Recording`` with at least one sample; ``RecordingError`` when the file is none (one
-line: file, what is wrong, what would be right); ``ConfigError`` when the file is one but more has to
-be said (``--rate``) or installed (pyarrow). A file cut off in the middle is read up to the cut.
-What is doubtful is never passed on as a number: a line without its end, an unreadable field or an
-infinite value becomes missing, and a note counts it.
+There are three outcomes. A ``Recording`` has at least one sample. ``RecordingError`` means that the file is not a
+recording. Its text is one line that names the file, the error and the expected content. ``ConfigError`` means that a
+setting (``--rate``) or a package (pyarrow) is missing. A truncated file is read up to the cut. Doubtful data never
+become numbers: an incomplete line, an unreadable field or an infinite value is read as missing, and a note counts it.
 
-Time stamps are passed on as stored, with their jitter, gaps and steps back. Nothing is resampled,
-sorted or filled here, no unit is guessed, and nothing is ever unpickled.
+Times are returned as stored, with their jitter, gaps and steps back. The module does not resample, sort or interpolate
+data, it does not guess units, and it never unpickles objects.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,33 +33,44 @@ from drivers.sample import AXES, Floats, SampleBlock, block
 
 __all__ = ["FORMATS", "Recording", "is_recording", "iter_blocks", "load_samples", "save_samples", "writing"]
 
-RESOLUTION_S: Final = 1e-6
-"""Of Unix times in a double, and a little more."""
+TIME_RESOLUTION_S: Final = 1e-6
+"""Slightly more than the resolution of Unix times in a float64."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """All samples of one file or folder, in stored order; arrays are read-only."""
+    """All samples of a file or folder in stored order. The arrays are read-only."""
 
-    t_s: Floats | None  # [n] s as stored, any origin; None where only a rate is known
+    t_s: Floats | None  # [n] s as stored, any origin; None if only a rate is known
     values: Floats  # [n, 6] in AXES order, rad/s and m/s²; NaN = missing or absent
     temperature_c: Floats  # [n] °C; NaN = missing or absent
     rate_hz: float | None  # stated (fs of the file, or the caller's), not measured
     axes: tuple[str, ...]  # axes present as columns, in AXES order
-    notes: tuple[str, ...]  # what was found and done
+    notes: tuple[str, ...]  # what was found and how it was handled
 
     def __len__(self) -> int:
         return int(self.values.shape[0])
 
 
 def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None = None) -> Recording:
-    """Read a recording, or a folder of segments sorted by name as one recording.
+    """Read a recording, or a folder of segments in the order of their names as one recording.
 
-    ``rate_hz`` is used where the file has no ``t``, and goes before the file's own ``fs``; of a long recording
-    ``last_s`` takes the end alone, and of a folder only the segments for it are read.
+    Parameters
+    ----------
+    path
+        File or folder.
+    rate_hz
+        Sample rate in Hz for a file without ``t``. It takes precedence over ``fs`` of the file.
+    last_s
+        Duration in s to take from the end of the recording. Of a folder, only the segments that cover it are read. None
+        for the whole recording.
 
-    Raises RecordingError when the path holds no recording, ConfigError when a rate or a library is missing,
-    the suffix is unknown, or the folder holds more than the memory does.
+    Raises
+    ------
+    RecordingError
+        The path holds no recording.
+    ConfigError
+        A rate or a library is missing, the suffix is unknown, or the samples do not fit into the memory.
     """
     for option, quantity, value in (("--rate", RATE_HZ, rate_hz), ("--last", DURATION_S, last_s)):
         try:
@@ -71,24 +81,35 @@ def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None 
     try:
         found = _load_folder(path, rate_hz, last_s) if path.is_dir() else _load_file(path, rate_hz)
     except OSError as error:
-        raise RecordingError(_why(path, error)) from error
+        raise RecordingError(_error_text(path, error)) from error
     except MemoryError as error:
         raise ConfigError(f"{path}: does not fit into the memory that is free; read a part of it") from error
-    return found if last_s is None else _end(found, last_s)
+    return found if last_s is None else _take_last(found, last_s)
 
 
 def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]:
-    """The recording as blocks of ``rows`` samples at most; ``t_ns`` are the recording's own times.
+    """Yield a recording in blocks of at most ``rows`` samples.
 
-    Without ``t`` the first sample is at 0 and the rest follow at the stated rate.
+    Parameters
+    ----------
+    recording
+        Recording to split.
+    rows
+        Maximum number of samples per block.
+
+    Yields
+    ------
+    SampleBlock
+        Block whose ``t_ns`` are the times of the recording. Without ``t``, the first sample is at 0 and the others
+        follow at the stated rate.
     """
     for start in range(0, len(recording), rows):
         part = slice(start, min(start + rows, len(recording)))
         yield block(_times_ns(recording, part), recording.values[part], recording.temperature_c[part])
 
 
-def _why(path: Path, error: RecordingError | OSError) -> str:
-    """Why a file cannot be read, in one line that names it."""
+def _error_text(path: Path, error: RecordingError | OSError) -> str:
+    """Return why a file cannot be read, in one line that names the file."""
     if isinstance(error, RecordingError):
         return str(error)
     return f"{error.filename or path}: cannot be read: {error.strerror or error}"
@@ -98,12 +119,13 @@ def _why(path: Path, error: RecordingError | OSError) -> str:
 
 
 def _load_file(path: Path, rate_hz: float | None) -> Recording:
+    """Read one file."""
     _check_content(path)
     return _assemble(path, format_of(path).read(path), rate_hz)
 
 
 def _check_content(path: Path) -> None:
-    """Raise an error for an empty file, and for a name that is not a regular file: a pipe or a device has no end."""
+    """Raise an error for an empty file, and for a path that is not a regular file. A pipe or a device has no end."""
     check_regular(path)
     if path.stat().st_size:
         return
@@ -117,10 +139,10 @@ def _check_content(path: Path) -> None:
 
 
 def _assemble(path: Path, table: Table, rate_hz: float | None) -> Recording:
-    """Give columns their meaning: lengths, times, rate, missing values."""
+    """Turn columns into a recording: check lengths, choose times and rate, and mark missing values."""
     n = _common_length(path, table.columns)
     notes = list(table.notes)
-    rate = _stated_rate(_supported_fs(table.fs, notes), rate_hz, notes)
+    rate = _choose_rate(_supported_fs(table.fs, notes), rate_hz, notes)
     t_s, rows = _usable_times(path, table.columns.get("t"), rate, notes)
     if t_s is None and rate is None:
         why = next((f" ({note.rstrip('.')})" for note in notes if note.startswith("fs ")), "")
@@ -144,6 +166,7 @@ def _recording(
     axes: tuple[str, ...],
     notes: Sequence[str],
 ) -> Recording:
+    """Return a recording with read-only arrays and one-line notes."""
     for array in (t_s, values, temperature_c):
         if array is not None:
             array.flags.writeable = False
@@ -151,6 +174,7 @@ def _recording(
 
 
 def _common_length(path: Path, columns: Mapping[str, Floats]) -> int:
+    """Return the length of all columns. Raise RecordingError if it differs between them or is zero."""
     first = next(iter(columns))
     n = columns[first].size
     for name, column in columns.items():
@@ -164,7 +188,7 @@ def _common_length(path: Path, columns: Mapping[str, Floats]) -> int:
 
 
 def _supported_fs(fs: float | None, notes: list[str]) -> float | None:
-    """Return the rate that the file states; None with a note if it is outside the supported range."""
+    """Return the rate that the file states. Return None and add a note if it is outside the supported range."""
     try:
         return fs if fs is None else RATE_HZ.check(fs)
     except ConfigError as error:
@@ -172,7 +196,8 @@ def _supported_fs(fs: float | None, notes: list[str]) -> float | None:
         return None
 
 
-def _stated_rate(fs: float | None, rate_hz: float | None, notes: list[str]) -> float | None:
+def _choose_rate(fs: float | None, rate_hz: float | None, notes: list[str]) -> float | None:
+    """Return the rate to use. The rate of the caller takes precedence over that of the file."""
     if rate_hz is not None and fs is not None and rate_hz != fs:
         notes.append(f"The file states {fs:g} Hz; {rate_hz:g} Hz was asked for and is used.")
     return fs if rate_hz is None else float(rate_hz)
@@ -181,10 +206,10 @@ def _stated_rate(fs: float | None, rate_hz: float | None, notes: list[str]) -> f
 def _usable_times(
     path: Path, t: Floats | None, rate_hz: float | None, notes: list[str]
 ) -> tuple[Floats | None, NDArray[np.bool_] | slice]:
-    """The times that can be used, and the rows they stand in; None and all rows where t is of no use."""
+    """Return the usable times and a mask of their rows; None and all rows if ``t`` is not usable."""
     if t is None:
         return None, slice(None)
-    usable = np.abs(t) < T_LIMIT_S  # false for NaN too
+    usable = np.abs(t) < T_LIMIT_S  # False for NaN as well
     lost = int(t.size - np.count_nonzero(usable))
     if 2 * lost > t.size:
         what = f"{lost} of {t.size} values of t are no time in seconds (first: {t[~usable][0]:g})"
@@ -198,6 +223,7 @@ def _usable_times(
 
 
 def _drop_infinite(values: Floats, temperature_c: Floats, notes: list[str]) -> None:
+    """Replace infinite values by NaN, and add a note."""
     count = 0
     for array in (values, temperature_c):
         infinite = np.isinf(array)
@@ -208,6 +234,7 @@ def _drop_infinite(values: Floats, temperature_c: Floats, notes: list[str]) -> N
 
 
 def _times_ns(recording: Recording, part: slice) -> NDArray[np.int64]:
+    """Return the times of some rows in ns."""
     if recording.t_s is not None:
         seconds = recording.t_s[part]
     elif recording.rate_hz is not None:
@@ -221,7 +248,7 @@ def _times_ns(recording: Recording, part: slice) -> NDArray[np.int64]:
 
 
 def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Recording:
-    """Segments in the order of their names; one that cannot be read is left out, with a note."""
+    """Read segments in the order of their names. A segment that cannot be read is left out, with a note."""
     segments = sorted(p for p in path.iterdir() if is_recording(p) and p.name[0] != ".")
     if not segments:
         raise RecordingError(f"{path}: no recordings in this folder; known are {' '.join(FORMATS)}")
@@ -234,21 +261,21 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
         try:
             part = _load_file(segment, rate_hz)
         except (RecordingError, OSError) as error:
-            notes.append(f"A segment was left out: {_why(segment, error)}.")
+            notes.append(f"A segment was left out: {_error_text(segment, error)}.")
             continue
         parts.append(part)
         taken += part.values.nbytes + 2 * part.temperature_c.nbytes
         memory_check.check(path, taken, free)
         notes += [f"{segment.name}: {note}" for note in reversed(part.notes)]
-        if last_s is not None and _lasted_s(parts) > last_s:
+        if last_s is not None and _duration_s(parts) > last_s:
             break
     if not parts:
         raise RecordingError(f"{path}: none of {len(segments)} segments can be read; {notes[-1]}")
-    return _joined(path, parts[::-1], notes[::-1])
+    return _concatenate(path, parts[::-1], notes[::-1])
 
 
 def _check_folder(path: Path, segments: Sequence[Path], free: int | None) -> None:
-    """Raise an error if the rows of all segments exceed the limits; segments that cannot be read do not count."""
+    """Raise an error if the rows of all segments exceed the limits. Unreadable segments do not count."""
     rows = size_bytes = 0
     for segment in segments:
         try:
@@ -260,19 +287,19 @@ def _check_folder(path: Path, segments: Sequence[Path], free: int | None) -> Non
         memory_check.ReadLimit(path, size_bytes, free).check_rows(rows)
 
 
-def _lasted_s(parts: Sequence[Recording]) -> float:
-    """From the first sample of the last of them to the end of the first."""
+def _duration_s(parts: Sequence[Recording]) -> float:
+    """Return the time from the first sample of the oldest part to the last sample of the newest part, in s."""
     newest, oldest = parts[0].t_s, parts[-1].t_s
     if newest is not None and oldest is not None:
         return float(newest[-1] - oldest[0])
     return sum(len(one) / one.rate_hz for one in parts if one.rate_hz)
 
 
-def _end(found: Recording, last_s: float) -> Recording:
-    """The last seconds, from where on no sample is older."""
+def _take_last(found: Recording, last_s: float) -> Recording:
+    """Return the samples of the last ``last_s`` seconds."""
     if found.t_s is not None:
-        older = np.flatnonzero(found.t_s <= found.t_s[-1] - last_s + RESOLUTION_S)
-        # the newest sample is always within a duration, however short that is
+        older = np.flatnonzero(found.t_s <= found.t_s[-1] - last_s + TIME_RESOLUTION_S)
+        # the newest sample is always included, however short the duration
         first = min(int(older[-1]) + 1, len(found) - 1) if older.size else 0
     else:
         first = max(len(found) - max(round(last_s * (found.rate_hz or 0.0)), 1), 0)
@@ -282,7 +309,8 @@ def _end(found: Recording, last_s: float) -> Recording:
     return _recording(t_s, values, temperature_c, found.rate_hz, found.axes, (*found.notes, note))
 
 
-def _joined(path: Path, parts: Sequence[Recording], notes: list[str]) -> Recording:
+def _concatenate(path: Path, parts: Sequence[Recording], notes: list[str]) -> Recording:
+    """Concatenate the recordings of all segments."""
     times = [part.t_s for part in parts if part.t_s is not None]
     rates = {part.rate_hz for part in parts}
     if 0 < len(times) < len(parts):

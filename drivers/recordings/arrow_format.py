@@ -1,8 +1,8 @@
-"""Parquet and Arrow IPC. pyarrow is an optional library: imported when a file asks for it.
+"""Reading and writing of Parquet and Arrow IPC. pyarrow is optional and imported when a file needs it.
 
-An Arrow file is read up to a cut, batch by batch; Parquet cannot be, since its index stands at the end. The stated
-numbers of rows and the types of the columns are checked against the limits of ``drivers.recordings.memory_check`` before data
-are read.
+An Arrow file is read batch by batch up to a truncation. A truncated Parquet file cannot be read, since its index is at
+the end. Before data are read, the stated numbers of rows and the types of the columns are checked against the limits
+of ``drivers.recordings.memory_check``.
 """
 
 import os
@@ -20,22 +20,28 @@ from drivers.recordings.arrow_messages import batch_sizes, buffer_count, check_b
 from drivers.recordings.table import BATCH_ROWS, PART, Append, Table, check_width, chosen_columns, looks_like
 from drivers.sample import Floats
 
-OWN: Final = b"imu-monitor"
-"""Key of the metadata by which a segment of the daemon's recordings is known."""
-BOOKKEEPING: Final = ("ticks", "lost")
-"""Columns of such a segment that are no measurement: a reader is not told that they were left aside."""
+METADATA_KEY: Final = b"imu-monitor"
+"""Key of the schema metadata that identifies a segment recorded by the daemon."""
+SEGMENT_COLUMNS: Final = ("ticks", "lost")
+"""Columns of such a segment that are not measurements. A reader does not report them as unused."""
 SLACK_BYTES: Final = 1 << 20
-"""Of a compressed buffer above what its rows need."""
+"""Allowed size of a compressed buffer in addition to the size that its rows need."""
 MAX_DICTIONARY_BYTES: Final = 64_000_000
 MAX_INDEX_BYTES: Final = 10_000_000
-"""Of a Parquet file. pyarrow needs about ten times as much memory for it."""
-PARQUET_END: Final = b"\0\0\0\0PAR1"  # behind the index, with its length in the zeros
+"""Maximum size of the index of a Parquet file. pyarrow needs about ten times as much memory for it."""
+PARQUET_FOOTER: Final = b"\0\0\0\0PAR1"  # after the index; the zeros are replaced by its length
 ARROW_MAGIC: Final = b"ARROW1\0\0"
 ARROW_END: Final = b"\xff\xff\xff\xff\0\0\0\0"  # end-of-stream mark of Arrow IPC
 
 
-def library(path: Path) -> Any:
-    """pyarrow. ConfigError where it is not installed: ``path`` cannot be read or written."""
+def import_pyarrow(path: Path) -> Any:
+    """Import pyarrow.
+
+    Raises
+    ------
+    ConfigError
+        pyarrow is not installed. The text names ``path`` as the file that cannot be read or written.
+    """
     try:
         import pyarrow as pa
     except ImportError as error:
@@ -45,13 +51,27 @@ def library(path: Path) -> Any:
 
 
 def count_rows_parquet(path: Path) -> int:
-    """Return the number of rows that the index states. Raises RecordingError and ConfigError as ``read_parquet``."""
+    """Return the number of rows that the index states.
+
+    Raises
+    ------
+    RecordingError, ConfigError
+        As for ``read_parquet``.
+    """
     with _parquet(path) as file:
         return _checked_parquet(path, file, [])[1]
 
 
 def read_parquet(path: Path) -> Table:
-    """Only the columns that mean something are read; RecordingError when the file is not whole."""
+    """Read the known columns of a Parquet file.
+
+    Raises
+    ------
+    RecordingError
+        The file is not complete, is not Parquet, or exceeds a limit.
+    ConfigError
+        pyarrow is not installed, or the samples do not fit into the memory.
+    """
     notes: list[str] = []
     with _parquet(path) as file:
         chosen, _ = _checked_parquet(path, file, notes)
@@ -60,13 +80,13 @@ def read_parquet(path: Path) -> Table:
 
 @contextmanager
 def _parquet(path: Path) -> Iterator[Any]:
-    """Open a Parquet file. Within the context pyarrow's errors are raised as RecordingError."""
-    pa = library(path)
+    """Open a Parquet file. Within the context, pyarrow's errors are raised as RecordingError."""
+    pa = import_pyarrow(path)
     from pyarrow import parquet
 
     with open_regular(path) as file:
         size_bytes = os.fstat(file.fileno()).st_size
-        file.seek(max(size_bytes - len(PARQUET_END), 0))
+        file.seek(max(size_bytes - len(PARQUET_FOOTER), 0))
         index_bytes = int.from_bytes(file.read()[:4], "little")
         if MAX_INDEX_BYTES < index_bytes < size_bytes:
             raise RecordingError(
@@ -85,7 +105,7 @@ def _parquet(path: Path) -> Iterator[Any]:
 
 
 def _checked_parquet(path: Path, file: Any, notes: list[str]) -> tuple[dict[str, str], int]:
-    """Return the columns to read and the number of rows, once both are within the limits."""
+    """Return the columns to read and the number of rows, after checking both against the limits."""
     check_width(path, file.metadata.num_columns)
     schema = file.schema_arrow
     chosen = chosen_columns(path, schema.names, notes)
@@ -97,20 +117,34 @@ def _checked_parquet(path: Path, file: Any, notes: list[str]) -> tuple[dict[str,
 
 
 def count_rows_ipc(path: Path) -> int:
-    """Return the number of rows of all batches up to a cut. Raises RecordingError and ConfigError as ``read_ipc``."""
+    """Return the number of rows of all batches up to a truncation.
+
+    Raises
+    ------
+    RecordingError, ConfigError
+        As for ``read_ipc``.
+    """
     with open_regular(path) as file:
         return _checked_ipc(path, _ipc_start(path), _ipc_schema(path, file), {})[1]
 
 
 def read_ipc(path: Path) -> Table:
-    """Arrow IPC up to a cut. A file is a stream after one magic word, so both are read as streams."""
-    pa = library(path)
+    """Read Arrow IPC up to a truncation. A file is a stream after a magic word, so both are read as streams.
+
+    Raises
+    ------
+    RecordingError
+        The file is not Arrow IPC, or it exceeds a limit.
+    ConfigError
+        pyarrow is not installed, or the samples do not fit into the memory.
+    """
+    pa = import_pyarrow(path)
     notes: list[str] = []
     start = _ipc_start(path)
     with open_regular(path) as file:
         schema = _ipc_schema(path, file)
-        own = OWN in (schema.metadata or {})
-        chosen = chosen_columns(path, [name for name in schema.names if not (own and name in BOOKKEEPING)], notes)
+        own = METADATA_KEY in (schema.metadata or {})
+        chosen = chosen_columns(path, [name for name in schema.names if not (own and name in SEGMENT_COLUMNS)], notes)
         count, _ = _checked_ipc(path, start, schema, chosen)
         if not _has_end_mark(path, start > 0):
             notes.append("The end mark is missing: the file is cut off and was read up to the cut.")
@@ -132,12 +166,13 @@ def read_ipc(path: Path) -> Table:
 
 
 def _ipc_start(path: Path) -> int:
-    """Return where the stream begins: behind the magic word of a file."""
+    """Return the offset of the stream, which is after the magic word of a file."""
     with open_regular(path) as file:
         return len(ARROW_MAGIC) if file.read(len(ARROW_MAGIC)) == ARROW_MAGIC else 0
 
 
 def _has_end_mark(path: Path, is_file: bool) -> bool:
+    """Return True if the file ends with the end mark of its format."""
     mark = ARROW_MAGIC.rstrip(b"\0") if is_file else ARROW_END
     with open_regular(path) as file:
         file.seek(max(path.stat().st_size - len(mark), 0))
@@ -145,13 +180,13 @@ def _has_end_mark(path: Path, is_file: bool) -> bool:
 
 
 def _ipc_schema(path: Path, file: Any) -> Any:
-    """Return the schema of the stream in an opened file; RecordingError where there is none."""
-    pa = library(path)
+    """Return the schema of the stream in an open file. Raise RecordingError if there is none."""
+    pa = import_pyarrow(path)
     try:
         file.seek(_ipc_start(path))
         schema = pa.ipc.open_stream(file).schema
         check_width(path, len(schema))
-        schema.names, schema.metadata  # noqa: B018 - raise for names that are no UTF-8
+        schema.names, schema.metadata  # noqa: B018 - raises for names that are not UTF-8
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise RecordingError(
             f"{path}: is no Arrow IPC file or stream ({_first_line(error)}){looks_like(path)}"
@@ -160,8 +195,8 @@ def _ipc_schema(path: Path, file: Any) -> Any:
 
 
 def _checked_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -> tuple[int, int]:
-    """Return the number of record batches and of rows, once both and the types of the columns are within the limits."""
-    pa = library(path)
+    """Return the number of record batches and of rows, after checking them and the column types against the limits."""
+    pa = import_pyarrow(path)
     _check_types(path, schema, chosen)
     counts = [
         count if count is None or field.name in chosen.values() else -count
@@ -188,8 +223,8 @@ def _checked_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str])
 
 
 def _check_types(path: Path, schema: Any, chosen: Mapping[str, str]) -> None:
-    """RecordingError if a column is not numeric."""
-    pa = library(path)
+    """Raise RecordingError if a column is not numeric."""
+    pa = import_pyarrow(path)
     numeric = (pa.types.is_floating, pa.types.is_integer, pa.types.is_null)
     for key in chosen.values():
         type_ = schema.field(key).type
@@ -199,24 +234,26 @@ def _check_types(path: Path, schema: Any, chosen: Mapping[str, str]) -> None:
 
 
 def _table(path: Path, table: Any, chosen: Mapping[str, str], notes: list[str]) -> Table:
+    """Return the chosen columns as a ``Table``."""
     columns = {name: _column(path, table.column(key)) for name, key in chosen.items()}
     return Table(columns, None, notes)
 
 
 def _column(path: Path, column: Any) -> Floats:
-    """One column as float64, null as NaN."""
-    pa = library(path)
+    """Return one column as float64, with null as NaN."""
+    pa = import_pyarrow(path)
     return np.asarray(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64)
 
 
 def _first_line(error: Exception) -> str:
+    """Return the first line of the text of an error."""
     return str(error).strip().partition("\n")[0].rstrip(".")
 
 
 @contextmanager
 def parquet_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
-    """Write with Parquet's default compression; what is appended at once is one row group."""
-    pa = library(path)
+    """Write Parquet with its default compression. Each call of the append function writes one row group."""
+    pa = import_pyarrow(path)
     from pyarrow import parquet
 
     schema = _schema(pa, names)
@@ -226,21 +263,23 @@ def parquet_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
 
 def ipc_file_writer(path: Path, names: Sequence[str]) -> AbstractContextManager[Append]:
     """Write an Arrow file (Feather version 2)."""
-    return _ipc_writer(library(path).ipc.new_file, path, names)
+    return _ipc_writer(import_pyarrow(path).ipc.new_file, path, names)
 
 
 def ipc_stream_writer(path: Path, names: Sequence[str]) -> AbstractContextManager[Append]:
     """Write an Arrow stream."""
-    return _ipc_writer(library(path).ipc.new_stream, path, names)
+    return _ipc_writer(import_pyarrow(path).ipc.new_stream, path, names)
 
 
 @contextmanager
 def _ipc_writer(new: Any, path: Path, names: Sequence[str]) -> Iterator[Append]:
-    pa = library(path)
+    """Write Arrow IPC with the pyarrow writer that ``new`` opens."""
+    pa = import_pyarrow(path)
     schema = _schema(pa, names)
     with new(str(path), schema) as file:
         yield lambda columns: file.write_table(pa.table(dict(columns), schema), max_chunksize=BATCH_ROWS)
 
 
 def _schema(pa: Any, names: Sequence[str]) -> Any:
+    """Return a schema of float64 columns."""
     return pa.schema([(name, pa.float64()) for name in names])

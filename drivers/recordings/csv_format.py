@@ -1,13 +1,13 @@
-"""CSV, plain or gzip: one header line, commas, empty field or ``nan`` = missing.
+"""Reading and writing of CSV recordings, plain or gzip. An empty field or ``nan`` is a missing value.
 
-Blank lines and comment lines (``#`` or ``%``) before the header are skipped. A header may itself be a comment.
+Blank lines and comment lines (``#`` or ``%``) before the header are skipped. The header itself may be a comment.
 
-Text is parsed in pieces of whole lines: quickly where every line is regular, line by line where one
-is not, so that a torn line costs only itself and is named by its number. A last line without its end
-may be cut inside a number, so it is left out. More bad lines than good ones: no recording.
+Text is parsed in pieces of complete lines. A piece of regular lines is parsed at once. Any other piece is parsed line
+by line, so that a damaged line affects no other line and is reported by its number. A last line without a line end may
+be cut inside a number and is left out. A file with more bad lines than good ones is not a recording.
 
-The lines are counted before any is parsed, and checked against the limits of ``drivers.recordings.memory_check``. A file is read
-up to a line longer than ``MAX_LINE_BYTES``.
+The lines are counted before any is parsed, and the number is checked against the limits of
+``drivers.recordings.memory_check``. Reading ends at a line that is longer than ``MAX_LINE_BYTES``.
 """
 
 import csv
@@ -41,42 +41,43 @@ from drivers.sample import AXES, Floats
 READ_BYTES: Final = 1 << 20
 MAX_LINE_BYTES: Final = 1 << 20
 MAX_PREAMBLE_BYTES: Final = 1 << 20
-"""Blank lines and comments before the header."""
+"""Maximum size of the blank lines and comments before the header."""
 MAX_EMPTY_MEMBERS: Final = 1000
-"""Members of a gzip file that hold nothing, one after another."""
-SURELY_BAD: Final = 100_000
-"""Bad lines after which a file with more bad lines than good ones is read no further."""
-COMMENTS: Final = (b"#", b"%")
+"""Maximum number of consecutive gzip members without content."""
+MAX_BAD_LINES: Final = 100_000
+"""Number of bad lines after which reading stops, if there are more bad lines than good ones."""
+COMMENT_MARKS: Final = (b"#", b"%")
 BOM: Final = b"\xef\xbb\xbf"
-GZIP_BYTES: Final = 1 << 16  # what a damaged gzip file may lose before the damage
+GZIP_BYTES: Final = 1 << 16  # a damaged gzip file loses at most this many bytes before the damage
 GZIP_MAGIC: Final = b"\x1f\x8b"
-GZIP_LEVEL: Final = 1  # digits of noise hardly compress: level 6 saves another 6 % in eight times the time
+GZIP_LEVEL: Final = 1  # digits of noise hardly compress: level 6 saves a further 6 % but takes eight times as long
 
 
 @dataclass(slots=True)
 class _BadLines:
-    """Lines that are no samples: how many, and the first of them in words."""
+    """Number of lines that are not samples, and a description of the first one."""
 
     count: int = 0
     first: str = ""
 
     def add(self, number: int, why: str) -> None:
+        """Count a bad line."""
         self.first = self.first or f"line {number}: {why}"
         self.count += 1
 
 
 def count_rows(path: Path) -> int:
-    """Count the lines of a plain or gzip text up to a cut, without parsing them.
+    """Count the lines of a plain or gzip text up to a truncation, without parsing them.
 
     Raises
     ------
     RecordingError, ConfigError
-        The file exceeds a limit of ``drivers.recordings.memory_check``; it is read only so far.
+        The file exceeds a limit of ``drivers.recordings.memory_check``. Reading stops at the limit.
     """
     limit = memory_check.limit_of(path)
     lines = unpacked = 0
     with open_regular(path) as file:
-        for text in _whole_lines(_unzipped(file, []), []):
+        for text in _whole_lines(_decompressed(file, []), []):
             lines += text.count(b"\n")
             unpacked += len(text)
             limit.check_rows(lines)
@@ -86,23 +87,31 @@ def count_rows(path: Path) -> int:
 
 
 def read_csv(path: Path) -> Table:
-    """Plain or gzip text up to a cut; RecordingError when most lines are no samples."""
+    """Read a plain or gzip CSV file up to a truncation.
+
+    Raises
+    ------
+    RecordingError
+        The file has no header or no samples, or most of its lines are not samples.
+    ConfigError
+        The samples do not fit into the memory.
+    """
     notes: list[str] = []
     bad = _BadLines()
     count_rows(path)
     with open_regular(path) as file:
-        texts = _whole_lines(_unzipped(file, notes), notes)
-        head = _head(path, texts)
+        texts = _whole_lines(_decompressed(file, notes), notes)
+        head = _find_header(path, texts)
         if head is None:
             what = notes[-1] if notes else "It has no line at all."
             raise RecordingError(f"{path}: has not one whole line, expected {EXAMPLE_HEADER}. {what}")
-        names = _header(path, head)
+        names = _column_names(path, head)
         chosen = chosen_columns(path, names, notes, f" in line {head.number}")
         use = [names.index(name) for name in chosen.values()]
-        parts = list(_parsed(path, head, texts, names, use, bad))
+        parts = list(_parse_pieces(path, head, texts, names, use, bad))
     rows = np.concatenate(parts) if parts else np.empty((0, len(use)))
     if 2 * bad.count > len(rows):
-        raise _mostly_bad(path, bad, len(rows))
+        raise _too_many_bad_lines(path, bad, len(rows))
     if bad.count:
         notes.append(f"{bad.count} of {len(rows)} lines are no samples: read as missing ({bad.first}).")
     if not len(rows):
@@ -111,16 +120,17 @@ def read_csv(path: Path) -> Table:
     return Table({name: rows[:, i] for i, name in enumerate(chosen)}, None, notes)
 
 
-def _mostly_bad(path: Path, bad: _BadLines, rows: int) -> RecordingError:
+def _too_many_bad_lines(path: Path, bad: _BadLines, rows: int) -> RecordingError:
+    """Return the error for a file with mostly bad lines."""
     return RecordingError(
         f"{path}: {bad.count} of {rows} lines are no samples ({bad.first}); every field must be a number, empty or nan"
     )
 
 
-def _unzipped(file: IO[bytes], notes: list[str]) -> Iterator[bytes]:
-    """The text of a plain or gzip file, by its first bytes and not by its name, up to a cut or damage.
+def _decompressed(file: IO[bytes], notes: list[str]) -> Iterator[bytes]:
+    """Yield the text of a plain or gzip file up to a truncation or damage, in pieces of at most READ_BYTES.
 
-    The pieces have READ_BYTES at most.
+    The first bytes of the file, not its name, decide whether it is compressed.
     """
     zipped = file.read(2) == GZIP_MAGIC
     file.seek(0)
@@ -129,7 +139,7 @@ def _unzipped(file: IO[bytes], notes: list[str]) -> Iterator[bytes]:
         return
     unzip = zlib.decompressobj(zlib.MAX_WBITS | 16)
     data = file.read(GZIP_BYTES)
-    empty, held = 0, False  # members in a row that hold nothing; True if the current member holds text
+    empty, held = 0, False  # number of consecutive empty members; True if the current member holds text
     while data:
         try:
             text = unzip.decompress(data, READ_BYTES)
@@ -139,12 +149,12 @@ def _unzipped(file: IO[bytes], notes: list[str]) -> Iterator[bytes]:
         if text:
             held = True
             yield text
-        if unzip.eof:  # another member may follow: files of gzip can be strung together
+        if unzip.eof:  # another member may follow, since gzip files can be concatenated
             empty = 0 if held else empty + 1
             if empty > MAX_EMPTY_MEMBERS:
                 notes.append(f"{empty} gzip members in a row are empty; read up to there.")
                 return
-            data = (unzip.unused_data or file.read(GZIP_BYTES)).lstrip(b"\0")  # and be padded with zeros
+            data = (unzip.unused_data or file.read(GZIP_BYTES)).lstrip(b"\0")  # and padded with zeros
             unzip, held = zlib.decompressobj(zlib.MAX_WBITS | 16), False
             if not data:
                 return
@@ -154,11 +164,11 @@ def _unzipped(file: IO[bytes], notes: list[str]) -> Iterator[bytes]:
 
 
 def _whole_lines(texts: Iterable[bytes], notes: list[str]) -> Iterator[bytes]:
-    """The same text in pieces that end with a line. A last line without an end may be cut: left out.
+    """Yield the text in pieces that end with a complete line. A last line without a line end is left out.
 
     Reading ends at a line that is longer than MAX_LINE_BYTES.
     """
-    rest: list[bytes] = []  # the beginning of a line, in parts
+    rest: list[bytes] = []  # parts of the beginning of a line
     size = lines = 0
     for text in texts:
         whole, end, tail = text.rpartition(b"\n")
@@ -177,8 +187,8 @@ def _whole_lines(texts: Iterable[bytes], notes: list[str]) -> Iterator[bytes]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Head:
-    """The header line of a text, and the whole lines that were read with it."""
+class _Header:
+    """Header line of a text, and the complete lines that were read with it."""
 
     line: bytes
     number: int
@@ -186,25 +196,25 @@ class _Head:
     rest_number: int  # line number of the first line of ``rest``
 
 
-def _head(path: Path, texts: Iterator[bytes]) -> _Head | None:
-    """Find the header line behind blank lines and comments; None where the text has no whole line.
+def _find_header(path: Path, texts: Iterator[bytes]) -> _Header | None:
+    """Find the header line after blank lines and comments; None if the text has no complete line.
 
-    The header is the first line that is no comment. If it names no axis and the last comment before it does, the
-    comment is the header, as ``numpy.savetxt`` writes it.
+    The header is the first line that is not a comment. If that line names no axis but the last comment before it does,
+    the comment is the header, as ``numpy.savetxt`` writes it.
     """
     number = size = 0
-    comment: _Head | None = None
+    comment: _Header | None = None
     for text in texts:
         start = 0
         while (end := text.find(b"\n", start)) >= 0:
             line = text[start:end].removeprefix(BOM if number == 0 else b"").strip()
             number, begin, start = number + 1, start, end + 1
-            if line.startswith(COMMENTS):
-                comment = _Head(line.lstrip(b"#% "), number, text[start:], number + 1) if _has_axis(line) else None
+            if line.startswith(COMMENT_MARKS):
+                comment = _Header(line.lstrip(b"#% "), number, text[start:], number + 1) if _has_axis(line) else None
             elif line:
                 if comment is not None and not _has_axis(line):
-                    return _Head(comment.line, comment.number, text[begin:], number)
-                return _Head(line, number, text[start:], number + 1)
+                    return _Header(comment.line, comment.number, text[begin:], number)
+                return _Header(line, number, text[start:], number + 1)
             size += end + 1 - begin
             if size > MAX_PREAMBLE_BYTES:
                 raise RecordingError(
@@ -212,18 +222,18 @@ def _head(path: Path, texts: Iterator[bytes]) -> _Head | None:
                     f"expected {EXAMPLE_HEADER} within {MAX_PREAMBLE_BYTES} bytes"
                 )
     if comment is None and number:
-        return _Head(b"", number, b"", number + 1)
+        return _Header(b"", number, b"", number + 1)
     return comment
 
 
 def _has_axis(line: bytes) -> bool:
-    """Return True if a field of this line, without its mark of a comment, is the name of an axis."""
+    """Return True if a field of this line, without its comment mark, is the name of an axis."""
     fields = line.lstrip(b"#% ").decode("utf-8", errors="replace").split(",")
     return any(field.strip(' \t"') in AXES for field in fields)
 
 
-def _header(path: Path, head: _Head) -> list[str]:
-    """Column names of the header line; says what is wrong when it is none."""
+def _column_names(path: Path, head: _Header) -> list[str]:
+    """Return the column names of the header line. Raise RecordingError if it is not a header."""
     if b"\0" in head.line or not head.line:
         raise RecordingError(f"{path}: is no CSV text; the first line would be {EXAMPLE_HEADER}{looks_like(path)}")
     text = head.line.decode("utf-8", errors="replace")
@@ -242,10 +252,10 @@ def _header(path: Path, head: _Head) -> list[str]:
     return names
 
 
-def _parsed(
-    path: Path, head: _Head, texts: Iterable[bytes], names: Sequence[str], use: Sequence[int], bad: _BadLines
+def _parse_pieces(
+    path: Path, head: _Header, texts: Iterable[bytes], names: Sequence[str], use: Sequence[int], bad: _BadLines
 ) -> Iterator[Floats]:
-    """Arrays [lines, used columns] of each piece of text: quickly where it is regular, else line by line."""
+    """Yield an array [lines, used columns] for each piece of text."""
     number, rows = head.rest_number, 0
     for text in chain((head.rest,), texts):
         text = text.replace(b"\r\n", b"\n")
@@ -254,14 +264,14 @@ def _parsed(
             quick = _parse_quickly(text, lines, len(names), use)
             part = _parse_slowly(lines, number, names, use, bad) if quick is None else quick
             rows += len(part)
-            if bad.count > SURELY_BAD and 2 * bad.count > rows:
-                raise _mostly_bad(path, bad, rows)
+            if bad.count > MAX_BAD_LINES and 2 * bad.count > rows:
+                raise _too_many_bad_lines(path, bad, rows)
             yield part
         number += len(lines)
 
 
 def _parse_quickly(text: bytes, lines: list[str], width: int, use: Sequence[int]) -> Floats | None:
-    """[lines, used columns] when every line has all its fields and all are numbers, else None."""
+    """Return an array [lines, used columns] if every line has all its fields and all are numbers, otherwise None."""
     codes = np.frombuffer(text, np.uint8)
     commas_before = np.searchsorted(np.flatnonzero(codes == ord(",")), np.flatnonzero(codes == ord("\n")))
     if np.any(np.diff(commas_before, prepend=0) != width - 1):
@@ -275,22 +285,22 @@ def _parse_quickly(text: bytes, lines: list[str], width: int, use: Sequence[int]
 def _parse_slowly(
     lines: Sequence[str], number: int, names: Sequence[str], use: Sequence[int], bad: _BadLines
 ) -> Floats:
-    """The same, line by line: an empty field is missing, a line that is no sample is missing as a whole."""
+    """Parse line by line. An empty field is a missing value, and a line that is not a sample is missing as a whole."""
     missing = [np.nan] * len(use)
     rows: list[list[float]] = []
     for offset, line in enumerate(lines):
         if not line.strip():
             continue
         try:
-            rows.append(_sample(line, names, use))
+            rows.append(_parse_sample(line, names, use))
         except ValueError as error:
             bad.add(number + offset, str(error))
             rows.append(missing)
     return np.array(rows).reshape(len(rows), len(use))
 
 
-def _sample(line: str, names: Sequence[str], use: Sequence[int]) -> list[float]:
-    """The used fields of one line; ValueError says why it is no sample."""
+def _parse_sample(line: str, names: Sequence[str], use: Sequence[int]) -> list[float]:
+    """Return the used fields of one line. Raise ValueError with the reason if the line is not a sample."""
     fields = _fields(line)
     if len(fields) != len(names):
         raise ValueError(f"{len(fields)} fields where the header has {len(names)}")
@@ -304,6 +314,7 @@ def _sample(line: str, names: Sequence[str], use: Sequence[int]) -> list[float]:
 
 
 def _fields(line: str) -> list[str]:
+    """Return the fields of one line."""
     if '"' not in line:
         return line.split(",")
     try:
@@ -313,7 +324,7 @@ def _fields(line: str) -> list[str]:
 
 
 def _number(field: str) -> float | None:
-    """NaN for an empty field, None for what is no number; float() alone would take 1_000."""
+    """Return a number, NaN for an empty field, or None for text. ``float`` alone would accept 1_000."""
     if not field or field.isspace():
         return float("nan")
     try:
@@ -324,24 +335,27 @@ def _number(field: str) -> float | None:
 
 @contextmanager
 def csv_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
-    """One header line, then one line a sample; missing is ``nan``."""
+    """Write one header line and one line per sample. A missing value is written as ``nan``."""
     with path.open("w", encoding="ascii", newline="") as file:
-        yield _lines_to(file, names)
+        yield _line_appender(file, names)
 
 
 @contextmanager
 def csv_gz_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
-    """The same, compressed; equal columns give equal bytes, so no time stamp goes into the gzip header."""
+    """Write CSV compressed with gzip. The gzip header has no time stamp, so that equal columns give equal bytes."""
     with (
         path.open("wb") as raw,
         gzip.GzipFile("", "wb", GZIP_LEVEL, raw, mtime=0) as packed,
         io.TextIOWrapper(packed, "ascii", newline="") as file,
     ):
-        yield _lines_to(file, names)
+        yield _line_appender(file, names)
 
 
-def _lines_to(file: TextIO, names: Sequence[str]) -> Append:
-    """repr() is the shortest text that reads back as the same float64."""
+def _line_appender(file: TextIO, names: Sequence[str]) -> Append:
+    """Write the header line, and return a function that appends rows.
+
+    Numbers are written by ``repr``, the shortest text that reads back as the same float64.
+    """
     file.write(",".join(names) + "\n")
 
     def append(columns: Columns) -> None:

@@ -1,8 +1,8 @@
-""".npz: one array a column, ``fs`` (Hz) may stand for ``t``.
+"""Reading and writing of .npz recordings, with one array per column. ``fs`` (Hz) can replace ``t``.
 
-Arrays of Python objects are refused, never unpickled. The headers of all columns are checked against the limits of
-``drivers.recordings.memory_check`` before the data of any are read. A zip archive keeps its index at the end, so
-from a cut file the arrays are found again by the header that stands before each.
+Arrays of Python objects are refused and never unpickled. The headers of all columns are checked against the limits of
+``drivers.recordings.memory_check`` before the data of any column are read. The index of a zip archive is at its end. In
+a truncated file, the arrays are therefore found by the header before each array.
 """
 
 import io
@@ -34,33 +34,34 @@ from drivers.sample import Floats
 
 LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # PKWARE APPNOTE 4.3.7
 LOCAL_MAGIC: Final = b"PK\3\4"
-ITEM: Final = np.dtype("<f8")
-UNREADABLE: Final = (
+ITEM_DTYPE: Final = np.dtype("<f8")
+NPY_ERRORS: Final = (
     ValueError, TypeError, SyntaxError, EOFError, MemoryError, OverflowError, RuntimeError, TokenError, zlib.error
 )  # fmt: skip
-"""What NumPy and zlib raise for an array of rubbish."""
+"""Exceptions that NumPy and zlib raise for a damaged array."""
 COPY_BYTES: Final = 1 << 18
 MAX_INDEX_BYTES: Final = 4_000_000
-"""Of the index of an archive: some 50 000 arrays."""
+"""Maximum size of the index of an archive, about 50 000 arrays."""
 MAX_HEADER_BYTES: Final = 1 << 16
 MAX_DEFLATE_RATIO: Final = 1032
-"""The most that deflate can pack, https://zlib.net/zlib_tech.html."""
-NUMBERS: Final = "fiu"
+"""Highest compression ratio of deflate, https://zlib.net/zlib_tech.html."""
+NUMERIC_KINDS: Final = "fiu"
 """Kinds of NumPy types that a column may have."""
 NPY_MAGIC: Final = b"\x93NUMPY"
-WANTED: Final = frozenset((*COLUMNS, *ALIASES, "fs"))
-NPY: Final = re.compile(
+KNOWN_KEYS: Final = frozenset((*COLUMNS, *ALIASES, "fs"))
+NPY_HEADER: Final = re.compile(
     rb"\x93NUMPY\x01\x00..{'descr': '(?P<kind>[<>|](?:f[248]|[iu][1248]))', 'fortran_order': (?:False|True), "
     rb"'shape': \((?:(?P<n>\d{1,18}),)?\), } *\n",
     re.DOTALL,
 )
-"""The head of an array of numbers with one dimension or none, as every NumPy writes it: nothing in it is evaluated."""
+"""Header of a numeric array with one dimension or none, as every version of NumPy writes it. It is not evaluated."""
 
 
 class _Archive(FileIO):
-    """A file that refuses to be read in parts larger than MAX_INDEX_BYTES.
+    """File that refuses to be read in parts larger than MAX_INDEX_BYTES.
 
-    ``zipfile`` reads the whole index of an archive at once, and makes some 500 bytes of every entry of 50.
+    ``zipfile`` reads the whole index of an archive at once. It needs about 500 bytes of memory for an entry of 50
+    bytes.
     """
 
     def read(self, size: int | None = -1, /) -> bytes:
@@ -72,11 +73,11 @@ class _Archive(FileIO):
 
 @dataclass(frozen=True, slots=True)
 class _Header:
-    """What the header of a .npy array says."""
+    """Content of the header of a .npy array."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
-    size_bytes: int  # of the header
+    size_bytes: int  # size of the header
 
     @property
     def values(self) -> int:
@@ -90,35 +91,43 @@ def count_rows(path: Path) -> int:
     Raises
     ------
     RecordingError, ConfigError
-        The file is no .npz, or exceeds a limit of ``drivers.recordings.memory_check``.
+        The file is not a .npz file, or exceeds a limit of ``drivers.recordings.memory_check``.
     """
     with _Archive(path) as file:
-        if not _is_whole(path, file):
-            return 0  # a cut archive is measured while it is read
-        with _opened(path, file) as archive:
+        if not _has_index(path, file):
+            return 0  # a truncated archive is measured while it is read
+        with _open_archive(path, file) as archive:
             return _checked_rows(path, archive, chosen_columns(path, _keys(archive), []))
 
 
 def read_npz(path: Path) -> Table:
-    """Only the arrays that mean something are read, the whole ones and up to a cut."""
+    """Read the known arrays of a .npz file. A truncated file is read up to the cut.
+
+    Raises
+    ------
+    RecordingError
+        The file is not a .npz file, is damaged before its first number, or exceeds a limit.
+    ConfigError
+        The samples do not fit into the memory.
+    """
     notes: list[str] = []
     with _Archive(path) as file:
-        if _is_whole(path, file):
-            with _opened(path, file) as archive:
+        if _has_index(path, file):
+            with _open_archive(path, file) as archive:
                 chosen = chosen_columns(path, _keys(archive), notes)
                 _checked_rows(path, archive, chosen)
                 columns = {name: _npz_column(path, archive, key) for name, key in chosen.items()}
                 return Table(columns, _npz_rate(path, archive, notes), notes)
-    arrays, cut = _recovered(path)
+    arrays, cut = _recover_arrays(path)
     if not arrays:
         raise RecordingError(f"{path}: is damaged or cut off before its first number")
     at = f" inside {cut}" if cut else ""
     notes.append(f"The file is cut off{at} and was read up to the cut; later columns are missing.")
-    return _recovered_table(path, arrays, cut, notes)
+    return _table_of_recovered(path, arrays, cut, notes)
 
 
-def _is_whole(path: Path, file: IO[bytes]) -> bool:
-    """Return True for a zip archive with its index, False for one without; RecordingError for anything else."""
+def _has_index(path: Path, file: IO[bytes]) -> bool:
+    """Return True for a zip archive with its index, False for one without. Raise RecordingError for any other file."""
     if file.read(len(LOCAL_MAGIC)) != LOCAL_MAGIC:
         raise RecordingError(f"{path}: is no .npz file (a zip archive with one array a column){looks_like(path)}")
     file.seek(0)
@@ -127,7 +136,8 @@ def _is_whole(path: Path, file: IO[bytes]) -> bool:
     return whole
 
 
-def _opened(path: Path, file: IO[bytes]) -> zipfile.ZipFile:
+def _open_archive(path: Path, file: IO[bytes]) -> zipfile.ZipFile:
+    """Open a zip archive. Raise RecordingError if its index is damaged."""
     try:
         return zipfile.ZipFile(file)
     except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
@@ -135,22 +145,24 @@ def _opened(path: Path, file: IO[bytes]) -> zipfile.ZipFile:
 
 
 def _keys(archive: zipfile.ZipFile) -> list[str]:
+    """Return the names of the arrays."""
     return [name.removesuffix(".npy") for name in archive.namelist()]
 
 
 def _member(archive: zipfile.ZipFile, key: str) -> zipfile.ZipInfo:
+    """Return the zip entry of an array."""
     names = archive.NameToInfo
     return names[key] if key in names else names[f"{key}.npy"]
 
 
 def _checked_rows(path: Path, archive: zipfile.ZipFile, chosen: Mapping[str, str]) -> int:
-    """Return the rows of the longest column; raise an error where the file cannot hold them or the memory does not."""
+    """Return the rows of the longest column, after checking all columns against the file size and the memory."""
     limit = memory_check.limit_of(path)
     rows = 0
     for key in chosen.values():
         header = _header(path, archive, key)
-        if header.dtype.kind not in NUMBERS:
-            raise RecordingError(f"{path}: {key} holds {_kind(header.dtype)}, not numbers")
+        if header.dtype.kind not in NUMERIC_KINDS:
+            raise RecordingError(f"{path}: {key} holds {_describe_dtype(header.dtype)}, not numbers")
         if len(header.shape) != 1:
             raise RecordingError(f"{path}: {key} has shape {header.shape}; a column has one dimension")
         rows = max(rows, header.values)
@@ -174,11 +186,11 @@ def _check_size(path: Path, limit: memory_check.ReadLimit, member: zipfile.ZipIn
 def _header(path: Path, archive: zipfile.ZipFile, key: str) -> _Header:
     """Return the header of an array without reading its data."""
     method = _member(archive, key).compress_type
-    if method not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # zipfile unpacks others without a bound
+    if method not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # zipfile unpacks other methods without a limit
         raise RecordingError(
             f"{path}: {key} is packed by method {method} of zip, expected stored or deflated, as NumPy writes them"
         )
-    with _errors(path, key), archive.open(_member(archive, key)) as member:
+    with _member_errors(path, key), archive.open(_member(archive, key)) as member:
         start = member.read(len(NPY_MAGIC) + 4)
         version, size_bytes = start[len(NPY_MAGIC) : len(NPY_MAGIC) + 2], 2
         if not start.startswith(NPY_MAGIC):
@@ -201,56 +213,60 @@ def _header(path: Path, archive: zipfile.ZipFile, key: str) -> _Header:
         return _Header(shape, dtype, len(start) + size)
 
 
-def _kind(dtype: np.dtype[Any]) -> str:
+def _describe_dtype(dtype: np.dtype[Any]) -> str:
+    """Return a description of a type for messages."""
     return "Python objects" if dtype.hasobject else str(dtype)
 
 
 def _npz_column(path: Path, archive: zipfile.ZipFile, key: str) -> Floats:
-    """One column as float64, whose header has been checked."""
-    with np.errstate(over="ignore"):  # a long double beyond the range of float64 becomes infinite: read as missing
+    """Return one column as float64. Its header has been checked."""
+    with np.errstate(over="ignore"):  # a long double beyond the range of float64 becomes infinite, hence missing
         return _npz_array(path, archive, key).astype(np.float64)
 
 
 def _npz_array(path: Path, archive: zipfile.ZipFile, key: str) -> NDArray[Any]:
-    """An array of numbers; one of objects is refused, since reading it would run code."""
-    with _errors(path, key), archive.open(_member(archive, key)) as member:
+    """Return an array of numbers. An array of objects is refused, since reading it would execute code."""
+    with _member_errors(path, key), archive.open(_member(archive, key)) as member:
         return np.asarray(np.lib.format.read_array(member, allow_pickle=False))
 
 
 @contextmanager
-def _errors(path: Path, key: str) -> Iterator[None]:
-    """Raise what NumPy and zipfile raise for a damaged member as RecordingError."""
+def _member_errors(path: Path, key: str) -> Iterator[None]:
+    """Raise the exceptions of NumPy and zipfile for a damaged member as RecordingError."""
     try:
-        with warnings.catch_warnings():  # of how old a file is, which is no matter here
+        with warnings.catch_warnings():  # warnings about the age of a file do not matter here
             warnings.simplefilter("ignore")
             yield
     except zipfile.BadZipFile as error:
         raise RecordingError(f"{path}: {key} is damaged: {error}") from error
-    except UNREADABLE as error:
+    except NPY_ERRORS as error:
         raise RecordingError(f"{path}: {key} is unreadable: {error}") from error
 
 
 def _npz_rate(path: Path, archive: zipfile.ZipFile, notes: list[str]) -> float | None:
+    """Return ``fs`` of an archive in Hz; None if there is none."""
     if "fs" not in _keys(archive):
         return None
     header = _header(path, archive, "fs")
     if header.dtype.hasobject:
         raise RecordingError(f"{path}: fs holds Python objects, not numbers")
-    single = header.values == 1 and header.dtype.kind in NUMBERS
-    return _rate(_npz_array(path, archive, "fs") if single else np.empty(0), notes)
+    single = header.values == 1 and header.dtype.kind in NUMERIC_KINDS
+    return _single_rate(_npz_array(path, archive, "fs") if single else np.empty(0), notes)
 
 
-def _rate(fs: NDArray[Any], notes: list[str]) -> float | None:
-    if fs.size == 1 and fs.dtype.kind in NUMBERS:
+def _single_rate(fs: NDArray[Any], notes: list[str]) -> float | None:
+    """Return ``fs`` in Hz. Return None and add a note if it is not a single number."""
+    if fs.size == 1 and fs.dtype.kind in NUMERIC_KINDS:
         return float(fs.item())
     notes.append("fs is not one number of Hz and was left aside.")
     return None
 
 
-# --- archives without their index ----------------------------------------------------------------
+# --- archives without an index -------------------------------------------------------------------
 
 
-def _recovered_table(path: Path, arrays: Mapping[str, NDArray[Any]], cut: str | None, notes: list[str]) -> Table:
+def _table_of_recovered(path: Path, arrays: Mapping[str, NDArray[Any]], cut: str | None, notes: list[str]) -> Table:
+    """Return recovered arrays as a ``Table``. The truncated column is padded with NaN."""
     chosen = chosen_columns(path, list(arrays), notes)
     columns = {}
     for name, key in chosen.items():
@@ -262,14 +278,14 @@ def _recovered_table(path: Path, arrays: Mapping[str, NDArray[Any]], cut: str | 
         column = columns[short]
         n = max(other.size for other in columns.values())
         columns[short] = np.concatenate([column, np.full(n - column.size, np.nan)])
-    return Table(columns, _rate(arrays["fs"], notes) if "fs" in arrays else None, notes)
+    return Table(columns, _single_rate(arrays["fs"], notes) if "fs" in arrays else None, notes)
 
 
-def _recovered(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
-    """The arrays of a cut .npz by the headers before each (a zip keeps its index at the end).
+def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
+    """Read the arrays of a truncated .npz by the header before each, since the index of a zip archive is at its end.
 
-    Gives them in order, and the name of the one that the cut goes through, if it goes through one. Arrays that mean
-    nothing in a recording are empty.
+    Return the arrays in order, and the name of the truncated array if there is one. Arrays with unknown names are
+    empty.
     """
     limit = memory_check.limit_of(path)
     arrays: dict[str, NDArray[Any]] = {}
@@ -286,8 +302,8 @@ def _recovered(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
             if packed == 0xFFFFFFFF and extra[:2] == b"\1\0" and len(extra) >= 20:  # ZIP64, APPNOTE 4.5.3
                 packed = int.from_bytes(extra[12:20], "little")
             start += extra_size
-            pieces = _Unpacked(data, start, method, packed, sized=not flags & 8)
-            array = _array_up_to_cut(pieces, limit, unpacked, wanted=key in WANTED)
+            pieces = _MemberReader(data, start, method, packed, sized=not flags & 8)
+            array = _array_up_to_cut(pieces, limit, unpacked, wanted=key in KNOWN_KEYS)
             unpacked += pieces.unpacked
             if array is not None:
                 arrays[key] = array
@@ -297,10 +313,11 @@ def _recovered(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
     return arrays, None
 
 
-class _Unpacked:
-    """The content of a member that starts at ``start``, in pieces.
+class _MemberReader:
+    """Content of a zip member that starts at ``start``, in pieces.
 
-    ``end`` is where the member ends, known after all pieces were taken; None if the file is cut before its end.
+    ``end`` is the end of the member and is known after all pieces have been taken. It is None if the file is truncated
+    before the end.
     """
 
     def __init__(self, data: mmap, start: int, method: int, size: int, *, sized: bool) -> None:
@@ -321,6 +338,7 @@ class _Unpacked:
             yield from self._inflated()
 
     def _inflated(self) -> Iterator[bytes]:
+        """Yield the pieces of a compressed member."""
         unzip = zlib.decompressobj(-zlib.MAX_WBITS)
         while not unzip.eof:
             packed = self._data[self._at : self._at + COPY_BYTES]
@@ -339,25 +357,41 @@ class _Unpacked:
 
 
 def _array_up_to_cut(
-    pieces: _Unpacked, limit: memory_check.ReadLimit, unpacked: int, *, wanted: bool
+    pieces: _MemberReader, limit: memory_check.ReadLimit, unpacked: int, *, wanted: bool
 ) -> NDArray[Any] | None:
-    """The numbers of a .npy member, fewer than the header says where the bytes end early; None where it is no array.
+    """Return the numbers of a .npy member, fewer than its header states if the file is truncated.
+
+    Parameters
+    ----------
+    pieces
+        Content of the member.
+    limit
+        Limits on the file.
+    unpacked
+        Unpacked size of all earlier members in bytes.
+    wanted
+        False if only the end of the member has to be found. The array is then empty.
+
+    Returns
+    -------
+    ndarray or None
+        The array; None if the member is not an array.
 
     Raises
     ------
     RecordingError, ConfigError
-        The array exceeds a limit; ``unpacked`` is what the members before it have unpacked to, in bytes.
+        The array exceeds a limit.
     """
     raw = bytearray()
     header: re.Match[bytes] | None = None
-    most = MAX_HEADER_BYTES  # bytes of use
+    most = MAX_HEADER_BYTES  # number of bytes that are needed
     for part in pieces:
         limit.check_unpacked(unpacked + pieces.unpacked)
         if len(raw) >= most:
-            continue  # up to the end, to find the next member
+            continue  # continue to the end to find the next member
         raw += part
-        if header is None and (header := NPY.match(raw)) is not None:
-            header = NPY.match(bytes(raw[: header.end()]))
+        if header is None and (header := NPY_HEADER.match(raw)) is not None:
+            header = NPY_HEADER.match(bytes(raw[: header.end()]))
             assert header is not None
             dtype, n = np.dtype(header["kind"].decode()), int(header["n"] or 1)
             most = header.end() + (n * dtype.itemsize if wanted else 0)
@@ -372,9 +406,10 @@ def _array_up_to_cut(
 
 @contextmanager
 def npz_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
-    """Write compressed. An archive holds one array after the other, so columns gather in files without a name.
+    """Write a compressed .npz file.
 
-    Those need the room of the numbers unpacked (8 bytes each) in the folder of ``path`` while it is written.
+    An archive contains one array after the other, so columns are collected in temporary files without a name. These
+    need 8 bytes per number in the folder of ``path`` while it is written.
     """
     with ExitStack() as stack:
         gathered = {name: stack.enter_context(TemporaryFile(dir=path.parent)) for name in names}
@@ -386,16 +421,16 @@ def npz_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
         yield append
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, file in gathered.items():
-                _put_array(archive, name, file)
+                _write_array(archive, name, file)
 
 
-def _put_array(archive: zipfile.ZipFile, name: str, numbers: IO[bytes]) -> None:
-    """A member as ``numpy.savez_compressed`` makes it, without the array in memory."""
-    shape = (numbers.tell() // ITEM.itemsize,)
+def _write_array(archive: zipfile.ZipFile, name: str, numbers: IO[bytes]) -> None:
+    """Write a member like ``numpy.savez_compressed``, without the array in memory."""
+    shape = (numbers.tell() // ITEM_DTYPE.itemsize,)
     numbers.seek(0)
-    member = zipfile.ZipInfo(f"{name}.npy")  # dated 1980: equal columns give equal bytes
+    member = zipfile.ZipInfo(f"{name}.npy")  # dated 1980, so that equal columns give equal bytes
     member.compress_type = zipfile.ZIP_DEFLATED
     with archive.open(member, "w", force_zip64=True) as file:
-        header = {"descr": ITEM.str, "fortran_order": False, "shape": shape}
+        header = {"descr": ITEM_DTYPE.str, "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(cast(Any, file), header)
         shutil.copyfileobj(numbers, file, COPY_BYTES)

@@ -1,13 +1,14 @@
-"""The daemon's own files: streams of Arrow IPC, appended to while samples come, read up to the last whole batch.
+"""Segments: the recording files of the daemon. They are Arrow IPC streams that are appended to while samples arrive.
 
-A folder of a device holds segments ``00000042_2026-11-22T03-00-00Z.arrows``. The number orders them, whatever the
-host's clock did; the time is that of the first row, for people. Rows are ``t`` (Unix s), six axes, ``temperature`` and,
-for whoever goes on from there, ``ticks`` and ``lost`` (missing just before the row); every batch carries what the
-daemon knew with it (``State``). A segment of raw bytes holds chunks as they came: ``t_ns`` (Unix), ``address``,
-``data``, ``attachment``.
+The folder of a device holds segments such as ``00000042_2026-11-22T03-00-00Z.arrows``. The number gives their order,
+whatever the clock of the host did. The time is that of the first row, for the user. The columns are ``t`` (Unix time in
+s), six axes and ``temperature``. The columns ``ticks`` and ``lost`` (samples missing just before the row) allow the
+daemon to continue from a segment. Every batch contains the state of the daemon at its end (``State``). A segment of raw
+bytes holds chunks as they were received: ``t_ns`` (Unix time), ``address``, ``data``, ``attachment``.
 
-A segment that grows is not compressed, so that a batch stands alone. One that has ended is written again in large
-compressed batches, and takes the other's place whole or not at all.
+A growing segment is not compressed, so that each batch can be read on its own. It can be read up to its last complete
+batch. A segment that has ended is written again in large compressed batches. The new file replaces the old one
+completely or not at all.
 """
 
 import errno
@@ -28,7 +29,7 @@ import numpy as np
 from drivers.errors import ImuError, RecordingError
 from drivers.file_access import open_regular
 from drivers.quantities import COUNTER_STEP, RATE_HZ
-from drivers.recordings.arrow_format import BOOKKEEPING, OWN, library
+from drivers.recordings.arrow_format import METADATA_KEY, SEGMENT_COLUMNS, import_pyarrow
 from drivers.recordings.arrow_messages import batch_sizes
 from drivers.recordings.memory_check import ROW_BYTES
 from drivers.recordings.table import BATCH_ROWS, PART, T_LIMIT_S
@@ -39,137 +40,159 @@ NAME: Final = re.compile(r"(\d{8})_[0-9TZ-]+\.arrows")
 SCHEMA: Final = "imu-monitor/recording/1"
 RAW_BATCH_BYTES: Final = 4_000_000
 MAX_BATCH_BYTES: Final = 64_000_000
-"""Of a batch unpacked, far above what ``SegmentWriter`` and ``pack`` write."""
-LARGEST_LOSS: Final = 10**11
-"""Samples missing at one place; above what any clock tells."""
+"""Maximum unpacked size of a batch, far above what ``SegmentWriter`` and ``pack`` write."""
+MAX_LOST_SAMPLES: Final = 10**11
+"""Maximum number of samples missing at one place, more than any clock reports."""
 
 Kind = Literal["samples", "raw"]
 
 
 class Origin(msgspec.Struct, frozen=True):
-    """What a segment is of."""
+    """Source of the data in a segment."""
 
     device: str
     kind: Kind
-    axes: str = ""  # how the sensor is mounted; samples of another mounting do not go on from these
-    carrier: str = ""  # of raw bytes: what their decoder reads
+    axes: str = ""  # mounting of the sensor; samples of another mounting do not continue these
+    carrier: str = ""  # for raw bytes: the carrier that their decoder reads
     decoder: str = ""
-    packed: bool = False  # written again, compressed
+    packed: bool = False  # True if the segment has been written again with compression
     schema: str = SCHEMA
 
 
 class State(msgspec.Struct, frozen=True):
-    """What the daemon knew with a batch, for the one that goes on from it."""
+    """State of the daemon at the end of a batch, from which a later run continues."""
 
     rate: float | None = None  # Hz
     since: tuple[float | None, ...] = (None,) * 6
-    """Unix s from which on the samples of an axis count, where its noise has changed or the window was emptied."""
-    tick_step: float | None = None  # of the device's counter, a sample
+    """Unix time in s from which the samples of an axis count, after a noise change or a cleared window."""
+    tick_step: float | None = None  # ticks of the device counter per sample
     theta: tuple[float | None, ...] = ()
     entered: tuple[bool, ...] = ()
-    """Sizes of the terms of the newest fit, and which it has, [5, 6] row by row."""
+    """Coefficients of the newest fit and whether each term is included, both [5, 6] row by row."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """One batch of a segment of samples."""
+    """Consecutive samples from one batch of a segment."""
 
     samples: SampleBlock  # t_ns are Unix times
     state: State
 
 
 class SegmentWriter:
-    """Appends to one segment.
+    """Writer that appends batches to one segment.
 
-    Args:
-        path: the new file; it appears with its first batch
-        origin: what it is of
-    Raises:
-        OSError: whatever the disk says, from every method; what was whole before stays readable
+    Parameters
+    ----------
+    path
+        New file. It appears with its first batch.
+    origin
+        Source of the data.
+
+    Raises
+    ------
+    OSError
+        Writing to the disk failed. Every method can raise it. Batches that were complete stay readable.
     """
 
     def __init__(self, path: Path, origin: Origin) -> None:
         self.path = path
-        self._pa = library(path)
+        self._pa = import_pyarrow(path)
         self._schema = _schema(self._pa, origin)
         self._state = State()
-        self._part = path.with_name(path.name + PART)
-        self._part.unlink(missing_ok=True)  # of a program that was killed
-        self._file: IO[bytes] = self._part.open("xb", buffering=0)
+        self._temporary_path = path.with_name(path.name + PART)
+        self._temporary_path.unlink(missing_ok=True)  # left by a program that was killed
+        self._file: IO[bytes] = self._temporary_path.open("xb", buffering=0)
         self._writer = self._pa.ipc.new_stream(self._file, self._schema)
-        self._whole = 0  # bytes that hold whole batches
+        self._valid_bytes = 0  # length in bytes of all complete batches
 
     def samples(self, blocks: Sequence[SampleBlock], state: State) -> None:
-        """One batch of blocks whose ``t_ns`` are Unix times."""
+        """Write one batch of samples.
+
+        Parameters
+        ----------
+        blocks
+            Blocks whose ``t_ns`` are Unix times.
+        state
+            State of the daemon after these samples.
+        """
         self._write(_sample_batch(self._pa, self._schema, blocks), {b"state": msgspec.json.encode(state)})
 
     def chunks(self, chunks: Sequence[Chunk]) -> None:
-        """One batch of chunks whose ``t_ns`` are Unix times."""
+        """Write one batch of chunks whose ``t_ns`` are Unix times."""
         self._write(_chunk_batch(self._pa, self._schema, chunks), None)
 
     def sync(self) -> None:
-        """Have the disk keep what was written, through a power cut too."""
+        """Flush the written data to the disk, so that they survive a power failure."""
         os.fdatasync(self._file.fileno())
 
     def change(self) -> str:
-        """Say what another program has done to the file that is written; "" if nothing."""
+        """Return how another program has changed the file that is being written; "" if it has not."""
         try:
-            named = os.stat(self.path if self._whole else self._part, follow_symlinks=False)
+            named = os.stat(self.path if self._valid_bytes else self._temporary_path, follow_symlinks=False)
         except OSError:
             return "was deleted or renamed"
         own = os.fstat(self._file.fileno())
         if not os.path.samestat(named, own):
             return "was replaced by another file"
-        return "was cut or written by another program" if self._whole and own.st_size != self._whole else ""
+        return "was cut or written by another program" if self._valid_bytes and own.st_size != self._valid_bytes else ""
 
     def abandon(self) -> None:
-        """Close a file that another program has changed: one that is whole is ended, another stays as it is."""
+        """Close a file that another program has changed. If its length is unchanged, the stream is ended properly."""
         try:
-            if os.fstat(self._file.fileno()).st_size == self._whole:
+            if os.fstat(self._file.fileno()).st_size == self._valid_bytes:
                 self._writer.close()
         finally:
             self._file.close()
 
     def close(self) -> None:
-        """End the stream; what was written stays where even that fails."""
+        """End the stream and close the file. The data already written remain even if ending the stream fails."""
         try:
             self._writer.close()
         finally:
             self._file.close()
-            if not self._whole:
-                self._part.unlink(missing_ok=True)
+            if not self._valid_bytes:
+                self._temporary_path.unlink(missing_ok=True)
 
     def _write(self, batch: Any, meta: dict[bytes, bytes] | None) -> None:
+        """Write one batch. After an error, truncate the file to its complete batches."""
         try:
             self._writer.write_batch(batch, custom_metadata=meta)
         except OSError:
-            # half a batch would hide all that follow it
-            self._file.truncate(self._whole)
-            self._file.seek(self._whole)
+            # an incomplete batch would hide all later batches
+            self._file.truncate(self._valid_bytes)
+            self._file.seek(self._valid_bytes)
             raise
-        if not self._whole:
+        if not self._valid_bytes:
             if os.path.lexists(self.path):
                 raise FileExistsError(errno.EEXIST, f"{self.path.name} is there already", str(self.path))
-            os.rename(self._part, self.path)
-            _keep_names(self.path.parent)
-        self._whole = self._file.tell()
+            os.rename(self._temporary_path, self.path)
+            _sync_folder(self.path.parent)
+        self._valid_bytes = self._file.tell()
 
 
 def segment_name(number: int, unix_s: float) -> str:
-    """The file of a segment.
+    """Return the file name of a segment.
+
+    Parameters
+    ----------
+    number
+        Number of the segment in its folder.
+    unix_s
+        Unix time of the first row in s.
 
     >>> segment_name(42, 1_700_000_000.0)
     '00000042_2023-11-14T22-13-20Z.arrows'
     """
     try:
         when = f"{datetime.fromtimestamp(unix_s, UTC):%Y-%m-%dT%H-%M-%SZ}"
-    except (ValueError, OverflowError, OSError):  # a sender's own times may be no date at all
+    except (ValueError, OverflowError, OSError):  # times given by a sender may be invalid as a date
         when = "0000-00-00T00-00-00Z"
     return f"{number:08d}_{when}{SUFFIX}"
 
 
 def began_s(path: Path) -> float:
-    """Unix time in the name of a segment, whole seconds; 0 where there is none.
+    """Return the Unix time in the name of a segment in whole seconds; 0 if the name contains none.
 
     >>> began_s(Path("00000042_2023-11-14T22-13-20Z.arrows"))
     1700000000.0
@@ -181,30 +204,40 @@ def began_s(path: Path) -> float:
 
 
 def segments(folder: Path) -> list[Path]:
-    """The segments of a folder, oldest first; none where there is no such folder."""
+    """Return the segments of a folder, oldest first. The list is empty if there is no such folder."""
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if NAME.fullmatch(path.name))
 
 
 def number_of(path: Path) -> int:
-    """Where a segment stands among those of its folder."""
+    """Return the number of a segment in its folder; 0 if the name is not that of a segment."""
     found = NAME.fullmatch(path.name)
     return int(found[1]) if found else 0
 
 
 def origin(path: Path) -> Origin:
-    """What a segment is of. RecordingError when it is none."""
-    pa = library(path)
-    with _reading(path), open_regular(path) as file:
+    """Return the source of the data in a segment.
+
+    Raises
+    ------
+    RecordingError
+        The file is not a segment.
+    """
+    pa = import_pyarrow(path)
+    with _arrow_errors(path), open_regular(path) as file:
         return _origin(path, pa.ipc.open_stream(file).schema)
 
 
 def newest(path: Path) -> Piece | None:
-    """The last batch of a segment nobody writes to any more, quickly; None where it has none.
+    """Read the last piece of a segment that is no longer written; None if the segment is empty.
 
-    Raises:
-        RecordingError: it is no segment
+    The file is mapped into memory, so that the other batches are not read.
+
+    Raises
+    ------
+    RecordingError
+        The file is not a segment.
     """
     last = deque(_batches(path, "samples", mapped=True), maxlen=1)
     pieces = [piece for batch in last for piece in _pieces(*batch)]
@@ -212,16 +245,22 @@ def newest(path: Path) -> Piece | None:
 
 
 def read_samples(path: Path) -> Iterator[Piece]:
-    """The batches of a segment, up to a cut. RecordingError when it is none."""
+    """Yield the pieces of a segment of samples, up to a truncation.
+
+    Raises
+    ------
+    RecordingError
+        The file is not a segment of samples.
+    """
     for batch, meta in _batches(path, "samples"):
         yield from _pieces(batch, meta)
 
 
 def _pieces(batch: Any, meta: Any) -> Iterator[Piece]:
-    """A batch, cut where samples are missing; none where a disk has spoilt what is in it."""
+    """Yield the samples of a batch, split where samples are missing. Yield nothing if the values are implausible."""
     columns = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in batch.schema.names}
     values = np.column_stack([columns[axis] for axis in AXES])
-    if not _possible(columns) or np.isinf(values).any():
+    if not _is_plausible(columns) or np.isinf(values).any():
         return
     state = _state(meta)
     rows = block(seconds_to_ns(columns["t"]), values, columns["temperature"].copy(), columns["ticks"].copy())
@@ -232,15 +271,18 @@ def _pieces(batch: Any, meta: Any) -> Iterator[Piece]:
         yield Piece(block(part.t_ns, part.values, part.temperature_c, part.ticks, int(lost[a])), state)
 
 
-def _possible(columns: Mapping[str, Any]) -> bool:
-    """Whether times, counts and losses are such as are written; one that is absent has made floats of whole numbers."""
+def _is_plausible(columns: Mapping[str, Any]) -> bool:
+    """Return True if times, counters and losses are in the ranges that are written.
+
+    A null value turns a column of integers into floats, which is implausible as well.
+    """
     lost, ticks = columns["lost"], columns["ticks"]
     whole = lost.dtype == ticks.dtype == np.int64
-    return bool(whole and (np.abs(columns["t"]) < T_LIMIT_S).all() and ((lost >= 0) & (lost <= LARGEST_LOSS)).all())
+    return bool(whole and (np.abs(columns["t"]) < T_LIMIT_S).all() and ((lost >= 0) & (lost <= MAX_LOST_SAMPLES)).all())
 
 
 def _state(meta: Any) -> State:
-    """What the daemon knew; nothing where that cannot be read."""
+    """Return the state in the metadata of a batch; an empty state if it cannot be read."""
     try:
         found = msgspec.json.decode(meta.get(b"state", b"{}"), type=State) if meta else State()
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
@@ -252,7 +294,13 @@ def _state(meta: Any) -> State:
 
 
 def read_chunks(path: Path) -> Iterator[Chunk]:
-    """The chunks of a raw segment, up to a cut; ``t_ns`` are Unix times. RecordingError when it is none."""
+    """Yield the chunks of a raw segment, up to a truncation. ``t_ns`` are Unix times.
+
+    Raises
+    ------
+    RecordingError
+        The file is not a segment of raw bytes.
+    """
     for batch, _ in _batches(path, "raw"):
         for start in range(0, batch.num_rows, BATCH_ROWS):
             part = batch.slice(start, BATCH_ROWS)
@@ -263,13 +311,18 @@ def read_chunks(path: Path) -> Iterator[Chunk]:
 
 
 def pack(path: Path) -> Iterator[None]:
-    """Write a segment that has ended again, compressed; it is replaced at the end. Yields after every piece of work.
+    """Write a segment that has ended again with compression, and replace the original at the end.
 
-    Raises:
-        RecordingError: it is no segment
-        OSError: there is no room; the segment stays as it was
+    The generator yields after each batch, so that the caller can spread the work.
+
+    Raises
+    ------
+    RecordingError
+        The file is not a segment.
+    OSError
+        The disk is full. The original segment is unchanged.
     """
-    pa = library(path)
+    pa = import_pyarrow(path)
     own = origin(path)
     if own.packed:
         return
@@ -279,19 +332,19 @@ def pack(path: Path) -> Iterator[None]:
     try:
         part.unlink(missing_ok=True)
         with part.open("xb") as file, pa.ipc.new_stream(file, schema, options=options) as writer:
-            for batch, meta in _joined(pa, schema, path, own.kind):
+            for batch, meta in _merged_batches(pa, schema, path, own.kind):
                 writer.write_batch(batch, custom_metadata=meta)
                 yield
         with open_regular(part) as written:
             os.fsync(written.fileno())
         os.replace(part, path)
-        _keep_names(path.parent)
+        _sync_folder(path.parent)
     finally:
         part.unlink(missing_ok=True)
 
 
-def _keep_names(folder: Path) -> None:
-    """Have the disk keep which files are there: without it a power cut takes a new file away, whatever it held."""
+def _sync_folder(folder: Path) -> None:
+    """Flush the entries of a folder to the disk. Otherwise a power failure can remove a new file."""
     place = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(place)
@@ -299,8 +352,8 @@ def _keep_names(folder: Path) -> None:
         os.close(place)
 
 
-def _joined(pa: Any, schema: Any, path: Path, kind: Kind) -> Iterator[tuple[Any, dict[bytes, bytes] | None]]:
-    """Small batches as large ones, each with what was known with its last row."""
+def _merged_batches(pa: Any, schema: Any, path: Path, kind: Kind) -> Iterator[tuple[Any, dict[bytes, bytes] | None]]:
+    """Yield small batches merged into large ones, each with the state of its last row."""
     waiting: list[Any] = []
     rows = size = 0
     meta: dict[bytes, bytes] | None = None
@@ -309,25 +362,26 @@ def _joined(pa: Any, schema: Any, path: Path, kind: Kind) -> Iterator[tuple[Any,
         rows, size = rows + batch.num_rows, size + batch.nbytes
         meta = {b"state": found[b"state"]} if found and b"state" in found else meta
         if rows >= BATCH_ROWS or size >= RAW_BATCH_BYTES:
-            yield _one(pa, schema, waiting), meta
+            yield _combine(pa, schema, waiting), meta
             waiting, rows, size = [], 0, 0
     if waiting:
-        yield _one(pa, schema, waiting), meta
+        yield _combine(pa, schema, waiting), meta
 
 
-def _one(pa: Any, schema: Any, batches: list[Any]) -> Any:
+def _combine(pa: Any, schema: Any, batches: list[Any]) -> Any:
+    """Combine batches into one."""
     table = pa.Table.from_batches(batches).combine_chunks()
     return pa.RecordBatch.from_arrays([column.chunk(0) for column in table.columns], schema=schema)
 
 
 def _batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any, Any]]:
-    """Batches with their metadata, up to a cut or a batch that states an impossible size.
+    """Yield batches with their metadata, up to a truncation or a batch with an implausible size.
 
-    ``mapped`` leaves rows that are not looked at on the disk.
+    If ``mapped`` is True, the file is mapped into memory, so that unused rows are not read from the disk.
     """
-    pa = library(path)
-    with _reading(path), open_regular(path) as file:
-        reader = pa.ipc.open_stream(_mapped(pa, file) if mapped else file)
+    pa = import_pyarrow(path)
+    with _arrow_errors(path), open_regular(path) as file:
+        reader = pa.ipc.open_stream(_memory_map(pa, file) if mapped else file)
         found = _origin(path, reader.schema)
         if found.kind != kind:
             raise RecordingError(f"{path}: a segment of {found.kind}, where one of {kind} is read")
@@ -336,13 +390,13 @@ def _batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any
                 batch, meta = reader.read_next_batch_with_custom_metadata()
                 batch.validate(full=not mapped)
             except (StopIteration, pa.ArrowException, OSError):
-                return  # the regular end, or a cut: what was whole has been given
+                return  # the regular end or a truncation: all complete batches have been yielded
             if batch.num_rows:
                 yield batch, meta
 
 
 def _regular_batches(path: Path) -> int:
-    """Number of batches before the first one whose stated size is not that of a batch of the daemon."""
+    """Return the number of batches before the first one whose stated size the daemon would not write."""
     count = 0
     with open_regular(path) as file:
         for size in batch_sizes(file):
@@ -353,15 +407,15 @@ def _regular_batches(path: Path) -> int:
     return count
 
 
-def _mapped(pa: Any, file: IO[bytes]) -> Any:
-    """The file in memory as far as it is looked at; an empty one cannot be mapped."""
+def _memory_map(pa: Any, file: IO[bytes]) -> Any:
+    """Map a file into memory. An empty file cannot be mapped and is returned unchanged."""
     if not os.fstat(file.fileno()).st_size:
         return file
     return pa.BufferReader(pa.py_buffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)))
 
 
-class _reading:  # noqa: N801 - reads as a word
-    """Arrow's errors as ours."""
+class _arrow_errors:  # noqa: N801 - used like a function
+    """Context that raises Arrow's errors as RecordingError."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -370,36 +424,39 @@ class _reading:  # noqa: N801 - reads as a word
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> None:
         unread = UnicodeDecodeError | RecursionError | msgspec.DecodeError
-        if isinstance(error, OSError) and error.errno in (errno.EINVAL, errno.EISDIR):  # no regular file
+        if isinstance(error, OSError) and error.errno in (errno.EINVAL, errno.EISDIR):  # not a regular file
             raise RecordingError(f"{self._path}: {error.strerror}") from error
         nonsense = isinstance(error, OSError) and error.errno is None and not isinstance(error, ImuError)
-        if nonsense or isinstance(error, library(self._path).ArrowException | unread):
+        if nonsense or isinstance(error, import_pyarrow(self._path).ArrowException | unread):
             first = str(error).strip().partition("\n")[0]
             raise RecordingError(f"{self._path}: is no segment of a recording ({first})") from error
 
 
 def _origin(path: Path, schema: Any) -> Origin:
-    meta = (schema.metadata or {}).get(OWN)
+    """Return the source of a segment from its schema. Raise RecordingError if it is not a segment."""
+    meta = (schema.metadata or {}).get(METADATA_KEY)
     if meta is None:
         raise RecordingError(f"{path}: is no segment of a recording: nothing says which device it is of")
     found = msgspec.json.decode(meta, type=Origin)
     if found.schema != SCHEMA:
         raise RecordingError(f'{path}: schema "{found.schema[:64]}" is not {SCHEMA}')
-    if not schema.equals(_schema(library(path), found), check_metadata=False):
+    if not schema.equals(_schema(import_pyarrow(path), found), check_metadata=False):
         raise RecordingError(f"{path}: is no segment of a recording: its columns are others")
     return found
 
 
 def _schema(pa: Any, of: Origin) -> Any:
+    """Return the schema of a segment."""
     if of.kind == "samples":
         fields = [(name, pa.float64()) for name in ("t", *AXES, "temperature")]
-        fields += [(name, pa.int64()) for name in BOOKKEEPING]
+        fields += [(name, pa.int64()) for name in SEGMENT_COLUMNS]
     else:
         fields = [("t_ns", pa.int64()), ("address", pa.uint32()), ("data", pa.binary()), ("attachment", pa.binary())]
-    return pa.schema(fields, metadata={OWN: msgspec.json.encode(of)})
+    return pa.schema(fields, metadata={METADATA_KEY: msgspec.json.encode(of)})
 
 
 def _sample_batch(pa: Any, schema: Any, blocks: Sequence[SampleBlock]) -> Any:
+    """Return blocks of samples as one record batch."""
     rows = join(blocks)
     lost = np.zeros(len(rows), np.int64)
     at = 0
@@ -411,6 +468,7 @@ def _sample_batch(pa: Any, schema: Any, blocks: Sequence[SampleBlock]) -> Any:
 
 
 def _chunk_batch(pa: Any, schema: Any, chunks: Sequence[Chunk]) -> Any:
+    """Return chunks as one record batch."""
     columns = (
         [one.t_ns for one in chunks], [one.address for one in chunks],
         [one.data for one in chunks], [one.attachment for one in chunks],

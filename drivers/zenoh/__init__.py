@@ -1,1 +1,1 @@
-"""zenoh sessions, connection errors and the sample message."""
+"""Connection to zenoh: sessions, causes of connection errors, and the message format of samples."""

@@ -1,9 +1,9 @@
-"""Why an endpoint does not let us in: zenoh itself only says that it could not connect.
+"""Causes of connection errors. zenoh itself only reports that it could not connect.
 
-In come an endpoint and the configuration it was tried with, out goes one line, "" where nobody listens there at all or
-the endpoint is of a kind that cannot be asked (QUIC, UDP). What is tried is what zenoh does first: a connection and,
-for TLS, the handshake with the same certificates, so the words are those of the failure itself. Nothing is sent beyond
-that handshake. May wait for ``timeout_s`` twice: never to be called where samples pass.
+The input is an endpoint and the configuration of the attempt. The result is one line, or "" if no program listens at
+the endpoint or if its protocol cannot be tested (QUIC, UDP). The test repeats the first steps of zenoh: a connection
+and, for TLS, the handshake with the same certificates. The reasons are therefore those of the failure itself. Nothing
+is sent after the handshake. The test can wait for ``timeout_s`` twice and must not be used in the path of the samples.
 """
 
 import json
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     import zenoh
 
 TIMEOUT_S: Final = 2.0
-ANSWERS: Final = "answers, but lets us not in: check user and password"
-"""All that is left once connection and handshake are well."""
+LOGIN_REFUSED: Final = "answers, but lets us not in: check user and password"
+"""Reason that remains if connection and handshake succeed."""
 _ENDPOINT: Final = re.compile(r"(tcp|tls|ws|wss)/\[?([^\]?#]+?)\]?:(\d+)(?:[?#].*)?")
-_OF_TLS: Final = {
+_TLS_REASONS: Final = {
     "CERTIFICATE_REQUIRED": "wants a certificate of ours: set connect_certificate and connect_private_key",
     "UNKNOWN_CA": "does not accept our certificate: it is not signed by its authority",
     "CERTIFICATE_EXPIRED": "does not accept our certificate: it has expired",
@@ -34,13 +34,31 @@ _OF_TLS: Final = {
 
 
 def refused(endpoints: Sequence[str], config: "zenoh.Config") -> str:
-    """Why these do not let us in, those that have no reason left out."""
+    """Return the reasons why endpoints refuse a connection, without the endpoints for which no reason is found.
+
+    Parameters
+    ----------
+    endpoints
+        Endpoints such as "tcp/127.0.0.1:7447".
+    config
+        Configuration of the session.
+    """
     found = [(endpoint, why(endpoint, config)) for endpoint in endpoints]
     return "; ".join(f"{masked(endpoint)}: {reason}" for endpoint, reason in found if reason)
 
 
 def why(endpoint: str, config: "zenoh.Config", timeout_s: float = TIMEOUT_S) -> str:
-    """One line, without the endpoint."""
+    """Return the reason why an endpoint refuses a connection, in one line without the endpoint; "" if none is found.
+
+    Parameters
+    ----------
+    endpoint
+        Endpoint such as "tcp/127.0.0.1:7447".
+    config
+        Configuration of the session.
+    timeout_s
+        Longest wait for the connection, and for the handshake, in s.
+    """
     found = _ENDPOINT.fullmatch(endpoint)
     if found is None:
         return ""
@@ -48,7 +66,7 @@ def why(endpoint: str, config: "zenoh.Config", timeout_s: float = TIMEOUT_S) -> 
     try:
         with socket.create_connection((host, int(port)), timeout_s) as plain:
             if protocol not in ("tls", "wss"):
-                return ANSWERS
+                return LOGIN_REFUSED
             return _handshake(plain, host, config)
     except ConnectionRefusedError:
         return ""
@@ -61,27 +79,28 @@ def why(endpoint: str, config: "zenoh.Config", timeout_s: float = TIMEOUT_S) -> 
 
 
 def _handshake(plain: socket.socket, host: str, config: "zenoh.Config") -> str:
+    """Perform the TLS handshake and return the reason for its failure."""
     try:
         context = _context(json.loads(config.get_json("transport/link/tls")))
     except (OSError, ssl.SSLError) as error:
         return f"our certificates cannot be read: {getattr(error, 'strerror', None) or error}"
     try:
         with context.wrap_socket(plain, server_hostname=host) as secure:
-            secure.recv(1)  # in TLS 1.3 a refusal of our certificate comes after the handshake
+            secure.recv(1)  # in TLS 1.3 a refusal of our certificate is sent after the handshake
     except TimeoutError:
-        return ANSWERS  # it waits for zenoh's first message
+        return LOGIN_REFUSED  # the other side waits for zenoh's first message
     except ssl.SSLCertVerificationError as error:
         return f"its certificate does not hold: {error.verify_message}"
     except ssl.SSLError as error:
         reason = error.reason or ""
-        return next((text for word, text in _OF_TLS.items() if word in reason), f"refuses TLS: {reason.lower()}")
+        return next((text for word, text in _TLS_REASONS.items() if word in reason), f"refuses TLS: {reason.lower()}")
     except ConnectionResetError:
         return "hangs up in the handshake"
-    return ANSWERS
+    return LOGIN_REFUSED
 
 
 def _context(tls: dict[str, Any]) -> ssl.SSLContext:
-    """TLS as zenoh has it of these settings."""
+    """Return the TLS context that zenoh creates from these settings."""
     context = ssl.create_default_context(cafile=tls.get("root_ca_certificate"))
     context.check_hostname = tls.get("verify_name_on_connect") is not False
     certificate, key = tls.get("connect_certificate"), tls.get("connect_private_key")

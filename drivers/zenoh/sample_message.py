@@ -1,13 +1,12 @@
-"""Samples as one message: ``SampleBlock`` <-> the msgpack map of ``<prefix>/<device>/samples``.
+"""Message format of samples: conversion between ``SampleBlock`` and the msgpack map of ``<prefix>/<device>/samples``.
 
-The one place that knows this layout: the daemon publishes with ``pack``, the ``samples`` decoder reads
-with ``unpack``, and a replayed recording travels in it. ``docs/samples-format.md`` is its page.
+Only this module knows the layout. The daemon publishes with ``pack``, the ``samples`` decoder reads with ``unpack``,
+and a replayed recording uses the same message. The format is documented in ``docs/samples-format.md``.
 
-``t`` is the Unix time of the newest sample in seconds, with ``t0`` (first sample) and ``rate`` (Hz) where the
-batch is evenly spaced to half a microsecond; otherwise ``t`` is the time of each row, float64
-little-endian. A float64 of Unix seconds holds 0.24 µs. Keys that this version does not know are left
-aside, as are columns that are no axis. Sizes are bounded and must agree; what does not is a
-``DecodeError``.
+If the rows are evenly spaced to within half a microsecond, ``t`` is the Unix time of the newest sample in seconds,
+``t0`` that of the first sample, and ``rate`` the sample rate in Hz. Otherwise ``t`` holds the time of each row as
+little-endian float64. A float64 of Unix seconds resolves 0.24 µs. Unknown keys and columns are ignored. Sizes are
+limited and must agree, otherwise a ``DecodeError`` is raised.
 """
 
 from collections.abc import Sequence
@@ -23,25 +22,25 @@ from drivers.sample import AXES, Floats, Ints, SampleBlock, block, ns_to_seconds
 
 SCHEMA: Final = "imu-monitor/samples/1"
 SCHEMAS: Final = (SCHEMA, "imu-monitor/compensated/1")
-"""Schemas whose payload has this layout."""
+"""Names of all schemas with this layout."""
 TEMPERATURE: Final = "temperature"
 COLUMNS: Final = (*AXES, TEMPERATURE)
 MAX_ROWS: Final = 1_000_000
 MAX_COLUMNS: Final = 64
 MAX_BYTES: Final = 1 << 26  # a million rows of seven columns
-EVEN_NS: Final = 500
-"""A row may stand this far from an even grid: twice the resolution of a float64 of Unix seconds."""
+MAX_GRID_DEVIATION_NS: Final = 500
+"""Largest deviation of a row from an even grid: twice the resolution of a float64 of Unix seconds."""
 T_LIMIT_S: Final = 4.6e9
-"""Years 1824 to 2115: the difference of any two is within int64 nanoseconds."""
+"""Largest absolute time, years 1824 to 2115. The difference of two times fits into int64 nanoseconds."""
 RATE_LIMITS_HZ: Final = (1e-6, 1e9)
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 53)]
 Lost = Annotated[int, msgspec.Meta(ge=0, le=1_000_000_000)]
-"""Eleven days at 1 kHz: more is no loss that a publisher can know of."""
+"""Number of lost samples, at most eleven days at 1 kHz. A publisher cannot know of a larger loss."""
 
 
 class _Payload(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The map itself."""
+    """Keys of the msgpack map."""
 
     schema: str
     axes: list[str]
@@ -60,18 +59,28 @@ _DECODER: Final = msgspec.msgpack.Decoder(_Payload)
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """One message: whose samples, how many that device had sent with it, and the samples."""
+    """Content of one message."""
 
     device: str
-    samples: int  # received by the publisher since it started, these included
+    samples: int  # received by the publisher since it started, including these
     block: SampleBlock  # t_ns are Unix times
 
 
 def pack(device: str, samples: int, rows: SampleBlock, offset_ns: int = 0, schema: str = SCHEMA) -> bytes:
-    """The message of these rows; ``samples`` counts since the start, these included.
+    """Encode samples as one message.
 
-    ``offset_ns`` is added to ``t_ns`` to make it Unix time. Axes without any value are left out; a block
-    of nothing but NaN keeps all six.
+    Parameters
+    ----------
+    device
+        Name of the device.
+    samples
+        Number of samples of the device since the start, including these.
+    rows
+        Samples to encode. Axes without any value are left out. If all values are NaN, all six axes are kept.
+    offset_ns
+        Added to ``t_ns`` to give Unix time, in ns.
+    schema
+        Name of the schema.
     """
     table = np.column_stack((rows.values, rows.temperature_c))
     measured: NDArray[np.bool_] = ~np.all(np.isnan(table), axis=0)
@@ -95,7 +104,13 @@ def pack(device: str, samples: int, rows: SampleBlock, offset_ns: int = 0, schem
 
 
 def unpack(data: bytes) -> Batch:
-    """The samples of one message. Raises ``DecodeError`` with what is wrong with it."""
+    """Decode the samples of one message.
+
+    Raises
+    ------
+    DecodeError
+        The message violates the format. The text names the reason.
+    """
     try:
         payload = _DECODER.decode(data)
     except (msgspec.DecodeError, msgspec.ValidationError, UnicodeDecodeError, RecursionError) as error:
@@ -116,19 +131,19 @@ def unpack(data: bytes) -> Batch:
 
 
 def _times(unix_ns: Ints) -> tuple[float | bytes, float | None, float | None]:
-    """``t``, ``t0``, ``rate``: the short form where the rows are evenly spaced."""
+    """Return ``t``, ``t0`` and ``rate``, in the short form if the rows are evenly spaced."""
     n = unix_ns.size
     span_ns = int(unix_ns[-1] - unix_ns[0])
     rate = (n - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
     if RATE_LIMITS_HZ[0] <= rate <= RATE_LIMITS_HZ[1]:
         grid = unix_ns[0] + np.rint(np.arange(n) * (span_ns / (n - 1))).astype(np.int64)
-        if np.abs(unix_ns - grid).max() <= EVEN_NS:
+        if np.abs(unix_ns - grid).max() <= MAX_GRID_DEVIATION_NS:
             return float(unix_ns[-1]) * 1e-9, float(unix_ns[0]) * 1e-9, rate
     return ns_to_seconds(unix_ns).astype("<f8").tobytes(), None, None
 
 
 def _table(payload: _Payload) -> Floats:
-    """Rows by columns [n, k], as sizes say."""
+    """Return the data as an array [rows, columns] after checking their sizes."""
     names: Sequence[str] = payload.axes
     if not 0 < len(names) <= MAX_COLUMNS or len(set(names)) != len(names):
         raise DecodeError(f"axes: {len(names)} names; need 1 to {MAX_COLUMNS}, each once")
@@ -141,6 +156,7 @@ def _table(payload: _Payload) -> Floats:
 
 
 def _times_ns(payload: _Payload, n: int) -> Ints:
+    """Return the Unix times [n] of the rows in ns."""
     if isinstance(payload.t, bytes):
         if len(payload.t) != 8 * n:
             raise DecodeError(f"t: {len(payload.t)} bytes for {n} rows; need one float64 a row")
@@ -161,5 +177,6 @@ def _times_ns(payload: _Payload, n: int) -> Ints:
 
 
 def _check_times(seconds: Floats) -> None:
+    """Raise DecodeError if a time is missing or out of range."""
     if not np.all(np.abs(seconds) < T_LIMIT_S):
         raise DecodeError("t: a time is no Unix time in seconds")

@@ -1,6 +1,6 @@
-"""zenoh sessions that are closed unless told otherwise: a peer that scouts nobody and listens nowhere.
+"""Configurations of zenoh sessions. By default a session is a peer that does not scout or listen.
 
-Nothing is opened here: the link, the daemon's results and ``watch`` each open the session of a configuration.
+This module opens no session. The link, the publisher of the daemon and ``watch`` each open their own session.
 """
 
 import contextlib
@@ -24,10 +24,10 @@ CLOSED: Final[Mapping[str, Any]] = {
     "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
     "transport/link/rx/max_message_size": 64_000_000,
 }
-"""What a session is unless told otherwise; zenoh's own defaults scout and listen everywhere, and take in 1 GiB at once.
+"""Default configuration of a session. zenoh's own defaults scout and listen everywhere, and accept 1 GiB at once.
 
-Who was there once is looked for every second. A longer message is dropped piece by piece as it comes, and the
-connection stays; an hour of a 1 kHz sensor in one batch would fit.
+A lost connection is retried at least every second. A longer message is dropped while it arrives, and the connection
+stays open. An hour of samples at 1 kHz in one batch would fit.
 """
 
 
@@ -37,7 +37,7 @@ SECRET_FILES: Final = (
     "transport/auth/usrpwd/dictionary_file",
     "transport/auth/pubkey/private_key_file",
 )
-"""Keys of files that nobody else should read."""
+"""Configuration keys of files that other users must not read."""
 PUBLIC_FILES: Final = (
     "transport/link/tls/root_ca_certificate",
     "transport/link/tls/listen_certificate",
@@ -45,15 +45,27 @@ PUBLIC_FILES: Final = (
     "transport/auth/pubkey/public_key_file",
     "transport/auth/pubkey/known_keys_file",
 )
+"""Configuration keys of files that other users may read."""
 
 
 def configuration(
     own: Mapping[str, Any], file: str | Path | None = None, unsaid: Mapping[str, Any] = CLOSED
 ) -> "zenoh.Config":
-    """zenoh's configuration: ``own`` keys that are not None, over the file's, over ``unsaid``.
+    """Return the configuration of a session.
 
-    Raises:
-        zenoh.ZError: a file or a value that zenoh refuses
+    Parameters
+    ----------
+    own
+        Values by configuration key, which take precedence over the file. None means not set.
+    file
+        zenoh configuration file; None for zenoh's defaults.
+    unsaid
+        Values for keys that the file leaves at zenoh's default.
+
+    Raises
+    ------
+    zenoh.ZError
+        zenoh refuses the file or a value.
     """
     import zenoh
 
@@ -73,9 +85,10 @@ def configuration(
 
 
 def plain(error: Exception) -> str:
-    """zenoh's reason in one line: without the place in its own source code, and without what a file says there.
+    """Return the text of a zenoh error in one line.
 
-    The line that zenoh shows of a file it cannot read may hold a password.
+    Positions in zenoh's source code and quoted file contents are removed. zenoh quotes a line of a file that it cannot
+    read, and that line may contain a password.
     """
     text = re.sub(r"\s+at \S+\.rs:\d+\.?", "", str(error))
     text = re.sub(r"\s*-->\s*(\d+):(\d+)\s*\n.*\n\s*=\s*", r"line \1, column \2: ", text, flags=re.DOTALL)
@@ -89,7 +102,7 @@ def plain(error: Exception) -> str:
 
 
 def alone(session: "zenoh.Session") -> bool:
-    """Whether this session is connected to nobody; False once it is closed."""
+    """Return True if the session has no connection; False once it is closed."""
     import zenoh
 
     with contextlib.suppress(zenoh.ZError):
@@ -98,7 +111,10 @@ def alone(session: "zenoh.Session") -> bool:
 
 
 def endpoints(config: "zenoh.Config") -> tuple[str, ...]:
-    """Where this configuration connects to; a list for each mode is that of its own."""
+    """Return the endpoints that a configuration connects to.
+
+    A list for each mode is resolved to the mode of the session.
+    """
     found = json.loads(config.get_json("connect/endpoints"))
     if isinstance(found, dict):
         found = found.get(json.loads(config.get_json("mode")) or "peer", [])
@@ -106,23 +122,23 @@ def endpoints(config: "zenoh.Config") -> tuple[str, ...]:
 
 
 def secret_files(config: "zenoh.Config") -> tuple[Path, ...]:
-    """Files of this configuration that nobody else should read: private keys and lists of passwords."""
+    """Return the files of a configuration that other users must not read: private keys and password lists."""
     return _named_files(config, SECRET_FILES)
 
 
 def _named_files(config: "zenoh.Config", keys: Sequence[str] | None = None) -> tuple[Path, ...]:
-    """Files that a configuration names; those of ``keys`` alone, or all."""
+    """Return the files that a configuration names under ``keys``, or under all keys."""
     found = (json.loads(config.get_json(key)) for key in keys or (*SECRET_FILES, *PUBLIC_FILES))
     return tuple(Path(named) for named in found if named)
 
 
 def _check_file(path: Path) -> None:
-    """Raise ZError if something else than a regular file has this name: zenoh would wait for a FIFO without end."""
+    """Raise ZError if the path is not a regular file. zenoh would wait for a FIFO without end."""
     import zenoh
 
     try:
         check_regular(path)
     except FileNotFoundError:
-        return  # zenoh says so itself
+        return  # zenoh reports this itself
     except OSError as error:
         raise zenoh.ZError(f"{path}: {error.strerror or error}") from error
