@@ -1,12 +1,12 @@
-"""Quantities that users and files give as numbers, each with the range that the program supports.
+"""Quantities: kinds of numbers from users and files, each with its unit and supported range.
 
-A number enters the program through a command-line option, a key of a configuration or model file, or a recording. Each
-of these entries checks the number against one of the quantities below, so that the code behind them never meets a
-value that overflows, divides by zero or asks for more memory than exists. The ranges are wider than any sensor or use
-that is known, and narrow enough that products, squares and quotients of the numbers stay finite.
+Numbers enter the program through command-line options, keys of configuration and model files, and recordings. Each of
+these entry points checks its numbers against one of the quantities below. The code behind them therefore never meets a
+value that overflows, divides by zero or asks for more memory than exists. The ranges are wider than those of any known
+sensor or use. They are narrow enough that products, squares and quotients of the numbers stay finite.
 
-A field of a settings struct names its quantity in its type: ``Annotated[float, RATE_HZ.meta]``. ``out_of_range``
-finds the quantity there and checks a value that msgspec has converted to that type.
+A field of a settings struct names its quantity in its type: ``Annotated[float, RATE_HZ.meta]``. ``out_of_range`` reads
+the quantity from the type, and checks a value that msgspec has converted to that type.
 """
 
 from collections.abc import Iterator, Mapping
@@ -25,13 +25,14 @@ DAY_S: Final = 86_400.0
 PREFIXED_UNITS: Final = ("Hz", "bit/s", "byte/s", "byte")
 """Units that are written with the prefixes k, M, G, T."""
 PREFIXES: Final = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"))
-LARGEST_WRITTEN: Final = 1 << 64
-"""An integer beyond this is described, not written: it may have thousands of digits."""
+"""Factors and names of the prefixes, largest first."""
+MAX_WRITTEN_INTEGER: Final = 1 << 64
+"""Largest integer that is written in a message. A larger one is described, since it may have thousands of digits."""
 
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A kind of number with its unit and the supported range, both ends included.
+    """Kind of number with its unit and supported range. Both ends are included.
 
     >>> RATE_HZ.check(200.0)
     200.0
@@ -43,23 +44,23 @@ class Quantity:
     unit: str  # "" for a number without a unit
     low: float
     high: float
-    zero: bool = False  # True: 0 is supported too, with a meaning of its own
-    signed: bool = False  # True: the range is that of the absolute value
+    zero: bool = False  # True if 0 is supported as well, with a special meaning
+    signed: bool = False  # True if the range applies to the absolute value
 
     def check(self, value: Number) -> Number:
-        """Return the value.
+        """Return the value if it is in the supported range.
 
         Raises
         ------
         ConfigError
-            The value is not a number or outside the supported range. The text names value, unit and range.
+            The value is not a number or is outside the supported range. The text names value, unit and range.
         """
         if self.supports(value):
             return value
-        raise ConfigError(f"{_amount(value, self.unit)} is outside the supported range {self.range_text()}")
+        raise ConfigError(f"{_format_number(value, self.unit)} is outside the supported range {self.range_text()}")
 
     def supports(self, value: float) -> bool:
-        """Return True if the value is in the supported range; False for NaN."""
+        """Return True if the value is in the supported range. Return False for NaN."""
         size = abs(value) if self.signed else value
         return self.low <= size <= self.high or (self.zero and value == 0)
 
@@ -72,37 +73,38 @@ class Quantity:
         sign = "±" if self.signed else ""
         ends = f"{sign}{self.low:g} to {sign}{self.high:g} {self.unit}".rstrip()
         if self.unit in PREFIXED_UNITS or self.unit == "s":
-            ends = f"{_amount(self.low, self.unit)} to {_amount(self.high, self.unit)}"
+            ends = f"{_format_number(self.low, self.unit)} to {_format_number(self.high, self.unit)}"
         return f"{ends}, or 0" if self.zero else ends
 
     @property
     def meta(self) -> msgspec.Meta:
-        """Annotation of a field of this quantity, for ``out_of_range``."""
+        """Annotation for a field of this quantity, which ``out_of_range`` reads."""
         return msgspec.Meta(extra={"quantity": self})
 
 
 # --- time and rates
 
 RATE_HZ: Final = Quantity("Hz", 1e-3, 1e6)
-"""Sample rate: from a sample in a quarter of an hour to far above the fastest vibration sensors (some 30 kHz)."""
+"""Sample rate: from a sample in a quarter of an hour to far above the fastest vibration sensors (about 30 kHz)."""
 EFFECT_FREQUENCY_HZ: Final = Quantity("Hz", 1e-12, 1e6, zero=True)
-"""Frequency of a line or of random events in a noise model; 0: none."""
+"""Frequency of a spectral line or of random events in a noise model; 0: none."""
 UPDATE_RATE_HZ: Final = Quantity("Hz", 1e-6, 1e6)
-"""Rate of results."""
+"""Rate at which results are published."""
 DURATION_S: Final = Quantity("s", 1e-6, 36_525.0 * DAY_S)
-"""Length of time: from one period of the highest sample rate to a century."""
+"""Duration: from one period of the highest sample rate to a century."""
 AVERAGING_TIME_S: Final = Quantity("s", 1e-6, 36_525.0 * DAY_S)
+"""Averaging time τ of the Allan variance."""
 DELAY_S: Final = Quantity("s", 1e-6, 36_525.0 * DAY_S, zero=True)
 """Time after a start; 0 is the start itself."""
 SILENCE_S: Final = Quantity("s", 1e-3, 36_525.0 * DAY_S, zero=True)
-"""Time without data after which something is done; 0: never."""
+"""Time without data after which the program reacts; 0: never."""
 RUN_TIME_S: Final = Quantity("s", 0.1, 36_525.0 * DAY_S)
-"""How long a command runs before it stops by itself."""
+"""Time after which a command ends by itself."""
 JITTER_S: Final = Quantity("s", 0.0, 0.5)
 READ_TIMEOUT_S: Final = Quantity("s", 1e-4, 0.1)
-"""A serial port without ``cancel_read`` is closed after at most this long."""
+"""Time that a read of a serial port may wait. A port without ``cancel_read`` is closed after at most this time."""
 TICK_S: Final = Quantity("s", 1e-12, DAY_S)
-"""Length of one count of a device's clock."""
+"""Length of one count of a device clock."""
 
 # --- transmission
 
@@ -111,7 +113,7 @@ BYTE_RATE: Final = Quantity("byte/s", 1.0, 1e9)
 PORT: Final = Quantity("", 0, 65_535)
 """TCP port."""
 SIZE_BYTES: Final = Quantity("byte", 1e6, 1e15)
-"""Limit of memory."""
+"""Memory limit."""
 
 # --- counts and factors
 
@@ -122,23 +124,23 @@ SEED: Final = Quantity("", 0, (1 << 63) - 1)
 SAMPLES: Final = Quantity("samples", 1, 10_000_000_000)
 """Length of a simulated recording."""
 COUNTER_MODULUS: Final = Quantity("counts", 2, 1 << 62)
-"""Counts after which a device's counter starts again at 0."""
+"""Number of counts after which a device counter starts again at 0."""
 COUNTER_STEP: Final = Quantity("counts", 1e-9, 1 << 62)
-"""Counts of a device's counter from one sample to the next."""
+"""Counts of a device counter from one sample to the next."""
 SOURCE_ADDRESS: Final = Quantity("", 0, 255)
-"""Of SAE J1939."""
+"""Source address of SAE J1939."""
 HEADER_LINES: Final = Quantity("lines", 0, 1_000_000)
 ALARMS_PER_DAY: Final = Quantity("a day", 1e-6, 1e4, zero=True)
-"""Rate of false alarms; 0: nothing is looked for."""
+"""Rate of false alarms; 0: detection is off."""
 REPLAY_SPEED: Final = Quantity("times", 1e-3, 1e6)
-"""Speed over real time."""
+"""Speed of a replay relative to real time."""
 SIMULATION_SPEED: Final = Quantity("times", 1e-3, 1e4)
 RATE_RATIO: Final = Quantity("", 1e-3, 1e3)
-"""True sample rate over the stated one."""
+"""True sample rate divided by the stated one."""
 CLOCK_RATIO: Final = Quantity("", 0.5, 2.0)
 INFLATION: Final = Quantity("", 1.0, 1e6)
 SCALE: Final = Quantity("", 1e-15, 1e15, signed=True)
-"""Factor from a device's own numbers."""
+"""Factor from the numbers of a device to a unit."""
 TIMES: Final = Quantity("times", 1e-6, 1e6)
 """Ratio of two amounts of noise."""
 
@@ -147,11 +149,11 @@ TIMES: Final = Quantity("times", 1e-6, 1e6)
 FULL_SCALE: Final = Quantity("", 1e-3, 1e6)
 """Full scale of a sensor, in g or °/s."""
 COEFFICIENT: Final = Quantity("", 1e-30, 1e30)
-"""Size of noise in an SI unit: far beyond every sensor, and squares and quotients are still numbers."""
+"""Noise coefficient in an SI unit. The range is far beyond every sensor, and squares and quotients stay finite."""
 PARAMETER: Final = Quantity("", 1e-30, 1e30, zero=True, signed=True)
-"""Any parameter of a noise model, in SI units."""
+"""Parameter of a noise model in SI units."""
 FIT_NUMBER: Final = Quantity("", 0.0, 1e30, signed=True)
-"""Any number of a fitted model that was written to a file."""
+"""Number of a fitted model that was written to a file."""
 TEMPERATURE_C: Final = Quantity("°C", -273.15, 2_000.0)
 
 
@@ -161,9 +163,9 @@ def out_of_range(value: Any, kind: Any) -> Iterator[tuple[str, str]]:
     Parameters
     ----------
     value
-        What ``msgspec.convert`` made of a key for the type ``kind``.
+        Value that ``msgspec.convert`` returned for the type ``kind``.
     kind
-        The type of a field of a struct; unions, containers and structs are searched.
+        Type of a field of a struct. Unions, containers and structs are searched.
 
     Yields
     ------
@@ -174,7 +176,7 @@ def out_of_range(value: Any, kind: Any) -> Iterator[tuple[str, str]]:
 
 
 def range_problems(settings: msgspec.Struct) -> Iterator[str]:
-    """Yield a line for each number of a struct outside its range; it begins with the name of the key."""
+    """Yield a line for each number of a struct that is out of range. The line begins with the name of the key."""
     for field in msgspec.structs.fields(settings):
         for place, text in out_of_range(getattr(settings, field.name), field.type):
             yield f"{field.encode_name}{place}: {text}"
@@ -193,6 +195,7 @@ def check_settings(settings: msgspec.Struct) -> None:
 
 
 def _out_of_range(value: Any, info: inspect.Type, place: str) -> Iterator[tuple[str, str]]:
+    """Search a value recursively according to the type information of msgspec."""
     if isinstance(info, inspect.Metadata):
         quantity = (info.extra or {}).get("quantity")
         if isinstance(quantity, Quantity) and isinstance(value, int | float) and not isinstance(value, bool):
@@ -215,13 +218,13 @@ def _out_of_range(value: Any, info: inspect.Type, place: str) -> Iterator[tuple[
             yield from _out_of_range(getattr(value, field.name), field.type, f"{place}.{field.encode_name}")
 
 
-def _amount(value: float, unit: str) -> str:
+def _format_number(value: float, unit: str) -> str:
     """Return a number with its unit.
 
-    >>> _amount(2e6, "Hz"), _amount(0.25, "s"), _amount(172_800.0, "s"), _amount(10**400, "")
+    >>> _format_number(2e6, "Hz"), _format_number(0.25, "s"), _format_number(172_800.0, "s"), _format_number(10**400, "")
     ('2 MHz', '250 ms', '2 d', 'an integer of more than 64 bits')
     """
-    if isinstance(value, int) and abs(value) > LARGEST_WRITTEN:
+    if isinstance(value, int) and abs(value) > MAX_WRITTEN_INTEGER:
         return "an integer of more than 64 bits"
     if unit in PREFIXED_UNITS and isfinite(value) and value < 1e15:
         for factor, prefix in PREFIXES:

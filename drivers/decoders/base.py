@@ -81,7 +81,7 @@ class Addressed(Protocol):
 
 @runtime_checkable
 class CountingLate(Protocol):
-    """Interface of a decoder that joins several frames to one sample and distinguishes late frames from missing ones."""
+    """Interface of a decoder that joins several frames to one sample, and tells late frames from missing ones."""
 
     @property
     def late(self) -> int:
@@ -136,9 +136,7 @@ class Rows:
             Number of frames that were rejected after the last row. They count before the first row of the next call.
         """
         good = plausible(values)
-        if (
-            good.size and good.all() and not bad_before.any()
-        ):  # fast path for nearly all calls, since most chunks hold few frames
+        if good.size and good.all() and not bad_before.any():  # fast path for nearly all calls
             carried, self._missing = self._missing, bad_after
             self.bad += bad_after
             return [block(t_ns, values, _valid_temperatures(temperature_c), ticks, carried)]

@@ -1,20 +1,20 @@
 """Sensonor STIM300 normal-mode datagrams over RS-422.
 
-Big-endian, no sync word: ``id | gyro 3 x i24, status | [acceleration 3 x i24, status] | [inclinometer ...] |
-[temperature 3 x i16, status of each included sensor] | [aux or PPS i24, status] | counter u8 | latency u16 |
-CRC u32``, then CR LF where that is switched on. The identifier says which parts follow. CRC-32 of polynomial
-0x04C11DB7, start 0xFFFFFFFF, not reflected, over all before it and zeros up to a multiple of four bytes.
-Sources: vortexntnu/stim300-driver, and the frame published in geirhovland/stim300; data sheet TS1524 tables
-5-21 to 5-23 as restated by public drivers.
+The format is big-endian without a sync word: ``id | gyro 3 x i24, status | [acceleration 3 x i24, status] |
+[inclinometer ...] | [temperature 3 x i16, status of each included sensor] | [aux or PPS i24, status] | counter u8 |
+latency u16 | CRC u32``, then CR LF if that is enabled. The identifier states which parts follow. The CRC-32 has the
+polynomial 0x04C11DB7 and the initial value 0xFFFFFFFF, and is not reflected. It covers all bytes before it, padded with
+zeros to a multiple of four bytes. Sources: vortexntnu/stim300-driver, and the frame published in geirhovland/stim300;
+data sheet TS1524 tables 5-21 to 5-23 as restated by public drivers.
 
-Neither the accelerometer's range nor the output units are in the datagram: they must be configured. An
-"increment" is the angle or velocity of one sample, and needs ``rate`` to become a rate. Integrated outputs
+The datagram contains neither the range of the accelerometer nor the output units, so both must be configured. An
+"increment" is the angle or velocity of one sample, and ``rate`` is needed to convert it to a rate. Integrated outputs
 are not supported. The counter runs with the internal 2000 Hz sampling (unconfirmed: it steps by 4 at 500 Hz).
 
-Status byte of the gyro and accelerometer: system integrity error (bit 7), start-up (6), overload (4) and
-channel error (3) make the sample bad: its values are wrong or unsettled. Outside operating conditions (5)
-is let through: the sensor still measures, as in a climate chamber beyond its stated range. The temperature
-is the mean of the gyro's three sensors, not measured when their status shows an error.
+In the status byte of gyro and accelerometer, system integrity error (bit 7), start-up (6), overload (4) and channel
+error (3) make the sample bad, since its values are wrong or unsettled. A sample outside the operating conditions (5) is
+accepted, because the sensor still measures, for example in a climate chamber beyond its stated range. The temperature
+is the mean of the three sensors of the gyro. It is not measured if their status shows an error.
 """
 
 import zlib
@@ -40,18 +40,18 @@ from drivers.sample import Chunk, Counter, Floats, Ints, SampleBlock, Timing
 from drivers.units import DEGREE, G0
 
 ACCEL_PART, INCL_PART, TEMPERATURE_PART, AUX_PART = 1, 2, 4, 8
-# in the order of the parts' bits; F0..F7 carry PPS in the place of aux; 97 is A7 of hardware up to revision C
+# in the order of the bits of the parts; F0..F7 carry PPS in place of aux; 97 is A7 of hardware up to revision C
 IDENTIFIERS: Final = {
     **dict(zip((0x90, 0x91, 0x92, 0x93, 0x94, 0xA5, 0xA6, 0xA7), range(8), strict=True)),
     **dict(zip((0x98, 0x99, 0x9A, 0x9B, 0x9C, 0xAD, 0xAE, 0xAF), range(8, 16), strict=True)),
     **dict(zip(range(0xF0, 0xF8), range(8, 16), strict=True)),
     0x97: 7,
 }
-"""Identifier -> parts beside the gyro."""
+"""Bit mask of the parts in addition to the gyro, by identifier."""
 
 
 def size(parts: int) -> int:
-    """Bytes of a datagram with these parts, CRC included, CR LF not."""
+    """Return the length of a datagram with these parts in bytes, with CRC but without CR LF."""
     sensors = 1 + (parts & (ACCEL_PART | INCL_PART)).bit_count()
     warm = sensors if parts & TEMPERATURE_PART else 0
     return 1 + 10 * sensors + 7 * warm + (4 if parts & AUX_PART else 0) + 1 + 2 + 4
@@ -61,35 +61,39 @@ SIZES: Final = {identifier: size(parts) for identifier, parts in IDENTIFIERS.ite
 LONGEST: Final = max(SIZES.values())
 
 ACCEL_BITS: Final = {"2g": 21, "5g": 20, "10g": 19, "30g": 18, "80g": 16}
-"""Least significant bit is 2**-bits g by accelerometer range; 8 times finer in m/s for an increment."""
-ERRORS: Final = 0x80 | 0x40 | 0x10 | 0x08
+"""Exponent of the resolution by accelerometer range. The least significant bit is 2**-bits g. For an increment, it is 8
+times finer, in m/s.
+"""
+ERROR_BITS: Final = 0x80 | 0x40 | 0x10 | 0x08
 START_UP: Final = 0x40
 CHANNEL_ERROR: Final = 0x08
 
 _BITS = np.arange(256, dtype=np.uint8)[:, None] >> np.arange(8, dtype=np.uint8) & 1
-MIRRORED: Final = np.packbits(_BITS, axis=1).tobytes()
-"""Each byte with its bits in reverse order: turns the CRC into zlib's, which is the reflected one."""
+BIT_REVERSAL: Final = np.packbits(_BITS, axis=1).tobytes()
+"""Each byte with its bits in reverse order. It converts the CRC to the reflected CRC of zlib."""
 
 
 class Settings(DecoderSettings, frozen=True):
     """Keys of ``[device.driver.decoder_options]``."""
 
     accelerometer_range: Literal["2g", "5g", "10g", "30g", "80g"] = "10g"
-    """Range of the accelerometers built in: it sets the scale."""
+    """Range of the installed accelerometers, which determines the scale."""
     gyro_output: Literal["rate", "increment"] = "rate"
-    """rate: angular rate or its mean, °/s; increment: angle of one sample, °."""
+    """Output of the gyro. rate: angular rate or its mean in °/s; increment: angle of one sample in °."""
     accelerometer_output: Literal["acceleration", "increment"] = "acceleration"
-    """acceleration, or its mean, g; increment: velocity of one sample, m/s."""
+    """Output of the accelerometer. acceleration: acceleration or its mean in g; increment: velocity of one sample in
+    m/s.
+    """
     rate: Annotated[float, RATE_HZ.meta] | None = None
-    """Sample rate in Hz; needed where an output is an increment."""
+    """Sample rate in Hz, which is needed if an output is an increment."""
     identifier: int | Literal["auto"] = "auto"
-    """First byte of the datagrams, as 0x93; auto takes that of the first whose CRC holds."""
+    """First byte of the datagrams, such as 0x93. With auto, it is taken from the first datagram with a correct CRC."""
     crlf: bool = False
-    """``encode`` ends datagrams with CR LF; reading takes both."""
+    """True if ``encode`` ends datagrams with CR LF. Both forms are read."""
 
 
 class Stim300Decoder:
-    """STIM300 datagrams <-> SampleBlock."""
+    """Decoder and encoder of STIM300 datagrams."""
 
     carrier: ClassVar[str] = "bytes"
 
@@ -108,12 +112,12 @@ class Stim300Decoder:
 
     @property
     def bad(self) -> int:
-        """Datagrams that failed their CRC, and samples whose status or value is wrong."""
+        """Number of datagrams with a wrong CRC, and of samples with an error status or implausible values."""
         return self._rows.bad
 
     @property
     def hint(self) -> str:
-        """What the status byte says, or why datagrams are rejected."""
+        """Meaning of the status byte, or reason for rejected datagrams."""
         if self._status & START_UP:
             return "the sensor is starting up"
         if self._status:
@@ -121,12 +125,12 @@ class Stim300Decoder:
         return self._buffer.hint
 
     def reset(self) -> None:
-        """Forget half a datagram, and with auto which identifier it had."""
+        """Forget an incomplete datagram, and with auto the identifier."""
         self._buffer.reset()
         self._rows.reset()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Samples of the datagrams that these chunks complete."""
+        """Return the samples of the datagrams that these chunks complete."""
         frames = self._buffer.feed(chunks)
         n = len(frames.data)
         if not n:
@@ -143,23 +147,24 @@ class Stim300Decoder:
         return self._rows.blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before)
 
     def _read(self, data: NDArray[np.uint8], parts: int) -> tuple[Floats, Floats]:
-        """Values [n, 6], infinite where the status byte says that they do not hold, and temperatures [n]."""
+        """Return values [n, 6], infinite where the status byte shows an error, and temperatures [n] in °C."""
         values = np.full((len(data), 6), np.nan)
         values[:, :3] = triples(data, 1) * self._gyro_step
         status = data[:, 10]
         if parts & ACCEL_PART:
             values[:, 3:] = triples(data, 11) * self._accel_step
             status = status | data[:, 20]
-        values[status & ERRORS != 0] = np.inf
-        self._status = int(status[-1]) & ERRORS
+        values[status & ERROR_BITS != 0] = np.inf
+        self._status = int(status[-1]) & ERROR_BITS
         temperature_c = np.full(len(data), np.nan)
         if parts & TEMPERATURE_PART:
             at = _temperature_at(parts)
             mean = np.ascontiguousarray(data[:, at : at + 6]).view(">i2").mean(axis=1) / 2**8
-            temperature_c = np.where(data[:, at + 6] & ERRORS, np.nan, mean)
+            temperature_c = np.where(data[:, at + 6] & ERROR_BITS, np.nan, mean)
         return values, temperature_c
 
     def _match(self, buffer: bytes, at: int) -> int:
+        """Return the length of a datagram at this offset (see ``drivers.decoders.base.Match``)."""
         if at >= len(buffer):
             return NEED_MORE
         length = SIZES.get(buffer[at])
@@ -173,9 +178,10 @@ class Stim300Decoder:
         return length
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Datagrams of the identifier set; with auto those with acceleration, and temperature where there is one.
+        """Return datagrams with the configured identifier.
 
-        A row with an axis that is not measured has the channel error set.
+        With auto, they contain acceleration, and temperature if there is any. A row with an unmeasured axis has the
+        channel error set.
         """
         identifier = self._settings.identifier
         if identifier == "auto":
@@ -197,12 +203,12 @@ class Stim300Decoder:
 
 
 def _temperature_at(parts: int) -> int:
-    """Offset of the gyro's temperatures."""
+    """Return the offset of the temperatures of the gyro."""
     return 1 + 10 * (1 + (parts & (ACCEL_PART | INCL_PART)).bit_count())
 
 
 def triples(data: NDArray[np.uint8], at: int) -> Ints:
-    """[n, 3] signed 24-bit big-endian integers at an offset of each row."""
+    """Return signed 24-bit big-endian integers [n, 3] at an offset of each row."""
     wide = np.zeros((len(data), 3, 4), np.uint8)
     wide[:, :, :3] = data[:, at : at + 9].reshape(-1, 3, 3)
     raised: Ints = wide.view(">i4")[:, :, 0].astype(np.int64) >> 8
@@ -210,22 +216,23 @@ def triples(data: NDArray[np.uint8], at: int) -> Ints:
 
 
 def _put(data: NDArray[np.uint8], at: int, values: Floats, step: float) -> None:
+    """Write values and their status at an offset of each row."""
     raw = quantize(values, step, 24).astype(">i4").reshape(-1, 3, 1).view(np.uint8)
     data[:, at : at + 9] = raw[:, :, 1:].reshape(-1, 9)
     data[:, at + 9] = np.where(np.isnan(values).any(axis=1), CHANNEL_ERROR, 0)
 
 
 def crc(body: bytes) -> bytes:
-    """The four bytes that follow a datagram's body."""
-    mirrored = zlib.crc32(bytes(-len(body) % 4), zlib.crc32(body.translate(MIRRORED))) ^ 0xFFFFFFFF
-    return mirrored.to_bytes(4, "little").translate(MIRRORED)
+    """Return the four CRC bytes of a datagram."""
+    mirrored = zlib.crc32(bytes(-len(body) % 4), zlib.crc32(body.translate(BIT_REVERSAL))) ^ 0xFFFFFFFF
+    return mirrored.to_bytes(4, "little").translate(BIT_REVERSAL)
 
 
 def crc_holds(frame: bytes) -> bool:
-    """Whether a whole datagram ends in its own CRC."""
-    mirrored = frame.translate(MIRRORED)
+    """Return True if the CRC of a complete datagram is correct."""
+    mirrored = frame.translate(BIT_REVERSAL)
     stated = int.from_bytes(mirrored[-4:], "little")
-    # zeros mirror to zeros, so that the padding can be appended after
+    # reversed zeros are zeros, so the padding can be appended afterwards
     return zlib.crc32(PADDING[-len(frame) % 4], zlib.crc32(mirrored[:-4])) ^ 0xFFFFFFFF == stated
 
 
@@ -233,13 +240,20 @@ PADDING: Final = (b"", b"\0", b"\0\0", b"\0\0\0")
 
 
 def build(settings: Settings) -> Decoder:
-    """A decoder with these settings; ConfigError for an unknown identifier or a missing rate."""
+    """Return a decoder with these settings.
+
+    Raises
+    ------
+    ConfigError
+        The identifier is unknown, or the rate is missing.
+    """
     if wrong := list(_problems(settings)):
         raise ConfigError(*wrong)
     return Stim300Decoder(settings)
 
 
 def _problems(settings: Settings) -> Iterator[str]:
+    """Yield a line for each mistake in the settings."""
     yield from range_problems(settings)
     if settings.identifier != "auto" and settings.identifier not in IDENTIFIERS:
         known = ", ".join(f"0x{identifier:02X}" for identifier in sorted(IDENTIFIERS))

@@ -1,14 +1,15 @@
-"""Plain text lines of numbers, as boards of the Arduino class print them.
+"""Text lines of numbers, as printed by boards of the Arduino class.
 
-No standard: ``columns`` says what stands where, and units turn it into SI. A line ends in LF, CR or both.
-With ``delimiter = "auto"`` commas, semicolons and tabs separate fields, and blanks where a line has none of
-them. An empty field, or ``nan``, is not measured. Lines that are empty or begin with the comment prefix are
-passed over; a line with another number of columns, or a field that is no number, is bad. With ``nmea`` a
-line reads ``$fields*CC``, CC the exclusive or between ``$`` and ``*``, and is bad unless that holds.
+There is no standard. ``columns`` names the content of each column, and the units convert it to SI. A line ends in LF,
+CR or both. With ``delimiter = "auto"``, fields are separated by commas, semicolons or tabs, or by blanks in a line
+without any of these. An empty field or ``nan`` is not measured. Empty lines and lines that begin with the comment
+prefix are skipped. A line with another number of columns, or with a field that is not a number, is bad. With ``nmea`` a
+line has the form ``$fields*CC``, where CC is the exclusive or of the characters between ``$`` and ``*``. A wrong CC
+makes the line bad.
 
-The first line after the link was opened is most often cut in front, and a cut number is still a number:
-``-0.012`` becomes ``12``. It is left out without being bad, unless a checksum vouches for it or
-``first_line = "keep"``. ``encode`` therefore puts a line end before a block's first line.
+The first line after the link was opened has usually lost its beginning, and a cut number is still a number: ``-0.012``
+becomes ``12``. The first line is therefore left out without being counted as bad, unless its checksum is correct or
+``first_line = "keep"``. For this reason ``encode`` puts a line end before the first line of a block.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,27 +33,27 @@ from drivers.quantities import COUNTER_MODULUS, HEADER_LINES, SCALE, range_probl
 from drivers.sample import AXES, NO_TICK, Arrival, Chunk, Counter, Floats, SampleBlock, Timing
 
 LONGEST: Final = 4096
-"""Bytes of a line; more without a line end is noise and is dropped."""
-NOISE: Final = b"\0"
-"""Stands for an overlong line: it is bad, as it is no number."""
-OVERLONG: Final = f"more than {LONGEST} bytes without a line end: is the baud rate right?"
+"""Maximum length of a line in bytes. A longer text without a line end is noise and is dropped."""
+OVERLONG_LINE: Final = b"\0"
+"""Replacement for an overlong line. It is bad, since it is not a number."""
+OVERLONG_HINT: Final = f"more than {LONGEST} bytes without a line end: is the baud rate right?"
 SKIP: Final = "-"
 COLUMNS: Final = (*AXES, "temperature", "t", "counter", SKIP)
 TICK_S: Final = 1e-9
-"""The ``t`` column becomes ticks of 1 ns."""
+"""Length of a tick. The ``t`` column is converted to ticks of 1 ns."""
 DEVICE_WRAP: Final = 1 << 32
 """Counts after which ``millis()`` and ``micros()`` of small boards start again at 0."""
-NEVER: Final = 1 << 62
-"""Ticks; 146 years of nanoseconds."""
+UNWRAPPED_TICKS: Final = 1 << 62
+"""Modulus of a clock that does not wrap, in ticks: 146 years of nanoseconds."""
 
 
 class Settings(DecoderSettings, frozen=True):
     """Keys of ``[device.driver.decoder_options]``."""
 
     columns: tuple[str, ...]
-    """What stands in each column: gx gy gz ax ay az temperature t counter, or - to skip it."""
+    """Content of each column: gx gy gz ax ay az temperature t counter, or - to skip it."""
     delimiter: str = "auto"
-    """auto, or the text between two fields; " " is any number of blanks."""
+    """Text between two fields, or auto. " " stands for any number of blanks."""
     gyro_unit: str = "rad/s"
     """Unit of gx gy gz: rad/s, mrad/s, deg/s, ..."""
     accel_unit: str = "m/s²"
@@ -62,21 +63,21 @@ class Settings(DecoderSettings, frozen=True):
     scale: dict[str, Annotated[float, SCALE.meta]] = msgspec.field(default_factory=dict)
     """Factor of a column before its unit is applied, as gx = 0.0305 for raw counts."""
     comment: str = "#"
-    """Lines that begin with it are passed over; "" = none."""
+    """Prefix of lines to skip; "" = none."""
     header: Annotated[int, HEADER_LINES.meta] = 0
-    """Lines to pass over after the link was opened."""
+    """Number of lines to skip after the link was opened."""
     first_line: Literal["drop", "keep"] = "drop"
-    """keep: the link always starts at the beginning of a line."""
+    """Handling of the first line. Use keep if the link always starts at the beginning of a line."""
     nmea: bool = False
-    """Lines read $fields*CC."""
+    """True if lines have the form $fields*CC."""
     time_unit: Literal["s", "ms", "us", "ns"] = "s"
-    """Unit of the t column, the device's own clock."""
+    """Unit of the t column, which is the clock of the device."""
     counter_modulus: Annotated[int, COUNTER_MODULUS.meta] = 1 << 32
     """Counts after which the counter column starts again at 0."""
 
 
 class TextDecoder:
-    """Lines of numbers <-> SampleBlock."""
+    """Decoder of lines of numbers to samples, and encoder."""
 
     carrier: ClassVar[str] = "bytes"
 
@@ -91,30 +92,30 @@ class TextDecoder:
         self._comment = settings.comment.encode()
         self._delimiter = settings.delimiter.encode()
         self._rows = Rows()
-        self._complaint = ""
-        self._quiet = QUIET_FRAMES  # good lines since the last bad one
+        self._last_error = ""
+        self._lines_since_bad = QUIET_FRAMES  # number of good lines since the last bad one
         self.reset()
 
     @property
     def bad(self) -> int:
-        """Lines that could not be read, and samples that cannot be."""
+        """Number of unreadable lines and implausible samples."""
         return self._rows.bad
 
     @property
     def hint(self) -> str:
-        """What was wrong with the last bad line, while it is not long ago."""
-        return self._complaint if self._quiet < QUIET_FRAMES else ""
+        """Description of the last bad line, while it is recent."""
+        return self._last_error if self._lines_since_bad < QUIET_FRAMES else ""
 
     def reset(self) -> None:
-        """Forget half a line; the next line is a first line again."""
+        """Forget an incomplete line. The next line is a first line again."""
         self._rest = b""
         self._overlong = False
-        self._joined = False  # whether the end of the first line has come
-        self._seen = 0  # lines since the link was opened
+        self._first_line_ended = False  # True if the end of the first line has arrived
+        self._lines_seen = 0  # lines since the link was opened
         self._rows.reset()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Samples of the lines that these chunks complete."""
+        """Return the samples of the lines that these chunks complete."""
         lines: list[bytes] = []
         t_ns: list[int] = []
         for chunk in chunks:
@@ -127,46 +128,46 @@ class TextDecoder:
         return self._blocks(table, np.array(t_ns, np.int64)[counted])
 
     def _lines(self, data: bytes) -> list[bytes]:
-        """Lines completed by these bytes, without their ends and blanks around; none is empty."""
+        """Return the lines that these bytes complete, stripped of line ends and blanks. Empty lines are left out."""
         *lines, rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
         if lines and self._overlong:
-            lines[0], self._overlong = NOISE, False
-        lines = [NOISE if len(line) > LONGEST else line.strip() for line in lines]
-        if lines and not self._joined:
-            self._joined = True
+            lines[0], self._overlong = OVERLONG_LINE, False
+        lines = [OVERLONG_LINE if len(line) > LONGEST else line.strip() for line in lines]
+        if lines and not self._first_line_ended:
+            self._first_line_ended = True
             lines[0] = lines[0] if self._first_is_whole(lines[0]) else b""
         if len(rest) > LONGEST:
             rest, self._overlong = b"", True
-            self._complain(OVERLONG)
+            self._note_bad_line(OVERLONG_HINT)
         self._rest = rest
         return [line for line in lines if line]
 
     def _first_is_whole(self, line: bytes) -> bool:
-        """Whether the first line counts; one that does not is not bad either."""
+        """Return True if the first line is used. If it is not used, it does not count as bad."""
         if self._settings.header:
-            return True  # it is passed over with the others
+            return True  # it is skipped with the rest of the header
         if self._settings.nmea:
-            return _checked(line) is not None
-        return self._settings.first_line == "keep" and self._row(line)[0] is not None
+            return _nmea_body(line) is not None
+        return self._settings.first_line == "keep" and self._parse_line(line)[0] is not None
 
     def _table(self, lines: list[bytes]) -> tuple[Floats, list[int]]:
-        """[n, columns] numbers of the lines that count, a bad line infinite; and which lines those are."""
-        bodies: list[bytes | None] = []  # None: fails its check
+        """Return an array [n, columns] of all lines that are not skipped, and their indices. A bad line is infinite."""
+        bodies: list[bytes | None] = []  # None: the checksum is wrong
         counted: list[int] = []
         comment, header = self._comment, self._settings.header
         for i, line in enumerate(lines):
             if comment and line.startswith(comment):
                 continue
-            self._seen += 1
-            if self._seen <= header:
+            self._lines_seen += 1
+            if self._lines_seen <= header:
                 continue
-            bodies.append(_checked(line) if self._settings.nmea else line)
+            bodies.append(_nmea_body(line) if self._settings.nmea else line)
             counted.append(i)
-        return self._numbers(bodies), counted
+        return self._parse_lines(bodies), counted
 
-    def _numbers(self, bodies: list[bytes | None]) -> Floats:
-        """[n, columns]; all lines at once where they look alike, one by one otherwise."""
-        alike = [self._separated(body) for body in bodies if body is not None]
+    def _parse_lines(self, bodies: list[bytes | None]) -> Floats:
+        """Return an array [n, columns]. Regular lines are parsed together, otherwise line by line."""
+        alike = [self._comma_separated(body) for body in bodies if body is not None]
         commas = self._width - 1
         joined = b",".join(alike)
         if len(alike) == len(bodies) and b"_" not in joined and all(a.count(b",") == commas for a in alike):
@@ -176,25 +177,26 @@ class TextDecoder:
                 for at in self._at.values() if bodies else ():
                     table[:, at] = list(map(float, fields[at :: self._width]))
             except ValueError:
-                pass  # an empty field, or one that is no number: find out which
+                pass  # an empty field, or one that is not a number: parse line by line
             else:
-                self._quiet += len(bodies)
+                self._lines_since_bad += len(bodies)
                 return table
         rows = []
         for body in bodies:
-            row, complaint = (None, "a line fails its checksum") if body is None else self._row(body)
+            row, complaint = (None, "a line fails its checksum") if body is None else self._parse_line(body)
             rows.append(row or [np.inf] * self._width)
             if complaint:
-                self._complain(complaint)
+                self._note_bad_line(complaint)
             else:
-                self._quiet += 1
+                self._lines_since_bad += 1
         return np.array(rows).reshape(-1, self._width)
 
-    def _complain(self, complaint: str) -> None:
-        self._complaint, self._quiet = complaint, 0
+    def _note_bad_line(self, complaint: str) -> None:
+        """Keep the description of a bad line for the hint."""
+        self._last_error, self._lines_since_bad = complaint, 0
 
-    def _separated(self, body: bytes) -> bytes:
-        """The line with commas between fields."""
+    def _comma_separated(self, body: bytes) -> bytes:
+        """Return the line with commas between the fields."""
         if self._delimiter == b"auto":
             body = body.replace(b";", b",").replace(b"\t", b",")
             return body if b"," in body else b",".join(body.split())
@@ -202,11 +204,11 @@ class TextDecoder:
             return b",".join(body.split())
         return body.replace(b",", b"?").replace(self._delimiter, b",") if self._delimiter != b"," else body
 
-    def _row(self, body: bytes) -> tuple[list[float] | None, str]:
-        """The numbers of one line, or None and what is wrong with it."""
-        if body == NOISE:
-            return None, OVERLONG
-        fields = self._separated(body).split(b",")
+    def _parse_line(self, body: bytes) -> tuple[list[float] | None, str]:
+        """Return the numbers of one line, or None and the reason."""
+        if body == OVERLONG_LINE:
+            return None, OVERLONG_HINT
+        fields = self._comma_separated(body).split(b",")
         if len(fields) != self._width:
             return None, f"a line has {len(fields)} columns, expected are {self._width}: {body[:60]!r}"
         try:
@@ -215,9 +217,10 @@ class TextDecoder:
             return None, f"a field is no number: {body[:60]!r}"
 
     def _blocks(self, table: Floats, t_ns: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> list[SampleBlock]:
+        """Convert a table of numbers to blocks of samples in SI units."""
         n = len(table)
         bad = np.isinf(table).any(axis=1)
-        with np.errstate(over="ignore", invalid="ignore"):  # too large for a float is too large for a sensor
+        with np.errstate(over="ignore", invalid="ignore"):  # an overflow is also implausible for a sensor
             scaled = table * self._factor + self._offset
         values = np.full((n, 6), np.nan)
         for axis, name in enumerate(AXES):
@@ -227,13 +230,13 @@ class TextDecoder:
         ticks = np.full(n, NO_TICK, np.int64)
         if isinstance(self.timing, Counter):
             counts = scaled[:, self._at["t" if "t" in self._at else "counter"]]
-            bad |= ~(np.abs(counts) < float(NEVER))  # no clock value, or none that can be
+            bad |= ~(np.abs(counts) < float(UNWRAPPED_TICKS))  # missing or implausible clock value
             ticks = np.rint(np.where(bad, 0.0, counts)).astype(np.int64) % self.timing.modulus
         values[bad] = np.inf
         return self._rows.blocks(t_ns, values, temperature_c, ticks, np.zeros(n, np.int64))
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """A line a sample, in the columns and units set, numbers as exact as they are."""
+        """Return one line per sample in the configured columns and units, with full precision."""
         n = len(samples)
         table = np.zeros((n, self._width))
         for name, at in self._at.items():
@@ -257,14 +260,15 @@ class TextDecoder:
 
 
 def _number(field: bytes) -> float:
+    """Return a number, or NaN for an empty field. Raise ValueError for text."""
     field = field.strip()
-    if b"_" in field:  # Python's own notation, nobody's number
+    if b"_" in field:  # Python accepts underscores in numbers, but no device sends them
         raise ValueError(field)
     return float(field) if field else np.nan
 
 
-def _checked(line: bytes) -> bytes | None:
-    """What stands between $ and * if its checksum holds."""
+def _nmea_body(line: bytes) -> bytes | None:
+    """Return the text between $ and * if its checksum is correct, otherwise None."""
     start, star = line.rfind(b"$") + 1, line.rfind(b"*")
     body, stated = line[start:star], line[star + 1 :]
     try:
@@ -274,7 +278,7 @@ def _checked(line: bytes) -> bytes | None:
 
 
 def _scales(settings: Settings) -> tuple[Floats, Floats]:
-    """Factor and offset of each column to SI, and of ``t`` to ticks."""
+    """Return factor and offset of each column for the conversion to SI, and of ``t`` to ticks."""
     factors, offsets = np.ones(len(settings.columns)), np.zeros(len(settings.columns))
     for i, name in enumerate(settings.columns):
         factor, offset = 1.0, 0.0
@@ -291,20 +295,28 @@ def _scales(settings: Settings) -> tuple[Floats, Floats]:
 
 
 def _timing(settings: Settings, tick: int) -> Timing:
+    """Return the timing according to the columns."""
     if "t" in settings.columns:
         wraps = settings.time_unit in ("ms", "us")
-        return Counter(DEVICE_WRAP * tick if wraps else NEVER, TICK_S)
+        return Counter(DEVICE_WRAP * tick if wraps else UNWRAPPED_TICKS, TICK_S)
     return Counter(settings.counter_modulus) if "counter" in settings.columns else Arrival()
 
 
 def build(settings: Settings) -> Decoder:
-    """A decoder with these settings; ConfigError names each key that is wrong."""
+    """Return a decoder with these settings.
+
+    Raises
+    ------
+    ConfigError
+        Some settings are wrong, one line for each.
+    """
     if wrong := list(_problems(settings)):
         raise ConfigError(*wrong)
     return TextDecoder(settings)
 
 
 def _problems(settings: Settings) -> Iterator[str]:
+    """Yield a line for each mistake in the settings."""
     given = [name for name in settings.columns if name != SKIP]
     for name in given:
         if name not in COLUMNS:

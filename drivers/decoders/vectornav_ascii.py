@@ -1,16 +1,16 @@
 r"""VectorNav VN-100/200/300 ASCII sentences ``$VNIMU`` and ``$VNYMR``.
 
-``$VNxxx,f1,f2,...*CC\r\n``: CC is the exclusive or of the characters between ``$`` and ``*`` in two hex
-digits; four digits are a CRC-16 of polynomial 0x1021 and start 0 over the same. ``*XX`` ("do not check") is
-for the host to send; a device always computes its checksum, so that it is rejected here. A line end that
-was made LF on the way is taken too. Other sentences that pass their check are ignored (VN-100 user manual
-UM001 v2.1, pages 27-43).
+A sentence is ``$VNxxx,f1,f2,...*CC\r\n``. CC is the exclusive or of the characters between ``$`` and ``*`` in two hex
+digits. Four digits are a CRC-16 of the same characters with the polynomial 0x1021 and the initial value 0. ``*XX`` ("do
+not check") is only for the host. A device always computes its checksum, so ``*XX`` is rejected here. A line end that
+was converted to LF is accepted. Other sentences with a correct checksum are ignored (VN-100 user manual UM001 v2.1,
+pages 27-43).
 
-``$VNIMU``: magnetic field [Gauss], acceleration [m/s²], rate [rad/s], temperature [°C], pressure [kPa], as
-the sensor measures. ``$VNYMR``: yaw, pitch, roll [°], magnetic field, acceleration, rate, compensated: the
-bias instability and random walk in it are those left over by the on-board filter, not the sensor's.
-What may be appended to a sentence (a count or time of synchronization) is not read. Printed resolution is
-0.001 m/s² and 1e-6 rad/s: quantization shows in the Allan plot; the binary messages have none of it.
+``$VNIMU`` contains the magnetic field [Gauss], acceleration [m/s²], rate [rad/s], temperature [°C] and pressure [kPa]
+as measured. ``$VNYMR`` contains yaw, pitch, roll [°], magnetic field, acceleration and rate, all compensated. Its bias
+instability and random walk are what the on-board filter leaves, and not those of the sensor. Data that may be appended
+to a sentence (a count or time of synchronization) are not read. The printed resolution is 0.001 m/s² and 1e-6 rad/s, so
+quantization is visible in the Allan deviation. The binary messages do not have this limit.
 """
 
 import binascii
@@ -34,9 +34,9 @@ from drivers.decoders.base import (
 from drivers.sample import Arrival, Chunk, Floats, SampleBlock, Timing
 
 LONGEST: Final = 256
-"""Bytes; the longest sentence of the manual is under 200."""
+"""Maximum length of a sentence in bytes. The longest sentence of the manual is under 200."""
 
-# columns of gx gy gz ax ay az in the sentence's numbers, how many numbers it has, column of the temperature
+# columns of gx gy gz ax ay az among the numbers of the sentence, number of numbers, column of the temperature
 COLUMNS: Final = {
     b"$VNIMU,": ((6, 7, 8, 3, 4, 5), 11, 9),
     b"$VNYMR,": ((9, 10, 11, 6, 7, 8), 12, None),
@@ -49,11 +49,11 @@ class Settings(DecoderSettings, frozen=True):
     """Keys of ``[device.driver.decoder_options]``."""
 
     sentence: Literal["auto", "VNIMU", "VNYMR"] = "auto"
-    """The sentence to read; auto takes the first of the two that comes."""
+    """Sentence to read. With auto, the first of the two that arrives is read."""
 
 
 class VectornavAsciiDecoder:
-    """VectorNav sentences <-> SampleBlock."""
+    """Decoder and encoder of VectorNav sentences."""
 
     carrier: ClassVar[str] = "bytes"
 
@@ -63,34 +63,34 @@ class VectornavAsciiDecoder:
         self._sentence = self._wanted
         self._buffer = FrameBuffer(b"$VN", match, LONGEST)
         self._rows = Rows()
-        self._others = 0  # sentences since the last one that was wanted
+        self._unwanted_sentences = 0  # number of sentences since the last wanted one
 
     @property
     def bad(self) -> int:
-        """Sentences that failed their check, and samples that cannot be."""
+        """Number of sentences with a wrong checksum, and of implausible samples."""
         return self._rows.bad
 
     @property
     def hint(self) -> str:
-        """Why there are no samples, or rejected ones."""
-        if self._others > 100:
+        """Reason for missing samples or rejected sentences."""
+        if self._unwanted_sentences > 100:
             return "sentences come, but none of those wanted: set the sensor's async output to VNIMU"
         return self._buffer.hint
 
     def reset(self) -> None:
-        """Forget a half-received sentence, and with auto which sentence it was."""
+        """Forget an incomplete sentence, and with auto the selected sentence."""
         self._buffer.reset()
         self._rows.reset()
         self._sentence = self._wanted
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Samples of the sentences that these chunks complete."""
+        """Return the samples of the sentences that these chunks complete."""
         frames = self._buffer.feed(chunks)
         if not self._sentence:
             self._sentence = next((f[:7] for f in frames.data if f[:7] in COLUMNS), b"")
         wanted = self._sentence or b"none yet"
         rows = [i for i, f in enumerate(frames.data) if f.startswith(wanted)]
-        self._others = 0 if rows else self._others + len(frames.data)
+        self._unwanted_sentences = 0 if rows else self._unwanted_sentences + len(frames.data)
         frames, bad_after = frames.keep(rows)
         if not rows and not bad_after:
             return []
@@ -102,7 +102,10 @@ class VectornavAsciiDecoder:
         return self._rows.blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before, bad_after)
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Sentences as the device prints them, VNIMU unless VNYMR is set; what is not known is sent as 0."""
+        """Return sentences as the device prints them: VNYMR if it is configured, otherwise VNIMU.
+
+        Unknown values are 0.
+        """
         imu = self._wanted != b"$VNYMR,"
         frames = []
         temperatures = np.nan_to_num(samples.temperature_c).tolist()
@@ -119,7 +122,7 @@ class VectornavAsciiDecoder:
 
 
 def numbers(bodies: list[bytes], width: int) -> Floats:
-    """[n, width] of the first numbers of each body; a row that is not made of numbers is infinite."""
+    """Return the first ``width`` numbers of each body [n, width]. A row that contains other text is infinite."""
     split = [body.split(b",", width)[:width] for body in bodies]
     try:
         return np.array([[float(field) for field in fields] for fields in split]).reshape(len(bodies), width)
@@ -128,6 +131,7 @@ def numbers(bodies: list[bytes], width: int) -> Floats:
 
 
 def _row(fields: list[bytes], width: int) -> list[float]:
+    """Return the numbers of one row; infinity if it contains other text or has another length."""
     try:
         row = [float(field) for field in fields]
     except ValueError:
@@ -136,7 +140,7 @@ def _row(fields: list[bytes], width: int) -> list[float]:
 
 
 def match(buffer: bytes, at: int) -> int:
-    """Length of the sentence at this place, if it is whole and its checksum holds."""
+    """Return the length of a sentence at this offset (see ``drivers.decoders.base.Match``)."""
     end = buffer.find(b"\n", at, at + LONGEST) + 1
     if not end:
         return NEED_MORE
@@ -151,5 +155,5 @@ def match(buffer: bytes, at: int) -> int:
 
 
 def build(settings: Settings) -> Decoder:
-    """A decoder with these settings."""
+    """Return a decoder with these settings."""
     return VectornavAsciiDecoder(settings)

@@ -1,15 +1,16 @@
 """VectorNav VN-100/200/300 binary messages.
 
-``FA | groups u8 | a field mask u16le for each group | payload little-endian | CRC u16be``. The masks say
-which fields follow, in group then bit order, so any message of groups 1, 2, 3 and 5 is understood; others
-are rejected, as the size of their fields is not known here. CRC-16 of polynomial 0x1021, start 0, over all
-behind 0xFA; run over the CRC as well it gives 0 (VN-100 user manual UM001 v2.1, pages 27-43).
+The format is ``FA | groups u8 | a field mask u16le for each group | payload little-endian | CRC u16be``. The masks
+state which fields follow, in the order of groups and bits. Messages of groups 1, 2, 3 and 5 are decoded. Others are
+rejected, since the sizes of their fields are unknown here. The CRC-16 has the polynomial 0x1021 and the initial value 0
+and covers all bytes after 0xFA. The CRC over these bytes and the CRC itself is 0 (VN-100 user manual UM001 v2.1, pages
+27-43).
 
-Recommended for noise work: TimeStartup and Imu of group 1 (``FA 01 01 02``, 38 bytes). Imu and the Uncomp
-fields are the sensor's own; AngularRate and Accel have the on-board filter's bias taken out, and hide the
-bias instability and random walk one wants to see. Where a message holds both, ``compensated`` chooses.
-A message with only accelerations or only rates leaves the other axes unmeasured, one with neither is
-ignored. VectorNav's z axis points down: at rest it reads -9.8.
+For noise analysis, TimeStartup and Imu of group 1 are recommended (``FA 01 01 02``, 38 bytes). Imu and the Uncomp
+fields are the values of the sensor. From AngularRate and Accel, the on-board filter has removed its bias estimate,
+which hides bias instability and random walk. If a message contains both, ``compensated`` selects one. A message with
+only accelerations or only rates leaves the other axes unmeasured. A message with neither is ignored. VectorNav's z axis
+points down and reads -9.8 at rest.
 """
 
 import binascii
@@ -41,10 +42,10 @@ FIELD_SIZES: Final = {
     3: (2, 12, 12, 12, 4, 4, 16, 12, 12, 12, 12),
     5: (2, 12, 16, 36, 12, 12, 12, 12, 12, 12, 28),
 }
-"""Bytes of each field, by group and bit."""
+"""Size of each field in bytes, by group and bit."""
 LONGEST: Final = 1 + 1 + 2 * len(FIELD_SIZES) + sum(map(sum, FIELD_SIZES.values())) + 2
 
-# (group, bit, offset of the part inside the field), the preferred one first
+# (group, bit, offset inside the field), in order of preference
 TIME: Final = ((1, 0, 0), (2, 0, 0))
 UNCOMPENSATED_GYRO: Final = ((1, 9, 12), (3, 3, 0))
 UNCOMPENSATED_ACCEL: Final = ((1, 9, 0), (3, 2, 0))
@@ -53,39 +54,58 @@ COMPENSATED_ACCEL: Final = ((1, 8, 0), (3, 9, 0))
 TEMPERATURE: Final = ((1, 10, 12), (3, 4, 0))
 
 TICKS: Final = 1 << 62
-"""TimeStartup is an unsigned 64-bit count of ns; 62 bits of it last 146 years and fit signed arithmetic."""
+"""Modulus of the time in ticks.
+
+TimeStartup is an unsigned 64-bit count of ns. 62 bits last 146 years and fit into int64.
+"""
 
 
 class Settings(DecoderSettings, frozen=True):
     """Keys of ``[device.driver.decoder_options]``."""
 
     compensated: bool = False
-    """Where a message holds both: take the rates and accelerations that the on-board filter corrected."""
+    """True if the rates and accelerations corrected by the on-board filter are used when a message contains both."""
     clock: Literal["time_startup", "arrival"] = "time_startup"
-    """Sample times from TimeStartup (ns, of the device), or from arrival where messages do not hold it."""
+    """Source of the sample times: TimeStartup (ns, by the device), or arrival times if messages do not contain it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """One combination of masks: ``row`` has those of time, gyro, accel, temperature that it holds."""
+    """Positions of the fields for one combination of masks.
+
+    ``row`` contains time, gyro, accel and temperature if present.
+    """
 
     row: np.dtype[np.void]
     names: tuple[str, ...]
 
     @property
     def length(self) -> int:
-        """Bytes of the whole message."""
+        """Length of the complete message in bytes."""
         return self.row.itemsize
 
     @property
     def inertial(self) -> bool:
-        """Whether a message of this layout is a sample."""
+        """True if a message of this layout is a sample."""
         return "gyro" in self.names or "accel" in self.names
 
 
 @lru_cache(maxsize=256)
 def layout(header: bytes, compensated: bool) -> Layout | None:
-    """Layout of the messages with this header (group byte and masks); None for one not understood."""
+    """Return the layout of the messages with this header.
+
+    Parameters
+    ----------
+    header
+        Group byte and masks.
+    compensated
+        True if compensated fields are preferred.
+
+    Returns
+    -------
+    Layout or None
+        None if the header contains unknown groups or fields.
+    """
     groups = [g for g in range(1, 9) if header[0] >> (g - 1) & 1]
     masks = struct.unpack(f"<{len(groups)}H", header[1:])
     at: dict[tuple[int, int], int] = {}
@@ -102,6 +122,7 @@ def layout(header: bytes, compensated: bool) -> Layout | None:
 
 
 def _rows(at: dict[tuple[int, int], int], length: int, compensated: bool) -> Layout:
+    """Return the layout for fields at these offsets."""
     order = -1 if compensated else 1
     gyro = (UNCOMPENSATED_GYRO, COMPENSATED_GYRO)[::order]
     accel = (UNCOMPENSATED_ACCEL, COMPENSATED_ACCEL)[::order]
@@ -123,7 +144,7 @@ def _rows(at: dict[tuple[int, int], int], length: int, compensated: bool) -> Lay
 
 
 def _header_end(groups: int) -> int:
-    """Offset behind the masks; 0 where there is no group, or a second group byte."""
+    """Return the offset after the masks; 0 if there is no group, or a second group byte."""
     return 0 if groups == 0 or groups & 0x80 else 2 + 2 * groups.bit_count()
 
 
@@ -131,7 +152,7 @@ HEADER_END: Final = tuple(map(_header_end, range(256)))
 
 
 class VectornavBinaryDecoder:
-    """VectorNav binary messages <-> SampleBlock."""
+    """Decoder and encoder of VectorNav binary messages."""
 
     carrier: ClassVar[str] = "bytes"
 
@@ -141,27 +162,27 @@ class VectornavBinaryDecoder:
         self.timing: Timing = Counter(TICKS, 1e-9) if self._counts else Arrival()
         self._buffer = FrameBuffer(b"\xfa", self._match, LONGEST)
         self._rows = Rows()
-        self._timeless = False
+        self._time_missing = False
 
     @property
     def bad(self) -> int:
-        """Messages that failed their CRC, and samples that cannot be."""
+        """Number of messages with a wrong CRC, and of implausible samples."""
         return self._rows.bad
 
     @property
     def hint(self) -> str:
-        """What to do about messages that are rejected or lack their time."""
-        if self._timeless:
+        """Remedy for messages that are rejected or contain no time."""
+        if self._time_missing:
             return 'messages hold no TimeStartup: switch it on in the sensor, or set clock = "arrival"'
         return self._buffer.hint
 
     def reset(self) -> None:
-        """Forget a half-received message."""
+        """Forget an incomplete message."""
         self._buffer.reset()
         self._rows.reset()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Samples of the messages that these chunks complete."""
+        """Return the samples of the messages that these chunks complete."""
         frames = self._buffer.feed(chunks)
         if not frames.data:
             return []
@@ -175,11 +196,13 @@ class VectornavBinaryDecoder:
         return self._decode(kept, [(layouts[h], at) for h, at in groups.items()], bad_after)
 
     def _layout(self, header: bytes) -> Layout:
+        """Return the layout of a message that the buffer has accepted."""
         found = layout(header, self._compensated)
         assert found is not None, "the buffer lets through only messages that have one"
         return found
 
     def _decode(self, frames: Frames, groups: list[tuple[Layout, list[int]]], bad_after: int) -> list[SampleBlock]:
+        """Return the samples of messages, grouped by layout."""
         n = len(frames.data)
         values = np.full((n, 6), np.nan)
         temperature_c = np.full(n, np.nan)
@@ -187,18 +210,19 @@ class VectornavBinaryDecoder:
         for form, at in groups:
             got = np.frombuffer(b"".join([frames.data[i] for i in at]), form.row)
             if "gyro" in form.names:
-                values[at, :3] = invalid(_wide(got["gyro"]))
+                values[at, :3] = invalid(_as_float64(got["gyro"]))
             if "accel" in form.names:
-                values[at, 3:] = invalid(_wide(got["accel"]))
+                values[at, 3:] = invalid(_as_float64(got["accel"]))
             if "temperature" in form.names:
-                temperature_c[at] = _wide(got["temperature"])
+                temperature_c[at] = _as_float64(got["temperature"])
             if "time" in form.names and self._counts:
                 ticks[at] = got["time"] & np.uint64(TICKS - 1)
         if n:
-            self._timeless = self._counts and int(ticks[-1]) == NO_TICK
+            self._time_missing = self._counts and int(ticks[-1]) == NO_TICK
         return self._rows.blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before, bad_after)
 
     def _match(self, buffer: bytes, at: int) -> int:
+        """Return the length of a message at this offset (see ``drivers.decoders.base.Match``)."""
         if len(buffer) < at + 2:
             return NEED_MORE
         header_end = HEADER_END[buffer[at + 1]]
@@ -215,7 +239,7 @@ class VectornavBinaryDecoder:
         return REJECT if binascii.crc_hqx(buffer[at + 1 : at + length], 0) else length
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """TimeStartup and Imu of group 1, with MagPres where the block has temperatures."""
+        """Return messages with TimeStartup and Imu of group 1, and with MagPres if the block has temperatures."""
         warm = bool(np.isfinite(samples.temperature_c).any())
         header = bytes.fromhex("01 01 06" if warm else "01 01 02")
         form = layout(header, compensated=False)
@@ -230,11 +254,12 @@ class VectornavBinaryDecoder:
         return one_chunk_each(frames, samples.t_ns)
 
 
-def _wide(numbers: NDArray[np.float32]) -> Floats:
-    with np.errstate(invalid="ignore"):  # a signalling NaN on the wire is just NaN
+def _as_float64(numbers: NDArray[np.float32]) -> Floats:
+    """Convert numbers to float64."""
+    with np.errstate(invalid="ignore"):  # a signalling NaN is treated as NaN
         return numbers.astype(np.float64)
 
 
 def build(settings: Settings) -> Decoder:
-    """A decoder with these settings."""
+    """Return a decoder with these settings."""
     return VectornavBinaryDecoder(settings)

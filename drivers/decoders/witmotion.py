@@ -1,16 +1,16 @@
-"""WitMotion WT901, JY61 and BWT61 over UART, and the Bluetooth models' combined packet.
+"""WitMotion WT901, JY61 and BWT61 over UART, and the combined packet of the Bluetooth models.
 
-UART: 11-byte packets ``55 | type | 8 bytes | SUM``, SUM the low byte of the sum of the ten before it. Type
-0x51 holds acceleration xyz and temperature, 0x52 rates xyz, as i16 little-endian of full scale 32768. One
-sample is a 0x51 with the 0x52 that follows it at once; either without the other is dropped. There is no
-counter. The temperature is that of 0x51: the fourth word of 0x52 is not one on every model. (WT901 data
-sheet v20-0702, section 5.1.) The manual reckons g = 9.8; here it is 9.80665 m/s².
+UART packets have 11 bytes: ``55 | type | 8 bytes | SUM``. SUM is the low byte of the sum of the ten bytes before it.
+Type 0x51 contains acceleration xyz and temperature, type 0x52 rates xyz, as i16 little-endian with a full scale of
+32768. One sample is a 0x51 packet directly followed by a 0x52 packet. A packet without its partner is dropped. There is
+no counter. The temperature is taken from 0x51, since the fourth word of 0x52 is not a temperature on every model (WT901
+data sheet v20-0702, section 5.1). The manual uses g = 9.8 m/s²; here it is 9.80665 m/s².
 
-A damaged packet of another type (angles, magnetic field) costs no sample: how many samples a hole swallowed
-is told from the number of packets between two samples.
+A damaged packet of another type (angles, magnetic field) costs no sample. The number of samples lost in a gap is
+therefore derived from the number of packets between two samples.
 
-Bluetooth: 20-byte packets ``55 61 | a xyz | w xyz | angles`` without any checksum. One is believed only when
-the header of the next follows it, so that a sample comes one packet late.
+Bluetooth packets have 20 bytes without a checksum: ``55 61 | a xyz | w xyz | angles``. A packet is accepted only when
+the header of the next packet follows it. Samples are therefore delayed by one packet.
 """
 
 from collections.abc import Sequence
@@ -39,11 +39,14 @@ TYPES: Final = range(0x50, 0x60)
 UART_LENGTH: Final = 11
 BLUETOOTH_LENGTH: Final = 20
 HEADERS: Final = (b"\x55\x61", b"\x55\x71")
-"""Of the Bluetooth models: a sample, and the answer to a register read."""
-FEWEST: Final = 2
-"""Packets a sample."""
-USUAL: Final = 8
-"""Samples, of which the shortest tells how many packets there are in one now: others come only now and then."""
+"""Headers of the Bluetooth models: a sample, and the answer to a register read."""
+MIN_PACKETS_PER_SAMPLE: Final = 2
+"""Minimum number of packets per sample."""
+CYCLE_SAMPLES: Final = 8
+"""Number of recent samples.
+
+The shortest of them gives the packets per sample, as other packets come only occasionally.
+"""
 
 # °C = raw * step + offset, by family (WT901 data sheet v20-0702; BWT61CL v20-0630)
 TEMPERATURE: Final = {"wt901": (1.0 / 100.0, 0.0), "jy61": (1.0 / 340.0, 36.53)}
@@ -53,17 +56,17 @@ class Settings(DecoderSettings, frozen=True):
     """Keys of ``[device.driver.decoder_options]``."""
 
     packet: Literal["uart", "bluetooth"] = "uart"
-    """uart: 11-byte packets with a checksum; bluetooth: 20-byte packets without one."""
+    """Packet format. uart: 11-byte packets with a checksum; bluetooth: 20-byte packets without one."""
     temperature: Literal["wt901", "jy61"] = "wt901"
-    """Rule of the family: raw / 100, or raw / 340 + 36.53 (JY61, BWT61)."""
+    """Temperature formula of the model family: raw / 100, or raw / 340 + 36.53 (JY61, BWT61)."""
     accelerometer_range: Annotated[float, FULL_SCALE.meta] = 16.0
-    """Full scale in g."""
+    """Full scale of the accelerometer in g."""
     gyro_range: Annotated[float, FULL_SCALE.meta] = 2000.0
-    """Full scale in °/s."""
+    """Full scale of the gyroscope in °/s."""
 
 
 class WitmotionDecoder:
-    """WitMotion packets <-> SampleBlock."""
+    """Decoder and encoder of WitMotion packets."""
 
     carrier: ClassVar[str] = "bytes"
 
@@ -78,35 +81,36 @@ class WitmotionDecoder:
         else:
             self._buffer = FrameBuffer(b"\x55", match_uart, UART_LENGTH)
         self._rows = Rows()
-        self._harmless = 0  # rejected packets that cost no sample
+        self._harmless_rejects = 0  # number of rejected packets that cost no sample
         self._pairs = Pairs()
 
     @property
     def bad(self) -> int:
-        """Packets that failed their check, and samples that cannot be."""
-        return self._rows.bad + self._harmless
+        """Number of packets that failed their check, and of implausible samples."""
+        return self._rows.bad + self._harmless_rejects
 
     @property
     def hint(self) -> str:
-        """Why there are no samples, or rejected packets."""
+        """Reason for missing samples or rejected packets."""
         if self._pairs.unpaired > 100:
             return "packets come, but not 0x51 and 0x52 in a row: switch both outputs on in the sensor"
         return self._buffer.hint
 
     def reset(self) -> None:
-        """Forget a half-received packet or pair."""
+        """Forget an incomplete packet or pair."""
         self._buffer.reset()
         self._rows.reset()
         self._pairs = Pairs()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Samples of the packets that these chunks complete."""
+        """Return the samples of the packets that these chunks complete."""
         frames = self._buffer.feed(chunks)
         if not frames.data:
             return []
         return self._combined(frames) if self._bluetooth else self._paired(frames)
 
     def _combined(self, frames: Frames) -> list[SampleBlock]:
+        """Return the samples of Bluetooth packets."""
         kept, bad_after = frames.keep([i for i, f in enumerate(frames.data) if f[1] == HEADERS[0][1]])
         n = len(kept.data)
         words = np.frombuffer(b"".join(kept.data), "<i2").reshape(n, 10)
@@ -115,8 +119,9 @@ class WitmotionDecoder:
         return self._rows.blocks(kept.t_ns, values, *nothing, kept.bad_before, bad_after)
 
     def _paired(self, frames: Frames) -> list[SampleBlock]:
+        """Return the samples of UART packets."""
         at, packets, missing, harmless = self._pairs.find(frames)
-        self._harmless += harmless
+        self._harmless_rejects += harmless
         words = np.ascontiguousarray(packets[:, :, 2:10]).view("<i2")  # [n, 0x51 and 0x52, 4]
         values = self._values(words[:, 1, :3], words[:, 0, :3])
         temperature_c = words[:, 0, 3] * self._temperature_step + self._temperature_offset
@@ -124,10 +129,14 @@ class WitmotionDecoder:
         return self._rows.blocks(frames.t_ns[at], values, temperature_c, ticks, missing)
 
     def _values(self, gyro: Ints, accel: Ints) -> Floats:
+        """Convert raw words to rad/s and m/s² [n, 6]."""
         return np.hstack([gyro * self._gyro_step, accel * self._accel_step])
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Both packets of a sample in one chunk; what is not measured is sent as 0, as it cannot be said."""
+        """Return both packets of each sample in one chunk.
+
+        The format cannot mark unmeasured values, so they are sent as 0.
+        """
         n = len(samples)
         gyro = quantize(samples.values[:, :3], self._gyro_step, 16)
         accel = quantize(samples.values[:, 3:], self._accel_step, 16)
@@ -148,24 +157,36 @@ class WitmotionDecoder:
 
 
 class Pairs:
-    """Finds each 0x51 with its 0x52 in a stream of packets, and how many samples each hole swallowed."""
+    """Finder of pairs of 0x51 and 0x52 packets, which also counts the samples lost in each gap."""
 
     def __init__(self) -> None:
-        self.unpaired = 0  # packets since the last pair
-        self._last = bytes(UART_LENGTH)  # the packet before the next one
-        self._elapsed = 0  # packets since the last pair's end, rejected ones too
-        self._rejected = 0  # those of them that were rejected, and halves torn apart
-        self._usual: list[int] = []  # packets of the last samples of which none was rejected
+        self.unpaired = 0  # number of packets since the last pair
+        self._last = bytes(UART_LENGTH)  # last packet of the previous call
+        self._elapsed = 0  # packets since the end of the last pair, including rejected ones
+        self._rejected = 0  # number of these packets that were rejected, and of separated pairs
+        self._recent_cycles: list[int] = []  # packets per sample of the last samples without a rejected packet
         self._first = True
 
     def find(self, frames: Frames) -> tuple[Ints, np.ndarray[tuple[int, ...], np.dtype[np.uint8]], Ints, int]:
-        """(index of each pair's 0x52, packets [n, 2, 11], samples missing before each, harmless rejects)."""
+        """Find the pairs in a list of packets.
+
+        Parameters
+        ----------
+        frames
+            Packets in order of arrival.
+
+        Returns
+        -------
+        tuple
+            Index of the 0x52 packet of each pair [n], packets [n, 2, 11] as uint8, samples missing before each pair
+            [n], and number of rejected packets that cost no sample.
+        """
         joined = np.frombuffer(self._last + b"".join(frames.data), np.uint8).reshape(-1, UART_LENGTH)
         self._last = frames.data[-1]
         kinds = joined[:, 1]
         fits = (kinds[:-1] == ACCEL) & (kinds[1:] == RATE)
         at = np.flatnonzero(fits & frames.at_once)
-        # bytes too few for a packet may be the rest of many: the halves need not be of one sample
+        # a few stray bytes may remain of many packets, so both packets need not belong to one sample
         torn = fits & ~frames.at_once & (frames.bad_before == 0)
         elapsed = self._elapsed + np.cumsum(1 + frames.bad_before)
         rejected = self._rejected + np.cumsum(frames.bad_before + torn)
@@ -178,29 +199,30 @@ class Pairs:
         return at, np.stack([joined[at], joined[at + 1]], axis=1), missing, harmless
 
     def _count(self, steps: Ints, holes: Ints) -> tuple[Ints, int]:
+        """Return the samples missing before each pair [n], and the number of rejected packets that cost no sample."""
         if not steps.size:
             return steps, 0
         whole = holes == 0
-        whole[0] &= not self._first  # it tells when we joined, not how many packets make a sample
-        usual = [*self._usual, *steps[whole].tolist()]
-        known = len(self._usual) + np.cumsum(whole)
+        whole[0] &= not self._first  # it depends on when reading began, not on the packets per sample
+        usual = [*self._recent_cycles, *steps[whole].tolist()]
+        known = len(self._recent_cycles) + np.cumsum(whole)
         missing = np.zeros(steps.size, np.int64)
-        for row in np.flatnonzero(holes).tolist():  # by what came before it, however the bytes are cut
-            cycle = min(usual[max(known[row] - USUAL, 0) : known[row]], default=FEWEST)
+        for row in np.flatnonzero(holes).tolist():  # earlier samples only: independent of the chunks
+            cycle = min(usual[max(known[row] - CYCLE_SAMPLES, 0) : known[row]], default=MIN_PACKETS_PER_SAMPLE)
             missing[row] = max(round(steps[row] / cycle) - 1, 0)
-        self._usual = usual[-USUAL:]
+        self._recent_cycles = usual[-CYCLE_SAMPLES:]
         self._first = False
         return missing, int(np.maximum(holes - missing, 0).sum())
 
 
 def packet(kind: int, data: bytes) -> bytes:
-    """An 11-byte packet."""
+    """Return an 11-byte packet of this type with 8 bytes of data."""
     body = bytes([0x55, kind]) + data
     return body + bytes([sum(body) & 0xFF])
 
 
 def match_uart(buffer: bytes, at: int) -> int:
-    """Length of the packet at this place, if it is whole and its sum holds."""
+    """Return the length of a UART packet at this offset (see ``drivers.decoders.base.Match``)."""
     if len(buffer) < at + UART_LENGTH:
         return NEED_MORE
     if buffer[at + 1] not in TYPES or sum(buffer[at : at + 10]) & 0xFF != buffer[at + 10]:
@@ -209,7 +231,7 @@ def match_uart(buffer: bytes, at: int) -> int:
 
 
 def match_bluetooth(buffer: bytes, at: int) -> int:
-    """Length of the packet at this place, if it has a header and another header follows."""
+    """Return the length of a Bluetooth packet at this offset if another header follows it."""
     if len(buffer) < at + BLUETOOTH_LENGTH + 2:
         return NEED_MORE
     following = buffer[at + BLUETOOTH_LENGTH : at + BLUETOOTH_LENGTH + 2]
@@ -217,6 +239,12 @@ def match_bluetooth(buffer: bytes, at: int) -> int:
 
 
 def build(settings: Settings) -> Decoder:
-    """A decoder with these settings; ConfigError for a full scale that no sensor has."""
+    """Return a decoder with these settings.
+
+    Raises
+    ------
+    ConfigError
+        A full scale is out of range.
+    """
     check_settings(settings)
     return WitmotionDecoder(settings)

@@ -1,17 +1,17 @@
 """Xsens / Movella MTi over UART or USB: MTData2 messages of the Xbus protocol.
 
-``FA FF 36 | LEN | payload | CS``, big-endian; LEN = 0xFF is followed by the true length as u16. The low byte
-of the sum of all behind 0xFA is 0. The payload is a list of ``DID u16 | size u8 | data``. The two low bits
-of a DID give the number format: float32, fixed 12.20, fixed 16.32, float64; the rest of its low nibble a
-frame of orientation, masked off here. A fixed 16.32 number is sent with its 32-bit fraction first, then its
-16-bit integer part, each big-endian (three independent public parsers agree; the manual was not at hand).
-Source: Movella, MT low level communication protocol (MT0101P).
+The format is ``FA FF 36 | LEN | payload | CS``, big-endian. LEN = 0xFF is followed by the true length as u16. The low
+byte of the sum of all bytes after 0xFA is 0. The payload is a list of ``DID u16 | size u8 | data``. The two low bits of
+a DID state the number format: float32, fixed 12.20, fixed 16.32, float64. The rest of its low nibble is a coordinate
+frame, which is masked off here. A fixed 16.32 number is sent with its 32-bit fraction first and then its 16-bit integer
+part, each big-endian (three independent public parsers agree; the manual was not available). Source: Movella, MT low
+level communication protocol (MT0101P).
 
-Of a packet are read: acceleration 0x4020 (or HR 0x4040), rate of turn 0x8020 (or HR 0x8040), the clock
-0x1060 or 0x1020, and temperature 0x0810. Free acceleration 0x4030 has gravity removed by the orientation
-filter and is no measurement of the sensor: never used. A packet with acceleration alone, or rates alone,
-leaves the other axes unmeasured (NaN); one with neither makes no sample and is not bad. Temperature often
-comes in slower packets of its own: the last one is held until the next, or until the link is opened anew.
+The decoder reads acceleration 0x4020 (or HR 0x4040), rate of turn 0x8020 (or HR 0x8040), the clock 0x1060 or 0x1020,
+and temperature 0x0810. It never uses free acceleration 0x4030, from which the orientation filter has removed gravity. A
+packet with acceleration alone, or rates alone, leaves the other axes unmeasured (NaN). A packet with neither is not a
+sample and is not bad. Temperature often arrives in separate packets at a lower rate. The last value is used until the
+next one, or until the link is opened again.
 """
 
 import struct
@@ -37,7 +37,7 @@ from drivers.sample import NO_TICK, Arrival, Chunk, Counter, Floats, Ints, Sampl
 
 SYNC: Final = b"\xfa\xff\x36"
 MAX_PAYLOAD: Final = 2048
-"""Bytes; no configuration of an MTi comes near it, and a damaged length must not stall the stream."""
+"""Maximum payload in bytes. No MTi configuration comes near it, and a damaged length must not block the stream."""
 LONGEST: Final = 7 + MAX_PAYLOAD
 
 TEMPERATURE: Final = 0x0810
@@ -48,43 +48,64 @@ GYRO, GYRO_HR = 0x8020, 0x8040
 
 Format = Literal["float32", "fp12.20", "fp16.32", "float64"]
 FORMATS: Final[tuple[Format, ...]] = ("float32", "fp12.20", "fp16.32", "float64")
-"""By the two low bits of a DID."""
+"""Number formats by the two low bits of a DID."""
 SIZES: Final = (4, 4, 6, 8)
-"""Bytes of one number, by the two low bits of a DID."""
+"""Size of one number in bytes, by the two low bits of a DID."""
 
 
 class Settings(DecoderSettings, frozen=True):
     """Keys of ``[device.driver.decoder_options]``."""
 
     clock: Literal["sample_time_fine", "packet_counter", "arrival"] = "sample_time_fine"
-    """Sample times from SampleTimeFine (0.1 ms), from PacketCounter (one a packet), or from arrival."""
+    """Source of the sample times: SampleTimeFine (0.1 ms), PacketCounter (one per packet), or arrival times."""
     high_rate: bool = False
-    """Read the HR items, 0x4040 and 0x8040, instead of 0x4020 and 0x8020."""
+    """True if the HR items 0x4040 and 0x8040 are read instead of 0x4020 and 0x8020."""
     format: Format = "float32"
-    """Number format that ``encode`` writes; reading understands all four."""
+    """Number format that ``encode`` writes. All four formats can be read."""
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where the items of a packet lie: (DID, offset of the data, its size), and what is not data."""
+    """Positions of the items of a packet: (DID, offset of the data, size)."""
 
     items: tuple[tuple[int, int, int], ...]
-    skeleton: tuple[int, ...]  # offsets of all DID and size bytes
+    skeleton: tuple[int, ...]  # offsets of the DID and size bytes of all items
 
     def find(self, kind: int, numbers: int) -> tuple[int, int] | None:
-        """(offset, DID) of the first item of this kind that holds so many numbers of its format."""
+        """Find the first item of a kind that holds a number of values.
+
+        Parameters
+        ----------
+        kind
+            DID without its low nibble.
+        numbers
+            Number of values in the item.
+
+        Returns
+        -------
+        tuple of int, or None
+            Offset of the data, and the DID.
+        """
         for did, at, size in self.items:
             if did & 0xFFF0 == kind and size == numbers * SIZES[did & 3]:
                 return at, did
         return None
 
     def find_integer(self, kind: int, size: int) -> int:
-        """Offset of an unsigned integer item of so many bytes; 0 if there is none."""
+        """Return the offset of an unsigned integer item; 0 if there is none.
+
+        Parameters
+        ----------
+        kind
+            DID without its low nibble.
+        size
+            Size of the integer in bytes.
+        """
         return next((at for did, at, n in self.items if did & 0xFFF0 == kind and n == size), 0)
 
 
 def layout(frame: bytes) -> Layout | None:
-    """Layout of a packet that passed its checksum; None if its items do not fill it exactly."""
+    """Return the layout of a packet with a correct checksum; None if its items do not fill it exactly."""
     at = 6 if frame[3] == 0xFF else 4
     end = len(frame) - 1
     items, skeleton = [], []
@@ -97,13 +118,13 @@ def layout(frame: bytes) -> Layout | None:
 
 
 class XsensMtdata2Decoder:
-    """MTData2 packets <-> SampleBlock."""
+    """Decoder and encoder of MTData2 packets."""
 
     carrier: ClassVar[str] = "bytes"
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        # (timing, DID, bytes of the counter)
+        # (timing, DID, size of the counter in bytes)
         clocks: dict[str, tuple[Timing, int, int]] = {
             "sample_time_fine": (Counter(1 << 32, 1e-4), SAMPLE_TIME_FINE, 4),
             "packet_counter": (Counter(1 << 16), PACKET_COUNTER, 2),
@@ -114,28 +135,28 @@ class XsensMtdata2Decoder:
         self._buffer = FrameBuffer(SYNC, match, LONGEST)
         self._rows = Rows()
         self._temperature_c = np.nan
-        self._clockless = False
+        self._clock_missing = False
 
     @property
     def bad(self) -> int:
-        """Packets that failed their check, and samples that cannot be."""
+        """Number of packets that failed their check, and of implausible samples."""
         return self._rows.bad
 
     @property
     def hint(self) -> str:
-        """What to do about packets that are rejected or lack their clock."""
-        if self._clockless:
+        """Remedy for packets that are rejected or contain no clock."""
+        if self._clock_missing:
             return f'packets hold no {self._settings.clock}: switch it on in the device, or set "clock"'
         return self._buffer.hint
 
     def reset(self) -> None:
-        """Forget a half-received packet and the last temperature."""
+        """Forget an incomplete packet and the last temperature."""
         self._buffer.reset()
         self._rows.reset()
         self._temperature_c = np.nan
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Samples of the packets that these chunks complete."""
+        """Return the samples of the packets that these chunks complete."""
         frames = self._buffer.feed(chunks)
         n = len(frames.data)
         if not n:
@@ -148,14 +169,15 @@ class XsensMtdata2Decoder:
                 values[at] = np.inf
             else:
                 self._read(form, packets, at, values, temperature_c, ticks)
-        temperature_c = self._held(temperature_c)
+        temperature_c = self._fill_temperatures(temperature_c)
         return self._blocks(frames, values, temperature_c, ticks)
 
     def _blocks(self, frames: Frames, values: Floats, temperature_c: Floats, ticks: Ints) -> list[SampleBlock]:
+        """Return the samples of all packets with at least one axis."""
         rows = np.flatnonzero(~np.isnan(values).all(axis=1))
         kept, bad_after = frames.keep(rows.tolist())
         if rows.size:
-            self._clockless = self._clock != 0 and int(ticks[rows[-1]]) == NO_TICK
+            self._clock_missing = self._clock != 0 and int(ticks[rows[-1]]) == NO_TICK
         return self._rows.blocks(kept.t_ns, values[rows], temperature_c[rows], ticks[rows], kept.bad_before, bad_after)
 
     def _read(
@@ -167,6 +189,7 @@ class XsensMtdata2Decoder:
         temperature_c: Floats,
         ticks: Ints,
     ) -> None:
+        """Read values, temperatures and ticks of the packets of one layout into the rows ``at``."""
         for kind, axes in ((self._gyro, slice(0, 3)), (self._accel, slice(3, 6))):
             if found := form.find(kind, 3):
                 values[at, axes] = invalid(numbers(packets, *found, 3))
@@ -176,8 +199,8 @@ class XsensMtdata2Decoder:
             weights = 256 ** np.arange(self._clock_size - 1, -1, -1)
             ticks[at] = packets[:, offset : offset + self._clock_size].astype(np.int64) @ weights
 
-    def _held(self, temperature_c: Floats) -> Floats:
-        """Each packet's temperature, or the last one before it."""
+    def _fill_temperatures(self, temperature_c: Floats) -> Floats:
+        """Return the temperature of each packet, or the last known one."""
         known = np.concatenate([[self._temperature_c], temperature_c])
         last = np.maximum.accumulate(np.where(np.isnan(known), 0, np.arange(known.size)))
         held: Floats = known[last][1:]
@@ -185,7 +208,7 @@ class XsensMtdata2Decoder:
         return held
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """One packet a sample: both clocks, temperature where there is one, the measured triples."""
+        """Return one packet per sample with both clocks, the temperature if there is one, and the measured axes."""
         kind = FORMATS.index(self._settings.format)
         frames = []
         rows = zip(samples.values, samples.temperature_c.tolist(), samples.ticks.tolist(), strict=True)
@@ -202,7 +225,14 @@ class XsensMtdata2Decoder:
 
 
 def alike(frames: list[bytes]) -> list[tuple[Layout | None, NDArray[np.intp], NDArray[np.uint8]]]:
-    """Frames grouped by layout: (layout, which frames, their bytes [k, length]); most often one group."""
+    """Group frames by layout. Most often there is one group.
+
+    Returns
+    -------
+    list of tuple
+        For each group: the layout (None if invalid), the indices of its frames [k], and their bytes [k, length] as
+        uint8.
+    """
     lengths = np.fromiter(map(len, frames), np.intp, len(frames))
     result = []
     for length in dict.fromkeys(lengths.tolist()):
@@ -218,11 +248,23 @@ def alike(frames: list[bytes]) -> list[tuple[Layout | None, NDArray[np.intp], ND
 
 
 def numbers(packets: NDArray[np.uint8], at: int, did: int, count: int) -> Floats:
-    """[k, count] numbers at an offset of each packet, in the format that the DID names."""
+    """Return numbers [k, count] at an offset of each packet.
+
+    Parameters
+    ----------
+    packets
+        [k, length] uint8.
+    at
+        Offset of the first number.
+    did
+        DID whose low bits state the number format.
+    count
+        Number of values.
+    """
     kind = did & 3
     data = np.ascontiguousarray(packets[:, at : at + count * SIZES[kind]])
     if kind == 0:
-        with np.errstate(invalid="ignore"):  # a signalling NaN on the wire is just NaN
+        with np.errstate(invalid="ignore"):  # a signalling NaN is treated as NaN
             return data.view(">f4").astype(np.float64)
     if kind == 1:
         return data.view(">i4") / 2.0**20
@@ -234,12 +276,12 @@ def numbers(packets: NDArray[np.uint8], at: int, did: int, count: int) -> Floats
 
 
 def written(triple: Floats, kind: int) -> bytes:
-    """Three numbers in one of the four formats, clipped to what it can hold."""
+    """Return three numbers in one of the four formats, clipped to its range. ``kind`` is the index in FORMATS."""
     if kind == 0:
         return triple.astype(">f4").tobytes()
     if kind == 3:
         return triple.astype(">f8").tobytes()
-    triple = np.nan_to_num(triple)  # a fixed-point number cannot say that it is not measured
+    triple = np.nan_to_num(triple)  # fixed-point numbers have no value for not measured
     if kind == 1:
         return np.clip(np.rint(triple * 2.0**20), -(2**31), 2**31 - 1).astype(">i4").tobytes()
     whole = [min(max(round(x * 2**32), -(2**47)), 2**47 - 1) for x in triple.tolist()]
@@ -247,7 +289,7 @@ def written(triple: Floats, kind: int) -> bytes:
 
 
 def message(payload: bytes) -> bytes:
-    """An MTData2 message around a payload."""
+    """Return an MTData2 message with this payload."""
     n = len(payload)
     head = b"\xff\x36" + (bytes([n]) if n < 0xFF else b"\xff" + n.to_bytes(2, "big"))
     body = head + payload
@@ -255,7 +297,7 @@ def message(payload: bytes) -> bytes:
 
 
 def match(buffer: bytes, at: int) -> int:
-    """Length of the message at this place, if it is whole and its checksum holds."""
+    """Return the length of a message at this offset (see ``drivers.decoders.base.Match``)."""
     have = len(buffer) - at
     if have < 6:
         return NEED_MORE
@@ -271,5 +313,5 @@ def match(buffer: bytes, at: int) -> int:
 
 
 def build(settings: Settings) -> Decoder:
-    """A decoder with these settings."""
+    """Return a decoder with these settings."""
     return XsensMtdata2Decoder(settings)

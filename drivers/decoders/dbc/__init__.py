@@ -1,23 +1,23 @@
-"""Any CAN sensor that a DBC file describes: frames in, samples out, by a map from axes to signals.
+"""Decoder for CAN sensors that a DBC file describes. The settings map axes to signals.
 
-``build`` reads the DBC with cantools and checks all of the map; from then on no file is touched and cantools
-is not used: frames of one message are stacked to bytes [n, size] and each signal is cut out of them at
-once (``drivers.decoders.dbc`` is compared with cantools in the tests).
+``build`` reads the DBC with cantools and checks the map. After that, no file is opened and cantools is not used. The
+frames of one message are stacked to bytes [n, size], and each signal is extracted from all frames at once (the tests
+compare ``drivers.decoders.dbc`` with cantools).
 
-One sample may be spread over several messages. Its frames are joined in order of arrival: a frame whose
-message the open sample already has starts the next sample. With ``join = "counter"`` the counter decides: a frame
-with another count, or, where the counter has a message of its own, the arrival of that message, starts the next
-sample. A sample with a frame missing, too short or not ``valid`` is bad, and leaves its place empty; with
-``partial = true`` missing frames only leave their axes unmeasured. A sample whose frames all come, but some of them
-after ``window``, is late: it leaves its place empty too, and is counted in ``late`` instead of ``bad``
-(``drivers.decoders.dbc.join`` says how a late frame is told from a frame of the next sample). Frames before the first
-whole sample are not counted. A message that brings nothing but temperature may be slower than the rest: the newest is
-used.
+One sample may be spread over several messages. Its frames are joined in order of arrival. A frame starts the next
+sample if the open sample already contains a frame of the same message. With ``join = "counter"`` the counter decides: a
+frame with another count starts the next sample. If the counter has a message of its own, the arrival of that message
+does. A sample with a frame that is missing, too short or not ``valid`` is bad and leaves its place empty. With
+``partial = true``, missing frames only leave their axes unmeasured. A sample with all its frames, some of them after
+``window``, is late. It also leaves its place empty, and is counted in ``late`` instead of ``bad``.
+``drivers.decoders.dbc.join`` describes how a late frame is distinguished from a frame of the next sample. Frames before
+the first complete sample are not counted. A message that contains only temperature may be slower than the others. Its
+newest value is used.
 
-J1939 messages (attribute VFrameFormat, or ``j1939 = true``) are known by their parameter group, whatever
-priority and sender; the first sender heard is the one listened to, unless ``source`` names another. A raw value in
-the top 2/256 of its range is "error" or "not available" there (SAE J1939-71: 0xFE00 to 0xFFFF of 16
-bits) and not measured; ``not_available = true`` applies the rule to other messages too.
+J1939 messages (attribute VFrameFormat, or ``j1939 = true``) are identified by their parameter group, whatever the
+priority and the sender. The first sender received is used, unless ``source`` names another. A raw value in the top
+2/256 of its range is "error" or "not available" (SAE J1939-71: 0xFE00 to 0xFFFF of 16 bits) and not measured.
+``not_available = true`` applies this rule to other messages, too.
 """
 
 from collections.abc import Sequence
@@ -35,12 +35,22 @@ from drivers.sample import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, Ints, 
 
 __all__ = ["DbcDecoder", "Settings", "SignalSettings", "build"]
 
-LARGEST_CACHE: Final = 4096
-"""29-bit identifiers looked up so far; noise on a bus must not fill the memory."""
+MAX_CACHED_IDS: Final = 4096
+"""Maximum number of 29-bit identifiers in the cache, so that noise on a bus does not fill the memory."""
 
 
 class DbcDecoder:
-    """Frames of one device, as its DBC says."""
+    """Decoder and encoder of the frames of one device according to its DBC.
+
+    Parameters
+    ----------
+    messages
+        Messages that contain the signals.
+    settings
+        Settings of the decoder.
+    timing
+        Timing of the samples.
+    """
 
     carrier: ClassVar[str] = "frames"
 
@@ -53,10 +63,10 @@ class DbcDecoder:
         self.bad = 0
         self.late = 0
         self.late_hint = ""
-        self._left_out = 0  # samples, bad or late
+        self._left_out = 0  # number of samples left out, bad or late
         self.hint = ""
-        self._rivals = ""  # the hint that two senders are on the bus
-        self._quiet = 0  # good samples since the last rejected one
+        self._two_senders_hint = ""  # hint that two senders are on the bus
+        self._samples_since_reject = 0  # number of good samples since the last rejected one
         self._rows = Rows()
         self._join = Join(self._messages, settings)
         self._known = {m.address: i for i, m in self._numbered() if not m.j1939}
@@ -66,22 +76,25 @@ class DbcDecoder:
 
     @property
     def addresses(self) -> tuple[int, ...]:
-        """What to listen for on the bus; ``ANY_SOURCE`` marks J1939 parameter groups."""
+        """Addresses to receive from the bus. ``ANY_SOURCE`` marks J1939 parameter groups."""
         return tuple(m.address | (ANY_SOURCE if m.j1939 else 0) for _, m in self._numbered())
 
     def reset(self) -> None:
-        """Forget an open sample, the newest temperature and the sender listened to."""
+        """Forget an open sample, the newest temperature and the selected sender."""
         self._join.reset()
         self._rows.reset()
         self._source = self._settings.source
-        self._rivals = ""
+        self._two_senders_hint = ""
         self._cache.clear()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Samples that these frames complete; ``t_ns`` is the arrival of the last frame of each."""
+        """Return the samples that these frames complete.
+
+        ``t_ns`` is the arrival time of the last frame of each sample.
+        """
         done: list[Sample] = []
         for chunk in chunks:
-            which = self._which(chunk.address)
+            which = self._message_index(chunk.address)
             if which is None:
                 continue
             if which < 0:
@@ -93,26 +106,26 @@ class DbcDecoder:
                 self.hint = f"{message}: frames of {len(chunk.data)} bytes, but its signals need {size}"
             self._join.put(which, chunk.data[:size] if len(chunk.data) >= size else b"", chunk.t_ns, done)
         blocks = self._decode(done)
-        self._quiet = self._quiet + len(done) if self._rows.bad == self._left_out else 0
-        if self._quiet >= QUIET_FRAMES:
+        self._samples_since_reject = self._samples_since_reject + len(done) if self._rows.bad == self._left_out else 0
+        if self._samples_since_reject >= QUIET_FRAMES:
             self.hint = self.late_hint = ""
         if delay_ns := self._join.take_delay_ns():
-            self._quiet = 0
+            self._samples_since_reject = 0
             self.hint = self.late_hint = (
                 f"frames of one sample arrive {delay_ns * 1e-6:.3g} ms apart, more than "
                 f"window = {self._settings.window:g} s: increase `window` in decoder_options"
             )
-        self.hint = self._rivals or self.hint
+        self.hint = self._two_senders_hint or self.hint
         self._left_out, self.late = self._rows.bad, self._join.late
         self.bad = self._left_out - self.late
         return blocks
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """The frames of each sample, message by message; bits of no signal are 0, in J1939 1."""
+        """Return the frames of each sample. Bits without a signal are 0, or 1 in J1939 messages."""
         n = len(samples)
         table = np.column_stack((samples.values, samples.temperature_c))
         sent: list[tuple[Message, Bytes]] = []
-        # the temperature goes first: it holds for the samples behind it
+        # the temperature is sent first, since it applies to the samples after it
         for _, message in sorted(self._numbered()):
             frames = np.full((n, message.length), 0xFF if message.j1939 else 0, np.uint8)
             for column in message.columns:
@@ -130,22 +143,27 @@ class DbcDecoder:
         ]
 
     def _numbered(self) -> list[tuple[int, Message]]:
-        """Messages with their place in a sample; -1 is the one that only brings temperature."""
+        """Return the messages with their index in a sample.
+
+        The index -1 is the message that contains only the temperature.
+        """
         slow = [(-1, self._slow)] if self._slow is not None else []
         return [*slow, *enumerate(self._messages)]
 
-    def _which(self, address: int) -> int | None:
+    def _message_index(self, address: int) -> int | None:
+        """Return the index of the message with this address; None if it is not used."""
         if address in self._known:
             return self._known[address]
         if not self._groups or not address & EXTENDED_ID:
             return None
         if address not in self._cache:
-            if len(self._cache) >= LARGEST_CACHE:
+            if len(self._cache) >= MAX_CACHED_IDS:
                 self._cache.clear()
             self._cache[address] = self._group_of(address)
         return self._cache[address]
 
     def _group_of(self, address: int) -> int | None:
+        """Return the index of the J1939 message with this address; None for an unused message or another sender."""
         which = self._groups.get(_group(address))
         if which is None:
             return None
@@ -155,19 +173,20 @@ class DbcDecoder:
         if source == self._source:
             return which
         if self._settings.source is None:
-            self._rivals = (
+            self._two_senders_hint = (
                 f"senders 0x{self._source:02X} and 0x{source:02X} both send these messages; "
                 f"listening to 0x{self._source:02X}, source = {source} would choose the other"
             )
         return None
 
     def _note_temperature(self, data: bytes) -> None:
+        """Keep the newest frame of the message that contains only the temperature."""
         assert self._slow is not None
         if len(data) >= self._slow.size:
             self._join.temperature = data[: self._slow.size]
 
     def _decode(self, done: Sequence[Sample]) -> list[SampleBlock]:
-        """Samples -> blocks, each signal of all of them at once."""
+        """Return joined samples as blocks. Each signal is extracted from all of them at once."""
         n = len(done)
         table = np.full((n, len(COLUMNS)), np.nan)
         ticks = np.full(n, NO_TICK, np.int64)
@@ -182,7 +201,7 @@ class DbcDecoder:
             if message.counter is not None:
                 raw: Ints = message.counter.raw(frames).astype(np.int64)
                 ticks[there] = raw[there]
-        # a row without any value is rejected below, and its place stays empty
+        # a row without any value is rejected by ``Rows``, and its place stays empty
         table[~valid] = np.nan
         if not valid.all():
             self.hint = f"{self._settings.valid} is not 1: the sensor says that its values do not hold"
@@ -197,7 +216,7 @@ class DbcDecoder:
 
 
 def _stack(done: Sequence[Sample], which: int, size: int) -> tuple[Bytes, NDArray[np.bool_]]:
-    """Frames [n, size] of one message, and where there are any."""
+    """Return the frames [n, size] of one message, and a mask [n] of those that exist."""
     frames = [s.temperature if which < 0 else s.frames[which] for s in done]
     empty = bytes(size)
     data = np.frombuffer(b"".join(f or empty for f in frames), np.uint8)
@@ -205,12 +224,18 @@ def _stack(done: Sequence[Sample], which: int, size: int) -> tuple[Bytes, NDArra
 
 
 def _group(frame_id: int) -> int:
-    """J1939 parameter group number of a 29-bit identifier (SAE J1939-21 5.1.2)."""
+    """Return the J1939 parameter group number of a 29-bit identifier (SAE J1939-21 5.1.2)."""
     group = frame_id >> 8 & 0x3_FFFF
     return group if group >> 8 & 0xFF >= 240 else group & 0x3_FF00
 
 
 def build(settings: Settings) -> Decoder:
-    """The decoder of these settings; reads the DBC. Raises ``ConfigError`` for all that is wrong with them."""
+    """Return the decoder of these settings, after reading the DBC file.
+
+    Raises
+    ------
+    ConfigError
+        Some settings are wrong, one line for each.
+    """
     database = Database(settings)
     return DbcDecoder(database.messages(), settings, database.timing())

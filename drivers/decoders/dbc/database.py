@@ -1,7 +1,7 @@
-"""From the settings and a DBC file to the messages and signals that a decoder uses.
+"""Lookup of the configured messages and signals in a DBC file.
 
-The file is read once, with cantools. Every name is looked up, every unit is known, every signal fits in
-its message, or a ``ConfigError`` says in one line which does not and what would be right.
+The file is read once with cantools. Every name must exist, every unit must be known, and every signal must fit in its
+message. Otherwise a ``ConfigError`` names the mistake and the expected value in one line.
 """
 
 import contextlib
@@ -25,42 +25,54 @@ from drivers.sample import AXES
 TEMPERATURE: Final = "temperature"
 SHIPPED: Final = Path(drivers.__file__).parent.parent / "config" / "dbc"
 SHIPPED_PREFIX: Final = "shipped:"
-LONGEST_COUNTER: Final = 62
-"""bits; ticks are int64."""
+MAX_COUNTER_BITS: Final = 62
+"""Maximum length of a counter in bits, since ticks are int64."""
 
 
 class Database:
-    """Looks up each name in the DBC, once."""
+    """Messages and signals of a DBC file that the settings name.
+
+    Parameters
+    ----------
+    settings
+        Settings of the decoder.
+
+    Raises
+    ------
+    ConfigError
+        Some settings are wrong, one line for each.
+    """
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._wrong = list(_problems(settings))
+        self._errors = list(_problems(settings))
         self._used: dict[str, Message] = {}
         self._timing: Timing = Arrival()
         with self._collecting():
             self._path = _locate(settings.file)
             self._messages: dict[str, Any] = {m.name: m for m in _load(self._path).messages}
             self._look_up()
-        if self._wrong:
-            raise ConfigError(*self._wrong)
+        if self._errors:
+            raise ConfigError(*self._errors)
 
     def messages(self) -> list[Message]:
-        """The messages that hold what the settings ask for; one that is only a counter comes first."""
+        """Return the messages with the configured signals. A message that contains only a counter comes first."""
         return sorted(self._used.values(), key=lambda m: not m.only_counter)
 
     def timing(self) -> Timing:
-        """How the samples get their time."""
+        """Return the timing of the samples."""
         return self._timing
 
     @contextlib.contextmanager
     def _collecting(self) -> Iterator[None]:
-        """Go on after a mistake, so that every one is told."""
+        """Collect a ConfigError and continue, so that all mistakes are reported."""
         try:
             yield
         except ConfigError as error:
-            self._wrong += error.lines
+            self._errors += error.lines
 
     def _look_up(self) -> None:
+        """Look up all signals of the settings."""
         s = self._settings
         for axis, entry in s.signals.items():
             with self._collecting():
@@ -74,16 +86,18 @@ class Database:
                 self._add_counter()
 
     def _add_counter(self) -> None:
+        """Look up the counter and derive the timing."""
         s = self._settings
         for message, signal in self._counters():
-            if signal.is_float or signal.length > LONGEST_COUNTER:
+            if signal.is_float or signal.length > MAX_COUNTER_BITS:
                 raise ConfigError(
-                    f'counter: "{s.counter}"; a counter is a whole number of at most {LONGEST_COUNTER} bits'
+                    f'counter: "{s.counter}"; a counter is a whole number of at most {MAX_COUNTER_BITS} bits'
                 )
             self._use(message, signal).counter = self._bits(message, signal)
             self._timing = Counter(1 << int(signal.length), s.tick)
 
     def _counters(self) -> list[tuple[Any, Any]]:
+        """Return message and signal of each counter."""
         name = self._settings.counter
         if "." in name or self._settings.join == "time":
             return [self._find("counter", name)]
@@ -92,6 +106,7 @@ class Database:
         return [self._find("counter", f"{message}.{name}") for message in inertial]
 
     def _add_axis(self, axis: str, entry: SignalSettings) -> None:
+        """Look up the signal of an axis."""
         if axis not in COLUMNS:
             raise ConfigError(f"signals.{axis}: unknown axis{possible(axis, COLUMNS)}")
         message, signal = self._find(f"signals.{axis}", entry.signal)
@@ -100,6 +115,7 @@ class Database:
         self._use(message, signal).columns.append(column)
 
     def _to_si(self, axis: str, entry: SignalSettings, signal: Any) -> tuple[float, float]:
+        """Return factor and offset from the unit of a signal to SI."""
         unit = entry.unit or signal.unit or ""
         try:
             if axis == TEMPERATURE:
@@ -116,7 +132,7 @@ class Database:
         return factor * entry.factor, offset * entry.factor
 
     def _find(self, key: str, name: str) -> tuple[Any, Any]:
-        """The DBC's message and signal of "Message.Signal"."""
+        """Return message and signal of the DBC for a name "Message.Signal"."""
         message_name, dot, signal_name = name.partition(".")
         if not dot:
             hint = ', or with join = "counter" a bare name' if key == "counter" else ""
@@ -135,7 +151,7 @@ class Database:
         return message, signal
 
     def _use(self, message: Any, signal: Any) -> Message:
-        """The entry of a message among those used, long enough for the signal."""
+        """Return the entry of a used message, after extending its size to contain the signal."""
         entry = self._used.get(message.name)
         if entry is None:
             entry = self._used[message.name] = Message(
@@ -152,13 +168,15 @@ class Database:
         return entry
 
     def _is_j1939(self, message: Any) -> bool:
+        """Return True if a message is a J1939 message."""
         s = self._settings
         return bool(message.protocol == "j1939" if s.j1939 is None else s.j1939)
 
     def _bits(self, message: Any, signal: Any) -> Bits:
+        """Return the bit field of a signal. Raise ConfigError if it is not supported."""
         s = self._settings
         big_endian = signal.byte_order == "big_endian"
-        first, last = _ends(signal.start, signal.length, big_endian)
+        first, last = _bit_range(signal.start, signal.length, big_endian)
         if first < 0 or last // 8 >= message.length or not 0 < signal.length <= 64:
             raise ConfigError(f"{self._path.name}: {signal.name} does not fit in {message.name}")
         if signal.is_float and signal.length not in (16, 32, 64):
@@ -168,7 +186,7 @@ class Database:
                 f"{self._path.name}: {signal.name} has factor {signal.scale:g} and offset {signal.offset:g}; finite "
                 f"numbers are needed, the factor other than 0"
             )
-        # Motorola counts from the most significant end: the least significant bit is the last one
+        # Motorola counts from the most significant bit, so the least significant bit is the last one
         shift = 7 - last % 8 if big_endian else first % 8
         rule = self._is_j1939(message) if s.not_available is None else s.not_available
         return Bits(
@@ -185,14 +203,14 @@ class Database:
         )
 
 
-def _ends(start: int, length: int, big_endian: bool) -> tuple[int, int]:
-    """First and last bit in order of transmission; a DBC numbers Motorola starts 7 … 0, 15 … 8, …"""
+def _bit_range(start: int, length: int, big_endian: bool) -> tuple[int, int]:
+    """Return the first and last bit in order of transmission. A DBC numbers Motorola starts 7 … 0, 15 … 8, …"""
     first = 8 * (start // 8) + 7 - start % 8 if big_endian else start
     return first, first + length - 1
 
 
 def _problems(settings: Settings) -> Iterator[str]:
-    """What is wrong whatever the database holds."""
+    """Yield a line for each mistake in the settings that does not depend on the database."""
     if not settings.signals:
         yield 'signals: empty; it maps axes to signals: gz = "Message.Signal"'
     elif set(settings.signals) == {TEMPERATURE}:
@@ -203,6 +221,7 @@ def _problems(settings: Settings) -> Iterator[str]:
 
 
 def _signal_settings(axis: str, entry: str | SignalSettings) -> SignalSettings:
+    """Return the settings of a signal from its short or long form."""
     if isinstance(entry, SignalSettings):
         return entry
     if entry.startswith("-"):
@@ -211,7 +230,7 @@ def _signal_settings(axis: str, entry: str | SignalSettings) -> SignalSettings:
 
 
 def _locate(file: str) -> Path:
-    """The path itself, or that of a shipped database."""
+    """Return the path of a database, which may be a shipped one."""
     path = file_access.path(file)
     name = file.removeprefix(SHIPPED_PREFIX)
     if name == file and (file_access.is_file(path) or len(path.parts) != 1):
@@ -224,13 +243,13 @@ def _locate(file: str) -> Path:
 
 
 def _load(path: Path) -> Any:
-    """The database, read leniently: other people's files overlap signals that nobody asks for."""
+    """Read the database without strict checks, since many files contain overlapping signals that are not used."""
     check_extra("can", "a CAN database")
     import cantools
 
     try:
         if path.suffix.lower() != ".dbc":
-            file_access.read(path)  # to know that it is one: what follows opens it anew
+            file_access.read(path)  # check that the file is readable, since cantools opens it again
             return cantools.database.load_file(path, strict=False)
         return cantools.database.load_string(_text(path), "dbc", strict=False)
     except OSError as error:
@@ -240,7 +259,7 @@ def _load(path: Path) -> Any:
 
 
 def _text(path: Path) -> str:
-    """DBC editors write the code page of Windows, others UTF-8; degree signs tell them apart."""
+    """Return the text of a DBC file. Editors write UTF-8 or a Windows code page, which differ in the degree sign."""
     data = file_access.read(path)
     try:
         return data.decode("utf-8-sig")

@@ -1,4 +1,4 @@
-"""Keys of the ``dbc`` decoder."""
+"""Settings of the ``dbc`` decoder."""
 
 from typing import Annotated, Literal
 
@@ -10,34 +10,34 @@ from drivers.quantities import DELAY_S, SCALE, SOURCE_ADDRESS, TICK_S
 
 
 class SignalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One signal in full, where a name alone does not say all."""
+    """Description of one signal, if a name alone is not sufficient."""
 
     signal: str
     unit: str = ""
-    """Absent: the DBC's own."""
+    """Unit of the signal. If it is absent, the unit of the DBC is used."""
     factor: Annotated[float, SCALE.meta] = 1.0
-    """Applied last: a sign, or a correction."""
+    """Factor that is applied last: a sign, or a correction."""
 
 
 class Settings(DecoderSettings, frozen=True, kw_only=True):
-    """Keys of a CAN database."""
+    """Keys of ``[device.driver.decoder_options]`` for a CAN database."""
 
     file: FileOrName
-    """A path, or the name of a shipped one: "j1939_imu", "canmod_gps", "xsens_mti", "bosch_mm7"."""
+    """Path of a DBC file, or name of a shipped database: "j1939_imu", "canmod_gps", "xsens_mti", "bosch_mm7"."""
     signals: dict[str, str | SignalSettings]
-    """Axis (gx … az, temperature) = "Message.Signal", "-Message.Signal", or a table."""
+    """Signal of each axis (gx … az, temperature): "Message.Signal", "-Message.Signal", or a table."""
     valid: str = ""
-    """A signal that is 1 where the sample holds."""
+    """Signal that is 1 if the sample is valid."""
     counter: str = ""
-    """"Message.Signal", or with join = "counter" a bare name that every message of a sample has."""
+    """"Message.Signal", or with join = "counter" the name of a signal that every message of a sample contains."""
     tick: Annotated[float, TICK_S.meta] | None = None
-    """Seconds a count; absent: the counter counts samples."""
+    """Length of a count in s. If it is absent, the counter counts samples."""
     join: Literal["time", "counter"] = "time"
     window: Annotated[float, DELAY_S.meta] = 0.0
-    """Seconds within which the frames of one sample come, at most half a sample period; 0 = any."""
+    """Time in s within which the frames of one sample arrive, at most half a sample period; 0 = any."""
     partial: bool = False
     j1939: bool | None = None
     source: Annotated[int, SOURCE_ADDRESS.meta] | None = None
     """J1939 source address, 0 to 255."""
     not_available: bool | None = None
-    """Absent: as the message is J1939 or not."""
+    """True if the J1939 rule for unavailable values is used. If it is absent, the rule is used for J1939 messages."""
