@@ -1,4 +1,4 @@
-"""Optional packages: check that the packages of an installation extra are installed, and say how to install them."""
+"""Optional packages: check whether the packages of an installation extra are installed, and how to install them."""
 
 import importlib.util
 from collections.abc import Mapping

@@ -87,12 +87,12 @@ def check_regular(path: Path) -> None:
 
 
 def check_folder(path: Path) -> None:
-    """Check that a name belongs to a folder or to nothing.
+    """Check that a path is a folder or does not exist.
 
     Raises
     ------
     OSError
-        Something else has this name. ``strerror`` says what it is, without the path.
+        The path is not a folder. ``strerror`` names the kind of file, without the path.
     """
     try:
         mode = os.stat(path).st_mode

@@ -57,7 +57,7 @@ class Quantity:
         """
         if self.supports(value):
             return value
-        raise ConfigError(f"{_format_number(value, self.unit)} is outside the supported range {self.range_text()}")
+        raise ConfigError(f"{_number_text(value, self.unit)} is outside the supported range {self.range_text()}")
 
     def supports(self, value: float) -> bool:
         """Return True if the value is in the supported range. Return False for NaN."""
@@ -73,7 +73,7 @@ class Quantity:
         sign = "±" if self.signed else ""
         ends = f"{sign}{self.low:g} to {sign}{self.high:g} {self.unit}".rstrip()
         if self.unit in PREFIXED_UNITS or self.unit == "s":
-            ends = f"{_format_number(self.low, self.unit)} to {_format_number(self.high, self.unit)}"
+            ends = f"{_number_text(self.low, self.unit)} to {_number_text(self.high, self.unit)}"
         return f"{ends}, or 0" if self.zero else ends
 
     @property
@@ -218,10 +218,10 @@ def _out_of_range(value: Any, info: inspect.Type, place: str) -> Iterator[tuple[
             yield from _out_of_range(getattr(value, field.name), field.type, f"{place}.{field.encode_name}")
 
 
-def _format_number(value: float, unit: str) -> str:
+def _number_text(value: float, unit: str) -> str:
     """Return a number with its unit.
 
-    >>> _format_number(2e6, "Hz"), _format_number(0.25, "s"), _format_number(172_800.0, "s"), _format_number(10**400, "")
+    >>> _number_text(2e6, "Hz"), _number_text(0.25, "s"), _number_text(172_800.0, "s"), _number_text(10**400, "")
     ('2 MHz', '250 ms', '2 d', 'an integer of more than 64 bits')
     """
     if isinstance(value, int) and abs(value) > MAX_WRITTEN_INTEGER:

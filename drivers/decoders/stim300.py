@@ -208,7 +208,15 @@ def _temperature_at(parts: int) -> int:
 
 
 def triples(data: NDArray[np.uint8], at: int) -> Ints:
-    """Return signed 24-bit big-endian integers [n, 3] at an offset of each row."""
+    """Return signed 24-bit big-endian integers [n, 3].
+
+    Parameters
+    ----------
+    data
+        [n, length] uint8, one datagram per row.
+    at
+        Offset of the first integer in each row.
+    """
     wide = np.zeros((len(data), 3, 4), np.uint8)
     wide[:, :, :3] = data[:, at : at + 9].reshape(-1, 3, 3)
     raised: Ints = wide.view(">i4")[:, :, 0].astype(np.int64) >> 8

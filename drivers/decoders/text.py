@@ -53,7 +53,7 @@ class Settings(DecoderSettings, frozen=True):
     columns: tuple[str, ...]
     """Content of each column: gx gy gz ax ay az temperature t counter, or - to skip it."""
     delimiter: str = "auto"
-    """Text between two fields, or auto. " " stands for any number of blanks."""
+    """Text between two fields, or auto. " " separates by any number of blanks."""
     gyro_unit: str = "rad/s"
     """Unit of gx gy gz: rad/s, mrad/s, deg/s, ..."""
     accel_unit: str = "m/s²"
@@ -177,7 +177,7 @@ class TextDecoder:
                 for at in self._at.values() if bodies else ():
                     table[:, at] = list(map(float, fields[at :: self._width]))
             except ValueError:
-                pass  # an empty field, or one that is not a number: parse line by line
+                pass  # a field is empty or not a number: parse line by line
             else:
                 self._lines_since_bad += len(bodies)
                 return table

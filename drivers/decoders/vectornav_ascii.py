@@ -8,9 +8,9 @@ pages 27-43).
 
 ``$VNIMU`` contains the magnetic field [Gauss], acceleration [m/s²], rate [rad/s], temperature [°C] and pressure [kPa]
 as measured. ``$VNYMR`` contains yaw, pitch, roll [°], magnetic field, acceleration and rate, all compensated. Its bias
-instability and random walk are what the on-board filter leaves, and not those of the sensor. Data that may be appended
-to a sentence (a count or time of synchronization) are not read. The printed resolution is 0.001 m/s² and 1e-6 rad/s, so
-quantization is visible in the Allan deviation. The binary messages do not have this limit.
+instability and random walk are the residuals of the on-board filter and do not describe the sensor. Data that may be
+appended to a sentence (a count or time of synchronization) are not read. The printed resolution is 0.001 m/s² and 1e-6
+rad/s, so quantization is visible in the Allan deviation. The binary messages do not have this limit.
 """
 
 import binascii
@@ -122,7 +122,20 @@ class VectornavAsciiDecoder:
 
 
 def numbers(bodies: list[bytes], width: int) -> Floats:
-    """Return the first ``width`` numbers of each body [n, width]. A row that contains other text is infinite."""
+    """Return the numbers of several sentences.
+
+    Parameters
+    ----------
+    bodies
+        Fields of each sentence, separated by commas.
+    width
+        Number of fields to read from each sentence.
+
+    Returns
+    -------
+    ndarray
+        [n, width] float64. A row that contains other text is infinite.
+    """
     split = [body.split(b",", width)[:width] for body in bodies]
     try:
         return np.array([[float(field) for field in fields] for fields in split]).reshape(len(bodies), width)
@@ -140,7 +153,20 @@ def _row(fields: list[bytes], width: int) -> list[float]:
 
 
 def match(buffer: bytes, at: int) -> int:
-    """Return the length of a sentence at this offset (see ``drivers.decoders.base.Match``)."""
+    """Return the length of a sentence.
+
+    Parameters
+    ----------
+    buffer
+        Received bytes.
+    at
+        Offset of a candidate.
+
+    Returns
+    -------
+    int
+        Length in bytes, NEED_MORE, or REJECT.
+    """
     end = buffer.find(b"\n", at, at + LONGEST) + 1
     if not end:
         return NEED_MORE

@@ -43,9 +43,9 @@ HEADERS: Final = (b"\x55\x61", b"\x55\x71")
 MIN_PACKETS_PER_SAMPLE: Final = 2
 """Minimum number of packets per sample."""
 CYCLE_SAMPLES: Final = 8
-"""Number of recent samples.
+"""Number of recent samples that determine the packets per sample.
 
-The shortest of them gives the packets per sample, as other packets come only occasionally.
+The sample with the fewest packets counts, since packets of other types are sent only occasionally.
 """
 
 # °C = raw * step + offset, by family (WT901 data sheet v20-0702; BWT61CL v20-0630)
@@ -216,13 +216,34 @@ class Pairs:
 
 
 def packet(kind: int, data: bytes) -> bytes:
-    """Return an 11-byte packet of this type with 8 bytes of data."""
+    """Return an 11-byte packet.
+
+    Parameters
+    ----------
+    kind
+        Type of the packet, such as 0x51.
+    data
+        Content of 8 bytes.
+    """
     body = bytes([0x55, kind]) + data
     return body + bytes([sum(body) & 0xFF])
 
 
 def match_uart(buffer: bytes, at: int) -> int:
-    """Return the length of a UART packet at this offset (see ``drivers.decoders.base.Match``)."""
+    """Return the length of a UART packet.
+
+    Parameters
+    ----------
+    buffer
+        Received bytes.
+    at
+        Offset of a candidate.
+
+    Returns
+    -------
+    int
+        Length in bytes, NEED_MORE, or REJECT.
+    """
     if len(buffer) < at + UART_LENGTH:
         return NEED_MORE
     if buffer[at + 1] not in TYPES or sum(buffer[at : at + 10]) & 0xFF != buffer[at + 10]:
@@ -231,7 +252,20 @@ def match_uart(buffer: bytes, at: int) -> int:
 
 
 def match_bluetooth(buffer: bytes, at: int) -> int:
-    """Return the length of a Bluetooth packet at this offset if another header follows it."""
+    """Return the length of a Bluetooth packet if another header follows it.
+
+    Parameters
+    ----------
+    buffer
+        Received bytes.
+    at
+        Offset of a candidate.
+
+    Returns
+    -------
+    int
+        Length in bytes, NEED_MORE, or REJECT.
+    """
     if len(buffer) < at + BLUETOOTH_LENGTH + 2:
         return NEED_MORE
     following = buffer[at + BLUETOOTH_LENGTH : at + BLUETOOTH_LENGTH + 2]

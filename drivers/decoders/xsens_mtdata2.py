@@ -37,7 +37,7 @@ from drivers.sample import NO_TICK, Arrival, Chunk, Counter, Floats, Ints, Sampl
 
 SYNC: Final = b"\xfa\xff\x36"
 MAX_PAYLOAD: Final = 2048
-"""Maximum payload in bytes. No MTi configuration comes near it, and a damaged length must not block the stream."""
+"""Maximum payload in bytes. Every MTi configuration is far below it, and a damaged length must not block the stream."""
 LONGEST: Final = 7 + MAX_PAYLOAD
 
 TEMPERATURE: Final = 0x0810
@@ -276,7 +276,15 @@ def numbers(packets: NDArray[np.uint8], at: int, did: int, count: int) -> Floats
 
 
 def written(triple: Floats, kind: int) -> bytes:
-    """Return three numbers in one of the four formats, clipped to its range. ``kind`` is the index in FORMATS."""
+    """Encode three numbers, clipped to the range of the format.
+
+    Parameters
+    ----------
+    triple
+        [3] float64.
+    kind
+        Index of the format in FORMATS.
+    """
     if kind == 0:
         return triple.astype(">f4").tobytes()
     if kind == 3:
@@ -297,7 +305,20 @@ def message(payload: bytes) -> bytes:
 
 
 def match(buffer: bytes, at: int) -> int:
-    """Return the length of a message at this offset (see ``drivers.decoders.base.Match``)."""
+    """Return the length of a message.
+
+    Parameters
+    ----------
+    buffer
+        Received bytes.
+    at
+        Offset of a candidate.
+
+    Returns
+    -------
+    int
+        Length in bytes, NEED_MORE, or REJECT.
+    """
     have = len(buffer) - at
     if have < 6:
         return NEED_MORE

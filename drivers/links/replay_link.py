@@ -1,19 +1,19 @@
 """Replay of a file in place of a device: recordings, CAN logs and captured bytes, at their own pace or another.
 
-The kind of file determines what the link carries:
+The link carries different data for each kind of file:
 
 - recordings (``drivers.recordings``: CSV, .npz, Parquet, Arrow, a folder) become messages for the decoder ``samples``;
 - CAN logs (.asc .blf .log .trc, CSV of python-can, CSV with ``t``, ``id_hex``, ``data_hex``) become frames;
 - captured bytes (.bin .raw .txt, also with .gz) become bytes;
-- raw bytes recorded by the daemon (a folder of segments, or one of them) become what they were received as: bytes,
-  frames or messages.
+- raw bytes recorded by the daemon (a folder of segments, or one of them) become bytes, frames or messages, according to
+  their original link.
 
 Recordings, logs and raw bytes keep their own times (``epoch`` is unix). Captured bytes have no times. With
 ``bytes_per_second``, each chunk gets the time at which that rate delivers it. Otherwise it gets the time of the read.
 
 ``read`` raises ``LinkEnded`` after all data have been returned. A truncated file is replayed up to the cut, and the
-message at the end says so. ``build`` reads the header of a CSV file, since the decoder must match. All other content is
-read by ``open``.
+message at the end mentions the cut. ``build`` reads the header of a CSV file, since the decoder must match. All other
+content is read by ``open``.
 """
 
 import binascii
@@ -352,6 +352,7 @@ def _blf(path: Path) -> "can.BLFReader":
             return data
 
         def _parse_container(self, data: bytes) -> "Iterator[can.Message]":
+            """Yield the messages of a container after checking the sizes of its objects."""
             at = data.find(BLF_OBJECT)
             while at >= 0:
                 size = data[at + BLF_SIZE.start : at + BLF_SIZE.stop]
@@ -507,7 +508,7 @@ def _paced_bytes(stream: IO[bytes], bytes_per_second: float) -> Iterator[Timed]:
         yield at_s, Chunk(data, start_ns + round(at_s * 1e9))
 
 
-# --- what kind of file ---------------------------------------------------------------------------
+# --- kind of file --------------------------------------------------------------------------------
 
 
 def _kind(path: Path) -> Kind:

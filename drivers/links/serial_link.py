@@ -8,9 +8,9 @@ arrival instead, within the same time.
 ``close`` sets a flag and ends a waiting read. The port itself is closed after the reader has left it. A descriptor that
 is closed while a reader waits on it could by then belong to another file.
 
-``open`` either succeeds or raises ``LinkUnavailable``, which says what to do: list of the existing ports, missing
-permission, or port in use by another program. ``read`` returns bytes or None, or raises ``LinkLost`` if the device was
-unplugged or the other end closed the connection. Nothing is ever written to the device.
+``open`` succeeds or raises ``LinkUnavailable``. Its text names the cause and the remedy, such as a list of the existing
+ports, a missing permission, or another program that uses the port. ``read`` returns bytes or None, or raises
+``LinkLost`` if the device was unplugged or the other end closed the connection. Nothing is ever written to the device.
 """
 
 import contextlib

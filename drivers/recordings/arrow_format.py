@@ -252,7 +252,20 @@ def _first_line(error: Exception) -> str:
 
 @contextmanager
 def parquet_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
-    """Write Parquet with its default compression. Each call of the append function writes one row group."""
+    """Write Parquet with its default compression.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    names
+        Names of the columns.
+
+    Yields
+    ------
+    Append
+        Function that appends rows. Each call writes one row group.
+    """
     pa = import_pyarrow(path)
     from pyarrow import parquet
 
@@ -262,12 +275,28 @@ def parquet_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
 
 
 def ipc_file_writer(path: Path, names: Sequence[str]) -> AbstractContextManager[Append]:
-    """Write an Arrow file (Feather version 2)."""
+    """Write an Arrow file (Feather version 2).
+
+    Parameters
+    ----------
+    path
+        File to write.
+    names
+        Names of the columns.
+    """
     return _ipc_writer(import_pyarrow(path).ipc.new_file, path, names)
 
 
 def ipc_stream_writer(path: Path, names: Sequence[str]) -> AbstractContextManager[Append]:
-    """Write an Arrow stream."""
+    """Write an Arrow stream.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    names
+        Names of the columns.
+    """
     return _ipc_writer(import_pyarrow(path).ipc.new_stream, path, names)
 
 

@@ -119,7 +119,20 @@ def check_buffers(size: BatchSize, counts: Sequence[int | None], slack_bytes: in
 
 
 def buffer_count(pa: Any, type_: Any) -> int | None:
-    """Return the number of buffers of a column of this type; None if the type is nested or has views."""
+    """Return the number of buffers of a column.
+
+    Parameters
+    ----------
+    pa
+        The module pyarrow.
+    type_
+        pyarrow type of the column.
+
+    Returns
+    -------
+    int or None
+        None if the type is nested or has views.
+    """
     types = pa.types
     if types.is_null(type_):
         return 0

@@ -285,7 +285,10 @@ def _parse_quickly(text: bytes, lines: list[str], width: int, use: Sequence[int]
 def _parse_slowly(
     lines: Sequence[str], number: int, names: Sequence[str], use: Sequence[int], bad: _BadLines
 ) -> Floats:
-    """Parse line by line. An empty field is a missing value, and a line that is not a sample is missing as a whole."""
+    """Parse line by line.
+
+    An empty field is a missing value. A line that is not a sample becomes a row of missing values.
+    """
     missing = [np.nan] * len(use)
     rows: list[list[float]] = []
     for offset, line in enumerate(lines):
@@ -335,14 +338,30 @@ def _number(field: str) -> float | None:
 
 @contextmanager
 def csv_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
-    """Write one header line and one line per sample. A missing value is written as ``nan``."""
+    """Write one header line and one line per sample. A missing value is written as ``nan``.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    names
+        Names of the columns.
+    """
     with path.open("w", encoding="ascii", newline="") as file:
         yield _line_appender(file, names)
 
 
 @contextmanager
 def csv_gz_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
-    """Write CSV compressed with gzip. The gzip header has no time stamp, so that equal columns give equal bytes."""
+    """Write CSV compressed with gzip. The gzip header has no time stamp, so that equal columns give equal bytes.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    names
+        Names of the columns.
+    """
     with (
         path.open("wb") as raw,
         gzip.GzipFile("", "wb", GZIP_LEVEL, raw, mtime=0) as packed,
@@ -359,6 +378,7 @@ def _line_appender(file: TextIO, names: Sequence[str]) -> Append:
     file.write(",".join(names) + "\n")
 
     def append(columns: Columns) -> None:
+        """Append rows to the file."""
         for start in range(0, columns[names[0]].size, BATCH_ROWS):
             fields = [map(repr, columns[name][start : start + BATCH_ROWS].tolist()) for name in names]
             file.writelines(",".join(row) + "\n" for row in zip(*fields, strict=True))

@@ -1,4 +1,4 @@
-"""Limits on what a reader takes into memory, and the available memory.
+"""Limits on the memory that a reader allocates, and the available memory.
 
 A reader checks the size of a recording before it allocates memory for the samples. If a process takes more memory than
 there is, the kernel ends the process and possibly the daemon on the same machine. A compressed file of a few megabytes

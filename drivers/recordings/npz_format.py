@@ -410,11 +410,19 @@ def npz_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
 
     An archive contains one array after the other, so columns are collected in temporary files without a name. These
     need 8 bytes per number in the folder of ``path`` while it is written.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    names
+        Names of the columns.
     """
     with ExitStack() as stack:
         gathered = {name: stack.enter_context(TemporaryFile(dir=path.parent)) for name in names}
 
         def append(columns: Columns) -> None:
+            """Append rows to the temporary files."""
             for name, file in gathered.items():
                 file.write(np.ascontiguousarray(columns[name]).data)
 

@@ -135,11 +135,11 @@ CONTENTS: Final = (
     (b"\x89PNG", "a picture", ()),
     (b"%PDF", "a PDF document", ()),
 )
-"""First bytes of files, what such a file is, and the suffixes under which a reader expects it."""
+"""First bytes of files, the kind of such a file, and the suffixes under which a reader expects it."""
 
 
 def looks_like(path: Path) -> str:
-    """Return the end of a message that says what the content of a file looks like and what to do.
+    """Return the end of a message that describes the content of a file and the remedy.
 
     The text is empty if the content matches the suffix, or if the kind of content is unknown.
     """

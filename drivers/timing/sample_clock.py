@@ -66,7 +66,9 @@ The check is given up after the first number if RATE_CHECK_S has passed as well,
 case.
 """
 MAX_GAP_SAMPLES: Final = 10**10
-"""Longest gap in samples, 116 days at 1 kHz. Given times that advance by more were set anew and count as this many."""
+"""Longest gap in samples, 116 days at 1 kHz. If given times advance by more, their clock was set, and the gap is
+limited to this number.
+"""
 MAX_OFFSET_S: Final = 4.6e9
 """Largest time from the first sample: half of the range of int64 nanoseconds."""
 MAX_STEP_TICKS: Final = 1 << 62
@@ -186,7 +188,7 @@ class SampleClock:
 
     @property
     def unchecked(self) -> bool:
-        """True if samples have arrived and the check of the nominal rate is still to come."""
+        """True if samples have arrived but the check of the nominal rate has not been made yet."""
         if self._check is None or self._check.measured_hz is not None or self._ended:
             return False
         if not self._stamped:
@@ -631,7 +633,7 @@ class _Delay:
     """Sudden delay of the arrivals that may turn out to be a gap."""
 
     since_ns: int  # first late arrival, or the arrival at which a gap was last reported
-    least_s: float  # minimum delay of all arrivals since then behind the line
+    least_s: float  # minimum lag of all arrivals since then relative to the line
     line: Line  # fitted to all arrivals since the first late one
 
 

@@ -156,7 +156,7 @@ def test_a_replay_s_end_ends_the_reader():
 @pytest.mark.parametrize("where", ["absent", "waiting", "running", "lost", "flooded", "before it began"])
 def test_it_ends_at_once_from_anywhere(where, monkeypatch):
     """The pauses and the waits for data are far longer than the test, so only an interrupted wait lets it end."""
-    for name in ("FIRST_PAUSE_S", "LONGEST_PAUSE_S"):
+    for name in ("MIN_RETRY_PAUSE_S", "MAX_RETRY_PAUSE_S"):
         monkeypatch.setattr(driver_module, name, FOREVER_S)
     rig = Rig(silence_s=0.0)
     if where == "before it began":

@@ -56,8 +56,8 @@ def measured() -> tuple[int, int, int]:
 
 
 def test_fifty_pulled_cables_leave_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(driver, "FIRST_PAUSE_S", 0.01)
-    monkeypatch.setattr(driver, "LONGEST_PAUSE_S", 0.05)
+    monkeypatch.setattr(driver, "MIN_RETRY_PAUSE_S", 0.01)
+    monkeypatch.setattr(driver, "MAX_RETRY_PAUSE_S", 0.05)
     with running(tmp_path, CONFIG) as run:
         for station in run.service.stations:
             counts = station.driver.counts

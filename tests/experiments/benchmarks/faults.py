@@ -248,7 +248,7 @@ def running(folder: Path, more: str = NO_ZENOH + NO_VIEWER) -> Iterator[Rig]:
 
 def cable(folder: Path, times: int) -> Outcome:
     """Out and in, again and again."""
-    pauses = mock.patch.multiple("drivers.driver", FIRST_PAUSE_S=0.01, LONGEST_PAUSE_S=0.05)
+    pauses = mock.patch.multiple("drivers.driver", MIN_RETRY_PAUSE_S=0.01, MAX_RETRY_PAUSE_S=0.05)
     with pauses, running(folder) as rig:
         for _ in range(times):
             rig.board.pull()

@@ -111,7 +111,7 @@ def test_another_cut_that_gives_other_samples_would_be_seen(monkeypatch: pytest.
 
     def forgetful(self: FrameBuffer, chunks: Sequence[Chunk]) -> Frames:
         frames = feed(self, chunks)
-        self._dropped += len(self._buffer)
+        self._buffer_offset += len(self._buffer)
         self._buffer = b""
         return frames
 

@@ -143,8 +143,8 @@ class Broken(SegmentWriter):
         if Broken.why is not None:
             Broken.refused += 1
             self._file.write(b"half a batch")
-            self._file.truncate(self._whole)
-            self._file.seek(self._whole)
+            self._file.truncate(self._valid_bytes)
+            self._file.seek(self._valid_bytes)
             raise OSError(Broken.why, os.strerror(Broken.why))
         super().samples(blocks, state)
 
