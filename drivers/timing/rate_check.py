@@ -17,7 +17,7 @@ AGREEMENT_LIMIT: Final = 0.005
 CONTRADICTION_LIMIT: Final = 0.02
 """Relative difference above which the configured rate is contradicted. Oscillators of sensors are better than this."""
 HYSTERESIS_FACTOR: Final = 0.75
-"""A contradiction ends below this share of the limit at which it began, so that it does not alternate."""
+"""A contradiction ends below this share of the limit at which it began, so that the decision does not alternate."""
 UPDATE_THRESHOLD: Final = 0.001
 """Relative change of the measured rate above which the rate in use is replaced."""
 
