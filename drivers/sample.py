@@ -148,9 +148,7 @@ class Event:
     t_ns: int
     text: str
     axis: str | None = None
-    what: Mapping[str, Mapping[str, float]] = field(
-        default_factory=dict
-    )  # numbers by coefficient, e.g. value and limit
+    what: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # by coefficient, e.g. value and limit
     since_ns: int | None = None  # time at which the condition began
     sigma: float | None = None  # significance in standard errors
 
