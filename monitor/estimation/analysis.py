@@ -27,7 +27,7 @@ from monitor.estimation.detection.change_detection import Change, ChangeDetector
 from monitor.estimation.detection.line_detection import lines, outliers
 from monitor.estimation.detection.motion_detection import Motion, find
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.bandwidth import LowPass, contradicted, power, sought, with_bandwidth
+from monitor.estimation.fit.bandwidth import LowPass, find_low_pass, is_contradicted, power, with_bandwidth
 from monitor.estimation.fit.coefficient_fit import Fit, Looks, design, fit
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.estimation.regular_grid import on_grid
@@ -171,7 +171,9 @@ def _fit_curve(
     looks = Looks(avar, terms, slope(values) * rate_hz, slopes(values, factors) * rate_hz)
     found = fit(columns, covariances, avar, terms, slope=looks.slope, slopes=looks.slopes)
     filters = [
-        sought(columns, covariances, looks.axis(axis), power(values[:, axis])) if contradicted(found, axis) else None
+        find_low_pass(columns, covariances, looks.axis(axis), power(values[:, axis]))
+        if is_contradicted(found, axis)
+        else None
         for axis in range(values.shape[1])
     ]
     found, filters = with_bandwidth(columns, covariances, looks, found, filters)

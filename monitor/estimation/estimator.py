@@ -29,8 +29,8 @@ from monitor.estimation.allan.uncertainty import AxisTables, Spans, Table, inter
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_spans
 from monitor.estimation.estimate import Course, Estimate
 from monitor.estimation.estimate import joined as joined_courses
-from monitor.estimation.fit.bandwidth import LowPass, contradicted, power, searching, with_bandwidth
-from monitor.estimation.fit.coefficient_fit import Fit, Looks, design, fit, joined, nothing_fitted
+from monitor.estimation.fit.bandwidth import LowPass, is_contradicted, power, search_low_pass, with_bandwidth
+from monitor.estimation.fit.coefficient_fit import Fit, Looks, concatenate_fits, design, fit, nothing_fitted
 from monitor.estimation.fit.continuous_refit import Refit
 from monitor.estimation.window_snapshot import Held, held
 
@@ -257,9 +257,9 @@ class Estimator:
             )  # fmt: skip
             self._theta[:, axes] = one.theta
             for column, axis in enumerate(axes.tolist()):
-                self._contradicting[axis] = (table, looks.axis(column)) if contradicted(one, column) else None
+                self._contradicting[axis] = (table, looks.axis(column)) if is_contradicted(one, column) else None
             fits.append(with_bandwidth(self._design, table, looks, one, [self._low_passes[axis] for axis in axes])[0])
-        result = fits[0] if len(fits) == 1 else joined(fits, np.concatenate(groups))
+        result = fits[0] if len(fits) == 1 else concatenate_fits(fits, np.concatenate(groups))
         self._entered = result.entered
         return result
 
@@ -279,7 +279,7 @@ class Estimator:
             self._search_axis = (self._search_axis + 1) % len(self._contradicting)
             odd = self._contradicting[self._search_axis]
             if odd is not None:
-                self._search = searching(
+                self._search = search_low_pass(
                     self._design, *odd, power(self._window.newest(self._search_axis, SPECTRUM_SAMPLES))
                 )
                 return

@@ -195,9 +195,7 @@ def moments(n: int, factor: int) -> Moments:
 
 
 def _points(places: Floats, n: int, m: int) -> tuple[Floats, Floats]:
-    """Return the phase points [i, 5] of the terms at ``places`` and their weights, including the end points of
-    reflection.
-    """
+    """Return the phase points [i, 5] of the terms at ``places`` and their weights, including the reflection points."""
     front, behind = places < m, places > n - m
     points = [0.0 * places, np.abs(places - m), places, np.minimum(places + m, 2 * n - m - places), n + 0.0 * places]
     signs = [2.0 * front, 1.0 - 2.0 * front, -2.0 + 0.0 * places, 1.0 - 2.0 * behind, 2.0 * behind]
@@ -233,8 +231,7 @@ def _covariance(n: int, m: int) -> Floats:
 
 
 def _pair_sums(n: int, m: int, step: float) -> Floats:
-    """Return Σ_jk r^a_jk r^b_jk [5, 5] over all pairs of terms of a record with points ``step`` samples apart on a
-    grid.
+    """Return Σ_jk r^a_jk r^b_jk [5, 5] over all pairs of terms of a record sampled every ``step`` samples.
 
     Quantization has two parts. The two ends are common to all reflected terms. Coinciding points lie along lines, so
     their number grows with the step, while the number of pairs grows with its square.
