@@ -15,7 +15,7 @@ from drivers.sample import AXES, Floats
 from monitor.common.rates import amount, plain
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.detection.change_detection import Change
-from monitor.estimation.detection.line_detection import FAR, Line, added
+from monitor.estimation.detection.line_detection import OUTLIER_SIGMA, Line, added
 from monitor.estimation.detection.motion_detection import Motion
 from monitor.estimation.fit.bandwidth import LowPass
 from monitor.estimation.fit.coefficient_fit import Fit
@@ -213,8 +213,8 @@ def of_departures(found: Sequence[Line], far: Floats) -> list[str]:
     shares = [f"{AXES[i]} {100.0 * far[i]:.2g} %" for i in np.flatnonzero(far > FAR_SHARE).tolist()]
     if shares:
         notes.append(
-            f"outliers beyond {FAR:g} σ of the other samples: {', '.join(shares)} of all; the noise is not Gaussian, "
-            "and intervals assume that it is"
+            f"outliers beyond {OUTLIER_SIGMA:g} σ of the other samples: {', '.join(shares)} of all; "
+            "the noise is not Gaussian, and intervals assume that it is"
         )
     return notes
 

@@ -10,10 +10,13 @@ the input into blocks.
   all z are therefore independent. The cost is two additions per sample and axis, for any number of octaves.
 - **Evidence.** n and S are the number and the sum of the z² since the start of the reference, n₁ and S₁ those since a
   suspected onset. The hypothesis "variance × r since the onset" is compared with "no change". The likelihood ratio uses
-  only quantities that do not depend on the unknown variance (the maximal invariant under scale): g = −(n/2) ln(1 − (1 −
-  1/r) S₁/S) − (n₁/2) ln r. For a long reference, g is Page's CUSUM, the sum of ½[u(1 − 1/r) − ln r]. For a short
-  reference, g includes the uncertainty of the reference. Without a change, the mean of the likelihood ratio e^g is 1
-  for every onset, so P(alarm within k looks) ≤ k e^−h (Shiryaev–Roberts). The onset moves on whenever g ≤ 0.
+  only quantities that do not depend on the unknown variance (the maximal invariant under scale). Its logarithm is
+
+      g = −(n/2) ln(1 − (1 − 1/r) S₁/S) − (n₁/2) ln r.
+
+  For a long reference, g is Page's CUSUM, the sum of ½[u(1 − 1/r) − ln r]. For a short reference, g includes the
+  uncertainty of the reference. Without a change, the mean of the likelihood ratio e^g is 1 for every onset, so P(alarm
+  within k looks) ≤ k e^−h (Shiryaev–Roberts). The onset moves on whenever g ≤ 0.
 - **Non-Gaussian and dependent noise.** z² is clipped at ``CLIP`` times the reference, (4σ)². This affects 6e-5 of
   Gaussian z² and lowers their mean by 2e-4, in the reference and after the onset alike. g is divided by F, the ratio by
   which sums of z² scatter more than Gaussian ones. A second cascade of Haar differences over the z² measures F. Heavy
