@@ -28,7 +28,7 @@ from monitor.estimation.detection.line_detection import lines, outliers
 from monitor.estimation.detection.motion_detection import Motion, find
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.bandwidth import LowPass, find_low_pass, is_contradicted, power, with_bandwidth
-from monitor.estimation.fit.coefficient_fit import Fit, Looks, design, fit
+from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, design, fit
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.estimation.regular_grid import on_grid
 
@@ -168,14 +168,14 @@ def _fit_curve(
     n = len(values)
     avar, terms = overlapping(values, factors, each)
     columns, covariances = design(factors, rate_hz), table(n, factors)
-    looks = Looks(avar, terms, slope(values) * rate_hz, slopes(values, factors) * rate_hz)
-    found = fit(columns, covariances, avar, terms, slope=looks.slope, slopes=looks.slopes)
+    measured = MeasuredCurve(avar, terms, slope(values) * rate_hz, slopes(values, factors) * rate_hz)
+    found = fit(columns, covariances, avar, terms, slope=measured.slope, slopes=measured.slopes)
     filters = [
-        find_low_pass(columns, covariances, looks.axis(axis), power(values[:, axis]))
+        find_low_pass(columns, covariances, measured.axis(axis), power(values[:, axis]))
         if is_contradicted(found, axis)
         else None
         for axis in range(values.shape[1])
     ]
-    found, filters = with_bandwidth(columns, covariances, looks, found, filters)
+    found, filters = with_bandwidth(columns, covariances, measured, found, filters)
     lo, hi = intervals(avar, found.edf)
     return AllanCurve(factors / rate_hz, factors, avar, terms, found.edf, lo, hi, n), found, filters

@@ -231,6 +231,7 @@ def _group_by_frequency(found: Sequence[Line]) -> list[list[Line]]:
 
 
 def _line_name(line: Line) -> str:
+    """Return the name of a line or a resonance with its frequency."""
     return f"{'a resonance about' if line.wide else 'a line at'} {line.frequency_hz:.4g} Hz"
 
 
@@ -244,14 +245,15 @@ def _line_names(found: Sequence[Line]) -> dict[Line, str]:
 
 
 def _count_omitted(count: int, what: str) -> list[str]:
+    """Return a note with the number of omitted notes, if there are any."""
     return [f"and {count - MAX_NOTES} more {what}"] if count > MAX_NOTES else []
 
 
 def _departure(curve: AllanCurve, fit: Fit, axis: int) -> Run:
     """Return the first and last τ of the range in which the curve of one axis exceeds the fit by the largest factor.
 
-    Noise outside the five terms adds to the curve. The fit is pulled towards it, so the largest residuals in σ lie
-    elsewhere: where the curve is below the fit, and at the shortest τ, which are known best. Only residuals above
+    Noise outside the five terms adds to the curve, and the fit is pulled towards it. The largest residuals in σ are
+    therefore elsewhere: where the curve is below the fit, and at the accurately known shortest τ. Only residuals above
     ``DEPARTURE_SIGMA`` count.
     """
     model, edf = fit.fitted[:, axis], fit.edf[:, axis]
@@ -269,6 +271,7 @@ def _departure(curve: AllanCurve, fit: Fit, axis: int) -> Run:
 
 
 def _append_axis(axes: dict[str, list[str]], axis: str, text: str) -> None:
+    """Add an axis to the note with this text."""
     axes.setdefault(text, []).append(axis)
 
 
@@ -300,6 +303,7 @@ def _left_out_note(tau_s: Floats, axes: Collection[int], why: str) -> str:
 
 
 def _bandwidth_note(low_pass: LowPass, rate_hz: float) -> str:
+    """Format the note on the low-pass of the sensor."""
     return (
         f"white noise ends below half the sample rate, as behind a {ORDINALS[low_pass.order]}-order low-pass at about "
         f"{low_pass.cutoff * rate_hz:.2g} Hz; N is the level below it"

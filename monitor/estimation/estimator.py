@@ -25,14 +25,14 @@ from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.live_total_hadamard import SlowStatistics
 from monitor.estimation.allan.total import TotalCurve
-from monitor.estimation.allan.uncertainty import AxisTables, Spans, Table, intervals
+from monitor.estimation.allan.uncertainty import AxisTables, SpanDegreesOfFreedom, Table, intervals
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_spans
 from monitor.estimation.estimate import Course, Estimate
 from monitor.estimation.estimate import joined as joined_courses
 from monitor.estimation.fit.bandwidth import LowPass, is_contradicted, power, search_low_pass, with_bandwidth
-from monitor.estimation.fit.coefficient_fit import Fit, Looks, concatenate_fits, design, fit, nothing_fitted
+from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, concatenate_fits, design, fit, nothing_fitted
 from monitor.estimation.fit.continuous_refit import Refit
-from monitor.estimation.window_snapshot import Held, held
+from monitor.estimation.window_snapshot import Held, copy_window
 
 SETTLING_FITS: Final = 10
 """Number of successive fits after which a fit has converged. Each fit leaves a quarter of the remaining error."""
@@ -77,7 +77,7 @@ class Estimator:
         self._factors = factors
         self._design = design(factors, rate_hz)
         self._tables = AxisTables(factors, length)
-        self._spans = Spans(factors, spans, self._design.columns)
+        self._spans = SpanDegreesOfFreedom(factors, spans, self._design.columns)
         self._entered: NDArray[np.bool_] = np.zeros((5, 6), np.bool_)
         self._lengths = np.zeros(6, np.int64)  # samples of each axis since its last restart, limited to the window
         self._refit = Refit(self._window, self._m, self._tables) if every_sample else None
@@ -85,7 +85,7 @@ class Estimator:
         self._course_samples = 0  # total number of samples in ``_course``
         self._total_hadamard = SlowStatistics(self._window)
         self._theta = np.full((5, 6), np.nan)  # squared coefficients of the newest fit
-        self._contradicting: list[tuple[Table, Looks] | None] = [None] * 6  # curves that contradict their fit
+        self._contradicting: list[tuple[Table, MeasuredCurve] | None] = [None] * 6  # curves that contradict their fit
         self._low_passes: list[LowPass | None] = [None] * 6
         self._search_axis = 0  # axis whose low-pass filter is being searched for
         self._search: Generator[None, None, LowPass | None] | None = None
@@ -109,7 +109,7 @@ class Estimator:
 
     def held(self) -> Held:
         """Return a copy of the samples in the window."""
-        return held(self._window, self.rate_hz)
+        return copy_window(self._window, self.rate_hz)
 
     def update(self, samples: SampleBlock) -> None:
         """Advance the window by the samples missing before the block, then by the block itself."""
@@ -247,18 +247,20 @@ class Estimator:
         for axes in groups:
             n = int(lengths[axes[0]])
             table = self._tables.of(int(axes[0]), n, self._window.n).at(n)
-            looks = Looks(
+            measured = MeasuredCurve(
                 avar[:, axes], terms[:, axes], slope[axes] * self.rate_hz, slopes[:, axes] * self.rate_hz,
                 before[:, axes],
             )  # fmt: skip
             one = fit(
-                self._design, table, looks.avar, looks.terms, looks.before, looks.slope, looks.slopes,
+                self._design, table, measured.avar, measured.terms, measured.before, measured.slope, measured.slopes,
                 start=self._theta[:, axes],
             )  # fmt: skip
             self._theta[:, axes] = one.theta
             for column, axis in enumerate(axes.tolist()):
-                self._contradicting[axis] = (table, looks.axis(column)) if is_contradicted(one, column) else None
-            fits.append(with_bandwidth(self._design, table, looks, one, [self._low_passes[axis] for axis in axes])[0])
+                self._contradicting[axis] = (table, measured.axis(column)) if is_contradicted(one, column) else None
+            fits.append(
+                with_bandwidth(self._design, table, measured, one, [self._low_passes[axis] for axis in axes])[0]
+            )
         result = fits[0] if len(fits) == 1 else concatenate_fits(fits, np.concatenate(groups))
         self._entered = result.entered
         return result

@@ -24,7 +24,7 @@ from drivers.timing.duplicate_rows import NS
 from drivers.timing.sample_clock import JUMP_S, LONG_S, SampleClock
 from monitor.common.rates import amount, plain
 from monitor.estimation.detection.repeated_samples import stale_share
-from monitor.estimation.detection.resolution import Steps, coarse
+from monitor.estimation.detection.resolution import QuantizationStep, coarse
 from monitor.estimation.late_rows import truly_missing
 
 MIN_RATE_DEVIATION: Final = 0.002
@@ -126,6 +126,7 @@ def _stamp(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[list[S
 
 
 def _value_notes(values: Floats) -> list[str]:
+    """Format the notes on repeated rows and on coarse resolution."""
     return _repeated_notes(values) + _resolution_notes(coarse(values))
 
 
@@ -179,10 +180,12 @@ def _contiguous(parts: Sequence[Floats]) -> Floats | None:
 
 
 def _address(array: Floats) -> int:
+    """Return the memory address of the first element."""
     return int(array.__array_interface__["data"][0])
 
 
 def _missing_notes(lost: Ints, rate_hz: float) -> list[str]:
+    """Format the notes on long pauses and on missing samples."""
     long, short = lost[lost > LONGEST_HOLE], lost[(lost > 0) & (lost <= LONGEST_HOLE)]
     notes = [f"a pause of {n / rate_hz:.6g} s is too long to keep in place; no term reaches across" for n in long]
     if short.size:
@@ -193,6 +196,7 @@ def _missing_notes(lost: Ints, rate_hz: float) -> list[str]:
 
 
 def _late_notes(late: int) -> list[str]:
+    """Format the note on late samples."""
     if not late:
         return []
     times = "once" if late == 1 else f"{late} times"
@@ -202,6 +206,7 @@ def _late_notes(late: int) -> list[str]:
 
 
 def _repeated_notes(values: Floats) -> list[str]:
+    """Format the note on rows that repeat the previous one."""
     share = stale_share(values)
     if share < MIN_REPEATED_SHARE:
         return []
@@ -209,9 +214,9 @@ def _repeated_notes(values: Floats) -> list[str]:
     return [f"{percent:.2g} % of rows repeat the one before: the sensor updates slower than it is read; they are kept"]
 
 
-def _resolution_notes(found: Sequence[Steps]) -> list[str]:
+def _resolution_notes(found: Sequence[QuantizationStep]) -> list[str]:
     """Format the notes on coarse resolution, grouped by unit and step size."""
-    alike: dict[str, list[Steps]] = {}
+    alike: dict[str, list[QuantizationStep]] = {}
     for one in found:
         alike.setdefault(amount(AXES[one.axis], one.step), []).append(one)
     notes = []
@@ -243,6 +248,7 @@ def _step_notes(steps: Ints, progress: tuple[Floats, Floats] | None, rate_hz: fl
 
 
 def _uneven_notes(steps: Ints, rate_hz: float) -> list[str]:
+    """Format the note on uneven time steps, or on the resolution of the time stamps that causes them."""
     if _is_even(steps):
         return []
     low, middle, high = (np.quantile(steps, [0.1, 0.5, 0.9]) / NS).tolist()

@@ -57,7 +57,7 @@ class Held:
         return np.column_stack(columns)
 
 
-def held(window: AllanWindow, rate_hz: float) -> Held:
+def copy_window(window: AllanWindow, rate_hz: float) -> Held:
     """Return a copy of the current content of a window.
 
     Parameters
@@ -163,6 +163,7 @@ class Temperatures:
         return self._ring[(self._next - np.arange(n, 0, -1)) % self._ring.size].astype(np.float64)
 
     def _write(self, temperature_c: Floats) -> None:
+        """Write temperatures to the ring, across its end if necessary."""
         before = min(self._ring.size - self._next, len(temperature_c))  # samples that fit before the end of the ring
         self._ring[self._next : self._next + before] = temperature_c[:before]
         self._ring[: len(temperature_c) - before] = temperature_c[before:]

@@ -41,7 +41,7 @@ Column = tuple[Floats, Ints]
 EachAxis = Callable[[Callable[[Floats], Column], Iterable[Floats]], Iterable[Column]]
 """Signature of ``map`` or of the ``map`` of a thread pool."""
 
-PRESENT: Final = 0.98
+MIN_PRESENT_SHARE: Final = 0.98
 """Minimum share of samples that must be present for a slope."""
 BLOCK: Final = 16_384
 """Number of phase points in a block. Three blocks fill a third of a second-level cache of 1 MB."""
@@ -122,7 +122,9 @@ def slope(values: Floats) -> Floats:
     newest = np.ascontiguousarray(values[len(values) - 3 * third :], np.float64)
     parts = [_mean(newest[part * third : (part + 1) * third]) for part in range(3)]
     counts = np.stack([count for count, _ in parts])
-    whole = (counts.sum(axis=0) >= PRESENT * 3 * third) & (counts[::2] >= PRESENT * third).all(axis=0)
+    whole = (counts.sum(axis=0) >= MIN_PRESENT_SHARE * 3 * third) & (counts[::2] >= MIN_PRESENT_SHARE * third).all(
+        axis=0
+    )
     return np.where(whole, (parts[2][1] - parts[0][1]) / (2.0 * third), np.nan)
 
 
@@ -163,7 +165,7 @@ def slopes(values: Floats, factors: Ints) -> Floats:
 def _present_mean(values: Floats) -> Floats:
     """Return the mean [k] of the present values of [n, k]; NaN where too many are missing."""
     count, mean = _mean(values)
-    return np.where(count < PRESENT * len(values), np.nan, mean)
+    return np.where(count < MIN_PRESENT_SHARE * len(values), np.nan, mean)
 
 
 @compiled

@@ -1,14 +1,16 @@
 """Mean and covariance of squared phase differences, for the bias and the degrees of freedom of a variance.
 
 A variance of the Allan family is an average over k of squares d_k². Here d_k = Σ_p w_p x(k_p) is a weighted sum of a
-few phase points that does not depend on a constant rate: Σ w_p = Σ w_p k_p = 0. Its covariance is Cov(d_j, d_k) = Σ_pq
-w_p w_q G(j_p − k_q) with the generalised autocovariances G of phase (Q δ, N −|t|/2, B t² ln|t| / 2π, K (|t|³ −
-|t|)/12). This also holds where points were reflected at the ends of a record. For Gaussian noise (Isserlis), Cov(d_j²,
-d_k²) = 2 Cov(d_j, d_k)².
+few phase points. It does not depend on a constant rate, because Σ w_p = Σ w_p k_p = 0.
 
-``Moments`` holds, for one cluster size, the mean of the variance and of the Allan variance for unit coefficients, and
-the quadratic form of the variance of the estimate. A ramp shifts a second difference by a known amount. The square of
-this amount adds to the mean, and its product with the noise adds to the variance. The ramp alone adds no variance.
+The covariance of two differences is Cov(d_j, d_k) = Σ_pq w_p w_q G(j_p − k_q). G is the generalised autocovariance of
+phase (Q δ, N −|t|/2, B t² ln|t| / 2π, K (|t|³ − |t|)/12). This also holds where points were reflected at the ends of a
+record. For Gaussian noise (Isserlis), Cov(d_j², d_k²) = 2 Cov(d_j, d_k)².
+
+``Moments`` holds the mean of the variance and of the Allan variance for unit coefficients at one cluster size. It also
+holds the quadratic form that gives the variance of the estimate. A ramp shifts a second difference by a known amount.
+The square of this amount adds to the mean, and its product with the noise adds to the variance. The ramp alone adds no
+variance.
 
 All quantities are in units of one sample: τ0 = 1, and θ = Q²/τ0², N²/τ0, B², K² τ0, R² τ0².
 """
@@ -24,7 +26,7 @@ from drivers.sample import Floats, Ints
 from monitor.estimation.allan.uncertainty import intervals
 from monitor.estimation.fit.coefficient_fit import TO_SI
 
-SOURCES: Final = 5
+NUM_COEFFICIENTS: Final = 5
 """Number of coefficients Q N B K R, in the order of θ."""
 
 _BLOCK_GROWTH: Final = 1.5
@@ -106,11 +108,12 @@ def autocovariance(t: Floats) -> Floats:
     return np.stack([np.where(t == 0.0, 1.0, 0.0), -0.5 * t, flicker, (t * t - 1.0) * t / 12.0])
 
 
-def nodes(begin: int, end: int, kinks: Iterable[int]) -> tuple[Floats, Floats]:
+def quadrature_nodes(begin: int, end: int, kinks: Iterable[int]) -> tuple[Floats, Floats]:
     """Return nodes and weights that sum a function over begin ≤ k < end. The function is smooth except at the kinks.
 
     The blocks grow with the distance to the nearest kink. Each block uses the three-point Gauss rule of L equally
-    spaced points, exact to degree 5: their second and fourth moments are (L² − 1)/12 and (L² − 1)(3L² − 7)/240.
+    spaced points, which is exact to degree 5. The second and fourth moments of these points are (L² − 1)/12 and (L² −
+    1)(3L² − 7)/240.
 
     Parameters
     ----------

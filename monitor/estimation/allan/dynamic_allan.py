@@ -1,8 +1,8 @@
 """Dynamic Allan variance of a whole recording: Allan deviation and coefficients Q N B K R as functions of time.
 
 A window slides along the recording in steps. At each step, the overlapping Allan variance of the window is computed and
-fitted, as in the live ``Estimator`` ("Dynamic extraction of random drift error coefficients of MEMS gyroscopes": the
-windowed variance is updated sample by sample, then fitted by least squares). Changes become visible that a curve of the
+fitted, as in the live ``Estimator``. The variance is updated sample by sample, and a least-squares fit follows
+("Dynamic extraction of random drift error coefficients of MEMS gyroscopes"). Changes become visible that a curve of the
 whole recording averages out. The terms use the hysteresis of a repeated fit, so each fit receives the terms of the fit
 before.
 

@@ -18,8 +18,15 @@ import numpy as np
 
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.estimation.allan.difference_moments import SOURCES, Moments, autocovariance, nodes, per_sample, spread
-from monitor.estimation.allan.total import octaves, phase_of
+from monitor.estimation.allan.difference_moments import (
+    NUM_COEFFICIENTS,
+    Moments,
+    autocovariance,
+    per_sample,
+    quadrature_nodes,
+    spread,
+)
+from monitor.estimation.allan.total import integrate_to_phase, octaves
 
 MAX_LAG_CLUSTERS: Final = 16
 """Distance in clusters beyond which terms count as uncorrelated.
@@ -62,7 +69,7 @@ def hadamard(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     >>> hadamard(ramp + np.tile([[0.0], [0.5]], (45, 1)), np.array([1, 2]))[0].ravel().round(12).tolist()
     [0.166666666667, 0.0]
     """
-    phase, missing = phase_of(values)
+    phase, missing = integrate_to_phase(values)
     sums = np.zeros((factors.size, values.shape[1]))
     terms = np.zeros(sums.shape, np.int64)
     for i, m in enumerate(factors):
@@ -145,13 +152,13 @@ def moments(n: int, factor: int) -> Moments:
     18000
     """
     terms = n + 1 - 3 * factor
-    lags, weights = nodes(0, min(terms, MAX_LAG_CLUSTERS * factor), [factor, 2 * factor, 3 * factor])
+    lags, weights = quadrature_nodes(0, min(terms, MAX_LAG_CLUSTERS * factor), [factor, 2 * factor, 3 * factor])
     shared = np.zeros((4, lags.size))
     for p, weight in zip(range(-3, 4), (-1.0, 6.0, -15.0, 20.0, -15.0, 6.0, -1.0), strict=True):
         shared += weight * autocovariance(lags + p * factor)
     pairs = weights * (terms - lags) * np.where(lags > 0.0, 2.0, 1.0)
     scale = 1.0 / (6.0 * factor**2)
-    mean, covariance = np.zeros(SOURCES), np.zeros((SOURCES, SOURCES))
+    mean, covariance = np.zeros(NUM_COEFFICIENTS), np.zeros((NUM_COEFFICIENTS, NUM_COEFFICIENTS))
     mean[:4] = scale * shared[:, np.argmin(lags)]
     covariance[:4, :4] = 2.0 * (scale / terms) ** 2 * (shared * pairs @ shared.T)
     return Moments(n, factor, terms, mean, mean, covariance)

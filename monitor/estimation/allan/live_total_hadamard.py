@@ -141,6 +141,7 @@ class SlowStatistics:
                 yield
 
     def _total(self, m: int) -> _Result:
+        """Compute the total variance at one cluster size."""
         phase, missing, first, unit = self._window.ring()
         n = self._window.n
         sums, terms = np.zeros(AXES), np.zeros(AXES, np.int64)
@@ -158,6 +159,7 @@ class SlowStatistics:
         return _Result(variance, terms, self._cached_moments(TOTAL, n, m))
 
     def _hadamard(self, m: int) -> _Result:
+        """Compute the Hadamard variance at one cluster size."""
         phase, missing, first, unit = self._window.ring()
         n = self._window.n
         sums, terms = np.zeros(AXES), np.zeros(AXES, np.int64)

@@ -31,7 +31,14 @@ from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.estimation.allan.difference_moments import SOURCES, Moments, autocovariance, nodes, per_sample, spread
+from monitor.estimation.allan.difference_moments import (
+    NUM_COEFFICIENTS,
+    Moments,
+    autocovariance,
+    per_sample,
+    quadrature_nodes,
+    spread,
+)
 
 MIN_SHARE: Final = 0.5
 """Minimum share of terms for a correction.
@@ -43,7 +50,7 @@ MAX_EXACT_TERMS: Final = 256
 """Maximum number of terms whose covariances are summed one by one. A longer record is sampled on a grid this coarse."""
 MIN_CLUSTER_POINTS: Final = 32
 """Minimum number of grid points in a cluster if the record is much longer than the cluster."""
-_RAMP: Final = SOURCES - 1
+_RAMP: Final = NUM_COEFFICIENTS - 1
 """Row of the ramp R in θ."""
 
 
@@ -80,7 +87,7 @@ def total(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     >>> total(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().round(9).tolist()
     [0.5, 0.002525253]
     """
-    phase, missing = phase_of(values)
+    phase, missing = integrate_to_phase(values)
     n = len(values)
     sums = np.zeros((factors.size, values.shape[1]))
     terms = np.zeros(sums.shape, np.int64)
@@ -140,7 +147,7 @@ def octaves(longest: int) -> Ints:
     return 2 ** np.arange(max(longest, 1).bit_length(), dtype=np.int64)
 
 
-def phase_of(values: Floats) -> tuple[Floats, NDArray[np.int32]]:
+def integrate_to_phase(values: Floats) -> tuple[Floats, NDArray[np.int32]]:
     """Return the phase of the mean-free rate and the running count of missing samples, both [n + 1, k] in C order."""
     phase = np.zeros((len(values) + 1, values.shape[1]))
     missing = np.zeros(phase.shape, np.int32)
@@ -186,7 +193,7 @@ def moments(n: int, factor: int) -> Moments:
     >>> print(f"{one.mean[3] / one.allan[3]:.3f}")
     0.625
     """
-    places, weights = nodes(1, n, [-(-factor // 2), factor, n - factor, n - factor // 2])
+    places, weights = quadrature_nodes(1, n, [-(-factor // 2), factor, n - factor, n - factor // 2])
     points, signs = _points(places, n, factor)
     half = 0.5 / factor**2
     mean = half / (n - 1) * (_squares(points, signs) @ weights)
@@ -244,16 +251,16 @@ def _pair_sums(n: int, m: int, step: float) -> Floats:
     ends = signs[:, [0, 4]] @ signs[:, [0, 4]].T
     random[0] -= ends
     ramp = (signs * 0.5 * (step * points) ** 2).sum(axis=1)
-    parts = np.concatenate([random, np.outer(ramp, ramp)[None], ends[None]]).reshape(SOURCES + 1, -1)
+    parts = np.concatenate([random, np.outer(ramp, ramp)[None], ends[None]]).reshape(NUM_COEFFICIENTS + 1, -1)
     products = step * step * (parts @ parts.T)
     products[0] /= step
     products[1:, 0] /= step
     products[0, 0] = step * (parts[0] @ parts[0])
     products[_RAMP, _RAMP] = 0.0  # a ramp alone has no variance
-    joined = products[:SOURCES, :SOURCES]
-    joined[0] += products[SOURCES, :SOURCES]
-    joined[:, 0] += products[:SOURCES, SOURCES]
-    joined[0, 0] += products[SOURCES, SOURCES]
+    joined = products[:NUM_COEFFICIENTS, :NUM_COEFFICIENTS]
+    joined[0] += products[NUM_COEFFICIENTS, :NUM_COEFFICIENTS]
+    joined[:, 0] += products[:NUM_COEFFICIENTS, NUM_COEFFICIENTS]
+    joined[0, 0] += products[NUM_COEFFICIENTS, NUM_COEFFICIENTS]
     return np.asarray(joined)
 
 

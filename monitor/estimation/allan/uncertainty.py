@@ -43,7 +43,7 @@ LAG_STEP: Final = 0.5
 TAIL: Final = 8.0
 """Lag in units of (m_i + m_j) beyond which the differences of t² ln t are computed from their series."""
 
-FOR_EVER: Final = 1 << 62
+UNLIMITED_SAMPLES: Final = 1 << 62
 """Number of samples that stands for an unlimited time."""
 
 TABLE_STEP: Final = 1.1
@@ -86,10 +86,13 @@ class Tables:
         return known
 
     def lasts(self, n: int) -> int:
-        """Return for how many samples ``at(n)`` stays valid, including sample n; ``FOR_EVER`` for a full window."""
+        """Return for how many samples ``at(n)`` stays valid, including sample n.
+
+        The number is ``UNLIMITED_SAMPLES`` for a full window.
+        """
         known = self.at(n)
         if n >= self._capacity:
-            return FOR_EVER
+            return UNLIMITED_SAMPLES
         return min(self._capacity, math.ceil(TABLE_STEP * known.n)) - n
 
 
@@ -193,7 +196,7 @@ def _bend_covariance(n: int, m: int) -> Floats:
     return np.array([float((weight * part).sum()) for part in parts])
 
 
-class Spans:
+class SpanDegreesOfFreedom:
     """Degrees of freedom of a curve whose τ use different spans.
 
     Parameters

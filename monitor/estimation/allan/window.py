@@ -8,9 +8,9 @@ sample adds one term and evicts one term per τ and axis, so the cost does not d
 The sums stay exact for years for three reasons:
 
 - Phase is an integer, the running sum of y · 2^s modulo 2⁶⁴. The rounding error of each sample is carried to the next.
-  A second difference x_k - 2x_{k-m} + x_{k-2m} is therefore exact to one unit of 2^-s, even if phase has wandered or
-  wrapped, with or without 9.81 m/s² on the axis. The exponent s is chosen so that full-scale input cannot overflow at
-  the longest τ.
+  A second difference x_k - 2x_{k-m} + x_{k-2m} is therefore exact to one unit of 2^-s. This holds even if phase has
+  wandered or wrapped, with or without 9.81 m/s² on the axis. The exponent s is chosen so that full-scale input cannot
+  overflow at the longest τ.
 - The same integers give the same squares when a term is added and when it is evicted. S_m is stored as a double
   together with the exact sum of its rounding errors (Knuth's TwoSum). The contribution of a transient is therefore
   removed again to 2⁻¹⁰⁶ of the largest sum ever held.

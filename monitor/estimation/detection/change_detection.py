@@ -156,7 +156,7 @@ class ChangeDetector:
         self.rate_hz = rate_hz
         self._octaves = min(max(floor(log2(MAX_CLUSTER_S * rate_hz)), 7), 20) + 1
         self._state = make_state(self._octaves)
-        looks = 86_400.0 * rate_hz * len(AXES)  # z² a day, and pairs of blocks a day
+        looks = 86_400.0 * rate_hz * len(AXES)  # z² per day, and pairs of blocks per day
         # computed from the lower tail, because 1 - p would be rounded to 1 for p below 1e-16
         once = -NormalDist().inv_cdf(min(0.5 * OTHER_SHARE * alarms_per_day / looks, 0.01))
         self._state.levels[:] = (
@@ -271,6 +271,7 @@ class ChangeDetector:
         return float((quantile(0.5 + 0.5 * usual) / quantile(0.5 + 0.5 * max(now, 1e-3))) ** 2)
 
     def _report_noise_change(self, axis: int, alarm: Floats, after: Floats, before_n: Floats, before_s: Floats) -> None:
+        """Report a noise change, and make the samples since the onset the new reference."""
         s = self._state
         band = s.band[axis]
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -290,6 +291,7 @@ class ChangeDetector:
         band[keep, LIMIT], band[keep, SEEDED] = CLIP * v1[keep], SEED
 
     def _report_burst(self, axis: int, alarm: Floats, after: Floats, before_n: Floats, before_s: Floats) -> None:
+        """Report a burst of outliers after its end, and remove it from the reference."""
         s = self._state
         now = self.samples
         latest = s.cum[axis, 0, UNIT_EXTREME] - self._cum_at(now - MIN_DWELL_SAMPLES // 2)[axis, 0, UNIT_EXTREME]
@@ -315,6 +317,7 @@ class ChangeDetector:
         self._clear_suspicion(axis)
 
     def _report_step(self, axis: int, alarm: Floats) -> None:
+        """Report a step of the bias."""
         before, after = (float(x) for x in self._state.step[axis, [BEFORE, AFTER]])
         text = f"{AXES[axis]} bias stepped by {amount(AXES[axis], after - before, sign=True)}"
         sigma = sqrt(2.0 * alarm[EVIDENCE])
@@ -355,6 +358,7 @@ def _noise_text(axis: str, what: Mapping[str, tuple[float, float]]) -> str:
 
 
 def _format_change(before: float, after: float) -> str:
+    """Format a relative change in percent."""
     if before == 0.0:
         return "appeared"
     if after == 0.0:

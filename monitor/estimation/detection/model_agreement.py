@@ -28,6 +28,8 @@ CLEAR_FACTOR: Final = 2.0
 
 @dataclass(slots=True)
 class _Axis:
+    """State of the decision for one axis."""
+
     agrees: bool | None = None  # None until the first decision
     since: tuple[int, int] | None = None  # samples and t_ns of the first comparison that contradicts the decision
 
@@ -49,8 +51,9 @@ class Agreement:
         return [event for event in found if event is not None]
 
     def _look(self, axis: _Axis, gap: AxisGap, look: ModelGap) -> Event | None:
+        """Update the decision for one axis, and return an event if it changed."""
         if axis.agrees is None and gap.gap <= gap.alarm:
-            axis.agrees = True  # nothing to tell
+            axis.agrees = True  # a first decision for agreement is not reported
         contradicted = gap.gap < gap.null95 if axis.agrees is False else gap.gap > gap.alarm
         if not contradicted:
             axis.since = None
@@ -66,6 +69,7 @@ class Agreement:
 
 
 def _event(gap: AxisGap, agrees: bool, t_ns: int, since_ns: int) -> Event:
+    """Build the event for a changed decision."""
     lo, hi = gap.tau_s
     what = {
         "agrees": agrees,

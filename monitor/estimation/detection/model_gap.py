@@ -1,6 +1,6 @@
 """Comparison of the Allan curve of the live window with the curve of the noise model of the sensor, for each axis.
 
-For each axis of the model, the comparison returns the difference at each τ in standard deviations, the largest
+For each axis of the model, the comparison gives the difference at each τ in standard deviations, the largest
 difference (the gap), its τ, and the limits for chance. ``model_agreement.Agreement`` converts successive comparisons
 into events. It keeps a decision until new samples have confirmed another one.
 
@@ -165,7 +165,7 @@ class _Expected:
 
     @classmethod
     def of(cls, model: NoiseModel, axis: str, factors: Ints, rate_hz: float) -> "_Expected":
-        """Compute the expected values of one axis of a model."""
+        """Compute the expected values of one axis of a model at the given cluster sizes."""
         spectrum = model.spectrum(axis, 1.0 / rate_hz)
         tau_s = factors / rate_hz
         shape, classic = _standard_terms(model, axis, rate_hz)

@@ -78,20 +78,30 @@ FEWEST: Final = 4
 """Minimum number of samples in a block for a decision. At least half of the block must be present as well."""
 
 OPEN, HELD, HELD_MOVES, QUIET_RUN, BEGAN, LATEST, STILL, QUIET, RECENT, TURNED = range(10)
-"""Elements of ``State.place``.
+"""Elements of ``State.place``:
 
-They are: current block, block whose decision is pending (-1 means none) and this decision, quiet blocks since the last
-moving one, first (-1 means none) and latest moving block of the open episode, blocks that were still, blocks quieter
-than the reference, total number of blocks, and whether the orientation changed in the episode.
+- ``OPEN``: block being filled.
+- ``HELD``, ``HELD_MOVES``: block whose decision is pending (-1 means none), and this decision.
+- ``QUIET_RUN``: quiet blocks since the last moving one.
+- ``BEGAN``, ``LATEST``: first (-1 means none) and latest moving block of the open episode.
+- ``STILL``: blocks that were still.
+- ``QUIET``: blocks quieter than the reference.
+- ``RECENT``: total number of blocks.
+- ``TURNED``: whether the orientation changed in the episode.
 """
 FIRST, LAST, CHANGED, AXIS, PEAK = range(5)
 """Columns of an episode: first and last moving block, whether the orientation changed, axis and size of the peak."""
 LOG_VARIANCE, MEAN = 0, 1
 """Kinds of block statistics, the first index of the rings."""
 COUNT, SHIFT, SUM, SQUARES, LOW, HIGH, BEFORE, STEP = range(8)
-"""Columns of ``State.open``.
+"""Columns of ``State.open``:
 
-They are: number of samples, first sample, sums about it, extremes, previous sample, and smallest step so far.
+- ``COUNT``: number of samples.
+- ``SHIFT``: first sample.
+- ``SUM``, ``SQUARES``: sums of the deviations from the first sample and of their squares.
+- ``LOW``, ``HIGH``: extremes.
+- ``BEFORE``: previous sample.
+- ``STEP``: smallest step so far.
 """
 
 

@@ -25,7 +25,7 @@ BISECTIONS: Final = 40
 def stale_share(values: Floats) -> float:
     """Return the share of rows [n, 6] that repeat the previous one because the sensor had no new measurement.
 
-    If a share s of the rows is repeated, axis a repeats in p_a = s + (1 - s) q_a of the rows, where q_a is due to its
+    Let s be the share of repeated rows. Axis a repeats in p_a = s + (1 - s) q_a of the rows, where q_a is due to its
     resolution. All axes repeat at once in s + (1 - s) Π q_a, because the noises of the axes are independent. This is
     one equation for s. NaN means missing.
 

@@ -29,7 +29,7 @@ GAUSSIAN: Final = 0.8862269254527580
 
 
 @dataclass(frozen=True, slots=True)
-class Steps:
+class QuantizationStep:
     """Quantization step and noise of one axis."""
 
     axis: int  # index into AXES
@@ -37,7 +37,7 @@ class Steps:
     noise: float  # σ from sample to sample, including quantization, rad/s or m/s²
 
 
-def coarse(values: Floats) -> list[Steps]:
+def coarse(values: Floats) -> list[QuantizationStep]:
     """Return the axes whose values [n, 6] have steps of at least ``COARSE`` of their noise.
 
     >>> noise = np.random.default_rng(0).standard_normal((20_000, 6))
@@ -57,7 +57,7 @@ def coarse(values: Floats) -> list[Steps]:
         levels = np.unique(np.concatenate(parts))
         step = _step(levels[np.isfinite(levels)], COARSE * noise)
         if step is not None and noise > 0.0:
-            found.append(Steps(axis, step, noise))
+            found.append(QuantizationStep(axis, step, noise))
     return found
 
 

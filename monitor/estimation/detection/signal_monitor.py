@@ -107,15 +107,18 @@ class Watch:
         return still
 
     def _begin(self) -> None:
+        """Start new detectors at the current rate."""
         self._began = self._received
         self._rest = Rest(self._rate_hz)
         self._first = 0  # index since then of the first sample that the change detector received
         self._changes = self._detector() if self._alarms_per_day > 0.0 else None
 
     def _detector(self) -> ChangeDetector:
+        """Return a new change detector."""
         return ChangeDetector(self._rate_hz, self._alarms_per_day)
 
     def _with_pending(self, still: list[SampleBlock]) -> list[SampleBlock]:
+        """Return the pending blocks of the previous rate, followed by the given blocks."""
         earlier, self._pending = self._pending, []
         return earlier + still
 
@@ -146,10 +149,12 @@ class Watch:
                 self._restarts.append(Restart(change.axis, handed_on - change.since))
 
     def _motion_event(self, motion: Motion) -> Event:
+        """Convert an episode of motion to an event."""
         what = {"moved": {"seconds": motion.seconds, "peak": motion.peak}}
         return Event("moved", self._t_ns(motion.until), motion.text, motion.axis, what, self._t_ns(motion.since))
 
     def _change_event(self, change: Change) -> Event:
+        """Convert a change to an event."""
         what = {name: {"before": before, "after": after} for name, (before, after) in change.what.items()}
         found_ns, since_ns = self._t_ns(self._first + change.found), self._t_ns(self._first + change.since)
         return Event(change.kind, found_ns, change.text, AXES[change.axis], what, since_ns, change.sigma)

@@ -20,9 +20,9 @@ import numpy as np
 
 from drivers.sample import Floats, Ints
 from monitor.common.minimization import golden_section
-from monitor.estimation.allan.batch import PRESENT
+from monitor.estimation.allan.batch import MIN_PRESENT_SHARE
 from monitor.estimation.allan.uncertainty import Table
-from monitor.estimation.fit.coefficient_fit import Design, Fit, Looks, fit_columns, replace_axis
+from monitor.estimation.fit.coefficient_fit import Design, Fit, MeasuredCurve, fit_columns, replace_axis
 from monitor.estimation.fit.coefficients import Status
 from monitor.estimation.fit.confidence_bounds import BOUND, highest
 from monitor.estimation.fit.least_squares import N, Q
@@ -127,7 +127,7 @@ def power(rates: Floats) -> Floats:
     if begins[0] < 0 or len(rates) < MIN_STRETCHES * rows:
         return np.empty(0)
     parts = np.stack([rates[begin : begin + rows] for begin in begins])
-    parts = parts[np.isfinite(parts).mean(axis=1) >= PRESENT]
+    parts = parts[np.isfinite(parts).mean(axis=1) >= MIN_PRESENT_SHARE]
     if len(parts) < MIN_STRETCHES:
         return np.empty(0)
     parts = parts - np.nanmean(parts, axis=1, keepdims=True)
@@ -160,7 +160,7 @@ def seen(low_pass: LowPass, power: Floats) -> bool:
 
 
 def with_bandwidth(
-    design: Design, table: Table, looks: Looks, found: Fit, filters: Sequence[LowPass | None]
+    design: Design, table: Table, measured: MeasuredCurve, found: Fit, filters: Sequence[LowPass | None]
 ) -> tuple[Fit, list[LowPass | None]]:
     """Replace the fit of each contradicted axis by a fit with its low-pass, if the low-pass explains the curve.
 
@@ -170,7 +170,7 @@ def with_bandwidth(
         Columns that were passed to ``fit``.
     table : Table
         Covariances that were passed to ``fit``.
-    looks : Looks
+    measured : MeasuredCurve
         Measured curve that was passed to ``fit``.
     found : Fit
         Result of ``fit``.
@@ -187,18 +187,18 @@ def with_bandwidth(
     used: list[LowPass | None] = [None] * len(filters)
     for axis, low_pass in enumerate(filters):
         if low_pass is not None and is_contradicted(found, axis):
-            better = _fit_low_pass(design, table, looks.axis(axis), low_pass)
+            better = _fit_low_pass(design, table, measured.axis(axis), low_pass)
             if better.scatter[0] < MAX_SCATTER:
-                _bound_q(design, better, looks.axis(axis))
+                _bound_q(design, better, measured.axis(axis))
                 found = replace_axis(found, axis, better)
                 used[axis] = low_pass
     return found, used
 
 
-def _bound_q(design: Design, found: Fit, looks: Looks) -> None:
+def _bound_q(design: Design, found: Fit, measured: MeasuredCurve) -> None:
     """Bound Q of a single-axis fit by the whole first point, because a fit with a filter cannot determine it."""
-    c, first = found.coefficients, int(np.argmax(looks.avar[:, 0] > 0.0))
-    most = highest(looks.avar[first, 0], found.edf[first, 0], BOUND) / design.columns[first, Q]
+    c, first = found.coefficients, int(np.argmax(measured.avar[:, 0] > 0.0))
+    most = highest(measured.avar[first, 0], found.edf[first, 0], BOUND) / design.columns[first, Q]
     if np.isfinite(most):
         c.status[Q], c.lo[Q], c.hi[Q] = Status.UPPER_BOUND, 0.0, most**0.5 / design.rate_hz
 
@@ -216,7 +216,7 @@ def is_contradicted(found: Fit, axis: int) -> bool:
     return bool(found.left_out[axis] > 0 or found.theta[0, axis] < 0.0 or found.misfit[axis] > 1.0)
 
 
-def find_low_pass(design: Design, table: Table, looks: Looks, power: Floats) -> LowPass | None:
+def find_low_pass(design: Design, table: Table, measured: MeasuredCurve, power: Floats) -> LowPass | None:
     """Return the low-pass with the smallest misfit for a single axis, or None if none explains its curve.
 
     Parameters
@@ -225,12 +225,12 @@ def find_low_pass(design: Design, table: Table, looks: Looks, power: Floats) -> 
         Columns for the cluster sizes of the curve.
     table : Table
         Covariances for the window length.
-    looks : Looks
+    measured : MeasuredCurve
         Measured curve of a single axis.
     power : ndarray of float64
         Spectrum of the axis, from ``power``.
     """
-    search = search_low_pass(design, table, looks, power)
+    search = search_low_pass(design, table, measured, power)
     while True:
         try:
             next(search)
@@ -239,7 +239,9 @@ def find_low_pass(design: Design, table: Table, looks: Looks, power: Floats) -> 
             return found
 
 
-def search_low_pass(design: Design, table: Table, looks: Looks, power: Floats) -> Generator[None, None, LowPass | None]:
+def search_low_pass(
+    design: Design, table: Table, measured: MeasuredCurve, power: Floats
+) -> Generator[None, None, LowPass | None]:
     """Search as ``find_low_pass`` in steps of a few milliseconds, for callers that must not block.
 
     The generator yields after each step and returns the low-pass or None.
@@ -250,7 +252,7 @@ def search_low_pass(design: Design, table: Table, looks: Looks, power: Floats) -
         Columns for the cluster sizes of the curve.
     table : Table
         Covariances for the window length.
-    looks : Looks
+    measured : MeasuredCurve
         Measured curve of a single axis.
     power : ndarray of float64
         Spectrum of the axis, from ``power``.
@@ -261,7 +263,7 @@ def search_low_pass(design: Design, table: Table, looks: Looks, power: Floats) -
         grids.append([])
         for number, cutoff in enumerate(CUTOFFS):
             column = _column(LowPass(kind, order, float(cutoff)), factors)
-            grids[-1].append(float(fit_columns(_with_noise_column(design, column), table, looks).scatter[0]))
+            grids[-1].append(float(fit_columns(_with_noise_column(design, column), table, measured).scatter[0]))
             if number % CUTOFFS_PER_STEP == CUTOFFS_PER_STEP - 1:
                 yield
     found = []
@@ -272,7 +274,7 @@ def search_low_pass(design: Design, table: Table, looks: Looks, power: Floats) -
 
         def of(log_cutoff: float, kind: Kind = kind, order: int = order) -> float:
             column = LowPass(kind, order, float(np.exp(log_cutoff))).avar(design.factors)
-            return float(fit_columns(_with_noise_column(design, column), table, looks).scatter[0])
+            return float(fit_columns(_with_noise_column(design, column), table, measured).scatter[0])
 
         least, log_cutoff = yield from yield_in_pieces(
             golden_section(of, float(ends[0]), float(ends[1]), CUTOFF_TOLERANCE)
@@ -304,15 +306,15 @@ def _with_noise_column(design: Design, column: Floats) -> Design:
     return replace(design, columns=columns)
 
 
-def _fit_low_pass(design: Design, table: Table, looks: Looks, low_pass: LowPass) -> Fit:
+def _fit_low_pass(design: Design, table: Table, measured: MeasuredCurve, low_pass: LowPass) -> Fit:
     """Return the fit with this filter, with the direction of a change of its cutoff projected out."""
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
     up, down = (
         _column(replace(low_pass, cutoff=low_pass.cutoff * by), factors) for by in (CUTOFF_STEP, 1.0 / CUTOFF_STEP)
     )
     own = _with_noise_column(design, _column(low_pass, factors))
-    rough = fit_columns(own, table, looks)
+    rough = fit_columns(own, table, measured)
     level = max(float(rough.theta[N, 0]) * design.rate_hz, 0.0)
     return fit_columns(
-        own, table, looks, full=True, blind=level * LOG_CUTOFF_SIGMA * (up - down) / (2.0 * np.log(CUTOFF_STEP))
+        own, table, measured, full=True, blind=level * LOG_CUTOFF_SIGMA * (up - down) / (2.0 * np.log(CUTOFF_STEP))
     )

@@ -129,7 +129,7 @@ def shared_inputs(design: Design, table: Table, blind: Floats | None = None, ask
 
 
 @dataclass(frozen=True, slots=True)
-class Looks:
+class MeasuredCurve:
     """Measured curve of k axes, and the slopes of the same window."""
 
     avar: Floats  # [m, k] Allan variance, squared unit of the axis; NaN if the window is too short
@@ -138,11 +138,11 @@ class Looks:
     slopes: Floats  # [m, k] unit/s, mean second difference of phase over τ² at each τ
     before: NDArray[np.bool_] | None = None  # [5, k] ``entered`` of the previous fit; None for a single fit
 
-    def axis(self, column: int) -> "Looks":
+    def axis(self, column: int) -> "MeasuredCurve":
         """Return the data of one axis."""
         one = slice(column, column + 1)
         before = None if self.before is None else self.before[:, one]
-        return Looks(self.avar[:, one], self.terms[:, one], self.slope[one], self.slopes[:, one], before)
+        return MeasuredCurve(self.avar[:, one], self.terms[:, one], self.slope[one], self.slopes[:, one], before)
 
 
 def fit(
@@ -184,11 +184,13 @@ def fit(
     """
     m, axes = avar.shape
     slope = np.full(axes, np.nan) if slope is None else slope
-    looks = Looks(avar, terms, slope, np.tile(slope, (m, 1)) if slopes is None else slopes, before)
-    return _fit(design, table, looks, shared_inputs(design, table), full, start)
+    measured = MeasuredCurve(avar, terms, slope, np.tile(slope, (m, 1)) if slopes is None else slopes, before)
+    return _fit(design, table, measured, shared_inputs(design, table), full, start)
 
 
-def fit_columns(design: Design, table: Table, looks: Looks, full: bool = False, blind: Floats | None = None) -> Fit:
+def fit_columns(
+    design: Design, table: Table, measured: MeasuredCurve, full: bool = False, blind: Floats | None = None
+) -> Fit:
     """Fit with the columns exactly as given, without leaving out any τ.
 
     Parameters
@@ -197,7 +199,7 @@ def fit_columns(design: Design, table: Table, looks: Looks, full: bool = False, 
         Columns for the cluster sizes of the curve.
     table : Table
         Covariances for the window length.
-    looks : Looks
+    measured : MeasuredCurve
         Measured curve and slopes.
     full : bool
         True to weight by the covariances of all τ, False to weight by their variances alone.
@@ -205,21 +207,21 @@ def fit_columns(design: Design, table: Table, looks: Looks, full: bool = False, 
         Direction of the curve that the fit ignores.
     """
     in_samples = np.zeros(design.factors.size) if blind is None else blind
-    return _fit(design, table, looks, shared_inputs(design, table, in_samples, ask=False), full)
+    return _fit(design, table, measured, shared_inputs(design, table, in_samples, ask=False), full)
 
 
 def _fit(
-    design: Design, table: Table, looks: Looks, shared: SharedInputs, full: bool, start: Floats | None = None
+    design: Design, table: Table, measured: MeasuredCurve, shared: SharedInputs, full: bool, start: Floats | None = None
 ) -> Fit:
     """Run the compiled fit and convert its results to SI."""
-    avar, terms, before = looks.avar, looks.terms, looks.before
+    avar, terms, before = measured.avar, measured.terms, measured.before
     m, axes = avar.shape
     found = answer(axes, m, np.zeros((axes, 5), np.bool_) if before is None else np.array(before.T, order="C"))
     frozen = gains(axes, m)
     if start is not None:
         found.theta[:] = start.T / design.rate_hz ** (2.0 * TO_SI)
     curves, counts = np.ascontiguousarray(avar.T), np.ascontiguousarray(terms.T, np.float64)
-    slope, slopes = looks.slope / design.rate_hz, np.ascontiguousarray(looks.slopes.T) / design.rate_hz
+    slope, slopes = measured.slope / design.rate_hz, np.ascontiguousarray(measured.slopes.T) / design.rate_hz
     thresholds, warm = THRESHOLDS_ONCE if before is None else THRESHOLDS_WATCHED, start is not None
     fit_axes(0, axes, shared, curves, counts, slope, slopes, thresholds, full, warm, found, frozen)
     to_si = design.rate_hz**TO_SI

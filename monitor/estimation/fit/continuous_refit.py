@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.estimation.allan.uncertainty import FOR_EVER, NOISES, AxisTables, Table
+from monitor.estimation.allan.uncertainty import NOISES, UNLIMITED_SAMPLES, AxisTables, Table
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.allan.window_kernel import (
     AXES,
@@ -148,7 +148,7 @@ class Refit:
     def _find_tables(self, design: Design, lengths: Ints) -> int:
         """Find the table of every axis, and return for how many samples all tables stay valid."""
         filled = min(self._window.n + 1, self._window.length)
-        lasts = FOR_EVER
+        lasts = UNLIMITED_SAMPLES
         for axis in range(AXES):
             n = min(int(lengths[axis]) + 1, filled)
             tables = self._tables.of(axis, n, filled)

@@ -106,7 +106,7 @@ def fit_axis(  # type: ignore[no-untyped-def]
         scatter, limit = _misfit(level, rows[first:], theta, flat, variance)
         if not full or scatter <= limit:
             break
-        full = False  # with covariances of noise that the curve does not have, the fit misses all of its points
+        full = False  # covariances of noise that the curve does not have make the fit miss all of its points
     for a in range(5):
         lo[a], hi[a], status[a] = np.nan, np.nan, 0
     misfit = scatter if scatter > limit else 1.0
