@@ -80,7 +80,7 @@ def _restore(units: Floats, unit: float, rng: np.random.Generator) -> Floats:
     """Restore values [n] from rounded ones: equal where the sensor has steps, dithered where it has none.
 
     >>> rounded = np.array([1000.0, 1001.0, 7.0, np.nan, 999.0])
-    >>> _as_given(rounded, 1e-6, np.random.default_rng(1)).round(9).tolist()
+    >>> _restore(rounded, 1e-6, np.random.default_rng(1)).round(9).tolist()
     [0.001, 0.001, 7e-06, nan, 0.001]
     """
     single = (units * unit).astype(np.float32)
@@ -110,7 +110,7 @@ def _merge_groups(units: Floats, rng: np.random.Generator) -> Floats:
 def _snap_to_grid(levels: Floats) -> Floats:
     """Return levels on an exact regular grid if they fit one up to rounding, otherwise unchanged.
 
-    >>> _even(np.array([1e5, 3.000001e5, 6.0e5])).round(3).tolist()
+    >>> _snap_to_grid(np.array([1e5, 3.000001e5, 6.0e5])).round(3).tolist()
     [100000.039, 300000.034, 600000.026]
     """
     if levels.size < 2:

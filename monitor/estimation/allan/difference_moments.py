@@ -127,7 +127,7 @@ def quadrature_nodes(begin: int, end: int, kinks: Iterable[int]) -> tuple[Floats
     places, weights : ndarray of float64
         Nodes and weights of the sum.
 
-    >>> places, weights = nodes(0, 1000, [0, 400])
+    >>> places, weights = quadrature_nodes(0, 1000, [0, 400])
     >>> places.size < 200, round(float(weights @ places**5) / sum(k**5 for k in range(1000)), 12)
     (True, 1.0)
     """
