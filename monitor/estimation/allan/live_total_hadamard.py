@@ -1,9 +1,9 @@
 """Total and Hadamard variance of the live window, computed one τ at a time.
 
-Computing both for every refit would take too long. Each call of ``step`` computes one τ of one of them, and the caller
-makes one call per pass of its loop. A round covers all τ of both variances, by default octaves of the window. Its
-results are returned together when the last τ is complete. Nothing is copied: the sums run over the ring of integer
-phase of the window, between two updates by the same caller.
+Computing both for every refit would take too long. Each call of ``step`` computes one τ of one of the two variances,
+and the caller makes one call per pass of its loop. A round covers all τ of both variances, by default octaves of the
+window. Its results are returned together when the last τ is complete. Nothing is copied: the sums run over the ring of
+integer phase of the window, between two updates by the same caller.
 
 The results lag behind the window. A window of 3.6 million samples has 22 τ of the total and 21 of the Hadamard
 variance. With ten steps per second, a round takes 4.3 s, and the oldest number returned by ``get`` is between 4.3 and

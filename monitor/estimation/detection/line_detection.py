@@ -53,7 +53,7 @@ A thousand recordings each of white, flicker, quantized, random-walk, low-passed
 with this value, with 2048 samples or 20 000.
 """
 MIN_PEAK_RATIO: Final = 1.6
-"""Minimum factor above both sides. Slopes and the edge of a filter rise by less within a side."""
+"""Minimum factor by which a peak exceeds both sides. Slopes and the edge of a filter rise by less within a side."""
 WIDE_BINS: Final = 16
 """Width in bins of the wider bins in which resonances are searched."""
 FIRST_BIN: Final = 6

@@ -33,7 +33,7 @@ BAND: Final = 8.0
 LOUDER: Final = log(4.0)
 """Minimum rise of the log variance for motion. Smaller changes are left to the change detector."""
 LOUDEST: Final = log(100.0)
-"""Rise of the log variance that is always motion. If the variance scattered more, the reference contained motion."""
+"""Rise of the log variance that is always motion, even if the reference scatters more because it contained motion."""
 TOGETHER: Final = log(2.5)
 """Minimum mean rise over all axes, for motion that no single axis shows."""
 TOGGLE: Final = 0.25

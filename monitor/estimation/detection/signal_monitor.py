@@ -15,7 +15,10 @@ from monitor.estimation.detection.motion_detection import Motion, Rest
 OTHER_RATE: Final = 0.02
 """Relative change of the sample rate below which the detectors continue. Blocks of a quarter of a second stay valid."""
 MAX_SKIPPED_SAMPLES: Final = 10_000_000
-"""Largest gap that the change detector processes as missing samples, in 1.6 s. It restarts after a longer gap."""
+"""Largest gap that the change detector processes as missing samples, which takes 1.6 s.
+
+After a longer gap, the detector starts again.
+"""
 
 
 @dataclass(frozen=True, slots=True)
