@@ -18,8 +18,8 @@ its last change. The detector returns a ``Change`` of one of three kinds:
   within this time is not detected. A reference is kept while nothing is detected, so it becomes more accurate. A slow
   drift of the noise is compared with all the past, so it is eventually reported as a change. The disadvantage is that
   noise that fluctuates more slowly than the learning time is reported as well.
-- **After a change**, the samples since the onset are the new reference. Octaves too long for these samples start without
-  a reference.
+- **After a change**, the samples since the onset are the new reference. Octaves too long for these samples start
+  without a reference.
 - **A burst** raises the share of extremes while the bulk of the differences stays the same. After its end, it is
   removed from the reference.
 """
