@@ -1,1 +1,1 @@
-"""What the samples say: windowed Allan variance, its uncertainty, and the coefficients fitted to it."""
+"""Estimation from samples: windowed Allan variance, its uncertainty, fitted coefficients and event detection."""

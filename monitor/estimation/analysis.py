@@ -1,11 +1,14 @@
-"""A whole recording at once: the Allan curve, its intervals and the fitted coefficients; the live service's reference.
+"""Analysis of a whole recording: Allan curve, confidence intervals and fitted coefficients.
 
-The recording is first put on a regular grid by the same clock that stamps live samples: what is missing becomes NaN in
-its place, and everything found about the time stamps is said in ``notes``. ``analyze`` makes the curve and the fit;
-``events_of`` asks of the same samples whether the sensor moved, whether its noise changed, and what of it is a line or
-an outlier, which takes longer than the curve and is a step of its own. Moving stretches are struck out of the curve
-only on demand, as a rest that was wrongly called motion would be lost; of what ``events_of`` asks they are always kept
-out.
+The results are the reference for the live estimator. The recording is first resampled to a regular grid by the clock
+that also stamps live samples. Missing samples become NaN. All findings about the time stamps are listed in
+``Analysis.notes``.
+
+``analyze`` computes the curve and the fit. ``events_of`` looks for motion, noise changes, spectral lines and outliers
+in the same samples. It is a separate step because it takes longer than the curve.
+
+Samples in motion are removed from the curve only on request, since a rest that was wrongly detected as motion would be
+lost. ``events_of`` always ignores them.
 """
 
 from collections.abc import Iterable, Sequence
@@ -24,31 +27,31 @@ from monitor.estimation.detection.change_detection import Change, ChangeDetector
 from monitor.estimation.detection.line_detection import lines, outliers
 from monitor.estimation.detection.motion_detection import Motion, find
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.bandwidth import LowPass, contradicted, power, sought, with_bandwidth
-from monitor.estimation.fit.coefficient_fit import Fit, Looks, design, fit
+from monitor.estimation.fit.bandwidth import LowPass, find_low_pass, is_contradicted, power, with_bandwidth
+from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, design, fit
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.estimation.regular_grid import on_grid
 
 FEWEST: Final = 50
-"""Samples; below this nothing can be said, and the command exits with status 3."""
+"""Minimum number of samples. With fewer samples, the command exits with status 3."""
 CHUNK: Final = 65_536
-"""Rows given to the detector of changes at a time."""
+"""Number of rows passed to the change detector at a time."""
 
 
 @dataclass(frozen=True, slots=True)
 class Analysis:
-    """What ``imu-monitor analyze`` finds."""
+    """Result of ``imu-monitor analyze``."""
 
     estimate: Estimate
     seconds: float
     notes: tuple[str, ...]
-    values: Floats  # [n, 6] on the grid, SI; NaN = missing, or moving and struck out
+    values: Floats  # [n, 6] on the grid, SI; NaN = missing, or removed because of motion
     fit: Fit
-    bandwidth_hz: Floats  # [6] the sensor's own, where the curve shows one; else NaN
+    bandwidth_hz: Floats  # [6] bandwidth of the sensor; NaN if the curve does not show one
     motions: tuple[Motion, ...] = ()
     changes: tuple[Change, ...] = ()
-    struck: bool = False  # moving stretches are missing in ``values``
-    axes_of_temperature: tuple[str, ...] = ()  # temperature explains most of their slow variance
+    struck: bool = False  # True if the samples in motion have been removed from ``values``
+    axes_of_temperature: tuple[str, ...] = ()  # axes whose slow variance is mostly explained by temperature
 
 
 def analyze(
@@ -59,27 +62,38 @@ def analyze(
     each: EachAxis = map,
     rest: bool = False,
 ) -> Analysis:
-    """The analysis of a recording.
+    """Compute the Allan curve of a recording and fit the coefficients to it.
 
-    Args:
-        blocks: the recording, with its own times
-        rate_hz: the stated rate; None = found from the times
-        tau: grid or list of averaging times, s
-        notes: what reading the file found
-        each: maps the axes; of an executor, they are done side by side
-        rest: strike out stretches in which the sensor moved
-    Raises:
-        NotReady: fewer than FEWEST samples, or fewer at rest
-        ConfigError: no τ of the list is possible
+    Parameters
+    ----------
+    blocks : sequence of SampleBlock
+        Recording with its own time stamps.
+    rate_hz : float or None
+        Stated sample rate in Hz. None to estimate it from the time stamps.
+    tau : TauGrid
+        Grid of averaging times, or a tuple of averaging times in seconds.
+    notes : iterable of str
+        Notes from reading the file. They come first in the notes of the result.
+    each : EachAxis
+        Function that maps over the axes. The ``map`` of an executor computes them in parallel.
+    rest : bool
+        True to remove the samples during which the sensor moved.
+
+    Raises
+    ------
+    NotReady
+        If the recording has fewer than ``FEWEST`` samples, or fewer at rest.
+    ConfigError
+        If none of the listed τ is possible.
     """
     values, rate, found = on_grid(blocks, rate_hz)
     if len(values) < FEWEST:
         raise NotReady(f"{len(values)} samples; at least {FEWEST} are needed to say anything")
     motions: tuple[Motion, ...] = ()
     if rest:
-        values, motions = _at_rest(values, rate)
+        values, motions = _without_motion(values, rate)
         found = [*found, *analysis_notes.of_motions(motions, rate, struck=True)]
-    curve, fitted, filters = _fitted(values, rate, cluster_sizes(len(values), rate, tau), each)
+    curve, fitted, filters = _fit_curve(values, rate, cluster_sizes(len(values), rate, tau), each)
     estimate = Estimate(
         int(blocks[-1].t_ns[-1]), rate, curve.n / rate, sum(len(samples) for samples in blocks),
         curve, fitted.fitted, fitted.coefficients, fitted.k_or_r,
@@ -93,11 +107,14 @@ def analyze(
 
 
 def events_of(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analysis:
-    """The same analysis with what happened in the recording: motion, changes, lines, outliers, told in its notes.
+    """Add motion, noise changes, spectral lines and outliers to an analysis and to its notes.
 
-    Args:
-        result: of ``analyze``
-        alarms_per_day: false alarms of the detector of changes to bear, of all axes together
+    Parameters
+    ----------
+    result : Analysis
+        Result of ``analyze``.
+    alarms_per_day : float
+        Accepted false alarms of the change detector per day, of all axes together.
     """
     rate = result.estimate.rate_hz
     moving = np.zeros(len(result.values), np.bool_)
@@ -120,13 +137,23 @@ def events_of(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analysis:
 
 
 def refitted(result: Analysis, values: Floats, each: EachAxis = map) -> Fit:
-    """The fit to the same averaging times of other samples [n, 6], such as what is left of those of an analysis."""
-    _, found, _ = _fitted(values, result.estimate.rate_hz, result.estimate.curve.factors, each)
+    """Fit other samples at the averaging times of an analysis.
+
+    Parameters
+    ----------
+    result : Analysis
+        Result of ``analyze``, which gives the sample rate and the cluster sizes.
+    values : ndarray of float64, shape (n, 6)
+        Samples in rad/s and m/s², for example the samples of ``result`` after a correction. NaN means missing.
+    each : EachAxis
+        Function that maps over the axes.
+    """
+    _, found, _ = _fit_curve(values, result.estimate.rate_hz, result.estimate.curve.factors, each)
     return found
 
 
-def _at_rest(values: Floats, rate_hz: float) -> tuple[Floats, tuple[Motion, ...]]:
-    """The samples with moving stretches missing, and the stretches."""
+def _without_motion(values: Floats, rate_hz: float) -> tuple[Floats, tuple[Motion, ...]]:
+    """Return the samples with those in motion replaced by NaN, and the episodes of motion."""
     moving, motions = find(values, rate_hz)
     left = len(values) - int(moving.sum())
     if left < FEWEST:
@@ -134,19 +161,21 @@ def _at_rest(values: Floats, rate_hz: float) -> tuple[Floats, tuple[Motion, ...]
     return np.where(moving[:, None], np.nan, values) if moving.any() else values, tuple(motions)
 
 
-def _fitted(
+def _fit_curve(
     values: Floats, rate_hz: float, factors: Ints, each: EachAxis
 ) -> tuple[AllanCurve, Fit, list[LowPass | None]]:
-    """The curve with its intervals, the fit to it, and the sensor's own low-pass on axes that show one."""
+    """Return the Allan curve with its intervals, the fit, and the low-pass of each axis that shows one."""
     n = len(values)
     avar, terms = overlapping(values, factors, each)
     columns, covariances = design(factors, rate_hz), table(n, factors)
-    looks = Looks(avar, terms, slope(values) * rate_hz, slopes(values, factors) * rate_hz)
-    found = fit(columns, covariances, avar, terms, slope=looks.slope, slopes=looks.slopes)
+    measured = MeasuredCurve(avar, terms, slope(values) * rate_hz, slopes(values, factors) * rate_hz)
+    found = fit(columns, covariances, avar, terms, slope=measured.slope, slopes=measured.slopes)
     filters = [
-        sought(columns, covariances, looks.axis(axis), power(values[:, axis])) if contradicted(found, axis) else None
+        find_low_pass(columns, covariances, measured.axis(axis), power(values[:, axis]))
+        if is_contradicted(found, axis)
+        else None
         for axis in range(values.shape[1])
     ]
-    found, filters = with_bandwidth(columns, covariances, looks, found, filters)
+    found, filters = with_bandwidth(columns, covariances, measured, found, filters)
     lo, hi = intervals(avar, found.edf)
     return AllanCurve(factors / rate_hz, factors, avar, terms, found.edf, lo, hi, n), found, filters

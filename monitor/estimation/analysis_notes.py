@@ -1,7 +1,8 @@
-"""What an analysis found, in sentences for people: of the fit, of motion, of changes.
+"""Notes of an analysis for users: sentences about the fit, motion, noise changes, spectral lines and outliers.
 
-Each function returns notes, none where there is nothing to say; a recording full of events gets MOST of a kind and a
-count. Times are seconds since the first sample. Numbers are looked up in results, nothing is estimated here.
+Each function returns a list of notes, which is empty if there is nothing to report. At most ``MAX_NOTES`` notes of one
+kind are listed; the remaining ones are counted. Times are in seconds since the first sample. The functions only format
+results and estimate nothing.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -14,7 +15,7 @@ from drivers.sample import AXES, Floats
 from monitor.common.rates import amount, plain
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.detection.change_detection import Change
-from monitor.estimation.detection.line_detection import FAR, Line, added
+from monitor.estimation.detection.line_detection import OUTLIER_SIGMA, Line, added
 from monitor.estimation.detection.motion_detection import Motion
 from monitor.estimation.fit.bandwidth import LowPass
 from monitor.estimation.fit.coefficient_fit import Fit
@@ -22,86 +23,126 @@ from monitor.estimation.fit.coefficients import Status
 from monitor.estimation.fit.least_squares import K, Q
 
 Run = tuple[int, int]
-"""First and last τ, by their places."""
+"""Row numbers of the first and the last τ of a range."""
 
-MOST: Final = 10
-"""Notes of one kind."""
-CLEAR: Final = 3.0
-"""σ from which on an averaging time is said to depart."""
+MAX_NOTES: Final = 10
+"""Maximum number of notes of one kind."""
+DEPARTURE_SIGMA: Final = 3.0
+"""Distance from the fit, in standard deviations, beyond which an averaging time departs from it."""
 SAME: Final = 0.01
-"""Of a frequency: lines that differ by less are one, on several axes."""
+"""Lines on several axes are reported as one if their frequencies differ by less than this share."""
 FAR_SHARE: Final = 0.001
-"""A smaller share of outliers is not told."""
-MAKES: Final = 0.05
-"""Of the Allan variance: a line that makes as much is why a curve departs there."""
-IS_Q: Final = 0.2
-"""The same, of one that Q may be."""
-SHORTEST: Final = 3
-"""Averaging times that tell Q."""
-BAND: Final = "the sensor's bandwidth or a vibration shows there"
-LOW: Final = (
+"""Shares of outliers up to this value are not reported."""
+MIN_EXPLAINING_SHARE: Final = 0.05
+"""A line explains a departure of the curve if it contributes at least this share of the Allan variance there."""
+MIN_Q_SHARE: Final = 0.2
+"""A line can be mistaken for quantization noise if it contributes at least this share of the Allan variance."""
+Q_ROWS: Final = 3
+"""Number of shortest averaging times that determine Q."""
+BANDWIDTH_OR_VIBRATION: Final = "the sensor's bandwidth or a vibration shows there"
+BELOW_WHITE_NOISE: Final = (
     "the shortest averaging times lie below white noise, as behind a filter; N is the level of the longer ones, and Q "
     "no more than a bound"
 )
-MOVED: Final = "the sensor moved, which may be why; --rest strikes it out"
-UNKNOWN: Final = "vibration, motion or temperature may be why"
-ORDERS: Final = ("", "first", "second", "third", "fourth")
-NEAR_WORST: Final = 0.5
-"""Averaging times that depart by this share of the worst, and to the same side, are told with it."""
+MOTION_LEFT_IN: Final = "the sensor moved, which may be why; --rest strikes it out"
+UNKNOWN_CAUSE: Final = "vibration, motion or temperature may be why"
+ORDINALS: Final = ("", "first", "second", "third", "fourth")
+MIN_DEPARTURE_RATIO: Final = 0.5
+"""Averaging times are reported together with the worst one if they depart to the same side by this share of it."""
 
 
 def of_fit(curve: AllanCurve, fit: Fit, filters: Sequence[LowPass | None], rate_hz: float) -> list[str]:
-    """Where the five terms are not the whole story; axes of which the same is said share a note."""
+    """Describe where the sum of the five terms does not explain the curve. Axes with the same note share it.
+
+    Parameters
+    ----------
+    curve : AllanCurve
+        Measured curve.
+    fit : Fit
+        Fit to the curve.
+    filters : sequence of LowPass or None
+        Low-pass of each axis, None where the curve does not show one.
+    rate_hz : float
+        Sample rate in Hz.
+    """
     axes: dict[str, list[str]] = {}
     for i, axis in enumerate(AXES):
         low_pass = filters[i]
         if low_pass is not None:
-            _add(axes, axis, _bandwidth(low_pass, rate_hz))
+            _append_axis(axes, axis, _bandwidth_note(low_pass, rate_hz))
         elif fit.theta[Q, i] < 0.0 and not fit.left_out[i]:
-            _add(axes, axis, LOW)
+            _append_axis(axes, axis, BELOW_WHITE_NOISE)
         if fit.k_or_r[i]:
-            _add(axes, axis, _k_or_r(fit.coefficients.status[K, i] == Status.ESTIMATED))
+            _append_axis(axes, axis, _k_or_r_note(fit.coefficients.status[K, i] == Status.ESTIMATED))
     return [f"{', '.join(those)}: {text}" for text, those in axes.items()] + of_misfit(curve, fit)
 
 
 def of_misfit(curve: AllanCurve, fit: Fit, found: Sequence[Line] = (), moved: bool = False) -> list[str]:
-    """Which axes no sum of the five terms follows, those of one cause together: a line that is told, or motion.
+    """List the axes whose curve no sum of the five terms explains, grouped by cause.
 
-    Of no known cause, they are apart where they depart at other τ.
+    The cause is a spectral line or motion. Axes without a known cause are grouped only if they depart at the same τ.
+
+    Parameters
+    ----------
+    curve : AllanCurve
+        Measured curve.
+    fit : Fit
+        Fit to the curve.
+    found : sequence of Line
+        Spectral lines that are reported.
+    moved : bool
+        True if the sensor moved and these samples are part of the curve.
     """
-    names, notes = _names(found), list[str]()
+    names, notes = _line_names(found), list[str]()
     out = [i for i in range(len(AXES)) if fit.left_out[i]]
-    for why, axes in _by_line(names, curve, {i: (0, int(fit.left_out[i]) - 1) for i in out}).items():
-        notes.append(_left_out(curve.tau_s[fit.left_out - 1], axes, why or BAND))
+    for why, axes in _group_by_line(names, curve, {i: (0, int(fit.left_out[i]) - 1) for i in out}).items():
+        notes.append(_left_out_note(curve.tau_s[fit.left_out - 1], axes, why or BANDWIDTH_OR_VIBRATION))
     runs = {i: _departure(curve, fit, i) for i in range(len(AXES)) if fit.misfit[i] > 1.0}
     if moved:
-        return [*notes, _misfit(curve.tau_s, fit, runs, MOVED, at=False)] if runs else notes
-    for why, axes in _by_line(names, curve, runs).items():
-        for those in [axes] if why else _alike(axes):
-            notes.append(_misfit(curve.tau_s, fit, those, why or UNKNOWN))
+        return [*notes, _misfit_note(curve.tau_s, fit, runs, MOTION_LEFT_IN, at=False)] if runs else notes
+    for why, axes in _group_by_line(names, curve, runs).items():
+        for those in [axes] if why else _group_overlapping(axes):
+            notes.append(_misfit_note(curve.tau_s, fit, those, why or UNKNOWN_CAUSE))
     return notes
 
 
 def of_quantization(curve: AllanCurve, fit: Fit, found: Sequence[Line]) -> list[str]:
-    """Where Q may be a line: one that makes much of the shortest τ."""
+    """Warn where a spectral line contributes so much at the shortest τ that Q may be this line.
+
+    Parameters
+    ----------
+    curve : AllanCurve
+        Measured curve.
+    fit : Fit
+        Fit to the curve.
+    found : sequence of Line
+        Spectral lines of all axes.
+    """
     axes: dict[str, list[str]] = {}
-    for one, name in _names(found).items():
+    for one, name in _line_names(found).items():
         estimated = fit.coefficients.status[Q, one.axis] == Status.ESTIMATED
-        if estimated and float(np.nanmax(added(one, curve)[:SHORTEST], initial=0.0)) >= IS_Q:
-            _add(axes, AXES[one.axis], f"quantization noise may be {name}")
+        if estimated and float(np.nanmax(added(one, curve)[:Q_ROWS], initial=0.0)) >= MIN_Q_SHARE:
+            _append_axis(axes, AXES[one.axis], f"quantization noise may be {name}")
     return [f"{', '.join(those)}: {text}" for text, those in axes.items()]
 
 
 def explained(
     notes: Sequence[str], curve: AllanCurve, fit: Fit, found: Sequence[Line], moved: bool = False
 ) -> list[str]:
-    """The notes with what is known of misfits, once lines and motion have been looked for, in place of guesses.
+    """Replace the guessed causes of misfits with the causes found by the search for lines and motion.
 
-    Args:
-        notes: among them those of ``of_fit``
-        curve, fit: what these were made of
-        found: lines that are told
-        moved: the sensor moved, and that was left in
+    Parameters
+    ----------
+    notes : sequence of str
+        Notes that include those of ``of_fit``.
+    curve : AllanCurve
+        Curve from which these notes were made.
+    fit : Fit
+        Fit from which these notes were made.
+    found : sequence of Line
+        Spectral lines that are reported.
+    moved : bool
+        True if the sensor moved and these samples are part of the curve.
     """
     known = of_misfit(curve, fit, found, moved)
     guessed = [note for note in of_misfit(curve, fit) if note not in known]
@@ -110,48 +151,76 @@ def explained(
 
 
 def of_motions(motions: Sequence[Motion], rate_hz: float, struck: bool) -> list[str]:
-    """That the sensor moved, how often, and what was done about it."""
+    """Report how often and how long the sensor moved, and how these samples were treated.
+
+    Parameters
+    ----------
+    motions : sequence of Motion
+        Episodes of motion.
+    rate_hz : float
+        Sample rate in Hz.
+    struck : bool
+        True if the samples in motion have been removed.
+    """
     if not motions:
         return []
     times = "once" if len(motions) == 1 else f"{len(motions)} times"
     seconds = sum(motion.seconds for motion in motions)
     done = "struck out" if struck else "left in; --rest strikes it out"
     notes = [f"the sensor moved {times}, {seconds:.3g} s in all: {done}"]
-    notes += [f"at {motion.since / rate_hz:.1f} s: {motion.text}" for motion in motions[:MOST]]
-    return notes + _more(len(motions), "motions")
+    notes += [f"at {motion.since / rate_hz:.1f} s: {motion.text}" for motion in motions[:MAX_NOTES]]
+    return notes + _count_omitted(len(motions), "motions")
 
 
 def of_changes(changes: Sequence[Change], rate_hz: float) -> list[str]:
-    """What changed, and what that means for a curve of all of it."""
+    """Report the changes, and the effect on a curve of the whole recording.
+
+    Parameters
+    ----------
+    changes : sequence of Change
+        Changes in order of time.
+    rate_hz : float
+        Sample rate in Hz.
+    """
     if not changes:
         return []
-    notes = [f"at {change.since / rate_hz:.1f} s: {change.text} ({change.sigma:.1f} σ)" for change in changes[:MOST]]
-    notes += _more(len(changes), "changes")
+    notes = [
+        f"at {change.since / rate_hz:.1f} s: {change.text} ({change.sigma:.1f} σ)" for change in changes[:MAX_NOTES]
+    ]
+    notes += _count_omitted(len(changes), "changes")
     if any(change.kind != "outlier_burst" for change in changes):
         notes.append("one curve of the whole recording mixes before and after; --window S shows them apart")
     return notes
 
 
 def of_departures(found: Sequence[Line], far: Floats) -> list[str]:
-    """Lines of the spectrum, those of several axes at one frequency together; and outliers, by axis [6] their share."""
-    groups = _together(found)
+    """Report spectral lines, one note for all axes of one frequency, and the share of outliers.
+
+    Parameters
+    ----------
+    found : sequence of Line
+        Spectral lines of all axes.
+    far : ndarray of float64, shape (6,)
+        Share of outliers of each axis, 0 to 1; NaN means unknown.
+    """
+    groups = _group_by_frequency(found)
     notes = []
-    for here in groups[:MOST]:
+    for here in groups[:MAX_NOTES]:
         sizes = [f"{AXES[one.axis]} {amount(AXES[one.axis], one.amplitude)}" for one in here]
-        notes.append(f"{_name(here[0])}: {', '.join(sizes)}")
-    left = [one for here in groups[MOST:] for one in here]
-    notes += _more(MOST + len(left), "lines")
+        notes.append(f"{_line_name(here[0])}: {', '.join(sizes)}")
+    left = [one for here in groups[MAX_NOTES:] for one in here]
+    notes += _count_omitted(MAX_NOTES + len(left), "lines")
     shares = [f"{AXES[i]} {100.0 * far[i]:.2g} %" for i in np.flatnonzero(far > FAR_SHARE).tolist()]
     if shares:
         notes.append(
-            f"outliers beyond {FAR:g} σ of the other samples: {', '.join(shares)} of all; the noise is not Gaussian, "
-            "and intervals assume that it is"
+            f"outliers beyond {OUTLIER_SIGMA:g} σ of the other samples: {', '.join(shares)} of all; "
+            "the noise is not Gaussian, and intervals assume that it is"
         )
     return notes
 
 
-def _together(found: Sequence[Line]) -> list[list[Line]]:
-    """Lines of one frequency, the strongest first."""
+def _group_by_frequency(found: Sequence[Line]) -> list[list[Line]]:
+    """Group lines of the same frequency; the strongest group comes first."""
     groups: list[list[Line]] = []
     left = sorted(found, key=lambda one: -one.share)
     while left:
@@ -161,32 +230,39 @@ def _together(found: Sequence[Line]) -> list[list[Line]]:
     return groups
 
 
-def _name(line: Line) -> str:
+def _line_name(line: Line) -> str:
+    """Return the name of a line or a resonance with its frequency."""
     return f"{'a resonance about' if line.wide else 'a line at'} {line.frequency_hz:.4g} Hz"
 
 
-def _names(found: Sequence[Line]) -> dict[Line, str]:
-    """What each line is called where it is told."""
-    return {one: _name(here[0]).replace("a ", "the ", 1) for here in _together(found)[:MOST] for one in here}
+def _line_names(found: Sequence[Line]) -> dict[Line, str]:
+    """Return the name under which each reported line appears in the notes."""
+    return {
+        one: _line_name(here[0]).replace("a ", "the ", 1)
+        for here in _group_by_frequency(found)[:MAX_NOTES]
+        for one in here
+    }
 
 
-def _more(count: int, what: str) -> list[str]:
-    return [f"and {count - MOST} more {what}"] if count > MOST else []
+def _count_omitted(count: int, what: str) -> list[str]:
+    """Return a note with the number of omitted notes, if there are any."""
+    return [f"and {count - MAX_NOTES} more {what}"] if count > MAX_NOTES else []
 
 
 def _departure(curve: AllanCurve, fit: Fit, axis: int) -> Run:
-    """First and last τ of the run in which the curve of one axis stands above the fit by the largest factor.
+    """Return the first and last τ of the range in which the curve of one axis exceeds the fit by the largest factor.
 
-    What no term makes adds to the curve, but the fit is pulled towards it and leaves most σ elsewhere: below itself,
-    and at the shortest τ, which are known best. Only what is more than chance counts.
+    Noise outside the five terms adds to the curve, and the fit is pulled towards it. The largest residuals in σ are
+    therefore elsewhere: where the curve is below the fit, and at the accurately known shortest τ. Only residuals above
+    ``DEPARTURE_SIGMA`` count.
     """
     model, edf = fit.fitted[:, axis], fit.edf[:, axis]
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = curve.avar[:, axis] / model
         sigma = (np.cbrt(ratio) - 1.0) * np.sqrt(4.5 * edf)  # Wilson & Hilferty 1931
-        off = np.where(np.abs(sigma) > CLEAR, np.log(ratio), 0.0)
+        off = np.where(np.abs(sigma) > DEPARTURE_SIGMA, np.log(ratio), 0.0)
     worst = int(off.argmax()) if (off > 0.0).any() else int(off.argmin())
-    near = off * np.sign(off[worst]) >= NEAR_WORST * abs(off[worst])
+    near = off * np.sign(off[worst]) >= MIN_DEPARTURE_RATIO * abs(off[worst])
     for belongs, run in groupby(range(off.size), key=near.__getitem__):
         rows = list(run)
         if belongs and rows[0] <= worst <= rows[-1]:
@@ -194,12 +270,16 @@ def _departure(curve: AllanCurve, fit: Fit, axis: int) -> Run:
     return worst, worst
 
 
-def _add(axes: dict[str, list[str]], axis: str, text: str) -> None:
+def _append_axis(axes: dict[str, list[str]], axis: str, text: str) -> None:
+    """Add an axis to the note with this text."""
     axes.setdefault(text, []).append(axis)
 
 
-def _by_line(names: Mapping[Line, str], curve: AllanCurve, runs: Mapping[int, Run]) -> dict[str, dict[int, Run]]:
-    """Axes and their runs of τ by the line that makes most there; by "" where none makes enough to show."""
+def _group_by_line(names: Mapping[Line, str], curve: AllanCurve, runs: Mapping[int, Run]) -> dict[str, dict[int, Run]]:
+    """Group axes and their ranges of τ by the line that contributes most there.
+
+    The key is an empty string if no line contributes enough.
+    """
     found: dict[str, dict[int, Run]] = {}
     for i, (first, last) in runs.items():
         shares = {
@@ -208,13 +288,13 @@ def _by_line(names: Mapping[Line, str], curve: AllanCurve, runs: Mapping[int, Ru
             if one.axis == i
         }
         most = max(shares, key=shares.__getitem__, default="")
-        why = f"{most} shows there" if shares.get(most, 0.0) >= MAKES else ""
+        why = f"{most} shows there" if shares.get(most, 0.0) >= MIN_EXPLAINING_SHARE else ""
         found.setdefault(why, {})[i] = (first, last)
     return found
 
 
-def _left_out(tau_s: Floats, axes: Collection[int], why: str) -> str:
-    """``tau_s`` [6]: the longest that is left out of each axis."""
+def _left_out_note(tau_s: Floats, axes: Collection[int], why: str) -> str:
+    """Format the note on τ left out of the fit. ``tau_s`` [6] is the longest one of each axis."""
     upto = ", ".join(dict.fromkeys(plain(float(tau_s[i])) for i in axes))
     return (
         f"{', '.join(AXES[i] for i in axes)}: the fit leaves out τ up to {upto} s, which no sum of the five terms "
@@ -222,15 +302,16 @@ def _left_out(tau_s: Floats, axes: Collection[int], why: str) -> str:
     )
 
 
-def _bandwidth(low_pass: LowPass, rate_hz: float) -> str:
+def _bandwidth_note(low_pass: LowPass, rate_hz: float) -> str:
+    """Format the note on the low-pass of the sensor."""
     return (
-        f"white noise ends below half the sample rate, as behind a {ORDERS[low_pass.order]}-order low-pass at about "
+        f"white noise ends below half the sample rate, as behind a {ORDINALS[low_pass.order]}-order low-pass at about "
         f"{low_pass.cutoff * rate_hz:.2g} Hz; N is the level below it"
     )
 
 
-def _alike(runs: Mapping[int, Run]) -> list[dict[int, Run]]:
-    """Axes whose runs of τ overlap."""
+def _group_overlapping(runs: Mapping[int, Run]) -> list[dict[int, Run]]:
+    """Group axes whose ranges of τ overlap."""
     groups: list[dict[int, Run]] = []
     for i, run in sorted(runs.items(), key=lambda item: item[1]):
         if groups and run[0] <= max(last for _, last in groups[-1].values()):
@@ -240,8 +321,8 @@ def _alike(runs: Mapping[int, Run]) -> list[dict[int, Run]]:
     return groups
 
 
-def _misfit(tau_s: Floats, fit: Fit, runs: Mapping[int, Run], why: str, at: bool = True) -> str:
-    """Of the axes of ``runs``; ``at``: with the τ."""
+def _misfit_note(tau_s: Floats, fit: Fit, runs: Mapping[int, Run], why: str, at: bool = True) -> str:
+    """Format the note on the axes of ``runs``; ``at`` adds the range of τ."""
     low, high = (f"{f(fit.misfit[i] for i in runs) ** 0.5:.2g}" for f in (min, max))
     times = low if low == high else f"{low} to {high}"
     first, last = min(run[0] for run in runs.values()), max(run[1] for run in runs.values())
@@ -254,9 +335,12 @@ def _misfit(tau_s: Floats, fit: Fit, runs: Mapping[int, Run], why: str, at: bool
     )
 
 
-def _k_or_r(seen: bool) -> str:
-    """A rise that may be either: ``seen`` where no slope was to be had, else where it drifts and is too short."""
-    if seen:
+def _k_or_r_note(no_slope: bool) -> str:
+    """Format the note on a rise that is K or R.
+
+    The rise cannot be attributed because no slope was measured (``no_slope``) or because the record is too short.
+    """
+    if no_slope:
         return "K or R: samples are missing, so that no slope tells a ramp from rate random walk"
     return (
         "K or R: the record drifts by more than Q, N and B make, and is too short to tell a ramp from rate random walk"

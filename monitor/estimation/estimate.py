@@ -1,4 +1,4 @@
-"""All that one look at the estimate gives."""
+"""Result of the estimator at one moment: ``Estimate``, and the per-sample coefficients ``Course``."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -13,14 +13,14 @@ from monitor.estimation.fit.coefficients import Coefficients, Status
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """The coefficients after each of n consecutive samples."""
+    """Coefficients after each of n consecutive samples."""
 
-    t_ns: Ints  # [n]
+    t_ns: Ints  # [n] host monotonic clock, nanoseconds
     value: Floats  # [n, 5, 6] Q N B K R in SI; NaN where not estimated
 
 
 def joined(courses: Collection[Course]) -> Course | None:
-    """Courses one after another as one; None of none."""
+    """Concatenate courses. Return None if there are none."""
     if not courses:
         return None
     return Course(np.concatenate([part.t_ns for part in courses]), np.concatenate([part.value for part in courses]))
@@ -28,21 +28,21 @@ def joined(courses: Collection[Course]) -> Course | None:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """The window's Allan curve and the coefficients fitted to it, at one sample."""
+    """Allan curve of the window and the fitted coefficients at one sample."""
 
-    t_ns: int  # newest sample
+    t_ns: int  # time of the newest sample
     rate_hz: float
-    window_s: float  # the window's full length
-    samples: int  # received since start
+    window_s: float  # length of the full window
+    samples: int  # received since the start
     curve: AllanCurve
-    fitted: Floats  # [m, 6] Allan variance of the fitted model at curve.tau_s; NaN where none, or left out of the fit
+    fitted: Floats  # [m, 6] Allan variance of the fitted model at curve.tau_s; NaN without a fit, or outside it
     coefficients: Coefficients
-    k_or_r: NDArray[np.bool_]  # [6] the window drifts, and does not tell whether by random walk or by a ramp
-    recent: AllanCurve | None = None  # the same τ, each over a span of its own, see window.quick_spans
-    course: Course | None = None  # since the look before, where a fit at every sample is wanted
+    k_or_r: NDArray[np.bool_]  # [6] True if the window drifts, but random walk and ramp cannot be distinguished
+    recent: AllanCurve | None = None  # same τ, each over its own shorter span; see ``window.quick_spans``
+    course: Course | None = None  # since the previous estimate, if a fit at every sample is requested
 
     def without_coefficients(self) -> "Estimate":
-        """Return the curve alone: every coefficient is unestimated, and nothing is fitted."""
+        """Return a copy with the curve alone: no fit, and every coefficient unestimated."""
         shape = self.coefficients.status.shape
         nothing = np.full(shape, np.nan)
         return replace(

@@ -1,12 +1,14 @@
-"""Blocks in, Estimate out: the window, its uncertainty and the fit of one device.
+"""Live estimator of one device: sliding window, Allan curve, confidence intervals and fitted coefficients.
 
-``update`` advances the window sample by sample, missing ones in their places; ``get`` is a look at the result, with
-the best fit there is (all covariances). Between looks, where it is wanted, the coefficients follow every sample by
-the gains of ``refit``. The rate enters only as the label of the τ axis and the units of the coefficients: a cluster
-is a number of samples.
+``Estimator.update`` advances the window by a block of samples. Missing samples keep their places in time.
+``Estimator.get`` returns the current curve and coefficients. It fits with the full covariance of all τ.
 
-Beside the fixed window of the fit, each τ has a shorter span of its own for the eye (``recent``): it shows a change of
-N within half a minute.
+Optionally, the coefficients are also updated after every sample, by the linear map of ``continuous_refit``.
+
+A cluster is a number of samples. The sample rate only sets the labels of the τ axis and the units of the coefficients.
+
+The fit uses one fixed window. For display, each τ has a second, shorter span (``Estimate.recent``), which shows a
+change of N within half a minute.
 """
 
 from collections import deque
@@ -23,35 +25,43 @@ from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.live_total_hadamard import SlowStatistics
 from monitor.estimation.allan.total import TotalCurve
-from monitor.estimation.allan.uncertainty import AxisTables, Spans, Table, intervals
+from monitor.estimation.allan.uncertainty import AxisTables, SpanDegreesOfFreedom, Table, intervals
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_spans
 from monitor.estimation.estimate import Course, Estimate
 from monitor.estimation.estimate import joined as joined_courses
-from monitor.estimation.fit.bandwidth import LowPass, contradicted, power, searching, with_bandwidth
-from monitor.estimation.fit.coefficient_fit import Fit, Looks, design, fit, joined, nothing_fitted
+from monitor.estimation.fit.bandwidth import LowPass, is_contradicted, power, search_low_pass, with_bandwidth
+from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, concatenate_fits, design, fit, nothing_fitted
 from monitor.estimation.fit.continuous_refit import Refit
-from monitor.estimation.window_snapshot import Held, held
+from monitor.estimation.window_snapshot import Held, copy_window
 
-SETTLING: Final = 10
-"""Looks that take a fit to its end; each leaves a quarter of what was left."""
+SETTLING_FITS: Final = 10
+"""Number of successive fits after which a fit has converged. Each fit leaves a quarter of the remaining error."""
 FEWEST: Final = 8
-"""Samples before the first answer: three τ with a few terms each."""
-POWER_ROWS: Final = 65_536
-"""The newest samples, whose spectrum is asked whether it shows a filter."""
+"""Minimum number of samples for an estimate. It gives three τ with a few terms each."""
+SPECTRUM_SAMPLES: Final = 65_536
+"""Number of newest samples whose spectrum is tested for a low-pass filter."""
 COURSE_SAMPLES: Final = 65_536
-"""Of the course of coefficients, the newest kept until someone looks."""
+"""Maximum number of samples for which the per-sample coefficients are kept between two calls of ``Estimator.get``."""
 
 
 class Estimator:
-    """The live estimate of one device.
+    """Live estimator of the Allan curve and the noise coefficients of one device.
 
-    Args:
-        rate_hz: nominal samples a second
-        window_s: length of the sliding window
-        tau: grid of averaging times, or a list of them in s
-        every_sample: have the coefficients follow every sample, not only each look
-    Raises:
-        ConfigError: the window or the list of τ is impossible at this rate
+    Parameters
+    ----------
+    rate_hz : float
+        Nominal sample rate in Hz.
+    window_s : float
+        Length of the sliding window in seconds.
+    tau : TauGrid
+        Grid of averaging times, or a tuple of averaging times in seconds.
+    every_sample : bool
+        True to update the coefficients after every sample, and not only at each call of ``get``.
+
+    Raises
+    ------
+    ConfigError
+        If none of the listed τ is possible in this window at this rate.
     """
 
     def __init__(self, rate_hz: float, window_s: float, tau: TauGrid = "octave", every_sample: bool = False) -> None:
@@ -61,48 +71,48 @@ class Estimator:
         factors = cluster_sizes(length, rate_hz, tau)
         spans = quick_spans(factors, rate_hz, length)
         self._m = factors.size
-        # the rows of the fit, then those for the eye
+        # the first m rows are fitted, the next m rows are only displayed
         rows, lengths = np.tile(factors, 2), np.concatenate([np.full(self._m, length), spans])
         self._window = AllanWindow(length, rows, lengths)
         self._factors = factors
         self._design = design(factors, rate_hz)
         self._tables = AxisTables(factors, length)
-        self._spans = Spans(factors, spans, self._design.columns)
+        self._spans = SpanDegreesOfFreedom(factors, spans, self._design.columns)
         self._entered: NDArray[np.bool_] = np.zeros((5, 6), np.bool_)
-        self._lengths = np.zeros(6, np.int64)  # samples of each axis since its last restart, at most the window
+        self._lengths = np.zeros(6, np.int64)  # samples of each axis since its last restart, limited to the window
         self._refit = Refit(self._window, self._m, self._tables) if every_sample else None
         self._course: deque[Course] = deque()
-        self._followed = 0  # samples in it
-        self._slow = SlowStatistics(self._window)
-        self._theta = np.full((5, 6), np.nan)  # of the newest fit
-        self._odd: list[tuple[Table, Looks] | None] = [None] * 6  # curves that contradict their fit
-        self._filters: list[LowPass | None] = [None] * 6
-        self._turn = 0  # the axis whose filter is sought
+        self._course_samples = 0  # total number of samples in ``_course``
+        self._total_hadamard = SlowStatistics(self._window)
+        self._theta = np.full((5, 6), np.nan)  # squared coefficients of the newest fit
+        self._contradicting: list[tuple[Table, MeasuredCurve] | None] = [None] * 6  # curves that contradict their fit
+        self._low_passes: list[LowPass | None] = [None] * 6
+        self._search_axis = 0  # axis whose low-pass filter is being searched for
         self._search: Generator[None, None, LowPass | None] | None = None
         self._samples = 0
         self._newest_ns = 0
 
     @property
     def samples(self) -> int:
-        """Samples received since the start, resets notwithstanding."""
+        """Number of samples received since the start. A reset does not clear it."""
         return self._samples
 
     @property
     def filled(self) -> int:
-        """Samples in the window now, missing ones included."""
+        """Number of samples in the window, including missing ones."""
         return self._window.n
 
     @property
     def length(self) -> int:
-        """Samples in the full window."""
+        """Number of samples in the full window."""
         return self._window.length
 
     def held(self) -> Held:
-        """The samples in the window now."""
-        return held(self._window, self.rate_hz)
+        """Return a copy of the samples in the window."""
+        return copy_window(self._window, self.rate_hz)
 
     def update(self, samples: SampleBlock) -> None:
-        """Advance by the samples missing before the block, then by the block."""
+        """Advance the window by the samples missing before the block, then by the block itself."""
         if samples.lost > self._window.length:
             self.reset()
         elif samples.lost:
@@ -114,9 +124,9 @@ class Estimator:
             self._lengths += len(samples)
         else:
             self._course.append(Course(samples.t_ns, self._refit.update(self._design, samples.values, self._lengths)))
-            self._followed += len(samples)
-            while self._followed - len(self._course[0].t_ns) >= COURSE_SAMPLES:
-                self._followed -= len(self._course.popleft().t_ns)
+            self._course_samples += len(samples)
+            while self._course_samples - len(self._course[0].t_ns) >= COURSE_SAMPLES:
+                self._course_samples -= len(self._course.popleft().t_ns)
         self._samples += len(samples)
         self._newest_ns = int(samples.t_ns[-1])
 
@@ -129,7 +139,15 @@ class Estimator:
             self._refit.reset()
 
     def restart(self, axis: int, samples: int) -> None:
-        """Of one axis, forget all but the newest samples: its noise was another before them."""
+        """Discard all but the newest samples of one axis, because its noise has changed.
+
+        Parameters
+        ----------
+        axis : int
+            Index into ``AXES``.
+        samples : int
+            Number of newest samples to keep.
+        """
         self._window.forget(axis, samples)
         self._lengths[axis] = min(samples, self._lengths[axis])
         self._entered[:, axis], self._theta[:, axis] = False, np.nan
@@ -137,30 +155,48 @@ class Estimator:
             self._refit.restart(axis)
 
     def fitted(self) -> tuple[NDArray[np.bool_], Floats]:
-        """Which terms the newest fit has, and their sizes [5, 6]: what the next one starts from."""
+        """Return the terms in the newest fit and the squared coefficients θ in SI, both of shape (5, 6).
+
+        ``start_from`` accepts both as the start of the next fit.
+        """
         return (self._entered if self._refit is None else self._refit.entered).copy(), self._theta.copy()
 
     def start_from(self, entered: NDArray[np.bool_], theta: Floats) -> None:
-        """Let the next fit start from one before a restart of the program, and take it to its end.
+        """Start the next fit from a fit made before a restart of the program, and repeat it until it has converged.
 
-        A term that is in the fit leaves it later than it enters, and the live fit follows by a step each look.
+        Terms use hysteresis: the threshold to drop a term is lower than the threshold to add it. A live fit otherwise
+        moves by only one re-weighting per call.
+
+        Parameters
+        ----------
+        entered : ndarray of bool, shape (5, 6)
+            True for each term that was in the fit.
+        theta : ndarray of float64, shape (5, 6)
+            Squared coefficients Q², N², B², K², R² in SI.
         """
         self._entered, self._theta = entered.copy(), theta.copy()
         if self._window.n >= FEWEST:
-            for _ in range(SETTLING):
+            for _ in range(SETTLING_FITS):
                 self.get()
 
     def relabel(self, rate_hz: float) -> None:
-        """The rate is known better now: the same clusters of samples, other τ and units."""
+        """Set a more accurate sample rate. The clusters of samples stay the same; τ and the units change."""
         self.rate_hz = rate_hz
         self.window_s = self._window.length / rate_hz
         self._design = design(self._factors, rate_hz)
 
     def get(self, fitted: bool = True) -> Estimate:
-        """The curve of the window and the coefficients fitted to it; without ``fitted``, deviations alone.
+        """Return the Allan curve of the window and the coefficients fitted to it.
 
-        Raises:
-            NotReady: fewer than FEWEST samples in the window
+        Parameters
+        ----------
+        fitted : bool
+            False to skip the fit and return the deviations alone.
+
+        Raises
+        ------
+        NotReady
+            If the window holds fewer than ``FEWEST`` samples.
         """
         n = self._window.n
         if n < FEWEST:
@@ -173,28 +209,34 @@ class Estimator:
         quick = self._curve(avar[recent], terms[recent], quick_edf, n)
         course = joined_courses(self._course)
         self._course.clear()
-        self._followed = 0
+        self._course_samples = 0
         return Estimate(
             self._newest_ns, self.rate_hz, self.window_s, self._samples, curve, result.fitted, result.coefficients,
             result.k_or_r, quick, course,
         )  # fmt: skip
 
     def step(self) -> tuple[TotalCurve, HadamardCurve] | None:
-        """One step of what takes long: total and Hadamard deviations, see ``slow``, and the sensor's own low-pass.
+        """Run one step of the slow computations.
 
-        Returns the two curves when a round of them is complete.
+        These are the total and Hadamard deviations (see ``live_total_hadamard``) and the search for the low-pass of the
+        sensor.
+
+        Returns
+        -------
+        tuple of TotalCurve and HadamardCurve, or None
+            Both curves if this step has completed a round, otherwise None.
         """
-        rounds = self._slow.rounds
-        self._slow.step()
+        rounds = self._total_hadamard.rounds
+        self._total_hadamard.step()
         self._seek_bandwidth()
         return (
-            self._slow.get(self.rate_hz, np.where(self._entered, self._theta, 0.0))
-            if self._slow.rounds > rounds
+            self._total_hadamard.get(self.rate_hz, np.where(self._entered, self._theta, 0.0))
+            if self._total_hadamard.rounds > rounds
             else None
         )
 
     def _fit(self, avar: Floats, terms: Ints) -> Fit:
-        """Fit the axes that fill the window together, each restarted one by the covariances of its own length."""
+        """Fit all axes that fill the window together. Fit each restarted axis with covariances of its own length."""
         lengths = np.minimum(self._lengths, self._window.n)
         slope, slopes = self._window.slope(lengths), self._window.slopes(lengths)[: self._m]
         before = self._entered if self._refit is None else self._refit.entered
@@ -205,39 +247,47 @@ class Estimator:
         for axes in groups:
             n = int(lengths[axes[0]])
             table = self._tables.of(int(axes[0]), n, self._window.n).at(n)
-            looks = Looks(
+            measured = MeasuredCurve(
                 avar[:, axes], terms[:, axes], slope[axes] * self.rate_hz, slopes[:, axes] * self.rate_hz,
                 before[:, axes],
             )  # fmt: skip
             one = fit(
-                self._design, table, looks.avar, looks.terms, looks.before, looks.slope, looks.slopes,
+                self._design, table, measured.avar, measured.terms, measured.before, measured.slope, measured.slopes,
                 start=self._theta[:, axes],
             )  # fmt: skip
             self._theta[:, axes] = one.theta
             for column, axis in enumerate(axes.tolist()):
-                self._odd[axis] = (table, looks.axis(column)) if contradicted(one, column) else None
-            fits.append(with_bandwidth(self._design, table, looks, one, [self._filters[axis] for axis in axes])[0])
-        result = fits[0] if len(fits) == 1 else joined(fits, np.concatenate(groups))
+                self._contradicting[axis] = (table, measured.axis(column)) if is_contradicted(one, column) else None
+            fits.append(
+                with_bandwidth(self._design, table, measured, one, [self._low_passes[axis] for axis in axes])[0]
+            )
+        result = fits[0] if len(fits) == 1 else concatenate_fits(fits, np.concatenate(groups))
         self._entered = result.entered
         return result
 
     def _seek_bandwidth(self) -> None:
-        """A piece of the search for the low-pass of one axis; then of the next whose shortest τ contradict the fit."""
+        """Run one part of the low-pass search of one axis.
+
+        When a search ends, the next axis whose shortest τ contradict its fit is searched.
+        """
         if self._search is not None:
             try:
                 next(self._search)
             except StopIteration as end:
-                self._filters[self._turn] = end.value
+                self._low_passes[self._search_axis] = end.value
                 self._search = None
             return
-        for _ in range(len(self._odd)):
-            self._turn = (self._turn + 1) % len(self._odd)
-            odd = self._odd[self._turn]
+        for _ in range(len(self._contradicting)):
+            self._search_axis = (self._search_axis + 1) % len(self._contradicting)
+            odd = self._contradicting[self._search_axis]
             if odd is not None:
-                self._search = searching(self._design, *odd, power(self._window.newest(self._turn, POWER_ROWS)))
+                self._search = search_low_pass(
+                    self._design, *odd, power(self._window.newest(self._search_axis, SPECTRUM_SAMPLES))
+                )
                 return
-            self._filters[self._turn] = None
+            self._low_passes[self._search_axis] = None
 
     def _curve(self, avar: Floats, terms: Ints, edf: Floats, n: int) -> AllanCurve:
+        """Build an ``AllanCurve`` with confidence intervals."""
         lo, hi = intervals(avar, edf)
         return AllanCurve(self._factors / self.rate_hz, self._factors, avar, terms, edf, lo, hi, n)

@@ -1,14 +1,18 @@
-"""Which holes of a recording are holes: a sample that is missing shifts all later times for good, a late one does not.
+"""Distinction of missing and late samples in a recording from its time stamps.
 
-The clock calls a step of two periods a hole, as the next sample has to be placed at once. A recording also knows what
-came after. Of each hole the times against those of a steady rate, in periods, are looked at on both sides: the medians
-of some tens of rows, which bear a few that are late. A late sender may need as many rows as seemed missing to catch up,
-so that the rows after a hole are more by those. Where holes are so near each other that a level may be that of a late
-sender, the lowest within reach counts, as nothing comes early. What the times are shifted by, as a whole number between
-none and what the clock said, is missing.
+A missing sample shifts all later time stamps permanently; a late sample does not. The live clock takes a step of two
+periods for a gap, because it must place the next sample at once. In a recording, the time stamps after the gap are
+known as well.
 
-The rate is the median over stretches without a hole, so that neither what is missing nor what came late bears on it. A
-rate that wanders by half a percent shifts times by a quarter of a period within reach, which is not counted.
+For each gap, the time stamps are compared with those of a constant rate, on both sides of the gap. The median of some
+tens of rows is used, which tolerates a few late rows. A late sender may need as many rows to catch up as seemed to be
+missing, so the range after the gap is longer by this number. Where gaps follow each other closely, the median of one
+may belong to a late sender. The lowest median within reach then counts, since no sample comes early. The shift of the
+time stamps is rounded to a whole number between zero and the number claimed by the clock. This is the number of missing
+samples.
+
+The rate is the median over stretches without a gap, so neither missing nor late samples bias it. A rate that wanders by
+half a percent shifts the time stamps by a quarter of a period within reach, which is not counted as a missing sample.
 """
 
 from typing import Final
@@ -19,27 +23,38 @@ from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 
 AROUND: Final = 60
-"""Rows to each side: bus adapters were seen to send twenty late at once, and most have to be on time."""
+"""Rows on each side of a gap. Most of them must be on time; bus adapters were seen to send twenty rows late at once."""
 FEWEST: Final = 2.0 / 3.0
-"""Periods: times that wander shift by half a period without any loss."""
+"""Minimum shift in periods that counts as missing samples. Wandering time stamps shift by half a period without loss.
+"""
 CATCH_UP: Final = 10_000
-"""Rows that a late sender is granted at most to catch up."""
+"""Maximum number of rows that a late sender may need to catch up."""
 WANDERS: Final = 0.01
-"""Of the rate, at most, within reach: a level that falls by less is nothing that was caught up."""
-STRETCHES: Final = (256, 128, 64, 32, 16, 8, 4, 2)
-"""Rows between two times that the rate is had from: the longest of which there are enough without a hole."""
-ENOUGH: Final = 4
-"""One in so many rows begins such a stretch."""
+"""Maximum relative wander of the rate within reach. A smaller fall of the median is not a sender that catches up."""
+STRETCH_ROWS: Final = (256, 128, 64, 32, 16, 8, 4, 2)
+"""Candidate distances in rows between two time stamps for the rate. The longest one with enough stretches is used."""
+MIN_STRETCH_RATIO: Final = 4
+"""A distance is usable if at least one in this many rows begins a stretch without a gap."""
 
 
 def truly_missing(t_ns: Ints, rows: Ints, claimed: Ints, breaks: Ints) -> Ints:
-    """Samples [k] that are missing before rows ``rows`` [k] of times [n]; the rest of what the clock said came late.
+    """Return the number of samples that are missing before each gap. The other samples claimed by the clock were late.
 
-    Args:
-        t_ns: given times, in their order
-        rows: of the holes, rising
-        claimed: samples [k] that would be missing if nothing came late
-        breaks: other rows that times before say nothing about: jumps, long pauses
+    Parameters
+    ----------
+    t_ns : ndarray of int64, shape (n,)
+        Time stamps in nanoseconds, in the order of the rows.
+    rows : ndarray of int64, shape (k,)
+        Rows after the gaps, ascending.
+    claimed : ndarray of int64, shape (k,)
+        Number of samples missing before each of ``rows`` if no sample was late.
+    breaks : ndarray of int64
+        Other rows across which time stamps cannot be compared, after jumps and long pauses.
+
+    Returns
+    -------
+    ndarray of int64, shape (k,)
+        Number of missing samples, at most ``claimed``.
 
     >>> t_ns = 10_000_000 * np.arange(300)
     >>> t_ns[100:110] += 10_000_000  # late
@@ -50,29 +65,32 @@ def truly_missing(t_ns: Ints, rows: Ints, claimed: Ints, breaks: Ints) -> Ints:
     period_ns = _period_ns(t_ns, np.concatenate([rows, breaks]))
     if not period_ns > 0.0:
         return claimed
-    # seconds of Unix time have no digits left for a period
+    # relative to the first time stamp, because absolute Unix time leaves no digits for fractions of a period
     late = (t_ns - t_ns[0]) / period_ns - np.arange(t_ns.size)
     ends = np.unique(np.concatenate([[0], rows, breaks, [t_ns.size]]))
     return _decided(late, rows, claimed, ends, np.searchsorted(ends, rows))
 
 
 def _period_ns(t_ns: Ints, edges: Ints) -> float:
-    """Median over stretches that cross no edge; over all steps where these are too few."""
+    """Return the median period over stretches that cross no edge, or over all steps if there are too few stretches."""
     part = np.zeros(t_ns.size, np.int64)
     part[edges] = 1
     part = np.cumsum(part)
-    for rows in STRETCHES:
+    for rows in STRETCH_ROWS:
         if t_ns.size <= rows:
             continue
         whole = part[rows:] == part[:-rows]
-        if ENOUGH * whole.sum() >= t_ns.size:
+        if MIN_STRETCH_RATIO * whole.sum() >= t_ns.size:
             return float(np.median((t_ns[rows:] - t_ns[:-rows])[whole])) / rows
     return float(np.median(np.diff(t_ns)))
 
 
 @compiled
 def _decided(late: Floats, rows: Ints, claimed: Ints, ends: Ints, at: Ints) -> Ints:
-    """Samples missing before each hole, by how late [n] the rows are, in periods; hole k is at ``ends[at[k]]``."""
+    """Count the missing samples before each gap from the delay ``late`` [n] of the rows in periods.
+
+    Gap k begins at row ``ends[at[k]]``.
+    """
     holes = rows.size
     reach = np.empty(holes, np.int64)
     after = np.empty(holes)

@@ -1,10 +1,14 @@
-"""A recording on a regular grid: by the same clock that stamps live samples, what is missing is NaN in its place.
+"""Resampling of a recording to a regular grid by the clock that stamps live samples. Missing samples become NaN.
 
-The clock calls a step of two periods a hole, as the next sample has to be placed at once. A whole recording knows
-better, hole by hole, what only came late. Rows that repeat others, time and values, are kept out. Rows that repeat the
-one before while time goes on stay, as they are what the sensor's register held. A stated rate is believed, also where
-the times say another. Everything found is said in notes, at most NOTES of one sort; so is a resolution of the values as
-coarse as their noise.
+The live clock takes a step of two periods for a gap, because it must place the next sample at once. With the whole
+recording, each gap is checked again for samples that were only late (``late_rows``).
+
+Rows that repeat an earlier row with its time stamp are dropped. Rows that repeat the previous values at a later time
+are kept, since they are what the register of the sensor held. A stated rate is used even if the time stamps contradict
+it.
+
+All findings are returned as notes, at most ``NOTES`` from the clock. A resolution as coarse as the noise is
+noted as well.
 """
 
 from collections.abc import Sequence
@@ -20,79 +24,118 @@ from drivers.timing.duplicate_rows import NS
 from drivers.timing.sample_clock import JUMP_S, LONG_S, SampleClock
 from monitor.common.rates import amount, plain
 from monitor.estimation.detection.repeated_samples import stale_share
-from monitor.estimation.detection.resolution import Steps, coarse
+from monitor.estimation.detection.resolution import QuantizationStep, coarse
 from monitor.estimation.late_rows import truly_missing
 
-OFF_RATE: Final = 0.002
-"""A stated rate further than this from what the times say is told, where they say it that well."""
-FAR_RATE: Final = 0.02
-"""Further than this it is told in any case."""
-STEADY: Final = 0.02
-"""Steps that differ by less are alike."""
+MIN_RATE_DEVIATION: Final = 0.002
+"""Relative deviation of the stated rate from the time stamps that is reported if the time stamps are that accurate."""
+LARGE_RATE_DEVIATION: Final = 0.02
+"""Relative deviation of the stated rate from the time stamps that is always reported."""
+STEP_TOLERANCE: Final = 0.02
+"""Relative difference up to which time steps count as equal."""
 NOTES: Final = 10
-"""Of the clock; what is beyond is counted."""
-STALE: Final = 0.01
-"""A share below this is not told."""
+"""Maximum number of notes of the clock; the remaining ones are counted."""
+MIN_REPEATED_SHARE: Final = 0.01
+"""Shares of repeated rows below this value are not reported."""
 LONGEST_HOLE: Final = 1_000_000
-"""Missing samples kept in place, 48 bytes each; one stands for a longer pause, and keeps terms from reaching across."""
-STRETCHES: Final = 8
-"""Of a recording, whose rates tell how well the mean of all is known."""
-SURE: Final = 5.0
-"""Standard errors of eight stretches."""
-UNIT: Final = 0.05
-"""Of a unit of times: what is nearer to a whole number of it is one."""
-UNEVEN: Final = 0.5
-"""Of a period: steps of which a fifth is further off than this are told."""
+"""Longest gap in samples that is kept at full length, at 48 bytes per sample.
+
+One missing sample stands for a longer pause. It keeps terms from reaching across the pause.
+"""
+SEGMENTS: Final = 8
+"""Number of segments of a recording. The scatter of their rates gives the standard error of the mean rate."""
+RATE_SIGMA: Final = 5.0
+"""Number of standard errors of the mean rate beyond which a deviation is significant."""
+UNIT_TOLERANCE: Final = 0.05
+"""A time step counts as a whole number of units if it deviates by less than this share of the unit."""
+UNEVEN_STEP_SHARE: Final = 0.5
+"""Share of a period. Time steps are reported as uneven if the outer fifth of them deviates by more than this."""
 
 
 def on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Floats, float, list[str]]:
-    """Values [n, 6] at a steady rate, missing samples NaN in their places; the rate; what was found about the times.
+    """Place the samples of a recording on a grid of constant rate, with NaN for missing samples.
 
-    The values may be the blocks' own memory: to be read, not written.
+    Parameters
+    ----------
+    blocks : sequence of SampleBlock
+        Recording with its own time stamps.
+    rate_hz : float or None
+        Stated sample rate in Hz. None to estimate it from the time stamps.
+
+    Returns
+    -------
+    values : ndarray of float64, shape (n, 6)
+        Samples in rad/s and m/s². The array may share the memory of ``blocks`` and must not be written.
+    rate_hz : float
+        Sample rate in Hz.
+    notes : list of str
+        Findings about the time stamps and the values.
     """
-    stamped, lost, rate, notes = _timed(blocks, rate_hz)
-    values = _placed(stamped, lost)
-    return values, rate, [*notes, *_said_of_values(values), *_said_missing(lost, rate)]
+    stamped, lost, rate, notes = _stamp(blocks, rate_hz)
+    values = _place_on_grid(stamped, lost)
+    return values, rate, [*notes, *_value_notes(values), *_missing_notes(lost, rate)]
 
 
 def with_temperature(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Floats, Floats, float, list[str]]:
-    """As ``on_grid``, and the temperature [n] in °C between values and rate."""
-    stamped, lost, rate, notes = _timed(blocks, rate_hz)
-    values = _placed(stamped, lost)
+    """Do the same as ``on_grid`` and also return the temperature.
+
+    Parameters
+    ----------
+    blocks : sequence of SampleBlock
+        Recording with its own time stamps.
+    rate_hz : float or None
+        Stated sample rate in Hz. None to estimate it from the time stamps.
+
+    Returns
+    -------
+    values : ndarray of float64, shape (n, 6)
+        Samples in rad/s and m/s². The array may share the memory of ``blocks`` and must not be written.
+    temperature_c : ndarray of float64, shape (n,)
+        Temperature in °C; NaN means not measured or a missing sample.
+    rate_hz : float
+        Sample rate in Hz.
+    notes : list of str
+        Findings about the time stamps and the values.
+    """
+    stamped, lost, rate, notes = _stamp(blocks, rate_hz)
+    values = _place_on_grid(stamped, lost)
     missing = np.where(lost > LONGEST_HOLE, 1, lost).tolist()
     parts = [
         part
         for samples, hole in zip(stamped, missing, strict=True)
         for part in (np.full(hole, np.nan), samples.temperature_c)
     ]
-    notes = [*notes, *_said_of_values(values), *_said_missing(lost, rate)]
+    notes = [*notes, *_value_notes(values), *_missing_notes(lost, rate)]
     return values, np.concatenate(parts), rate, notes
 
 
-def _timed(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[list[SampleBlock], Ints, float, list[str]]:
-    """Blocks as they follow each other, how many samples are missing before each, the rate, and what the times say."""
+def _stamp(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[list[SampleBlock], Ints, float, list[str]]:
+    """Return the stamped blocks, the missing samples before each block, the rate, and the notes on the time stamps."""
     clock = SampleClock(Given(), rate_hz)
     stamped = [one for samples in blocks for one in clock.stamp(samples)]
-    told = [event.text for event in clock.take_events(ended=True)]
+    clock_notes = [event.text for event in clock.take_events(ended=True)]
     t_ns = np.concatenate([samples.t_ns for samples in stamped])
-    lost, late = _without_late(stamped, t_ns)
+    lost, late = _count_missing(stamped, t_ns)
     steps = np.diff(t_ns)
-    going = _going(stamped, t_ns, lost, steps)
-    rate = rate_hz or _mean_rate(going)
-    notes = told[:NOTES] + ([f"and {len(told) - NOTES} more notes on the times"] if len(told) > NOTES else [])
-    return stamped, lost, rate, notes + _said_of_steps(steps, going, rate) + _said_late(late)
+    progress = _count_and_time(stamped, t_ns, lost, steps)
+    rate = rate_hz or _mean_rate(progress)
+    notes = clock_notes[:NOTES] + (
+        [f"and {len(clock_notes) - NOTES} more notes on the times"] if len(clock_notes) > NOTES else []
+    )
+    return stamped, lost, rate, notes + _step_notes(steps, progress, rate) + _late_notes(late)
 
 
-def _said_of_values(values: Floats) -> list[str]:
-    return _said_stale(values) + _said_coarse(coarse(values))
+def _value_notes(values: Floats) -> list[str]:
+    """Format the notes on repeated rows and on coarse resolution."""
+    return _repeated_notes(values) + _resolution_notes(coarse(values))
 
 
-def _without_late(stamped: Sequence[SampleBlock], t_ns: Ints) -> tuple[Ints, int]:
-    """Samples missing before each block, and how many holes were none, as all that is missing only came late."""
+def _count_missing(stamped: Sequence[SampleBlock], t_ns: Ints) -> tuple[Ints, int]:
+    """Return the samples missing before each block, and the number of gaps that were only late samples."""
     lost = np.array([samples.lost for samples in stamped], np.int64)
     short = (lost > 0) & (lost <= LONGEST_HOLE)
     rows = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])
-    short &= rows > 0  # nothing is known of what was before the first
+    short &= rows > 0  # the time before the first sample is unknown
     if not short.any():
         return lost, 0
     steps = np.diff(t_ns)
@@ -103,10 +146,10 @@ def _without_late(stamped: Sequence[SampleBlock], t_ns: Ints) -> tuple[Ints, int
     return missing, int((short & (missing == 0)).sum())
 
 
-def _placed(stamped: Sequence[SampleBlock], lost: Ints) -> Floats:
-    """All rows in one array [n, 6], NaN where samples are missing; not copied where blocks lie side by side."""
+def _place_on_grid(stamped: Sequence[SampleBlock], lost: Ints) -> Floats:
+    """Return all rows in one array [n, 6] with NaN for missing samples, without a copy if the blocks are contiguous."""
     missing = np.where(lost > LONGEST_HOLE, 1, lost)
-    if not missing.any() and (whole := _side_by_side([samples.values for samples in stamped])) is not None:
+    if not missing.any() and (whole := _contiguous([samples.values for samples in stamped])) is not None:
         return whole
     values = np.empty((int(missing.sum()) + sum(len(samples) for samples in stamped), 6))
     row = 0
@@ -118,8 +161,8 @@ def _placed(stamped: Sequence[SampleBlock], lost: Ints) -> Floats:
     return values
 
 
-def _side_by_side(parts: Sequence[Floats]) -> Floats | None:
-    """The rows of the one array that these parts are, each beginning where the last ended; None where they are not."""
+def _contiguous(parts: Sequence[Floats]) -> Floats | None:
+    """Return the rows of the common base array if the parts follow each other in it, otherwise None."""
     whole = parts[0].base
     if len(parts) == 1:
         return parts[0]
@@ -137,10 +180,12 @@ def _side_by_side(parts: Sequence[Floats]) -> Floats | None:
 
 
 def _address(array: Floats) -> int:
+    """Return the memory address of the first element."""
     return int(array.__array_interface__["data"][0])
 
 
-def _said_missing(lost: Ints, rate_hz: float) -> list[str]:
+def _missing_notes(lost: Ints, rate_hz: float) -> list[str]:
+    """Format the notes on long pauses and on missing samples."""
     long, short = lost[lost > LONGEST_HOLE], lost[(lost > 0) & (lost <= LONGEST_HOLE)]
     notes = [f"a pause of {n / rate_hz:.6g} s is too long to keep in place; no term reaches across" for n in long]
     if short.size:
@@ -150,7 +195,8 @@ def _said_missing(lost: Ints, rate_hz: float) -> list[str]:
     return notes
 
 
-def _said_late(late: int) -> list[str]:
+def _late_notes(late: int) -> list[str]:
+    """Format the note on late samples."""
     if not late:
         return []
     times = "once" if late == 1 else f"{late} times"
@@ -159,17 +205,18 @@ def _said_late(late: int) -> list[str]:
     ]
 
 
-def _said_stale(values: Floats) -> list[str]:
+def _repeated_notes(values: Floats) -> list[str]:
+    """Format the note on rows that repeat the previous one."""
     share = stale_share(values)
-    if share < STALE:
+    if share < MIN_REPEATED_SHARE:
         return []
     percent = 100.0 * share
     return [f"{percent:.2g} % of rows repeat the one before: the sensor updates slower than it is read; they are kept"]
 
 
-def _said_coarse(found: Sequence[Steps]) -> list[str]:
-    """By kind of sensor and size of the steps."""
-    alike: dict[str, list[Steps]] = {}
+def _resolution_notes(found: Sequence[QuantizationStep]) -> list[str]:
+    """Format the notes on coarse resolution, grouped by unit and step size."""
+    alike: dict[str, list[QuantizationStep]] = {}
     for one in found:
         alike.setdefault(amount(AXES[one.axis], one.step), []).append(one)
     notes = []
@@ -184,31 +231,32 @@ def _said_coarse(found: Sequence[Steps]) -> list[str]:
     return notes
 
 
-def _said_of_steps(steps: Ints, going: tuple[Floats, Floats] | None, rate_hz: float) -> list[str]:
-    """Where times step unevenly; where they say another rate."""
+def _step_notes(steps: Ints, progress: tuple[Floats, Floats] | None, rate_hz: float) -> list[str]:
+    """Format the notes on uneven time steps and on a rate that contradicts the time stamps."""
     if not steps.size:
         return []
-    if going is None:
+    if progress is None:
         return [f"the rate used is {rate_hz:g} Hz; the times do not go on and say none"]
-    uneven = _said_uneven(steps, rate_hz)
-    mean_hz, known = _rate(*going)
-    if abs(mean_hz / rate_hz - 1.0) < min(max(OFF_RATE, SURE * known), FAR_RATE):
+    uneven = _uneven_notes(steps, rate_hz)
+    mean_hz, known = _rate(*progress)
+    if abs(mean_hz / rate_hz - 1.0) < min(max(MIN_RATE_DEVIATION, RATE_SIGMA * known), LARGE_RATE_DEVIATION):
         return uneven
-    if _steady(steps):
+    if _is_even(steps):
         step_s = float(steps.mean()) / NS
         return [f"the rate used is {rate_hz:g} Hz, but the times step by {step_s:.6g} s, {1.0 / step_s:.6g} Hz"]
     return [*uneven, f"the rate used is {rate_hz:g} Hz, but by the times {mean_hz:.5g} samples came a second"]
 
 
-def _said_uneven(steps: Ints, rate_hz: float) -> list[str]:
-    if _steady(steps):
+def _uneven_notes(steps: Ints, rate_hz: float) -> list[str]:
+    """Format the note on uneven time steps, or on the resolution of the time stamps that causes them."""
+    if _is_even(steps):
         return []
     low, middle, high = (np.quantile(steps, [0.1, 0.5, 0.9]) / NS).tolist()
-    alike = middle > 0.0 and high - low <= STEADY * middle
-    if alike or max(1.0 / rate_hz - low, high - 1.0 / rate_hz) <= UNEVEN / rate_hz:
+    alike = middle > 0.0 and high - low <= STEP_TOLERANCE * middle
+    if alike or max(1.0 / rate_hz - low, high - 1.0 / rate_hz) <= UNEVEN_STEP_SHARE / rate_hz:
         return []
     unit_s = _unit_s(steps)
-    if unit_s > UNEVEN / rate_hz:
+    if unit_s > UNEVEN_STEP_SHARE / rate_hz:
         return [f"times have a resolution of {unit_s:.3g} s; samples are taken to be even"]
     worst_s = float(steps[steps < LONG_S * NS].max()) / NS
     return [
@@ -217,34 +265,39 @@ def _said_uneven(steps: Ints, rate_hz: float) -> list[str]:
     ]
 
 
-def _steady(steps: Ints) -> bool:
-    """Return True if all steps are alike.
+def _is_even(steps: Ints) -> bool:
+    """Return True if all steps are equal within ``STEP_TOLERANCE``.
 
-    The difference of two steps may exceed int64 where a time stamp is far off, so it is taken in floating point.
+    The difference of two steps may exceed int64 if a time stamp is far off, so it is computed in floating point.
     """
-    return float(steps.max()) - float(steps.min()) <= STEADY * float(steps.min())
+    return float(steps.max()) - float(steps.min()) <= STEP_TOLERANCE * float(steps.min())
 
 
 def _unit_s(steps: Ints) -> float:
-    """The unit that all steps are none or some of; 0 where there is none."""
+    """Return the time unit of which all steps are whole multiples, in seconds; 0 if there is none."""
     on = steps[steps > 0]
     if not on.size:
         return 0.0
     unit = float(on[on < 1.5 * on.min()].mean())  # a third of a second is not a whole number of nanoseconds
-    whole = np.abs(steps / unit - np.rint(steps / unit)) < UNIT
+    whole = np.abs(steps / unit - np.rint(steps / unit)) < UNIT_TOLERANCE
     return unit / NS if whole.all() else 0.0
 
 
-def _going(stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints, steps: Ints) -> tuple[Floats, Floats] | None:
-    """Samples that came, missing ones too, and s that passed, by the ends of STRETCHES, where times do not jump."""
-    rows = np.unique(np.linspace(0, steps.size, STRETCHES + 1).astype(np.int64))
+def _count_and_time(
+    stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints, steps: Ints
+) -> tuple[Floats, Floats] | None:
+    """Return the cumulative samples (with missing ones) and seconds at the segment ends, without jumps of the clock.
+
+    The result is None if no time passes.
+    """
+    rows = np.unique(np.linspace(0, steps.size, SEGMENTS + 1).astype(np.int64))
     starts = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])
     missing = np.cumsum(np.concatenate([[0], lost[1:]]))
     low, high = int(steps.min(initial=0)), int(steps.max(initial=0))
     jumps = np.zeros(0, np.int64)
     if low <= -JUMP_S * NS or high >= LONG_S * NS:
         jumps = np.flatnonzero((steps <= -JUMP_S * NS) | (steps >= LONG_S * NS)) + 1
-    # what a jump skips is neither time nor samples
+    # the time and the samples that a jump skips are not counted
     over = np.concatenate([[0], np.cumsum(steps[jumps - 1])])[np.searchsorted(jumps, rows, "right")]
     at_jumps = np.where(np.isin(jumps, starts), lost[np.searchsorted(starts, jumps, "right") - 1], 0) + 1
     left_out = np.concatenate([[0], np.cumsum(at_jumps)])[np.searchsorted(jumps, rows, "right")]
@@ -254,19 +307,19 @@ def _going(stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints, steps: Ints) 
 
 
 def _rate(came: Floats, passed_s: Floats) -> tuple[float, float]:
-    """Samples a second over all, and its relative standard error by the scatter of stretches; 1 where there are few."""
+    """Return the mean rate in Hz and its relative standard error from the segments; the error is 1 for few samples."""
     mean_hz = float(came[-1] / passed_s[-1])
-    if came[-1] < 2 * STRETCHES or (np.diff(came) <= 0.0).any():
+    if came[-1] < 2 * SEGMENTS or (np.diff(came) <= 0.0).any():
         return mean_hz, 1.0
     periods = np.diff(passed_s) / np.diff(came)
-    return mean_hz, float(periods.std(ddof=1)) / STRETCHES**0.5 * mean_hz
+    return mean_hz, float(periods.std(ddof=1)) / SEGMENTS**0.5 * mean_hz
 
 
-def _mean_rate(going: tuple[Floats, Floats] | None) -> float:
-    """The rate of a recording of which none is stated."""
-    if going is None:
+def _mean_rate(progress: tuple[Floats, Floats] | None) -> float:
+    """Return the rate of a recording without a stated rate."""
+    if progress is None:
         raise NotReady("the times of the recording do not go on, so that its rate is unknown; state it with --rate HZ")
-    rate_hz = made_rate(_rate(*going)[0])
+    rate_hz = made_rate(_rate(*progress)[0])
     try:
         return RATE_HZ.check(rate_hz)
     except ConfigError as error:

@@ -1,14 +1,18 @@
-"""The samples that a live window holds, taken out of it again: for work that wants a recording.
+"""Copy of the samples in a live window, for work that needs a recording, and a ring of temperatures.
 
-The window keeps phase, not samples, so that no second copy of an hour has to be held: a sample is the difference of two
-phases, exact but for the rounding to a unit of phase (1e-11 rad/s and m/s² for an hour at 100 Hz), which the phase
-carries on from sample to sample. Whoever asks for levels and repeats must not see those of this rounding, but the
-sensor's own, which are a million times larger. So where the values of an axis stand in groups, closer than NEAR units
-within and further than FAR apart, each group becomes one value again, and these lie on a grid if they may; where they
-do not, they had no steps, and what the rounding took is filled up with as much at random. Where all may have been
-float32, they are.
+The window stores phase instead of samples, so that an hour of samples is not held twice. A sample is the difference of
+two phases. It is exact except for the rounding to one unit of phase, which is 1e-11 rad/s and m/s² for an hour at 100
+Hz. The rounding error is carried from sample to sample.
 
-A missing sample comes back as NaN in its place, as does what the window was told to forget.
+Analyses of quantization levels and repeated values must see the steps of the sensor, which are a million times larger,
+and not this rounding. The following rules restore the values:
+
+- If all samples may have been float32 numbers, they are rounded to float32.
+- If the values of an axis form groups narrower than ``MAX_GROUP_UNITS`` and further apart than
+  ``MIN_GROUP_DISTANCE_UNITS``, each group becomes one value again. The values are placed on a regular grid if one fits.
+- Otherwise the sensor had no steps, and uniform random numbers replace the rounded part.
+
+Missing samples and samples discarded by the window are NaN.
 """
 
 from dataclasses import dataclass
@@ -20,96 +24,114 @@ from numpy.typing import NDArray
 from drivers.sample import AXES, Floats, Ints
 from monitor.estimation.allan.window import AllanWindow
 
-NEAR: Final = 2.0
-"""Units of phase: each sample is off by one at most, either way."""
-FAR: Final = 16.0
-TELLING: Final = 20
-DIVISORS: Final = 6
+MAX_GROUP_UNITS: Final = 2.0
+"""Maximum distance of neighbours within a group, in units of phase. Each sample is off by at most one unit either way.
+"""
+MIN_GROUP_DISTANCE_UNITS: Final = 16.0
+"""Minimum distance between groups, in units of phase."""
+MIN_FLOAT32_EVIDENCE: Final = 20
+"""Minimum number of samples that can distinguish float32 input from other values."""
+MAX_GRID_DIVISOR: Final = 6
+"""The smallest distance of two levels is tried as 1 to this many grid steps."""
 
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """A copy of what a window held at one moment, quick to make; ``values`` takes its time."""
+    """Copy of the phase in a window at one moment. The copy is quick; ``values`` takes longer."""
 
     phase: Ints  # [n + 1, 6 or more] modulo 2⁶⁴, oldest first
-    missing: NDArray[np.int32]  # alike: how many samples were missing up to each
-    unit: Floats  # [6] rad/s and m/s² in one unit of phase
+    missing: NDArray[np.int32]  # [n + 1, 6 or more] running count of missing samples
+    unit: Floats  # [6] size of one unit of phase in rad/s and m/s²
     rate_hz: float
 
     def __len__(self) -> int:
         return len(self.phase) - 1
 
     def values(self) -> Floats:
-        """The samples [n, 6] in rad/s and m/s², the same at every call; NaN = missing."""
+        """Return the samples [n, 6] in rad/s and m/s², identical at every call; NaN means missing."""
         columns, rng = [], np.random.default_rng(0)
         for axis in range(len(AXES)):
             units = np.diff(self.phase[:, axis]).astype(np.float64)
             units[np.diff(self.missing[:, axis]) > 0] = np.nan
-            columns.append(_as_given(units, float(self.unit[axis]), rng))
+            columns.append(_restore(units, float(self.unit[axis]), rng))
         return np.column_stack(columns)
 
 
-def held(window: AllanWindow, rate_hz: float) -> Held:
-    """What the window holds now."""
+def copy_window(window: AllanWindow, rate_hz: float) -> Held:
+    """Return a copy of the current content of a window.
+
+    Parameters
+    ----------
+    window : AllanWindow
+        Window to copy.
+    rate_hz : float
+        Sample rate in Hz.
+    """
     phase, missing, first, unit = window.ring()
     end = first + window.n + 1
-    # the ring's end may lie between
+    # the window may wrap around the end of the ring
     rows = [slice(first, min(end, len(phase))), slice(0, max(end - len(phase), 0))]
     return Held(
         np.concatenate([phase[one] for one in rows]), np.concatenate([missing[one] for one in rows]), unit, rate_hz
     )
 
 
-def _as_given(units: Floats, unit: float, rng: np.random.Generator) -> Floats:
-    """Rounded values [n] as they may have been: equal where a sensor has steps, on no grid where it has none.
+def _restore(units: Floats, unit: float, rng: np.random.Generator) -> Floats:
+    """Restore values [n] from rounded ones: equal where the sensor has steps, dithered where it has none.
 
     >>> rounded = np.array([1000.0, 1001.0, 7.0, np.nan, 999.0])
-    >>> _as_given(rounded, 1e-6, np.random.default_rng(1)).round(9).tolist()
+    >>> _restore(rounded, 1e-6, np.random.default_rng(1)).round(9).tolist()
     [0.001, 0.001, 7e-06, nan, 0.001]
     """
     single = (units * unit).astype(np.float32)
     apart = np.abs(single.astype(np.float64) - units * unit)
-    telling = np.spacing(np.abs(single)) > FAR * unit  # chance is as near to a float32 in one of four such
-    if np.count_nonzero(telling) >= TELLING and not (apart > NEAR * unit).any():
+    # other values are this close to a float32 by chance in one of four cases
+    telling = np.spacing(np.abs(single)) > MIN_GROUP_DISTANCE_UNITS * unit
+    if np.count_nonzero(telling) >= MIN_FLOAT32_EVIDENCE and not (apart > MAX_GROUP_UNITS * unit).any():
         return single.astype(np.float64)
-    return _apart(units, rng) * unit
+    return _merge_groups(units, rng) * unit
 
 
-def _apart(units: Floats, rng: np.random.Generator) -> Floats:
-    """Groups as one value each, all else with what the rounding took."""
+def _merge_groups(units: Floats, rng: np.random.Generator) -> Floats:
+    """Replace each group by one value, or add uniform dither of one unit if there are no groups."""
     known = np.flatnonzero(~np.isnan(units))
     order = known[np.argsort(units[known], kind="stable")]
     ordered = units[order]
     apart = np.diff(ordered, prepend=-np.inf)
     result = units.copy()
-    if (apart[apart > NEAR] > FAR).all():
-        level = np.cumsum(apart > NEAR) - 1
-        result[order] = _even(np.bincount(level, ordered) / np.bincount(level))[level]
+    if (apart[apart > MAX_GROUP_UNITS] > MIN_GROUP_DISTANCE_UNITS).all():
+        level = np.cumsum(apart > MAX_GROUP_UNITS) - 1
+        result[order] = _snap_to_grid(np.bincount(level, ordered) / np.bincount(level))[level]
     else:
         result[known] += rng.random(known.size) - 0.5
     return result
 
 
-def _even(levels: Floats) -> Floats:
-    """Levels that lie on one grid, but for their rounding, exactly on it; others as they are.
+def _snap_to_grid(levels: Floats) -> Floats:
+    """Return levels on an exact regular grid if they fit one up to rounding, otherwise unchanged.
 
-    >>> _even(np.array([1e5, 3.000001e5, 6.0e5])).round(3).tolist()
+    >>> _snap_to_grid(np.array([1e5, 3.000001e5, 6.0e5])).round(3).tolist()
     [100000.039, 300000.034, 600000.026]
     """
     if levels.size < 2:
         return levels
     shortest = float(np.diff(levels).min())
-    for parts in range(1, DIVISORS + 1):  # the shortest way between two levels may be more than a step
+    for parts in range(1, MAX_GRID_DIVISOR + 1):  # the smallest distance of two levels may be several steps
         count = np.rint((levels - levels[0]) * (parts / shortest))
         step, first = np.polynomial.polynomial.polyfit(count, levels, 1)[::-1]
         even = first + step * count
-        if np.abs(even - levels).max() <= NEAR:
+        if np.abs(even - levels).max() <= MAX_GROUP_UNITS:
             return np.asarray(even)
     return levels
 
 
 class Temperatures:
-    """The newest temperatures of a device, 4 bytes a sample, beside the window that holds its axes.
+    """Ring of the newest temperatures of a device, at 4 bytes per sample.
+
+    Parameters
+    ----------
+    length : int
+        Number of samples to keep.
 
     >>> newest = Temperatures(3)
     >>> newest.push(0, np.array([20.0, 21.0]))
@@ -123,17 +145,26 @@ class Temperatures:
         self._next = 0
 
     def push(self, lost: int, temperature_c: Floats) -> None:
-        """So many missing samples, then these [n] in °C."""
+        """Append missing samples, then temperatures.
+
+        Parameters
+        ----------
+        lost : int
+            Number of missing samples before ``temperature_c``.
+        temperature_c : ndarray of float64, shape (n,)
+            Temperatures in °C.
+        """
         if lost:
             self._write(np.full(min(lost, self._ring.size), np.nan))
         self._write(temperature_c[-self._ring.size :])
 
     def newest(self, n: int) -> Floats:
-        """Of the newest n samples, oldest first; NaN = not measured."""
+        """Return the temperatures of the newest n samples in °C, oldest first; NaN means not measured."""
         return self._ring[(self._next - np.arange(n, 0, -1)) % self._ring.size].astype(np.float64)
 
     def _write(self, temperature_c: Floats) -> None:
-        before = min(self._ring.size - self._next, len(temperature_c))  # the ring's end
+        """Write temperatures to the ring, across its end if necessary."""
+        before = min(self._ring.size - self._next, len(temperature_c))  # samples that fit before the end of the ring
         self._ring[self._next : self._next + before] = temperature_c[:before]
         self._ring[: len(temperature_c) - before] = temperature_c[before:]
         self._next = (self._next + len(temperature_c)) % self._ring.size

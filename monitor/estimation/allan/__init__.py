@@ -1,1 +1,1 @@
-"""Allan, total and Hadamard variance with covariance and degrees of freedom."""
+"""Allan, total and Hadamard variance with their covariances and degrees of freedom."""

@@ -1,23 +1,26 @@
-"""Allan variance of a whole recording at once, in floating point: the reference for the window.
+"""Overlapping Allan variance of a whole recording in floating point, the reference for the sliding window.
 
-Shares no arithmetic with ``window``, which works in integers. Three things keep the digits, with 9.81 m/s² under 1e-4
-of noise or not, and for 10⁷ samples and more:
+It shares no arithmetic with ``window``, which uses integers. Three measures keep the precision for 10⁷ samples and
+more, even with 9.81 m/s² under 1e-4 of noise:
 
-- A term never reaches across a missing sample, so each unbroken run is a recording of its own. Its mean is taken off
-  first: exact where the noise is small beside it (Sterbenz), and second differences do not see which constant it was.
-- Phase is the running sum of what is left, with the roundings of all its steps summed beside it and put back
-  (Ogita, Rump & Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26(6), 2005): right to its last digit.
-- Squares are added in LANES separate sums, and these by NumPy in pairs.
+- A term never reaches across a missing sample, so each unbroken run is treated as a recording of its own. Its mean is
+  subtracted first. The subtraction is exact if the noise is small beside the mean (Sterbenz), and second differences do
+  not depend on the constant.
+- Phase is the running sum of the remainder. The rounding errors of all steps are summed separately and added back
+  (Ogita, Rump & Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26(6), 2005). Phase is therefore correct to
+  its last digit.
+- Squares are added in ``LANES`` separate sums, which NumPy adds in pairs.
 
-Against sums in whole numbers without any rounding σ² is right to 1e-15 for stationary noise, and to 1e-12 under a
-random walk. What remains is the last digit of phase, large where the mean is not steady: 1e-10 with a rate that ramps
+Compared with exact sums in whole numbers, σ² is correct to 1e-15 for stationary noise and to 1e-12 under a random walk.
+The remaining error is the last digit of phase. It is largest if the mean is not constant: 1e-10 for a rate that ramps
 through 20 000 times its noise.
 
-One float64 a sample and axis is held beside the samples. The kernel runs without the GIL, an axis a call: who has
-threads maps the axes over them, ``overlapping(values, factors, each=pool.map)``.
+One float64 per sample and axis is allocated in addition to the samples. The kernel releases the GIL and computes one
+axis per call, so a thread pool can compute the axes in parallel: ``overlapping(values, factors, each=pool.map)``.
 
-A run is walked in blocks, all τ to each: for τ shorter than a block phase comes from memory once for all of them, and
-of a longer octave's three places two were touched by the octave before. A τ at a time, memory would bound it.
+A run is processed in blocks, with all τ per block. For τ shorter than a block, phase is then read from memory once for
+all of them. For longer octaves, two of the three points of a term are still in the cache from the octave before. One τ
+at a time would be limited by the memory bandwidth.
 """
 
 from collections.abc import Callable, Iterable
@@ -30,31 +33,46 @@ from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 
 TauGrid = Literal["octave", "decade10"] | tuple[float, ...]
+"""Name of a grid of averaging times, or the averaging times in seconds."""
 
 Column = tuple[Floats, Ints]
-"""Allan variance [m] of one axis, and the number of its terms [m]."""
+"""Allan variance [m] of one axis and the number of its terms [m]."""
 
 EachAxis = Callable[[Callable[[Floats], Column], Iterable[Floats]], Iterable[Column]]
-"""What ``map`` does, and an executor's ``map`` in threads."""
+"""Signature of ``map`` or of the ``map`` of a thread pool."""
 
-PRESENT: Final = 0.98
-"""Share of the samples that must be there for a slope."""
+MIN_PRESENT_SHARE: Final = 0.98
+"""Minimum share of samples that must be present for a slope."""
 BLOCK: Final = 16_384
-"""Phase points of a block: three of them fill a third of a second-level cache of 1 MB."""
+"""Number of phase points in a block. Three blocks fill a third of a second-level cache of 1 MB."""
 LANES: Final = 512
-"""Separate sums of squares a τ: a row long enough for the set-up of a vector loop, and in the first-level cache."""
+"""Number of separate sums of squares per τ.
+
+A row of this length is worth the set-up of a vector loop and fits the first-level cache.
+"""
 
 
 def overlapping(values: Floats, factors: Ints, each: EachAxis = map) -> tuple[Floats, Ints]:
-    """Overlapping Allan variance [m, k] of rates [n, k], and the number of its terms [m, k].
+    """Return the overlapping Allan variance of rates and the number of its terms.
 
     NIST SP 1065 eq. 11 on rates: σ²(m) = Σ (x_{k+2m} - 2x_{k+m} + x_k)² / (2 m² C), with phase x in samples of the
-    rate, so that τ0 does not enter. What is not finite is missing: terms that touch it are left out.
+    rate, so that τ0 does not enter. Values that are not finite are missing, and terms that touch them are left out.
 
-    Args:
-        values: rates [n, k] of any floating type; left alone
-        factors: cluster sizes m ≥ 1
-        each: maps the axes; of an executor, they are done side by side
+    Parameters
+    ----------
+    values : ndarray of float, shape (n, k)
+        Rates of k axes. The array is not changed.
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples, at least 1.
+    each : EachAxis
+        Function that maps over the axes. The ``map`` of an executor computes them in parallel.
+
+    Returns
+    -------
+    avar : ndarray of float64, shape (m, k)
+        Allan variance in squared units of the axis; NaN where no term is complete.
+    terms : ndarray of int64, shape (m, k)
+        Number of terms.
 
     >>> overlapping(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().tolist()
     [0.5, 0.0]
@@ -64,21 +82,36 @@ def overlapping(values: Floats, factors: Ints, each: EachAxis = map) -> tuple[Fl
 
 
 def overlapping_axis(rate: Floats, factors: Ints) -> Column:
-    """``overlapping`` of one axis [n]: variance and terms, [m] each."""
+    """Return the overlapping Allan variance of one axis and the number of its terms, see ``overlapping``.
+
+    Parameters
+    ----------
+    rate : ndarray of float, shape (n,)
+        Rates of the axis. Values that are not finite are missing.
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
+
+    Returns
+    -------
+    avar : ndarray of float64, shape (m,)
+        Allan variance in squared units of the axis.
+    terms : ndarray of int64, shape (m,)
+        Number of terms.
+    """
     phase = np.empty(len(rate) + 1)
     phase[0] = 0.0
-    phase[1:] = rate  # a copy in float64, whatever came: float32 sums hold no Allan variance
+    phase[1:] = rate  # always a copy in float64, because float32 sums are too inaccurate for an Allan variance
     m = np.ascontiguousarray(factors, np.int64)
     lanes, terms = np.zeros((m.size, LANES)), np.zeros(m.size, np.int64)
     _add_runs(phase, m, lanes, terms)
-    with np.errstate(invalid="ignore"):  # 0/0 where no term is whole
+    with np.errstate(invalid="ignore"):  # 0/0 where no term is complete
         return lanes.sum(axis=1) / (2.0 * m * m * terms), terms
 
 
 def slope(values: Floats) -> Floats:
-    """Slope of the rate [k] over a recording [n, k], unit a sample, from its first and last third.
+    """Return the slope of the rate [k] over a recording [n, k] in units per sample, from its first and last third.
 
-    NaN where more than a fiftieth of the samples is missing.
+    The slope is NaN if more than a fiftieth of the samples is missing.
 
     >>> slope(0.5 * np.arange(9.0)[:, None]).tolist()
     [0.5]
@@ -89,15 +122,29 @@ def slope(values: Floats) -> Floats:
     newest = np.ascontiguousarray(values[len(values) - 3 * third :], np.float64)
     parts = [_mean(newest[part * third : (part + 1) * third]) for part in range(3)]
     counts = np.stack([count for count, _ in parts])
-    whole = (counts.sum(axis=0) >= PRESENT * 3 * third) & (counts[::2] >= PRESENT * third).all(axis=0)
+    whole = (counts.sum(axis=0) >= MIN_PRESENT_SHARE * 3 * third) & (counts[::2] >= MIN_PRESENT_SHARE * third).all(
+        axis=0
+    )
     return np.where(whole, (parts[2][1] - parts[0][1]) / (2.0 * third), np.nan)
 
 
 def slopes(values: Floats, factors: Ints) -> Floats:
-    """Slope of the rate [m, k] as each τ sees it, unit a sample: mean second difference of phase over m².
+    """Return the slope of the rate as seen by each τ: the mean second difference of phase divided by m².
 
-    NaN where no term is whole, and for an axis of which more than a fiftieth is missing; fewer count as its mean. The
-    sum of all second differences telescopes to four blocks of phase at the ends, so that no τ costs a walk.
+    The sum of all second differences telescopes to four blocks of phase at the ends, so one pass serves all τ. Missing
+    samples are replaced by the mean.
+
+    Parameters
+    ----------
+    values : ndarray of float, shape (n, k)
+        Rates of k axes; values that are not finite are missing.
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
+
+    Returns
+    -------
+    ndarray of float64, shape (m, k)
+        Slope in units per sample; NaN where no term is complete, and for axes with more than a fiftieth missing.
 
     >>> slopes(0.5 * np.arange(90.0)[:, None], np.array([1, 8])).round(12).ravel().tolist()
     [0.5, 0.5]
@@ -116,14 +163,17 @@ def slopes(values: Floats, factors: Ints) -> Floats:
 
 
 def _present_mean(values: Floats) -> Floats:
-    """Mean [k] of what is there in [n, k]; NaN where too little is."""
+    """Return the mean [k] of the present values of [n, k]; NaN where too many are missing."""
     count, mean = _mean(values)
-    return np.where(count < PRESENT * len(values), np.nan, mean)
+    return np.where(count < MIN_PRESENT_SHARE * len(values), np.nan, mean)
 
 
 @compiled
 def _mean(values: Floats) -> tuple[Ints, Floats]:
-    """How many are finite, and their mean, [k] each; sums are of what differs from the first, to keep its digits."""
+    """Return the number of finite values and their mean, [k] each.
+
+    Differences from the first value are summed, which keeps the precision.
+    """
     n, k = values.shape
     first, total, count = np.zeros(k), np.zeros(k), np.zeros(k, np.int64)
     for i in range(n):
@@ -138,7 +188,10 @@ def _mean(values: Floats) -> tuple[Ints, Floats]:
 
 @compiled
 def _sums_of_phase(values: Floats, mean: Floats, places: Ints) -> Floats:
-    """Running sum of phase, itself the running sum of the mean-free rates [n, k], before the ascending ``places``."""
+    """Return the running sum of phase before each of the ascending ``places``.
+
+    Phase is the running sum of the mean-free rates [n, k].
+    """
     n, k = values.shape
     phase, total, result = np.zeros(k), np.zeros(k), np.zeros((places.size, k))
     at = 0
@@ -156,14 +209,30 @@ def _sums_of_phase(values: Floats, mean: Floats, places: Ints) -> Floats:
 
 
 def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints:
-    """Cluster sizes m for a window of that many samples: τ = m/rate.
+    """Return the cluster sizes m = τ · rate of a grid of averaging times.
 
-    ``octave``: 1, 2, 4, …; ``decade10``: ten a decade; else the nearest m of each τ in seconds. The longest named by
-    a grid is a quarter of the window, where each estimate still rests on several independent terms; τ asked for by the
-    user may reach half of it.
+    The grid ``octave`` is 1, 2, 4, …, and ``decade10`` has ten sizes per decade. A grid ends at a quarter of the
+    window, where each variance still averages several independent terms. Averaging times requested by the user may
+    reach half the window.
 
-    Raises:
-        ConfigError: no τ of the list lies between one sample and half the window
+    Parameters
+    ----------
+    samples : int
+        Length of the window or recording in samples.
+    rate_hz : float
+        Sample rate in Hz.
+    tau : TauGrid
+        Name of a grid, or a tuple of averaging times in seconds, each rounded to the nearest m.
+
+    Returns
+    -------
+    ndarray of int64, shape (m,)
+        Cluster sizes in samples, ascending.
+
+    Raises
+    ------
+    ConfigError
+        If no τ of the tuple lies between one sample and half the window.
     """
     longest = samples // 4
     if tau == "octave":
@@ -183,7 +252,10 @@ def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints
 
 @compiled
 def _add_runs(phase: Floats, factors: Ints, lanes: Floats, terms: Ints) -> None:
-    """Add all terms of rates ``phase[1:]``, which become phase in place, each run from 0 in the slot before it."""
+    """Add all terms of the rates ``phase[1:]``, which are replaced by phase.
+
+    The phase of each run starts at 0 in the slot before the run.
+    """
     before = 0
     while before + 1 < phase.size:
         last = _integrate(phase, before)
@@ -199,7 +271,7 @@ def _add_runs(phase: Floats, factors: Ints, lanes: Floats, terms: Ints) -> None:
 
 @compiled
 def _integrate(phase: Floats, before: int) -> int:
-    """Turn the run of finite rates behind a slot into phase; returns its last slot, ``before`` where there is none."""
+    """Replace the run of finite rates after a slot by phase. Return its last slot, or ``before`` if it is empty."""
     total, last = 0.0, before
     while last + 1 < phase.size and np.isfinite(phase[last + 1]):
         last += 1
@@ -219,9 +291,9 @@ def _integrate(phase: Floats, before: int) -> int:
 
 @compiled
 def _add_squares(phase: Floats, first: int, end: int, m: int, lanes: Floats) -> None:
-    """Squared second differences that end at first … end - 1, to the lanes in turn.
+    """Add the squared second differences that end at first … end - 1 to the lanes in turn.
 
-    An index that could be negative would make a scalar loop of the inner one.
+    An index that could be negative would make the inner loop scalar.
     """
     for row in range(first, end, LANES):
         at0, at1, at2 = np.uintp(row), np.uintp(row - m), np.uintp(row - 2 * m)

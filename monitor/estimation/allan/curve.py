@@ -1,4 +1,4 @@
-"""One Allan curve: what the window or a whole recording says at each τ, with degrees of freedom."""
+"""``AllanCurve``: Allan variance of a window or a recording at each τ, with degrees of freedom and intervals."""
 
 from dataclasses import dataclass
 
@@ -7,13 +7,13 @@ from drivers.sample import Floats, Ints
 
 @dataclass(frozen=True, slots=True)
 class AllanCurve:
-    """Overlapping Allan variance of the rate at m averaging times, six axes."""
+    """Overlapping Allan variance of six axes at m averaging times."""
 
     tau_s: Floats  # [m]
     factors: Ints  # [m] cluster sizes in samples
-    avar: Floats  # [m, 6] unit² of the axis; NaN where the window is still too short
-    terms: Ints  # [m, 6] second differences averaged
-    edf: Floats  # [m, 6] equivalent degrees of freedom; NaN as avar
-    lo: Floats  # [m, 6] deviation, lower end of the 95 % interval
-    hi: Floats  # [m, 6] deviation, upper end
-    n: int  # samples in the window, missing ones included
+    avar: Floats  # [m, 6] Allan variance, squared unit of the axis; NaN while the window is too short
+    terms: Ints  # [m, 6] number of second differences averaged
+    edf: Floats  # [m, 6] equivalent degrees of freedom; NaN where avar is
+    lo: Floats  # [m, 6] lower end of the 95 % interval of the Allan deviation
+    hi: Floats  # [m, 6] upper end of the same interval
+    n: int  # number of samples in the window, including missing ones

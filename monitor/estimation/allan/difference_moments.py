@@ -1,14 +1,18 @@
-"""Mean and covariance of squared differences of phase: what bias and degrees of freedom are computed from.
+"""Mean and covariance of squared phase differences, for the bias and the degrees of freedom of a variance.
 
-A variance of the Allan family is an average over k of squares d_k², d_k = Σ_p w_p x(k_p) a weighted sum of a few phase
-points that no constant rate moves: Σ w_p = Σ w_p k_p = 0. So Cov(d_j, d_k) = Σ_pq w_p w_q G(j_p − k_q) with the
-generalised autocovariances G of phase (Q δ, N −|t|/2, B t² ln|t| / 2π, K (|t|³ − |t|)/12), also where the points were
-reflected at the ends of a record, and for Gaussian noise (Isserlis) Cov(d_j², d_k²) = 2 Cov(d_j, d_k)². ``Moments``
-holds, for one cluster size, the mean of the variance and of Allan's for coefficients of one, and the quadratic form of
-its variance. A ramp moves a second difference by a known amount: its square adds to the mean, its product with the
-noise to the variance, nothing by itself.
+A variance of the Allan family is an average over k of squares d_k². Here d_k = Σ_p w_p x(k_p) is a weighted sum of a
+few phase points. It does not depend on a constant rate, because Σ w_p = Σ w_p k_p = 0.
 
-Everything here is in units of one sample: τ0 = 1, and θ = Q²/τ0², N²/τ0, B², K² τ0, R² τ0².
+The covariance of two differences is Cov(d_j, d_k) = Σ_pq w_p w_q G(j_p − k_q). G is the generalised autocovariance of
+phase (Q δ, N −|t|/2, B t² ln|t| / 2π, K (|t|³ − |t|)/12). This also holds where points were reflected at the ends of a
+record. For Gaussian noise (Isserlis), Cov(d_j², d_k²) = 2 Cov(d_j, d_k)².
+
+``Moments`` holds the mean of the variance and of the Allan variance for unit coefficients at one cluster size. It also
+holds the quadratic form that gives the variance of the estimate. A ramp shifts a second difference by a known amount.
+The square of this amount adds to the mean, and its product with the noise adds to the variance. The ramp alone adds no
+variance.
+
+All quantities are in units of one sample: τ0 = 1, and θ = Q²/τ0², N²/τ0, B², K² τ0, R² τ0².
 """
 
 from collections.abc import Iterable
@@ -22,37 +26,64 @@ from drivers.sample import Floats, Ints
 from monitor.estimation.allan.uncertainty import intervals
 from monitor.estimation.fit.coefficient_fit import TO_SI
 
-SOURCES: Final = 5
-"""Q N B K R, in the order of θ."""
+NUM_COEFFICIENTS: Final = 5
+"""Number of coefficients Q N B K R, in the order of θ."""
 
-_GROWTH: Final = 1.5
-"""Blocks of terms grow by this ratio with their distance from a kink."""
+_BLOCK_GROWTH: Final = 1.5
+"""Ratio by which blocks of terms grow with their distance from a kink."""
 
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """One variance at one cluster size of a record of ``n`` samples without gaps."""
+    """Moments of one variance estimate at one cluster size for a record of ``n`` samples without gaps."""
 
-    n: int
-    factor: int
-    terms: int
-    mean: Floats  # [5] expectation of the variance for each coefficient of one
-    allan: Floats  # [5] Allan variance of the same, which a corrected variance estimates
-    covariance: Floats  # [5, 5] Var = Σ_ab θ_a θ_b C_ab
+    n: int  # samples in the record
+    factor: int  # cluster size in samples
+    terms: int  # number of differences averaged
+    mean: Floats  # [5] expectation of the variance for each unit coefficient
+    allan: Floats  # [5] Allan variance for the same coefficients, which a corrected variance estimates
+    covariance: Floats  # [5, 5] C of the quadratic form Var = Σ_ab θ_a θ_b C_ab
 
 
 def per_sample(theta: Floats, rate_hz: float) -> Floats:
-    """θ [5, k] of a fit in SI to units of one sample; Q² < 0 stands for a band limit, which has no part here."""
+    """Convert θ of a fit from SI to units of one sample. A negative Q² stands for a band limit and becomes 0.
+
+    Parameters
+    ----------
+    theta : ndarray of float64, shape (5, k)
+        Q² N² B² K² R² in SI.
+    rate_hz : float
+        Sample rate in Hz.
+    """
     return np.asarray(np.maximum(theta, 0.0) * (rate_hz ** (-2.0 * TO_SI))[:, None])
 
 
 def spread(
     moments: Iterable[Moments], theta: Floats, variance: Floats, terms: Ints
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """What measured variances [m, k] say of Allan's: corrected for bias, degrees of freedom, ends of the deviation.
+    """Correct measured variances for bias, and compute their degrees of freedom and intervals.
 
-    Degrees of freedom edf = 2 E²/Var of the noise θ [5, k], in proportion to the terms that are there; NaN where θ is
-    not known, or there is no noise at all.
+    The degrees of freedom are edf = 2 E²/Var for the noise θ, in proportion to the terms present.
+
+    Parameters
+    ----------
+    moments : iterable of Moments
+        Moments of the m cluster sizes.
+    theta : ndarray of float64, shape (5, k)
+        Q² N² B² K² R² in units of one sample; NaN means unknown.
+    variance : ndarray of float64, shape (m, k)
+        Measured variances.
+    terms : ndarray of int64, shape (m, k)
+        Number of differences averaged.
+
+    Returns
+    -------
+    corrected : ndarray of float64, shape (m, k)
+        Estimate of the Allan variance.
+    edf : ndarray of float64, shape (m, k)
+        Degrees of freedom; NaN if θ is unknown or there is no noise.
+    lo, hi : ndarray of float64, shape (m, k)
+        Ends of the 95 % interval of the deviation.
     """
     each = list(moments)
     mean = np.stack([one.mean for one in each]) @ theta
@@ -68,25 +99,41 @@ def spread(
 
 
 def autocovariance(t: Floats) -> Floats:
-    """Generalised autocovariance of phase [4, …] of Q N B K at lags t in samples: discrete sums of white noise."""
+    """Return the generalised autocovariance of phase [4, …] for unit Q N B K at lags t in samples.
+
+    The noises are discrete sums of white noise.
+    """
     t = np.abs(t)
     flicker = t * t * np.log(np.where(t == 0.0, 1.0, t)) / (2.0 * np.pi)
     return np.stack([np.where(t == 0.0, 1.0, 0.0), -0.5 * t, flicker, (t * t - 1.0) * t / 12.0])
 
 
-def nodes(begin: int, end: int, kinks: Iterable[int]) -> tuple[Floats, Floats]:
-    """Places and weights that sum a function over begin ≤ k < end, smooth but at the kinks.
+def quadrature_nodes(begin: int, end: int, kinks: Iterable[int]) -> tuple[Floats, Floats]:
+    """Return nodes and weights that sum a function over begin ≤ k < end. The function is smooth except at the kinks.
 
-    Blocks that grow with the distance to the nearest kink, each by the three-point Gauss rule of L equally spaced
-    points, exact to degree 5: their second and fourth moments are (L² − 1)/12 and (L² − 1)(3L² − 7)/240.
+    The blocks grow with the distance to the nearest kink. Each block uses the three-point Gauss rule of L equally
+    spaced points, which is exact to degree 5. The second and fourth moments of these points are (L² − 1)/12 and (L² −
+    1)(3L² − 7)/240.
 
-    >>> places, weights = nodes(0, 1000, [0, 400])
+    Parameters
+    ----------
+    begin, end : int
+        Range of the sum.
+    kinks : iterable of int
+        Points at which the function is not smooth.
+
+    Returns
+    -------
+    places, weights : ndarray of float64
+        Nodes and weights of the sum.
+
+    >>> places, weights = quadrature_nodes(0, 1000, [0, 400])
     >>> places.size < 200, round(float(weights @ places**5) / sum(k**5 for k in range(1000)), 12)
     (True, 1.0)
     """
     steps = [0, 1]
     while 2 * steps[-1] < end - begin:
-        steps.append(max(steps[-1] + 1, int(_GROWTH * steps[-1])))
+        steps.append(max(steps[-1] + 1, int(_BLOCK_GROWTH * steps[-1])))
     growing = np.array(steps)
     corners = np.unique([begin, *(k for k in kinks if begin < k < end), end])
     edges = np.unique(

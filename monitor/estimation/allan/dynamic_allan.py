@@ -1,14 +1,15 @@
-"""Dynamic curves of a whole recording: the Allan surface and Q(t) N(t) B(t) K(t) R(t).
+"""Dynamic Allan variance of a whole recording: Allan deviation and coefficients Q N B K R as functions of time.
 
-A window slides along the recording in steps; at each step the overlapping Allan variance of the window is read and
-fitted, as the live ``Estimator`` does while it watches ("Dynamic extraction of random drift error coefficients of MEMS
-gyroscopes": the windowed variance renewed sample by sample, then a least-squares fit). What changed shows where a
-curve of the whole recording averages over before and after. Terms enter and leave with the hysteresis of a fit that
-is repeated: each step is told what was in at the step before.
+A window slides along the recording in steps. At each step, the overlapping Allan variance of the window is computed and
+fitted, as in the live ``Estimator``. The variance is updated sample by sample, and a least-squares fit follows
+("Dynamic extraction of random drift error coefficients of MEMS gyroscopes"). Changes become visible that a curve of the
+whole recording averages out. The terms use the hysteresis of a repeated fit, so each fit receives the terms of the fit
+before.
 
-Only full windows are shown, so that every time step is as sure as the next. There are MOST_STEPS steps at most,
-however long the recording is, so that months cost no more memory than hours; all samples enter every window that
-holds them. A change is seen in full one window after it happened: until then old and new are mixed.
+Only full windows are reported, so that all time steps are equally certain. The number of steps is limited to
+``MOST_STEPS``, so the memory does not grow with the length of the recording. Every sample enters all windows that
+contain it. A change is fully visible one window length after it happened; until then the window mixes old and new
+noise.
 """
 
 from collections.abc import Callable
@@ -25,28 +26,30 @@ from monitor.estimation.allan.uncertainty import intervals, table
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow
 from monitor.estimation.fit.coefficient_fit import design, fit
 
-STEPS_A_WINDOW: Final = 20
-"""Steps in the time of one window, unless told otherwise."""
+STEPS_PER_WINDOW: Final = 20
+"""Default number of steps per window length."""
 MOST_STEPS: Final = 500
+"""Maximum number of steps."""
 
 Progress = Callable[[float], None]
+"""Callback that receives the completed share, 0 to 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class Dynamic:
-    """What the window showed at T times; columns gx … az, rows of the coefficients Q N B K R, all in SI."""
+    """Dynamic Allan variance at T times. Columns are gx … az, rows of the coefficients are Q N B K R, all in SI."""
 
-    t_s: Floats  # [T] END of the window, seconds since the first sample; the window began ``window_s`` before
-    window_s: float
+    t_s: Floats  # [T] END of each window in seconds since the first sample
+    window_s: float  # length of the window
     rate_hz: float
     tau_s: Floats  # [m]
-    deviation: Floats  # [T, m, 6] Allan deviation, unit of the axis; NaN = no complete term in that window
-    lo: Floats  # [T, m, 6] ends of its 95 % interval
-    hi: Floats
+    deviation: Floats  # [T, m, 6] Allan deviation, unit of the axis; NaN if no term is complete
+    lo: Floats  # [T, m, 6] lower end of its 95 % interval
+    hi: Floats  # [T, m, 6] upper end
     value: Floats  # [T, 5, 6] coefficients; NaN unless estimated
-    value_lo: Floats  # [T, 5, 6] ends of the 95 % interval; of a bound 0 and the one-sided 95 % bound
-    value_hi: Floats
-    status: NDArray[np.int8]  # [T, 5, 6] of Status
+    value_lo: Floats  # [T, 5, 6] lower end of the 95 % interval; 0 for an upper bound
+    value_hi: Floats  # [T, 5, 6] upper end; the one-sided 95 % bound for an upper bound
+    status: NDArray[np.int8]  # [T, 5, 6] values of ``Status``
 
 
 def dynamic(
@@ -57,19 +60,30 @@ def dynamic(
     step_s: float | None = None,
     progress: Progress | None = None,
 ) -> Dynamic:
-    """The dynamic curves of a recording on a regular grid.
+    """Compute the dynamic Allan variance and the coefficients of a recording on a regular grid.
 
-    Args:
-        values: [n, 6] rad/s and m/s²; NaN = missing, in its place
-        rate_hz: samples a second
-        window_s: length of the sliding window
-        tau: grid or list of averaging times within the window
-        step_s: between two times; None = a twentieth of the window. It is made longer where there would be more than
-            MOST_STEPS steps
-        progress: called with the share that is done, 0 … 1
-    Raises:
-        ConfigError: a window that is too short or too long, a step below 0, or no τ that fits the window
-        NotReady: the recording is shorter than the window
+    Parameters
+    ----------
+    values : ndarray of float64, shape (n, 6)
+        Samples in rad/s and m/s²; NaN means missing.
+    rate_hz : float
+        Sample rate in Hz.
+    window_s : float
+        Length of the sliding window in seconds.
+    tau : TauGrid
+        Grid of averaging times, or a tuple of averaging times in seconds, within the window.
+    step_s : float or None
+        Time between two windows in seconds. None means a twentieth of the window. The step is made longer if there
+        would be more than ``MOST_STEPS`` steps.
+    progress : Progress or None
+        Called with the completed share, 0 to 1.
+
+    Raises
+    ------
+    ConfigError
+        If the window is too short or too long, the step is not above 0, or no τ fits the window.
+    NotReady
+        If the recording is shorter than the window.
 
     >>> steady = dynamic(np.random.default_rng(1).standard_normal((3000, 6)), 10.0, 100.0, step_s=50.0)
     >>> steady.t_s.tolist()
@@ -108,7 +122,7 @@ def dynamic(
 
 
 def _length(rate_hz: float, window_s: float) -> int:
-    """Samples in the window."""
+    """Return the window length in samples."""
     length = round(window_s * rate_hz)
     if not MIN_LENGTH <= length <= MAX_LENGTH:
         raise ConfigError(
@@ -119,11 +133,11 @@ def _length(rate_hz: float, window_s: float) -> int:
 
 
 def _ends(n: int, length: int, rate_hz: float, step_s: float | None) -> NDArray[np.int64]:
-    """How many samples have passed at each step: the first full window, then on in equal steps."""
+    """Return the number of samples passed at each step: the first full window, then equal steps."""
     if step_s is not None and not 0.0 < step_s < np.inf:
         raise ConfigError(f"step of {step_s:g} s; it must be above 0")
     if n < length:
         raise NotReady(f"{n / rate_hz:g} s are recorded, less than the window of {length / rate_hz:g} s")
-    step = max(round(length / STEPS_A_WINDOW if step_s is None else step_s * rate_hz), 1)
+    step = max(round(length / STEPS_PER_WINDOW if step_s is None else step_s * rate_hz), 1)
     fewest = -(-(n - length) // (MOST_STEPS - 1))
     return np.arange(length, n + 1, max(step, fewest), dtype=np.int64)

@@ -1,12 +1,13 @@
-"""Overlapping Hadamard variance: Allan's with third differences of phase, which no linear drift of the rate moves.
+"""Overlapping Hadamard variance: mean square of third phase differences, insensitive to a linear drift of the rate.
 
 NIST SP 1065 eq. 20 on rates: σ²(m) = mean of (x_{i+3m} − 3 x_{i+2m} + 3 x_{i+m} − x_i)² / 6m² over every i, m ≤ n/3.
-The 6 makes white noise read as in Allan's; the others do not: quantization 10/9 of it, flicker 0.811, random walk 0.5
-beyond the first few samples. So it stands beside the Allan curve, to read past a ramp or slow heating, and is not
-corrected to it.
+With the divisor 6, white noise reads as in the Allan variance. Other noises do not: beyond the first few samples,
+quantization reads 10/9 of the Allan variance, flicker 0.811 and random walk 0.5. The curve is therefore shown beside
+the Allan curve and is not corrected to it. It shows the noise below a ramp or slow heating.
 
-Degrees of freedom are 2 E²/Var of the fitted mixture from the exact covariance of its terms, where the formula of
-Greenhall & Riley (PTTI 2003, d = 3) holds for one power law at a time. What is missing strikes out the terms across it.
+The degrees of freedom are 2 E²/Var of the fitted mixture, from the exact covariance of the terms. The formula of
+Greenhall & Riley (PTTI 2003, d = 3) holds only for one power law at a time. Terms that touch a missing sample are left
+out.
 """
 
 from collections.abc import Iterable
@@ -17,36 +18,58 @@ import numpy as np
 
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.estimation.allan.difference_moments import SOURCES, Moments, autocovariance, nodes, per_sample, spread
-from monitor.estimation.allan.total import octaves, phase_of
+from monitor.estimation.allan.difference_moments import (
+    NUM_COEFFICIENTS,
+    Moments,
+    autocovariance,
+    per_sample,
+    quadrature_nodes,
+    spread,
+)
+from monitor.estimation.allan.total import integrate_to_phase, octaves
 
-FARTHEST: Final = 16
-"""Clusters apart beyond which terms share nothing: the square of what flicker leaves is 1e-9 of that of one term."""
+MAX_LAG_CLUSTERS: Final = 16
+"""Distance in clusters beyond which terms count as uncorrelated.
+
+For flicker, the squared correlation at this distance is 1e-9 of that of one term.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class HadamardCurve:
-    """Overlapping Hadamard variance at m averaging times of k axes."""
+    """Overlapping Hadamard variance of k axes at m averaging times."""
 
     tau_s: Floats  # [m]
     factors: Ints  # [m] cluster sizes in samples
-    hvar: Floats  # [m, k] unit²; NaN where no term is complete
-    terms: Ints  # [m, k] third differences averaged
-    edf: Floats  # [m, k] equivalent degrees of freedom; NaN where no noise is known
-    lo: Floats  # [m, k] deviation, lower end of the 95 % interval
-    hi: Floats  # [m, k] deviation, upper end
+    hvar: Floats  # [m, k] squared unit of the axis; NaN where no term is complete
+    terms: Ints  # [m, k] number of third differences averaged
+    edf: Floats  # [m, k] equivalent degrees of freedom; NaN if the noise is unknown
+    lo: Floats  # [m, k] lower end of the 95 % interval of the deviation
+    hi: Floats  # [m, k] upper end of the same interval
 
 
 def hadamard(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
-    """Overlapping Hadamard variance [m, k] of rates [n, k], and the number of its terms [m, k].
+    """Return the overlapping Hadamard variance of rates and the number of its terms.
 
-    τ0 does not enter. What is not finite is missing.
+    Parameters
+    ----------
+    values : ndarray of float64, shape (n, k)
+        Rates of k axes; values that are not finite are missing.
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples, up to n/3.
+
+    Returns
+    -------
+    hvar : ndarray of float64, shape (m, k)
+        Hadamard variance in squared units of the axis. It does not depend on τ0.
+    terms : ndarray of int64, shape (m, k)
+        Number of terms.
 
     >>> ramp = np.arange(90.0)[:, None]
     >>> hadamard(ramp + np.tile([[0.0], [0.5]], (45, 1)), np.array([1, 2]))[0].ravel().round(12).tolist()
     [0.166666666667, 0.0]
     """
-    phase, missing = phase_of(values)
+    phase, missing = integrate_to_phase(values)
     sums = np.zeros((factors.size, values.shape[1]))
     terms = np.zeros(sums.shape, np.int64)
     for i, m in enumerate(factors):
@@ -55,13 +78,18 @@ def hadamard(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
 
 
 def hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> HadamardCurve:
-    """Hadamard variance of a record with intervals.
+    """Return the Hadamard variance of a record with confidence intervals.
 
-    Args:
-        values: [n, k] rates; what is not finite is missing
-        rate_hz: samples a second
-        theta: [5, k] fitted Q² N² B² K² R² in SI, as ``fit.Fit.theta``; NaN = not known
-        factors: cluster sizes up to n/3; None = octaves
+    Parameters
+    ----------
+    values : ndarray of float64, shape (n, k)
+        Rates of k axes; values that are not finite are missing.
+    rate_hz : float
+        Sample rate in Hz.
+    theta : ndarray of float64, shape (5, k)
+        Fitted Q² N² B² K² R² in SI, see ``coefficient_fit.Fit.theta``; NaN means unknown.
+    factors : ndarray of int64, shape (m,), or None
+        Cluster sizes in samples, up to n/3. None means octaves.
     """
     n = len(values)
     factors = octaves(n // 3) if factors is None else factors
@@ -70,7 +98,21 @@ def hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints 
 
 
 def curve_of(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Floats, terms: Ints) -> HadamardCurve:
-    """Variances [m, k] to a curve."""
+    """Return Hadamard variances as a curve with degrees of freedom and intervals.
+
+    Parameters
+    ----------
+    known : iterable of Moments
+        Moments of the m cluster sizes.
+    rate_hz : float
+        Sample rate in Hz.
+    theta : ndarray of float64, shape (5, k)
+        Fitted Q² N² B² K² R² in SI; NaN means unknown.
+    raw : ndarray of float64, shape (m, k)
+        Hadamard variances.
+    terms : ndarray of int64, shape (m, k)
+        Number of terms.
+    """
     each = list(known)
     _, edf, lo, hi = spread(each, per_sample(theta, rate_hz), raw, terms)
     factors = np.array([one.factor for one in each])
@@ -78,28 +120,45 @@ def curve_of(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Float
 
 
 def variance(sums: Floats, terms: Ints, factors: Ints) -> Floats:
-    """Sums of squared third differences to variances."""
+    """Convert sums of squared third differences to variances.
+
+    Parameters
+    ----------
+    sums : ndarray of float64, shape (m, k)
+        Sums of squared third differences of phase.
+    terms : ndarray of int64, shape (m, k)
+        Number of terms in each sum.
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
+    """
     with np.errstate(invalid="ignore"):
         return np.asarray(np.where(terms > 0, sums / (6.0 * factors[:, None] ** 2 * terms), np.nan))
 
 
 def moments(n: int, factor: int) -> Moments:
-    """Mean and covariance of the Hadamard variance of ``n`` samples, 3 factor ≤ n; a millisecond.
+    """Return mean and covariance of the Hadamard variance. The computation takes a millisecond.
 
-    White noise, m = 1: neighbours share parts, edf = 18/35 of the terms.
+    In the example, white noise at m = 1 has edf = 18/35 of the terms, because neighbouring terms overlap.
+
+    Parameters
+    ----------
+    n : int
+        Number of samples in the record.
+    factor : int
+        Cluster size in samples, at most n/3.
 
     >>> one = moments(35_002, 1)
     >>> round(2 * one.mean[1] ** 2 / one.covariance[1, 1])
     18000
     """
     terms = n + 1 - 3 * factor
-    lags, weights = nodes(0, min(terms, FARTHEST * factor), [factor, 2 * factor, 3 * factor])
+    lags, weights = quadrature_nodes(0, min(terms, MAX_LAG_CLUSTERS * factor), [factor, 2 * factor, 3 * factor])
     shared = np.zeros((4, lags.size))
     for p, weight in zip(range(-3, 4), (-1.0, 6.0, -15.0, 20.0, -15.0, 6.0, -1.0), strict=True):
         shared += weight * autocovariance(lags + p * factor)
     pairs = weights * (terms - lags) * np.where(lags > 0.0, 2.0, 1.0)
     scale = 1.0 / (6.0 * factor**2)
-    mean, covariance = np.zeros(SOURCES), np.zeros((SOURCES, SOURCES))
+    mean, covariance = np.zeros(NUM_COEFFICIENTS), np.zeros((NUM_COEFFICIENTS, NUM_COEFFICIENTS))
     mean[:4] = scale * shared[:, np.argmin(lags)]
     covariance[:4, :4] = 2.0 * (scale / terms) ** 2 * (shared * pairs @ shared.T)
     return Moments(n, factor, terms, mean, mean, covariance)
@@ -109,7 +168,22 @@ def moments(n: int, factor: int) -> Moments:
 def add_hadamard(phase, missing, first, n, m, sums, terms):  # type: ignore[no-untyped-def]
     """Add the squares of all terms of the n + 1 phase points that start at row ``first`` of a ring.
 
-    phase [places, ≥ k] float64, or integers that wrap; missing alike; sums [k] and terms [k] are added to.
+    Parameters
+    ----------
+    phase : ndarray of float64 or wrapping int64, shape (places, at least k)
+        Ring of phase.
+    missing : ndarray of int32, shape (places, at least k)
+        Running count of missing samples.
+    first : int
+        Row of the oldest point.
+    n : int
+        Number of samples.
+    m : int
+        Cluster size in samples.
+    sums : ndarray of float64, shape (k,)
+        Sums of squares, updated in place.
+    terms : ndarray of int64, shape (k,)
+        Number of terms, updated in place.
     """
     places = phase.shape[0]
     last = (first + n) % places

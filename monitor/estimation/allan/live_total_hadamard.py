@@ -1,18 +1,20 @@
-"""Total and Hadamard variance of the live window: too much for every refit, so one τ of one of them at a time.
+"""Total and Hadamard variance of the live window, computed one τ at a time.
 
-``step`` does one; its caller makes one call a pass of its loop. A round goes once through all τ of both, octaves of
-the window by default, and is handed over as a whole when its last is done. Nothing is copied: the sums run over the
-window's own ring of integer phase, between two updates, by the caller of both.
+Computing both for every refit would take too long. Each call of ``step`` computes one τ of one of the two variances,
+and the caller makes one call per pass of its loop. A round covers all τ of both variances, by default octaves of the
+window. Its results are returned together when the last τ is complete. Nothing is copied: the sums run over the ring of
+integer phase of the window, between two updates by the same caller.
 
-How stale: a window of 3.6 million samples has 22 τ of the total and 21 of the Hadamard variance, so with ten steps a
-second a round takes 4.3 s, and the oldest number that ``get`` hands over is between 4.3 and 8.6 s old, 0.24 % of the
-hour that such a window spans at 1 kHz. Each number is exact for the window as it stood at its own step.
+The results lag behind the window. A window of 3.6 million samples has 22 τ of the total and 21 of the Hadamard
+variance. With ten steps per second, a round takes 4.3 s, and the oldest number returned by ``get`` is between 4.3 and
+8.6 s old. This is 0.24 % of the hour that the window spans at 1 kHz. Each number is exact for the window at the time of
+its own step.
 
-A term of the total variance inside the record is one of the Allan variance: where the window has that τ over all of its
-length, its sum is taken from there and only the reflected ends are added up.
+Inside the record, a term of the total variance is a term of the Allan variance. If the window already has this τ over
+its full length, the sum is taken from there, and only the reflected ends are added.
 
-Integer phase carries a difference of two means over τ up to half of full scale: τ that could pass 2⁶³ are left out. It
-also shows a constant axis as one whose phase is off by one unit or two; such sums are zero.
+Integer phase can represent the difference of two means over τ up to half of full scale. τ that could exceed 2⁶³ are
+left out. Rounding moves the phase of a constant axis by one or two units; such sums are set to zero.
 """
 
 from collections.abc import Iterator
@@ -31,32 +33,44 @@ from monitor.estimation.allan.window import FULL_SCALE, AllanWindow
 from monitor.estimation.allan.window_kernel import AXES
 
 TOTAL, HADAMARD = 0, 1
+"""Indices of the two statistics."""
 FEWEST: Final = 8
-"""Samples before the first round."""
-RENEWED_AT: Final = 1.02
-"""While the window grows, bias and degrees of freedom are computed anew at this ratio of lengths."""
-ROUNDING: Final = (9.0, 16.0)
-"""Square of the sum of |weights| times half a unit, of the second difference of reflected phase and of the third."""
+"""Minimum number of samples for a round."""
+MOMENTS_RENEWAL_RATIO: Final = 1.02
+"""Ratio of window lengths at which bias and degrees of freedom are recomputed while the window grows."""
+MAX_ROUNDING_SQUARE: Final = (9.0, 16.0)
+"""Largest squared difference that rounding alone can make, in squared units of phase, for each statistic.
+
+It is the square of half a unit times the sum of the absolute weights, for the second difference of reflected phase and
+for the third difference.
+"""
 
 
 @dataclass(frozen=True, slots=True)
-class _Sum:
-    """One τ of one statistic, as the window stood at its step."""
+class _Result:
+    """One τ of one statistic, for the window at the time of its step."""
 
-    variance: Floats  # [6] unit², with its bias
-    terms: Ints  # [6]
+    variance: Floats  # [6] squared unit of the axis, not corrected for bias
+    terms: Ints  # [6] number of terms
     moments: Moments
 
 
 class SlowStatistics:
-    """Total and Hadamard variance of a window, in rounds.
+    """Total and Hadamard variance of a window, computed in rounds.
 
-    Args:
-        window: looked at, never changed
-        totals: cluster sizes of the total variance, below the window's length; None = octaves
-        hadamards: of the Hadamard variance, up to a third of it; None = octaves
-    Raises:
-        ConfigError: a cluster size that is not possible
+    Parameters
+    ----------
+    window : AllanWindow
+        Window to read. It is not changed.
+    totals : ndarray of int64 or None
+        Cluster sizes of the total variance in samples, below the window length. None means octaves.
+    hadamards : ndarray of int64 or None
+        Cluster sizes of the Hadamard variance in samples, up to a third of the window length. None means octaves.
+
+    Raises
+    ------
+    ConfigError
+        If a cluster size is out of range.
     """
 
     def __init__(self, window: AllanWindow, totals: Ints | None = None, hadamards: Ints | None = None) -> None:
@@ -71,40 +85,43 @@ class SlowStatistics:
                 raise ConfigError(f"cluster sizes {factors.tolist()} must lie within 1 and {limit}")
         self._factors = [[int(m) for m in factors] for factors in given]
         self._moments: list[dict[int, Moments]] = [{}, {}]
-        self.rounds = 0  # complete ones
-        self._seen = window.resets
+        self.rounds = 0  # number of complete rounds
+        self._window_resets = window.resets
         self._round = self._steps()
-        self._last: tuple[list[_Sum], list[_Sum]] | None = None
+        self._last: tuple[list[_Result], list[_Result]] | None = None
 
     def step(self) -> None:
-        """Compute one τ of one statistic; nothing while the window is nearly empty.
+        """Compute one τ of one statistic, or nothing while the window is nearly empty.
 
-        A window that was emptied ends the round, and what was handed over before is no longer.
+        If the window has been emptied, the round starts again and the results of the last round are discarded.
         """
-        if self._window.resets != self._seen:
+        if self._window.resets != self._window_resets:
             self._last = None
             self._round = self._steps()
-        self._seen = self._window.resets
+        self._window_resets = self._window.resets
         next(self._round)
 
     def get(self, rate_hz: float, theta: Floats) -> tuple[TotalCurve, HadamardCurve] | None:
-        """The last complete round as curves; None before the first.
+        """Return the last complete round as curves, or None before the first round is complete.
 
-        Args:
-            rate_hz: samples a second
-            theta: [5, 6] fitted Q² N² B² K² R² in SI, as ``fit.Fit.theta``; it corrects the bias and gives the
-                degrees of freedom
+        Parameters
+        ----------
+        rate_hz : float
+            Sample rate in Hz.
+        theta : ndarray of float64, shape (5, 6)
+            Fitted Q² N² B² K² R² in SI, see ``coefficient_fit.Fit.theta``. They determine the bias correction and the
+            degrees of freedom.
         """
         if self._last is None:
             return None
         totals, hadamards = self._last
         return (
-            total.curve_of([one.moments for one in totals], rate_hz, theta, *_stacked(totals)),
-            hadamard.curve_of([one.moments for one in hadamards], rate_hz, theta, *_stacked(hadamards)),
+            total.curve_of([one.moments for one in totals], rate_hz, theta, *_stack(totals)),
+            hadamard.curve_of([one.moments for one in hadamards], rate_hz, theta, *_stack(hadamards)),
         )
 
     def _steps(self) -> Iterator[None]:
-        """Rounds without end, a step each; a round's τ are those that the window can hold at its beginning."""
+        """Run rounds without end, and yield after each step. The window length at its start sets the τ of a round."""
         while True:
             n = self._window.n
             totals = [m for m in self._factors[TOTAL] if m < n]
@@ -112,7 +129,7 @@ class SlowStatistics:
             if n < FEWEST or not totals or not hadamards:
                 yield
                 continue
-            sums: tuple[list[_Sum], list[_Sum]] = [], []
+            sums: tuple[list[_Result], list[_Result]] = [], []
             for m in totals:
                 sums[TOTAL].append(self._total(m))
                 yield
@@ -123,7 +140,8 @@ class SlowStatistics:
                     self.rounds += 1
                 yield
 
-    def _total(self, m: int) -> _Sum:
+    def _total(self, m: int) -> _Result:
+        """Compute the total variance at one cluster size."""
         phase, missing, first, unit = self._window.ring()
         n = self._window.n
         sums, terms = np.zeros(AXES), np.zeros(AXES, np.int64)
@@ -136,29 +154,30 @@ class SlowStatistics:
             total.add_total(phase, missing, first, n, m, n - m + 1, n, sums, terms)
         else:
             total.add_total(phase, missing, first, n, m, 1, n, sums, terms)
-        sums[sums <= ROUNDING[TOTAL] * terms] = 0.0
+        sums[sums <= MAX_ROUNDING_SQUARE[TOTAL] * terms] = 0.0
         variance = total.variance((sums * unit**2)[None], terms[None], np.array([m]))[0]
-        return _Sum(variance, terms, self._known(TOTAL, n, m))
+        return _Result(variance, terms, self._cached_moments(TOTAL, n, m))
 
-    def _hadamard(self, m: int) -> _Sum:
+    def _hadamard(self, m: int) -> _Result:
+        """Compute the Hadamard variance at one cluster size."""
         phase, missing, first, unit = self._window.ring()
         n = self._window.n
         sums, terms = np.zeros(AXES), np.zeros(AXES, np.int64)
         hadamard.add_hadamard(phase, missing, first, n, m, sums, terms)
-        sums[sums <= ROUNDING[HADAMARD] * terms] = 0.0
+        sums[sums <= MAX_ROUNDING_SQUARE[HADAMARD] * terms] = 0.0
         variance = hadamard.variance((sums * unit**2)[None], terms[None], np.array([m]))[0]
-        return _Sum(variance, terms, self._known(HADAMARD, n, m))
+        return _Result(variance, terms, self._cached_moments(HADAMARD, n, m))
 
-    def _known(self, statistic: int, n: int, m: int) -> Moments:
-        """Moments for about this many samples, exactly so many once the window is full."""
+    def _cached_moments(self, statistic: int, n: int, m: int) -> Moments:
+        """Return moments for about n samples, or for exactly n once the window is full."""
         known = self._moments[statistic].get(m)
         full = n == self._window.length
-        if known is None or not (known.n == n or (known.n < n < RENEWED_AT * known.n and not full)):
+        if known is None or not (known.n == n or (known.n < n < MOMENTS_RENEWAL_RATIO * known.n and not full)):
             known = total.moments(n, m) if statistic == TOTAL else hadamard.moments(n, m)
             self._moments[statistic][m] = known
         return known
 
 
-def _stacked(sums: list[_Sum]) -> tuple[Floats, Ints]:
-    """Variances and terms, [m, 6] each."""
+def _stack(sums: list[_Result]) -> tuple[Floats, Ints]:
+    """Return variances and terms, [m, 6] each."""
     return np.stack([one.variance for one in sums]), np.stack([one.terms for one in sums])

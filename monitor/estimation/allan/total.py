@@ -1,22 +1,25 @@
-"""Total variance of a rate: Allan's with the record reflected at both ends, for averaging times up to its length.
+"""Total variance of a rate: Allan variance of a record reflected at both ends, for τ up to the record length.
 
 "Applications of total variance method in random error analysis of the fiber optic gyro signal" shows that a rate must
-be reflected as a rate (y*_{-j} = y_{j-1}), not as a phase, and differences cluster sums, D_k(m) = (1/m) Σ_{i≤m}
-(y*_{k+i+m} − y*_{k+i}), σ² = mean of D²/2; here over every k, which is Howe's TOTVAR on the integrated rate (NIST SP
-1065 eq. 25). In phase: d_i = x*_{i-m} − 2 x*_i + x*_{i+m} at every inner point i, x*_{-j} = 2 x_0 − x_j at the front,
-likewise behind. For m ≤ i ≤ n − m these are the terms of the overlapping Allan variance.
+be reflected as a rate (y*_{-j} = y_{j-1}) and not as a phase. It differences cluster sums, D_k(m) = (1/m) Σ_{i≤m}
+(y*_{k+i+m} − y*_{k+i}), with σ² = mean of D²/2. Here the mean is taken over every k, which is Howe's TOTVAR on the
+integrated rate (NIST SP 1065 eq. 25). In phase: d_i = x*_{i-m} − 2 x*_i + x*_{i+m} at every inner point i, with x*_{-j}
+= 2 x_0 − x_j at the front and likewise at the back. For m ≤ i ≤ n − m these are the terms of the overlapping Allan
+variance.
 
-``total`` gives the sums as they are. ``total_curve`` corrects them to what the Allan variance of the same noise would
-be: E[TOTVAR] is computed exactly for any mixture (for τ ≤ T/2 it is AVAR (1 − a τ/T), a = 0, 0.481, 0.750 for white,
-flicker, random walk, SP 1065 table 7, and −4/3 for quantization), and so are its degrees of freedom; a formula of one
-power law holds for neither. Intervals are χ² and end at T/2: with the noise known they hold up to T, but the correction
-rests on the noise that was fitted to the same record, and beyond T/2 intervals of such a curve hold the truth in 67 to
-92 of 100 records, for 95 stated. There the value stands alone: what the record says of τ if its fit is right. A ramp R
-has a known part in every term: its square is in the mean exactly (R²τ²/2 where nothing is reflected, less at the ends),
-its product with the noise in the degrees of freedom.
+``total`` returns the uncorrected variances. ``total_curve`` corrects them to the Allan variance of the same noise.
+E[TOTVAR] is computed exactly for any mixture of noises. For τ ≤ T/2 it is AVAR (1 − a τ/T), with a = 0, 0.481 and 0.750
+for white, flicker and random walk noise (SP 1065 table 7) and −4/3 for quantization. The degrees of freedom are exact
+as well. Formulas for a single power law hold for neither.
 
-A sample that is missing strikes out the terms that touch it. Bias and degrees of freedom per term stay those of a
-record without gaps, so where fewer than MIN_SHARE of the terms are left there is neither correction nor interval.
+The intervals are χ² and end at T/2. With known noise they would hold up to T, but the correction relies on the noise
+fitted to the same record. Beyond T/2, nominal 95 % intervals contain the true value in only 67 to 92 of 100 records.
+There the value is given without an interval. A ramp R has a known part in every term. Its square is included in the
+mean exactly (R²τ²/2 where nothing is reflected, less at the ends). Its product with the noise is included in the
+degrees of freedom.
+
+Terms that touch a missing sample are left out. Bias and degrees of freedom per term are those of a record without gaps.
+If fewer than ``MIN_SHARE`` of the terms remain, neither correction nor interval is given.
 """
 
 from collections.abc import Iterable
@@ -28,40 +31,63 @@ from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.estimation.allan.difference_moments import SOURCES, Moments, autocovariance, nodes, per_sample, spread
+from monitor.estimation.allan.difference_moments import (
+    NUM_COEFFICIENTS,
+    Moments,
+    autocovariance,
+    per_sample,
+    quadrature_nodes,
+    spread,
+)
 
 MIN_SHARE: Final = 0.5
-"""Of the terms; with fewer, the reflected ones weigh more than the correction knows: one gap in the middle, half of the
-terms left, makes random walk read 18 % low in variance and quantization 21 % high (3000 records)."""
-GRID: Final = 256
-"""Terms whose covariances are summed one by one; a longer record is looked at on so coarse a grid."""
-CLUSTER: Final = 32
-"""Grid points of a cluster in a record that is long beside it."""
-_RAMP: Final = SOURCES - 1
+"""Minimum share of terms for a correction.
+
+With fewer terms, the reflected ones have more weight than the correction assumes. One gap in the middle that leaves
+half of the terms makes random walk read 18 % low in variance and quantization 21 % high (3000 records).
+"""
+MAX_EXACT_TERMS: Final = 256
+"""Maximum number of terms whose covariances are summed one by one. A longer record is sampled on a grid this coarse."""
+MIN_CLUSTER_POINTS: Final = 32
+"""Minimum number of grid points in a cluster if the record is much longer than the cluster."""
+_RAMP: Final = NUM_COEFFICIENTS - 1
+"""Row of the ramp R in θ."""
 
 
 @dataclass(frozen=True, slots=True)
 class TotalCurve:
-    """Total variance at m averaging times, corrected for bias: an estimate of the Allan variance of k axes."""
+    """Total variance of k axes at m averaging times, corrected for bias: an estimate of the Allan variance."""
 
     tau_s: Floats  # [m]
     factors: Ints  # [m] cluster sizes in samples
-    tvar: Floats  # [m, k] unit²; NaN where no noise is known, or too little is left beside gaps
-    terms: Ints  # [m, k] differences averaged
-    edf: Floats  # [m, k] equivalent degrees of freedom; NaN as tvar
-    lo: Floats  # [m, k] deviation, lower end of the 95 % interval; NaN beyond half the record
-    hi: Floats  # [m, k] deviation, upper end
+    tvar: Floats  # [m, k] squared unit of the axis; NaN if the noise is unknown or too few terms remain
+    terms: Ints  # [m, k] number of differences averaged
+    edf: Floats  # [m, k] equivalent degrees of freedom; NaN where tvar is
+    lo: Floats  # [m, k] lower end of the 95 % interval of the deviation; NaN beyond half the record
+    hi: Floats  # [m, k] upper end of the same interval
 
 
 def total(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
-    """Total variance [m, k] of rates [n, k] with its bias, and the number of its terms [m, k]; m < n.
+    """Return the uncorrected total variance of rates and the number of its terms.
 
-    τ0 does not enter. What is not finite is missing.
+    Parameters
+    ----------
+    values : ndarray of float64, shape (n, k)
+        Rates of k axes; values that are not finite are missing.
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples, below n.
+
+    Returns
+    -------
+    tvar : ndarray of float64, shape (m, k)
+        Biased total variance in squared units of the axis. It does not depend on τ0.
+    terms : ndarray of int64, shape (m, k)
+        Number of terms.
 
     >>> total(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().round(9).tolist()
     [0.5, 0.002525253]
     """
-    phase, missing = phase_of(values)
+    phase, missing = integrate_to_phase(values)
     n = len(values)
     sums = np.zeros((factors.size, values.shape[1]))
     terms = np.zeros(sums.shape, np.int64)
@@ -72,13 +98,18 @@ def total(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
 
 
 def total_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> TotalCurve:
-    """Total variance of a record, corrected, with intervals.
+    """Return the bias-corrected total variance of a record with confidence intervals.
 
-    Args:
-        values: [n, k] rates; what is not finite is missing
-        rate_hz: samples a second
-        theta: [5, k] fitted Q² N² B² K² R² in SI, as ``fit.Fit.theta``; NaN = not known
-        factors: cluster sizes below n; None = octaves
+    Parameters
+    ----------
+    values : ndarray of float64, shape (n, k)
+        Rates of k axes; values that are not finite are missing.
+    rate_hz : float
+        Sample rate in Hz.
+    theta : ndarray of float64, shape (5, k)
+        Fitted Q² N² B² K² R² in SI, see ``coefficient_fit.Fit.theta``; NaN means unknown.
+    factors : ndarray of int64, shape (m,), or None
+        Cluster sizes in samples, below n. None means octaves.
     """
     n = len(values)
     factors = octaves(n - 1) if factors is None else factors
@@ -87,7 +118,21 @@ def total_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | N
 
 
 def curve_of(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Floats, terms: Ints) -> TotalCurve:
-    """Total variances [m, k] with their bias to a curve without."""
+    """Correct uncorrected total variances for bias and return them as a curve.
+
+    Parameters
+    ----------
+    known : iterable of Moments
+        Moments of the m cluster sizes.
+    rate_hz : float
+        Sample rate in Hz.
+    theta : ndarray of float64, shape (5, k)
+        Fitted Q² N² B² K² R² in SI; NaN means unknown.
+    raw : ndarray of float64, shape (m, k)
+        Uncorrected total variances.
+    terms : ndarray of int64, shape (m, k)
+        Number of terms.
+    """
     each = list(known)
     enough = terms >= MIN_SHARE * np.array([one.terms for one in each])[:, None]
     tvar, edf, lo, hi = spread(each, per_sample(theta, rate_hz), np.where(enough, raw, np.nan), terms)
@@ -98,19 +143,19 @@ def curve_of(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Float
 
 
 def octaves(longest: int) -> Ints:
-    """1, 2, 4, … up to ``longest``."""
+    """Return the powers of two 1, 2, 4, … up to ``longest``."""
     return 2 ** np.arange(max(longest, 1).bit_length(), dtype=np.int64)
 
 
-def phase_of(values: Floats) -> tuple[Floats, NDArray[np.int32]]:
-    """Phase of the mean-free rate [n + 1, k] and how many samples before each point are missing; C order."""
+def integrate_to_phase(values: Floats) -> tuple[Floats, NDArray[np.int32]]:
+    """Return the phase of the mean-free rate and the running count of missing samples, both [n + 1, k] in C order."""
     phase = np.zeros((len(values) + 1, values.shape[1]))
     missing = np.zeros(phase.shape, np.int32)
     rate = phase[1:]
     rate[:] = values
     absent = ~np.isfinite(rate)
     rate[absent] = 0.0
-    # phase of the mean-free rate stays small, and so keeps its digits
+    # the phase of the mean-free rate stays small, which keeps its precision
     rate -= rate.sum(axis=0) / np.maximum((~absent).sum(axis=0), 1)
     rate[absent] = 0.0
     np.cumsum(rate, axis=0, out=rate)
@@ -119,19 +164,36 @@ def phase_of(values: Floats) -> tuple[Floats, NDArray[np.int32]]:
 
 
 def variance(sums: Floats, terms: Ints, factors: Ints) -> Floats:
-    """Sums of squared second differences to variances."""
+    """Convert sums of squared second differences to variances.
+
+    Parameters
+    ----------
+    sums : ndarray of float64, shape (m, k)
+        Sums of squared second differences of phase.
+    terms : ndarray of int64, shape (m, k)
+        Number of terms in each sum.
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
+    """
     with np.errstate(invalid="ignore"):
         return np.asarray(np.where(terms > 0, sums / (2.0 * factors[:, None] ** 2 * terms), np.nan))
 
 
 def moments(n: int, factor: int) -> Moments:
-    """Mean and covariance of the total variance of ``n`` samples, 1 ≤ factor < n; a few milliseconds.
+    """Return mean and covariance of the total variance. The computation takes a few milliseconds.
+
+    Parameters
+    ----------
+    n : int
+        Number of samples in the record.
+    factor : int
+        Cluster size in samples, from 1 to n − 1.
 
     >>> one = moments(100_000, 50_000)               # random walk at T/2: 1 − 0.750/2
     >>> print(f"{one.mean[3] / one.allan[3]:.3f}")
     0.625
     """
-    places, weights = nodes(1, n, [-(-factor // 2), factor, n - factor, n - factor // 2])
+    places, weights = quadrature_nodes(1, n, [-(-factor // 2), factor, n - factor, n - factor // 2])
     points, signs = _points(places, n, factor)
     half = 0.5 / factor**2
     mean = half / (n - 1) * (_squares(points, signs) @ weights)
@@ -140,7 +202,7 @@ def moments(n: int, factor: int) -> Moments:
 
 
 def _points(places: Floats, n: int, m: int) -> tuple[Floats, Floats]:
-    """Phase points [i, 5] of the terms at ``places``, and their weights: what is reflected, and about what."""
+    """Return the phase points [i, 5] of the terms at ``places`` and their weights, including the reflection points."""
     front, behind = places < m, places > n - m
     points = [0.0 * places, np.abs(places - m), places, np.minimum(places + m, 2 * n - m - places), n + 0.0 * places]
     signs = [2.0 * front, 1.0 - 2.0 * front, -2.0 + 0.0 * places, 1.0 - 2.0 * behind, 2.0 * behind]
@@ -148,7 +210,7 @@ def _points(places: Floats, n: int, m: int) -> tuple[Floats, Floats]:
 
 
 def _squares(points: Floats, signs: Floats) -> Floats:
-    """Mean squares [5, i] of differences for each coefficient of one."""
+    """Return the mean squares [5, i] of differences for each unit coefficient."""
     lags = points[:, :, None] - points[:, None, :]
     random = np.einsum("ip,iq,aipq->ai", signs, signs, autocovariance(lags))
     ramp = (signs * 0.5 * points**2).sum(axis=1) ** 2
@@ -156,18 +218,18 @@ def _squares(points: Floats, signs: Floats) -> Floats:
 
 
 def _covariance(n: int, m: int) -> Floats:
-    """Quadratic form [5, 5] of the variance.
+    """Return the quadratic form [5, 5] of the variance of the total variance.
 
-    Up to GRID samples the sum over all pairs of terms itself. Above, pairs on a coarse grid, as the autocovariances are
-    smooth. In a record longer than GRID/CLUSTER clusters the ends are as in a shorter one, and each term more adds the
-    same.
+    Up to ``MAX_EXACT_TERMS`` samples, all pairs of terms are summed. Longer records use pairs on a coarse grid, because
+    the autocovariances are smooth. In a record of more than ``MAX_EXACT_TERMS`` / ``MIN_CLUSTER_POINTS`` clusters, the
+    ends are the same as in a shorter record, and each further term adds the same amount.
     """
     scale = 2.0 * (0.5 / (m * m * (n - 1.0))) ** 2
-    if n <= GRID:
+    if n <= MAX_EXACT_TERMS:
         return _pair_sums(n, m, 1.0) * scale
-    cluster = m if m <= CLUSTER else max(CLUSTER, round(GRID * m / n))
+    cluster = m if m <= MIN_CLUSTER_POINTS else max(MIN_CLUSTER_POINTS, round(MAX_EXACT_TERMS * m / n))
     step = m / cluster
-    length = max(min(GRID, round(n / step)), cluster + 1)
+    length = max(min(MAX_EXACT_TERMS, round(n / step)), cluster + 1)
     sums = _pair_sums(length, cluster, step)
     beyond = n / step - length
     if beyond >= 1.0:
@@ -176,34 +238,34 @@ def _covariance(n: int, m: int) -> Floats:
 
 
 def _pair_sums(n: int, m: int, step: float) -> Floats:
-    """Σ_jk r^a_jk r^b_jk [5, 5] over all pairs of terms of a record whose points lie ``step`` samples apart on a grid.
+    """Return Σ_jk r^a_jk r^b_jk [5, 5] over all pairs of terms of a record sampled every ``step`` samples.
 
-    Quantization is two parts: the two ends, which all reflected terms have in common, and points met along lines, which
-    grow with the step where pairs grow with its square.
+    Quantization has two parts. The two ends are common to all reflected terms. Coinciding points lie along lines, so
+    their number grows with the step, while the number of pairs grows with its square.
     """
     at = np.arange(n + 1)
     lags = autocovariance(step * np.arange(n + 1.0))[:, np.abs(at[:, None] - at)]
     points, signs = _points(np.arange(1.0, n), n, m)
     rows = points.astype(np.int64)
-    random = _combined(_combined(lags, rows, signs).transpose(0, 2, 1), rows, signs)
+    random = _combine_points(_combine_points(lags, rows, signs).transpose(0, 2, 1), rows, signs)
     ends = signs[:, [0, 4]] @ signs[:, [0, 4]].T
     random[0] -= ends
     ramp = (signs * 0.5 * (step * points) ** 2).sum(axis=1)
-    parts = np.concatenate([random, np.outer(ramp, ramp)[None], ends[None]]).reshape(SOURCES + 1, -1)
+    parts = np.concatenate([random, np.outer(ramp, ramp)[None], ends[None]]).reshape(NUM_COEFFICIENTS + 1, -1)
     products = step * step * (parts @ parts.T)
     products[0] /= step
     products[1:, 0] /= step
     products[0, 0] = step * (parts[0] @ parts[0])
-    products[_RAMP, _RAMP] = 0.0  # a ramp by itself does not vary
-    joined = products[:SOURCES, :SOURCES]
-    joined[0] += products[SOURCES, :SOURCES]
-    joined[:, 0] += products[:SOURCES, SOURCES]
-    joined[0, 0] += products[SOURCES, SOURCES]
+    products[_RAMP, _RAMP] = 0.0  # a ramp alone has no variance
+    joined = products[:NUM_COEFFICIENTS, :NUM_COEFFICIENTS]
+    joined[0] += products[NUM_COEFFICIENTS, :NUM_COEFFICIENTS]
+    joined[:, 0] += products[:NUM_COEFFICIENTS, NUM_COEFFICIENTS]
+    joined[0, 0] += products[NUM_COEFFICIENTS, NUM_COEFFICIENTS]
     return np.asarray(joined)
 
 
-def _combined(of_points: Floats, rows: Ints, signs: Floats) -> Floats:
-    """Rows [4, points, …] of phase points to rows [4, terms, …] of differences."""
+def _combine_points(of_points: Floats, rows: Ints, signs: Floats) -> Floats:
+    """Combine rows [4, points, …] of phase points into rows [4, terms, …] of differences."""
     terms = signs[:, 0, None] * of_points[:, rows[:, 0]]
     for p in range(1, rows.shape[1]):
         terms += signs[:, p, None] * of_points[:, rows[:, p]]
@@ -214,8 +276,26 @@ def _combined(of_points: Floats, rows: Ints, signs: Floats) -> Floats:
 def add_total(phase, missing, first, n, m, begin, end, sums, terms):  # type: ignore[no-untyped-def]
     """Add the squares of the terms begin ≤ i < end of the n + 1 phase points that start at row ``first`` of a ring.
 
-    phase [places, ≥ k] float64, or integers that wrap; missing alike; sums [k] and terms [k] are added to. The
-    reflected neighbour of a term goes the other way with the other sign, beside twice the end's phase.
+    The reflected neighbour of a term enters with the opposite sign, together with twice the phase at the end.
+
+    Parameters
+    ----------
+    phase : ndarray of float64 or wrapping int64, shape (places, at least k)
+        Ring of phase.
+    missing : ndarray of int32, shape (places, at least k)
+        Running count of missing samples.
+    first : int
+        Row of the oldest point.
+    n : int
+        Number of samples.
+    m : int
+        Cluster size in samples.
+    begin, end : int
+        Range of terms.
+    sums : ndarray of float64, shape (k,)
+        Sums of squares, updated in place.
+    terms : ndarray of int64, shape (k,)
+        Number of terms, updated in place.
     """
     places = phase.shape[0]
     last = (first + n) % places
@@ -241,9 +321,9 @@ def add_total(phase, missing, first, n, m, begin, end, sums, terms):  # type: ig
 
 @compiled
 def _add_run(phase, missing, left, at, right, before, behind, first, last, mirror, rows, sums, terms):  # type: ignore[no-untyped-def]
-    """Terms of one kind, but for those that touch a missing sample from their first to their last point.
+    """Add a run of terms of one kind, except those with a missing sample between their first and last point.
 
-    A term that is reflected in front begins with the record, one that is reflected behind ends with it.
+    A term reflected at the front begins with the record, and a term reflected at the back ends with it.
     """
     whole = True
     for lane in range(sums.size):

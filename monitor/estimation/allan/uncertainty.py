@@ -1,19 +1,20 @@
-"""How sure an Allan variance is: covariances of the estimates, degrees of freedom, χ² intervals.
+"""Uncertainty of an Allan variance: covariances of the estimates, degrees of freedom and χ² intervals.
 
-The covariance of two overlapping Allan variances of Gaussian noise is a quadratic form in the
-variances θ = (Q², N², B², K²) of its terms (Isserlis: Cov(d², e²) = 2 Cov(d, e)²),
+The covariance of two overlapping Allan variances of Gaussian noise is a quadratic form in the variances θ = (Q², N²,
+B², K²) of its terms (Isserlis: Cov(d², e²) = 2 Cov(d, e)²),
 
-    Cov(σ²_i, σ²_j) = Σ_ab θ_a θ_b C^ab_ij,   C^ab_ij = 1/(2 M_i M_j) Σ_c w(c) r^a_ij(c) r^b_ij(c)
+    Cov(σ²_i, σ²_j) = Σ_ab θ_a θ_b C^ab_ij,   C^ab_ij = 1/(2 M_i M_j) Σ_c w(c) r^a_ij(c) r^b_ij(c).
 
-with r the second differences, over clusters of m_i and of m_j samples, of the generalised
-autocovariance of phase (Q δ, N −|t|/2, B t² ln|t| / 2π, K (|t|³ − |t|)/12: discrete sums of white
-noise), w(c) how many pairs of terms stand c samples apart, and M the number of terms. ``table``
-computes C once for a window length and a list of cluster sizes; a fit then costs products only.
+Here r denotes the second differences, over clusters of m_i and of m_j samples, of the generalised autocovariance of
+phase (Q δ, N −|t|/2, B t² ln|t| / 2π, K (|t|³ − |t|)/12: discrete sums of white noise). w(c) is the number of pairs of
+terms that are c samples apart, and M is the number of terms. ``table`` computes C once for a window length and a list
+of cluster sizes. A fit then only needs products.
 
-It gives the exact degrees of freedom of mixed noise, edf = 2 σ⁴ / Cov_ii. The usual formulas
-(Greenhall & Riley, PTTI 2003) hold for one power law at a time and are 15–25 % off near m = 1;
-since the exact sum takes milliseconds, they are not used. Everything here is in units of one
-sample: τ0 = 1, and θ stands for Q²/τ0², N²/τ0, B², K² τ0, R² τ0².
+The result is the exact number of degrees of freedom of mixed noise, edf = 2 σ⁴ / Cov_ii. The usual formulas (Greenhall
+& Riley, PTTI 2003) hold for one power law at a time and are 15–25 % off near m = 1. They are not used, because the
+exact sum takes only milliseconds.
+
+All quantities are in units of one sample: τ0 = 1, and θ stands for Q²/τ0², N²/τ0, B², K² τ0, R² τ0².
 """
 
 import math
@@ -31,37 +32,46 @@ from monitor.noise.effects.bias_instability import BiasInstability
 Q, N, B, K, R = range(5)
 
 NOISES: Final = 4
-"""Random terms of the table, Q N B K; the ramp R is deterministic and adds no variance of its own."""
+"""Number of random terms in the table, Q N B K. The ramp R is deterministic and adds no variance of its own."""
 
 PAIRS: Final = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
-"""The pairs a ≤ b of noises, in the order of the table's last index."""
+"""Pairs a ≤ b of noises, in the order of the last index of the table."""
 
 LAG_STEP: Final = 0.5
-"""Lags are summed in blocks of this share of their distance to the nearest kink of r."""
+"""Lags are summed in blocks whose length is this share of their distance to the nearest kink of r."""
 
 TAIL: Final = 8.0
-"""Beyond this many (m_i + m_j) the differences of t² ln t are taken from their series."""
+"""Lag in units of (m_i + m_j) beyond which the differences of t² ln t are computed from their series."""
 
-FOR_EVER: Final = 1 << 62
+UNLIMITED_SAMPLES: Final = 1 << 62
+"""Number of samples that stands for an unlimited time."""
 
 TABLE_STEP: Final = 1.1
-"""While a window grows, its table is renewed at this ratio of lengths; terms rescale it between."""
+"""Ratio of window lengths at which the table of a growing window is recomputed. In between, terms scale it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """C for one window length; read-only arrays."""
+    """Covariance coefficients C for one window length. The arrays are read-only."""
 
     n: int  # samples in the window
-    factors: Ints  # [m] cluster sizes
-    terms: Ints  # [m] second differences in a window without gaps; ≤ 0 where it is too short
-    covariance: Floats  # [m, m, 10] C^ab_ij of the pairs a ≤ b; NaN where the window is too short
-    slope: Floats  # [4] variance of the slope of thirds, for θ of one
-    bend: Floats  # [m, 4] its covariance with the slope that each τ sees (``window_kernel.mean_bend``)
+    factors: Ints  # [m] cluster sizes in samples
+    terms: Ints  # [m] number of second differences in a window without gaps; ≤ 0 if the window is too short
+    covariance: Floats  # [m, m, 10] C^ab_ij of the pairs a ≤ b; NaN if the window is too short
+    slope: Floats  # [4] variance of the slope of thirds, for unit θ
+    bend: Floats  # [m, 4] covariance of this slope with the slope seen by each τ (``window_kernel.mean_bend``)
 
 
 class Tables:
-    """Hands out the table that fits a window, and makes a new one when the window has outgrown it."""
+    """Cache of the covariance table for a growing window.
+
+    Parameters
+    ----------
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
+    capacity : int
+        Length of the full window in samples.
+    """
 
     def __init__(self, factors: Ints, capacity: int) -> None:
         self._factors = factors
@@ -69,36 +79,64 @@ class Tables:
         self._table: Table | None = None
 
     def at(self, n: int) -> Table:
-        """A table of n samples, or of up to a tenth fewer while the window is growing."""
+        """Return a table for n samples. While the window grows, the table may be for up to a tenth fewer samples."""
         known = self._table
         if known is None or not (known.n == n or known.n < n < min(self._capacity, TABLE_STEP * known.n)):
             known = self._table = table(n, self._factors)
         return known
 
     def lasts(self, n: int) -> int:
-        """For how many samples, the one of n included, ``at(n)`` stays the table to use; for ever in a full window."""
+        """Return for how many samples ``at(n)`` stays valid, including sample n.
+
+        The number is ``UNLIMITED_SAMPLES`` for a full window.
+        """
         known = self.at(n)
         if n >= self._capacity:
-            return FOR_EVER
+            return UNLIMITED_SAMPLES
         return min(self._capacity, math.ceil(TABLE_STEP * known.n)) - n
 
 
 class AxisTables:
-    """The tables of six axes: all that reach back over the whole window share one, each that began anew has its own."""
+    """Covariance tables of six axes. Axes that fill the window share one, and each restarted axis has its own.
+
+    Parameters
+    ----------
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
+    capacity : int
+        Length of the full window in samples.
+    """
 
     def __init__(self, factors: Ints, capacity: int) -> None:
         self._shared = Tables(factors, capacity)
         self._own = [Tables(factors, capacity) for _ in AXES]
 
     def of(self, axis: int, n: int, filled: int) -> Tables:
-        """For an axis with the newest ``n`` of the ``filled`` samples that the window holds."""
+        """Return the tables of an axis.
+
+        Parameters
+        ----------
+        axis : int
+            Index of the axis.
+        n : int
+            Number of newest samples that this axis uses.
+        filled : int
+            Number of samples in the window.
+        """
         return self._shared if n == filled else self._own[axis]
 
 
 def table(n: int, factors: Ints) -> Table:
-    """Covariances of overlapping Allan variances of ``n`` samples at these cluster sizes.
+    """Return the covariances of overlapping Allan variances of n samples.
 
-    White noise, m = 1: neighbours share one sample, edf = 2/3 of the terms.
+    In the example, white noise at m = 1 has edf = 2/3 of the terms, because neighbouring terms share one sample.
+
+    Parameters
+    ----------
+    n : int
+        Number of samples in the window.
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
 
     >>> t = table(30_001, np.array([1, 2]))
     >>> round(2 * 1.0**2 / t.covariance[0, 0, PAIRS.index((1, 1))])
@@ -107,7 +145,7 @@ def table(n: int, factors: Ints) -> Table:
     factors = np.ascontiguousarray(factors, np.int64)
     covariance = np.full((factors.size, factors.size, len(PAIRS)), np.nan)
     _fill(n, factors, covariance)
-    # t² ln t is continuous 1/f; sampled, there is none above half the rate: less at the shortest τ
+    # t² ln t is continuous 1/f noise; sampled noise has none above half the rate, so less at the shortest τ
     share = np.array([_sampled_flicker(m) for m in factors.tolist()])
     for pair, (a, b) in enumerate(PAIRS):
         covariance[:, :, pair] *= np.outer(share, share) ** ((a == B) + (b == B))
@@ -120,14 +158,15 @@ def table(n: int, factors: Ints) -> Table:
 
 @cache
 def _sampled_flicker(m: int) -> float:
-    """Deviation of sampled 1/f noise over that of continuous, one but at the shortest τ."""
+    """Return the deviation of sampled over continuous 1/f noise; the ratio is one except at the shortest τ."""
     return float(np.sqrt(BiasInstability(B=1.0).avar(np.array([float(m)]), 1.0)[0] / (2.0 * np.log(2.0) / np.pi)))
 
 
 def _slope_variance(n: int) -> Floats:
-    """Variance of ``fit.slope_of_thirds`` for Q² N² B² K² of one, τ0 = 1, from the autocovariances of phase.
+    """Return the variance of ``coefficient_fit.slope_of_thirds`` for unit Q² N² B² K², τ0 = 1.
 
-    With τ = n/3 the sums over the four points are 4, 2τ, (9 ln 3 − 8 ln 2) τ²/π and 5τ³/3, over (2τ²)².
+    It follows from the autocovariances of phase. With τ = n/3 the sums over the four points are 4, 2τ, (9 ln 3 − 8 ln
+    2) τ²/π and 5τ³/3, divided by (2τ²)².
     """
     if n < 3:
         return np.full(NOISES, np.nan)
@@ -137,10 +176,11 @@ def _slope_variance(n: int) -> Floats:
 
 
 def _bend_covariance(n: int, m: int) -> Floats:
-    """Covariance of the slope of thirds and of the mean second difference over m², for Q² N² B² K² of one, τ0 = 1.
+    """Return the covariance of the slope of thirds and the mean second difference over m², for unit Q² N² B² K².
 
-    Both are sums over a few points of phase, so it is a sum of the generalised autocovariances over the lags between
-    them; of the blocks of m points behind a mean second difference some sixty stand for all.
+    Both are sums over a few points of phase. The covariance is therefore a sum of the generalised autocovariances over
+    the lags between these points. About sixty points represent each block of m points of a mean second difference. τ0 =
+    1.
     """
     if n < 3 or n + 1 <= 2 * m:
         return np.full(NOISES, np.nan)
@@ -156,20 +196,38 @@ def _bend_covariance(n: int, m: int) -> Floats:
     return np.array([float((weight * part).sum()) for part in parts])
 
 
-class Spans:
-    """Degrees of freedom of a curve whose τ look back over different spans."""
+class SpanDegreesOfFreedom:
+    """Degrees of freedom of a curve whose τ use different spans.
+
+    Parameters
+    ----------
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
+    spans : ndarray of int64, shape (m,)
+        Number of samples that each τ uses.
+    columns : ndarray of float64, shape (m, 4 or more)
+        Allan variance of unit Q N B K at τ0 = 1.
+    """
 
     def __init__(self, factors: Ints, spans: Ints, columns: Floats) -> None:
-        """``columns`` [m, 4 or more]: Allan variance of Q N B K of one at τ0 = 1."""
         tables = [table(int(span), np.array([m])) for m, span in zip(factors, spans, strict=True)]
         self._covariance = np.array([one.covariance[0, 0] for one in tables])  # [m, 10]
         self._columns = columns[:, :NOISES]
         self._terms = np.array([one.terms[0] for one in tables])
 
     def edf(self, theta: Floats, rate_hz: float, terms: Ints) -> Floats:
-        """Degrees of freedom [m, k] of terms [m, k] under noise of the shape of ``theta`` [5, k], SI.
+        """Return the degrees of freedom [m, k] for noise with the relative shares of ``theta``.
 
-        Where nothing was fitted, of white noise.
+        White noise is assumed where nothing has been fitted.
+
+        Parameters
+        ----------
+        theta : ndarray of float64, shape (5, k)
+            Q² N² B² K² R² in SI; NaN means not fitted.
+        rate_hz : float
+            Sample rate in Hz.
+        terms : ndarray of int64, shape (m, k)
+            Number of second differences averaged.
         """
         shape = np.maximum(theta[:NOISES], 0.0) * (rate_hz ** np.array([2.0, 1.0, 0.0, -1.0]))[:, None]
         shape = np.where(np.isnan(shape).any(axis=0) | (shape.sum(axis=0) == 0.0), np.eye(NOISES)[1][:, None], shape)
@@ -181,9 +239,21 @@ class Spans:
 
 
 def intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Floats, Floats]:
-    """Ends of the two-sided χ² interval of the Allan deviation, edf s²/χ² (NIST SP 1065 eq. 45).
+    """Return the ends of the two-sided χ² interval of the Allan deviation, edf s²/χ² (NIST SP 1065 eq. 45).
 
-    Shapes of ``avar`` and ``edf`` alike; NaN stays NaN.
+    Parameters
+    ----------
+    avar : ndarray of float64
+        Allan variance; NaN stays NaN.
+    edf : ndarray of float64
+        Degrees of freedom, in the shape of ``avar``.
+    probability : float
+        Probability of the interval.
+
+    Returns
+    -------
+    lo, hi : ndarray of float64
+        Ends of the interval of the deviation, in the shape of ``avar``.
 
     >>> lo, hi = intervals(np.array([1.0]), np.array([10.0]))
     >>> print(f"{lo[0]:.3f} {hi[0]:.3f}")
@@ -192,7 +262,7 @@ def intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Flo
     tail = (1.0 - probability) / 2.0
     safe = np.where(edf > 0.0, edf, np.nan)
     low, high = chi2_quantile(safe, tail), chi2_quantile(safe, 1.0 - tail)
-    # a fraction of one degree of freedom bounds nothing from above, not even a sum of zeros
+    # with a fraction of one degree of freedom there is no upper bound, even if all terms are zero
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         lo, hi = np.sqrt(avar * safe / high), np.sqrt(avar * safe / low)
     return lo, np.where((low == 0.0) & (avar >= 0.0), np.inf, hi)
@@ -200,6 +270,7 @@ def intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Flo
 
 @compiled
 def _fill(n, factors, covariance):  # type: ignore[no-untyped-def]
+    """Fill the covariance table [m, m, 10] for a window of n samples."""
     sums = np.empty(10)
     for i in range(factors.size):
         for j in range(i, factors.size):
@@ -215,7 +286,7 @@ def _fill(n, factors, covariance):  # type: ignore[no-untyped-def]
 
 @compiled
 def _sum_lags(n, small, large, sums):  # type: ignore[no-untyped-def]
-    """Σ w(c) r^a(c) r^b(c) over all lags c of the terms' centres: kinks one by one, between them blocks."""
+    """Sum w(c) r^a(c) r^b(c) over all lags c of the centres of the terms: kinks one by one, and blocks between them."""
     for pair in range(10):
         sums[pair] = 0.0
     end = n + 1 - small - large  # w(end) = 0
@@ -238,10 +309,10 @@ def _sum_lags(n, small, large, sums):  # type: ignore[no-untyped-def]
 
 @compiled
 def _add_blocks(kink, count, side, n, small, large, sums):  # type: ignore[no-untyped-def]
-    """``count`` lags beside a kink in growing blocks, each by the three-point Gauss rule of a block.
+    """Add ``count`` lags beside a kink in growing blocks, each by the three-point Gauss rule of a block.
 
-    Nodes and weights integrate polynomials of degree 5 exactly over L equally spaced points: the
-    second and fourth moments are (L² − 1)/12 and (L² − 1)(3L² − 7)/240.
+    Nodes and weights integrate polynomials of degree 5 exactly over L equally spaced points. The second and fourth
+    moments are (L² − 1)/12 and (L² − 1)(3L² − 7)/240.
     """
     done = 0
     while done < count:
@@ -261,7 +332,7 @@ def _add_blocks(kink, count, side, n, small, large, sums):  # type: ignore[no-un
 
 @compiled
 def _add(lag, weight, n, small, large, sums):  # type: ignore[no-untyped-def]
-    """One lag: the products of the differences of every two noises, times the pairs so far apart."""
+    """Add one lag: the products of the differences of every two noises, times the number of pairs at this lag."""
     weight *= min(n + 1.0 - 2 * large, n + 1.0 - small - large - lag)
     if lag > TAIL * (small + large):
         r = small * large / (np.pi * lag * lag) * (1.0 + 0.5 * (small * small + large * large) / (lag * lag))

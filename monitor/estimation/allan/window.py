@@ -1,27 +1,27 @@
-"""The sliding window: overlapping Allan variance of the last L samples, renewed with every sample.
+"""Sliding window with the overlapping Allan variance of the last L samples, updated with every sample.
 
-Comes in: samples, missing ones included as NaN, in their places. Goes out: sums of squared second
-differences S_m and their counts C_m for every cluster size m and axis, from which
-σ²(m) = S_m / (2 m² C_m) (rate form; "Dynamic extraction of random
-drift error coefficients of MEMS gyroscopes", eq. 12-15). Cost per sample: one added and one
-evicted term a τ and axis, whatever the window's length.
+The window holds, for every cluster size m and axis, the sum S_m of squared second differences of phase and their count
+C_m. They give the Allan variance of the rate, σ²(m) = S_m / (2 m² C_m) ("Dynamic extraction of random drift error
+coefficients of MEMS gyroscopes", eq. 12-15). Missing samples are NaN in the input and keep their places in time. Each
+sample adds one term and evicts one term per τ and axis, so the cost does not depend on the window length.
 
-Why it stays exact for years:
+The sums stay exact for years for three reasons:
 
-- Phase is an integer: the running sum of y · 2^s modulo 2⁶⁴, each rounding carried on to the next sample. So a
-  second difference x_k - 2x_{k-m} + x_{k-2m} is right to one unit of 2^-s however far phase has wandered or
-  wrapped, with 9.81 m/s² on the axis or not. s is chosen so that full-scale input cannot overflow at the longest τ.
-- The same integers give the same squares when a term is evicted as when it was added, and S_m is kept as
-  a double and the exact sum of its roundings (Knuth's TwoSum), so what a transient added is taken out again
-  to 2⁻¹⁰⁶ of the largest sum ever held. Nothing is left behind.
-- A missing sample keeps its place in time. A running count of missing samples a axis tells for every term
-  whether its 2m samples were all there; only then does it enter, and the same count decides its leaving.
+- Phase is an integer, the running sum of y · 2^s modulo 2⁶⁴. The rounding error of each sample is carried to the next.
+  A second difference x_k - 2x_{k-m} + x_{k-2m} is therefore exact to one unit of 2^-s. This holds even if phase has
+  wandered or wrapped, with or without 9.81 m/s² on the axis. The exponent s is chosen so that full-scale input cannot
+  overflow at the longest τ.
+- The same integers give the same squares when a term is added and when it is evicted. S_m is stored as a double
+  together with the exact sum of its rounding errors (Knuth's TwoSum). The contribution of a transient is therefore
+  removed again to 2⁻¹⁰⁶ of the largest sum ever held.
+- A running count of missing samples per axis shows for every term whether all of its 2m samples are present. Only such
+  terms are added, and the same count decides whether they are evicted.
 
-A row may look back over fewer samples than the window holds (``spans``): all rows share the one ring of phase, and each
-evicts at its own distance.
+A row can use fewer samples than the window holds (``spans``). All rows share one ring of phase, and each row evicts at
+its own distance.
 
-The rounding is white phase noise of variance 2^-2s/12 and changes σ²(m) by about 2·2^-s/(σ √L) of itself at every m,
-σ being the noise of a sample: for an hour at 100 Hz (s = 38, 36) and σ = 1e-4, 1e-10.
+The rounding is white phase noise of variance 2^-2s/12. It changes σ²(m) by a relative amount of about 2·2^-s/(σ √L) at
+every m, where σ is the noise of one sample. For an hour at 100 Hz (s = 38, 36) and σ = 1e-4, this is 1e-10.
 """
 
 from typing import Any, Final
@@ -51,24 +51,45 @@ from monitor.estimation.allan.window_kernel import (
 )
 
 MIN_LENGTH: Final = 100
-"""Samples; a shorter window holds no Allan curve worth a name."""
+"""Minimum window length in samples. A shorter window gives no useful Allan curve."""
 MAX_LENGTH: Final = 10_000_000
-"""Samples; 64 bytes each are kept, 96 once any has been missing."""
-HOLE_ROWS: Final = 4096
+"""Maximum window length in samples. Each sample takes 64 bytes, or 96 bytes once a sample has been missing."""
+SKIP_BLOCK_ROWS: Final = 4096
+"""Number of missing samples that are processed at a time."""
 FULL_SCALE: Final = (70.0,) * 3 + (400.0,) * 3 + (1.0,) * 2
-"""rad/s and m/s²: the mean over τ may reach these at the longest τ (4000 °/s, 40 g), more at shorter ones."""
+"""Full scale in rad/s and m/s² (4000 °/s, 40 g).
+
+The mean over τ may reach these values at the longest τ, and larger ones at shorter τ.
+"""
 QUICK_S: Final = 10.0
-"""A shorter span makes the deviation of one sample jump about under the eye: 1000 samples at 100 Hz hold it to 3 %."""
+"""Shortest span of a displayed deviation in seconds.
+
+With a shorter span, the displayed deviation at one sample fluctuates visibly. 1000 samples at 100 Hz limit this to 3 %.
+"""
 QUICK_CLUSTERS: Final = 16
-"""Of τ in its span: 15 independent differences, a deviation to ±20 %."""
+"""Minimum number of clusters of length τ in a span. It gives 15 independent differences and a deviation to ±20 %."""
 
 
 def quick_spans(factors: Ints, rate_hz: float, length: int) -> Ints:
-    """Samples that a displayed deviation looks back over: max(10 s, 16 τ), within the window.
+    """Return the number of samples that each displayed deviation uses: max(10 s, 16 τ), at most the whole window.
 
-    A change of N shows within a minute at τ up to 3 s, where a window of an hour needs the hour, and long τ keep the
-    confidence they can have. Such a curve is for the eye: its points speak of different times, so a fit over it
-    invents terms while anything changes (measured: ``docs/windows.md``).
+    A change of N then shows within a minute at τ up to 3 s, while a window of an hour needs the hour. Long τ keep the
+    best possible confidence. The curve is only for display. Its points cover different times, so a fit to it finds
+    spurious terms while the noise changes (measured: ``docs/windows.md``).
+
+    Parameters
+    ----------
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
+    rate_hz : float
+        Sample rate in Hz.
+    length : int
+        Window length in samples.
+
+    Returns
+    -------
+    ndarray of int64, shape (m,)
+        Span of each cluster size in samples.
 
     >>> quick_spans(np.array([1, 100, 10_000]), 100.0, 100_000).tolist()
     [1000, 1600, 100000]
@@ -77,22 +98,31 @@ def quick_spans(factors: Ints, rate_hz: float, length: int) -> Ints:
 
 
 def phase_scale(longest: int) -> Floats:
-    """2^s [LANES], units of integer phase in one unit of the axis times a sample, for clusters of up to ``longest``.
+    """Return 2^s [LANES], the units of integer phase per unit of the axis and sample, for clusters up to ``longest``.
 
-    |second difference| ≤ 2 m · full scale must stay below 2^63.
+    The bound |second difference| ≤ 2 m · full scale must stay below 2^63.
     """
     bits = 62 - np.ceil(np.log2(2.0 * longest * np.array(FULL_SCALE)))
     return np.asarray(np.exp2(np.minimum(bits, 48.0)))
 
 
 class AllanWindow:
-    """Windowed overlapping Allan variance of six axes at many cluster sizes.
+    """Sliding window with the overlapping Allan variance of six axes at many cluster sizes.
 
-    Args:
-        length: samples in the full window, MIN_LENGTH … MAX_LENGTH
-        factors: cluster sizes m in samples, ascending, 1 ≤ m ≤ length/2
-        spans: samples each row looks back over, 2m ≤ span ≤ length; absent: all of the window. With it, rows may
-            come in any order and an m may occur again with another span
+    Parameters
+    ----------
+    length : int
+        Length of the full window in samples, from ``MIN_LENGTH`` to ``MAX_LENGTH``.
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples, ascending, from 1 to length/2.
+    spans : ndarray of int64, shape (m,), or None
+        Number of samples that each row uses, from two clusters to ``length``. None means the whole window. If spans are
+        given, the rows may have any order, and a cluster size may occur again with another span.
+
+    Raises
+    ------
+    ConfigError
+        If the length, a cluster size or a span is out of range.
 
     >>> window = AllanWindow(100, np.array([1, 2]))
     >>> window.update(np.tile([[1.0], [2.0]], (50, 6)))   # 1, 2, 1, 2, … : σ²(1) = 1/2, σ²(2) = 0
@@ -116,7 +146,7 @@ class AllanWindow:
         self.spans = spans.astype(np.int64)
         self._taus = int(factors.size)
         self._scale = phase_scale(int(factors.max()))
-        # few arrays for all, as the interpreter takes 50 ns to hand one to the kernel; see view_ints, view_floats
+        # only a few arrays, because passing one to the kernel takes 50 ns; see view_ints and view_floats
         taus, places = self._taus, length + 1 + RUN
         self._ints = _aligned(LANES + -(-2 * taus // LINE) * LINE + taus * LANES + places * LANES, np.int64)
         self._floats = _aligned((2 + 2 * RUN + 2 * taus + STAGE) * LANES, np.float64)
@@ -127,21 +157,24 @@ class AllanWindow:
         self._terms = terms.reshape(taus, LANES)
         self._sums, self._rest = sums.reshape(taus, LANES), rest.reshape(taus, LANES)
         self._stage = stage[: STAGE * AXES].reshape(STAGE, AXES)
-        self.resets = -1  # how many times it was emptied
+        self.resets = -1  # number of times the window has been emptied; the call below makes it 0
         self.reset()
 
     @property
     def n(self) -> int:
-        """Samples in the window now, missing ones included."""
+        """Number of samples in the window, including missing ones."""
         return min(int(self._state[TOTAL]), self.length)
 
     @property
     def total(self) -> int:
-        """Samples since the last reset, missing ones included."""
+        """Number of samples since the last reset, including missing ones."""
         return int(self._state[TOTAL])
 
     def reset(self) -> None:
-        """Forget all samples; phase and the count of missing ones only matter by their differences, and stay."""
+        """Discard all samples.
+
+        Phase and the count of missing samples are kept, because only their differences matter.
+        """
         self.resets += 1
         self._terms[:] = 0
         self._floats[:] = 0
@@ -149,7 +182,18 @@ class AllanWindow:
         self._state[[TOTAL, STRUCK, WIDTH]] = (0, -(1 << 62), LANES)
 
     def update(self, values: Floats) -> None:
-        """Advance by samples [n, 6], one by one; NaN, and what is beyond any phase (1e7 and more), = missing."""
+        """Advance the window by samples.
+
+        Parameters
+        ----------
+        values : ndarray of float, shape (n, 6)
+            Samples in rad/s and m/s². NaN and values too large for integer phase (1e7 and more) count as missing.
+
+        Raises
+        ------
+        ValueError
+            If the shape is not (n, 6).
+        """
         rows = np.asarray(values)
         shape = rows.shape
         if len(shape) != 2 or shape[1] != AXES:
@@ -159,51 +203,68 @@ class AllanWindow:
             for start in range(0, n, STAGE):
                 self.update(rows[start : start + STAGE])
             return
-        self._stage[:n] = rows  # as ``stage`` does; calling it would cost a single sample 3 %
+        self._stage[:n] = rows  # the same as ``stage``; calling it would slow down a single sample by 3 %
         advance(self._ints, self._floats, self._missing, self._taus, 0, n)
 
     def stage(self, values: Floats) -> None:
-        """Lay up to STAGE samples [n, 6] ready for compiled code that advances by them (``parts``)."""
-        # copied: each layout and access flag of an array would be compiled anew, for seconds
+        """Copy up to ``STAGE`` samples [n, 6] to the input buffer of compiled code (``parts``)."""
+        # copied, because each new memory layout or access flag of an array triggers a compilation of seconds
         self._stage[: len(values)] = values
 
     def parts(self) -> Parts:
-        """What compiled code needs to advance the window."""
+        """Return the arrays with which compiled code advances the window."""
         return Parts(self._ints, self._floats, self._missing, self._taus, self.length)
 
     def skip(self, n: int) -> None:
-        """Advance by n missing samples; more than the window holds empty it at once."""
+        """Advance by n missing samples. If n exceeds the window length, the window is emptied."""
         if n > self.length:
             self.reset()
             return
-        # in pieces, so that a long outage needs no array of its length
-        hole = np.full((min(n, HOLE_ROWS), AXES), np.nan)
-        for start in range(0, n, HOLE_ROWS):
+        # in blocks, so that a long outage needs no array of its full length
+        hole = np.full((min(n, SKIP_BLOCK_ROWS), AXES), np.nan)
+        for start in range(0, n, SKIP_BLOCK_ROWS):
             self.update(hole[: n - start])
 
     def forget(self, axis: int, n: int) -> None:
-        """Of one axis, forget all but the newest n samples: those before are missing from now on.
+        """Discard all but the newest samples of one axis, and count the older ones as missing.
 
-        Costs a walk over the window, and what n samples cost.
+        The cost is one pass over the window plus the cost of n samples.
+
+        Parameters
+        ----------
+        axis : int
+            Index of the axis.
+        n : int
+            Number of newest samples to keep.
         """
         if n < self.n:
             forget(self._ints, self._floats, self._missing, self._taus, axis, n)
 
     def avar(self) -> Floats:
-        """Allan variance [m, 6] in unit² of the axis; NaN where no term is complete."""
+        """Return the Allan variance [m, 6] in squared units of the axis; NaN where no term is complete."""
         sums = (self._sums + self._rest)[:, :AXES]
         m = self.factors[:, None] * self._scale[:AXES]
         terms = self._terms[:, :AXES]
-        # a constant axis shows second differences of up to one unit, the rounding of its phase: no noise at all
+        # the second differences of a constant axis reach one unit by rounding alone, which is not noise
         sums = np.where(sums <= terms, 0.0, sums)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(terms > 0, sums / (2.0 * m * m * terms), np.nan)
 
     def slope(self, lengths: Ints | None = None) -> Floats:
-        """Slope of the rate over the newest ``lengths`` [6] samples, by default all; NaN where one is missing.
+        """Return the slope of the rate of each axis over its newest samples.
 
-        [6], unit of the axis a sample: mean of the last third less that of the first, over two thirds of the
-        window (``fit.slope_of_thirds``).
+        The slope is the mean of the last third minus the mean of the first third, divided by two thirds of the duration
+        (``coefficient_fit.slope_of_thirds``).
+
+        Parameters
+        ----------
+        lengths : ndarray of int64, shape (6,), or None
+            Number of newest samples of each axis. None means all samples in the window.
+
+        Returns
+        -------
+        ndarray of float64, shape (6,)
+            Slope in units of the axis per sample; NaN if too many samples are missing.
         """
         newest = int(self._state[NEWEST])
         lengths = np.full(AXES, self.n) if lengths is None else lengths
@@ -211,9 +272,17 @@ class AllanWindow:
         return result / self._scale[:AXES]
 
     def slopes(self, lengths: Ints | None = None) -> Floats:
-        """Slope of the rate [m, 6] as each τ sees it: its mean second difference of phase over m²; unit a sample.
+        """Return the slope of the rate as seen by each τ: the mean second difference of phase divided by m².
 
-        NaN where a sample is missing. Not of spans, but of the newest ``lengths`` [6] samples; of all by default.
+        Parameters
+        ----------
+        lengths : ndarray of int64, shape (6,), or None
+            Number of newest samples of each axis, independent of ``spans``. None means all samples in the window.
+
+        Returns
+        -------
+        ndarray of float64, shape (m, 6)
+            Slope in units of the axis per sample; NaN if too many samples are missing.
         """
         result = np.empty((self._taus, AXES))
         lengths = np.full(AXES, self.n) if lengths is None else lengths
@@ -221,21 +290,37 @@ class AllanWindow:
         return result / self._scale[:AXES]
 
     def terms(self) -> Ints:
-        """Number of second differences averaged, [m, 6]."""
+        """Return the number of second differences averaged, shape (m, 6)."""
         return self._terms[:, :AXES].copy()
 
     def newest(self, axis: int, n: int) -> Floats:
-        """Up to n of the newest samples of one axis, from its phase; NaN = missing."""
+        """Return up to n of the newest samples of one axis from its phase; NaN means missing.
+
+        Parameters
+        ----------
+        axis : int
+            Index of the axis.
+        n : int
+            Maximum number of samples.
+        """
         places = self._phase.size // LANES
         at = (int(self._state[NEWEST]) - np.arange(min(n, self.n), -1, -1)) % places
         phase, missing = self._phase[at * LANES + axis], self._missing[at * LANES + axis]
         return np.where(np.diff(missing) > 0, np.nan, np.diff(phase) / self._scale[axis])
 
     def ring(self) -> tuple[Ints, NDArray[np.int32], int, Floats]:
-        """A look at phase without a copy, good until the next update.
+        """Return a view of the ring of phase without a copy. It is valid until the next update.
 
-        Phase [places, LANES] modulo 2⁶⁴; how many samples before each point were missing, alike; the row of the oldest
-        of the window's n + 1 points, from which they go round; what one unit of phase is, in rad/s and m/s² [6].
+        Returns
+        -------
+        phase : ndarray of int64, shape (places, LANES)
+            Integer phase modulo 2⁶⁴.
+        missing : ndarray of int32, shape (places, LANES)
+            Running count of missing samples before each point.
+        first : int
+            Row of the oldest of the n + 1 points of the window. The points wrap around the end of the ring.
+        unit : ndarray of float64, shape (6,)
+            Size of one unit of phase in rad/s and m/s².
         """
         rows = (self._phase.size // LANES, LANES)
         phase, missing = self._phase.reshape(rows), self._missing.reshape(rows)
@@ -244,7 +329,7 @@ class AllanWindow:
 
 
 def _aligned(size: int, dtype: type[np.generic]) -> NDArray[Any]:
-    """So many zeros that begin with a cache line."""
+    """Return an array of zeros that begins at a cache line."""
     space = np.zeros(size + LINE, dtype)
     start = -(space.ctypes.data // space.itemsize) % LINE
     return space[start : start + size]

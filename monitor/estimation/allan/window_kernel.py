@@ -1,6 +1,7 @@
-"""The compiled part of ``window``: phase into the ring, terms in and out of the sums; see there for the arithmetic.
+"""Compiled kernels of ``AllanWindow``: they append phase to the ring and update the sums of all cluster sizes.
 
-All of a window lies in three arrays (``Parts``), as the interpreter takes 50 ns to hand one to compiled code.
+The arithmetic is described in ``window``. All data of a window lie in three arrays (``Parts``), because the interpreter
+takes 50 ns to pass one array to compiled code.
 """
 
 from typing import Final, NamedTuple
@@ -13,47 +14,73 @@ from monitor.common.compiled import compiled, inlined
 
 AXES: Final = 6
 LANES: Final = 8
-"""Columns kept a sample: six axes padded to a vector register."""
+"""Number of columns per sample: six axes, padded to a vector register."""
 TOTAL, NEWEST, STRUCK, WIDTH = 0, 1, 2, 3
-"""Of the state: samples since reset, place of the newest phase point, newest sample that was missing on any axis;
-and LANES, from where the compiler cannot know it: it would make eight scalar lines of a vector loop."""
+"""Indices of the state array.
+
+They are: samples since the last reset, row of the newest phase point, newest sample that was missing on any axis, and
+``LANES``. ``LANES`` is stored there so that the compiler does not know it. Otherwise it would turn a vector loop into
+eight scalar statements.
+"""
 RUN: Final = 64
-"""Samples whose phase is written before the τ take their terms."""
+"""Maximum number of samples whose phase is written before the sums are updated."""
 STAGE: Final = 512
-"""Samples handed to the kernel at a time."""
+"""Maximum number of samples passed to the kernel at a time."""
 LINE: Final = 8
-"""Numbers of eight bytes in a cache line: a row of phase fills one, and must not lie across two."""
+"""Number of 8-byte numbers in a cache line. A row of phase fills one line and must not cross into a second."""
 PRESENT: Final = 0.98
-"""Share of the samples that must be there for a slope: gaps shift the middle of what is left, by less than this."""
+"""Minimum share of samples that must be present for a slope.
+
+Gaps shift the centre of the remaining samples by less than this share.
+"""
 LEVEL: Final = 64
-"""Samples whose mean is the level: full scale in the finest phase still fits 64 bits."""
+"""Number of samples averaged for the reference level. At full scale in the finest phase, the sum fits 64 bits."""
 NEVER: Final = 1 << 62
+"""Marker for "no level": no sample of the reference level is present."""
 BEND_POINTS: Final = 64
-"""Of a block of phase, that stand for its sum to a percent of its scatter."""
+"""Number of points that represent a block of phase. The sum of the block is exact to a percent of its scatter."""
 
 
 class Parts(NamedTuple):
-    """The window's arrays, for compiled code."""
+    """Arrays of a window, in the form that compiled code takes."""
 
     ints: Ints  # see view_ints
     floats: Floats  # see view_floats
-    missing: NDArray[np.int32]
-    taus: int
-    length: int
+    missing: NDArray[np.int32]  # [places · LANES] running count of missing samples
+    taus: int  # number of cluster sizes
+    length: int  # samples in the full window
 
 
 def view_ints(ints: Ints, taus: int) -> tuple[Ints, Ints, Ints, Ints, Ints]:
-    """State, factors [m], spans [m], terms [m · LANES], phase [places · LANES]."""
+    """Return views of the integer array: state, factors [m], spans [m], terms [m · LANES] and phase [places · LANES].
+
+    Parameters
+    ----------
+    ints : ndarray of int64
+        Integer array of a window.
+    taus : int
+        Number of cluster sizes m.
+    """
     spans, terms = LANES + taus, LANES + (2 * taus + LINE - 1) // LINE * LINE
     phase = terms + taus * LANES
     return ints[:LANES], ints[LANES:spans], ints[spans : spans + taus], ints[terms:phase], ints[phase:]
 
 
 def view_floats(floats: Floats, taus: int) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Parts of the workspace.
+    """Return views of the float array.
 
-    Scale and rounding not yet in phase [2 · LANES], two scratches for a run, sums and what their roundings left
-    [m · LANES], and the stage [STAGE · AXES and more].
+    Parameters
+    ----------
+    floats : ndarray of float64
+        Float array of a window.
+    taus : int
+        Number of cluster sizes m.
+
+    Returns
+    -------
+    tuple of ndarray of float64
+        Scale and rounding not yet in phase [2 · LANES], two scratch arrays of a run, sums [m · LANES], the rounding
+        errors of the sums [m · LANES], and the input buffer [at least STAGE · AXES].
     """
     scratch, sums = 2 * LANES, (2 + 2 * RUN) * LANES
     rest, stage = sums + taus * LANES, sums + 2 * taus * LANES
@@ -61,15 +88,27 @@ def view_floats(floats: Floats, taus: int) -> tuple[Floats, Floats, Floats, Floa
 
 
 cut_ints, cut_floats = compiled(view_ints), compiled(view_floats)
-"""The same for kernels."""
+"""Compiled versions of ``view_ints`` and ``view_floats`` for kernels."""
 
 
 @compiled
 def advance(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, start: int, n: int) -> None:
-    """Advance by n staged samples from row ``start`` of the stage on; see the module's head for the arithmetic.
+    """Advance the window by n samples from the input buffer, from row ``start`` on.
 
-    Phase is written for a run of up to RUN samples, then each τ takes its terms one by one along that run: few
-    streams through memory at a time, which the processor fetches ahead, where a walk over all τ would need a hundred.
+    Phase is first written for a run of up to ``RUN`` samples. Then each τ takes its terms along that run. This keeps
+    the number of memory streams small, so that the processor can prefetch them. A loop over all τ per sample would need
+    a hundred streams.
+
+    Parameters
+    ----------
+    ints, floats, missing : ndarray
+        Arrays of the window, see ``Parts``.
+    taus : int
+        Number of cluster sizes.
+    start : int
+        First row of the input buffer.
+    n : int
+        Number of rows.
     """
     state, factors, spans, terms, phase = cut_ints(ints, taus)
     scaling, scratch, sums, rest, stage = cut_floats(floats, taus)
@@ -82,7 +121,7 @@ def advance(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, s
         for row in range(done, done + run):
             _append(stage[row * AXES : (row + 1) * AXES], scaling, phase, missing, state)
         done += run
-        count = state[TOTAL] - run  # samples before this run
+        count = state[TOTAL] - run  # number of samples before this run
         whole = count - state[STRUCK] > length
         if run == 1 and whole and count >= length:
             for row in range(0, taus, RUN):
@@ -108,13 +147,16 @@ def _take(
     rest: Floats,
     lanes: int,
 ) -> None:
-    """Each τ takes the terms of ``run`` samples, whose phase begins at ``first``, after ``count`` samples before."""
+    """Update the sums of each τ by ``run`` samples whose phase begins at row ``first``.
+
+    ``count`` is the number of earlier samples.
+    """
     places = phase.size // LANES
     for i in range(factors.size):
-        row = max(0, 2 * factors[i] - 1 - count)  # the first whose term is complete
+        row = max(0, 2 * factors[i] - 1 - count)  # first row with a complete term
         own = slice(i * LANES, (i + 1) * LANES)
         while row < run:
-            # as far as no stream comes to the ring's end, and the span is full throughout or not at all
+            # up to the row at which a stream reaches the end of the ring or the span becomes full
             now = first + row if first + row < places else first + row - places
             leaving = count + row >= spans[i]
             end = run if leaving else min(run, spans[i] - count)
@@ -142,7 +184,7 @@ def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.in
             phase[now + lane] = phase[before + lane]
             count = missing[before + lane] + 1
             state[STRUCK] = state[TOTAL]
-        if missing[now + lane] != count:  # not written while it stays 0, so that the system need not give the memory
+        if missing[now + lane] != count:  # not written while it is 0, so that the system does not allocate the memory
             missing[now + lane] = count
 
 
@@ -162,9 +204,9 @@ def _slide(
     rest: Floats,
     lanes: int,
 ) -> int:
-    """Add the terms that end at up to ``rows`` phase points from ``now`` on, evict as many when ``leaving``.
+    """Add the terms that end at up to ``rows`` phase points from row ``now`` on, and evict as many if ``leaving``.
 
-    Returns the rows done: fewer than asked where a stream comes to the end of the ring.
+    Return the number of rows processed. It is smaller than ``rows`` if a stream reaches the end of the ring.
     """
     places = phase.size // LANES
     old = now - span - 1
@@ -190,13 +232,21 @@ def _slide(
 
 @compiled
 def place(index: int, places: int) -> int:
-    """Place in the ring of a phase point less than one turn back."""
+    """Return the row of a phase point in the ring.
+
+    Parameters
+    ----------
+    index : int
+        Row of the point, or a negative number of rows before the start of the ring.
+    places : int
+        Number of rows in the ring.
+    """
     return index if index >= 0 else index + places
 
 
 @compiled
 def _square(phase: Ints, at0: int, at1: int, at2: int, n: int, out: Floats) -> None:
-    """Squared second differences of n lanes; flat, so that it runs a vector register at a time."""
+    """Compute the squared second differences of n numbers; one flat loop, so that it is vectorized."""
     i0, i1, i2 = np.uintp(at0 * LANES), np.uintp(at1 * LANES), np.uintp(at2 * LANES)
     for i in range(np.uintp(n)):
         d = float(phase[i0 + i] - 2 * phase[i1 + i] + phase[i2 + i])
@@ -205,7 +255,7 @@ def _square(phase: Ints, at0: int, at1: int, at2: int, n: int, out: Floats) -> N
 
 @compiled
 def _strike(missing: NDArray[np.int32], at0: int, at2: int, step: int, n: int, squares: Floats, terms: Ints) -> None:
-    """Strike out the terms that touch a missing sample, count the others."""
+    """Set to zero the squares that touch a missing sample, and count the others."""
     for i in range(n):
         if missing[at0 * LANES + i] == missing[at2 * LANES + i]:
             terms[i % LANES] += step
@@ -215,10 +265,10 @@ def _strike(missing: NDArray[np.int32], at0: int, at2: int, step: int, n: int, s
 
 @compiled
 def _exchange(added: Floats, evicted: Floats, n: int, sums: Floats, rest: Floats, lanes: int) -> None:
-    """sums + rest += added - evicted, row by row, each rounding kept in rest.
+    """Compute sums + rest += added - evicted row by row, with the rounding errors collected in ``rest``.
 
-    TwoSum: Knuth, TAOCP vol. 2, 4.2.2, theorem B. An index that could be negative, or a known number of
-    ``lanes``, would make scalar lines of the inner loop: three times the cost.
+    TwoSum: Knuth, TAOCP vol. 2, 4.2.2, theorem B. An index that could be negative, or a constant number of ``lanes``,
+    would make the inner loop scalar at three times the cost.
     """
     for row in range(np.uintp(0), np.uintp(n), np.uintp(lanes)):
         for lane in range(np.uintp(lanes)):
@@ -234,10 +284,10 @@ def _exchange(added: Floats, evicted: Floats, n: int, sums: Floats, rest: Floats
 
 @compiled
 def _swap(now: int, factors: Ints, spans: Ints, phase: Ints, scratch: Floats, sums: Floats, rest: Floats) -> None:
-    """The same for a single sample of a full window without gaps: all τ in one go.
+    """Update all τ at once for a single sample of a full window without gaps.
 
-    Setting up vector loops for each τ would cost more than the work; so the differences are gathered one by one, and
-    one loop exchanges them all.
+    Setting up a vector loop for each τ would cost more than the work itself. The differences are therefore collected
+    one by one, and a single loop updates all sums.
     """
     places = phase.size // LANES
     added, evicted = scratch[: RUN * LANES], scratch[RUN * LANES :]
@@ -259,11 +309,23 @@ def _swap(now: int, factors: Ints, spans: Ints, phase: Ints, scratch: Floats, su
 
 @compiled
 def forget(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, axis: int, n: int) -> None:
-    """Of one axis, all but the newest n samples become missing, and the sums are made anew from those n."""
+    """Mark all but the newest n samples of one axis as missing, and recompute the sums from those n.
+
+    Parameters
+    ----------
+    ints, floats, missing : ndarray
+        Arrays of the window, see ``Parts``.
+    taus : int
+        Number of cluster sizes.
+    axis : int
+        Index of the axis.
+    n : int
+        Number of newest samples to keep.
+    """
     state, factors, spans, terms, phase = cut_ints(ints, taus)
     _, _, sums, rest, _ = cut_floats(floats, taus)
     places = phase.size // LANES
-    # a count that differs from point to point: no term can begin and end with the same
+    # the count differs from point to point, so no term can begin and end with the same count
     oldest = place(state[NEWEST] - n, places) * LANES + axis
     for back in range(1, min(state[TOTAL], places - 1 - RUN) - n + 1):
         missing[place(state[NEWEST] - n - back, places) * LANES + axis] = missing[oldest] - back
@@ -287,9 +349,27 @@ def forget(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, ax
 
 @inlined
 def level(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> int:
-    """Mean of the newest samples of an axis, in its integers: near enough to its mean that differences fit in 64 bits.
+    """Return the mean of the newest samples of an axis in integer units, as a reference level.
 
-    NEVER where none of them is there.
+    The level is close enough to the mean of the axis for differences to fit 64 bits.
+
+    Parameters
+    ----------
+    phase : ndarray of int64, shape (places · LANES,)
+        Integer phase.
+    missing : ndarray of int32, shape (places · LANES,)
+        Running count of missing samples.
+    newest : int
+        Row of the newest phase point.
+    n : int
+        Number of samples in use.
+    axis : int
+        Index of the axis.
+
+    Returns
+    -------
+    int
+        Level, or ``NEVER`` if none of the samples is present.
     """
     places = phase.size // LANES
     last, first = newest * LANES + axis, place(newest - min(n, LEVEL), places) * LANES + axis
@@ -299,7 +379,26 @@ def level(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: in
 
 @inlined
 def thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> float:
-    """Slope of the last n samples by their thirds, in units of the integers; NaN where too many are missing."""
+    """Return the slope of the last n samples from the means of the first and the last third.
+
+    Parameters
+    ----------
+    phase : ndarray of int64, shape (places · LANES,)
+        Integer phase.
+    missing : ndarray of int32, shape (places · LANES,)
+        Running count of missing samples.
+    newest : int
+        Row of the newest phase point.
+    n : int
+        Number of samples in use.
+    axis : int
+        Index of the axis.
+
+    Returns
+    -------
+    float
+        Slope in integer units per sample; NaN if too many samples are missing.
+    """
     third, places = n // 3, phase.size // LANES
     middle = level(phase, missing, newest, n, axis)
     if third == 0 or middle == NEVER:
@@ -309,7 +408,7 @@ def thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: i
     late, early = third - (missing[at0] - missing[at1]), third - (missing[at2] - missing[at3])
     if min(late, early) < PRESENT * third or 3 * third - (missing[at0] - missing[at3]) < PRESENT * 3 * third:
         return np.nan
-    # phase wraps, and so does the level times a count: their difference is small, and is taken before it is a number
+    # phase and level · count both wrap modulo 2⁶⁴; their difference is small and is taken before the conversion
     rise = float(phase[at0] - phase[at1] - middle * late) / late
     rise -= float(phase[at2] - phase[at3] - middle * early) / early
     return float(rise / (2.0 * third))
@@ -317,7 +416,23 @@ def thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: i
 
 @compiled
 def bends(phase: Ints, missing: NDArray[np.int32], newest: int, lengths: Ints, factors: Ints, out: Floats) -> None:
-    """``mean_bend`` of all τ and axes [m, AXES]."""
+    """Compute ``mean_bend`` of all τ and axes.
+
+    Parameters
+    ----------
+    phase : ndarray of int64, shape (places · LANES,)
+        Integer phase.
+    missing : ndarray of int32, shape (places · LANES,)
+        Running count of missing samples.
+    newest : int
+        Row of the newest phase point.
+    lengths : ndarray of int64, shape (6,)
+        Number of newest samples of each axis.
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
+    out : ndarray of float64, shape (m, 6)
+        Result in integer units per sample.
+    """
     for i in range(factors.size):
         for axis in range(AXES):
             out[i, axis] = mean_bend(phase, missing, newest, lengths[axis], factors[i], axis)
@@ -325,11 +440,31 @@ def bends(phase: Ints, missing: NDArray[np.int32], newest: int, lengths: Ints, f
 
 @compiled
 def mean_bend(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, m: int, axis: int) -> float:
-    """Mean second difference of phase over clusters of m in the last n samples, over m²; NaN where too few are there.
+    """Return the mean second difference of phase over clusters of m samples, divided by m².
 
-    The sum of all second differences telescopes to those of four blocks of m points at the ends. Of a
-    long block BEND_POINTS points are taken: phase is so smooth that they stand for all. A missing sample counts as one
-    of the level.
+    The sum of all second differences telescopes to four blocks of m points at the ends. Only ``BEND_POINTS`` points of
+    a long block are used, because phase is smooth enough for them to represent the block. A missing sample counts as
+    one of the level.
+
+    Parameters
+    ----------
+    phase : ndarray of int64, shape (places · LANES,)
+        Integer phase.
+    missing : ndarray of int32, shape (places · LANES,)
+        Running count of missing samples.
+    newest : int
+        Row of the newest phase point.
+    n : int
+        Number of newest samples in use.
+    m : int
+        Cluster size in samples.
+    axis : int
+        Index of the axis.
+
+    Returns
+    -------
+    float
+        Slope of the rate in integer units per sample; NaN if too many samples are missing.
     """
     places = phase.size // LANES
     last, first = newest * LANES + axis, place(newest - n, places) * LANES + axis
@@ -345,5 +480,5 @@ def mean_bend(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, m: i
         absent = missing[at0] - missing[at1] - missing[at2] + missing[at3]
         total += float(phase[at0] - phase[at1] - phase[at2] + phase[at3] + middle * absent)
     points = (m + stride - 1) // stride
-    # the blocks are n + 1 − 2m apart, so many differences have their mean
+    # the blocks are n + 1 − 2m points apart, which is the number of second differences
     return total / points * m / (n + 1.0 - 2 * m) / (float(m) * m)

@@ -1,20 +1,27 @@
-"""Has the noise changed, the bias stepped, or a burst of outliers come? At a stated rate of false alarms.
+"""Detector of noise changes, bias steps and bursts of outliers, with a specified rate of false alarms.
 
-Samples in, ``Change`` out. Each axis is watched in octaves of averaging time, each by its own reference, learned from
-the samples since its last change. Possible outcomes: ``noise_changed`` with the letters Q N B K that explain the
-variances since the onset, or else the band of frequencies; ``bias_stepped`` with the means on both sides;
-``outlier_burst`` with how many and how large. ``change_kernel`` holds the statistics, ``change_size`` the letters.
+Each axis is monitored in octaves of averaging time. Each octave has its own reference, learned from the samples since
+its last change. The detector returns a ``Change`` of one of three kinds:
 
-- **How often it errs.** ``alarms_per_day`` of six axes with unchanging noise, shared by noise (eight tenths), steps
-  and bursts. The threshold for noise is h = ln(looks a day · RATE_AT_ZERO / alarms a day); the one constant was
-  measured at thresholds of 8 to 12, where alarms are many, and is used at 13 to 20 (``tests/experiments/benchmarks/changes.py``).
-- **Learning.** A band may accuse when its reference has LEARN terms and LEARN_S have passed: a minute for the
-  shortest octaves, 128 clusters for the longer ones, more where terms are bound together. What changes within that
-  time is not seen. A reference is never forgotten while nothing is found: it gets slowly more exact, and a slow drift
-  of the noise is set against all the past, so it cannot hide, and is reported at some time, as a change. The price:
-  noise that breathes more slowly than was learned is reported too.
-- **After a change** the samples since the onset are the new reference; octaves too long to have any learn from nothing.
-- **A burst** shows in extremes while the bulk of the differences stays; once over, it is taken out of the reference.
+- ``noise_changed``: with the coefficients Q N B K that explain the variances since the onset, or with a frequency band.
+- ``bias_stepped``: with the means on both sides.
+- ``outlier_burst``: with the number and the size of the outliers.
+
+``change_kernel`` computes the statistics, ``change_size`` the coefficients.
+
+- **False alarms.** ``alarms_per_day`` of six axes with constant noise is divided among noise changes (eight tenths),
+  steps and bursts. The threshold for noise changes is h = ln(looks per day · RATE_AT_ZERO / alarms per day). Its one
+  constant was measured at thresholds of 8 to 12, where alarms are frequent, and is used at 13 to 20
+  (``tests/experiments/benchmarks/changes.py``).
+- **Learning.** A band can raise an alarm when its reference has ``LEARN`` terms and ``LEARN_S`` have passed. This takes
+  a minute for the shortest octaves and 128 clusters for the longer ones, and longer for correlated terms. A change
+  within this time is not detected. A reference is kept while nothing is detected, so it becomes more accurate. A slow
+  drift of the noise is compared with all the past, so it is eventually reported as a change. The disadvantage is that
+  noise that fluctuates more slowly than the learning time is reported as well.
+- **After a change**, the samples since the onset are the new reference. Octaves too long for these samples start
+  without a reference.
+- **A burst** raises the share of extremes while the bulk of the differences stays the same. After its end, it is
+  removed from the reference.
 """
 
 from collections.abc import Mapping
@@ -62,50 +69,58 @@ from monitor.estimation.detection.change_kernel import (
 )
 from monitor.estimation.detection.change_size import Octaves, named
 
-LONGEST_S: Final = 300.0
-"""The longest clusters; longer ones would learn for days, and show temperature rather than noise."""
+MAX_CLUSTER_S: Final = 300.0
+"""Longest cluster in seconds. Longer ones would learn for days and show temperature rather than noise."""
 LEARN_S: Final = 60.0
-"""A line of the width 1/LEARN_S is seen by then for what it is."""
-DWELL: Final = 256
-"""Samples that a verdict waits for at least."""
-LONGEST_DWELL_S: Final = 60.0
-LONGEST_BURST_S: Final = 60.0
-"""A burst that lasts longer is how the axis is now."""
+"""Minimum learning time in seconds. By then, a spectral line of width 1/``LEARN_S`` is known as dependent noise."""
+MIN_DWELL_SAMPLES: Final = 256
+"""Minimum number of samples between an alarm and its decision."""
+MAX_DWELL_S: Final = 60.0
+"""Maximum time between an alarm and its decision, in seconds."""
+MAX_BURST_S: Final = 60.0
+"""Maximum duration of a burst in seconds. After a longer burst, the axis learns a new reference."""
 RATE_AT_ZERO: Final = 0.07
-"""Alarms a z², of six ratios, are this times e^−h: 0.053–0.065 measured (``tests/experiments/benchmarks/changes.py``)."""
-NOISE_SHARE: Final = 0.8
-OTHER_SHARE: Final = 0.1
-HOLE_ROWS: Final = 4096
-MANY: Final = 4.0
-"""Times the clipped variance from which on clipping bends the size, and all squares are taken as they are."""
+"""Number of alarms per z², for six ratios together, divided by e^−h.
 
-STEEP: Final = "quantization noise or vibration near Nyquist"
-"""Octaves do not tell them apart (``change_size``)."""
+Measured values are 0.053–0.065 (``tests/experiments/benchmarks/changes.py``).
+"""
+NOISE_SHARE: Final = 0.8
+"""Share of the false alarms for noise changes."""
+OTHER_SHARE: Final = 0.1
+"""Share of the false alarms for steps, and for bursts."""
+SKIP_BLOCK_ROWS: Final = 4096
+"""Number of missing samples that are processed at a time."""
+MAX_CLIPPED_RATIO: Final = 4.0
+"""Ratio of the clipped variances above which clipping biases the size of a change. Unclipped squares are then used."""
+
+Q_OR_VIBRATION: Final = "quantization noise or vibration near Nyquist"
+"""Name of a change of Q. Octaves cannot distinguish the two causes (``change_size``)."""
 NOISE_NAMES: Final = {
-    "g": {"Q": STEEP, "N": "angle random walk", "B": "bias instability", "K": "rate random walk"},
+    "g": {"Q": Q_OR_VIBRATION, "N": "angle random walk", "B": "bias instability", "K": "rate random walk"},
     "a": {
-        "Q": STEEP,
+        "Q": Q_OR_VIBRATION,
         "N": "velocity random walk",
         "B": "bias instability",
         "K": "acceleration random walk",
     },
 }
+"""Names of the coefficients of gyroscopes (g) and accelerometers (a)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One change of one axis; times are counts of samples since the detector's start."""
+    """One change of one axis. Times are numbers of samples since the start of the detector."""
 
     kind: str  # noise_changed, bias_stepped, outlier_burst
     axis: int  # index into AXES
-    since: int  # when it began, as estimated
-    found: int  # when the alarm was raised; handed out up to a minute later, when it is sized
-    sigma: float  # how sure
-    what: Mapping[str, tuple[float, float]]  # before, after in SI: letters; or band (Hz, from, to) and rms; bias; count
-    text: str
+    since: int  # estimated onset
+    found: int  # sample of the alarm; the change is returned up to a minute later, after its size is estimated
+    sigma: float  # significance in standard deviations
+    what: Mapping[str, tuple[float, float]]  # before, after in SI: coefficients, band (from, to in Hz) and rms, …
+    text: str  # description for users
 
     def sides(self) -> dict[str, dict[str, float]]:
-        """``what`` as it leaves the process: ``before`` and ``after``, of a band ``from`` and ``to``."""
+        """Return ``what`` for output, with the keys ``before`` and ``after``, or ``from`` and ``to`` for a band."""
         return {
             name: {"from": first, "to": second} if name == "band" else {"before": first, "after": second}
             for name, (first, second) in self.what.items()
@@ -113,13 +128,19 @@ class Change:
 
 
 class ChangeDetector:
-    """Watches six axes for changes of noise and bias.
+    """Detector of changes of noise and bias on six axes.
 
-    Args:
-        rate_hz: samples a second, for times of learning and the units of what is found
-        alarms_per_day: false alarms to bear, of all axes together
-    Raises:
-        ConfigError: a rate or a number of alarms that is not positive
+    Parameters
+    ----------
+    rate_hz : float
+        Sample rate in Hz. It sets the learning times and the units of the results.
+    alarms_per_day : float
+        Accepted false alarms per day, of all axes together.
+
+    Raises
+    ------
+    ConfigError
+        If the rate or the number of alarms is not positive.
 
     >>> detector = ChangeDetector(100.0)
     >>> noise = 1e-3 * np.random.default_rng(1).standard_normal((30_000, 6))
@@ -133,41 +154,53 @@ class ChangeDetector:
         if not (0.0 < rate_hz < np.inf and 0.0 < alarms_per_day < np.inf):
             raise ConfigError(f"rate {rate_hz} Hz and {alarms_per_day} alarms a day must be positive")
         self.rate_hz = rate_hz
-        self._octaves = min(max(floor(log2(LONGEST_S * rate_hz)), 7), 20) + 1
+        self._octaves = min(max(floor(log2(MAX_CLUSTER_S * rate_hz)), 7), 20) + 1
         self._state = make_state(self._octaves)
-        looks = 86_400.0 * rate_hz * len(AXES)  # z² a day, and pairs of blocks a day
-        # by the lower tail: 1 - p would be rounded to 1 for p below 1e-16
+        looks = 86_400.0 * rate_hz * len(AXES)  # z² per day, and pairs of blocks per day
+        # computed from the lower tail, because 1 - p would be rounded to 1 for p below 1e-16
         once = -NormalDist().inv_cdf(min(0.5 * OTHER_SHARE * alarms_per_day / looks, 0.01))
         self._state.levels[:] = (
             max(log(looks * RATE_AT_ZERO / (NOISE_SHARE * alarms_per_day)), 1.0),
             max(log(looks / TICK / (OTHER_SHARE * alarms_per_day)), 1.0),
-            once, DWELL, max(LONGEST_DWELL_S * rate_hz, DWELL), LEARN_S * rate_hz,
+            once, MIN_DWELL_SAMPLES, max(MAX_DWELL_S * rate_hz, MIN_DWELL_SAMPLES), LEARN_S * rate_hz,
         )  # fmt: skip
         self._found: list[Change] = []
 
     @property
     def samples(self) -> int:
-        """Samples since the start, missing ones included."""
+        """Number of samples since the start, including missing ones."""
         return int(self._state.clock[TOTAL])
 
     @property
     def watched(self) -> NDArray[np.bool_]:
-        """[J, 6]: octaves (clusters of 2^j samples) whose reference is long enough to accuse."""
+        """True for octaves [J, 6] (clusters of 2^j samples) whose reference is long enough for an alarm."""
         band = self._state.band
         known = (band[:, :, N] >= LEARN * band[:, :, F] ** 2) & (band[:, :, S] > 0.0)
-        return np.asarray((known & self._old[:, None]).T)
+        return np.asarray((known & self._is_old_enough[:, None]).T)
 
     @property
     def learned(self) -> NDArray[np.bool_]:
-        """[6]: axes of which at least the shortest octave is watched."""
+        """True for axes [6] on which at least the shortest octave can raise an alarm."""
         return np.asarray(self.watched[0])
 
     @property
-    def _old(self) -> NDArray[np.bool_]:
+    def _is_old_enough(self) -> NDArray[np.bool_]:
+        """True for axes whose reference is at least ``LEARN_S`` old."""
         return np.asarray(self.samples - self._state.born >= LEARN_S * self.rate_hz)
 
     def update(self, values: Floats) -> None:
-        """Advance by samples [n, 6] in SI; NaN = missing."""
+        """Process samples.
+
+        Parameters
+        ----------
+        values : ndarray of float, shape (n, 6)
+            Samples in rad/s and m/s²; NaN means missing.
+
+        Raises
+        ------
+        ValueError
+            If the shape is not (n, 6).
+        """
         rows = np.ascontiguousarray(values, np.float64)
         if rows.ndim != 2 or rows.shape[1] != len(AXES):
             raise ValueError(f"samples of shape {rows.shape}; expected is [n, {len(AXES)}]")
@@ -178,57 +211,57 @@ class ChangeDetector:
                 for axis in np.flatnonzero(
                     (self._state.alarm[:, KIND] > 0) & (self._state.alarm[:, DUE] <= self.samples)
                 ):
-                    self._judge(int(axis))
+                    self._decide(int(axis))
                 set_due(self._state)
 
     def skip(self, n: int) -> None:
-        """Advance by n missing samples."""
-        hole = np.full((min(n, HOLE_ROWS), len(AXES)), np.nan)
-        for start in range(0, n, HOLE_ROWS):
+        """Process n missing samples."""
+        hole = np.full((min(n, SKIP_BLOCK_ROWS), len(AXES)), np.nan)
+        for start in range(0, n, SKIP_BLOCK_ROWS):
             self.update(hole[: n - start])
 
     def take(self) -> list[Change]:
-        """What was found since the last call, in order."""
+        """Return the changes found since the last call, in order."""
         found, self._found = self._found, []
         return found
 
     def restart(self, axis: int | None = None) -> None:
-        """Learn the reference of one axis, or of all, anew."""
+        """Restart the reference of one axis, or of all axes."""
         for one in range(len(AXES)) if axis is None else (axis,):
-            self._forget(one)
+            self._restart_reference(one)
         set_due(self._state)
 
-    def _judge(self, axis: int) -> None:
-        """The alarm of one axis has waited its time."""
+    def _decide(self, axis: int) -> None:
+        """Decide on the alarm of one axis after its waiting time."""
         s = self._state
         alarm = s.alarm[axis].copy()
         s.alarm[axis] = 0.0
         if alarm[KIND] == STEP:
-            self._stepped(axis, alarm)
+            self._report_step(axis, alarm)
             return
         after = s.cum[axis] - self._cum_at(int(alarm[START]))[axis]  # [J, 5]
         n, total = s.band[axis, :, N], s.band[axis, :, S]
         before_n, before_s = n - after[:, UNIT_N], total - after[:, UNIT_S]
-        if self._bulk_is_the_same(axis, after[0], before_s[0] / before_n[0]):
-            self._burst(axis, alarm, after, before_n, before_s)
+        if self._is_bulk_unchanged(axis, after[0], before_s[0] / before_n[0]):
+            self._report_burst(axis, alarm, after, before_n, before_s)
         else:
-            self._noise(axis, alarm, after, before_n, before_s)
+            self._report_noise_change(axis, alarm, after, before_n, before_s)
 
     def _cum_at(self, sample: int) -> Floats:
-        """Sums [6, J, 5] kept at or soon after a time; ages are known to a quarter."""
+        """Return the sums [6, J, 5] stored at or shortly after a sample; the age is accurate to a quarter."""
         at = self._state.snap_at
         later = np.where(at >= sample, at, NEVER)
         return np.asarray(self._state.snap[np.unravel_index(int(later.argmin()), at.shape)])
 
-    def _bulk_is_the_same(self, axis: int, after: Floats, before: float) -> bool:
-        """Outliers raise the mean of z² more than they move its median."""
+    def _is_bulk_unchanged(self, axis: int, after: Floats, before: float) -> bool:
+        """Return True if outliers explain the alarm: they raise the mean of z² more than they change its median."""
         n, extremes = after[UNIT_N], after[UNIT_EXTREME]
         if extremes < 3 or not before > 0.0:
             return False
-        return bool(self._bulk(axis, after) < 1.0 + 0.5 * (after[UNIT_RAW] / n / before - 1.0))
+        return bool(self._bulk_variance_ratio(axis, after) < 1.0 + 0.5 * (after[UNIT_RAW] / n / before - 1.0))
 
-    def _bulk(self, axis: int, after: Floats) -> float:
-        """Variance over reference by the share of small differences, as if Gaussian."""
+    def _bulk_variance_ratio(self, axis: int, after: Floats) -> float:
+        """Return the variance relative to the reference from the share of small differences of Gaussian noise."""
         whole = self._state.cum[axis, 0] - after
         usual, now = whole[UNIT_INSIDE] / whole[UNIT_N], after[UNIT_INSIDE] / after[UNIT_N]
         if not 0.02 < usual < 0.98 or now >= 1.0:
@@ -237,13 +270,14 @@ class ChangeDetector:
         quantile = NormalDist().inv_cdf
         return float((quantile(0.5 + 0.5 * usual) / quantile(0.5 + 0.5 * max(now, 1e-3))) ** 2)
 
-    def _noise(self, axis: int, alarm: Floats, after: Floats, before_n: Floats, before_s: Floats) -> None:
+    def _report_noise_change(self, axis: int, alarm: Floats, after: Floats, before_n: Floats, before_s: Floats) -> None:
+        """Report a noise change, and make the samples since the onset the new reference."""
         s = self._state
         band = s.band[axis]
         with np.errstate(invalid="ignore", divide="ignore"):
             v0, spread = np.where(before_n > 0, before_s / before_n, 0.0), band[:, F]
             v1 = after[:, UNIT_S] / after[:, UNIT_N]
-            if np.nanmax(np.where(v0 > 0, v1 / v0, np.nan)) > MANY:
+            if np.nanmax(np.where(v0 > 0, v1 / v0, np.nan)) > MAX_CLIPPED_RATIO:
                 v1 = after[:, UNIT_RAW] / after[:, UNIT_N]
             v1 = np.where(after[:, UNIT_N] > 0, v1, 0.0)
         octaves = Octaves(v0, np.maximum(before_n, 0.0) / spread, v1, after[:, UNIT_N] / spread)
@@ -251,22 +285,23 @@ class ChangeDetector:
         sigma = sqrt(2.0 * max(octaves.evidence(), alarm[EVIDENCE]))
         text = f"{AXES[axis]} {_noise_text(AXES[axis], what)}"
         self._found.append(Change("noise_changed", axis, int(alarm[START]), int(alarm[FOUND]), sigma, what, text))
-        self._forget(axis, int(alarm[START]))
+        self._restart_reference(axis, int(alarm[START]))
         keep = (after[:, UNIT_N] >= SEED) & (v1 > 0.0)
         band[keep, N], band[keep, S] = after[keep, UNIT_N], after[keep, UNIT_N] * v1[keep]
         band[keep, LIMIT], band[keep, SEEDED] = CLIP * v1[keep], SEED
 
-    def _burst(self, axis: int, alarm: Floats, after: Floats, before_n: Floats, before_s: Floats) -> None:
+    def _report_burst(self, axis: int, alarm: Floats, after: Floats, before_n: Floats, before_s: Floats) -> None:
+        """Report a burst of outliers after its end, and remove it from the reference."""
         s = self._state
         now = self.samples
-        latest = s.cum[axis, 0, UNIT_EXTREME] - self._cum_at(now - DWELL // 2)[axis, 0, UNIT_EXTREME]
-        lasting = now - alarm[START] >= max(LONGEST_BURST_S * self.rate_hz, 2 * DWELL)
+        latest = s.cum[axis, 0, UNIT_EXTREME] - self._cum_at(now - MIN_DWELL_SAMPLES // 2)[axis, 0, UNIT_EXTREME]
+        lasting = now - alarm[START] >= max(MAX_BURST_S * self.rate_hz, 2 * MIN_DWELL_SAMPLES)
         if latest > 0 and not lasting:
             s.alarm[axis] = alarm
-            s.alarm[axis, DUE] = now + DWELL  # a multiple of TICK, as all dues
+            s.alarm[axis, DUE] = now + MIN_DWELL_SAMPLES  # a multiple of TICK, like all decision times
             return
         count, variance = after[0, UNIT_EXTREME], before_s[0] / before_n[0]
-        # an outlier a in one sample gives one z² = a²/2
+        # an outlier of size a in one sample gives one z² = a²/2
         scale = sqrt(2.0 * max(after[0, UNIT_RAW] - after[0, UNIT_S], 0.0) / max(count, 1.0))
         what = {"count": (0.0, float(count)), "scale": (sqrt(variance), scale)}
         text = f"{AXES[axis]} {count:.0f} outliers of about {amount(AXES[axis], scale)} within " + (
@@ -275,22 +310,23 @@ class ChangeDetector:
         sigma = sqrt(2.0 * alarm[EVIDENCE])
         self._found.append(Change("outlier_burst", axis, int(alarm[START]), int(alarm[FOUND]), sigma, what, text))
         if lasting:
-            self._forget(axis)
+            self._restart_reference(axis)
             return
         enough = before_n >= SEED
         s.band[axis, enough, N], s.band[axis, enough, S] = before_n[enough], before_s[enough]
-        self._doubt(axis)
+        self._clear_suspicion(axis)
 
-    def _stepped(self, axis: int, alarm: Floats) -> None:
+    def _report_step(self, axis: int, alarm: Floats) -> None:
+        """Report a step of the bias."""
         before, after = (float(x) for x in self._state.step[axis, [BEFORE, AFTER]])
         text = f"{AXES[axis]} bias stepped by {amount(AXES[axis], after - before, sign=True)}"
         sigma = sqrt(2.0 * alarm[EVIDENCE])
         what = {"bias": (before, after)}
         self._found.append(Change("bias_stepped", axis, int(alarm[START]), int(alarm[FOUND]), sigma, what, text))
-        self._doubt(axis)
+        self._clear_suspicion(axis)
 
-    def _doubt(self, axis: int) -> None:
-        """Suspect nothing of what lies behind; what is half done contains it."""
+    def _clear_suspicion(self, axis: int) -> None:
+        """Clear all suspicions of one axis, and skip the blocks that contain samples of the change."""
         s = self._state
         s.cusum[axis] = s.unit[axis] = 0.0
         s.cusum[axis, :, :, SINCE] = self.samples
@@ -299,29 +335,30 @@ class ChangeDetector:
         under_way = self.samples % (2 << np.arange(self._octaves)) != 0
         s.fill[axis] = -under_way.astype(np.int64)
 
-    def _forget(self, axis: int, born: int | None = None) -> None:
-        """No reference, no suspicion; the cascade of sums goes on."""
+    def _restart_reference(self, axis: int, born: int | None = None) -> None:
+        """Discard reference and suspicions of one axis; the cascade of sums continues."""
         s = self._state
         s.born[axis] = self.samples if born is None else born
         s.band[axis] = s.spread[axis] = 0.0
         s.band[axis, :, F] = 1.0
         s.alarm[axis] = 0.0
-        self._doubt(axis)
+        self._clear_suspicion(axis)
 
 
 def _noise_text(axis: str, what: Mapping[str, tuple[float, float]]) -> str:
-    """The change in the field's words."""
+    """Describe the change with the names of the coefficients."""
     names = NOISE_NAMES[axis[0]]
-    letters = [f"{names[letter]} {_grew(*what[letter])}" for letter in what if letter in names]
+    letters = [f"{names[letter]} {_format_change(*what[letter])}" for letter in what if letter in names]
     if letters:
         return ", ".join(letters)
     if "band" not in what:
         return "noise changed"
     low, high = what["band"]
-    return f"noise between {low:.2g} and {high:.2g} Hz {_grew(*what['rms'])}"
+    return f"noise between {low:.2g} and {high:.2g} Hz {_format_change(*what['rms'])}"
 
 
-def _grew(before: float, after: float) -> str:
+def _format_change(before: float, after: float) -> str:
+    """Format a relative change in percent."""
     if before == 0.0:
         return "appeared"
     if after == 0.0:

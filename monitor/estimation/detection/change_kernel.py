@@ -1,25 +1,27 @@
-"""Compiled part of ``change``: Haar differences of every octave, their CUSUMs, and what verdicts are made of.
+"""Compiled kernel of the change detector: Haar differences of every octave, their CUSUMs and the alarm state.
 
-Samples come in, missing ones as NaN in their places, and are worked off in ticks of 32; what comes out lies in
-``State``. An alarm that has waited its time stops the kernel, so that the verdict is made at the same sample however
-blocks are cut.
+Samples are processed in ticks of 32, with NaN for missing ones, and the results are stored in ``State``. The kernel
+stops when an alarm has reached its waiting time. The decision is therefore made at the same sample for any division of
+the input into blocks.
 
-- **Cascade.** A binary counter of block sums: octave j joins two blocks of m = 2^j samples to one difference
-  z = (mean − mean')/√2, whose mean square is the Allan variance at m; then hands their sum on. Differences of one
-  octave do not overlap and Haar functions of different octaves are orthogonal, so for white noise and random walk
-  all z are independent. Two additions a sample and axis, whatever the number of octaves.
-- **Evidence.** n, S: number and sum of the z² since the reference began, n₁, S₁ those since a suspected onset. The
-  likelihood ratio of "variance × r since then" against "no change", of what does not depend on the unknown variance
-  (the maximal invariant under scale), is
-  g = −(n/2) ln(1 − (1 − 1/r) S₁/S) − (n₁/2) ln r.
-  For a long reference it is Page's CUSUM ½[u(1 − 1/r) − ln r] summed; for a short one it has the reference's own
-  uncertainty in it, and its mean without a change is 1 for every onset, so that P(alarm within k looks) ≤ k e^−h
-  (Shiryaev–Roberts). The onset moves on whenever g ≤ 0.
-- **Not Gaussian, not independent.** z² is clipped at CLIP times the reference: (4σ)², which cuts 6e-5 of Gaussian
-  z² and lowers their mean by 2e-4, in reference and suspicion alike. g is divided by F, by how much sums of z² spread
-  more than Gaussian ones do, found by a second cascade of Haar differences over the z² themselves: tails, lines and
-  coarse steps have fewer degrees of freedom than terms.
-- **Steps** are sought where a pair of blocks is left of, and the next but one right of, a possible jump.
+- **Cascade.** A binary counter of block sums: octave j joins two blocks of m = 2^j samples to one difference z = (mean
+  − mean')/√2, whose mean square is the Allan variance at m. It then passes their sum to the next octave. Differences of
+  one octave do not overlap, and Haar functions of different octaves are orthogonal. For white noise and random walk,
+  all z are therefore independent. The cost is two additions per sample and axis, for any number of octaves.
+- **Evidence.** n and S are the number and the sum of the z² since the start of the reference, n₁ and S₁ those since a
+  suspected onset. The hypothesis "variance × r since the onset" is compared with "no change". The likelihood ratio uses
+  only quantities that do not depend on the unknown variance (the maximal invariant under scale). Its logarithm is
+
+      g = −(n/2) ln(1 − (1 − 1/r) S₁/S) − (n₁/2) ln r.
+
+  For a long reference, g is Page's CUSUM, the sum of ½[u(1 − 1/r) − ln r]. For a short reference, g includes the
+  uncertainty of the reference. Without a change, the mean of the likelihood ratio e^g is 1 for every onset, so P(alarm
+  within k looks) ≤ k e^−h (Shiryaev–Roberts). The onset moves on whenever g ≤ 0.
+- **Non-Gaussian and dependent noise.** z² is clipped at ``CLIP`` times the reference, (4σ)². This affects 6e-5 of
+  Gaussian z² and lowers their mean by 2e-4, in the reference and after the onset alike. g is divided by F, the ratio by
+  which sums of z² scatter more than Gaussian ones. A second cascade of Haar differences over the z² measures F. Heavy
+  tails, spectral lines and coarse resolution have fewer degrees of freedom than terms.
+- **Steps** are detected where one pair of blocks lies before, and the next but one after, a possible step.
 """
 
 from typing import Final, NamedTuple
@@ -31,76 +33,93 @@ from monitor.common.compiled import compiled
 
 AXES: Final = 6
 RATIOS: Final = np.array([1.2, 1.44, 2.25, 1 / 1.2, 1 / 1.44, 1 / 2.25])
-"""Variance after over before that each CUSUM is tuned to."""
+"""Ratios of the variance after and before a change to which the CUSUMs are tuned."""
 GAIN: Final = 1.0 - 1.0 / RATIOS
+"""The factor 1 − 1/r of each ratio r."""
 HALF_LOG: Final = 0.5 * np.log(RATIOS)
+"""The term ½ ln r of each ratio r."""
 TICK: Final = 32
-"""Samples that are taken at a time: z² of the shortest octaves are summed that long, as logarithms cost."""
+"""Number of samples processed at a time. z² of the shortest octaves are summed over it, because logarithms are slow."""
 SHORT: Final = 5
-"""Octaves that lie within a tick."""
+"""Number of octaves within a tick."""
 RAREST: Final = 1e-6
-"""Least share of extremes that is held for usual."""
+"""Minimum share of extremes that is assumed for the reference."""
 HUGE: Final = 1e150
-"""Whose square is no number any more: such samples count as missing."""
+"""Samples at or above this absolute value count as missing, because their square overflows."""
 CLIP: Final = 16.0
+"""Level at which z² is clipped, relative to the reference."""
 EXTREME: Final = 36.0
-"""u beyond which a difference of two samples counts as an outlier: 6σ, 2e-9 of Gaussian ones."""
+"""Value of u = z² over the reference beyond which a difference counts as an outlier: 6σ, 2e-9 of Gaussian noise."""
 MEDIAN: Final = 0.45494
 """Median of χ² with one degree of freedom."""
 SEED: Final = 31
-"""First z² of a band, whose median sets where to clip, so that an outlier at the start does not count."""
+"""Number of first z² of a band. Their median sets the clip level, so that an outlier at the start has no effect."""
 SETTLED: Final = 256
-"""z² after which the clip level is set for good."""
+"""Number of z² after which the clip level is final."""
 LEARN: Final = 64
-"""Terms, times F², that a reference must have before it may accuse: F, so that they are as good as so many independent
-ones, and F again, so that F is known of sums much longer than what binds the terms together."""
+"""Minimum number of terms of a reference for an alarm, multiplied by F².
+
+One factor F makes the terms as informative as this many independent ones. The other ensures that F is known for sums
+much longer than the correlation of the terms.
+"""
 FEW: Final = 16
-"""Terms that a band must have to bound how far slow noise moves the mean."""
+"""Minimum number of terms of a band for a bound on the variation of the mean by slow noise."""
 PAIRS: Final = 8
-"""Pairs before a spread is believed."""
+"""Minimum number of pairs for a valid spread F."""
 FLANK: Final = 12.0
-"""u beyond which a pair beside a step is not at rest."""
+"""Value of u beyond which a pair of blocks beside a step is not at rest."""
 CONFIRM: Final = 2
-"""Pairs after a step that must stay at its height."""
+"""Number of pairs after a step that must stay at its height."""
 SLOTS: Final = 4
+"""Number of snapshots per level in ``State.snap``."""
 NEVER: Final = 1 << 62
+"""Sample number that stands for "no decision is due"."""
 
 N, S, LIMIT, SEEDED, F = range(5)
+"""Columns of ``State.band``."""
 UNIT_N, UNIT_S, UNIT_RAW, UNIT_INSIDE, UNIT_EXTREME = range(5)
+"""Columns of ``State.unit`` and ``State.cum``."""
 N1, S1, SINCE, G = range(4)
+"""Columns of ``State.cusum``."""
 HELD, FULL, SQUARES, COUNT, SPREAD = range(5)
+"""Columns of ``State.spread``."""
 NOISE, BURST, STEP = 1.0, 2.0, 3.0
+"""Kinds of alarms."""
 KIND, WHERE, START, FOUND, EVIDENCE, DUE = range(6)
+"""Columns of ``State.alarm``."""
 BEFORE, AFTER, PLACE, SIGMA, LEFT = range(1, 6)
+"""Columns of ``State.step``; column 0 is the octave."""
 TOTAL, NEXT_DUE = 0, 1
+"""Elements of ``State.clock``."""
 H_NOISE, H_BURST, STEP_SIGMA, DWELL, LONGEST_DWELL, LEARN_SAMPLES = range(6)
+"""Elements of ``State.levels``."""
 
 
 class State(NamedTuple):
-    """All that the detector remembers; A = 6 axes, J octaves. Sizes do not grow."""
+    """State of the detector of constant size. A = 6 axes, J octaves, L = 12 levels."""
 
-    levels: Floats  # [6] thresholds and times in samples, H_NOISE …
-    clock: Ints  # [2] samples since start; when the next verdict is due
+    levels: Floats  # [6] thresholds, and times in samples; see H_NOISE
+    clock: Ints  # [2] samples since the start; sample of the next decision
     born: Ints  # [A] sample at which the reference began
-    stage: Floats  # [A, TICK] samples of the tick under way
+    stage: Floats  # [A, TICK] samples of the current tick
     half: Floats  # [A, J, 2] sum and count of the block that waits for its partner
-    fill: Ints  # [A, J] whole pairs of blocks held for steps; −1: the one under way is not to be used
-    ring: Floats  # [A, J, 2, 2] the last two pairs: mean, difference of their blocks
+    fill: Ints  # [A, J] number of complete pairs stored for steps; −1: do not use the current pair
+    ring: Floats  # [A, J, 2, 2] mean and block difference of the last two pairs
     seeds: Floats  # [A, J, SEED] first z²
-    band: Floats  # [A, J, 5] N, S, LIMIT, SEEDED, F
-    unit: Floats  # [A, J, 5] since the last look: count, clipped z², z², count inside the median, extremes
-    cum: Floats  # [A, J, 5] the same since start
+    band: Floats  # [A, J, 5] reference: count, sum of clipped z², clip level, seeds stored, F
+    unit: Floats  # [A, J, 5] since the last look: count, clipped z², z², count below the median, extremes
+    cum: Floats  # [A, J, 5] the same since the start
     cusum: Floats  # [A, J, 6, 4] n1, S1, sample of the suspected onset, evidence g
-    spread: Floats  # [A, J, L, 5] cascade over z²: held sum, whether, squared differences, pairs, spread
-    burst: Floats  # [A, 2] CUSUM of extremes and its last zero
-    alarm: Floats  # [A, 6] KIND 0 = none
-    step: Floats  # [A, 6] octave (−1 none), mean before, after, place, sigma, pairs left
-    snap: Floats  # [levels, SLOTS, A, J, 5] ``cum`` at times spaced as their age
-    snap_at: Ints  # [levels, SLOTS] those times
+    spread: Floats  # [A, J, L, 5] cascade over z²: stored sum, 1 if stored, squared differences, pairs, spread
+    burst: Floats  # [A, 2] CUSUM of extremes, and the sample at which it was last zero
+    alarm: Floats  # [A, 6] pending alarm, see KIND; kind 0 means none
+    step: Floats  # [A, 6] octave (−1 means none), mean before and after, position, sigma, pairs left to confirm
+    snap: Floats  # [levels, SLOTS, A, J, 5] snapshots of ``cum``, with a spacing proportional to their age
+    snap_at: Ints  # [levels, SLOTS] sample numbers of the snapshots
 
 
 def make_state(octaves: int) -> State:
-    """Nothing seen yet; thresholds are to be filled in."""
+    """Return the initial state. The caller must set ``levels``."""
     a, j = AXES, octaves
     state = State(
         np.zeros(6), np.array([0, NEVER], np.int64), np.zeros(a, np.int64),
@@ -117,7 +136,17 @@ def make_state(octaves: int) -> State:
 
 @compiled
 def advance(s: State, rows: Floats, first: int) -> int:
-    """Advance by rows [n, 6] from ``first`` on, up to a verdict that is due; returns the row after the last done."""
+    """Process rows until a decision is due, and return the row after the last one processed.
+
+    Parameters
+    ----------
+    s : State
+        State, updated in place.
+    rows : ndarray of float64, shape (n, 6)
+        Samples in rad/s and m/s²; NaN means missing.
+    first : int
+        First row to process.
+    """
     for row in range(first, len(rows)):
         place = s.clock[TOTAL] % TICK
         for axis in range(AXES):
@@ -135,7 +164,7 @@ def advance(s: State, rows: Floats, first: int) -> int:
 
 @compiled
 def _tick(s: State, axis: int, now: int) -> None:
-    """TICK samples of one axis: the short octaves within them, then a carry through the longer ones."""
+    """Process a tick of one axis: first the octaves within the tick, then the carry through the longer octaves."""
     sums = s.stage[axis]
     total, count = 0.0, 0.0
     for i in range(TICK):
@@ -171,7 +200,10 @@ def _tick(s: State, axis: int, now: int) -> None:
 
 @compiled
 def _differences(sums: Floats, band: Floats, unit: Floats, seeds: Floats, axis: int, j: int) -> None:
-    """All pairs of sums of 2^j samples in a tick; leaves their sums in front. Indices, as views cost more than work."""
+    """Add all differences of sums of 2^j samples in a tick, and leave the joined sums in front of ``sums``.
+
+    Indices are used because array views would cost more than the work itself.
+    """
     scale = 0.5 / (1 << j) ** 2
     limit = band[axis, j, LIMIT]
     inner, outer = limit * (MEDIAN / CLIP), limit * (EXTREME / CLIP)
@@ -199,7 +231,7 @@ def _differences(sums: Floats, band: Floats, unit: Floats, seeds: Floats, axis: 
 
 @compiled
 def _pair(s: State, axis: int, j: int, sum1: float, count1: float, sum2: float, count2: float, now: int) -> None:
-    """Two blocks of 2^j samples; none is used of which more than a sixteenth is missing."""
+    """Process two blocks of 2^j samples. A block is not used if more than a sixteenth of it is missing."""
     m = 1 << j
     least = m - m // 16
     fill = s.fill[axis, j]
@@ -208,7 +240,7 @@ def _pair(s: State, axis: int, j: int, sum1: float, count1: float, sum2: float, 
         return
     d = sum2 / count2 - sum1 / count1
     mean = (sum1 + sum2) / (count1 + count2)
-    # as if white: 1/count1 + 1/count2 in the place of 2/m
+    # scaled as for white noise, with 1/count1 + 1/count2 instead of 2/m
     z2 = d * d * count1 * count2 / ((count1 + count2) * m)
     _gather(s.band, s.unit, s.seeds, axis, j, z2)
     if s.step[axis, 0] == j:
@@ -222,7 +254,7 @@ def _pair(s: State, axis: int, j: int, sum1: float, count1: float, sum2: float, 
 
 @compiled
 def _gather(band: Floats, unit: Floats, seeds: Floats, axis: int, j: int, z2: float) -> None:
-    """One z² into the unit of its band, or among the first, which only tell where to clip."""
+    """Add one z² to its band, or store it with the first ones, which only set the clip level."""
     if band[axis, j, SEEDED] == SEED:
         limit = band[axis, j, LIMIT]
         unit[axis, j, UNIT_N] += 1.0
@@ -239,9 +271,9 @@ def _gather(band: Floats, unit: Floats, seeds: Floats, axis: int, j: int, z2: fl
         if scale == 0.0:
             for value in first:
                 scale += value
-            scale /= SEED  # steps of resolution larger than the noise
+            scale /= SEED  # the resolution is coarser than the noise
         if scale == 0.0:
-            one[SEEDED] = 0.0  # an axis that shows nothing has no noise that could change
+            one[SEEDED] = 0.0  # a constant axis has no noise that could change
         one[LIMIT] = CLIP * scale
         one[N], one[S] = SEED, 0.0
         for value in first:
@@ -250,7 +282,7 @@ def _gather(band: Floats, unit: Floats, seeds: Floats, axis: int, j: int, z2: fl
 
 @compiled
 def _median_of_seeds(first: Floats) -> float:
-    """Return the value that half of the others do not exceed, by counting."""
+    """Return the median by counting smaller and equal values."""
     for value in first:
         below, equal = 0, 0
         for other in first:
@@ -265,7 +297,10 @@ def _median_of_seeds(first: Floats) -> float:
 def _look(
     unit: Floats, cum: Floats, band: Floats, spread: Floats, cusum: Floats, axis: int, j: int, now: int, h: float
 ) -> int:
-    """Take what was gathered into reference and CUSUMs of one band; returns the ratio that is beyond h, or −1."""
+    """Add the collected z² to the reference and the CUSUMs of one band.
+
+    Return the index of the ratio whose evidence exceeds h, or −1.
+    """
     k, q = unit[axis, j, UNIT_N], unit[axis, j, UNIT_S]
     if k == 0.0:
         return -1
@@ -284,9 +319,10 @@ def _look(
 
 @compiled
 def _feed_spread(spread: Floats, band: Floats, axis: int, j: int, q: float, k: float) -> None:
-    """F: Haar differences of sums of z² over 1, 2, 4, … looks, squared, over those of independent Gaussian z.
+    """Update F: squared Haar differences of sums of z² over 1, 2, 4, … looks, relative to independent Gaussian z.
 
-    Less their own standard deviation where that may be all there is to it. The largest of all lengths counts.
+    The standard deviation of the estimate is subtracted if chance may explain it. F is the largest value of all
+    lengths.
     """
     v = band[axis, j, S] / band[axis, j, N]
     for level in range(spread.shape[2]):
@@ -302,7 +338,7 @@ def _feed_spread(spread: Floats, band: Floats, axis: int, j: int, q: float, k: f
         if count >= PAIRS and v > 0.0:
             expected = 4.0 * k * (1 << level) * v * v * count
             found, error = spread[axis, j, level, SQUARES] / expected, np.sqrt(3.0 / count)
-            if found < 1.0 + 2.0 * error:  # else clearly more than chance: taken whole
+            if found < 1.0 + 2.0 * error:  # a significantly larger value is used without a correction
                 found /= 1.0 + error
             spread[axis, j, level, SPREAD] = found
             largest = 1.0
@@ -315,13 +351,16 @@ def _feed_spread(spread: Floats, band: Floats, axis: int, j: int, q: float, k: f
 def _raise_cusums(
     cusum: Floats, band: Floats, axis: int, j: int, k: float, q: float, now: int, threshold: float
 ) -> int:
-    """The evidence g of each ratio, as in the module's head; returns the ratio of the largest beyond the threshold."""
+    """Update the evidence g of each ratio as described in the module docstring.
+
+    Return the ratio with the largest evidence above the threshold, or −1.
+    """
     n, total, spread = band[axis, j, N], band[axis, j, S], band[axis, j, F]
     best, largest = -1, threshold
     for i in range(RATIOS.size):
         n1 = cusum[axis, j, i, N1] + k
         s1 = cusum[axis, j, i, S1] + q
-        g = -1.0  # by Jensen, unless the mean since the onset lies on the ratio's side
+        g = -1.0  # negative by Jensen's inequality, unless the mean since the onset changed in the direction of r
         if (s1 * n - total * n1) * GAIN[i] > 0.0:
             g = (-0.5 * n * np.log(1.0 - GAIN[i] * s1 / total) - n1 * HALF_LOG[i]) / spread
         if g <= 0.0:
@@ -335,7 +374,7 @@ def _raise_cusums(
 
 @compiled
 def _suspect(s: State, axis: int, j: int, i: int, now: int) -> None:
-    """A ratio is beyond its threshold: an alarm if the reference is known well enough."""
+    """Raise an alarm for a ratio above its threshold, if the reference is long enough."""
     since = s.cusum[axis, j, i, SINCE]
     enough = s.band[axis, j, N] - s.cusum[axis, j, i, N1] >= LEARN * s.band[axis, j, F] ** 2
     if enough and since - s.born[axis] >= s.levels[LEARN_SAMPLES]:
@@ -346,7 +385,7 @@ def _suspect(s: State, axis: int, j: int, i: int, now: int) -> None:
 
 @compiled
 def _relearn(s: State, axis: int, j: int) -> None:
-    """What changed while a band was learned is no reference: begin it anew."""
+    """Restart the reference of a band that changed while it was being learned."""
     s.band[axis, j] = 0.0
     s.band[axis, j, F] = 1.0
     s.spread[axis, j] = 0.0
@@ -356,7 +395,10 @@ def _relearn(s: State, axis: int, j: int) -> None:
 
 @compiled
 def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis: int, now: int) -> float:
-    """CUSUM of Bernoulli trials: a share of extremes ten times the usual, at least 1 %; returns its height."""
+    """Update the CUSUM of extremes as Bernoulli trials, and return its value.
+
+    It tests for a share of extremes ten times the usual one, and at least 1 %.
+    """
     outer = 2.0 * band[axis, 0, LIMIT] * (EXTREME / CLIP)  # (y − y')² is 2 z²
     if band[axis, 0, SEEDED] != SEED or outer == 0.0:
         return 0.0
@@ -378,14 +420,17 @@ def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis
 
 @compiled
 def _suspect_burst(s: State, axis: int, now: int) -> None:
-    """Too many extremes: an alarm once the reference is known."""
+    """Raise an alarm for too many extremes, if the reference is long enough."""
     if s.burst[axis, 1] - s.born[axis] >= s.levels[LEARN_SAMPLES]:
         _alarm(s, axis, BURST, 0, s.burst[axis, 1], s.burst[axis, 0], now)
 
 
 @compiled
 def _alarm(s: State, axis: int, kind: float, j: int, since: float, evidence: float, now: int) -> None:
-    """Note the first alarm; the verdict waits for as long again as it took to raise it, within limits."""
+    """Record the first alarm of an axis.
+
+    The decision waits for as long again as the alarm took to be raised, within limits.
+    """
     alarm = s.alarm[axis]
     if alarm[KIND] != 0.0 and not (alarm[FOUND] == now and evidence > alarm[EVIDENCE]):
         return
@@ -398,7 +443,7 @@ def _alarm(s: State, axis: int, kind: float, j: int, since: float, evidence: flo
 
 @compiled
 def set_due(s: State) -> None:
-    """When the kernel is to stop for a verdict."""
+    """Set the sample at which the kernel stops for the next decision."""
     s.clock[NEXT_DUE] = NEVER
     for axis in range(AXES):
         if s.alarm[axis, KIND] != 0.0:
@@ -407,7 +452,10 @@ def set_due(s: State) -> None:
 
 @compiled
 def _seek_step(s: State, axis: int, j: int, mean: float, d: float, now: int) -> None:
-    """Is the newest pair of blocks far from the one before the last, both at rest, and no slope through them?"""
+    """Test whether the newest pair of blocks shows a step from the one before the last.
+
+    Both pairs must be at rest, and no slope may explain the difference.
+    """
     ring = s.ring[axis, j]
     height = mean - ring[0, 0]
     band = s.band[axis, j]
@@ -425,11 +473,11 @@ def _seek_step(s: State, axis: int, j: int, mean: float, d: float, now: int) -> 
     for above in range(j + 1, j + 4):
         if s.band[axis, above, N] < FEW:
             return
-        # what random walk and flicker do to means four blocks apart: 10/3 of 5.33, and less
+        # variation of means four blocks apart by random walk and flicker: 10/3 of 5.33, and less
         v = max(v, 2.0 * s.band[axis, above, S] / s.band[axis, above, N])
     sigma = np.abs(height) / np.sqrt(v * band[F])
-    straight = height - 2.0 * (d + ring[0, 1])  # less what the slopes on both sides explain
-    share = (ring[1, 0] - ring[0, 0]) / height  # of the pair between that lies after the step
+    straight = height - 2.0 * (d + ring[0, 1])  # without the part explained by the slopes on both sides
+    share = (ring[1, 0] - ring[0, 0]) / height  # share of the middle pair that lies after the step
     if sigma <= s.levels[STEP_SIGMA] or straight * height < 0.5 * square or not -0.3 < share < 1.3:
         return
     step, m = s.step[axis], 1 << j
@@ -440,7 +488,7 @@ def _seek_step(s: State, axis: int, j: int, mean: float, d: float, now: int) -> 
 
 @compiled
 def _confirm(s: State, axis: int, mean: float, now: int) -> None:
-    """A step stays at its height, else it was none; found when it has."""
+    """Confirm a step that stays at its height for ``CONFIRM`` pairs, and discard it otherwise."""
     step = s.step[axis]
     if np.abs(mean - step[AFTER]) > 0.5 * np.abs(step[AFTER] - step[BEFORE]):
         step[0] = -1.0
@@ -455,7 +503,10 @@ def _confirm(s: State, axis: int, mean: float, now: int) -> None:
 
 @compiled
 def _remember(s: State, tick: int) -> None:
-    """Keep ``cum``: odd multiples of 2^k ticks in the slots of level k, so that spacing grows as age."""
+    """Store a snapshot of ``cum``.
+
+    Odd multiples of 2^k ticks go to the slots of level k, so that the spacing of the snapshots grows with their age.
+    """
     level = 0
     while tick & 1 == 0:
         tick >>= 1

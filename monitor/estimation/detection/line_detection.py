@@ -1,19 +1,22 @@
-"""What no sum of five Gaussian noises has: steady lines and resonances in the spectrum, and outliers.
+"""Detection of spectral lines, resonances and outliers, which no sum of the five Gaussian noise terms explains.
 
-Comes in: a recording on its grid, and its Allan curve. Goes out: ``Line`` for each peak that matters to the curve, and
-the share of outliers of each axis. Both are asked of at most MOST stretches of ROWS samples, spread over the recording,
-so that the longest costs no more than a second of it; stretches with more than LACKING missing are passed over.
+The input is a recording on a regular grid and its Allan curve. The results are a ``Line`` for each relevant peak, and
+the share of outliers of each axis. Both use at most ``MAX_STRETCHES`` stretches of ``ROWS`` samples, spread over the
+recording, so that the longest recording takes no more than a second. Stretches with more than ``LACKING`` missing
+samples are skipped.
 
-- **Lines.** Periodograms (Hann) of the stretches are averaged (Welch 1967). A peak stands CLEAR σ and a factor RISES
-  above the medians of the bins to both of its sides, as it is and in bins WIDE times wider: lines and resonances. Its
-  power is what stands above the sides of its feet. Told is what adds MATTERS or more of the Allan variance at some τ:
-  a line of amplitude A makes A² sin⁴(πfτ) / (m sin(πf/rate))² (the sine of IEEE Std 952, annex C, averaged over m
-  samples rather than without pause), and a resonance is taken for a line of the same power.
-- **Outliers** lie beyond FAR σ of their stretch, by the distance from the median of BLOCK samples around, and half as
-  far from that of the NEXT to both sides, as no slope or curve within the block does; σ is by the median distance,
-  which one sample in ten moves by an eighth. A step of the resolution is the least σ.
+- **Lines.** The periodograms (Hann) of the stretches are averaged (Welch 1967). A peak exceeds the medians of the bins
+  on both sides by ``MIN_PEAK_SIGMA`` and by the factor ``MIN_PEAK_RATIO``. The search uses single bins for lines and
+  bins ``WIDE_BINS`` times wider for resonances. The power of a peak is the part above the level on both sides of its
+  feet. A peak is reported if it adds ``MATTERS`` or more of the Allan variance at some τ. A line of amplitude A adds A²
+  sin⁴(πfτ) / (m sin(πf/rate))² (the sine of IEEE Std 952, annex C, averaged over m samples instead of continuously). A
+  resonance is treated as a line of the same power.
+- **Outliers** deviate by more than ``OUTLIER_SIGMA`` σ of their stretch from the median of the ``BLOCK`` samples around
+  them. They also deviate by half as much from the median of the ``NEIGHBOURS`` samples on each side, which excludes
+  slopes and curvature within the block. σ is estimated from the median distance, which changes by an eighth if one
+  sample in ten is an outlier. It is at least one step of the resolution.
 
-Not found: lines below FIRST bins of a stretch, and what lasts only for a moment.
+Lines below ``FIRST_BIN`` bins of a stretch and short-lived lines are not detected.
 """
 
 from collections.abc import Iterator
@@ -29,88 +32,121 @@ from monitor.estimation.allan.curve import AllanCurve
 Mask = NDArray[np.bool_]
 
 ROWS: Final = 4096
+"""Maximum number of samples in a stretch."""
 FEWEST_ROWS: Final = 256
+"""Minimum number of samples in a stretch."""
 LEAST: Final = 8
-"""Stretches: with fewer there is no spectrum."""
-MOST: Final = 128
-MOST_FAR: Final = 32
-"""Stretches that are asked for outliers: 131 072 samples, of which a thousandth is counted to a tenth."""
+"""Minimum number of stretches for a spectrum."""
+MAX_STRETCHES: Final = 128
+"""Maximum number of stretches for a spectrum."""
+MAX_OUTLIER_STRETCHES: Final = 32
+"""Maximum number of stretches searched for outliers.
+
+They hold 131 072 samples, of which a share of a thousandth is measured to a tenth.
+"""
 LACKING: Final = 0.05
-"""Share of a stretch."""
-CLEAR: Final = 6.5
-"""σ: none of a thousand recordings each of white, flicker, quantized, walking, low-passed, coarse and held noise has a
-line, of 2048 samples or of 20 000."""
-RISES: Final = 1.6
-"""Factor above both sides: slopes and the edge of a filter rise by less within a side."""
-WIDE: Final = 16
-FIRST: Final = 6
-FEWEST_BINS: Final = 64
-"""Of a spectrum: with fewer, a side spans so much that quantization noise rises within it."""
+"""Maximum share of missing samples in a stretch."""
+MIN_PEAK_SIGMA: Final = 6.5
+"""Minimum height of a peak in σ.
+
+A thousand recordings each of white, flicker, quantized, random-walk, low-passed, coarse and repeated noise show no line
+with this value, with 2048 samples or 20 000.
+"""
+MIN_PEAK_RATIO: Final = 1.6
+"""Minimum factor by which a peak exceeds both sides. Slopes and the edge of a filter rise by less within a side."""
+WIDE_BINS: Final = 16
+"""Width in bins of the wider bins in which resonances are searched."""
+FIRST_BIN: Final = 6
+"""First bin in which peaks are searched."""
+MIN_BINS: Final = 64
+"""Minimum number of bins in a spectrum. With fewer bins, quantization noise rises within a side."""
 NEAR_BINS: Final = 3
-"""Bins to each side that the Hann window may fill with a line; they belong to no side."""
+"""Number of bins on each side that the Hann window may fill with a line. They belong to no side."""
 SIDE_BINS: Final = 16
-"""Bins of a side; a quarter of it among the wider ones."""
-FALLS: Final = 2.0
-"""σ by which NEAR_BINS together are below those before while a peak still falls to its foot."""
+"""Number of bins in a side; a quarter of it for the wider bins."""
+FOOT_SIGMA: Final = 2.0
+"""Distance in σ by which ``NEAR_BINS`` bins together are below the previous ones while a peak falls to its foot."""
 MATTERS: Final = 0.002
+"""Minimum share of the Allan variance for a reported line."""
 LINES: Final = 3
-"""Of an axis, the strongest."""
-FAR: Final = 5.0
+"""Maximum number of lines per axis, the strongest first."""
+OUTLIER_SIGMA: Final = 5.0
+"""Minimum deviation of an outlier in σ."""
 BLOCK: Final = 63
-"""Odd, so that the median is a sample and distances from it are whole steps of the resolution."""
-NEXT: Final = 3
-"""To each side: up to three outliers in a row are told."""
-GAUSSIAN: Final = 1.4826
-"""σ over the median distance, of Gaussian noise."""
+"""Number of samples in a block for the median.
+
+It is odd, so that the median is a sample and distances from it are whole steps of the resolution.
+"""
+NEIGHBOURS: Final = 3
+"""Number of neighbours on each side. Up to three outliers in a row are detected."""
+SIGMA_PER_MEDIAN: Final = 1.4826
+"""Ratio of σ to the median distance for Gaussian noise."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A peak of the spectrum of one axis."""
+    """Spectral peak of one axis."""
 
     axis: int  # index into AXES
-    frequency_hz: float  # as sampled
-    amplitude: float  # of a sine of its power, rad/s or m/s²
-    share: float  # of the Allan variance, at the τ where it is largest
-    wide: bool  # a resonance, wider than the spectrum resolves
+    frequency_hz: float  # as sampled, possibly an alias
+    amplitude: float  # amplitude of a sine of the same power, rad/s or m/s²
+    share: float  # share of the Allan variance, at the τ where it is largest
+    wide: bool  # True for a resonance, wider than the resolution of the spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class _Peak:
-    """A peak of one spectrum."""
+    """Peak of one spectrum."""
 
-    middle: float  # bins
-    power: float  # mean square above the level of its sides, unit² of the axis
-    wide: bool
+    middle: float  # centre in bins
+    power: float  # mean square above the level of its sides, squared unit of the axis
+    wide: bool  # True if it is wider than the resolution of the spectrum
 
 
 def lines(values: Floats, moving: Mask, rate_hz: float, curve: AllanCurve) -> list[Line]:
-    """Peaks of all axes, the strongest of an axis first.
+    """Return the spectral peaks of all axes, the strongest of each axis first.
 
-    Args:
-        values: recording [n, 6], SI; NaN = missing
-        moving: rows [n] to leave out
-        rate_hz: samples a second
-        curve: its Allan curve, for what matters
+    Parameters
+    ----------
+    values : ndarray of float64, shape (n, 6)
+        Samples in rad/s and m/s²; NaN means missing.
+    moving : ndarray of bool, shape (n,)
+        True for samples to ignore.
+    rate_hz : float
+        Sample rate in Hz.
+    curve : AllanCurve
+        Allan curve of the recording, which determines the relevant peaks.
     """
     rows = min(ROWS, 1 << (len(values) // LEAST).bit_length() >> 1)
     if rows < FEWEST_ROWS:
         return []
     found = []
     for axis in range(len(AXES)):
-        parts = [_filled(part) for part in _stretches(values[:, axis], moving, rows, MOST)]
+        parts = [_filled(part) for part in _stretches(values[:, axis], moving, rows, MAX_STRETCHES)]
         if len(parts) < LEAST:
             continue
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # an axis at rest, or beyond all measure
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # constant axes and extreme values
             peaks = _peaks(_spectrum(np.stack(parts)), len(parts))
-            of_axis = [_line(axis, peak, rate_hz / rows, rate_hz, curve) for peak in peaks]
+            of_axis = [_make_line(axis, peak, rate_hz / rows, rate_hz, curve) for peak in peaks]
         strong = sorted((one for one in of_axis if one.share >= MATTERS), key=lambda one: -one.share)
         found += strong[:LINES]
     return found
 
 
 def outliers(values: Floats, moving: Mask) -> Floats:
-    """Share [6] of the samples [n, 6] beyond FAR σ of those around, without rows ``moving`` [n]; NaN where too few are.
+    """Return the share of outliers of each axis.
+
+    Parameters
+    ----------
+    values : ndarray of float64, shape (n, 6)
+        Samples in rad/s and m/s²; NaN means missing.
+    moving : ndarray of bool, shape (n,)
+        True for samples to ignore.
+
+    Returns
+    -------
+    ndarray of float64, shape (6,)
+        Share of samples beyond ``OUTLIER_SIGMA`` σ; NaN with too few samples.
 
     >>> noise = np.random.default_rng(0).standard_normal((20_000, 6))
     >>> noise[::50, 2] = 30.0
@@ -120,20 +156,31 @@ def outliers(values: Floats, moving: Mask) -> Floats:
     shares = np.full(len(AXES), np.nan)
     rows = min(ROWS, len(values) // BLOCK * BLOCK)
     for axis in range(len(AXES)) if rows else ():
-        far = [_far(part[np.isfinite(part)]) for part in _stretches(values[:, axis], moving, rows, MOST_FAR)]
+        far = [
+            _outlier_share(part[np.isfinite(part)])
+            for part in _stretches(values[:, axis], moving, rows, MAX_OUTLIER_STRETCHES)
+        ]
         if far:
             shares[axis] = np.mean(far)
     return shares
 
 
 def added(line: Line, curve: AllanCurve) -> Floats:
-    """Share [m] of its axis' Allan variance that a line makes at each τ."""
+    """Return the share [m] of the Allan variance of its axis that a line contributes at each τ.
+
+    Parameters
+    ----------
+    line : Line
+        Spectral line.
+    curve : AllanCurve
+        Allan curve of the recording.
+    """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        return _added(line.axis, line.frequency_hz * curve.tau_s[0] / curve.factors[0], line.amplitude, curve)
+        return _allan_share(line.axis, line.frequency_hz * curve.tau_s[0] / curve.factors[0], line.amplitude, curve)
 
 
 def _stretches(column: Floats, moving: Mask, rows: int, most: int) -> Iterator[Floats]:
-    """Stretches [rows] of an axis that lack little; NaN = missing or moving."""
+    """Yield stretches [rows] of an axis with few missing samples; NaN means missing or in motion."""
     begins = np.linspace(0, len(column) - rows, min(most, max(2 * len(column) // rows - 1, 1))).astype(np.int64)
     for begin in begins:
         part = np.where(moving[begin : begin + rows], np.nan, column[begin : begin + rows])
@@ -142,62 +189,65 @@ def _stretches(column: Floats, moving: Mask, rows: int, most: int) -> Iterator[F
 
 
 def _filled(part: Floats) -> Floats:
-    """A stretch about its mean, 0 in the place of what is missing."""
+    """Return a stretch minus its mean, with 0 for missing samples."""
     there = np.isfinite(part)
     return np.where(there, part - part[there].mean(), 0.0)
 
 
 def _spectrum(parts: Floats) -> Floats:
-    """Mean square a bin [rows / 2], of stretches [k, rows] with a mean of 0: they add up to the variance."""
+    """Return the mean square per bin [rows / 2] of zero-mean stretches [k, rows]; the sum is the variance."""
     window = np.hanning(parts.shape[1])
-    turned = np.fft.rfft(parts * window, axis=1)[:, :-1]  # half the rate has but one degree of freedom
+    turned = np.fft.rfft(parts * window, axis=1)[:, :-1]  # the bin at half the rate has only one degree of freedom
     power = (turned.real**2 + turned.imag**2).mean(axis=0)
     return np.asarray(2.0 * power / (parts.shape[1] * (window**2).sum()))
 
 
 def _peaks(spectrum: Floats, parts: int) -> list[_Peak]:
-    """Lines first, then resonances where no line is."""
+    """Return lines, then resonances in bins without a line."""
     taken = np.zeros(spectrum.size, np.bool_)
     found = []
-    for width, side in ((1, SIDE_BINS), (WIDE, SIDE_BINS // 4)):
+    for width, side in ((1, SIDE_BINS), (WIDE_BINS, SIDE_BINS // 4)):
         power = spectrum[: spectrum.size // width * width].reshape(-1, width).mean(axis=1)
-        if power.size < FEWEST_BINS:
+        if power.size < MIN_BINS:
             continue
-        runs = _runs(_clear(power, parts * width, side))
-        for first, last in sorted(runs, key=lambda run: -power[slice(*run)].max()):  # flanks belong to their summit
-            if first * width < FIRST or taken[first * width : last * width].any():
+        runs = _find_runs(_significant_bins(power, parts * width, side))
+        for first, last in sorted(runs, key=lambda run: -power[slice(*run)].max()):  # the highest peak takes its flanks
+            if first * width < FIRST_BIN or taken[first * width : last * width].any():
                 continue
-            begin, end = _feet(power, first, last, parts * width)
+            begin, end = _find_feet(power, first, last, parts * width)
             taken[begin * width : end * width] = True
             sides = np.concatenate([power[max(begin - side, 0) : begin], power[end : end + side]])
             above = power[begin:end] - np.median(sides)
             if above.sum() > 0.0:
                 weights = np.maximum(above, 0.0)
                 middle = float((np.arange(begin, end) * weights).sum() / weights.sum())
-                # the leaks of a strong line are clear far from it, but not high
+                # leakage of a strong line is significant far from it, but not high
                 high = int((above > above.max() / 4.0).sum())
                 wide = width > 1 or high > 2 * NEAR_BINS + 1
                 found.append(_Peak(width * (middle + 0.5) - 0.5, width * float(above.sum()), wide))
     return found
 
 
-def _clear(power: Floats, averaged: int, side: int) -> Mask:
-    """Bins that stand above the medians of both sides, by more than chance and by more than a slope."""
+def _significant_bins(power: Floats, averaged: int, side: int) -> Mask:
+    """Return the bins above the medians of both sides, by more than chance and by more than a slope."""
     bins, reach = power.size, NEAR_BINS + side
-    # beyond the ends the spectrum goes on as in a mirror
+    # the spectrum is mirrored at both ends
     padded = np.pad(power, reach, mode="reflect")
     around = np.lib.stride_tricks.sliding_window_view(padded, side)
     left, right = (np.median(around[at : at + bins], axis=1) for at in (0, reach + NEAR_BINS + 1))
     level = np.maximum(left, right)
     ratio = power / level
-    chi = 2.0 / (9.0 * 2.0 * averaged)  # Wilson & Hilferty 1931, 2 degrees of freedom a periodogram
+    chi = 2.0 / (9.0 * 2.0 * averaged)  # Wilson & Hilferty 1931, 2 degrees of freedom per periodogram
     sigma = (np.cbrt(ratio) - (1.0 - chi)) / np.sqrt(chi)
-    return np.asarray((sigma > CLEAR) & (ratio > RISES) & (level > 0.0))
+    return np.asarray((sigma > MIN_PEAK_SIGMA) & (ratio > MIN_PEAK_RATIO) & (level > 0.0))
 
 
-def _feet(power: Floats, first: int, last: int, averaged: int) -> tuple[int, int]:
-    """First bin of a peak and the one after the last: NEAR_BINS beyond what is clear, and on while it still falls."""
-    falls, step = 1.0 - FALLS / (NEAR_BINS * averaged) ** 0.5, NEAR_BINS
+def _find_feet(power: Floats, first: int, last: int, averaged: int) -> tuple[int, int]:
+    """Return the first bin of a peak and the one after the last.
+
+    The feet begin ``NEAR_BINS`` beyond the significant bins and extend while the spectrum still falls.
+    """
+    falls, step = 1.0 - FOOT_SIGMA / (NEAR_BINS * averaged) ** 0.5, NEAR_BINS
     first, last = max(first - step, 0), min(last + step, power.size)
     while first >= step and power[first - step : first].sum() < falls * power[first : first + step].sum():
         first -= step
@@ -206,28 +256,28 @@ def _feet(power: Floats, first: int, last: int, averaged: int) -> tuple[int, int
     return first, last
 
 
-def _runs(marks: Mask) -> list[tuple[int, int]]:
-    """First of each run of marks, and the one after its last."""
+def _find_runs(marks: Mask) -> list[tuple[int, int]]:
+    """Return the start of each run of marks, and the index after its end."""
     edges = np.flatnonzero(np.diff(marks.astype(np.int8), prepend=0, append=0)).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
 
 
-def _line(axis: int, peak: _Peak, bin_hz: float, rate_hz: float, curve: AllanCurve) -> Line:
-    """What a peak adds to the Allan curve."""
+def _make_line(axis: int, peak: _Peak, bin_hz: float, rate_hz: float, curve: AllanCurve) -> Line:
+    """Convert a peak to a line with its share of the Allan curve."""
     frequency, amplitude = peak.middle * bin_hz, (2.0 * peak.power) ** 0.5
-    shares = _added(axis, frequency / rate_hz, amplitude, curve)
+    shares = _allan_share(axis, frequency / rate_hz, amplitude, curve)
     return Line(axis, frequency, amplitude, float(np.nanmax(shares, initial=0.0)), peak.wide)
 
 
-def _added(axis: int, turns: float, amplitude: float, curve: AllanCurve) -> Floats:
-    """Share [m] of a curve that a line makes, of so many turns a sample."""
+def _allan_share(axis: int, turns: float, amplitude: float, curve: AllanCurve) -> Floats:
+    """Return the share [m] of a curve that a line of this many cycles per sample contributes."""
     half = np.pi * turns
     made = (amplitude * np.sin(curve.factors * half) ** 2 / np.sin(half)) ** 2 / curve.factors
     return np.asarray(made / (curve.factors * curve.avar[:, axis]))
 
 
-def _far(part: Floats) -> float:
-    """Share of a stretch, of what is there of it, that lies far from the rest."""
+def _outlier_share(part: Floats) -> float:
+    """Return the share of outliers in the present samples of a stretch."""
     steps = np.abs(np.diff(part))
     step = float(steps[steps > 0.0].min(initial=np.inf))
     part = part[: part.size // BLOCK * BLOCK]
@@ -235,15 +285,15 @@ def _far(part: Floats) -> float:
         return 0.0
     blocks = part.reshape(-1, BLOCK)
     away = np.abs(blocks - np.median(blocks, axis=1, keepdims=True))
-    least = FAR * max(GAUSSIAN * _median(away, step), step)
+    least = OUTLIER_SIGMA * max(SIGMA_PER_MEDIAN * _interpolated_median(away, step), step)
     rows = np.flatnonzero(away > least)
-    around = np.clip(rows[:, None] + np.arange(-NEXT, NEXT + 1), 0, part.size - 1)
+    around = np.clip(rows[:, None] + np.arange(-NEIGHBOURS, NEIGHBOURS + 1), 0, part.size - 1)
     alone = np.abs(part[rows] - np.median(part[around], axis=1)) > least / 2.0
     return float(alone.sum()) / part.size
 
 
-def _median(away: Floats, step: float) -> float:
-    """Of distances that come in steps: where within its step half of them are reached."""
+def _interpolated_median(away: Floats, step: float) -> float:
+    """Return the median of distances that come in steps, interpolated within a step."""
     middle = float(np.median(away))
     below, upto = (away < middle - step / 4.0).mean(), (away < middle + step / 4.0).mean()
     return middle + step * float((0.5 - below) / max(upto - below, 1.0 / away.size) - 0.5)

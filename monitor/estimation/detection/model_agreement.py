@@ -1,13 +1,14 @@
-"""The moment a sensor stops agreeing with its model, and the moment it agrees again: looks in, events out.
+"""Decision whether a sensor agrees with its noise model, and events when this decision changes.
 
-Looks at a sliding window follow each other ten times a second and are nearly the same: one look above its threshold is
-no second witness of the one before, and of many windows some pass the threshold by chance. So the verdict changes when
-the gap has been above ``alarm``, which is stricter, at every look while an eighth of the window's samples were renewed,
-and FEWEST at least; past twice the threshold, where chance is out of the question, FEWEST will do. On the way back the
-gap has to stay under ``null95`` as long: between the two the verdict stays as it is. In a simulation of 1600 windows of
-six axes, looked at 128 times each, a true model was accused three times.
+The window is compared with the model ten times per second, and successive results are nearly the same. A second result
+above the threshold is therefore no independent evidence, and some of many windows exceed the threshold by chance. The
+decision changes only if the gap exceeded the stricter limit ``AxisGap.alarm`` in every comparison while an eighth of
+the window was renewed, and at least ``FEWEST`` samples. Above twice the threshold, where chance is excluded, ``FEWEST``
+samples suffice. For the opposite decision, the gap must stay below ``null95`` for as long. Between these limits, the
+decision does not change. In a simulation of 1600 windows of six axes with 128 comparisons each, a true model was
+rejected three times.
 
-Both ways the event is a ``model_disagrees``, as that is the question; ``what`` says ``agrees``.
+Both changes are reported as a ``model_disagrees`` event. Its field ``agrees`` gives the decision.
 """
 
 from collections.abc import Mapping
@@ -18,37 +19,41 @@ from drivers.sample import AXES, Event
 from monitor.estimation.detection.model_gap import FEWEST, AxisGap, ModelGap
 
 KIND: Final = "model_disagrees"
+"""Kind of the events."""
 RENEWED: Final = 0.125
-"""Of the window's samples, while a gap is held."""
-CLEAR: Final = 2.0
-"""Thresholds."""
+"""Share of the window that must be renewed while a gap persists."""
+CLEAR_FACTOR: Final = 2.0
+"""Multiple of the threshold above which chance is excluded."""
 
 
 @dataclass(slots=True)
 class _Axis:
-    agrees: bool | None = None  # None: not judged yet
-    since: tuple[int, int] | None = None  # samples and t_ns of the first look that contradicts it
+    """State of the decision for one axis."""
+
+    agrees: bool | None = None  # None until the first decision
+    since: tuple[int, int] | None = None  # samples and t_ns of the first comparison that contradicts the decision
 
 
 class Agreement:
-    """The verdict on each axis of one device."""
+    """Decision for each axis of one device whether it agrees with its model."""
 
     def __init__(self) -> None:
         self._axes = {axis: _Axis() for axis in AXES}
 
     @property
     def verdicts(self) -> Mapping[str, bool]:
-        """axis -> whether it agrees with its model, of those that were judged."""
+        """Current decision for each axis that has one: True if it agrees with its model."""
         return {axis: one.agrees for axis, one in self._axes.items() if one.agrees is not None}
 
     def update(self, look: ModelGap) -> list[Event]:
-        """One look; the events that it brings."""
+        """Process one comparison and return the events that it causes."""
         found = (self._look(self._axes[axis], gap, look) for axis, gap in look.axes.items())
         return [event for event in found if event is not None]
 
     def _look(self, axis: _Axis, gap: AxisGap, look: ModelGap) -> Event | None:
+        """Update the decision for one axis, and return an event if it changed."""
         if axis.agrees is None and gap.gap <= gap.alarm:
-            axis.agrees = True  # nothing to tell
+            axis.agrees = True  # a first decision for agreement is not reported
         contradicted = gap.gap < gap.null95 if axis.agrees is False else gap.gap > gap.alarm
         if not contradicted:
             axis.since = None
@@ -56,7 +61,7 @@ class Agreement:
         if axis.since is None:
             axis.since = look.samples, look.t_ns
         samples, since_ns = axis.since
-        clear = axis.agrees is not False and gap.gap > CLEAR * gap.threshold
+        clear = axis.agrees is not False and gap.gap > CLEAR_FACTOR * gap.threshold
         if look.samples - samples < max(FEWEST, 0 if clear else round(RENEWED * gap.samples)):
             return None
         axis.agrees, axis.since = axis.agrees is False, None
@@ -64,6 +69,7 @@ class Agreement:
 
 
 def _event(gap: AxisGap, agrees: bool, t_ns: int, since_ns: int) -> Event:
+    """Build the event for a changed decision."""
     lo, hi = gap.tau_s
     what = {
         "agrees": agrees,
@@ -84,7 +90,7 @@ def _event(gap: AxisGap, agrees: bool, t_ns: int, since_ns: int) -> Event:
 
 
 def place(gap: AxisGap) -> str:
-    """The τ where it is, in words.
+    """Format the range of τ with the largest gap.
 
     >>> import numpy as np
     >>> one = np.ones(1)

@@ -1,24 +1,25 @@
-"""Does the live window still agree with the sensor's model: measured Allan curve against the model's, axis by axis.
+"""Comparison of the Allan curve of the live window with the curve of the noise model of the sensor, for each axis.
 
-Comes in: the curve of a look at the window, and the model in force. Goes out, for each axis that the model knows: how
-many standard deviations apart the two are at each τ, the largest of them (the gap), where it is, and the limits that
-chance stays under. ``Agreement`` turns looks into events: it holds a verdict until new samples have confirmed another.
+For each axis of the model, the comparison gives the difference at each τ in standard deviations, the largest
+difference (the gap), its τ, and the limits for chance. ``model_agreement.Agreement`` converts successive comparisons
+into events. It keeps a decision until new samples have confirmed another one.
 
-If the model is true, ν σ²(τ)/σ²_model(τ) is χ² with ν degrees of freedom, nearly; the cube root of a χ² is nearly
-normal (Wilson & Hilferty, PNAS 17, 1931), which gives
+If the model is true, ν σ²(τ)/σ²_model(τ) is approximately χ² with ν degrees of freedom. The cube root of χ² is
+approximately normal (Wilson & Hilferty, PNAS 17, 1931), which gives
 
     z(τ) = ((σ²/σ²_model)^(1/3) − 1 + 2/(9ν)) / √(2/(9ν)).
 
-ν = 2 σ⁴_model/Var comes from the model, not from the fit: the exact covariance of ``uncertainty`` for its Q N B K, and
-for all else that it has (resonance, low-pass, correlated noise) the integral 4/M ∫ (S G)² df of M terms through the
-kernel G of the variance, right where the window is long against the memory of the noise. τ with fewer than FEWEST_EDF
-degrees of freedom are not judged: there a sum of squares is further from χ² than the limits can bear.
+ν = 2 σ⁴_model/Var is computed from the model and not from the fit. For Q N B K of the model, Var is the exact
+covariance of ``uncertainty``. For its other effects (resonance, low-pass, correlated noise), Var is the integral 4/M ∫
+(S G)² df of M terms with the kernel G of the variance. The integral is accurate if the window is long compared with the
+memory of the noise. τ with fewer than ``FEWEST_EDF`` degrees of freedom are not compared, because a sum of squares then
+differs too much from χ².
 
-Whatever the correlation of normal z_i, P(all |z_i| < c) ≥ ∏ P(|z_i| < c) (Šidák, J. Am. Stat. Assoc. 62, 1967). So the
-limits pay for every τ by its number, and for the axes: of 100 independent windows of a true model one at most passes
-``threshold`` on any of them. Overlapping τ are correlated, and the true share is lower: of 2500 simulated windows of
-six axes and 14 octaves 0.5 % passed with Q N B K, 0.9 % with random walk alone. Telegraph noise and jumps are no
-Gaussian noise, and with them it is higher.
+For normal z_i with any correlation, P(all |z_i| < c) ≥ ∏ P(|z_i| < c) (Šidák, J. Am. Stat. Assoc. 62, 1967). The limits
+therefore account for the number of τ and axes. Of 100 independent windows of a true model, at most one exceeds
+``threshold`` on any axis. Overlapping τ are correlated, so the true share is lower. Of 2500 simulated windows of six
+axes and 14 octaves, 0.5 % exceeded it with Q N B K, and 0.9 % with random walk alone. The share is higher with
+telegraph noise and jumps, which are not Gaussian.
 """
 
 from collections.abc import Mapping
@@ -40,61 +41,65 @@ from monitor.noise.model import NoiseModel
 from monitor.noise.spectrum import BELOW, Spectrum, frequencies
 
 FEWEST_EDF: Final = 2.0
+"""Minimum degrees of freedom of a compared τ."""
 FEWEST: Final = 1000
-"""Samples of an axis before it is judged: N to 3 %."""
+"""Minimum number of samples of an axis. It determines N to 3 %."""
 FALSE_ALARM: Final = 0.01
-"""Of independent windows of a true model: how many pass the threshold on some axis."""
+"""Share of independent windows of a true model that exceed the threshold on any axis."""
 FALSE_ALARM_WATCHED: Final = 0.001
-"""The same of ``alarm``."""
+"""The same share for ``AxisGap.alarm``."""
 
 
 @dataclass(frozen=True, slots=True)
 class AxisGap:
-    """One axis of the window beside its model."""
+    """Comparison of one axis of the window with its model."""
 
     axis: str
-    measured: Floats  # [m] Allan deviation, unit of the axis; NaN where the window is too short
-    model: Floats  # [m] of the model; NaN where it is not known
-    z: Floats  # [m] standard deviations above the model; NaN where not judged
-    gap: float  # the largest |z|
-    tau_s: tuple[float, float]  # where: the τ round the largest that are on the same side and past the threshold
-    at: int  # row of the largest
-    null95: float  # 95 of 100 windows of a true model stay below, this axis alone
-    threshold: float  # 99 of 100 stay below on all axes
-    alarm: float  # 999 of 1000 do: for whoever looks again and again
-    samples: int  # of this axis in the window
+    measured: Floats  # [m] Allan deviation, unit of the axis; NaN if the window is too short
+    model: Floats  # [m] Allan deviation of the model; NaN if unknown
+    z: Floats  # [m] standard deviations above the model; NaN if not compared
+    gap: float  # largest |z|
+    tau_s: tuple[float, float]  # range of τ around the largest |z| that exceed the threshold on the same side
+    at: int  # row of the largest |z|
+    null95: float  # 95 of 100 windows of a true model are below, for this axis alone
+    threshold: float  # 99 of 100 windows are below on all axes
+    alarm: float  # 999 of 1000 windows are below on all axes, for repeated comparisons
+    samples: int  # samples of this axis in the window
 
     @property
     def passes(self) -> bool:
-        """Whether this is more than chance."""
+        """True if the gap exceeds the threshold, so that chance does not explain it."""
         return self.gap > self.threshold
 
     @property
     def ratio(self) -> float:
-        """Measured over model, of deviations, where the gap is largest."""
+        """Ratio of the measured deviation to that of the model at the largest gap."""
         return float(self.measured[self.at] / self.model[self.at])
 
 
 @dataclass(frozen=True, slots=True)
 class ModelGap:
-    """One look at all axes."""
+    """Comparison of all axes at one moment."""
 
-    t_ns: int  # newest sample
+    t_ns: int  # time of the newest sample
     rate_hz: float
     window_s: float
-    samples: int  # received since start
+    samples: int  # received since the start
     n: int  # samples in the window
     tau_s: Floats  # [m]
-    axes: Mapping[str, AxisGap]  # those that can be judged, in AXES order
-    agrees: Mapping[str, bool] = field(default_factory=dict)  # the verdicts that stand, see ``agreement``
+    axes: Mapping[str, AxisGap]  # axes that can be compared, in the order of AXES
+    agrees: Mapping[str, bool] = field(default_factory=dict)  # current decisions, see ``model_agreement``
 
 
 class ModelInForce:
-    """A model, ready to be laid beside the curves of one window.
+    """Noise model prepared for comparison with the curves of one window.
 
-    Args:
-        model: of the sensor
-        length: samples in the full window
+    Parameters
+    ----------
+    model : NoiseModel
+        Noise model of the sensor.
+    length : int
+        Number of samples in the full window.
     """
 
     def __init__(self, model: NoiseModel, length: int) -> None:
@@ -102,10 +107,10 @@ class ModelInForce:
         self._length = length
         self._expected: dict[str, _Expected] = {}
         self._tables = AxisTables(np.empty(0, np.int64), length)
-        self._of: tuple[float, tuple[int, ...]] = (0.0, ())  # rate and cluster sizes that these are for
+        self._of: tuple[float, tuple[int, ...]] = (0.0, ())  # rate and cluster sizes of the prepared values
 
     def look(self, estimate: Estimate) -> ModelGap:
-        """Each axis that is measured, known to the model and long enough beside the model."""
+        """Compare all axes that are measured, part of the model, and long enough."""
         curve = estimate.curve
         tables = self._prepare(curve.factors, estimate.rate_hz)
         found: dict[str, AxisGap] = {}
@@ -124,7 +129,7 @@ class ModelInForce:
         )
 
     def _prepare(self, factors: Ints, rate_hz: float) -> AxisTables:
-        """What the model says at these τ, once for each rate and list."""
+        """Compute the expected curves once per rate and list of cluster sizes, and return the covariance tables."""
         of = (rate_hz, tuple(factors.tolist()))
         if self._of[1] != of[1]:
             self._tables = AxisTables(factors, self._length)
@@ -137,32 +142,41 @@ class ModelInForce:
 
 
 def samples_of(curve: AllanCurve, axis: int) -> int:
-    """How many samples of an axis the window holds: fewer than ``curve.n`` where it began anew."""
+    """Return the number of samples of an axis in the window. It is less than ``curve.n`` if the axis was restarted.
+
+    Parameters
+    ----------
+    curve : AllanCurve
+        Curve of the window.
+    axis : int
+        Index into ``AXES``.
+    """
     terms = curve.terms[:, axis]
     return int((terms + 2 * curve.factors - 1)[terms > 0].max(initial=0))
 
 
 @dataclass(frozen=True, slots=True)
 class _Expected:
-    """What the model says of one axis at m averaging times."""
+    """Expected values of the model for one axis at m averaging times."""
 
-    avar: Floats  # [m] unit²
+    avar: Floats  # [m] Allan variance, squared unit of the axis
     shape: Floats  # [4] Q² N² B² K² at τ0 = 1
-    more: Floats  # [m] variance of the Allan variance of one term, beyond that of the shape; unit⁴
+    more: Floats  # [m] variance of one term in excess of that of Q N B K, unit⁴
 
     @classmethod
     def of(cls, model: NoiseModel, axis: str, factors: Ints, rate_hz: float) -> "_Expected":
+        """Compute the expected values of one axis of a model at the given cluster sizes."""
         spectrum = model.spectrum(axis, 1.0 / rate_hz)
         tau_s = factors / rate_hz
-        shape, classic = _classic(model, axis, rate_hz)
-        more = _beyond(spectrum, classic, factors, rate_hz)
-        # a ramp adds no variance of its own, but it multiplies that of the noise on it: no more than random walk of
-        # the same size would
+        shape, classic = _standard_terms(model, axis, rate_hz)
+        more = _excess_variance(spectrum, classic, factors, rate_hz)
+        # a ramp has no variance of its own, but its product with the noise has; the effect is at most that of a
+        # random walk of the same size
         shape[K] += 1.5 * spectrum.slope**2 * float(tau_s.max()) / rate_hz
         return cls(spectrum.allan(tau_s), shape, more)
 
     def edf(self, table: Table, terms: Ints) -> Floats:
-        """Degrees of freedom [m] of so many terms; NaN where there are none."""
+        """Return the degrees of freedom [m] for these numbers of terms; NaN without terms."""
         pairs = np.array([self.shape[a] * self.shape[b] * (1.0 if a == b else 2.0) for a, b in PAIRS])
         exact = np.einsum("iik,k->i", table.covariance, pairs)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -170,8 +184,8 @@ class _Expected:
             return np.where((terms > 0) & (variance > 0.0), 2.0 * self.avar**2 / variance, np.nan)
 
 
-def _classic(model: NoiseModel, axis: str, rate_hz: float) -> tuple[Floats, NoiseModel]:
-    """Q² N² B² K² of an axis at τ0 = 1, and the model of these alone."""
+def _standard_terms(model: NoiseModel, axis: str, rate_hz: float) -> tuple[Floats, NoiseModel]:
+    """Return Q² N² B² K² of an axis at τ0 = 1, and the model of these terms alone."""
     kinds = (QuantizationNoise, AngleRandomWalk, BiasInstability, RateRandomWalk)
     letters = ("Q", "N", "B", "K")
     powers = (2.0, 1.0, 0.0, -1.0)
@@ -183,11 +197,11 @@ def _classic(model: NoiseModel, axis: str, rate_hz: float) -> tuple[Floats, Nois
     return shape, NoiseModel({axis: effects})
 
 
-def _beyond(spectrum: Spectrum, classic: NoiseModel, factors: Ints, rate_hz: float) -> Floats:
-    """4 ∫ (S² − S_classic²) G² df, with the lines' 4 Σ P S G², at τ0 = 1; times 1/M it is a variance.
+def _excess_variance(spectrum: Spectrum, classic: NoiseModel, factors: Ints, rate_hz: float) -> Floats:
+    """Return 4 ∫ (S² − S_standard²) G² df plus 4 Σ P S G² of the lines, at τ0 = 1; times 1/M it is a variance.
 
-    d is a second difference, of spectrum S G with G = 2 sin⁴(πνm)/(m sin πν)², and over M terms Var(mean d²) is
-    2/M Σ_c r(c)², by Parseval 2/M ∫ (S G)² dν. A line of mean square P adds 4/M P S G² at its frequency.
+    d is a second difference with spectrum S G, where G = 2 sin⁴(πνm)/(m sin πν)². Over M terms, Var(mean d²) is 2/M Σ_c
+    r(c)², by Parseval 2/M ∫ (S G)² dν. A line of mean square P adds 4/M P S G² at its frequency.
     """
     (axis,) = classic.effects
     f_hz = frequencies(BELOW * rate_hz / float(factors.max()), 1.0 / rate_hz, spectrum.peaks)
@@ -208,13 +222,14 @@ def _beyond(spectrum: Spectrum, classic: NoiseModel, factors: Ints, rate_hz: flo
 
 
 def _kernel(nu: Floats, m: int) -> Floats:
+    """Return the spectral kernel G of the Allan variance at cluster size m."""
     return np.asarray(2.0 * np.sin(np.pi * nu * m) ** 4 / (m * np.sin(np.pi * nu)) ** 2)
 
 
 def _axis_gap(
     axis: str, tau_s: Floats, avar: Floats, expected: Floats, edf: Floats, samples: int, axes: int
 ) -> AxisGap | None:
-    """One axis, of so many that the model knows; None where no τ can be judged."""
+    """Compare one axis of a model with ``axes`` axes; return None if no τ can be compared."""
     expected = np.where(expected > 0.0, expected, np.nan)
     z = normal_score(avar / expected, edf)
     judged = np.isfinite(z)
@@ -238,9 +253,16 @@ def _axis_gap(
 
 
 def normal_score(ratio: Floats, edf: Floats) -> Floats:
-    """How many standard deviations χ²/ν is above one, by its cube root; NaN below FEWEST_EDF.
+    """Return the distance of χ²/ν from one in standard deviations, by its cube root; NaN below ``FEWEST_EDF``.
 
-    The 97.5 % point of χ² with 100 degrees of freedom is 129.561:
+    In the example, 129.561 is the 97.5 % point of χ² with 100 degrees of freedom.
+
+    Parameters
+    ----------
+    ratio : ndarray of float64
+        Ratio χ²/ν.
+    edf : ndarray of float64
+        Degrees of freedom ν.
 
     >>> round(float(normal_score(np.array([1.29561]), np.array([100.0]))[0]), 2)
     1.96
@@ -250,7 +272,16 @@ def normal_score(ratio: Floats, edf: Floats) -> Floats:
 
 
 def limit(share: float, numbers: int) -> float:
-    """What the largest of so many |z| stays below, but for this share; for independent ones exactly, else at most.
+    """Return the limit that the largest of several |z| exceeds with a given probability.
+
+    The probability is exact for independent z, and an upper bound otherwise.
+
+    Parameters
+    ----------
+    share : float
+        Probability that the limit is exceeded.
+    numbers : int
+        Number of z.
 
     >>> f"{limit(0.05, 1):.3f} {limit(0.01, 6 * 14):.3f}"
     '1.960 3.847'

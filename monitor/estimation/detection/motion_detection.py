@@ -1,15 +1,16 @@
-"""At rest or not: motion, knocks and handling of the sensor are recognised, counted, and struck out of its samples.
+"""Motion detector: finds motion, knocks and handling of the sensor, and removes these samples from the stream.
 
-Comes in: samples in order. Goes out: the same samples, those of moving stretches NaN in their places, so that every
-statistic behind treats them as missing; and a ``Motion`` for each stretch. No noise figure is configured: what is usual
-at rest is learned from the samples, axis by axis, and followed (``rest_kernel`` has the method). A moving stretch is
-struck out from one block before its first moving block to two after its last.
+The detector returns the same samples with NaN in place of those in motion, so that all later statistics treat them as
+missing. It also returns a ``Motion`` for each episode. No noise level has to be configured. The level at rest is
+learned from the samples of each axis and updated (method: ``motion_kernel``). An episode is removed from one block
+before its first moving block to two blocks after its last.
 
-Samples are held back until the block after theirs is judged: by two blocks, 0.5 s, or 16 samples of a sensor
-slower than 32 Hz. What persists steadily for 60 s is rest from then on and left to the detector of changes. A first
-reference takes eight blocks; until it stands, only what no MEMS sensor shows at rest is called motion.
+Samples are delayed until the next block is decided. The delay is two blocks: 0.5 s, or 16 samples of a sensor slower
+than 32 Hz. A disturbance that persists steadily for 60 s counts as rest from then on and is left to the change
+detector. A first reference takes eight blocks. Until then, only signals that no MEMS sensor shows at rest count as
+motion.
 
-Not found: rotation at a constant rate below 2 °/s, and motion that hides in the noise.
+Rotation at a constant rate below 2 °/s, and motion below the noise, are not detected.
 """
 
 from collections import deque
@@ -24,32 +25,36 @@ from monitor.common.rates import amount
 from monitor.estimation.detection.motion_kernel import AFTER, AXIS, BEGAN, CHANGED, FIRST, LAST, PEAK, advance, state
 
 BLOCK_S: Final = 0.25
-FEWEST: Final = 8
-"""Samples a block at the least: with fewer its variance says nothing."""
-KNOCK_BLOCKS: Final = 2
-"""A stretch of so many moving blocks, with the sensor left as it lay, is a knock."""
+"""Length of a block in seconds."""
+MIN_BLOCK_SAMPLES: Final = 8
+"""Minimum number of samples in a block. With fewer samples, the variance is too uncertain."""
+MAX_KNOCK_BLOCKS: Final = 2
+"""Largest number of moving blocks of a knock, if the orientation of the sensor did not change."""
 
 Kind = Literal["knock", "motion", "handling/orientation"]
+"""Kinds of motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """One moving stretch."""
+    """One episode of motion."""
 
     kind: Kind
-    since: int  # index of the first sample struck out, missing ones counted
-    until: int  # index after the last
-    seconds: float  # moving, without what is struck out before and after
-    axis: str  # where the excursion is largest against the noise
-    peak: float  # the excursion from the mean at rest, rad/s or m/s²
-    text: str
+    since: int  # index of the first removed sample, including missing samples
+    until: int  # index after the last removed sample
+    seconds: float  # duration of the motion, without the blocks removed before and after
+    axis: str  # axis with the largest excursion relative to the noise
+    peak: float  # excursion from the mean at rest, rad/s or m/s²
+    text: str  # description for users
 
 
 class Rest:
-    """Finds and strikes out the moving stretches of a stream of samples.
+    """Motion detector that removes the samples in motion from a stream.
 
-    Args:
-        rate_hz: samples a second
+    Parameters
+    ----------
+    rate_hz : float
+        Sample rate in Hz.
 
     >>> rest = Rest(100.0)
     >>> still = np.random.default_rng(0).normal(0.0, 1e-3, (2000, 6))
@@ -67,44 +72,45 @@ class Rest:
         self._rate_hz = rate_hz
         self._size = block_size(rate_hz)
         self._state = state()
-        self._held: deque[tuple[int, SampleBlock]] = deque()  # with the index of their first rows
-        self._index = 0  # of the next sample
+        self._held: deque[tuple[int, SampleBlock]] = deque()  # blocks with the index of their first row
+        self._index = 0  # index of the next sample
         self._motions: list[Motion] = []
 
     @property
     def moving(self) -> bool:
-        """Whether the newest judged block belongs to a moving stretch."""
+        """True if the newest decided block belongs to an episode of motion."""
         return bool(self._state.place[BEGAN] >= 0)
 
     @property
     def held_back_s(self) -> float:
-        """Longest delay of a sample, s."""
+        """Longest delay of a sample in seconds."""
         return 2 * self._size / self._rate_hz
 
     def update(self, samples: SampleBlock) -> list[SampleBlock]:
-        """The samples that have become final, oldest first."""
+        """Process a block, and return the samples that have become final, oldest first."""
         first = self._index + samples.lost
         self._held.append((first, samples))
         self._index = first + len(samples)
-        blocks, moving, episodes = _room(len(samples), self._size)
+        blocks, moving, episodes = _allocate_output(len(samples), self._size)
         filled = advance(samples.values, first, self._size, False, self._state, blocks, moving, episodes)
-        return self._let_go(blocks[: filled[0]], moving[: filled[0]], episodes[: filled[1]])
+        return self._release(blocks[: filled[0]], moving[: filled[0]], episodes[: filled[1]])
 
     def flush(self) -> list[SampleBlock]:
-        """What is held back, judged as if the stream ended here; an open stretch ends too."""
-        blocks, moving, episodes = _room(0, self._size)
+        """Return the delayed samples as if the stream ended here. An open episode ends, too."""
+        blocks, moving, episodes = _allocate_output(0, self._size)
         filled = advance(
             _read_only(np.empty((0, len(AXES)))), 0, self._size, True, self._state, blocks, moving, episodes
         )
-        return self._let_go(blocks[: filled[0]], moving[: filled[0]], episodes[: filled[1]])
+        return self._release(blocks[: filled[0]], moving[: filled[0]], episodes[: filled[1]])
 
     def take(self) -> list[Motion]:
-        """Stretches that ended since the last call."""
+        """Return the episodes that ended since the last call."""
         motions, self._motions = self._motions, []
         return motions
 
-    def _let_go(self, blocks: Ints, moving: Ints, episodes: Floats) -> list[SampleBlock]:
-        motions = [_motion(episode, self._size, self._rate_hz) for episode in episodes]
+    def _release(self, blocks: Ints, moving: Ints, episodes: Floats) -> list[SampleBlock]:
+        """Store the episodes, and return the samples of the decided blocks."""
+        motions = [_make_motion(episode, self._size, self._rate_hz) for episode in episodes]
         self._motions += motions
         self.episodes += len(motions)
         out: list[SampleBlock] = []
@@ -117,50 +123,71 @@ class Rest:
             rows = (first + np.arange(len(samples))) // self._size
             struck = moving[np.searchsorted(blocks, rows)].astype(bool)
             self.moved_samples += int(struck.sum())
-            out.append(_strike(samples, struck))
+            out.append(_remove_moving(samples, struck))
         return out
 
 
 def find(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], list[Motion]]:
-    """Moving samples [n] of a whole recording [n, 6] on its grid (NaN = missing), and the stretches they form."""
+    """Find motion in a whole recording on a regular grid.
+
+    Parameters
+    ----------
+    values : ndarray of float64, shape (n, 6)
+        Samples in rad/s and m/s²; NaN means missing.
+    rate_hz : float
+        Sample rate in Hz.
+
+    Returns
+    -------
+    moving : ndarray of bool, shape (n,)
+        True for samples in motion.
+    motions : list of Motion
+        Episodes of motion.
+    """
     size = block_size(rate_hz)
-    known = state()
-    blocks, moving, episodes = _room(len(values), size)
-    verdicts, stretches = advance(_read_only(values), 0, size, True, known, blocks, moving, episodes)
+    kernel_state = state()
+    blocks, moving, episodes = _allocate_output(len(values), size)
+    verdicts, stretches = advance(_read_only(values), 0, size, True, kernel_state, blocks, moving, episodes)
     mask = np.repeat(moving[:verdicts].astype(bool), size)[: len(values)]
-    return mask, [_motion(episode, size, rate_hz) for episode in episodes[:stretches]]
+    return mask, [_make_motion(episode, size, rate_hz) for episode in episodes[:stretches]]
 
 
 def block_size(rate_hz: float) -> int:
-    """Samples of a block."""
-    return max(round(BLOCK_S * rate_hz), FEWEST)
+    """Return the number of samples in a block."""
+    return max(round(BLOCK_S * rate_hz), MIN_BLOCK_SAMPLES)
 
 
 def _read_only(values: Floats) -> Floats:
-    """Return the samples as those of a ``SampleBlock`` are: other layouts and access flags would be compiled anew."""
+    """Return the samples as a contiguous read-only array, like those of a ``SampleBlock``.
+
+    Other layouts and access flags would compile the kernel again.
+    """
     view = np.ascontiguousarray(values, np.float64).view()
     view.flags.writeable = False
     return view
 
 
-def _room(rows: int, size: int) -> tuple[Ints, Ints, Floats]:
+def _allocate_output(rows: int, size: int) -> tuple[Ints, Ints, Floats]:
+    """Allocate the output arrays of the kernel."""
     n = rows // size + 4
     return np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros((n, 5))
 
 
-def _strike(samples: SampleBlock, struck: NDArray[np.bool_]) -> SampleBlock:
+def _remove_moving(samples: SampleBlock, struck: NDArray[np.bool_]) -> SampleBlock:
+    """Replace the samples in motion by NaN."""
     if not struck.any():
         return samples
     values = np.where(struck[:, None], np.nan, samples.values)
     return block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
 
 
-def _motion(episode: Floats, size: int, rate_hz: float) -> Motion:
+def _make_motion(episode: Floats, size: int, rate_hz: float) -> Motion:
+    """Convert an episode of the kernel to a ``Motion``."""
     first, last = int(episode[FIRST]), int(episode[LAST])
     axis, peak = AXES[int(episode[AXIS])], float(episode[PEAK])
     moving = last - first + 1
     seconds = moving * size / rate_hz
-    kind: Kind = "handling/orientation" if episode[CHANGED] else "knock" if moving <= KNOCK_BLOCKS else "motion"
+    kind: Kind = "handling/orientation" if episode[CHANGED] else "knock" if moving <= MAX_KNOCK_BLOCKS else "motion"
     size_text = f"{axis} up to {amount(axis, peak)}"
     verb = {"knock": "knocked", "motion": "moved", "handling/orientation": "handled, and left in another orientation,"}
     text = f"{verb[kind]} for {seconds:.1f} s: {size_text}"

@@ -1,16 +1,17 @@
-"""The compiled part of ``rest``: short blocks of samples, what is usual at rest, and the verdict on each block.
+"""Compiled kernel of the motion detector: blocks of samples, the reference at rest, and the decision for each block.
 
-A block holds two numbers an axis, the logarithm of its variance and its mean, both without the one sample furthest
-from the mean (an outlier is isolated, a knock rings). The reference is the median and the half-width between quartiles
-of both over the last LEARNED blocks at rest, exact by insertion into a sorted ring: up to a quarter of strange blocks
-in it does no harm, and drift within it widens the band it is judged by.
+A block is described by two numbers per axis: the logarithm of its variance and its mean. Both exclude the sample
+furthest from the mean, because an outlier is isolated while a knock rings. The reference is the median and the
+half-width between the quartiles of both numbers over the last ``LEARNED`` blocks at rest. It is computed exactly by
+insertion into a sorted ring. Up to a quarter of unusual blocks does not affect it, and drift within the ring widens the
+accepted band.
 
-Verdict: "moving" if the variance of any axis is loud or its mean is off. A new mean at which all axes hold still is a
-new orientation and taken over; what persists in a steady way replaces the reference; so does what is far quieter than
-all that was learned, as then the reference was learned in motion.
+A block is moving if the variance of any axis is too large or its mean is off. If all axes are still at a new mean, this
+is a new orientation, and the reference is shifted. A disturbance that persists steadily replaces the reference. Blocks
+far quieter than all learned ones replace it as well, because the reference was then learned in motion.
 
-Never called with samples out of order; which rows lie in which block is decided by their index alone, so that any cut
-of the stream gives the same verdicts.
+Samples must be passed in order. Their index alone determines the block of a row, so the decisions do not depend on how
+the stream is divided.
 """
 
 from math import exp, inf, log, nan, sqrt
@@ -24,73 +25,101 @@ from monitor.common.compiled import compiled
 AXES: Final = 6
 GYROS: Final = 3
 LEARNED: Final = 240
-"""Blocks at rest that the reference is made of, and blocks of steady unrest that make a new one: 60 s of 0.25 s."""
+"""Number of blocks at rest in the reference, and of steady moving blocks that make a new one: 60 s of 0.25 s."""
 LEAST: Final = 8
-"""Blocks at rest that make a first reference; its bands are twice as wide as later."""
+"""Minimum number of blocks at rest for a first reference. Its bands are twice as wide as later."""
 BAND: Final = 8.0
-"""Standard deviations (from quartiles) of a block's mean or log variance that are still rest."""
+"""Deviation of the mean or the log variance of a block that is still rest, in standard deviations (from quartiles)."""
 LOUDER: Final = log(4.0)
-"""The variance must rise by this at the least: smaller changes are left to the detector of changes."""
+"""Minimum rise of the log variance for motion. Smaller changes are left to the change detector."""
 LOUDEST: Final = log(100.0)
-"""A greater rise is unrest however much the variance scattered: the reference had motion in it."""
+"""Rise of the log variance that is always motion, even if the reference scatters more because it contained motion."""
 TOGETHER: Final = log(2.5)
-"""Mean rise over all axes at the least, where all together tell what none does alone."""
+"""Minimum mean rise over all axes, for motion that no single axis shows."""
 TOGGLE: Final = 0.25
-"""Variance of toggling between two neighbouring levels, in steps²."""
+"""Variance of toggling between two neighbouring levels, in squared steps."""
 DRIFT: Final = 100.0
-"""Means are never at rest further away than this times what the noise within blocks explains."""
+"""Maximum deviation of a mean at rest, as a multiple of what the noise within blocks explains."""
 QUIETER: Final = log(9.0)
-"""Most axes so far below the lower quartile for LEAST blocks: the reference was learned in motion."""
+"""Distance of the log variance below the lower quartile that replaces the reference.
+
+If most axes are this quiet for ``LEAST`` blocks, the reference was learned in motion.
+"""
 SURE: Final = (0.1,) * 3 + (1.0,) * 3
-"""rad/s and m/s²: rms within a block, or change from block to block, that no MEMS sensor shows at rest. Judged by this
-only until there is a reference."""
+"""Limits in rad/s and m/s² that no MEMS sensor exceeds at rest.
+
+They apply to the rms within a block and to the change between blocks, and only until there is a reference.
+"""
 SETTLED: Final = 4
-"""Blocks without change at which another mean is a new orientation."""
+"""Number of blocks without change after which another mean is a new orientation."""
 NEW_BIAS: Final = 0.035
-"""rad/s, 2 °/s: a gyro's mean may differ by this after handling (g-sensitivity, a bias step); more is rotation,"""
+"""Deviation of the mean of a gyroscope that is accepted after handling: 0.035 rad/s, 2 °/s.
+
+It covers g-sensitivity and bias steps. A larger deviation is rotation, with the exception of ``SPUN``.
+"""
 SPUN: Final = 40
-"""unless held for so many blocks (10 s) without other signs of motion: the reference was learned in rotation."""
+"""Number of blocks (10 s) after which a larger mean without other signs of motion is accepted.
+
+The reference was then learned in rotation.
+"""
 AFTER: Final = 2
-"""Blocks after a moving one that are struck out too; one before."""
+"""Number of blocks removed after a moving block. One block before it is removed as well."""
 APART: Final = 4
-"""Blocks at rest that end an episode."""
+"""Number of blocks at rest that end an episode."""
 LOOK_EVERY: Final = 20
-"""Blocks between looks whether an episode has become steady."""
+"""Number of blocks between two tests whether an episode has become steady."""
 WANDER: Final = 4.0
-"""Times the scatter of means that the scatter within blocks explains: above, the means move."""
+"""Largest ratio of the scatter of means to what the scatter within blocks explains. Above it, the means move."""
 SIGMA_OF_QUARTER: Final = 0.6745
 """Upper quartile of the standard normal distribution."""
 NOTHING: Final = 1e-30
-"""Variance that a constant is given."""
+"""Variance assigned to a constant."""
 FEWEST: Final = 4
-"""Samples of a block, and half of its places, that must be there for a verdict."""
+"""Minimum number of samples in a block for a decision. At least half of the block must be present as well."""
 
 OPEN, HELD, HELD_MOVES, QUIET_RUN, BEGAN, LATEST, STILL, QUIET, RECENT, TURNED = range(10)
-"""Of ``place``: the block being filled, the one whose verdict is held back (-1 = none) and that verdict, quiet blocks
-since the last moving one, first (-1 = none) and latest moving block of the open episode, blocks that held still, blocks
-quieter than the reference, blocks ever, whether the orientation changed in the episode."""
+"""Elements of ``State.place``:
+
+- ``OPEN``: block being filled.
+- ``HELD``, ``HELD_MOVES``: block whose decision is pending (-1 means none), and this decision.
+- ``QUIET_RUN``: quiet blocks since the last moving one.
+- ``BEGAN``, ``LATEST``: first (-1 means none) and latest moving block of the open episode.
+- ``STILL``: blocks that were still.
+- ``QUIET``: blocks quieter than the reference.
+- ``RECENT``: total number of blocks.
+- ``TURNED``: whether the orientation changed in the episode.
+"""
 FIRST, LAST, CHANGED, AXIS, PEAK = range(5)
 """Columns of an episode: first and last moving block, whether the orientation changed, axis and size of the peak."""
 LOG_VARIANCE, MEAN = 0, 1
+"""Kinds of block statistics, the first index of the rings."""
 COUNT, SHIFT, SUM, SQUARES, LOW, HIGH, BEFORE, STEP = range(8)
-"""Of ``open``: samples, the first of them, sums about it, extremes; the sample before; the smallest step ever seen."""
+"""Columns of ``State.open``:
+
+- ``COUNT``: number of samples.
+- ``SHIFT``: first sample.
+- ``SUM``, ``SQUARES``: sums of the deviations from the first sample and of their squares.
+- ``LOW``, ``HIGH``: extremes.
+- ``BEFORE``: previous sample.
+- ``STEP``: smallest step so far.
+"""
 
 
 class State(NamedTuple):
-    """All that is remembered; arrays only."""
+    """State of the motion detector."""
 
-    place: Ints  # [10]
-    open: Floats  # [6, 8] the block being filled
-    seen: Ints  # [6] blocks at rest ever learned
-    shifted: Floats  # [6] what orientations taken over have added to the means, since the ring held nothing else
-    ring: Floats  # [2, 6, LEARNED] log variance and mean of blocks at rest, in order of coming
+    place: Ints  # [10] counters and flags, see OPEN
+    open: Floats  # [6, 8] block being filled, see COUNT
+    seen: Ints  # [6] total number of blocks at rest that were learned
+    shifted: Floats  # [6] sum of the shifts of the means by new orientations that are still in the ring
+    ring: Floats  # [2, 6, LEARNED] log variance and mean of blocks at rest, in order of time
     ordered: Floats  # [2, 6, LEARNED] the same, sorted
-    recent: Floats  # [2, 6, LEARNED] of all blocks
-    peaks: Floats  # [2, 6] of the open episode: largest excursion in SI, and over the noise
+    recent: Floats  # [2, 6, LEARNED] log variance and mean of all recent blocks
+    peaks: Floats  # [2, 6] largest excursion of the open episode, in SI and relative to the noise
 
 
 def state() -> State:
-    """Nothing seen yet."""
+    """Return the initial state."""
     place = np.zeros(10, np.int64)
     place[[HELD, BEGAN]] = -1
     place[QUIET_RUN] = APART
@@ -106,19 +135,30 @@ def state() -> State:
 def advance(
     values: Floats, first: int, size: int, ends: bool, s: State, blocks: Ints, moving: Ints, episodes: Floats
 ) -> Ints:
-    """Take consecutive rows in; verdicts and episodes that became final go out.
+    """Process consecutive rows, and return the decisions and episodes that have become final.
 
-    Args:
-        values: [n, 6] in SI, NaN = missing
-        first: index of the first row, missing samples counted
-        size: samples a block
-        ends: True if the stream ends after these rows: the open block is judged, what is held back goes out, and an
-            open episode ends
-        blocks, moving: [≥ n/size + 2] filled: number of a block, and whether it moves
-        episodes: [≥ n/size + 2, 5] filled: first and last moving block, whether the orientation changed, axis and size
-            of the peak
-    Returns:
-        How many verdicts and episodes were filled in.
+    Parameters
+    ----------
+    values : ndarray of float64, shape (n, 6)
+        Samples in rad/s and m/s²; NaN means missing.
+    first : int
+        Index of the first row, including missing samples.
+    size : int
+        Number of samples in a block.
+    ends : bool
+        True if the stream ends after these rows. The open block is then decided, the pending decision is returned, and
+        an open episode ends.
+    s : State
+        State, updated in place.
+    blocks, moving : ndarray of int64, shape (at least n/size + 2,)
+        Result: number of each block, and 1 if it moves.
+    episodes : ndarray of float64, shape (at least n/size + 2, 5)
+        Result: first and last moving block, whether the orientation changed, axis and size of the peak.
+
+    Returns
+    -------
+    ndarray of int64, shape (2,)
+        Number of decisions and number of episodes.
     """
     filled = np.zeros(2, np.int64)
     for i in range(values.shape[0]):
@@ -154,7 +194,7 @@ def advance(
 
 @compiled
 def _close(size: int, s: State, blocks: Ints, moving: Ints, episodes: Floats, filled: Ints) -> None:
-    """The open block is complete: measure, judge, learn, let go of the one before."""
+    """Complete the open block: measure, decide, learn, and release the previous block."""
     number = s.place[OPEN]
     follows = s.place[HELD] == number - 1
     now = np.empty((2, AXES))
@@ -178,7 +218,7 @@ def _close(size: int, s: State, blocks: Ints, moving: Ints, episodes: Floats, fi
 
 @compiled
 def _measure(a: int, s: State, now: Floats) -> None:
-    """Log variance and mean of one axis of the block, the sample furthest from the mean left out."""
+    """Compute log variance and mean of one axis of the block without the sample furthest from the mean."""
     n = s.open[a, COUNT]
     mean = s.open[a, SUM] / n
     square = s.open[a, SQUARES] - n * mean * mean
@@ -187,23 +227,23 @@ def _measure(a: int, s: State, now: Floats) -> None:
     furthest = high if high > -low else low
     square = max(square - furthest * furthest * n / (n - 1.0), 0.0)
     mean -= furthest / (n - 1.0)
-    floor = s.open[a, STEP] ** 2 / 12.0  # what rounding may hide
+    floor = s.open[a, STEP] ** 2 / 12.0  # variance that rounding may hide
     now[LOG_VARIANCE, a] = log(square / (n - 2.0) + floor + NOTHING)
     now[MEAN, a] = mean
     floor = log(floor + NOTHING)
-    if s.ordered[LOG_VARIANCE, a, 0] < floor:  # the step was not known when these were learned
+    if s.ordered[LOG_VARIANCE, a, 0] < floor:  # the step was not known when these values were learned
         for ring in (s.ordered, s.ring, s.recent):
             for k in range(LEARNED):
                 if ring[LOG_VARIANCE, a, k] < floor:
                     ring[LOG_VARIANCE, a, k] = floor
 
 
-# --- judging
+# --- decision
 
 
 @compiled
 def _judge(now: Floats, follows: bool, size: int, s: State) -> bool:
-    """Whether the block moves; orientations are taken over, and references replaced, on the way."""
+    """Return True if the block moves. A new orientation shifts the reference."""
     loud, off, rotates = False, False, False
     still = follows
     before = (s.place[RECENT] - 1) % LEARNED
@@ -219,7 +259,7 @@ def _judge(now: Floats, follows: bool, size: int, s: State) -> bool:
         young = 1.0 + LEAST / n
         step = s.open[a, STEP]
         middle = _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)
-        # of the logarithm of χ² over its freedom, nearly
+        # approximately the standard deviation of the logarithm of χ² over its degrees of freedom
         sigma = min(max(_scatter(s.ordered[LOG_VARIANCE, a], n), sqrt(2.0 / (size - 2.0))), LOUDEST / BAND)
         loud |= exp(now[LOG_VARIANCE, a]) > exp(middle + young * max(LOUDER, BAND * sigma)) + step * step
         rise = log(max(exp(now[LOG_VARIANCE, a]) - TOGGLE * step * step, NOTHING)) - middle
@@ -243,14 +283,14 @@ def _judge(now: Floats, follows: bool, size: int, s: State) -> bool:
 
 @compiled
 def _band(a: int, n: int, size: int, s: State) -> float:
-    """Distance of a block's mean from the median of the means that is still rest."""
+    """Return the distance of the mean of a block from the median of the means that is still rest."""
     explained = exp(0.5 * _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)) / sqrt(size)
     return BAND * min(max(_scatter(s.ordered[MEAN, a], n), explained), DRIFT / BAND * explained)
 
 
 @compiled
 def _take_over(now: Floats, s: State) -> None:
-    """The means at which all axes hold still are those of rest now; their scatter is what it was."""
+    """Shift the reference to the current means of all axes; their scatter is kept."""
     for a in range(AXES):
         n = min(s.seen[a], LEARNED)
         if now[MEAN, a] == now[MEAN, a] and n > 0:
@@ -267,7 +307,7 @@ def _take_over(now: Floats, s: State) -> None:
 
 @compiled
 def _learn(now: Floats, moves: bool, number: int, size: int, s: State) -> None:
-    """The block enters the reference if it is at rest; the reference is replaced where it has proved wrong."""
+    """Add a block at rest to the reference, or replace a reference that has proved wrong."""
     newest = s.place[RECENT] % LEARNED
     s.place[RECENT] += 1
     quieter = measured = 0
@@ -294,7 +334,7 @@ def _learn(now: Floats, moves: bool, number: int, size: int, s: State) -> None:
 
 @compiled
 def _insert(a: int, log_variance: float, mean: float, s: State) -> None:
-    """One more value in both rings of an axis; the oldest leaves."""
+    """Add one value to both rings of an axis, and remove the oldest."""
     at, n = s.seen[a] % LEARNED, min(s.seen[a], LEARNED)
     for kind in range(2):
         value, ordered = log_variance if kind == LOG_VARIANCE else mean, s.ordered[kind, a]
@@ -316,7 +356,7 @@ def _insert(a: int, log_variance: float, mean: float, s: State) -> None:
 
 @compiled
 def _rank(ordered: Floats, n: int, value: float) -> int:
-    """Where a value stands in a sorted ring."""
+    """Return the position of a value in a sorted ring."""
     low, high = 0, n - 1
     while low < high:
         middle = (low + high) // 2
@@ -329,7 +369,7 @@ def _rank(ordered: Floats, n: int, value: float) -> int:
 
 @compiled
 def _begin_anew(blocks: int, s: State) -> None:
-    """The reference is made of the last blocks and nothing else."""
+    """Replace the reference by the most recent blocks."""
     for a in range(AXES):
         s.seen[a], s.shifted[a] = 0, 0.0
         for kind in range(2):
@@ -344,7 +384,10 @@ def _begin_anew(blocks: int, s: State) -> None:
 
 @compiled
 def _steady(size: int, s: State) -> bool:
-    """Whether the last LEARNED blocks are one steady state: both halves agree, nothing bursts, no mean wanders."""
+    """Return True if the last ``LEARNED`` blocks are one steady state.
+
+    Both halves must agree, without bursts and without a mean that wanders.
+    """
     half, ordered = LEARNED // 2, np.empty(LEARNED)
     for a in range(AXES):
         n = _sort_recent(s, MEAN, a, 0, LEARNED, ordered)
@@ -373,7 +416,7 @@ def _steady(size: int, s: State) -> bool:
 
 @compiled
 def _sort_recent(s: State, kind: int, a: int, begin: int, end: int, ordered: Floats) -> int:
-    """Sort the values that are not NaN of the recent blocks begin ≤ k < end, oldest first; return how many."""
+    """Sort the values that are not NaN of the recent blocks begin ≤ k < end, oldest first; return their number."""
     n = 0
     for k in range(begin, end):
         value = s.recent[kind, a, (s.place[RECENT] + k) % LEARNED]
@@ -404,23 +447,23 @@ def _interpolate(ordered: Floats, n: int, p: float) -> float:
 
 @compiled
 def _quantile(ordered: Floats, n: int, p: float) -> float:
-    """Of the first n of a sorted ring, nearest rank."""
+    """Return the quantile of the first n of a sorted ring by the nearest rank."""
     return float(ordered[int(p * (n - 1) + 0.5)])
 
 
 @compiled
 def _scatter(ordered: Floats, n: int) -> float:
-    """Standard deviation by the wider half between quartiles."""
+    """Return the standard deviation estimated from the wider half between the quartiles."""
     low, middle, high = _quantile(ordered, n, 0.25), _quantile(ordered, n, 0.5), _quantile(ordered, n, 0.75)
     return max(high - middle, middle - low) / SIGMA_OF_QUARTER
 
 
-# --- giving out
+# --- output
 
 
 @compiled
 def _remember(now: Floats, number: int, s: State) -> None:
-    """A moving block: the episode goes on, or begins, and its peaks grow."""
+    """Start or continue an episode with a moving block, and update its peaks."""
     if s.place[BEGAN] < 0:
         s.place[BEGAN], s.place[TURNED] = number, 0
         for a in range(AXES):
@@ -441,6 +484,7 @@ def _remember(now: Floats, number: int, s: State) -> None:
 
 @compiled
 def _emit(s: State, blocks: Ints, moving: Ints, filled: Ints) -> None:
+    """Write the pending decision to the output."""
     if s.place[HELD] >= 0:
         blocks[filled[0]], moving[filled[0]] = s.place[HELD], s.place[HELD_MOVES]
         filled[0] += 1
@@ -448,6 +492,7 @@ def _emit(s: State, blocks: Ints, moving: Ints, filled: Ints) -> None:
 
 @compiled
 def _end(s: State, episodes: Floats, filled: Ints) -> None:
+    """Write the open episode to the output and close it."""
     axis = 0
     for a in range(1, AXES):
         if s.peaks[1, a] > s.peaks[1, axis]:

@@ -1,9 +1,9 @@
-"""Rows that the sensor had not measured anew: what share of a recording repeats the row before for no better reason.
+"""Share of rows in a recording that repeat the previous row because the sensor had no new measurement.
 
-In comes a recording; out goes one number. Rows repeat by coarse resolution too, but then axes do so independently of
-each other, and held rows repeat in all axes at once: that tells them apart. Noise may change during a recording, so
-that the share is solved for in stretches of ROWS, MOST of them spread over the recording, and their median is the
-answer. It takes two axes that move; with fewer it is 0.
+Rows also repeat because of coarse resolution, but then the axes repeat independently of each other. A repeated
+measurement repeats all axes at once, which distinguishes the two. The noise may change during a recording. The share is
+therefore computed in up to ``MAX_STRETCHES`` stretches of ``ROWS`` rows, spread over the recording, and the median is
+returned. At least two axes with data are needed; otherwise the share is 0.
 """
 
 from typing import Final
@@ -15,17 +15,19 @@ from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 
 ROWS: Final = 1000
-"""Of a stretch: within it noise is taken to be the same."""
-MOST: Final = 500
-"""Stretches."""
-HALVINGS: Final = 40
+"""Number of rows in a stretch, within which the noise is assumed constant."""
+MAX_STRETCHES: Final = 500
+"""Maximum number of stretches."""
+BISECTIONS: Final = 40
+"""Number of bisection steps."""
 
 
 def stale_share(values: Floats) -> float:
-    """Share of rows [n, 6] that repeat the one before because the sensor had not measured anew; NaN = missing.
+    """Return the share of rows [n, 6] that repeat the previous one because the sensor had no new measurement.
 
-    Where a share s of rows is held, axis a repeats in p_a = s + (1 - s) q_a of the rows, q_a by its coarse resolution,
-    and all axes at once in s + (1 - s) Π q_a, as noises of axes are independent: one equation for s.
+    Let s be the share of repeated rows. Axis a repeats in p_a = s + (1 - s) q_a of the rows, where q_a is due to its
+    resolution. All axes repeat at once in s + (1 - s) Π q_a, because the noises of the axes are independent. This is
+    one equation for s. NaN means missing.
 
     >>> noise = np.random.default_rng(0).normal(size=(5000, 6)).round()
     >>> stale_share(noise), round(stale_share(noise.repeat(2, axis=0)), 1)
@@ -34,19 +36,19 @@ def stale_share(values: Floats) -> float:
     there = np.array([not np.isnan(column[:1]).all() or not np.isnan(column).all() for column in values.T])
     if there.sum() < 2 or len(values) < 2:
         return 0.0
-    begins = np.linspace(0, max(len(values) - ROWS, 0), min(-(-len(values) // ROWS), MOST)).astype(np.int64)
+    begins = np.linspace(0, max(len(values) - ROWS, 0), min(-(-len(values) // ROWS), MAX_STRETCHES)).astype(np.int64)
     asked, whole = np.zeros(begins.size, np.int64), np.zeros(begins.size, np.int64)
     repeats = np.zeros((begins.size, values.shape[1]), np.int64)
     _count(values, there, begins, asked, repeats, whole)
     some = asked > 0
     if not some.any():
         return 0.0
-    return float(np.median(_held(repeats[some][:, there] / asked[some, None], whole[some] / asked[some])))
+    return float(np.median(_solve_share(repeats[some][:, there] / asked[some, None], whole[some] / asked[some])))
 
 
 @compiled
 def _count(values: Floats, there: NDArray[np.bool_], begins: Ints, asked: Ints, repeats: Ints, whole: Ints) -> None:
-    """Pairs of rows of each stretch: how many lack nothing, in how many each axis repeats, and in how many all do."""
+    """Count the complete pairs of rows of each stretch, those in which each axis repeats, and those in which all do."""
     for stretch in range(begins.size):
         begin = begins[stretch]
         for i in range(begin + 1, min(begin + ROWS, len(values))):
@@ -67,14 +69,14 @@ def _count(values: Floats, there: NDArray[np.bool_], begins: Ints, asked: Ints, 
                         repeats[stretch, a] += values[i, a] == values[i - 1, a]
 
 
-def _held(each: Floats, all_of_them: Floats) -> Floats:
-    """The shares s [k] that solve all_of_them = s + (1 - s) Π (each - s)/(1 - s), each [k, axes], by halving."""
+def _solve_share(each: Floats, all_of_them: Floats) -> Floats:
+    """Solve all_of_them = s + (1 - s) Π (each - s)/(1 - s) for the shares s [k] by bisection; ``each`` is [k, axes]."""
     explained = each.prod(axis=1)
-    # within its counting error; an axis that never moves, each = 1, says nothing for or against
+    # no repeated rows within the counting error; a constant axis, each = 1, does not affect the test
     none = all_of_them <= explained + 3.0 * np.sqrt(explained / ROWS)
     each, all_of_them = each[~none], all_of_them[~none]
     low, high = np.zeros(len(each)), np.minimum(each.min(axis=1), all_of_them)
-    for _ in range(HALVINGS):
+    for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
         by_chance = ((each - middle[:, None]) / (1.0 - middle[:, None])).prod(axis=1)
         more = middle + (1.0 - middle) * by_chance < all_of_them

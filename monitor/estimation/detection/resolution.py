@@ -1,9 +1,9 @@
-"""Coarse values: steps that are as large as the noise, so that quantization shapes what is seen of it.
+"""Detection of coarse resolution: quantization steps as large as the noise, which distort its measurement.
 
-In comes a recording; out goes, for each axis, the step of the grid that all its values lie on, and the noise from
-sample to sample. Both are asked of at most MOST stretches of ROWS samples, spread over the recording. Steps are the
-distances of neighbouring values that occur; the noise is by the mean distance of samples that follow each other, which
-coarse steps leave as it is, and which a few outliers or a slow drift move little.
+For each axis, the step of the grid of all values and the noise from sample to sample are determined. Both use at most
+``MAX_STRETCHES`` stretches of ``ROWS`` samples, spread over the recording. The step is the distance of neighbouring
+values that occur. The noise is computed from the mean distance of successive samples. Coarse steps do not change this
+mean, and a few outliers or a slow drift change it little.
 """
 
 from dataclasses import dataclass
@@ -14,27 +14,31 @@ import numpy as np
 from drivers.sample import AXES, Floats
 
 COARSE: Final = 0.5
-"""Of the noise: smaller steps add two percent to its variance at most."""
+"""Minimum step as a share of the noise. Smaller steps add at most two percent to the variance of the noise."""
 ROWS: Final = 4096
-MOST: Final = 16
-"""Stretches."""
+"""Maximum number of samples in a stretch."""
+MAX_STRETCHES: Final = 16
+"""Maximum number of stretches."""
 ON_GRID: Final = 0.1
-"""Of a step: values nearer to a whole number of steps are on its grid, which numbers of 32 bits are."""
+"""Deviation from a whole number of steps, as a share of the step, within which a value is on the grid.
+
+Values rounded to float32 are on the grid.
+"""
 GAUSSIAN: Final = 0.8862269254527580
-"""√π/2: σ over the mean distance of two samples, of Gaussian noise."""
+"""√π/2, the ratio of σ to the mean distance of two samples of Gaussian noise."""
 
 
 @dataclass(frozen=True, slots=True)
-class Steps:
-    """Steps of the values of one axis."""
+class QuantizationStep:
+    """Quantization step and noise of one axis."""
 
     axis: int  # index into AXES
     step: float  # rad/s or m/s²
-    noise: float  # σ from sample to sample, its quantization included, rad/s or m/s²
+    noise: float  # σ from sample to sample, including quantization, rad/s or m/s²
 
 
-def coarse(values: Floats) -> list[Steps]:
-    """The axes whose values [n, 6] come in steps of COARSE or more of their noise.
+def coarse(values: Floats) -> list[QuantizationStep]:
+    """Return the axes whose values [n, 6] have steps of at least ``COARSE`` of their noise.
 
     >>> noise = np.random.default_rng(0).standard_normal((20_000, 6))
     >>> noise[:, 4] = noise[:, 4].round()
@@ -42,7 +46,7 @@ def coarse(values: Floats) -> list[Steps]:
     [(4, 1.0, 1.0)]
     """
     rows = min(ROWS, len(values))
-    count = min(MOST, -(-len(values) // ROWS))
+    count = min(MAX_STRETCHES, -(-len(values) // ROWS))
     begins = np.linspace(0, len(values) - rows, count).astype(np.int64)
     found = []
     for axis in range(len(AXES)) if rows > 1 else ():
@@ -53,12 +57,12 @@ def coarse(values: Floats) -> list[Steps]:
         levels = np.unique(np.concatenate(parts))
         step = _step(levels[np.isfinite(levels)], COARSE * noise)
         if step is not None and noise > 0.0:
-            found.append(Steps(axis, step, noise))
+            found.append(QuantizationStep(axis, step, noise))
     return found
 
 
 def _step(levels: Floats, least: float) -> float | None:
-    """The step of a grid that these values lie on, where it is ``least`` or more."""
+    """Return the step of the grid on which all values lie, or None without a grid of steps of at least ``least``."""
     apart = np.diff(levels)
     if not apart.size or not apart.min() >= least:
         return None

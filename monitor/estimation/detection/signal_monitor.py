@@ -1,8 +1,8 @@
-"""Watches over the samples of one device on their way to the estimate: is it at rest, has its noise changed?
+"""Motion and change detection on the samples of one device, before they reach the estimator.
 
-Comes in: blocks in order. Goes out: the blocks for the estimate, those of moving stretches struck out where that is
-wanted; and what was found, as events with the times of the samples. A change of noise names the axis whose estimate is
-to begin anew, and with how many samples. The detector of changes never sees a moving stretch.
+The monitor receives blocks in order and returns the blocks for the estimator. On request, samples in motion are removed
+from them. The findings are events with the times of the samples. A noise change names the axis whose estimate must
+restart, and the number of samples to keep. The change detector never receives samples in motion.
 """
 
 from dataclasses import dataclass
@@ -13,27 +13,35 @@ from monitor.estimation.detection.change_detection import Change, ChangeDetector
 from monitor.estimation.detection.motion_detection import Motion, Rest
 
 OTHER_RATE: Final = 0.02
-"""A rate known better by less than this share is the same to blocks of a quarter of a second."""
-LONGEST_HOLE: Final = 10_000_000
-"""Samples missing at once, over which the detector of changes still passes, in 1.6 s; after more it learns anew."""
+"""Relative change of the sample rate below which the detectors continue. Blocks of a quarter of a second stay valid."""
+MAX_SKIPPED_SAMPLES: Final = 10_000_000
+"""Largest gap that the change detector processes as missing samples, which takes 1.6 s.
+
+After a longer gap, the detector starts again.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Restart:
-    """The estimate of one axis is to begin anew."""
+    """Request to restart the estimate of one axis."""
 
-    axis: int
-    samples: int  # the newest that belong to the new noise, missing ones included
+    axis: int  # index into AXES
+    samples: int  # number of newest samples that belong to the new noise, including missing ones
 
 
 class Watch:
-    """Motion and changes of one device.
+    """Motion and change detection for one device.
 
-    Args:
-        rate_hz: samples a second
-        leave_out: hand on moving stretches as missing; else all samples pass at once, as they are
-        alarms_per_day: false alarms of changes to bear; 0 = do not look for changes
-        keep_still: have ``take_still`` give the samples at rest, whatever is handed on
+    Parameters
+    ----------
+    rate_hz : float
+        Sample rate in Hz.
+    leave_out : bool
+        True to return samples in motion as missing. False to return all samples at once and unchanged.
+    alarms_per_day : float
+        Accepted false alarms of the change detector per day. 0 disables the change detection.
+    keep_still : bool
+        True to make the samples at rest available from ``take_still``, independent of ``leave_out``.
     """
 
     def __init__(
@@ -45,109 +53,115 @@ class Watch:
         self._keep_still = keep_still
         self._still: list[SampleBlock] = []
         self.handled = 0
-        """How often the device was left in another orientation."""
-        self._came = 0  # samples since the start, missing ones included
+        """Number of times that the device was left in another orientation."""
+        self._received = 0  # samples since the start, including missing ones
         self._newest_ns = 0
         self._moved_before = 0
         self._events: list[Event] = []
         self._restarts: list[Restart] = []
-        self._final: list[SampleBlock] = []  # held back at the rate before, to go out with the next
+        self._pending: list[SampleBlock] = []  # delayed at the previous rate, returned with the next block
         self._begin()
 
     @property
     def moving(self) -> bool:
-        """Whether the device is moved just now."""
+        """True if the device is being moved."""
         return self._rest.moving
 
     @property
     def moved_samples(self) -> int:
-        """Samples of moving stretches so far."""
+        """Number of samples in motion so far."""
         return self._moved_before + self._rest.moved_samples
 
     def relabel(self, rate_hz: float) -> None:
-        """The rate is known better; if it is another one, what was learned was of other times."""
+        """Set a more accurate sample rate. If it differs by more than ``OTHER_RATE``, the detectors start again."""
         if abs(rate_hz / self._rate_hz - 1.0) > OTHER_RATE:
-            self._final = self.flush()
+            self._pending = self.flush()
             self._moved_before += self._rest.moved_samples
             self._rate_hz = rate_hz
             self._begin()
 
     def update(self, samples: SampleBlock) -> list[SampleBlock]:
-        """The blocks that are to be estimated now."""
-        self._came += samples.lost + len(samples)
+        """Process a block, and return the blocks to be estimated now."""
+        self._received += samples.lost + len(samples)
         self._newest_ns = int(samples.t_ns[-1])
         still = self._rest.update(samples)
-        self._look(still)
-        return self._let_go(still) if self._leave_out else [samples]
+        self._search(still)
+        return self._with_pending(still) if self._leave_out else [samples]
 
     def flush(self) -> list[SampleBlock]:
-        """What was held back, when no more will come."""
+        """Return the delayed samples at the end of the stream."""
         still = self._rest.flush()
-        self._look(still)
-        return self._let_go(still) if self._leave_out else []
+        self._search(still)
+        return self._with_pending(still) if self._leave_out else []
 
     def take_events(self) -> list[Event]:
-        """What was found since the last call."""
+        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 
     def take_restarts(self) -> list[Restart]:
-        """Which axes are to begin anew, since the last call."""
+        """Return the requests to restart an axis since the last call."""
         restarts, self._restarts = self._restarts, []
         return restarts
 
     def take_still(self) -> list[SampleBlock]:
-        """Samples that are judged, those of moving stretches struck out, since the last call; 0.5 s late."""
+        """Return the decided samples since the last call, with those in motion removed; they are 0.5 s late."""
         still, self._still = self._still, []
         return still
 
     def _begin(self) -> None:
-        self._began = self._came
+        """Start new detectors at the current rate."""
+        self._began = self._received
         self._rest = Rest(self._rate_hz)
-        self._first = 0  # of the samples since then, the first that the detector of changes has seen
+        self._first = 0  # index since then of the first sample that the change detector received
         self._changes = self._detector() if self._alarms_per_day > 0.0 else None
 
     def _detector(self) -> ChangeDetector:
+        """Return a new change detector."""
         return ChangeDetector(self._rate_hz, self._alarms_per_day)
 
-    def _let_go(self, still: list[SampleBlock]) -> list[SampleBlock]:
-        earlier, self._final = self._final, []
+    def _with_pending(self, still: list[SampleBlock]) -> list[SampleBlock]:
+        """Return the pending blocks of the previous rate, followed by the given blocks."""
+        earlier, self._pending = self._pending, []
         return earlier + still
 
-    def _look(self, still: list[SampleBlock]) -> None:
+    def _search(self, still: list[SampleBlock]) -> None:
+        """Collect the episodes of motion, and pass the samples at rest to the change detector."""
         if self._keep_still:
             self._still += still
         motions = self._rest.take()
         self.handled += sum(motion.kind == "handling/orientation" for motion in motions)
-        self._events += [self._moved(motion) for motion in motions]
+        self._events += [self._motion_event(motion) for motion in motions]
         if self._changes is None:
             return
         for samples in still:
-            if samples.lost > LONGEST_HOLE:
-                self._take(self._changes)
+            if samples.lost > MAX_SKIPPED_SAMPLES:
+                self._report_changes(self._changes)
                 self._changes, self._first = self._detector(), self._first + self._changes.samples + samples.lost
             elif samples.lost:
                 self._changes.skip(samples.lost)
             self._changes.update(samples.values)
-        self._take(self._changes)
+        self._report_changes(self._changes)
 
-    def _take(self, changes: ChangeDetector) -> None:
-        """Tell what was found, and let axes begin anew."""
+    def _report_changes(self, changes: ChangeDetector) -> None:
+        """Report the changes found, and request restarts of axes whose noise changed."""
         for change in changes.take():
-            self._events.append(self._changed(change))
+            self._events.append(self._change_event(change))
             if change.kind == "noise_changed":
-                handed_on = changes.samples if self._leave_out else self._came - self._began - self._first
+                handed_on = changes.samples if self._leave_out else self._received - self._began - self._first
                 self._restarts.append(Restart(change.axis, handed_on - change.since))
 
-    def _moved(self, motion: Motion) -> Event:
+    def _motion_event(self, motion: Motion) -> Event:
+        """Convert an episode of motion to an event."""
         what = {"moved": {"seconds": motion.seconds, "peak": motion.peak}}
         return Event("moved", self._t_ns(motion.until), motion.text, motion.axis, what, self._t_ns(motion.since))
 
-    def _changed(self, change: Change) -> Event:
+    def _change_event(self, change: Change) -> Event:
+        """Convert a change to an event."""
         what = {name: {"before": before, "after": after} for name, (before, after) in change.what.items()}
         found_ns, since_ns = self._t_ns(self._first + change.found), self._t_ns(self._first + change.since)
         return Event(change.kind, found_ns, change.text, AXES[change.axis], what, since_ns, change.sigma)
 
     def _t_ns(self, index: int) -> int:
-        """Time of a sample by its number since the watch began, of the newest at the latest."""
-        return self._newest_ns - round(max(self._came - self._began - 1 - index, 0) / self._rate_hz * 1e9)
+        """Return the time of a sample from its index since the last start, at most the time of the newest sample."""
+        return self._newest_ns - round(max(self._received - self._began - 1 - index, 0) / self._rate_hz * 1e9)

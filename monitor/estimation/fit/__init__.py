@@ -1,1 +1,1 @@
-"""Coefficients Q, N, B, K and R from an Allan curve, with intervals."""
+"""Least-squares fit of the coefficients Q, N, B, K and R to an Allan curve, with confidence intervals."""

@@ -1,15 +1,14 @@
-"""The sensor's own bandwidth: which low-pass explains the shortest τ of a curve, and what the coefficients then are.
+"""Bandwidth of the sensor: the low-pass that explains the shortest τ of an Allan curve, and the fit with it.
 
-A sensor that ends below half the sample rate has less noise at the shortest τ than N²/τ says. A day's curve knows them
-to 0.04 %, so that a shape which is 1 % off there spoils N. Here N's column is that of white noise through a Butterworth
-low-pass, of a few orders, as a digital filter at the sample rate or as an analogue one that was sampled; cutoff and
-order are those with the least misfit. The cutoff is not known better than the data tell it: its direction is projected
-out of the fit, so that no interval is too narrow by it. If no such filter explains the curve, the answer of ``fit``
-stands: the shortest τ left out.
+A sensor with a bandwidth below half the sample rate has less noise at the shortest τ than N²/τ. The curve of a day is
+known there to 0.04 %, so a model that is 1 % off biases N. Here, the column of N is white noise behind a Butterworth
+low-pass of order 1 to 4, either digital at the sample rate or analogue and then sampled. Cutoff and order are those
+with the smallest misfit. The uncertainty of the cutoff is projected out of the fit, so that it does not make any
+interval too narrow. If no such filter explains the curve, the result of ``fit`` without the shortest τ is kept.
 
-Every filter has a flat bottom, so N is the level of the white noise inside the band. Q is left out and only bounded:
-beside it almost any filter explains almost any curve. A filter must also be seen in the spectrum: where that does not
-fall beyond the cutoff, something else bent the curve.
+All these filters have a flat passband, so N is the level of the white noise in the passband. Q is not estimated and
+only bounded, because almost any filter together with Q explains almost any curve. A filter must also be visible in the
+spectrum. If the spectrum does not fall beyond the cutoff, the curve has another cause.
 """
 
 from collections.abc import Generator, Sequence
@@ -21,58 +20,65 @@ import numpy as np
 
 from drivers.sample import Floats, Ints
 from monitor.common.minimization import golden_section
-from monitor.estimation.allan.batch import PRESENT
+from monitor.estimation.allan.batch import MIN_PRESENT_SHARE
 from monitor.estimation.allan.uncertainty import Table
-from monitor.estimation.fit.coefficient_fit import Design, Fit, Looks, fit_columns, replaced
+from monitor.estimation.fit.coefficient_fit import Design, Fit, MeasuredCurve, fit_columns, replace_axis
 from monitor.estimation.fit.coefficients import Status
 from monitor.estimation.fit.confidence_bounds import BOUND, highest
 from monitor.estimation.fit.least_squares import N, Q
 
 Kind = Literal["digital", "sampled"]
+"""Digital filter at the sample rate, or analogue filter before sampling."""
 FAMILIES: Final[tuple[tuple[Kind, int], ...]] = tuple(
     (kind, order) for order in (1, 2, 3, 4) for kind in ("digital", "sampled")
 )
+"""Kinds and orders of low-pass filters that are tried."""
 CUTOFFS: Final = np.geomspace(0.005, 0.49, 56)
-"""Of the sample rate."""
-BINS: Final = 1 << 13
-"""Of the spectrum from zero to half the sample rate: a filter forgets within so many samples."""
-REFINED: Final = 3
-"""Families, of those nearest on the grid, whose cutoff is sought to the end."""
-PIECE: Final = 8
-"""Cutoffs tried in one piece of a search."""
-REFINEMENT_PIECE: Final = 10
-"""Cutoffs between those of the grid that are tried in one piece; each needs a spectrum of its own."""
+"""Grid of cutoff frequencies, as shares of the sample rate."""
+SPECTRUM_BINS: Final = 1 << 13
+"""Number of bins of the squared response from zero to half the sample rate. It limits the memory of a filter."""
+REFINED_FAMILIES: Final = 3
+"""Number of families whose cutoff is refined. They are those with the smallest misfit on the grid."""
+CUTOFFS_PER_STEP: Final = 8
+"""Number of grid cutoffs tried in one step of a search."""
+REFINED_CUTOFFS_PER_STEP: Final = 10
+"""Number of cutoffs between those of the grid tried in one step. Each needs its own spectrum."""
 CUTOFF_TOLERANCE: Final = 1e-4
-"""Of the logarithm of a cutoff, at the end of a search."""
+"""Tolerance of the logarithm of the cutoff at the end of a search."""
 ALIASES: Final = 8
-AGREES: Final = 2.0
-"""Variance about the fit over that of noise, up to which a filter explains a curve."""
+"""Number of aliases on each side that are added to the response of a sampled analogue filter."""
+MAX_SCATTER: Final = 2.0
+"""Largest variance about the fit, relative to that of noise, with which a filter explains a curve."""
 POWER_BINS: Final = 1024
-MOST_STRETCHES: Final = 64
-FEWEST_STRETCHES: Final = 4
-BEYOND: Final = 1.2
-"""Cutoffs, from which on a spectrum is asked whether it falls."""
-FALLS: Final = 2.0
-RESIDUE: Final = 0.05
-"""A spectrum may lie so many times above the filter's, and by this share of its own bottom."""
-STEP: Final = 1.01
-"""Of a cutoff, for the derivative by it."""
-WIDE: Final = 3.0
-"""Standard deviation of ln cutoff that is granted before the data are seen: any."""
+"""Number of bins of the measured spectrum from zero to half the sample rate."""
+MAX_STRETCHES: Final = 64
+"""Maximum number of stretches averaged in a spectrum."""
+MIN_STRETCHES: Final = 4
+"""Minimum number of stretches for a spectrum."""
+STOPBAND_START: Final = 1.2
+"""Frequency, as a multiple of the cutoff, from which on the spectrum must have fallen."""
+MAX_STOPBAND_RATIO: Final = 2.0
+"""Largest ratio of the measured to the expected stopband level."""
+MAX_STOPBAND_SHARE: Final = 0.05
+"""Share of the passband level that is added to the limit of the stopband level."""
+CUTOFF_STEP: Final = 1.01
+"""Factor of the cutoff in the numerical derivative with respect to it."""
+LOG_CUTOFF_SIGMA: Final = 3.0
+"""Prior standard deviation of the logarithm of the cutoff. It is wide enough to allow any cutoff."""
 
 
 @dataclass(frozen=True, slots=True)
 class LowPass:
-    """A Butterworth low-pass."""
+    """Butterworth low-pass filter."""
 
     kind: Kind
     order: int
-    cutoff: float  # of the sample rate
+    cutoff: float  # as a share of the sample rate
 
     def avar(self, factors: Ints) -> Floats:
-        """Allan variance [m] of white noise of one through it, τ0 = 1.
+        """Return the Allan variance [m] of unit white noise behind the filter, τ0 = 1.
 
-        With V(m) the variance of a sum of m samples, from their autocovariance, σ² = (4 V(m) − V(2m)) / 2m².
+        With V(m) the variance of a sum of m samples, computed from their autocovariance, σ² = (4 V(m) − V(2m)) / 2m².
 
         >>> LowPass("digital", 2, 0.1).avar(np.array([1, 1000])).round(6).tolist()
         [0.024355, 0.000998]
@@ -81,13 +87,14 @@ class LowPass:
         return (4.0 * self._sums(m) - self._sums(2 * m)) / (2.0 * m.astype(np.float64) ** 2)
 
     def _sums(self, m: Ints) -> Floats:
-        level, first = _moments(self.kind, self.order, self.cutoff)
+        """Return the variance of sums of m samples."""
+        level, first = _autocovariance_sums(self.kind, self.order, self.cutoff)
         k = np.minimum(m, level.size) - 1
         return np.asarray(m * level[k] - first[k])
 
 
-def _spectrum(kind: Kind, order: int, cutoff: float, bins: int = BINS) -> Floats:
-    """Squared response [bins + 1] from zero to half the sample rate."""
+def _squared_response(kind: Kind, order: int, cutoff: float, bins: int = SPECTRUM_BINS) -> Floats:
+    """Return the squared response [bins + 1] from zero to half the sample rate."""
     f = np.arange(bins + 1) / (2.0 * bins)
     if kind == "digital":
         with np.errstate(over="ignore"):
@@ -98,29 +105,30 @@ def _spectrum(kind: Kind, order: int, cutoff: float, bins: int = BINS) -> Floats
 
 @lru_cache(1024)
 def _column(low_pass: LowPass, factors: bytes) -> Floats:
+    """Return the cached Allan variance of a low-pass; ``factors`` is the buffer of an int64 array."""
     return low_pass.avar(np.frombuffer(factors, np.int64))
 
 
-def _moments(kind: Kind, order: int, cutoff: float) -> tuple[Floats, Floats]:
-    """Σ r over |k| < n, and Σ |k| r, for n = 1, 2, …; the white noise inside the band has Σ r = 1."""
-    r = np.fft.irfft(_spectrum(kind, order, cutoff))[:BINS]
-    both = np.where(np.arange(BINS) > 0, 2.0, 1.0) * r
-    level, first = np.cumsum(both), np.cumsum(both * np.arange(BINS))
+def _autocovariance_sums(kind: Kind, order: int, cutoff: float) -> tuple[Floats, Floats]:
+    """Return Σ r over |k| < n, and Σ |k| r, for n = 1, 2, …; the white noise in the passband has Σ r = 1."""
+    r = np.fft.irfft(_squared_response(kind, order, cutoff))[:SPECTRUM_BINS]
+    both = np.where(np.arange(SPECTRUM_BINS) > 0, 2.0, 1.0) * r
+    level, first = np.cumsum(both), np.cumsum(both * np.arange(SPECTRUM_BINS))
     return level / level[-1], first / level[-1]
 
 
 def power(rates: Floats) -> Floats:
-    """Spectrum [POWER_BINS + 1] of one axis [n], in no unit: the mean of stretches spread over it that lack little.
+    """Return the spectrum [POWER_BINS + 1] of one axis [n] in arbitrary units, or an empty array without enough data.
 
-    Empty where there are too few.
+    The spectrum is the mean over stretches that are spread over the samples and have few missing ones.
     """
     rows = 2 * POWER_BINS
-    begins = np.unique(np.linspace(0, len(rates) - rows, MOST_STRETCHES).astype(np.int64))
-    if begins[0] < 0 or len(rates) < FEWEST_STRETCHES * rows:
+    begins = np.unique(np.linspace(0, len(rates) - rows, MAX_STRETCHES).astype(np.int64))
+    if begins[0] < 0 or len(rates) < MIN_STRETCHES * rows:
         return np.empty(0)
     parts = np.stack([rates[begin : begin + rows] for begin in begins])
-    parts = parts[np.isfinite(parts).mean(axis=1) >= PRESENT]
-    if len(parts) < FEWEST_STRETCHES:
+    parts = parts[np.isfinite(parts).mean(axis=1) >= MIN_PRESENT_SHARE]
+    if len(parts) < MIN_STRETCHES:
         return np.empty(0)
     parts = parts - np.nanmean(parts, axis=1, keepdims=True)
     turned = np.fft.rfft(np.nan_to_num(parts) * np.hanning(rows), axis=1)
@@ -128,57 +136,101 @@ def power(rates: Floats) -> Floats:
 
 
 def seen(low_pass: LowPass, power: Floats) -> bool:
-    """Whether a spectrum falls beyond the cutoff as it would behind the filter; medians, so that no line matters."""
+    """Return True if a spectrum falls beyond the cutoff as expected behind the filter.
+
+    Medians are compared, so that spectral lines do not matter.
+
+    Parameters
+    ----------
+    low_pass : LowPass
+        Filter to test.
+    power : ndarray of float64, shape (POWER_BINS + 1,)
+        Spectrum of the axis, from ``power``.
+    """
     f = np.arange(power.size) / (2.0 * max(power.size - 1, 1))
     below = (f >= low_pass.cutoff / 4.0) & (f <= low_pass.cutoff / 2.0) & (f >= 3.0 / (2.0 * POWER_BINS))
-    beyond = f >= min(BEYOND * low_pass.cutoff, 0.49)
+    beyond = f >= min(STOPBAND_START * low_pass.cutoff, 0.49)
     if not below.any():
         return False
-    filtered = _spectrum(low_pass.kind, low_pass.order, low_pass.cutoff, POWER_BINS)
+    filtered = _squared_response(low_pass.kind, low_pass.order, low_pass.cutoff, POWER_BINS)
     expected = np.median(filtered[beyond]) / np.median(filtered[below])
-    return bool(np.median(power[beyond]) <= (FALLS * expected + RESIDUE) * np.median(power[below]))
+    return bool(
+        np.median(power[beyond]) <= (MAX_STOPBAND_RATIO * expected + MAX_STOPBAND_SHARE) * np.median(power[below])
+    )
 
 
 def with_bandwidth(
-    design: Design, table: Table, looks: Looks, found: Fit, filters: Sequence[LowPass | None]
+    design: Design, table: Table, measured: MeasuredCurve, found: Fit, filters: Sequence[LowPass | None]
 ) -> tuple[Fit, list[LowPass | None]]:
-    """The fit with the low-pass of each axis where that explains what contradicted it, and those that do.
+    """Replace the fit of each contradicted axis by a fit with its low-pass, if the low-pass explains the curve.
 
-    Args:
-        design, table, looks: what ``fit`` was given
-        found: what it gave
-        filters: of ``sought``, or None, for each axis
+    Parameters
+    ----------
+    design : Design
+        Columns that were passed to ``fit``.
+    table : Table
+        Covariances that were passed to ``fit``.
+    measured : MeasuredCurve
+        Measured curve that was passed to ``fit``.
+    found : Fit
+        Result of ``fit``.
+    filters : sequence of LowPass or None
+        Candidate of each axis from ``find_low_pass``, or None.
+
+    Returns
+    -------
+    fit : Fit
+        Fit with the accepted filters.
+    filters : list of LowPass or None
+        Accepted filter of each axis.
     """
     used: list[LowPass | None] = [None] * len(filters)
     for axis, low_pass in enumerate(filters):
-        if low_pass is not None and contradicted(found, axis):
-            better = _fitted(design, table, looks.axis(axis), low_pass)
-            if better.scatter[0] < AGREES:
-                _bound(design, better, looks.axis(axis))
-                found = replaced(found, axis, better)
+        if low_pass is not None and is_contradicted(found, axis):
+            better = _fit_low_pass(design, table, measured.axis(axis), low_pass)
+            if better.scatter[0] < MAX_SCATTER:
+                _bound_q(design, better, measured.axis(axis))
+                found = replace_axis(found, axis, better)
                 used[axis] = low_pass
     return found, used
 
 
-def _bound(design: Design, found: Fit, looks: Looks) -> None:
-    """Q of the one axis, which no fit beside a filter can tell: no more than the whole of the first point."""
-    c, first = found.coefficients, int(np.argmax(looks.avar[:, 0] > 0.0))
-    most = highest(looks.avar[first, 0], found.edf[first, 0], BOUND) / design.columns[first, Q]
+def _bound_q(design: Design, found: Fit, measured: MeasuredCurve) -> None:
+    """Bound Q of a single-axis fit by the whole first point, because a fit with a filter cannot determine it."""
+    c, first = found.coefficients, int(np.argmax(measured.avar[:, 0] > 0.0))
+    most = highest(measured.avar[first, 0], found.edf[first, 0], BOUND) / design.columns[first, Q]
     if np.isfinite(most):
         c.status[Q], c.lo[Q], c.hi[Q] = Status.UPPER_BOUND, 0.0, most**0.5 / design.rate_hz
 
 
-def contradicted(found: Fit, axis: int) -> bool:
-    """Whether the shortest τ, or others, are not what the five terms say."""
+def is_contradicted(found: Fit, axis: int) -> bool:
+    """Return True if the shortest or other τ of an axis contradict the five terms.
+
+    Parameters
+    ----------
+    found : Fit
+        Fit of the curve.
+    axis : int
+        Column of the fit.
+    """
     return bool(found.left_out[axis] > 0 or found.theta[0, axis] < 0.0 or found.misfit[axis] > 1.0)
 
 
-def sought(design: Design, table: Table, looks: Looks, power: Floats) -> LowPass | None:
-    """The low-pass with the least misfit for the one axis of ``looks``; None where none explains its curve.
+def find_low_pass(design: Design, table: Table, measured: MeasuredCurve, power: Floats) -> LowPass | None:
+    """Return the low-pass with the smallest misfit for a single axis, or None if none explains its curve.
 
-    ``power``: its spectrum, of ``power``.
+    Parameters
+    ----------
+    design : Design
+        Columns for the cluster sizes of the curve.
+    table : Table
+        Covariances for the window length.
+    measured : MeasuredCurve
+        Measured curve of a single axis.
+    power : ndarray of float64
+        Spectrum of the axis, from ``power``.
     """
-    search = searching(design, table, looks, power)
+    search = search_low_pass(design, table, measured, power)
     while True:
         try:
             next(search)
@@ -187,36 +239,54 @@ def sought(design: Design, table: Table, looks: Looks, power: Floats) -> LowPass
             return found
 
 
-def searching(design: Design, table: Table, looks: Looks, power: Floats) -> Generator[None, None, LowPass | None]:
-    """``sought`` in pieces of a few milliseconds, for who must not be kept waiting."""
+def search_low_pass(
+    design: Design, table: Table, measured: MeasuredCurve, power: Floats
+) -> Generator[None, None, LowPass | None]:
+    """Search as ``find_low_pass`` in steps of a few milliseconds, for callers that must not block.
+
+    The generator yields after each step and returns the low-pass or None.
+
+    Parameters
+    ----------
+    design : Design
+        Columns for the cluster sizes of the curve.
+    table : Table
+        Covariances for the window length.
+    measured : MeasuredCurve
+        Measured curve of a single axis.
+    power : ndarray of float64
+        Spectrum of the axis, from ``power``.
+    """
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
     grids: list[list[float]] = []
     for kind, order in FAMILIES:
         grids.append([])
         for number, cutoff in enumerate(CUTOFFS):
             column = _column(LowPass(kind, order, float(cutoff)), factors)
-            grids[-1].append(float(fit_columns(_with(design, column), table, looks).scatter[0]))
-            if number % PIECE == PIECE - 1:
+            grids[-1].append(float(fit_columns(_with_noise_column(design, column), table, measured).scatter[0]))
+            if number % CUTOFFS_PER_STEP == CUTOFFS_PER_STEP - 1:
                 yield
     found = []
-    for family in np.argsort([min(grid) for grid in grids])[:REFINED]:
+    for family in np.argsort([min(grid) for grid in grids])[:REFINED_FAMILIES]:
         kind, order = FAMILIES[family]
         at = int(np.argmin(grids[family]))
         ends = np.log(CUTOFFS[[max(at - 1, 0), min(at + 1, CUTOFFS.size - 1)]])
 
         def of(log_cutoff: float, kind: Kind = kind, order: int = order) -> float:
             column = LowPass(kind, order, float(np.exp(log_cutoff))).avar(design.factors)
-            return float(fit_columns(_with(design, column), table, looks).scatter[0])
+            return float(fit_columns(_with_noise_column(design, column), table, measured).scatter[0])
 
-        least, log_cutoff = yield from in_pieces(golden_section(of, float(ends[0]), float(ends[1]), CUTOFF_TOLERANCE))
+        least, log_cutoff = yield from yield_in_pieces(
+            golden_section(of, float(ends[0]), float(ends[1]), CUTOFF_TOLERANCE)
+        )
         found.append((least, LowPass(kind, order, float(np.exp(log_cutoff)))))
         yield
     least, low_pass = min(found, key=lambda one: one[0])
-    return low_pass if least < AGREES and seen(low_pass, power) else None
+    return low_pass if least < MAX_SCATTER and seen(low_pass, power) else None
 
 
-def in_pieces(search: Generator[None, None, tuple[float, float]]) -> Generator[None, None, tuple[float, float]]:
-    """Run a search, and yield after each REFINEMENT_PIECE of its steps."""
+def yield_in_pieces(search: Generator[None, None, tuple[float, float]]) -> Generator[None, None, tuple[float, float]]:
+    """Run a search and yield after every ``REFINED_CUTOFFS_PER_STEP`` of its steps."""
     steps = 0
     while True:
         try:
@@ -225,21 +295,26 @@ def in_pieces(search: Generator[None, None, tuple[float, float]]) -> Generator[N
             found: tuple[float, float] = end.value
             return found
         steps += 1
-        if steps % REFINEMENT_PIECE == 0:
+        if steps % REFINED_CUTOFFS_PER_STEP == 0:
             yield
 
 
-def _with(design: Design, column: Floats) -> Design:
+def _with_noise_column(design: Design, column: Floats) -> Design:
+    """Return the design with another column for N and without Q."""
     columns = design.columns.copy()
     columns[:, N], columns[:, Q] = column, 0.0
     return replace(design, columns=columns)
 
 
-def _fitted(design: Design, table: Table, looks: Looks, low_pass: LowPass) -> Fit:
-    """The fit with this filter, blind to a change of its cutoff."""
+def _fit_low_pass(design: Design, table: Table, measured: MeasuredCurve, low_pass: LowPass) -> Fit:
+    """Return the fit with this filter, with the direction of a change of its cutoff projected out."""
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
-    up, down = (_column(replace(low_pass, cutoff=low_pass.cutoff * by), factors) for by in (STEP, 1.0 / STEP))
-    own = _with(design, _column(low_pass, factors))
-    rough = fit_columns(own, table, looks)
+    up, down = (
+        _column(replace(low_pass, cutoff=low_pass.cutoff * by), factors) for by in (CUTOFF_STEP, 1.0 / CUTOFF_STEP)
+    )
+    own = _with_noise_column(design, _column(low_pass, factors))
+    rough = fit_columns(own, table, measured)
     level = max(float(rough.theta[N, 0]) * design.rate_hz, 0.0)
-    return fit_columns(own, table, looks, full=True, blind=level * WIDE * (up - down) / (2.0 * np.log(STEP)))
+    return fit_columns(
+        own, table, measured, full=True, blind=level * LOG_CUTOFF_SIGMA * (up - down) / (2.0 * np.log(CUTOFF_STEP))
+    )

@@ -1,25 +1,26 @@
-"""Allan curve in, coefficients Q N B K R out, six axes at a time.
+"""Weighted non-negative least-squares fit of the coefficients Q N B K R to an Allan curve of several axes.
 
-The curve is linear in θ = (Q², N², B², K², R²). Each axis is fitted by non-negative least squares, weighted by the
-covariance of the τ under the model itself, or by its diagonal alone where time is short, and re-weighted a few times
-(such weights come within a few percent of the Cramér–Rao limit). The unconstrained solution û beside it decides what
-a coefficient is worth: its variance were v(t) = c0 + c1 t + c2 t² if the true θ_a were t, from the
-covariances of ``uncertainty``. A term is in when û_a/√c0, the variance taken as if it were absent,
-passes a threshold; its interval is the set of t that û does not contradict; a term that is not in
-has a one-sided bound, never tighter than an estimate of zero would give.
+The curve is linear in θ = (Q², N², B², K², R²). Each axis is fitted by non-negative least squares. The weights are the
+inverse covariance of the τ under the fitted model, or its diagonal alone where time is short. They are recomputed a few
+times (such weights come within a few percent of the Cramér–Rao limit).
 
-A ramp cannot be told from random walk by the curve alone. Given the window's slope s, the fit is to the curve
-that the samples have without that line, so that K is unbiased whether or not there is a ramp, and R is in when s is
-more than noise makes with K at the upper end of its interval. Else K or R may be its cause, and
-both are bounded. Without a slope, R is only bounded, and a ramp does pass as K.
+The unconstrained solution û determines the status of each coefficient. Its variance is v(t) = c0 + c1 t + c2 t² if the
+true θ_a is t, from the covariances of ``uncertainty``. A term is included if û_a/√c0, computed with the variance for an
+absent term, exceeds a threshold. Its interval is the set of t that û does not contradict. A term that is not included
+has a one-sided bound, which is never tighter than the bound from an estimate of zero.
 
-Real sensors end below half the sample rate. White noise through a low-pass looks, beyond the
-filter's memory, like N²/τ − c/τ²: exactly the column of Q with a negative sign. So when the
-shortest τ contradict the fit, Q² may turn negative (it then stands for the band limit and Q is only
-bounded by the first point of the curve); while they still do, the shortest τ is left out. If no
-filter explains it, as with a line or motion, nothing is left out, and the misfit is there to see.
+The curve alone cannot distinguish a ramp from a random walk. Given the slope s of the window, the fit uses the curve of
+the samples without this line, so that K is unbiased with and without a ramp. R is included if s is larger than noise
+explains with K at the upper end of its interval. Otherwise K or R may cause the slope, and both are bounded. Without a
+slope, R is only bounded, and a ramp is estimated as K.
 
-A fit refuses nothing: an axis with too few τ, or without noise at all, is UNESTIMATED.
+The bandwidth of real sensors ends below half the sample rate. White noise behind a low-pass looks like N²/τ − c/τ²
+beyond the memory of the filter, which is the column of Q with a negative sign. If the shortest τ contradict the fit, Q²
+may therefore become negative. It then stands for the band limit, and Q is only bounded by the first point of the curve.
+While the shortest τ still contradict the fit, the shortest one is left out. If no filter explains the curve, for
+example because of a spectral line or motion, no τ is left out, and the misfit is reported.
+
+The fit accepts any curve. An axis with too few τ, or without noise, is UNESTIMATED.
 """
 
 from collections.abc import Sequence
@@ -34,7 +35,7 @@ from monitor.estimation.allan.uncertainty import NOISES, Table
 from monitor.estimation.fit.coefficients import Coefficients, Status
 from monitor.estimation.fit.fit_kernel import WHITE, fit_axes
 from monitor.estimation.fit.least_squares import N, R
-from monitor.estimation.fit.term_selection import Known, answer, gains
+from monitor.estimation.fit.term_selection import SharedInputs, answer, gains
 from monitor.noise.effect import Source
 from monitor.noise.effects.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.bias_instability import BiasInstability
@@ -49,77 +50,99 @@ UNIT_SOURCES: Final[tuple[Source, ...]] = (
     RateRandomWalk(K=1.0),
     RateRamp(R=1.0),
 )
-"""Rows of the coefficients; their Allan variances are the columns of the fit."""
+"""Noise terms with unit coefficients. Their Allan variances are the columns of the fit."""
 
 TO_SI: Final = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
-"""Powers of the sample rate that bring Q N B K R from τ0 = 1 to SI."""
+"""Powers of the sample rate that convert Q N B K R from τ0 = 1 to SI."""
 
-ENTER_ONCE: Final = 2.33  # σ: one look at one curve, 1 % of absent terms enter
-ENTER_WATCHED: Final = 3.0  # σ: looked at again and again
-LEAVE_WATCHED: Final = 1.5  # σ
-FIELDS: Final = ("theta", "fitted", "edf", "entered", "left_out", "scatter", "misfit", "k_or_r")
-"""Of a Fit, what is by the axis, beside the coefficients."""
+ENTER_ONCE: Final = 2.33  # σ, for a single fit of one curve: 1 % of absent terms are added
+ENTER_WATCHED: Final = 3.0  # σ, for repeated fits of a live window
+LEAVE_WATCHED: Final = 1.5  # σ, for repeated fits of a live window
+PER_AXIS_FIELDS: Final = ("theta", "fitted", "edf", "entered", "left_out", "scatter", "misfit", "k_or_r")
+"""Fields of ``Fit`` that have one column per axis, besides the coefficients."""
 THRESHOLDS_ONCE: Final = (ENTER_ONCE, ENTER_ONCE)
+"""Thresholds in σ to add and to drop a term in a single fit."""
 THRESHOLDS_WATCHED: Final = (ENTER_WATCHED, LEAVE_WATCHED)
+"""Thresholds in σ to add and to drop a term in repeated fits. The difference is a hysteresis."""
 
 
 @dataclass(frozen=True, slots=True)
 class Design:
-    """The columns of the fit for one list of cluster sizes."""
+    """Columns of the fit for one list of cluster sizes."""
 
-    factors: Ints  # [m]
+    factors: Ints  # [m] cluster sizes in samples
     rate_hz: float
-    columns: Floats  # [m, 5] Allan variance at τ0 = 1 of coefficients of one
+    columns: Floats  # [m, 5] Allan variance of unit coefficients at τ0 = 1
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """One fit of six axes."""
+    """Result of one fit of six axes."""
 
     coefficients: Coefficients
     theta: Floats  # [5, 6] Q² N² B² K² R² of the fitted curve, SI; Q² < 0 stands for a band limit
-    fitted: Floats  # [m, 6] unit², Allan variance of the fitted model; NaN where there is none or left_out
-    edf: Floats  # [m, 6] equivalent degrees of freedom of the measured curve; NaN as the curve
-    entered: NDArray[np.bool_]  # [5, 6] terms that are in: hand them to the next fit
-    left_out: Ints  # [6] shortest τ that contradicted every fit
-    scatter: Floats  # [6] variance of the curve about the fit over that of noise of the five terms
-    misfit: Floats  # [6] the same where it is more than chance makes, else 1
-    k_or_r: NDArray[np.bool_]  # [6] the window drifts, by random walk or by a ramp: which of them, it does not tell
+    fitted: Floats  # [m, 6] Allan variance of the fitted model, squared unit; NaN without a model or if left out
+    edf: Floats  # [m, 6] equivalent degrees of freedom of the measured curve; NaN where the curve is
+    entered: NDArray[np.bool_]  # [5, 6] True for the terms in the fit; the next fit takes them as ``before``
+    left_out: Ints  # [6] number of shortest τ that contradicted every fit
+    scatter: Floats  # [6] variance of the curve about the fit, relative to noise of the five terms
+    misfit: Floats  # [6] the same if it is larger than chance explains, otherwise 1
+    k_or_r: NDArray[np.bool_]  # [6] True if the window drifts, but random walk and ramp cannot be distinguished
 
 
 def design(factors: Ints, rate_hz: float) -> Design:
-    """The columns of the fit, from the effects' own Allan variances."""
+    """Return the columns of the fit from the Allan variances of the noise terms.
+
+    Parameters
+    ----------
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
+    rate_hz : float
+        Sample rate in Hz.
+    """
     m = np.asarray(factors, np.float64)
     columns = np.ascontiguousarray(np.stack([source.avar(m, 1.0) for source in UNIT_SOURCES], axis=1))
     return Design(factors, rate_hz, columns)
 
 
-def known(design: Design, table: Table, blind: Floats | None = None, ask: bool = True) -> Known:
-    """What every fit at this length of the window shares."""
+def shared_inputs(design: Design, table: Table, blind: Floats | None = None, ask: bool = True) -> SharedInputs:
+    """Return the inputs that are the same for every fit at one window length.
+
+    Parameters
+    ----------
+    design : Design
+        Columns for the cluster sizes of the curve.
+    table : Table
+        Covariances for the window length.
+    blind : ndarray of float64, shape (m,), or None
+        Direction of the curve that the fit ignores, in units of one sample. None means no such direction.
+    ask : bool
+        True to leave out the shortest τ that contradict the fit.
+    """
     flat = design.columns.copy()
-    # what taking away the line costs each noise on average, see the level in ``fit_axis``
+    # the mean amount by which subtracting the line lowers each noise, see the level in ``fit_axis``
     flat[:, :NOISES] -= (2.0 * table.bend - table.slope) * design.columns[:, R, None]
-    flat[:, ~design.columns.any(axis=0)] = 0.0  # not asked for
+    flat[:, ~design.columns.any(axis=0)] = 0.0  # terms that are not fitted
     blind = np.zeros(design.factors.size) if blind is None else blind
     whole = table.terms.astype(np.float64)
-    return Known(design.columns, flat, table.covariance, whole, table.slope, blind, ask)
+    return SharedInputs(design.columns, flat, table.covariance, whole, table.slope, blind, ask)
 
 
 @dataclass(frozen=True, slots=True)
-class Looks:
-    """What is fitted: the curve of some axes, and the slopes of the same window."""
+class MeasuredCurve:
+    """Measured curve of k axes, and the slopes of the same window."""
 
-    avar: Floats  # [m, k] unit²; NaN where the window is too short
-    terms: Ints  # [m, k] second differences behind each
-    slope: Floats  # [k] unit/s, ``slope_of_thirds``; NaN = not measured: then a ramp is only bounded
-    slopes: Floats  # [m, k] unit/s, the mean second difference of phase over τ² at each τ
-    before: NDArray[np.bool_] | None = None  # [5, k] ``entered`` of the fit before, of who looks again and again
+    avar: Floats  # [m, k] Allan variance, squared unit of the axis; NaN if the window is too short
+    terms: Ints  # [m, k] number of second differences averaged
+    slope: Floats  # [k] unit/s, ``slope_of_thirds``; NaN means not measured, then a ramp is only bounded
+    slopes: Floats  # [m, k] unit/s, mean second difference of phase over τ² at each τ
+    before: NDArray[np.bool_] | None = None  # [5, k] ``entered`` of the previous fit; None for a single fit
 
-    def axis(self, column: int) -> "Looks":
-        """One axis."""
+    def axis(self, column: int) -> "MeasuredCurve":
+        """Return the data of one axis."""
         one = slice(column, column + 1)
         before = None if self.before is None else self.before[:, one]
-        return Looks(self.avar[:, one], self.terms[:, one], self.slope[one], self.slopes[:, one], before)
+        return MeasuredCurve(self.avar[:, one], self.terms[:, one], self.slope[one], self.slopes[:, one], before)
 
 
 def fit(
@@ -133,43 +156,72 @@ def fit(
     full: bool = True,
     start: Floats | None = None,
 ) -> Fit:
-    """Coefficients of six axes from overlapping Allan variances.
+    """Fit the coefficients of six axes to overlapping Allan variances.
 
-    Args:
-        design: columns for the cluster sizes of the curve
-        table: covariances from ``uncertainty`` for the window's length
-        avar: [m, 6] unit²; NaN where the window is too short
-        terms: [m, 6] second differences behind each
-        before: ``entered`` of the fit before, when one looks continuously: terms enter at 3 σ and leave at
-            1.5 σ; without it, one look at 2.33 σ
-        slope: [6] unit/s, ``slope_of_thirds`` of the same window, NaN = not measured; without it a ramp is
-            never estimated, only bounded
-        slopes: [m, 6] unit/s, the mean second difference of phase over τ² at each τ, of the same window; without it a
-            strong ramp's products with the noise pull K
-        full: weigh by the covariances of all τ, else by their variances alone
-        start: [5, 6] ``theta`` of a fit a moment ago, to begin with its weights: a third of the work
+    Parameters
+    ----------
+    design : Design
+        Columns for the cluster sizes of the curve.
+    table : Table
+        Covariances for the window length.
+    avar : ndarray of float64, shape (m, 6)
+        Allan variance in squared units of the axis; NaN if the window is too short.
+    terms : ndarray of int64, shape (m, 6)
+        Number of second differences averaged.
+    before : ndarray of bool, shape (5, 6), or None
+        ``entered`` of the previous fit of a live window. Terms are then added at 3 σ and dropped at 1.5 σ. None means a
+        single fit with a threshold of 2.33 σ.
+    slope : ndarray of float64, shape (6,), or None
+        Slope of the rate in unit/s, ``slope_of_thirds`` of the same window; NaN means not measured. Without a slope, a
+        ramp is never estimated, only bounded.
+    slopes : ndarray of float64, shape (m, 6), or None
+        Mean second difference of phase over τ² at each τ of the same window, in unit/s. Without it, the products of a
+        strong ramp with the noise bias K.
+    full : bool
+        True to weight by the covariances of all τ, False to weight by their variances alone.
+    start : ndarray of float64, shape (5, 6), or None
+        ``theta`` of a recent fit whose weights start this one. This takes a third of the work.
     """
     m, axes = avar.shape
     slope = np.full(axes, np.nan) if slope is None else slope
-    looks = Looks(avar, terms, slope, np.tile(slope, (m, 1)) if slopes is None else slopes, before)
-    return _fit(design, table, looks, known(design, table), full, start)
+    measured = MeasuredCurve(avar, terms, slope, np.tile(slope, (m, 1)) if slopes is None else slopes, before)
+    return _fit(design, table, measured, shared_inputs(design, table), full, start)
 
 
-def fit_columns(design: Design, table: Table, looks: Looks, full: bool = False, blind: Floats | None = None) -> Fit:
-    """The same with the columns as they are: no τ is left out, and the fit does not look along ``blind`` [m]."""
+def fit_columns(
+    design: Design, table: Table, measured: MeasuredCurve, full: bool = False, blind: Floats | None = None
+) -> Fit:
+    """Fit with the columns exactly as given, without leaving out any τ.
+
+    Parameters
+    ----------
+    design : Design
+        Columns for the cluster sizes of the curve.
+    table : Table
+        Covariances for the window length.
+    measured : MeasuredCurve
+        Measured curve and slopes.
+    full : bool
+        True to weight by the covariances of all τ, False to weight by their variances alone.
+    blind : ndarray of float64, shape (m,), or None
+        Direction of the curve that the fit ignores.
+    """
     in_samples = np.zeros(design.factors.size) if blind is None else blind
-    return _fit(design, table, looks, known(design, table, in_samples, ask=False), full)
+    return _fit(design, table, measured, shared_inputs(design, table, in_samples, ask=False), full)
 
 
-def _fit(design: Design, table: Table, looks: Looks, shared: Known, full: bool, start: Floats | None = None) -> Fit:
-    avar, terms, before = looks.avar, looks.terms, looks.before
+def _fit(
+    design: Design, table: Table, measured: MeasuredCurve, shared: SharedInputs, full: bool, start: Floats | None = None
+) -> Fit:
+    """Run the compiled fit and convert its results to SI."""
+    avar, terms, before = measured.avar, measured.terms, measured.before
     m, axes = avar.shape
     found = answer(axes, m, np.zeros((axes, 5), np.bool_) if before is None else np.array(before.T, order="C"))
     frozen = gains(axes, m)
     if start is not None:
         found.theta[:] = start.T / design.rate_hz ** (2.0 * TO_SI)
     curves, counts = np.ascontiguousarray(avar.T), np.ascontiguousarray(terms.T, np.float64)
-    slope, slopes = looks.slope / design.rate_hz, np.ascontiguousarray(looks.slopes.T) / design.rate_hz
+    slope, slopes = measured.slope / design.rate_hz, np.ascontiguousarray(measured.slopes.T) / design.rate_hz
     thresholds, warm = THRESHOLDS_ONCE if before is None else THRESHOLDS_WATCHED, start is not None
     fit_axes(0, axes, shared, curves, counts, slope, slopes, thresholds, full, warm, found, frozen)
     to_si = design.rate_hz**TO_SI
@@ -185,8 +237,18 @@ def _fit(design: Design, table: Table, looks: Looks, shared: Known, full: bool, 
     )  # fmt: skip
 
 
-def replaced(whole: Fit, axis: int, one: Fit) -> Fit:
-    """A fit with one axis of it from another fit, of that axis alone."""
+def replace_axis(whole: Fit, axis: int, one: Fit) -> Fit:
+    """Return a fit in which one axis comes from another fit.
+
+    Parameters
+    ----------
+    whole : Fit
+        Fit of all axes.
+    axis : int
+        Index of the axis to replace.
+    one : Fit
+        Fit of this axis alone.
+    """
 
     def put(into: NDArray[Any], part: NDArray[Any]) -> NDArray[Any]:
         result = into.copy()
@@ -195,12 +257,20 @@ def replaced(whole: Fit, axis: int, one: Fit) -> Fit:
 
     names = ("value", "lo", "hi", "status")
     coefficients = [put(getattr(whole.coefficients, name), getattr(one.coefficients, name)) for name in names]
-    fields: dict[str, Any] = {name: put(getattr(whole, name), getattr(one, name)) for name in FIELDS}
+    fields: dict[str, Any] = {name: put(getattr(whole, name), getattr(one, name)) for name in PER_AXIS_FIELDS}
     return replace(whole, coefficients=Coefficients(*coefficients), **fields)
 
 
-def joined(fits: Sequence[Fit], axes: Ints) -> Fit:
-    """Fits of some axes each, as one of all: column ``axes[k]`` of the result is the k-th of theirs."""
+def concatenate_fits(fits: Sequence[Fit], axes: Ints) -> Fit:
+    """Concatenate fits of some axes each, in the order of the axes.
+
+    Parameters
+    ----------
+    fits : sequence of Fit
+        Fits of one or more axes.
+    axes : ndarray of int64, shape (k,)
+        Axis of each column of the fits, in the order of the fits.
+    """
     order = np.argsort(axes)
 
     def side_by_side(field: str, of: str = "") -> NDArray[Any]:
@@ -208,11 +278,11 @@ def joined(fits: Sequence[Fit], axes: Ints) -> Fit:
         return np.concatenate(parts, axis=-1)[..., order]
 
     coefficients = Coefficients(*(side_by_side(field, "coefficients") for field in ("value", "lo", "hi", "status")))
-    return Fit(coefficients, **{name: side_by_side(name) for name in FIELDS})
+    return Fit(coefficients, **{name: side_by_side(name) for name in PER_AXIS_FIELDS})
 
 
 def nothing_fitted(avar: Floats) -> Fit:
-    """What is said of a curve [m, 6] that has not been fitted: nothing."""
+    """Return the result for a curve [m, 6] that has not been fitted: every coefficient is unestimated."""
     nothing = np.full((5, avar.shape[1]), np.nan)
     status = np.full((5, avar.shape[1]), Status.UNESTIMATED, np.int8)
     return Fit(
@@ -229,11 +299,23 @@ def nothing_fitted(avar: Floats) -> Fit:
 
 
 def slope_of_thirds(phase: Floats, seconds: float) -> Floats:
-    """Slope of the rate over a window from its integral at the start, one third, two thirds and the end.
+    """Return the slope of the rate over a window from its integral at the start, one third, two thirds and the end.
 
-    ``phase`` [4, k] in unit·s, ``seconds`` the window's length; returns [k] unit/s: the mean of the last third
-    less that of the first, over two thirds of the window. Under white noise its variance is 13.5 N²/T³, a
-    regression's 12 N²/T³; under rate random walk 5/4 and 6/5 of K²/T.
+    The slope is the mean of the last third minus the mean of the first third, divided by two thirds of the window.
+    Under white noise its variance is 13.5 N²/T³, compared with 12 N²/T³ for a regression. Under rate random walk, the
+    variances are 5/4 and 6/5 of K²/T.
+
+    Parameters
+    ----------
+    phase : ndarray of float64, shape (4, k)
+        Integral of the rate in unit·s.
+    seconds : float
+        Length of the window in seconds.
+
+    Returns
+    -------
+    ndarray of float64, shape (k,)
+        Slope in unit/s.
 
     >>> t = np.array([[0.0], [30.0], [60.0], [90.0]])
     >>> slope_of_thirds(0.5 * 0.1 * t**2, 90.0).round(12).tolist()
@@ -243,11 +325,14 @@ def slope_of_thirds(phase: Floats, seconds: float) -> Floats:
 
 
 def _white_edf(design: Design, table: Table, terms: Ints) -> Floats:
-    """Degrees of freedom of white noise, for as long as there is no fit: so a sensor's first seconds are."""
-    own = table.covariance[:, :, WHITE].diagonal()[:, None] * _ratio(table.terms[:, None], terms)
+    """Return the degrees of freedom for white noise, used until there is a fit.
+
+    A sensor shows white noise in its first seconds.
+    """
+    own = table.covariance[:, :, WHITE].diagonal()[:, None] * _present_ratio(table.terms[:, None], terms)
     return np.asarray(2.0 * design.columns[:, N, None] ** 2 / own)
 
 
-def _ratio(whole: Ints, terms: Ints) -> Floats:
-    """How many terms a window without gaps has for each that is there; NaN where there is none."""
+def _present_ratio(whole: Ints, terms: Ints) -> Floats:
+    """Return the terms of a window without gaps over the terms present; NaN if there are none."""
     return np.where((whole > 0) & (terms > 0), whole / np.maximum(terms, 1), np.nan)

@@ -1,4 +1,4 @@
-"""The five coefficients of IEEE Std 952 for six axes, each with an interval and a status."""
+"""Noise coefficients of IEEE Std 952 for six axes, each with a confidence interval and a status."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -10,21 +10,25 @@ from numpy.typing import NDArray
 from drivers.sample import Floats
 
 LETTERS: Final = ("Q", "N", "B", "K", "R")
+"""Symbols of the coefficients in the order of their rows.
+
+They denote quantization noise, angle random walk, bias instability, rate random walk and rate ramp.
+"""
 
 
 class Status(IntEnum):
-    """What a coefficient's number is worth; a number without a status is not published."""
+    """Status of a coefficient. A coefficient is never published without it."""
 
-    UNESTIMATED = 0  # too few data yet, or withheld: value, lo and hi are NaN
-    UPPER_BOUND = 1  # the data only bound it: value NaN, lo 0, hi the one-sided 95 % bound
-    ESTIMATED = 2  # value with its two-sided 95 % interval
+    UNESTIMATED = 0  # too few data, or withheld: value, lo and hi are NaN
+    UPPER_BOUND = 1  # only bounded by the data: value is NaN, lo is 0, hi is the one-sided 95 % bound
+    ESTIMATED = 2  # value with a two-sided 95 % interval
 
 
 @dataclass(frozen=True, slots=True)
 class Coefficients:
-    """Rows Q N B K R, columns gx … az, in SI: rad, m, s."""
+    """Values and 95 % intervals of the coefficients: rows Q N B K R, columns gx … az, in SI units (rad, m, s)."""
 
-    value: Floats  # [5, 6]
-    lo: Floats  # [5, 6]
-    hi: Floats  # [5, 6]
-    status: NDArray[np.int8]  # [5, 6] of Status
+    value: Floats  # [5, 6] NaN unless the status is ESTIMATED
+    lo: Floats  # [5, 6] lower end of the interval
+    hi: Floats  # [5, 6] upper end of the interval
+    status: NDArray[np.int8]  # [5, 6] values of ``Status``

@@ -1,4 +1,4 @@
-"""Ends of intervals, and what a measured variance allows at most: compiled, of one coefficient at a time."""
+"""Confidence bounds of one coefficient: ends of intervals and upper bounds from measured variances (compiled)."""
 
 from typing import Final
 
@@ -8,29 +8,58 @@ from monitor.common.compiled import compiled
 from monitor.estimation.fit.least_squares import N, Q
 
 TWO_SIDED_95: Final = 1.959963984540054
+"""Quantile of the normal distribution for a two-sided probability of 95 %."""
 BOUND: Final = TWO_SIDED_95
-"""Of an upper bound: 97.5 % for one look, and still 95 % of what is said where terms that come out large are estimated
-instead and their intervals miss too."""
+"""Quantile of an upper bound.
+
+It gives 97.5 % for a single fit. It still gives 95 % of the reported bounds when large terms are estimated instead and
+their intervals miss as well.
+"""
 
 SURELY: Final = 3.3
-"""σ by which a curve is below a term that it does not have; of 20 τ none is so far by chance in 99 of 100."""
+"""Distance in σ by which a curve lies below a term that it does not contain.
+
+With 20 τ, none is that far off by chance in 99 of 100 cases.
+"""
 
 LEAST_SHRUNK: Final = 0.05
-"""Below this (under two degrees of freedom) a measured variance is no bound."""
+"""Minimum factor of the cube root of χ². Below it (under two degrees of freedom) a measured variance gives no bound."""
 
 
 @compiled
 def quantile(z, skewness):  # type: ignore[no-untyped-def]
-    """Of probability Φ(z), Pearson III of variance one, as χ² with 8/skewness² degrees (Wilson & Hilferty 1931)."""
+    """Return the quantile of probability Φ(z) of the standardized Pearson III distribution.
+
+    The distribution is a χ² with 8/skewness² degrees of freedom, in the approximation of Wilson & Hilferty (1931).
+
+    Parameters
+    ----------
+    z : float
+        Quantile of the normal distribution.
+    skewness : float
+        Skewness of the distribution.
+    """
     s = skewness
     return z if s < 1e-6 else 2.0 / s * (max(1.0 + s * z / 6.0 - s * s / 36.0, 0.0) ** 3 - 1.0)
 
 
 @compiled
 def interval_end(estimate, c0, c1, c2, skewness, z):  # type: ignore[no-untyped-def]
-    """√t where the estimate lies k √v(t) above t, k the quantile of Φ(z) with the skewness 2 √c2 of the estimate alone.
+    """Return √t at which the estimate lies k √v(t) above t.
 
-    t solves (1 − k²c2) t² − (2û + k²c1) t + û² − k²c0 = 0; the end is clipped at zero.
+    k is the quantile of Φ(z) with the skewness 2 √c2 of the estimate alone. t solves (1 − k²c2) t² − (2û + k²c1) t + û²
+    − k²c0 = 0. The end is clipped at zero.
+
+    Parameters
+    ----------
+    estimate : float
+        Unconstrained estimate û of the squared coefficient.
+    c0, c1, c2 : float
+        Coefficients of its variance v(t) = c0 + c1 t + c2 t².
+    skewness : float
+        Skewness 2 √c2 of the estimate.
+    z : float
+        Normal quantile, positive for the lower end and negative for the upper end.
     """
     k = quantile(z, skewness)
     a = 1.0 - k * k * c2
@@ -46,9 +75,22 @@ def interval_end(estimate, c0, c1, c2, skewness, z):  # type: ignore[no-untyped-
 def cap(  # type: ignore[no-untyped-def]
     curve, edf, rows, columns, memory, entered, theta, lo, hi, status
 ):
-    """Where the five terms are no description of the curve: none may be more than the whole of it at any τ.
+    """Limit the coefficients of a curve that the five terms do not describe: none may exceed the whole curve at any τ.
 
-    N only beyond ``memory`` samples: within, the sensor's own filter may have taken white noise away.
+    N is only limited beyond ``memory`` samples. Below, the filter of the sensor may have removed white noise.
+
+    Parameters
+    ----------
+    curve, edf : ndarray of float64, shape (m,)
+        Allan variance and its degrees of freedom.
+    rows : ndarray of int64
+        Rows in use.
+    columns : ndarray of float64, shape (m, 5)
+        Allan variance of unit coefficients.
+    memory : int
+        Memory of the filter in samples.
+    entered, theta, lo, hi, status : ndarray, shape (5,)
+        Results of the fit, updated in place.
     """
     for a in range(5):
         most = np.inf
@@ -65,7 +107,17 @@ def cap(  # type: ignore[no-untyped-def]
 
 @compiled
 def highest(avar, edf, z):  # type: ignore[no-untyped-def]
-    """What the truth may be above a measured variance, at z σ (Wilson & Hilferty); infinite with too little freedom."""
+    """Return the upper limit of the true variance at z σ (Wilson & Hilferty); infinite with too few degrees of freedom.
+
+    Parameters
+    ----------
+    avar : float
+        Measured variance.
+    edf : float
+        Degrees of freedom.
+    z : float
+        Normal quantile.
+    """
     spread = 2.0 / (9.0 * max(edf, 1.0))
     shrunk = 1.0 - spread - z * np.sqrt(spread)
     return avar / shrunk**3 if shrunk > LEAST_SHRUNK else np.inf
@@ -73,7 +125,17 @@ def highest(avar, edf, z):  # type: ignore[no-untyped-def]
 
 @compiled
 def bound_by_first_point(avar, edf, column, entered, lo, hi, status):  # type: ignore[no-untyped-def]
-    """Q is hidden behind the sensor's band limit: it makes no more than the whole of the first point."""
+    """Bound Q by the whole first point of the curve, because the band limit of the sensor hides it.
+
+    Parameters
+    ----------
+    avar, edf : float
+        First point of the curve and its degrees of freedom.
+    column : float
+        Allan variance of unit Q at this point.
+    entered, lo, hi, status : ndarray, shape (5,)
+        Results of the fit, updated in place.
+    """
     entered[Q] = False
     status[Q] = 1
     lo[Q] = 0.0

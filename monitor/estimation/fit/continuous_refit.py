@@ -1,17 +1,24 @@
-"""A fit at every sample: the window advances by one, and the coefficients follow, in compiled code.
+"""Per-sample update of the coefficients in compiled code: the window advances by one sample, and the fit follows.
 
-For frozen weights the normal equations of the fit are linear in the curve: a row of ``Gains`` a term, some eighty
-products an axis; the non-negative solution is a matter of four by four. Where another set of terms becomes positive,
-that is solved anew with the same weights. Weights and verdicts are made anew when they no longer hold: a term would
-enter or leave, a coefficient has moved by a fifth and by more than its scatter, the slope would make or unmake a ramp,
-the window has grown by a tenth, or half of it has passed. In between weights are stale by less than that, which adds
-2 % to the error of a coefficient at most: it depends on the weights in second order.
+For fixed weights, the normal equations of the fit are linear in the curve. Each term is a row of ``Gains``, which takes
+about eighty products per axis. The non-negative solution is a problem of four unknowns. If another set of terms becomes
+positive, the equations are solved again with the same weights.
 
-The kernel returns where an axis needs new gains, and ``fit_axes`` is called from here: it is seldom needed, and would
-otherwise be compiled a second time as a part of the kernel.
+Weights and the selection of terms are recomputed in the following cases:
 
-Comes in: samples. Goes out: the course of Q N B K R, a row a sample; what is not estimated is NaN there.
-Intervals are for who looks: ``Estimator.get``.
+- A term would be added or dropped.
+- A coefficient has moved by a fifth and by more than its scatter.
+- The slope would add or drop a ramp.
+- The window has grown by a tenth, or half of it has been replaced.
+
+Between these events, the weights are out of date by less than that. This adds at most 2 % to the error of a
+coefficient, because the error depends on the weights in second order.
+
+The kernel returns when an axis needs new gains, and ``fit_axes`` is then called from Python. It is seldom needed, and
+would otherwise be compiled a second time as a part of the kernel.
+
+The result is one row of Q N B K R per sample, with NaN where a coefficient is not estimated. Intervals are computed
+only by ``Estimator.get``.
 """
 
 from typing import Final
@@ -21,7 +28,7 @@ from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.estimation.allan.uncertainty import FOR_EVER, NOISES, AxisTables, Table
+from monitor.estimation.allan.uncertainty import NOISES, UNLIMITED_SAMPLES, AxisTables, Table
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.allan.window_kernel import (
     AXES,
@@ -35,29 +42,35 @@ from monitor.estimation.allan.window_kernel import (
     mean_bend,
     thirds,
 )
-from monitor.estimation.fit.coefficient_fit import THRESHOLDS_WATCHED, TO_SI, Design, known
+from monitor.estimation.fit.coefficient_fit import THRESHOLDS_WATCHED, TO_SI, Design, shared_inputs
 from monitor.estimation.fit.coefficients import Status
 from monitor.estimation.fit.fit_kernel import fit_axes
 from monitor.estimation.fit.least_squares import Q, R, invert, present, solve_nonnegative
-from monitor.estimation.fit.term_selection import NUMBERS, Answer, Gains, Known, answer, gains
+from monitor.estimation.fit.term_selection import NUMBERS, Answer, Gains, SharedInputs, answer, gains
 
 REFRESH: Final = 2
-"""Gains are made anew at least so often in the time a window takes to pass."""
+"""Minimum number of times that the gains are recomputed within one window length."""
 
 PATIENCE: Final = 64
-"""An axis is tried again after this share of the window while it has no solution, or one that the five terms alone do
-not explain: gains cannot tell when a band limit, a line or a transient is gone."""
+"""Number of attempts per window length for an axis without a solution, or with a misfit of the five terms.
+
+The gains cannot detect that a band limit, a spectral line or a transient has disappeared.
+"""
 
 U0, U1, U2, U3 = (np.uintp(a) for a in range(NOISES))
 
 
 class Refit:
-    """The coefficients of a window, renewed with every sample.
+    """Coefficients of a window, updated with every sample.
 
-    Args:
-        window: advanced from here only
-        rows: how many of its rows, from the first, are fitted
-        tables: covariances of those rows, for each axis those of its own length
+    Parameters
+    ----------
+    window : AllanWindow
+        Window that is advanced only by this object.
+    rows : int
+        Number of rows of the window that are fitted, from the first.
+    tables : AxisTables
+        Covariances of these rows, for the length of each axis.
     """
 
     def __init__(self, window: AllanWindow, rows: int, tables: AxisTables) -> None:
@@ -68,27 +81,39 @@ class Refit:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew, with no term in."""
+        """Restart the fit of all axes, without any term."""
         self._answer: Answer = answer(AXES, self._rows, np.zeros((AXES, 5), np.bool_))
         self._gains: Gains = gains(AXES, self._rows)
-        self._used: list[Table | None] = [None] * AXES  # whose ``Known`` those are
-        self._known: list[Known] = []
+        self._used: list[Table | None] = [None] * AXES  # tables from which ``_known`` was computed
+        self._known: list[SharedInputs] = []
 
     def restart(self, axis: int) -> None:
-        """One axis begins anew, and is fitted at the next sample."""
+        """Restart the fit of one axis. It is fitted at the next sample."""
         self._answer.entered[axis], self._answer.status[axis] = False, 0
         self._answer.theta[axis] = np.nan
-        self._fit_anew(axis)
+        self._request_fit(axis)
 
     @property
     def entered(self) -> NDArray[np.bool_]:
-        """Which terms are in [5, 6]."""
+        """Terms in the fit, shape (5, 6)."""
         return self._answer.entered.T
 
     def update(self, design: Design, values: Floats, lengths: Ints) -> Floats:
-        """Advance by samples [n, 6]; the coefficients [n, 5, 6] in SI after each, NaN where not estimated.
+        """Advance the window by samples and return the coefficients after each.
 
-        ``lengths`` [6], samples of each axis that the window holds, are advanced too.
+        Parameters
+        ----------
+        design : Design
+            Columns of the fit.
+        values : ndarray of float64, shape (n, 6)
+            Samples in rad/s and m/s²; NaN means missing.
+        lengths : ndarray of int64, shape (6,)
+            Number of samples of each axis in the window, updated in place.
+
+        Returns
+        -------
+        ndarray of float64, shape (n, 5, 6)
+            Coefficients in SI; NaN where not estimated.
         """
         course = np.empty((len(values), 5, AXES))
         for start in range(0, len(values), STAGE):
@@ -96,11 +121,12 @@ class Refit:
         return course
 
     def _advance(self, design: Design, values: Floats, lengths: Ints, course: Floats) -> None:
+        """Advance by up to ``STAGE`` samples and write the coefficients into ``course``."""
         self._window.stage(values)
         to_si = design.rate_hz**TO_SI
         done = 0
         while done < len(values):
-            until = done + min(len(values) - done, self._lookup(design, lengths))
+            until = done + min(len(values) - done, self._find_tables(design, lengths))
             while done < until:
                 done, due = _follow(
                     self._window.parts(), done, until, lengths, to_si, self._answer, self._gains, self._ages,
@@ -110,7 +136,7 @@ class Refit:
                     self._fit([axis for axis in range(AXES) if due >> axis & 1], to_si, course[done - 1])
 
     def _fit(self, axes: list[int], to_si: Floats, coefficients: Floats) -> None:
-        """Fit some axes to ``_curve``, and write what is estimated into ``coefficients`` [5, 6]."""
+        """Fit some axes to ``_curve``, and write the estimated coefficients into ``coefficients`` [5, 6]."""
         for axis in axes:
             fit_axes(
                 axis, axis + 1, self._known[axis], self._curve, self._terms, self._slope, self._slopes,
@@ -119,23 +145,23 @@ class Refit:
         size = np.sqrt(np.maximum(self._answer.theta[axes], 0.0)) * to_si
         coefficients[:, axes] = np.where(self._answer.status[axes] == Status.ESTIMATED, size, np.nan).T
 
-    def _lookup(self, design: Design, lengths: Ints) -> int:
-        """Find the table of every axis; for how many samples these last."""
+    def _find_tables(self, design: Design, lengths: Ints) -> int:
+        """Find the table of every axis, and return for how many samples all tables stay valid."""
         filled = min(self._window.n + 1, self._window.length)
-        lasts = FOR_EVER
+        lasts = UNLIMITED_SAMPLES
         for axis in range(AXES):
             n = min(int(lengths[axis]) + 1, filled)
             tables = self._tables.of(axis, n, filled)
             table = tables.at(n)
             if table is not self._used[axis]:
                 self._used[axis] = table
-                self._fit_anew(axis)
-                self._known[axis : axis + 1] = [known(design, table)]
+                self._request_fit(axis)
+                self._known[axis : axis + 1] = [shared_inputs(design, table)]
             lasts = min(lasts, tables.lasts(n))
         return lasts
 
-    def _fit_anew(self, axis: int) -> None:
-        """At the next sample."""
+    def _request_fit(self, axis: int) -> None:
+        """Request a fit of one axis at the next sample."""
         self._gains.used[axis] = 0
         self._ages[axis] = self._window.length
 
@@ -144,10 +170,10 @@ class Refit:
 def _follow(  # type: ignore[no-untyped-def]
     parts, start, end, lengths, to_si, answer, gains, ages, curve, terms, slope, slopes, course
 ):
-    """Advance by staged samples from row ``start``, each with its coefficients into that row of ``course``.
+    """Advance by staged samples from row ``start``, and write the coefficients of each into that row of ``course``.
 
-    Stop at row ``end``, or after a row at which axes are to be fitted to ``curve``. Return the row after the last, and
-    those axes as a set of bits.
+    Stop at row ``end``, or after a row at which axes must be fitted to ``curve``. Return the next row and these axes as
+    a bit set.
     """
     ints, floats, missing, taus, window = parts
     state, factors, _, counts, phase = cut_ints(ints, taus)
@@ -182,7 +208,7 @@ def _follow(  # type: ignore[no-untyped-def]
                     at = i * LANES + axis
                     total, terms[axis, i] = sums[at] + rest[at], counts[at]
                     inverse[axis, i] = 1.0 / (units[axis, i] * counts[at])
-                    # as AllanWindow.avar: a constant axis has no noise
+                    # as in AllanWindow.avar, a constant axis has no noise
                     curve[axis, i] = total * inverse[axis, i] if total > counts[at] else 0.0
                     bend = mean_bend(phase, missing, state[NEWEST], lengths[axis], factors[i], axis)
                     slopes[axis, i] = bend / scaling[axis]
@@ -200,8 +226,8 @@ def _follow(  # type: ignore[no-untyped-def]
 def _project(  # type: ignore[no-untyped-def]
     units, inverse, terms, counts, sums, rest, slope, rows, ramp, twist, used, right
 ):
-    """r = Xᵀ V⁻¹ y [axes, NOISES] of the curve as it is now."""
-    lanes = np.uintp(LANES)  # an index that could be negative would cost as much as the arithmetic
+    """Compute r = Xᵀ V⁻¹ y [axes, NOISES] of the current curve."""
+    lanes = np.uintp(LANES)  # unsigned, because checks for negative indices would cost as much as the arithmetic
     for axis in range(np.uintp(AXES)):
         q = n = b = k = 0.0
         for i in range(np.uintp(used[axis, 0]), np.uintp(used[axis, 1])):
@@ -223,9 +249,9 @@ def _project(  # type: ignore[no-untyped-def]
 def _settle(  # type: ignore[no-untyped-def]
     right, slope, normal, inverse, whole, low, high, used, free, straight, entered, theta, held
 ):
-    """θ [axes, 5] by the gains, and whether they hold [axes].
+    """Compute θ [axes, 5] from the gains, and whether the gains are still valid [axes].
 
-    Where another set of terms is positive now, θ is solved for anew with the same weights. Without gains it stays.
+    If another set of terms is now positive, θ is solved again with the same weights. Without gains, θ is not changed.
     """
     for axis in range(np.uintp(AXES)):
         if used[axis, 1] <= used[axis, 0]:
@@ -244,8 +270,8 @@ def _settle(  # type: ignore[no-untyped-def]
             if there:
                 allowed = x > 0.0 or (free[axis] and a == Q)
                 same = same and allowed
-                theta[axis, a] = x if allowed else 0.0  # a new fit begins with the weights of these
-            # false for NaN too; only a term that is there can enter
+                theta[axis, a] = x if allowed else 0.0  # a new fit starts with the weights of this θ
+            # False for NaN, too; only a term that is not zero can be added
             limit = high[axis, NOISES + a] if there else np.inf
             holds = holds and low[axis, NOISES + a] <= u <= limit
         for a in range(np.uintp(NOISES)):

@@ -1,10 +1,11 @@
-"""The arithmetic of ``fit``, compiled: weights and a non-negative solution, one axis after another.
+"""Compiled kernel of the fit: weights and a non-negative solution, one axis after another.
 
-Everything is in units of one sample: avar of the axis, θ as in ``uncertainty``. Results are arrays of the caller, one
-row an axis (``verdict.Answer``, ``verdict.Gains``); what stays NaN was not to be had.
+All quantities are in units of one sample: the Allan variance in the unit of the axis, and θ as in ``uncertainty``. The
+results are written to arrays of the caller with one row per axis (``term_selection.Answer``, ``term_selection.Gains``).
+A result that stays NaN could not be computed.
 
-For given weights the solution is linear in the curve. So beside the answer the rows of that linear map are kept, with
-the limits inside which their answer is as good as a new one: ``refit`` applies them to the curve of every sample.
+For given weights, the solution is linear in the curve. The rows of this linear map are stored together with the limits
+within which they are as good as a new fit. ``continuous_refit`` applies them to the curve after every sample.
 """
 
 from typing import Final
@@ -18,51 +19,76 @@ from monitor.estimation.fit.least_squares import K, N, Q, R, normal_equations, s
 from monitor.estimation.fit.term_selection import freeze, judge, judge_ramp, sharpen
 
 MIN_ROWS: Final = NOISES + 1
-"""Fewer τ than this leave a fit no freedom to be contradicted."""
+"""Minimum number of τ. With fewer τ, a fit has no degree of freedom left to be contradicted."""
 
 PASSES: Final = 3
-"""Re-weightings from nothing; more of them move no coefficient by a tenth of its standard deviation."""
+"""Number of re-weightings from scratch. More passes move no coefficient by a tenth of its standard deviation."""
 
 WARM_PASSES: Final = 1
-"""Re-weightings from the coefficients of a moment ago."""
+"""Number of re-weightings from the coefficients of a recent fit."""
 
 MISFIT: Final = 4.0
-"""A short τ contradicts the fit when it is this many σ away."""
+"""Distance in σ from which a short τ contradicts the fit."""
 
 MISFIT_AGAIN: Final = 2.5
-"""The same once one has: what is left of a band limit must not pull N."""
+"""Same threshold after a contradiction, so that the remaining effect of a band limit does not bias N."""
 
 MISFIT_OF_ALL: Final = 6.0
-"""Standard deviations of a χ² a τ, beyond which the five terms are no description of the curve."""
+"""Standard deviations of χ² per τ beyond which the five terms do not describe the curve."""
 
 SHORT_ROWS: Final = 4
-"""How many of the shortest τ in use are asked whether they contradict the fit."""
+"""Number of shortest τ in use that are tested for a contradiction."""
 
 FILTER_MEMORY: Final = 16
-"""Clusters of more samples are not left out: a filter that reaches so far would be no noise of the sensor."""
+"""Largest cluster size in samples that can be left out. A filter with a longer memory is not noise of the sensor."""
 
 WHITE: Final = PAIRS.index((N, N))
+"""Index of the pair (N, N) in the table."""
 
 
 @compiled
 def fit_axes(  # type: ignore[no-untyped-def]
-    first, end, known, avar, terms, slope, slopes, thresholds, full, warm, answer, gains
+    first, end, shared, avar, terms, slope, slopes, thresholds, full, warm, answer, gains
 ):
-    """Fit the axes first ≤ axis < end: ``avar``, ``terms`` and ``slopes`` [axes, m], ``slope`` [axes] or NaN."""
+    """Fit the axes first ≤ axis < end.
+
+    Parameters
+    ----------
+    first, end : int
+        Range of axes.
+    shared : SharedInputs
+        Inputs that are the same for all axes.
+    avar, terms : ndarray of float64, shape (axes, m)
+        Allan variance and number of terms.
+    slope : ndarray of float64, shape (axes,)
+        Slope of the rate in units of one sample; NaN means not measured.
+    slopes : ndarray of float64, shape (axes, m)
+        Slope as seen by each τ.
+    thresholds : tuple of float
+        Thresholds in σ to add and to drop a term.
+    full : bool
+        True to weight by the covariances of all τ.
+    warm : bool
+        True to start with the weights of ``answer.theta``.
+    answer : Answer
+        Results, updated in place.
+    gains : Gains
+        Linear map of the solution, updated in place.
+    """
     for axis in range(first, end):
-        fit_axis(axis, known, avar, terms, slope[axis], slopes, thresholds, full, warm, answer, gains)
+        fit_axis(axis, shared, avar, terms, slope[axis], slopes, thresholds, full, warm, answer, gains)
 
 
 @compiled
 def fit_axis(  # type: ignore[no-untyped-def]
-    axis, known, avar, terms, slope, slopes, thresholds, full, warm, answer, gains
+    axis, shared, avar, terms, slope, slopes, thresholds, full, warm, answer, gains
 ):
-    """Fit one axis; ``warm``: begin with the weights of ``answer.theta``. Without enough τ nothing is said."""
-    m = known.whole.size
+    """Fit one axis; see ``fit_axes`` for the parameters. With too few τ, all coefficients are unestimated."""
+    m = shared.whole.size
     curve, level, stretch = avar[axis], np.empty(m), np.empty(m)
     straight = slope == slope
-    flat = known.flat if straight else known.columns
-    rows = _levels(known, curve, terms[axis], slope, slopes[axis], level, stretch)
+    flat = shared.flat if straight else shared.columns
+    rows = _levels(shared, curve, terms[axis], slope, slopes[axis], level, stretch)
     gains.used[axis, 0] = gains.used[axis, 1] = 0
     gains.either[axis] = False
     gains.straight[axis] = straight
@@ -75,65 +101,65 @@ def fit_axis(  # type: ignore[no-untyped-def]
     variance, weighted, normal, right = np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5)
     while True:
         first, free = _fit_terms(
-            curve, level, rows, stretch, flat, known, full, warm, variance, weighted, normal, right, theta
+            curve, level, rows, stretch, flat, shared, full, warm, variance, weighted, normal, right, theta
         )
         scatter, limit = _misfit(level, rows[first:], theta, flat, variance)
         if not full or scatter <= limit:
             break
-        full = False  # covariances of noises that are not those of the curve draw a fit away from all of its points
+        full = False  # covariances of noise that the curve does not have make the fit miss all of its points
     for a in range(5):
         lo[a], hi[a], status[a] = np.nan, np.nan, 0
     misfit = scatter if scatter > limit else 1.0
     found, c0, enters = judge(
-        level, rows[first:], stretch, known.covariance, weighted, normal, thresholds, straight, misfit,
+        level, rows[first:], stretch, shared.covariance, weighted, normal, thresholds, straight, misfit,
         entered, theta, lo, hi, status,
     )  # fmt: skip
-    sharpen(level, rows[first:], stretch, flat, known.covariance, misfit, found, c0, theta, hi, status)
+    sharpen(level, rows[first:], stretch, flat, shared.covariance, misfit, found, c0, theta, hi, status)
     for a in range(5):
-        if status[a] == 1 and not hi[a] < np.inf:  # the curve is too short to bound it
+        if status[a] == 1 and not hi[a] < np.inf:  # the curve is too short for a bound
             status[a], lo[a], hi[a] = 0, np.nan, np.nan
     noise, most = 0.0, np.nan
     if straight:
-        noise, most = judge_ramp(slope, known.slope_variance, thresholds, entered, theta, lo, hi, status)
-    # K is no more than a bound, and the slope more than the others make; or no slope could tell a ramp from K
-    others = noise - max(theta[K], 0.0) * known.slope_variance[K]
+        noise, most = judge_ramp(slope, shared.slope_variance, thresholds, entered, theta, lo, hi, status)
+    # K is only bounded and the other terms do not explain the slope, or K is estimated without a measured slope
+    others = noise - max(theta[K], 0.0) * shared.slope_variance[K]
     gains.either[axis] = (
         status[K] == 1 and status[R] == 1 and slope * slope > thresholds[0] ** 2 * others
         if straight
         else status[K] == 2
     )
-    variances(rows, theta, known.covariance, stretch, variance)
-    _draw(rows, first, theta, known.columns, noise, variance, answer.fitted[axis], answer.edf[axis])
+    variances(rows, theta, shared.covariance, stretch, variance)
+    _draw(rows, first, theta, shared.columns, noise, variance, answer.fitted[axis], answer.edf[axis])
     answer.left_out[axis] = first
     answer.misfit[axis], answer.scatter[axis] = misfit, scatter
     freeze(
         axis, rows[first:], weighted, normal, free, thresholds, found, c0, enters, most,
-        known.columns, slope, slopes, answer, gains,
+        shared.columns, slope, slopes, answer, gains,
     )  # fmt: skip
     if misfit > 1.0:
-        cap(curve, answer.edf[axis], rows[first:], known.columns, FILTER_MEMORY, entered, theta, lo, hi, status)
+        cap(curve, answer.edf[axis], rows[first:], shared.columns, FILTER_MEMORY, entered, theta, lo, hi, status)
     if free:
         i = rows[0]
-        bound_by_first_point(curve[i], answer.edf[axis, i], known.columns[i, Q], entered, lo, hi, status)
+        bound_by_first_point(curve[i], answer.edf[axis, i], shared.columns[i, Q], entered, lo, hi, status)
 
 
 @compiled
-def _levels(known, curve, terms, slope, slopes, level, stretch):  # type: ignore[no-untyped-def]
-    """The τ in use, and of each the curve that its samples have without the line of that slope, if there is one."""
+def _levels(shared, curve, terms, slope, slopes, level, stretch):  # type: ignore[no-untyped-def]
+    """Return the τ in use, and compute the curve without the line of the measured slope."""
     rows, count = np.empty(curve.size, np.int64), 0
     for i in range(curve.size):
-        if curve[i] > 0.0 and terms[i] > 0.0 and known.whole[i] > 0.0:
+        if curve[i] > 0.0 and terms[i] > 0.0 and shared.whole[i] > 0.0:
             rows[count] = i
-            stretch[i] = np.sqrt(known.whole[i] / terms[i])
+            stretch[i] = np.sqrt(shared.whole[i] / terms[i])
             line = slope * (2.0 * slopes[i] - slope) if slope == slope else 0.0
-            level[i] = curve[i] - line * known.columns[i, R]
+            level[i] = curve[i] - line * shared.columns[i, R]
             count += 1
     return rows[:count]
 
 
 @compiled
 def _draw(rows, first, theta, columns, noise, variance, fitted, edf):  # type: ignore[no-untyped-def]
-    """The fitted model, NaN where it was left out, and the degrees of freedom of the curve under it."""
+    """Compute the fitted model, NaN for τ left out, and the degrees of freedom of the curve under it."""
     for k in range(rows.size):
         i = rows[k]
         model, positive = 0.0, 0.0
@@ -141,32 +167,35 @@ def _draw(rows, first, theta, columns, noise, variance, fitted, edf):  # type: i
             model += columns[i, a] * theta[a]
             positive += columns[i, a] * max(theta[a], 0.0)
         fitted[i] = model if k >= first and model > 0.0 else np.nan
-        # a ramp multiplies the noise of the mean second difference: 4 R² (m²/2)² Var(slope)
+        # the product of a ramp with the noise of the mean second difference adds 4 R² (m²/2)² Var(slope)
         variance[i] += 4.0 * theta[R] * columns[i, R] ** 2 * noise
         edf[i] = 2.0 * positive * positive / variance[i]
 
 
 @compiled
 def _fit_terms(  # type: ignore[no-untyped-def]
-    avar, level, rows, stretch, columns, known, full, warm, variance, weighted, normal, right, theta
+    avar, level, rows, stretch, columns, shared, full, warm, variance, weighted, normal, right, theta
 ):
-    """Re-weighted Q N B K; how many of the shortest τ were left out, and whether Q² was set free."""
+    """Fit Q N B K with re-weighting.
+
+    Return the number of shortest τ left out, and whether Q² was allowed to be negative.
+    """
     first, free = 0, False
-    asking, covariance = known.ask, known.covariance
+    asking, covariance = shared.ask, shared.covariance
     warm = warm and theta[N] > 0.0
     while True:
         used = rows[first:]
         if warm:
-            weigh(used, theta, covariance, stretch, columns, known.blind, full, variance, weighted)
+            weigh(used, theta, covariance, stretch, columns, shared.blind, full, variance, weighted)
         else:
-            for i in used:  # white noise of that level, to begin with
+            for i in used:  # start with white noise of the level of the curve
                 variance[i] = avar[i] * avar[i] * covariance[i, i, WHITE] / columns[i, N] ** 2
                 for a in range(5):
                     weighted[i, a] = columns[i, a] / variance[i]
         for _ in range(WARM_PASSES if warm else PASSES):
             normal_equations(level, used, columns, weighted, normal, right)
             solve_nonnegative(normal, right, free, theta)
-            weigh(used, theta, covariance, stretch, columns, known.blind, full, variance, weighted)
+            weigh(used, theta, covariance, stretch, columns, shared.blind, full, variance, weighted)
         limit = MISFIT_AGAIN if free else MISFIT
         if not asking or not _contradicted(level, used[:SHORT_ROWS], theta, columns, variance, limit):
             break
@@ -174,7 +203,7 @@ def _fit_terms(  # type: ignore[no-untyped-def]
             free = True
         elif used.size > MIN_ROWS and columns[used[0], N] * FILTER_MEMORY >= 1.0:
             first += 1
-        else:  # no filter: a line, motion, or what else the five terms do not know
+        else:  # not a filter, but a spectral line, motion, or another effect outside the five terms
             first, free, asking = 0, False, False
     normal_equations(level, used, columns, weighted, normal, right)
     solve_nonnegative(normal, right, free, theta)
@@ -183,9 +212,9 @@ def _fit_terms(  # type: ignore[no-untyped-def]
 
 @compiled
 def _misfit(level, rows, theta, columns, variance):  # type: ignore[no-untyped-def]
-    """How many times wider the curve scatters about the fit, in variance, than noise of the five terms would.
+    """Return the variance of the curve about the fit relative to noise of the five terms, and its limit by chance.
 
-    And the limit beyond which chance does not make that of so many τ: then intervals are as much wider (Birge 1932).
+    Beyond the limit, intervals are widened accordingly (Birge 1932).
     """
     total, freedom = 0.0, rows.size
     for a in range(NOISES):
@@ -204,7 +233,7 @@ def _misfit(level, rows, theta, columns, variance):  # type: ignore[no-untyped-d
 
 @compiled
 def _contradicted(avar, rows, theta, columns, variance, limit):  # type: ignore[no-untyped-def]
-    """Whether a row lies ``limit`` σ off; χ² made normal by its cube root (Wilson & Hilferty 1931)."""
+    """Return True if a row is more than ``limit`` σ off. The cube root makes χ² normal (Wilson & Hilferty 1931)."""
     for i in rows:
         model = 0.0
         for a in range(5):

@@ -1,7 +1,7 @@
-"""Small least-squares problems in compiled loops: at most five columns, non-negative, with the curve's own covariance.
+"""Small weighted least-squares problems in compiled loops: five columns, non-negative, correlated observations.
 
-Arrays are the caller's; ``columns`` and ``weighted`` = V⁻¹ columns hold all τ, ``rows`` those in use. Written out in
-loops because that compiles several times faster than array expressions do.
+The caller provides all arrays. ``columns`` and ``weighted`` = V⁻¹ columns hold all τ, and ``rows`` lists the τ in use.
+The code uses loops because they compile several times faster than array expressions.
 """
 
 from typing import Final
@@ -12,14 +12,23 @@ from monitor.common.compiled import compiled
 from monitor.estimation.allan.uncertainty import NOISES
 
 SINGULAR: Final = 1e-9
-"""A pivot of the correlations below this is rounding."""
+"""Pivots of the correlation matrix below this value are rounding errors."""
 
 Q, N, B, K, R = range(5)
+"""Rows of the coefficients in θ."""
 
 
 @compiled
 def variance_form(theta, c):  # type: ignore[no-untyped-def]
-    """Σ_ab θ_a θ_b C^ab of one entry of the table; a negative Q² stands for a band limit and adds none."""
+    """Return Σ_ab θ_a θ_b C^ab for one entry of the table. A negative Q² stands for a band limit and adds nothing.
+
+    Parameters
+    ----------
+    theta : ndarray of float64, shape (5,)
+        Squared coefficients in units of one sample.
+    c : ndarray of float64, shape (10,)
+        Entry of ``Table.covariance``.
+    """
     q, n, b, k = max(theta[0], 0.0), theta[1], theta[2], theta[3]
     return (
         q * (q * c[0] + 2.0 * (n * c[1] + b * c[2] + k * c[3]))
@@ -31,14 +40,41 @@ def variance_form(theta, c):  # type: ignore[no-untyped-def]
 
 @compiled
 def variances(rows, theta, covariance, stretch, variance):  # type: ignore[no-untyped-def]
-    """Var σ²_i of the model; ``stretch``: √ of how many terms a window without gaps has for each that is there."""
+    """Compute the variances of σ²_i under the model.
+
+    Parameters
+    ----------
+    rows : ndarray of int64
+        Rows in use.
+    theta : ndarray of float64, shape (5,)
+        Squared coefficients of the model.
+    covariance : ndarray of float64, shape (m, m, 10)
+        See ``Table.covariance``.
+    stretch : ndarray of float64, shape (m,)
+        Square root of the terms in a window without gaps over the terms present.
+    variance : ndarray of float64, shape (m,)
+        Result.
+    """
     for i in rows:
         variance[i] = variance_form(theta, covariance[i, i]) * stretch[i] * stretch[i]
 
 
 @compiled
 def whiten(rows, theta, covariance, stretch, columns, blind, variance, weighted):  # type: ignore[no-untyped-def]
-    """V⁻¹ columns by Cholesky of the correlations; False where they are no positive definite matrix."""
+    """Compute V⁻¹ columns by Cholesky decomposition of the correlations.
+
+    Parameters
+    ----------
+    rows, theta, covariance, stretch, columns, blind, variance
+        See ``weigh``.
+    weighted : ndarray of float64, shape (m, 5)
+        Result.
+
+    Returns
+    -------
+    bool
+        False if the correlation matrix is not positive definite.
+    """
     m = rows.size
     factor = np.empty((m, m))
     for k in range(m):
@@ -72,7 +108,29 @@ def whiten(rows, theta, covariance, stretch, columns, blind, variance, weighted)
 
 @compiled
 def weigh(rows, theta, covariance, stretch, columns, blind, full, variance, weighted):  # type: ignore[no-untyped-def]
-    """``weighted`` = V⁻¹ columns with the model's own covariance V of the τ, and ``blind`` blindᵀ, or its diagonal."""
+    """Compute ``weighted`` = V⁻¹ columns with the covariance V of the τ under the model, or with its diagonal.
+
+    Parameters
+    ----------
+    rows : ndarray of int64
+        Rows in use.
+    theta : ndarray of float64, shape (5,)
+        Squared coefficients of the model.
+    covariance : ndarray of float64, shape (m, m, 10)
+        See ``Table.covariance``.
+    stretch : ndarray of float64, shape (m,)
+        Square root of the terms in a window without gaps over the terms present.
+    columns : ndarray of float64, shape (m, 5)
+        Columns of the fit.
+    blind : ndarray of float64, shape (m,)
+        Direction that the fit ignores. ``blind`` blindᵀ is added to V.
+    full : bool
+        True to use the covariances, False to use the variances alone.
+    variance : ndarray of float64, shape (m,)
+        Variances under the model, overwritten.
+    weighted : ndarray of float64, shape (m, 5)
+        Result.
+    """
     variances(rows, theta, covariance, stretch, variance)
     if full and whiten(rows, theta, covariance, stretch, columns, blind, variance, weighted):
         return
@@ -83,7 +141,23 @@ def weigh(rows, theta, covariance, stretch, columns, blind, full, variance, weig
 
 @compiled
 def normal_equations(level, rows, columns, weighted, normal, right):  # type: ignore[no-untyped-def]
-    """Xᵀ V⁻¹ X and Xᵀ V⁻¹ y; a column of zeros is a term that is not asked for, and comes out as zero."""
+    """Compute Xᵀ V⁻¹ X and Xᵀ V⁻¹ y. A column of zeros is a term that is not fitted; its solution is zero.
+
+    Parameters
+    ----------
+    level : ndarray of float64, shape (m,)
+        Observations y.
+    rows : ndarray of int64
+        Rows in use.
+    columns : ndarray of float64, shape (m, 5)
+        Columns X of the fit.
+    weighted : ndarray of float64, shape (m, 5)
+        V⁻¹ X.
+    normal : ndarray of float64, shape (5, 5)
+        Result Xᵀ V⁻¹ X.
+    right : ndarray of float64, shape (5,)
+        Result Xᵀ V⁻¹ y.
+    """
     for a in range(5):
         right[a] = 0.0
         for b in range(a + 1):
@@ -102,9 +176,20 @@ def normal_equations(level, rows, columns, weighted, normal, right):  # type: ig
 
 @compiled
 def solve_nonnegative(normal, right, free, theta):  # type: ignore[no-untyped-def]
-    """Least squares with Q N B K not negative (Q may be, if free): the subset that meets Kuhn and Tucker.
+    """Solve least squares with non-negative Q N B K by finding the subset that meets the Kuhn–Tucker conditions.
 
-    Terms in the subset are positive, and none of those left out would lower the error by growing.
+    Terms in the subset are positive, and the error would not decrease if one of the others grew.
+
+    Parameters
+    ----------
+    normal : ndarray of float64, shape (5, 5)
+        Normal matrix.
+    right : ndarray of float64, shape (5,)
+        Right-hand side.
+    free : bool
+        True if Q² may be negative.
+    theta : ndarray of float64, shape (5,)
+        Solution.
     """
     for subset in range(2**NOISES - 1, 0, -1):
         if not solve(normal, right, subset, theta):
@@ -127,7 +212,24 @@ def solve_nonnegative(normal, right, free, theta):  # type: ignore[no-untyped-de
 
 @compiled
 def solve(normal, right, subset, solution):  # type: ignore[no-untyped-def]
-    """Cholesky on the columns of a subset, each scaled to one; False when they cannot be told apart."""
+    """Solve the normal equations on a subset of the columns by Cholesky decomposition, each column scaled to one.
+
+    Parameters
+    ----------
+    normal : ndarray of float64, shape (5, 5)
+        Normal matrix.
+    right : ndarray of float64, shape (5,)
+        Right-hand side.
+    subset : int
+        Bit set of the columns.
+    solution : ndarray of float64, shape (5,)
+        Solution, zero outside the subset.
+
+    Returns
+    -------
+    bool
+        False if the columns cannot be distinguished.
+    """
     factor = np.zeros((5, 5))
     for a in range(5):
         solution[a] = 0.0
@@ -165,7 +267,7 @@ def solve(normal, right, subset, solution):  # type: ignore[no-untyped-def]
 
 @compiled
 def present(theta):  # type: ignore[no-untyped-def]
-    """The subset of terms that are not zero."""
+    """Return the bit set of the terms that are not zero."""
     subset = 0
     for a in range(NOISES):
         if theta[a] != 0.0:
@@ -175,7 +277,22 @@ def present(theta):  # type: ignore[no-untyped-def]
 
 @compiled
 def invert(normal, subset, inverse):  # type: ignore[no-untyped-def]
-    """Inverse [NOISES, NOISES] on the terms of a subset, zero elsewhere; False where they cannot be told apart."""
+    """Compute the inverse [NOISES, NOISES] on the terms of a subset, zero elsewhere.
+
+    Parameters
+    ----------
+    normal : ndarray of float64, shape (5, 5)
+        Normal matrix.
+    subset : int
+        Bit set of the terms.
+    inverse : ndarray of float64, shape (4, 4)
+        Result.
+
+    Returns
+    -------
+    bool
+        False if the terms cannot be distinguished.
+    """
     unit, solution = np.empty(5), np.empty(5)
     for a in range(NOISES):
         for b in range(5):

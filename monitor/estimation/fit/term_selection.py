@@ -1,7 +1,8 @@
-"""What a solution is worth, compiled: which terms are in, their intervals, and how long the solution may stand.
+"""Selection of significant terms, their confidence intervals, and the limits within which a solution stays valid.
 
-The unconstrained solution û beside the fit has the variance v(t) = c0 + c1 t + c2 t² if the true θ_a were t, from the
-covariances of ``uncertainty``; all that is said here of a term rests on that, see the head of ``fit``.
+The unconstrained solution û has the variance v(t) = c0 + c1 t + c2 t² if the true θ_a is t, from the covariances of
+``uncertainty``. All decisions in this module are based on this variance; see the docstring of ``coefficient_fit``. The
+functions are compiled.
 """
 
 from typing import Final, NamedTuple
@@ -16,67 +17,77 @@ from monitor.estimation.fit.confidence_bounds import BOUND, TWO_SIDED_95, interv
 from monitor.estimation.fit.least_squares import K, Q, R, invert, normal_equations, present, solve, weigh
 
 MOVED: Final = 0.4
-"""Gains are made anew when a θ has moved by this share, a coefficient by a fifth, and by more than its own scatter."""
+"""Gains are recomputed when a θ has moved by this share (a coefficient by a fifth) and by more than its own scatter."""
 
 SCATTER: Final = 1.0
-"""σ by which a θ may move before its gains are made anew, where that is more."""
+"""Distance in σ that a θ may move before its gains are recomputed, if this is more than the share ``MOVED``."""
 
 JUST_SEEN: Final = 3.0
-"""σ of an absent term, at which it would be seen."""
+"""Size in σ at which an absent term would be detected."""
 
 NUMBERS: Final = 2 * NOISES
-"""With limits in Gains: θ of Q N B K, then û of Q N B K, the solution without bounds."""
+"""Number of quantities with limits in ``Gains``: θ of Q N B K, then the unconstrained û of Q N B K."""
 
 
-class Known(NamedTuple):
-    """What holds for all axes at one length of the window."""
+class SharedInputs(NamedTuple):
+    """Inputs of a fit that are the same for all axes at one window length."""
 
-    columns: Floats  # [m, 5] Allan variance of coefficients of one
-    flat: Floats  # [m, 5] the same without what their own noise puts into slope² τ²/2 on average
-    covariance: Floats  # [m, m, 10] of ``uncertainty.Table``
-    whole: Floats  # [m] terms in a window without gaps
-    slope_variance: Floats  # [4] of the slope of thirds, for θ of one
-    blind: Floats  # [m] a direction of the curve that the fit does not look along, larger than any noise; zero = none
-    ask: bool  # leave out short τ that contradict the fit
+    columns: Floats  # [m, 5] Allan variance of unit coefficients
+    flat: Floats  # [m, 5] the same without the mean contribution of their own noise to slope² τ²/2
+    covariance: Floats  # [m, m, 10] ``uncertainty.Table.covariance``
+    whole: Floats  # [m] number of terms in a window without gaps
+    slope_variance: Floats  # [4] variance of the slope of thirds, for unit θ
+    blind: Floats  # [m] direction of the curve that the fit ignores, larger than any noise; zero means none
+    ask: bool  # True to leave out short τ that contradict the fit
 
 
 class Answer(NamedTuple):
-    """One fit, a row an axis."""
+    """Results of a fit, one row per axis."""
 
-    entered: NDArray[np.bool_]  # [axes, 5] which terms are in; also read, as what was in before
-    theta: Floats  # [axes, 5] also read by a warm start
-    lo: Floats  # [axes, 5]
-    hi: Floats  # [axes, 5]
-    status: NDArray[np.int8]  # [axes, 5]
-    edf: Floats  # [axes, m]
-    fitted: Floats  # [axes, m]
-    left_out: Ints  # [axes]
-    misfit: Floats  # [axes] variance about the fit over that of noise of the five terms; one where chance explains it
-    scatter: Floats  # [axes] the same, whether or not
+    entered: NDArray[np.bool_]  # [axes, 5] terms in the fit; on input, the terms of the previous fit
+    theta: Floats  # [axes, 5] squared coefficients; on input, the start of a warm fit
+    lo: Floats  # [axes, 5] lower end of the interval
+    hi: Floats  # [axes, 5] upper end of the interval
+    status: NDArray[np.int8]  # [axes, 5] values of ``Status``
+    edf: Floats  # [axes, m] degrees of freedom of the curve
+    fitted: Floats  # [axes, m] fitted model
+    left_out: Ints  # [axes] number of shortest τ left out
+    misfit: Floats  # [axes] variance about the fit, relative to noise of the five terms; 1 if chance explains it
+    scatter: Floats  # [axes] the same ratio in any case
 
 
 class Gains(NamedTuple):
-    """A solution as a linear map from curve to coefficients, and how far it holds; a row an axis.
+    """Solution as a linear map from curve to coefficients, with the limits of its validity, one row per axis.
 
-    With r = Xᵀ V⁻¹ y of the normal equations: θ = ``inverse`` r on the terms that are not zero, û = ``whole`` r.
+    With r = Xᵀ V⁻¹ y of the normal equations, θ = ``inverse`` r on the terms that are not zero, and û = ``whole`` r.
     """
 
     rows: Floats  # [axes, m, NOISES] V⁻¹ X
-    ramp: Floats  # [axes, NOISES] of r, what slope² takes away
-    twist: Floats  # [axes, NOISES] and what the slope itself does, as the τ see other slopes than the window
+    ramp: Floats  # [axes, NOISES] part of r that is subtracted per slope²
+    twist: Floats  # [axes, NOISES] part of r per slope, because each τ sees another slope than the window
     normal: Floats  # [axes, 5, 5] Xᵀ V⁻¹ X
     inverse: Floats  # [axes, NOISES, NOISES]
     whole: Floats  # [axes, NOISES, NOISES]
-    low: Floats  # [axes, NUMBERS + 1] θ, û, and last the slope's size, must stay between these
-    high: Floats  # [axes, NUMBERS + 1]
-    used: Ints  # [axes, 2] first τ used, and the one after the last; equal: there is no solution
-    free: NDArray[np.bool_]  # [axes] Q² may be negative
-    straight: NDArray[np.bool_]  # [axes] they stand for a curve from which slope² τ²/2 is taken
-    either: NDArray[np.bool_]  # [axes] the slope is more than noise without K makes: K or R
+    low: Floats  # [axes, NUMBERS + 1] lower limits of θ, û, and last of the absolute slope
+    high: Floats  # [axes, NUMBERS + 1] upper limits of the same
+    used: Ints  # [axes, 2] first τ in use and the one after the last; equal if there is no solution
+    free: NDArray[np.bool_]  # [axes] True if Q² may be negative
+    straight: NDArray[np.bool_]  # [axes] True if slope² τ²/2 is subtracted from the curve
+    either: NDArray[np.bool_]  # [axes] True if noise without K does not explain the slope: K or R
 
 
 def answer(axes: int, m: int, entered: NDArray[np.bool_]) -> Answer:
-    """Room for the answer of m τ."""
+    """Allocate the results of a fit.
+
+    Parameters
+    ----------
+    axes : int
+        Number of axes.
+    m : int
+        Number of τ.
+    entered : ndarray of bool, shape (axes, 5)
+        Terms of the previous fit. The array is kept and updated.
+    """
     theta, lo, hi = np.full((3, axes, 5), np.nan)
     edf, fitted = np.full((2, axes, m), np.nan)
     status, left_out = np.zeros((axes, 5), np.int8), np.zeros(axes, np.int64)
@@ -84,7 +95,15 @@ def answer(axes: int, m: int, entered: NDArray[np.bool_]) -> Answer:
 
 
 def gains(axes: int, m: int) -> Gains:
-    """Room for the gains of m τ; they do not hold yet."""
+    """Allocate gains that are not valid yet.
+
+    Parameters
+    ----------
+    axes : int
+        Number of axes.
+    m : int
+        Number of τ.
+    """
     return Gains(
         np.zeros((axes, m, NOISES)),
         np.zeros((axes, NOISES)),
@@ -106,9 +125,33 @@ def judge(  # type: ignore[no-untyped-def]
     level, rows, stretch, covariance, weighted, normal, thresholds, straight, misfit,
     entered, theta, lo, hi, status,
 ):  # fmt: skip
-    """Which terms are in, and the interval of each: see the head of ``fit``.
+    """Select the terms and compute their intervals; see the docstring of ``coefficient_fit``.
 
-    Returns û, its variance if its term were absent, and from where on a term that is out comes in.
+    Parameters
+    ----------
+    level : ndarray of float64, shape (m,)
+        Curve without the line of the slope.
+    rows : ndarray of int64
+        Rows in use.
+    stretch, covariance, weighted, normal
+        See ``least_squares.weigh`` and ``least_squares.normal_equations``.
+    thresholds : tuple of float
+        Thresholds in σ to add and to drop a term.
+    straight : bool
+        True if the line of the slope has been subtracted.
+    misfit : float
+        Factor by which variances are widened.
+    entered, theta, lo, hi, status : ndarray, shape (5,)
+        Results of the axis, updated in place.
+
+    Returns
+    -------
+    estimate : ndarray of float64, shape (5,)
+        Unconstrained solution û.
+    absent : ndarray of float64, shape (4,)
+        Variance of û if its term were absent.
+    enters : ndarray of float64, shape (4,)
+        Value of û above which an absent term is added.
     """
     terms = NOISES if straight else 5
     gain, estimate, enters, absent = np.zeros((5, rows.size)), np.zeros(5), np.empty(NOISES), np.empty(NOISES)
@@ -131,16 +174,16 @@ def judge(  # type: ignore[no-untyped-def]
         low = interval_end(estimate[a], c0, c1, c2, skewness, TWO_SIDED_95)
         high = interval_end(estimate[a], c0, c1, c2, skewness, -TWO_SIDED_95)
         if theta[a] > 0.0 and not low < np.sqrt(theta[a]) < high:
-            # others were held at zero, and this one is not û: the interval of what it is
+            # other terms were held at zero, so θ differs from û: include the interval of θ
             low = min(low, interval_end(theta[a], c0, c1, c2, skewness, TWO_SIDED_95))
             high = max(high, interval_end(theta[a], c0, c1, c2, skewness, -TWO_SIDED_95))
-        # what was out stays out while its interval reaches to zero
+        # an absent term stays out while its interval includes zero
         seen = entered[a] or low > 0.0
         entered[a] = seen and a != R and theta[a] > 0.0 and estimate[a] > threshold * np.sqrt(c0)
         if entered[a]:
             status[a], lo[a], hi[a] = 2, low, high
         else:
-            # a bound below what an estimate of zero would give claims more than the curve can know
+            # a bound tighter than the one from an estimate of zero would claim more than the curve supports
             status[a] = 1
             lo[a] = 0.0
             hi[a] = interval_end(max(estimate[a], 0.0), c0, c1, c2, skewness, -BOUND)
@@ -151,10 +194,25 @@ def judge(  # type: ignore[no-untyped-def]
 def sharpen(  # type: ignore[no-untyped-def]
     level, rows, stretch, columns, covariance, misfit, found, c0, theta, hi, status
 ):
-    """Bounds of the terms that are not in, each by the weights that suit a term just as large as could be seen.
+    """Recompute the bounds of absent terms with weights that suit a term just large enough to be detected.
 
-    Weights for an absent term look where none of it is: on the few long τ that K would fill, say, they leave so little
-    that its own scatter drowns it, and the bound is far off or infinite.
+    Weights for an absent term use the τ where the term has no effect. For K, for example, they give so little weight to
+    the few long τ that its own scatter dominates. The bound is then very large or infinite.
+
+    Parameters
+    ----------
+    level : ndarray of float64, shape (m,)
+        Curve without the line of the slope.
+    rows : ndarray of int64
+        Rows in use.
+    stretch, columns, covariance
+        See ``least_squares.weigh``.
+    misfit : float
+        Factor by which variances are widened.
+    found, c0 : ndarray of float64
+        Unconstrained solution and its variance for absent terms, from ``judge``.
+    theta, hi, status : ndarray, shape (5,)
+        Results of the axis; ``hi`` is updated in place.
     """
     supposed, scratch, weights = np.empty(5), np.empty(level.size), np.empty((level.size, 5))
     normal, right, gain = np.empty((5, 5)), np.empty(5), np.empty((1, rows.size))
@@ -175,7 +233,7 @@ def sharpen(  # type: ignore[no-untyped-def]
 
 @compiled
 def _estimate(gain, level, rows, stretch):  # type: ignore[no-untyped-def]
-    """û of one row."""
+    """Return û from one row of the linear map."""
     estimate = 0.0
     for k in range(rows.size):
         estimate += gain[k] / stretch[rows[k]] * level[rows[k]]
@@ -184,7 +242,10 @@ def _estimate(gain, level, rows, stretch):  # type: ignore[no-untyped-def]
 
 @compiled
 def _row_of(a, rows, weighted, normal, stretch, gain):  # type: ignore[no-untyped-def]
-    """The row of the linear map from curve to û_a, each τ as if it had all terms; False where there is none."""
+    """Compute the row of the linear map from curve to û_a, as if each τ had all terms.
+
+    Return False if the row does not exist.
+    """
     unit, solution = np.zeros(5), np.empty(5)
     unit[a] = 1.0
     if not solve(normal, unit, (2**NOISES - 1) | (1 << a), solution):
@@ -199,9 +260,9 @@ def _row_of(a, rows, weighted, normal, stretch, gain):  # type: ignore[no-untype
 
 @compiled
 def _variance_forms(first, end, gain, rows, theta, covariance):  # type: ignore[no-untyped-def]
-    """c0 c1 c2 [end - first, 3] of û = g σ² of each term from ``first``: its variance is c0 + c1 t + c2 t² if θ were t.
+    """Return c0 c1 c2 [end - first, 3] of the variance c0 + c1 t + c2 t² of û, for each term from ``first``.
 
-    One walk over the pairs of τ for all terms; of those the ramp, which has no noise, only has c0.
+    One pass over the pairs of τ serves all terms. The ramp has no noise and only has c0.
     """
     q, n, b, k = max(theta[0], 0.0), theta[1], theta[2], theta[3]
     forms, bent, own = np.zeros((end - first, 3)), np.zeros(5), np.zeros(5)
@@ -235,9 +296,25 @@ def _variance_forms(first, end, gain, rows, theta, covariance):  # type: ignore[
 
 @compiled
 def judge_ramp(slope, slope_variance, thresholds, entered, theta, lo, hi, status):  # type: ignore[no-untyped-def]
-    """R is in when the slope is more than noise makes even with K at the upper end of its interval.
+    """Include R if the slope is larger than noise explains with K at the upper end of its interval.
 
-    Returns the variance of the slope under the fitted noise, and under that with most K.
+    Parameters
+    ----------
+    slope : float
+        Slope of the rate in units of one sample.
+    slope_variance : ndarray of float64, shape (4,)
+        Variance of the slope for unit θ.
+    thresholds : tuple of float
+        Thresholds in σ to add and to drop a term.
+    entered, theta, lo, hi, status : ndarray, shape (5,)
+        Results of the axis, updated in place.
+
+    Returns
+    -------
+    noise : float
+        Variance of the slope under the fitted noise.
+    most : float
+        Variance of the slope with K at the upper end of its interval.
     """
     noise = 0.0
     for a in range(NOISES):
@@ -257,9 +334,37 @@ def judge_ramp(slope, slope_variance, thresholds, entered, theta, lo, hi, status
 def freeze(  # type: ignore[no-untyped-def]
     axis, rows, weighted, normal, free, thresholds, found, c0, enters, most, columns, slope, slopes, answer, gains
 ):
-    """Keep the solution as a linear map, with the limits of its use."""
+    """Store the solution as a linear map with the limits of its validity.
+
+    Parameters
+    ----------
+    axis : int
+        Row of ``answer`` and ``gains``.
+    rows : ndarray of int64
+        Rows in use.
+    weighted, normal
+        See ``least_squares.normal_equations``.
+    free : bool
+        True if Q² may be negative.
+    thresholds : tuple of float
+        Thresholds in σ to add and to drop a term.
+    found, c0, enters
+        Results of ``judge``.
+    most : float
+        Result of ``judge_ramp``; NaN without a slope.
+    columns : ndarray of float64, shape (m, 5)
+        Columns of the fit.
+    slope : float
+        Slope of the rate in units of one sample.
+    slopes : ndarray of float64, shape (axes, m)
+        Slope as seen by each τ.
+    answer : Answer
+        Results of the fit.
+    gains : Gains
+        Gains, updated in place.
+    """
     if rows[-1] - rows[0] != rows.size - 1:
-        return  # a τ between others without a term: only a gap nearly as long as the window makes that
+        return  # a τ without terms between others, which only a gap nearly as long as the window can cause
     low, high = gains.low[axis], gains.high[axis]
     theta, entered, status = answer.theta[axis], answer.entered[axis], answer.status[axis]
     for a in range(5):
@@ -276,7 +381,7 @@ def freeze(  # type: ignore[no-untyped-def]
                 gains.twist[axis, a] += weighted[i, a] * columns[i, R] * 2.0 * (slopes[axis, i] - slope)
         reach = max(MOVED * abs(theta[a]), SCATTER * np.sqrt(c0[a]))
         low[a], high[a] = theta[a] - reach, theta[a] + reach
-        # of û: where the term would enter or leave
+        # limits of û, at which the term would be added or dropped
         low[NOISES + a], high[NOISES + a] = -np.inf, np.inf
         if entered[a]:
             low[NOISES + a] = thresholds[1] * np.sqrt(c0[a])

@@ -160,7 +160,7 @@ def test_many_events_are_counted_rather_than_listed():
     assert notes[0] == "the sensor moved 14 times, 7 s in all: struck out"
     assert notes[1] == "at 0.0 s: moved for 0.5 s: gx up to 5.7 °/s"
     assert notes[-1] == "and 4 more motions"
-    assert len(notes) == 1 + analysis_notes.MOST + 1
+    assert len(notes) == 1 + analysis_notes.MAX_NOTES + 1
     notes = analysis_notes.of_changes([change()] * 11, RATE_HZ)
     assert notes[0] == "at 1.0 s: gx noise changed (8.0 σ)"
     assert notes[-2] == "and 1 more changes"
