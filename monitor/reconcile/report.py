@@ -1,12 +1,13 @@
-"""A reconciliation as JSON for programs: ``report.json``, schema imu-monitor/reconcile/1.
+"""JSON report of a reconciliation: ``report.json``, schema imu-monitor/reconcile/1.
 
-In comes a ``Reconciliation``, out go bytes; the same reconciliation gives the same bytes. Numbers are SI of their axis,
-times s from the start of the recording. What is not a finite number becomes null, as JSON has no word for it; a
-parameter that names an axis has a value and no interval.
+The same reconciliation always gives the same bytes. Numbers are in SI units of their axis, and times are in seconds
+from the start of the recording. A number that is not finite becomes null, because JSON cannot represent it. A parameter
+that names an axis has a value and no interval.
 
-Of each step, ``found`` has the place and the threshold that it passed, under the model before the step; ``gap`` is the
-same lens before and after, with ``null95`` and ``threshold`` under the model after it, which decide what is left over.
-``scores`` are all lenses: of an axis beside the first model, of a step after it.
+In each step, ``found`` holds the location and the threshold that the difference passed, under the model before the
+step. ``gap`` holds the same diagnostic before and after the step. Its ``null95`` and ``threshold`` belong to the model
+after the step and decide whether a difference is left over. ``scores`` holds all diagnostics: for an axis, the
+comparison with the first model; for a step, the comparison after the step.
 """
 
 from math import isfinite
@@ -18,12 +19,12 @@ from drivers.sample import AXES
 from monitor.reconcile.result import AxisResult, Bounds, Reconciliation, Score, Step, Where
 
 SCHEMA: Final = "imu-monitor/reconcile/1"
-_ENCODER: Final = msgspec.json.Encoder()
+_JSON_ENCODER: Final = msgspec.json.Encoder()
 
 
 def to_json(r: Reconciliation) -> bytes:
-    """The report, axes in the order of ``AXES``."""
-    return _ENCODER.encode({
+    """Encode a reconciliation as JSON, with the axes in the order of ``AXES``."""
+    return _JSON_ENCODER.encode({
         "schema": SCHEMA,
         "verdict": r.verdict,
         "rate": _number(r.rate_hz),
@@ -37,6 +38,7 @@ def to_json(r: Reconciliation) -> bytes:
 
 
 def _axis(result: AxisResult) -> dict[str, Any]:
+    """Return the report entry of one axis."""
     return {
         "verdict": result.verdict,
         "steps": [_step(step) for step in result.steps],
@@ -46,6 +48,7 @@ def _axis(result: AxisResult) -> dict[str, Any]:
 
 
 def _step(step: Step) -> dict[str, Any]:
+    """Return the report entry of one step."""
     held_out = _gap(step.held_out_before, step.held_out_after)
     return {
         "found": _score(step.found),
@@ -63,6 +66,7 @@ def _step(step: Step) -> dict[str, Any]:
 
 
 def _gap(before: Score | None, after: Score | None) -> dict[str, float | None] | None:
+    """Return the gaps before and after a step, or None if one of them is unknown."""
     if before is None or after is None:
         return None
     return {
@@ -74,6 +78,7 @@ def _gap(before: Score | None, after: Score | None) -> dict[str, float | None] |
 
 
 def _score(score: Score) -> dict[str, Any]:
+    """Return the report entry of one score."""
     return {
         "lens": score.lens,
         "where": _where(score.where),
@@ -84,16 +89,18 @@ def _score(score: Score) -> dict[str, Any]:
 
 
 def _where(where: Where) -> dict[str, Any]:
+    """Return the report entry of a location."""
     found = where.found().items()
     return {name: place if isinstance(place, str) else [_number(end) for end in place] for name, place in found}
 
 
 def _bounds(bounds: Bounds) -> dict[str, Any]:
+    """Return the report entry of a parameter."""
     if isinstance(bounds.value, str):
         return {"value": bounds.value}
     return {"value": _number(bounds.value), "lo": _number(bounds.lo), "hi": _number(bounds.hi)}
 
 
 def _number(value: float | None) -> float | None:
-    """Python's own float: NumPy's are not known to the encoder."""
+    """Return a Python float, because the encoder does not accept NumPy scalars, or None if the value is not finite."""
     return None if value is None or not isfinite(value) else float(value)
