@@ -15,7 +15,7 @@ import numpy as np
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Narrowband, Sinusoidal
 from monitor.reconcile.diagnostics.diagnostics import periodogram, sight
-from monitor.reconcile.likelihood.hypothesis import GOLDEN, HALF, believed
+from monitor.reconcile.likelihood.hypothesis import GOLDEN, CHI2_HALF_NATS, believed
 from monitor.reconcile.preparation.axis import Axis, Effects
 from monitor.reconcile.result import Bounds
 from monitor.reconcile.search.candidates import peaks
@@ -195,13 +195,13 @@ def _maximise_gain(gain: Any, x: float, width: float) -> float:
 
 
 def _interval_end(gain: Any, x: float, top: float, step: float) -> float:
-    """Return the point on one side of the maximum at which the gain has fallen by ``HALF``."""
+    """Return the point on one side of the maximum at which the gain has fallen by ``CHI2_HALF_NATS``."""
     near, far = x, x + step
     for _ in range(12):
-        if top - gain(far) > HALF:
+        if top - gain(far) > CHI2_HALF_NATS:
             break
         near, far = far, x + 2.0 * (far - x)
     for _ in range(10):
         middle = 0.5 * (near + far)
-        near, far = (near, middle) if top - gain(middle) > HALF else (middle, far)
+        near, far = (near, middle) if top - gain(middle) > CHI2_HALF_NATS else (middle, far)
     return far

@@ -33,7 +33,7 @@ from monitor.noise.effects import (
 )
 from monitor.reconcile.diagnostics.diagnostics import MARGIN, Sight, unsteady
 from monitor.reconcile.likelihood.effect_terms import NOISE
-from monitor.reconcile.likelihood.hypothesis import GOLDEN, RETUNED, Hypothesis, settled
+from monitor.reconcile.likelihood.hypothesis import GOLDEN, RESIZE_PENALTY_NATS, Hypothesis, settled
 from monitor.reconcile.preparation.axis import Axis, Effects
 from monitor.reconcile.preparation.value_statistics import Size
 from monitor.reconcile.result import Bounds
@@ -244,7 +244,7 @@ def _curved(axis: Axis, state: Hypothesis) -> float:
     """Score of a drift that is a curve and nothing else, less its price."""
     ramp = RateRamp(R=1e-3 * float(np.sqrt(np.mean(axis.coefficients**2))))
     bent = axis.fit((*state.effects, ramp), state.likely.held, curved=True)
-    return bent.log_likelihood - RETUNED * state.freed - PRICE["rate_ramp"] - BEND
+    return bent.log_likelihood - RESIZE_PENALTY_NATS * state.freed - PRICE["rate_ramp"] - BEND
 
 
 def _beyond(effect: Effect) -> float:
@@ -255,7 +255,7 @@ def _beyond(effect: Effect) -> float:
 def _slow(axis: Axis, state: Hypothesis) -> list[Callable[[Effects], float]]:
     """Scores beside each slow noise that could stand in for a course; sizes of the model's noises as they are."""
     small = 1e-3 * float(np.sqrt(np.mean(axis.coefficients**2)))
-    held, cost, length_s = state.likely.held, RETUNED * state.freed, axis.n / axis.rate_hz
+    held, cost, length_s = state.likely.held, RESIZE_PENALTY_NATS * state.freed, axis.n / axis.rate_hz
 
     def beside(one: Effect) -> Callable[[Effects], float]:
         return lambda effects: axis.fit((*effects, one), held).log_likelihood - cost - PRICE[one.name]
@@ -273,7 +273,10 @@ def _slow(axis: Axis, state: Hypothesis) -> list[Callable[[Effects], float]]:
 
 def _nameless(axis: Axis, state: Hypothesis, exponent: float) -> float:
     """Score beside a power law."""
-    return axis.fit(state.effects, state.likely.held, _power_law(axis, exponent)).log_likelihood - RETUNED * state.freed
+    return (
+        axis.fit(state.effects, state.likely.held, _power_law(axis, exponent)).log_likelihood
+        - RESIZE_PENALTY_NATS * state.freed
+    )
 
 
 def _power_law(axis: Axis, exponent: float) -> Floats:
