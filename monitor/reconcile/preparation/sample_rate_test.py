@@ -15,7 +15,7 @@ import numpy as np
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Narrowband, Sinusoidal
 from monitor.reconcile.diagnostics.diagnostics import periodogram, sight
-from monitor.reconcile.likelihood.hypothesis import GOLDEN, CHI2_HALF_NATS, believed
+from monitor.reconcile.likelihood.hypothesis import CHI2_HALF_NATS, GOLDEN, believed
 from monitor.reconcile.preparation.axis import Axis, Effects
 from monitor.reconcile.result import Bounds
 from monitor.reconcile.search.candidates import peaks

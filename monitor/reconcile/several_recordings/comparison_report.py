@@ -1,9 +1,10 @@
-"""A comparison of several recordings as JSON for programs: schema imu-monitor/reconcile-runs/1.
+"""JSON report of a comparison of several recordings: schema imu-monitor/reconcile-runs/1.
 
-In comes a ``Comparison``, out go bytes; the same comparison gives the same bytes. Numbers are SI of their axis; what is
-not a finite number is null. Of each effect, ``parameters`` are pooled over the recordings that show it, each with the
-probability ``p`` that values as different as theirs are of one; ``consistent`` and ``p`` of the effect speak of its
-size. ``each`` has the recordings by themselves; all else of them is in their own ``report.json``, in ``folder``.
+The same comparison always gives the same bytes. Numbers are in SI units of their axis, and a number that is not finite
+becomes null. The ``parameters`` of an effect are pooled over the recordings that show it. Each has the probability
+``p`` that values as different as these come from one value. ``consistent`` and ``p`` of the effect refer to its size.
+``each`` contains the values of the single recordings. All further results of a recording are in its own
+``report.json``, in ``folder``.
 """
 
 from math import isfinite
@@ -18,7 +19,7 @@ SCHEMA: Final = "imu-monitor/reconcile-runs/1"
 
 
 def to_json(c: Comparison) -> bytes:
-    """The report."""
+    """Encode a comparison as JSON."""
     return msgspec.json.encode({
         "schema": SCHEMA,
         "verdict": c.verdict,
@@ -33,6 +34,7 @@ def to_json(c: Comparison) -> bytes:
 
 
 def _run(run: Run) -> dict[str, Any]:
+    """Return the report entry of one recording."""
     return {
         "name": run.name,
         "folder": run.name,
@@ -44,6 +46,7 @@ def _run(run: Run) -> dict[str, Any]:
 
 
 def _axis(one: AxisRuns) -> dict[str, Any]:
+    """Return the report entry of one axis."""
     return {
         "verdicts": {run: result.verdict for run, result in one.results.items()},
         "common": [_seen(seen) for seen in one.common],
@@ -58,6 +61,7 @@ def _axis(one: AxisRuns) -> dict[str, Any]:
 
 
 def _seen(seen: Seen) -> dict[str, Any]:
+    """Return the report entry of one effect."""
     return {
         "effect": seen.effect,
         "kind": seen.kind,
@@ -73,6 +77,7 @@ def _seen(seen: Seen) -> dict[str, Any]:
 
 
 def _each(step: Step) -> dict[str, Any]:
+    """Return the report entry of one effect in one recording."""
     return {
         "parameters": {name: _bounds(one) for name, one in step.parameters.items()},
         "confidence": _number(step.confidence),
@@ -81,10 +86,12 @@ def _each(step: Step) -> dict[str, Any]:
 
 
 def _bounds(one: Bounds) -> dict[str, Any]:
+    """Return the report entry of a parameter."""
     if isinstance(one.value, str):
         return {"value": one.value}
     return {"value": _number(one.value), "lo": _number(one.lo), "hi": _number(one.hi)}
 
 
 def _number(value: float | None) -> float | None:
+    """Return the value, or None if it is not finite."""
     return None if value is None or not isfinite(value) else float(value)
