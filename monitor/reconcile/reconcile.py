@@ -56,6 +56,7 @@ MIN_VALID_FRACTION: Final = 0.5
 MIN_TERM_GAIN_NATS: Final = 3.0
 """Log-likelihood gain in nats that a term of the first fit must reach to be kept."""
 ProgressCallback = Callable[[str], None]
+"""Function that is called with the name of each stage."""
 
 MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """Function with the signature of ``map``, such as the ``map`` method of a thread pool."""
@@ -67,7 +68,7 @@ class Recording:
 
     values: Mapping[str, Floats]  # axis -> [n] SI; NaN = missing
     rate_hz: float
-    temperature_c: Floats | None = None  # [n] °C, without holes
+    temperature_c: Floats | None = None  # [n] °C; NaN = missing
 
     @property
     def samples(self) -> int:

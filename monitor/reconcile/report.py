@@ -19,6 +19,7 @@ from drivers.sample import AXES
 from monitor.reconcile.result import AxisResult, Bounds, Reconciliation, Score, Step, Where
 
 SCHEMA: Final = "imu-monitor/reconcile/1"
+"""Name and version of the JSON schema."""
 _JSON_ENCODER: Final = msgspec.json.Encoder()
 
 

@@ -14,7 +14,9 @@ from drivers.sample import Floats
 from monitor.noise.model import NoiseModel
 
 Verdict = Literal["agrees", "explained", "partly_explained", "unexplained"]
+"""Decision for an axis or a recording."""
 Kind = Literal["added", "retuned"]
+"""Kind of a step: an effect was added, or the size of a known effect was changed."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,6 +25,7 @@ TIME_BLOCKS: Final = 240
 TEMPERATURE_BINS: Final = 24
 """Number of temperature intervals."""
 Z95: Final = 1.959964
+"""Number of standard deviations on each side of a 95 % interval."""
 LEVEL_UNITS: Final = {"g": "rad/s", "a": "m/s²"}
 """Unit of the level by the first letter of the axis."""
 DENSITY_UNITS: Final = {"g": "(rad/s)²/Hz", "a": "(m/s²)²/Hz"}

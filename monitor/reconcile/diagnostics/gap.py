@@ -30,6 +30,7 @@ AXIS_MARGIN_NATS: Final = 3.0
 """Margin in nats above the largest simulated gain of an axis."""
 
 Findings = Mapping[str, Finding]
+"""Findings of all diagnostics on one axis, by the name of the diagnostic."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,9 +21,11 @@ from monitor.reconcile.result import Bounds
 RESIZE_PENALTY_NATS: Final = 5.0
 """Log-likelihood gain in nats that justifies another size of a noise effect of the model."""
 Z95: Final = 1.959964
+"""Number of standard deviations on each side of a 95 % interval."""
 CHI2_HALF_NATS: Final = 1.920729
 """Decrease of the log-likelihood at the ends of a 95 % interval of one parameter, in nats: χ²(0.95; 1)/2."""
 GOLDEN: Final = 0.6180339887498949
+"""Inverse of the golden ratio."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +109,7 @@ def settled(axis: Axis, found: Sequence[Effect], model: Effects) -> Hypothesis:
     return best
 
 
-def refined(axis: Axis, effects: Effects, at: int, names: Sequence[str], reach: float = 1.5) -> Effects:
+def refined(axis: Axis, effects: Effects, index: int, names: Sequence[str], reach: float = 1.5) -> Effects:
     """Maximise the likelihood over shape parameters of one effect with all sizes free.
 
     The parameters are varied in turn, by golden-section search in their logarithm.
@@ -118,7 +120,7 @@ def refined(axis: Axis, effects: Effects, at: int, names: Sequence[str], reach: 
         Axis to fit.
     effects : tuple of Effect
         Effects of the axis.
-    at : int
+    index : int
         Index of the effect whose shape is varied.
     names : sequence of str
         Names of its shape parameters.
@@ -134,35 +136,35 @@ def refined(axis: Axis, effects: Effects, at: int, names: Sequence[str], reach: 
     for turn in range(1 if len(names) == 1 else 3):
         for name in names:
             width = log(reach) / (turn + 1)
-            middle = log(getattr(found[at], name))
-            best = _golden_section(axis, found, at, name, middle - width, middle + width)
-            found = with_shape(found, at, name, exp(best))
+            middle = log(getattr(found[index], name))
+            best = _golden_section(axis, found, index, name, middle - width, middle + width)
+            found = with_shape(found, index, name, exp(best))
     return found
 
 
-def with_shape(effects: Effects, at: int, name: str, value: float) -> Effects:
+def with_shape(effects: Effects, index: int, name: str, value: float) -> Effects:
     """Return the effects with another value of one parameter of one effect.
 
     Parameters
     ----------
     effects : tuple of Effect
         Effects of the axis.
-    at : int
+    index : int
         Index of the effect to change.
     name : str
         Name of the parameter.
     value : float
         New value, in the unit of the parameter.
     """
-    changed: Any = replace(effects[at], **{name: value})  # type: ignore[type-var]
-    return (*effects[:at], changed, *effects[at + 1 :])
+    changed: Any = replace(effects[index], **{name: value})  # type: ignore[type-var]
+    return (*effects[:index], changed, *effects[index + 1 :])
 
 
-def _golden_section(axis: Axis, effects: Effects, at: int, name: str, lo: float, hi: float) -> float:
+def _golden_section(axis: Axis, effects: Effects, index: int, name: str, lo: float, hi: float) -> float:
     """Return the logarithm of the shape parameter with the largest likelihood within an interval."""
 
     def value(x: float) -> float:
-        return axis.fit(with_shape(effects, at, name, exp(x))).log_likelihood
+        return axis.fit(with_shape(effects, index, name, exp(x))).log_likelihood
 
     a, b = hi - GOLDEN * (hi - lo), lo + GOLDEN * (hi - lo)
     at_a, at_b = value(a), value(b)
@@ -178,7 +180,7 @@ def _golden_section(axis: Axis, effects: Effects, at: int, name: str, lo: float,
     return 0.5 * (lo + hi)
 
 
-def size_bounds(likely: Likely, at: int) -> Bounds:
+def size_bounds(likely: Likely, index: int) -> Bounds:
     """Return the size of an effect with its 95 % interval.
 
     The logarithm of a standard deviation, and the value of a signed size, is taken as Gaussian.
@@ -187,18 +189,18 @@ def size_bounds(likely: Likely, at: int) -> Bounds:
     ----------
     likely : Likely
         Fit that contains the effect.
-    at : int
+    index : int
         Index of the effect.
     """
-    value, error = size(likely.effects[at]), likely.error(at)
-    if type(likely.effects[at]) in COURSE:
+    value, error = size(likely.effects[index]), likely.error(index)
+    if type(likely.effects[index]) in COURSE:
         return Bounds(value, value - Z95 * error, value + Z95 * error)
     if not value > 0.0 or not np.isfinite(error):
         return Bounds(value)
     return Bounds(value, value * exp(-Z95 * error / value), value * exp(Z95 * error / value))
 
 
-def shape_bounds(axis: Axis, hypothesis: Hypothesis, at: int, name: str) -> Bounds:
+def shape_bounds(axis: Axis, hypothesis: Hypothesis, index: int, name: str) -> Bounds:
     """Return a shape parameter with its 95 % interval from the profile likelihood.
 
     Each end of the interval is the value at which the log-likelihood has fallen by ``CHI2_HALF_NATS``.
@@ -209,17 +211,17 @@ def shape_bounds(axis: Axis, hypothesis: Hypothesis, at: int, name: str) -> Boun
         Axis that was fitted.
     hypothesis : Hypothesis
         Fitted effects.
-    at : int
+    index : int
         Index of the effect.
     name : str
         Name of the shape parameter.
     """
     effects, held = hypothesis.effects, hypothesis.likely.held
-    value = float(getattr(effects[at], name))
+    value = float(getattr(effects[index], name))
     top = hypothesis.likely.log_likelihood
 
     def fall(factor: float) -> float:
-        return top - axis.fit(with_shape(effects, at, name, value * factor), held).log_likelihood
+        return top - axis.fit(with_shape(effects, index, name, value * factor), held).log_likelihood
 
     ends = []
     for sign in (-1.0, 1.0):

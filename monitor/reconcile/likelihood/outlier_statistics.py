@@ -49,6 +49,7 @@ MIN_GAIN_NATS: Final = 0.01
 MAX_Z: Final = 37.0
 """Value of z that is used if the probability underflows in 64 bits."""
 Z95: Final = 1.959964
+"""Number of standard deviations on each side of a 95 % interval."""
 
 
 @dataclass(frozen=True, slots=True)

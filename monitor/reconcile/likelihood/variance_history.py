@@ -53,6 +53,7 @@ MIN_SQUARES_PER_CELL: Final = 64
 MIN_SQUARES_FOR_DECREASE: Final = 8
 """Number of squares in a cell below which a low power is no evidence."""
 Z95: Final = 1.959964
+"""Number of standard deviations on each side of a 95 % interval."""
 
 
 @dataclass(frozen=True, slots=True)

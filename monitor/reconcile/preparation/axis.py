@@ -46,6 +46,7 @@ MIN_CACHED_SERIES: Final = 16
 MAX_CACHED_PRODUCTS: Final = 4096
 """Largest number of cached sums over bins for each axis."""
 Effects = tuple[Effect, ...]
+"""Effects of one axis in a fixed order."""
 CURVATURE_REGRESSOR: Final = Bias(value=1.0)
 """Marker for the regressor t². As an effect, a constant bias would have no influence."""
 

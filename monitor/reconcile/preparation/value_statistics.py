@@ -27,6 +27,7 @@ from monitor.common.compiled import compiled
 from monitor.estimation.detection.resolution import GAUSSIAN, ON_GRID
 
 Mask = NDArray[np.bool_]
+"""Boolean array."""
 
 MIN_SAMPLES: Final = 16
 """Smallest number of samples for any statistic."""
@@ -57,6 +58,7 @@ MIN_DISTINCT_DECIMALS: Final = 8
 PREDICTOR_TAPS: Final = 8
 """Number of neighbours on each side that predict a sample."""
 Z95: Final = 1.959964
+"""Number of standard deviations on each side of a 95 % interval."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -153,7 +153,7 @@ def ringing(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
     return found
 
 
-def refined_frequency(axis: Axis, effects: Effects, at: int) -> Effects:
+def refined_frequency(axis: Axis, effects: Effects, index: int) -> Effects:
     """Return the effects with the centre frequency of a resonance refined within its width.
 
     Parameters
@@ -162,12 +162,12 @@ def refined_frequency(axis: Axis, effects: Effects, at: int) -> Effects:
         Axis to fit.
     effects : tuple of Effect
         Effects of the axis.
-    at : int
+    index : int
         Index of the resonance.
     """
-    peak = effects[at]
+    peak = effects[index]
     assert isinstance(peak, Narrowband)
-    return refined(axis, effects, at, ["frequency"], 1.0 + 0.7 * peak.bandwidth / peak.frequency)
+    return refined(axis, effects, index, ["frequency"], 1.0 + 0.7 * peak.bandwidth / peak.frequency)
 
 
 def peaks(seen: Sight, most: int = MAX_PEAKS) -> list[tuple[float, float]]:

@@ -127,10 +127,10 @@ def _part_of_series(coefficients: Floats, part: slice) -> Floats:
     return series(coefficients)[part]
 
 
-def _expected_gain(half: Axis, state: Hypothesis, at: int) -> float:
+def _expected_gain(half: Axis, state: Hypothesis, index: int) -> float:
     """Return the gain in nats of a deterministic effect with the fitted size in one half: ½ Σ (β R)²/v."""
     learned = half.fit(state.effects, state.likely.held)
-    effect = state.effects[at]
+    effect = state.effects[index]
     columns = half.columns(effect)
     weight = half.bins.spread(half.heard / learned.fitted.variance)
     if isinstance(effect, Sinusoidal):

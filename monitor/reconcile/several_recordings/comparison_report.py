@@ -16,6 +16,7 @@ from monitor.reconcile.result import Bounds, Step
 from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, Run, Seen
 
 SCHEMA: Final = "imu-monitor/reconcile-runs/1"
+"""Name and version of the JSON schema."""
 
 
 def to_json(c: Comparison) -> bytes:
