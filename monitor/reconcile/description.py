@@ -54,7 +54,7 @@ def described(found: Search, null: Mapping[str, Null], final: Mapping[str, Null]
     null : mapping of str to Null
         Null distributions under the model under test, which decided the search.
     final : mapping of str to Null
-        Null distributions under the extended model, which decide what is left over.
+        Null distributions under the extended model, which decide which differences are left over.
     """
     looks = [Look(scores(one.seen, null), one.views) for one in found.rounds]
     end = Look(scores(found.seen, final), found.views)
@@ -66,11 +66,11 @@ def described(found: Search, null: Mapping[str, Null], final: Mapping[str, Null]
         index = next((i for i in left if type(found.state.effects[i]) is type(last)), None)
         if index is not None and len(one.state.effects) > one.state.given and one.trials[0].effect is not None:
             left.remove(index)
-            steps.append(_step(found, one, index, "added", looks[at], looks[at + 1]))
+            steps.append(_describe_step(found, one, index, "added", looks[at], looks[at + 1]))
         before = found.rounds[at - 1].state.likely.noises if at else ()
         for noise in one.state.likely.noises:
             if noise < found.state.given and noise not in before and noise in found.state.likely.noises:
-                steps.append(_step(found, one, noise, "retuned", looks[at], looks[at + 1]))
+                steps.append(_describe_step(found, one, noise, "retuned", looks[at], looks[at + 1]))
     left_over = (*(score for score in end.scores if score.passes), *_noise_floor_score(found, end))
     return AxisResult(
         found.axis.name, _axis_decision(bool(steps), bool(left_over)), looks[0], tuple(steps), left_over, end
@@ -103,7 +103,7 @@ def _axis_decision(steps: bool, left: bool) -> Verdict:
     return "explained" if steps else "agrees"
 
 
-def _step(found: Search, one: Round, index: int, kind: Kind, before: Look, after: Look) -> Step:
+def _describe_step(found: Search, one: Round, index: int, kind: Kind, before: Look, after: Look) -> Step:
     """Return the result of one step of the search."""
     effect = found.state.effects[index]
     score = _triggering_score(effect, kind, before)
@@ -115,14 +115,14 @@ def _step(found: Search, one: Round, index: int, kind: Kind, before: Look, after
             Score(score.lens, score.where, proof.before, score.null95, score.threshold),
             Score(score.lens, score.where, proof.after, later.null95, later.threshold),
         )
-    confidence, others = _confidence(effect.name if kind == "added" else RETUNE, one.trials)
+    confidence, others = _confidence_and_runners_up(effect.name if kind == "added" else RETUNE, one.trials)
     if kind == "retuned" and one.trials[0].name != RETUNE:  # the size changed together with an added effect
         confidence, others = _resize_confidence(found.state, index), ()
     return Step(
         found=score,
         kind=kind,
         effect=effect.name,
-        parameters=_parameters(found.axis, found.state, index, one.trials[0], kind),
+        parameters=_parameters_with_bounds(found.axis, found.state, index, one.trials[0], kind),
         confidence=confidence,
         runners_up=others,
         before=score,
@@ -136,8 +136,10 @@ def _step(found: Search, one: Round, index: int, kind: Kind, before: Look, after
 
 
 def _triggering_score(effect: Effect, kind: Kind, before: Look) -> Score:
-    """Return the score that led to an effect: the natural diagnostic of the effect if it passes, otherwise the
-    strongest one."""
+    """Return the score that led to an effect.
+
+    This is the natural diagnostic of the effect if it passes its threshold, otherwise the strongest diagnostic.
+    """
     passing = [score for score in before.scores if score.passes] or list(before.scores)
     natural = NATURAL.get(effect.name) if kind == "added" else "psd"
     for score in passing:
@@ -146,7 +148,7 @@ def _triggering_score(effect: Effect, kind: Kind, before: Look) -> Score:
     return max(passing, key=lambda score: score.gap / max(score.threshold, 1e-9))
 
 
-def _confidence(name: str, trials: tuple[Trial, ...]) -> tuple[float, tuple[RunnerUp, ...]]:
+def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[float, tuple[RunnerUp, ...]]:
     """Return the probability of an effect and of its alternatives.
 
     The probabilities follow from the log-likelihood gains less the penalties of the effects. One alternative is that
@@ -169,8 +171,10 @@ def _confidence(name: str, trials: tuple[Trial, ...]) -> tuple[float, tuple[Runn
 
 
 def _resize_confidence(state: Hypothesis, index: int) -> float:
-    """Return the probability that a size differs from the size in the model, from the distance of their logarithms in
-    standard errors."""
+    """Return the probability that the size of an effect differs from its size in the model.
+
+    It follows from the distance of the logarithms of the two sizes, in standard errors.
+    """
     now, before = size(state.effects[index]), size(state.model[index])
     error = state.likely.error(index)
     if not (now > 0.0 and before > 0.0 and error > 0.0):
@@ -178,7 +182,7 @@ def _resize_confidence(state: Hypothesis, index: int) -> float:
     return erf(abs(log(now / before)) * now / error / 2.0**0.5)
 
 
-def _parameters(axis: Axis, state: Hypothesis, index: int, trial: Trial, kind: Kind) -> dict[str, Bounds]:
+def _parameters_with_bounds(axis: Axis, state: Hypothesis, index: int, trial: Trial, kind: Kind) -> dict[str, Bounds]:
     """Return the parameters of an effect with their 95 % intervals."""
     effect = state.effects[index]
     if kind == "added" and trial.bounds and trial.name == effect.name:

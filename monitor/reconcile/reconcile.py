@@ -4,8 +4,7 @@ The procedure has these steps:
 
 1. Simulate recordings from the model and run all diagnostics on them, which gives the thresholds.
 2. Run the same diagnostics on the measured recording.
-3. On each axis that disagrees, try candidate effects and keep the best one. Repeat until nothing is left or no known
-effect helps.
+3. On each axis that disagrees, try candidate effects and keep the best one, until nothing is left or no effect helps.
 4. Simulate the extended model and compare once more.
 
 The axes are independent of each other, except for the sample rate, which is common to all axes.
@@ -339,7 +338,7 @@ def usable(recording: Recording, model: NoiseModel | None) -> tuple[Recording, t
 
 
 def five_terms(recording: Recording, courses: Courses, seed: int) -> NoiseModel:
-    """Fit the terms Q, N, B, K and R to each axis and keep those that the data support.
+    """Fit the terms Q, N, B, K and R to each axis and keep the terms that the data support.
 
     Parameters
     ----------

@@ -116,7 +116,10 @@ def sight(axis: Axis, likely: Likely) -> Sight:
 
 
 def _flattened_series(axis: Axis, likely: Likely, whitened: Floats) -> Floats:
-    """Return the fast series, whose tails and variance are those of white noise whatever the spectrum is."""
+    """Return the whitened series with the fitted power of each bin removed.
+
+    For any spectrum, its tails and variance are then those of white noise.
+    """
     count, together = axis.bins.count, np.ones(SMOOTHING_BINS)
     sums = axis.bins.sums(whitened**2)
     around = np.convolve(sums, together, "same") / np.convolve(count, together, "same")

@@ -1,7 +1,7 @@
 """Plot data of an axis and a model: the measurement, the expectation and the 95 % band.
 
-The band contains 95 of 100 simulated recordings at each place. It is computed from the spectrum of the model in closed
-form. A view has a few hundred points.
+The band contains 95 of 100 simulated recordings at each place. It is calculated from the spectrum of the model, without
+simulation. A view has a few hundred points.
 """
 
 from collections.abc import Callable
@@ -34,13 +34,20 @@ DENSITY_UNITS: Final = {"g": "(rad/s)²/Hz", "a": "(m/s²)²/Hz"}
 
 def views(seen: Sight) -> tuple[View, ...]:
     """Return the plot data of every diagnostic that has a plot."""
-    made = [_psd(seen), _allan(seen), _level(seen), _variance(seen), _tails(seen), _autocorrelation(seen)]
+    made = [
+        _psd_view(seen),
+        _allan_view(seen),
+        _level_view(seen),
+        _variance_view(seen),
+        _tails_view(seen),
+        _autocorrelation_view(seen),
+    ]
     if seen.axis.temperature_c is not None and np.ptp(seen.axis.temperature_c) > 0.0:
-        made.append(_temperature(seen))
+        made.append(_temperature_view(seen))
     return tuple(made)
 
 
-def _psd(seen: Sight) -> View:
+def _psd_view(seen: Sight) -> View:
     """Return the plot of the spectral density."""
     bins, tau0_s = seen.axis.bins, 1.0 / seen.axis.rate_hz
     variance, power = seen.likely.fitted.variance, seen.likely.fitted.residual
@@ -70,7 +77,7 @@ def _psd(seen: Sight) -> View:
     )
 
 
-def _allan(seen: Sight) -> View:
+def _allan_view(seen: Sight) -> View:
     """Return the plot of the Allan deviation."""
     axis, tau0_s = seen.axis, 1.0 / seen.axis.rate_hz
     m = cluster_sizes(axis.n, axis.rate_hz)
@@ -125,7 +132,7 @@ def _allan_degrees_of_freedom(seen: Sight, m: Ints) -> Floats:
     return np.maximum(found, 1.0)
 
 
-def _level(seen: Sight) -> View:
+def _level_view(seen: Sight) -> View:
     """Return the plot of the level over time."""
     axis = seen.axis
     size = max(1, axis.n // TIME_BLOCKS)
@@ -139,7 +146,7 @@ def _level(seen: Sight) -> View:
     return View("level", "time", "s", "level", unit, False, t, measured, expected, expected - spread, expected + spread)
 
 
-def _variance(seen: Sight) -> View:
+def _variance_view(seen: Sight) -> View:
     """Return the plot of the noise standard deviation over time."""
     axis = seen.axis
     size = max(1, axis.n // TIME_BLOCKS)
@@ -152,7 +159,7 @@ def _variance(seen: Sight) -> View:
     )
 
 
-def _tails(seen: Sight) -> View:
+def _tails_view(seen: Sight) -> View:
     """Return the plot of the share of samples beyond a distance."""
     sizes = np.sort(np.abs(seen.fast))
     n = sizes.size
@@ -176,7 +183,7 @@ def _tails(seen: Sight) -> View:
     )
 
 
-def _autocorrelation(seen: Sight) -> View:
+def _autocorrelation_view(seen: Sight) -> View:
     """Return the plot of the autocorrelation of the whitened series."""
     n = seen.white.size
     size = next_fast_len(n + LAGS, real=True)
@@ -187,7 +194,7 @@ def _autocorrelation(seen: Sight) -> View:
     return View("autocorrelation", "lag", "s", "autocorrelation", "1", False, lag_s, measured, zero, -band, band)
 
 
-def _temperature(seen: Sight) -> View:
+def _temperature_view(seen: Sight) -> View:
     """Return the plot of the level over temperature."""
     axis = seen.axis
     warmth = axis.temperature_c

@@ -85,7 +85,7 @@ NATURAL: Final[dict[str, str]] = {
     "saturation": "values",
     "sample_hold": "values",
 }
-"""For each effect, the diagnostic in which a person would look for it. It is used if it passes its threshold."""
+"""For each effect, the diagnostic that shows it most directly. It is used if it passes its threshold."""
 
 
 def size(effect: Effect) -> float:

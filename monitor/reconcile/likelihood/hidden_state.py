@@ -1,9 +1,9 @@
 """Shared parts of the likelihoods for effects that have the same spectrum.
 
-A random telegraph has the same second moments as exponentially correlated noise, and Poisson steps have those of a
-random walk. Only their distributions differ. Both effects of a pair therefore get their full likelihood on the same
-data with the same additional noise. The result is a ``ModelComparison``. Its gain is the logarithm of the ratio of the
-two likelihoods, each at its maximum. The caller subtracts penalties for parameters and prior odds.
+A random telegraph has the same second moments as exponentially correlated noise. Poisson steps have the same second
+moments as a random walk. Only the distributions differ. Both effects of a pair therefore get their full likelihood on
+the same data with the same additional noise. The result is a ``ModelComparison``. Its gain is the logarithm of the
+ratio of the two likelihoods, each at its maximum. The caller subtracts penalties for parameters and prior odds.
 
 The data are block means. The additional noise is a ``Rest``: white, random walk, flicker and exponentially correlated
 noise. It is written as a sum of independent first-order processes whose block means are known given their value at the

@@ -143,8 +143,9 @@ def _bin_magnitudes(w, unit):  # type: ignore[no-untyped-def]
 
 @compiled
 def _fit_mixture(counts, squares, wider):  # type: ignore[no-untyped-def]
-    """Return variances, share and log-likelihood of the best mixture. EM runs briefly from every start and converges
-    from the best.
+    """Return variances, share and log-likelihood of the best mixture.
+
+    EM runs for a few steps from every start, and then until convergence from the best result.
     """
     total = counts.sum()
     mean = (counts * squares).sum() / total
@@ -166,8 +167,9 @@ def _fit_mixture(counts, squares, wider):  # type: ignore[no-untyped-def]
 
 @compiled
 def _em_step(counts, squares, total, narrow, wide, share, held):  # type: ignore[no-untyped-def]
-    """Perform one EM step and return the log-likelihood before it. If ``held`` is True, the wide variance stays
-    fixed.
+    """Perform one EM step and return the log-likelihood before it.
+
+    If ``held`` is True, the wide variance stays fixed.
     """
     outside, outside_squares, inside_squares, like = 0.0, 0.0, 0.0, 0.0
     log_narrow = np.log1p(-share) - 0.5 * np.log(narrow)

@@ -109,7 +109,7 @@ def block_for(span_s: float, rest: Rest, K: float) -> float:
 def fit_jumps(means: Floats, block_s: float, rest: Rest, K: float) -> EventProcessFit:
     """Maximise the likelihood over the rate and the height of the jumps.
 
-    The search starts from the likeliest of several rates whose second moments are those of ``K``.
+    The search starts from the likeliest of several rates, with the second moments of a random walk ``K``.
 
     Parameters
     ----------
@@ -219,9 +219,7 @@ def jump_log_likelihood(means, table, white, start, ages, none, some, variance):
 
 @compiled
 def _merge_hypotheses(first, end, weight, moved, spread, to, share, at, covariance):  # type: ignore[no-untyped-def]
-    """Merge hypotheses ``first`` to ``end`` − 1 into one Gaussian with their mean, covariance and probability, at index
-    ``to``.
-    """
+    """Merge hypotheses ``first`` to ``end`` − 1 into one Gaussian with their mean and covariance, at index ``to``."""
     share[to] = 0.0
     for k in range(first, end):
         share[to] += weight[k]

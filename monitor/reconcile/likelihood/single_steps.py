@@ -119,8 +119,9 @@ def fit_once(means: Floats, around: StateSpaceNoise, most: int) -> SingleStepsFi
 
 
 def _shock_gains(means: Floats, around: StateSpaceNoise, blocks: list[int]) -> Floats:
-    """Return twice the log-likelihood gain of one more shock at the start of each block, shape (m,), beside those in
-    ``blocks``.
+    """Return twice the log-likelihood gain, shape (m,), of one more shock at the start of each block.
+
+    The shocks in ``blocks`` are already present.
     """
     free = np.zeros(means.size)
     free[blocks] = anywhere(means)

@@ -223,8 +223,9 @@ def _step_gains(sums: Floats, k: Ints) -> Floats:
 
 
 def _segment_steps(squares: Floats, tau0_s: float, step: VarianceStep) -> tuple[VarianceStep, ...]:
-    """Return the given step and further steps. Each step divides the segment in which it gains most (binary
-    segmentation).
+    """Return the given step and further steps by binary segmentation.
+
+    Each further step divides the segment in which it gains most.
     """
     found = [step]
     ends = [0, squares.size]
@@ -240,10 +241,10 @@ def _segment_steps(squares: Floats, tau0_s: float, step: VarianceStep) -> tuple[
 
 
 def _log_linear_gain(energy: Floats, length: int, rows: Floats) -> float:
-    """Return the log-likelihood gain of ln σ² = a + Σ b_i row_i over a constant. The energies are means of ``length``
-    squares.
+    """Return the log-likelihood gain of ln σ² = a + Σ b_i row_i over a constant.
 
-    The fit is Fisher scoring of a Gamma model with logarithmic link (McCullagh & Nelder 1989).
+    The energies are means of ``length`` squares. The fit is Fisher scoring of a Gamma model with logarithmic link
+    (McCullagh & Nelder 1989).
     """
     x = np.vstack([np.ones(energy.size), rows])
     normal = np.linalg.inv(x @ x.T)
@@ -324,8 +325,9 @@ def _best_tiles(power: Floats, piece: int) -> tuple[TileScore, TileScore]:
 
 @compiled
 def _column_extremes(power):  # type: ignore[no-untyped-def]
-    """Return minimum, maximum and their positions in each column, and the sum of logarithms, taken of products of
-    eight.
+    """Return the minimum and maximum of each column with their positions, and the sum of its logarithms.
+
+    The logarithms are taken of products of eight values.
     """
     rows, columns = power.shape
     low, high, logs = power[0].copy(), power[0].copy(), np.zeros(columns)

@@ -177,8 +177,9 @@ def _log_likelihood(count, variance, residual):  # type: ignore[no-untyped-def]
 
 @compiled
 def _regress(cross, gram, variance):  # type: ignore[no-untyped-def]
-    """Return the generalised least-squares estimate of β and its normal matrix. A small ridge handles collinear
-    regressors.
+    """Return the generalised least-squares estimate of β and its normal matrix.
+
+    A small ridge makes collinear regressors solvable.
     """
     q, m = cross.shape
     normal = np.zeros((q, q))

@@ -195,26 +195,26 @@ class Axis:
             Effects with fitted sizes and their log-likelihood.
         """
         f_hz, tau0_s = self.bins.f_hz, 1.0 / self.rate_hz
-        transforms = sorted((e for e in effects if self._shapes(e)), key=lambda e: ORDER.index(type(e)))
+        transforms = sorted((e for e in effects if self._changes_spectrum(e)), key=lambda e: ORDER.index(type(e)))
         constant = apply_transforms(transforms, Spectrum(np.zeros_like, np.zeros_like, tau0_s), f_hz) / tau0_s
         noises, bases, start = [], [], []
         for at, effect in enumerate(effects):
             if type(effect) not in NOISE:
                 continue
-            made = self._basis(effect, effects, transforms)
+            made = self._variance_basis(effect, effects, transforms)
             if at in held:
                 constant = constant + size(effect) ** 2 * made
             else:
                 noises.append(at)
                 bases.append(made)
-                start.append(min(size(effect) ** 2, self._whole(made)))
+                start.append(min(size(effect) ** 2, self._full_power_theta(made)))
         floor = floor and any(isinstance(one, BandwidthLimit) for one in transforms)
         if floor:
             bases.append(np.ones_like(f_hz))
-            start.append(1e-3 * self._whole(bases[-1]))
+            start.append(1e-3 * self._full_power_theta(bases[-1]))
         for row in extra if extra is not None else ():
             bases.append(row)
-            start.append(1e-2 * self._whole(row))
+            start.append(1e-2 * self._full_power_theta(row))
         courses: list[tuple[int, slice]] = []
         regressors: list[tuple[Effect, int]] = []
         for at, effect in enumerate(effects):
@@ -224,11 +224,11 @@ class Axis:
                 regressors += [(effect, i) for i in range(len(made_columns))]
         if curved:
             regressors.append((CURVATURE_REGRESSOR, 0))
-        found = self._sums(regressors)
+        found = self._binned_sums(regressors)
         stacked = np.asarray(bases).reshape(len(bases), f_hz.size)
         fitted = maximise(self.bins.count * self.heard, found, stacked, constant, np.asarray(start, np.float64))
         return Likely(
-            self._resized(effects, noises, courses, fitted),
+            self._with_fitted_sizes(effects, noises, courses, fitted),
             held,
             fitted.log_likelihood,
             fitted,
@@ -249,7 +249,7 @@ class Axis:
         """
         fitted = likely.fitted
         regressors = [(likely.effects[at], i) for at, place in likely.courses for i in range(place.stop - place.start)]
-        found = self._sums(regressors)
+        found = self._binned_sums(regressors)
         residual = found.power - 2.0 * beta @ found.cross + np.einsum("i,j,ijb->b", beta, beta, found.gram)
         count = self.bins.count * self.heard
         value = -0.5 * float((count * np.log(fitted.variance) + residual / fitted.variance).sum())
@@ -264,14 +264,14 @@ class Axis:
                 left -= factor * column
         return left
 
-    def _shapes(self, effect: Effect) -> TypeGuard[Transform]:
+    def _changes_spectrum(self, effect: Effect) -> TypeGuard[Transform]:
         """Return True if a transform changes the spectrum. Repeats whose positions are known have been replaced and do
         not.
         """
         mended = isinstance(effect, SampleHold) and self.shown.repeats is not None and self.shown.repeats.mask.any()
         return isinstance(effect, Transform) and not mended
 
-    def _basis(self, effect: Effect, effects: Sequence[Effect], transforms: Sequence[Transform]) -> Floats:
+    def _variance_basis(self, effect: Effect, effects: Sequence[Effect], transforms: Sequence[Transform]) -> Floats:
         """Return the variance, shape (m,), of the coefficients of each bin for a noise effect with size one."""
         tau0_s = 1.0 / self.rate_hz
         share = 1.0
@@ -285,38 +285,38 @@ class Axis:
         with_it = apply_transforms(transforms, raw, self.bins.f_hz)
         return np.asarray((with_it - apply_transforms(transforms, empty, self.bins.f_hz)) / tau0_s)
 
-    def _whole(self, basis: Floats) -> float:
+    def _full_power_theta(self, basis: Floats) -> float:
         """Return the θ for which a basis would have the total power of the axis."""
-        return float(self._product(None, None).sum() / max((self.bins.count * self.heard * basis).sum(), 1e-300))
+        return float(self._binned_product(None, None).sum() / max((self.bins.count * self.heard * basis).sum(), 1e-300))
 
-    def _sums(self, regressors: Sequence[tuple[Effect, int]]) -> Sums:
+    def _binned_sums(self, regressors: Sequence[tuple[Effect, int]]) -> Sums:
         """Return the sums over bins of the products of the axis and its regressors."""
         q, m = len(regressors), self.bins.count.size
         cross, gram = np.empty((q, m)), np.empty((q, q, m))
         for i, one in enumerate(regressors):
-            cross[i] = self._product(one, None)
+            cross[i] = self._binned_product(one, None)
             for j in range(i + 1):
-                gram[i, j] = gram[j, i] = self._product(one, regressors[j])
-        return Sums(self._product(None, None), cross, gram)
+                gram[i, j] = gram[j, i] = self._binned_product(one, regressors[j])
+        return Sums(self._binned_product(None, None), cross, gram)
 
-    def _product(self, one: tuple[Effect, int] | None, other: tuple[Effect, int] | None) -> Floats:
-        """Return the sums over bins of the product of two columns. None stands for the axis itself."""
+    def _binned_product(self, one: tuple[Effect, int] | None, other: tuple[Effect, int] | None) -> Floats:
+        """Return the sums over bins of the product of two columns. None means the axis itself."""
         key = (_regressor_key(one), _regressor_key(other))
         if key not in self._products:
-            a, b = (self._column(x) for x in (one, other))
+            a, b = (self._regressor(x) for x in (one, other))
             if len(self._products) > MAX_CACHED_PRODUCTS:
                 self._products.clear()
             self._products[key] = self.bins.sums(a * b) * self.heard
         return self._products[key]
 
-    def _column(self, one: tuple[Effect, int] | None) -> Floats:
+    def _regressor(self, one: tuple[Effect, int] | None) -> Floats:
         """Return the transform of a regressor, or of the axis itself for None."""
         if one is None:
             return self.coefficients
         return self.courses.curve if one[0] is CURVATURE_REGRESSOR else self.columns(one[0])[one[1]]
 
     @staticmethod
-    def _resized(
+    def _with_fitted_sizes(
         effects: Sequence[Effect], noises: Sequence[int], courses: Sequence[tuple[int, slice]], fitted: Fitted
     ) -> Effects:
         """Return the effects with their fitted sizes."""

@@ -158,8 +158,9 @@ def mend(y: Floats, shown: Shown, effects: Effects, rng: np.random.Generator) ->
 
 
 def _restore_clipped(y: Floats, limit: float, sigma: float, rng: np.random.Generator) -> Floats:
-    """Redraw the clipped samples and update the standard deviation in turns. A few iterations suffice if few samples
-    were clipped.
+    """Redraw the clipped samples and update the standard deviation in turns until it converges.
+
+    A few iterations suffice if few samples were clipped.
     """
     whole = y
     for _ in range(MAX_ITERATIONS):

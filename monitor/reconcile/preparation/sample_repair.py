@@ -225,8 +225,9 @@ def _draw_missing(new, where, missing, sums, counts, middle, width, chances):  #
 
 
 def _wander_variance(sums: Floats, counts: Ints, length: int, width: int) -> float:
-    """Return the variance per sample of a random walk that changes the level over ``length`` samples as much as the
-    recording does.
+    """Return the variance per sample of the random walk that describes the drift of the recording.
+
+    The drift is measured over about ``length`` samples.
     """
     n = counts.size - 1
     length = min(length, n // MIN_WANDER_INTERVALS)
@@ -247,8 +248,6 @@ def _wander_variance(sums: Floats, counts: Ints, length: int, width: int) -> flo
 
 
 def _brownian_bridge(length: int, variance: float, rng: np.random.Generator) -> Floats:
-    """Return a random walk with a given variance per sample that is zero just before its first and just after its last
-    sample.
-    """
+    """Return a random walk with a given variance per sample that returns to zero after its last sample."""
     walk = np.cumsum(rng.standard_normal(length + 1)) * variance**0.5
     return np.asarray(walk[:-1] - walk[-1] * np.arange(1, length + 1) / (length + 1))

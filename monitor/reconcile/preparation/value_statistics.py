@@ -253,8 +253,9 @@ def _total_variation(values):  # type: ignore[no-untyped-def]
 
 
 def _float_spacing(values: Floats) -> float:
-    """Return the spacing of floating-point numbers at the largest value. It is that of float32 if a few thousand
-    sampled values are all exact in float32.
+    """Return the spacing of floating-point numbers at the largest value.
+
+    The spacing is that of float32 if a few thousand of the values are all exact in float32.
     """
     values = values[:: max(1, values.size // GRID_SEARCH_SAMPLES)]
     largest = float(np.abs(values).max())
@@ -281,8 +282,9 @@ def _last_decimal(levels: Floats) -> float:
 
 
 def _common_divisor(gaps: Floats, blur: float) -> float | None:
-    """Return the greatest common divisor of ascending distances that are known to within ``blur``, by Euclid's
-    algorithm with error bounds.
+    """Return the greatest common divisor of ascending distances by Euclid's algorithm with error bounds.
+
+    The values are known to within ``blur``.
     """
     gaps = gaps[gaps > 2.0 * blur]
     if not gaps.size:
@@ -391,8 +393,9 @@ def _count_difference_gain(one: float, other: float) -> float:
 
 
 def _predict_from_neighbours(values: Floats) -> tuple[Floats, float]:
-    """Return the symmetric linear prediction of every sample from ``PREDICTOR_TAPS`` neighbours on each side, and its
-    standard error.
+    """Return the prediction of every sample from its neighbours, and the standard deviation of the error.
+
+    The prediction is linear and symmetric in ``PREDICTOR_TAPS`` neighbours on each side.
     """
     z = values - values.mean()
     lags = np.array([np.dot(z[: z.size - k], z[k:]) for k in range(2 * PREDICTOR_TAPS + 1)]) / z.size
@@ -459,8 +462,16 @@ def _repeats_of_stepped(apart: Floats, twice: Floats, n: int) -> Repeats | None:
 
 
 def _zero_difference_excess(apart: Floats, most: int) -> tuple[Floats, float, float]:
-    """Return the counts of 0, 1, … ``most`` steps, the expected number of zeros, and the gain in nats of a free number
-    of zeros.
+    """Return the statistics of zero differences between stepped values.
+
+    Returns
+    -------
+    counts : ndarray of float64, shape (most + 1,)
+        Counts of differences of 0, 1, … ``most`` steps.
+    chance : float
+        Number of zeros that the distribution of the other differences predicts.
+    gain : float
+        Log-likelihood gain of a free number of zeros, nats.
     """
     counts = np.bincount(np.minimum(np.rint(apart), most + 1).astype(np.int64), minlength=most + 2)[:-1].astype(float)
     alone, _ = _fit_difference_spread(counts, 0)

@@ -251,8 +251,9 @@ def compare_jump_processes(axis: Axis, state: Hypothesis, view: Sight) -> NonGau
 
 
 def _is_gaussian_and_stationary(view: Sight, null: Mapping[str, Null]) -> bool:
-    """Return True if the samples are Gaussian and stationary. Otherwise, effects that differ only in distribution
-    cannot be identified.
+    """Return True if the samples are Gaussian and stationary.
+
+    Otherwise, effects that differ only in their distribution cannot be distinguished.
     """
     return all(LENSES[lens](view).gain <= null[lens].threshold for lens in DISTRIBUTION_DIAGNOSTICS)
 

@@ -1,10 +1,11 @@
-"""Trials of candidate effects: each candidate is added alone, everything is fitted again, and the best comes first.
+"""Trials of candidate effects. Each candidate is added alone, everything is fitted again, and the best trial comes
+first.
 
 - **Values and single samples** come first, because their evidence is either certain or absent.
 - **Deterministic effects come before noise effects.** An effect that follows time, temperature or another axis must
-  exceed its penalty beside the slow noise that could replace it: none, a random walk, a correlated noise or a power
-  law, on both sides of the comparison. Otherwise a noise effect would absorb a drift, and later fits would not correct
-  this.
+  exceed its penalty in comparison with the slow noise that could replace it: none, a random walk, a correlated noise or
+  a power law. This noise is present on both sides of the comparison. Otherwise a noise effect would absorb a drift, and
+  later fits would not correct this.
 - **Noise effects** are ordered by their score: the gain in ln L, less the penalty of the effect, less the penalty for
   changed sizes of known noise effects.
 - A power law with any exponent takes part among the noise effects, and a curved drift among the deterministic effects,
@@ -78,7 +79,7 @@ class Trial:
 
     name: str
     effect: Effect | None  # None: no known effect, or no new effect
-    value: float  # gain less penalty, nats; for a deterministic effect beside the best alternative slow noise
+    value: float  # gain less penalty, nats; for a deterministic effect, together with the best slow noise
     alone: float = 0.0  # gain less penalty of a deterministic effect without such noise, nats
     bounds: Mapping[str, Bounds] = field(default_factory=dict)  # parameters that the spectrum does not determine
     events: int = 0  # number of events that were detected
@@ -110,7 +111,7 @@ def tried(axis: Axis, state: Hypothesis, seen: Sight) -> Iterator[list[Trial]]:
 
 
 def replacements_for_resizing(axis: Axis, state: Hypothesis, view: Sight) -> list[Trial]:
-    """Return effects that explain better what changed sizes of known noise effects were fitted to.
+    """Return effects that explain the data better than changed sizes of known noise effects.
 
     Parameters
     ----------
@@ -136,17 +137,23 @@ def _value_trials(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
     if shown.levels and Resolution not in have:
         grid = shown.levels
         found.append(
-            _penalised_trial(Resolution(step=grid.step.value), grid.gain, {"step": _bounds(grid.step)}, grid.levels)
+            _penalised_trial(
+                Resolution(step=grid.step.value), grid.gain, {"step": _scaled_bounds(grid.step)}, grid.levels
+            )
         )
     if shown.clipped and shown.clipped.symmetric and Saturation not in have:
         ends = shown.clipped
         found.append(
-            _penalised_trial(Saturation(limit=ends.limit.value), ends.gain, {"limit": _bounds(ends.limit)}, ends.count)
+            _penalised_trial(
+                Saturation(limit=ends.limit.value), ends.gain, {"limit": _scaled_bounds(ends.limit)}, ends.count
+            )
         )
     if shown.repeats and SampleHold not in have:
         twice = shown.repeats
         hold = SampleHold(fraction=min(twice.fraction.value, 0.999))
-        found.append(_penalised_trial(hold, twice.gain, {"fraction": _bounds(twice.fraction)}, round(twice.count)))
+        found.append(
+            _penalised_trial(hold, twice.gain, {"fraction": _scaled_bounds(twice.fraction)}, round(twice.count))
+        )
     return sorted(found, key=lambda one: -one.value)
 
 
@@ -164,7 +171,7 @@ def _sample_trials(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
         # convert the sizes of the whitened series to the unit of the axis
         unit = _whitened_unit(axis, state)
         effect = Outliers(fraction=min(far.fraction.value, 1.0), scale=unit * far.scale.value)
-        bounds = {"fraction": _bounds(far.fraction), "scale": _bounds(far.scale, unit)}
+        bounds = {"fraction": _scaled_bounds(far.fraction), "scale": _scaled_bounds(far.scale, unit)}
         found.append(_penalised_trial(effect, far.gain, bounds, far.count))
     rival = max(course.trend, course.periodic.gain, course.wander)
     length_s = axis.n / axis.rate_hz
@@ -176,14 +183,15 @@ def _sample_trials(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
         and course.step.gain > _band_burst_gain(seen) - RIVAL_MARGIN_NATS
     ):
         step = NoiseStep(time=course.step.time.value, ratio=course.step.ratio.value)
-        bounds = {"time": _bounds(course.step.time), "ratio": _bounds(course.step.ratio)}
+        bounds = {"time": _scaled_bounds(course.step.time), "ratio": _scaled_bounds(course.step.ratio)}
         found.append(_penalised_trial(step, course.step.gain, bounds))
     return sorted(found, key=lambda one: -one.value)
 
 
 def _band_burst_gain(seen: Sight) -> float:
-    """Return the gain in nats of the least constant place of the spectrogram if it is a band. Then no white noise has
-    changed.
+    """Return the gain in nats of the least constant place of the spectrogram if it is a band, otherwise 0.
+
+    A change within a band is no step of the white noise.
     """
     found = unsteady(seen)
     return found.gain if np.ptp(found.frequency) < MAX_BAND_FRACTION * seen.axis.rate_hz else 0.0
@@ -203,7 +211,7 @@ def _penalised_trial(effect: Effect, gain: float, bounds: Mapping[str, Bounds], 
     return Trial(effect.name, effect, gain - PRICE[effect.name], bounds=bounds, events=events)
 
 
-def _bounds(found: Size, unit: float = 1.0) -> Bounds:
+def _scaled_bounds(found: Size, unit: float = 1.0) -> Bounds:
     """Return an interval in another unit."""
     return Bounds(unit * found.value, unit * found.lo, unit * found.hi)
 
@@ -267,10 +275,10 @@ def _deterministic_trials(axis: Axis, state: Hypothesis, seen: Sight) -> list[Tr
 
 
 def _has_flat_coefficient(seen: Sight, leak: Leak) -> bool:
-    """Return True if one coefficient describes a leak at all frequencies. It does not if something shakes both axes.
+    """Return True if one coefficient describes a leak at all frequencies.
 
-    The coefficients in ``FREQUENCY_BANDS`` bands of equal width have the variance 1/(Σ X²/v). Their scatter about the
-    mean is tested with χ².
+    If something shakes both axes, the coefficient depends on the frequency. The coefficients in ``FREQUENCY_BANDS``
+    bands of equal width have the variance 1/(Σ X²/v). Their scatter about the mean is tested with χ².
     """
     column = seen.axis.others[leak.source] * seen.weight
     edges = np.linspace(0, column.size, FREQUENCY_BANDS + 1).astype(np.int64)[:-1]
@@ -293,7 +301,7 @@ def _quadratic_penalty(effect: Effect) -> float:
 
 
 def _slow_noise_scores(axis: Axis, state: Hypothesis) -> list[Callable[[Effects], float]]:
-    """Return functions that score effects beside each slow noise that could replace a deterministic effect.
+    """Return functions that score effects together with each slow noise that could replace a deterministic effect.
 
     The sizes of the model's noise effects are not changed.
     """

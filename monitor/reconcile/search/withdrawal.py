@@ -61,7 +61,7 @@ FREQUENCY_DIAGNOSTICS: Final = ("psd", "lines", "spectrogram")
 def upheld(
     state: Hypothesis, closing: Mapping[type[Effect], float], seen: Findings, null: Mapping[str, Null]
 ) -> Effects:
-    """Return the effects that were found on an axis without those that the checks contradict.
+    """Return the effects that were found on an axis and pass all checks.
 
     Parameters
     ----------

@@ -58,10 +58,10 @@ def absence(shown: Shown, run: str, other: Reconciliation) -> Absence:
     other : Reconciliation
         Result of the recording without the effect.
     """
-    return Absence(run, *_meaning(shown, other))
+    return Absence(run, *_explain_absence(shown, other))
 
 
-def _meaning(shown: Shown, other: Reconciliation) -> tuple[Meaning, str]:
+def _explain_absence(shown: Shown, other: Reconciliation) -> tuple[Meaning, str]:
     """Return the meaning of the absence and the sentence that explains it."""
     step, of = shown.step, shown.of
     there = other.axes.get(of.axis)
@@ -99,8 +99,9 @@ def _compare_expected_gap(expected: float, growth: float, seen: Score, seconds: 
 
 
 def _gap_ratio(step: Step, seconds: float, other_s: float, seen: Score) -> float | None:
-    """Return the expected gap of the other recording over that of the first for the same size, or None if it is not
-    visible.
+    """Return the expected gap of the other recording relative to the first one, for an effect of the same size.
+
+    The result is None if the effect cannot be visible there.
     """
     longer = other_s / seconds
     if step.effect == "rate_ramp":

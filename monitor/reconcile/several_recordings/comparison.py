@@ -105,7 +105,7 @@ def compare(runs: Sequence[Run], fitted_to: str | None = None, silent: Mapping[s
         Recordings without a result, with the reason.
     """
     baseline = runs[0].result.baseline
-    axes = {axis: _axis(axis, runs) for axis in AXES if any(axis in run.result.axes for run in runs)}
+    axes = {axis: _compare_axis(axis, runs) for axis in AXES if any(axis in run.result.axes for run in runs)}
     return Comparison(
         overall([run.result.verdict for run in runs]),
         tuple(runs),
@@ -153,20 +153,23 @@ def _with_pooled_parameters(effect: Effect, seen: Seen) -> Effect:
     return replace(made, phase=None) if isinstance(made, Sinusoidal) else made
 
 
-def _axis(axis: str, runs: Sequence[Run]) -> AxisRuns:
+def _compare_axis(axis: str, runs: Sequence[Run]) -> AxisRuns:
     """Return the common and the single effects of one axis."""
     results = {run.name: run.result.axes[axis] for run in runs if axis in run.result.axes}
     groups: list[dict[str, Step]] = []
     for run in runs:
-        for step in _steps(run, axis, runs):
+        for step in _steps_of_axis(run, axis, runs):
             _add_to_group(groups, run.name, step, axis, runs)
-    every = [_seen(group, axis, runs) for group in groups]
+    every = [_summarise_group(group, axis, runs) for group in groups]
     common = tuple(one for one in every if not one.absent and len(one.steps) > 1)
     return AxisRuns(axis, results, common, tuple(one for one in every if one not in common))
 
 
-def _steps(run: Run, axis: str, runs: Sequence[Run]) -> list[Step]:
-    """Return the steps of one axis. A sample rate error belongs to the first axis on which any recording shows it."""
+def _steps_of_axis(run: Run, axis: str, runs: Sequence[Run]) -> list[Step]:
+    """Return the steps of one axis.
+
+    A sample rate error belongs to the first axis on which any recording shows it.
+    """
     found = run.result.axes[axis].steps if axis in run.result.axes else ()
     steps = [step for step in found if step.effect != SAMPLE_RATE_EFFECT]
     return _sample_rate_steps(run) + steps if axis == _sample_rate_axis(runs) else steps
@@ -206,10 +209,10 @@ def _add_to_group(groups: list[dict[str, Step]], run: str, step: Step, axis: str
         best[1][run] = step
 
 
-def _seen(group: Mapping[str, Step], axis: str, runs: Sequence[Run]) -> Seen:
+def _summarise_group(group: Mapping[str, Step], axis: str, runs: Sequence[Run]) -> Seen:
     """Return the effect that a group of steps describes."""
     first = next(iter(group.values()))
-    parameters = _pooled(group)
+    parameters = _pool_parameters(group)
     sizes = [one for name, one in parameters.items() if name not in (*NON_SIZE_PARAMETERS, place_name(first.effect))]
     having = [run for run in runs if axis in run.result.axes or first.effect == SAMPLE_RATE_EFFECT]
     strongest = max((run for run in runs if run.name in group), key=lambda run: group[run.name].before.gap)
@@ -222,8 +225,9 @@ def _seen(group: Mapping[str, Step], axis: str, runs: Sequence[Run]) -> Seen:
 
 
 def _gap_of_effect(step: Step, axis: str, result: Reconciliation) -> float:
-    """Return the gap that an effect itself causes. For a resized term, return the distance of the model's size in
-    standard deviations.
+    """Return the gap that an effect itself causes.
+
+    For a changed size, return the distance of the size in the model from its interval, in standard deviations.
     """
     if step.kind == "added":
         return sqrt(max(step.before.gap**2 - step.after.gap**2, 0.0))
@@ -232,13 +236,14 @@ def _gap_of_effect(step: Step, axis: str, result: Reconciliation) -> float:
 
 
 def _size_agreement(sizes: Sequence[Pooled], parameters: Mapping[str, Pooled]) -> float | None:
-    """Return the probability that the sizes agree. An effect without a size, such as a bandwidth limit, uses all
-    parameters.
+    """Return the probability that the sizes agree.
+
+    For an effect without a size, such as a bandwidth limit, all parameters are compared.
     """
     return agreement(sizes or parameters.values())
 
 
-def _pooled(group: Mapping[str, Step]) -> dict[str, Pooled]:
+def _pool_parameters(group: Mapping[str, Step]) -> dict[str, Pooled]:
     """Return the pooled parameters of a group of steps."""
     steps = [_at_common_reference(step, next(iter(group.values()))) for step in group.values()]
     names = dict.fromkeys(name for step in steps for name in step.parameters if name != "phase")
@@ -246,20 +251,21 @@ def _pooled(group: Mapping[str, Step]) -> dict[str, Pooled]:
 
 
 def _at_common_reference(step: Step, first: Step) -> Step:
-    """Return a quadratic temperature dependence at the reference temperature of the first recording: c + 2 q (T₁ −
-    T₀).
+    """Return a step whose quadratic temperature dependence refers to the temperature of the first recording.
+
+    The coefficient becomes c + 2 q (T₁ − T₀).
     """
     own = step.parameters
     if "quadratic" not in own or "reference" not in first.parameters:
         return step
-    twice = 2.0 * (_value(first.parameters["reference"]) - _value(own["reference"]))
-    value = _value(own["coefficient"]) + twice * _value(own["quadratic"])
+    twice = 2.0 * (_numerical_value(first.parameters["reference"]) - _numerical_value(own["reference"]))
+    value = _numerical_value(own["coefficient"]) + twice * _numerical_value(own["quadratic"])
     half = hypot(_half_width(own["coefficient"]), twice * _half_width(own["quadratic"]))
     moved = {"coefficient": Bounds(value, value - half, value + half), "reference": first.parameters["reference"]}
     return replace(step, parameters={**own, **moved})
 
 
-def _value(one: Bounds) -> float:
+def _numerical_value(one: Bounds) -> float:
     """Return the numerical value of a parameter."""
     assert not isinstance(one.value, str)
     return one.value

@@ -27,33 +27,33 @@ def to_json(c: Comparison) -> bytes:
         "seed": int(c.seed),
         "fitted_to": c.fitted_to,
         "recordings": [
-            *(_run(run) for run in c.runs),
+            *(_run_entry(run) for run in c.runs),
             *({"name": name, "folder": name, "verdict": None, "why": why} for name, why in c.silent.items()),
         ],
-        "axes": {axis: _axis(one) for axis, one in c.axes.items()},
+        "axes": {axis: _axis_entry(one) for axis, one in c.axes.items()},
     })  # fmt: skip
 
 
-def _run(run: Run) -> dict[str, Any]:
+def _run_entry(run: Run) -> dict[str, Any]:
     """Return the report entry of one recording."""
     return {
         "name": run.name,
         "folder": run.name,
         "verdict": run.result.verdict,
-        "rate": _number(run.result.rate_hz),
+        "rate": _finite_or_none(run.result.rate_hz),
         "samples": int(run.result.samples),
-        "seconds": _number(run.result.seconds),
+        "seconds": _finite_or_none(run.result.seconds),
     }
 
 
-def _axis(one: AxisRuns) -> dict[str, Any]:
+def _axis_entry(one: AxisRuns) -> dict[str, Any]:
     """Return the report entry of one axis."""
     return {
         "verdicts": {run: result.verdict for run, result in one.results.items()},
-        "common": [_seen(seen) for seen in one.common],
+        "common": [_effect_entry(seen) for seen in one.common],
         "single": [
             {
-                **_seen(seen),
+                **_effect_entry(seen),
                 "absent": [{"run": a.run, "meaning": a.meaning, "because": a.because} for a in seen.absent],
             }
             for seen in one.single
@@ -61,38 +61,38 @@ def _axis(one: AxisRuns) -> dict[str, Any]:
     }
 
 
-def _seen(seen: Seen) -> dict[str, Any]:
+def _effect_entry(seen: Seen) -> dict[str, Any]:
     """Return the report entry of one effect."""
     return {
         "effect": seen.effect,
         "kind": seen.kind,
         "recordings": list(seen.steps),
         "parameters": {
-            name: {**_bounds(one.bounds), **({} if one.p is None else {"p": _number(one.p)})}
+            name: {**_bounds_entry(one.bounds), **({} if one.p is None else {"p": _finite_or_none(one.p)})}
             for name, one in seen.parameters.items()
         },
         "consistent": seen.consistent,
-        "p": _number(seen.p),
-        "each": {run: _each(step) for run, step in seen.steps.items()},
+        "p": _finite_or_none(seen.p),
+        "each": {run: _step_entry(step) for run, step in seen.steps.items()},
     }
 
 
-def _each(step: Step) -> dict[str, Any]:
+def _step_entry(step: Step) -> dict[str, Any]:
     """Return the report entry of one effect in one recording."""
     return {
-        "parameters": {name: _bounds(one) for name, one in step.parameters.items()},
-        "confidence": _number(step.confidence),
-        "gap": {"before": _number(step.before.gap), "after": _number(step.after.gap)},
+        "parameters": {name: _bounds_entry(one) for name, one in step.parameters.items()},
+        "confidence": _finite_or_none(step.confidence),
+        "gap": {"before": _finite_or_none(step.before.gap), "after": _finite_or_none(step.after.gap)},
     }
 
 
-def _bounds(one: Bounds) -> dict[str, Any]:
+def _bounds_entry(one: Bounds) -> dict[str, Any]:
     """Return the report entry of a parameter."""
     if isinstance(one.value, str):
         return {"value": one.value}
-    return {"value": _number(one.value), "lo": _number(one.lo), "hi": _number(one.hi)}
+    return {"value": _finite_or_none(one.value), "lo": _finite_or_none(one.lo), "hi": _finite_or_none(one.hi)}
 
 
-def _number(value: float | None) -> float | None:
+def _finite_or_none(value: float | None) -> float | None:
     """Return the value, or None if it is not finite."""
     return None if value is None or not isfinite(value) else float(value)

@@ -42,7 +42,7 @@ def place_name(effect: str) -> str:
 
 
 def place(step: Step, axis: str, model: NoiseModel) -> Bounds | None:
-    """Return the parameter that identifies an effect among those of the same name.
+    """Return the parameter that identifies an effect among effects of the same name.
 
     A step that changes a known effect contains only its size. The model of the recording then provides the parameter.
 
