@@ -44,51 +44,51 @@ MIN_RUNNER_UP_CONFIDENCE: Final = 0.001
 """Smallest confidence of an alternative effect that is reported."""
 
 
-def described(found: Search, null: Mapping[str, Null], final: Mapping[str, Null]) -> AxisResult:
+def described(search: Search, null: Mapping[str, Null], final: Mapping[str, Null]) -> AxisResult:
     """Return the result of one axis.
 
     Parameters
     ----------
-    found : Search
+    search : Search
         Search on the axis.
     null : mapping of str to Null
         Null distributions under the model under test, which decided the search.
     final : mapping of str to Null
         Null distributions under the extended model, which decide which differences are left over.
     """
-    looks = [Look(scores(one.seen, null), one.views) for one in found.rounds]
-    end = Look(scores(found.seen, final), found.views)
-    looks.append(end if found.before is None else Look(scores(found.before[1], null), found.before[0]))
+    looks = [Look(scores(one.seen, null), one.views) for one in search.rounds]
+    end = Look(scores(search.seen, final), search.views)
+    looks.append(end if search.before is None else Look(scores(search.before[1], null), search.before[0]))
     steps: list[Step] = []
-    left = sorted(range(found.state.given, len(found.state.effects)))
-    for at, one in enumerate(found.rounds):
+    left = sorted(range(search.state.given, len(search.state.effects)))
+    for at, one in enumerate(search.rounds):
         last = one.state.effects[-1]
-        index = next((i for i in left if type(found.state.effects[i]) is type(last)), None)
+        index = next((i for i in left if type(search.state.effects[i]) is type(last)), None)
         if index is not None and len(one.state.effects) > one.state.given and one.trials[0].effect is not None:
             left.remove(index)
-            steps.append(_describe_step(found, one, index, "added", looks[at], looks[at + 1]))
-        before = found.rounds[at - 1].state.likely.noises if at else ()
+            steps.append(_describe_step(search, one, index, "added", looks[at], looks[at + 1]))
+        before = search.rounds[at - 1].state.likely.noises if at else ()
         for noise in one.state.likely.noises:
-            if noise < found.state.given and noise not in before and noise in found.state.likely.noises:
-                steps.append(_describe_step(found, one, noise, "retuned", looks[at], looks[at + 1]))
-    left_over = (*(score for score in end.scores if score.passes), *_noise_floor_score(found, end))
+            if noise < search.state.given and noise not in before and noise in search.state.likely.noises:
+                steps.append(_describe_step(search, one, noise, "retuned", looks[at], looks[at + 1]))
+    left_over = (*(score for score in end.scores if score.passes), *_noise_floor_score(search, end))
     return AxisResult(
-        found.axis.name, _axis_decision(bool(steps), bool(left_over)), looks[0], tuple(steps), left_over, end
+        search.axis.name, _axis_decision(bool(steps), bool(left_over)), looks[0], tuple(steps), left_over, end
     )
 
 
-def _noise_floor_score(found: Search, look: Look) -> tuple[Score, ...]:
+def _noise_floor_score(search: Search, look: Look) -> tuple[Score, ...]:
     """Score the white noise floor after a low-pass filter that was found.
 
     No effect produces this noise, so it is reported as left over if it is larger than chance. Its gap is the gap that
     the low-pass filter alone would leave, and at most the gap without a low-pass filter.
     """
-    state, axis = found.state, found.axis
+    state, axis = search.state, search.axis
     limit = next((effect for effect in state.found if isinstance(effect, BandwidthLimit)), None)
     if limit is None or not state.likely.behind > 0.0:
         return ()
     without = axis.fit(state.effects, state.likely.held, floor=False)
-    most = max(one.seen["psd"].gain for one in found.rounds)
+    most = max(one.seen["psd"].gain for one in search.rounds)
     gain = max(min(state.likely.log_likelihood - without.log_likelihood, most), 0.0)
     psd = next(score for score in look.scores if score.lens == "psd")
     place = Where(frequency=(limit.cutoff, 0.5 * axis.rate_hz))
@@ -103,26 +103,26 @@ def _axis_decision(steps: bool, left: bool) -> Verdict:
     return "explained" if steps else "agrees"
 
 
-def _describe_step(found: Search, one: Round, index: int, kind: Kind, before: Look, after: Look) -> Step:
+def _describe_step(search: Search, search_round: Round, index: int, kind: Kind, before: Look, after: Look) -> Step:
     """Return the result of one step of the search."""
-    effect = found.state.effects[index]
+    effect = search.state.effects[index]
     score = _triggering_score(effect, kind, before)
     later = next(other for other in after.scores if other.lens == score.lens)
-    proof = one.proof
+    proof = search_round.proof
     unseen: tuple[Score | None, Score | None] = None, None
     if not proof.reason:
         unseen = (
             Score(score.lens, score.where, proof.before, score.null95, score.threshold),
             Score(score.lens, score.where, proof.after, later.null95, later.threshold),
         )
-    confidence, others = _confidence_and_runners_up(effect.name if kind == "added" else RETUNE, one.trials)
-    if kind == "retuned" and one.trials[0].name != RETUNE:  # the size changed together with an added effect
-        confidence, others = _resize_confidence(found.state, index), ()
+    confidence, others = _confidence_and_runners_up(effect.name if kind == "added" else RETUNE, search_round.trials)
+    if kind == "retuned" and search_round.trials[0].name != RETUNE:  # the size changed together with an added effect
+        confidence, others = _resize_confidence(search.state, index), ()
     return Step(
         found=score,
         kind=kind,
         effect=effect.name,
-        parameters=_parameters_with_bounds(found.axis, found.state, index, one.trials[0], kind),
+        parameters=_parameters_with_bounds(search.axis, search.state, index, search_round.trials[0], kind),
         confidence=confidence,
         runners_up=others,
         before=score,
@@ -130,7 +130,7 @@ def _describe_step(found: Search, one: Round, index: int, kind: Kind, before: Lo
         held_out_before=unseen[0],
         held_out_after=unseen[1],
         held_out_reason=proof.reason,
-        because=_justification(effect, kind, score, later, others, one.trials[0]),
+        because=_justification(effect, kind, score, later, others, search_round.trials[0]),
         look=after,
     )
 

@@ -77,7 +77,7 @@ class Recording:
 
 def diagnose_simulations(
     model: NoiseModel,
-    like: Recording,
+    template: Recording,
     courses: Courses,
     seed: int,
     each: MapFunction = map,
@@ -90,7 +90,7 @@ def diagnose_simulations(
     ----------
     model : NoiseModel
         Model to simulate.
-    like : Recording
+    template : Recording
         Recording whose axes, length, sample rate and temperature the simulations copy.
     courses : Courses
         Cached regressors for the same length, sample rate and temperature.
@@ -108,14 +108,14 @@ def diagnose_simulations(
     dict of str to list of Findings
         For each axis, the findings of each simulated recording.
     """
-    effects = effects_of(model, like)
-    wanted = [name for name in like.values if only is None or name in only]
+    effects = effects_of(model, template)
+    wanted = [name for name in template.values if only is None or name in only]
 
     def one(run: int) -> dict[str, Findings]:
-        drawn = model.simulate(like.samples, like.rate_hz, seed + run, like.temperature_c)
-        raw = {axis: drawn[:, AXES.index(axis)] for axis in like.values}
+        drawn = model.simulate(template.samples, template.rate_hz, seed + run, template.temperature_c)
+        raw = {axis: drawn[:, AXES.index(axis)] for axis in template.values}
         rng = np.random.default_rng(seed + run)
-        axes = prepared(raw, like.rate_hz, effects, like.temperature_c, courses, rng)
+        axes = prepared(raw, template.rate_hz, effects, template.temperature_c, courses, rng)
         return {name: look(sight(axes[name], believed(axes[name], effects[name]).likely)) for name in wanted}
 
     seen = list(each(one, range(runs)))
@@ -246,12 +246,12 @@ def reconcile(
     Returns
     -------
     Reconciliation
-        Decisions, effects and remaining differences of all axes.
+        Decision, effects and remaining differences of each axis.
 
     Raises
     ------
     NotReady
-        If there are too few samples or the model describes none of the recorded axes.
+        If there are too few samples or no axis can be compared with the model.
     """
     recording, notes = usable(recording, model)
     courses = Courses(recording.samples, recording.rate_hz, recording.temperature_c)
@@ -299,7 +299,7 @@ def usable(recording: Recording, model: NoiseModel | None) -> tuple[Recording, t
     recording : Recording
         Recording to check.
     model : NoiseModel or None
-        Model under test. If None, every axis with enough samples is kept.
+        Model under test. If None, every axis with enough samples and varying values is kept.
 
     Returns
     -------

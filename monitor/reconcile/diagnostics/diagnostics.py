@@ -243,7 +243,7 @@ def periodogram(white: Floats) -> Floats:
     size += size % 2
     turned = rfft(white, size)
     power = (turned.real**2 + turned.imag**2) / n
-    power[: 2 * size // n] = 0.0  # slower than one turn
+    power[: 2 * size // n] = 0.0  # less than one cycle in the recording
     power[-2:] = 0.0
     return np.asarray(power)
 

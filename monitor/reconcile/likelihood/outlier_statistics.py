@@ -142,7 +142,7 @@ def _bin_magnitudes(w, unit):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _fit_mixture(counts, squares, wider):  # type: ignore[no-untyped-def]
+def _fit_mixture(counts, squares, start_widths):  # type: ignore[no-untyped-def]
     """Return variances, share and log-likelihood of the best mixture.
 
     EM runs for a few steps from every start, and then until convergence from the best result.
@@ -150,7 +150,7 @@ def _fit_mixture(counts, squares, wider):  # type: ignore[no-untyped-def]
     total = counts.sum()
     mean = (counts * squares).sum() / total
     best = (mean, mean, 0.0, -np.inf)
-    for one in wider:
+    for one in start_widths:
         narrow, wide, share = min(1.0, mean), one * one, 0.01
         for step in range(40):
             share, narrow, wide, like = _em_step(counts, squares, total, narrow, wide, share, step < 15)
@@ -267,48 +267,48 @@ def _parameter_intervals(
     return Size(*map(float, f)), Size(*map(float, scale))
 
 
-def _vuong_statistic(counts: Floats, apart: Floats) -> float:
+def _vuong_statistic(counts: Floats, log_density_difference: Floats) -> float:
     """Return the mean difference of log-densities divided by its standard error."""
     total = float(counts.sum())
-    mean = float(np.dot(counts, apart)) / total
-    spread = float(np.dot(counts, (apart - mean) ** 2)) / total
+    mean = float(np.dot(counts, log_density_difference)) / total
+    spread = float(np.dot(counts, (log_density_difference - mean) ** 2)) / total
     return mean * (total / spread) ** 0.5 if spread > 0.0 else 0.0
 
 
-def _clustering_z(when: Ints, n: int) -> float:
+def _clustering_z(positions: Ints, n: int) -> float:
     """Return the z of the strongest of several tests for clustering of events.
 
     The first test compares the number of pairs at most ``NEIGHBOUR_SAMPLES`` samples apart with a Poisson count. The
     other tests divide the recording into 4, 8, … parts with at least two events per part on average, and compare the
     dispersion of their counts with χ² (Cochran 1954). The smallest p is multiplied by the number of tests.
     """
-    if when.size < 2:
+    if positions.size < 2:
         return 0.0
     pairs = sum(
-        int(np.count_nonzero(when[k:] - when[:-k] <= NEIGHBOUR_SAMPLES))
-        for k in range(1, min(NEIGHBOUR_SAMPLES, when.size - 1) + 1)
+        int(np.count_nonzero(positions[k:] - positions[:-k] <= NEIGHBOUR_SAMPLES))
+        for k in range(1, min(NEIGHBOUR_SAMPLES, positions.size - 1) + 1)
     )
-    expected = NEIGHBOUR_SAMPLES * when.size * (when.size - 1.0) / n
-    if expected < 0.2 * when.size:
+    expected = NEIGHBOUR_SAMPLES * positions.size * (positions.size - 1.0) / n
+    if expected < 0.2 * positions.size:
         chances = [float(pdtrc(pairs - 1, expected)) if pairs else 1.0]
     else:  # outliers are so frequent that only the next sample is informative
-        following = int(np.count_nonzero(np.diff(when) == 1))
-        chances = [float(bdtrc(following - 1, when.size, when.size / n)) if following else 1.0]
+        following = int(np.count_nonzero(np.diff(positions) == 1))
+        chances = [float(bdtrc(following - 1, positions.size, positions.size / n)) if following else 1.0]
     parts = 4
-    while 2 * parts <= when.size and parts <= 4096:
-        held = np.bincount(when * parts // n, minlength=parts)
-        mean = when.size / parts
-        spread = float(((held - mean) ** 2).sum()) / (mean * (1.0 - when.size / n))
+    while 2 * parts <= positions.size and parts <= 4096:
+        held = np.bincount(positions * parts // n, minlength=parts)
+        mean = positions.size / parts
+        spread = float(((held - mean) ** 2).sum()) / (mean * (1.0 - positions.size / n))
         chances.append(float(chdtrc(parts - 1, spread)))
         parts *= 2
     return _z_of_probability(min(chances) * len(chances))
 
 
-def _z_of_probability(chance: float) -> float:
+def _z_of_probability(probability: float) -> float:
     """Return the z that a standard Gaussian exceeds with a given probability, or 0 for probabilities above 0.5."""
-    if chance > 0.5:
+    if probability > 0.5:
         return 0.0
-    return -float(ndtri(chance)) if chance > 1e-300 else MAX_Z
+    return -float(ndtri(probability)) if probability > 1e-300 else MAX_Z
 
 
 def _misfit_z(counts: Floats, kept: NDArray[np.intp], narrow: float, wide: float, share: float) -> float:

@@ -77,8 +77,8 @@ def steps_or_walk(y: Floats, tau0_s: float, rest: Rest, K: float) -> ModelCompar
     start, span_s = anywhere(means), means.size * block_s
 
     def walk(K: float) -> float:
-        around = parts(replace(rest, walk=rest.walk + K * K), block_s, span_s)
-        return float(kalman(means, around.table, around.white, start))
+        noise = parts(replace(rest, walk=rest.walk + K * K), block_s, span_s)
+        return float(kalman(means, noise.table, noise.white, start))
 
     first = fit_jumps(means, block_s, rest, K)
     second = maximise(walk, (K,))
@@ -123,10 +123,10 @@ def fit_jumps(means: Floats, block_s: float, rest: Rest, K: float) -> EventProce
         Random walk coefficient in unit/√s.
     """
     span_s, start = means.size * block_s, anywhere(means)
-    around = parts(rest, block_s, span_s)
+    noise = parts(rest, block_s, span_s)
 
     def poisson(rate: float, height: float, odds: float = 1.0) -> float:
-        return log_likelihood(means, around, start, rate * block_s, height, odds)
+        return log_likelihood(means, noise, start, rate * block_s, height, odds)
 
     rates = np.geomspace(2.0 / span_s, max(MAX_START_JUMPS * K / rest.white**0.5, 4.0 / span_s), START_RATES)
     rate = max(rates, key=lambda rate: poisson(rate, K / rate**0.5))
@@ -134,7 +134,7 @@ def fit_jumps(means: Floats, block_s: float, rest: Rest, K: float) -> EventProce
 
 
 def log_likelihood(
-    means: Floats, around: StateSpaceNoise, start: float, jumps: float, height: float, odds: float = 1.0
+    means: Floats, noise: StateSpaceNoise, start: float, jumps: float, height: float, odds: float = 1.0
 ) -> float:
     """Return the log-likelihood of Poisson steps in block means.
 
@@ -142,7 +142,7 @@ def log_likelihood(
     ----------
     means : ndarray of float64, shape (m,)
         Block means in the unit of the axis.
-    around : StateSpaceNoise
+    noise : StateSpaceNoise
         Additional noise.
     start : float
         Prior variance of the first level, in the squared unit of the axis.
@@ -156,7 +156,7 @@ def log_likelihood(
     some = -expm1(-jumps)
     variance = jumps / some * height**2  # variance of the sum of all jumps in a block with at least one jump
     return float(
-        jump_log_likelihood(means, around.table, around.white, start, JUMP_AGES, exp(-jumps), odds * some, variance)
+        jump_log_likelihood(means, noise.table, noise.white, start, JUMP_AGES, exp(-jumps), odds * some, variance)
     )
 
 

@@ -82,13 +82,13 @@ def telegraph_or_correlated(
         If there are too few samples or no white noise.
     """
     means, block_s = block_means(y, tau0_s, block_for(y.size * tau0_s, tau0_s, correlation_time, rest.white / sigma**2))
-    around, start = parts(rest, block_s, means.size * block_s), anywhere(means)
+    noise, start = parts(rest, block_s, means.size * block_s), anywhere(means)
 
     def correlated(sigma: float, time_s: float) -> float:
         row, own = markov(sigma, time_s, block_s)
-        return float(kalman(means, np.vstack([around.table, row]), around.white + own, start))
+        return float(kalman(means, np.vstack([noise.table, row]), noise.white + own, start))
 
-    first = fit_telegraph(means, block_s, around, sigma, correlation_time)
+    first = fit_telegraph(means, block_s, noise, sigma, correlation_time)
     second = maximise(correlated, (sigma, correlation_time))
     return ModelComparison(
         first.peak.height - second.height,
@@ -121,7 +121,7 @@ def block_for(span_s: float, tau0_s: float, correlation_time: float, even_s: flo
 
 
 def fit_telegraph(
-    means: Floats, block_s: float, around: StateSpaceNoise, sigma: float, correlation_time: float
+    means: Floats, block_s: float, noise: StateSpaceNoise, sigma: float, correlation_time: float
 ) -> EventProcessFit:
     """Maximise the likelihood over amplitude and dwell time.
 
@@ -131,17 +131,17 @@ def fit_telegraph(
         Block means in the unit of the axis.
     block_s : float
         Length of a block in seconds.
-    around : StateSpaceNoise
+    noise : StateSpaceNoise
         Additional noise.
     sigma : float
-        Standard deviation from which the starting amplitudes follow, in the unit of the axis.
+        Standard deviation that determines the starting amplitudes, in the unit of the axis.
     correlation_time : float
-        Correlation time in seconds from which the starting dwell times follow.
+        Correlation time in seconds that determines the starting dwell times.
     """
     start = anywhere(means)
 
     def two_levels(amplitude: float, dwell_s: float, odds: float) -> float:
-        return log_likelihood(means, around, start, amplitude, block_s / dwell_s, odds)
+        return log_likelihood(means, noise, start, amplitude, block_s / dwell_s, odds)
 
     starts = [
         (2.0 * sigma * a, 2.0 * correlation_time * d)
@@ -153,7 +153,7 @@ def fit_telegraph(
 
 
 def log_likelihood(
-    means: Floats, around: StateSpaceNoise, start: float, amplitude: float, switches: float, odds: float = 1.0
+    means: Floats, noise: StateSpaceNoise, start: float, amplitude: float, switches: float, odds: float = 1.0
 ) -> float:
     """Return the log-likelihood of a random telegraph in block means.
 
@@ -161,7 +161,7 @@ def log_likelihood(
     ----------
     means : ndarray of float64, shape (m,)
         Block means in the unit of the axis.
-    around : StateSpaceNoise
+    noise : StateSpaceNoise
         Additional noise.
     start : float
         Prior variance of the first level, in the squared unit of the axis.
@@ -183,13 +183,13 @@ def log_likelihood(
     ])  # fmt: skip
     # The position of the levels is unknown as well. If the filter began in both levels at once, the two explanations
     # would be merged too soon.
-    states = [_initial_state(around.table, start, first) for first in (0, 1)]
+    states = [_initial_state(noise.table, start, first) for first in (0, 1)]
     heads = [
-        switching_log_likelihood(means[:INITIAL_LEVEL_BLOCKS], around.table, around.white, cases, *state)
+        switching_log_likelihood(means[:INITIAL_LEVEL_BLOCKS], noise.table, noise.white, cases, *state)
         for state in states
     ]
     rest = switching_log_likelihood(
-        means[INITIAL_LEVEL_BLOCKS:], around.table, around.white, cases, *states[int(np.argmax(heads))]
+        means[INITIAL_LEVEL_BLOCKS:], noise.table, noise.white, cases, *states[int(np.argmax(heads))]
     )
     return float(np.logaddexp(*heads) - log(2.0) + rest)
 

@@ -94,43 +94,43 @@ def steps_or_once(y: Floats, tau0_s: float, rest: Rest, K: float, most: int = 5)
     )
 
 
-def fit_once(means: Floats, around: StateSpaceNoise, most: int) -> SingleStepsFit:
+def fit_once(means: Floats, noise: StateSpaceNoise, most: int) -> SingleStepsFit:
     """Fit the number of single steps that explains the block means at the smallest cost.
 
     Parameters
     ----------
     means : ndarray of float64, shape (m,)
         Block means in the unit of the axis.
-    around : StateSpaceNoise
+    noise : StateSpaceNoise
         Additional noise.
     most : int
         Largest number of steps.
     """
     blocks: list[int] = []
-    best = SingleStepsFit(kalman(means, around.table, around.white, anywhere(means)), *np.empty((5, 0)))
+    best = SingleStepsFit(kalman(means, noise.table, noise.white, anywhere(means)), *np.empty((5, 0)))
     for _ in range(most):
-        blocks.append(int(np.argmax(_shock_gains(means, around, blocks))))
+        blocks.append(int(np.argmax(_shock_gains(means, noise, blocks))))
         for k in range(len(blocks)):
-            blocks[k] = int(np.argmax(_shock_gains(means, around, blocks[:k] + blocks[k + 1 :])))
-        found = _refine_steps(means, around, sorted(blocks))
+            blocks[k] = int(np.argmax(_shock_gains(means, noise, blocks[:k] + blocks[k + 1 :])))
+        found = _refine_steps(means, noise, sorted(blocks))
         if found.height > best.height:
             best = found
     return best
 
 
-def _shock_gains(means: Floats, around: StateSpaceNoise, blocks: list[int]) -> Floats:
+def _shock_gains(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> Floats:
     """Return twice the log-likelihood gain, shape (m,), of one more shock at the start of each block.
 
     The shocks in ``blocks`` are already present.
     """
     free = np.zeros(means.size)
     free[blocks] = anywhere(means)
-    scores = np.asarray(shocks(means, around.table, around.white, anywhere(means), free))
+    scores = np.asarray(shocks(means, noise.table, noise.white, anywhere(means), free))
     scores[blocks] = 0.0
     return scores
 
 
-def _refine_steps(means: Floats, around: StateSpaceNoise, blocks: list[int]) -> SingleStepsFit:
+def _refine_steps(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> SingleStepsFit:
     """Refine the times of the steps within their blocks and return the fit with its penalties."""
     times = np.array(blocks, np.float64)
     places = np.arange(-TIMES_PER_BLOCK, TIMES_PER_BLOCK + 1) / TIMES_PER_BLOCK
@@ -138,23 +138,23 @@ def _refine_steps(means: Floats, around: StateSpaceNoise, blocks: list[int]) -> 
         others = np.delete(times, k)
         apart = [at for at in times[k] + places if 0.0 <= at < means.size and (np.abs(others - at) >= 1.0).all()]
         tried = [np.insert(others, k, at) for at in apart]
-        times = max(tried, key=lambda t: _fit_heights(means, around, t)[0])
-    total, heights, deviations = _fit_heights(means, around, times)
+        times = max(tried, key=lambda t: _fit_heights(means, noise, t)[0])
+    total, heights, deviations = _fit_heights(means, noise, times)
     cost = times.size * log(means.size) + 0.5 * float(np.log1p((heights / deviations) ** 2).sum())
-    earliest, latest = np.array([_time_interval(means, around, blocks, k) for k in range(len(blocks))]).T
+    earliest, latest = np.array([_time_interval(means, noise, blocks, k) for k in range(len(blocks))]).T
     return SingleStepsFit(
         total - cost, times, np.minimum(earliest, times), np.maximum(latest, times), heights, deviations
     )
 
 
-def _fit_heights(means: Floats, around: StateSpaceNoise, times: Floats) -> tuple[float, Floats, Floats]:
+def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[float, Floats, Floats]:
     """Return the log-likelihood with steps at given times, and the heights with standard deviations, by least
     squares.
     """
     # fraction of each block that lies after the step
     columns = np.clip(np.arange(1.0, means.size + 1.0)[:, None] - times, 0.0, 1.0)
     columns = np.column_stack([means, columns])
-    logarithms = whiten(columns, around.table, around.white, anywhere(means))
+    logarithms = whiten(columns, noise.table, noise.white, anywhere(means))
     data, design = columns[:, 0], columns[:, 1:]
     normal = np.linalg.inv(design.T @ design)
     heights = normal @ (design.T @ data)
@@ -162,9 +162,9 @@ def _fit_heights(means: Floats, around: StateSpaceNoise, times: Floats) -> tuple
     return -0.5 * float(logarithms + left @ left), heights, np.sqrt(np.diag(normal))
 
 
-def _time_interval(means: Floats, around: StateSpaceNoise, blocks: list[int], k: int) -> tuple[float, float]:
+def _time_interval(means: Floats, noise: StateSpaceNoise, blocks: list[int], k: int) -> tuple[float, float]:
     """Return the 95 % interval of the time of step ``k``, in blocks, with the other steps fixed."""
-    scores = _shock_gains(means, around, blocks[:k] + blocks[k + 1 :])
+    scores = _shock_gains(means, noise, blocks[:k] + blocks[k + 1 :])
     worse = np.flatnonzero(scores < scores[blocks[k]] - INTERVAL_SIGMAS**2)
     before, after = worse[worse < blocks[k]], worse[worse > blocks[k]]
     return float(before[-1] if before.size else 0), float(after[0] if after.size else means.size)

@@ -248,6 +248,9 @@ def _wander_variance(sums: Floats, counts: Ints, length: int, width: int) -> flo
 
 
 def _brownian_bridge(length: int, variance: float, rng: np.random.Generator) -> Floats:
-    """Return a random walk with a given variance per sample that returns to zero after its last sample."""
+    """Return a random walk that starts at zero before its first sample and returns to zero after its last sample.
+
+    ``variance`` is its variance per sample.
+    """
     walk = np.cumsum(rng.standard_normal(length + 1)) * variance**0.5
     return np.asarray(walk[:-1] - walk[-1] * np.arange(1, length + 1) / (length + 1))

@@ -407,7 +407,7 @@ def _predict_from_neighbours(values: Floats) -> tuple[Floats, float]:
     return expected + values.mean(), float((z - expected).std())
 
 
-def _repeats_of_continuous(y: Floats, pairs: Mask, apart: Floats, noise: float) -> Repeats | None:
+def _repeats_of_continuous(y: Floats, pairs: Mask, differences: Floats, noise: float) -> Repeats | None:
     """Return the repeats of values without a known step.
 
     If values also recur after a different value in between, they lie on an unknown grid. Neighbours are then equal by
@@ -418,7 +418,7 @@ def _repeats_of_continuous(y: Floats, pairs: Mask, apart: Floats, noise: float) 
     count = int(mask.sum())
     later = (y[2:] == y[:-2]) & pairs[1:] & pairs[:-1]
     if np.count_nonzero(later & ~mask[2:]):
-        n = float(apart.size)
+        n = float(differences.size)
         again = int(np.count_nonzero(later)) / n
         share = 0.0
         for _ in range(3):
@@ -431,12 +431,14 @@ def _repeats_of_continuous(y: Floats, pairs: Mask, apart: Floats, noise: float) 
         size = Size(share, max(share - error, 0.0), share + error)
         return Repeats(size, n * share, np.zeros_like(mask), gain) if gain > 0.0 else None
     # probability density of a difference at zero, times the spacing of the numbers
-    chance = max(MIN_EXPECTED_COINCIDENCES, apart.size * _float_spacing(_finite_values(y)) / (noise * 2.0 * np.pi**0.5))
+    chance = max(
+        MIN_EXPECTED_COINCIDENCES, differences.size * _float_spacing(_finite_values(y)) / (noise * 2.0 * np.pi**0.5)
+    )
     gain = _poisson_gain(count, chance)
-    return Repeats(_wilson_interval(count, apart.size), float(count), mask, gain) if gain > 0.0 else None
+    return Repeats(_wilson_interval(count, differences.size), float(count), mask, gain) if gain > 0.0 else None
 
 
-def _repeats_of_stepped(apart: Floats, twice: Floats, n: int) -> Repeats | None:
+def _repeats_of_stepped(differences: Floats, differences_over_two: Floats, n: int) -> Repeats | None:
     """Return the repeats of stepped values.
 
     The arguments are the absolute differences, in steps, of successive samples and of every second sample. The
@@ -445,10 +447,10 @@ def _repeats_of_stepped(apart: Floats, twice: Floats, n: int) -> Repeats | None:
     differences over two samples as well, whereas repeats with a share h add only h² there. The smaller gain therefore
     counts.
     """
-    most = int(np.clip(np.ceil(GAUSSIAN * 2.0**0.5 * apart.mean()), 2, 64))
-    counts, chance, gain = _zero_difference_excess(apart, most)
-    _, chance_of_two, _ = _zero_difference_excess(twice, most)
-    of_two = float(np.count_nonzero(twice < 0.5)) - chance_of_two
+    most = int(np.clip(np.ceil(GAUSSIAN * 2.0**0.5 * differences.mean()), 2, 64))
+    counts, chance, gain = _zero_difference_excess(differences, most)
+    _, chance_of_two, _ = _zero_difference_excess(differences_over_two, most)
+    of_two = float(np.count_nonzero(differences_over_two < 0.5)) - chance_of_two
     excess = float(counts[0] - chance)
     gain = min(
         gain, _excess_gain(float(counts[0]), chance + max(of_two, 0.0), 3.0 * chance**2 / max(counts[1:].sum(), 1.0))
@@ -456,12 +458,12 @@ def _repeats_of_stepped(apart: Floats, twice: Floats, n: int) -> Repeats | None:
     if not (excess > 0.0 and gain > 0.0):
         return None
     error = (counts[0] + 3.0 * chance**2 / max(counts[1:].sum(), 1.0)) ** 0.5
-    lo, hi = ((excess + sign * Z95 * error) / apart.size for sign in (-1.0, 1.0))
-    fraction = Size(excess / apart.size, max(float(lo), 0.0), float(hi))
+    lo, hi = ((excess + sign * Z95 * error) / differences.size for sign in (-1.0, 1.0))
+    fraction = Size(excess / differences.size, max(float(lo), 0.0), float(hi))
     return Repeats(fraction, excess, np.zeros(n, dtype=np.bool_), gain)
 
 
-def _zero_difference_excess(apart: Floats, most: int) -> tuple[Floats, float, float]:
+def _zero_difference_excess(differences: Floats, most: int) -> tuple[Floats, float, float]:
     """Return the statistics of zero differences between stepped values.
 
     Returns
@@ -473,7 +475,9 @@ def _zero_difference_excess(apart: Floats, most: int) -> tuple[Floats, float, fl
     gain : float
         Log-likelihood gain of a free number of zeros, nats.
     """
-    counts = np.bincount(np.minimum(np.rint(apart), most + 1).astype(np.int64), minlength=most + 2)[:-1].astype(float)
+    counts = np.bincount(np.minimum(np.rint(differences), most + 1).astype(np.int64), minlength=most + 2)[:-1].astype(
+        float
+    )
     alone, _ = _fit_difference_spread(counts, 0)
     others, spread = _fit_difference_spread(counts, 1)
     form = _step_difference_probabilities(spread, most)

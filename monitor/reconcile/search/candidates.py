@@ -102,7 +102,8 @@ def noises(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
 
 
 def correlated(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
-    """Return the best exponentially correlated noise, or nothing if its correlation time is out of range.
+    """Return a list with the best exponentially correlated noise, or an empty list if its correlation time is out of
+    range.
 
     Parameters
     ----------
@@ -254,7 +255,8 @@ def line_frequency(seen: Sight, f_hz: float) -> float:
 
 
 def low_pass(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
-    """Return the best low-pass filter if the effects contain none.
+    """Return a list with the best low-pass filter, or an empty list if the effects already contain one or no filter
+    fits.
 
     Parameters
     ----------

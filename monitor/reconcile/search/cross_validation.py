@@ -71,13 +71,13 @@ def proof(
         return _not_applicable("it happens once")
     parts = [slice(0, axis.n // 2), slice(axis.n - axis.n // 2, axis.n)]
     sources = {getattr(effect, "source", "") for effect in (*before.effects, *after.effects)}
-    mended = [_half_axis(axis, part, after.effects, sources, rng) for part in parts]
+    repaired = [_half_axis(axis, part, after.effects, sources, rng) for part in parts]
     if isinstance(added, SAMPLE_EFFECTS):
         halves = [_half_axis(axis, part, before.effects, sources, rng) for part in parts]
-        return _validate_sample_effect(halves, mended, before, after, lens)
+        return _validate_sample_effect(halves, repaired, before, after, lens)
     if (
         type(added) in COURSE
-        and min(_expected_gain(half, after, len(after.effects) - 1) for half in mended) < MIN_HALF_GAIN_NATS
+        and min(_expected_gain(half, after, len(after.effects) - 1) for half in repaired) < MIN_HALF_GAIN_NATS
     ):
         return _not_applicable("one half of the recording alone shows too little of it")
     gain = after.likely.log_likelihood - before.likely.log_likelihood
@@ -87,9 +87,9 @@ def proof(
     better = 0.0
     for learn, test in ((0, 1), (1, 0)):
         for at, state in enumerate((before, after)):
-            learned = mended[learn].fit(state.effects, state.likely.held)
-            seen = _predict_half(mended[test], learned)
-            gaps[at] += LENSES[lens](sight(mended[test], seen)).gain
+            learned = repaired[learn].fit(state.effects, state.likely.held)
+            seen = _predict_half(repaired[test], learned)
+            gaps[at] += LENSES[lens](sight(repaired[test], seen)).gain
             better += seen.log_likelihood * (2 * at - 1)
     gap_before, gap_after = (sqrt(gain) for gain in gaps)
     below = gap_after < max(gap_before, sqrt(2.0 * null.threshold))
@@ -182,11 +182,11 @@ def _regularised(covariance: Floats) -> Floats:
 
 
 def _validate_sample_effect(
-    halves: list[Axis], mended: list[Axis], before: Hypothesis, after: Hypothesis, lens: str
+    halves: list[Axis], repaired: list[Axis], before: Hypothesis, after: Hypothesis, lens: str
 ) -> CrossValidation:
     """Compare the halves before and after the repair of single samples."""
     gaps = np.zeros(2)
-    for half, put_right in zip(halves, mended, strict=True):
+    for half, put_right in zip(halves, repaired, strict=True):
         for at, (axis, state) in enumerate(((half, before), (put_right, after))):
             gaps[at] += LENSES[lens](sight(axis, axis.fit(state.effects, state.likely.held))).gain
     one, other = (sqrt(gain) for gain in gaps)

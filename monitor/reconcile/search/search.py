@@ -196,19 +196,19 @@ def resolve_distribution(
     trials : list of Trial
         Trials with the alternatives included.
     """
-    last, twin = len(state.effects) - 1, None
+    last, alternative = len(state.effects) - 1, None
     if isinstance(trials[0].effect, ExponentiallyCorrelated) and isinstance(
         state.effects[last], ExponentiallyCorrelated
     ):
-        twin = telegraph(axis, state, last)
+        alternative = telegraph(axis, state, last)
     elif isinstance(trials[0].effect, BiasStep):
-        twin = compare_jump_processes(axis, state, view)
-    if twin is None:
+        alternative = compare_jump_processes(axis, state, view)
+    if alternative is None:
         return state, trials
-    named = _trials_of_alternative(twin, trials[0].value)
-    if twin.gain <= MIN_GAIN_NATS:
+    named = _trials_of_alternative(alternative, trials[0].value)
+    if alternative.gain <= MIN_GAIN_NATS:
         return state, [trials[0], *named, *trials[1:]]
-    return settled(axis, twin.found, state.model), [*named, *trials]
+    return settled(axis, alternative.found, state.model), [*named, *trials]
 
 
 def compare_jump_processes(axis: Axis, state: Hypothesis, view: Sight) -> NonGaussianAlternative | None:
@@ -296,8 +296,8 @@ def _has_zero_size(effect: Effect) -> bool:
     return type(effect) in NOISE and size(effect) == 0.0
 
 
-def _trials_of_alternative(twin: NonGaussianAlternative, value: float) -> tuple[Trial, ...]:
+def _trials_of_alternative(alternative: NonGaussianAlternative, value: float) -> tuple[Trial, ...]:
     """Return the trials of an alternative to an effect with the given value in nats, and of its own rival."""
-    effect = twin.found[-1]
-    one = Trial(effect.name, effect, value + twin.gain, bounds=twin.bounds, events=twin.events)
-    return (one,) if twin.rival is None else (one, *_trials_of_alternative(twin.rival, value))
+    effect = alternative.found[-1]
+    one = Trial(effect.name, effect, value + alternative.gain, bounds=alternative.bounds, events=alternative.events)
+    return (one,) if alternative.rival is None else (one, *_trials_of_alternative(alternative.rival, value))

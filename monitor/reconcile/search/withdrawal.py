@@ -119,12 +119,12 @@ def _overlaps(effect: Effect, place: tuple[float, float]) -> bool:
     return lo < place[1] and place[0] < hi
 
 
-def _overlapping_features(tones: Sequence[tuple[int, Effect]]) -> list[int]:
+def _overlapping_features(features: Sequence[tuple[int, Effect]]) -> list[int]:
     """Return the indices of lines and resonances that overlap each other."""
     fallen: set[int] = set()
-    for at, one in tones:
+    for at, one in features:
         lo, hi = _frequency_range(one)
-        near = {other for other, two in tones if other != at and lo < two.frequency < hi}  # type: ignore[attr-defined]
+        near = {other for other, two in features if other != at and lo < two.frequency < hi}  # type: ignore[attr-defined]
         fallen |= near | {at} if near else set()
     return sorted(fallen)
 

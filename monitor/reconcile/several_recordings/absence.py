@@ -116,10 +116,10 @@ def _gap_ratio(step: Step, seconds: float, other_s: float, seen: Score) -> float
     return sqrt(longer) * swing
 
 
-def _confused_effect(step: Step, of: AxisResult, there: AxisResult) -> str:
+def _confused_effect(step: Step, axis_result: AxisResult, other_axis_result: AxisResult) -> str:
     """Return an effect that only the other recording has if one of the two effects was the runner-up of the other."""
-    mine = {one.effect for one in of.steps}
-    for one in there.steps:
+    mine = {one.effect for one in axis_result.steps}
+    for one in other_axis_result.steps:
         rivals = step.effect in _runner_up_names(one) or one.effect in _runner_up_names(step)
         if one.kind == step.kind == "added" and one.effect not in mine and rivals:
             return one.effect

@@ -265,12 +265,12 @@ def _at_common_reference(step: Step, first: Step) -> Step:
     return replace(step, parameters={**own, **moved})
 
 
-def _numerical_value(one: Bounds) -> float:
+def _numerical_value(bounds: Bounds) -> float:
     """Return the numerical value of a parameter."""
-    assert not isinstance(one.value, str)
-    return one.value
+    assert not isinstance(bounds.value, str)
+    return bounds.value
 
 
-def _half_width(one: Bounds) -> float:
+def _half_width(bounds: Bounds) -> float:
     """Return half the width of the interval, or NaN if there is none."""
-    return nan if one.lo is None or one.hi is None else 0.5 * (one.hi - one.lo)
+    return nan if bounds.lo is None or bounds.hi is None else 0.5 * (bounds.hi - bounds.lo)

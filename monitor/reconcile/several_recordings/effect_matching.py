@@ -62,6 +62,8 @@ def place(step: Step, axis: str, model: NoiseModel) -> Bounds | None:
 def distance(effect: str, a: Bounds | None, b: Bounds | None) -> float | None:
     """Return the relative distance of two identifying parameters, or None if they do not match.
 
+    The distance is 0 if one of the parameters is None.
+
     Parameters
     ----------
     effect : str
@@ -135,10 +137,10 @@ def _relative_difference(a: Any, b: Any) -> float:
     return min(abs(a - b) / (abs(a) + abs(b)), 1.0) if a != b else 0.0
 
 
-def _widened_interval(one: Bounds, share: float) -> tuple[float, float]:
+def _widened_interval(bounds: Bounds, share: float) -> tuple[float, float]:
     """Return the stretched and widened interval of a parameter."""
-    assert not isinstance(one.value, str)
-    below = 0.0 if one.lo is None else one.value - one.lo
-    above = 0.0 if one.hi is None else one.hi - one.value
-    more = share * abs(one.value)
-    return one.value - INTERVAL_STRETCH * below - more, one.value + INTERVAL_STRETCH * above + more
+    assert not isinstance(bounds.value, str)
+    below = 0.0 if bounds.lo is None else bounds.value - bounds.lo
+    above = 0.0 if bounds.hi is None else bounds.hi - bounds.value
+    more = share * abs(bounds.value)
+    return bounds.value - INTERVAL_STRETCH * below - more, bounds.value + INTERVAL_STRETCH * above + more

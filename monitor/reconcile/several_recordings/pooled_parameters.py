@@ -75,14 +75,14 @@ def pooled(found: Sequence[Bounds]) -> Pooled:
     return Pooled(Bounds(*(float(value) for value in values)), chi2, freedom)
 
 
-def deviations(one: Bounds, value: float) -> float:
+def deviations(bounds: Bounds, value: float) -> float:
     """Return the distance of a value from a parameter, in standard deviations of the parameter.
 
     The distance is 0 if the parameter has no interval.
 
     Parameters
     ----------
-    one : Bounds
+    bounds : Bounds
         Parameter with its interval.
     value : float
         Value in the unit of the parameter.
@@ -92,7 +92,7 @@ def deviations(one: Bounds, value: float) -> float:
     >>> round(deviations(Bounds(10.0, 8.04, 11.96), 13.0), 3)
     3.0
     """
-    three = _finite_interval(one)
+    three = _finite_interval(bounds)
     if three is None:
         return 0.0
     ((lo, at, hi),), factors = _symmetric_scale(np.array([three]))
@@ -100,11 +100,11 @@ def deviations(one: Bounds, value: float) -> float:
     return float(abs(at - other) * 2.0 * Z95 / (hi - lo))
 
 
-def _finite_interval(one: Bounds) -> tuple[float, float, float] | None:
+def _finite_interval(bounds: Bounds) -> tuple[float, float, float] | None:
     """Return the lower end, the value and the upper end, or None if there is no finite interval."""
-    if isinstance(one.value, str) or one.lo is None or one.hi is None or not one.lo < one.hi:
+    if isinstance(bounds.value, str) or bounds.lo is None or bounds.hi is None or not bounds.lo < bounds.hi:
         return None
-    three = one.lo, one.value, one.hi
+    three = bounds.lo, bounds.value, bounds.hi
     return three if np.isfinite(three).all() else None
 
 
