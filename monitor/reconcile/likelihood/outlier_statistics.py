@@ -44,7 +44,7 @@ NEIGHBOUR_SAMPLES: Final = 4
 """Distance in samples up to which two outliers are neighbours."""
 STUDENT_FREEDOMS: Final = np.geomspace(1.0, 300.0, 40)
 """Degrees of freedom of Student's t that are tried."""
-MIN_GAIN_NATS: Final = 0.01
+MIN_MIXTURE_GAIN_NATS: Final = 0.01
 """Smallest gain in nats of a second Gaussian."""
 MAX_Z: Final = 37.0
 """Value of z that is used if the probability underflows in 64 bits."""
@@ -102,7 +102,7 @@ def outliers(w: Floats) -> Outliers | None:
     counts, squares = counts[kept], squares[kept] / counts[kept]
     narrow, wide, share, best = _fit_mixture(counts, squares, START_WIDTHS)
     gain = best - _gaussian_log_likelihood(counts, squares)
-    if not (gain > MIN_GAIN_NATS and wide > narrow):
+    if not (gain > MIN_MIXTURE_GAIN_NATS and wide > narrow):
         return None
     freedom, student, each_student = _fit_student(counts, squares)
     each = _mixture_log_density(squares, narrow, wide, share)

@@ -40,7 +40,7 @@ JUMP_AGES: Final = 16
 Together they cover five times N/K. If they cover 1.3 times N/K, the rate is 15 to 25 % too low; with 2.7 times N/K it
 is 5 to 10 % too low.
 """
-MIN_PROBABILITY: Final = 1e-6
+MIN_HYPOTHESIS_PROBABILITY: Final = 1e-6
 """Probability below which a hypothesis is dropped."""
 MAX_START_JUMPS: Final = 2.0
 """Largest number of jumps in N/K at the start of a search. More frequent jumps are too small to be seen one by one."""
@@ -179,7 +179,7 @@ def jump_log_likelihood(means, table, white, start, ages, none, some, variance):
     for z in means:
         for age in range(ages):
             weight[age] = weight[ages + age] = -np.inf
-            if share[age] < MIN_PROBABILITY:
+            if share[age] < MIN_HYPOTHESIS_PROBABILITY:
                 continue
             seen = predict_block(table, covariance[age], reach) + white
             innovation = z
@@ -223,7 +223,7 @@ def _merge_hypotheses(first, end, weight, moved, spread, to, share, at, covarian
     share[to] = 0.0
     for k in range(first, end):
         share[to] += weight[k]
-    if share[to] < MIN_PROBABILITY:
+    if share[to] < MIN_HYPOTHESIS_PROBABILITY:
         return
     d = moved.shape[1]
     for i in range(d):

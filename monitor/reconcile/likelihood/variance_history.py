@@ -36,9 +36,9 @@ FINE_SEARCH_SAMPLES: Final = 20_000
 """Largest range in samples in which the time of a step is then sought sample by sample."""
 MIN_BLOCK_SAMPLES: Final = 32
 """Smallest number of samples in a block. The energies of fewer samples are far from Gaussian."""
-MAX_BLOCKS: Final = 4096
+MAX_VARIANCE_BLOCKS: Final = 4096
 """Largest number of blocks."""
-MIN_BLOCKS: Final = 8
+MIN_VARIANCE_BLOCKS: Final = 8
 """Smallest number of blocks or pieces for a variance history."""
 MIN_CYCLES: Final = 2
 """Smallest number of periods in the recording. A slower variation is a trend."""
@@ -124,10 +124,10 @@ def variance_course(w: Floats, tau0_s: float) -> Course:
     >>> print(f"{found.step.gain > 100} {found.step.time.value:.1f} {found.step.ratio.value:.1f}")
     True 200.5 1.2
     """
-    if w.size < MIN_BLOCKS * MIN_BLOCK_SAMPLES:
-        raise ValueError(f"{w.size} samples are too few, {MIN_BLOCKS * MIN_BLOCK_SAMPLES} are needed")
+    if w.size < MIN_VARIANCE_BLOCKS * MIN_BLOCK_SAMPLES:
+        raise ValueError(f"{w.size} samples are too few, {MIN_VARIANCE_BLOCKS * MIN_BLOCK_SAMPLES} are needed")
     squares = w * w
-    length = max(MIN_BLOCK_SAMPLES, -(-w.size // MAX_BLOCKS))
+    length = max(MIN_BLOCK_SAMPLES, -(-w.size // MAX_VARIANCE_BLOCKS))
     count = w.size // length
     energy = squares[: count * length].reshape(count, length).mean(axis=1)
     scores = energy / energy.mean() - 1.0
@@ -168,10 +168,10 @@ def tiles(w: Floats, tau0_s: float) -> Tiles:
     >>> found.gain > 50.0, found.frequency[0] < 17.3 < found.frequency[1]
     (True, True)
     """
-    if w.size < MIN_BLOCKS * PIECE_SAMPLES[0]:
-        raise ValueError(f"{w.size} samples are too few, {MIN_BLOCKS * PIECE_SAMPLES[0]} are needed")
+    if w.size < MIN_VARIANCE_BLOCKS * PIECE_SAMPLES[0]:
+        raise ValueError(f"{w.size} samples are too few, {MIN_VARIANCE_BLOCKS * PIECE_SAMPLES[0]} are needed")
     best = row = (-1.0, 0, 0, 0, 0, 0, 0.0)
-    for piece in (one for one in PIECE_SAMPLES if w.size >= MIN_BLOCKS * one):
+    for piece in (one for one in PIECE_SAMPLES if w.size >= MIN_VARIANCE_BLOCKS * one):
         one, other = _best_tiles(_piece_spectra(w, piece), piece)
         best, row = max(best, one), max(row, other)
     _, piece, a, i, b, j, ratio = best

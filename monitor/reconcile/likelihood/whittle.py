@@ -24,9 +24,9 @@ from drivers.sample import Floats
 from monitor.common.compiled import compiled
 from monitor.reconcile.preparation.cosine_bins import Bins
 
-MAX_ITERATIONS: Final = 200
+MAX_FIT_ITERATIONS: Final = 200
 """Largest number of iterations."""
-MIN_GAIN_NATS: Final = 1e-5
+CONVERGENCE_NATS: Final = 1e-5
 """Gain in nats below which the iteration stops."""
 MIN_VARIANCE_RATIO: Final = 1e-20
 """Lower limit of a variance, relative to the largest power of a bin."""
@@ -114,7 +114,7 @@ def _maximise(count, power, cross, gram, bases, constant, start):  # type: ignor
         residual = _residual(power, cross, gram, beta)
     best = _log_likelihood(count, variance, residual)
     information = np.zeros((p, p))
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(MAX_FIT_ITERATIONS):
         gradient = np.zeros(p)
         for j in range(p):
             total = 0.0
@@ -139,7 +139,7 @@ def _maximise(count, power, cross, gram, bases, constant, start):  # type: ignor
                 trial_residual = _residual(power, cross, gram, trial_beta)
             value = _log_likelihood(count, trial_variance, trial_residual)
             if value > best:
-                climbed = value > best + MIN_GAIN_NATS
+                climbed = value > best + CONVERGENCE_NATS
                 theta, variance, beta, normal, residual, best = (
                     trial,
                     trial_variance,

@@ -238,7 +238,7 @@ class Axis:
         )
 
     def at(self, likely: Likely, beta: Floats) -> Likely:
-        """Return the log-likelihood for given sizes of the deterministic effects and unchanged noise.
+        """Return the fit with given sizes of the deterministic effects and unchanged noise.
 
         Parameters
         ----------

@@ -26,7 +26,7 @@ FEWEST: Final = 4096
 """Smallest number of samples. With fewer samples, neither a spectrum nor a spectrogram is meaningful."""
 CLIP_RELATIVE_TOLERANCE: Final = 1e-9
 """Relative distance to the limit below which a sample counts as clipped."""
-MAX_ITERATIONS: Final = 40
+MAX_SIGMA_ITERATIONS: Final = 40
 """Largest number of iterations between clipped samples and their standard deviation."""
 SIGMA_RELATIVE_TOLERANCE: Final = 5e-4
 """Relative change of the standard deviation that ends the iterations."""
@@ -163,7 +163,7 @@ def _restore_clipped(y: Floats, limit: float, sigma: float, rng: np.random.Gener
     A few iterations suffice if few samples were clipped.
     """
     whole = y
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(MAX_SIGMA_ITERATIONS):
         whole = unclipped(y, limit, sigma, rng)
         before, sigma = sigma, float(np.std(np.diff(whole))) / 2.0**0.5
         if abs(sigma - before) < SIGMA_RELATIVE_TOLERANCE * sigma:

@@ -2,7 +2,7 @@
 
 The pairs are correlated noise and random telegraph, random walk and Poisson steps, and single steps and Poisson steps.
 The search first finds the effect with a Gaussian likelihood. Here the alternative gets its own likelihood on the same
-axis, with all other effects unchanged. It replaces the effect if it is better by ``MIN_GAIN_NATS``.
+axis, with all other effects unchanged. It replaces the effect if it is better by ``MIN_ALTERNATIVE_GAIN_NATS``.
 """
 
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ from monitor.reconcile.preparation.axis import Axis, Effects
 from monitor.reconcile.preparation.cosine_bins import series
 from monitor.reconcile.result import Bounds
 
-MIN_GAIN_NATS: Final = 3.0
+MIN_ALTERNATIVE_GAIN_NATS: Final = 3.0
 """Gain in nats that an alternative must reach. In 2 of 4000 simulated recordings, telegraph and correlated noise were
 confused in spite of a larger gain.
 """

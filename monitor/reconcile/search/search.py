@@ -26,7 +26,12 @@ from monitor.reconcile.preparation.prepare import again
 from monitor.reconcile.result import View
 from monitor.reconcile.search.candidates import PRICE, correlated, peaks
 from monitor.reconcile.search.cross_validation import CrossValidation, proof
-from monitor.reconcile.search.non_gaussian_alternatives import MIN_GAIN_NATS, NonGaussianAlternative, poisson, telegraph
+from monitor.reconcile.search.non_gaussian_alternatives import (
+    MIN_ALTERNATIVE_GAIN_NATS,
+    NonGaussianAlternative,
+    poisson,
+    telegraph,
+)
 from monitor.reconcile.search.trials import UNNAMED, Trial, replacements_for_resizing, tried
 from monitor.reconcile.search.withdrawal import SMOOTH_SPECTRA, upheld
 
@@ -105,7 +110,7 @@ def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.
                 if rounds and _is_gaussian_and_stationary(view, null)
                 else None
             )
-            if jumps is None or jumps.gain <= MIN_GAIN_NATS:
+            if jumps is None or jumps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
                 break
             state = settled(axis, jumps.found, model)
             rounds.append(Round(views(view), seen, _trials_of_alternative(jumps, 0.0), state, SHARED_SPECTRUM))
@@ -206,7 +211,7 @@ def resolve_distribution(
     if alternative is None:
         return state, trials
     named = _trials_of_alternative(alternative, trials[0].value)
-    if alternative.gain <= MIN_GAIN_NATS:
+    if alternative.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return state, [trials[0], *named, *trials[1:]]
     return settled(axis, alternative.found, state.model), [*named, *trials]
 
@@ -229,7 +234,7 @@ def compare_jump_processes(axis: Axis, state: Hypothesis, view: Sight) -> NonGau
         The alternative, or None if the axis has no random walk and no steps that it could replace.
     """
     steps = poisson(axis, state)
-    if steps is None or steps.gain <= MIN_GAIN_NATS:
+    if steps is None or steps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return steps
     # Use the original random walk of the model. An increased random walk would leave nothing for a telegraph.
     walks = frozenset(at for at, effect in enumerate(state.model) if type(effect) in WALK_EFFECTS)

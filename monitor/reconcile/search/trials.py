@@ -53,7 +53,7 @@ SCALE_FACTOR_MARGIN_NATS: Final = 3.0
 """Gain in nats by which separately fitted sizes may be better than one common factor, which has fewer parameters."""
 FREQUENCY_BANDS: Final = 8
 """Number of frequency bands in which a leak must have the same coefficient."""
-MIN_PROBABILITY: Final = 1e-5
+MIN_LEAK_PROBABILITY: Final = 1e-5
 """Smallest probability of coefficients that differ as much between bands. Below it, something shakes both axes."""
 QUADRATIC_PENALTY_NATS: Final = 2.5
 """Penalty in nats for a second parameter."""
@@ -227,12 +227,12 @@ def _noise_trials(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
     found.append(_scale_factor_trial(axis, state, resized))
     found.sort(key=lambda one: -one.value)
     value = max(_power_law_score(axis, state, exponent) for exponent in EXPONENTS) - state.score - PRICE[UNNAMED]
-    if value > max(found[0].value, 0.0) + UNNAMED_MARGIN_NATS and found[0].name in SMOOTH_SPECTRA:
+    if value > max(found[0].value, 0.0) + UNNAMED_MARGIN_NATS and found[0].name in POWER_LAW_RIVALS:
         return [Trial(UNNAMED, None, value), *found]
     return found
 
 
-SMOOTH_SPECTRA: Final = frozenset(
+POWER_LAW_RIVALS: Final = frozenset(
     {
         "quantization_noise",
         "angle_random_walk",
@@ -285,7 +285,7 @@ def _has_flat_coefficient(seen: Sight, leak: Leak) -> bool:
     length = np.maximum(np.add.reduceat(column**2, edges), 1e-300)
     product = np.add.reduceat(column * seen.whitened, edges)
     spread = float((length * (product / length - product.sum() / length.sum()) ** 2).sum())
-    return bool(chdtrc(FREQUENCY_BANDS - 1, spread) > MIN_PROBABILITY)
+    return bool(chdtrc(FREQUENCY_BANDS - 1, spread) > MIN_LEAK_PROBABILITY)
 
 
 def _curved_drift_score(axis: Axis, state: Hypothesis) -> float:
