@@ -2,14 +2,13 @@
 first.
 
 - **Values and single samples** come first, because their evidence is either certain or absent.
-- **Deterministic effects come before noise effects.** An effect that follows time, temperature or another axis must
-  exceed its penalty in comparison with the slow noise that could replace it: none, a random walk, a correlated noise or
-  a power law. This noise is present on both sides of the comparison. Otherwise a noise effect would absorb a drift, and
-  later fits would not correct this.
-- **Noise effects** are ordered by their score: the gain in ln L, less the penalty of the effect, less the penalty for
-  changed sizes of known noise effects.
-- A power law with any exponent takes part among the noise effects, and a curved drift among the deterministic effects,
-  both without a name. If one of them is the best, no known effect is right.
+- **Deterministic effects** come before noise effects. Otherwise a noise effect would absorb a drift, and later fits
+  would not correct this. A deterministic effect must exceed its penalty even if a slow noise that could replace it is
+  present before and after. This noise is a random walk, a correlated noise or a power law.
+- **Noise effects** are ordered by their score. The score is the gain in ln L, less the penalty of the effect and the
+  penalty for changed sizes of known noise effects.
+- **Unnamed alternatives** are a power law with any exponent among the noise effects, and a curved drift among the
+  deterministic effects. If one of them is the best, no known effect is right.
 """
 
 from collections.abc import Callable, Iterator, Mapping

@@ -16,8 +16,13 @@ from monitor.reconcile.likelihood.effect_terms import ONCE
 from monitor.reconcile.result import AxisResult, Reconciliation, Score, Step
 
 Meaning = Literal["contradiction", "too_faint", "other_name", "unnamed", "may_differ"]
-"""Meaning of an absence: the data would have shown the effect, are not sensitive enough, show it under another name,
-show a difference without a name, or need not contain it.
+"""Meaning of an absence.
+
+- ``contradiction``: the data would have shown the effect.
+- ``too_faint``: the data are not sensitive enough.
+- ``other_name``: the data show the effect under another name.
+- ``unnamed``: the data show a difference without a name.
+- ``may_differ``: the recording need not contain the effect.
 """
 MIN_EXCESS_SIGMA: Final = 2.0
 """Number of standard deviations between the expected gap and a gap that would be sufficient."""
