@@ -1,1 +1,1 @@
-"""Where simulation and measurement disagree, which effect is missing, and what is left once it is added."""
+"""Search for the noise effects that a sensor model lacks, by comparing a recording with simulations of the model."""

@@ -1,4 +1,6 @@
-"""From a search to what people read: each step with its sizes, its confidence, and a sentence that can be checked."""
+"""Conversion of a search into readable results: steps with parameters, confidence and a justification that can be
+checked.
+"""
 
 from collections.abc import Mapping
 from math import erf, exp, inf, log
@@ -25,7 +27,7 @@ from monitor.reconcile.result import AxisResult, Bounds, Kind, Look, RunnerUp, S
 from monitor.reconcile.search.search import Round, Search
 from monitor.reconcile.search.trials import RETUNE, Trial
 
-SHAPES: Final[dict[type[Effect], tuple[str, ...]]] = {
+SHAPE_PARAMETERS: Final[dict[type[Effect], tuple[str, ...]]] = {
     ExponentiallyCorrelated: ("correlation_time",),
     Narrowband: ("frequency", "bandwidth"),
     Sinusoidal: ("frequency",),
@@ -35,49 +37,58 @@ SHAPES: Final[dict[type[Effect], tuple[str, ...]]] = {
     BandwidthLimit: ("cutoff",),
     ScaleFactor: ("factor",),
 }
-SHOWN: Final = 3
-"""Runners-up that are told."""
-LEAST: Final = 0.001
-"""Confidence of a runner-up that is told."""
+"""For each effect, the shape parameters that are reported with an interval."""
+MAX_RUNNERS_UP: Final = 3
+"""Number of alternative effects that are reported."""
+MIN_RUNNER_UP_CONFIDENCE: Final = 0.001
+"""Smallest confidence of an alternative effect that is reported."""
 
 
-def described(found: Search, null: Mapping[str, Null], final: Mapping[str, Null]) -> AxisResult:
-    """One axis.
+def described(search: Search, null: Mapping[str, Null], final: Mapping[str, Null]) -> AxisResult:
+    """Return the result of one axis.
 
-    Args:
-        null: of the model under test, which decided
-        final: of the model with everything found, which decides what is left
+    Parameters
+    ----------
+    search : Search
+        Search on the axis.
+    null : mapping of str to Null
+        Null distributions under the model under test, which decided the search.
+    final : mapping of str to Null
+        Null distributions under the extended model, which decide which differences are left over.
     """
-    looks = [Look(scores(one.seen, null), one.views) for one in found.rounds]
-    end = Look(scores(found.seen, final), found.views)
-    looks.append(end if found.before is None else Look(scores(found.before[1], null), found.before[0]))
+    looks = [Look(scores(one.seen, null), one.views) for one in search.rounds]
+    end = Look(scores(search.seen, final), search.views)
+    looks.append(end if search.before is None else Look(scores(search.before[1], null), search.before[0]))
     steps: list[Step] = []
-    left = sorted(range(found.state.given, len(found.state.effects)))
-    for at, one in enumerate(found.rounds):
+    left = sorted(range(search.state.given, len(search.state.effects)))
+    for at, one in enumerate(search.rounds):
         last = one.state.effects[-1]
-        index = next((i for i in left if type(found.state.effects[i]) is type(last)), None)
+        index = next((i for i in left if type(search.state.effects[i]) is type(last)), None)
         if index is not None and len(one.state.effects) > one.state.given and one.trials[0].effect is not None:
             left.remove(index)
-            steps.append(_step(found, one, index, "added", looks[at], looks[at + 1]))
-        before = found.rounds[at - 1].state.likely.noises if at else ()
+            steps.append(_describe_step(search, one, index, "added", looks[at], looks[at + 1]))
+        before = search.rounds[at - 1].state.likely.noises if at else ()
         for noise in one.state.likely.noises:
-            if noise < found.state.given and noise not in before and noise in found.state.likely.noises:
-                steps.append(_step(found, one, noise, "retuned", looks[at], looks[at + 1]))
-    left_over = (*(score for score in end.scores if score.passes), *_behind(found, end))
-    return AxisResult(found.axis.name, _verdict(bool(steps), bool(left_over)), looks[0], tuple(steps), left_over, end)
+            if noise < search.state.given and noise not in before and noise in search.state.likely.noises:
+                steps.append(_describe_step(search, one, noise, "retuned", looks[at], looks[at + 1]))
+    left_over = (*(score for score in end.scores if score.passes), *_noise_floor_score(search, end))
+    return AxisResult(
+        search.axis.name, _axis_decision(bool(steps), bool(left_over)), looks[0], tuple(steps), left_over, end
+    )
 
 
-def _behind(found: Search, look: Look) -> tuple[Score, ...]:
-    """White noise behind a low-pass that was found: no effect makes it, and it is left over where it is no chance.
+def _noise_floor_score(search: Search, look: Look) -> tuple[Score, ...]:
+    """Score the white noise floor after a low-pass filter that was found.
 
-    Its gap is what the low-pass alone would leave, and never more than what there was without one.
+    No effect produces this noise, so it is reported as left over if it is larger than chance. Its gap is the gap that
+    the low-pass filter alone would leave, and at most the gap without a low-pass filter.
     """
-    state, axis = found.state, found.axis
+    state, axis = search.state, search.axis
     limit = next((effect for effect in state.found if isinstance(effect, BandwidthLimit)), None)
     if limit is None or not state.likely.behind > 0.0:
         return ()
     without = axis.fit(state.effects, state.likely.held, floor=False)
-    most = max(one.seen["psd"].gain for one in found.rounds)
+    most = max(one.seen["psd"].gain for one in search.rounds)
     gain = max(min(state.likely.log_likelihood - without.log_likelihood, most), 0.0)
     psd = next(score for score in look.scores if score.lens == "psd")
     place = Where(frequency=(limit.cutoff, 0.5 * axis.rate_hz))
@@ -85,31 +96,33 @@ def _behind(found: Search, look: Look) -> tuple[Score, ...]:
     return (score,) if score.passes else ()
 
 
-def _verdict(steps: bool, left: bool) -> Verdict:
+def _axis_decision(steps: bool, left: bool) -> Verdict:
+    """Return the decision for an axis from the presence of steps and of differences that are left."""
     if left:
         return "partly_explained" if steps else "unexplained"
     return "explained" if steps else "agrees"
 
 
-def _step(found: Search, one: Round, index: int, kind: Kind, before: Look, after: Look) -> Step:
-    effect = found.state.effects[index]
-    score = _found(effect, kind, before)
+def _describe_step(search: Search, search_round: Round, index: int, kind: Kind, before: Look, after: Look) -> Step:
+    """Return the result of one step of the search."""
+    effect = search.state.effects[index]
+    score = _triggering_score(effect, kind, before)
     later = next(other for other in after.scores if other.lens == score.lens)
-    proof = one.proof
+    proof = search_round.proof
     unseen: tuple[Score | None, Score | None] = None, None
     if not proof.reason:
         unseen = (
             Score(score.lens, score.where, proof.before, score.null95, score.threshold),
             Score(score.lens, score.where, proof.after, later.null95, later.threshold),
         )
-    confidence, others = _confidence(effect.name if kind == "added" else RETUNE, one.trials)
-    if kind == "retuned" and one.trials[0].name != RETUNE:  # it moved beside something that was added
-        confidence, others = _moved(found.state, index), ()
+    confidence, others = _confidence_and_runners_up(effect.name if kind == "added" else RETUNE, search_round.trials)
+    if kind == "retuned" and search_round.trials[0].name != RETUNE:  # the size changed together with an added effect
+        confidence, others = _resize_confidence(search.state, index), ()
     return Step(
         found=score,
         kind=kind,
         effect=effect.name,
-        parameters=_parameters(found.axis, found.state, index, one.trials[0], kind),
+        parameters=_parameters_with_bounds(search.axis, search.state, index, search_round.trials[0], kind),
         confidence=confidence,
         runners_up=others,
         before=score,
@@ -117,12 +130,16 @@ def _step(found: Search, one: Round, index: int, kind: Kind, before: Look, after
         held_out_before=unseen[0],
         held_out_after=unseen[1],
         held_out_reason=proof.reason,
-        because=_because(effect, kind, score, later, others, one.trials[0]),
+        because=_justification(effect, kind, score, later, others, search_round.trials[0]),
         look=after,
     )
 
 
-def _found(effect: Effect, kind: Kind, before: Look) -> Score:
+def _triggering_score(effect: Effect, kind: Kind, before: Look) -> Score:
+    """Return the score that led to an effect.
+
+    This is the natural diagnostic of the effect if it passes its threshold, otherwise the strongest diagnostic.
+    """
     passing = [score for score in before.scores if score.passes] or list(before.scores)
     natural = NATURAL.get(effect.name) if kind == "added" else "psd"
     for score in passing:
@@ -131,30 +148,42 @@ def _found(effect: Effect, kind: Kind, before: Look) -> Score:
     return max(passing, key=lambda score: score.gap / max(score.threshold, 1e-9))
 
 
-def _confidence(name: str, trials: tuple[Trial, ...]) -> tuple[float, tuple[RunnerUp, ...]]:
-    """Probabilities of the names, by their gains above their prices; one of them is that there is nothing."""
+def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[float, tuple[RunnerUp, ...]]:
+    """Return the probability of an effect and of its alternatives.
+
+    The probabilities follow from the log-likelihood gains less the penalties of the effects. One alternative is that
+    there is no effect.
+    """
     best: dict[str, float] = {"": 0.0}
     for trial in trials:
         best[trial.name] = max(best.get(trial.name, -inf), trial.value)
     top = max(best.values())
     whole = sum(exp(value - top) for value in best.values())
     chances = {other: exp(value - top) / whole for other, value in best.items()}
-    others = sorted((c, other) for other, c in chances.items() if other in EFFECTS and other != name and c >= LEAST)
+    others = sorted(
+        (c, other)
+        for other, c in chances.items()
+        if other in EFFECTS and other != name and c >= MIN_RUNNER_UP_CONFIDENCE
+    )
     return chances.get(name, chances[max(best, key=lambda one: best[one])]), tuple(
-        RunnerUp(other, chance) for chance, other in reversed(others[-SHOWN:])
+        RunnerUp(other, chance) for chance, other in reversed(others[-MAX_RUNNERS_UP:])
     )
 
 
-def _moved(state: Hypothesis, index: int) -> float:
-    """Probability that a size is another than the model's, by its distance in standard errors of its logarithm."""
+def _resize_confidence(state: Hypothesis, index: int) -> float:
+    """Return the probability that the size of an effect differs from its size in the model.
+
+    It follows from the distance of the logarithms of the two sizes, in standard errors.
+    """
     now, before = size(state.effects[index]), size(state.model[index])
     error = state.likely.error(index)
     if not (now > 0.0 and before > 0.0 and error > 0.0):
-        return 1.0  # gone, or where none was
+        return 1.0  # the effect vanished, or the model had none
     return erf(abs(log(now / before)) * now / error / 2.0**0.5)
 
 
-def _parameters(axis: Axis, state: Hypothesis, index: int, trial: Trial, kind: Kind) -> dict[str, Bounds]:
+def _parameters_with_bounds(axis: Axis, state: Hypothesis, index: int, trial: Trial, kind: Kind) -> dict[str, Bounds]:
+    """Return the parameters of an effect with their 95 % intervals."""
     effect = state.effects[index]
     if kind == "added" and trial.bounds and trial.name == effect.name:
         return dict(trial.bounds)
@@ -167,26 +196,27 @@ def _parameters(axis: Axis, state: Hypothesis, index: int, trial: Trial, kind: K
     if isinstance(effect, TemperatureBias):
         found["reference"] = Bounds(effect.reference)
         if effect.quadratic is not None:
-            found["quadratic"] = _quadratic(state, index)
-    for shape in SHAPES.get(type(effect), ()) if kind == "added" else ():
+            found["quadratic"] = _quadratic_bounds(state, index)
+    for shape in SHAPE_PARAMETERS.get(type(effect), ()) if kind == "added" else ():
         found[shape] = shape_bounds(axis, state, index, shape)
     if isinstance(effect, BandwidthLimit):
         found["order"] = Bounds(float(effect.order))
     if isinstance(effect, Sinusoidal) and effect.phase is not None and effect.amplitude > 0.0:
-        # at the start of a recording a frequency that is fitted too doubles the error (Rife & Boorstyn 1974)
+        # fitting the frequency as well doubles the phase error at the start of a recording (Rife & Boorstyn 1974)
         error = 2.0 * Z95 * state.likely.error(index) / effect.amplitude
         found["phase"] = Bounds(effect.phase, effect.phase - error, effect.phase + error)
     return found
 
 
-def _quadratic(state: Hypothesis, index: int) -> Bounds:
+def _quadratic_bounds(state: Hypothesis, index: int) -> Bounds:
+    """Return the quadratic temperature coefficient with its 95 % interval."""
     place = next(place for at, place in state.likely.courses if at == index)
     value = float(state.likely.fitted.beta[place.start + 1])
     error = Z95 * float(state.likely.fitted.beta_covariance[place.start + 1, place.start + 1]) ** 0.5
     return Bounds(value, value - error, value + error)
 
 
-WHAT: Final = {
+EVIDENCE_TEXT: Final = {
     "values": "the values themselves show it",
     "psd": "power stands apart from the model's spectrum",
     "lines": "a steady oscillation stands out of the spectrum",
@@ -198,27 +228,33 @@ WHAT: Final = {
     "variance": "the strength of the noise changes in time",
     "spectrogram": "power changes in time within a band",
 }
+"""For each diagnostic, the text that describes its evidence."""
 
 
-def _because(effect: Effect, kind: Kind, score: Score, after: Score, others: tuple[RunnerUp, ...], trial: Trial) -> str:
-    where = _where(score)
-    seen = f"{WHAT[score.lens]}{where}, {score.gap:.1f} where a true model stays below {score.threshold:.1f}"
+def _justification(
+    effect: Effect, kind: Kind, score: Score, after: Score, others: tuple[RunnerUp, ...], trial: Trial
+) -> str:
+    """Return the sentence that justifies a step."""
+    where = _location_text(score)
+    seen = f"{EVIDENCE_TEXT[score.lens]}{where}, {score.gap:.1f} where a true model stays below {score.threshold:.1f}"
     if kind == "retuned":
         done = f"with another size of {effect.name}, which the model has, {after.gap:.1f} is left"
     else:
         done = f"with {effect.name} {after.gap:.1f} is left"
     rival = ""
     if others and kind == "added":
-        rival = f"; {others[0].effect} explains it {_less(others[0].confidence)}"
+        rival = f"; {others[0].effect} explains it {_comparison_phrase(others[0].confidence)}"
     events = f" ({trial.events} seen)" if kind == "added" and trial.events and trial.name == effect.name else ""
     return f"{seen[0].upper()}{seen[1:]}; {done}{events}{rival}."
 
 
-def _less(confidence: float) -> str:
+def _comparison_phrase(confidence: float) -> str:
+    """Return a phrase that compares an alternative with the chosen effect."""
     return "nearly as well" if confidence > 0.2 else "less well" if confidence > 0.01 else "clearly less well"
 
 
-def _where(score: Score) -> str:
+def _location_text(score: Score) -> str:
+    """Return a phrase for the location of a score, or an empty string."""
     place = score.where
     if place.frequency is not None:
         lo, hi = place.frequency

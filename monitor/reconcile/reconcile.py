@@ -1,8 +1,13 @@
-"""The whole walk: a recording and a model in, a ``Reconciliation`` out.
+"""Compare a recording with a noise model and return a ``Reconciliation``.
 
-look → simulate the model and look at that → compare → on each axis that disagrees: propose, try, choose, until nothing
-is left or nothing known helps → simulate the new model and compare once more. Axes are independent of each other but
-for the clock, which is one for all.
+The procedure has these steps:
+
+1. Simulate recordings from the model and run all diagnostics on them, which gives the thresholds.
+2. Run the same diagnostics on the measured recording.
+3. On each axis that disagrees, try candidate effects and keep the best one, until nothing is left or no effect helps.
+4. Simulate the extended model and compare once more.
+
+The axes are independent of each other, except for the sample rate, which is common to all axes.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -38,59 +43,79 @@ from monitor.reconcile.result import AxisResult, Reconciliation, Score, Step, Ve
 from monitor.reconcile.search.candidates import PRICE
 from monitor.reconcile.search.search import Search, search
 
-RUNS: Final = 6
-"""Simulated recordings behind a null: of six axes, 36 gains a lens."""
+SIMULATED_RECORDINGS: Final = 6
+"""Number of simulated recordings that determine a null distribution: with six axes, 36 gains for each diagnostic."""
 
-SMOOTH: Final = 0.001
-"""Of the recording: temperature is averaged over as much, as heat is slow and thermometers are noisy."""
+TEMPERATURE_SMOOTHING_FRACTION: Final = 0.001
+"""Length of the moving average of the temperature, as a fraction of the recording. Heat is slow and thermometers are
+noisy."""
 
-MOSTLY: Final = 0.5
-"""Of the samples of an axis must be there."""
-SUPPORTED: Final = 3.0
-"""Nats that a term of the first fit must be worth."""
-Tell = Callable[[str], None]
+MIN_VALID_FRACTION: Final = 0.5
+"""Smallest fraction of samples of an axis that must be present."""
+MIN_TERM_GAIN_NATS: Final = 3.0
+"""Log-likelihood gain in nats that a term of the first fit must reach to be kept."""
+ProgressCallback = Callable[[str], None]
+"""Function that is called with the name of each stage."""
 
-Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
-"""What ``map`` does, and an executor's ``map`` in threads."""
+MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+"""Function with the signature of ``map``, such as the ``map`` method of a thread pool."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """What is compared."""
+    """Measured samples of one recording, with its sample rate and temperature."""
 
     values: Mapping[str, Floats]  # axis -> [n] SI; NaN = missing
     rate_hz: float
-    temperature_c: Floats | None = None  # [n] °C, without holes
+    temperature_c: Floats | None = None  # [n] °C; NaN = missing
 
     @property
     def samples(self) -> int:
-        """Of each axis."""
+        """Number of samples of each axis."""
         return next(iter(self.values.values())).size
 
 
-def seen_in(
+def diagnose_simulations(
     model: NoiseModel,
-    like: Recording,
+    template: Recording,
     courses: Courses,
     seed: int,
-    each: Each = map,
-    runs: int = RUNS,
+    each: MapFunction = map,
+    runs: int = SIMULATED_RECORDINGS,
     only: Collection[str] | None = None,
 ) -> dict[str, list[Findings]]:
-    """What the lenses see in recordings simulated from a model, of each axis.
+    """Run the diagnostics on recordings that are simulated from a model.
 
-    Args:
-        like: the recording that these are as long and as warm as
-        only: axes to look at; all
+    Parameters
+    ----------
+    model : NoiseModel
+        Model to simulate.
+    template : Recording
+        Recording whose axes, length, sample rate and temperature the simulations copy.
+    courses : Courses
+        Cached regressors for the same length, sample rate and temperature.
+    seed : int
+        Seed of the first simulation. Each further simulation uses the next integer.
+    each : callable, optional
+        Function with the signature of ``map`` that distributes the simulations.
+    runs : int, optional
+        Number of simulated recordings.
+    only : collection of str, optional
+        Names of the axes to diagnose. If None, all axes are diagnosed.
+
+    Returns
+    -------
+    dict of str to list of Findings
+        For each axis, the findings of each simulated recording.
     """
-    effects = effects_of(model, like)
-    wanted = [name for name in like.values if only is None or name in only]
+    effects = effects_of(model, template)
+    wanted = [name for name in template.values if only is None or name in only]
 
     def one(run: int) -> dict[str, Findings]:
-        drawn = model.simulate(like.samples, like.rate_hz, seed + run, like.temperature_c)
-        raw = {axis: drawn[:, AXES.index(axis)] for axis in like.values}
+        drawn = model.simulate(template.samples, template.rate_hz, seed + run, template.temperature_c)
+        raw = {axis: drawn[:, AXES.index(axis)] for axis in template.values}
         rng = np.random.default_rng(seed + run)
-        axes = prepared(raw, like.rate_hz, effects, like.temperature_c, courses, rng)
+        axes = prepared(raw, template.rate_hz, effects, template.temperature_c, courses, rng)
         return {name: look(sight(axes[name], believed(axes[name], effects[name]).likely)) for name in wanted}
 
     seen = list(each(one, range(runs)))
@@ -98,10 +123,21 @@ def seen_in(
 
 
 def smooth(temperature_c: Floats) -> Floats:
-    """Temperature [n] without its missing samples and without the thermometer's noise."""
+    """Return the temperature with missing samples interpolated and with thermometer noise averaged out.
+
+    Parameters
+    ----------
+    temperature_c : ndarray of float64, shape (n,)
+        Temperature in °C. NaN marks a missing sample. At least one sample must be finite.
+
+    Returns
+    -------
+    ndarray of float64, shape (n,)
+        Smoothed temperature in °C.
+    """
     known = np.flatnonzero(np.isfinite(temperature_c))
     whole = np.interp(np.arange(temperature_c.size), known, temperature_c[known])
-    half = int(0.5 * SMOOTH * whole.size)
+    half = int(0.5 * TEMPERATURE_SMOOTHING_FRACTION * whole.size)
     if half < 1:
         return whole
     sums = np.concatenate([[0.0], np.cumsum(np.pad(whole - whole[0], half, mode="edge"))])
@@ -109,7 +145,22 @@ def smooth(temperature_c: Floats) -> Floats:
 
 
 def effects_of(model: NoiseModel, recording: Recording) -> dict[str, Effects]:
-    """Of each recorded axis; a constant bias is no part of the comparison, as a mean is always free."""
+    """Return the effects of each recorded axis without constant biases.
+
+    A constant bias is not compared, because the mean of each axis is always free.
+
+    Parameters
+    ----------
+    model : NoiseModel
+        Model under test.
+    recording : Recording
+        Recording whose axes are used.
+
+    Returns
+    -------
+    dict of str to tuple of Effect
+        Effects of each axis.
+    """
     return {
         axis: tuple(effect for effect in model.effects.get(axis, ()) if not isinstance(effect, Bias))
         for axis in recording.values
@@ -117,22 +168,41 @@ def effects_of(model: NoiseModel, recording: Recording) -> dict[str, Effects]:
 
 
 @dataclass(frozen=True, slots=True)
-class Explained:
-    """What the search found in one recording."""
+class SearchResults:
+    """Results of the search on all axes of one recording."""
 
     searches: dict[str, Search]
     clock: Clock | None
 
 
-def searched(
+def search_all_axes(
     recording: Recording,
     model: NoiseModel,
     null: Mapping[str, Mapping[str, Null]],
     courses: Courses,
     seed: int,
-    each: Each,
-) -> Explained:
-    """Every axis explained as far as it goes."""
+    each: MapFunction,
+) -> SearchResults:
+    """Search every axis for missing effects.
+
+    The sample rate is tested first. If two axes each seem to leak into the other, the search is repeated on one of them
+    without that source.
+
+    Parameters
+    ----------
+    recording : Recording
+        Recording to explain.
+    model : NoiseModel
+        Model under test.
+    null : mapping of str to mapping of str to Null
+        Null distribution for each axis and diagnostic.
+    courses : Courses
+        Cached regressors for the same length, sample rate and temperature.
+    seed : int
+        Seed of all random draws.
+    each : callable
+        Function with the signature of ``map`` that distributes the axes.
+    """
     effects = effects_of(model, recording)
     rng = np.random.default_rng(seed)
     axes = prepared(recording.values, recording.rate_hz, effects, recording.temperature_c, courses, rng)
@@ -145,25 +215,43 @@ def searched(
         return search(axes[name], effects[name], null[name], np.random.default_rng([seed, AXES.index(name)]))
 
     found = dict(zip(axes, each(one, axes), strict=True))
-    for name, innocent in _wrongly_accused(found, null).items():
+    for name, innocent in _reversed_leak_sources(found, null).items():
         axes[name] = without_sources(axes[name], innocent)
         found[name] = one(name)
-    return Explained(found, clock)
+    return SearchResults(found, clock)
 
 
 def reconcile(
-    recording: Recording, model: NoiseModel | None, seed: int, each: Each = map, tell: Tell = lambda _what: None
+    recording: Recording,
+    model: NoiseModel | None,
+    seed: int,
+    each: MapFunction = map,
+    tell: ProgressCallback = lambda _what: None,
 ) -> Reconciliation:
-    """The whole walk.
+    """Compare a recording with a model and find the effects that the model lacks.
 
-    Args:
-        recording: at least FEWEST samples of each axis
-        model: under test; None: the five classic terms are fitted first
-        seed: of all that is simulated and drawn; the same seed gives the same result
-        each: maps work over axes and simulated recordings
-        tell: told what is being done
-    Raises:
-        NotReady: too few samples, or no axis that the model has
+    Parameters
+    ----------
+    recording : Recording
+        Recording with at least ``FEWEST`` samples for each axis.
+    model : NoiseModel or None
+        Model under test. If None, the five classic terms are fitted first.
+    seed : int
+        Seed of all simulations and random draws. The same seed gives the same result.
+    each : callable, optional
+        Function with the signature of ``map`` that distributes work over axes and simulated recordings.
+    tell : callable, optional
+        Function that is called with the name of each stage.
+
+    Returns
+    -------
+    Reconciliation
+        Decision, effects and remaining differences of each axis.
+
+    Raises
+    ------
+    NotReady
+        If there are too few samples or no axis can be compared with the model.
     """
     recording, notes = usable(recording, model)
     courses = Courses(recording.samples, recording.rate_hz, recording.temperature_c)
@@ -171,22 +259,24 @@ def reconcile(
         tell("fitting the five terms")
     tested = model or five_terms(recording, courses, seed)
     tell("simulating the model")
-    simulated = seen_in(tested, recording, courses, seed, each)
+    simulated = diagnose_simulations(tested, recording, courses, seed, each)
     null = nulls(simulated, len(simulated))
     tell("looking for what is missing")
-    found = searched(recording, tested, null, courses, seed, each)
+    found = search_all_axes(recording, tested, null, courses, seed, each)
     rounds = {name: one for name, one in found.searches.items() if one.rounds}
-    augmented = with_found(tested, found)
+    augmented = add_found_effects(tested, found)
     final = null
     if rounds or found.clock:
         tell("simulating the new model")
         changed = None if found.clock else rounds
-        simulated |= seen_in(augmented, recording, courses, seed + RUNS, each, only=changed)
+        simulated |= diagnose_simulations(
+            augmented, recording, courses, seed + SIMULATED_RECORDINGS, each, only=changed
+        )
         final = nulls(simulated, len(simulated))
     tell("writing down")
     axes = {name: described(one, null[name], final[name]) for name, one in found.searches.items()}
     if found.clock is not None:
-        axes = with_clock(axes, found.clock, null)
+        axes = add_sample_rate_step(axes, found.clock, null)
     return Reconciliation(
         verdict=overall([one.verdict for one in axes.values()]),
         axes=axes,
@@ -202,7 +292,27 @@ def reconcile(
 
 
 def usable(recording: Recording, model: NoiseModel | None) -> tuple[Recording, tuple[str, ...]]:
-    """The axes that can be compared, and what is said of the others."""
+    """Select the axes that can be compared.
+
+    Parameters
+    ----------
+    recording : Recording
+        Recording to check.
+    model : NoiseModel or None
+        Model under test. If None, every axis with enough samples and varying values is kept.
+
+    Returns
+    -------
+    recording : Recording
+        Recording with the selected axes and the smoothed temperature.
+    notes : tuple of str
+        One sentence for each axis that was left out.
+
+    Raises
+    ------
+    NotReady
+        If there are too few samples or no axis is left.
+    """
     if recording.samples < FEWEST:
         raise NotReady(
             f"{recording.samples} samples; {FEWEST} are the least that anything can be said of "
@@ -211,7 +321,7 @@ def usable(recording: Recording, model: NoiseModel | None) -> tuple[Recording, t
     notes, kept = [], {}
     for name, y in recording.values.items():
         there = y[np.isfinite(y)]
-        if there.size < FEWEST or there.size < MOSTLY * y.size:
+        if there.size < FEWEST or there.size < MIN_VALID_FRACTION * y.size:
             notes.append(f"{name}: {there.size} of {y.size} samples are there; left out")
         elif np.ptp(there) == 0.0:
             notes.append(f"{name}: all samples are the same; left out")
@@ -228,15 +338,31 @@ def usable(recording: Recording, model: NoiseModel | None) -> tuple[Recording, t
 
 
 def five_terms(recording: Recording, courses: Courses, seed: int) -> NoiseModel:
-    """Q, N, B, K and R of each axis, those of them that the data support."""
+    """Fit the terms Q, N, B, K and R to each axis and keep the terms that the data support.
+
+    Parameters
+    ----------
+    recording : Recording
+        Recording to fit.
+    courses : Courses
+        Cached regressors for the same length, sample rate and temperature.
+    seed : int
+        Seed of the draws that replace missing samples.
+
+    Returns
+    -------
+    NoiseModel
+        Model with the supported terms of each axis.
+    """
     start = (QuantizationNoise(Q=1.0), AngleRandomWalk(N=1.0), BiasInstability(B=1.0), RateRandomWalk(K=1.0))
     rng = np.random.default_rng(seed)
     none: dict[str, Effects] = dict.fromkeys(recording.values, ())
     axes = prepared(recording.values, recording.rate_hz, none, recording.temperature_c, courses, rng)
-    return NoiseModel({name: _terms(axis, start) for name, axis in axes.items()}, recording.rate_hz)
+    return NoiseModel({name: _fit_terms(axis, start) for name, axis in axes.items()}, recording.rate_hz)
 
 
-def _terms(axis: Axis, start: Effects) -> Effects:
+def _fit_terms(axis: Axis, start: Effects) -> Effects:
+    """Fit the classic terms to one axis and drop each term that gains too little likelihood."""
     scale = float(np.sqrt(np.mean(axis.coefficients**2)))
     best = axis.fit([resized(effect, scale) for effect in start])
     with_ramp = axis.fit((*best.effects, RateRamp(R=scale)))
@@ -247,13 +373,21 @@ def _terms(axis: Axis, start: Effects) -> Effects:
         if isinstance(effect, (AngleRandomWalk, RateRamp)):
             continue
         less = axis.fit(best.effects[:at] + best.effects[at + 1 :])
-        if best.log_likelihood - less.log_likelihood < SUPPORTED:
+        if best.log_likelihood - less.log_likelihood < MIN_TERM_GAIN_NATS:
             best = less
     return best.effects
 
 
-def with_found(model: NoiseModel, found: Explained) -> NoiseModel:
-    """The model with all that was found."""
+def add_found_effects(model: NoiseModel, found: SearchResults) -> NoiseModel:
+    """Return the model with all effects that were found.
+
+    Parameters
+    ----------
+    model : NoiseModel
+        Model under test.
+    found : SearchResults
+        Results of the search.
+    """
     ratio = float(found.clock.ratio.value) if found.clock else 1.0
     effects = dict(model.effects)
     for name, one in found.searches.items():
@@ -266,10 +400,20 @@ def with_found(model: NoiseModel, found: Explained) -> NoiseModel:
     return NoiseModel(effects, model.sample_rate_hz, model.temperature)
 
 
-def with_clock(
+def add_sample_rate_step(
     axes: Mapping[str, AxisResult], clock: Clock, null: Mapping[str, Mapping[str, Null]]
 ) -> dict[str, AxisResult]:
-    """The step of a wrong clock, first on the axis that shows it most."""
+    """Return the results with a step for the wrong sample rate, on the axis that shows the error most clearly.
+
+    Parameters
+    ----------
+    axes : mapping of str to AxisResult
+        Results of all axes.
+    clock : Clock
+        Detected sample rate error.
+    null : mapping of str to mapping of str to Null
+        Null distribution for each axis and diagnostic.
+    """
     one = axes[clock.axis]
     half = abs(clock.frequency[1] - clock.frequency[0])
     where = Where(frequency=(min(clock.frequency) - 0.01 * half, max(clock.frequency) + 0.01 * half))
@@ -302,7 +446,7 @@ def with_clock(
 
 
 def overall(verdicts: Iterable[Verdict]) -> Verdict:
-    """Of a recording, from those of its axes."""
+    """Combine the decisions of all axes into the decision for the recording."""
     every = set(verdicts)
     if every <= {"agrees"}:
         return "agrees"
@@ -311,8 +455,11 @@ def overall(verdicts: Iterable[Verdict]) -> Verdict:
     return "unexplained" if every <= {"agrees", "unexplained"} else "partly_explained"
 
 
-def _wrongly_accused(found: Mapping[str, Search], null: Mapping[str, Mapping[str, Null]]) -> dict[str, frozenset[str]]:
-    """Axis -> axes that do not leak into it, though they seem to: it is the axis that leaks into them, and more."""
+def _reversed_leak_sources(
+    found: Mapping[str, Search], null: Mapping[str, Mapping[str, Null]]
+) -> dict[str, frozenset[str]]:
+    """Return, for each axis, the sources whose leak is wrongly assumed because the true leak has the opposite
+    direction."""
     gains = {
         (name, effect.source): step.trials[0].value
         for name, one in found.items()

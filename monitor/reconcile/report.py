@@ -1,12 +1,13 @@
-"""A reconciliation as JSON for programs: ``report.json``, schema imu-monitor/reconcile/1.
+"""JSON report of a reconciliation: ``report.json``, schema imu-monitor/reconcile/1.
 
-In comes a ``Reconciliation``, out go bytes; the same reconciliation gives the same bytes. Numbers are SI of their axis,
-times s from the start of the recording. What is not a finite number becomes null, as JSON has no word for it; a
-parameter that names an axis has a value and no interval.
+The same reconciliation always gives the same bytes. Numbers are in SI units of their axis, and times are in seconds
+from the start of the recording. A number that is not finite becomes null, because JSON cannot represent it. A parameter
+that names an axis has a value and no interval.
 
-Of each step, ``found`` has the place and the threshold that it passed, under the model before the step; ``gap`` is the
-same lens before and after, with ``null95`` and ``threshold`` under the model after it, which decide what is left over.
-``scores`` are all lenses: of an axis beside the first model, of a step after it.
+In each step, ``found`` holds the location and the threshold that the difference passed, under the model before the
+step. ``gap`` holds the same diagnostic before and after the step. Its ``null95`` and ``threshold`` belong to the model
+after the step and decide whether a difference is left over. ``scores`` holds all diagnostics: for an axis, the
+comparison with the first model; for a step, the comparison after the step.
 """
 
 from math import isfinite
@@ -18,82 +19,91 @@ from drivers.sample import AXES
 from monitor.reconcile.result import AxisResult, Bounds, Reconciliation, Score, Step, Where
 
 SCHEMA: Final = "imu-monitor/reconcile/1"
-_ENCODER: Final = msgspec.json.Encoder()
+"""Name and version of the JSON schema."""
+_JSON_ENCODER: Final = msgspec.json.Encoder()
 
 
 def to_json(r: Reconciliation) -> bytes:
-    """The report, axes in the order of ``AXES``."""
-    return _ENCODER.encode({
+    """Encode a reconciliation as JSON, with the axes in the order of ``AXES``."""
+    return _JSON_ENCODER.encode({
         "schema": SCHEMA,
         "verdict": r.verdict,
-        "rate": _number(r.rate_hz),
+        "rate": _finite_or_none(r.rate_hz),
         "samples": int(r.samples),
-        "seconds": _number(r.seconds),
+        "seconds": _finite_or_none(r.seconds),
         "seed": int(r.seed),
         "fitted_first": bool(r.fitted_first),
         "notes": r.notes,
-        "axes": {axis: _axis(r.axes[axis]) for axis in AXES if axis in r.axes},
+        "axes": {axis: _axis_entry(r.axes[axis]) for axis in AXES if axis in r.axes},
     })  # fmt: skip
 
 
-def _axis(result: AxisResult) -> dict[str, Any]:
+def _axis_entry(result: AxisResult) -> dict[str, Any]:
+    """Return the report entry of one axis."""
     return {
         "verdict": result.verdict,
-        "steps": [_step(step) for step in result.steps],
-        "left_over": [_score(score) for score in result.left_over],
-        "scores": [_score(score) for score in result.start.scores],
+        "steps": [_step_entry(step) for step in result.steps],
+        "left_over": [_score_entry(score) for score in result.left_over],
+        "scores": [_score_entry(score) for score in result.start.scores],
     }
 
 
-def _step(step: Step) -> dict[str, Any]:
-    held_out = _gap(step.held_out_before, step.held_out_after)
+def _step_entry(step: Step) -> dict[str, Any]:
+    """Return the report entry of one step."""
+    held_out = _gap_entry(step.held_out_before, step.held_out_after)
     return {
-        "found": _score(step.found),
+        "found": _score_entry(step.found),
         "kind": step.kind,
         "effect": step.effect,
-        "parameters": {name: _bounds(bounds) for name, bounds in step.parameters.items()},
-        "confidence": _number(step.confidence),
-        "runners_up": [{"effect": one.effect, "confidence": _number(one.confidence)} for one in step.runners_up],
-        "gap": _gap(step.before, step.after),
+        "parameters": {name: _bounds_entry(bounds) for name, bounds in step.parameters.items()},
+        "confidence": _finite_or_none(step.confidence),
+        "runners_up": [
+            {"effect": one.effect, "confidence": _finite_or_none(one.confidence)} for one in step.runners_up
+        ],
+        "gap": _gap_entry(step.before, step.after),
         "held_out_gap": held_out,
         **({} if held_out else {"held_out_reason": step.held_out_reason}),
         "because": step.because,
-        "scores": [_score(score) for score in step.look.scores],
+        "scores": [_score_entry(score) for score in step.look.scores],
     }
 
 
-def _gap(before: Score | None, after: Score | None) -> dict[str, float | None] | None:
+def _gap_entry(before: Score | None, after: Score | None) -> dict[str, float | None] | None:
+    """Return the gaps before and after a step, or None if one of them is unknown."""
     if before is None or after is None:
         return None
     return {
-        "before": _number(before.gap),
-        "after": _number(after.gap),
-        "null95": _number(after.null95),
-        "threshold": _number(after.threshold),
+        "before": _finite_or_none(before.gap),
+        "after": _finite_or_none(after.gap),
+        "null95": _finite_or_none(after.null95),
+        "threshold": _finite_or_none(after.threshold),
     }
 
 
-def _score(score: Score) -> dict[str, Any]:
+def _score_entry(score: Score) -> dict[str, Any]:
+    """Return the report entry of one score."""
     return {
         "lens": score.lens,
-        "where": _where(score.where),
-        "gap": _number(score.gap),
-        "null95": _number(score.null95),
-        "threshold": _number(score.threshold),
+        "where": _where_entry(score.where),
+        "gap": _finite_or_none(score.gap),
+        "null95": _finite_or_none(score.null95),
+        "threshold": _finite_or_none(score.threshold),
     }
 
 
-def _where(where: Where) -> dict[str, Any]:
+def _where_entry(where: Where) -> dict[str, Any]:
+    """Return the report entry of a location."""
     found = where.found().items()
-    return {name: place if isinstance(place, str) else [_number(end) for end in place] for name, place in found}
+    return {name: place if isinstance(place, str) else [_finite_or_none(end) for end in place] for name, place in found}
 
 
-def _bounds(bounds: Bounds) -> dict[str, Any]:
+def _bounds_entry(bounds: Bounds) -> dict[str, Any]:
+    """Return the report entry of a parameter."""
     if isinstance(bounds.value, str):
         return {"value": bounds.value}
-    return {"value": _number(bounds.value), "lo": _number(bounds.lo), "hi": _number(bounds.hi)}
+    return {"value": _finite_or_none(bounds.value), "lo": _finite_or_none(bounds.lo), "hi": _finite_or_none(bounds.hi)}
 
 
-def _number(value: float | None) -> float | None:
-    """Python's own float: NumPy's are not known to the encoder."""
+def _finite_or_none(value: float | None) -> float | None:
+    """Return a Python float, because the encoder does not accept NumPy scalars, or None if the value is not finite."""
     return None if value is None or not isfinite(value) else float(value)

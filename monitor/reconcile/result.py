@@ -1,8 +1,9 @@
-"""What ``reconcile`` finds, as it travels to report, JSON and viewer.
+"""Result types of ``reconcile``, as used by the report, the JSON output and the viewer.
 
-A ``Reconciliation`` has one ``AxisResult`` an axis; that has one ``Step`` for each effect that was added or retuned,
-and a ``Score`` for everything that is left. A ``View`` is one axis through one lens, measured beside what the model
-under test gives: what a plot shows. All sizes are SI of the axis; times are s from the start of the recording.
+A ``Reconciliation`` holds one ``AxisResult`` for each axis. An ``AxisResult`` holds one ``Step`` for each effect that
+was added or whose size was changed, and a ``Score`` for each difference that is left. A ``View`` holds the data of one
+plot: the measurement of one axis and the expectation of the model under test. All values are in SI units of the axis.
+Times are in seconds from the start of the recording.
 """
 
 from collections.abc import Mapping
@@ -13,12 +14,14 @@ from drivers.sample import Floats
 from monitor.noise.model import NoiseModel
 
 Verdict = Literal["agrees", "explained", "partly_explained", "unexplained"]
+"""Decision for an axis or a recording."""
 Kind = Literal["added", "retuned"]
+"""Kind of a step: an effect was added, or the size of a known effect was changed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Where:
-    """A place: what a lens does not look along is None."""
+    """Location of a difference. A dimension that the diagnostic does not resolve is None."""
 
     frequency: tuple[float, float] | None = None  # Hz
     tau: tuple[float, float] | None = None  # s
@@ -28,30 +31,30 @@ class Where:
     source: str | None = None  # another axis
 
     def found(self) -> dict[str, tuple[float, float] | str]:
-        """What is known of the place, by name."""
+        """Return the dimensions that are known, by name."""
         names = ("frequency", "tau", "time", "temperature", "value", "source")
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """How far measurement and model are apart through one lens, and where most."""
+    """Difference between measurement and model in one diagnostic, and the location of its maximum."""
 
     lens: str
     where: Where
     gap: float  # 0 = perfect agreement
-    null95: float  # 95 of 100 recordings of a true model stay below, through this lens
-    threshold: float  # with all lenses, places and axes paid for: 99 of 100 recordings stay below all of theirs
+    null95: float  # 95 of 100 recordings of a true model stay below this gap in this diagnostic
+    threshold: float  # 99 of 100 recordings of a true model stay below it in all diagnostics, at all places and axes
 
     @property
     def passes(self) -> bool:
-        """Whether this is more than chance."""
+        """True if the difference is larger than chance allows."""
         return self.gap > self.threshold
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """A parameter with its 95 % interval; the name of a source axis has none."""
+    """Value of a parameter with its 95 % interval. The name of a source axis has no interval."""
 
     value: float | str
     lo: float | None = None
@@ -60,7 +63,7 @@ class Bounds:
 
 @dataclass(frozen=True, slots=True)
 class RunnerUp:
-    """Another name that was tried for the same gap."""
+    """Alternative effect that was tried for the same difference."""
 
     effect: str
     confidence: float
@@ -68,34 +71,34 @@ class RunnerUp:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One axis through one lens."""
+    """Plot data of one axis for one diagnostic."""
 
     lens: str
-    x_name: str  # what is along x: "frequency", "averaging time", "time", …
+    x_name: str  # quantity on the x axis: "frequency", "averaging time", "time", …
     x_unit: str
     y_name: str
     y_unit: str  # SI of the axis
     log: bool  # both scales logarithmic
     x: Floats  # [k]
     measured: Floats  # [k]
-    expected: Floats  # [k] of the model
-    lo: Floats  # [k] band that holds 95 of 100 simulated recordings, at each x by itself
-    hi: Floats  # [k]
+    expected: Floats  # [k] expectation of the model
+    lo: Floats  # [k] lower limit of the pointwise band that holds 95 of 100 simulated recordings
+    hi: Floats  # [k] upper limit of the same band
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """An axis beside one model, through all lenses."""
+    """Scores and plot data of an axis, compared with one model."""
 
-    scores: tuple[Score, ...]  # one a lens
-    views: tuple[View, ...]  # of those that have a picture
+    scores: tuple[Score, ...]  # one for each diagnostic
+    views: tuple[View, ...]  # one for each diagnostic that has a plot
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One effect that was added, or a known one that got another size."""
+    """Effect that was added, or an effect of the model whose size was changed."""
 
-    found: Score  # what led to it
+    found: Score  # difference that led to this step
     kind: Kind
     effect: str
     parameters: Mapping[str, Bounds]
@@ -105,32 +108,32 @@ class Step:
     after: Score
     held_out_before: Score | None
     held_out_after: Score | None
-    held_out_reason: str  # why there is no held-out gap; empty where there is one
-    because: str  # one sentence that a person can check
-    look: Look  # after the step
+    held_out_reason: str  # why there is no held-out gap; empty if there is a held-out gap
+    because: str  # one sentence of justification that a person can check
+    look: Look  # comparison after the step
 
 
 @dataclass(frozen=True, slots=True)
 class AxisResult:
-    """What was found on one axis."""
+    """Result of the search on one axis."""
 
     axis: str
     verdict: Verdict
-    start: Look  # beside the model that was given, or the five terms
+    start: Look  # comparison with the given model, or with the five terms
     steps: tuple[Step, ...]
     left_over: tuple[Score, ...]
-    end: Look  # beside the model with everything that was found
+    end: Look  # comparison with the model that contains everything that was found
 
 
 @dataclass(frozen=True, slots=True)
 class Reconciliation:
-    """What was found in one recording."""
+    """Result of the comparison of one recording with a model."""
 
     verdict: Verdict
     axes: Mapping[str, AxisResult]  # in AXES order
     baseline: NoiseModel  # the model that was given, or the five terms fitted first
     model: NoiseModel  # with everything that was found
-    fitted_first: bool  # no model was given
+    fitted_first: bool  # True if no model was given and the five terms were fitted
     rate_hz: float
     samples: int
     seconds: float

@@ -1,1 +1,1 @@
-"""Diagnostics that compare a recording with a model, and their null distribution."""
+"""Diagnostics that compare a recording with a model, and the distribution of their results under the model."""

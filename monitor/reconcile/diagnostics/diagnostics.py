@@ -1,11 +1,13 @@
-"""Lenses: one function each, for measured and simulated recordings alike.
+"""Diagnostics: functions that measure how far an axis differs from a model, for measured and simulated recordings
+alike.
 
-A lens sees a ``Sight``: an axis beside a model, made white by it. Where the model is true, the whitened coefficients
-are independent with variance one, and so is the whitened series; every lens asks this in its own way, and answers with
-the largest gain in ln L, in nats, that a departure of its kind would bring at one place, and with the place. Gains of a
-true model are nearly the same for every model and length, which is what ``gap`` builds its thresholds on.
+A diagnostic takes a ``Sight``: an axis whitened by a model. If the model is true, the whitened coefficients are
+independent with variance one, and so are the samples of the whitened series. Each diagnostic tests one kind of
+departure from this. It returns the largest gain in ln L, in nats, that such a departure would bring at one place,
+together with the place. The gains of a true model are nearly the same for every model and every length. The thresholds
+in ``gap`` rely on this.
 
-The same data give the same answer; nothing is changed.
+The diagnostics are deterministic and do not change their input.
 """
 
 from collections.abc import Callable
@@ -38,81 +40,116 @@ from monitor.reconcile.preparation.cosine_bins import series
 from monitor.reconcile.result import Where
 
 LAGS: Final = 64
-"""Samples of the autocorrelation."""
-DECAYS: Final = 0.3 / 3.0 ** np.arange(6)
-"""Of the recording: time constants of transients."""
-DELAYS_S: Final = (10.0, 30.0, 90.0, 270.0, 810.0)
-SLOW: Final = 0.01
-"""Of the band: slower parts say nothing of tails and variance, and are the first that a model misses."""
-FEW: Final = 64
-"""Coefficients whose power is known to a sixth; where a bin has fewer, NEIGHBOURS bins are taken together."""
-NEIGHBOURS: Final = 9
+"""Number of lags of the autocorrelation, in samples."""
+TRANSIENT_TIME_FRACTIONS: Final = 0.3 / 3.0 ** np.arange(6)
+"""Time constants of transients, as fractions of the recording."""
+TEMPERATURE_DELAYS_S: Final = (10.0, 30.0, 90.0, 270.0, 810.0)
+"""Time constants of delayed temperature effects, in seconds."""
+SLOW_BAND_FRACTION: Final = 0.01
+"""Fraction of the band that is ignored for tails and variance. Low frequencies contain no information about them and
+are the first that a model describes wrongly.
+"""
+MIN_COEFFICIENTS_PER_BIN: Final = 64
+"""Number of coefficients whose power is known to a sixth. Bins with fewer coefficients are averaged over
+``SMOOTHING_BINS`` bins.
+"""
+SMOOTHING_BINS: Final = 9
+"""Number of bins that are averaged if one bin has too few coefficients."""
 MARGIN: Final = 0.001
-"""Of the recording, at each end: no step is looked for there, where the ends show in the spectrum themselves."""
-LOW: Final = 1e-3
-"""Of the power in the median bin: a stop band says nothing of single samples."""
+"""Fraction of the recording at each end in which no step is sought, because the ends of a recording affect the
+spectrum.
+"""
+MIN_DENSITY_RATIO: Final = 1e-3
+"""Smallest density relative to the median bin. A stop band contains no information about single samples."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """An axis beside a model."""
+    """Axis whitened by a model."""
 
     axis: Axis
     likely: Likely
-    whitened: Floats  # [n − 1] coefficients over their standard deviation; draws where nothing is heard
-    weight: Floats  # [n − 1] one over their standard deviation; 0 where nothing is heard
-    white: Floats  # [n] the series of these
-    fast: Floats  # [n] the same without slow parts and with every bin at its own power: for tails and variance
+    whitened: Floats  # [n − 1] coefficients divided by their standard deviation; random draws in stop bands
+    weight: Floats  # [n − 1] inverse of the standard deviation; 0 in stop bands
+    white: Floats  # [n] series of the whitened coefficients
+    fast: Floats  # [n] the same without low frequencies and with each bin at unit power, for tails and variance
 
     @property
     def course(self) -> Course:
-        """Its variance over time."""
+        """Variance of the whitened series as a function of time."""
         return variance_course(self.fast, 1.0 / self.axis.rate_hz)
 
     @property
     def outliers(self) -> Outliers | None:
-        """Its tails."""
+        """Outlier statistics of the whitened series, or None if a Gaussian fits no worse."""
         return outliers(self.fast)
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """The strongest departure that a lens sees."""
+    """Strongest departure that a diagnostic detects."""
 
-    gain: float  # nats
+    gain: float  # log-likelihood gain, nats
     where: Where
 
 
-Lens = Callable[[Sight], Finding]
+Diagnostic = Callable[[Sight], Finding]
+"""Function that measures one kind of departure."""
 
 
 def sight(axis: Axis, likely: Likely) -> Sight:
-    """Make an axis white by a model."""
+    """Whiten an axis by a fitted model.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to whiten.
+    likely : Likely
+        Fitted effects of the axis.
+    """
     weight = axis.bins.spread(axis.heard / np.sqrt(likely.fitted.variance))
     whitened = axis.residual(likely) * weight
     silent = np.flatnonzero(weight == 0.0)
-    # a hole in the band would itself be seen
+    # a gap in the spectrum would itself be detected
     whitened[silent] = np.random.default_rng(silent.size).standard_normal(silent.size)
-    return Sight(axis, likely, whitened, weight, series(whitened), _fast(axis, likely, whitened))
+    return Sight(axis, likely, whitened, weight, series(whitened), _flattened_series(axis, likely, whitened))
 
 
-def _fast(axis: Axis, likely: Likely, whitened: Floats) -> Floats:
-    """Whatever the spectrum is, tails and variance are then those of white noise."""
-    count, together = axis.bins.count, np.ones(NEIGHBOURS)
+def _flattened_series(axis: Axis, likely: Likely, whitened: Floats) -> Floats:
+    """Return the whitened series with the fitted power of each bin removed.
+
+    For any spectrum, its tails and variance are then those of white noise.
+    """
+    count, together = axis.bins.count, np.ones(SMOOTHING_BINS)
     sums = axis.bins.sums(whitened**2)
     around = np.convolve(sums, together, "same") / np.convolve(count, together, "same")
-    power = np.where(count >= FEW, sums / count, around)
+    power = np.where(count >= MIN_COEFFICIENTS_PER_BIN, sums / count, around)
     flat = whitened * axis.bins.spread(1.0 / np.sqrt(power))
     density = power * likely.fitted.variance
-    silent = np.flatnonzero(axis.bins.spread(density) < LOW * np.median(density))
+    silent = np.flatnonzero(axis.bins.spread(density) < MIN_DENSITY_RATIO * np.median(density))
     flat[silent] = np.random.default_rng(silent.size).standard_normal(silent.size)
-    slow = int(SLOW * axis.n)
-    flat[:slow] = np.random.default_rng(slow).standard_normal(slow)  # as above
+    slow = int(SLOW_BAND_FRACTION * axis.n)
+    flat[:slow] = np.random.default_rng(slow).standard_normal(slow)  # replaced for the same reason
     return series(flat) / noise_course(likely.effects, axis.n, axis.rate_hz)
 
 
 def noise_course(effects: Effects, n: int, rate_hz: float) -> Floats:
-    """Deviation [n] of the white noise over its root mean square, by the noise steps of the axis."""
+    """Return the standard deviation of the white noise as a function of time, according to the noise steps of the axis.
+
+    Parameters
+    ----------
+    effects : tuple of Effect
+        Effects of the axis.
+    n : int
+        Number of samples.
+    rate_hz : float
+        Sample rate in Hz.
+
+    Returns
+    -------
+    ndarray of float64, shape (n,)
+        Standard deviation divided by its root mean square.
+    """
     course = np.ones(n)
     for effect in effects:
         if isinstance(effect, NoiseStep):
@@ -121,8 +158,8 @@ def noise_course(effects: Effects, n: int, rate_hz: float) -> Floats:
 
 
 def psd(seen: Sight) -> Finding:
-    """Power over frequency: the run of bins, of any width, that is furthest from its expectation."""
-    bins = even_bins(seen.axis.n, seen.axis.rate_hz)  # the same for recordings with peaks and without
+    """Find the range of frequency bins, of any width, whose power differs most from its expectation."""
+    bins = even_bins(seen.axis.n, seen.axis.rate_hz)  # the same bins for recordings with and without peaks
     power = np.concatenate([[0.0], np.cumsum(bins.sums(seen.whitened**2))])
     count = np.concatenate([[0.0], np.cumsum(bins.count)])
     best, place = 0.0, (0, 1)
@@ -141,13 +178,26 @@ def psd(seen: Sight) -> Finding:
 
 
 def power_gain(ratio: Floats, count: Floats) -> Floats:
-    """Gain of a variance of its own for ``count`` coefficients whose mean square is ``ratio``: n/2 (ρ − 1 − ln ρ)."""
+    """Return the log-likelihood gain of a free variance: n/2 (ρ − 1 − ln ρ).
+
+    Parameters
+    ----------
+    ratio : ndarray of float64, shape (k,)
+        Mean square of the coefficients.
+    count : ndarray of float64, shape (k,)
+        Number of coefficients.
+
+    Returns
+    -------
+    ndarray of float64, shape (k,)
+        Gain in nats.
+    """
     safe = np.maximum(ratio, 1e-300)
     return np.asarray(0.5 * count * (safe - 1.0 - np.log(safe)))
 
 
 def lines(seen: Sight) -> Finding:
-    """A steady oscillation: the largest of the periodogram, at twice its own spacing."""
+    """Find a steady oscillation: the largest value of the periodogram at twice the usual resolution."""
     found = line_peaks(seen.white, seen.axis.rate_hz, 1)
     gain, f_hz = found[0]
     half = seen.axis.rate_hz / seen.axis.n
@@ -155,7 +205,22 @@ def lines(seen: Sight) -> Finding:
 
 
 def line_peaks(white: Floats, rate_hz: float, most: int) -> list[tuple[float, float]]:
-    """(gain, Hz) of the largest peaks of the periodogram of a white series, strongest first, apart from each other."""
+    """Return the largest peaks of the periodogram, strongest first and separated from each other.
+
+    Parameters
+    ----------
+    white : ndarray of float64, shape (n,)
+        Whitened series.
+    rate_hz : float
+        Sample rate in Hz.
+    most : int
+        Largest number of peaks.
+
+    Returns
+    -------
+    list of tuple of float
+        Gain in nats and frequency in Hz of each peak.
+    """
     power = periodogram(white)
     size = 2 * (power.size - 1)
     found = []
@@ -169,21 +234,24 @@ def line_peaks(white: Floats, rate_hz: float, most: int) -> list[tuple[float, fl
 
 
 def periodogram(white: Floats) -> Floats:
-    """Gain of a line [m + 1] at frequencies from 0 to half the rate, more than twice as many as samples have turns."""
+    """Return the gain in nats of a line at frequencies from 0 to half the sample rate, shape (m + 1,).
+
+    The frequencies are at least twice as dense as in a transform without zero padding.
+    """
     n = white.size
     size = next_fast_len(2 * n, real=True)
     size += size % 2
     turned = rfft(white, size)
     power = (turned.real**2 + turned.imag**2) / n
-    power[: 2 * size // n] = 0.0  # slower than one turn
+    power[: 2 * size // n] = 0.0  # less than one cycle in the recording
     power[-2:] = 0.0
     return np.asarray(power)
 
 
 def level(seen: Sight) -> Finding:
-    """The level over time: a step at any time, a slope, or a transient after the start.
+    """Find a change of the level: a step at any time, a slope, or a transient after the start.
 
-    Where the model itself jumps, a level that moves says nothing: no spectrum takes jumps out.
+    If the model itself contains jumps, a change of the level is no evidence, because whitening does not remove jumps.
     """
     if any(isinstance(effect, (PoissonSteps, RandomTelegraph)) for effect in seen.likely.effects):
         return Finding(0.0, Where())
@@ -192,7 +260,7 @@ def level(seen: Sight) -> Finding:
     best = Finding(float(gains[at]), Where(time=(float(times_s[at]), float(times_s[at]))))
     axis = seen.axis
     length_s = axis.n / axis.rate_hz
-    for share in DECAYS:
+    for share in TRANSIENT_TIME_FRACTIONS:
         effect = TurnOnTransient(amplitude=1.0, time_constant=float(share * length_s))
         gain = course_gain(seen, axis.columns(effect))
         if gain > best.gain:
@@ -203,18 +271,31 @@ def level(seen: Sight) -> Finding:
 
 
 def step_gains(seen: Sight) -> tuple[Floats, Floats]:
-    """Gain of one step at each time, and the times in s: all by two transforms.
+    """Return the gain of a step at each time, by two Fourier transforms.
 
-    The coefficients of a step at sample s are −√(2/n) sin(πks/n)/(2 sin(πk/2n)), so its squared length under weights W
-    is Σ W_k (1 − cos(2πks/n))/(4n sin²(πk/2n)), one Fourier transform; its product with the data is a running sum.
+    The coefficients of a step at sample s are −√(2/n) sin(πks/n)/(2 sin(πk/2n)). Its squared length under the weights W
+    is Σ W_k (1 − cos(2πks/n))/(4n sin²(πk/2n)), which is one Fourier transform. Its product with the data is a running
+    sum.
+
+    Parameters
+    ----------
+    seen : Sight
+        Whitened axis.
+
+    Returns
+    -------
+    gains : ndarray of float64, shape (k,)
+        Gain in nats.
+    times : ndarray of float64, shape (k,)
+        Time of the step in seconds from the start.
     """
     axis = seen.axis
     n = axis.n
     weighted = series(seen.whitened * seen.weight)
-    product = np.cumsum(weighted[::-1])[::-1]  # [n] of a step at each sample
+    product = np.cumsum(weighted[::-1])[::-1]  # [n] product of the data with a step at each sample
     u = np.zeros(n)
     u[1:] = seen.weight**2 * axis.courses.steps
-    cosines = rfft(u).real  # of s up to n/2; those beyond are the same, backwards
+    cosines = rfft(u).real  # for s up to n/2; the values beyond are the mirror image
     length = u.sum() - np.concatenate([cosines, cosines[1 : n - cosines.size + 1][::-1]])
     margin = ceil(MARGIN * n)
     inside = slice(margin, n - margin)
@@ -223,7 +304,15 @@ def step_gains(seen: Sight) -> tuple[Floats, Floats]:
 
 
 def course_gain(seen: Sight, columns: list[Floats]) -> float:
-    """Gain of a course of free size on a sight."""
+    """Return the log-likelihood gain in nats of regressors with free sizes.
+
+    Parameters
+    ----------
+    seen : Sight
+        Whitened axis.
+    columns : list of ndarray of float64, shape (n − 1,)
+        Transforms of the regressors.
+    """
     stacked = np.stack([column * seen.weight for column in columns])
     normal, right = stacked @ stacked.T, stacked @ seen.whitened
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -232,7 +321,7 @@ def course_gain(seen: Sight, columns: list[Floats]) -> float:
 
 
 def autocorrelation(seen: Sight) -> Finding:
-    """The whitened series against itself, a few samples later."""
+    """Find the lag at which the whitened series is most strongly correlated with itself."""
     n = seen.white.size
     turned = rfft(seen.white, next_fast_len(n + LAGS, real=True))
     products = irfft(turned.real**2 + turned.imag**2, next_fast_len(n + LAGS, real=True))[1 : LAGS + 1]
@@ -243,7 +332,7 @@ def autocorrelation(seen: Sight) -> Finding:
 
 
 def temperature(seen: Sight) -> Finding:
-    """Level against temperature, at once and late."""
+    """Find a dependence of the level on the temperature, with and without delay."""
     warmth = seen.axis.temperature_c
     if warmth is None:
         return Finding(0.0, Where())
@@ -251,14 +340,14 @@ def temperature(seen: Sight) -> Finding:
     place = Where(temperature=(float(warmth.min()), float(warmth.max())))
     best = course_gain(seen, seen.axis.columns(TemperatureBias(coefficient=1.0, reference=reference, quadratic=1.0)))
     best = max(best - 1.0, course_gain(seen, seen.axis.columns(TemperatureBias(coefficient=1.0, reference=reference))))
-    for delay_s in DELAYS_S:
+    for delay_s in TEMPERATURE_DELAYS_S:
         lag = TemperatureLag(coefficient=1.0, reference=reference, time_constant=delay_s)
         best = max(best, course_gain(seen, seen.axis.columns(lag)))
     return Finding(best, place)
 
 
 def other_axes(seen: Sight) -> Finding:
-    """What another axis measures, in this one."""
+    """Find the axis that leaks most strongly into this axis."""
     best = Finding(0.0, Where())
     for name, coefficients in seen.axis.others.items():
         gain = course_gain(seen, [coefficients])
@@ -268,14 +357,14 @@ def other_axes(seen: Sight) -> Finding:
 
 
 def variance(seen: Sight) -> Finding:
-    """The variance of the noise over time: a step, a trend, a period, or any slow course."""
+    """Find a variation of the noise variance in time: a step, a trend, a period or a slow random variation."""
     found = seen.course
     gain = max(found.step.gain, found.trend, found.periodic.gain, found.wander)
     return Finding(gain, Where(time=(found.step.time.lo, found.step.time.hi)))
 
 
 def spectrogram(seen: Sight) -> Finding:
-    """Power over time and frequency: the rectangle, or the row, that is least steady."""
+    """Find the place in time and frequency whose power is least constant: a rectangle or a whole row."""
     found = unsteady(seen)
     if found.gain >= found.row_gain:
         return Finding(found.gain, Where(time=found.time, frequency=found.frequency))
@@ -283,19 +372,19 @@ def spectrogram(seen: Sight) -> Finding:
 
 
 def unsteady(seen: Sight) -> Tiles:
-    """The least steady places over time and frequency, beside the noise steps of the axis."""
+    """Return the least constant rectangle and row of the spectrogram, corrected for the noise steps of the axis."""
     axis = seen.axis
     return tiles(seen.white / noise_course(seen.likely.effects, axis.n, axis.rate_hz), 1.0 / axis.rate_hz)
 
 
 def tails(seen: Sight) -> Finding:
-    """The distribution: samples far out."""
+    """Find outliers in the distribution of the samples."""
     found = seen.outliers
     return Finding(found.gain if found else 0.0, Where())
 
 
 def values(seen: Sight) -> Finding:
-    """The values as they were measured: steps, ends and repeats that the model has not."""
+    """Find quantization, clipping or repeats in the measured values that the model does not contain."""
     have = {type(effect) for effect in seen.likely.effects}
     shown = seen.axis.shown
     best = Finding(0.0, Where())
@@ -307,7 +396,7 @@ def values(seen: Sight) -> Finding:
     return best
 
 
-LENSES: Final[dict[str, Lens]] = {
+LENSES: Final[dict[str, Diagnostic]] = {
     "values": values,
     "psd": psd,
     "lines": lines,
@@ -319,3 +408,4 @@ LENSES: Final[dict[str, Lens]] = {
     "variance": variance,
     "spectrogram": spectrogram,
 }
+"""Diagnostics by name, in the order of the report."""

@@ -1,5 +1,7 @@
-"""Pictures of an axis beside a model: what was measured, what the model expects, and the band that 95 of 100 simulated
-recordings stay in at each place, from the model's spectrum in closed form. A view is small: some hundred points.
+"""Plot data of an axis and a model: the measurement, the expectation and the 95 % band.
+
+The band contains 95 of 100 simulated recordings at each place. It is calculated from the spectrum of the model, without
+simulation. A view has a few hundred points.
 """
 
 from collections.abc import Callable
@@ -16,39 +18,50 @@ from monitor.reconcile.diagnostics.diagnostics import LAGS, Sight, noise_course
 from monitor.reconcile.preparation.cosine_bins import series
 from monitor.reconcile.result import View
 
-POINTS: Final = 240
-"""Of a spectrum."""
-BLOCKS: Final = 240
-"""Of a course over time."""
-DEGREES: Final = 24
-"""Intervals of temperature."""
+SPECTRUM_POINTS: Final = 240
+"""Approximate number of points of a spectrum."""
+TIME_BLOCKS: Final = 240
+"""Number of blocks of a plot over time."""
+TEMPERATURE_BINS: Final = 24
+"""Number of temperature intervals."""
 Z95: Final = 1.959964
-RATE: Final = {"g": "rad/s", "a": "m/s²"}
-DENSITY: Final = {"g": "(rad/s)²/Hz", "a": "(m/s²)²/Hz"}
+"""Number of standard deviations on each side of a 95 % interval."""
+LEVEL_UNITS: Final = {"g": "rad/s", "a": "m/s²"}
+"""Unit of the level by the first letter of the axis."""
+DENSITY_UNITS: Final = {"g": "(rad/s)²/Hz", "a": "(m/s²)²/Hz"}
+"""Unit of the spectral density by the first letter of the axis."""
 
 
 def views(seen: Sight) -> tuple[View, ...]:
-    """Of every lens that has one."""
-    made = [_psd(seen), _allan(seen), _level(seen), _variance(seen), _tails(seen), _autocorrelation(seen)]
+    """Return the plot data of every diagnostic that has a plot."""
+    made = [
+        _psd_view(seen),
+        _allan_view(seen),
+        _level_view(seen),
+        _variance_view(seen),
+        _tails_view(seen),
+        _autocorrelation_view(seen),
+    ]
     if seen.axis.temperature_c is not None and np.ptp(seen.axis.temperature_c) > 0.0:
-        made.append(_temperature(seen))
+        made.append(_temperature_view(seen))
     return tuple(made)
 
 
-def _psd(seen: Sight) -> View:
+def _psd_view(seen: Sight) -> View:
+    """Return the plot of the spectral density."""
     bins, tau0_s = seen.axis.bins, 1.0 / seen.axis.rate_hz
     variance, power = seen.likely.fitted.variance, seen.likely.fitted.residual
     used = np.flatnonzero(seen.axis.heard)
-    # neighbours together, as many as make POINTS points even in the logarithm of frequency
+    # average neighbouring bins to about SPECTRUM_POINTS points that are evenly spaced in the logarithm of frequency
     f = np.log(bins.f_hz[used])
-    cell = np.floor((f - f[0]) / max(f[-1] - f[0], 1e-9) * POINTS)
+    cell = np.floor((f - f[0]) / max(f[-1] - f[0], 1e-9) * SPECTRUM_POINTS)
     first = np.flatnonzero(np.diff(cell, prepend=-1.0))
     count = np.add.reduceat(bins.count[used], first)
     expected = np.add.reduceat((bins.count * variance)[used], first) / count * tau0_s
     measured = np.add.reduceat(power[used], first) / count * tau0_s
     middle = np.exp(np.add.reduceat((bins.count * np.log(bins.f_hz))[used], first) / count)
-    lo, hi = _chi(count)
-    unit = DENSITY[seen.axis.name[0]]
+    lo, hi = _chi2_band(count)
+    unit = DENSITY_UNITS[seen.axis.name[0]]
     return View(
         "psd",
         "frequency",
@@ -64,19 +77,20 @@ def _psd(seen: Sight) -> View:
     )
 
 
-def _allan(seen: Sight) -> View:
+def _allan_view(seen: Sight) -> View:
+    """Return the plot of the Allan deviation."""
     axis, tau0_s = seen.axis, 1.0 / seen.axis.rate_hz
     m = cluster_sizes(axis.n, axis.rate_hz)
     measured, _ = overlapping_axis(axis.y, m)
     courses = axis.y - axis.y.mean() - series(axis.residual(seen.likely))
     of_courses, _ = overlapping_axis(courses, m)
     tau_s = np.asarray(m * tau0_s, np.float64)
-    density = _density(seen)
+    density = _density_function(seen)
     noise = allan_of_density(density, tau_s, tau0_s, ())
-    lo, hi = _chi(_freedom(seen, m))
+    lo, hi = _chi2_band(_allan_degrees_of_freedom(seen, m))
     expected = noise + of_courses
     bounds = (np.sqrt(lo * noise + of_courses), np.sqrt(hi * noise + of_courses))
-    unit = RATE[axis.name[0]]
+    unit = LEVEL_UNITS[axis.name[0]]
     return View(
         "allan",
         "averaging time",
@@ -91,16 +105,18 @@ def _allan(seen: Sight) -> View:
     )
 
 
-def _density(seen: Sight) -> Callable[[Floats], Floats]:
+def _density_function(seen: Sight) -> Callable[[Floats], Floats]:
+    """Return the spectral density of the fitted noise as an interpolating function of the frequency in Hz."""
     bins = seen.axis.bins
     x, y = np.log(bins.f_hz), np.log(seen.likely.fitted.variance / seen.axis.rate_hz)
     return lambda f: np.asarray(np.exp(np.interp(np.log(f), x, y)))
 
 
-def _freedom(seen: Sight, m: Ints) -> Floats:
-    """Degrees of freedom of overlapping Allan variances: of Σ a_k Y_k², 2 E²/Var = (Σ a v)²/Σ (a v)².
+def _allan_degrees_of_freedom(seen: Sight, m: Ints) -> Floats:
+    """Return the degrees of freedom of overlapping Allan variances: for Σ a_k Y_k², 2 E²/Var = (Σ a v)²/Σ (a v)².
 
-    a_k ∝ sin⁴(πfτ)/sin²(πfτ0); where a bin holds more than a turn of it, its mean 3/8 and mean square 35/128.
+    The weights are a_k ∝ sin⁴(πfτ)/sin²(πfτ0). If a bin contains more than a period of sin⁴, the mean 3/8 and the mean
+    square 35/128 are used.
     """
     bins, variance = seen.axis.bins, seen.likely.fitted.variance
     f, count = bins.f_hz, bins.count
@@ -116,32 +132,35 @@ def _freedom(seen: Sight, m: Ints) -> Floats:
     return np.maximum(found, 1.0)
 
 
-def _level(seen: Sight) -> View:
+def _level_view(seen: Sight) -> View:
+    """Return the plot of the level over time."""
     axis = seen.axis
-    size = max(1, axis.n // BLOCKS)
+    size = max(1, axis.n // TIME_BLOCKS)
     courses = axis.y - axis.y.mean() - series(axis.residual(seen.likely))
-    measured, expected = _means(axis.y, size), _means(courses, size) + axis.y.mean()
+    measured, expected = _block_means(axis.y, size), _block_means(courses, size) + axis.y.mean()
     t = np.asarray((np.arange(measured.size) + 0.5) * size / axis.rate_hz, np.float64)
     bins = axis.bins
     block = np.sinc(bins.f_hz * size / axis.rate_hz) ** 2
     spread = Z95 * float(np.sqrt((bins.count * seen.likely.fitted.variance * block).sum() / axis.n))
-    unit = RATE[axis.name[0]]
+    unit = LEVEL_UNITS[axis.name[0]]
     return View("level", "time", "s", "level", unit, False, t, measured, expected, expected - spread, expected + spread)
 
 
-def _variance(seen: Sight) -> View:
+def _variance_view(seen: Sight) -> View:
+    """Return the plot of the noise standard deviation over time."""
     axis = seen.axis
-    size = max(1, axis.n // BLOCKS)
+    size = max(1, axis.n // TIME_BLOCKS)
     course = noise_course(seen.likely.effects, axis.n, axis.rate_hz)
-    measured, expected = np.sqrt(_means((seen.fast * course) ** 2, size)), np.sqrt(_means(course**2, size))
+    measured, expected = np.sqrt(_block_means((seen.fast * course) ** 2, size)), np.sqrt(_block_means(course**2, size))
     t = np.asarray((np.arange(measured.size) + 0.5) * size / axis.rate_hz, np.float64)
-    lo, hi = np.sqrt(_chi(np.array([float(size)])))
+    lo, hi = np.sqrt(_chi2_band(np.array([float(size)])))
     return View(
         "variance", "time", "s", "noise over its mean", "1", False, t, measured, expected, lo * expected, hi * expected
     )
 
 
-def _tails(seen: Sight) -> View:
+def _tails_view(seen: Sight) -> View:
+    """Return the plot of the share of samples beyond a distance."""
     sizes = np.sort(np.abs(seen.fast))
     n = sizes.size
     x = np.linspace(0.5, max(float(sizes[-1]), 4.0), 80)
@@ -164,7 +183,8 @@ def _tails(seen: Sight) -> View:
     )
 
 
-def _autocorrelation(seen: Sight) -> View:
+def _autocorrelation_view(seen: Sight) -> View:
+    """Return the plot of the autocorrelation of the whitened series."""
     n = seen.white.size
     size = next_fast_len(n + LAGS, real=True)
     turned = rfft(seen.white, size)
@@ -174,16 +194,17 @@ def _autocorrelation(seen: Sight) -> View:
     return View("autocorrelation", "lag", "s", "autocorrelation", "1", False, lag_s, measured, zero, -band, band)
 
 
-def _temperature(seen: Sight) -> View:
+def _temperature_view(seen: Sight) -> View:
+    """Return the plot of the level over temperature."""
     axis = seen.axis
     warmth = axis.temperature_c
     assert warmth is not None
     courses = axis.y - axis.y.mean() - series(axis.residual(seen.likely))
-    edges = np.linspace(float(warmth.min()), float(warmth.max()), DEGREES + 1)
-    of = np.clip(np.searchsorted(edges, warmth, "right") - 1, 0, DEGREES - 1)
-    count = np.bincount(of, minlength=DEGREES)
+    edges = np.linspace(float(warmth.min()), float(warmth.max()), TEMPERATURE_BINS + 1)
+    of = np.clip(np.searchsorted(edges, warmth, "right") - 1, 0, TEMPERATURE_BINS - 1)
+    count = np.bincount(of, minlength=TEMPERATURE_BINS)
     there = count > 0
-    mean = [np.bincount(of, weights=one, minlength=DEGREES)[there] / count[there] for one in (axis.y, courses)]
+    mean = [np.bincount(of, weights=one, minlength=TEMPERATURE_BINS)[there] / count[there] for one in (axis.y, courses)]
     expected = mean[1] + axis.y.mean()
     longest_s = count[there] / axis.rate_hz
     bins = axis.bins
@@ -195,7 +216,7 @@ def _temperature(seen: Sight) -> View:
         ]
     )
     x = 0.5 * (edges[1:] + edges[:-1])[there]
-    unit = RATE[axis.name[0]]
+    unit = LEVEL_UNITS[axis.name[0]]
     return View(
         "temperature",
         "temperature",
@@ -211,11 +232,12 @@ def _temperature(seen: Sight) -> View:
     )
 
 
-def _means(values: Floats, size: int) -> Floats:
+def _block_means(values: Floats, size: int) -> Floats:
+    """Return the means of consecutive blocks."""
     count = values.size // size
     return np.asarray(values[: count * size].reshape(count, size).mean(axis=1))
 
 
-def _chi(freedom: Floats) -> tuple[Floats, Floats]:
-    """95 % band of a mean square over its expectation."""
+def _chi2_band(freedom: Floats) -> tuple[Floats, Floats]:
+    """Return the 95 % band of a mean square relative to its expectation."""
     return np.asarray(chdtri(freedom, 0.975) / freedom), np.asarray(chdtri(freedom, 0.025) / freedom)

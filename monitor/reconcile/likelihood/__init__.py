@@ -1,1 +1,1 @@
-"""Likelihoods of effects on one axis."""
+"""Likelihood functions for the noise effects of one axis."""

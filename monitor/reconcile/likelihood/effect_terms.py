@@ -1,9 +1,10 @@
-"""How each effect enters the likelihood of an axis, said once for all that fit, propose and describe.
+"""Role of each effect in the likelihood of an axis: noise variance, regressor or transform.
 
-An effect has one **size** that scales it, and **shapes** that do not. Of a ``NOISE`` effect the variance grows with
-the square of its size, and its spectrum with size one is its basis. A ``COURSE`` is a series times its size: the
-regressor is that very series with size one, so that what is fitted is what would be simulated. A ``Leak`` is a course
-whose series is another axis. A transform shapes the bases of all that stand before it.
+Each effect has one **size** that scales it, and **shape parameters** that do not. The variance of a ``NOISE`` effect is
+proportional to the square of its size. Its basis is its spectrum with size one. A ``COURSE`` effect is a deterministic
+series times its size. Its regressor is the series with size one that the simulation also uses, so that fit and
+simulation agree. A ``Leak`` is a deterministic effect whose series is another axis. A transform changes the bases of
+all effects before it.
 """
 
 from dataclasses import replace
@@ -43,7 +44,7 @@ NOISE: Final[dict[type[Effect], str]] = {
     RandomTelegraph: "amplitude",
     PoissonSteps: "height",
 }
-"""Effect -> the parameter that is its size."""
+"""For each noise effect, the parameter that is its size."""
 
 COURSE: Final[dict[type[Effect], str]] = {
     RateRamp: "R",
@@ -55,9 +56,10 @@ COURSE: Final[dict[type[Effect], str]] = {
     GSensitivity: "coefficient",
     CrossAxis: "coefficient",
 }
+"""For each deterministic effect, the parameter that is its size."""
 
 ONCE: Final = frozenset({"bias_step", "noise_step", "turn_on_transient"})
-"""Effects that happen once: one part of a recording says nothing of another."""
+"""Names of the effects that happen once. One part of a recording contains no information about another part."""
 
 
 NATURAL: Final[dict[str, str]] = {
@@ -83,29 +85,78 @@ NATURAL: Final[dict[str, str]] = {
     "saturation": "values",
     "sample_hold": "values",
 }
-"""The lens through which a person would look for an effect, if it passes its threshold there."""
+"""For each effect, the diagnostic that shows it most directly. It is used if it passes its threshold."""
 
 
 def size(effect: Effect) -> float:
-    """Of a noise or a course."""
+    """Return the size of a noise effect or of a deterministic effect."""
     return float(getattr(effect, (NOISE | COURSE)[type(effect)]))
 
 
 def resized(effect: Effect, value: float) -> Effect:
-    """The same with another size; a ramp and an amplitude of a line have no sign."""
+    """Return the effect with another size.
+
+    The size of a noise, of a ramp and of a sinusoid has no sign.
+
+    Parameters
+    ----------
+    effect : Effect
+        Noise effect or deterministic effect.
+    value : float
+        New size, in the unit of the size parameter.
+    """
     name = (NOISE | COURSE)[type(effect)]
     unsigned = isinstance(effect, (RateRamp, Sinusoidal)) or type(effect) in NOISE
     return replace(effect, **{name: abs(value) if unsigned else value})  # type: ignore[type-var]
 
 
 def basis(effect: Effect, f_hz: Floats, tau0_s: float) -> Floats:
-    """Two-sided spectrum [m] of a noise with size one, unit²/Hz before transforms."""
+    """Return the two-sided spectral density of a noise effect with size one, before transforms.
+
+    Parameters
+    ----------
+    effect : Effect
+        Noise effect.
+    f_hz : ndarray of float64, shape (m,)
+        Frequencies in Hz.
+    tau0_s : float
+        Sample period in seconds.
+
+    Returns
+    -------
+    ndarray of float64, shape (m,)
+        Spectral density in unit²/Hz.
+    """
     assert isinstance(effect, Source)
     return np.asarray(resized(effect, 1.0).psd(f_hz, tau0_s))  # type: ignore[attr-defined]
 
 
 def columns(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | None) -> list[Floats]:
-    """Series [n] whose sum, each times a factor, is a course of any size; two for what has a phase or a curve."""
+    """Return the regressors whose linear combinations give a deterministic effect of any size.
+
+    Effects with a phase or a quadratic term have two regressors.
+
+    Parameters
+    ----------
+    effect : Effect
+        Deterministic effect.
+    n : int
+        Number of samples.
+    rate_hz : float
+        Sample rate in Hz.
+    temperature_c : ndarray of float64, shape (n,), or None
+        Temperature in °C.
+
+    Returns
+    -------
+    list of ndarray of float64, shape (n,)
+        One or two series.
+
+    Raises
+    ------
+    TypeError
+        If the effect is a leak, whose series is another axis.
+    """
     if isinstance(effect, Leak):
         raise TypeError("the series of a leak is another axis")
     variants: list[Any]
@@ -118,11 +169,19 @@ def columns(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | None
         ]
     else:
         variants = [resized(effect, 1.0)]
-    return [_drawn(one, n, rate_hz, temperature_c) for one in variants]
+    return [_series_of(one, n, rate_hz, temperature_c) for one in variants]
 
 
 def sized(effect: Effect, factors: Floats) -> Effect:
-    """The effect whose columns have these factors."""
+    """Return the effect whose regressors have the given factors.
+
+    Parameters
+    ----------
+    effect : Effect
+        Deterministic effect.
+    factors : ndarray of float64, shape (1,) or (2,)
+        Factor of each regressor.
+    """
     if isinstance(effect, Sinusoidal):
         return replace(effect, amplitude=hypot(*factors), phase=atan2(factors[1], factors[0]) % (2.0 * pi))
     if isinstance(effect, TemperatureBias) and effect.quadratic is not None:
@@ -130,9 +189,10 @@ def sized(effect: Effect, factors: Floats) -> Effect:
     return resized(effect, float(factors[0]))
 
 
-def _drawn(effect: Source, n: int, rate_hz: float, temperature_c: Floats | None) -> Floats:
+def _series_of(effect: Source, n: int, rate_hz: float, temperature_c: Floats | None) -> Floats:
+    """Return the series of a deterministic effect."""
     values = np.zeros(n)
     warmth = np.full(n, np.nan) if temperature_c is None else temperature_c
-    # a course draws nothing: the generator is a formality
+    # a deterministic effect draws no random numbers, but the interface requires a generator
     effect.start(rate_hz, np.random.default_rng(0)).add(values, Block(0, warmth, np.empty(n)))
     return values

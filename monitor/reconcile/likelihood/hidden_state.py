@@ -1,13 +1,14 @@
-"""Likelihoods for effects that share a spectrum: what ``telegraph`` and ``steps`` have in common.
+"""Shared parts of the likelihoods for effects that have the same spectrum.
 
-A random telegraph has the second moments of exponentially correlated noise, Poisson steps those of a random walk. What
-differs is the distribution, so both of a pair are given their full likelihood on the same data, with the same noise
-around it: that is a ``Contest``. Its gain is the logarithm of the ratio of the likelihoods, each at its maximum; the
-prices of parameters and of prejudice are the caller's.
+A random telegraph has the same second moments as exponentially correlated noise. Poisson steps have the same second
+moments as a random walk. Only the distributions differ. Both effects of a pair therefore get their full likelihood on
+the same data with the same additional noise. The result is a ``ModelComparison``. Its gain is the logarithm of the
+ratio of the two likelihoods, each at its maximum. The caller subtracts penalties for parameters and prior odds.
 
-Data are block means. The noise around is ``Rest``: white, random walk, flicker, exponentially correlated, written as
-independent first-order processes whose mean over a block is known given where they begin: a block costs one step of a
-Kalman filter, and no error is made by averaging. The level begins anywhere: a flat prior, the same on both sides.
+The data are block means. The additional noise is a ``Rest``: white, random walk, flicker and exponentially correlated
+noise. It is written as a sum of independent first-order processes whose block means are known given their value at the
+start of the block. Each block thus needs one step of a Kalman filter, and averaging adds no error. The first level has
+a nearly flat prior, the same for both effects.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -21,30 +22,36 @@ from drivers.sample import Floats
 from monitor.common.compiled import compiled
 from monitor.reconcile.result import Bounds
 
-MOST_BLOCKS: Final = 1 << 15
-"""Of a longer recording the first blocks stand for all."""
-WANTED: Final = 200.0
-"""Blocks in a recording, unless its samples are fewer."""
-FEWEST_BLOCKS: Final = 16
-ANYWHERE: Final = 100.0
-"""Variance of the first level, in variances of the data: as good as infinite, and the same for both models."""
-DECADE: Final = 10.0
-"""Spacing of the processes that make flicker: their sum then ripples by 5 % about 1/f."""
-WHITE_RULES: Final = 20.0
-"""Flicker is not modelled above this many times the frequency at which it crosses the white noise."""
-DEVIATIONS: Final = 1.96
-"""Standard deviations either side that hold 95 of 100."""
-NEARBY: Final = 0.1
-"""Spacing, in the logarithm of a parameter, of the points from which the curvature at the maximum is taken."""
-LITTLE: Final = 1e-3
-"""Relative change of the odds by which events are counted."""
+MAX_BLOCKS: Final = 1 << 15
+"""Largest number of blocks. Only the first blocks of a longer recording are used."""
+TARGET_BLOCKS: Final = 200.0
+"""Number of blocks in a recording, unless it has fewer samples."""
+MIN_BLOCKS: Final = 16
+"""Smallest number of blocks."""
+INITIAL_VARIANCE_RATIO: Final = 100.0
+"""Prior variance of the first level relative to the variance of the data. It is effectively infinite and the same for
+both effects.
+"""
+FLICKER_TIME_RATIO: Final = 10.0
+"""Ratio of successive correlation times of the processes that approximate flicker noise. Their sum deviates by 5 % from
+1/f.
+"""
+FLICKER_CUTOFF_RATIO: Final = 20.0
+"""Highest frequency at which flicker noise is modelled, relative to the frequency at which it equals the white noise.
+"""
+INTERVAL_SIGMAS: Final = 1.96
+"""Number of standard deviations on each side of a 95 % interval."""
+CURVATURE_STEP: Final = 0.1
+"""Step in the logarithm of a parameter for the numerical curvature at the maximum."""
+ODDS_STEP: Final = 1e-3
+"""Relative change of the odds for the numerical derivative that counts the events."""
 FACTOR: Final = log(30.0)
-"""Farther from its start than this a parameter is not followed."""
+"""Largest distance of the logarithm of a parameter from its starting value."""
 
 
 @dataclass(frozen=True, slots=True)
-class Contest:
-    """Two explanations of one axis."""
+class ModelComparison:
+    """Comparison of two effects that have the same spectrum on one axis."""
 
     gain: float  # log-likelihood of the first minus that of the second
     first: Mapping[str, Bounds]  # parameters at the maximum, SI, 95 %
@@ -54,73 +61,104 @@ class Contest:
 
 @dataclass(frozen=True, slots=True)
 class Rest:
-    """The other noise of an axis; two-sided spectra."""
+    """Additional noise of an axis, as two-sided spectra."""
 
     white: float  # N²: S(f) = N², unit² s
     walk: float = 0.0  # K²: S(f) = K²/(2πf)², unit²/s
     flicker: float = 0.0  # B²: S(f) = B²/(2πf), unit²
-    correlated: tuple[tuple[float, float], ...] = ()  # σ, unit, and T_c, s, of each exponentially correlated noise
+    correlated: tuple[tuple[float, float], ...] = ()  # (σ, unit; T_c, s) of each exponentially correlated noise
 
 
-class Parts(NamedTuple):
-    """The noise of block means, as sum of independent first-order processes and of white noise.
+class StateSpaceNoise(NamedTuple):
+    """Noise of block means as a sum of independent first-order processes and of white noise.
 
-    From the start of one block to the start of the next x ← decay·x + w, and the mean of the block is seen·x + v with
-    Var w = drive, Cov(v, w) = shared. The first process is the level, with the random walk on it.
+    From the start of one block to the start of the next, x ← decay·x + w. The mean of the block is seen·x + v, with Var
+    w = drive and Cov(v, w) = shared. The first process is the level, including the random walk.
     """
 
     table: Floats  # [d, 4] decay, seen, drive, shared
-    white: float  # variance of white noise and of all v
+    white: float  # variance of the white noise and of all v
 
 
 class Peak(NamedTuple):
-    """A maximum of a log-likelihood over the logarithms of its parameters."""
+    """Maximum of a log-likelihood over the logarithms of its parameters."""
 
-    height: float
+    height: float  # log-likelihood at the maximum
     at: Floats  # [k] parameters
-    deviation: Floats  # [k] standard deviations of their logarithms; NaN where there is no peak
+    deviation: Floats  # [k] standard deviations of their logarithms; NaN if there is no maximum
 
     def bounds(self, k: int) -> Bounds:
-        """Parameter ``k`` with its 95 % interval; none where it is wider than the search."""
-        value, wide = float(self.at[k]), DEVIATIONS * float(self.deviation[k])
+        """Return parameter ``k`` with its 95 % interval, or without an interval if it is wider than the search."""
+        value, wide = float(self.at[k]), INTERVAL_SIGMAS * float(self.deviation[k])
         return Bounds(value, value * exp(-wide), value * exp(wide)) if wide < FACTOR else Bounds(value)
 
 
-class Process(NamedTuple):
-    """Events at random times, at the maximum of their likelihood."""
+class EventProcessFit(NamedTuple):
+    """Fit of a process of random events at the maximum of its likelihood."""
 
     peak: Peak
     names: tuple[str, str]
-    events: float  # expected, given the data
+    events: float  # expected number of events, given the data
 
     @property
     def parameters(self) -> dict[str, Bounds]:
-        """By name."""
+        """Parameters with their intervals, by name."""
         return {name: self.peak.bounds(k) for k, name in enumerate(self.names)}
 
 
 def block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Floats, float]:
-    """Means of blocks of about ``block_s``, less their mean, and their true length in s.
+    """Return the means of consecutive blocks without their overall mean, and the length of a block.
 
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Series in the unit of the axis.
+    tau0_s : float
+        Sample period in seconds.
+    block_s : float
+        Approximate length of a block in seconds.
+
+    Returns
+    -------
+    means : ndarray of float64, shape (m,)
+        Block means in the unit of ``y``.
+    block_s : float
+        Exact length of a block in seconds.
+
+    Raises
+    ------
+    ValueError
+        If the series has too few blocks.
+
+    Examples
+    --------
     >>> block_means(np.arange(48.0), 0.5, 1.4)[0][:3].tolist(), block_means(np.arange(48.0), 0.5, 1.4)[1]
     ([-22.5, -19.5, -16.5], 1.5)
-
-    Raises:
-        ValueError: too short a series for that
     """
     size = max(1, round(block_s / tau0_s))
-    count = min(y.size // size, MOST_BLOCKS)
-    if count < FEWEST_BLOCKS:
-        raise ValueError(f"{count} blocks of {size * tau0_s:g} s; at least {FEWEST_BLOCKS} are needed")
+    count = min(y.size // size, MAX_BLOCKS)
+    if count < MIN_BLOCKS:
+        raise ValueError(f"{count} blocks of {size * tau0_s:g} s; at least {MIN_BLOCKS} are needed")
     means = y[: count * size].reshape(count, size).mean(1)
     return means - means.mean(), size * tau0_s
 
 
-def parts(rest: Rest, block_s: float, span_s: float) -> Parts:
-    """``rest`` as it shows in means over ``block_s`` of a recording that lasts ``span_s``.
+def parts(rest: Rest, block_s: float, span_s: float) -> StateSpaceNoise:
+    """Return the noise as it appears in block means.
 
-    Raises:
-        ValueError: no white noise: then nothing hides a single switch, and no likelihood is needed
+    Parameters
+    ----------
+    rest : Rest
+        Noise of the axis.
+    block_s : float
+        Length of a block in seconds.
+    span_s : float
+        Length of the recording in seconds.
+
+    Raises
+    ------
+    ValueError
+        If there is no white noise. Every single switch is then visible and no likelihood is needed.
     """
     if not rest.white > 0.0:
         raise ValueError(f"white noise of {rest.white:g}; it must be above zero")
@@ -130,14 +168,31 @@ def parts(rest: Rest, block_s: float, span_s: float) -> Parts:
         row, own = markov(sigma, time_s, block_s)
         rows.append(row)
         white += own
-    return Parts(np.array(rows), white)
+    return StateSpaceNoise(np.array(rows), white)
 
 
 def markov(sigma: float, time_s: float, block_s: float) -> tuple[tuple[float, float, float, float], float]:
-    """Exponentially correlated noise in block means: its row of ``Parts.table``, and the variance of its v.
+    """Return exponentially correlated noise as it appears in block means.
 
-    With x = Δ/T_c the mean of a block has variance σ² 2(x − 1 + e^−x)/x², and covariance σ² (1 − e^−x)/x with either
-    end (integrals of σ² e^−|t|/T_c); given the start of the block, what is left of them.
+    With x = Δ/T_c the mean of a block has the variance σ² 2(x − 1 + e^−x)/x². Its covariance with the value at either
+    end is σ² (1 − e^−x)/x. Both are integrals of σ² e^−|t|/T_c. The result is conditional on the value at the start of
+    the block.
+
+    Parameters
+    ----------
+    sigma : float
+        Standard deviation, in the unit of the axis.
+    time_s : float
+        Correlation time in seconds.
+    block_s : float
+        Length of a block in seconds.
+
+    Returns
+    -------
+    row : tuple of float
+        Row of ``StateSpaceNoise.table``.
+    variance : float
+        Variance of the block mean that is not explained by the start of the block.
     """
     x = block_s / time_s
     decay, seen = exp(-x), -float(np.expm1(-x)) / x
@@ -146,23 +201,46 @@ def markov(sigma: float, time_s: float, block_s: float) -> tuple[tuple[float, fl
 
 
 def flicker(rest: Rest, block_s: float, span_s: float) -> list[tuple[float, float]]:
-    """σ and T_c of exponentially correlated noises whose sum is B²/(2πf) from 1/span to where white noise rules.
+    """Return exponentially correlated noises whose sum is flicker noise.
 
-    Processes of equal variance s, equally spaced by ln ρ in ln T_c, add to πs/(ln ρ 2πf) (Keshner, "1/f noise",
-    Proc. IEEE 70, 1982): s = B² ln ρ/π.
+    The sum is B²/(2πf) from 1/span to the frequency at which white noise dominates. Processes with equal variance s and
+    with a constant spacing ln ρ of ln T_c add up to πs/(ln ρ 2πf) (Keshner, "1/f noise", Proc. IEEE 70, 1982).
+    Therefore s = B² ln ρ/π.
+
+    Parameters
+    ----------
+    rest : Rest
+        Noise of the axis.
+    block_s : float
+        Length of a block in seconds.
+    span_s : float
+        Length of the recording in seconds.
+
+    Returns
+    -------
+    list of tuple of float
+        Standard deviation, in the unit of the axis, and correlation time in seconds of each process.
     """
     if rest.flicker <= 0.0:
         return []
     slowest = span_s / pi
-    fastest = min(max(block_s / pi, rest.white / (WHITE_RULES * rest.flicker)), 0.1 * slowest)
-    count = ceil(log(slowest / fastest) / log(DECADE)) + 1
+    fastest = min(max(block_s / pi, rest.white / (FLICKER_CUTOFF_RATIO * rest.flicker)), 0.1 * slowest)
+    count = ceil(log(slowest / fastest) / log(FLICKER_TIME_RATIO)) + 1
     spacing = log(slowest / fastest) / (count - 1)
     sigma = (rest.flicker * spacing / pi) ** 0.5
     return [(sigma, slowest * exp(-k * spacing)) for k in range(count)]
 
 
 def maximise(log_likelihood: Callable[..., float], start: Sequence[float]) -> Peak:
-    """The maximum over positive parameters, by the simplex method in their logarithms from ``start``."""
+    """Maximise a log-likelihood over positive parameters, by the Nelder-Mead method in their logarithms.
+
+    Parameters
+    ----------
+    log_likelihood : callable
+        Function of the parameters.
+    start : sequence of float
+        Starting values of the parameters.
+    """
     from scipy.optimize import minimize
 
     origin = np.log(np.asarray(start, np.float64))
@@ -180,44 +258,54 @@ def maximise(log_likelihood: Callable[..., float], start: Sequence[float]) -> Pe
     return Peak(-float(found.fun), np.exp(found.x), deviation)
 
 
-def fit_process(likelihood: Callable[[float, float, float], float], start: Mapping[str, float]) -> Process:
-    """The maximum over two named parameters from ``start``; the third argument is a factor on the odds of an event.
+def fit_process(likelihood: Callable[[float, float, float], float], start: Mapping[str, float]) -> EventProcessFit:
+    """Maximise the likelihood of a process of random events over its two parameters.
 
-    Fisher's identity: the derivative of the log-likelihood by the logarithm of that factor is the number of events
-    expected from the data.
+    The number of events expected from the data is the derivative of the log-likelihood by the logarithm of the odds of
+    an event (Fisher's identity).
+
+    Parameters
+    ----------
+    likelihood : callable
+        Function of the two parameters and of a factor on the odds of an event.
+    start : mapping of str to float
+        Names and starting values of the two parameters.
     """
     first, second = start
     peak = maximise(lambda a, b: likelihood(a, b, 1.0), (start[first], start[second]))
     a, b = peak.at.tolist()
-    events = (likelihood(a, b, 1.0 + LITTLE) - peak.height) / LITTLE
-    return Process(peak, (first, second), events)
+    events = (likelihood(a, b, 1.0 + ODDS_STEP) - peak.height) / ODDS_STEP
+    return EventProcessFit(peak, (first, second), events)
 
 
 def _simplex(origin: Floats) -> Floats:
+    """Return the initial simplex."""
     return np.vstack([origin, origin + 0.3 * np.eye(origin.size)])
 
 
 def _curvature(function: Callable[[Floats], float], at: Floats, height: float) -> Floats:
-    """Second derivatives [k, k], from differences over ``NEARBY``."""
+    """Return the second derivatives, shape (k, k), from differences over ``CURVATURE_STEP``."""
     k = at.size
-    steps = NEARBY * np.eye(k)
+    steps = CURVATURE_STEP * np.eye(k)
     curvature = np.empty((k, k))
     for i in range(k):
         curvature[i, i] = function(at + steps[i]) - 2.0 * height + function(at - steps[i])
         for j in range(i):
             crossed = [function(at + p * steps[i] + q * steps[j]) * p * q for p in (1.0, -1.0) for q in (1.0, -1.0)]
             curvature[i, j] = curvature[j, i] = 0.25 * sum(crossed)
-    return curvature / NEARBY**2
+    return curvature / CURVATURE_STEP**2
 
 
 def anywhere(means: Floats) -> float:
-    """Variance of the first level."""
-    return ANYWHERE * float(means.var())
+    """Return the prior variance of the first level."""
+    return INITIAL_VARIANCE_RATIO * float(means.var())
 
 
 @compiled
-def begin(table, start):  # type: ignore[no-untyped-def]
-    """Covariance [d, d] before the first block: the level anywhere, the others stationary."""
+def initial_covariance(table, start):  # type: ignore[no-untyped-def]
+    """Return the state covariance, shape (d, d), before the first block: a wide prior for the level, stationary for the
+    others.
+    """
     d = table.shape[0]
     covariance = np.zeros((d, d))
     covariance[0, 0] = start
@@ -227,8 +315,8 @@ def begin(table, start):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def predict(table, covariance, reach):  # type: ignore[no-untyped-def]
-    """Variance of a block's mean without its v, and in ``reach`` [d] its covariance with the next start."""
+def predict_block(table, covariance, reach):  # type: ignore[no-untyped-def]
+    """Return the variance of a block mean without its v. Store its covariance with the next state in ``reach`` [d]."""
     d = table.shape[0]
     variance = 0.0
     for i in range(d):
@@ -242,12 +330,15 @@ def predict(table, covariance, reach):  # type: ignore[no-untyped-def]
 
 @compiled
 def kalman(means, table, white, start):  # type: ignore[no-untyped-def]
-    """Log-likelihood of Gaussian noise (Anderson & Moore, "Optimal Filtering", 1979, sections 5.5 and 10.4)."""
+    """Return the log-likelihood of Gaussian noise in block means.
+
+    The Kalman filter follows Anderson & Moore, "Optimal Filtering", 1979, sections 5.5 and 10.4.
+    """
     d = table.shape[0]
-    covariance, at, reach = begin(table, start), np.zeros(d), np.empty(d)
+    covariance, at, reach = initial_covariance(table, start), np.zeros(d), np.empty(d)
     total = 0.0
     for z in means:
-        variance = predict(table, covariance, reach) + white
+        variance = predict_block(table, covariance, reach) + white
         innovation = z
         for i in range(d):
             innovation -= table[i, 1] * at[i]

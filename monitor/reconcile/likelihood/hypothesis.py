@@ -1,9 +1,9 @@
-"""A hypothesis about one axis: the effects of the model, some of them of another size, and effects that were found.
+"""Hypothesis about one axis: effects of the model, some of them with another size, and effects that were found.
 
-The sizes that a model gives are believed until the data object: the size of a noise is fitted only where that is worth
-RETUNED nats of likelihood. So a model whose N is 5 % off gets another N and no new name, while a K that is right keeps
-its weight against everything that looks like a random walk. Sizes of what was found, and of all courses (a line, a
-slope, what follows temperature), are always fitted.
+The sizes in a model are kept unless the data contradict them. The size of a noise effect is fitted only if this gains
+more than ``RESIZE_PENALTY_NATS`` of log-likelihood. A model whose N is 5 % wrong thus gets another N and no new effect.
+A correct K keeps its size against everything that looks like a random walk. The sizes of new effects and of all
+deterministic effects (lines, slopes, temperature dependence) are always fitted.
 """
 
 from collections.abc import Sequence
@@ -18,61 +18,83 @@ from monitor.reconcile.likelihood.effect_terms import COURSE, NOISE, size
 from monitor.reconcile.preparation.axis import Axis, Effects, Likely
 from monitor.reconcile.result import Bounds
 
-RETUNED: Final = 5.0
-"""Nats that another size of a known noise must be worth."""
+RESIZE_PENALTY_NATS: Final = 5.0
+"""Log-likelihood gain in nats that justifies another size of a noise effect of the model."""
 Z95: Final = 1.959964
-HALF: Final = 1.920729
-"""Nats below the maximum at the ends of a 95 % interval of one parameter: χ²(0.95; 1)/2."""
+"""Number of standard deviations on each side of a 95 % interval."""
+CHI2_HALF_NATS: Final = 1.920729
+"""Decrease of the log-likelihood at the ends of a 95 % interval of one parameter, in nats: χ²(0.95; 1)/2."""
 GOLDEN: Final = 0.6180339887498949
+"""Inverse of the golden ratio."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """Effects, fitted."""
+    """Fitted effects of one axis."""
 
-    model: Effects  # of the model under test, as it stands; they are the first of ``effects``
+    model: Effects  # effects of the model under test with their original sizes; they come first in ``effects``
     likely: Likely
 
     @property
     def given(self) -> int:
-        """How many effects stand in the model under test."""
+        """Number of effects in the model under test."""
         return len(self.model)
 
     @property
     def found(self) -> Effects:
-        """Beyond the model."""
+        """Effects that are not in the model under test."""
         return self.likely.effects[self.given :]
 
     @property
     def effects(self) -> Effects:
-        """With fitted sizes."""
+        """All effects with fitted sizes."""
         return self.likely.effects
 
     @property
     def freed(self) -> int:
-        """Noises of the model that have another size."""
+        """Number of noise effects of the model whose size was fitted."""
         return sum(at < self.given for at in self.likely.noises)
 
     @property
     def score(self) -> float:
-        """ln L less what other sizes cost."""
-        return self.likely.log_likelihood - RETUNED * self.freed
+        """Log-likelihood less the penalty for the fitted sizes of the model, in nats."""
+        return self.likely.log_likelihood - RESIZE_PENALTY_NATS * self.freed
 
 
 def believed(axis: Axis, model: Effects) -> Hypothesis:
-    """A model as it stands: only courses, whose sizes differ from run to run, are fitted."""
+    """Fit the deterministic effects of a model and keep the sizes of its noise effects.
+
+    The sizes of deterministic effects differ from recording to recording.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    model : tuple of Effect
+        Effects of the axis in the model under test.
+    """
     return Hypothesis(model, axis.fit(model, frozenset(at for at, e in enumerate(model) if type(e) in NOISE)))
 
 
 def settled(axis: Axis, found: Sequence[Effect], model: Effects) -> Hypothesis:
-    """Fit what was found beside a model, with as few other sizes of the model's noises as the data ask for."""
+    """Fit new effects together with a model and change as few sizes of the model as the data require.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    found : sequence of Effect
+        Effects that are added to the model.
+    model : tuple of Effect
+        Effects of the axis in the model under test.
+    """
     effects = (*model, *found)
     held = frozenset(at for at, effect in enumerate(model) if type(effect) in NOISE)
     best = Hypothesis(model, axis.fit(effects, held))
     if not held:
         return best
     free = axis.fit(effects)
-    if free.log_likelihood - best.likely.log_likelihood < RETUNED:
+    if free.log_likelihood - best.likely.log_likelihood < RESIZE_PENALTY_NATS:
         return best
     while held:
         trials = [Hypothesis(model, axis.fit(effects, held - {at})) for at in sorted(held)]
@@ -80,40 +102,69 @@ def settled(axis: Axis, found: Sequence[Effect], model: Effects) -> Hypothesis:
         if better.score <= best.score:
             break
         best, held = better, better.likely.held
-    # one noise may have stood in for two others
+    # freeing sizes one at a time may miss that two sizes are wrong together
     loose = Hypothesis(model, free)
     if loose.score > best.score:
         best = loose
     return best
 
 
-def refined(axis: Axis, effects: Effects, at: int, names: Sequence[str], reach: float = 1.5) -> Effects:
-    """Shapes of one effect at their best, all sizes free: in turns, by golden section in their logarithm.
+def refined(axis: Axis, effects: Effects, index: int, names: Sequence[str], reach: float = 1.5) -> Effects:
+    """Maximise the likelihood over shape parameters of one effect with all sizes free.
 
-    Args:
-        at: index of the effect
-        names: its shapes
-        reach: factor up and down that is searched at first
+    The parameters are varied in turn, by golden-section search in their logarithm.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    effects : tuple of Effect
+        Effects of the axis.
+    index : int
+        Index of the effect whose shape is varied.
+    names : sequence of str
+        Names of its shape parameters.
+    reach : float, optional
+        Factor by which the first search extends up and down.
+
+    Returns
+    -------
+    tuple of Effect
+        Effects with the best shape. Sizes are not changed.
     """
     found = effects
     for turn in range(1 if len(names) == 1 else 3):
         for name in names:
             width = log(reach) / (turn + 1)
-            middle = log(getattr(found[at], name))
-            best = _golden(axis, found, at, name, middle - width, middle + width)
-            found = with_shape(found, at, name, exp(best))
+            middle = log(getattr(found[index], name))
+            best = _golden_section(axis, found, index, name, middle - width, middle + width)
+            found = with_shape(found, index, name, exp(best))
     return found
 
 
-def with_shape(effects: Effects, at: int, name: str, value: float) -> Effects:
-    """Another value of one parameter of one effect."""
-    changed: Any = replace(effects[at], **{name: value})  # type: ignore[type-var]
-    return (*effects[:at], changed, *effects[at + 1 :])
+def with_shape(effects: Effects, index: int, name: str, value: float) -> Effects:
+    """Return the effects with another value of one parameter of one effect.
+
+    Parameters
+    ----------
+    effects : tuple of Effect
+        Effects of the axis.
+    index : int
+        Index of the effect to change.
+    name : str
+        Name of the parameter.
+    value : float
+        New value, in the unit of the parameter.
+    """
+    changed: Any = replace(effects[index], **{name: value})  # type: ignore[type-var]
+    return (*effects[:index], changed, *effects[index + 1 :])
 
 
-def _golden(axis: Axis, effects: Effects, at: int, name: str, lo: float, hi: float) -> float:
+def _golden_section(axis: Axis, effects: Effects, index: int, name: str, lo: float, hi: float) -> float:
+    """Return the logarithm of the shape parameter with the largest likelihood within an interval."""
+
     def value(x: float) -> float:
-        return axis.fit(with_shape(effects, at, name, exp(x))).log_likelihood
+        return axis.fit(with_shape(effects, index, name, exp(x))).log_likelihood
 
     a, b = hi - GOLDEN * (hi - lo), lo + GOLDEN * (hi - lo)
     at_a, at_b = value(a), value(b)
@@ -129,36 +180,57 @@ def _golden(axis: Axis, effects: Effects, at: int, name: str, lo: float, hi: flo
     return 0.5 * (lo + hi)
 
 
-def size_bounds(likely: Likely, at: int) -> Bounds:
-    """95 % interval of the size of an effect.
+def size_bounds(likely: Likely, index: int) -> Bounds:
+    """Return the size of an effect with its 95 % interval.
 
-    A standard deviation is as its logarithm, a size with a sign is Gaussian.
+    The logarithm of a standard deviation, and the value of a signed size, is taken as Gaussian.
+
+    Parameters
+    ----------
+    likely : Likely
+        Fit that contains the effect.
+    index : int
+        Index of the effect.
     """
-    value, error = size(likely.effects[at]), likely.error(at)
-    if type(likely.effects[at]) in COURSE:
+    value, error = size(likely.effects[index]), likely.error(index)
+    if type(likely.effects[index]) in COURSE:
         return Bounds(value, value - Z95 * error, value + Z95 * error)
     if not value > 0.0 or not np.isfinite(error):
         return Bounds(value)
     return Bounds(value, value * exp(-Z95 * error / value), value * exp(Z95 * error / value))
 
 
-def shape_bounds(axis: Axis, hypothesis: Hypothesis, at: int, name: str) -> Bounds:
-    """95 % interval of a shape: where the profile of the likelihood falls by HALF, by its two flanks."""
+def shape_bounds(axis: Axis, hypothesis: Hypothesis, index: int, name: str) -> Bounds:
+    """Return a shape parameter with its 95 % interval from the profile likelihood.
+
+    Each end of the interval is the value at which the log-likelihood has fallen by ``CHI2_HALF_NATS``.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis that was fitted.
+    hypothesis : Hypothesis
+        Fitted effects.
+    index : int
+        Index of the effect.
+    name : str
+        Name of the shape parameter.
+    """
     effects, held = hypothesis.effects, hypothesis.likely.held
-    value = float(getattr(effects[at], name))
+    value = float(getattr(effects[index], name))
     top = hypothesis.likely.log_likelihood
 
     def fall(factor: float) -> float:
-        return top - axis.fit(with_shape(effects, at, name, value * factor), held).log_likelihood
+        return top - axis.fit(with_shape(effects, index, name, value * factor), held).log_likelihood
 
     ends = []
     for sign in (-1.0, 1.0):
         step = 1e-6
-        while step < 2.0 and fall(exp(sign * step)) < HALF:
+        while step < 2.0 and fall(exp(sign * step)) < CHI2_HALF_NATS:
             step *= 2.0
         lo, hi = 0.5 * step, step
         for _ in range(8):
             middle = 0.5 * (lo + hi)
-            lo, hi = (middle, hi) if fall(exp(sign * middle)) < HALF else (lo, middle)
+            lo, hi = (middle, hi) if fall(exp(sign * middle)) < CHI2_HALF_NATS else (lo, middle)
         ends.append(value * exp(sign * hi))
     return Bounds(value, ends[0], ends[1])

@@ -1,11 +1,11 @@
-"""Poisson steps, or something with the same second moments: a random walk.
+"""Likelihood ratio of Poisson steps and a random walk, which have the same second moments.
 
-Poisson steps are a jump mixture: in a block there is a jump of Gaussian height, or there is none. Whether there was one
-shows only some blocks later, so hypotheses are kept apart by the time since their last jump; those for which it is the
-same are merged into one Gaussian of their mean and covariance (Harrison & Stevens, "Bayesian forecasting", J. R.
-Statist. Soc. B 38, 1976; by run length: Fearnhead & Liu, "On-line inference for multiple changepoint problems", ibid.
-69, 2007). A random walk is the limit of ever more and ever smaller jumps, so it loses little at the worst: not the
-sign of the gain but its size says that there are jumps.
+Poisson steps are a mixture: each block contains a jump of Gaussian height or no jump. Several later blocks are needed
+to decide whether there was a jump. The filter therefore keeps separate hypotheses by the time since the last jump.
+Hypotheses with the same time are merged into one Gaussian with their mean and covariance (Harrison & Stevens, "Bayesian
+forecasting", J. R. Statist. Soc. B 38, 1976; by run length: Fearnhead & Liu, "On-line inference for multiple
+changepoint problems", ibid. 69, 2007). A random walk is the limit of many small jumps, so Poisson steps never fit much
+worse. The size of the gain indicates jumps, not its sign.
 """
 
 from dataclasses import replace
@@ -17,58 +17,72 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
 from monitor.reconcile.likelihood.hidden_state import (
-    WANTED,
-    Contest,
-    Parts,
-    Process,
+    TARGET_BLOCKS,
+    EventProcessFit,
+    ModelComparison,
     Rest,
+    StateSpaceNoise,
     anywhere,
-    begin,
     block_means,
     fit_process,
+    initial_covariance,
     kalman,
     maximise,
     parts,
-    predict,
+    predict_block,
 )
 
-FINE: Final = 3.0
-"""Blocks in N/K, the time in which white noise and a random walk grow equal."""
-AGES: Final = 16
-"""Hypotheses: a jump in the newest block, in the one before, and so on; the last holds all that are older.
+BLOCKS_PER_CROSSING_TIME: Final = 3.0
+"""Number of blocks in N/K, the time at which white noise and random walk are equal."""
+JUMP_AGES: Final = 16
+"""Number of hypotheses: a jump in the newest block, in the block before, and so on. The last one holds all older jumps.
 
-Together five times N/K: with a memory of 1.3 of them the rate comes out 15 to 25 % low, with 2.7 of them 5 to 10 %.
+Together they cover five times N/K. If they cover 1.3 times N/K, the rate is 15 to 25 % too low; with 2.7 times N/K it
+is 5 to 10 % too low.
 """
-GONE: Final = 1e-6
-"""Probability of a hypothesis that is given up."""
-OFTEN: Final = 2.0
-"""Jumps in N/K beyond which no search begins: they are too small to be seen one by one."""
-STARTS: Final = 6
+MIN_HYPOTHESIS_PROBABILITY: Final = 1e-6
+"""Probability below which a hypothesis is dropped."""
+MAX_START_JUMPS: Final = 2.0
+"""Largest number of jumps in N/K at the start of a search. More frequent jumps are too small to be seen one by one."""
+START_RATES: Final = 6
+"""Number of starting rates."""
 
 
-def steps_or_walk(y: Floats, tau0_s: float, rest: Rest, K: float) -> Contest:
-    """Poisson steps (first) against a random walk (second).
+def steps_or_walk(y: Floats, tau0_s: float, rest: Rest, K: float) -> ModelComparison:
+    """Compare Poisson steps with a random walk.
 
-    Args:
-        y: [n] series of one axis, unit of the axis, without gaps
-        tau0_s: s between samples
-        rest: the other noise of the axis; a random walk in it is there besides, on both sides
-        K: coefficient of the random walk in question, unit/√s, where the search begins; above zero
-    Returns:
-        ``rate`` and ``height`` against ``K``; jumps of the Poisson steps
-    Raises:
-        ValueError: hardly any samples, or no white noise
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Series in the unit of the axis, without gaps.
+    tau0_s : float
+        Sample period in seconds.
+    rest : Rest
+        Additional noise of the axis. A random walk in it is present in both alternatives.
+    K : float
+        Starting value of the random walk coefficient, in unit/√s, above zero.
+
+    Returns
+    -------
+    ModelComparison
+        ``rate`` and ``height`` of the Poisson steps (first), ``K`` of the random walk (second), and the number of
+        jumps.
+
+    Raises
+    ------
+    ValueError
+        If there are too few samples or no white noise.
     """
     means, block_s = block_means(y, tau0_s, block_for(y.size * tau0_s, rest, K))
     start, span_s = anywhere(means), means.size * block_s
 
     def walk(K: float) -> float:
-        around = parts(replace(rest, walk=rest.walk + K * K), block_s, span_s)
-        return float(kalman(means, around.table, around.white, start))
+        noise = parts(replace(rest, walk=rest.walk + K * K), block_s, span_s)
+        return float(kalman(means, noise.table, noise.white, start))
 
     first = fit_jumps(means, block_s, rest, K)
     second = maximise(walk, (K,))
-    return Contest(
+    return ModelComparison(
         first.peak.height - second.height,
         first.parameters,
         {"K": second.bounds(0)},
@@ -77,60 +91,97 @@ def steps_or_walk(y: Floats, tau0_s: float, rest: Rest, K: float) -> Contest:
 
 
 def block_for(span_s: float, rest: Rest, K: float) -> float:
-    """Length of a block, s."""
+    """Return the length of a block in seconds.
+
+    Parameters
+    ----------
+    span_s : float
+        Length of the recording in seconds.
+    rest : Rest
+        Additional noise of the axis.
+    K : float
+        Random walk coefficient in unit/√s.
+    """
     crossing_s: float = rest.white**0.5 / K
-    return min(crossing_s / FINE, span_s / WANTED)
+    return min(crossing_s / BLOCKS_PER_CROSSING_TIME, span_s / TARGET_BLOCKS)
 
 
-def fit_jumps(means: Floats, block_s: float, rest: Rest, K: float) -> Process:
-    """Maximum over rate and height, from the likeliest of some rates whose second moments are those of ``K``."""
+def fit_jumps(means: Floats, block_s: float, rest: Rest, K: float) -> EventProcessFit:
+    """Maximise the likelihood over the rate and the height of the jumps.
+
+    The search starts from the likeliest of several rates, with the second moments of a random walk ``K``.
+
+    Parameters
+    ----------
+    means : ndarray of float64, shape (m,)
+        Block means in the unit of the axis.
+    block_s : float
+        Length of a block in seconds.
+    rest : Rest
+        Additional noise of the axis.
+    K : float
+        Random walk coefficient in unit/√s.
+    """
     span_s, start = means.size * block_s, anywhere(means)
-    around = parts(rest, block_s, span_s)
+    noise = parts(rest, block_s, span_s)
 
     def poisson(rate: float, height: float, odds: float = 1.0) -> float:
-        return log_likelihood(means, around, start, rate * block_s, height, odds)
+        return log_likelihood(means, noise, start, rate * block_s, height, odds)
 
-    rates = np.geomspace(2.0 / span_s, max(OFTEN * K / rest.white**0.5, 4.0 / span_s), STARTS)
+    rates = np.geomspace(2.0 / span_s, max(MAX_START_JUMPS * K / rest.white**0.5, 4.0 / span_s), START_RATES)
     rate = max(rates, key=lambda rate: poisson(rate, K / rate**0.5))
     return fit_process(poisson, {"rate": rate, "height": K / rate**0.5})
 
 
-def log_likelihood(means: Floats, around: Parts, start: float, jumps: float, height: float, odds: float = 1.0) -> float:
-    """Of Poisson steps in block means.
+def log_likelihood(
+    means: Floats, noise: StateSpaceNoise, start: float, jumps: float, height: float, odds: float = 1.0
+) -> float:
+    """Return the log-likelihood of Poisson steps in block means.
 
-    Args:
-        means: [m] block means
-        around: the other noise
-        start: variance of the first level
-        jumps: expected in a block, λΔ
-        height: standard deviation of a jump
-        odds: factor on the probability of each jump
+    Parameters
+    ----------
+    means : ndarray of float64, shape (m,)
+        Block means in the unit of the axis.
+    noise : StateSpaceNoise
+        Additional noise.
+    start : float
+        Prior variance of the first level, in the squared unit of the axis.
+    jumps : float
+        Expected number of jumps in a block, λΔ.
+    height : float
+        Standard deviation of a jump, in the unit of the axis.
+    odds : float, optional
+        Factor on the probability of each jump.
     """
     some = -expm1(-jumps)
-    variance = jumps / some * height**2  # of all jumps in a block, given that there are some
-    return float(jumping(means, around.table, around.white, start, AGES, exp(-jumps), odds * some, variance))
+    variance = jumps / some * height**2  # variance of the sum of all jumps in a block with at least one jump
+    return float(
+        jump_log_likelihood(means, noise.table, noise.white, start, JUMP_AGES, exp(-jumps), odds * some, variance)
+    )
 
 
 @compiled
-def jumping(means, table, white, start, ages, none, some, variance):  # type: ignore[no-untyped-def]
-    """Log-likelihood of a level that jumps in a block with probability ``some``, by a height of that variance.
+def jump_log_likelihood(means, table, white, start, ages, none, some, variance):  # type: ignore[no-untyped-def]
+    """Return the log-likelihood of a level that jumps in a block with probability ``some``, by a height with that
+    variance.
 
-    A jump at a uniform time in the block shows in its mean with 1/2 of its height and 1/3 of its variance.
+    A jump at a uniformly distributed time in the block changes the block mean by 1/2 of its height on average and
+    contributes 1/3 of its variance.
     """
     d = table.shape[0]
     share, at, covariance = np.zeros(ages), np.zeros((ages, d)), np.zeros((ages, d, d))
-    # of each hypothesis: no jump, and from ages on a jump
+    # for each hypothesis: entries below ``ages`` without a jump, the others with a jump
     weight, moved, spread = np.empty(2 * ages), np.zeros((2 * ages, d)), np.zeros((2 * ages, d, d))
     reach = np.empty(d)
     share[ages - 1] = 1.0
-    covariance[ages - 1] = begin(table, start)
+    covariance[ages - 1] = initial_covariance(table, start)
     total = -0.5 * means.size * np.log(2.0 * np.pi)
     for z in means:
         for age in range(ages):
             weight[age] = weight[ages + age] = -np.inf
-            if share[age] < GONE:
+            if share[age] < MIN_HYPOTHESIS_PROBABILITY:
                 continue
-            seen = predict(table, covariance[age], reach) + white
+            seen = predict_block(table, covariance[age], reach) + white
             innovation = z
             for i in range(d):
                 innovation -= table[i, 1] * at[age, i]
@@ -158,21 +209,21 @@ def jumping(means, table, white, start, ages, none, some, variance):  # type: ig
         for k in range(2 * ages):
             weight[k] /= density
         for age in range(ages):
-            if age == 0:  # all jumps
+            if age == 0:  # all hypotheses with a jump in this block
                 first, end = ages, 2 * ages
-            else:  # no jump since: those of one block less, and of the last age as well
+            else:  # no jump in this block: the previous age, and for the last age also the last age itself
                 first, end = age - 1, age + age // (ages - 1)
-            _merge(first, end, weight, moved, spread, age, share, at, covariance)
+            _merge_hypotheses(first, end, weight, moved, spread, age, share, at, covariance)
     return total
 
 
 @compiled
-def _merge(first, end, weight, moved, spread, to, share, at, covariance):  # type: ignore[no-untyped-def]
-    """Put the Gaussian of the same mean and covariance as ``first`` … ``end`` − 1 in place ``to``, with their share."""
+def _merge_hypotheses(first, end, weight, moved, spread, to, share, at, covariance):  # type: ignore[no-untyped-def]
+    """Merge hypotheses ``first`` to ``end`` − 1 into one Gaussian with their mean and covariance, at index ``to``."""
     share[to] = 0.0
     for k in range(first, end):
         share[to] += weight[k]
-    if share[to] < GONE:
+    if share[to] < MIN_HYPOTHESIS_PROBABILITY:
         return
     d = moved.shape[1]
     for i in range(d):

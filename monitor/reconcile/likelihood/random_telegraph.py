@@ -1,11 +1,11 @@
-"""Random telegraph, or something with the same second moments.
+"""Likelihood ratio of a random telegraph and exponentially correlated noise, which have the same second moments.
 
-The two levels are the modes of a switching Kalman filter; everything else (``Rest``, and where the level lies) is its
-Gaussian state. In a block the level stays, or it changes once, or there and back: three cases, each with mean and
-variance of its block's mean. After each block the cases that end in the same level are merged into one Gaussian of
+The two levels are the modes of a switching Kalman filter. Its Gaussian state holds the ``Rest`` and the position of the
+levels. In each block the level stays, changes once, or changes there and back. Each of the three cases has its own mean
+and variance of the block mean. After each block, the cases that end in the same level are merged into one Gaussian with
 their mean and covariance (GPB2 of Bar-Shalom, Li & Kirubarajan, "Estimation with Applications to Tracking and
-Navigation", 2001, section 11.6.4). With white noise around a known level nothing is merged but the cases within a
-block: then it is the forward algorithm of a hidden Markov model.
+Navigation", 2001, section 11.6.4). With white noise around a known level, only the cases within a block are merged. The
+filter is then the forward algorithm of a hidden Markov model.
 """
 
 from math import log
@@ -16,62 +16,81 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
 from monitor.reconcile.likelihood.hidden_state import (
-    WANTED,
-    Contest,
-    Parts,
-    Process,
+    TARGET_BLOCKS,
+    EventProcessFit,
+    ModelComparison,
     Rest,
+    StateSpaceNoise,
     anywhere,
-    begin,
     block_means,
     fit_process,
+    initial_covariance,
     kalman,
     markov,
     maximise,
     parts,
-    predict,
+    predict_block,
 )
 
-BLOCKS: Final = 8.0
-"""Blocks in a correlation time: one dwell in sixteen blocks ends."""
-FINEST: Final = 20_000.0
-"""Blocks in a recording, at most, for sharper times."""
-SAMPLES: Final = 20
-"""In a block, where a correlation time has as many: a sensor's noise is white from a few samples on only."""
-AMPLITUDES: Final = np.geomspace(0.5, 2.0, 7)
-"""Where the search begins, times 2 σ: few dwells tell σ badly, and between two wrong levels a likelihood is rough."""
-DWELLS: Final = (0.35, 1.0)
-"""The same for the dwell time, times 2 T_c: a random walk beside it makes correlation longer."""
-HEAD: Final = 1024
-"""Blocks, 64 dwells, after which it is no longer asked in which level the recording began."""
-NEVER: Final = 1e-300
-"""Weight of what is all but impossible, beside the likeliest case: nothing is divided by zero."""
+BLOCKS_PER_CORRELATION_TIME: Final = 8.0
+"""Number of blocks in a correlation time: the level changes in one of sixteen blocks."""
+MAX_FINE_BLOCKS: Final = 20_000.0
+"""Largest number of blocks in a recording if the time of switches is resolved more finely."""
+MIN_SAMPLES_PER_BLOCK: Final = 20
+"""Smallest number of samples in a block if the correlation time allows it. The noise of a sensor is white only over
+several samples.
+"""
+START_AMPLITUDE_FACTORS: Final = np.geomspace(0.5, 2.0, 7)
+"""Starting amplitudes as multiples of 2 σ. Few dwells determine σ badly, and the likelihood is rough between two wrong
+levels.
+"""
+START_DWELL_FACTORS: Final = (0.35, 1.0)
+"""Starting dwell times as multiples of 2 T_c. A random walk in the noise makes the correlation appear longer."""
+INITIAL_LEVEL_BLOCKS: Final = 1024
+"""Number of blocks, about 64 dwells, after which the unknown first level is no longer tracked."""
+MIN_WEIGHT: Final = 1e-300
+"""Lower limit of the weight of a case relative to the likeliest one. It avoids a division by zero."""
 
 
-def telegraph_or_correlated(y: Floats, tau0_s: float, rest: Rest, sigma: float, correlation_time: float) -> Contest:
-    """Random telegraph (first) against exponentially correlated noise (second).
+def telegraph_or_correlated(
+    y: Floats, tau0_s: float, rest: Rest, sigma: float, correlation_time: float
+) -> ModelComparison:
+    """Compare a random telegraph with exponentially correlated noise.
 
-    Args:
-        y: [n] series of one axis, unit of the axis, without gaps
-        tau0_s: s between samples
-        rest: the other noise of the axis
-        sigma: standard deviation of the process, unit of the axis, where the search begins
-        correlation_time: s, where the search begins
-    Returns:
-        ``amplitude`` and ``dwell_time`` against ``sigma`` and ``correlation_time``; switches of the telegraph
-    Raises:
-        ValueError: hardly any samples, or no white noise
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Series in the unit of the axis, without gaps.
+    tau0_s : float
+        Sample period in seconds.
+    rest : Rest
+        Additional noise of the axis.
+    sigma : float
+        Starting value of the standard deviation of the process, in the unit of the axis.
+    correlation_time : float
+        Starting value of the correlation time in seconds.
+
+    Returns
+    -------
+    ModelComparison
+        ``amplitude`` and ``dwell_time`` of the telegraph (first), ``sigma`` and ``correlation_time`` of the correlated
+        noise (second), and the number of switches of the telegraph.
+
+    Raises
+    ------
+    ValueError
+        If there are too few samples or no white noise.
     """
     means, block_s = block_means(y, tau0_s, block_for(y.size * tau0_s, tau0_s, correlation_time, rest.white / sigma**2))
-    around, start = parts(rest, block_s, means.size * block_s), anywhere(means)
+    noise, start = parts(rest, block_s, means.size * block_s), anywhere(means)
 
     def correlated(sigma: float, time_s: float) -> float:
         row, own = markov(sigma, time_s, block_s)
-        return float(kalman(means, np.vstack([around.table, row]), around.white + own, start))
+        return float(kalman(means, np.vstack([noise.table, row]), noise.white + own, start))
 
-    first = fit_levels(means, block_s, around, sigma, correlation_time)
+    first = fit_telegraph(means, block_s, noise, sigma, correlation_time)
     second = maximise(correlated, (sigma, correlation_time))
-    return Contest(
+    return ModelComparison(
         first.peak.height - second.height,
         first.parameters,
         {"sigma": second.bounds(0), "correlation_time": second.bounds(1)},
@@ -80,69 +99,118 @@ def telegraph_or_correlated(y: Floats, tau0_s: float, rest: Rest, sigma: float, 
 
 
 def block_for(span_s: float, tau0_s: float, correlation_time: float, even_s: float) -> float:
-    """Length of a block, s; switches are timed better by short ones.
+    """Return the length of a block in seconds. Shorter blocks resolve the time of a switch better.
 
-    Args:
-        even_s: white noise of blocks as long is half of the amplitude; shorter ones tell nothing more
+    Parameters
+    ----------
+    span_s : float
+        Length of the recording in seconds.
+    tau0_s : float
+        Sample period in seconds.
+    correlation_time : float
+        Correlation time in seconds.
+    even_s : float
+        Block length in seconds at which the white noise of a block mean is half of the amplitude. Shorter blocks
+        contain no more information.
     """
-    return min(correlation_time / BLOCKS, span_s / WANTED, max(even_s, span_s / FINEST, SAMPLES * tau0_s))
+    return min(
+        correlation_time / BLOCKS_PER_CORRELATION_TIME,
+        span_s / TARGET_BLOCKS,
+        max(even_s, span_s / MAX_FINE_BLOCKS, MIN_SAMPLES_PER_BLOCK * tau0_s),
+    )
 
 
-def fit_levels(means: Floats, block_s: float, around: Parts, sigma: float, correlation_time: float) -> Process:
-    """Maximum over amplitude and dwell time, from those whose second moments are ``sigma`` and ``correlation_time``."""
+def fit_telegraph(
+    means: Floats, block_s: float, noise: StateSpaceNoise, sigma: float, correlation_time: float
+) -> EventProcessFit:
+    """Maximise the likelihood over amplitude and dwell time.
+
+    Parameters
+    ----------
+    means : ndarray of float64, shape (m,)
+        Block means in the unit of the axis.
+    block_s : float
+        Length of a block in seconds.
+    noise : StateSpaceNoise
+        Additional noise.
+    sigma : float
+        Standard deviation that determines the starting amplitudes, in the unit of the axis.
+    correlation_time : float
+        Correlation time in seconds that determines the starting dwell times.
+    """
     start = anywhere(means)
 
     def two_levels(amplitude: float, dwell_s: float, odds: float) -> float:
-        return log_likelihood(means, around, start, amplitude, block_s / dwell_s, odds)
+        return log_likelihood(means, noise, start, amplitude, block_s / dwell_s, odds)
 
-    starts = [(2.0 * sigma * a, 2.0 * correlation_time * d) for a in AMPLITUDES.tolist() for d in DWELLS]
+    starts = [
+        (2.0 * sigma * a, 2.0 * correlation_time * d)
+        for a in START_AMPLITUDE_FACTORS.tolist()
+        for d in START_DWELL_FACTORS
+    ]
     amplitude, dwell_s = max(starts, key=lambda start: two_levels(start[0], start[1], 1.0))
     return fit_process(two_levels, {"amplitude": amplitude, "dwell_time": dwell_s})
 
 
 def log_likelihood(
-    means: Floats, around: Parts, start: float, amplitude: float, switches: float, odds: float = 1.0
+    means: Floats, noise: StateSpaceNoise, start: float, amplitude: float, switches: float, odds: float = 1.0
 ) -> float:
-    """Of a telegraph in block means.
+    """Return the log-likelihood of a random telegraph in block means.
 
-    Args:
-        means: [m] block means
-        around: the other noise
-        start: variance of the first level
-        amplitude: from level to level
-        switches: expected in a block, Δ/T
-        odds: factor on the probability of each switch
+    Parameters
+    ----------
+    means : ndarray of float64, shape (m,)
+        Block means in the unit of the axis.
+    noise : StateSpaceNoise
+        Additional noise.
+    start : float
+        Prior variance of the first level, in the squared unit of the axis.
+    amplitude : float
+        Difference of the two levels, in the unit of the axis.
+    switches : float
+        Expected number of switches in a block, Δ/T.
+    odds : float, optional
+        Factor on the probability of each switch.
     """
     even, odd = 0.5 * (1.0 + np.exp(-2.0 * switches)), -0.5 * np.expm1(-2.0 * switches)
     none = np.exp(-switches)
-    # the time spent in the other level: none; uniform in the block; density 2(1 − x), mean 1/3 and variance 1/18
+    # The cases differ in the fraction x of the block that is spent in the other level: none; there and back, with the
+    # density 2(1 − x), the mean 1/3 and the variance 1/18; one change, with a uniform density.
     cases = np.array([
         [none, 0.5 * amplitude, 0.0],
         [odds**2 * (even - none), amplitude / 6.0, amplitude**2 / 18.0],
         [odds * odd, 0.0, amplitude**2 / 12.0],
     ])  # fmt: skip
-    # where the level lies is not known either: begun in both at once, the two explanations would be merged too soon
-    states = [_begin(around.table, start, first) for first in (0, 1)]
-    heads = [switching(means[:HEAD], around.table, around.white, cases, *state) for state in states]
-    rest = switching(means[HEAD:], around.table, around.white, cases, *states[int(np.argmax(heads))])
+    # The position of the levels is unknown as well. If the filter began in both levels at once, the two explanations
+    # would be merged too soon.
+    states = [_initial_state(noise.table, start, first) for first in (0, 1)]
+    heads = [
+        switching_log_likelihood(means[:INITIAL_LEVEL_BLOCKS], noise.table, noise.white, cases, *state)
+        for state in states
+    ]
+    rest = switching_log_likelihood(
+        means[INITIAL_LEVEL_BLOCKS:], noise.table, noise.white, cases, *states[int(np.argmax(heads))]
+    )
     return float(np.logaddexp(*heads) - log(2.0) + rest)
 
 
 @compiled
-def _begin(table, start, first):  # type: ignore[no-untyped-def]
+def _initial_state(table, start, first):  # type: ignore[no-untyped-def]
+    """Return the mode probabilities, state means and covariances for a known first level."""
     d = table.shape[0]
     share, covariance = np.zeros(2), np.empty((2, d, d))
     share[first] = 1.0
-    covariance[:] = begin(table, start)
+    covariance[:] = initial_covariance(table, start)
     return share, np.zeros((2, d)), covariance
 
 
 @compiled
-def switching(means, table, white, cases, share, at, covariance):  # type: ignore[no-untyped-def]
-    """Log-likelihood of two levels; ``share`` [2], ``at`` [2, d] and ``covariance`` [2, d, d] are carried on.
+def switching_log_likelihood(means, table, white, cases, share, at, covariance):  # type: ignore[no-untyped-def]
+    """Return the log-likelihood of two levels and update the filter state in place.
 
-    ``cases`` [3, 3]: probability, mean (from the upper level) and variance of what a block adds. The first two end in
-    the level they began in, the third in the other.
+    The filter state is ``share`` [2], ``at`` [2, d] and ``covariance`` [2, d, d]. ``cases`` [3, 3] holds the
+    probability, the mean (from the upper level) and the variance of the contribution to a block mean. The first two
+    cases end in the level in which they began. The third case ends in the other level.
     """
     d = table.shape[0]
     reach, weight, pull, known = np.empty((2, d)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
@@ -150,7 +218,7 @@ def switching(means, table, white, cases, share, at, covariance):  # type: ignor
     total = -0.5 * means.size * np.log(2.0 * np.pi)
     for z in means:
         for level in range(2):
-            variance = predict(table, covariance[level], reach[level]) + white
+            variance = predict_block(table, covariance[level], reach[level]) + white
             innovation = z
             for i in range(d):
                 innovation -= table[i, 1] * at[level, i]
@@ -164,11 +232,11 @@ def switching(means, table, white, cases, share, at, covariance):  # type: ignor
         for level in range(2):
             for k in range(3):
                 prior = share[level] * cases[k, 0] * np.sqrt(known[level, k])
-                weight[level, k] = prior * np.exp(least - weight[level, k]) + NEVER
+                weight[level, k] = prior * np.exp(least - weight[level, k]) + MIN_WEIGHT
                 density += weight[level, k]
         total += np.log(density) - least
         for level in range(2):
-            _join_stays(weight[level], pull[level], known[level])
+            _merge_returning_cases(weight[level], pull[level], known[level])
         for level in range(2):
             other = 1 - level
             stays, comes = weight[level, 0], weight[other, 2]
@@ -192,8 +260,8 @@ def switching(means, table, white, cases, share, at, covariance):  # type: ignor
 
 
 @compiled
-def _join_stays(weight, pull, known):  # type: ignore[no-untyped-def]
-    """Merge the two cases that end where they began into the first of them."""
+def _merge_returning_cases(weight, pull, known):  # type: ignore[no-untyped-def]
+    """Merge the two cases that end in the level in which they began into the first of them."""
     back = weight[1] / (weight[0] + weight[1])
     apart = pull[1] - pull[0]
     pull[0] += back * apart

@@ -1,13 +1,15 @@
-"""A few steps that happened once each, against Poisson steps, a process that goes on.
+"""Likelihood ratio of Poisson steps, a continuing process, and a few single steps.
 
-Steps at fixed times with free heights are found one after the other, where the smoother of the rest of the noise sees
-the likeliest shock of the level (de Jong & Penzer, "Diagnosing shocks in time series", JASA 93, 1998), and each once
-more beside all others. Then their times are refined within blocks, and their heights are a least squares fit.
+Steps at fixed times with free heights are found one after the other. Each step is placed where the smoother of the
+remaining noise shows the likeliest shock of the level (de Jong & Penzer, "Diagnosing shocks in time series", JASA 93,
+1998). Each step is then placed once more with all others present. Finally the times are refined within blocks, and the
+heights are fitted by least squares.
 
-The likelihood of a process is an average over the times and heights that it allows, that of fixed steps is their
-maximum. So each step pays what its time and height would cost in such an average: ln of the number of blocks, and
-½ ln(1 + h²/Var h) (the minimum description length of Rissanen, 1978). Up to five steps are
-mostly cheaper each by itself; from a dozen on the process is, which knows that they are of one kind.
+The likelihood of a process is an average over all times and heights that it allows. The likelihood of fixed steps is a
+maximum. Each step therefore gets the penalty that its time and height would have in such an average: ln of the number
+of blocks, and ½ ln(1 + h²/Var h) (the minimum description length of Rissanen, 1978). Up to about five steps, single
+steps usually have the smaller penalty. From about a dozen steps on, the process has the smaller penalty, because it
+describes them by common parameters.
 """
 
 from math import log
@@ -19,100 +21,140 @@ from drivers.sample import Floats
 from monitor.common.compiled import compiled
 from monitor.reconcile.likelihood import poisson_steps
 from monitor.reconcile.likelihood.hidden_state import (
-    DEVIATIONS,
-    Contest,
-    Parts,
+    INTERVAL_SIGMAS,
+    ModelComparison,
     Rest,
+    StateSpaceNoise,
     anywhere,
-    begin,
     block_means,
+    initial_covariance,
     kalman,
     parts,
-    predict,
+    predict_block,
 )
 from monitor.reconcile.result import Bounds
 
-PLACES: Final = 8
-"""Times tried in a block."""
+TIMES_PER_BLOCK: Final = 8
+"""Number of times that are tried within a block."""
 
 
-class Steps(NamedTuple):
-    """Fixed steps at their best."""
+class SingleStepsFit(NamedTuple):
+    """Best fit of single steps."""
 
-    height: float  # log-likelihood, less what times and heights cost
+    height: float  # log-likelihood less the penalties for times and heights
     times: Floats  # [k] in blocks since the start
-    earliest: Floats  # [k]
-    latest: Floats  # [k]
+    earliest: Floats  # [k] lower end of the 95 % interval of the time
+    latest: Floats  # [k] upper end of the same interval
     heights: Floats  # [k] unit of the axis
-    deviations: Floats  # [k] their standard deviations
+    deviations: Floats  # [k] standard deviations of the heights
 
     def parameters(self, block_s: float) -> dict[str, Bounds]:
-        """``time_1``, ``height_1``, ``time_2``, … in the order of time."""
+        """Return ``time_1``, ``height_1``, ``time_2``, … with 95 % intervals, in the order of time."""
         found: dict[str, Bounds] = {}
         for k in range(self.times.size):
             time, early, late = (float(t[k]) * block_s for t in (self.times, self.earliest, self.latest))
-            height, wide = float(self.heights[k]), DEVIATIONS * float(self.deviations[k])
+            height, wide = float(self.heights[k]), INTERVAL_SIGMAS * float(self.deviations[k])
             found[f"time_{k + 1}"] = Bounds(time, early, late)
             found[f"height_{k + 1}"] = Bounds(height, height - wide, height + wide)
         return found
 
 
-def steps_or_once(y: Floats, tau0_s: float, rest: Rest, K: float, most: int = 5) -> Contest:
-    """Poisson steps (first) against none to ``most`` steps that happened once (second).
+def steps_or_once(y: Floats, tau0_s: float, rest: Rest, K: float, most: int = 5) -> ModelComparison:
+    """Compare Poisson steps with a few single steps.
 
-    Arguments, errors and the first's parameters are those of ``steps_or_walk``; the second's are ``time_1``, s from the
-    start, and ``height_1``, ``time_2``, ….
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Series in the unit of the axis, without gaps.
+    tau0_s : float
+        Sample period in seconds.
+    rest : Rest
+        Additional noise of the axis.
+    K : float
+        Starting value of the random walk coefficient, in unit/√s, above zero.
+    most : int, optional
+        Largest number of single steps.
+
+    Returns
+    -------
+    ModelComparison
+        ``rate`` and ``height`` of the Poisson steps (first). ``time_1`` in seconds from the start, ``height_1``,
+        ``time_2``, … of the single steps (second). The number of jumps of the Poisson steps.
+
+    Raises
+    ------
+    ValueError
+        If there are too few samples or no white noise.
     """
     means, block_s = block_means(y, tau0_s, poisson_steps.block_for(y.size * tau0_s, rest, K))
     first = poisson_steps.fit_jumps(means, block_s, rest, K)
     second = fit_once(means, parts(rest, block_s, means.size * block_s), most)
-    return Contest(first.peak.height - second.height, first.parameters, second.parameters(block_s), round(first.events))
+    return ModelComparison(
+        first.peak.height - second.height, first.parameters, second.parameters(block_s), round(first.events)
+    )
 
 
-def fit_once(means: Floats, around: Parts, most: int) -> Steps:
-    """The number of steps, from none to ``most``, that explains ``means`` at the least cost."""
+def fit_once(means: Floats, noise: StateSpaceNoise, most: int) -> SingleStepsFit:
+    """Fit the number of single steps that explains the block means at the smallest cost.
+
+    Parameters
+    ----------
+    means : ndarray of float64, shape (m,)
+        Block means in the unit of the axis.
+    noise : StateSpaceNoise
+        Additional noise.
+    most : int
+        Largest number of steps.
+    """
     blocks: list[int] = []
-    best = Steps(kalman(means, around.table, around.white, anywhere(means)), *np.empty((5, 0)))
+    best = SingleStepsFit(kalman(means, noise.table, noise.white, anywhere(means)), *np.empty((5, 0)))
     for _ in range(most):
-        blocks.append(int(np.argmax(_scores(means, around, blocks))))
+        blocks.append(int(np.argmax(_shock_gains(means, noise, blocks))))
         for k in range(len(blocks)):
-            blocks[k] = int(np.argmax(_scores(means, around, blocks[:k] + blocks[k + 1 :])))
-        found = _fit(means, around, sorted(blocks))
+            blocks[k] = int(np.argmax(_shock_gains(means, noise, blocks[:k] + blocks[k + 1 :])))
+        found = _refine_steps(means, noise, sorted(blocks))
         if found.height > best.height:
             best = found
     return best
 
 
-def _scores(means: Floats, around: Parts, blocks: list[int]) -> Floats:
-    """[m] twice the log-likelihood gained by one more shock at the start of each block, beside those in ``blocks``."""
+def _shock_gains(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> Floats:
+    """Return twice the log-likelihood gain, shape (m,), of one more shock at the start of each block.
+
+    The shocks in ``blocks`` are already present.
+    """
     free = np.zeros(means.size)
     free[blocks] = anywhere(means)
-    scores = np.asarray(shocks(means, around.table, around.white, anywhere(means), free))
+    scores = np.asarray(shocks(means, noise.table, noise.white, anywhere(means), free))
     scores[blocks] = 0.0
     return scores
 
 
-def _fit(means: Floats, around: Parts, blocks: list[int]) -> Steps:
-    """Times within blocks, heights, and the cost of both."""
+def _refine_steps(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> SingleStepsFit:
+    """Refine the times of the steps within their blocks and return the fit with its penalties."""
     times = np.array(blocks, np.float64)
-    places = np.arange(-PLACES, PLACES + 1) / PLACES
+    places = np.arange(-TIMES_PER_BLOCK, TIMES_PER_BLOCK + 1) / TIMES_PER_BLOCK
     for k in range(times.size):
         others = np.delete(times, k)
         apart = [at for at in times[k] + places if 0.0 <= at < means.size and (np.abs(others - at) >= 1.0).all()]
         tried = [np.insert(others, k, at) for at in apart]
-        times = max(tried, key=lambda t: _regress(means, around, t)[0])
-    total, heights, deviations = _regress(means, around, times)
+        times = max(tried, key=lambda t: _fit_heights(means, noise, t)[0])
+    total, heights, deviations = _fit_heights(means, noise, times)
     cost = times.size * log(means.size) + 0.5 * float(np.log1p((heights / deviations) ** 2).sum())
-    earliest, latest = np.array([_reach(means, around, blocks, k) for k in range(len(blocks))]).T
-    return Steps(total - cost, times, np.minimum(earliest, times), np.maximum(latest, times), heights, deviations)
+    earliest, latest = np.array([_time_interval(means, noise, blocks, k) for k in range(len(blocks))]).T
+    return SingleStepsFit(
+        total - cost, times, np.minimum(earliest, times), np.maximum(latest, times), heights, deviations
+    )
 
 
-def _regress(means: Floats, around: Parts, times: Floats) -> tuple[float, Floats, Floats]:
-    """Log-likelihood with steps at ``times``, and their heights with standard deviations, by least squares."""
-    # what part of a block lies after the step
+def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[float, Floats, Floats]:
+    """Return the log-likelihood with steps at given times, and the heights with standard deviations, by least
+    squares.
+    """
+    # fraction of each block that lies after the step
     columns = np.clip(np.arange(1.0, means.size + 1.0)[:, None] - times, 0.0, 1.0)
     columns = np.column_stack([means, columns])
-    logarithms = whiten(columns, around.table, around.white, anywhere(means))
+    logarithms = whiten(columns, noise.table, noise.white, anywhere(means))
     data, design = columns[:, 0], columns[:, 1:]
     normal = np.linalg.inv(design.T @ design)
     heights = normal @ (design.T @ data)
@@ -120,18 +162,18 @@ def _regress(means: Floats, around: Parts, times: Floats) -> tuple[float, Floats
     return -0.5 * float(logarithms + left @ left), heights, np.sqrt(np.diag(normal))
 
 
-def _reach(means: Floats, around: Parts, blocks: list[int], k: int) -> tuple[float, float]:
-    """From where to where step ``k`` may be moved, others where they are, in 95 of 100."""
-    scores = _scores(means, around, blocks[:k] + blocks[k + 1 :])
-    worse = np.flatnonzero(scores < scores[blocks[k]] - DEVIATIONS**2)
+def _time_interval(means: Floats, noise: StateSpaceNoise, blocks: list[int], k: int) -> tuple[float, float]:
+    """Return the 95 % interval of the time of step ``k``, in blocks, with the other steps fixed."""
+    scores = _shock_gains(means, noise, blocks[:k] + blocks[k + 1 :])
+    worse = np.flatnonzero(scores < scores[blocks[k]] - INTERVAL_SIGMAS**2)
     before, after = worse[worse < blocks[k]], worse[worse > blocks[k]]
     return float(before[-1] if before.size else 0), float(after[0] if after.size else means.size)
 
 
 @compiled
 def whiten(columns, table, white, start):  # type: ignore[no-untyped-def]
-    """Make columns [m, c] independent, of variance one, in place; Σ ln 2πS of the variances that they had."""
-    variances, reaches = _gains(np.zeros(columns.shape[0]), table, white, start)
+    """Whiten columns, shape (m, c), in place to unit variance and return Σ ln 2πS of their innovation variances."""
+    variances, reaches = _innovation_variances(np.zeros(columns.shape[0]), table, white, start)
     total = 0.0
     for c in range(columns.shape[1]):
         innovations = _innovations(columns[:, c].copy(), table, variances, reaches)
@@ -144,13 +186,14 @@ def whiten(columns, table, white, start):  # type: ignore[no-untyped-def]
 
 @compiled
 def shocks(means, table, white, start, free):  # type: ignore[no-untyped-def]
-    """Twice the log-likelihood ratio [m] of a shock of the level at the start of each block; ``free`` as in ``_gains``.
+    """Return twice the log-likelihood ratio, shape (m,), of a shock of the level at the start of each block.
 
-    r²/N of the fixed-interval smoother (de Jong & Penzer 1998, section 2), with state r ← h e/S + L'r and
-    N ← h h'/S + L'N L backwards, L = F − reach h'/S.
+    The ratio is r²/N of the fixed-interval smoother (de Jong & Penzer 1998, section 2). The backward recursions are r ←
+    h e/S + L'r and N ← h h'/S + L'N L, with L = F − reach h'/S. ``free`` has the same meaning as in
+    ``_innovation_variances``.
     """
     d, m = table.shape[0], means.size
-    variances, reaches = _gains(free, table, white, start)
+    variances, reaches = _innovation_variances(free, table, white, start)
     innovations = _innovations(means, table, variances, reaches)
     r, N, scores = np.zeros(d), np.zeros((d, d)), np.empty(m)
     L, NL, new = np.empty((d, d)), np.empty((d, d)), np.empty(d)
@@ -176,16 +219,16 @@ def shocks(means, table, white, start, free):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _gains(free, table, white, start):  # type: ignore[no-untyped-def]
-    """Of a Kalman filter: variances [m] of the innovations, and their covariances [m, d] with the next state.
+def _innovation_variances(free, table, white, start):  # type: ignore[no-untyped-def]
+    """Return the variances of the innovations, shape (m,), and their covariances with the next state, shape (m, d).
 
-    ``free`` [m] is variance that the level is given at the start of each block.
+    ``free`` [m] is additional variance of the level at the start of each block.
     """
     d, m = table.shape[0], free.size
-    variances, reaches, covariance = np.empty(m), np.empty((m, d)), begin(table, start)
+    variances, reaches, covariance = np.empty(m), np.empty((m, d)), initial_covariance(table, start)
     for k in range(m):
         covariance[0, 0] += free[k]
-        variances[k] = predict(table, covariance, reaches[k]) + white
+        variances[k] = predict_block(table, covariance, reaches[k]) + white
         for i in range(d):
             for j in range(d):
                 covariance[i, j] *= table[i, 0] * table[j, 0]
@@ -196,7 +239,7 @@ def _gains(free, table, white, start):  # type: ignore[no-untyped-def]
 
 @compiled
 def _innovations(series, table, variances, reaches):  # type: ignore[no-untyped-def]
-    """What of a series [m] its past does not tell."""
+    """Return the innovations of a series, shape (m,): the differences from the predictions of the Kalman filter."""
     d = table.shape[0]
     at, innovations = np.zeros(d), np.empty(series.size)
     for k in range(series.size):

@@ -1,17 +1,18 @@
-"""How the variance of white residuals goes in time, over all frequencies and band by band.
+"""Variance of white residuals as a function of time, for all frequencies together and for each band.
 
-``variance_course``: one step of the noise, at every time at once, and its rivals, which are fitted to the energies of
-blocks (χ²; log-linear variances): a trend, a period, more steps, a slow wandering. Every gain is one in log-likelihood
-over a constant variance, so that they may be compared; a step is a step when it gains more than its rivals and
-nothing is left after it.
+``variance_course`` fits a step of the variance at every time, and alternatives to a step: a trend, a periodic
+variation, several steps and a slow random variation. The alternatives are fitted to the energies of blocks (χ²;
+log-linear variances). Every gain is a log-likelihood gain over a constant variance, so that the gains are comparable. A
+step is accepted if it gains more than its alternatives and nothing is left after it.
 
-``tiles``: the recording is cut into pieces, each as its Fourier transform between the usual frequencies, in which
-white noise is independent everywhere and a steady line has a steady power. Every rectangle of 2^a pieces by 2^b
-frequencies is held against the rest of its frequencies, so that a steady line or colour says nothing; and every row of
-them against a steady one. Long pieces see lines that waver, short ones bursts.
+``tiles`` cuts the recording into pieces and takes the Fourier transform of each piece midway between the usual
+frequencies. There white noise is independent everywhere and a steady line has a steady power. Every rectangle of 2^a
+pieces by 2^b frequencies is compared with the rest of its frequencies, so that a steady line or a coloured spectrum has
+no influence. Every row of rectangles is also compared with a constant row. Long pieces detect lines that vary, and
+short pieces detect bursts.
 
-All statistics are of ratios of energies: they know no unit and their law under white Gaussian noise depends on the
-number of samples only. Outliers break it: they are to be replaced before.
+All statistics are ratios of energies. They have no unit, and their distribution under white Gaussian noise depends only
+on the number of samples. Outliers violate this and must be replaced before.
 """
 
 from dataclasses import dataclass
@@ -27,82 +28,95 @@ from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.reconcile.preparation.value_statistics import Size
 
-AWAY: Final = 16
-"""Samples on each side of a step, at least."""
-STRIDE: Final = 8
-FINE: Final = 20_000
-"""Samples: among fewer the time of a step is sought sample by sample."""
-BLOCK: Final = 32
-"""Samples of a block, at least: energies of fewer are far from Gaussian."""
-BLOCKS: Final = 4096
-"""At most."""
-PARTS: Final = 8
-"""Blocks, or pieces, that say anything of a course."""
-CYCLES: Final = 2
-"""Of a period in the recording, at least: less is a trend."""
-CHANGES: Final = 8
-"""Steps that are looked for, one after the other."""
-FURTHER: Final = 12.0
-"""Nats: a change that gains less is the last that is told."""
-PIECES: Final = (256, 2048)
-"""Samples of a piece of the spectrogram."""
-EVEN_ROWS: Final = 64
-"""Squares in each cell from which cells of several pieces are asked whether their row is steady."""
-QUIET: Final = 8
-"""Squares."""
+MIN_SEGMENT_SAMPLES: Final = 16
+"""Smallest number of samples on each side of a step."""
+STEP_SEARCH_STRIDE: Final = 8
+"""Distance in samples of the times in the first search for a step."""
+FINE_SEARCH_SAMPLES: Final = 20_000
+"""Largest range in samples in which the time of a step is then sought sample by sample."""
+MIN_BLOCK_SAMPLES: Final = 32
+"""Smallest number of samples in a block. The energies of fewer samples are far from Gaussian."""
+MAX_VARIANCE_BLOCKS: Final = 4096
+"""Largest number of blocks."""
+MIN_VARIANCE_BLOCKS: Final = 8
+"""Smallest number of blocks or pieces for a variance history."""
+MIN_CYCLES: Final = 2
+"""Smallest number of periods in the recording. A slower variation is a trend."""
+MAX_CHANGES: Final = 8
+"""Largest number of steps that are sought one after the other."""
+MIN_CHANGE_GAIN_NATS: Final = 12.0
+"""Gain in nats below which no further steps are sought."""
+PIECE_SAMPLES: Final = (256, 2048)
+"""Numbers of samples in a piece of the spectrogram."""
+MIN_SQUARES_PER_CELL: Final = 64
+"""Number of squares in each cell from which a row of cells of several pieces is tested for a constant power."""
+MIN_SQUARES_FOR_DECREASE: Final = 8
+"""Number of squares in a cell below which a low power is no evidence."""
 Z95: Final = 1.959964
+"""Number of standard deviations on each side of a 95 % interval."""
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
-    """A step of the noise."""
+class VarianceStep:
+    """Step of the variance."""
 
-    gain: float  # nats over a constant variance
+    gain: float  # log-likelihood gain over a constant variance, nats
     time: Size  # s from the first sample
-    ratio: Size  # of the deviations, after over before
+    ratio: Size  # standard deviation after the step over the one before it
 
 
 @dataclass(frozen=True, slots=True)
-class Periodic:
-    """Variance that swings."""
+class PeriodicVariance:
+    """Periodic variation of the variance."""
 
-    gain: float
+    gain: float  # log-likelihood gain over a constant variance, nats
     frequency: float  # Hz
-    depth: float  # of ln σ: σ swings by e^±depth
+    depth: float  # amplitude of ln σ: σ varies by the factor e^±depth
 
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """The variance over time: a step, and what else it may be."""
+    """Variance history: a step and its alternatives."""
 
-    step: Change
-    trend: float  # nats of ln σ² = a + b t + c t² over a constant
-    periodic: Periodic
-    wander: float  # nats of a slow random course over a constant
-    changes: tuple[Change, ...]  # one after the other, each with what it gains beside those before
+    step: VarianceStep
+    trend: float  # gain of ln σ² = a + b t + c t² over a constant, nats
+    periodic: PeriodicVariance
+    wander: float  # gain of a slow random variation over a constant, nats
+    changes: tuple[VarianceStep, ...]  # in the order in which they were found, each with its gain over those before
     block_s: float
-    energy: Floats  # [k] mean square of each block, in the unit of w squared
+    energy: Floats  # [k] mean square of each block, in the squared unit of w
 
 
 @dataclass(frozen=True, slots=True)
 class Tiles:
-    """The most striking place of a spectrogram, and its most striking row."""
+    """Rectangle and row of a spectrogram that are least constant in time."""
 
-    gain: float  # nats of the best rectangle over the rest of its row
-    ratio: float  # its power over that of the rest
+    gain: float  # gain of the best rectangle over the rest of its row, nats
+    ratio: float  # power of the rectangle over the power of the rest
     time: tuple[float, float]  # s from the first sample
     frequency: tuple[float, float]  # Hz
-    row_gain: float  # −ln of the chance that a steady row is so uneven
-    row: tuple[float, float]  # Hz
-    seconds: tuple[float, float]  # of the pieces: of the rectangle, of the row
+    row_gain: float  # −ln of the probability that a row with constant power is as uneven
+    row: tuple[float, float]  # frequency range of the row, Hz
+    seconds: tuple[float, float]  # length of the pieces of the rectangle and of the row, s
 
 
 def variance_course(w: Floats, tau0_s: float) -> Course:
-    """Steps and other courses of the variance of white residuals [n], τ0 apart; none may be missing.
+    """Fit steps and other variations of the variance of white residuals.
 
-    Raises:
-        ValueError: fewer than 256 samples
+    Parameters
+    ----------
+    w : ndarray of float64, shape (n,)
+        White residuals without missing samples.
+    tau0_s : float
+        Sample period in seconds.
 
+    Raises
+    ------
+    ValueError
+        If there are fewer than 256 samples.
+
+    Examples
+    --------
     >>> rng = np.random.default_rng(0)
     >>> w = rng.standard_normal(60_000)
     >>> w[20_000:] *= 1.2
@@ -110,34 +124,43 @@ def variance_course(w: Floats, tau0_s: float) -> Course:
     >>> print(f"{found.step.gain > 100} {found.step.time.value:.1f} {found.step.ratio.value:.1f}")
     True 200.5 1.2
     """
-    if w.size < PARTS * BLOCK:
-        raise ValueError(f"{w.size} samples are too few, {PARTS * BLOCK} are needed")
+    if w.size < MIN_VARIANCE_BLOCKS * MIN_BLOCK_SAMPLES:
+        raise ValueError(f"{w.size} samples are too few, {MIN_VARIANCE_BLOCKS * MIN_BLOCK_SAMPLES} are needed")
     squares = w * w
-    length = max(BLOCK, -(-w.size // BLOCKS))
+    length = max(MIN_BLOCK_SAMPLES, -(-w.size // MAX_VARIANCE_BLOCKS))
     count = w.size // length
     energy = squares[: count * length].reshape(count, length).mean(axis=1)
     scores = energy / energy.mean() - 1.0
-    step = _change(squares, tau0_s)
+    step = _best_step(squares, tau0_s)
     time = np.linspace(-1.0, 1.0, count)
     return Course(
         step=step,
-        trend=_log_linear(energy, length, np.stack([time, time**2 - 1.0 / 3.0])),
-        periodic=_periodic(energy, scores, length, length * tau0_s),
-        wander=_wander(scores, length),
-        changes=_changes(squares, tau0_s, step),
+        trend=_log_linear_gain(energy, length, np.stack([time, time**2 - 1.0 / 3.0])),
+        periodic=_fit_periodic(energy, scores, length, length * tau0_s),
+        wander=_slow_variation_gain(scores, length),
+        changes=_segment_steps(squares, tau0_s, step),
         block_s=length * tau0_s,
         energy=energy,
     )
 
 
 def tiles(w: Floats, tau0_s: float) -> Tiles:
-    """The rectangle of time and frequency, and the row, where white residuals [n] are least steady.
+    """Find the rectangle of time and frequency, and the row, in which the power of white residuals is least constant.
 
-    Samples τ0 apart; none may be missing.
+    Parameters
+    ----------
+    w : ndarray of float64, shape (n,)
+        White residuals without missing samples.
+    tau0_s : float
+        Sample period in seconds.
 
-    Raises:
-        ValueError: fewer than 2048 samples
+    Raises
+    ------
+    ValueError
+        If there are fewer than 2048 samples.
 
+    Examples
+    --------
     >>> rng = np.random.default_rng(0)
     >>> w, t = rng.standard_normal(60_000), 0.01 * np.arange(60_000)
     >>> w[30_000:40_000] += 0.3 * np.sin(2.0 * np.pi * 17.3 * t[30_000:40_000])
@@ -145,11 +168,11 @@ def tiles(w: Floats, tau0_s: float) -> Tiles:
     >>> found.gain > 50.0, found.frequency[0] < 17.3 < found.frequency[1]
     (True, True)
     """
-    if w.size < PARTS * PIECES[0]:
-        raise ValueError(f"{w.size} samples are too few, {PARTS * PIECES[0]} are needed")
+    if w.size < MIN_VARIANCE_BLOCKS * PIECE_SAMPLES[0]:
+        raise ValueError(f"{w.size} samples are too few, {MIN_VARIANCE_BLOCKS * PIECE_SAMPLES[0]} are needed")
     best = row = (-1.0, 0, 0, 0, 0, 0, 0.0)
-    for piece in (one for one in PIECES if w.size >= PARTS * one):
-        one, other = _rectangle(_powers(w, piece), piece)
+    for piece in (one for one in PIECE_SAMPLES if w.size >= MIN_VARIANCE_BLOCKS * one):
+        one, other = _best_tiles(_piece_spectra(w, piece), piece)
         best, row = max(best, one), max(row, other)
     _, piece, a, i, b, j, ratio = best
     return Tiles(
@@ -163,20 +186,23 @@ def tiles(w: Floats, tau0_s: float) -> Tiles:
     )
 
 
-def _change(squares: Floats, tau0_s: float, first: int = 0) -> Change:
-    """The best single step of squares that begin at sample ``first``.
+def _best_step(squares: Floats, tau0_s: float, first: int = 0) -> VarianceStep:
+    """Return the best single step of squared residuals that begin at sample ``first``.
 
-    The gain at every STRIDE-th time, and at every one where a step is likely at all.
+    The gain is computed at every ``STEP_SEARCH_STRIDE``-th time, and at every time in the range where a step is likely.
     """
     sums = np.cumsum(squares)
-    k = np.arange(AWAY, sums.size - AWAY + 1, STRIDE)
-    gains = _gains(sums, k)
+    k = np.arange(MIN_SEGMENT_SAMPLES, sums.size - MIN_SEGMENT_SAMPLES + 1, STEP_SEARCH_STRIDE)
+    gains = _step_gains(sums, k)
     likely = k[gains > gains.max() - 10.0]
-    stride = STRIDE
-    if likely[-1] - likely[0] < FINE:
+    stride = STEP_SEARCH_STRIDE
+    if likely[-1] - likely[0] < FINE_SEARCH_SAMPLES:
         stride = 1
-        k = np.arange(max(likely[0] - STRIDE, AWAY), min(likely[-1] + STRIDE, sums.size - AWAY) + 1)
-        gains = _gains(sums, k)
+        k = np.arange(
+            max(likely[0] - STEP_SEARCH_STRIDE, MIN_SEGMENT_SAMPLES),
+            min(likely[-1] + STEP_SEARCH_STRIDE, sums.size - MIN_SEGMENT_SAMPLES) + 1,
+        )
+        gains = _step_gains(sums, k)
     best = int(gains.argmax())
     chance = np.cumsum(np.exp(gains - gains[best]))
     lo, hi = np.searchsorted(chance, np.array([0.025, 0.975]) * chance[-1])
@@ -185,36 +211,40 @@ def _change(squares: Floats, tau0_s: float, first: int = 0) -> Change:
     ratio = float(((sums[-1] / sums[at - 1] - 1.0) * at / after) ** 0.5)
     half = float(np.exp(Z95 * (0.5 / at + 0.5 / after) ** 0.5))
     ends = (at, min(int(k[lo]), at) - stride + 1, max(int(k[hi]), at) + stride - 1)
-    return Change(
+    return VarianceStep(
         float(gains[best]), Size(*((first + one) * tau0_s for one in ends)), Size(ratio, ratio / half, ratio * half)
     )
 
 
-def _gains(sums: Floats, k: Ints) -> Floats:
-    """Log-likelihood gains of a step after ``k`` samples, by running sums of squares."""
+def _step_gains(sums: Floats, k: Ints) -> Floats:
+    """Return the log-likelihood gains of a step after ``k`` samples, from running sums of squares."""
     n, before, after = sums.size, sums[k - 1], sums[-1] - sums[k - 1]
     return np.asarray(0.5 * (n * np.log(sums[-1] / n) - k * np.log(before / k) - (n - k) * np.log(after / (n - k))))
 
 
-def _changes(squares: Floats, tau0_s: float, step: Change) -> tuple[Change, ...]:
-    """That step and more: each time the segment is cut that gains most by it (binary segmentation)."""
+def _segment_steps(squares: Floats, tau0_s: float, step: VarianceStep) -> tuple[VarianceStep, ...]:
+    """Return the given step and further steps by binary segmentation.
+
+    Each further step divides the segment in which it gains most.
+    """
     found = [step]
     ends = [0, squares.size]
-    open_: dict[tuple[int, int], Change] = {}
-    while len(found) < CHANGES and found[-1].gain >= FURTHER:
+    open_: dict[tuple[int, int], VarianceStep] = {}
+    while len(found) < MAX_CHANGES and found[-1].gain >= MIN_CHANGE_GAIN_NATS:
         ends = sorted({*ends, round(found[-1].time.value / tau0_s)})
-        parts = [(a, b) for a, b in pairwise(ends) if b - a > 4 * AWAY]
-        open_ = {part: open_.get(part) or _change(squares[slice(*part)], tau0_s, part[0]) for part in parts}
+        parts = [(a, b) for a, b in pairwise(ends) if b - a > 4 * MIN_SEGMENT_SAMPLES]
+        open_ = {part: open_.get(part) or _best_step(squares[slice(*part)], tau0_s, part[0]) for part in parts}
         if not open_:
             break
         found.append(max(open_.values(), key=lambda one: one.gain))
     return tuple(found)
 
 
-def _log_linear(energy: Floats, length: int, rows: Floats) -> float:
-    """Likelihood gain of ln σ² = a + Σ b_i row_i over a constant, energies being means of ``length`` squares.
+def _log_linear_gain(energy: Floats, length: int, rows: Floats) -> float:
+    """Return the log-likelihood gain of ln σ² = a + Σ b_i row_i over a constant.
 
-    Fisher scoring of a Gamma model with logarithmic link (McCullagh & Nelder 1989).
+    The energies are means of ``length`` squares. The fit is Fisher scoring of a Gamma model with logarithmic link
+    (McCullagh & Nelder 1989).
     """
     x = np.vstack([np.ones(energy.size), rows])
     normal = np.linalg.inv(x @ x.T)
@@ -230,23 +260,26 @@ def _log_linear(energy: Floats, length: int, rows: Floats) -> float:
     return max(0.5 * length * float(constant - (level + energy * np.exp(-level)).sum()), 0.0)
 
 
-def _periodic(energy: Floats, scores: Floats, length: int, block_s: float) -> Periodic:
-    """The best frequency of the score's periodogram, padded twofold, and the fit there."""
+def _fit_periodic(energy: Floats, scores: Floats, length: int, block_s: float) -> PeriodicVariance:
+    """Return the fit at the best frequency of the periodogram of the scores, which is zero-padded to twice its
+    length.
+    """
     power = np.abs(np.fft.rfft(scores, 2 * scores.size)) ** 2
-    power[: 2 * CYCLES] = 0.0
+    power[: 2 * MIN_CYCLES] = 0.0
     best = int(power[:-1].argmax())
-    around = np.fft.rfft(scores, 16 * scores.size)[max(8 * best - 8, 16 * CYCLES) : 8 * best + 9]
-    frequency = (max(8 * best - 8, 16 * CYCLES) + int(np.abs(around).argmax())) / (16.0 * scores.size)
+    around = np.fft.rfft(scores, 16 * scores.size)[max(8 * best - 8, 16 * MIN_CYCLES) : 8 * best + 9]
+    frequency = (max(8 * best - 8, 16 * MIN_CYCLES) + int(np.abs(around).argmax())) / (16.0 * scores.size)
     angle = 2.0 * np.pi * frequency * np.arange(scores.size)
     rows = np.stack([np.cos(angle), np.sin(angle)])
     depth = float(np.hypot(*(rows @ np.log(energy)))) / scores.size
-    return Periodic(_log_linear(energy, length, rows), frequency / block_s, depth)
+    return PeriodicVariance(_log_linear_gain(energy, length, rows), frequency / block_s, depth)
 
 
-def _wander(scores: Floats, length: int) -> float:
-    """Likelihood gain of the lowest 2^j frequencies of the scores being stronger, for the best j.
+def _slow_variation_gain(scores: Floats, length: int) -> float:
+    """Return the log-likelihood gain of larger power at the lowest 2^j frequencies of the scores, for the best j.
 
-    Ordinates of a white score of variance 2/length are exponential; K of them with mean p gain K (p − 1 − ln p).
+    The periodogram values of a white score with variance 2/length are exponential. K of them with mean p gain K (p − 1
+    − ln p).
     """
     ordinates = np.abs(np.fft.rfft(scores)[1 : scores.size // 2]) ** 2 * length / (2.0 * scores.size)
     ends = 2 ** np.arange(2, int(np.log2(max(ordinates.size, 4))) + 1)
@@ -255,30 +288,33 @@ def _wander(scores: Floats, length: int) -> float:
     return float(np.where(means > 1.0, gains, 0.0).max())
 
 
-Place = tuple[float, int, int, int, int, int, float]
-"""Gain, samples of a piece, pieces, which of those, frequencies, which of those, ratio of powers."""
+TileScore = tuple[float, int, int, int, int, int, float]
+"""Gain, samples in a piece, pieces, index of the pieces, frequencies, index of the frequencies, and ratio of powers."""
 
 
-def _powers(w: Floats, piece: int) -> Floats:
-    """Powers [pieces, piece/2] of a Fourier transform at (k + ½)/piece: of white noise each is χ² of two squares."""
+def _piece_spectra(w: Floats, piece: int) -> Floats:
+    """Return the powers, shape (pieces, piece/2), of Fourier transforms at (k + ½)/piece.
+
+    For white noise each power is χ² with two degrees of freedom.
+    """
     half = np.exp(-1j * np.pi / piece * np.arange(piece))
     lines = fft(w[: w.size // piece * piece].reshape(-1, piece) * half, axis=1)[:, : piece // 2]
     return np.asarray(lines.real**2 + lines.imag**2)
 
 
-def _rectangle(power: Floats, piece: int) -> tuple[Place, Place]:
-    """The best rectangle and the best row of powers [pieces, frequencies]."""
+def _best_tiles(power: Floats, piece: int) -> tuple[TileScore, TileScore]:
+    """Return the best rectangle and the best row of powers, shape (pieces, frequencies)."""
     best = row = (-1.0, piece, 1, 0, 1, 0, 1.0)
     b, total = 1, power.sum(axis=0)
     while True:
         tall, a = power, 1
         while tall.shape[0] >= 2:
-            low, low_at, high, high_at, logs = _columns(tall)
+            low, low_at, high, high_at, logs = _column_extremes(tall)
             for x, at in ((low, low_at), (high, high_at)):
-                gain, j, ratio = _over_rest(x, total, 2 * a * b, 2 * power.shape[0] * b)
+                gain, j, ratio = _best_contrast(x, total, 2 * a * b, 2 * power.shape[0] * b)
                 best = max(best, (gain, piece, a, int(at[j]), b, j, ratio))
-            if 2 * a * b >= EVEN_ROWS or a == 1:
-                gain, j = _uneven(tall.sum(axis=0), logs, tall.shape[0], 2 * a * b)
+            if 2 * a * b >= MIN_SQUARES_PER_CELL or a == 1:
+                gain, j = _bartlett_test(tall.sum(axis=0), logs, tall.shape[0], 2 * a * b)
                 row = max(row, (gain, piece, a, 0, b, j, 1.0))
             even = tall.shape[0] // 2 * 2
             tall, a = tall[0:even:2] + tall[1:even:2], 2 * a
@@ -288,8 +324,11 @@ def _rectangle(power: Floats, piece: int) -> tuple[Place, Place]:
 
 
 @compiled
-def _columns(power):  # type: ignore[no-untyped-def]
-    """Least and largest of each column, which those are, and the sum of the logarithms (of products of eight)."""
+def _column_extremes(power):  # type: ignore[no-untyped-def]
+    """Return the minimum and maximum of each column with their positions, and the sum of its logarithms.
+
+    The logarithms are taken of products of eight values.
+    """
     rows, columns = power.shape
     low, high, logs = power[0].copy(), power[0].copy(), np.zeros(columns)
     low_at, high_at = np.zeros(columns, np.int64), np.zeros(columns, np.int64)
@@ -310,17 +349,18 @@ def _columns(power):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _over_rest(x, total, inside, whole):  # type: ignore[no-untyped-def]
-    """The best of energies of ``inside`` squares each over the rest of their columns: gain, which, ratio of powers.
+def _best_contrast(x, total, inside, whole):  # type: ignore[no-untyped-def]
+    """Return gain, index and power ratio of the best energy of ``inside`` squares over the rest of its column.
 
-    With x of c squares inside and R of d outside: (c+d)/2 ln((x+R)/(c+d)) − c/2 ln(x/c) − d/2 ln(R/d), which is convex
-    in x: of a column only its least and its largest can be the best. That a few squares are silent is no evidence.
+    With x of c squares inside and R of d squares outside, the gain is (c+d)/2 ln((x+R)/(c+d)) − c/2 ln(x/c) − d/2
+    ln(R/d). It is convex in x, so that only the smallest and the largest value of a column can be the best. A low power
+    of only a few squares is no evidence.
     """
     outside = whole - inside
     best, place, ratio = -1.0, 0, 1.0
     for j in range(x.size):
         u = max(x[j] * whole / (inside * total[j]), 1e-30)
-        if u < 1.0 and inside < QUIET:
+        if u < 1.0 and inside < MIN_SQUARES_FOR_DECREASE:
             gain, v = 0.0, 1.0
         else:
             v = max((total[j] - x[j]) * whole / (outside * total[j]), 1e-30)
@@ -330,22 +370,24 @@ def _over_rest(x, total, inside, whole):  # type: ignore[no-untyped-def]
     return best, place, ratio
 
 
-def _uneven(total: Floats, logs: Floats, count: int, squares: int) -> tuple[float, int]:
-    """−ln p and place of the column of ``count`` energies that is least steady, by Bartlett's (1937) statistic.
+def _bartlett_test(total: Floats, logs: Floats, count: int, squares: int) -> tuple[float, int]:
+    """Return −ln p and the index of the least constant column of ``count`` energies, by Bartlett's (1937) statistic.
 
-    Σ c/2 (ln of the mean − ln of each), c squares in each cell; its law is taken for a Gamma's of the same moments.
+    The statistic is Σ c/2 (ln of the mean − ln of each), with c squares in each cell. Its distribution is approximated
+    by a Gamma distribution with the same mean and variance.
     """
     uneven = 0.5 * squares * (count * np.log(total / count) - logs)
     j = int(uneven.argmax())
-    expected, variance = _moments(count, 0.5 * squares)
+    expected, variance = _bartlett_moments(count, 0.5 * squares)
     shape, x = expected**2 / variance, float(uneven[j]) * expected / variance
     chance = float(gammaincc(shape, x))
-    far = x - (shape - 1.0) * float(np.log(x)) + float(gammaln(shape))  # the first term, where 64 bits have no number
+    # first term of the asymptotic series, used if the probability underflows
+    far = x - (shape - 1.0) * float(np.log(x)) + float(gammaln(shape))
     return -float(np.log(chance)) if chance > 1e-300 else far, j
 
 
 @lru_cache(maxsize=1024)
-def _moments(count: int, half: float) -> tuple[float, float]:
-    """Mean and variance of Bartlett's statistic of ``count`` χ² of 2 ``half`` squares each: exact."""
+def _bartlett_moments(count: int, half: float) -> tuple[float, float]:
+    """Return the exact mean and variance of Bartlett's statistic of ``count`` χ² values of 2 ``half`` squares each."""
     expected = half * count * (float(psi(count * half)) - float(np.log(count)) - float(psi(half)))
     return expected, half**2 * (count * float(polygamma(1, half)) - count**2 * float(polygamma(1, count * half)))

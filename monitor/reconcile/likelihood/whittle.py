@@ -1,16 +1,18 @@
-"""The likelihood of one axis, and its maximum: variances of a spectrum and sizes of regressors together.
+"""Whittle likelihood of one axis, maximised over the variances of the noise and the sizes of the regressors together.
 
-The coefficients of an axis are independent and Gaussian (Whittle 1953, on the cosine transform): in bin b, of variance
+The coefficients of an axis are independent and Gaussian (Whittle 1953, on the cosine transform). In bin b they have the
+variance
 
     v_b = c_b + Σ_j θ_j B_jb,    θ_j ≥ 0,
 
-about Σ_i β_i R_ik, so that
+about the mean Σ_i β_i R_ik, so that
 
     ln L = −½ Σ_b [ count_b ln v_b + P_b(β)/v_b ],    P_b = Σ_k (Y_k − Σ β_i R_ik)².
 
-Regressors R are what follows time, temperature or another axis; sums over bins of their products are all that is asked
-of the samples. θ by Fisher scoring with the bound θ ≥ 0 kept by coordinate descent on its quadratic form, β by
-generalised least squares for the v at hand, in turns until ln L stands still. A step that does not climb is halved.
+The regressors R depend on time, temperature or another axis. The likelihood needs only sums over bins of products of
+the samples and the regressors. θ is found by Fisher scoring. Coordinate descent on the quadratic form keeps the bound θ
+≥ 0. For the current v, β is found by generalised least squares. Both steps alternate until ln L no longer increases. A
+step that does not increase ln L is halved.
 """
 
 from dataclasses import dataclass
@@ -22,16 +24,17 @@ from drivers.sample import Floats
 from monitor.common.compiled import compiled
 from monitor.reconcile.preparation.cosine_bins import Bins
 
-TURNS: Final = 200
-STILL: Final = 1e-5
-"""Nats: a turn that gains less is the last."""
-LEAST: Final = 1e-20
-"""Of the power of a bin: no variance is below."""
+MAX_FIT_ITERATIONS: Final = 200
+"""Largest number of iterations."""
+CONVERGENCE_NATS: Final = 1e-5
+"""Gain in nats below which the iteration stops."""
+MIN_VARIANCE_RATIO: Final = 1e-20
+"""Lower limit of a variance, relative to the largest power of a bin."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sums:
-    """What the likelihood asks of an axis and its regressors."""
+    """Sums over bins that the likelihood needs."""
 
     power: Floats  # [m] Σ Y²
     cross: Floats  # [q, m] Σ R_i Y
@@ -40,19 +43,29 @@ class Sums:
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """A maximum."""
+    """Maximum of the likelihood."""
 
     theta: Floats  # [p] variances
     beta: Floats  # [q] sizes of the regressors
-    variance: Floats  # [m] of a coefficient in each bin
-    residual: Floats  # [m] Σ of squares in each bin, regressors taken out
+    variance: Floats  # [m] variance of a coefficient in each bin
+    residual: Floats  # [m] sum of squares in each bin after the regressors are removed
     log_likelihood: float
-    theta_information: Floats  # [p, p] Fisher's, of all θ
-    beta_covariance: Floats  # [q, q]
+    theta_information: Floats  # [p, p] Fisher information of θ
+    beta_covariance: Floats  # [q, q] covariance of β
 
 
 def sums(bins: Bins, y: Floats, regressors: Floats) -> Sums:
-    """Of coefficients [n − 1] and regressors' coefficients [q, n − 1]."""
+    """Return the sums over bins of an axis and its regressors.
+
+    Parameters
+    ----------
+    bins : Bins
+        Frequency bins.
+    y : ndarray of float64, shape (n − 1,)
+        Transform coefficients of the axis.
+    regressors : ndarray of float64, shape (q, n − 1)
+        Transform coefficients of the regressors.
+    """
     q, m = len(regressors), bins.count.size
     cross, gram = np.empty((q, m)), np.empty((q, q, m))
     for i in range(q):
@@ -63,16 +76,22 @@ def sums(bins: Bins, y: Floats, regressors: Floats) -> Sums:
 
 
 def maximise(count: Floats, found: Sums, bases: Floats, constant: Floats, start: Floats) -> Fitted:
-    """θ and β of largest likelihood.
+    """Return the θ and β with the largest likelihood.
 
-    Args:
-        count: [m] coefficients in each bin
-        found: sums of the axis
-        bases: [p, m] variance of a coefficient for θ_j = 1
-        constant: [m] variance that is not fitted
-        start: [p] θ to start from
+    Parameters
+    ----------
+    count : ndarray of float64, shape (m,)
+        Number of coefficients in each bin.
+    found : Sums
+        Sums over bins of the axis and its regressors.
+    bases : ndarray of float64, shape (p, m)
+        Variance of a coefficient for θ_j = 1.
+    constant : ndarray of float64, shape (m,)
+        Variance that is not fitted.
+    start : ndarray of float64, shape (p,)
+        Starting values of θ.
     """
-    least = LEAST * float((found.power / np.maximum(count, 1.0)).max(initial=0.0)) or LEAST
+    least = MIN_VARIANCE_RATIO * float((found.power / np.maximum(count, 1.0)).max(initial=0.0)) or MIN_VARIANCE_RATIO
     theta, beta, variance, residual, likelihood, information, normal = _maximise(
         count, found.power, found.cross, found.gram, bases, constant + least, np.maximum(start, 0.0)
     )
@@ -82,6 +101,7 @@ def maximise(count: Floats, found: Sums, bases: Floats, constant: Floats, start:
 
 @compiled
 def _maximise(count, power, cross, gram, bases, constant, start):  # type: ignore[no-untyped-def]
+    """Alternate Fisher scoring for θ and least squares for β until the log-likelihood no longer increases."""
     p, m = bases.shape
     q = cross.shape[0]
     theta = start.copy()
@@ -94,7 +114,7 @@ def _maximise(count, power, cross, gram, bases, constant, start):  # type: ignor
         residual = _residual(power, cross, gram, beta)
     best = _log_likelihood(count, variance, residual)
     information = np.zeros((p, p))
-    for _ in range(TURNS):
+    for _ in range(MAX_FIT_ITERATIONS):
         gradient = np.zeros(p)
         for j in range(p):
             total = 0.0
@@ -107,7 +127,7 @@ def _maximise(count, power, cross, gram, bases, constant, start):  # type: ignor
                     total += 0.5 * count[b] * bases[j, b] * bases[i, b] / variance[b] ** 2
                 information[j, i] = total
                 information[i, j] = total
-        aim = _bounded(information, gradient, theta)
+        aim = _nonnegative_maximum(information, gradient, theta)
         climbed = False
         share = 1.0
         for _ in range(12):
@@ -119,7 +139,7 @@ def _maximise(count, power, cross, gram, bases, constant, start):  # type: ignor
                 trial_residual = _residual(power, cross, gram, trial_beta)
             value = _log_likelihood(count, trial_variance, trial_residual)
             if value > best:
-                climbed = value > best + STILL
+                climbed = value > best + CONVERGENCE_NATS
                 theta, variance, beta, normal, residual, best = (
                     trial,
                     trial_variance,
@@ -137,6 +157,7 @@ def _maximise(count, power, cross, gram, bases, constant, start):  # type: ignor
 
 @compiled
 def _variance(bases, constant, theta):  # type: ignore[no-untyped-def]
+    """Return the variance of a coefficient in each bin."""
     variance = constant.copy()
     for j in range(theta.size):
         if theta[j] > 0.0:
@@ -147,6 +168,7 @@ def _variance(bases, constant, theta):  # type: ignore[no-untyped-def]
 
 @compiled
 def _log_likelihood(count, variance, residual):  # type: ignore[no-untyped-def]
+    """Return the log-likelihood without its constant term."""
     total = 0.0
     for b in range(count.size):
         total -= 0.5 * (count[b] * np.log(variance[b]) + residual[b] / variance[b])
@@ -155,7 +177,10 @@ def _log_likelihood(count, variance, residual):  # type: ignore[no-untyped-def]
 
 @compiled
 def _regress(cross, gram, variance):  # type: ignore[no-untyped-def]
-    """Generalised least squares; a regressor that others make up gets a little ridge."""
+    """Return the generalised least-squares estimate of β and its normal matrix.
+
+    A small ridge makes collinear regressors solvable.
+    """
     q, m = cross.shape
     normal = np.zeros((q, q))
     right = np.zeros(q)
@@ -181,6 +206,7 @@ def _regress(cross, gram, variance):  # type: ignore[no-untyped-def]
 
 @compiled
 def _residual(power, cross, gram, beta):  # type: ignore[no-untyped-def]
+    """Return the sum of squares in each bin after the regressors are removed."""
     q, m = cross.shape
     left = power.copy()
     for b in range(m):
@@ -189,13 +215,13 @@ def _residual(power, cross, gram, beta):  # type: ignore[no-untyped-def]
             for j in range(q):
                 left[b] += beta[i] * beta[j] * gram[i, j, b]
         if left[b] < 0.0:
-            left[b] = 0.0  # rounding
+            left[b] = 0.0  # negative only by rounding
     return left
 
 
 @compiled
-def _bounded(information, gradient, theta):  # type: ignore[no-untyped-def]
-    """Maximum over θ ≥ 0 of the quadratic form at θ, one θ at a time."""
+def _nonnegative_maximum(information, gradient, theta):  # type: ignore[no-untyped-def]
+    """Return the maximum of the quadratic form over θ ≥ 0, by coordinate descent."""
     p = theta.size
     found = theta.copy()
     slope = gradient.copy()

@@ -1,13 +1,15 @@
-"""One axis by frequency: its orthonormal cosine transform (DCT-II), and sums of it over bins.
+"""Orthonormal cosine transform (DCT-II) of one axis and sums of its coefficients over frequency bins.
 
-The transform needs no window. Its coefficients Y_k, k = 1 … n − 1 at f_k = k·rate/2n, of a stationary series are nearly
-independent, with variance S(f_k)/τ0; of white noise and random walk exactly. A slope or a step leaks nothing from its
-ends, as it does in a periodogram, since the series is continued as in a mirror. The mean is Y_0, and is left out: a
-model's mean is always free.
+The transform needs no window. The coefficients of a stationary series are Y_k for k = 1 … n − 1, at the frequencies f_k
+= k·rate/2n. They are nearly independent and have the variance S(f_k)/τ0. For white noise and random walk, both
+statements are exact. A slope or a step does not leak from the ends of the series as it does in a periodogram, because
+the transform continues the series as a mirror image. The mean is Y_0. It is left out, because the mean of a model is
+always free.
 
-All that the likelihood asks of a recording are sums over bins narrow enough for the spectrum to be even within each:
-the first SINGLE coefficients by themselves, then PER_OCTAVE bins an octave, none wider than WIDEST_HZ, and finer ones
-round narrow peaks and towards half the rate. An hour at 100 Hz comes to some 850 numbers a product.
+The likelihood needs only sums over bins that are so narrow that the spectrum is nearly constant within each. The first
+``SINGLE_COEFFICIENT_BINS`` coefficients have a bin each. ``BINS_PER_OCTAVE`` bins per octave follow, and none is wider
+than ``MAX_BIN_WIDTH_HZ``. The bins are finer around narrow peaks and towards half the sample rate. For an hour at 100
+Hz there are about 850 bins.
 """
 
 from collections.abc import Sequence
@@ -19,58 +21,75 @@ from scipy.fft import dct, idct
 
 from drivers.sample import Floats, Ints
 
-SINGLE: Final = 48
-PER_OCTAVE: Final = 16
-WIDEST_HZ: Final = 0.1
-WIDEST_SHARE: Final = 0.002
-"""Of the band: a slow recording has no bin wider than this either."""
-PEAK_STEPS: Final = 24
-"""Bins from the middle of a peak to where it no longer matters, on each side."""
-PEAK_REACH: Final = 30.0
-"""Half widths of a peak that get finer bins."""
+SINGLE_COEFFICIENT_BINS: Final = 48
+"""Number of bins at the lowest frequencies that hold one coefficient each."""
+BINS_PER_OCTAVE: Final = 16
+"""Number of bins per octave."""
+MAX_BIN_WIDTH_HZ: Final = 0.1
+"""Largest width of a bin in Hz."""
+MAX_BIN_WIDTH_FRACTION: Final = 0.002
+"""Largest width of a bin as a fraction of the band. This limit matters for recordings with a low sample rate."""
+BINS_PER_PEAK_SIDE: Final = 24
+"""Number of bins on each side of a narrow peak, from its centre to where its power no longer matters."""
+PEAK_REACH_HALF_WIDTHS: Final = 30.0
+"""Distance from the centre of a peak, in half widths, up to which the bins are finer."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bins:
-    """Which coefficients are summed together."""
+    """Assignment of transform coefficients to frequency bins."""
 
     first: Ints  # [m] k of the first coefficient of each bin, minus 1
-    count: Floats  # [m] coefficients
-    f_hz: Floats  # [m] middle
+    count: Floats  # [m] number of coefficients
+    f_hz: Floats  # [m] centre frequency, Hz
     n: int  # samples of the series
     rate_hz: float
 
     def sums(self, products: Floats) -> Floats:
-        """Sum [m] over bins of something [n − 1] that each coefficient has."""
+        """Return the sum over each bin, shape (m,), of a value per coefficient, shape (n − 1,)."""
         return np.asarray(np.add.reduceat(products, self.first))
 
     def spread(self, of_bins: Floats) -> Floats:
-        """The value [n − 1] of each coefficient's bin."""
+        """Return for each coefficient, shape (n − 1,), the value of its bin, shape (m,)."""
         return np.repeat(of_bins, self.count.astype(np.int64))
 
 
 def bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] = ()) -> Bins:
-    """Bins of a series of ``n`` samples.
+    """Return the frequency bins of a series.
 
-    Args:
-        peaks: (middle, full width) in Hz of narrow peaks
+    Parameters
+    ----------
+    n : int
+        Number of samples.
+    rate_hz : float
+        Sample rate in Hz.
+    peaks : sequence of tuple of float, optional
+        Centre and full width, in Hz, of the narrow peaks that get finer bins.
 
+    Returns
+    -------
+    Bins
+        Bins that together hold the n − 1 coefficients.
+
+    Examples
+    --------
     >>> found = bins(360_000, 100.0)
     >>> int(found.count.sum()), 700 < found.count.size < 1000
     (359999, True)
     """
     step_hz = 0.5 * rate_hz / n
-    widest = min(WIDEST_HZ, WIDEST_SHARE * 0.5 * rate_hz) / step_hz
-    ratio = 2.0 ** (1.0 / PER_OCTAVE) - 1.0
-    edges = list(range(1, min(SINGLE, n - 1) + 1))
+    widest = min(MAX_BIN_WIDTH_HZ, MAX_BIN_WIDTH_FRACTION * 0.5 * rate_hz) / step_hz
+    ratio = 2.0 ** (1.0 / BINS_PER_OCTAVE) - 1.0
+    edges = list(range(1, min(SINGLE_COEFFICIENT_BINS, n - 1) + 1))
     at = float(edges[-1])
     while at < n:
-        # towards half the rate as towards zero: there the null of a digital filter is a power law of the distance
+        # The bins narrow towards half the rate as they do towards zero, because the null of a digital filter at half
+        # the rate follows a power law of the distance from it.
         at += max(min(at * ratio, (n - at) * ratio, widest), 1.0)
         edges.append(round(at))
     parts = [np.asarray(edges, np.int64)]
     for middle, width in peaks:
-        away = np.geomspace(0.1, PEAK_REACH, PEAK_STEPS) * 0.5 * width
+        away = np.geomspace(0.1, PEAK_REACH_HALF_WIDTHS, BINS_PER_PEAK_SIDE) * 0.5 * width
         at_hz = np.concatenate([middle - away, [middle], middle + away])
         parts.append(np.rint(at_hz / step_hz).astype(np.int64))
     k = np.unique(np.concatenate(parts))
@@ -80,13 +99,26 @@ def bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] = ()) -> B
 
 
 def transform(y: Floats) -> Floats:
-    """Coefficients [n − 1] of a series [n] without missing samples, in its own unit."""
+    """Return the cosine transform of a series without its mean.
+
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Series without missing samples.
+
+    Returns
+    -------
+    ndarray of float64, shape (n − 1,)
+        Coefficients in the unit of ``y``.
+    """
     return np.asarray(dct(y - y.mean(), norm="ortho")[1:])
 
 
 def series(coefficients: Floats) -> Floats:
-    """The series [n] of coefficients [n − 1], its mean zero.
+    """Return the zero-mean series, shape (n,), that has the given coefficients, shape (n − 1,).
 
+    Examples
+    --------
     >>> y = np.array([1.0, 4.0, -5.0])
     >>> bool(np.allclose(series(transform(y)), y))
     True

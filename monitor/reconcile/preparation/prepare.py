@@ -1,8 +1,9 @@
-"""A recording made ready: its holes filled, and put right what the model says is wrong with single samples.
+"""Preparation of a recording: replace missing samples and samples that the model describes as wrong.
 
-What is missing is filled by draws from around it. Repeats of continuous values are known one by one and taken for
-missing; so are outliers, once the axis is white enough to see them; clipped samples are drawn from beyond the limit.
-Measured and simulated recordings go the same way, each by its model: what is left after that is for the spectrum.
+Missing samples are replaced by random draws from their neighbourhood. The positions of repeats of continuous values are
+known, and these samples are treated as missing. Outliers are also treated as missing, once the axis is white enough to
+detect them. Clipped samples are drawn from beyond the limit. Measured and simulated recordings are prepared in the same
+way, each with its own model. The spectrum then describes the remaining effects.
 """
 
 from collections.abc import Mapping
@@ -22,12 +23,13 @@ from monitor.reconcile.preparation.sample_repair import filled, unclipped
 from monitor.reconcile.preparation.value_statistics import clipped, levels, repeats
 
 FEWEST: Final = 4096
-"""Samples: with fewer there is no spectrum to speak of, and no spectrogram."""
-NEAR: Final = 1e-9
-"""Relative: a sample that near to the limit is at it."""
-TURNS: Final = 40
-STILL: Final = 5e-4
-"""Relative change of the deviation that ends the turns."""
+"""Smallest number of samples. With fewer samples, neither a spectrum nor a spectrogram is meaningful."""
+CLIP_RELATIVE_TOLERANCE: Final = 1e-9
+"""Relative distance to the limit below which a sample counts as clipped."""
+MAX_SIGMA_ITERATIONS: Final = 40
+"""Largest number of iterations between clipped samples and their standard deviation."""
+SIGMA_RELATIVE_TOLERANCE: Final = 5e-4
+"""Relative change of the standard deviation that ends the iterations."""
 E = TypeVar("E", bound=Effect)
 
 
@@ -39,13 +41,22 @@ def prepared(
     courses: Courses,
     rng: np.random.Generator,
 ) -> dict[str, Axis]:
-    """Axes of one recording.
+    """Return the prepared axes of one recording.
 
-    Args:
-        raw: axis -> samples [n], SI; NaN = missing
-        effects: what each axis is said to have
-        temperature_c: [n] °C, without holes
-        courses: of that length, rate and temperature
+    Parameters
+    ----------
+    raw : mapping of str to ndarray of float64, shape (n,)
+        Samples of each axis in rad/s or m/s². NaN marks a missing sample.
+    rate_hz : float
+        Sample rate in Hz.
+    effects : mapping of str to tuple of Effect
+        Effects of each axis according to the model.
+    temperature_c : ndarray of float64, shape (n,), or None
+        Temperature in °C without missing samples.
+    courses : Courses
+        Cached regressors for the same length, sample rate and temperature.
+    rng : numpy.random.Generator
+        Generator for the replacement samples.
     """
     even = bins(len(next(iter(raw.values()))), rate_hz)
     shown = {name: look_at_values(y) for name, y in raw.items()}
@@ -55,18 +66,36 @@ def prepared(
     for name, y in raw.items():
         others = {other: one for other, one in coefficients.items() if may_leak(other, name)}
         axis = Axis(name, y, mended[name], coefficients[name], even, others, temperature_c, shown[name], courses)
-        axes[name] = without_outliers(axis, effects[name], rng)
+        axes[name] = replace_outliers(axis, effects[name], rng)
     return axes
 
 
 def again(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:
-    """The same axis, put right for other effects."""
+    """Return the same axis, repaired for other effects.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to repair again from its measured samples.
+    effects : tuple of Effect
+        Effects of the axis.
+    rng : numpy.random.Generator
+        Generator for the replacement samples.
+    """
     y = mend(axis.raw, axis.shown, effects, rng)
-    return without_outliers(_with(axis, y, axis.bins), effects, rng)
+    return replace_outliers(_replace_samples(axis, y, axis.bins), effects, rng)
 
 
 def without_sources(axis: Axis, sources: frozenset[str]) -> Axis:
-    """The same axis, in which some axes are known not to leak."""
+    """Return the same axis without some axes as possible sources of a leak.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to copy.
+    sources : frozenset of str
+        Names of the axes that do not leak into this axis.
+    """
     others = {name: one for name, one in axis.others.items() if name not in sources}
     return Axis(
         axis.name, axis.raw, axis.y, axis.coefficients, axis.bins, others, axis.temperature_c, axis.shown, axis.courses
@@ -74,12 +103,22 @@ def without_sources(axis: Axis, sources: frozenset[str]) -> Axis:
 
 
 def may_leak(source: str, axis: str) -> bool:
-    """Gyroscopes and accelerometers into their kind, accelerometers into gyroscopes too."""
+    """Return True if one axis may leak into another.
+
+    Gyroscopes and accelerometers leak into their own kind. Accelerometers also leak into gyroscopes.
+
+    Parameters
+    ----------
+    source : str
+        Name of the axis that leaks.
+    axis : str
+        Name of the affected axis.
+    """
     return source != axis and (axis.startswith("g") or source.startswith("a"))
 
 
 def look_at_values(y: Floats) -> Shown:
-    """Steps, ends and repeats of samples [n] as measured."""
+    """Return the quantization, clipping and repeats of measured samples ``y``, shape (n,), in rad/s or m/s²."""
     grid = levels(y)
     step = grid.step.value if grid else 0.0
     ends = clipped(y, step)
@@ -87,42 +126,74 @@ def look_at_values(y: Floats) -> Shown:
 
 
 def mend(y: Floats, shown: Shown, effects: Effects, rng: np.random.Generator) -> Floats:
-    """Samples [n] without holes, repeats and clipping."""
+    """Return the samples with missing, repeated and clipped samples replaced.
+
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Measured samples. NaN marks a missing sample.
+    shown : Shown
+        Statistics of the measured values.
+    effects : tuple of Effect
+        Effects of the axis. Repeats and clipping are repaired only if they are among them.
+    rng : numpy.random.Generator
+        Generator for the replacement samples.
+
+    Returns
+    -------
+    ndarray of float64, shape (n,)
+        Repaired samples in the unit of ``y``.
+    """
     missing = ~np.isfinite(y)
-    if _first(effects, SampleHold) and shown.repeats:
+    if _first_of_type(effects, SampleHold) and shown.repeats:
         missing = missing | shown.repeats.mask
     mended = filled(y, missing, rng)
-    limit = _first(effects, Saturation)
+    limit = _first_of_type(effects, Saturation)
     if limit is not None and shown.clipped is not None and shown.clipped.symmetric:
         at = shown.clipped.limit.value
-        inside = np.abs(mended) < at * (1.0 - NEAR)
+        inside = np.abs(mended) < at * (1.0 - CLIP_RELATIVE_TOLERANCE)
         sigma = float(np.std(np.diff(mended)[inside[1:] & inside[:-1]])) / 2.0**0.5
-        return _beyond(mended, at, sigma, rng)
+        return _restore_clipped(mended, at, sigma, rng)
     return mended
 
 
-def _beyond(y: Floats, limit: float, sigma: float, rng: np.random.Generator) -> Floats:
-    """Clipped samples drawn anew, and the deviation of all with them, in turns: where few were clipped few turns do."""
+def _restore_clipped(y: Floats, limit: float, sigma: float, rng: np.random.Generator) -> Floats:
+    """Redraw the clipped samples and update the standard deviation in turns until it converges.
+
+    A few iterations suffice if few samples were clipped.
+    """
     whole = y
-    for _ in range(TURNS):
+    for _ in range(MAX_SIGMA_ITERATIONS):
         whole = unclipped(y, limit, sigma, rng)
         before, sigma = sigma, float(np.std(np.diff(whole))) / 2.0**0.5
-        if abs(sigma - before) < STILL * sigma:
+        if abs(sigma - before) < SIGMA_RELATIVE_TOLERANCE * sigma:
             break
     return whole
 
 
-def without_outliers(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:
-    """The axis with its outliers taken for missing, if it is said to have any."""
-    if _first(effects, Outliers) is None:
+def replace_outliers(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:
+    """Return the axis with its outliers replaced, if its effects include outliers.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to repair.
+    effects : tuple of Effect
+        Effects of the axis.
+    rng : numpy.random.Generator
+        Generator for the replacement samples.
+    """
+    if _first_of_type(effects, Outliers) is None:
         return axis
     found = outliers(sight(axis, believed(axis, effects).likely).fast)
-    return axis if found is None else _with(axis, filled(axis.y, found.mask, rng), axis.bins)
+    return axis if found is None else _replace_samples(axis, filled(axis.y, found.mask, rng), axis.bins)
 
 
-def _with(axis: Axis, y: Floats, binned: Bins) -> Axis:
+def _replace_samples(axis: Axis, y: Floats, binned: Bins) -> Axis:
+    """Return a copy of an axis with other samples and bins."""
     return Axis(axis.name, axis.raw, y, transform(y), binned, axis.others, axis.temperature_c, axis.shown, axis.courses)
 
 
-def _first(effects: Effects, kind: type[E]) -> E | None:
+def _first_of_type(effects: Effects, kind: type[E]) -> E | None:
+    """Return the first effect of a type, or None."""
     return next((effect for effect in effects if isinstance(effect, kind)), None)

@@ -1,8 +1,8 @@
-"""The clock of the whole recording: is its true rate the stated one?
+"""Test of whether the true sample rate of a recording differs from the stated one.
 
-A wrong rate moves everything along the axis of frequency, on all axes by one ratio. It can be told where the model has
-a feature that stands at one frequency, a line or a resonance: such a feature is then missing where it should be, and
-one stands where it should not. Without a feature a wrong rate is a wrong N, and nobody can tell.
+A wrong sample rate shifts all frequencies on all axes by one ratio. It is detectable if the model has a feature at a
+known frequency, such as a line or a resonance. The feature is then missing at its own frequency and appears at another
+one. Without such a feature, a wrong sample rate cannot be distinguished from a wrong N.
 """
 
 from collections.abc import Mapping
@@ -15,23 +15,25 @@ import numpy as np
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Narrowband, Sinusoidal
 from monitor.reconcile.diagnostics.diagnostics import periodogram, sight
-from monitor.reconcile.likelihood.hypothesis import GOLDEN, HALF, believed
+from monitor.reconcile.likelihood.hypothesis import CHI2_HALF_NATS, GOLDEN, believed
 from monitor.reconcile.preparation.axis import Axis, Effects
 from monitor.reconcile.result import Bounds
 from monitor.reconcile.search.candidates import peaks
 
-FURTHEST: Final = 0.15
-"""A clock that is further off is another sensor."""
-OTHERS: Final = 6.0
-"""Nats that everything but the strongest feature must gain, the others and the noise of all axes; and that no feature
-loses, which would then stand where it was."""
-SAME: Final = 1.01
-"""Factor between frequencies of one feature, seen on several axes."""
-TRIED: Final = 12
-"""Ratios at which all axes are fitted."""
+MAX_LOG_RATIO: Final = 0.15
+"""Largest absolute logarithm of the ratio. A larger error means that the recording is from another sensor."""
+MIN_OTHER_GAIN_NATS: Final = 6.0
+"""Log-likelihood gain in nats that everything except the strongest feature must reach: the other features and the noise
+of all axes. It is also the largest loss of a single feature. A feature that loses more has stayed at its stated
+frequency.
+"""
+SAME_FEATURE_RATIO: Final = 1.01
+"""Largest ratio of two frequencies, on any axes, that belong to the same feature."""
+MAX_TRIAL_RATIOS: Final = 12
+"""Number of ratios at which all axes are fitted."""
 PRICE: Final = 12.0
-"""Nats: for the ratio, and for the features that may be meant."""
-POWERS: Final[Mapping[str, float]] = {
+"""Penalty in nats for the ratio and for the choice of features."""
+RATIO_EXPONENTS: Final[Mapping[str, float]] = {
     "Q": 1.0,
     "N": 0.5,
     "K": -0.5,
@@ -45,35 +47,60 @@ POWERS: Final[Mapping[str, float]] = {
     "time": 1.0,
     "rate": -1.0,
 }
-"""Power of (true rate over stated rate) by which a parameter reads in stated time: S(f) becomes r S(rf), τ becomes
-τ/r."""
+"""For each parameter, the power of r = (true rate / stated rate) that converts it to stated time: S(f) becomes r S(rf),
+and τ becomes τ/r.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """A rate that is not the stated one."""
+    """Detected error of the sample rate."""
 
-    ratio: Bounds  # true over stated
-    gain: float  # nats over all axes
-    axis: str  # where it shows most
-    frequency: tuple[float, float]  # Hz, of the feature: as the model has it, as it is seen
+    ratio: Bounds  # true rate over stated rate
+    gain: float  # log-likelihood gain summed over all axes, nats
+    axis: str  # axis with the largest gain
+    frequency: tuple[float, float]  # frequency of the feature in the model and in the recording, Hz
 
 
 def restated(effect: Effect, ratio: float) -> Effect:
-    """The effect as it reads in a recording whose clock states 1/ratio of the true rate.
+    """Return the effect as it appears in a recording whose stated sample rate is 1/ratio of the true rate.
 
+    Parameters
+    ----------
+    effect : Effect
+        Effect in true time.
+    ratio : float
+        True rate over stated rate.
+
+    Examples
+    --------
     >>> restated(Sinusoidal(amplitude=1.0, frequency=10.1), 1.01).frequency
     10.0
     """
     changed: dict[str, Any] = {
-        name: getattr(effect, name) * ratio**power for name, power in POWERS.items() if getattr(effect, name, None)
+        name: getattr(effect, name) * ratio**power
+        for name, power in RATIO_EXPONENTS.items()
+        if getattr(effect, name, None)
     }
     return replace(effect, **changed) if changed else effect  # type: ignore[type-var]
 
 
 def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clock | None:
-    """The ratio at which all axes together fit best, if it is worth its price."""
-    trials = _ratios(axes, effects)
+    """Detect a sample rate error that is common to all axes.
+
+    Parameters
+    ----------
+    axes : mapping of str to Axis
+        Prepared axes of the recording.
+    effects : mapping of str to tuple of Effect
+        Effects of each axis in the model under test.
+
+    Returns
+    -------
+    Clock or None
+        The ratio at which all axes together fit best, or None if its gain does not exceed the penalty.
+    """
+    trials = _candidate_ratios(axes, effects)
     if not trials:
         return None
     before = {name: believed(axes[name], effects[name]).likely.log_likelihood for name in axes}
@@ -86,14 +113,14 @@ def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clo
         return sum(gains(x).values())
 
     ratio, width = max(trials, key=lambda one: gain(log(one[0])))
-    x = _highest(gain, log(ratio), width)
+    x = _maximise_gain(gain, log(ratio), width)
     top = gain(x)
     if top < PRICE:
         return None
-    alone = _each(axes, effects, before, exp(x))
-    if top - max(alone) < OTHERS or min(alone) < -OTHERS:
+    alone = _gain_per_feature(axes, effects, before, exp(x))
+    if top - max(alone) < MIN_OTHER_GAIN_NATS or min(alone) < -MIN_OTHER_GAIN_NATS:
         return None
-    ends = [_end(gain, x, top, sign * width) for sign in (-1.0, 1.0)]
+    ends = [_interval_end(gain, x, top, sign * width) for sign in (-1.0, 1.0)]
     of_axes = gains(x)
     strongest = max(of_axes, key=lambda one: of_axes[one])
     features = [e for e in effects[strongest] if isinstance(e, (Sinusoidal, Narrowband))]
@@ -101,14 +128,14 @@ def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clo
     return Clock(Bounds(exp(x), exp(ends[0]), exp(ends[1])), top, strongest, (stated, stated / exp(x)))
 
 
-def _each(
+def _gain_per_feature(
     axes: Mapping[str, Axis], effects: Mapping[str, Effects], before: Mapping[str, float], ratio: float
 ) -> list[float]:
-    """Nats that each feature gains where the ratio puts it, alone; the strongest may have moved itself."""
+    """Return the gain in nats of each feature when only this feature is moved by the ratio."""
     features = sorted({e.frequency for of in effects.values() for e in of if isinstance(e, (Sinusoidal, Narrowband))})
     groups: list[list[float]] = []
     for f_hz in features:
-        if groups and f_hz < groups[-1][-1] * SAME:
+        if groups and f_hz < groups[-1][-1] * SAME_FEATURE_RATIO:
             groups[-1].append(f_hz)
         else:
             groups.append([f_hz])
@@ -123,8 +150,10 @@ def _each(
     return gains
 
 
-def _ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> list[tuple[float, float]]:
-    """(ratio, how far to look around it) that put features of the model where something is seen: the best of many."""
+def _candidate_ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> list[tuple[float, float]]:
+    """Return the best ratios that move features of the model to observed peaks, each with the width of the search
+    around it.
+    """
     found: list[tuple[float, float]] = []
     features = {name: [e for e in of if isinstance(e, (Sinusoidal, Narrowband))] for name, of in effects.items()}
     if not any(features.values()):
@@ -132,7 +161,7 @@ def _ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> list[tu
     highest = max(one.frequency for of in features.values() for one in of)
     first = next(iter(axes.values()))
     step = 0.25 * first.rate_hz / first.n / highest
-    grid = np.arange(-FURTHEST, FURTHEST, step)  # ln ratio
+    grid = np.arange(-MAX_LOG_RATIO, MAX_LOG_RATIO, step)  # ln ratio
     power = np.zeros(grid.size)
     for name, axis in axes.items():
         lines = [one for one in features[name] if isinstance(one, Sinusoidal)]
@@ -148,15 +177,16 @@ def _ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> list[tu
         for one in features[name]:
             if isinstance(one, Narrowband):
                 places = [middle for middle, _ in peaks(view, 4)]
-                near = [place for place in places if abs(log(one.frequency / place)) < FURTHEST]
+                near = [place for place in places if abs(log(one.frequency / place)) < MAX_LOG_RATIO]
                 found += [(one.frequency / place, 2.0 * one.bandwidth / one.frequency) for place in near]
-    for at in np.argsort(power)[-TRIED:]:
+    for at in np.argsort(power)[-MAX_TRIAL_RATIOS:]:
         if power[at] > 0.0:
             found.append((exp(float(grid[at])), 8.0 * step))
     return found
 
 
-def _highest(gain: Any, x: float, width: float) -> float:
+def _maximise_gain(gain: Any, x: float, width: float) -> float:
+    """Return the logarithm of the ratio with the largest gain, by golden-section search."""
     lo, hi = x - width, x + width
     for _ in range(18):
         a, b = hi - GOLDEN * (hi - lo), lo + GOLDEN * (hi - lo)
@@ -164,14 +194,14 @@ def _highest(gain: Any, x: float, width: float) -> float:
     return 0.5 * (lo + hi)
 
 
-def _end(gain: Any, x: float, top: float, step: float) -> float:
-    """Where the gain has fallen by HALF, on one side."""
+def _interval_end(gain: Any, x: float, top: float, step: float) -> float:
+    """Return the point on one side of the maximum at which the gain has fallen by ``CHI2_HALF_NATS``."""
     near, far = x, x + step
     for _ in range(12):
-        if top - gain(far) > HALF:
+        if top - gain(far) > CHI2_HALF_NATS:
             break
         near, far = far, x + 2.0 * (far - x)
     for _ in range(10):
         middle = 0.5 * (near + far)
-        near, far = (near, middle) if top - gain(middle) > HALF else (middle, far)
+        near, far = (near, middle) if top - gain(middle) > CHI2_HALF_NATS else (middle, far)
     return far

@@ -1,14 +1,16 @@
-"""Samples that are missing, wrong or clipped, replaced by such as might have been there.
+"""Replacement of missing, wrong and clipped samples by plausible random draws.
 
-``filled`` draws each from around it: the mean of good neighbours and what another neighbour, by chance, is away from
-its own, so that level, drift and white noise go on through the hole. The neighbourhood is as wide as the drift allows.
-A mean carries the noise of what it is made of; where p samples of a hundred are missing, frequencies below one over the
-neighbourhood therefore read 2p percent high where noise is white, and no others do. Through a long hole runs a line
-between the levels at its ends, wandering as much as the recording does over such a time.
+``filled`` draws each missing sample from its neighbourhood. The draw is the mean of good neighbours plus the deviation
+of a randomly chosen neighbour from its own mean. Level, drift and white noise thus continue through the gap. The
+neighbourhood is as wide as the drift allows. The mean carries the noise of the samples it is made of. If p percent of
+the samples are missing and the noise is white, frequencies below the inverse of the neighbourhood length are therefore
+2p percent too high. Other frequencies are not affected. A long gap is filled along a line between the levels at its
+ends. Its random walk is as strong as that of the recording over such a time.
 
-``unclipped`` draws from the tail of a Gaussian beyond the limit, about a level that knows what was clipped.
+``unclipped`` draws from the tail of a Gaussian beyond the limit. The local mean of this Gaussian accounts for the
+clipped samples.
 
-What comes in stays as it is; of the samples that were good none changes.
+The input arrays are not changed, and good samples keep their values.
 """
 
 from typing import Final
@@ -20,32 +22,52 @@ from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.reconcile.preparation.value_statistics import Mask
 
-WIDTHS: Final = (1024, 256, 64, 16, 4)
-"""Samples on each side that a neighbourhood may have, widest first."""
-DRIFT: Final = 1.01
-"""A neighbourhood whose mean foretells samples worse than the best one, by more than this in variance, is too wide."""
-ASKED: Final = 20_000
-"""Samples at which widths are compared."""
-DONORS: Final = 1024
-"""Good samples on each side of which any may lend what it is away from its own level."""
-LONG: Final = 100
-"""Samples: longer holes are bridged."""
-WANDERS: Final = 16
-"""Times that the way over which the recording's wandering is measured goes into it, at least."""
-LEVEL: Final = 64
-"""Samples on each side that the level of clipped samples is taken from."""
-ROUNDS: Final = 50
-"""Of the level and the samples beyond the limit in turn, at most."""
-SETTLED: Final = 1e-2
-"""Deviations that no sample moves by any more."""
+NEIGHBOURHOOD_WIDTHS: Final = (1024, 256, 64, 16, 4)
+"""Possible numbers of neighbours on each side, widest first."""
+MAX_VARIANCE_RATIO: Final = 1.01
+"""Largest prediction variance of a neighbourhood relative to the best one. A neighbourhood with a larger variance is
+too wide.
+"""
+MAX_WIDTH_TEST_SAMPLES: Final = 20_000
+"""Number of samples at which the widths are compared."""
+DONOR_RANGE_SAMPLES: Final = 1024
+"""Number of good samples on each side from which the random deviation is taken."""
+LONG_GAP_SAMPLES: Final = 100
+"""Length in samples above which a gap is filled with a Brownian bridge."""
+MIN_WANDER_INTERVALS: Final = 16
+"""Smallest ratio of the recording length to the interval over which its wander is measured."""
+CLIP_LEVEL_SAMPLES: Final = 64
+"""Number of samples on each side that determine the level of clipped samples."""
+MAX_CLIP_ITERATIONS: Final = 50
+"""Largest number of iterations between the level and the clipped samples."""
+CLIP_TOLERANCE_SIGMA: Final = 1e-2
+"""Largest change of a sample, in standard deviations, that ends the iterations."""
 
 
 def filled(y: Floats, mask: Mask, rng: np.random.Generator) -> Floats:
-    """A copy of y [n] with the samples of ``mask`` [n] and those that are no number replaced.
+    """Return a copy of the series with masked and non-finite samples replaced.
 
-    Raises:
-        ValueError: no sample is good
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Series in the unit of the axis.
+    mask : ndarray of bool, shape (n,)
+        True for each sample to replace.
+    rng : numpy.random.Generator
+        Generator for the replacement samples.
 
+    Returns
+    -------
+    ndarray of float64, shape (n,)
+        Series without missing samples.
+
+    Raises
+    ------
+    ValueError
+        If no sample is good.
+
+    Examples
+    --------
     >>> rng = np.random.default_rng(0)
     >>> y = 5.0 + rng.standard_normal(100_000)
     >>> new = filled(y, rng.random(100_000) < 0.3, rng)
@@ -61,28 +83,41 @@ def filled(y: Floats, mask: Mask, rng: np.random.Generator) -> Floats:
     if not where.size:
         raise ValueError("no sample is good")
     middle = float(y[where[where.size // 2]])
-    sums, counts = _sums(y, good, middle)
-    width = _width(y, where, sums, counts, middle)
-    _draw(new, where, missing, sums, counts, middle, width, rng.random(missing.size))
+    sums, counts = _running_sums(y, good, middle)
+    width = _neighbourhood_width(y, where, sums, counts, middle)
+    _draw_missing(new, where, missing, sums, counts, middle, width, rng.random(missing.size))
     breaks = np.flatnonzero(np.diff(missing) > 1)
     firsts = missing[np.concatenate([[0], breaks + 1])]
     lasts = missing[np.concatenate([breaks, [missing.size - 1]])]
     for first, last in zip(firsts, lasts, strict=True):
-        if last - first >= LONG and first > 0 and last < y.size - 1:
+        if last - first >= LONG_GAP_SAMPLES and first > 0 and last < y.size - 1:
             length = int(last - first + 1)
-            wander = _wander(sums, counts, length, width)
-            new[first : last + 1] += _bridge(length, wander, rng)
+            wander = _wander_variance(sums, counts, length, width)
+            new[first : last + 1] += _brownian_bridge(length, wander, rng)
     return new
 
 
 def unclipped(y: Floats, limit: float, sigma: float, rng: np.random.Generator) -> Floats:
-    """A copy of y [n] with the samples at or beyond ± limit replaced by draws from beyond it.
+    """Return a copy of the series with clipped samples replaced by draws from beyond the limit.
 
-    Args:
-        y: values [n]; NaN stay
-        limit: of the range
-        sigma: deviation of the noise before it was clipped
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Series in the unit of the axis. NaN values are kept.
+    limit : float
+        Limit of the measuring range, in the unit of ``y``. Samples at or beyond ± limit are replaced.
+    sigma : float
+        Standard deviation of the noise before clipping, in the unit of ``y``.
+    rng : numpy.random.Generator
+        Generator for the replacement samples.
 
+    Returns
+    -------
+    ndarray of float64, shape (n,)
+        Series with values beyond the limit.
+
+    Examples
+    --------
     >>> rng = np.random.default_rng(0)
     >>> x = 0.5 + rng.standard_normal(100_000)
     >>> new = unclipped(np.clip(x, -1.0, 1.0), 1.0, 1.0, rng)
@@ -95,31 +130,31 @@ def unclipped(y: Floats, limit: float, sigma: float, rng: np.random.Generator) -
         return new
     side = np.sign(y[at])
     good = np.isfinite(y)
-    for _ in range(ROUNDS):
-        level = _levels(new, good, at)
+    for _ in range(MAX_CLIP_ITERATIONS):
+        level = _local_means(new, good, at)
         beyond = (limit - side * level) / sigma
-        # mean of the tail: m + σ φ(a)/Φ(−a)
+        # mean of the Gaussian tail: m + σ φ(a)/Φ(−a)
         tail = level + side * sigma * np.exp(-0.5 * beyond**2 - log_ndtr(-beyond)) / np.sqrt(2.0 * np.pi)
         moved = float(np.abs(tail - new[at]).max())
         new[at] = tail
-        if moved < SETTLED * sigma:
+        if moved < CLIP_TOLERANCE_SIGMA * sigma:
             break
-    beyond = (limit - side * _levels(new, good, at)) / sigma
+    beyond = (limit - side * _local_means(new, good, at)) / sigma
     chance = (1.0 - rng.random(at.size)) * ndtr(-np.minimum(beyond, 37.0))
     new[at] = side * (limit + sigma * np.maximum(-ndtri(chance) - np.minimum(beyond, 37.0), 0.0))
     return new
 
 
-def _levels(y: Floats, good: Mask, at: Ints) -> Floats:
-    """Means of the good among LEVEL samples on each side."""
-    sums, counts = _sums(y, good, 0.0)
-    lo, hi = np.maximum(at - LEVEL, 0), np.minimum(at + LEVEL + 1, y.size)
+def _local_means(y: Floats, good: Mask, at: Ints) -> Floats:
+    """Return the means of the good samples within ``CLIP_LEVEL_SAMPLES`` samples of the given positions."""
+    sums, counts = _running_sums(y, good, 0.0)
+    lo, hi = np.maximum(at - CLIP_LEVEL_SAMPLES, 0), np.minimum(at + CLIP_LEVEL_SAMPLES + 1, y.size)
     return np.asarray((sums[hi] - sums[lo]) / (counts[hi] - counts[lo]))
 
 
 @compiled
-def _sums(y, good, middle):  # type: ignore[no-untyped-def]
-    """Running sums of the good samples less ``middle``, and their number, before each sample."""
+def _running_sums(y, good, middle):  # type: ignore[no-untyped-def]
+    """Return, before each sample, the sum of the good samples less ``middle`` and their number."""
     sums, counts = np.empty(y.size + 1), np.empty(y.size + 1, np.int64)
     total, count = 0.0, 0
     for k in range(y.size):
@@ -131,35 +166,43 @@ def _sums(y, good, middle):  # type: ignore[no-untyped-def]
     return sums, counts
 
 
-def _width(y: Floats, where: Ints, sums: Floats, counts: Ints, middle: float) -> int:
-    """The widest neighbourhood whose mean, without the sample itself, foretells samples as well as any."""
-    some = where[:: max(1, where.size // ASKED)]
+def _neighbourhood_width(y: Floats, where: Ints, sums: Floats, counts: Ints, middle: float) -> int:
+    """Return the widest neighbourhood whose mean, without the sample itself, predicts samples as well as any other."""
+    some = where[:: max(1, where.size // MAX_WIDTH_TEST_SAMPLES)]
     errors = []
-    for width in WIDTHS:
+    for width in NEIGHBOURHOOD_WIDTHS:
         lo, hi = np.maximum(some - width, 0), np.minimum(some + width + 1, y.size)
         others = counts[hi] - counts[lo] - 1
         some_, lo, hi, others = (x[others > 0] for x in (some, lo, hi, others))
         value = y[some_] - middle
         foretold = (sums[hi] - sums[lo] - value) / others
-        # a mean of k has the noise of one sample over k more than it need
+        # the mean of k samples adds 1/k of the variance of one sample
         errors.append(float(np.mean((value - foretold) ** 2 / (1.0 + 1.0 / others))) if some_.size else np.inf)
-    return next(width for width, error in zip(WIDTHS, errors, strict=True) if error <= DRIFT * min(errors))
+    return next(
+        width
+        for width, error in zip(NEIGHBOURHOOD_WIDTHS, errors, strict=True)
+        if error <= MAX_VARIANCE_RATIO * min(errors)
+    )
 
 
 @compiled
-def _draw(new, where, missing, sums, counts, middle, width, chances):  # type: ignore[no-untyped-def]
-    """Fill the missing samples of ``new``; ``where`` are the good ones, ``chances`` [missing] in [0, 1)."""
+def _draw_missing(new, where, missing, sums, counts, middle, width, chances):  # type: ignore[no-untyped-def]
+    """Fill the missing samples of ``new`` in place.
+
+    ``where`` holds the positions of the good samples. ``chances`` holds a random number in [0, 1) for each missing
+    sample.
+    """
     n = new.size
     for k in range(missing.size):
         at = missing[k]
-        # to each side the nearest good samples, as many as the width
+        # use the nearest good samples, ``width`` on each side
         left = counts[at]
         first, last = max(left - width, 0), min(left + width, where.size)
         before, after = left - first, last - left
         lo = where[first]
         hi = where[last - 1] + 1
         gap = where[left] - where[left - 1] if before > 0 and after > 0 else 1
-        if gap > LONG:  # a line between the levels at both ends
+        if gap > LONG_GAP_SAMPLES:  # interpolate between the levels at both ends
             start = (sums[where[left - 1] + 1] - sums[lo]) / before
             end = (sums[hi] - sums[where[left]]) / after
             part = (at - where[left - 1]) / gap
@@ -168,22 +211,26 @@ def _draw(new, where, missing, sums, counts, middle, width, chances):  # type: i
         else:
             level = (sums[hi] - sums[lo]) / (before + after)
             used = float(before + after)
-        pool, stop = max(left - DONORS, 0), min(left + DONORS, where.size)
+        pool, stop = max(left - DONOR_RANGE_SAMPLES, 0), min(left + DONOR_RANGE_SAMPLES, where.size)
         donor = where[pool + int(chances[k] * (stop - pool))]
         from_, to = max(donor - width, 0), min(donor + width + 1, n)
         others = counts[to] - counts[from_]
         away = new[donor] - middle - (sums[to] - sums[from_]) / others
-        # variances: of the level 1/used, of the donor from its own mean 1 − 1/others; together 1
+        # Relative variances: the level has 1/used and the donor's deviation from its mean has 1 − 1/others. The
+        # deviation is scaled so that their sum is 1.
         grown = 1.0
         if used > 1.0 and others > 1:
             grown = ((1.0 - 1.0 / used) / (1.0 - 1.0 / others)) ** 0.5
         new[at] = middle + level + grown * away
 
 
-def _wander(sums: Floats, counts: Ints, length: int, width: int) -> float:
-    """Variance a sample of a random walk that moves the level over about ``length`` as the recording does."""
+def _wander_variance(sums: Floats, counts: Ints, length: int, width: int) -> float:
+    """Return the variance per sample of the random walk that describes the drift of the recording.
+
+    The drift is measured over about ``length`` samples.
+    """
     n = counts.size - 1
-    length = min(length, n // WANDERS)
+    length = min(length, n // MIN_WANDER_INTERVALS)
     begins = np.arange(0, n - length - 2 * width, max(width, (n - length) // 2000 or 1))
     if begins.size < 8:
         return 0.0
@@ -195,12 +242,15 @@ def _wander(sums: Floats, counts: Ints, length: int, width: int) -> float:
         return 0.0
     first = (sums[begins + width] - sums[begins]) / left
     second = (sums[begins + length + 2 * width] - sums[begins + length + width]) / right
-    near = np.diff(first)  # what white noise, and drift within a neighbourhood, move a mean by
+    near = np.diff(first)  # changes of the mean due to white noise and to drift within a neighbourhood
     moved = float(np.median((second - first) ** 2)) - float(np.median(near**2))
     return max(moved, 0.0) / 0.4549364231195724 / (length + width)  # median of χ² with one degree of freedom
 
 
-def _bridge(length: int, variance: float, rng: np.random.Generator) -> Floats:
-    """A random walk of that variance a sample that is 0 before its first and after its last sample."""
+def _brownian_bridge(length: int, variance: float, rng: np.random.Generator) -> Floats:
+    """Return a random walk that starts at zero before its first sample and returns to zero after its last sample.
+
+    ``variance`` is its variance per sample.
+    """
     walk = np.cumsum(rng.standard_normal(length + 1)) * variance**0.5
     return np.asarray(walk[:-1] - walk[-1] * np.arange(1, length + 1) / (length + 1))

@@ -1,17 +1,18 @@
-"""What the values of one axis show by themselves: the steps they come in, the ends they pile up at, the repeats.
+"""Detection of quantization, clipping and repeated samples from the values of one axis.
 
-In comes one axis as measured, NaN where nothing was; out goes what was found, or None. Evidence is a gain in
-log-likelihood, nats, of values that are so made over values that are not.
+The input is one axis as measured, with NaN for missing samples. Each function returns its finding, or None. The
+evidence is a log-likelihood gain in nats over values without the property.
 
-Values lie on a grid when every one of them is a whole number of steps from the others; steps far finer than the noise
-count too. Numbers have steps of their own, which say nothing of a sensor: the spacing of float32 or float64, or the
-last decimal of a text, in SI or in degrees or g. A grid that is no coarser than that is told only where it is as coarse
-as a tenth of the noise, when it shapes the spectrum whoever made it.
+Values lie on a grid if all their differences are whole multiples of a step. Steps that are far finer than the noise are
+detected too. Numbers have steps of their own that do not come from the sensor: the spacing of float32 or float64
+values, or the last decimal of a text in SI units, degrees or g. A grid that is not coarser than these steps is reported
+only if it is at least a tenth of the noise. Such a grid shapes the spectrum, whatever its origin.
 
-A continuous quantity never meets its largest value twice; a stepped one meets its last step less often than the form
-of the steps before lets expect, and nobody misses what should have come beyond. Repeats of continuous values are each
-known; of stepped ones only their number is, by what zero has too much among the differences. Steps larger than the
-noise leave repeats untold, and steps of two deviations also the ends.
+A continuous quantity never takes its largest value twice. A stepped quantity takes its last step less often than the
+distribution of the steps before it predicts, unless it is clipped. Each repeat of a continuous value is identified. For
+stepped values only the number of repeats is known, from the excess of zeros among the differences. If the steps are
+larger than the noise, repeats cannot be detected. If the steps are larger than two standard deviations, clipping cannot
+be detected either.
 """
 
 from dataclasses import dataclass
@@ -26,35 +27,43 @@ from monitor.common.compiled import compiled
 from monitor.estimation.detection.resolution import GAUSSIAN, ON_GRID
 
 Mask = NDArray[np.bool_]
+"""Boolean array."""
 
-FEW: Final = 16
-"""Samples that say anything."""
-PART: Final = 4096
-"""Samples among which a grid is sought; all are asked whether they lie on it."""
-APART: Final = 25.0
-"""Of the rounding of the values: finer steps are not told from none."""
-SHAPING: Final = 0.1
-"""Of the noise: steps as coarse as that are told whoever made them."""
-SMOOTH: Final = 0.5
-"""Of a step: noise below it leaves to the level between two steps what the ends look like."""
-SMOOTHER: Final = 0.9
-"""Of a step: with noise above it the level moves the chance of repeats by less than exp(−π²·0.8) = 4·10⁻⁴."""
-PERCENT: Final = 0.01
-"""To which the share of neighbours that are equal by chance is known, as noise is nearly Gaussian at best."""
-CHANCE: Final = 1e-3
-"""Expected coincidences are never taken for fewer."""
-UNITS: Final = (1.0, np.pi / 180.0, np.pi / 180.0 / 3600.0, 9.80665)
-"""Of the texts that values may come from: SI, °/s, °/h, g."""
-SAID: Final = 8
-"""Different decimals that tell a text from chance; one that has fewer is coarse anyway."""
-TAPS: Final = 8
-"""Neighbours on each side that a sample is expected from."""
+MIN_SAMPLES: Final = 16
+"""Smallest number of samples for any statistic."""
+GRID_SEARCH_SAMPLES: Final = 4096
+"""Number of samples among which a grid is sought. All samples are then checked against the grid."""
+MIN_STEP_TO_ROUNDING: Final = 25.0
+"""Smallest detectable step, as a multiple of the rounding of the values."""
+MIN_STEP_TO_NOISE: Final = 0.1
+"""Ratio of step to noise from which a step is reported, whatever its origin."""
+MIN_NOISE_TO_STEP_CLIPPING: Final = 0.5
+"""Smallest ratio of noise to step at which clipping is tested. With less noise, the shape of the ends depends on the
+position of the level between two steps.
+"""
+MIN_NOISE_TO_STEP_REPEATS: Final = 0.9
+"""Smallest ratio of noise to step at which repeats are tested. With more noise, the level changes the probability of a
+repeat by less than exp(−π²·0.8) = 4·10⁻⁴.
+"""
+CHANCE_RELATIVE_ERROR: Final = 0.01
+"""Relative uncertainty of the share of neighbours that are equal by chance, because noise is only approximately
+Gaussian.
+"""
+MIN_EXPECTED_COINCIDENCES: Final = 1e-3
+"""Lower limit of the expected number of coincidences."""
+TEXT_UNITS: Final = (1.0, np.pi / 180.0, np.pi / 180.0 / 3600.0, 9.80665)
+"""Units of the texts that values may come from, in SI units: SI, °/s, °/h, g."""
+MIN_DISTINCT_DECIMALS: Final = 8
+"""Number of different decimals that distinguishes a text from chance. A text with fewer decimals is coarse anyway."""
+PREDICTOR_TAPS: Final = 8
+"""Number of neighbours on each side that predict a sample."""
 Z95: Final = 1.959964
+"""Number of standard deviations on each side of a 95 % interval."""
 
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """A number with its 95 % interval."""
+    """Value with its 95 % interval."""
 
     value: float
     lo: float
@@ -63,91 +72,115 @@ class Size:
 
 @dataclass(frozen=True, slots=True)
 class Levels:
-    """The grid that all values lie on."""
+    """Grid that all values lie on."""
 
     step: Size
-    offset: float  # of the grid from zero, in [−step/2, step/2]
-    levels: int  # from the smallest value to the largest
-    noise: float  # σ from sample to sample, steps included
-    gain: float  # nats over continuous values
+    offset: float  # offset of the grid from zero, in [−step/2, step/2]
+    levels: int  # number of grid levels from the smallest to the largest value
+    noise: float  # standard deviation from sample to sample, including the steps
+    gain: float  # log-likelihood gain over continuous values, nats
 
     @property
     def coarse(self) -> float:
-        """Step over noise."""
+        """Ratio of step to noise."""
         return self.step.value / self.noise if self.noise > 0.0 else np.inf
 
 
 @dataclass(frozen=True, slots=True)
 class Clipped:
-    """Values piled up at an end."""
+    """Values that accumulate at an end of the range."""
 
     limit: Size
-    count: int  # samples at the ends that pile up
-    upper: bool  # piled up at the largest value
-    lower: bool  # at the smallest
-    symmetric: bool  # nothing lies beyond ± limit, as y = clip(x, ± limit) has it
-    gain: float  # nats over values without an end
+    count: int  # number of clipped samples
+    upper: bool  # True if values are clipped at the largest value
+    lower: bool  # True if values are clipped at the smallest value
+    symmetric: bool  # True if no value lies beyond ± limit, as for y = clip(x, ± limit)
+    gain: float  # log-likelihood gain over values without clipping, nats
 
 
 @dataclass(frozen=True, slots=True)
 class Repeats:
-    """Samples that repeat the one before."""
+    """Samples that repeat the sample before them."""
 
     fraction: Size
-    count: float  # in excess of chance
-    mask: Mask  # [n] each of them where values are continuous; nowhere where they come in steps
-    gain: float  # nats over chance
+    count: float  # number of repeats in excess of chance
+    mask: Mask  # [n] True for each repeat of a continuous value; all False for stepped values
+    gain: float  # log-likelihood gain over chance, nats
 
 
 def levels(y: Floats) -> Levels | None:
-    """The grid that all values [n] lie on, if there is one that numbers do not have of themselves.
+    """Detect the grid that all values lie on.
 
+    A grid that the number format explains is not reported.
+
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Values in the unit of the axis. NaN marks a missing sample.
+
+    Returns
+    -------
+    Levels or None
+        The grid, or None if there is none.
+
+    Examples
+    --------
     >>> x = np.random.default_rng(0).standard_normal(10_000)
     >>> round(levels(0.013 * np.rint(x / 0.013) + 9.81).step.value, 9)
     0.013
     >>> levels(x), levels(x.astype(np.float32).astype(float)), levels(x.round(4))
     (None, None, None)
     """
-    values = _finite(y)
-    if values.size < FEW:
+    values = _finite_values(y)
+    if values.size < MIN_SAMPLES:
         return None
-    noise = _noise(values)
-    part = np.unique(values[np.linspace(0, values.size - 1, min(PART, values.size)).astype(np.int64)])
-    if part.size < FEW:
+    noise = _sample_noise(values)
+    part = np.unique(values[np.linspace(0, values.size - 1, min(GRID_SEARCH_SAMPLES, values.size)).astype(np.int64)])
+    if part.size < MIN_SAMPLES:
         part = np.unique(values)
-    rounding, last = _spacing(part), _last_decimal(part)
+    rounding, last = _float_spacing(part), _last_decimal(part)
     for blur, own in ((rounding, max(rounding, last)), (0.5 * last, last)):
-        step = _common(np.unique(np.diff(part)), blur) if blur > 0.0 else None
-        if step is not None and (step > 1.5 * own or step >= SHAPING * noise):
-            return _on_grid(values, step, blur, noise)
+        step = _common_divisor(np.unique(np.diff(part)), blur) if blur > 0.0 else None
+        if step is not None and (step > 1.5 * own or step >= MIN_STEP_TO_NOISE * noise):
+            return _fit_grid(values, step, blur, noise)
     return None
 
 
 def clipped(y: Floats, step: float = 0.0) -> Clipped | None:
-    """The ends of the range, if values [n] pile up at the largest or the smallest one.
+    """Detect values that accumulate at the largest or the smallest value.
 
-    Args:
-        y: values [n]
-        step: of the grid that they lie on; 0 = none
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Values in the unit of the axis. NaN marks a missing sample.
+    step : float, optional
+        Step of the grid that the values lie on, in the unit of ``y``. Zero means no grid.
 
+    Returns
+    -------
+    Clipped or None
+        The clipping limit, or None if no values are clipped.
+
+    Examples
+    --------
     >>> x = np.random.default_rng(0).standard_normal(10_000)
     >>> found = clipped(np.clip(x, -2.5, 2.5))
     >>> round(found.limit.value, 3), found.count, clipped(x)
     (2.5, 131, None)
     """
-    values = _finite(y)
-    if values.size < FEW:
+    values = _finite_values(y)
+    if values.size < MIN_SAMPLES:
         return None
     ends = np.array([values.max(), -values.min()])
     if step == 0.0 and max(np.count_nonzero(values == ends[0]), np.count_nonzero(values == -ends[1])) < 2:
-        return None  # as of nearly all, and soon said
-    noise = _noise(values)
-    pile = _stepped_pile if step >= 0.5 * SHAPING * noise > 0.0 else _tied_pile
+        return None  # fast path for most recordings
+    noise = _sample_noise(values)
+    pile = _stepped_clipping_gain if step >= 0.5 * MIN_STEP_TO_NOISE * noise > 0.0 else _continuous_clipping_gain
     gains = np.array([pile(sign * values, end, step, noise) for sign, end in zip((1.0, -1.0), ends, strict=True)])
     if ends.sum() == 0.0 or not gains.max() > 0.0:
         return None
     limit = float(ends[gains.argmax()])
-    near = max(0.5 * step, 2.0 * _spacing(values))
+    near = max(0.5 * step, 2.0 * _float_spacing(values))
     piled = (gains > 0.0) & (np.abs(ends - limit) <= near)
     at = [int(np.count_nonzero(sign * values >= end - near)) for sign, end in zip((1, -1), ends, strict=True)]
     return Clipped(
@@ -161,89 +194,106 @@ def clipped(y: Floats, step: float = 0.0) -> Clipped | None:
 
 
 def repeats(y: Floats, step: float = 0.0, limit: float = np.inf) -> Repeats | None:
-    """Samples that repeat the one before more often than chance has it.
+    """Detect samples that repeat the sample before them more often than chance explains.
 
-    None where there are none, and where a stepped axis is too quiet to tell.
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Values in the unit of the axis. NaN marks a missing sample.
+    step : float, optional
+        Step of the grid that the values lie on, in the unit of ``y``. Zero means no grid.
+    limit : float, optional
+        Limit of the measuring range, in the unit of ``y``. Samples at the limit are left out.
 
-    Args:
-        y: values [n]
-        step: of the grid that they lie on; 0 = none
-        limit: of the range; samples at it are left out
+    Returns
+    -------
+    Repeats or None
+        The repeats, or None if there are none or if a stepped axis has too little noise to detect them.
 
+    Examples
+    --------
     >>> x = np.random.default_rng(0).standard_normal(10_000)
     >>> x[5000] = x[4999]
     >>> repeats(x).count
     1.0
     """
     if step == 0.0 and not (y[1:] == y[:-1]).any():
-        return None  # as above
+        return None  # fast path for most recordings
     good = np.isfinite(y) & (np.abs(y) < limit - max(0.5 * step, 1e-9 * abs(limit)) if np.isfinite(limit) else True)
     pairs = good[1:] & good[:-1]
     apart = np.diff(y)[pairs]
-    noise = GAUSSIAN * float(np.abs(apart).mean()) if apart.size >= FEW else 0.0
+    noise = GAUSSIAN * float(np.abs(apart).mean()) if apart.size >= MIN_SAMPLES else 0.0
     if not noise > 0.0:
         return None
     if step < 1e-6 * noise:
-        return _known_repeats(y, pairs, apart, noise)
+        return _repeats_of_continuous(y, pairs, apart, noise)
     twice = (y[2:] - y[:-2])[good[2:] & good[1:-1] & good[:-2]]
-    quiet = GAUSSIAN * float(np.abs(twice).mean()) < SMOOTHER * step  # over two samples repeats matter less
-    return None if quiet else _counted_repeats(np.abs(apart) / step, np.abs(twice) / step, y.size)
+    # differences over two samples are less affected by repeats
+    quiet = GAUSSIAN * float(np.abs(twice).mean()) < MIN_NOISE_TO_STEP_REPEATS * step
+    return None if quiet else _repeats_of_stepped(np.abs(apart) / step, np.abs(twice) / step, y.size)
 
 
-def _finite(y: Floats) -> Floats:
+def _finite_values(y: Floats) -> Floats:
+    """Return the finite values."""
     return y if np.isfinite(y.sum()) else y[np.isfinite(y)]
 
 
-def _noise(values: Floats) -> float:
-    """σ from sample to sample, by the mean distance of neighbours."""
-    return GAUSSIAN * float(_moved(values)) / (values.size - 1)
+def _sample_noise(values: Floats) -> float:
+    """Return the standard deviation from sample to sample, from the mean absolute difference of neighbours."""
+    return GAUSSIAN * float(_total_variation(values)) / (values.size - 1)
 
 
 @compiled
-def _moved(values):  # type: ignore[no-untyped-def]
-    """Sum of the distances of neighbours."""
+def _total_variation(values):  # type: ignore[no-untyped-def]
+    """Return the sum of the absolute differences of neighbours."""
     total = 0.0
     for k in range(1, values.size):
         total += abs(values[k] - values[k - 1])
     return total
 
 
-def _spacing(values: Floats) -> float:
-    """Of the largest of these numbers: as float32 where all of them (a few thousand are asked) are."""
-    values = values[:: max(1, values.size // PART)]
+def _float_spacing(values: Floats) -> float:
+    """Return the spacing of floating-point numbers at the largest value.
+
+    The spacing is that of float32 if a few thousand of the values are all exact in float32.
+    """
+    values = values[:: max(1, values.size // GRID_SEARCH_SAMPLES)]
     largest = float(np.abs(values).max())
     narrow = values.astype(np.float32)
     return float(np.spacing(narrow.dtype.type(largest)) if (narrow == values).all() else np.spacing(largest))
 
 
 def _last_decimal(levels: Floats) -> float:
-    """The last decimal of a text that says all of these values, in the unit it is in; 0 = no text does."""
+    """Return the last decimal of a text that represents all values exactly, in SI units, or 0 if no text does."""
     some = levels[np.linspace(0, levels.size - 1, min(256, levels.size)).astype(np.int64)]
     some = np.abs(some[some != 0.0])
     if not some.size:
         return 0.0
-    most = 6 if _spacing(some) > 1e-9 * some.max() else 13  # float32, float64
+    most = 6 if _float_spacing(some) > 1e-9 * some.max() else 13  # float32, float64
     found = 0.0
-    for unit in UNITS:
+    for unit in TEXT_UNITS:
         before = np.floor(np.log10(some / unit) + 1e-12)  # exponent of the first digit
         for digits in range(1, most + 1):
             whole = some / unit * 10.0 ** (digits - 1 - before)
-            if (np.abs(whole - np.rint(whole)) < 0.1).all() and np.unique(np.rint(whole)).size > SAID:
+            if (np.abs(whole - np.rint(whole)) < 0.1).all() and np.unique(np.rint(whole)).size > MIN_DISTINCT_DECIMALS:
                 found = max(found, unit * 10.0 ** float(before.max() - digits + 1))
                 break
     return found
 
 
-def _common(gaps: Floats, blur: float) -> float | None:
-    """The greatest common divisor of distances (ascending) of values known to ``blur``: Euclid's, with its errors."""
+def _common_divisor(gaps: Floats, blur: float) -> float | None:
+    """Return the greatest common divisor of ascending distances by Euclid's algorithm with error bounds.
+
+    The values are known to within ``blur``.
+    """
     gaps = gaps[gaps > 2.0 * blur]
     if not gaps.size:
         return None
     step, error, reached = float(gaps[0]), 2.0 * blur, 1.0
     for _ in range(300):
-        if step < APART * blur:
+        if step < MIN_STEP_TO_ROUNDING * blur:
             return None
-        most = max(1.5, min(0.2 * step / error, 8.0 * reached))  # multiples that the error of the step leaves certain
+        most = max(1.5, min(0.2 * step / error, 8.0 * reached))  # largest multiple that the error leaves unambiguous
         near = gaps[: max(1, np.searchsorted(gaps, most * step))]
         counts = np.rint(near / step)
         if counts[0] * error > 0.25 * step:
@@ -262,10 +312,10 @@ def _common(gaps: Floats, blur: float) -> float | None:
     return None
 
 
-def _on_grid(values: Floats, step: float, blur: float, noise: float) -> Levels | None:
-    """The grid with that step, if every value is on it."""
+def _fit_grid(values: Floats, step: float, blur: float, noise: float) -> Levels | None:
+    """Return the grid with a given step if every value lies on it."""
     middle = float(values[values.size // 2])
-    for _ in range(2):  # the step from the ends once they are counted
+    for _ in range(2):  # the second pass uses the step derived from the two extreme values
         counts = np.rint((values - middle) / step)
         low, high = values.argmin(), values.argmax()
         between = float(counts[high] - counts[low])
@@ -276,7 +326,7 @@ def _on_grid(values: Floats, step: float, blur: float, noise: float) -> Levels |
     if not (between and most < ON_GRID * step):
         return None
     offset = middle + 0.5 * float(left.max() + left.min())
-    told = np.count_nonzero(np.diff(values)) - 1  # a held sample is no evidence
+    told = np.count_nonzero(np.diff(values)) - 1  # a repeated sample is no evidence
     gain = told * np.log(step / (2.0 * most)) - 2.0 * np.log(between + 1.0)
     error = 2.0 * most / between
     return Levels(
@@ -288,8 +338,8 @@ def _on_grid(values: Floats, step: float, blur: float, noise: float) -> Levels |
     )
 
 
-def _tied_pile(values: Floats, end: float, step: float, noise: float) -> float:
-    """Gain of an end at the largest of continuous values: it is met again and again, and stays."""
+def _continuous_clipping_gain(values: Floats, end: float, step: float, noise: float) -> float:
+    """Return the gain of clipping at the largest of continuous values, which is then reached repeatedly and held."""
     at = values == end
     count = int(np.count_nonzero(at))
     visits = int(np.count_nonzero(at[1:] & ~at[:-1])) + int(at[0])
@@ -297,7 +347,11 @@ def _tied_pile(values: Floats, end: float, step: float, noise: float) -> float:
         return 0.0
     below = values[~at]
     top = np.partition(below, -20)[-20:] if below.size > 20 else below
-    ties = max(CHANCE, step * top.size / max(float(end - top.min()), step)) if top.size else CHANCE
+    ties = (
+        max(MIN_EXPECTED_COINCIDENCES, step * top.size / max(float(end - top.min()), step))
+        if top.size
+        else MIN_EXPECTED_COINCIDENCES
+    )
     same = np.count_nonzero(values[1:] == values[:-1]) - (count - visits)
     stay = (same + 0.5) / (values.size + 1.0)
     stays = float(count - visits)
@@ -306,120 +360,151 @@ def _tied_pile(values: Floats, end: float, step: float, noise: float) -> float:
     )
 
 
-def _stepped_pile(values: Floats, end: float, step: float, noise: float) -> float:
-    """Gain of an end at the largest of stepped values.
+def _stepped_clipping_gain(values: Floats, end: float, step: float, noise: float) -> float:
+    """Return the gain of clipping at the largest of stepped values.
 
-    Two things must hold, and the lesser gain counts: the last step is met more often than those before it let expect,
-    and more samples are missing beyond it than their neighbours, by the best linear interpolation, let expect.
+    Two conditions must hold, and the smaller gain counts. The last step occurs more often than the steps before it
+    predict. More samples are missing beyond the last step than the best linear interpolation from their neighbours
+    predicts.
     """
-    if noise < SMOOTH * step:
+    if noise < MIN_NOISE_TO_STEP_CLIPPING * step:
         return 0.0
     counts = np.array([np.count_nonzero(np.abs(values - end + k * step) < 0.5 * step) for k in range(4)], dtype=float)
-    pile = max(_not_gaussian(counts), _larger(counts[0], counts[1]))
+    pile = max(_excess_over_parabola(counts), _count_difference_gain(counts[0], counts[1]))
     if not pile > 0.0:
         return 0.0
-    expected, deviation = _from_neighbours(values)
+    expected, deviation = _predict_from_neighbours(values)
     away = (end + 0.5 * step - expected) / deviation
     return min(pile, -float(log_ndtr(away[away < 7.0]).sum()))
 
 
-def _not_gaussian(counts: Floats) -> float:
-    """Gain of the first of four counts over the parabola that goes through the logarithms of the others."""
+def _excess_over_parabola(counts: Floats) -> float:
+    """Return the gain of the first of four counts over the parabola through the logarithms of the other three."""
     if not counts[1:].all():
         return 0.0
     above = float(np.log(counts) @ np.array([1.0, -3.0, 3.0, -1.0]))
     return 0.5 * above**2 / float((1.0 / counts) @ np.array([1.0, 9.0, 9.0, 1.0])) if above > 0.0 else 0.0
 
 
-def _larger(one: float, other: float) -> float:
-    """Likelihood gain of two counts as they are over equal ones, where the first is larger."""
+def _count_difference_gain(one: float, other: float) -> float:
+    """Return the log-likelihood gain of two different counts over equal counts if the first is larger, otherwise 0."""
     half = 0.5 * (one + other)
     return float(xlogy(one, one / half) + xlogy(other, other / half)) if one > other else 0.0
 
 
-def _from_neighbours(values: Floats) -> tuple[Floats, float]:
-    """What TAPS neighbours on each side let expect of every sample, and the deviation from that: linear, symmetric."""
+def _predict_from_neighbours(values: Floats) -> tuple[Floats, float]:
+    """Return the prediction of every sample from its neighbours, and the standard deviation of the error.
+
+    The prediction is linear and symmetric in ``PREDICTOR_TAPS`` neighbours on each side.
+    """
     z = values - values.mean()
-    lags = np.array([np.dot(z[: z.size - k], z[k:]) for k in range(2 * TAPS + 1)]) / z.size
-    k = np.arange(1, TAPS + 1)
+    lags = np.array([np.dot(z[: z.size - k], z[k:]) for k in range(2 * PREDICTOR_TAPS + 1)]) / z.size
+    k = np.arange(1, PREDICTOR_TAPS + 1)
     both = 2.0 * (lags[np.abs(k[:, None] - k)] + lags[k[:, None] + k])
     weights = np.linalg.lstsq(both, 2.0 * lags[k], rcond=1e-10)[0]
     taps = np.concatenate([weights[::-1], [0.0], weights])
-    expected = np.convolve(np.pad(z, TAPS, mode="reflect"), taps, mode="valid")
+    expected = np.convolve(np.pad(z, PREDICTOR_TAPS, mode="reflect"), taps, mode="valid")
     return expected + values.mean(), float((z - expected).std())
 
 
-def _known_repeats(y: Floats, pairs: Mask, apart: Floats, noise: float) -> Repeats | None:
-    """Of values without a step that is known.
+def _repeats_of_continuous(y: Floats, pairs: Mask, differences: Floats, noise: float) -> Repeats | None:
+    """Return the repeats of values without a known step.
 
-    Where values come back after another one between them they stand on steps all the same: then neighbours are equal by
-    chance as often as every other sample is, but for those that were repeated twice.
+    If values also recur after a different value in between, they lie on an unknown grid. Neighbours are then equal by
+    chance as often as every second sample is, except for samples that were repeated twice.
     """
     mask = np.zeros(y.size, dtype=np.bool_)
     mask[1:] = pairs & (y[1:] == y[:-1])
     count = int(mask.sum())
     later = (y[2:] == y[:-2]) & pairs[1:] & pairs[:-1]
     if np.count_nonzero(later & ~mask[2:]):
-        n = float(apart.size)
+        n = float(differences.size)
         again = int(np.count_nonzero(later)) / n
         share = 0.0
         for _ in range(3):
             chance = max(again - share**2, 0.0)
             share = max(count / n - chance, 0.0) / (1.0 - chance)
-        gain = min(_larger_share(np.array([count, n * chance]), np.full(2, n)), _beyond(count, n * chance, 0.0))
+        gain = min(
+            _share_difference_gain(np.array([count, n * chance]), np.full(2, n)), _excess_gain(count, n * chance, 0.0)
+        )
         error = Z95 * (count + n * again) ** 0.5 / n
         size = Size(share, max(share - error, 0.0), share + error)
         return Repeats(size, n * share, np.zeros_like(mask), gain) if gain > 0.0 else None
-    chance = max(CHANCE, apart.size * _spacing(_finite(y)) / (noise * 2.0 * np.pi**0.5))  # density at 0 of a difference
+    # probability density of a difference at zero, times the spacing of the numbers
+    chance = max(
+        MIN_EXPECTED_COINCIDENCES, differences.size * _float_spacing(_finite_values(y)) / (noise * 2.0 * np.pi**0.5)
+    )
     gain = _poisson_gain(count, chance)
-    return Repeats(_wilson(count, apart.size), float(count), mask, gain) if gain > 0.0 else None
+    return Repeats(_wilson_interval(count, differences.size), float(count), mask, gain) if gain > 0.0 else None
 
 
-def _counted_repeats(apart: Floats, twice: Floats, n: int) -> Repeats | None:
-    """Of stepped values, from distances in steps of samples that follow each other, and of every other one.
+def _repeats_of_stepped(differences: Floats, differences_over_two: Floats, n: int) -> Repeats | None:
+    """Return the repeats of stepped values.
 
-    Differences of stepped values with a Gaussian difference behind them have a known form (``_steps_apart``): zero has
-    too many. Outliers, modulated noise and a level that stays between two steps make too many as well, but then over
-    two samples too, where repeats of a share h have h² only. So the lesser gain counts.
+    The arguments are the absolute differences, in steps, of successive samples and of every second sample. The
+    differences of stepped Gaussian values have a known distribution (``_step_difference_probabilities``), and repeats
+    add zeros to it. Outliers, modulated noise and a level that stays between two steps also add zeros. They add them to
+    differences over two samples as well, whereas repeats with a share h add only h² there. The smaller gain therefore
+    counts.
     """
-    most = int(np.clip(np.ceil(GAUSSIAN * 2.0**0.5 * apart.mean()), 2, 64))
-    counts, chance, gain = _beside_form(apart, most)
-    _, chance_of_two, _ = _beside_form(twice, most)
-    of_two = float(np.count_nonzero(twice < 0.5)) - chance_of_two
+    most = int(np.clip(np.ceil(GAUSSIAN * 2.0**0.5 * differences.mean()), 2, 64))
+    counts, chance, gain = _zero_difference_excess(differences, most)
+    _, chance_of_two, _ = _zero_difference_excess(differences_over_two, most)
+    of_two = float(np.count_nonzero(differences_over_two < 0.5)) - chance_of_two
     excess = float(counts[0] - chance)
-    gain = min(gain, _beyond(float(counts[0]), chance + max(of_two, 0.0), 3.0 * chance**2 / max(counts[1:].sum(), 1.0)))
+    gain = min(
+        gain, _excess_gain(float(counts[0]), chance + max(of_two, 0.0), 3.0 * chance**2 / max(counts[1:].sum(), 1.0))
+    )
     if not (excess > 0.0 and gain > 0.0):
         return None
     error = (counts[0] + 3.0 * chance**2 / max(counts[1:].sum(), 1.0)) ** 0.5
-    lo, hi = ((excess + sign * Z95 * error) / apart.size for sign in (-1.0, 1.0))
-    fraction = Size(excess / apart.size, max(float(lo), 0.0), float(hi))
+    lo, hi = ((excess + sign * Z95 * error) / differences.size for sign in (-1.0, 1.0))
+    fraction = Size(excess / differences.size, max(float(lo), 0.0), float(hi))
     return Repeats(fraction, excess, np.zeros(n, dtype=np.bool_), gain)
 
 
-def _beside_form(apart: Floats, most: int) -> tuple[Floats, float, float]:
-    """Counts of 0, 1, … ``most`` steps apart; the zeros that the form of the others lets expect; nats for their own."""
-    counts = np.bincount(np.minimum(np.rint(apart), most + 1).astype(np.int64), minlength=most + 2)[:-1].astype(float)
-    alone, _ = _best_spread(counts, 0)
-    others, spread = _best_spread(counts, 1)
-    form = _steps_apart(spread, most)
+def _zero_difference_excess(differences: Floats, most: int) -> tuple[Floats, float, float]:
+    """Return the statistics of zero differences between stepped values.
+
+    Returns
+    -------
+    counts : ndarray of float64, shape (most + 1,)
+        Counts of differences of 0, 1, … ``most`` steps.
+    chance : float
+        Number of zeros that the distribution of the other differences predicts.
+    gain : float
+        Log-likelihood gain of a free number of zeros, nats.
+    """
+    counts = np.bincount(np.minimum(np.rint(differences), most + 1).astype(np.int64), minlength=most + 2)[:-1].astype(
+        float
+    )
+    alone, _ = _fit_difference_spread(counts, 0)
+    others, spread = _fit_difference_spread(counts, 1)
+    form = _step_difference_probabilities(spread, most)
     chance = float(form[0] / form[1:].sum() * counts[1:].sum())
     free = others + xlogy(counts[0], counts[0] / counts.sum())
     free += xlogy(counts[1:].sum(), counts[1:].sum() / counts.sum())
     return counts, chance, float(free - alone)
 
 
-def _beyond(count: float, chance: float, variance: float) -> float:
-    """Gain of a count over what chance lets expect, known to ``variance`` and to a PERCENT of itself."""
+def _excess_gain(count: float, chance: float, variance: float) -> float:
+    """Return the gain of a count over its expectation, which has a given variance and a relative error of
+    ``CHANCE_RELATIVE_ERROR``.
+    """
     excess = count - chance
-    return 0.5 * excess**2 / (count + chance + variance + (PERCENT * chance) ** 2) if excess > 0.0 else 0.0
+    return (
+        0.5 * excess**2 / (count + chance + variance + (CHANCE_RELATIVE_ERROR * chance) ** 2) if excess > 0.0 else 0.0
+    )
 
 
-def _best_spread(counts: Floats, first: int) -> tuple[float, float]:
-    """Largest log-likelihood of counts of 0, 1, … steps apart, from ``first`` on, and the deviation that has it."""
+def _fit_difference_spread(counts: Floats, first: int) -> tuple[float, float]:
+    """Return the largest log-likelihood of the counts of 0, 1, … steps, from ``first`` on, and the standard deviation
+    that maximises it.
+    """
     kept = counts[first:]
 
     def cost(log_spread: float) -> float:
-        form = _steps_apart(float(np.exp(log_spread)), counts.size - 1)[first:]
+        form = _step_difference_probabilities(float(np.exp(log_spread)), counts.size - 1)[first:]
         return -float(xlogy(kept, form / form.sum()).sum())
 
     from scipy.optimize import minimize_scalar
@@ -428,11 +513,12 @@ def _best_spread(counts: Floats, first: int) -> tuple[float, float]:
     return -float(best.fun), float(np.exp(best.x))
 
 
-def _steps_apart(spread: float, most: int) -> Floats:
-    """Chances that two stepped values are 0 … ``most`` steps apart, either way, ``spread`` steps the deviation behind.
+def _step_difference_probabilities(spread: float, most: int) -> Floats:
+    """Return the probabilities that two stepped values differ by 0 … ``most`` steps in either direction.
 
-    With the level anywhere between two steps, the second difference of ∫∫ of the Gaussian (a triangle of two steps
-    on it).
+    ``spread`` is the standard deviation of the underlying Gaussian difference, in steps. The level may lie anywhere
+    between two steps. The probabilities are second differences of the double integral of the Gaussian, which is the
+    Gaussian weighted with a triangle of two steps.
     """
     x = np.arange(-1.0, most + 2.0)
     twice = x * ndtr(x / spread) + spread * np.exp(-0.5 * (x / spread) ** 2) / np.sqrt(2.0 * np.pi)
@@ -441,8 +527,8 @@ def _steps_apart(spread: float, most: int) -> Floats:
     return np.asarray(form)
 
 
-def _larger_share(counts: Floats, trials: Floats) -> float:
-    """Likelihood gain of two shares over one, where the first is larger."""
+def _share_difference_gain(counts: Floats, trials: Floats) -> float:
+    """Return the log-likelihood gain of two shares over one common share if the first is larger, otherwise 0."""
     share, same = counts / trials, counts.sum() / trials.sum()
     if share[0] <= share[1]:
         return 0.0
@@ -450,12 +536,12 @@ def _larger_share(counts: Floats, trials: Floats) -> float:
 
 
 def _poisson_gain(count: float, expected: float) -> float:
-    """Likelihood gain of a count over its expectation, where it is larger."""
+    """Return the log-likelihood gain of a count over its expectation if it is larger, otherwise 0."""
     return float(count * np.log(count / expected) - count + expected) if count > expected else 0.0
 
 
-def _wilson(count: int, trials: int) -> Size:
-    """A share with its 95 % interval (Wilson 1927)."""
+def _wilson_interval(count: int, trials: int) -> Size:
+    """Return a share with its 95 % interval (Wilson 1927)."""
     share, extra = count / trials, Z95**2 / trials
     middle = (share + 0.5 * extra) / (1.0 + extra)
     half = Z95 / (1.0 + extra) * (share * (1.0 - share) / trials + 0.25 * extra / trials) ** 0.5

@@ -1,1 +1,1 @@
-"""Search for missing effects on one axis, and the checks that each name has to pass."""
+"""Search for missing effects on one axis, with the checks that each effect must pass."""

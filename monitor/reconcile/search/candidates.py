@@ -1,9 +1,9 @@
-"""From what a lens shows to effects worth trying, with first guesses from the data.
+"""Candidate effects for one axis, with starting values from the data.
 
-Every function looks at one family and gives effects whose shapes are the best of their kind beside the effects at
-hand; their sizes are fitted by whoever tries them. ``PRICE`` is what a name must be worth before it is given: what
-chance gives a true model, more for names that can stand in many places, and an allowance for the shapes that were
-fitted. The numbers are empirical.
+Each function examines one family of effects. It returns effects whose shape parameters are the best of their family,
+given the effects that are already in the model. The caller fits their sizes. ``PRICE`` is the penalty in nats that an
+effect must exceed. It consists of the gain that chance gives a true model, an allowance for effects that can occur at
+many places, and an allowance for fitted shape parameters. The values are empirical.
 """
 
 from collections.abc import Callable
@@ -61,53 +61,91 @@ PRICE: Final[dict[str, float]] = {
     "poisson_steps": 8.5 + 1.5,
     "power_law": 9.5 + 2.0,
 }
-PER_DECADE: Final = 4
-"""Shapes of a first look."""
-LONGEST: Final = 0.1
-"""Of the recording: a correlation that is longer reads as a random walk."""
-SLOWEST: Final = 0.4
-"""Of the recording: a transient or a delay that is longer reads as a slope."""
-APART: Final = 24
-"""Quarters of a width, to each side: windows nearer than that see one peak."""
-PROMPT: Final = 0.002
-"""Of the recording: what follows temperature with less delay follows it at once; the thermometer's noise does the
-rest."""
-PEAKS: Final = 2
-ORDERS: Final = (1, 2, 3, 4)
+"""Penalty of each effect in nats of log-likelihood gain."""
+SHAPES_PER_DECADE: Final = 4
+"""Number of shape values per decade in the first search."""
+MAX_CORRELATION_FRACTION: Final = 0.1
+"""Longest correlation time as a fraction of the recording. A longer correlation looks like a random walk."""
+MAX_TIME_CONSTANT_FRACTION: Final = 0.4
+"""Longest time constant of a transient or delay as a fraction of the recording. A longer one looks like a slope."""
+PEAK_SEPARATION_STEPS: Final = 24
+"""Distance to each side, in quarters of a width, within which two windows contain the same peak."""
+MIN_DELAY_FRACTION: Final = 0.002
+"""Shortest temperature delay as a fraction of the recording. A shorter delay cannot be distinguished from none, because
+of the noise of the thermometer.
+"""
+MAX_PEAKS: Final = 2
+"""Largest number of peaks that are examined."""
+FILTER_ORDERS: Final = (1, 2, 3, 4)
+"""Orders of the low-pass filters that are tried."""
 
-Family = Callable[[Axis, Hypothesis, Sight], list[Effect]]
+CandidateFunction = Callable[[Axis, Hypothesis, Sight], list[Effect]]
+"""Function that proposes effects of one family."""
 
 
 def noises(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
-    """The classic terms that the axis has not."""
+    """Return the classic terms Q, N, B and K that the axis does not have yet.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    state : Hypothesis
+        Fitted effects.
+    seen : Sight
+        Axis whitened by ``state``.
+    """
     have = {type(effect) for effect in state.effects}
-    small = _small(axis)
+    small = _start_size(axis)
     every = (QuantizationNoise(Q=small), AngleRandomWalk(N=small), BiasInstability(B=small), RateRandomWalk(K=small))
     return [effect for effect in every if type(effect) not in have]
 
 
 def correlated(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
-    """One exponentially correlated noise."""
-    shortest, longest = 2.0 / axis.rate_hz, LONGEST * axis.n / axis.rate_hz
+    """Return a list with the best exponentially correlated noise, or an empty list if its correlation time is out of
+    range.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    state : Hypothesis
+        Fitted effects.
+    seen : Sight
+        Axis whitened by ``state``.
+    """
+    shortest, longest = 2.0 / axis.rate_hz, MAX_CORRELATION_FRACTION * axis.n / axis.rate_hz
     if longest <= shortest:
         return []
-    times_s = np.geomspace(shortest, longest, max(3, round(PER_DECADE * np.log10(longest / shortest))))
-    trials: list[Effect] = [ExponentiallyCorrelated(sigma=_small(axis), correlation_time=float(t)) for t in times_s]
-    best = _best(axis, state.effects, trials)
+    times_s = np.geomspace(shortest, longest, max(3, round(SHAPES_PER_DECADE * np.log10(longest / shortest))))
+    trials: list[Effect] = [
+        ExponentiallyCorrelated(sigma=_start_size(axis), correlation_time=float(t)) for t in times_s
+    ]
+    best = _most_likely(axis, state.effects, trials)
     found = refined(axis, (*state.effects, best), len(state.effects), ["correlation_time"], 2.0)[-1]
     assert isinstance(found, ExponentiallyCorrelated)
     return [found] if shortest <= found.correlation_time <= longest else []
 
 
 def ringing(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
-    """Resonances, where the whitened spectrum has peaks."""
+    """Return resonances at the peaks of the whitened spectrum.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    state : Hypothesis
+        Fitted effects.
+    seen : Sight
+        Axis whitened by ``state``.
+    """
     found: list[Effect] = []
     for middle, width in peaks(seen):
         trials: list[Effect] = [
-            Narrowband(sigma=_small(axis), frequency=middle, bandwidth=float(width * factor))
+            Narrowband(sigma=_start_size(axis), frequency=middle, bandwidth=float(width * factor))
             for factor in (0.3, 0.6, 1.0, 1.8)
         ]
-        best = _best(axis, state.effects, trials)
+        best = _most_likely(axis, state.effects, trials)
         at = len(state.effects)
         effects = refined(axis, (*state.effects, best), at, ["bandwidth"], 2.5)
         effects = refined_frequency(axis, effects, at)
@@ -116,15 +154,38 @@ def ringing(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
     return found
 
 
-def refined_frequency(axis: Axis, effects: Effects, at: int) -> Effects:
-    """The middle of a resonance, searched within its width."""
-    peak = effects[at]
+def refined_frequency(axis: Axis, effects: Effects, index: int) -> Effects:
+    """Return the effects with the centre frequency of a resonance refined within its width.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    effects : tuple of Effect
+        Effects of the axis.
+    index : int
+        Index of the resonance.
+    """
+    peak = effects[index]
     assert isinstance(peak, Narrowband)
-    return refined(axis, effects, at, ["frequency"], 1.0 + 0.7 * peak.bandwidth / peak.frequency)
+    return refined(axis, effects, index, ["frequency"], 1.0 + 0.7 * peak.bandwidth / peak.frequency)
 
 
-def peaks(seen: Sight, most: int = PEAKS) -> list[tuple[float, float]]:
-    """(middle, width) in Hz of what stands out of the whitened spectrum, strongest first, each wider than a line."""
+def peaks(seen: Sight, most: int = MAX_PEAKS) -> list[tuple[float, float]]:
+    """Return the peaks of the whitened spectrum that are wider than a line, strongest first.
+
+    Parameters
+    ----------
+    seen : Sight
+        Whitened axis.
+    most : int, optional
+        Largest number of peaks.
+
+    Returns
+    -------
+    list of tuple of float
+        Centre frequency and width of each peak in Hz.
+    """
     n = seen.axis.n
     step_hz = 0.5 * seen.axis.rate_hz / n
     running = np.concatenate([[0.0], np.cumsum(seen.whitened**2)])
@@ -139,7 +200,7 @@ def peaks(seen: Sight, most: int = PEAKS) -> list[tuple[float, float]]:
             at = int(np.argmax(gains))
             middle = (first[at] + 0.5 * width) * step_hz
             found.append((float(gains[at]), float(middle), float(width * step_hz)))
-            gains[max(at - APART, 0) : at + APART + 1] = 0.0
+            gains[max(at - PEAK_SEPARATION_STEPS, 0) : at + PEAK_SEPARATION_STEPS + 1] = 0.0
         width *= 2
     chosen: list[tuple[float, float]] = []
     for gain, middle, wide in sorted(found, reverse=True):
@@ -151,17 +212,35 @@ def peaks(seen: Sight, most: int = PEAKS) -> list[tuple[float, float]]:
 
 
 def oscillations(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
-    """Lines of the spectrum, their frequency at the top of the periodogram."""
+    """Return sinusoids at the lines of the spectrum.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    state : Hypothesis
+        Fitted effects.
+    seen : Sight
+        Axis whitened by ``state``.
+    """
     found: list[Effect] = []
-    for gain, f_hz in line_peaks(seen.white, axis.rate_hz, PEAKS):
+    for gain, f_hz in line_peaks(seen.white, axis.rate_hz, MAX_PEAKS):
         if gain > PRICE["sinusoidal"] / 2.0:
             best = line_frequency(seen, f_hz)
-            found.append(Sinusoidal(amplitude=_small(axis), frequency=best, phase=0.0))
+            found.append(Sinusoidal(amplitude=_start_size(axis), frequency=best, phase=0.0))
     return found
 
 
 def line_frequency(seen: Sight, f_hz: float) -> float:
-    """The maximum of the periodogram near a frequency, by golden section."""
+    """Return the frequency of the maximum of the periodogram near a given frequency, by golden-section search.
+
+    Parameters
+    ----------
+    seen : Sight
+        Whitened axis.
+    f_hz : float
+        Approximate frequency in Hz.
+    """
     t = np.arange(seen.axis.n) / seen.axis.rate_hz
     half = 0.5 * seen.axis.rate_hz / seen.axis.n
 
@@ -176,35 +255,56 @@ def line_frequency(seen: Sight, f_hz: float) -> float:
 
 
 def low_pass(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
-    """The sensor's own bandwidth, unless the model has one."""
+    """Return a list with the best low-pass filter, or an empty list if the effects already contain one or no filter
+    fits.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    state : Hypothesis
+        Fitted effects.
+    seen : Sight
+        Axis whitened by ``state``.
+    """
     if any(isinstance(effect, BandwidthLimit) for effect in state.effects):
         return []
     nyquist = 0.5 * axis.rate_hz
     cutoffs = nyquist * np.geomspace(0.04, 0.95, 11)
     found: list[Effect] = []
-    for order in ORDERS:
-        best = _best(axis, state.effects, [BandwidthLimit(cutoff=float(f), order=order) for f in cutoffs])
+    for order in FILTER_ORDERS:
+        best = _most_likely(axis, state.effects, [BandwidthLimit(cutoff=float(f), order=order) for f in cutoffs])
         at = len(state.effects)
         effects = refined(axis, (*state.effects, best), at, ["cutoff"], 1.4)
         if effects[at].cutoff < 0.99 * nyquist:  # type: ignore[attr-defined]
             found.append(effects[at])
-    return [_best(axis, state.effects, found)] if found else []
+    return [_most_likely(axis, state.effects, found)] if found else []
 
 
 def drifts(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
-    """What follows the clock: a slope, a transient, a step."""
+    """Return effects that follow time: a ramp, a transient after the start, and a step.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    state : Hypothesis
+        Fitted effects.
+    seen : Sight
+        Axis whitened by ``state``.
+    """
     length_s = axis.n / axis.rate_hz
     have = {type(effect) for effect in state.effects}
     found: list[Effect] = []
     if RateRamp not in have:
-        found.append(RateRamp(R=_small(axis)))
+        found.append(RateRamp(R=_start_size(axis)))
     if TurnOnTransient not in have:
-        times_s = np.geomspace(0.003, SLOWEST, 9) * length_s
+        times_s = np.geomspace(0.003, MAX_TIME_CONSTANT_FRACTION, 9) * length_s
         trials: list[Effect] = [TurnOnTransient(amplitude=1.0, time_constant=float(t)) for t in times_s]
-        best = _best(axis, state.effects, trials)
+        best = _most_likely(axis, state.effects, trials)
         at = len(state.effects)
         effects = refined(axis, (*state.effects, best), at, ["time_constant"], 1.6)
-        if effects[at].time_constant <= SLOWEST * length_s:  # type: ignore[attr-defined]
+        if effects[at].time_constant <= MAX_TIME_CONSTANT_FRACTION * length_s:  # type: ignore[attr-defined]
             found.append(effects[at])
     if not have & {PoissonSteps, RandomTelegraph}:
         gains, times = step_gains(seen)
@@ -213,7 +313,17 @@ def drifts(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
 
 
 def warmth(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
-    """What follows temperature: at once, with a curve, or late."""
+    """Return effects that follow the temperature: linearly, quadratically or with a delay.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    state : Hypothesis
+        Fitted effects.
+    seen : Sight
+        Axis whitened by ``state``.
+    """
     if axis.temperature_c is None or np.ptp(axis.temperature_c) == 0.0:
         return []
     have = {type(effect) for effect in state.effects}
@@ -224,20 +334,30 @@ def warmth(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
         found.append(TemperatureBias(coefficient=1.0, reference=reference, quadratic=1.0))
     if TemperatureLag not in have:
         length_s = axis.n / axis.rate_hz
-        times_s = np.geomspace(PROMPT * length_s, SLOWEST * length_s, 9)
+        times_s = np.geomspace(MIN_DELAY_FRACTION * length_s, MAX_TIME_CONSTANT_FRACTION * length_s, 9)
         trials: list[Effect] = [
             TemperatureLag(coefficient=1.0, reference=reference, time_constant=float(t)) for t in times_s
         ]
-        best = _best(axis, state.effects, trials)
+        best = _most_likely(axis, state.effects, trials)
         at = len(state.effects)
         effects = refined(axis, (*state.effects, best), at, ["time_constant"], 2.2)
-        if PROMPT * length_s < effects[at].time_constant <= SLOWEST * length_s:  # type: ignore[attr-defined]
+        if MIN_DELAY_FRACTION * length_s < effects[at].time_constant <= MAX_TIME_CONSTANT_FRACTION * length_s:  # type: ignore[attr-defined]
             found.append(effects[at])
     return found
 
 
 def leaks(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
-    """Other axes in this one."""
+    """Return leaks from the other axes.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    state : Hypothesis
+        Fitted effects.
+    seen : Sight
+        Axis whitened by ``state``.
+    """
     have = {getattr(effect, "source", None) for effect in state.effects}
     found: list[Effect] = []
     for source in axis.others:
@@ -248,15 +368,17 @@ def leaks(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
     return found
 
 
-NOISE_FAMILIES: Final[tuple[Family, ...]] = (noises, correlated, ringing, oscillations, low_pass)
-COURSE_FAMILIES: Final[tuple[Family, ...]] = (drifts, warmth, leaks)
+NOISE_CANDIDATES: Final[tuple[CandidateFunction, ...]] = (noises, correlated, ringing, oscillations, low_pass)
+"""Functions that propose noise effects and filters."""
+DETERMINISTIC_CANDIDATES: Final[tuple[CandidateFunction, ...]] = (drifts, warmth, leaks)
+"""Functions that propose effects that follow time, temperature or another axis."""
 
 
-def _best(axis: Axis, effects: Effects, trials: list[Effect]) -> Effect:
-    """The most likely of several, all sizes free."""
+def _most_likely(axis: Axis, effects: Effects, trials: list[Effect]) -> Effect:
+    """Return the effect with the largest likelihood, with all sizes free."""
     return max(trials, key=lambda one: axis.fit((*effects, one)).log_likelihood)
 
 
-def _small(axis: Axis) -> float:
-    """A size to start from: none, beside the samples' own deviation."""
+def _start_size(axis: Axis) -> float:
+    """Return a starting size that is small compared with the standard deviation of the samples."""
     return 1e-3 * float(np.sqrt(np.mean(axis.coefficients**2)))

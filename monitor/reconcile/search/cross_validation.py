@@ -1,9 +1,10 @@
-"""Does a step hold on data that did not choose it?
+"""Cross-validation of a new effect on the two halves of a recording.
 
-The recording is cut in halves. What the step adds is fitted on one, sizes and all, and the other is looked at through
-the lens that found the gap, beside the model before and the model after; then the other way round. The step is kept if
-the gap shrinks and the likelihood of the unseen half grows. Where one half alone would show less than FAINT of it, as
-of what happens once, there is nothing to hold out, and the reason is told.
+The effect is fitted to one half of the recording, including all sizes. The other half is examined with the diagnostic
+that found the difference, with the model before and with the model after the step. Then the halves are exchanged. The
+effect is kept if the difference decreases and the likelihood of the unseen half increases. Some effects cannot be
+validated, because they happen once or because one half would gain less than ``MIN_HALF_GAIN_NATS``. They are kept, and
+the reason is reported.
 """
 
 from collections.abc import Collection
@@ -24,20 +25,20 @@ from monitor.reconcile.preparation.axis import Axis, Courses, Effects, Likely
 from monitor.reconcile.preparation.cosine_bins import bins, series, transform
 from monitor.reconcile.preparation.prepare import again, look_at_values
 
-FAINT: Final = 5.0
-"""Nats that a half must be able to show."""
-PER_SAMPLE: Final = (Resolution, Saturation, SampleHold, Outliers)
-"""Seen in single samples, not in the spectrum."""
+MIN_HALF_GAIN_NATS: Final = 5.0
+"""Smallest gain in nats that one half must be able to provide."""
+SAMPLE_EFFECTS: Final = (Resolution, Saturation, SampleHold, Outliers)
+"""Effects that are visible in single samples and not in the spectrum."""
 
 
 @dataclass(frozen=True, slots=True)
-class Proof:
-    """A step beside unseen data."""
+class CrossValidation:
+    """Result of the cross-validation of one step."""
 
-    before: float  # gap
-    after: float  # gap
+    before: float  # gap without the step, standard deviations
+    after: float  # gap with the step, standard deviations
     kept: bool
-    reason: str  # why there is no such data; then the gaps are NaN and the step is kept
+    reason: str  # why no validation was possible; the gaps are then NaN and the step is kept
 
 
 def proof(
@@ -48,51 +49,64 @@ def proof(
     lens: str,
     null: Null,
     rng: np.random.Generator,
-) -> Proof:
-    """Hold out one half of the axis, then the other.
+) -> CrossValidation:
+    """Cross-validate a step on the two halves of an axis.
 
-    Args:
-        axis: mended for ``after``
-        before, after: fitted to the whole axis
-        added: what was tried; None: other sizes of known noises
-        lens: that found the gap
-        null: of that lens
+    Parameters
+    ----------
+    axis : Axis
+        Axis, repaired for the effects in ``after``.
+    before, after : Hypothesis
+        Effects before and after the step, fitted to the whole axis.
+    added : Effect or None
+        Effect that was added. None means that only sizes of known noise effects were changed.
+    lens : str
+        Name of the diagnostic that found the difference.
+    null : Null
+        Null distribution of this diagnostic.
+    rng : numpy.random.Generator
+        Generator for the replacement samples.
     """
     if added is not None and added.name in ONCE:
-        return _nothing("it happens once")
+        return _not_applicable("it happens once")
     parts = [slice(0, axis.n // 2), slice(axis.n - axis.n // 2, axis.n)]
     sources = {getattr(effect, "source", "") for effect in (*before.effects, *after.effects)}
-    mended = [_half(axis, part, after.effects, sources, rng) for part in parts]
-    if isinstance(added, PER_SAMPLE):
-        halves = [_half(axis, part, before.effects, sources, rng) for part in parts]
-        return _of_samples(halves, mended, before, after, lens)
-    if type(added) in COURSE and min(_shown(half, after, len(after.effects) - 1) for half in mended) < FAINT:
-        return _nothing("one half of the recording alone shows too little of it")
+    repaired = [_half_axis(axis, part, after.effects, sources, rng) for part in parts]
+    if isinstance(added, SAMPLE_EFFECTS):
+        halves = [_half_axis(axis, part, before.effects, sources, rng) for part in parts]
+        return _validate_sample_effect(halves, repaired, before, after, lens)
+    if (
+        type(added) in COURSE
+        and min(_expected_gain(half, after, len(after.effects) - 1) for half in repaired) < MIN_HALF_GAIN_NATS
+    ):
+        return _not_applicable("one half of the recording alone shows too little of it")
     gain = after.likely.log_likelihood - before.likely.log_likelihood
-    if gain < 4.0 * FAINT:
-        return _nothing("one half of the recording alone shows too little of it")
+    if gain < 4.0 * MIN_HALF_GAIN_NATS:
+        return _not_applicable("one half of the recording alone shows too little of it")
     gaps = np.zeros(2)
     better = 0.0
     for learn, test in ((0, 1), (1, 0)):
         for at, state in enumerate((before, after)):
-            learned = mended[learn].fit(state.effects, state.likely.held)
-            seen = _beside(mended[test], learned)
-            gaps[at] += LENSES[lens](sight(mended[test], seen)).gain
+            learned = repaired[learn].fit(state.effects, state.likely.held)
+            seen = _predict_half(repaired[test], learned)
+            gaps[at] += LENSES[lens](sight(repaired[test], seen)).gain
             better += seen.log_likelihood * (2 * at - 1)
     gap_before, gap_after = (sqrt(gain) for gain in gaps)
     below = gap_after < max(gap_before, sqrt(2.0 * null.threshold))
-    return Proof(gap_before, gap_after, bool(better > 0.0 and below), "")
+    return CrossValidation(gap_before, gap_after, bool(better > 0.0 and below), "")
 
 
-def _nothing(reason: str) -> Proof:
-    return Proof(float("nan"), float("nan"), True, reason)
+def _not_applicable(reason: str) -> CrossValidation:
+    """Return the result for a step that cannot be validated, with the reason."""
+    return CrossValidation(float("nan"), float("nan"), True, reason)
 
 
-def _half(axis: Axis, part: slice, effects: Effects, sources: Collection[str], rng: np.random.Generator) -> Axis:
+def _half_axis(axis: Axis, part: slice, effects: Effects, sources: Collection[str], rng: np.random.Generator) -> Axis:
+    """Return one half of an axis as an axis of its own."""
     raw = axis.raw[part]
     n = raw.size
     warmth = None if axis.temperature_c is None else axis.temperature_c[part]
-    others = {name: transform(_part(one, part)) for name, one in axis.others.items() if name in sources}
+    others = {name: transform(_part_of_series(one, part)) for name, one in axis.others.items() if name in sources}
     y = axis.y[part]
     half = Axis(
         axis.name,
@@ -108,14 +122,15 @@ def _half(axis: Axis, part: slice, effects: Effects, sources: Collection[str], r
     return again(half, effects, rng)
 
 
-def _part(coefficients: Floats, part: slice) -> Floats:
+def _part_of_series(coefficients: Floats, part: slice) -> Floats:
+    """Return a part of the series that has the given coefficients."""
     return series(coefficients)[part]
 
 
-def _shown(half: Axis, state: Hypothesis, at: int) -> float:
-    """Nats that a course of the size found would gain in one half: ½ Σ (β R)²/v."""
+def _expected_gain(half: Axis, state: Hypothesis, index: int) -> float:
+    """Return the gain in nats of a deterministic effect with the fitted size in one half: ½ Σ (β R)²/v."""
     learned = half.fit(state.effects, state.likely.held)
-    effect = state.effects[at]
+    effect = state.effects[index]
     columns = half.columns(effect)
     weight = half.bins.spread(half.heard / learned.fitted.variance)
     if isinstance(effect, Sinusoidal):
@@ -125,13 +140,13 @@ def _shown(half: Axis, state: Hypothesis, at: int) -> float:
     return 0.5 * float((made**2 * weight).sum())
 
 
-def _beside(half: Axis, learned: Likely) -> Likely:
-    """A half beside what the other half taught.
+def _predict_half(half: Axis, learned: Likely) -> Likely:
+    """Return one half of an axis with the fit of the other half.
 
-    Noises have the sizes learned there. So have courses, as far as they are known there: with sizes β₁ of covariance C₁
-    from the one half, and β₂, C₂ from this one alone, the evidence is that of β₂ less the price of their distance,
-    ½ Δ'(C₁ + C₂)⁻¹Δ + ½ ln |C₁ + C₂|/|C₂|, and the sizes are the mean of both by their weights. Of a line the phase
-    begins anew.
+    Noise effects keep the sizes that were learned. Deterministic effects keep them as far as they are known. The
+    learning half gives the sizes β₁ with covariance C₁, and the other half alone gives β₂ with C₂. The log-likelihood
+    is that of β₂ less the penalty for their distance Δ, ½ Δ'(C₁ + C₂)⁻¹Δ + ½ ln |C₁ + C₂|/|C₂|. The resulting sizes are
+    the weighted mean of both. The phase of a line is fitted anew.
     """
     effects = learned.effects
     held = frozenset(at for at, effect in enumerate(effects) if type(effect) in NOISE)
@@ -139,7 +154,7 @@ def _beside(half: Axis, learned: Likely) -> Likely:
     beta = free.fitted.beta.copy()
     for at, place in free.courses:
         line = effects[at]
-        if isinstance(line, Sinusoidal):  # its phase begins anew, its amplitude does not
+        if isinstance(line, Sinusoidal):  # the phase is fitted anew, the amplitude is kept
             beta[place] *= line.amplitude / max(float(np.hypot(*beta[place])), 1e-300)
     free = half.at(free, beta)
     known = [
@@ -151,7 +166,7 @@ def _beside(half: Axis, learned: Likely) -> Likely:
     if not known:
         return free
     pick = np.ix_(known, known)
-    here, there = (_regular(one.fitted.beta_covariance[pick]) for one in (free, learned))
+    here, there = (_regularised(one.fitted.beta_covariance[pick]) for one in (free, learned))
     apart = free.fitted.beta[known] - learned.fitted.beta[known]
     both = here + there
     price = 0.5 * float(apart @ np.linalg.pinv(both) @ apart)
@@ -161,15 +176,18 @@ def _beside(half: Axis, learned: Likely) -> Likely:
     return replace(fixed, log_likelihood=free.log_likelihood - price)
 
 
-def _regular(covariance: Floats) -> Floats:
-    """With a little on its diagonal, so that what one half cannot tell has a determinant."""
+def _regularised(covariance: Floats) -> Floats:
+    """Return a covariance with a small addition to its diagonal, so that its determinant exists."""
     return covariance + np.diag(1e-9 * np.diag(covariance) + 1e-300)
 
 
-def _of_samples(halves: list[Axis], mended: list[Axis], before: Hypothesis, after: Hypothesis, lens: str) -> Proof:
+def _validate_sample_effect(
+    halves: list[Axis], repaired: list[Axis], before: Hypothesis, after: Hypothesis, lens: str
+) -> CrossValidation:
+    """Compare the halves before and after the repair of single samples."""
     gaps = np.zeros(2)
-    for half, put_right in zip(halves, mended, strict=True):
+    for half, put_right in zip(halves, repaired, strict=True):
         for at, (axis, state) in enumerate(((half, before), (put_right, after))):
             gaps[at] += LENSES[lens](sight(axis, axis.fit(state.effects, state.likely.held))).gain
     one, other = (sqrt(gain) for gain in gaps)
-    return Proof(one, other, other < one, "")
+    return CrossValidation(one, other, other < one, "")

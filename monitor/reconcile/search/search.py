@@ -1,9 +1,10 @@
-"""The search on one axis: look, try what may be missing, keep the best, look again.
+"""Search for missing effects on one axis, by forward selection.
 
-One round: the axis is made white by the model and looked at; if nothing passes its threshold, the round was the last.
-Else the candidates of ``trials`` are asked, one kind after the other, until one of them is worth its price and holds
-on data that did not choose it. What was found earlier and is worth nothing any more is dropped. When spectrum and
-level are closed, twins are told apart; at the end names that do not stand are withdrawn.
+In each round the axis is whitened by the current model and examined. If no diagnostic passes its threshold, the search
+ends. Otherwise the candidates of ``trials`` are tried, one kind after the other. The first one that exceeds its penalty
+and passes cross-validation is added. Effects from earlier rounds that no longer contribute are dropped. When spectrum
+and level agree, effects with the same spectrum are distinguished by their distribution. At the end, effects that fail a
+consistency check are withdrawn.
 """
 
 from collections.abc import Mapping
@@ -24,59 +25,74 @@ from monitor.reconcile.preparation.cosine_bins import bins
 from monitor.reconcile.preparation.prepare import again
 from monitor.reconcile.result import View
 from monitor.reconcile.search.candidates import PRICE, correlated, peaks
-from monitor.reconcile.search.cross_validation import Proof, proof
-from monitor.reconcile.search.non_gaussian_alternatives import WORTH, Twin, poisson, telegraph
-from monitor.reconcile.search.trials import NAMELESS, Trial, instead, tried
-from monitor.reconcile.search.withdrawal import SMOOTH, upheld
+from monitor.reconcile.search.cross_validation import CrossValidation, proof
+from monitor.reconcile.search.non_gaussian_alternatives import (
+    MIN_ALTERNATIVE_GAIN_NATS,
+    NonGaussianAlternative,
+    poisson,
+    telegraph,
+)
+from monitor.reconcile.search.trials import UNNAMED, Trial, replacements_for_resizing, tried
+from monitor.reconcile.search.withdrawal import SMOOTH_SPECTRA, upheld
 
-ROUNDS: Final = 8
-CHANCES: Final = 3
-"""Candidates of one kind that may fail on unseen data before the next kind is asked."""
-MENDED: Final = frozenset({Saturation, SampleHold, Outliers})
-"""Effects after which the samples are put right."""
-DISTRIBUTION: Final = ("tails", "variance")
-"""Lenses that tell whether samples are Gaussian and steady."""
-SWITCHES: Final = 10
-"""Of a telegraph that is told from Poisson steps: fewer may well alternate by chance."""
-WALKS: Final = frozenset({BiasStep, RateRandomWalk})
-"""Effects that jumps are told from."""
-SHARED: Final = Proof(float("nan"), float("nan"), True, "its spectrum is that of what it stands for, and was held out")
-"""Of a twin that is told by its distribution."""
+MAX_ROUNDS: Final = 8
+"""Largest number of rounds."""
+MAX_VALIDATION_ATTEMPTS: Final = 3
+"""Number of candidates of one kind that may fail cross-validation before the next kind is tried."""
+REPAIRED_EFFECTS: Final = frozenset({Saturation, SampleHold, Outliers})
+"""Effects after which the samples are repaired again."""
+DISTRIBUTION_DIAGNOSTICS: Final = ("tails", "variance")
+"""Diagnostics that test whether samples are Gaussian and stationary."""
+MIN_SWITCHES: Final = 10
+"""Smallest number of switches of a telegraph that is preferred to Poisson steps. Fewer jumps may alternate in sign by
+chance.
+"""
+WALK_EFFECTS: Final = frozenset({BiasStep, RateRandomWalk})
+"""Effects that jump processes are compared with."""
+SHARED_SPECTRUM: Final = CrossValidation(
+    float("nan"), float("nan"), True, "its spectrum is that of what it stands for, and was held out"
+)
+"""Cross-validation result of an alternative that differs only in its distribution."""
 
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """What one round found."""
+    """Result of one round of the search."""
 
-    views: tuple[View, ...]  # before
-    seen: Findings  # before
-    trials: tuple[Trial, ...]  # the first was taken; the others best first
-    state: Hypothesis  # after
-    proof: Proof
+    views: tuple[View, ...]  # before the round
+    seen: Findings  # before the round
+    trials: tuple[Trial, ...]  # the first was selected; the others follow, best first
+    state: Hypothesis  # after the round
+    proof: CrossValidation
 
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """All rounds on one axis."""
+    """Result of all rounds on one axis."""
 
-    start: Hypothesis  # the model as it stands
+    start: Hypothesis  # the unchanged model
     rounds: tuple[Round, ...]
-    axis: Axis  # mended, with bins as fine as its peaks
+    axis: Axis  # repaired, with bins as fine as its peaks require
     state: Hypothesis
     views: tuple[View, ...]  # at the end
-    seen: Findings
-    before: tuple[tuple[View, ...], Findings] | None  # before names were withdrawn, if any were
-    rivals: tuple[Trial, ...]  # of a round that took nothing
+    seen: Findings  # at the end
+    before: tuple[tuple[View, ...], Findings] | None  # state before effects were withdrawn; None if none were
+    rivals: tuple[Trial, ...]  # trials of a last round that selected nothing
 
 
 def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.Generator) -> Search:
-    """Explain one axis.
+    """Search for the effects that explain one axis.
 
-    Args:
-        axis: prepared by the model
-        model: effects of the axis in the model under test
-        null: of each lens
-        rng: for what fills the place of samples that are found to be wrong
+    Parameters
+    ----------
+    axis : Axis
+        Axis, prepared with the model.
+    model : tuple of Effect
+        Effects of the axis in the model under test.
+    null : mapping of str to Null
+        Null distribution of each diagnostic.
+    rng : numpy.random.Generator
+        Generator for the replacement of samples that are found to be wrong.
     """
     state = start = believed(axis, model)
     rounds: list[Round] = []
@@ -85,15 +101,19 @@ def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.
         view = sight(axis, state.likely)
         seen = look(view)
         closed = not any(one.gain > null[lens].threshold for lens, one in seen.items())
-        if len(rounds) == ROUNDS:
+        if len(rounds) == MAX_ROUNDS:
             break
-        better = instead(axis, state, view) if closed and state.freed else []
+        better = replacements_for_resizing(axis, state, view) if closed and state.freed else []
         if closed and not better:
-            jumps = jumping(axis, state, view) if rounds and _well_formed(view, null) else None
-            if jumps is None or jumps.gain <= WORTH:
+            jumps = (
+                compare_jump_processes(axis, state, view)
+                if rounds and _is_gaussian_and_stationary(view, null)
+                else None
+            )
+            if jumps is None or jumps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
                 break
             state = settled(axis, jumps.found, model)
-            rounds.append(Round(views(view), seen, _names(jumps, 0.0), state, SHARED))
+            rounds.append(Round(views(view), seen, _trials_of_alternative(jumps, 0.0), state, SHARED_SPECTRUM))
             continue
         finer = bins(axis.n, axis.rate_hz, peaks(view))
         if finer.count.size > axis.bins.count.size + 8:
@@ -105,8 +125,8 @@ def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.
         taken = None
         for trials in [better] if better else tried(axis, state, view):
             asked += trials
-            taken = _taken(axis, state, trials, view, seen, null, rng)
-            if taken is not None or (trials and trials[0].name == NAMELESS):
+            taken = _select_trial(axis, state, trials, view, seen, null, rng)
+            if taken is not None or (trials and trials[0].name == UNNAMED):
                 break
         if taken is None:
             rivals = tuple(sorted(asked, key=lambda one: -one.value))
@@ -114,18 +134,18 @@ def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.
         axis, done = taken
         state = done.state
         rounds.append(done)
-    kept = tuple(effect for effect in upheld(state, _closing(rounds), seen, null) if not _nothing(effect))
+    kept = tuple(effect for effect in upheld(state, _gains_by_type(rounds), seen, null) if not _has_zero_size(effect))
     before = None
     while kept != state.found:
         before = before or (views(view), seen)
         state = settled(axis, kept, model)
         view = sight(axis, state.likely)
         seen = look(view)
-        kept = tuple(effect for effect in state.found if not _nothing(effect))
+        kept = tuple(effect for effect in state.found if not _has_zero_size(effect))
     return Search(start, tuple(rounds), axis, state, views(view), seen, before, rivals)
 
 
-def _taken(
+def _select_trial(
     axis: Axis,
     state: Hypothesis,
     trials: list[Trial],
@@ -134,63 +154,99 @@ def _taken(
     null: Mapping[str, Null],
     rng: np.random.Generator,
 ) -> tuple[Axis, Round] | None:
-    """The best trial of one kind that holds on data that did not choose it."""
+    """Return the best trial of one kind that passes cross-validation, or None."""
     strongest = max(seen, key=lambda name: seen[name].gain - null[name].threshold)
-    for at, trial in enumerate(trials[:CHANCES]):
-        if trial.value <= 0.0 or trial.name == NAMELESS:
+    for at, trial in enumerate(trials[:MAX_VALIDATION_ATTEMPTS]):
+        if trial.value <= 0.0 or trial.name == UNNAMED:
             return None
         lens = NATURAL.get(trial.name, strongest)
         found = state.found if trial.effect is None else (*state.found, trial.effect)
-        mended = again(axis, (*state.model, *found), rng) if type(trial.effect) in MENDED else axis
+        mended = again(axis, (*state.model, *found), rng) if type(trial.effect) in REPAIRED_EFFECTS else axis
         after = pruned(mended, settled(mended, found, state.model))
-        if trial.effect is not None and _nothing(after.found[-1]):
+        if trial.effect is not None and _has_zero_size(after.found[-1]):
             continue
         if trial.name in ONCE and LENSES[lens](sight(mended, after.likely)).gain >= seen[lens].gain:
             continue
         added = None if trial.effect is None else after.found[-1]
         told = trials[at:]
         beside = sight(mended, after.likely)
-        if _well_formed(beside, null):
-            after, told = told_apart(mended, after, told, beside)
+        if _is_gaussian_and_stationary(beside, null):
+            after, told = resolve_distribution(mended, after, told, beside)
         proven = proof(mended, state, after, added, lens, null[lens], rng)
         if proven.kept:
             return mended, Round(views(view), seen, tuple(told), after, proven)
     return None
 
 
-def told_apart(axis: Axis, state: Hypothesis, trials: list[Trial], view: Sight) -> tuple[Hypothesis, list[Trial]]:
-    """The state with what was just found under its right name, where second moments do not tell."""
-    last, twin = len(state.effects) - 1, None
+def resolve_distribution(
+    axis: Axis, state: Hypothesis, trials: list[Trial], view: Sight
+) -> tuple[Hypothesis, list[Trial]]:
+    """Replace a new effect by one with the same spectrum if its distribution fits better.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    state : Hypothesis
+        Fitted effects, of which the last one is new.
+    trials : list of Trial
+        Trials of which the first one was selected.
+    view : Sight
+        Axis whitened by ``state``.
+
+    Returns
+    -------
+    state : Hypothesis
+        Fitted effects with the selected alternative.
+    trials : list of Trial
+        Trials with the alternatives included.
+    """
+    last, alternative = len(state.effects) - 1, None
     if isinstance(trials[0].effect, ExponentiallyCorrelated) and isinstance(
         state.effects[last], ExponentiallyCorrelated
     ):
-        twin = telegraph(axis, state, last)
+        alternative = telegraph(axis, state, last)
     elif isinstance(trials[0].effect, BiasStep):
-        twin = jumping(axis, state, view)
-    if twin is None:
+        alternative = compare_jump_processes(axis, state, view)
+    if alternative is None:
         return state, trials
-    named = _names(twin, trials[0].value)
-    if twin.gain <= WORTH:
+    named = _trials_of_alternative(alternative, trials[0].value)
+    if alternative.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return state, [trials[0], *named, *trials[1:]]
-    return settled(axis, twin.found, state.model), [*named, *trials]
+    return settled(axis, alternative.found, state.model), [*named, *trials]
 
 
-def jumping(axis: Axis, state: Hypothesis, view: Sight) -> Twin | None:
-    """Poisson steps instead of a walk or of single steps, or a slow telegraph where that explains the same better."""
+def compare_jump_processes(axis: Axis, state: Hypothesis, view: Sight) -> NonGaussianAlternative | None:
+    """Return Poisson steps as alternative to a random walk or single steps, or a slow telegraph if it fits better.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    state : Hypothesis
+        Fitted effects.
+    view : Sight
+        Axis whitened by ``state``.
+
+    Returns
+    -------
+    NonGaussianAlternative or None
+        The alternative, or None if the axis has no random walk and no steps that it could replace.
+    """
     steps = poisson(axis, state)
-    if steps is None or steps.gain <= WORTH:
+    if steps is None or steps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return steps
-    # the walk of the model as it was: with what it grew by, a telegraph would have nothing left to explain
-    walks = frozenset(at for at, effect in enumerate(state.model) if type(effect) in WALKS)
+    # Use the original random walk of the model. An increased random walk would leave nothing for a telegraph.
+    walks = frozenset(at for at, effect in enumerate(state.model) if type(effect) in WALK_EFFECTS)
     held = state.likely.held | walks
     known = [state.model[at] if at in walks else state.effects[at] for at in range(state.given)]
-    bare = (*known, *(one for one in state.found if type(one) not in WALKS))
+    bare = (*known, *(one for one in state.found if type(one) not in WALK_EFFECTS))
     for noise in correlated(axis, Hypothesis(state.model, axis.fit(bare, held)), view):
         other = Hypothesis(state.model, axis.fit((*bare, noise), held))
-        if _nothing(other.found[-1]):
+        if _has_zero_size(other.found[-1]):
             continue
         switching = telegraph(axis, other, len(other.effects) - 1)
-        if switching is None or switching.events < SWITCHES:
+        if switching is None or switching.events < MIN_SWITCHES:
             continue
         over = other.likely.log_likelihood + switching.gain - steps.whole
         over -= PRICE["random_telegraph"] - PRICE["poisson_steps"]
@@ -199,13 +255,24 @@ def jumping(axis: Axis, state: Hypothesis, view: Sight) -> Twin | None:
     return steps
 
 
-def _well_formed(view: Sight, null: Mapping[str, Null]) -> bool:
-    """Whether samples are Gaussian and steady: among others, names that rest on a distribution mean nothing."""
-    return all(LENSES[lens](view).gain <= null[lens].threshold for lens in DISTRIBUTION)
+def _is_gaussian_and_stationary(view: Sight, null: Mapping[str, Null]) -> bool:
+    """Return True if the samples are Gaussian and stationary.
+
+    Otherwise, effects that differ only in their distribution cannot be distinguished.
+    """
+    return all(LENSES[lens](view).gain <= null[lens].threshold for lens in DISTRIBUTION_DIAGNOSTICS)
 
 
 def pruned(axis: Axis, state: Hypothesis) -> Hypothesis:
-    """Without what was found before and is worth nothing any more."""
+    """Return the hypothesis without effects from earlier rounds that no longer contribute.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    state : Hypothesis
+        Fitted effects. The last one is never dropped.
+    """
     for at in range(len(state.found) - 2, -1, -1):
         effect = state.found[at]
         less = settled(axis, state.found[:at] + state.found[at + 1 :], state.model)
@@ -214,28 +281,28 @@ def pruned(axis: Axis, state: Hypothesis) -> Hypothesis:
     return state
 
 
-def _closing(rounds: list[Round]) -> dict[type[Effect], float]:
-    """Kind of effect -> the largest gain of a lens when one of its kind was taken: what it was to close.
+def _gains_by_type(rounds: list[Round]) -> dict[type[Effect], float]:
+    """Return, for each type of effect, the largest gain of a diagnostic when an effect of this type was selected.
 
-    Of leaks, steps and smooth spectra, that of the lens which shows them.
+    For leaks, steps and smooth spectra, only their natural diagnostic counts.
     """
     found: dict[type[Effect], float] = {}
     for one in rounds:
         if one.state.found:
             kind = type(one.state.found[-1])
-            own = issubclass(kind, (Leak, BiasStep, *SMOOTH))
+            own = issubclass(kind, (Leak, BiasStep, *SMOOTH_SPECTRA))
             lenses = (NATURAL[kind.name],) if own else tuple(one.seen)
             found[kind] = max(found.get(kind, 0.0), *(one.seen[lens].gain for lens in lenses))
     return found
 
 
-def _nothing(effect: Effect) -> bool:
-    """Whether the fit left a noise without any size."""
+def _has_zero_size(effect: Effect) -> bool:
+    """Return True if the fit gave a noise effect the size zero."""
     return type(effect) in NOISE and size(effect) == 0.0
 
 
-def _names(twin: Twin, value: float) -> tuple[Trial, ...]:
-    """A twin of what is worth ``value``, and the twin's own rival."""
-    effect = twin.found[-1]
-    one = Trial(effect.name, effect, value + twin.gain, bounds=twin.bounds, events=twin.events)
-    return (one,) if twin.rival is None else (one, *_names(twin.rival, value))
+def _trials_of_alternative(alternative: NonGaussianAlternative, value: float) -> tuple[Trial, ...]:
+    """Return the trials of an alternative to an effect with the given value in nats, and of its own rival."""
+    effect = alternative.found[-1]
+    one = Trial(effect.name, effect, value + alternative.gain, bounds=alternative.bounds, events=alternative.events)
+    return (one,) if alternative.rival is None else (one, *_trials_of_alternative(alternative.rival, value))

@@ -1,9 +1,10 @@
-"""A comparison of several recordings as JSON for programs: schema imu-monitor/reconcile-runs/1.
+"""JSON report of a comparison of several recordings: schema imu-monitor/reconcile-runs/1.
 
-In comes a ``Comparison``, out go bytes; the same comparison gives the same bytes. Numbers are SI of their axis; what is
-not a finite number is null. Of each effect, ``parameters`` are pooled over the recordings that show it, each with the
-probability ``p`` that values as different as theirs are of one; ``consistent`` and ``p`` of the effect speak of its
-size. ``each`` has the recordings by themselves; all else of them is in their own ``report.json``, in ``folder``.
+The same comparison always gives the same bytes. Numbers are in SI units of their axis, and a number that is not finite
+becomes null. The ``parameters`` of an effect are pooled over the recordings that show it. Each has the probability
+``p`` that values as different as these come from one value. ``consistent`` and ``p`` of the effect refer to its size.
+``each`` contains the values of the single recordings. All further results of a recording are in its own
+``report.json``, in ``folder``.
 """
 
 from math import isfinite
@@ -15,41 +16,44 @@ from monitor.reconcile.result import Bounds, Step
 from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, Run, Seen
 
 SCHEMA: Final = "imu-monitor/reconcile-runs/1"
+"""Name and version of the JSON schema."""
 
 
 def to_json(c: Comparison) -> bytes:
-    """The report."""
+    """Encode a comparison as JSON."""
     return msgspec.json.encode({
         "schema": SCHEMA,
         "verdict": c.verdict,
         "seed": int(c.seed),
         "fitted_to": c.fitted_to,
         "recordings": [
-            *(_run(run) for run in c.runs),
+            *(_run_entry(run) for run in c.runs),
             *({"name": name, "folder": name, "verdict": None, "why": why} for name, why in c.silent.items()),
         ],
-        "axes": {axis: _axis(one) for axis, one in c.axes.items()},
+        "axes": {axis: _axis_entry(one) for axis, one in c.axes.items()},
     })  # fmt: skip
 
 
-def _run(run: Run) -> dict[str, Any]:
+def _run_entry(run: Run) -> dict[str, Any]:
+    """Return the report entry of one recording."""
     return {
         "name": run.name,
         "folder": run.name,
         "verdict": run.result.verdict,
-        "rate": _number(run.result.rate_hz),
+        "rate": _finite_or_none(run.result.rate_hz),
         "samples": int(run.result.samples),
-        "seconds": _number(run.result.seconds),
+        "seconds": _finite_or_none(run.result.seconds),
     }
 
 
-def _axis(one: AxisRuns) -> dict[str, Any]:
+def _axis_entry(one: AxisRuns) -> dict[str, Any]:
+    """Return the report entry of one axis."""
     return {
         "verdicts": {run: result.verdict for run, result in one.results.items()},
-        "common": [_seen(seen) for seen in one.common],
+        "common": [_effect_entry(seen) for seen in one.common],
         "single": [
             {
-                **_seen(seen),
+                **_effect_entry(seen),
                 "absent": [{"run": a.run, "meaning": a.meaning, "because": a.because} for a in seen.absent],
             }
             for seen in one.single
@@ -57,34 +61,38 @@ def _axis(one: AxisRuns) -> dict[str, Any]:
     }
 
 
-def _seen(seen: Seen) -> dict[str, Any]:
+def _effect_entry(seen: Seen) -> dict[str, Any]:
+    """Return the report entry of one effect."""
     return {
         "effect": seen.effect,
         "kind": seen.kind,
         "recordings": list(seen.steps),
         "parameters": {
-            name: {**_bounds(one.bounds), **({} if one.p is None else {"p": _number(one.p)})}
+            name: {**_bounds_entry(one.bounds), **({} if one.p is None else {"p": _finite_or_none(one.p)})}
             for name, one in seen.parameters.items()
         },
         "consistent": seen.consistent,
-        "p": _number(seen.p),
-        "each": {run: _each(step) for run, step in seen.steps.items()},
+        "p": _finite_or_none(seen.p),
+        "each": {run: _step_entry(step) for run, step in seen.steps.items()},
     }
 
 
-def _each(step: Step) -> dict[str, Any]:
+def _step_entry(step: Step) -> dict[str, Any]:
+    """Return the report entry of one effect in one recording."""
     return {
-        "parameters": {name: _bounds(one) for name, one in step.parameters.items()},
-        "confidence": _number(step.confidence),
-        "gap": {"before": _number(step.before.gap), "after": _number(step.after.gap)},
+        "parameters": {name: _bounds_entry(one) for name, one in step.parameters.items()},
+        "confidence": _finite_or_none(step.confidence),
+        "gap": {"before": _finite_or_none(step.before.gap), "after": _finite_or_none(step.after.gap)},
     }
 
 
-def _bounds(one: Bounds) -> dict[str, Any]:
+def _bounds_entry(one: Bounds) -> dict[str, Any]:
+    """Return the report entry of a parameter."""
     if isinstance(one.value, str):
         return {"value": one.value}
-    return {"value": _number(one.value), "lo": _number(one.lo), "hi": _number(one.hi)}
+    return {"value": _finite_or_none(one.value), "lo": _finite_or_none(one.lo), "hi": _finite_or_none(one.hi)}
 
 
-def _number(value: float | None) -> float | None:
+def _finite_or_none(value: float | None) -> float | None:
+    """Return the value, or None if it is not finite."""
     return None if value is None or not isfinite(value) else float(value)

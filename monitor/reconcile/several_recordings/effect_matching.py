@@ -1,8 +1,8 @@
-"""Whether two recordings of a sensor show one effect, or two of one kind: by its place.
+"""Matching of effects between recordings of one sensor.
 
-A place is the parameter that tells effects of one name apart: a frequency, a time constant, a source axis. Two places
-are the same where their intervals, stretched and widened by a share that real sensors drift by, overlap. An effect
-without a place is there once on an axis.
+The key of an effect is the parameter that distinguishes effects of the same name: a frequency, a time constant or a
+source axis. Two keys match if their intervals overlap after they are stretched and widened by a share that allows for
+the drift of real sensors. An effect without a key occurs only once on an axis.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,27 +26,53 @@ PLACES: Final[Mapping[str, tuple[str, float]]] = {
     "g_sensitivity": ("source", 0.0),
     "cross_axis": ("source", 0.0),
 }
-"""Effect -> the parameter that says which one of its kind it is, and the share by which its interval is widened on
-both sides: motors and clocks drift by parts in a hundred, time constants within a factor of two."""
-STRETCH: Final = 2.0
-"""Times a 95 % interval, so that one effect is not taken for two by chance."""
-CLOCK: Final = "sample_rate_error"
+"""For each effect, the parameter that identifies it and the share by which its interval is widened on both sides.
+
+Motors and clocks drift by a few percent, and time constants vary within a factor of two.
+"""
+INTERVAL_STRETCH: Final = 2.0
+"""Factor by which a 95 % interval is stretched, so that one effect is not taken for two by chance."""
+SAMPLE_RATE_EFFECT: Final = "sample_rate_error"
+"""Name of the effect that is common to all axes of a recording."""
 
 
 def place_name(effect: str) -> str:
-    """The parameter that is the place of an effect; "" where it has none."""
+    """Return the name of the parameter that identifies an effect, or "" if there is none."""
     return PLACES.get(effect, ("", 0.0))[0]
 
 
 def place(step: Step, axis: str, model: NoiseModel) -> Bounds | None:
-    """Which one of its kind it is; of a retuned term, which tells its size only, its recording's own model knows."""
+    """Return the parameter that identifies an effect among effects of the same name.
+
+    A step that changes a known effect contains only its size. The model of the recording then provides the parameter.
+
+    Parameters
+    ----------
+    step : Step
+        Step of the reconciliation.
+    axis : str
+        Name of the axis.
+    model : NoiseModel
+        Model of the same recording, with all effects that were found.
+    """
     name = place_name(step.effect)
     return (step.parameters.get(name) or Bounds(getattr(effect_of(model, axis, step), name))) if name else None
 
 
 def distance(effect: str, a: Bounds | None, b: Bounds | None) -> float | None:
-    """How far two places of an effect are from each other, as a share; None where they are not the same.
+    """Return the relative distance of two identifying parameters, or None if they do not match.
 
+    The distance is 0 if one of the parameters is None.
+
+    Parameters
+    ----------
+    effect : str
+        Name of the effect.
+    a, b : Bounds or None
+        Identifying parameters in two recordings.
+
+    Examples
+    --------
     >>> distance("sinusoidal", Bounds(17.30), Bounds(17.32)) is None, distance("sinusoidal", Bounds(17.3), Bounds(19.0))
     (False, None)
     """
@@ -55,41 +81,66 @@ def distance(effect: str, a: Bounds | None, b: Bounds | None) -> float | None:
     if isinstance(a.value, str) or isinstance(b.value, str):
         return 0.0 if a.value == b.value else None
     share = PLACES[effect][1]
-    (lo, hi), (other_lo, other_hi) = _widened(a, share), _widened(b, share)
-    return _unlike(a.value, b.value) if lo <= other_hi and other_lo <= hi else None
+    (lo, hi), (other_lo, other_hi) = _widened_interval(a, share), _widened_interval(b, share)
+    return _relative_difference(a.value, b.value) if lo <= other_hi and other_lo <= hi else None
 
 
 def effect_of(model: NoiseModel, axis: str, step: Step) -> Effect:
-    """What a step left in its recording's own model."""
-    clock = [effect for _, effect in model if effect.name == CLOCK] if step.effect == CLOCK else []
+    """Return the effect that a step added or changed, from the model of its recording.
+
+    Parameters
+    ----------
+    model : NoiseModel
+        Model of the recording, with all effects that were found.
+    axis : str
+        Name of the axis.
+    step : Step
+        Step of the reconciliation.
+    """
+    clock = (
+        [effect for _, effect in model if effect.name == SAMPLE_RATE_EFFECT]
+        if step.effect == SAMPLE_RATE_EFFECT
+        else []
+    )
     parameters = {name: one.value for name, one in step.parameters.items()}
     return nearest(clock or model.effects[axis], step.effect, parameters)
 
 
 def nearest(effects: Sequence[Effect], name: str, parameters: Mapping[str, Any]) -> Effect:
-    """Of several effects of one name, the one whose parameters are most like these."""
+    """Return the effect of a given name whose parameters are closest to the given ones.
+
+    Parameters
+    ----------
+    effects : sequence of Effect
+        Effects of an axis.
+    name : str
+        Name of the effect.
+    parameters : mapping of str to float, str or None
+        Parameters to compare, in SI units.
+    """
 
     def apart(effect: Effect) -> float:
-        return sum(_unlike(getattr(effect, key, None), value) for key, value in parameters.items())
+        return sum(_relative_difference(getattr(effect, key, None), value) for key, value in parameters.items())
 
     return min((effect for effect in effects if effect.name == name), key=apart)
 
 
 def fields_of(effect: Effect) -> dict[str, Any]:
-    """All parameters of an effect."""
+    """Return all parameters of an effect by name."""
     return {f.name: getattr(effect, f.name) for f in fields(effect)}  # type: ignore[arg-type]
 
 
-def _unlike(a: Any, b: Any) -> float:
-    """0 for equal parameters, 1 for those of other signs or words."""
+def _relative_difference(a: Any, b: Any) -> float:
+    """Return 0 for equal parameters and 1 for parameters with different signs or different names."""
     if isinstance(a, str) or isinstance(b, str) or a is None or b is None:
         return float(a != b)
     return min(abs(a - b) / (abs(a) + abs(b)), 1.0) if a != b else 0.0
 
 
-def _widened(one: Bounds, share: float) -> tuple[float, float]:
-    assert not isinstance(one.value, str)
-    below = 0.0 if one.lo is None else one.value - one.lo
-    above = 0.0 if one.hi is None else one.hi - one.value
-    more = share * abs(one.value)
-    return one.value - STRETCH * below - more, one.value + STRETCH * above + more
+def _widened_interval(bounds: Bounds, share: float) -> tuple[float, float]:
+    """Return the stretched and widened interval of a parameter."""
+    assert not isinstance(bounds.value, str)
+    below = 0.0 if bounds.lo is None else bounds.value - bounds.lo
+    above = 0.0 if bounds.hi is None else bounds.hi - bounds.value
+    more = share * abs(bounds.value)
+    return bounds.value - INTERVAL_STRETCH * below - more, bounds.value + INTERVAL_STRETCH * above + more

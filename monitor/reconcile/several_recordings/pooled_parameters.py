@@ -1,10 +1,10 @@
-"""One parameter from several recordings: the mean by the inverse of their variances, and whether they agree.
+"""Weighted mean of one parameter over several recordings, and a test of whether the recordings agree.
 
-In come the 95 % intervals of one parameter, each from a recording by itself; out goes the mean with its interval, and
-χ² of their distances from it with its degrees of freedom. A parameter whose intervals are even as factors (a standard
-deviation, a time constant) is averaged as its logarithm. Where the recordings disagree, the mean is known no better
-than they scatter: its interval is wider by √(χ²/ν) (Birge, "The calculation of errors by the method of least
-squares", Phys. Rev. 40, 1932). What has no interval (the name of an axis, an order) is taken from the first.
+The 95 % intervals of the parameter in each recording give the mean with inverse variances as weights, its interval, and
+χ² with its degrees of freedom. If the intervals are symmetric as factors (a standard deviation, a time constant), the
+logarithm is averaged. If the recordings disagree, the interval of the mean is widened by √(χ²/ν) to reflect their
+scatter (Birge, "The calculation of errors by the method of least squares", Phys. Rev. 40, 1932). A parameter without an
+interval (the name of an axis, an order) is taken from the first recording.
 """
 
 from collections.abc import Iterable, Sequence
@@ -20,45 +20,51 @@ from monitor.reconcile.likelihood.hypothesis import Z95
 from monitor.reconcile.result import Bounds
 
 DISAGREE: Final = 0.01
-"""Probability below which recordings do not agree: each of the many parameters of a report is asked."""
-EXACT: Final = 1e-6
-"""Of a value: no interval is narrower, as times of samples and numbers in files are rounded."""
+"""Probability below which recordings disagree. It is small because a report contains many parameters."""
+MIN_RELATIVE_ERROR: Final = 1e-6
+"""Smallest standard deviation relative to the value, because sample times and numbers in files are rounded."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pooled:
-    """A parameter from all recordings that have it."""
+    """Parameter, averaged over all recordings that contain it."""
 
     bounds: Bounds
-    chi2: float = 0.0  # of the recordings about their mean
-    freedom: int = 0  # recordings with an interval, less one
+    chi2: float = 0.0  # χ² of the recordings about their mean
+    freedom: int = 0  # degrees of freedom: number of recordings with an interval, less one
 
     @property
     def p(self) -> float | None:
-        """Probability of a larger χ² if all measure the same; None where fewer than two have an interval."""
+        """Probability of a larger χ² if all recordings measure the same value, or None if fewer than two have an
+        interval.
+        """
         return agreement([self])
 
 
 def agreement(parameters: Iterable[Pooled]) -> float | None:
-    """Probability of a larger χ² of all these together, as if they were independent."""
+    """Return the probability of a larger total χ² of all parameters, treated as independent, or None without degrees of
+    freedom.
+    """
     every = list(parameters)
     freedom = sum(one.freedom for one in every)
     return float(chdtrc(freedom, sum(one.chi2 for one in every))) if freedom else None
 
 
 def pooled(found: Sequence[Bounds]) -> Pooled:
-    """One parameter from one recording or more.
+    """Return the mean of one parameter over one or more recordings.
 
+    Examples
+    --------
     >>> both = pooled([Bounds(10.0, 8.04, 11.96), Bounds(12.0, 10.04, 13.96)])  # ± 1 standard deviation each
     >>> print(both.bounds.value, round(both.chi2, 3), both.freedom)
     11.0 2.0 1
     """
-    known = [one for one in found if _interval(one) is not None]
+    known = [one for one in found if _finite_interval(one) is not None]
     if len(known) < 2:
         return Pooled(known[0] if known else found[0])
-    ends, factors = _even(np.array([_interval(one) for one in known]))
+    ends, factors = _symmetric_scale(np.array([_finite_interval(one) for one in known]))
     x, deviation = ends[:, 1], 0.5 * (ends[:, 2] - ends[:, 0]) / Z95
-    weight = np.maximum(deviation, EXACT * (1.0 if factors else np.abs(x))) ** -2
+    weight = np.maximum(deviation, MIN_RELATIVE_ERROR * (1.0 if factors else np.abs(x))) ** -2
     mean = float(np.average(x, weights=weight))
     chi2, freedom = float(weight @ (x - mean) ** 2), x.size - 1
     half = Z95 / float(np.sqrt(weight.sum()))
@@ -69,29 +75,41 @@ def pooled(found: Sequence[Bounds]) -> Pooled:
     return Pooled(Bounds(*(float(value) for value in values)), chi2, freedom)
 
 
-def deviations(one: Bounds, value: float) -> float:
-    """Between a parameter and a value, in standard deviations of the parameter; 0 where it has no interval.
+def deviations(bounds: Bounds, value: float) -> float:
+    """Return the distance of a value from a parameter, in standard deviations of the parameter.
 
+    The distance is 0 if the parameter has no interval.
+
+    Parameters
+    ----------
+    bounds : Bounds
+        Parameter with its interval.
+    value : float
+        Value in the unit of the parameter.
+
+    Examples
+    --------
     >>> round(deviations(Bounds(10.0, 8.04, 11.96), 13.0), 3)
     3.0
     """
-    three = _interval(one)
+    three = _finite_interval(bounds)
     if three is None:
         return 0.0
-    ((lo, at, hi),), factors = _even(np.array([three]))
+    ((lo, at, hi),), factors = _symmetric_scale(np.array([three]))
     other = (log(value) if value > 0.0 else -inf) if factors else value
     return float(abs(at - other) * 2.0 * Z95 / (hi - lo))
 
 
-def _interval(one: Bounds) -> tuple[float, float, float] | None:
-    if isinstance(one.value, str) or one.lo is None or one.hi is None or not one.lo < one.hi:
+def _finite_interval(bounds: Bounds) -> tuple[float, float, float] | None:
+    """Return the lower end, the value and the upper end, or None if there is no finite interval."""
+    if isinstance(bounds.value, str) or bounds.lo is None or bounds.hi is None or not bounds.lo < bounds.hi:
         return None
-    three = one.lo, one.value, one.hi
+    three = bounds.lo, bounds.value, bounds.hi
     return three if np.isfinite(three).all() else None
 
 
-def _even(ends: Floats) -> tuple[Floats, bool]:
-    """Intervals [k, 3] on the scale on which they are even, and whether that is the logarithm."""
+def _symmetric_scale(ends: Floats) -> tuple[Floats, bool]:
+    """Return intervals, shape (k, 3), on the scale on which they are symmetric, and True if it is logarithmic."""
     lo, value, hi = ends.T
     if np.any(lo <= 0.0) or np.abs(value - np.sqrt(lo * hi)).sum() >= np.abs(value - 0.5 * (lo + hi)).sum():
         return ends, False

@@ -50,7 +50,7 @@ def without_proof() -> Iterator[None]:
     from monitor.reconcile.search import search
 
     def believed(*_arguments: object) -> Any:
-        return search.Proof(float("nan"), float("nan"), True, "not asked")
+        return search.CrossValidation(float("nan"), float("nan"), True, "not asked")
 
     with patch.object(search, "proof", believed):
         yield
