@@ -67,7 +67,7 @@ REPLACED: Final = "was replaced by another file"
 EMPTIED: Final = "was emptied"
 CHANGED: Final = "was changed by another program"
 MOVE: Final = "move it away, and a new one is begun"
-_ROW_COLUMNS: Final = "start, width, newest, layout, received, lost, bad, overflowed, state, numbers"
+_FIELDS: Final = "start, width, newest, layout, received, lost, bad, overflowed, state, numbers"
 
 
 _FileState = tuple[int, int, int, int]
@@ -140,7 +140,7 @@ class Store:
                         self._db.execute(statement)
                     self._db.execute(f"PRAGMA application_id = {APPLICATION}")
                     self._db.execute(f"PRAGMA user_version = {VERSION}")
-        # Each commit, one per minute, is flushed to disk. The cost is negligible, and a power cut loses one commit at most.
+        # Each commit, one per minute, is flushed to disk. The cost is negligible; a power cut loses one commit at most.
         self._db.execute("PRAGMA synchronous = FULL")
         self._db.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
 
@@ -245,14 +245,14 @@ class Store:
     def _stored_row(self, device: int, width_s: int, start_s: int) -> Row | None:
         """Return the stored row of a bucket; None if there is none."""
         found = self._db.execute(
-            f"SELECT {_ROW_COLUMNS} FROM row WHERE device = ? AND width = ? AND start = ?", (device, width_s, start_s)
+            f"SELECT {_FIELDS} FROM row WHERE device = ? AND width = ? AND start = ?", (device, width_s, start_s)
         ).fetchone()
         return None if found is None else self._layouts.row(found)
 
     def _write(self, device: int, row: Row) -> None:
         """Insert a row, or replace the stored row of the same bucket."""
         self._db.execute(
-            f"INSERT OR REPLACE INTO row (device, {_ROW_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            f"INSERT OR REPLACE INTO row (device, {_FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             (
                 device,
                 row.start_s,
@@ -284,7 +284,7 @@ class Store:
         bucket = (device, width_s, start_s, start_s + wider_s)
         where = "device = ? AND width = ? AND start >= ? AND start < ?"
         with self._transaction():
-            found = self._db.execute(f"SELECT {_ROW_COLUMNS} FROM row WHERE {where} ORDER BY start", bucket).fetchall()
+            found = self._db.execute(f"SELECT {_FIELDS} FROM row WHERE {where} ORDER BY start", bucket).fetchall()
             rows = [self._layouts.row(one) for one in found]
             held = self._stored_row(device, wider_s, start_s)
             self._write(device, merged([*([held] if held else []), *rows], start_s, wider_s))
@@ -424,7 +424,7 @@ class Reader:
         """
         for width_s, _ in LEVELS[::-1]:
             found = self._db.execute(
-                f"SELECT {_ROW_COLUMNS} FROM row WHERE device = ? AND width = ? AND start > ? AND start <= ? ORDER BY start",
+                f"SELECT {_FIELDS} FROM row WHERE device = ? AND width = ? AND start > ? AND start <= ? ORDER BY start",
                 (self._id(device), width_s, _clamp_time(span.start_s - width_s), _clamp_time(span.end_s)),
             )
             for one in found:
