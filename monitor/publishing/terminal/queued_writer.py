@@ -150,22 +150,24 @@ class QueuedWriter:
             detach(self._stream)
         return not self._given_up
 
-    # --- the thread
+    # --- methods of the thread
 
     def _run(self) -> None:
+        """Write queued lines and frames until the writer is closed."""
         while True:
             closing = self._closing.is_set()  # read first: what was queued before close() is written
             lines = self._queue.take(0.0 if closing else self._period_s or IDLE_S)
             if self._period_s is not None and not closing:
                 self._closing.wait(GATHER_S)
                 lines += self._queue.take(0.0)
-            self._turn([line for line in lines if line], closing)
+            self._process_batch([line for line in lines if line], closing)
             if closing:
                 if rest := self._queue.take(0.0):  # the report of dropped lines
-                    self._turn(rest, closing)
+                    self._process_batch(rest, closing)
                 return
 
-    def _turn(self, lines: list[str], last: bool) -> None:
+    def _process_batch(self, lines: list[str], last: bool) -> None:
+        """Render and write one batch of lines."""
         if not lines and not last and self._period_s is None:
             return
         dropped = self._dropped_lines()
@@ -192,6 +194,7 @@ class QueuedWriter:
             return "".join(lines), error
 
     def _write(self, text: str) -> None:
+        """Write the text in chunks, and count the frames that are lost while the destination is blocked."""
         if self._stream is None or not text:
             return
         self._write_since_s = time.monotonic()
@@ -228,12 +231,15 @@ class QueuedWriter:
         return blocked_s if blocked_s >= BLOCKED_S else 0.0
 
     def _frames_in(self, blocked_s: float) -> int:
+        """Return the number of frames that would have been drawn in this time."""
         return 0 if self._period_s is None else int(blocked_s / self._period_s)
 
     def _dropped_lines(self) -> int:
+        """Return the number of lines that were dropped or could not be written."""
         return self._queue.dropped + self._lost_lines
 
     def _begin_closing(self) -> None:
+        """Tell the thread to write the remaining lines and stop."""
         self._closing.set()
         self._queue.push("", 0)  # unlike wake(), this is not lost if the thread is not waiting yet
 
@@ -289,10 +295,12 @@ def can_write(descriptor: int | None, timeout_s: float = 0.0) -> bool:
 
 
 def _count(count: int, name: str) -> str:
+    """Format a count with its noun in singular or plural."""
     return f"{count:,} {name}{'' if count == 1 else 's'}"
 
 
 def _reason(error: Exception) -> str:
+    """Return the text of an error for a message."""
     if isinstance(error, OSError):
         return error.strerror or errno.errorcode.get(error.errno or 0, str(error))
     return f"{type(error).__name__}: {error}"
