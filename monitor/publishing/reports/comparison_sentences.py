@@ -64,6 +64,7 @@ def agreement(seen: Seen) -> str:
 
 def probability(p: float) -> str:
     """Format a p-value.
+
     >>> probability(0.413), probability(2e-5)
     ('p = 0.41', 'p < 0.001')
     """

@@ -482,6 +482,7 @@ def _format_short_count(count: int) -> str:
 
 def _age(age_s: float) -> str:
     """Format an age given in seconds.
+
     >>> _age(0.44), _age(75.0), _age(600.0), _age(90_000.0)
     ('0.4 s', '75 s', '10 min', '25 h')
     """
