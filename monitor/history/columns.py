@@ -23,10 +23,10 @@ HEALTH: Final = ("rate", "latency", "memory")
 """Sample rate [Hz], 99th percentile of the latency from receipt to publication [s], memory of the process [bytes]."""
 TEMPERATURE: Final = ("temperature",)
 """Mean temperature of a batch [°C]."""
-PARTS: Final = ("", ".lo", ".hi", ".bound")
-NEAR: Final = 1.02
+VALUE_SUFFIXES: Final = ("", ".lo", ".hi", ".bound")
+TAU_MATCH_RATIO: Final = 1.02
 """A point of the curve within this factor of a stored averaging time is used without interpolation."""
-APART: Final = 2.5
+MAX_TAU_RATIO: Final = 2.5
 """Largest ratio of neighbouring averaging times between which deviations are interpolated."""
 
 
@@ -50,7 +50,7 @@ class Numbers:
         self._letters = np.array([row * columns + axis for row in range(rows) for axis in self._axes], np.intp)
         axes = [AXES[i] for i in self._axes]
         self.names = (
-            *(f"{axis}.{letter}{part}" for part in PARTS for letter in LETTERS for axis in axes),
+            *(f"{axis}.{letter}{part}" for part in VALUE_SUFFIXES for letter in LETTERS for axis in axes),
             *(f"{axis}.sigma.{TAU_S[i]:g}" for i in at for axis in axes),
         )
         self._letter_count = len(self._letters)
@@ -94,12 +94,12 @@ def _interpolation_points(tau_s: Floats) -> "tuple[list[int], list[int], list[in
     at, below, above, share = [], [], [], []
     for i, wanted in enumerate(TAU_S):
         near = int(np.argmin(np.abs(np.log(tau_s / wanted)))) if tau_s.size else 0
-        if tau_s.size and 1.0 / NEAR < tau_s[near] / wanted < NEAR:
+        if tau_s.size and 1.0 / TAU_MATCH_RATIO < tau_s[near] / wanted < TAU_MATCH_RATIO:
             low, high, part = near, near, 0.0
         else:
             high = int(np.searchsorted(tau_s, wanted))
             low = high - 1
-            if low < 0 or high >= tau_s.size or tau_s[high] > APART * tau_s[low]:
+            if low < 0 or high >= tau_s.size or tau_s[high] > MAX_TAU_RATIO * tau_s[low]:
                 continue
             part = float(np.log(wanted / tau_s[low]) / np.log(tau_s[high] / tau_s[low]))
         at.append(i)

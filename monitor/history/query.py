@@ -24,8 +24,8 @@ EVENTS: Final = "events"
 WHAT: Final = (COEFFICIENTS, DEVIATIONS, STATUS, EVENTS)
 UNASKED: Final = (COEFFICIENTS, STATUS, EVENTS)
 """Parts returned by default; deviations would be larger than all other parts together."""
-KEYS: Final = ("_time", "step", "what", "axis", "letter")
-LONGEST: Final = 1000
+PARAMETER_NAMES: Final = ("_time", "step", "what", "axis", "letter")
+MAX_PARAMETERS_LENGTH: Final = 1000
 """Longest accepted parameter string [characters]."""
 _PART: Final = re.compile(r"([^=;]+)(?:=((?:[\[\]][^\[\]]*[\[\]])|[^;]*))?(?:;|$)")
 
@@ -90,8 +90,8 @@ def question(parameters: str, now_s: float) -> Question:
     """
     given = _split(parameters)
     for key in given:
-        if key not in KEYS and not key.startswith("_"):
-            raise ConfigError(f'"{key[:40]}": unknown parameter{nearest(key, KEYS)}')
+        if key not in PARAMETER_NAMES and not key.startswith("_"):
+            raise ConfigError(f'"{key[:40]}": unknown parameter{nearest(key, PARAMETER_NAMES)}')
     step_s = length(given["step"]) if given.get("step") else None
     if step_s is not None and not 1.0 <= step_s <= 1e10:
         raise ConfigError(f"step: {step_s:g} s; possible are 1 s and more")
@@ -106,8 +106,8 @@ def question(parameters: str, now_s: float) -> Question:
 
 def _split(parameters: str) -> Mapping[str, str]:
     """Split parameters into keys and values; a semicolon within the brackets of a time range does not separate them."""
-    if len(parameters) > LONGEST:
-        raise ConfigError(f"parameters of {len(parameters)} characters; at most {LONGEST}")
+    if len(parameters) > MAX_PARAMETERS_LENGTH:
+        raise ConfigError(f"parameters of {len(parameters)} characters; at most {MAX_PARAMETERS_LENGTH}")
     return {key.strip(): (value or "").strip() for key, value in _PART.findall(parameters)}
 
 

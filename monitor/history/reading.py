@@ -19,7 +19,7 @@ from monitor.history.bucket import Row, Singles, chosen, merged
 from monitor.history.sqlite_store import PastEvent, Reader
 from monitor.history.time_ranges import Span
 
-POINTS: Final = 1000
+DEFAULT_POINTS: Final = 1000
 """Approximate number of buckets in a table; at most twice as many if old and new rows differ in width."""
 EVENTS: Final = 1000
 DAY_S: Final = 86_400
@@ -93,7 +93,7 @@ def read(
     span: Span | None,
     wanted: Callable[[str], bool] = lambda _name: True,
     step_s: int | None = None,
-    points: int = POINTS,
+    points: int = DEFAULT_POINTS,
 ) -> Past:
     """Read the history of a device as a table.
 
@@ -179,7 +179,7 @@ def table(
     )
 
 
-def step(span: Span, step_s: int | None = None, points: int = POINTS) -> int:
+def step(span: Span, step_s: int | None = None, points: int = DEFAULT_POINTS) -> int:
     """Return the bucket width [s]: the smallest permitted one for this number of points, at least ``step_s``.
 
     >>> step(Span(0.0, 86_400.0)), step(Span(0.0, 5 * 31_536_000.0)), step(Span(0.0, 3600.0), 900)

@@ -40,7 +40,7 @@ LEVELS: Final = ((60, 7 * DAY_S), (900, 90 * DAY_S), (21_600, None))
 """Width of the rows of a level [s], and the age at which they are merged into the next level [s]; None: never."""
 EVENTS_AT_MOST: Final = 20_000
 """Largest number of events per device."""
-EVENT_SPANS_S: Final = (DAY_S, 30 * DAY_S, 365 * DAY_S)
+EVENT_THINNING_SPANS_S: Final = (DAY_S, 30 * DAY_S, 365 * DAY_S)
 MAX_TEXT_LENGTH: Final = 2000
 BUSY_S: Final = 5.0
 CACHE_KIB: Final = 2048
@@ -232,8 +232,7 @@ class Store:
     # --- rows
 
     def _put(self, device: int, row: Row) -> None:
-        """Merge a row into the stored row of its bucket, or into the wider row if the bucket has been merged
-        already."""
+        """Merge a row into the stored row of its bucket, or into the wider row that contains the bucket."""
         for width_s, _ in LEVELS[::-1]:
             start_s = row.start_s // width_s * width_s
             held = self._stored_row(device, width_s, start_s)
@@ -315,7 +314,7 @@ class Store:
         """Thin the events of a device by day, month and year until half of the limit remains; 0 if they are few."""
         if self._count_events(device) <= EVENTS_AT_MOST:
             return 0
-        for span_s in EVENT_SPANS_S:
+        for span_s in EVENT_THINNING_SPANS_S:
             with self._transaction():
                 self._thin_events_by_span(device, span_s)
             if self._count_events(device) <= EVENTS_AT_MOST // 2:
@@ -327,8 +326,7 @@ class Store:
         return int(self._db.execute("SELECT count(*) FROM event WHERE device = ?", (device,)).fetchone()[0])
 
     def _thin_events_by_span(self, device: int, span_s: int) -> None:
-        """Keep the first, last and most significant event of each kind, axis and time span; the last counts the
-        others."""
+        """Keep the first, last and most significant event per kind, axis and time span; the last counts the others."""
         keep: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
         rows = self._db.execute(
             "SELECT id, t, kind, axis, sigma, stands_for FROM event WHERE device = ? ORDER BY t, id", (device,)

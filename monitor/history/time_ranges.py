@@ -27,7 +27,7 @@ UNITS_S: Final = {
     "w": 604_800.0,
 }
 """Length of each unit [s]: the units of zenoh, and ``min``, which the configuration file uses for zenoh's ``m``."""
-LIMIT_S: Final = 1e11
+MAX_DURATION_S: Final = 1e11
 """Longest accepted duration, about three thousand years; longer ones are taken for typing errors."""
 MAX_DATE_S: Final = 253_402_300_800.0  # the year 10000
 _DURATION: Final = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([a-z]*)\s*")
@@ -66,6 +66,13 @@ class Span:
 
         >>> Span(60.0, 120.0).touches(0.0, 60.0), Span(60.0, 120.0).touches(120.0, 180.0)
         (False, True)
+
+        Parameters
+        ----------
+        start_s
+            Start of the row, Unix time [s].
+        end_s
+            End of the row, Unix time [s].
         """
         before = start_s <= self.end_s if self.end_in else start_s < self.end_s
         return before and end_s > self.start_s
@@ -195,7 +202,7 @@ def _duration_s(text: str) -> float:
     if match is None or match[2] not in UNITS_S:
         raise ConfigError(f'"{_short(text)}" is no duration; write 90s, 30m, 1h, 2d, 1w')
     seconds = float(match[1]) * UNITS_S[match[2]]
-    if seconds > LIMIT_S:
+    if seconds > MAX_DURATION_S:
         raise ConfigError(f'"{_short(text)}" is too long; at most some three thousand years')
     return seconds
 

@@ -39,7 +39,7 @@ CHECK_S: Final = 10.0
 """Interval between two checks that the file still exists, if there is nothing to write."""
 ASIDE_AT_MOST: Final = 10
 """Largest number of renamed files; beyond it, an unusable file is left in place until a user intervenes."""
-AT_ONCE: Final = 256
+BATCH_SIZE: Final = 256
 MERGES_PER_STEP: Final = 50
 CLOSE_TIMEOUT_S: Final = 10.0
 ASIDE: Final = ".aside-"
@@ -244,7 +244,7 @@ class Writer:
     def _next_batch(self) -> list[tuple[str, Row | PastEvent]]:
         """Return the next items of the queue without removing them."""
         with self._lock:
-            return [self._waiting[i] for i in range(min(AT_ONCE, len(self._waiting)))]
+            return [self._waiting[i] for i in range(min(BATCH_SIZE, len(self._waiting)))]
 
     def _remove_written(self, n: int) -> None:
         """Remove ``n`` written items from the queue."""

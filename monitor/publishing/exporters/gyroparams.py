@@ -13,7 +13,7 @@ from typing import Final
 
 from monitor.publishing.exporters.noise import AXES_OF, Noise, head, number, tail, text
 
-POLES: Final = 500
+N_POLES: Final = 500
 """Number of poles of the 1/f filter, as in the Allan variance example of MathWorks."""
 
 
@@ -31,7 +31,7 @@ def gyroparams(noise: Noise, inflation: float = 1.0) -> str:
         "% Noise of an IMU for imuSensor (Navigation Toolbox, or Sensor Fusion and Tracking Toolbox), R2023b or newer",
         *head(noise, inflation, "%"),
         "% single-sided: white noise of sigma = NoiseDensity*sqrt(rate) a sample, N of IEEE Std 952",
-        f"% fractalcoef({POLES}): 1/f noise down to about rate/{POLES}; more poles reach lower and take longer",
+        f"% fractalcoef({N_POLES}): 1/f noise down to about rate/{N_POLES}; more poles reach lower and take longer",
     ]
     made = []
     for kind, maker, name, unit in (
@@ -48,7 +48,7 @@ def gyroparams(noise: Noise, inflation: float = 1.0) -> str:
             _property(noise, kind, "B", "BiasInstability", unit, inflation),
             _property(noise, kind, "K", "RandomWalk", f"({unit})*sqrt(Hz)", inflation),
             "    'NoiseType', 'single-sided', ...",
-            f"    'BiasInstabilityCoefficients', fractalcoef({POLES}));",
+            f"    'BiasInstabilityCoefficients', fractalcoef({N_POLES}));",
         ]
     rate = "" if noise.sample_rate_hz is None else f", 'SampleRate', {noise.sample_rate_hz!r}"
     lines += ["", f"imu = imuSensor('accel-gyro'{rate}{''.join(made)});"]

@@ -9,7 +9,7 @@ and the comment says so.
 from drivers.errors import ConfigError
 from monitor.publishing.exporters.noise import EFFECT_OF, Noise, Term, head, lacking, number, tail, text
 
-ADVICE = (
+INFLATION_COMMENT = (
     "# Kalibr's wiki, IMU Noise Model: a sensor at rest at one temperature shows too little; for the",
     "# lowest-cost sensors it may be necessary to raise these values by a factor of 10 or more (--inflation 10)",
 )
@@ -41,7 +41,7 @@ def kalibr(noise: Noise, inflation: float = 1.0, rostopic: str = "/imu0") -> str
     lines = [
         "# imu.yaml for Kalibr: continuous-time noise; one value for all axes of a kind, that of the worst axis",
         *head(noise, inflation, "#"),
-        *ADVICE,
+        *INFLATION_COMMENT,
         f"rostopic: {rostopic}",
         f"update_rate: {noise.sample_rate_hz!r}  # Hz",
     ]

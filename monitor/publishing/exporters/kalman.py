@@ -24,16 +24,16 @@ from drivers.quantities import DURATION_S
 from drivers.sample import Floats
 from monitor.publishing.exporters.noise import AXES_OF, Noise, Term, head, number, tail, text
 
-FLOOR: Final = math.sqrt(2.0 * math.log(2.0) / math.pi)
+FLICKER_FLOOR_RATIO: Final = math.sqrt(2.0 * math.log(2.0) / math.pi)
 """Ratio of the Allan deviation of flicker noise to B (IEEE Std 952)."""
 MARKOV_PEAK: Final = 0.437 * math.sqrt(2.0)
 """Ratio of the peak Allan deviation of the Gauss-Markov process to σ: 0.437 q √T with q² = 2σ²/T (IEEE Std 952)."""
 MARKOV_PEAK_AT: Final = 1.89
 """Averaging time of this peak in units of the correlation time T."""
-SMALL: Final = 0.1
+SERIES_BELOW: Final = 0.1
 """Value of dt/T below which differences of exponentials are computed from their series."""
 
-EXPLAINED: Final = (
+HEADER_COMMENT: Final = (
     "# Process noise of a Kalman filter. States of an axis: angle (velocity) error, bias that walks, and a first-order",
     "# Gauss-Markov bias that stands for the bias instability B (peak of its Allan deviation on the floor 0.664 B):",
     "#   angle' = bias_walk + bias_markov + w_white,  bias_walk' = w_walk,  bias_markov' = -bias_markov/T + w_markov",
@@ -75,7 +75,7 @@ def kalman(
         except ConfigError as error:
             raise ConfigError(f"correlation time: {error}") from None
     lines = [
-        *EXPLAINED,
+        *HEADER_COMMENT,
         *head(noise, inflation, "#"),
         'schema = "imu-monitor/kalman/1"',
         f"dt = {step_s!r}  # s",
@@ -97,7 +97,7 @@ def markov_sigma(B: float) -> float:
     B
         Bias instability, in the unit of the result.
     """
-    return FLOOR * B / MARKOV_PEAK
+    return FLICKER_FLOOR_RATIO * B / MARKOV_PEAK
 
 
 def markov_time_s(N: float, K: float) -> float:
@@ -157,7 +157,7 @@ def process_noise(dt_s: float, N: float, K: float, sigma: float, time_s: float) 
 
 def _integrated_markov_variance(x: float) -> float:
     """Return x - 2(1 - e^-x) + (1 - e^-2x)/2; a series for small x, where the leading term is x³/3, keeps precision."""
-    if x > SMALL:
+    if x > SERIES_BELOW:
         return x + 2.0 * math.expm1(-x) - 0.5 * math.expm1(-2.0 * x)
     return math.fsum((-x) ** k * (2.0 - 2.0 ** (k - 1)) / math.factorial(k) for k in range(3, 14))
 

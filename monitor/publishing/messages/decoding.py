@@ -17,7 +17,7 @@ from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import LETTERS, Coefficients
 from monitor.publishing.messages import remote_device
 
-MOST_TAU: Final = 1000
+MAX_AVERAGING_TIMES: Final = 1000
 """Largest accepted number of averaging times."""
 
 
@@ -38,7 +38,12 @@ def estimate(allan: remote_device.AllanMessage, noise: remote_device.Noise) -> E
     """
     tau_s = np.array(allan.tau)
     m = tau_s.size
-    if not 0 < m <= MOST_TAU or not np.all(tau_s > 0) or not np.all(np.diff(tau_s) > 0) or not allan.rate > 0:
+    if (
+        not 0 < m <= MAX_AVERAGING_TIMES
+        or not np.all(tau_s > 0)
+        or not np.all(np.diff(tau_s) > 0)
+        or not allan.rate > 0
+    ):
         raise ValueError("averaging times must rise from above zero")
     deviation, lo, hi = (np.full((m, len(AXES)), np.nan) for _ in range(3))
     for axis, curve in allan.axes.items():

@@ -74,7 +74,9 @@ def coefficients(device: str, unix_s: float, estimate: Estimate) -> bytes:
 
 
 def gap(device: str, unix_s: float, look: ModelGap) -> bytes:
-    """Encode ``imu/<device>/gap``: measured deviations and those of the model in use, for each axis that can be tested.
+    """Encode ``imu/<device>/gap``: measured deviations and those of the model in use.
+
+    Only axes that can be tested are included.
 
     ``agrees`` is the current decision (null: none yet), see ``agreement``. It has hysteresis: it changes later than
     ``gap`` crosses its threshold.

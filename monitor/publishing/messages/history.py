@@ -23,7 +23,7 @@ from monitor.history.reading import Course, Past
 from monitor.history.sqlite_store import PastEvent
 from monitor.history.time_ranges import Span
 
-POINTS_AT_MOST: Final = 1_000_000
+MAX_BUCKETS: Final = 1_000_000
 """Largest number of buckets accepted in a message."""
 Numbers = list[float | None]
 State = Literal["ended", "running", "waiting", "lost"]
@@ -161,7 +161,7 @@ def read(payload: bytes) -> Past:
     """
     said = msgspec.json.decode(payload, type=HistoryMessage)
     p = len(said.start)
-    if said.schema != topics.HISTORY.schema() or len(said.width) != p or p > POINTS_AT_MOST:
+    if said.schema != topics.HISTORY.schema() or len(said.width) != p or p > MAX_BUCKETS:
         raise ValueError("not an answer of a history")
     columns: dict[str, Course] = {}
     for axis, letters in (said.axes or {}).items():

@@ -16,21 +16,21 @@ from monitor.common import topics
 from monitor.estimation.fit.coefficients import LETTERS, Coefficients, Status
 
 STATUSES: Final = {status.name.lower(): status for status in Status}
-QUIET: Final = ("ok", "off")
+NORMAL_OUTPUT_STATES: Final = ("ok", "off")
 """States of an output that are not shown."""
 GONE_S: Final = 1.5
 """Age of the newest message [s] after which a device without liveliness token is gone. The status comes at 1 Hz, so a
 daemon that is killed is reported within two seconds."""
-NAMED: Final = 6
+MAX_NAMED_LIMITS: Final = 6
 """Largest number of exceeded limits that are listed by name."""
 SILENT_S: Final = 5.0
 """Age of the newest message [s] after which a device is silent, if its token exists or was never seen."""
-LONGEST_TEXT: Final = 400
-MOST_OUTPUTS: Final = 16
+MAX_TEXT_LENGTH: Final = 400
+MAX_OUTPUTS: Final = 16
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 
-LARGEST_BYTES: Final = 1_000_000
+MAX_PAYLOAD_BYTES: Final = 1_000_000
 """Largest accepted payload; a message of six axes has a few kilobytes."""
 
 
@@ -179,7 +179,7 @@ class Heard:
             return 3
         if status is None or state != "running":
             return 1
-        well = all(output in QUIET or output.startswith("ok,") for output in status.outputs.values())
+        well = all(output in NORMAL_OUTPUT_STATES or output.startswith("ok,") for output in status.outputs.values())
         well &= not status.text and not status.overflowed and not status.crossed
         return 2 if well and not self.disagreements() else 1
 
@@ -189,12 +189,12 @@ class Heard:
             return ""
         said = [clean(self.status.text)] if self.status.text else []
         outputs = self.status.outputs.items()
-        said += [f"{clean(name)}: {clean(state)}" for name, state in outputs if state not in QUIET]
+        said += [f"{clean(name)}: {clean(state)}" for name, state in outputs if state not in NORMAL_OUTPUT_STATES]
         if self.status.overflowed:
             said.append(f"{self.status.overflowed:,} samples overwritten before they were used: too slow here")
         if crossed := self.status.crossed:
-            more = f" and {len(crossed) - NAMED} more" if len(crossed) > NAMED else ""
-            said.append(f"beyond its limit: {', '.join(clean(one) for one in crossed[:NAMED])}{more}")
+            more = f" and {len(crossed) - MAX_NAMED_LIMITS} more" if len(crossed) > MAX_NAMED_LIMITS else ""
+            said.append(f"beyond its limit: {', '.join(clean(one) for one in crossed[:MAX_NAMED_LIMITS])}{more}")
         return "; ".join([*said, *self.disagreements()])
 
     def disagreements(self) -> list[str]:
@@ -238,8 +238,8 @@ def read(kind: type[M], topic: topics.Topic, payload: bytes) -> M:
     ValueError
         The payload is too large, is not a message of this type, or has another schema.
     """
-    if len(payload) > LARGEST_BYTES:
-        raise ValueError(f"{len(payload)} bytes; {LARGEST_BYTES} are the most that is read")
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        raise ValueError(f"{len(payload)} bytes; {MAX_PAYLOAD_BYTES} are the most that is read")
     try:
         found = msgspec.json.decode(payload, type=kind)  # its errors are ValueErrors
     except RecursionError as error:
@@ -252,9 +252,11 @@ def read(kind: type[M], topic: topics.Topic, payload: bytes) -> M:
 def status(payload: bytes) -> StatusMessage:
     """Decode a status message; text is truncated, so that no device can exhaust the memory of the receiver."""
     found = read(StatusMessage, topics.STATUS, payload)
-    outputs = {name[:LONGEST_TEXT]: said[:LONGEST_TEXT] for name, said in list(found.outputs.items())[:MOST_OUTPUTS]}
+    outputs = {
+        name[:MAX_TEXT_LENGTH]: said[:MAX_TEXT_LENGTH] for name, said in list(found.outputs.items())[:MAX_OUTPUTS]
+    }
     return msgspec.structs.replace(
-        found, state=found.state[:LONGEST_TEXT], text=found.text[:LONGEST_TEXT], outputs=outputs
+        found, state=found.state[:MAX_TEXT_LENGTH], text=found.text[:MAX_TEXT_LENGTH], outputs=outputs
     )
 
 
@@ -262,7 +264,9 @@ def event(payload: bytes) -> EventMessage:
     """Decode an event message; text is truncated as in a status message."""
     found = read(EventMessage, topics.EVENT, payload)
     what = {letter: found.what[letter] for letter in LETTERS if letter in found.what}
-    return msgspec.structs.replace(found, kind=found.kind[:LONGEST_TEXT], text=found.text[:LONGEST_TEXT], what=what)
+    return msgspec.structs.replace(
+        found, kind=found.kind[:MAX_TEXT_LENGTH], text=found.text[:MAX_TEXT_LENGTH], what=what
+    )
 
 
 def gap(payload: bytes) -> GapMessage:

@@ -31,18 +31,20 @@ RING_SIZES: Final = (12.0, 8.5, 5.0)
 DASHES: Final = ((0, (4, 8)), (4, (4, 8)), (8, (4, 8)))  # dashes of identical fits fill each other's gaps
 GREY: Final = "#6b6b6b"
 DARK: Final = "#222222"
-READ_AT_S: Final = {"Q": 3.0**0.5, "N": 1.0, "K": 3.0, "R": 2.0**0.5}  # τ at which the term's deviation equals it
+READING_TAU_S: Final = {"Q": 3.0**0.5, "N": 1.0, "K": 3.0, "R": 2.0**0.5}  # τ at which the term's deviation equals it
 SLOPES: Final = {"Q": -1.0, "N": -0.5, "B": 0.0, "K": 0.5, "R": 1.0}  # log-log slope of the deviation
-FLOOR: Final = (2.0 * np.log(2.0) / np.pi) ** 0.5  # ratio of the deviation of flicker noise to B
+FLICKER_FLOOR_RATIO: Final = (2.0 * np.log(2.0) / np.pi) ** 0.5  # ratio of the deviation of flicker noise to B
 READING: Final = (
     "○ a coefficient, read on its own line: Q at √3 s, N at 1 s, K at 3 s, R at √2 s; 0.664 B where the curve is lowest"
 )
-STYLES: Final = ("-", ":", "-.")  # line styles of other deviations
-BELOW: Final = 300.0  # a ring further than this factor below the curve is omitted, as it would flatten the curve
-BEYOND: Final = 3.0  # a band extends the plot at most by this factor beyond its points
-SPAN: Final = 1.6  # margin around the plotted data, as a factor
-FEW: Final = 60.0  # an axis with a smaller ratio of its ends has numbers between the powers of ten
-LETTER_SHARE: Final = 0.045  # rings closer than this share of the plot's height share a letter
+OTHER_LINE_STYLES: Final = ("-", ":", "-.")  # line styles of other deviations
+MAX_DEPTH_RATIO: Final = (
+    300.0  # a ring further than this factor below the curve is omitted, as it would flatten the curve
+)
+MAX_BAND_RATIO: Final = 3.0  # a band extends the plot at most by this factor beyond its points
+MARGIN_FACTOR: Final = 1.6  # margin around the plotted data, as a factor
+FEW_DECADES_RATIO: Final = 60.0  # an axis with a smaller ratio of its ends has numbers between the powers of ten
+MIN_LETTER_DISTANCE: Final = 0.045  # rings closer than this share of the plot's height share a letter
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +101,7 @@ class _Ring:
 
     @property
     def colour(self) -> str:
+        """Colour of the axis."""
         return COLOURS[self.number]
 
 
@@ -145,8 +148,8 @@ def allan_panel(axes: "Axes", estimate: Estimate, kind: Kind, others: Sequence[B
         shown += [
             measured[rows],
             fitted,
-            np.clip(lo, measured[rows] / BEYOND, None),
-            np.clip(hi, None, measured[rows] * BEYOND),
+            np.clip(lo, measured[rows] / MAX_BAND_RATIO, None),
+            np.clip(hi, None, measured[rows] * MAX_BAND_RATIO),
         ]
         shown += _draw_others(axes, others, i, colour, marker, factor, float(tau_s[rows][-1]))
         drawn |= {other.name for other in others if other.rows(i, float(tau_s[rows][-1])).any()}
@@ -168,7 +171,9 @@ def _draw_others(
         # The line begins at the last point of the Allan deviation, so that its origin is visible.
         line = marks | (other.tau_s == longest_s) if other.only_beyond else marks
         y = other.deviation[:, i] * factor
-        axes.plot(other.tau_s[line], y[line], STYLES[number % 3], color=colour, linewidth=0.9, alpha=0.8, zorder=2)
+        axes.plot(
+            other.tau_s[line], y[line], OTHER_LINE_STYLES[number % 3], color=colour, linewidth=0.9, alpha=0.8, zorder=2
+        )
         shown.append(y[line])
         if other.only_beyond:  # at shorter τ, the markers would hide those of the Allan deviation
             ends = np.abs([y - other.lo[:, i] * factor, other.hi[:, i] * factor - y])[:, marks]
@@ -193,11 +198,16 @@ def _rings(estimate: Estimate, i: int, factor: float, lowest_s: float, floor: fl
     """Return the rings of the estimated coefficients of one axis."""
     known = estimate.coefficients
     rings = [
-        _Ring(letter, READ_AT_S.get(letter, lowest_s), float(value) * (FLOOR if letter == "B" else 1.0) * factor, i % 3)
+        _Ring(
+            letter,
+            READING_TAU_S.get(letter, lowest_s),
+            float(value) * (FLICKER_FLOOR_RATIO if letter == "B" else 1.0) * factor,
+            i % 3,
+        )
         for letter, value, status in zip(LETTERS, known.value[:, i], known.status[:, i], strict=True)
         if status == Status.ESTIMATED
     ]
-    return [ring for ring in rings if ring.sigma > floor / BELOW]
+    return [ring for ring in rings if ring.sigma > floor / MAX_DEPTH_RATIO]
 
 
 def _set_limits(axes: "Axes", shown: Sequence[Floats], rings: Sequence[_Ring]) -> None:
@@ -205,10 +215,10 @@ def _set_limits(axes: "Axes", shown: Sequence[Floats], rings: Sequence[_Ring]) -
     axes.set(xscale="log", yscale="log")
     values = np.concatenate([*shown, [ring.sigma for ring in rings]]) if shown else np.array([1.0])
     values = values[np.isfinite(values) & (values > 0)]
-    axes.set_ylim(values.min() / SPAN, values.max() * SPAN)
+    axes.set_ylim(values.min() / MARGIN_FACTOR, values.max() * MARGIN_FACTOR)
     left, right = axes.get_xlim()
     at = [ring.tau_s for ring in rings]
-    axes.set_xlim(min([left, *(t / SPAN for t in at)]), max([right, *(t * SPAN for t in at)]))
+    axes.set_xlim(min([left, *(t / MARGIN_FACTOR for t in at)]), max([right, *(t * MARGIN_FACTOR for t in at)]))
 
 
 def _draw_terms(axes: "Axes", rings: Sequence[_Ring]) -> None:
@@ -244,7 +254,7 @@ def _group_rings(axes: "Axes", rings: Sequence[_Ring]) -> list[list[_Ring]]:
     heaps: list[list[_Ring]] = []
     for ring in sorted(rings, key=lambda one: (one.letter, one.sigma)):
         before = heaps[-1][-1] if heaps else None
-        close = before is not None and np.log(ring.sigma / before.sigma) < LETTER_SHARE * (top - bottom)
+        close = before is not None and np.log(ring.sigma / before.sigma) < MIN_LETTER_DISTANCE * (top - bottom)
         if before is not None and close and before.letter == ring.letter:
             heaps[-1].append(ring)
         else:
@@ -260,7 +270,16 @@ def _draw_labels(axes: "Axes", kind: Kind, others: Sequence[Beside], drawn: Coll
         if other.name not in drawn:
             continue
         marker = "o" if other.only_beyond else ""
-        axes.plot([], [], STYLES[number % 3], marker=marker, mfc="white", color=GREY, linewidth=0.9, label=other.name)
+        axes.plot(
+            [],
+            [],
+            OTHER_LINE_STYLES[number % 3],
+            marker=marker,
+            mfc="white",
+            color=GREY,
+            linewidth=0.9,
+            label=other.name,
+        )
     axes.set(xlabel="averaging time τ, s", ylabel=f"Allan deviation σ(τ), {DEVIATION_UNITS[kind].name}")
     axes.set_title(KIND_NAMES[kind], loc="left", fontsize=12)
     plain_ticks(axes)
@@ -291,7 +310,7 @@ def plain_ticks(axes: "Axes") -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     low, high = axes.get_ylim()
-    few = high / low < FEW
+    few = high / low < FEW_DECADES_RATIO
     axes.yaxis.set_minor_locator(LogLocator(subs=(2.0, 3.0, 5.0) if few else tuple(range(2, 10)), numticks=50))
     axes.yaxis.set_minor_formatter(FuncFormatter(lambda y, _: f"{y:g}") if few else NullFormatter())
     if few:

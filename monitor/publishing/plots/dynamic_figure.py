@@ -29,13 +29,20 @@ if TYPE_CHECKING:
 SURFACE_INCHES: Final = 1.35
 LINE_INCHES: Final = 1.6
 SPARE_INCHES: Final = 1.2  # height of title, colour bar and time axis
-SHARE: Final = 0.05  # smallest share of time steps with an estimate for a coefficient to have a panel
-PALE: Final = 0.3
-DASHED: Final = (0, (4, 2))
+MIN_ESTIMATED_SHARE: Final = 0.05  # smallest share of time steps with an estimate for a coefficient to have a panel
+PALE_ALPHA: Final = 0.3
+DASHED_LINE: Final = (0, (4, 2))
 APART: Final = 0.13  # smallest distance between two labels, as a share of the width
-RATIOS: Final = (1.25, 1.5, 2.0, 3.0, 5.0, 10.0)  # possible ends of the colour scale; the first that holds most cells
+COLOUR_SCALE_RATIOS: Final = (
+    1.25,
+    1.5,
+    2.0,
+    3.0,
+    5.0,
+    10.0,
+)  # possible ends of the colour scale; the first that holds most cells
 BANDS: Final = 0.9  # share of the ends of the bands inside a panel; the widest would determine its scale
-WIDE: Final = 3.0  # ratio of largest to smallest value above which a logarithmic scale is used
+LOG_SCALE_RATIO: Final = 3.0  # ratio of largest to smallest value above which a logarithmic scale is used
 UNITS_S: Final = (("s", 1.0, 600.0), ("min", 60.0, 10_800.0), ("h", 3600.0, 259_200.0), ("d", 86_400.0, np.inf))
 
 
@@ -76,7 +83,7 @@ def letters(dynamic: Dynamic, kind: Kind) -> tuple[str, ...]:
     """
     columns = [AXES.index(axis) for axis in axes_of(kind)]
     share = (dynamic.status[:, :, columns] == Status.ESTIMATED).mean(axis=0).max(axis=1)
-    return tuple(letter for letter, one in zip(LETTERS, share, strict=True) if one >= SHARE)
+    return tuple(letter for letter, one in zip(LETTERS, share, strict=True) if one >= MIN_ESTIMATED_SHARE)
 
 
 def axes_shown(dynamic: Dynamic, kind: Kind) -> tuple[str, ...]:
@@ -160,9 +167,9 @@ def _draw_changes(panels: "Sequence[Axes]", axes: Sequence[str], marks: Sequence
     for panel, axis in zip(panels, axes, strict=False):
         times = [mark.t_s / clock.seconds for mark in marks if mark.axis == axis]
         for at in times:
-            panel.axvline(at, color=DARK, linewidth=1.1, linestyle=DASHED)
+            panel.axvline(at, color=DARK, linewidth=1.1, linestyle=DASHED_LINE)
             for course in panels[len(axes) :]:
-                course.axvline(at, color=COLOURS[AXES.index(axis) % 3], linewidth=1.1, linestyle=DASHED)
+                course.axvline(at, color=COLOURS[AXES.index(axis) % 3], linewidth=1.1, linestyle=DASHED_LINE)
         for near in _group_times(np.clip(times, left + apart / 2.0, right - apart / 2.0).tolist(), apart):
             panel.annotate(
                 "change" if len(near) == 1 else f"{len(near)} changes", (sum(near) / len(near), 1.0), (0, -4),
@@ -200,7 +207,7 @@ def _draw_heat_map(panel: "Axes", dynamic: Dynamic, axis: str, edges: Floats, ra
     median = _median(dynamic)[:, :, i]
     usual = (dynamic.lo[:, :, i] <= median) & (median <= dynamic.hi[:, :, i])
     end = np.log(ratio)
-    pale: Any = np.where(usual.T, PALE, 1.0)  # matplotlib accepts an array, but its type hints do not
+    pale: Any = np.where(usual.T, PALE_ALPHA, 1.0)  # matplotlib accepts an array, but its type hints do not
     mesh = panel.pcolormesh(
         edges, _edges_of_tau(dynamic.tau_s), colour,
         cmap="RdBu_r", vmin=-end, vmax=end, alpha=pale, rasterized=True, linewidth=0,
@@ -245,7 +252,7 @@ def _draw_coefficient(panel: "Axes", dynamic: Dynamic, kind: Kind, letter: str, 
         held.append(value)
         ends.append((lo, hi))
     low, high = np.nanmin(held), np.nanmax(held)
-    if low > 0 and high > WIDE * low:
+    if low > 0 and high > LOG_SCALE_RATIO * low:
         panel.set_yscale("log")
         panel.set_ylim(low / 1.5, high * 1.5)
         plain_ticks(panel)
@@ -283,8 +290,8 @@ def _colour_scale_end(ratios: Floats) -> float:
     with np.errstate(invalid="ignore", divide="ignore"):
         size = np.abs(np.log(ratios))
     size = size[np.isfinite(size)]
-    most = float(np.exp(np.quantile(size, 0.95))) if size.size else RATIOS[0]
-    return next((ratio for ratio in RATIOS if ratio >= most), RATIOS[-1])
+    most = float(np.exp(np.quantile(size, 0.95))) if size.size else COLOUR_SCALE_RATIOS[0]
+    return next((ratio for ratio in COLOUR_SCALE_RATIOS if ratio >= most), COLOUR_SCALE_RATIOS[-1])
 
 
 def _edges(t: Floats) -> Floats:

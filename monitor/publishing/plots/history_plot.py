@@ -27,12 +27,12 @@ from monitor.publishing.terminal.history_text import head
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-INCHES: Final = (7.4, 1.75)
+PANEL_INCHES: Final = (7.4, 1.75)
 """Size of one panel."""
 SPARE_INCHES: Final = 1.1
-WIDE: Final = 3.0  # ratio of largest to smallest value above which a logarithmic scale is used
-NARROW: Final = 1.5  # intervals whose ends differ from the value by more than this factor are not drawn
-WORDS: Final = {
+LOG_SCALE_RATIO: Final = 3.0  # ratio of largest to smallest value above which a logarithmic scale is used
+MAX_INTERVAL_RATIO: Final = 1.5  # intervals whose ends differ from the value by more than this factor are not drawn
+EVENT_LABELS: Final = {
     "noise_changed": "noise",
     "bias_stepped": "bias",
     "link_lost": "lost",
@@ -43,10 +43,10 @@ WORDS: Final = {
     "drift_unexplained": "drift",
 }
 """Label of each kind of event that is drawn; lost samples have a panel of their own."""
-EVENTS: Final = 40
+MAX_EVENTS: Final = 40
 """Largest number of events that are drawn; the most significant ones are selected."""
-APART: Final = 0.055  # smallest distance between two labels, as a share of the width
-AXIS_FIRST: Final = ("noise_changed", "bias_stepped", "limit_crossed", "model_disagrees")
+MIN_LABEL_DISTANCE: Final = 0.055  # smallest distance between two labels, as a share of the width
+PRIORITY_KINDS: Final = ("noise_changed", "bias_stepped", "limit_crossed", "model_disagrees")
 
 
 def history_plot(past: Past, path: Path, axes: Sequence[str] = AXES) -> None:
@@ -80,7 +80,9 @@ def history_plot(past: Past, path: Path, axes: Sequence[str] = AXES) -> None:
     kinds = [kind for kind in KINDS if shown[kind]] or [KINDS[0]]
     letters = [one for one in LETTERS if any(_was_estimated(past, axis, one) for kind in kinds for axis in shown[kind])]
     rows = len(letters) + (1 if len(kinds) > 1 else 2)
-    figure = Figure(figsize=(INCHES[0] * len(kinds), SPARE_INCHES + INCHES[1] * rows), dpi=DPI, layout="constrained")
+    figure = Figure(
+        figsize=(PANEL_INCHES[0] * len(kinds), SPARE_INCHES + PANEL_INCHES[1] * rows), dpi=DPI, layout="constrained"
+    )
     FigureCanvasAgg(figure)
     panels: Any = figure.subplots(rows, len(kinds), squeeze=False, sharex=True)
     for column, kind in enumerate(kinds):
@@ -118,7 +120,7 @@ def _draw_coefficient(panel: "Axes", past: Past, kind: Kind, letter: str, axes: 
         ))  # fmt: skip
         if not np.isfinite(last).any():
             continue
-        near = (lo * NARROW > last) & (hi < last * NARROW)
+        near = (lo * MAX_INTERVAL_RATIO > last) & (hi < last * MAX_INTERVAL_RATIO)
         panel.fill_between(t, np.where(near, lo, np.nan), np.where(near, hi, np.nan), color=colour, alpha=0.12, lw=0)
         panel.fill_between(t, low, high, color=colour, alpha=0.45, lw=0)
         panel.plot(t, last, "-", color=colour, lw=1.1, label=axis)
@@ -126,7 +128,7 @@ def _draw_coefficient(panel: "Axes", past: Past, kind: Kind, letter: str, axes: 
         highs.append(np.nanmax(high))
     if not lows:
         panel.text(0.5, 0.5, "never estimated", transform=panel.transAxes, ha="center", color=GREY)
-    elif min(lows) > 0 and max(highs) > WIDE * min(lows):
+    elif min(lows) > 0 and max(highs) > LOG_SCALE_RATIO * min(lows):
         panel.set_yscale("log")
         panel.set_ylim(min(lows) / 1.2, max(highs) * 1.2)
         plain_ticks(panel)
@@ -176,9 +178,9 @@ def _draw_title(panel: "Axes", text: str) -> None:
 
 def _select_events(past: Past) -> list[PastEvent]:
     """Return the events to draw, in order of time."""
-    kinds = [one for one in past.events if one.kind in WORDS]
-    kinds.sort(key=lambda one: (one.kind not in AXIS_FIRST, -(one.sigma or 0.0)))
-    return sorted(kinds[:EVENTS], key=lambda one: one.t_s)
+    kinds = [one for one in past.events if one.kind in EVENT_LABELS]
+    kinds.sort(key=lambda one: (one.kind not in PRIORITY_KINDS, -(one.sigma or 0.0)))
+    return sorted(kinds[:MAX_EVENTS], key=lambda one: one.t_s)
 
 
 def _draw_events(panels: "Sequence[Axes]", events: Sequence[PastEvent]) -> None:
@@ -190,10 +192,10 @@ def _draw_events(panels: "Sequence[Axes]", events: Sequence[PastEvent]) -> None:
         colour = GREY if event.axis is None else COLOURS[AXES.index(event.axis) % 3]
         for panel in panels:
             panel.axvline(at, color=colour, lw=0.9, ls=(0, (4, 2)), alpha=0.6)
-        if at - said_to < APART * (right - left):
+        if at - said_to < MIN_LABEL_DISTANCE * (right - left):
             continue
         said_to = at
-        word = WORDS[event.kind] + (f" {event.axis}" if event.axis else "")
+        word = EVENT_LABELS[event.kind] + (f" {event.axis}" if event.axis else "")
         above = panels[0].annotate(
             word, (at, 1.0), xycoords=("data", "axes fraction"), xytext=(1, 3), textcoords="offset points",
             fontsize=7.5, color=colour, rotation=25, ha="left", va="bottom", annotation_clip=False,

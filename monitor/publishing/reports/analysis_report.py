@@ -41,11 +41,11 @@ if TYPE_CHECKING:
 
 TEMPLATE: Final = "report.html.j2"
 ALLAN_INCHES: Final = (7.2, 5.2)
-WIDE_INCHES: Final = 7.2
-PIXELS_DPI: Final = 80  # resolution of heat maps and bands, which are images inside the SVG
-SIMPLER_PX: Final = 0.6  # corners of a line closer than this to it are removed
-MISSING: Final = 'matplotlib and Jinja2 are needed: pip install "imu-monitor[plot]"'
-WORDS: Final = {
+DYNAMIC_WIDTH_INCHES: Final = 7.2
+IMAGE_DPI: Final = 80  # resolution of heat maps and bands, which are images inside the SVG
+SIMPLIFY_THRESHOLD_PX: Final = 0.6  # corners of a line closer than this to it are removed
+MISSING_MESSAGE: Final = 'matplotlib and Jinja2 are needed: pip install "imu-monitor[plot]"'
+STATUS_TEXTS: Final = {
     Status.ESTIMATED: "",
     Status.UPPER_BOUND: "upper bound",
     Status.UNESTIMATED: "too few data",
@@ -150,7 +150,7 @@ def html(
         import matplotlib.figure as _  # noqa: F401
         from jinja2 import Environment, PackageLoader, StrictUndefined
     except ImportError as error:
-        raise ConfigError(MISSING) from error
+        raise ConfigError(MISSING_MESSAGE) from error
     environment = Environment(
         loader=PackageLoader("monitor.publishing"),
         autoescape=True,
@@ -209,7 +209,7 @@ def _cell(estimate: Estimate, letter: str, axis: str) -> Cell:
     status = Status(int(known.status[LETTERS.index(letter), AXES.index(axis)]))
     one = reading(known, letter, axis)
     value = one.value if status == Status.UNESTIMATED else f"{one.value} {unit_of(letter, axis).name}"
-    word = K_OR_R if analysis_plot.k_or_r(estimate, letter, axis) else WORDS[status]
+    word = K_OR_R if analysis_plot.k_or_r(estimate, letter, axis) else STATUS_TEXTS[status]
     return Cell(value, one.interval, word)
 
 
@@ -225,7 +225,7 @@ def _part(
     import matplotlib
 
     # A path keeps the threshold that was set when it was created.
-    with matplotlib.rc_context({"path.simplify_threshold": SIMPLER_PX}):
+    with matplotlib.rc_context({"path.simplify_threshold": SIMPLIFY_THRESHOLD_PX}):
         return _draw_part(estimate, kind, others, dynamic, marks, axes_of_temperature)
 
 
@@ -244,7 +244,7 @@ def _draw_part(
     allan_panel(curves.subplots(), estimate, kind, others)
     surface = ""
     if dynamic is not None:
-        figure = Figure(figsize=(WIDE_INCHES, height_inches(dynamic, kind)), layout="constrained")
+        figure = Figure(figsize=(DYNAMIC_WIDTH_INCHES, height_inches(dynamic, kind)), layout="constrained")
         dynamic_panels(figure, dynamic, kind, marks)
         surface = _svg(figure, f"{kind}-dynamic")
     names = (marked(axis, axes_of_temperature) for axis in axes_of(kind))
@@ -258,9 +258,7 @@ def _svg(figure: "Figure", salt: str) -> str:
 
     text = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": salt}):
-        figure.savefig(
-            text, format="svg", dpi=PIXELS_DPI, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        )
+        figure.savefig(text, format="svg", dpi=IMAGE_DPI, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     element = text.getvalue()[text.getvalue().index("<svg") :]
     # The identifiers of glyphs and clip paths are unique only within a figure.
     element = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{salt}-", element)

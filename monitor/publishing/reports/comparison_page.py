@@ -27,7 +27,7 @@ from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison
 
 TEMPLATE: Final = "reconcile_runs.html.j2"
 STRIP_PX: Final = (260.0, 22.0)
-MARGIN: Final = 0.06
+STRIP_MARGIN: Final = 0.06
 """Margin at both ends of a strip, as a share of the span of all intervals."""
 
 
@@ -196,7 +196,7 @@ def _ruler(intervals: Sequence[Bounds]) -> Ruler | None:
     if not ends or not max(ends) > min(ends):
         return None
     low, high = min(ends), max(ends)
-    more = MARGIN * (high - low)
+    more = STRIP_MARGIN * (high - low)
     return Ruler(low - more, high + more, False, 0.0, STRIP_PX[0])
 
 

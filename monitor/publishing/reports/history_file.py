@@ -16,12 +16,14 @@ from monitor.history.bucket import COUNTS, STATES
 from monitor.history.reading import Past
 from monitor.publishing.coefficient_cells import kind_of
 
-UNITS: Final = {
+COEFFICIENT_SI_UNITS: Final = {
     "gyro": {"Q": "rad", "N": "rad/sqrt(s)", "B": "rad/s", "K": "rad/s/sqrt(s)", "R": "rad/s^2", "sigma": "rad/s"},
     "accel": {"Q": "m/s", "N": "m/s/sqrt(s)", "B": "m/s^2", "K": "m/s^2/sqrt(s)", "R": "m/s^3", "sigma": "m/s^2"},
 }
 STATUS_UNITS: Final = {"rate": "Hz", "latency": "s", "memory": "B", "temperature": "degC"}
-STATE_NAMES: Final = "state (" + ", ".join(f"{i} {name}" for i, name in enumerate(STATES)).replace(", ", "; ") + ")"
+STATE_COLUMN_NAME: Final = (
+    "state (" + ", ".join(f"{i} {name}" for i, name in enumerate(STATES)).replace(", ", "; ") + ")"
+)
 
 
 def save(past: Past, path: Path) -> None:
@@ -61,7 +63,7 @@ def table(past: Past) -> dict[str, Floats]:
         columns[f"{name} n"] = course.n.astype(np.float64)
     for i, name in enumerate(COUNTS):
         columns[f"{name} (samples)"] = past.counts[:, i].astype(np.float64)
-    columns[STATE_NAMES] = past.state.astype(np.float64)
+    columns[STATE_COLUMN_NAME] = past.state.astype(np.float64)
     return columns
 
 
@@ -72,4 +74,4 @@ def unit_of(name: str) -> str:
     ('rad/sqrt(s)', 'm/s^2', 'Hz')
     """
     axis, _, rest = name.partition(".")
-    return UNITS[kind_of(axis)][rest.split(".")[0]] if rest else STATUS_UNITS[name]
+    return COEFFICIENT_SI_UNITS[kind_of(axis)][rest.split(".")[0]] if rest else STATUS_UNITS[name]

@@ -26,15 +26,15 @@ from monitor.reconcile.result import AxisResult, Look, Reconciliation, Score, St
 
 TEMPLATE: Final = "reconcile.html.j2"
 MISSING: Final = 'Jinja2 is needed: pip install "imu-monitor[plot]"'
-WIDE_PX: Final = (840.0, 330.0)  # plot of a range in its diagnostic, without a detail plot
-WHERE_PX: Final = (500.0, 330.0)  # the same plot next to a detail plot
-NEAR_PX: Final = (340.0, 330.0)  # detail plot of the range
-PAIR_PX: Final = (670.0, 230.0)
-ONE_PX: Final = (335.0, 200.0)
+RANGE_PLOT_PX: Final = (840.0, 330.0)  # plot of a range in its diagnostic, without a detail plot
+RANGE_PLOT_WITH_DETAIL_PX: Final = (500.0, 330.0)  # the same plot next to a detail plot
+DETAIL_PLOT_PX: Final = (340.0, 330.0)  # detail plot of the range
+PAIR_PLOT_PX: Final = (670.0, 230.0)
+SINGLE_PLOT_PX: Final = (335.0, 200.0)
 BAR_PX: Final = (240.0, 22.0)
-BAR_ENDS: Final = (0.05, 20.0)  # smallest range of gap over threshold on a bar
-OPEN: Final = "#b3261e"  # colour of a gap above its threshold
-CLOSED: Final = "#1b7f4d"
+BAR_LIMITS: Final = (0.05, 20.0)  # smallest range of gap over threshold on a bar
+ABOVE_THRESHOLD_COLOUR: Final = "#b3261e"  # colour of a gap above its threshold
+BELOW_THRESHOLD_COLOUR: Final = "#1b7f4d"
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +143,13 @@ def page(r: Reconciliation, title: str = "") -> str:
         agreeing=_agreeing([result for result in results if result.verdict == "agrees"]),
         notes=r.notes,
         model=str(r.model),
-        colours={"dark": DARK, "band": BAND, "place": PLACE, "open": OPEN, "closed": CLOSED},
+        colours={
+            "dark": DARK,
+            "band": BAND,
+            "place": PLACE,
+            "open": ABOVE_THRESHOLD_COLOUR,
+            "closed": BELOW_THRESHOLD_COLOUR,
+        },
     )
 
 
@@ -205,7 +211,7 @@ def _agreeing(results: Sequence[AxisResult]) -> Agreeing:
 
 def _first_model_plots(result: AxisResult) -> tuple[str, ...]:
     """Return the plots of all diagnostics of an axis with the first model."""
-    return tuple(chart([("", view)], result.axis, *ONE_PX) for view in result.start.views)
+    return tuple(chart([("", view)], result.axis, *SINGLE_PLOT_PX) for view in result.start.views)
 
 
 def _of_threshold(score: Score) -> str:
@@ -217,7 +223,7 @@ def _step(r: Reconciliation, axis: str, count: int, step: Step, before: Look) ->
     """Return the section of one step."""
     after = {view.lens: view for view in step.look.views}
     pairs = tuple(
-        chart([("before", view), ("after", after[view.lens])], axis, *PAIR_PX)
+        chart([("before", view), ("after", after[view.lens])], axis, *PAIR_PLOT_PX)
         for view in before.views
         if view.lens in after
     )
@@ -251,9 +257,9 @@ def _plots_of_range(look: Look, found: Score, axis: str) -> tuple[str, ...]:
         return ()
     part = near(view, found.where)
     if part is None:
-        return (chart([("", view)], axis, *WIDE_PX, where=found.where),)
-    whole = chart([("", view)], axis, *WHERE_PX, where=replace(found.where, source=None))
-    return whole, chart([("", part)], axis, *NEAR_PX, where=found.where)
+        return (chart([("", view)], axis, *RANGE_PLOT_PX, where=found.where),)
+    whole = chart([("", view)], axis, *RANGE_PLOT_WITH_DETAIL_PX, where=replace(found.where, source=None))
+    return whole, chart([("", part)], axis, *DETAIL_PLOT_PX, where=found.where)
 
 
 def _lenses(before: Look, after: Look | None, axis: str) -> tuple[LensRow, ...]:
@@ -261,7 +267,7 @@ def _lenses(before: Look, after: Look | None, axis: str) -> tuple[LensRow, ...]:
     later = {} if after is None else {score.lens: score for score in after.scores}
     pairs = [(score, later.get(score.lens)) for score in before.scores]
     largest = max((words.over_threshold(one) for pair in pairs for one in pair if one is not None), default=1.0)
-    ruler = Ruler(BAR_ENDS[0], max(BAR_ENDS[1], 1.3 * largest), True, 8.0, BAR_PX[0] - 8.0)
+    ruler = Ruler(BAR_LIMITS[0], max(BAR_LIMITS[1], 1.3 * largest), True, 8.0, BAR_PX[0] - 8.0)
     return tuple(_lens(score, other, axis, ruler) for score, other in pairs)
 
 
@@ -282,8 +288,7 @@ def _lens(score: Score, later: Score | None, axis: str, ruler: Ruler) -> LensRow
 
 
 def _bar(score: Score, later: Score | None, ruler: Ruler) -> str:
-    """Return the SVG of gap over threshold on a logarithmic bar: a ring before, a dot after, a line at the
-    threshold."""
+    """Return the SVG of gap over threshold: a ring before, a dot after, a line at the threshold."""
     wide, high = BAR_PX
     at = [_on_strip(one, ruler) for one in (score, later) if one is not None]
     one = _on_strip(None, ruler)
@@ -310,7 +315,7 @@ def _on_strip(score: Score | None, ruler: Ruler) -> float:
 
 def _gap_colour(score: Score) -> str:
     """Return the colour of a gap: above or below its threshold."""
-    return OPEN if score.passes else CLOSED
+    return ABOVE_THRESHOLD_COLOUR if score.passes else BELOW_THRESHOLD_COLOUR
 
 
 def _colour(axis: str) -> str:

@@ -3,8 +3,8 @@
 Each axis has a tab. On the left are the steps as text and the gap of each diagnostic relative to its threshold. On the
 right, each logarithmic diagnostic is drawn twice, with the first model and after the steps. The timeline ``step`` is
 the index of the model. Index 0 is the model that was given or fitted first, and the others are the models after each
-step. The right plot of a pair follows this timeline. Rerun has no logarithmic axes, so plots are drawn as lines by ``allan_chart``. The stream is
-separate from that of the live view. Importing this module imports Rerun.
+step. The right plot of a pair follows this timeline. Rerun has no logarithmic axes, so plots are drawn as lines by
+``allan_chart``. The stream is separate from that of the live view. Importing this module imports Rerun.
 
 Entities: ``/<axis>/steps``, ``/<axis>/gap/<lens>``, ``/<axis>/<lens>/before``, ``/<axis>/<lens>/after``, ``/overview``.
 """
@@ -28,11 +28,11 @@ from monitor.reconcile.result import AxisResult, Look, Reconciliation
 
 APPLICATION: Final = "imu-monitor"
 TIMELINE: Final = "step"
-PICTURES: Final = 2  # number of diagnostics drawn per axis; the first ones are used
-BAND: Final = colours.mixed(colours.FRAME, 0.55)
-KEY_X: Final = (8.6, 12.2, 15.4)  # positions of the names of the curves, above the box
-PLACE: Final = colours.TEMPERATURE  # orange, as on the HTML page
-LINES: Final = (  # colours of the gap lines; more lines would not fit into the legend
+MAX_PLOTTED_DIAGNOSTICS: Final = 2  # number of diagnostics drawn per axis; the first ones are used
+BAND_COLOUR: Final = colours.mixed(colours.FRAME, 0.55)
+LEGEND_X: Final = (8.6, 12.2, 15.4)  # positions of the names of the curves, above the box
+RANGE_COLOUR: Final = colours.TEMPERATURE  # orange, as on the HTML page
+GAP_LINE_COLOURS: Final = (  # colours of the gap lines; more lines would not fit into the legend
     (240, 98, 77),
     (45, 190, 130),
     (84, 160, 255),
@@ -143,7 +143,7 @@ def _looks_by_step(result: AxisResult) -> list[Look]:
 
 def _lenses(result: AxisResult) -> list[str]:
     """Return the logarithmic diagnostics of an axis that are drawn."""
-    return [view.lens for view in result.start.views if view.log][:PICTURES]
+    return [view.lens for view in result.start.views if view.log][:MAX_PLOTTED_DIAGNOSTICS]
 
 
 def _tab(result: AxisResult) -> rrb.Container:
@@ -194,7 +194,7 @@ def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
     looks = [{score.lens: words.over_threshold(score) for score in look.scores} for look in _looks_by_step(result)]
     path = f"{result.axis}/gap"
     largest = sorted(looks[0], key=lambda lens: -max(look.get(lens, 0.0) for look in looks))
-    for lens, tint in zip(largest, LINES, strict=False):
+    for lens, tint in zip(largest, GAP_LINE_COLOURS, strict=False):
         line = rr.SeriesLines(colors=[tint], widths=[2.0], names=[words.lens_name(lens)])
         stream.log(f"{path}/{lens}", line, static=True)
         _log_by_step(stream, f"{path}/{lens}", [look.get(lens, np.nan) for look in looks])
@@ -230,7 +230,9 @@ def _log_curves(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot,
     """Log the band, the measured curve and the expected curve."""
     # A lower end of zero has no logarithm; it is drawn below the box.
     low, high = (scale.place(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
-    fill = rr.LineStrips2D(list(band(low, high)), colors=[BAND], radii=[WIDTH / FILL_STEPS / 2], draw_order=-20.0)
+    fill = rr.LineStrips2D(
+        list(band(low, high)), colors=[BAND_COLOUR], radii=[WIDTH / FILL_STEPS / 2], draw_order=-20.0
+    )
     stream.log(f"{path}/band", fill, static=static)
     colour, at = colours.AXIS_COLOURS[axis], _inside(scale.place(plot.x, plot.measured))
     thin = rr.Radius.ui_points(0.8)
@@ -256,7 +258,7 @@ def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, resul
     one = 10.0 ** np.array([scale.y[0], scale.y[0]], float)
     ends = [np.clip(scale.place(np.array(bound), one)[:, 0], 0.0, WIDTH) for bound in bounds]
     frames = [np.array([[a, 0], [b, 0], [b, HEIGHT], [a, HEIGHT], [a, 0]]) for a, b in ends]
-    strips = rr.LineStrips2D(frames, colors=[PLACE], radii=rr.Radius.ui_points(0.75), draw_order=-5.0)
+    strips = rr.LineStrips2D(frames, colors=[RANGE_COLOUR], radii=rr.Radius.ui_points(0.75), draw_order=-5.0)
     stream.log(f"{path}/place", strips, static=True)
 
 
@@ -270,9 +272,9 @@ def _log_grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot, a
     ):
         strip = rr.LineStrips2D(strips, colors=[colour], radii=rr.Radius.ui_points(0.5), draw_order=order)
         stream.log(f"{path}/grid/{name}", strip, static=True)
-    key = [("measured", colours.AXIS_COLOURS[axis]), ("model", colours.TEXT), ("95 %", BAND)]
-    at = [(x, -0.85, name) for x, (name, _) in zip(KEY_X, key, strict=True)]
-    strokes = [np.array([[x - 1.9, -0.42], [x - 1.2, -0.42]]) for x in KEY_X]
+    key = [("measured", colours.AXIS_COLOURS[axis]), ("model", colours.TEXT), ("95 %", BAND_COLOUR)]
+    at = [(x, -0.85, name) for x, (name, _) in zip(LEGEND_X, key, strict=True)]
+    strokes = [np.array([[x - 1.9, -0.42], [x - 1.2, -0.42]]) for x in LEGEND_X]
     strip = rr.LineStrips2D(strokes, colors=[tint for _, tint in key], radii=rr.Radius.ui_points(2.0), draw_order=30.0)
     stream.log(f"{path}/grid/key", strip, static=True)
     labels = [*lines.ticks, (WIDTH / 2, HEIGHT + 0.85, plot.x_label), (2.4, -0.85, plot.y_label), *at]

@@ -34,26 +34,26 @@ VERDICTS: Final = {
     "unexplained": "unexplained",
 }
 """Text of each result."""
-LENSES: Final = {"psd": "spectrum", "allan": "Allan deviation"}
+DIAGNOSTIC_NAMES: Final = {"psd": "spectrum", "allan": "Allan deviation"}
 """Names of diagnostics that differ from their identifier."""
 GRAVITY: Final = 9.80665  # m/s², standard (CGPM 1901)
-TURN_H: Final = DEGREE * HOUR  # °/h per rad/s
-SMALL: Final = 0.1  # °/s or m/s²; below it, a rate or an acceleration is shown in °/h or µg
+DEGREES_PER_HOUR: Final = DEGREE * HOUR  # °/h per rad/s
+SMALL_UNIT_BELOW: Final = 0.1  # °/s or m/s²; below it, a rate or an acceleration is shown in °/h or µg
 _GYRO, _ACCEL = COEFFICIENT_UNITS["gyro"], COEFFICIENT_UNITS["accel"]
-UNITS: Final = {
+FIELD_UNITS: Final = {
     "1": Unit(1.0, ""),
     "rad": _GYRO["Q"],
     "rad/√s": _GYRO["N"],
     "rad/s/√s": _GYRO["K"],
     "rad/s²": _GYRO["R"],
-    "rad/s/°C": Unit(TURN_H, "°/h/°C"),
-    "rad/s/°C²": Unit(TURN_H, "°/h/°C²"),
-    "rad/s per m/s²": Unit(TURN_H * GRAVITY, "°/h/g"),
-    "(rad/s)²/Hz": Unit(TURN_H**2, "(°/h)²/Hz"),
-    "rad²/s²/Hz": Unit(TURN_H**2, "(°/h)²/Hz"),
-    "rad/s/√Hz": Unit(TURN_H, "°/h/√Hz"),
-    "(rad/s)²": Unit(TURN_H**2, "(°/h)²"),
-    "rad²/s²": Unit(TURN_H**2, "(°/h)²"),
+    "rad/s/°C": Unit(DEGREES_PER_HOUR, "°/h/°C"),
+    "rad/s/°C²": Unit(DEGREES_PER_HOUR, "°/h/°C²"),
+    "rad/s per m/s²": Unit(DEGREES_PER_HOUR * GRAVITY, "°/h/g"),
+    "(rad/s)²/Hz": Unit(DEGREES_PER_HOUR**2, "(°/h)²/Hz"),
+    "rad²/s²/Hz": Unit(DEGREES_PER_HOUR**2, "(°/h)²/Hz"),
+    "rad/s/√Hz": Unit(DEGREES_PER_HOUR, "°/h/√Hz"),
+    "(rad/s)²": Unit(DEGREES_PER_HOUR**2, "(°/h)²"),
+    "rad²/s²": Unit(DEGREES_PER_HOUR**2, "(°/h)²"),
     "m/s": _ACCEL["Q"],
     "m/s/√s": _ACCEL["N"],
     "m/s²/√s": _ACCEL["K"],
@@ -67,17 +67,17 @@ UNITS: Final = {
     "m²/s⁴": Unit(MICRO_G**2, "µg²"),
 }
 """Unit of the field for each SI unit; units that are absent (Hz, s, °C) are used as they are."""
-BY_NAME: Final = {"phase": Unit(DEGREE, "°"), "fraction": Unit(100.0, "%")}
+UNITS_BY_NAME: Final = {"phase": Unit(DEGREE, "°"), "fraction": Unit(100.0, "%")}
 """Units of parameters that their SI unit does not determine."""
-PLACES: Final = {
+RANGE_FORMATS: Final = {
     "frequency": ("", "Hz"),
     "tau": ("τ = ", "s"),
     "time": ("t = ", "s"),
     "temperature": ("", "°C"),
 }
 """Prefix and unit of each kind of range."""
-ONE_PLACE: Final = 1e-3  # a range narrower than this share of its position is written as one number
-EVEN: Final = 0.1  # sides of an interval that differ by less than this share are written as ±
+MIN_RANGE_SHARE: Final = 1e-3  # a range narrower than this share of its position is written as one number
+SYMMETRY_TOLERANCE: Final = 0.1  # sides of an interval that differ by less than this share are written as ±
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,8 +108,8 @@ def field_unit(si: str, size: float) -> Unit:
     for kind, unit in (("gyro", "rad/s"), ("accel", "m/s²")):
         if si == unit:
             large = SAMPLE_UNITS[kind]  # type: ignore[index]
-            return DEVIATION_UNITS[kind] if abs(size) * large.factor < SMALL else large  # type: ignore[index]
-    return UNITS.get(si, Unit(1.0, si))
+            return DEVIATION_UNITS[kind] if abs(size) * large.factor < SMALL_UNIT_BELOW else large  # type: ignore[index]
+    return FIELD_UNITS.get(si, Unit(1.0, si))
 
 
 def plain(name: str) -> str:
@@ -119,7 +119,7 @@ def plain(name: str) -> str:
 
 def lens_name(lens: str) -> str:
     """Return the name of a diagnostic for the user."""
-    return LENSES.get(lens, plain(lens))
+    return DIAGNOSTIC_NAMES.get(lens, plain(lens))
 
 
 def percent(share: float) -> str:
@@ -148,7 +148,7 @@ def span(low: float, high: float, unit: str) -> str:
     unit
         Name of the unit.
     """
-    if not abs(high - low) > ONE_PLACE * max(abs(low), abs(high)):
+    if not abs(high - low) > MIN_RANGE_SHARE * max(abs(low), abs(high)):
         return f"{_short(0.5 * (low + high))} {unit}".rstrip()
     return f"{_short(low)} … {_short(high)} {unit}".rstrip()
 
@@ -174,7 +174,7 @@ def place(where: Where, axis: str) -> str:
             unit = field_unit("rad/s" if kind_of(axis) == "gyro" else "m/s²", max(map(abs, at)))
             found.append(span(at[0] * unit.factor, at[1] * unit.factor, unit.name))
         else:
-            sign, unit_name = PLACES[name]
+            sign, unit_name = RANGE_FORMATS[name]
             found.append(sign + span(*at, unit_name))
     return ", ".join(found) or "everywhere"
 
@@ -291,7 +291,7 @@ def _parameter(effect: str, name: str, bounds: Bounds, axis: str, given: Any) ->
     if isinstance(bounds.value, str):
         return Parameter(name, bounds.value, "", bounds.value, "", "" if given is None else str(given))
     known = {f.name: f.metadata for f in fields(EFFECTS[effect])}[name]  # type: ignore[arg-type]
-    unit = BY_NAME.get(name) or field_unit(known["units"][0 if kind_of(axis) == "gyro" else 1], bounds.value)
+    unit = UNITS_BY_NAME.get(name) or field_unit(known["units"][0 if kind_of(axis) == "gyro" else 1], bounds.value)
     was = "" if given is None else f"{number(given * unit.factor)} {unit.name}".rstrip()
     value, lo, hi = (None if one is None else one * unit.factor for one in (bounds.value, bounds.lo, bounds.hi))
     assert value is not None
@@ -307,7 +307,7 @@ def _parameter(effect: str, name: str, bounds: Bounds, axis: str, given: Any) ->
 def _plus_minus(value: float, lo: float, hi: float, texts: Sequence[str]) -> str:
     """Format a value with ±, or with both ends if its interval is asymmetric."""
     below, above = value - lo, hi - value
-    if abs(above - below) > EVEN * (above + below):
+    if abs(above - below) > SYMMETRY_TOLERANCE * (above + below):
         return f"{texts[0]} ({texts[1]} … {texts[2]})"
     return f"{texts[0]} ± {texts[3]}"
 
@@ -344,6 +344,7 @@ def _counted(steps: Sequence[Step]) -> list[str]:
 
 def _listed(words: Sequence[str]) -> str:
     """Join words with commas and "and".
+
     >>> _listed(["gx"]), _listed(["gx", "gy", "gz"])
     ('gx', 'gx, gy and gz')
     """

@@ -12,14 +12,14 @@ from monitor.estimation.estimate import Estimate
 
 COLUMNS = 300
 """Largest number of columns; it must be even, because columns are merged in pairs."""
-COLUMN_S = 2.0
+INITIAL_COLUMN_S = 2.0
 """Initial time span of a column [s], in sample time."""
 
 
 class Surface:
     """Allan deviations of one device over time. An estimate with other τ or an earlier time starts a new history."""
 
-    def __init__(self, column_s: float = COLUMN_S) -> None:
+    def __init__(self, column_s: float = INITIAL_COLUMN_S) -> None:
         """Create an empty history; ``column_s`` is the initial time span of a column [s]."""
         self._first_s = column_s
         self._reset(np.empty(0), 0.0)

@@ -28,13 +28,15 @@ from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH
 from monitor.publishing.rerun.scene import TIMELINE
 
 RAW_SPAN_S: Final = 30.0  # time span of raw samples in view, up to the cursor
-LABEL_SHARE: Final = 0.08  # width of half a tick label, as a share of the plot's width
-COURSES: Final = ("N", "B")
-DYNAMIC_COURSES: Final = ("N", "B", "K")
-TAUS: Final = 17  # octaves of one hour at 100 Hz; a surface with another number of τ has a slightly different height
-BOTH_KINDS: Final = 4  # largest number of devices for which the overview also shows accelerometers
+HALF_LABEL_SHARE: Final = 0.08  # width of half a tick label, as a share of the plot's width
+NOW_COEFFICIENTS: Final = ("N", "B")
+DYNAMIC_COEFFICIENTS: Final = ("N", "B", "K")
+TYPICAL_TAU_COUNT: Final = (
+    17  # octaves of one hour at 100 Hz; a surface with another number of τ has a slightly different height
+)
+MAX_DEVICES_WITH_ACCEL: Final = 4  # largest number of devices for which the overview also shows accelerometers
 COLUMNS: Final = 4
-SHORT: Final = {"gyro": "Gyro", "accel": "Accel"}
+SHORT_KIND_NAMES: Final = {"gyro": "Gyro", "accel": "Accel"}
 
 
 def blueprint(
@@ -84,7 +86,7 @@ def _device(device: str, has_model: bool, has_thermal: bool, compensated: bool) 
     )
     right = rrb.Vertical(
         rrb.Horizontal(*(_allan(device, kind) for kind in KINDS)),
-        rrb.Horizontal(*(_course(device, kind, letter) for kind in KINDS for letter in COURSES)),
+        rrb.Horizontal(*(_course(device, kind, letter) for kind in KINDS for letter in NOW_COEFFICIENTS)),
         *([rrb.Horizontal(*(_gap(device, kind) for kind in KINDS))] if has_model else []),
         rrb.Horizontal(*(_raw(device, kind) for kind in KINDS), _temperature(device), column_shares=[2, 2, 1]),
         row_shares=[5, 2.2, 1.6, 2.2] if has_model else [5, 2.2, 2.2],
@@ -149,7 +151,7 @@ def _dynamic(device: str) -> rrb.Container:
     columns = [
         rrb.Vertical(
             *(_surface(device, axis) for axis in axes_of(kind)),
-            rrb.Horizontal(*(_course(device, kind, letter) for letter in DYNAMIC_COURSES)),
+            rrb.Horizontal(*(_course(device, kind, letter) for letter in DYNAMIC_COEFFICIENTS)),
             row_shares=[3, 3, 3, 2.6],
         )
         for kind in KINDS
@@ -159,7 +161,7 @@ def _dynamic(device: str) -> rrb.Container:
 
 def _surface(device: str, axis: str) -> rrb.View:
     """Return the view of the Allan surface of one axis."""
-    x, y = dynamic_surface.bounds(TAUS)
+    x, y = dynamic_surface.bounds(TYPICAL_TAU_COUNT)
     return rrb.Spatial2DView(
         origin=f"/{device}/dynamic/{axis}",
         contents="$origin/**",
@@ -171,7 +173,7 @@ def _surface(device: str, axis: str) -> rrb.View:
 
 def _overview(devices: Sequence[str]) -> rrb.Container:
     """Return the overview of several devices."""
-    kinds = KINDS if len(devices) <= BOTH_KINDS else KINDS[:1]
+    kinds = KINDS if len(devices) <= MAX_DEVICES_WITH_ACCEL else KINDS[:1]
     charts = [_allan(d, kind, f"{d}: ") for kind in kinds for d in devices]
     return rrb.Vertical(
         rrb.Horizontal(
@@ -216,7 +218,7 @@ def _course(device: str, kind: Kind, letter: str) -> rrb.View:
     return rrb.TimeSeriesView(
         origin=f"/{device}/coefficients/{letter}",
         contents=[f"+ $origin/{axis}/**" for axis in axes_of(kind)],
-        name=f"{SHORT[kind]} {letter}, {unit}",
+        name=f"{SHORT_KIND_NAMES[kind]} {letter}, {unit}",
         plot_legend=rrb.PlotLegend(visible=False),
         axis_x=_until_cursor(),
     )
@@ -262,7 +264,7 @@ def _log_columns() -> rrb.TextLogColumns:
 
 def _last_seconds(seconds: float) -> rrb.TimeAxis:
     """Return a time axis of the last seconds, with space on the right for a tick label at the cursor."""
-    first, last = (rr.TimeRangeBoundary.cursor_relative(seconds=s) for s in (-seconds, LABEL_SHARE * seconds))
+    first, last = (rr.TimeRangeBoundary.cursor_relative(seconds=s) for s in (-seconds, HALF_LABEL_SHARE * seconds))
     return rrb.TimeAxis(view_range=rr.TimeRange(first, last))
 
 

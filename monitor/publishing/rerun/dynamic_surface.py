@@ -19,18 +19,18 @@ from monitor.publishing.plots import colours
 from monitor.publishing.rerun.allan_history import COLUMNS, Surface
 
 HEIGHT: Final = 60  # approximate height of an image [pixels]; with COLUMNS the shape of a third of a tab
-ENDS: Final = 2.0  # ends of the colour scale: half and twice the median
+COLOUR_SCALE_RATIO: Final = 2.0  # ends of the colour scale: half and twice the median
 SHADES: Final = 127  # shades on either side of the median
 NOTHING: Final = 2 * SHADES + 1  # palette index of a missing deviation
-LEAST: Final = 4  # number of columns required for a meaningful median
+MIN_COLUMNS: Final = 4  # number of columns required for a meaningful median
 BAR_X: Final = COLUMNS + 9.0
 BAR_STEPS: Final = 24
-MARGIN: Final = (24.0, 7.0, 32.0, 13.0)  # left, above, right and below the image, for labels
+LABEL_MARGINS_PX: Final = (24.0, 7.0, 32.0, 13.0)  # left, above, right and below the image, for labels
 
 
 def bounds(taus: int) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the bounds in x and y of a view for this number of τ."""
-    left, above, right, below = MARGIN
+    left, above, right, below = LABEL_MARGINS_PX
     return (-left, COLUMNS + right), (-above, _rows(taus) * taus + below)
 
 
@@ -47,7 +47,7 @@ def draw(stream: rr.RecordingStream, device: str, surface: Surface) -> None:
         Deviations over time.
     """
     whole = surface.relative()
-    if len(whole) < LEAST:
+    if len(whole) < MIN_COLUMNS:
         return
     for i, axis in enumerate(AXES):
         if not np.isfinite(whole[:, :, i]).any():
@@ -61,7 +61,7 @@ def draw(stream: rr.RecordingStream, device: str, surface: Surface) -> None:
 
 def picture(relative: Floats) -> bytes:
     """Return a PNG of ln(deviation / median), shape [columns, m]: COLUMNS pixels wide, the longest τ at the top."""
-    share = np.clip(np.nan_to_num(relative) / np.log(ENDS), -1.0, 1.0)
+    share = np.clip(np.nan_to_num(relative) / np.log(COLOUR_SCALE_RATIO), -1.0, 1.0)
     shade = np.where(np.isfinite(relative), np.rint(SHADES * (1.0 + share)), NOTHING).astype(np.uint8)
     wide = shade[np.arange(COLUMNS) * len(relative) // COLUMNS]
     image = Image.fromarray(np.repeat(wide.T[::-1], _rows(relative.shape[1]), axis=0), "P")
@@ -103,7 +103,11 @@ def _time_labels(surface: Surface, height: int) -> list[tuple[float, float, str]
 
 def _bar_labels(height: int) -> list[tuple[float, float, str]]:
     """Return the labels of the colour scale."""
-    ends = zip((2.0, height / 2.0, height - 2.0), (f"× {ENDS:g}", "× 1", f"× {1 / ENDS:g}"), strict=True)
+    ends = zip(
+        (2.0, height / 2.0, height - 2.0),
+        (f"× {COLOUR_SCALE_RATIO:g}", "× 1", f"× {1 / COLOUR_SCALE_RATIO:g}"),
+        strict=True,
+    )
     return [(BAR_X + 11.0, y, text) for y, text in ends]
 
 

@@ -21,9 +21,9 @@ from monitor.publishing.rerun.view import RerunView
 from monitor.publishing.terminal.live_table import Board, note
 from monitor.publishing.zenoh.subscriber import Message, ZenohIn
 
-TAKE_S: Final = 0.1
-TABLE_S: Final = 1.0
-ROWS: Final = 40
+RECEIVE_TIMEOUT_S: Final = 0.1
+TABLE_PERIOD_S: Final = 1.0
+MAX_ROWS: Final = 40
 """Largest number of rows of the table, about one screen; the devices left out have the fewest problems."""
 
 
@@ -85,10 +85,10 @@ class FleetView:
         end_s = None if seconds is None else time.monotonic() + seconds
         table_s, told = 0.0, ""
         while not stop.is_set() and (end_s is None or time.monotonic() < end_s):
-            for message in self._arriving.take(TAKE_S):
+            for message in self._arriving.take(RECEIVE_TIMEOUT_S):
                 self.take(message)
             now_s = time.monotonic()
-            if now_s - table_s < TABLE_S:
+            if now_s - table_s < TABLE_PERIOD_S:
                 continue
             table_s = now_s
             self.draw(time.time(), now_s)
@@ -128,7 +128,7 @@ class FleetView:
             Current time on the clock of the messages [s].
         """
         devices = self.board.devices(now_s)
-        self._viewer.overview(wall_s, fleet_text(devices, now_s, ROWS, note(self.board, self._arriving)))
+        self._viewer.overview(wall_s, fleet_text(devices, now_s, MAX_ROWS, note(self.board, self._arriving)))
 
     def _show(self, device: str, topic: topics.Topic, payload: bytes) -> None:
         """Pass a message of a device shown in detail to the viewer."""

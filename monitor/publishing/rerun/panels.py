@@ -29,9 +29,9 @@ from monitor.publishing.coefficient_cells import (
 from monitor.publishing.messages import remote_device
 from monitor.publishing.messages.remote_device import Heard
 
-SHOWN: Final = ("gx", "gy", "gz")
+FLEET_AXES: Final = ("gx", "gy", "gz")
 """Axes whose white noise is shown in the table of all devices [°/√h]."""
-WORDS: Final = {
+STATE_TEXTS: Final = {
     "running": "RUNNING",
     "waiting": "WAITING for the device",
     "lost": "LOST: the device is gone, trying again",
@@ -51,7 +51,7 @@ def health_text(device: str, health: Health, about: str = "") -> str:
     about
         Short description of the device.
     """
-    lines = [f"## {WORDS.get(health.state, health.state)}"]
+    lines = [f"## {STATE_TEXTS.get(health.state, health.state)}"]
     if health.text:
         lines.append(f"**{health.text}**")
     if health.crossed:
@@ -102,7 +102,7 @@ def fleet_text(devices: Sequence[Heard], now_s: float, rows: int, note: str = ""
     head += [f"**{remote_device.clean(note)}**"] if note else []
     table = [_fleet_row(one, now_s) for one in devices[:rows]]
     if table:
-        columns = [*("device", "state", "rate", "received", "lost", "bad"), *(f"N {axis}" for axis in SHOWN), ""]
+        columns = [*("device", "state", "rate", "received", "lost", "bad"), *(f"N {axis}" for axis in FLEET_AXES), ""]
         table = [f"| {' | '.join(columns)} |", "|:--|:--|" + "--:|" * (len(columns) - 3) + ":--|", *table]
     left = [f"… and {len(devices) - rows:,} more with less trouble"] if len(devices) > rows else []
     return "\n\n".join([*head, *(["\n".join(table)] if table else []), *left])
@@ -115,7 +115,7 @@ def _fleet_row(one: Heard, now_s: float) -> str:
     word = f"**{state.upper()}**" if one.rank(now_s) == 0 else _escape_cell(state)
     noise = [
         "" if one.noise is None else reading(one.noise.coefficients, "N", axis).value.replace("| ", "")
-        for axis in SHOWN
+        for axis in FLEET_AXES
     ]
     if status is None:
         return f"| **{name}** | {word} | | | | | {' | '.join(noise)} | nothing known yet |"

@@ -11,7 +11,7 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.history.reading import Course, Past
 
-NARROW: Final = 1.5
+MAX_INTERVAL_RATIO: Final = 1.5
 """Intervals whose ends differ from the value by more than this factor are not drawn: they would determine the scale."""
 
 
@@ -29,7 +29,7 @@ def points(past: Past, course: Course, lo: Floats, hi: Floats) -> tuple[Floats, 
     """
     start_s, width_s = past.start_s.astype(np.float64), past.width_s.astype(np.float64)
     newest_s = start_s + width_s
-    near = (lo * NARROW > course.last) & (hi < course.last * NARROW)
+    near = (lo * MAX_INTERVAL_RATIO > course.last) & (hi < course.last * MAX_INTERVAL_RATIO)
     lo, hi = np.where(near, lo, np.nan), np.where(near, hi, np.nan)
     ends = [np.fmin(lo, course.last), np.fmax(hi, course.last)]
     parts = [_rows(newest_s, course.last, lo, hi, np.isfinite(course.last))]

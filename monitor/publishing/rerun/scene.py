@@ -54,13 +54,13 @@ from monitor.publishing.rerun.panels import drift_text, health_text, noise_text,
 
 TIMELINE: Final = "sample_time"
 TEMPERATURES_PER_S: Final = 5.0
-BETWEEN: Final = 20
+POINTS_BETWEEN_ESTIMATES: Final = 20
 """Number of coefficient points between two estimates, if the estimator provides values for every sample."""
 Z95: Final = 1.959964
-PAST_EVENTS: Final = 200
+MAX_PAST_EVENTS: Final = 200
 """Largest number of stored events that are shown."""
-NARROW: Final = 1.5  # intervals whose ends differ from the value by more than this factor are not shown
-LEVELS: Final = {
+MAX_INTERVAL_RATIO: Final = 1.5  # intervals whose ends differ from the value by more than this factor are not shown
+EVENT_LOG_LEVELS: Final = {
     "link_lost": "ERROR",
     "samples_lost": "WARN",
     "noise_changed": "WARN",
@@ -225,7 +225,7 @@ class Scene:
         if np.isfinite(temperature.last).any():
             at, values = past_points.points(past, temperature, temperature.last, temperature.last)
             self._scalars(f"{device}/temperature", at, values[:, 0])
-        for event in past.events[-PAST_EVENTS:]:
+        for event in past.events[-MAX_PAST_EVENTS:]:
             text = f"{said(event.t_s)[:10]}: {event.text}"  # the log line shows only the time of day
             self.event(device, event.t_s, Event(event.kind, round(event.t_s * 1e9), text, event.axis, event.what))
 
@@ -319,7 +319,7 @@ class Scene:
             The event.
         """
         self._set_time(wall_s)
-        level, at = LEVELS.get(event.kind, "INFO"), _clock_time(wall_s)
+        level, at = EVENT_LOG_LEVELS.get(event.kind, "INFO"), _clock_time(wall_s)
         if self._fleet or len(self._shown) > 1:
             self._stream.log("overview/events", rr.TextLog(f"{at}  {device}: {event.text}", level=level))
         if device in self._devices:
@@ -531,11 +531,12 @@ class _Curve:
 def _values_between_estimates(wall_s: float, estimate: Estimate) -> tuple[Floats, Floats]:
     """Return times [n] and coefficients [n, 5, 6] since the previous estimate; the last entry is the estimate itself.
 
-    The entries are thinned to BETWEEN points, because more cannot be distinguished and would overload the viewer.
+    The entries are thinned to POINTS_BETWEEN_ESTIMATES points. More could not be distinguished and would overload the
+    viewer.
     """
     if estimate.course is None:
         return np.array([wall_s]), np.full((1, 5, 6), np.nan)
-    step = -(-estimate.course.t_ns.size // BETWEEN)
+    step = -(-estimate.course.t_ns.size // POINTS_BETWEEN_ESTIMATES)
     rows = slice((estimate.course.t_ns.size - 1) % step, None, step)
     before_s = (estimate.course.t_ns[-1] - estimate.course.t_ns[rows]) / 1e9
     return wall_s - before_s, estimate.course.value[rows].copy()
@@ -550,7 +551,11 @@ def _value_with_interval(estimate: Estimate, row: int, column: int) -> tuple[flo
     if c.status[row, column] != Status.ESTIMATED:
         return np.nan, np.nan, np.nan
     value, lo, hi = (float(part[row, column]) for part in (c.value, c.lo, c.hi))
-    return (value, lo, hi) if lo * NARROW > value and hi < value * NARROW else (value, np.nan, np.nan)
+    return (
+        (value, lo, hi)
+        if lo * MAX_INTERVAL_RATIO > value and hi < value * MAX_INTERVAL_RATIO
+        else (value, np.nan, np.nan)
+    )
 
 
 def _thermal(one: AxisThermal | None) -> tuple[float, float, float, float]:

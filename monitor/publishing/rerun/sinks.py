@@ -38,12 +38,12 @@ from monitor.publishing.rerun.viewer_settings import ViewerClosed, ViewerSetting
 
 LOOPBACK: Final = "127.0.0.1"
 APPLICATION: Final = "imu-monitor"
-START_S: Final = 20.0  # timeout for the viewer to listen: the first start of a 300 MB program from a slow disk
+START_TIMEOUT_S: Final = 20.0  # timeout for the viewer to listen: the first start of a 300 MB program from a slow disk
 PORTS_TRIED: Final = 20
 CLOSED: Final = "viewer was closed: start `rerun` to look again"
 PROGRAM_MIB: Final = 256  # memory of the program itself; an empty viewer window uses 125 to 170 MB
-LIVE_FLUSH_S: Final = 0.2  # appears continuous; Rerun keeps about 1 kB per chunk in addition to the data
-PROBE: Final = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadTables"
+LIVE_FLUSH_PERIOD_S: Final = 0.2  # appears continuous; Rerun keeps about 1 kB per chunk in addition to the data
+PROBE_METHOD: Final = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadTables"
 
 
 def has_desktop() -> bool:
@@ -189,7 +189,7 @@ def is_rerun(port: int) -> bool:
 
     Other gRPC servers answer "unimplemented" (status 12), and other servers do not answer with gRPC.
     """
-    reply = ask(port, PROBE, 1.0)
+    reply = ask(port, PROBE_METHOD, 1.0)
     return reply is not None and "grpc" in reply.get("content-type", "") and reply.get("grpc-status") != "12"
 
 
@@ -362,7 +362,7 @@ def _connected(port: int, recording_id: str, child: Child | None = None, joined_
     """Return an output that is connected to a Rerun server."""
     stream = _stream(recording_id)
     stream.set_sinks(rr.GrpcSink(server_url(port)))
-    return Output(stream, LIVE_FLUSH_S, server_url(port), child, port)
+    return Output(stream, LIVE_FLUSH_PERIOD_S, server_url(port), child, port)
 
 
 def _stream(recording_id: str) -> rr.RecordingStream:
@@ -381,7 +381,7 @@ def _stream(recording_id: str) -> rr.RecordingStream:
 
 def _wait_for(port: int, child: Child, given_up: Callable[[], bool]) -> None:
     """Wait until the viewer listens; end it and raise ViewerTrouble if it does not."""
-    end = time.monotonic() + START_S
+    end = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < end and not given_up():
         trouble = child.trouble()
         if trouble is not None:
@@ -391,4 +391,4 @@ def _wait_for(port: int, child: Child, given_up: Callable[[], bool]) -> None:
             return
         time.sleep(0.05)
     child.end()
-    raise ViewerTrouble(f"the viewer did not listen on {port} within {START_S:.0f} s")
+    raise ViewerTrouble(f"the viewer did not listen on {port} within {START_TIMEOUT_S:.0f} s")

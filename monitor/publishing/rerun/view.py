@@ -37,14 +37,14 @@ if TYPE_CHECKING:
     from monitor.publishing.rerun.sinks import Child, Output
 
 BACKLOG_BYTES: Final = 16_000_000  # about 25 s of 16 devices at 1 kHz with six axes
-CHECK_EVERY_S: Final = 1.0  # interval between checks that drawn data have reached the viewer
+CONFIRM_PERIOD_S: Final = 1.0  # interval between checks that drawn data have reached the viewer
 PATIENCE_S: Final = 1.0  # timeout of this check
-STALL_S: Final = 2.0  # duration of one Rerun call above which the viewer counts as stalled
+STALL_TIMEOUT_S: Final = 2.0  # duration of one Rerun call above which the viewer counts as stalled
 RETRY_S: Final = (2.0, 5.0, 15.0, 30.0)
 PLOTS_PER_S: Final = 8.0  # rate of Allan plots, shared by all devices; at most one per second and device
-COURSE_EVERY_S: Final = 5.0  # interval at which collected coefficient points are sent
-COURSE_STEP_S: Final = 1.0  # interval between two coefficient points, in sample time
-EARLY_END_S: Final = 10.0  # a window that closes sooner is taken as not working
+POINTS_PERIOD_S: Final = 5.0  # interval at which collected coefficient points are sent
+POINT_INTERVAL_S: Final = 1.0  # interval between two coefficient points, in sample time
+MIN_WINDOW_LIFETIME_S: Final = 10.0  # a window that closes sooner is taken as not working
 MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
 
 Recall = Callable[[str], Past | None]
@@ -166,7 +166,7 @@ class RerunView:
     def state(self) -> str:
         """``ok``, or a short description of what is wrong; part of the status message."""
         inside = self._inside_since
-        if self._stalled or (inside is not None and time.monotonic() - inside > STALL_S):
+        if self._stalled or (inside is not None and time.monotonic() - inside > STALL_TIMEOUT_S):
             return f"stalled ({self._backlog.dropped} dropped)"
         return self._phase
 
@@ -374,7 +374,7 @@ class RerunView:
         if self._closing.is_set():
             return settings, attempt
         attempt = 0 if lived_s > 60.0 or settings.mode == "join" else attempt + 1
-        if settings.mode == "auto" and lived_s < EARLY_END_S:
+        if settings.mode == "auto" and lived_s < MIN_WINDOW_LIFETIME_S:
             return replace(settings, mode="web"), attempt
         self._closing.wait(RETRY_S[min(attempt, len(RETRY_S) - 1)])
         return settings, attempt
@@ -435,7 +435,7 @@ class RerunView:
                     self._draw_history(scene, device)
             queue.draw(scene, everything=closing)
             now = time.monotonic()
-            if closing or now - checked > CHECK_EVERY_S:
+            if closing or now - checked > CONFIRM_PERIOD_S:
                 self._confirm(output)
                 checked = time.monotonic()
             self._inside_since = None
@@ -531,7 +531,7 @@ class _Pending:
             scene.thermal(device, np.array([one.wall_s for one in means]), [one.look for one in means])
         self.thermals.clear()
         for device in list(self.gaps):  # before the plot, which also shows the curve of the model
-            if everything or self._due("gap", device, COURSE_STEP_S):
+            if everything or self._due("gap", device, POINT_INTERVAL_S):
                 looks = self.gaps.pop(device)
                 scene.gaps(device, np.array([g.wall_s for g in looks]), [g.gap for g in looks])
         for device in list(self.newest):
@@ -539,23 +539,23 @@ class _Pending:
                 newest = self.newest.pop(device)
                 scene.estimate(device, newest.wall_s, newest.estimate)
         for device in list(self.course):
-            if everything or self._due("course", device, COURSE_EVERY_S):
+            if everything or self._due("course", device, POINTS_PERIOD_S):
                 points = self.course.pop(device)
                 scene.courses(device, np.array([p.wall_s for p in points]), [p.estimate for p in points])
 
     def _add_to_course(self, device: str, message: _Estimate) -> None:
-        """Add a coefficient point; replace the previous one if it is younger than COURSE_STEP_S."""
+        """Add a coefficient point; replace the previous one if it is younger than POINT_INTERVAL_S."""
         points = self.course.setdefault(device, [])
-        if len(points) > 1 and message.wall_s - points[-2].wall_s < COURSE_STEP_S:
+        if len(points) > 1 and message.wall_s - points[-2].wall_s < POINT_INTERVAL_S:
             # The per-sample values between the points are kept.
             course = joined([part for part in (points.pop().estimate.course, message.estimate.course) if part])
             message = _Estimate(message.wall_s, replace(message.estimate, course=course))
         points.append(message)
 
     def _add_gap(self, device: str, message: _Gap) -> None:
-        """Add a comparison; replace the previous one if it is younger than COURSE_STEP_S."""
+        """Add a comparison; replace the previous one if it is younger than POINT_INTERVAL_S."""
         looks = self.gaps.setdefault(device, [])
-        if len(looks) > 1 and message.wall_s - looks[-2].wall_s < COURSE_STEP_S:
+        if len(looks) > 1 and message.wall_s - looks[-2].wall_s < POINT_INTERVAL_S:
             looks.pop()
         looks.append(message)
 

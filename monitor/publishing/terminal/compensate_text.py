@@ -16,7 +16,7 @@ from monitor.publishing.rerun.panels import duration
 
 SCHEMA: Final = "imu-monitor/compensate/1"
 UNIT: Final = DEVIATION_UNITS["gyro"]
-NAMES: Final = ("phi1", "phi2", "theta1")
+ARMA_COEFFICIENT_NAMES: Final = ("phi1", "phi2", "theta1")
 """JSON keys of the ARMA coefficients."""
 
 
@@ -99,7 +99,7 @@ def _model(model: Arma) -> dict[str, Any]:
         "order": list(model.order),
         **{
             name: {"value": value, "lo": lo, "hi": hi}
-            for name, value, lo, hi in zip(NAMES, values, model.lo, model.hi, strict=True)
+            for name, value, lo, hi in zip(ARMA_COEFFICIENT_NAMES, values, model.lo, model.hi, strict=True)
             if np.isfinite(lo)
         },
         "variance": model.variance,

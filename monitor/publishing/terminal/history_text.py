@@ -21,14 +21,14 @@ from monitor.publishing.coefficient_cells import KIND_NAMES, KINDS, Kind, axes_o
 
 LETTERS: Final = ("N", "B", "K")
 """Coefficients shown for all axes; for a single axis all five are shown."""
-HEIGHTS: Final = "▁▂▃▄▅▆▇█"
+SPARKLINE_HEIGHTS: Final = "▁▂▃▄▅▆▇█"
 GAP: Final = "·"
-WIDTH: Final = 32
+SPARKLINE_WIDTH: Final = 32
 """Width of a sparkline [characters]."""
-EVENTS: Final = 20
+MAX_EVENTS: Final = 20
 """Largest number of events that are printed."""
-NONE: Final = "—"
-UNITS: Final = ((86_400, "d"), (3600, "h"), (60, "min"), (1, "s"))
+NO_VALUE: Final = "—"
+WIDTH_UNITS: Final = ((86_400, "d"), (3600, "h"), (60, "min"), (1, "s"))
 """Units of bucket widths, the largest first."""
 
 
@@ -88,7 +88,7 @@ def tell_course(past: Past, axis: str, letters: tuple[str, ...], console: Consol
 
 
 def tell_events(past: Past, console: Console) -> None:
-    """Print the newest EVENTS events.
+    """Print the newest MAX_EVENTS events.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def tell_events(past: Past, console: Console) -> None:
     """
     if not past.events:
         return
-    shown = past.events[-EVENTS:]
+    shown = past.events[-MAX_EVENTS:]
     more = past.events_in_all - len(shown)
     console.print()
     if more > 0:
@@ -140,7 +140,7 @@ def status_lines(past: Past) -> list[str]:
     return lines
 
 
-def sparkline(last: Floats, t_s: Floats, span: tuple[float, float], width: int = WIDTH) -> str:
+def sparkline(last: Floats, t_s: Floats, span: tuple[float, float], width: int = SPARKLINE_WIDTH) -> str:
     """Draw values between two times as text; each character shows the mean of its time interval.
 
     >>> steps = np.arange(8.0)
@@ -165,8 +165,8 @@ def sparkline(last: Floats, t_s: Floats, span: tuple[float, float], width: int =
     count = np.bincount(at, minlength=width)
     means = np.bincount(at, last[there], width)[count > 0] / count[count > 0]
     low, wide = means.min(), np.ptp(means)
-    heights = ((means - low) / wide if wide > 0.0 else np.full(means.size, 0.5)) * len(HEIGHTS)
-    marks = iter([HEIGHTS[min(int(one), len(HEIGHTS) - 1)] for one in heights])
+    heights = ((means - low) / wide if wide > 0.0 else np.full(means.size, 0.5)) * len(SPARKLINE_HEIGHTS)
+    marks = iter([SPARKLINE_HEIGHTS[min(int(one), len(SPARKLINE_HEIGHTS) - 1)] for one in heights])
     return "".join(next(marks) if some else GAP for some in count)
 
 
@@ -185,7 +185,7 @@ def _summary(past: Past, kind: Kind, axes: list[str], letters: tuple[str, ...]) 
             label = Text.assemble((f"{axis} {letter}", "bold"), f"  {unit.name}")
             there = course.last[np.isfinite(course.last)]
             if not there.size:
-                table.add_row(label, NONE, *_bound(past, axis, letter), "")
+                table.add_row(label, NO_VALUE, *_bound(past, axis, letter), "")
                 continue
             numbers = [float(one) * unit.factor for one in (there[0], there[-1], *_extremes(course))]
             table.add_row(label, *(number(one) for one in numbers), sparkline(course.last, middle_s, span))
@@ -197,8 +197,8 @@ def _bound(past: Past, axis: str, letter: str) -> tuple[str, str, str]:
     bound, unit = past.column(f"{axis}.{letter}.bound"), unit_of(letter, axis)
     there = bound.last[np.isfinite(bound.last)]
     if not there.size:
-        return NONE, NONE, NONE
-    return f"≤ {number(float(there[-1]) * unit.factor)}", NONE, NONE
+        return NO_VALUE, NO_VALUE, NO_VALUE
+    return f"≤ {number(float(there[-1]) * unit.factor)}", NO_VALUE, NO_VALUE
 
 
 def _cell(past: Past, axis: str, letter: str, p: int) -> str:
@@ -209,7 +209,7 @@ def _cell(past: Past, axis: str, letter: str, p: int) -> str:
         alike = number(low) == number(high)
         return number(last) if alike else f"{number(last)} [{number(low)} … {number(high)}]"
     bound = float(past.column(f"{axis}.{letter}.bound").last[p]) * unit.factor
-    return f"≤ {number(bound)}" if math.isfinite(bound) else NONE
+    return f"≤ {number(bound)}" if math.isfinite(bound) else NO_VALUE
 
 
 def _format_width(seconds: int) -> str:
@@ -218,7 +218,7 @@ def _format_width(seconds: int) -> str:
     >>> _format_width(300), _format_width(21_600), _format_width(604_800)
     ('5 min', '6 h', '7 d')
     """
-    unit_s, unit = next((size, name) for size, name in UNITS if seconds % size == 0)
+    unit_s, unit = next((size, name) for size, name in WIDTH_UNITS if seconds % size == 0)
     return f"{seconds // unit_s} {unit}"
 
 

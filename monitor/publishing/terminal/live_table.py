@@ -35,22 +35,22 @@ from monitor.publishing.rerun.panels import duration
 from monitor.publishing.terminal.queued_writer import QueuedWriter
 from monitor.publishing.zenoh.subscriber import KEYEXPR, ZenohIn
 
-REFRESH_S: Final = 0.5
+REFRESH_PERIOD_S: Final = 0.5
 DEVICES: Final = 20_000
 """Largest number of devices. A further device replaces one that has been silent for FORGET_S, or is ignored."""
 FORGET_S: Final = 600.0
-KEY_LENGTH: Final = 200
-QUIET_S: Final = 5.0
+MAX_KEY_LENGTH: Final = 200
+SILENCE_NOTE_S: Final = 5.0
 """Time without any message after which the note says so, because access control refuses silently."""
 STDOUT: Final = "standard output"
-PLAIN_S: Final = 1.0
+PLAIN_PERIOD_S: Final = 1.0
 """Interval between two tables if the output is not a terminal."""
 EVENTS: Final = 5
-TROUBLES: Final = 6
-HEADS: Final = 6
+MAX_TROUBLE_LINES: Final = 6
+HEADER_LINES: Final = 6
 """Lines of the screen without a table row: summary, note, table head and blank lines."""
-SHOWN: Final[tuple[tuple[Kind, str], ...]] = (("gyro", "N"), ("gyro", "B"), ("accel", "N"))
-NONE: Final = "—"
+TABLE_COEFFICIENTS: Final[tuple[tuple[Kind, str], ...]] = (("gyro", "N"), ("gyro", "B"), ("accel", "N"))
+NO_VALUE: Final = "—"
 K_OR_R: Final = "K or R"
 STATES: Final = {
     "running": ("●", "green"),
@@ -62,7 +62,7 @@ STATES: Final = {
     "ended": ("■", "cyan"),
 }
 """Symbol and colour of each state."""
-UNKNOWN: Final = ("?", "yellow")
+UNKNOWN_STATE_STYLE: Final = ("?", "yellow")
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ class Layout:
 
 
 LAYOUTS: Final = (Layout(3, True, False, 2), Layout(3, False, False, 1), Layout(2, False, False, 1))
-NARROW: Final = Layout(3, False, True, 1)
+NARROW_LAYOUT: Final = Layout(3, False, True, 1)
 
 
 class Board:
@@ -203,7 +203,7 @@ class Board:
             return known
         now_s = self._clock()
         full = len(self._devices) >= DEVICES
-        if len(device) > KEY_LENGTH or (full and now_s - next(iter(self._devices.values())).heard_s < FORGET_S):
+        if len(device) > MAX_KEY_LENGTH or (full and now_s - next(iter(self._devices.values())).heard_s < FORGET_S):
             self.passed_over += 1
             return None
         if full:
@@ -216,7 +216,7 @@ class Board:
         counts = Counter(one.state(now_s) for one in devices)
         line.append(f"  {len(devices)} device{'' if len(devices) == 1 else 's'}", style="not bold")
         for state, count in counts.items():
-            sign, colour = STATES.get(state, UNKNOWN)
+            sign, colour = STATES.get(state, UNKNOWN_STATE_STYLE)
             line.append(f"  {sign} {count} {state}", style=f"not bold {colour}")
         if self.malformed:
             line.append(
@@ -238,7 +238,7 @@ class Fleet:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Yield the table, and a line with the number of devices that are not shown."""
-        layout = next((one for one in LAYOUTS if self._fits(one, console, options)), NARROW)
+        layout = next((one for one in LAYOUTS if self._fits(one, console, options)), NARROW_LAYOUT)
         room = self._visible_rows(layout, console)
         yield fleet_table(self._devices[:room], self._now_s, layout)
         if len(self._devices) > room:
@@ -248,7 +248,7 @@ class Fleet:
         """Return the number of rows that are shown; all rows if the output is not a terminal."""
         if not console.is_terminal:
             return len(self._devices)
-        return max((console.size.height - EVENTS - TROUBLES - HEADS) // (3 if layout.stacked else 1), 3)
+        return max((console.size.height - EVENTS - MAX_TROUBLE_LINES - HEADER_LINES) // (3 if layout.stacked else 1), 3)
 
     def _fits(self, layout: Layout, console: Console, options: ConsoleOptions) -> bool:
         """Return True if the table in this layout fits into the width."""
@@ -273,7 +273,7 @@ def fleet_table(devices: Sequence[Heard], now_s: float, layout: Layout) -> Table
         table.add_column(head, no_wrap=True)
     for head in ("Hz", "received", "lost", "bad"):
         table.add_column(head, justify="right", no_wrap=True)
-    shown = [pair for pair in SHOWN if any(_has_axis_of(one, pair[0]) for one in devices)]
+    shown = [pair for pair in TABLE_COEFFICIENTS if any(_has_axis_of(one, pair[0]) for one in devices)]
     noise = [_noise_column(devices, kind, letter, layout) for kind, letter in shown]
     if layout.stacked and shown:
         noise.insert(0, (Text(), [Text("x\ny\nz" if one.noise else "", style="bold") for one in devices]))
@@ -388,14 +388,14 @@ def watch(
                 out.finish(stop)
         elif console.is_terminal:
             with QueuedWriter(
-                cast("TextIO", console.file), STDOUT, LiveTable(console, board).render, REFRESH_S
+                cast("TextIO", console.file), STDOUT, LiveTable(console, board).render, REFRESH_PERIOD_S
             ) as screen:
-                while not stop.wait(REFRESH_S) and screen.error is None:
+                while not stop.wait(REFRESH_PERIOD_S) and screen.error is None:
                     _take(board, arriving)
                     screen.redraw()
         else:
             with QueuedWriter(cast("TextIO", console.file), STDOUT, limit=1) as out:  # queue at most one table
-                while not stop.wait(PLAIN_S) and out.error is None:
+                while not stop.wait(PLAIN_PERIOD_S) and out.error is None:
                     _take(board, arriving)
                     with console.capture() as captured:
                         console.print(board.table(time.monotonic()))
@@ -424,7 +424,7 @@ def note(board: Board, arriving: ZenohIn) -> str:
     """
     state, dropped = arriving.state, arriving.dropped
     notes = [state] if state != "ok" else []
-    if state == "ok" and arriving.open_s > QUIET_S and not board.devices(time.monotonic()):
+    if state == "ok" and arriving.open_s > SILENCE_NOTE_S and not board.devices(time.monotonic()):
         notes.append("connected, but nothing comes: no daemon there, or no right to listen")
     notes += [f"{dropped:,} messages dropped: too slow here"] if dropped else []
     return "; ".join(notes)
@@ -442,15 +442,15 @@ def _names(keys: Sequence[str]) -> dict[str, str]:
 
 def _state(state: str) -> Text:
     """Return the symbol and name of a state in its colour."""
-    sign, colour = STATES.get(state, UNKNOWN)
+    sign, colour = STATES.get(state, UNKNOWN_STATE_STYLE)
     return Text(f"{sign} {state}", style=colour)
 
 
 def _counts(one: Heard, layout: Layout) -> list[Text]:
     """Return the cells of the rate and of the sample counters."""
     if one.status is None:
-        return [Text(NONE, style="dim")] * 4
-    rate = NONE if one.status.rate is None else coefficient_cells.number(one.status.rate, 4)
+        return [Text(NO_VALUE, style="dim")] * 4
+    rate = NO_VALUE if one.status.rate is None else coefficient_cells.number(one.status.rate, 4)
     write = _format_full_count if layout.full_counts else _format_short_count
     lost, bad = (Text(write(count), style="yellow" if count else "dim") for count in (one.status.lost, one.status.bad))
     return [Text(rate), Text(write(one.status.received)), lost, bad]
@@ -459,7 +459,7 @@ def _counts(one: Heard, layout: Layout) -> list[Text]:
 def _latency(one: Heard) -> Text:
     """Return the cell of the 99th percentile of the latency [ms]."""
     p99_s = None if one.status is None else one.status.latency.p99
-    return Text(NONE, style="dim") if p99_s is None else Text(coefficient_cells.number(p99_s * 1e3, 2))
+    return Text(NO_VALUE, style="dim") if p99_s is None else Text(coefficient_cells.number(p99_s * 1e3, 2))
 
 
 def _format_full_count(count: int) -> str:
@@ -533,11 +533,14 @@ def _troubles(devices: Sequence[Heard], now_s: float) -> list[Text]:
     lines = []
     for one in devices:
         if trouble := one.trouble():
-            sign, colour = STATES.get(one.state(now_s), UNKNOWN)
+            sign, colour = STATES.get(one.state(now_s), UNKNOWN_STATE_STYLE)
             sign = "!" if sign == "●" else sign
             lines.append(Text.assemble((f"{sign} {names[one.key]}  ", colour), trouble))
-    if len(lines) > TROUBLES:
-        lines = [*lines[: TROUBLES - 1], Text(f"… and {len(lines) - TROUBLES + 1} more with trouble", style="dim")]
+    if len(lines) > MAX_TROUBLE_LINES:
+        lines = [
+            *lines[: MAX_TROUBLE_LINES - 1],
+            Text(f"… and {len(lines) - MAX_TROUBLE_LINES + 1} more with trouble", style="dim"),
+        ]
     return lines
 
 
@@ -580,7 +583,9 @@ def _coefficient_tables(
     known += (
         f"; {coefficient_cells.TEMPERATURE_MARK} {coefficient_cells.TEMPERATURE_MEANS}" if axes_of_temperature else ""
     )
-    parts: list[RenderableType] = [Text(f"{seen}[95 % interval]; ≤ bound; {NONE} too few data yet{known}", style="dim")]
+    parts: list[RenderableType] = [
+        Text(f"{seen}[95 % interval]; ≤ bound; {NO_VALUE} too few data yet{known}", style="dim")
+    ]
     for kind in coefficient_cells.KINDS:
         if set(coefficient_cells.axes_of(kind)) & set(noise.axes):
             wide, narrow = (detail_table(noise, kind, each, either, axes_of_temperature) for each in (False, True))

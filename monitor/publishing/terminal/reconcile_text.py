@@ -20,7 +20,7 @@ from monitor.publishing.rerun.panels import duration
 from monitor.reconcile.result import AxisResult, Reconciliation, Step
 from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, Seen
 
-STYLES: Final = {
+RESULT_STYLES: Final = {
     "agrees": ("●", "green"),
     "explained": ("●", "green"),
     "partly_explained": ("◐", "yellow"),
@@ -79,7 +79,7 @@ def _step(r: Reconciliation, axis: str, step: Step) -> tuple[str, str, Text]:
 
 def _verdict(verdict: str) -> Text:
     """Return the symbol and word of a result in its colour."""
-    sign, style = STYLES[verdict]
+    sign, style = RESULT_STYLES[verdict]
     return Text(f"{sign} {words.VERDICTS[verdict]}", style=style)
 
 
@@ -153,8 +153,7 @@ def _single(c: Comparison) -> list[tuple[str, Text]]:
 
 
 def _single_on(c: Comparison, axis: str, one: AxisRuns) -> list[tuple[str, Text]]:
-    """Return the lines of one axis for effects that only some recordings show, and why they are absent in the
-    others."""
+    """Return the lines of effects on one axis that only some recordings show, with reasons for their absence."""
     found = []
     for seen in one.single:
         said = _effect(c, axis, seen)

@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from zenoh.ext import AdvancedPublisher
 
 RETRY_S: Final = 2.0
-QUERIES_WAITING: Final = 64
+MAX_QUEUED_QUERIES: Final = 64
 """Capacity of the queue of commands and of each channel of queries."""
-LOOK_S: Final = 3.0
+REFUSAL_CHECK_S: Final = 3.0
 """Interval between two checks of why a router refuses the connection."""
-TWIN_S: Final = 10.0
+DUPLICATE_REPORT_S: Final = 10.0
 """Time during which a status that another program published under the same key is reported."""
 
 
@@ -76,7 +76,7 @@ class ZenohOut:
         self._recall = recall
         self._session_state = "off" if settings.mode == "none" else "not open yet"
         self._unsent = ""  # reason why the newest message could not be sent
-        self.commands: queue.Queue[Command] = queue.Queue(QUERIES_WAITING)
+        self.commands: queue.Queue[Command] = queue.Queue(MAX_QUEUED_QUERIES)
         self._devices = tuple(devices)
         self._alive: dict[str, bool] = dict.fromkeys(devices, False)
         self._session: zenoh.Session | None = None
@@ -215,7 +215,7 @@ class ZenohOut:
                 self._closing.wait(RETRY_S)
             else:
                 break
-        while self._connect and not self._closing.wait(LOOK_S):
+        while self._connect and not self._closing.wait(REFUSAL_CHECK_S):
             session = self._session
             self._refusal = self._find_refusal() if session is not None and alone(session) else ""
         if self._closing.is_set():  # close() may have stopped waiting before the session was open
@@ -329,7 +329,7 @@ class ZenohOut:
         import zenoh
 
         key = f"{self.settings.prefix}/{device}/command/*"
-        queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(QUERIES_WAITING))
+        queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(MAX_QUEUED_QUERIES))
         taker = threading.Thread(
             target=self._take_queries, args=(device, queryable), name=f"commands of {device}", daemon=True
         )
@@ -341,7 +341,7 @@ class ZenohOut:
         import zenoh
 
         key = topics.HISTORY.key(self.settings.prefix, device)
-        queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(QUERIES_WAITING))
+        queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(MAX_QUEUED_QUERIES))
         taker = threading.Thread(
             target=self._answer_history, args=(device, key, queryable, recall), name=f"history of {device}", daemon=True
         )
@@ -424,12 +424,12 @@ class _DuplicatePublishers:
         self._subscribers, self._heard_s = {}, {}
 
     def found(self, now_s: float) -> str:
-        """Return a message if another program published a device's status within the last TWIN_S; else ""."""
+        """Return a message if another program published a device's status within DUPLICATE_REPORT_S; else ""."""
         for device, one in self._subscribers.items():
             with contextlib.suppress(*_zenoh_errors()):  # the session is being closed
                 if one.handler.try_recv() is not None:
                     self._heard_s[device] = now_s
-        keys = [f"{self._prefix}/{one}" for one, at_s in self._heard_s.items() if now_s - at_s < TWIN_S]
+        keys = [f"{self._prefix}/{one}" for one, at_s in self._heard_s.items() if now_s - at_s < DUPLICATE_REPORT_S]
         if not keys:
             return ""
         return f"another program publishes {', '.join(sorted(keys))} too; change a device's name, or zenoh.prefix"

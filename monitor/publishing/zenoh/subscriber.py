@@ -10,7 +10,7 @@ A late subscriber receives the last values and last events that daemons keep for
 connection, it also receives the missed events. Each subscription ends in a ring of zenoh that drops its oldest
 entries. A thread moves the entries to one common queue, because a Python callback that is registered at exit would
 block the process. ``take`` returns messages in order of arrival within a topic; payloads are not decoded here. Memory
-is bounded: zenoh rejects messages above ``MESSAGE_BYTES``, and the queue drops its oldest entries.
+is bounded: zenoh rejects messages above ``MAX_MESSAGE_BYTES``, and the queue drops its oldest entries.
 """
 
 import threading
@@ -34,22 +34,22 @@ if TYPE_CHECKING:
 
 KEYEXPR: Final = "imu/**"
 TOPICS: Final = (topics.STATUS, topics.COEFFICIENTS, topics.EVENT)
-DETAIL: Final = (topics.SAMPLES, topics.ALLAN, topics.GAP)
+DETAIL_TOPICS: Final = (topics.SAMPLES, topics.ALLAN, topics.GAP)
 """Topics of devices shown in detail, in addition to TOPICS."""
 RING_MESSAGES: Final = 4096
 BACKLOG_BYTES: Final = 16_000_000
-MESSAGE_BYTES: Final = 4_000_000
+MAX_MESSAGE_BYTES: Final = 4_000_000
 """Longest accepted message; batches of samples of a fast replay are the longest, all others have a few kilobytes."""
-BEAT_S: Final = 0.25
+CONNECTION_CHECK_S: Final = 0.25
 """Interval between two checks that an endpoint is still connected."""
-TOKENS: Final = 20_000
+MAX_TOKENS: Final = 20_000
 """Largest number of liveliness tokens that are remembered per endpoint."""
-LOOK_S: Final = 3.0
+REFUSAL_CHECK_S: Final = 3.0
 """Interval between two checks of why an endpoint refuses the connection."""
 RETRY_S: Final = 1.0
-OPENING_S: Final = 5.0
+CLOSE_TIMEOUT_S: Final = 5.0
 """Longest time that ``close`` waits for a session that is being opened."""
-REMEMBERED: Final = 20_000
+MAX_REMEMBERED_MESSAGES: Final = 20_000
 """Number of messages remembered to remove duplicates from several endpoints: two seconds of 1000 devices at 10 Hz."""
 
 
@@ -91,7 +91,7 @@ class ZenohIn:
     ) -> None:
         keys = {topic: narrowed(keyexpr, topic) for topic in (*TOPICS, topics.ALIVE)}
         _check_keys(keyexpr, [key for part in keys.values() for key in part])
-        keys |= {topic: tuple(f"{device}/{topic.name}" for device in detail) for topic in DETAIL}
+        keys |= {topic: tuple(f"{device}/{topic.name}" for device in detail) for topic in DETAIL_TOPICS}
         self._backlog: Backlog[Message] = Backlog(BACKLOG_BYTES)
         found = listeners(connect, file)
         self._duplicate_filter = _DuplicateFilter() if len(found) > 1 else None
@@ -158,7 +158,7 @@ class _DuplicateFilter:
             if (key, stamp) in self._seen:
                 return False
             self._seen[key, stamp] = None
-            if len(self._seen) > REMEMBERED:
+            if len(self._seen) > MAX_REMEMBERED_MESSAGES:
                 self._seen.popitem(last=False)
             return True
 
@@ -203,7 +203,7 @@ class _EndpointSession:
         """Close the session and stop the threads."""
         self.closing.set()
         if self._opener.is_alive():
-            self._opener.join(OPENING_S)
+            self._opener.join(CLOSE_TIMEOUT_S)
         self._close_session()
 
     def _keep_open(self) -> None:
@@ -224,15 +224,15 @@ class _EndpointSession:
 
     def _monitor(self) -> None:
         """Monitor the connection until closed. zenoh reconnects by itself, but keeps the tokens of a lost endpoint."""
-        asked_s = -LOOK_S
-        while not self.closing.wait(BEAT_S):
+        asked_s = -REFUSAL_CHECK_S
+        while not self.closing.wait(CONNECTION_CHECK_S):
             if self.open:
                 self.why, self._since_s = "", self._since_s or time.monotonic()
                 continue
             self._since_s = None
             while self._tokens:
                 self._push(Message(self._tokens.pop(), None, there=False), "")
-            if time.monotonic() - asked_s >= LOOK_S:
+            if time.monotonic() - asked_s >= REFUSAL_CHECK_S:
                 self.why = why(self._endpoint, self._config)
                 asked_s = time.monotonic()
 
@@ -270,7 +270,7 @@ class _EndpointSession:
             if liveliness:
                 if not there:
                     self._tokens.discard(key)
-                elif len(self._tokens) < TOKENS:
+                elif len(self._tokens) < MAX_TOKENS:
                     self._tokens.add(key)
             stamp = "" if liveliness or sample.timestamp is None else str(sample.timestamp)
             self._push(Message(key, None if liveliness else bytes(sample.payload), there), stamp)
@@ -324,7 +324,7 @@ def listeners(connect: Sequence[str], file: Path | None) -> dict[str, "zenoh.Con
     except zenoh.ZError as error:
         text = plain(error)
         raise ConfigError(text if text.startswith(str(file)) else f"{file}: {text}") from error
-    unsaid = {**CLOSED, "transport/link/rx/max_message_size": MESSAGE_BYTES}
+    unsaid = {**CLOSED, "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES}
     found = {}
     for endpoint in dict.fromkeys(connect or theirs or (topics.ENDPOINT,)):
         own = {"mode": "client", "connect/endpoints": [endpoint], "listen/endpoints": []}
@@ -336,8 +336,7 @@ def listeners(connect: Sequence[str], file: Path | None) -> dict[str, "zenoh.Con
 
 
 def _subscriber(session: "zenoh.Session", topic: topics.Topic, key: str) -> Any:
-    """Subscribe to a key, including the values that daemons keep for late subscribers and the events missed
-    meanwhile."""
+    """Subscribe to a key, including the values that daemons keep for late subscribers and missed events."""
     import zenoh
     from zenoh import ext
 
