@@ -1,11 +1,11 @@
 """Columns of a history row, and the conversion of an estimate into column values.
 
-Each measured axis and letter has the columns ``gz.N`` (value, if estimated), ``gz.N.lo`` and ``gz.N.hi`` (ends of its
-interval) and ``gz.N.bound`` (the upper bound, if the data only bound the value). The set of present columns encodes the
-status, so a value is never stored without its status. Deviations are stored at the averaging times 1, 3, 10 … s
-(``gz.sigma.0.3``). The grid of the curve depends on the measured rate, so the deviations are interpolated linearly in
-log-log between two neighbouring points. Half an octave from a point of a five-term curve, the error is below 1 %.
-The module does no I/O.
+Each measured axis and letter has four columns. ``gz.N`` is the value, if it is estimated. ``gz.N.lo`` and ``gz.N.hi``
+are the ends of its interval. ``gz.N.bound`` is the upper bound, if the data only bound the value. The set of present
+columns encodes the status, so a value is never stored without its status. Deviations are stored at the averaging times
+1, 3, 10 … s (``gz.sigma.0.3``). The grid of the curve depends on the measured rate, so the deviations are interpolated
+linearly in log-log between two neighbouring points. Half an octave from a point of a five-term curve, the error is
+below 1 %. The module does no I/O.
 """
 
 from typing import Final

@@ -1,9 +1,9 @@
 """Aggregation of one device's results into rows of one minute, by the time of the samples.
 
 A row is returned when the first result of the next minute arrives. A result that is slightly late is counted in the
-current row. A result from an earlier time (the clock was set back, or a recording is replayed) begins a new row, which
-the store merges with the existing one. When the process ends, at most one minute of aggregated results is lost.
-The module does no I/O.
+current row. A result from an earlier time begins a new row, for example after the clock was set back or when a
+recording is replayed. The store merges this row with the existing one. When the process ends, at most one minute of
+aggregated results is lost. The module does no I/O.
 """
 
 from typing import Final

@@ -6,9 +6,9 @@ merges the rows of one wider bucket per transaction, so each moment belongs to e
 killed. A row for an existing bucket is merged with the stored row. Restarts, late rows and repeated replays therefore
 leave one row per bucket.
 
-All events are kept up to EVENTS_AT_MOST per device. Beyond that limit, the first, the last and the most significant
-event of each kind, axis and day are kept, then of each month, then of each year. ``stands_for`` of the last event
-counts the deleted ones.
+All events are kept up to EVENTS_AT_MOST per device. Beyond that limit, only the first, the last and the most
+significant event of each kind, axis and day are kept. If this is not sufficient, the same is done per month and then
+per year. ``stands_for`` of the last event counts the deleted ones.
 
 A file that is damaged, was written by a newer version, or is not a history is never modified. RecordingError names the
 cause. Errors of a full or read-only disk are raised as ``sqlite3.Error``. A transaction is complete or has no effect.

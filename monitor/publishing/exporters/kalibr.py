@@ -1,9 +1,9 @@
 """Export as Kalibr's ``imu.yaml``: continuous-time densities, the largest of the three axes for each kind of sensor.
 
-Keys and units follow the wiki of Kalibr, pages "YAML formats" and "IMU Noise Model". Kalibr multiplies a density by
-1/√Δt to get the σ of a sample, and by √Δt to get a step of the bias, as N and K of IEEE Std 952 require. Kalibr
-rejects zero, so a term that no axis has is an error. If the axes have only upper bounds, the largest bound is used
-and the comment says so.
+Keys and units follow the wiki of Kalibr, pages "YAML formats" and "IMU Noise Model". Kalibr multiplies the white-noise
+density by 1/√Δt to get the σ of a sample. It multiplies the random-walk density by √Δt to get a step of the bias. Both
+agree with N and K of IEEE Std 952. Kalibr rejects zero, so a term that no axis has is an error. If the axes have only
+upper bounds, the largest bound is used and the comment says so.
 """
 
 from drivers.errors import ConfigError

@@ -1,7 +1,8 @@
 """Encoding of results as JSON messages with schema, device, time and sample count.
 
 NaN becomes null, because JSON cannot represent it. ``t`` is the Unix time of the newest sample in seconds. In a status
-and in the reply to a reset it is null before the first sample of a recording, or of a device that has its own clock.
+and in the reply to a reset it may be null. This is the case before the first sample of a recording or of a device that
+has its own clock.
 """
 
 from collections.abc import Mapping, Sequence

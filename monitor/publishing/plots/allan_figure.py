@@ -1,10 +1,11 @@
 """Allan plot of one kind of sensor on matplotlib axes, used by the PNG plot and by the report.
 
 The plot is log-log in the units of the field: measured points with their 95 % band, and the fitted curve as a dashed
-line. Each estimated term has a thin line of its own and a ring where its coefficient is read (IEEE Std 952): Q at τ =
-√3 s, N at 1 s, K at 3 s, R at √2 s, and B, as 0.664 B, at the minimum of the curve. Rings that would overlap share a
-letter. Axes differ by colour and marker and do not hide each other: markers and rings of the second and third axis
-are smaller, and the dashes of each fit lie in the gaps of the others. Only the drawing functions import matplotlib.
+line. Each estimated term has a thin line of its own and a ring where its coefficient is read (IEEE Std 952). Q is read
+at τ = √3 s, N at 1 s, K at 3 s and R at √2 s. B is read, as 0.664 B, at the minimum of the curve. Rings that would
+overlap share a letter. Axes differ by colour and marker and do not hide each other. Markers and rings of the second
+and third axis are smaller. The dashes of each fit lie in the gaps of the others. Only the drawing functions import
+matplotlib.
 """
 
 from collections.abc import Collection, Sequence

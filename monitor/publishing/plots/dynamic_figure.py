@@ -1,7 +1,7 @@
 """Plot of the dynamic Allan deviation of one kind of sensor: heat maps over time, and the coefficients Q(t) … R(t).
 
 All panels share one time axis, the end of the window. A heat map shows each τ over time, coloured by the deviation
-relative to its median over time, so that all τ have one scale: red is above the median, blue below. Cells whose 95 %
+relative to its median over time, so all τ share one scale. Red is above the median, blue below. Cells whose 95 %
 interval contains the median are pale, because their colour is not significant. Coefficients are drawn if they are
 estimated for some time on some axis, with their intervals as bands. A line is interrupted where there is no estimate.
 A change is a labelled vertical line through the heat map of its axis and, in the colour of the axis, through the

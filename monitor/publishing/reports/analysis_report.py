@@ -1,9 +1,9 @@
 """Report of one analysis as a self-contained HTML page, for ``imu-monitor analyze --plot FILE.html``.
 
-The page needs no network. It holds the Allan plot of each kind of sensor as inline SVG, the table of coefficients
-with intervals in the units of the field, facts about the recording, the notes, and the dynamic curves if they were
-computed. Heat maps are images inside the SVG, so that the page stays below one megabyte. matplotlib and Jinja2 are
-imported when a report is requested.
+The page needs no network. It holds the Allan plot of each kind of sensor as inline SVG and the table of coefficients
+with intervals in the units of the field. It also holds facts about the recording, the notes, and the dynamic curves if
+they were computed. Heat maps are images inside the SVG, so that the page stays below one megabyte. matplotlib and
+Jinja2 are imported when a report is requested.
 """
 
 import io

@@ -1,10 +1,10 @@
 """Report of a reconciliation as a self-contained HTML page, ``report.html``.
 
-The page needs no network. It holds a summary, a table of the axes, and a section for each step: where measurement and
-model differed, what was added or changed and why, its parameters, and every diagnostic before and after. Axes that
-agree with the model share a table of their diagnostics. Sentences and units come from ``reconcile_sentences``,
-drawings from ``reconcile_chart``; this module arranges them. Jinja2 is imported when a page is requested. Equal
-results give equal pages.
+The page needs no network. It holds a summary, a table of the axes, and a section for each step. A section shows where
+measurement and model differed, the added or changed effect with its parameters, and every diagnostic before and after.
+Axes that agree with the model share a table of their diagnostics. Sentences and units come from
+``reconcile_sentences``, drawings from ``reconcile_chart``; this module arranges them. Jinja2 is imported when a page
+is requested. Equal results give equal pages.
 """
 
 from collections.abc import Sequence

@@ -1,9 +1,9 @@
 """Sentences and formatted values for the results of ``reconcile``, used by the page, the viewer and the terminal.
 
-Functions convert the types of ``monitor.reconcile.result`` (SI) into short text. The unit is selected by the SI unit,
-and also by the size of the number if one SI unit serves for small and large quantities (rad/s for a bias and for a
-range). A value has as many digits as its 95 % interval allows. This module does not depend on HTML, Rerun or a
-terminal.
+Functions convert the types of ``monitor.reconcile.result`` (SI) into short text. The SI unit selects the unit of the
+field. The size of the number is also considered if one SI unit serves for small and large quantities, such as rad/s
+for a bias and for a range. A value has as many digits as its 95 % interval allows. This module does not depend on
+HTML, Rerun or a terminal.
 """
 
 from collections.abc import Sequence

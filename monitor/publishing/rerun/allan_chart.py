@@ -1,8 +1,8 @@
 """Geometry of a log-log Allan plot for a viewer without logarithmic axes.
 
-Curves in the units of the field are converted to points and lines in chart units: a box of ``WIDTH`` by ``HEIGHT``
-with y pointing down, as in Rerun's 2D view, and equal units on both axes. The box is fixed, so the bounds of the view
-are set once. The decades inside the box follow the data. The module does no I/O.
+Curves in the units of the field are converted to points and lines in chart units. The chart is a box of ``WIDTH`` by
+``HEIGHT`` with equal units on both axes. The y axis points down, as in Rerun's 2D view. The box is fixed, so the
+bounds of the view are set once. The decades inside the box follow the data. The module does no I/O.
 """
 
 import math

@@ -31,9 +31,8 @@ RAW_SPAN_S: Final = 30.0  # time span of raw samples in view, up to the cursor
 HALF_LABEL_SHARE: Final = 0.08  # width of half a tick label, as a share of the plot's width
 NOW_COEFFICIENTS: Final = ("N", "B")
 DYNAMIC_COEFFICIENTS: Final = ("N", "B", "K")
-TYPICAL_TAU_COUNT: Final = (
-    17  # octaves of one hour at 100 Hz; a surface with another number of τ has a slightly different height
-)
+TYPICAL_TAU_COUNT: Final = 17
+"""Octaves of one hour at 100 Hz. A surface with another number of τ has a slightly different height."""
 MAX_DEVICES_WITH_ACCEL: Final = 4  # largest number of devices for which the overview also shows accelerometers
 COLUMNS: Final = 4
 SHORT_KIND_NAMES: Final = {"gyro": "Gyro", "accel": "Accel"}

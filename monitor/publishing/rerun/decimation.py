@@ -1,8 +1,8 @@
 """Decimation of samples for display.
 
-At most ``ROWS_PER_S`` rows per second and axis are passed to the viewer. Samples of a slow device are not changed.
-For a fast device, each time bucket keeps its smallest and its largest sample, each at its own time, so that an
-outlier of a single sample remains visible. Only the display uses these rows.
+At most ``ROWS_PER_S`` rows per second and axis are passed to the viewer. Samples of a slow device are not changed. For
+a fast device, each time bucket keeps its smallest and its largest sample, each at its own time. An outlier of a single
+sample therefore remains visible. Only the display uses these rows.
 """
 
 from typing import Final

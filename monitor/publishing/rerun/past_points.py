@@ -1,7 +1,8 @@
 """Points that the viewer draws for stored history: a few per bucket, including its extremes. The module does no I/O.
 
 Each bucket yields its last value with its interval, at the end of the bucket. An extreme outside this interval is more
-than chance explains, and yields an additional point: the minimum at one third of the bucket, the maximum at two thirds.
+than chance explains and yields an additional point. The minimum is drawn at one third of the bucket, the maximum at
+two thirds.
 """
 
 from typing import Final

@@ -2,9 +2,9 @@
 
 ``open_output`` returns an ``Output``: a Rerun stream and the child process that belongs to it. ``ViewerTrouble``
 states in one line what is wrong, and the caller repeats the attempt later. The viewer program is started directly,
-because its Python wrapper would leave it running when killed. It listens on the loopback interface only, and its
-usage statistics are off. Window and page are the same to the daemon: a Rerun server in a separate process, so that
-its data do not use the memory of the daemon. Importing this module imports Rerun.
+because its Python wrapper would leave it running when killed. It listens on the loopback interface only, and its usage
+statistics are off. For the daemon, a window and a page are both a Rerun server in a separate process. The data of the
+viewer therefore do not use the memory of the daemon. Importing this module imports Rerun.
 
 Rerun raises no error for a port that is in use, so ports are checked first. If a Rerun server listens on the port, it
 is used instead of a new window. Any other listener is an error. For the page, the next free port is used.
