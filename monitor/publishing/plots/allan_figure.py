@@ -39,9 +39,7 @@ READING: Final = (
     "○ a coefficient, read on its own line: Q at √3 s, N at 1 s, K at 3 s, R at √2 s; 0.664 B where the curve is lowest"
 )
 OTHER_LINE_STYLES: Final = ("-", ":", "-.")  # line styles of other deviations
-MAX_DEPTH_RATIO: Final = (
-    300.0  # a ring further than this factor below the curve is omitted, as it would flatten the curve
-)
+MAX_DEPTH_RATIO: Final = 300.0  # rings further below the curve are omitted, as they would flatten the curve
 MAX_BAND_RATIO: Final = 3.0  # a band extends the plot at most by this factor beyond its points
 MARGIN_FACTOR: Final = 1.6  # margin around the plotted data, as a factor
 FEW_DECADES_RATIO: Final = 60.0  # an axis with a smaller ratio of its ends has numbers between the powers of ten

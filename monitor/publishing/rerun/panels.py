@@ -120,7 +120,9 @@ def _fleet_row(one: Heard, now_s: float) -> str:
     if status is None:
         return f"| **{name}** | {word} | | | | | {' | '.join(noise)} | nothing known yet |"
     rate = "—" if status.rate is None else f"{status.rate:.2f} Hz"
-    trouble = _escape_cell(one.trouble()) or ("nothing comes any more" if state in ("gone", "silent") else "")
+    trouble = _escape_cell(one.trouble()) or (
+        f"no data for {now_s - one.heard_s:.1f} s" if state in ("gone", "silent") else ""
+    )
     counts = f"{status.received:,} | {status.lost:,} | {status.bad:,}"
     return f"| **{name}** | {word} | {rate} | {counts} | {' | '.join(noise)} | {trouble} |"
 
