@@ -1,1 +1,1 @@
-"""Results of years: gathered by the minute, kept in one file, thinned with age without losing extremes."""
+"""Long-term history: results aggregated per minute, kept in one file, merged with age without loss of extremes."""

@@ -1,12 +1,13 @@
-"""One row of history: what a device's results were within one bucket of time, and how several become one.
+"""One history row: the statistics of a device's results within one time bucket, and the merging of rows.
 
-Of each number (``gz.N``, ``gz.sigma.0.1``, ``temperature``: see ``numbers``) a row has how often it was there, its
-lowest, highest and last value. Lowest of lowests is the lowest of all: extremes survive any number of merges exactly.
-Counts (samples received, lost, bad, overflowed) are increments and add up. Values are kept to seven digits (float32),
-rounded once, before anything is compared; rounding keeps the order, so nothing is lost by merging later. Pure.
+For each number (``gz.N``, ``gz.sigma.0.1``, ``temperature``; see ``columns``) a row holds the count, minimum, maximum
+and last value. The minimum of several minima is the overall minimum, so extremes survive any number of merges exactly.
+Counters (samples received, lost, bad, overflowed) are increments and are added. Values are rounded once to float32
+(seven digits) before they are compared. Rounding keeps the order, so later merges lose nothing. The module does no I/O.
 
-Packed, a row's extremes are kept as differences of their bits from the lowest, bytes of one significance together,
-compressed: values of a minute differ little, and most of it is zeros.
+In the packed form, the bits of the maximum and of the last value are stored as differences (XOR) from the minimum.
+Bytes of equal significance are grouped and compressed. Values within a minute differ little, so most of these bytes
+are zero.
 """
 
 import zlib
@@ -24,36 +25,36 @@ from drivers.sample import Floats, Ints
 Singles = NDArray[np.float32]
 
 STATES: Final = ("ended", "running", "waiting", "lost")
-"""From good to bad: a row has the worst of its bucket."""
+"""States ordered from best to worst; a row holds the worst state of its bucket."""
 COUNTS: Final = ("received", "lost", "bad", "overflowed")
 NUMBERS_AT_MOST: Final = 4096
-"""In a row; a device has about two hundred."""
-_N_LIMIT: Final = 2**32 - 1
+"""Largest number of columns in a row; a device has about two hundred."""
+_MAX_N: Final = 2**32 - 1
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A bucket of ``width_s`` from ``start_s`` on; k numbers."""
+    """Statistics of k numbers in the bucket from ``start_s`` to ``start_s + width_s``."""
 
     start_s: int  # Unix time, a multiple of width_s
     width_s: int
     newest_s: float  # Unix time of the newest result in it
     names: tuple[str, ...]  # [k]
-    n: Ints  # [k] how often each was there
-    low: Singles  # [k] SI; NaN where it never was
+    n: Ints  # [k] count of values of each number
+    low: Singles  # [k] SI; NaN if the number never had a value
     high: Singles
     last: Singles
-    counts: tuple[int, int, int, int] = (0, 0, 0, 0)  # of COUNTS, within the bucket
+    counts: tuple[int, int, int, int] = (0, 0, 0, 0)  # increments of COUNTS within the bucket
     state: int = 0  # index of the worst of STATES
 
     @property
     def end_s(self) -> int:
-        """Where the next bucket begins."""
+        """Unix time at which the bucket ends [s]."""
         return self.start_s + self.width_s
 
 
 class Extremes:
-    """How often, lowest, highest and last of k numbers that come again and again.
+    """Running count, minimum, maximum and last value of k numbers.
 
     >>> seen = Extremes(("a", "b"))
     >>> for numbers in ([1.0, 5.0], [3.0, np.nan], [2.0, 4.0]):
@@ -70,7 +71,7 @@ class Extremes:
         self.last: Singles = self.low.copy()
 
     def add(self, numbers: Floats) -> None:
-        """One look, [k]; NaN = not there."""
+        """Update the statistics with one value of each number ([k], SI); NaN marks a missing value."""
         with np.errstate(over="ignore"):
             single = numbers.astype(np.float32)
         there = ~np.isnan(single)
@@ -88,7 +89,23 @@ def joined(
     counts: tuple[int, int, int, int],
     state: int,
 ) -> Row:
-    """One row of several sources of numbers."""
+    """Concatenate the statistics of several sources into one row.
+
+    Parameters
+    ----------
+    start_s
+        Unix time at which the bucket begins [s], a multiple of ``width_s``.
+    width_s
+        Width of the bucket [s].
+    newest_s
+        Unix time of the newest result in the bucket [s].
+    parts
+        Statistics of each source; their names must not overlap.
+    counts
+        Increments of COUNTS within the bucket.
+    state
+        Index of the worst state in STATES.
+    """
     return Row(
         start_s,
         width_s,
@@ -104,31 +121,49 @@ def joined(
 
 
 def chosen(row: Row, names: tuple[str, ...]) -> Row:
-    """The same with these numbers, in this order; those that it has not are missing."""
+    """Return the row with its columns selected and reordered.
+
+    Parameters
+    ----------
+    row
+        The row.
+    names
+        Names of the columns to return, in this order. Names that the row lacks become missing values.
+    """
     if names == row.names:
         return row
-    index = _places(row.names, names)
+    index = _column_indices(row.names, names)
     n = np.append(row.n, 0)[index]
     low, high, last = (np.append(part, np.float32(np.nan))[index] for part in (row.low, row.high, row.last))
     return Row(row.start_s, row.width_s, row.newest_s, names, n, low, high, last, row.counts, row.state)
 
 
 @lru_cache(maxsize=64)
-def _places(names: tuple[str, ...], wanted: tuple[str, ...]) -> NDArray[np.int64]:
-    """Where each wanted name stands; -1 = nowhere."""
+def _column_indices(names: tuple[str, ...], wanted: tuple[str, ...]) -> NDArray[np.int64]:
+    """Return the index of each wanted name in ``names``; -1 if it is absent."""
     at = {name: i for i, name in enumerate(names)}
     return np.array([at.get(name, -1) for name in wanted], np.int64)
 
 
 def merged(rows: Sequence[Row], start_s: int, width_s: int) -> Row:
-    """One row of several, one at least; the last value of a number is that of the newest row that has it."""
+    """Merge rows into one; the last value of a number comes from the newest row that has the number.
+
+    Parameters
+    ----------
+    rows
+        At least one row.
+    start_s
+        Unix time at which the merged bucket begins [s].
+    width_s
+        Width of the merged bucket [s].
+    """
     rows = sorted(rows, key=lambda row: row.newest_s)
     names = rows[0].names
     if any(row.names is not names and row.names != names for row in rows):
         names = tuple(dict.fromkeys(name for row in rows for name in row.names))
         rows = [chosen(row, names) for row in rows]
     n = np.stack([row.n for row in rows])
-    newest = len(rows) - 1 - np.argmax(n[::-1] > 0, axis=0)  # never there: any row, its NaN
+    newest = len(rows) - 1 - np.argmax(n[::-1] > 0, axis=0)  # a number without values takes the NaN of any row
     counts = tuple(sum(each) for each in zip(*(row.counts for row in rows), strict=True))
     return Row(
         start_s,
@@ -145,18 +180,27 @@ def merged(rows: Sequence[Row], start_s: int, width_s: int) -> Row:
 
 
 def pack(row: Row) -> bytes:
-    """The numbers of a row, without their names."""
+    """Return the statistics of a row as compressed bytes, without the column names."""
     low = row.low.view(np.uint32)
-    n = np.minimum(row.n, _N_LIMIT).astype(np.uint32)
+    n = np.minimum(row.n, _MAX_N).astype(np.uint32)
     words = np.stack([n, low, row.high.view(np.uint32) ^ low, row.last.view(np.uint32) ^ low]).astype("<u4")
     return zlib.compress(words.view(np.uint8).reshape(-1, 4).T.tobytes(), 6)
 
 
 def unpack(data: bytes, count: int) -> tuple[Ints, Singles, Singles, Singles]:
-    """n, low, high and last of ``count`` numbers.
+    """Return the count, minimum, maximum and last value of each number in packed bytes.
 
-    Raises:
-        RecordingError: what was read is not what was packed
+    Parameters
+    ----------
+    data
+        Bytes made by ``pack``.
+    count
+        Number of columns.
+
+    Raises
+    ------
+    RecordingError
+        The bytes cannot be decompressed or do not hold ``count`` columns.
     """
     size = 16 * count
     try:

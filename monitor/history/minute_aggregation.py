@@ -1,9 +1,9 @@
-"""One device's results as they come, gathered into rows of a minute of the samples' own time. Pure.
+"""Aggregation of one device's results into rows of one minute, by the time of the samples.
 
-A row is handed out when the first result of the next minute comes. A result a moment late is counted where the others
-are; one of an older time, as when a clock was set back or a recording is played again, begins a row of its own, which
-the store adds to the one that it has. What was gathered and not handed out when the process ends is lost: a minute at
-most.
+A row is returned when the first result of the next minute arrives. A result that is slightly late is counted in the
+current row. A result from an earlier time begins a new row, for example after the clock was set back or when a
+recording is replayed. The store merges this row with the existing one. When the process ends, at most one minute of
+aggregated results is lost. The module does no I/O.
 """
 
 from typing import Final
@@ -17,12 +17,12 @@ from monitor.history.bucket import STATES, Extremes, Row, joined
 from monitor.history.columns import HEALTH, TEMPERATURE, Numbers
 
 MINUTE_S: Final = 60
-LATE_S: Final = 5.0
-"""Batches of samples and estimates of one moment are not told at one moment."""
+LATE_TOLERANCE_S: Final = 5.0
+"""Tolerance for results that arrive out of order: batches and estimates of the same time are not reported together."""
 
 
 class Minutes:
-    """What has come of one device since the last full minute."""
+    """Aggregator of one device's results within the current minute."""
 
     def __init__(self) -> None:
         self._numbers: Numbers | None = None
@@ -31,18 +31,26 @@ class Minutes:
         self._estimates: Extremes | None = None
         self._health = Extremes(HEALTH)
         self._temperature = Extremes(TEMPERATURE)
-        self._counted = (0, 0, 0, 0)  # at the last report, since the start
-        self._counts = (0, 0, 0, 0)  # in this minute
+        self._previous_counters = (0, 0, 0, 0)  # counters at the last report, since the start of the device
+        self._counts = (0, 0, 0, 0)  # increments within this minute
         self._state = 0
 
     def estimate(self, unix_s: float, estimate: Estimate) -> Row | None:
-        """One estimate; the row that is full with it."""
-        full = self._turn(unix_s)
+        """Add an estimate, and return the previous row if the estimate begins a new one.
+
+        Parameters
+        ----------
+        unix_s
+            Unix time of the estimate [s].
+        estimate
+            The estimate.
+        """
+        full = self._advance(unix_s)
         if self._numbers is None or not self._numbers.fit(estimate):
             self._numbers = Numbers(estimate)
         if self._estimates is not None and self._estimates.names != self._numbers.names:
             start_s = self._start_s
-            full = self._end()  # the store makes one row of both
+            full = self._close_row()  # the store merges both rows of this minute
             self._start_s, self._newest_s = start_s, unix_s
         if self._estimates is None:
             self._estimates = Extremes(self._numbers.names)
@@ -50,43 +58,62 @@ class Minutes:
         return full
 
     def temperature(self, unix_s: float, temperature_c: Floats) -> Row | None:
-        """A batch's temperatures [n] °C; NaN = not measured."""
+        """Add the mean temperature of a batch, and return the previous row if a new one begins.
+
+        Parameters
+        ----------
+        unix_s
+            Unix time of the batch [s].
+        temperature_c
+            Temperatures of the samples, shape [n] [°C]; NaN if not measured.
+        """
         there = temperature_c[~np.isnan(temperature_c)]
         if not there.size:
             return None
-        full = self._turn(unix_s)
+        full = self._advance(unix_s)
         self._temperature.add(np.array([there.mean()]))
         return full
 
     def health(self, unix_s: float, health: Health) -> Row | None:
-        """How the device does: counts since the start, of which what came since the last report is kept."""
-        full = self._turn(unix_s)
+        """Add a health report, and return the previous row if a new one begins.
+
+        Parameters
+        ----------
+        unix_s
+            Unix time of the report [s].
+        health
+            Health of the device. Its counters run since the start; the increments since the last report are stored.
+        """
+        full = self._advance(unix_s)
         known = [np.nan if one is None else float(one) for one in (health.rate_hz, health.latency_p99_s)]
         self._health.add(np.array([*known, float(health.memory_bytes)]))
         counted = (health.received, health.lost, health.bad, health.overflowed)
-        # smaller than before: counted from the start anew
-        more = tuple(now - old if now >= old else now for now, old in zip(counted, self._counted, strict=True))
+        # A counter below its previous value has been restarted from zero.
+        more = tuple(
+            now - old if now >= old else now for now, old in zip(counted, self._previous_counters, strict=True)
+        )
         self._counts = tuple(a + b for a, b in zip(self._counts, more, strict=True))  # type: ignore[assignment]
-        self._counted = counted
+        self._previous_counters = counted
         worst = STATES.index(health.state) if health.state in STATES else 0
         self._state = max(self._state, worst)
         return full
 
     def end(self) -> Row | None:
-        """The row that is not full yet; None where nothing has come."""
-        return self._end() if self._start_s is not None else None
+        """Return the current, incomplete row and close it; None if there were no results."""
+        return self._close_row() if self._start_s is not None else None
 
-    def _turn(self, unix_s: float) -> Row | None:
-        """Go to the minute of a moment; the row that it leaves behind."""
+    def _advance(self, unix_s: float) -> Row | None:
+        """Advance to the minute of ``unix_s``, and return the row of the previous minute if it is complete."""
         start_s = int(unix_s // MINUTE_S) * MINUTE_S
-        if self._start_s is not None and self._start_s - LATE_S <= unix_s < self._start_s + MINUTE_S:
+        if self._start_s is not None and self._start_s - LATE_TOLERANCE_S <= unix_s < self._start_s + MINUTE_S:
             self._newest_s = max(self._newest_s, min(unix_s, self._start_s + MINUTE_S))
             return None
         full = self.end()
         self._start_s, self._newest_s = start_s, unix_s
         return full
 
-    def _end(self) -> Row:
+    def _close_row(self) -> Row:
+        """Close the current row and return it."""
         parts = [part for part in (self._estimates, self._health, self._temperature) if part is not None]
         parts = [part for part in parts if part.n.any()]
         assert self._start_s is not None

@@ -1,7 +1,8 @@
-"""What a query asks of a history: the parameters of a zenoh selector in, a ``Question`` out. Pure.
+"""Query of a device's history, parsed from the parameters of a zenoh selector.
 
-``_time=[…]`` (absent: the last day), ``step=15min``, ``what=coefficients,deviations,status,events``, ``axis=gz,gx``,
-``letter=N,B``. Zenoh's own parameters, which begin with ``_``, are for zenoh; any other is a ConfigError.
+Parameters are ``_time=[…]`` (default: the last day), ``step=15min``, ``what=coefficients,deviations,status,events``,
+``axis=gz,gx`` and ``letter=N,B``. Parameters that begin with ``_`` belong to zenoh and are ignored. Any other parameter
+raises a ConfigError. The module does no I/O.
 """
 
 import re
@@ -22,25 +23,25 @@ STATUS: Final = "status"
 EVENTS: Final = "events"
 WHAT: Final = (COEFFICIENTS, DEVIATIONS, STATUS, EVENTS)
 UNASKED: Final = (COEFFICIENTS, STATUS, EVENTS)
-"""What is given where nothing is asked for: deviations would be more than all else together."""
-KEYS: Final = ("_time", "step", "what", "axis", "letter")
-LONGEST: Final = 1000
-"""Characters of all parameters together."""
+"""Parts returned by default; deviations would be larger than all other parts together."""
+PARAMETER_NAMES: Final = ("_time", "step", "what", "axis", "letter")
+MAX_PARAMETERS_LENGTH: Final = 1000
+"""Longest accepted parameter string [characters]."""
 _PART: Final = re.compile(r"([^=;]+)(?:=((?:[\[\]][^\[\]]*[\[\]])|[^;]*))?(?:;|$)")
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is asked for."""
+    """A query: time range, bucket width and the requested parts, axes and letters."""
 
-    span: Span | None = None  # None: the last day that there is
-    step_s: int | None = None
+    span: Span | None = None  # None: the last day of the stored history
+    step_s: int | None = None  # None: chosen by the reader
     what: tuple[str, ...] = UNASKED
     axes: tuple[str, ...] = AXES
     letters: tuple[str, ...] = LETTERS
 
     def wants(self, name: str) -> bool:
-        """Whether a number of ``numbers`` belongs to the answer.
+        """Return True if the query requests the column ``name`` (see ``columns``).
 
         >>> Question(axes=("gz",)).wants("gz.N.lo"), Question(axes=("gz",)).wants("gx.N"), Question().wants("rate")
         (True, False, True)
@@ -54,7 +55,7 @@ class Question:
         return DEVIATIONS in self.what if letter == "sigma" else COEFFICIENTS in self.what and letter in self.letters
 
     def parameters(self) -> str:
-        """As a selector's parameters.
+        """Format the query as the parameters of a zenoh selector.
 
         >>> Question(Span(0.0, float("inf"), end_in=False), 900, ("status",), ("gz",)).parameters()
         '_time=[1970-01-01T00:00:00.000000Z..[;step=900s;what=status;axis=gz;letter=Q,N,B,K,R'
@@ -70,39 +71,48 @@ class Question:
 
 
 def question(parameters: str, now_s: float) -> Question:
-    """The question of a selector's parameters.
+    """Parse the parameters of a zenoh selector.
 
     >>> question("_time=[now(-2h);30m];axis=gz;what=coefficients", 7200.0).span
     Span(start_s=0.0, end_s=1800.0, start_in=True, end_in=True)
 
-    Raises:
-        ConfigError: one line
+    Parameters
+    ----------
+    parameters
+        Parameters, separated by semicolons.
+    now_s
+        Current Unix time [s].
+
+    Raises
+    ------
+    ConfigError
+        A parameter is unknown, or its value is not valid.
     """
     given = _split(parameters)
     for key in given:
-        if key not in KEYS and not key.startswith("_"):
-            raise ConfigError(f'"{key[:40]}": unknown parameter{nearest(key, KEYS)}')
+        if key not in PARAMETER_NAMES and not key.startswith("_"):
+            raise ConfigError(f'"{key[:40]}": unknown parameter{nearest(key, PARAMETER_NAMES)}')
     step_s = length(given["step"]) if given.get("step") else None
     if step_s is not None and not 1.0 <= step_s <= 1e10:
         raise ConfigError(f"step: {step_s:g} s; possible are 1 s and more")
     return Question(
         zenoh_span(given["_time"], now_s) if given.get("_time") else None,
         None if step_s is None else int(step_s),
-        _listed("what", given.get("what", ""), WHAT) or UNASKED,
-        _listed("axis", given.get("axis", ""), AXES) or AXES,
-        _listed("letter", given.get("letter", ""), LETTERS) or LETTERS,
+        _parse_list("what", given.get("what", ""), WHAT) or UNASKED,
+        _parse_list("axis", given.get("axis", ""), AXES) or AXES,
+        _parse_list("letter", given.get("letter", ""), LETTERS) or LETTERS,
     )
 
 
 def _split(parameters: str) -> Mapping[str, str]:
-    """Keys and values. A semicolon inside a time range's brackets is the range's; zenoh's own parser cuts there."""
-    if len(parameters) > LONGEST:
-        raise ConfigError(f"parameters of {len(parameters)} characters; at most {LONGEST}")
+    """Split parameters into keys and values; a semicolon within the brackets of a time range does not separate them."""
+    if len(parameters) > MAX_PARAMETERS_LENGTH:
+        raise ConfigError(f"parameters of {len(parameters)} characters; at most {MAX_PARAMETERS_LENGTH}")
     return {key.strip(): (value or "").strip() for key, value in _PART.findall(parameters)}
 
 
-def _listed(key: str, text: str, known: tuple[str, ...]) -> tuple[str, ...]:
-    """Words with commas, in the order in which they are known."""
+def _parse_list(key: str, text: str, known: tuple[str, ...]) -> tuple[str, ...]:
+    """Parse a comma-separated list, and return its words in the order of ``known``."""
     words = [word.strip() for word in text.split(",") if word.strip()]
     for word in words:
         if word not in known:

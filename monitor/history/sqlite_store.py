@@ -1,14 +1,17 @@
 """History on disk: one SQLite file in WAL mode, with one writer and any number of readers in threads and processes.
 
-Three levels of rows: a minute for a week, a quarter of an hour for three months, six hours for good. Age is counted
-from a device's newest row, or from now where that lies in the future. ``Store.thin`` makes one row of those of a longer
-bucket, bucket by bucket, each in a transaction of its own: a process killed anywhere leaves every moment in exactly one
-row. A row for a bucket that is there already is added to it, so restarts, late rows and recordings played again leave
-one row a bucket. Events are all kept up to EVENTS_AT_MOST a device; beyond, of a kind, axis and day the first, the last
-and the surest stay, then of a month, then of a year, and what is gone is counted in ``stands_for`` of the last.
+Rows have three levels: one minute for a week, 15 minutes for three months, and six hours without limit. Age is
+counted from a device's newest row, or from the current time if the newest row lies in the future. ``Store.thin``
+merges the rows of one wider bucket per transaction, so each moment belongs to exactly one row even if the process is
+killed. A row for an existing bucket is merged with the stored row. Restarts, late rows and repeated replays therefore
+leave one row per bucket.
 
-A file that is damaged, of a newer version or somebody else's is never touched: RecordingError says which it is. What a
-full or read-only disk does comes through as ``sqlite3.Error``; a transaction is whole or has not happened.
+All events are kept up to EVENTS_AT_MOST per device. Beyond that limit, only the first, the last and the most
+significant event of each kind, axis and day are kept. If this is not sufficient, the same is done per month and then
+per year. ``stands_for`` of the last event counts the deleted ones.
+
+A file that is damaged, was written by a newer version, or is not a history is never modified. RecordingError names the
+cause. Errors of a full or read-only disk are raised as ``sqlite3.Error``. A transaction is complete or has no effect.
 """
 
 import contextlib
@@ -34,11 +37,11 @@ VERSION: Final = 1
 APPLICATION: Final = 0x494D5548  # "IMUH"
 DAY_S: Final = 86_400
 LEVELS: Final = ((60, 7 * DAY_S), (900, 90 * DAY_S), (21_600, None))
-"""Width of a row, and its age at which it becomes part of one of the next width; all in s."""
+"""Width of the rows of a level [s], and the age at which they are merged into the next level [s]; None: never."""
 EVENTS_AT_MOST: Final = 20_000
-"""Of one device."""
-EVENT_SPANS_S: Final = (DAY_S, 30 * DAY_S, 365 * DAY_S)
-TEXT_AT_MOST: Final = 2000
+"""Largest number of events per device."""
+EVENT_THINNING_SPANS_S: Final = (DAY_S, 30 * DAY_S, 365 * DAY_S)
+MAX_TEXT_LENGTH: Final = 2000
 BUSY_S: Final = 5.0
 CACHE_KIB: Final = 2048
 SCHEMA: Final = """
@@ -58,45 +61,51 @@ CREATE INDEX event_time ON event (device, t);
 """
 TABLES: Final = frozenset({"device", "layout", "row", "event"})
 BESIDE: Final = ("-wal", "-shm", "-journal")
-"""Ends of the names of files that SQLite keeps beside a database."""
+"""Suffixes of the files that SQLite keeps next to a database."""
 DELETED: Final = "was deleted or renamed"
 REPLACED: Final = "was replaced by another file"
 EMPTIED: Final = "was emptied"
 CHANGED: Final = "was changed by another program"
 MOVE: Final = "move it away, and a new one is begun"
-_ROW: Final = "start, width, newest, layout, received, lost, bad, overflowed, state, numbers"
+_FIELDS: Final = "start, width, newest, layout, received, lost, bad, overflowed, state, numbers"
 
 
-_Stat = tuple[int, int, int, int]
-"""Device, inode, size and time of change of a file."""
+_FileState = tuple[int, int, int, int]
+"""Device number, inode, size and modification time of a file."""
 
 
 @dataclass(frozen=True, slots=True)
 class PastEvent:
-    """Something that happened to a device."""
+    """An event of a device, as it is stored."""
 
-    t_s: float  # Unix
+    t_s: float  # Unix time
     kind: str
     text: str
     axis: str | None = None
     what: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    since_s: float | None = None
+    since_s: float | None = None  # Unix time at which the reported condition began
     sigma: float | None = None
-    stands_for: int = 1  # events, itself and those of its kind that were thinned out before it
+    stands_for: int = 1  # number of events it represents: itself, and deleted earlier events of its kind
 
 
 class UnusableHistory(RecordingError):
-    """A file in place of a history that is damaged or holds something else."""
+    """Error: the history file is damaged or holds something else."""
 
 
 class Store:
-    """The writer. One thread is to use it.
+    """Writer of a history file; it must be used by one thread only.
 
-    Args:
-        path: the file; made where there is none, its folder too
-    Raises:
-        RecordingError: the file is not a history, damaged, or of a newer version
-        sqlite3.Error, OSError: it cannot be opened now
+    Parameters
+    ----------
+    path
+        The file. The file and its folder are created if they do not exist.
+
+    Raises
+    ------
+    RecordingError
+        The file is not a history, is damaged, or was written by a newer version.
+    sqlite3.Error, OSError
+        The file cannot be opened now.
     """
 
     def __init__(self, path: Path) -> None:
@@ -104,50 +113,81 @@ class Store:
         check_folder(path.parent)
         path.parent.mkdir(parents=True, exist_ok=True)
         _check_files(path)
-        path.touch()  # it has an identity before SQLite opens it
+        path.touch()  # the file needs an inode that can be compared before SQLite opens it
         before = os.stat(path)
-        self._files = _stats(path)
+        self._files = _file_states(path)
         self._db = sqlite3.connect(path, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
         self._devices: dict[str, int] = {}
-        self._layouts = _Layouts(self._db)
+        self._layouts = _LayoutCache(self._db)
         self._version = -1
         try:
-            with _explained(path):
+            with _damage_as_unusable(path):
                 self._prepare()
             if not os.path.samestat(before, os.stat(path)):
                 raise OSError(errno.EBUSY, "was replaced while it was being opened", str(path))
-            self._files, self._version = _stats(path), self._data_version()
+            self._files, self._version = _file_states(path), self._data_version()
         except BaseException:
             self.close()
             raise
 
     def _prepare(self) -> None:
+        """Create the tables if the file is empty, and set the options of the connection."""
         if not check(self._db, self.path):
             self._db.execute("PRAGMA journal_mode = WAL")
             with self._transaction():
-                if not check(self._db, self.path):  # another process was as quick
+                if not check(self._db, self.path):  # another process may have created the tables meanwhile
                     for statement in SCHEMA.split(";"):
                         self._db.execute(statement)
                     self._db.execute(f"PRAGMA application_id = {APPLICATION}")
                     self._db.execute(f"PRAGMA user_version = {VERSION}")
-        # a commit a minute is on the disk before the next: that costs nothing, and a power cut takes no more than it
+        # Each commit, one per minute, is flushed to disk. The cost is negligible; a power cut loses one commit at most.
         self._db.execute("PRAGMA synchronous = FULL")
         self._db.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
 
     def add(self, rows: Sequence[tuple[str, Row]], events: Sequence[tuple[str, PastEvent]] = ()) -> None:
-        """Rows and events of devices, all of them or none."""
-        with _explained(self.path), self._transaction():
+        """Write rows and events in one transaction.
+
+        Parameters
+        ----------
+        rows
+            Pairs of device name and row.
+        events
+            Pairs of device name and event.
+
+        Raises
+        ------
+        UnusableHistory
+            The file is damaged.
+        sqlite3.OperationalError
+            The file cannot be written now.
+        """
+        with _damage_as_unusable(self.path), self._transaction():
             for device, row in rows:
-                self._put(self._device(device), row)
+                self._put(self._device_id(device), row)
             for device, event in events:
-                self._put_event(self._device(device), event)
-        self._files = _stats(self.path)
+                self._put_event(self._device_id(device), event)
+        self._files = _file_states(self.path)
 
     def thin(self, now_s: float, at_most: int = 100) -> int:
-        """Let rows be old: merge up to so many buckets, and say how many were; 0 = nothing is due."""
+        """Merge rows that are old enough, and return the number of merged buckets; 0 if nothing is due.
+
+        Parameters
+        ----------
+        now_s
+            Current Unix time [s].
+        at_most
+            Limit of the number of buckets merged in this call.
+
+        Raises
+        ------
+        UnusableHistory
+            The file is damaged.
+        sqlite3.OperationalError
+            The file cannot be written now.
+        """
         done = 0
-        with _explained(self.path):
-            for device, newest_s in self._newest().items():
+        with _damage_as_unusable(self.path):
+            for device, newest_s in self._newest_end_s().items():
                 done += self._thin_events(device)
                 age_from_s = min(newest_s, now_s)
                 for (width_s, age_s), (wider_s, _) in pairwise(LEVELS):
@@ -156,15 +196,15 @@ class Store:
                     while done < at_most and self._merge_oldest(device, width_s, wider_s, limit_s):
                         done += 1
         if done:
-            self._files = _stats(self.path)
+            self._files = _file_states(self.path)
         return done
 
     def change(self) -> str:
-        """Say what another program has done to the file since this store used it last; "" if nothing.
+        """Return what another program has done to the file since its last use by this store; "" if nothing.
 
-        SQLite itself notices none of it: it would go on writing to a file that has no name any more.
+        SQLite does not detect such changes: it would continue to write to a file that has been deleted.
         """
-        now = _stats(self.path)
+        now = _file_states(self.path)
         if now == self._files:
             return ""
         (before, _), (file, _) = self._files, now
@@ -175,40 +215,43 @@ class Store:
         return CHANGED if file[2] else EMPTIED
 
     def close(self) -> None:
-        """What was added stays; without a reader the file is left in one piece.
+        """Close the connection; if there is no reader, the log is merged into the file.
 
-        SQLite leaves the log of a file that lost its name, and would bring the log into one that was written over.
+        SQLite does not merge the log of a file that was deleted or renamed. If another program has overwritten the
+        file, SQLite would apply the log to the new content. This method handles both cases.
         """
-        before, now = self._files[0], _stats(self.path)[0]
+        before, now = self._files[0], _file_states(self.path)[0]
         if before is not None and (now is None or now[:2] != before[:2]):
-            with contextlib.suppress(sqlite3.Error):  # a full disk: the log stays, and nothing of it is lost
+            with contextlib.suppress(sqlite3.Error):  # if the disk is full, the log keeps the data
                 self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
         elif now != before and not self._committed_by_others():
-            with contextlib.suppress(OSError):  # there is no log
+            with contextlib.suppress(OSError):  # there may be no log
                 os.truncate(f"{self.path}-wal", 0)
         self._db.close()
 
     # --- rows
 
     def _put(self, device: int, row: Row) -> None:
-        """Add to the row of that bucket, or be it. Where the bucket was thinned already, to the wider one."""
+        """Merge a row into the stored row of its bucket, or into the wider row that contains the bucket."""
         for width_s, _ in LEVELS[::-1]:
             start_s = row.start_s // width_s * width_s
-            held = self._held(device, width_s, start_s)
+            held = self._stored_row(device, width_s, start_s)
             if held is not None and width_s >= row.width_s:
                 row = merged([held, row], start_s, width_s)
                 break
         self._write(device, row)
 
-    def _held(self, device: int, width_s: int, start_s: int) -> Row | None:
+    def _stored_row(self, device: int, width_s: int, start_s: int) -> Row | None:
+        """Return the stored row of a bucket; None if there is none."""
         found = self._db.execute(
-            f"SELECT {_ROW} FROM row WHERE device = ? AND width = ? AND start = ?", (device, width_s, start_s)
+            f"SELECT {_FIELDS} FROM row WHERE device = ? AND width = ? AND start = ?", (device, width_s, start_s)
         ).fetchone()
         return None if found is None else self._layouts.row(found)
 
     def _write(self, device: int, row: Row) -> None:
+        """Insert a row, or replace the stored row of the same bucket."""
         self._db.execute(
-            f"INSERT OR REPLACE INTO row (device, {_ROW}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            f"INSERT OR REPLACE INTO row (device, {_FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             (
                 device,
                 row.start_s,
@@ -221,14 +264,14 @@ class Store:
             ),
         )
 
-    def _newest(self) -> dict[int, float]:
-        """Of each device the end of its newest row; without one nothing is old."""
+    def _newest_end_s(self) -> dict[int, float]:
+        """Return the end of each device's newest row (Unix time); -inf for a device without rows."""
         devices = [one for (one,) in self._db.execute("SELECT id FROM device").fetchall()]
-        spans = {device: _held_span(self._db, device) for device in devices}
+        spans = {device: _stored_span(self._db, device) for device in devices}
         return {device: -math.inf if span is None else span[1] for device, span in spans.items()}
 
     def _merge_oldest(self, device: int, width_s: int, wider_s: int, limit_s: float) -> bool:
-        """Make one row of the oldest wider bucket that ends at ``limit_s`` or before; False where there is none."""
+        """Merge the rows of the oldest wider bucket that ends by ``limit_s``; False if there is no such bucket."""
         oldest = self._db.execute(
             "SELECT min(start) FROM row WHERE device = ? AND width = ?", (device, width_s)
         ).fetchone()[0]
@@ -240,9 +283,9 @@ class Store:
         bucket = (device, width_s, start_s, start_s + wider_s)
         where = "device = ? AND width = ? AND start >= ? AND start < ?"
         with self._transaction():
-            found = self._db.execute(f"SELECT {_ROW} FROM row WHERE {where} ORDER BY start", bucket).fetchall()
+            found = self._db.execute(f"SELECT {_FIELDS} FROM row WHERE {where} ORDER BY start", bucket).fetchall()
             rows = [self._layouts.row(one) for one in found]
-            held = self._held(device, wider_s, start_s)
+            held = self._stored_row(device, wider_s, start_s)
             self._write(device, merged([*([held] if held else []), *rows], start_s, wider_s))
             self._db.execute(f"DELETE FROM row WHERE {where}", bucket)
         return True
@@ -250,6 +293,7 @@ class Store:
     # --- events
 
     def _put_event(self, device: int, event: PastEvent) -> None:
+        """Insert an event."""
         self._db.execute(
             "INSERT INTO event (device, t, kind, axis, since, sigma, stands_for, what, text)"
             " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -261,27 +305,28 @@ class Store:
                 event.since_s,
                 event.sigma,
                 event.stands_for,
-                _what_text(event.what),
-                event.text[:TEXT_AT_MOST],
+                _encode_values(event.what),
+                event.text[:MAX_TEXT_LENGTH],
             ),
         )
 
     def _thin_events(self, device: int) -> int:
-        """Whether there were too many; then the oldest half of what may be kept is thinned by days, months, years."""
+        """Thin the events of a device by day, month and year until half of the limit remains; 0 if they are few."""
         if self._count_events(device) <= EVENTS_AT_MOST:
             return 0
-        for span_s in EVENT_SPANS_S:
+        for span_s in EVENT_THINNING_SPANS_S:
             with self._transaction():
-                self._thin_events_of(device, span_s)
+                self._thin_events_by_span(device, span_s)
             if self._count_events(device) <= EVENTS_AT_MOST // 2:
                 break
         return 1
 
     def _count_events(self, device: int) -> int:
+        """Return the number of stored events of a device."""
         return int(self._db.execute("SELECT count(*) FROM event WHERE device = ?", (device,)).fetchone()[0])
 
-    def _thin_events_of(self, device: int, span_s: int) -> None:
-        """Of a kind, axis and span the first, the last and the surest stay; the last stands for those that go."""
+    def _thin_events_by_span(self, device: int, span_s: int) -> None:
+        """Keep the first, last and most significant event per kind, axis and time span; the last counts the others."""
         keep: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
         rows = self._db.execute(
             "SELECT id, t, kind, axis, sigma, stands_for FROM event WHERE device = ? ORDER BY t, id", (device,)
@@ -298,17 +343,18 @@ class Store:
             more = sum(one[5] for one in gone)
             self._db.execute("UPDATE event SET stands_for = stands_for + ? WHERE id = ?", (more, group[-1][0]))
 
-    # --- inside
+    # --- internal
 
-    def _device(self, name: str) -> int:
+    def _device_id(self, name: str) -> int:
+        """Return the identifier of a device, which is created if it does not exist."""
         if name not in self._devices:
             self._db.execute("INSERT OR IGNORE INTO device (name) VALUES (?)", (name,))
             (found,) = self._db.execute("SELECT id FROM device WHERE name = ?", (name,)).fetchone()
             self._devices[name] = int(found)
         return self._devices[name]
 
-    def _renumber(self) -> None:
-        """Forget the numbers of devices and layouts if another connection has changed the file."""
+    def _refresh_identifiers(self) -> None:
+        """Clear the cached identifiers of devices and layouts if another connection has changed the file."""
         version = self._data_version()
         if version != self._version:
             self._version = version
@@ -316,25 +362,26 @@ class Store:
             self._layouts.forget()
 
     def _committed_by_others(self) -> bool:
-        """Whether another connection of SQLite has changed the file; False for one that was written over."""
+        """Return True if another SQLite connection has changed the file; False if the file has been overwritten."""
         try:
             return self._data_version() != self._version
         except sqlite3.Error:
             return False
 
     def _data_version(self) -> int:
-        """A number that changes with every commit of another connection."""
+        """Return a number that changes with every commit of another connection."""
         return int(self._db.execute("PRAGMA data_version").fetchone()[0])
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
+        """Run the body in one transaction, which is rolled back if the body raises."""
         self._db.execute("BEGIN IMMEDIATE")
         try:
-            self._renumber()
+            self._refresh_identifiers()
             yield
             self._db.execute("COMMIT")
         except BaseException:
-            self._devices.clear()  # what was numbered within it may not be there
+            self._devices.clear()  # identifiers created in this transaction may no longer exist
             self._layouts.forget()
             if self._db.in_transaction:
                 self._db.execute("ROLLBACK")
@@ -342,33 +389,41 @@ class Store:
 
 
 class Reader:
-    """A look at a history: all its answers are of one moment. Made by ``reading``."""
+    """Reader of a history file; all its results belong to one moment. Created by ``reading``."""
 
     def __init__(self, db: sqlite3.Connection, path: Path) -> None:
         self._db = db
         self.path = path
-        self._layouts = _Layouts(db)
+        self._layouts = _LayoutCache(db)
 
     def devices(self) -> tuple[str, ...]:
-        """Those of which anything is kept, by name."""
+        """Return the names of all devices in the file, sorted."""
         return tuple(name for (name,) in self._db.execute("SELECT name FROM device ORDER BY name"))
 
     def held(self, device: str) -> tuple[float, float] | None:
-        """From when to when there are rows, Unix s; None where there are none."""
-        return _held_span(self._db, self._id(device))
+        """Return the start and end of the stored rows of a device (Unix time [s]); None if there are no rows."""
+        return _stored_span(self._db, self._id(device))
 
     def newest_s(self, device: str) -> float:
-        """Unix time of the newest result in a row; NaN where there is none."""
+        """Return the Unix time of the newest result of a device [s]; NaN if there are no rows."""
         query = "SELECT newest FROM row WHERE device = ? AND width = ? ORDER BY start DESC LIMIT 1"
         found = [self._db.execute(query, (self._id(device), width_s)).fetchone() for width_s, _ in LEVELS]
         return max((one[0] for one in found if one is not None), default=math.nan)
 
     def rows(self, device: str, span: Span) -> Iterator[Row]:
-        """Those of which anything is in the span; each level by time, the widest first."""
+        """Iterate over the rows that overlap a time range: the widest level first, each level in order of time.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        span
+            Time range.
+        """
         for width_s, _ in LEVELS[::-1]:
             found = self._db.execute(
-                f"SELECT {_ROW} FROM row WHERE device = ? AND width = ? AND start > ? AND start <= ? ORDER BY start",
-                (self._id(device), width_s, _bound(span.start_s - width_s), _bound(span.end_s)),
+                f"SELECT {_FIELDS} FROM row WHERE device = ? AND width = ? AND start > ? AND start <= ? ORDER BY start",
+                (self._id(device), width_s, _clamp_time(span.start_s - width_s), _clamp_time(span.end_s)),
             )
             for one in found:
                 row = self._layouts.row(one)
@@ -376,16 +431,26 @@ class Reader:
                     yield row
 
     def events(self, device: str, span: Span, at_most: int) -> tuple[list[PastEvent], int]:
-        """The newest of the span, by time, and how many there are in it."""
+        """Return the newest events in a time range, in order of time, and the number of all events in it.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        span
+            Time range.
+        at_most
+            Largest number of events to return.
+        """
         where = "device = ? AND t >= ? AND t <= ?"
-        bounds = (self._id(device), _bound(span.start_s), _bound(span.end_s))
+        bounds = (self._id(device), _clamp_time(span.start_s), _clamp_time(span.end_s))
         found = self._db.execute(
             f"SELECT t, kind, text, axis, what, since, sigma, stands_for FROM event WHERE {where}"
             " ORDER BY t DESC, id DESC LIMIT ?",
-            (*bounds, at_most + 2),  # those at the very ends may not belong to it
+            (*bounds, at_most + 2),  # events exactly at the ends may be excluded by the time range
         ).fetchall()
         events = [
-            PastEvent(t, kind, text, axis, _what(what), since, sigma, stands_for)
+            PastEvent(t, kind, text, axis, _decode_values(what), since, sigma, stands_for)
             for t, kind, text, axis, what, since, sigma, stands_for in found
             if span.holds(t)
         ]
@@ -393,16 +458,19 @@ class Reader:
         return events[:at_most][::-1], max(int(count), len(events[:at_most]))
 
     def _id(self, device: str) -> int:
+        """Return the identifier of a device; -1 if the file does not contain the device."""
         found = self._db.execute("SELECT id FROM device WHERE name = ?", (device,)).fetchone()
         return -1 if found is None else int(found[0])
 
 
 @contextlib.contextmanager
 def reading(path: Path) -> Iterator[Reader]:
-    """A look at the history in a file, which is left as it is.
+    """Open a history file for reading, without changing it.
 
-    Raises:
-        RecordingError: there is none, or it cannot be read
+    Raises
+    ------
+    RecordingError
+        The file does not exist or cannot be read.
     """
     try:
         os.stat(path)
@@ -412,7 +480,7 @@ def reading(path: Path) -> Iterator[Reader]:
     except OSError as error:
         raise RecordingError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
     try:
-        with _explained(path), contextlib.closing(_opened(path)) as db:
+        with _damage_as_unusable(path), contextlib.closing(_open_read_only(path)) as db:
             if not check(db, path):
                 raise RecordingError(f"{path}: nothing is in it yet")
             db.execute("BEGIN")
@@ -421,8 +489,8 @@ def reading(path: Path) -> Iterator[Reader]:
         raise RecordingError(f"{path}: cannot be read: {error}") from error
 
 
-def _held_span(db: sqlite3.Connection, device: int) -> tuple[float, float] | None:
-    """From when to when a device has rows; each end is a step into the index, none is a scan."""
+def _stored_span(db: sqlite3.Connection, device: int) -> tuple[float, float] | None:
+    """Return the start and end of the rows of a device; each end is one index lookup and needs no scan."""
     starts: list[int] = []
     ends: list[int] = []
     for width_s, _ in LEVELS:
@@ -435,10 +503,21 @@ def _held_span(db: sqlite3.Connection, device: int) -> tuple[float, float] | Non
 
 
 def check(db: sqlite3.Connection, path: Path) -> bool:
-    """Whether the file is a history; False for an empty one.
+    """Return True if the database is a history, and False if it is empty.
 
-    Raises:
-        RecordingError: it is something else, or of a newer version
+    Parameters
+    ----------
+    db
+        Connection to the database.
+    path
+        Path of the file, for the message.
+
+    Raises
+    ------
+    UnusableHistory
+        The database is not a history or lacks a table.
+    RecordingError
+        The history was written by a newer version.
     """
     (version,), (application,) = (
         db.execute(f"PRAGMA {what}").fetchone() for what in ("user_version", "application_id")
@@ -456,8 +535,8 @@ def check(db: sqlite3.Connection, path: Path) -> bool:
     return True
 
 
-class _Layouts:
-    """Names of the numbers of rows, by their number in the file."""
+class _LayoutCache:
+    """Cache of layouts: the column names of rows, each stored once in the file under an identifier."""
 
     def __init__(self, db: sqlite3.Connection) -> None:
         self._db = db
@@ -465,10 +544,12 @@ class _Layouts:
         self._names: dict[int, tuple[str, ...]] = {}
 
     def forget(self) -> None:
+        """Clear the cache."""
         self._ids.clear()
         self._names.clear()
 
     def id(self, names: tuple[str, ...]) -> int:
+        """Return the identifier of a layout, which is created if it does not exist."""
         if names not in self._ids:
             text = " ".join(names)
             self._db.execute("INSERT OR IGNORE INTO layout (names) VALUES (?)", (text,))
@@ -477,7 +558,7 @@ class _Layouts:
         return self._ids[names]
 
     def row(self, found: Sequence[Any]) -> Row:
-        """A row as it was selected."""
+        """Convert the selected database columns into a row."""
         start, width, newest, layout, received, lost, bad, overflowed, state, data = found
         whole = (start, width, layout, received, lost, bad, overflowed, state)
         if not (all(isinstance(one, int) for one in whole) and isinstance(newest, float) and isinstance(data, bytes)):
@@ -494,8 +575,8 @@ class _Layouts:
         return Row(start, width, newest, names, *unpack(data, len(names)), counts, state)
 
 
-def _opened(path: Path) -> sqlite3.Connection:
-    """For reading; where the folder cannot be written to either, and no writer left anything beside the file, as is."""
+def _open_read_only(path: Path) -> sqlite3.Connection:
+    """Open a file for reading; as immutable if there is no log and the folder cannot be written to."""
     options = ["mode=ro"]
     if not Path(f"{path}-wal").exists():
         options.append("mode=ro&immutable=1")
@@ -512,9 +593,9 @@ def _opened(path: Path) -> sqlite3.Connection:
     raise AssertionError("one of them was the last")
 
 
-def _stats(path: Path) -> tuple[_Stat | None, _Stat | None]:
-    """What the file and its log look like; None for one that is not there, and for an empty log."""
-    found: list[_Stat | None] = []
+def _file_states(path: Path) -> tuple[_FileState | None, _FileState | None]:
+    """Return the state of the file and of its log; None for a missing file, and for a missing or empty log."""
+    found: list[_FileState | None] = []
     for one in (path, Path(f"{path}-wal")):
         try:
             seen = os.stat(one)
@@ -527,15 +608,15 @@ def _stats(path: Path) -> tuple[_Stat | None, _Stat | None]:
 
 
 def _check_files(path: Path) -> None:
-    """Raise OSError if the file or one that SQLite keeps beside it is there and is not a regular file."""
+    """Raise OSError if the file, or a file that SQLite keeps next to it, is not a regular file."""
     for end in ("", *BESIDE):
         with contextlib.suppress(FileNotFoundError):
             check_regular(Path(f"{path}{end}"))
 
 
 @contextlib.contextmanager
-def _explained(path: Path) -> Iterator[None]:
-    """What is wrong with the file itself, in a line; what may pass (busy, full, read-only) as it is."""
+def _damage_as_unusable(path: Path) -> Iterator[None]:
+    """Raise damage of the file as UnusableHistory; errors that may pass (busy, full, read-only) are not changed."""
     try:
         yield
     except sqlite3.OperationalError:
@@ -548,18 +629,19 @@ def _explained(path: Path) -> Iterator[None]:
         raise UnusableHistory(f"{path}: damaged: {error}; {MOVE}") from error
 
 
-def _bound(t_s: float) -> float:
-    """A time that SQLite can compare."""
+def _clamp_time(t_s: float) -> float:
+    """Clamp a time to the range that SQLite can compare."""
     return max(min(t_s, 1e18), -1e18)
 
 
-def _what_text(what: Mapping[str, Mapping[str, float]]) -> str:
-    """As JSON; NaN as null. What is longer than any of our own events is left out."""
+def _encode_values(what: Mapping[str, Mapping[str, float]]) -> str:
+    """Encode event values as JSON, NaN as null; ``{}`` if they are longer than those of any event of this program."""
     text = msgspec.json.encode(what).decode()
-    return text if len(text) <= TEXT_AT_MOST else "{}"
+    return text if len(text) <= MAX_TEXT_LENGTH else "{}"
 
 
-def _what(text: str) -> dict[str, dict[str, float]]:
+def _decode_values(text: str) -> dict[str, dict[str, float]]:
+    """Decode event values from JSON, null as NaN."""
     found = msgspec.json.decode(text, type=dict[str, dict[str, float | None]])
     return {
         name: {key: math.nan if one is None else one for key, one in sides.items()} for name, sides in found.items()

@@ -1,9 +1,9 @@
-"""Spans of time as people and zenoh write them: text and the time it is now in, Unix seconds out. Pure.
+"""Parsing and formatting of times, durations and time ranges, as users and zenoh write them.
 
-Zenoh's selectors have ``_time=[<start>..<end>]`` or ``_time=[<start>;<duration>]``, where either end may be left out,
-and a bracket that points outwards leaves the end itself out. A time is RFC 3339 in UTC, ``now()`` or ``now(-1h)``.
-People write ``-1d``, ``2026-11-20`` or ``2026-11-20 14:30`` (UTC), or ``now``. What is none of these is a ConfigError
-that says what would be.
+The selectors of zenoh have ``_time=[<start>..<end>]`` or ``_time=[<start>;<duration>]``. Either end may be omitted,
+and a bracket that points outwards excludes its end. A time is RFC 3339 in UTC, ``now()`` or ``now(-1h)``. Users write
+``-1d``, ``2026-11-20``, ``2026-11-20 14:30`` (UTC) or ``now``. Any other text raises a ConfigError that names the
+accepted forms. Results are Unix times in seconds. The module does no I/O.
 """
 
 import math
@@ -26,17 +26,17 @@ UNITS_S: Final = {
     "d": 86_400.0,
     "w": 604_800.0,
 }
-"""Zenoh's units; ``min`` is the configuration file's word for its ``m``."""
-LIMIT_S: Final = 1e11
-"""Times further from 1970 than some three thousand years are a slip."""
-DATES_END_S: Final = 253_402_300_800.0  # the year 10000
+"""Length of each unit [s]: the units of zenoh, and ``min``, which the configuration file uses for zenoh's ``m``."""
+MAX_DURATION_S: Final = 1e11
+"""Longest accepted duration, about three thousand years; longer ones are taken for typing errors."""
+MAX_DATE_S: Final = 253_402_300_800.0  # the year 10000
 _DURATION: Final = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([a-z]*)\s*")
 _NOW: Final = re.compile(r"now\(\s*([+-]?)\s*([^)]*)\)")
 
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """From ``start_s`` to ``end_s``, Unix s; infinite where it is not bounded.
+    """A time range from ``start_s`` to ``end_s`` in Unix seconds; an open end is infinite.
 
     >>> Span(10.0, 20.0).holds(20.0), Span(10.0, 20.0, end_in=False).holds(20.0)
     (True, False)
@@ -44,40 +44,59 @@ class Span:
 
     start_s: float
     end_s: float
-    start_in: bool = True  # whether the end itself belongs to it
-    end_in: bool = True
+    start_in: bool = True  # True if the range includes its start
+    end_in: bool = True  # True if the range includes its end
 
     def holds(self, t_s: float) -> bool:
-        """Whether a moment is in it."""
+        """Return True if the time range contains ``t_s``."""
         after = t_s >= self.start_s if self.start_in else t_s > self.start_s
         before = t_s <= self.end_s if self.end_in else t_s < self.end_s
         return after and before
 
     def zenoh(self) -> str:
-        """As zenoh writes it; before 1970 nothing is kept."""
+        """Return the range in the notation of zenoh; ends before 1970 are left open, as no results are older."""
         ends = [
-            "" if not 0.0 <= one < DATES_END_S else f"{datetime.fromtimestamp(one, UTC):%Y-%m-%dT%H:%M:%S.%fZ}"
+            "" if not 0.0 <= one < MAX_DATE_S else f"{datetime.fromtimestamp(one, UTC):%Y-%m-%dT%H:%M:%S.%fZ}"
             for one in (self.start_s, self.end_s)
         ]
         return f"{'[' if self.start_in else ']'}{'..'.join(ends)}{']' if self.end_in else '['}"
 
     def touches(self, start_s: float, end_s: float) -> bool:
-        """Whether anything of [start_s, end_s), a row's time, can be in it.
+        """Return True if the range overlaps the row from ``start_s`` (included) to ``end_s`` (excluded).
 
         >>> Span(60.0, 120.0).touches(0.0, 60.0), Span(60.0, 120.0).touches(120.0, 180.0)
         (False, True)
+
+        Parameters
+        ----------
+        start_s
+            Start of the row, Unix time [s].
+        end_s
+            End of the row, Unix time [s].
         """
         before = start_s <= self.end_s if self.end_in else start_s < self.end_s
         return before and end_s > self.start_s
 
 
 def zenoh_span(text: str, now_s: float) -> Span:
-    """The span of a selector's ``_time``.
+    """Parse the ``_time`` parameter of a zenoh selector.
 
     >>> zenoh_span("[now(-1h)..now()]", 7200.0)
     Span(start_s=3600.0, end_s=7200.0, start_in=True, end_in=True)
     >>> zenoh_span("]1970-01-01T01:00:00Z;2m[", 0.0)
     Span(start_s=3600.0, end_s=3720.0, start_in=False, end_in=False)
+
+    Parameters
+    ----------
+    text
+        The parameter, e.g. ``[now(-1h)..now()]``.
+    now_s
+        Current Unix time [s].
+
+    Raises
+    ------
+    ConfigError
+        The text is not a time range, or the range ends before it begins.
     """
     text = text.strip()
     if len(text) < 2 or text[0] not in "[]" or text[-1] not in "[]":
@@ -99,10 +118,22 @@ def zenoh_span(text: str, now_s: float) -> Span:
 
 
 def moment(text: str, now_s: float) -> float:
-    """A moment as a person writes it, Unix s.
+    """Parse a time as a user writes it, and return Unix time [s].
 
     >>> moment("-1d", 90_000.0), moment("1970-01-02", 0.0), moment("1970-01-01T00:01:30Z", 0.0)
     (3600.0, 86400.0, 90.0)
+
+    Parameters
+    ----------
+    text
+        The time, e.g. ``-1d``, ``2026-11-20 14:30`` or ``now``.
+    now_s
+        Current Unix time [s].
+
+    Raises
+    ------
+    ConfigError
+        The text is not a time.
     """
     text = text.strip()
     if text == "now":
@@ -115,10 +146,15 @@ def moment(text: str, now_s: float) -> float:
 
 
 def length(text: str) -> float:
-    """A duration in s, above zero.
+    """Parse a duration above zero, and return it in seconds.
 
     >>> length("15min"), length("1d"), length("90")
     (900.0, 86400.0, 90.0)
+
+    Raises
+    ------
+    ConfigError
+        The text is not a duration, or the duration is zero or too long.
     """
     seconds = _duration_s(text)
     if seconds <= 0.0:
@@ -127,7 +163,7 @@ def length(text: str) -> float:
 
 
 def said(t_s: float) -> str:
-    """A moment for people, in UTC.
+    """Format a Unix time [s] as date and time in UTC.
 
     >>> said(90.0)
     '1970-01-01 00:01:30'
@@ -139,6 +175,7 @@ def said(t_s: float) -> str:
 
 
 def _zenoh_time(text: str, now_s: float) -> float:
+    """Return the Unix time of an RFC 3339 time or of ``now(±duration)``."""
     text = text.strip()
     match = _NOW.fullmatch(text)
     if match is None:
@@ -148,7 +185,7 @@ def _zenoh_time(text: str, now_s: float) -> float:
 
 
 def _instant(text: str) -> float:
-    """RFC 3339; a date alone is its midnight, and without an offset it is UTC."""
+    """Parse an RFC 3339 time; a date means midnight, and a time without an offset means UTC."""
     try:
         found = datetime.fromisoformat(text.strip())
         found = found if found.tzinfo is not None else found.replace(tzinfo=UTC)
@@ -160,16 +197,17 @@ def _instant(text: str) -> float:
 
 
 def _duration_s(text: str) -> float:
+    """Parse a duration of zero or more, and return it in seconds."""
     match = _DURATION.fullmatch(text)
     if match is None or match[2] not in UNITS_S:
         raise ConfigError(f'"{_short(text)}" is no duration; write 90s, 30m, 1h, 2d, 1w')
     seconds = float(match[1]) * UNITS_S[match[2]]
-    if seconds > LIMIT_S:
+    if seconds > MAX_DURATION_S:
         raise ConfigError(f'"{_short(text)}" is too long; at most some three thousand years')
     return seconds
 
 
 def _short(text: str) -> str:
-    """Enough of what a stranger sent to be recognised."""
+    """Return the text shortened to 60 printable characters, for use in an error message."""
     printable = "".join(c if c.isprintable() else "?" for c in text)
     return printable if len(printable) <= 60 else f"{printable[:57]}…"

@@ -1,16 +1,17 @@
-"""The thread that writes history: rows and events in, a file on disk, the loop never waits.
+"""Background writer of the history: rows and events are queued, and a thread writes them to a file.
 
-``put`` and ``tell`` leave things on a bounded queue and return. The thread writes what has come in one transaction,
-then lets old rows be thinned, a little at a time. What cannot be written now (disk full, read-only, busy) stays on the
-queue and is tried again; when the queue is full, what comes is dropped and counted. A file of a newer version is left
-alone, and history goes on once it is out of the way. A file that is damaged or holds something else is renamed and a
-new one is begun, as long as fewer than ASIDE_AT_MOST such files are kept. Before each write and every CHECK_S the
-thread checks that the file is still the one that it wrote. If it was deleted, replaced or emptied, a new one is begun.
-``state`` says all of that. On ``close`` what is left is written, once.
+``put`` and ``tell`` add to a bounded queue and return at once. The thread writes the queue in one transaction and then
+merges a few old rows. If a write fails (disk full, read-only or busy), the data remain in the queue and the write is
+repeated. If the queue is full, new data are dropped and counted. A file of a newer version is not modified. Writing
+continues once it has been moved away. A file that is damaged or holds something else is renamed and a new file is
+created, unless ASIDE_AT_MOST renamed files exist already. Before each write and every CHECK_S, the thread checks that
+the file is still the one that it wrote. If the file was deleted, replaced or emptied, a new one is created. ``state``
+reports all of these conditions. ``close`` makes one attempt to write the remaining data.
 
-One process at a time writes the history of a folder (``FolderLock``). While another one does, rows and events are
-discarded, since the other keeps its own; ``state`` says which process it is. When that process ends this one goes on.
-The first row of each device is discarded then: it began before, and is partly in the file already.
+Only one process at a time writes the history of a folder (``FolderLock``). While another process holds the lock, rows
+and events are discarded, because that process stores its own. ``state`` names the process. When that process ends,
+this writer continues. It then discards the first row of each device, because that row began earlier and is partly
+stored.
 """
 
 import contextlib
@@ -32,39 +33,44 @@ from monitor.history.bucket import Row
 from monitor.history.sqlite_store import BESIDE, DELETED, EMPTIED, MOVE, REPLACED, PastEvent, Store, UnusableHistory
 
 WAITING_AT_MOST: Final = 4096
-"""Rows and events: with one device three days of a full disk, some 12 MB."""
+"""Capacity of the queue in rows and events: three days of a full disk with one device, about 12 MB."""
 RETRY_S: Final = 5.0
 CHECK_S: Final = 10.0
-"""Between two looks whether the file is still there, where nothing is to be written."""
+"""Interval between two checks that the file still exists, if there is nothing to write."""
 ASIDE_AT_MOST: Final = 10
-"""Files that were moved aside; beyond, the next one stays where it is until people have looked."""
-AT_ONCE: Final = 256
-THINNED_AT_ONCE: Final = 50
-CLOSING_S: Final = 10.0
+"""Largest number of renamed files; beyond it, an unusable file is left in place until a user intervenes."""
+BATCH_SIZE: Final = 256
+MERGES_PER_STEP: Final = 50
+CLOSE_TIMEOUT_S: Final = 10.0
 ASIDE: Final = ".aside-"
-"""Between the name of a history and the time at which it was moved aside."""
+"""Separator between the name of a history file and the time at which it was renamed."""
 
 _log = structlog.get_logger("imu-monitor")
 
 
 class Writer:
-    """One file's writer.
+    """Background writer of one history file.
 
-    Args:
-        path: the file
-        now_s: Unix time
+    Parameters
+    ----------
+    path
+        The file.
+    now_s
+        Function that returns the current Unix time [s].
     """
 
     def __init__(self, path: Path, now_s: Callable[[], float]) -> None:
         self.path = path
-        self.dropped = 0  # rows and events, since it was made
+        self.dropped = 0  # rows and events since creation
         self.written = 0
         self._now_s = now_s
-        self._wrong = ""
-        self._note = ""  # the newest thing that happened to the file
+        self._error = ""
+        self._note = ""  # description of the newest incident with the file
         self._folder = FolderLock(path.parent, HISTORY_LOCK)
-        self._excluded = False  # another process keeps the history of this folder
-        self._partial: set[str] | None = None  # devices whose row since then was discarded; None: none is to be
+        self._excluded = False  # True if another process writes the history of this folder
+        self._resumed_devices: set[str] | None = (
+            None  # devices whose first row has been discarded; None: discard nothing
+        )
         self._waiting: deque[tuple[str, Row | PastEvent]] = deque()
         self._lock = threading.Lock()
         self._wake = threading.Event()
@@ -74,36 +80,53 @@ class Writer:
 
     @property
     def state(self) -> str:
-        """``ok``, or what is wrong: for the status."""
+        """``ok``, or a description of what is wrong; part of the status message."""
         dropped = f"{self.dropped} results not kept" if self.dropped else ""
-        if self._wrong:
-            return f"{self._wrong} ({dropped})" if dropped else self._wrong
+        if self._error:
+            return f"{self._error} ({dropped})" if dropped else self._error
         but = "; ".join(filter(None, (self._note, self._folder.warning, dropped)))
         return f"ok, but {but}" if but else "ok"
 
     def start(self) -> None:
-        """Begin to write."""
+        """Start the thread."""
         self._thread.start()
 
     def put(self, device: str, row: Row | None) -> None:
-        """A row to be written; None is nothing."""
+        """Queue a row for writing.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        row
+            The row; None is ignored.
+        """
         if row is not None:
             self._push(device, row)
 
     def tell(self, device: str, event: PastEvent) -> None:
-        """An event to be written."""
+        """Queue an event for writing.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        event
+            The event.
+        """
         self._push(device, event)
 
     def close(self) -> None:
-        """Write what is left, and end."""
+        """Write the remaining data and stop the thread; a thread that needs longer than CLOSE_TIMEOUT_S is logged."""
         self._closing.set()
         self._wake.set()
         if self._thread.is_alive():
-            self._thread.join(CLOSING_S)
+            self._thread.join(CLOSE_TIMEOUT_S)
             if self._thread.is_alive():
                 _log.warning("history did not end in time", path=str(self.path))
 
     def _push(self, device: str, what: Row | PastEvent) -> None:
+        """Add an item to the queue; drop and count it if the queue is full."""
         with self._lock:
             if self._discards(device, what):
                 return
@@ -114,17 +137,18 @@ class Writer:
         self._wake.set()
 
     def _discards(self, device: str, what: Row | PastEvent) -> bool:
-        """Return True for what another process keeps."""
+        """Return True if another process stores this item."""
         if self._excluded:
             return True
-        if self._partial is None or device in self._partial or isinstance(what, PastEvent):
+        if self._resumed_devices is None or device in self._resumed_devices or isinstance(what, PastEvent):
             return False
-        self._partial.add(device)
+        self._resumed_devices.add(device)
         return True
 
-    # --- the thread
+    # --- methods of the thread
 
     def _run(self) -> None:
+        """Write until the writer is closed."""
         while True:
             closing = self._closing.is_set()
             self._wake.clear()
@@ -138,111 +162,119 @@ class Writer:
         if self._waiting:
             self.dropped += len(self._waiting)
             _log.warning("history is not whole", path=str(self.path), state=self.state)
-        self._end()
+        self._close_store()
         self._folder.release()
 
     def _write(self) -> bool:
-        """All that waits, and what is due of thinning; False where something was in the way."""
+        """Write the queue and merge old rows; False if something prevented it."""
         try:
             if holder := self._folder.hold():
-                self._exclude(holder)
+                self._suspend(holder)
                 return False
-            self._include()
-            store = self._checked()
-            while batch := self._batch():
+            self._resume()
+            store = self._current_store()
+            while batch := self._next_batch():
                 rows = [(device, what) for device, what in batch if isinstance(what, Row)]
                 events = [(device, what) for device, what in batch if isinstance(what, PastEvent)]
                 store.add(rows, events)
-                self._done(len(batch))
-            while store.thin(self._now_s(), THINNED_AT_ONCE) and not self._waiting and not self._closing.is_set():
+                self._remove_written(len(batch))
+            while store.thin(self._now_s(), MERGES_PER_STEP) and not self._waiting and not self._closing.is_set():
                 pass
         except UnusableHistory as error:
-            self._end()
+            self._close_store()
             return self._move_aside(error) and self._write()
         except (sqlite3.Error, RecordingError, OSError) as error:
-            self._say(str(error) if isinstance(error, RecordingError) else f"{self.path}: {_why(error)}; trying again")
-            self._end()
+            self._set_error(
+                str(error) if isinstance(error, RecordingError) else f"{self.path}: {_error_text(error)}; trying again"
+            )
+            self._close_store()
             return False
-        self._say("")
+        self._set_error("")
         return True
 
-    def _exclude(self, holder: str) -> None:
-        """Keep nothing while another process does."""
-        self._end()
+    def _suspend(self, holder: str) -> None:
+        """Discard the queue and stop writing while another process holds the lock."""
+        self._close_store()
         with self._lock:
             self._excluded = True
             self._waiting.clear()
-        self._say(f"{holder}; no history is kept here until it ends; end it, or choose another folder in [storage]")
+        self._set_error(
+            f"{holder}; no history is kept here until it ends; end it, or choose another folder in [storage]"
+        )
 
-    def _include(self) -> None:
-        """Go on where another process has ended."""
+    def _resume(self) -> None:
+        """Continue after the other process has ended."""
         if self._excluded:
             with self._lock:
-                self._excluded, self._partial = False, set()
+                self._excluded, self._resumed_devices = False, set()
 
-    def _checked(self) -> Store:
-        """The open file; opened anew if another program has changed it."""
+    def _current_store(self) -> Store:
+        """Return the open store; reopen it if another program has changed the file."""
         change = "" if self._store is None else self._store.change()
         if change:
-            self._end()
+            self._close_store()
         if self._store is None:
             self._store = Store(self.path)
         if change in (DELETED, EMPTIED):
-            self._tell(f"{self.path} {change}; a new one was begun")
+            self._set_note(f"{self.path} {change}; a new one was begun")
         elif change == REPLACED:
-            self._tell(f"{self.path} {change}; results are added to that one")
+            self._set_note(f"{self.path} {change}; results are added to that one")
         return self._store
 
     def _move_aside(self, error: UnusableHistory) -> bool:
-        """Rename a file that is no history, and return True, so that a new one is begun."""
+        """Rename an unusable file, and return True if a new one can be created."""
         taken = {one.name for one in self.path.parent.iterdir() if one.name.startswith(f"{self.path.name}{ASIDE}")}
         if sum(not name.endswith(BESIDE) for name in taken) >= ASIDE_AT_MOST:
-            self._say(f"{error}; {ASIDE_AT_MOST} such files are kept already: look at {self.path.name}{ASIDE}*")
+            self._set_error(f"{error}; {ASIDE_AT_MOST} such files are kept already: look at {self.path.name}{ASIDE}*")
             return False
         when = datetime.fromtimestamp(self._now_s(), UTC)
         name = f"{self.path.name}{ASIDE}{when:%Y-%m-%dT%H-%M-%SZ}"
         name = next(one for one in chain([name], (f"{name}.{i}" for i in count(2))) if one not in taken)
         try:
-            for end in (*BESIDE, ""):  # SQLite takes what is beside a file for a part of it
+            for end in (*BESIDE, ""):  # SQLite would use the old companion files for a new database of the same name
                 with contextlib.suppress(FileNotFoundError):
                     os.rename(f"{self.path}{end}", self.path.with_name(f"{name}{end}"))
         except OSError as failed:
-            self._say(f"{error}; it cannot be moved: {_why(failed)}")
+            self._set_error(f"{error}; it cannot be moved: {_error_text(failed)}")
             return False
         why = str(error).removesuffix(f"; {MOVE}")
-        self._tell(f"{why}; it was moved to {name}, and a new one was begun")
+        self._set_note(f"{why}; it was moved to {name}, and a new one was begun")
         return True
 
-    def _batch(self) -> list[tuple[str, Row | PastEvent]]:
+    def _next_batch(self) -> list[tuple[str, Row | PastEvent]]:
+        """Return the next items of the queue without removing them."""
         with self._lock:
-            return [self._waiting[i] for i in range(min(AT_ONCE, len(self._waiting)))]
+            return [self._waiting[i] for i in range(min(BATCH_SIZE, len(self._waiting)))]
 
-    def _done(self, n: int) -> None:
+    def _remove_written(self, n: int) -> None:
+        """Remove ``n`` written items from the queue."""
         with self._lock:
             for _ in range(n):
                 self._waiting.popleft()
         self.written += n
 
-    def _tell(self, note: str) -> None:
-        """Keep for the state what has happened to the file, and log it."""
+    def _set_note(self, note: str) -> None:
+        """Set the note about the file in the state, and log it."""
         self._note = note
         _log.warning("history", text=note)
 
-    def _say(self, wrong: str) -> None:
-        """Keep for the state what is wrong, and log it when it has changed."""
-        if wrong == self._wrong:
+    def _set_error(self, wrong: str) -> None:
+        """Set the error in the state; log it if it has changed."""
+        if wrong == self._error:
             return
-        self._wrong = wrong
+        self._error = wrong
         if wrong:
             _log.warning("history", text=wrong)
         else:
             _log.info("history", text="written again")
 
-    def _end(self) -> None:
+    def _close_store(self) -> None:
+        """Close the store."""
         store, self._store = self._store, None
         if store is not None:
             store.close()
 
 
-def _why(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
+    """Return the text of an error, without the number of an OSError."""
     return getattr(error, "strerror", None) or str(error)

@@ -1,1 +1,1 @@
-"""Where results leave the process: zenoh, Rerun, the terminal, plots."""
+"""Output of results: zenoh, the Rerun viewer, the terminal, plots, reports and parameter files."""

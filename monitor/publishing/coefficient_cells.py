@@ -1,4 +1,4 @@
-"""Coefficients as people read them: one cell of a table, in the field's unit; and the units, of ``monitor.common.units``."""
+"""Formatting of coefficients for tables, in the units of the field; it also re-exports ``monitor.common.units``."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -52,19 +52,32 @@ __all__ = [
 
 TEMPERATURE_MARK: Final = "†"
 TEMPERATURE_MEANS: Final = "its slow part is temperature"
+"""Meaning of TEMPERATURE_MARK, for a legend."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One coefficient of one axis as a person reads it, without its unit."""
+    """Text of one coefficient of one axis in a table: value, interval and unit."""
 
-    value: str  # "0.516", "≤ 2.10" where the data only bound it, "—" where there are too few
-    interval: str  # "0.512 … 0.520", or "" where there is none
+    value: str  # "0.516"; "≤ 2.10" for an upper bound; "—" if it is not estimated
+    interval: str  # "0.512 … 0.520", or "" if there is none
     unit: str
 
 
 def reading(coefficients: Coefficients, letter: str, axis: str, digits: int = 3) -> Reading:
-    """One cell of a table of coefficients, in the field's unit."""
+    """Format one coefficient in the unit of the field.
+
+    Parameters
+    ----------
+    coefficients
+        Coefficients of all axes, SI.
+    letter
+        Coefficient: Q, N, B, K or R.
+    axis
+        Name of the axis.
+    digits
+        Number of significant digits.
+    """
     at = LETTERS.index(letter), AXES.index(axis)
     unit = unit_of(letter, axis)
     value, lo, hi = (float(a[at]) * unit.factor for a in (coefficients.value, coefficients.lo, coefficients.hi))
@@ -78,14 +91,21 @@ def reading(coefficients: Coefficients, letter: str, axis: str, digits: int = 3)
 
 
 def marked(axis: str, axes_of_temperature: Collection[str]) -> str:
-    """Return the name of an axis, with TEMPERATURE_MARK if its slow part is temperature.
+    """Return the name of an axis, with TEMPERATURE_MARK if temperature explains most of its slow variance.
 
     >>> marked("gy", ("gy", "gz")), marked("gx", ("gy", "gz"))
     ('gy †', 'gx')
+
+    Parameters
+    ----------
+    axis
+        Name of the axis.
+    axes_of_temperature
+        Axes on which temperature explains most of the slow variance.
     """
     return f"{axis} {TEMPERATURE_MARK}" if axis in axes_of_temperature else axis
 
 
 def measured_axes(avar: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> tuple[str, ...]:
-    """The axes of ``avar`` ([m, 6]) that hold any number at all."""
+    """Return the axes on which ``avar`` (shape [m, 6]) has at least one finite value."""
     return tuple(axis for i, axis in enumerate(AXES) if bool(np.isfinite(avar[:, i]).any()))

@@ -1,13 +1,14 @@
-"""Noise parameters for other tools: Kalibr's imu.yaml, MATLAB's gyroparams and accelparams, a Kalman filter's Q.
+"""Export of noise parameters for other tools: Kalibr, MATLAB (gyroparams and accelparams) and Kalman filters.
 
-In comes a ``Noise``, what is known of each axis, from a model file or from ``analyze --json``; out goes the text of a
-file that states its units, the source of its numbers and the inflation it used. No factor is hidden: IEEE Std 952's N
-in rad/√s is the two-sided density of white noise in rad/s/√Hz, its K in rad/s/√s that of the white noise which drives
-the bias, rad/s²/√Hz.
+The input is a ``Noise`` object with the coefficients of each axis, from a model file or from ``analyze --json``. The
+output is the text of a file that states its units, the source of its numbers and the inflation factor. No other
+factor is applied. N of IEEE Std 952 in rad/√s equals the two-sided density of white noise in rad/s/√Hz. K in rad/s/√s
+equals the density of the white noise that drives the bias, in rad/s²/√Hz.
 
-Inflation multiplies N, B and K: a sensor at rest at one temperature shows less than the same sensor on a vehicle. An
-upper bound is used by the filters' formats, with a comment, and never by the simulator's. What a format has no place
-for is named in a comment. Texts are ASCII, as some of those who read them want it.
+The inflation factor multiplies N, B and K, because a sensor at rest at constant temperature has less noise than the
+same sensor on a vehicle. The formats for filters use an upper bound as if it were a value, with a comment. The format
+for simulation does not use it. Comments name the terms that a format cannot represent. All text is ASCII, as some of
+the target programs require it.
 """
 
 from collections.abc import Callable
@@ -23,19 +24,29 @@ from monitor.publishing.exporters.noise import Noise, Term, from_analysis, from_
 __all__ = ["FORMATS", "Noise", "Term", "export", "from_analysis", "from_model"]
 
 FORMATS: Final[dict[str, Callable[..., str]]] = {"kalibr": kalibr, "gyroparams": gyroparams, "kalman": kalman}
+"""Export function of each format."""
 
 
 def export(noise: Noise, form: str, inflation: float = 1.0, **options: Any) -> str:
-    """The text of one format.
+    """Return the text of a parameter file.
 
-    Args:
-        noise: from ``from_model`` or ``from_analysis``
-        form: a name of FORMATS
-        inflation: factor on N, B and K, 1 or more
-        options: of that format: ``kalibr`` rostopic; ``kalman`` dt_s, correlation_time_s
-    Raises:
-        ConfigError: unknown format, an inflation below 1, or the model lacks what the format needs
-        NotReady: the analysed recording did not show what the format needs
+    Parameters
+    ----------
+    noise
+        Coefficients from ``from_model`` or ``from_analysis``.
+    form
+        Name of the format, a key of FORMATS.
+    inflation
+        Factor on N, B and K, at least 1.
+    options
+        Options of the format: rostopic for ``kalibr``; dt_s and correlation_time_s for ``kalman``.
+
+    Raises
+    ------
+    ConfigError
+        The format is unknown, the inflation is below 1, or the model lacks a coefficient that the format needs.
+    NotReady
+        The analysed recording does not determine a coefficient that the format needs.
     """
     if form not in FORMATS:
         raise ConfigError(f'unknown format "{form}"; possible are {", ".join(FORMATS)}')

@@ -1,28 +1,37 @@
-"""A MATLAB script: ``gyroparams`` and ``accelparams`` for ``imuSensor``, a value an axis.
+"""Export as a MATLAB script with ``gyroparams`` and ``accelparams`` for ``imuSensor``, one value per axis.
 
-Properties and units are those of MathWorks' reference pages. ``single-sided`` is MathWorks' word for white noise of
-σ = NoiseDensity·√rate a sample, which is N of IEEE Std 952; their default would be smaller by √2. ``BiasInstability``
-is the σ of the white noise that drives a filter; with ``fractalcoef`` (Kasdin, Proc. IEEE 83(5), 1995) the result has
-the spectrum B²/(2πf), which is B of IEEE Std 952; with the default filter, one pole at 0.5, it is no flicker at all.
+Properties and units follow the reference pages of MathWorks. ``single-sided`` is the MathWorks term for white noise
+with σ = NoiseDensity·√rate per sample, which is N of IEEE Std 952. The default of MathWorks would be smaller by √2.
+``BiasInstability`` is the σ of the white noise that drives a filter. With ``fractalcoef`` (Kasdin, Proc. IEEE 83(5),
+1995) the result has the spectrum B²/(2πf), which is B of IEEE Std 952. The default filter has one pole at 0.5, and
+its output is not flicker noise.
 
-It is for simulation, so what the data only bound stays 0, with the bound in a comment.
+The script is meant for simulation. A coefficient with only an upper bound is therefore 0, with the bound in a comment.
 """
 
 from typing import Final
 
 from monitor.publishing.exporters.noise import AXES_OF, Noise, head, number, tail, text
 
-POLES: Final = 500
-"""Of the 1/f filter, as in MathWorks' own example of the Allan variance."""
+N_POLES: Final = 500
+"""Number of poles of the 1/f filter, as in the Allan variance example of MathWorks."""
 
 
 def gyroparams(noise: Noise, inflation: float = 1.0) -> str:
-    """The script; see the module."""
+    """Return the script; for its properties see the module.
+
+    Parameters
+    ----------
+    noise
+        Coefficients of each axis, SI.
+    inflation
+        Factor on N, B and K.
+    """
     lines = [
         "% Noise of an IMU for imuSensor (Navigation Toolbox, or Sensor Fusion and Tracking Toolbox), R2023b or newer",
         *head(noise, inflation, "%"),
         "% single-sided: white noise of sigma = NoiseDensity*sqrt(rate) a sample, N of IEEE Std 952",
-        f"% fractalcoef({POLES}): 1/f noise down to about rate/{POLES}; more poles reach lower and take longer",
+        f"% fractalcoef({N_POLES}): 1/f noise down to about rate/{N_POLES}; more poles reach lower and take longer",
     ]
     made = []
     for kind, maker, name, unit in (
@@ -39,7 +48,7 @@ def gyroparams(noise: Noise, inflation: float = 1.0) -> str:
             _property(noise, kind, "B", "BiasInstability", unit, inflation),
             _property(noise, kind, "K", "RandomWalk", f"({unit})*sqrt(Hz)", inflation),
             "    'NoiseType', 'single-sided', ...",
-            f"    'BiasInstabilityCoefficients', fractalcoef({POLES}));",
+            f"    'BiasInstabilityCoefficients', fractalcoef({N_POLES}));",
         ]
     rate = "" if noise.sample_rate_hz is None else f", 'SampleRate', {noise.sample_rate_hz!r}"
     lines += ["", f"imu = imuSensor('accel-gyro'{rate}{''.join(made)});"]
@@ -47,7 +56,7 @@ def gyroparams(noise: Noise, inflation: float = 1.0) -> str:
 
 
 def _property(noise: Noise, kind: str, letter: str, name: str, unit: str, inflation: float) -> str:
-    """One property of three axes; what is not known is 0, and said."""
+    """Return one property of three axes; unknown values are 0 and named in a comment."""
     known, values, said = noise.of(kind, letter), [], ""
     for axis in AXES_OF[kind]:
         term = known.get(axis)

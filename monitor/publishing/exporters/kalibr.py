@@ -1,27 +1,47 @@
-"""Kalibr's ``imu.yaml``: continuous-time densities, one value for the three axes of a kind, that of the worst.
+"""Export as Kalibr's ``imu.yaml``: continuous-time densities, the largest of the three axes for each kind of sensor.
 
-Keys and units are those of Kalibr's wiki, "YAML formats" and "IMU Noise Model". Kalibr makes a sample's σ of a density
-by 1/√Δt, and a step of the bias by √Δt, as N and K of IEEE Std 952 want it. It refuses a zero, so a term that no axis
-shows is an error; a term that the axes only bound is the largest bound, and the comment says so.
+Keys and units follow the wiki of Kalibr, pages "YAML formats" and "IMU Noise Model". Kalibr multiplies the white-noise
+density by 1/√Δt to get the σ of a sample. It multiplies the random-walk density by √Δt to get a step of the bias. Both
+agree with N and K of IEEE Std 952. Kalibr rejects zero, so a term that no axis has is an error. If the axes have only
+upper bounds, the largest bound is used and the comment says so.
 """
 
 from drivers.errors import ConfigError
 from monitor.publishing.exporters.noise import EFFECT_OF, Noise, Term, head, lacking, number, tail, text
 
-ADVICE = (
+INFLATION_COMMENT = (
     "# Kalibr's wiki, IMU Noise Model: a sensor at rest at one temperature shows too little; for the",
     "# lowest-cost sensors it may be necessary to raise these values by a factor of 10 or more (--inflation 10)",
 )
 
+"""Comment on the inflation of the values."""
+
 
 def kalibr(noise: Noise, inflation: float = 1.0, rostopic: str = "/imu0") -> str:
-    """The file; see the module."""
+    """Return the text of the file.
+
+    Parameters
+    ----------
+    noise
+        Coefficients of each axis, SI.
+    inflation
+        Factor on the densities.
+    rostopic
+        ROS topic of the IMU.
+
+    Raises
+    ------
+    ConfigError
+        The model has no sample rate or lacks N or K on one kind of sensor.
+    NotReady
+        The analysed recording does not determine N or K on one kind of sensor.
+    """
     if noise.sample_rate_hz is None:
         raise ConfigError("kalibr needs an update_rate, and the model has no sample_rate")
     lines = [
         "# imu.yaml for Kalibr: continuous-time noise; one value for all axes of a kind, that of the worst axis",
         *head(noise, inflation, "#"),
-        *ADVICE,
+        *INFLATION_COMMENT,
         f"rostopic: {rostopic}",
         f"update_rate: {noise.sample_rate_hz!r}  # Hz",
     ]
@@ -30,13 +50,13 @@ def kalibr(noise: Noise, inflation: float = 1.0, rostopic: str = "/imu0") -> str
         ("gyro", "gyroscope", "rad/s/sqrt(Hz)", "rad/s^2/sqrt(Hz)"),
     ):
         for letter, key, unit in (("N", "noise_density", white), ("K", "random_walk", walk)):
-            worst, said = _worst(noise, kind, letter)
+            worst, said = _largest_term(noise, kind, letter)
             lines += [f"# {letter}: {said}", f"{word}_{key}: {number(worst.value * inflation)}  # {unit}"]
     return text([*lines, *tail(noise, "NK", "#")])
 
 
-def _worst(noise: Noise, kind: str, letter: str) -> tuple[Term, str]:
-    """The largest estimate of a kind, or the largest bound where there is no estimate; and a comment on it."""
+def _largest_term(noise: Noise, kind: str, letter: str) -> tuple[Term, str]:
+    """Return the largest estimate of a kind, or the largest bound if there is no estimate, and a comment on it."""
     known = noise.of(kind, letter)
     if not known:
         raise lacking(noise, f"kalibr needs {letter} ({EFFECT_OF[letter]}) above 0 on the {kind} axes, and none has it")

@@ -1,15 +1,16 @@
-"""Process noise of a Kalman filter, as TOML: densities, and the discrete F and Q of every axis over one time step.
+"""Export of the process noise of a Kalman filter as TOML: densities, and discrete F and Q of each axis.
 
-Error model of one gyroscope (of an accelerometer with velocity for angle):
+Error model of one gyroscope (for an accelerometer, velocity replaces the angle):
 
     angle' = walk + markov + white,   walk' = white of density K²,   markov' = -markov/T + white of density 2σ²/T
 
-with white noise of density N² on the rate. Flicker has no finite state; a first-order Gauss-Markov process stands for
-it where it matters: its Allan deviation peaks at 0.618 σ and τ = 1.89 T (IEEE Std 952), which is put on the floor
-0.664 B, in the middle (of log τ) of the range that flicker rules: from τ = N²/(0.664 B)² to 3 (0.664 B)²/K², so √3 N/K.
-Without N or K that range has no end; then T must be given, or B is left out and the file says so.
+The rate has white noise of density N². Flicker noise has no finite-dimensional state model, so a first-order
+Gauss-Markov process approximates it. The Allan deviation of this process peaks at 0.618 σ and τ = 1.89 T (IEEE Std
+952). The peak equals the flicker floor 0.664 B and lies in the middle (of log τ) of the range in which flicker
+dominates. This range extends from τ = N²/(0.664 B)² to 3 (0.664 B)²/K², so its middle is √3 N/K. Without N or K the
+range is not bounded. T must then be given, or B is omitted and the file says so.
 
-A bound counts as if it were the value: a filter that trusts too little is safer. The file says where.
+An upper bound is used as if it were the value, because a larger process noise is the safer choice. The file says where.
 """
 
 import math
@@ -23,28 +24,46 @@ from drivers.quantities import DURATION_S
 from drivers.sample import Floats
 from monitor.publishing.exporters.noise import AXES_OF, Noise, Term, head, number, tail, text
 
-FLOOR: Final = math.sqrt(2.0 * math.log(2.0) / math.pi)
-"""Allan deviation of flicker noise over B (IEEE Std 952)."""
+FLICKER_FLOOR_RATIO: Final = math.sqrt(2.0 * math.log(2.0) / math.pi)
+"""Ratio of the Allan deviation of flicker noise to B (IEEE Std 952)."""
 MARKOV_PEAK: Final = 0.437 * math.sqrt(2.0)
-"""Peak of the Allan deviation of the Gauss-Markov process over its σ: 0.437 q √T with q² = 2σ²/T (IEEE Std 952)."""
+"""Ratio of the peak Allan deviation of the Gauss-Markov process to σ: 0.437 q √T with q² = 2σ²/T (IEEE Std 952)."""
 MARKOV_PEAK_AT: Final = 1.89
-"""Where that peak stands, in correlation times."""
-SMALL: Final = 0.1
-"""Of dt/T: below, differences of exponentials are taken from their series."""
+"""Averaging time of this peak in units of the correlation time T."""
+SERIES_BELOW: Final = 0.1
+"""Value of dt/T below which differences of exponentials are computed from their series."""
 
-EXPLAINED: Final = (
+HEADER_COMMENT: Final = (
     "# Process noise of a Kalman filter. States of an axis: angle (velocity) error, bias that walks, and a first-order",
     "# Gauss-Markov bias that stands for the bias instability B (peak of its Allan deviation on the floor 0.664 B):",
     "#   angle' = bias_walk + bias_markov + w_white,  bias_walk' = w_walk,  bias_markov' = -bias_markov/T + w_markov",
     "# psd: two-sided densities of the w; white noise of a sample has variance psd_white/dt",
     "# x[k+1] = F x[k] + w[k], cov(w) = Q: exact over dt",
 )
+"""Comment at the beginning of the file."""
 
 
 def kalman(
     noise: Noise, inflation: float = 1.0, dt_s: float | None = None, correlation_time_s: float | None = None
 ) -> str:
-    """The file; the time step is that of the samples, the correlation time as in the module, unless given."""
+    """Return the text of the file.
+
+    Parameters
+    ----------
+    noise
+        Coefficients of each axis, SI.
+    inflation
+        Factor on N, B and K.
+    dt_s
+        Time step [s]. None: the sample period.
+    correlation_time_s
+        Correlation time T of the Gauss-Markov process [s]. None: computed from N and K, see the module.
+
+    Raises
+    ------
+    ConfigError
+        The time step is unknown or not valid, or the correlation time is not valid.
+    """
     step_s = 1.0 / noise.sample_rate_hz if dt_s is None and noise.sample_rate_hz else dt_s
     if step_s is None or not DURATION_S.supports(step_s):
         raise ConfigError(
@@ -56,7 +75,7 @@ def kalman(
         except ConfigError as error:
             raise ConfigError(f"correlation time: {error}") from None
     lines = [
-        *EXPLAINED,
+        *HEADER_COMMENT,
         *head(noise, inflation, "#"),
         'schema = "imu-monitor/kalman/1"',
         f"dt = {step_s!r}  # s",
@@ -68,43 +87,77 @@ def kalman(
 
 
 def markov_sigma(B: float) -> float:
-    """σ of the Gauss-Markov process whose Allan deviation peaks at the floor of flicker noise.
+    """Return σ of the Gauss-Markov process whose peak Allan deviation equals the floor of flicker noise.
 
     >>> round(markov_sigma(1.0), 3)
     1.075
+
+    Parameters
+    ----------
+    B
+        Bias instability, in the unit of the result.
     """
-    return FLOOR * B / MARKOV_PEAK
+    return FLICKER_FLOOR_RATIO * B / MARKOV_PEAK
 
 
 def markov_time_s(N: float, K: float) -> float:
-    """Correlation time of the process that peaks in the middle of the floor, √3 N/K.
+    """Return the correlation time [s] of the process that peaks at τ = √3 N/K, the middle of the flicker range.
 
     >>> round(markov_time_s(N=1.5e-4, K=1.5e-6), 1)
     91.6
+
+    Parameters
+    ----------
+    N
+        White noise, in rad/√s or m/s/√s.
+    K
+        Rate random walk, in rad/s/√s or m/s²/√s.
     """
     return math.sqrt(3.0) * N / K / MARKOV_PEAK_AT
 
 
 def transition(dt_s: float, time_s: float) -> Floats:
-    """F [3, 3] of angle, walking bias and Gauss-Markov bias over dt."""
+    """Return the transition matrix F [3, 3] of angle, random-walk bias and Gauss-Markov bias.
+
+    Parameters
+    ----------
+    dt_s
+        Time step [s].
+    time_s
+        Correlation time T [s].
+    """
     lost = -math.expm1(-dt_s / time_s)
     return np.array([[1.0, dt_s, time_s * lost], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0 - lost]])
 
 
 def process_noise(dt_s: float, N: float, K: float, sigma: float, time_s: float) -> Floats:
-    """Q [3, 3] of angle, walking bias and Gauss-Markov bias over dt: ∫ F(s) G F(s)ᵀ ds in closed form."""
+    """Return the process noise Q [3, 3] of angle, random-walk bias and Gauss-Markov bias: ∫ F(s) G F(s)ᵀ ds.
+
+    Parameters
+    ----------
+    dt_s
+        Time step [s].
+    N
+        White noise, in rad/√s or m/s/√s.
+    K
+        Rate random walk, in rad/s/√s or m/s²/√s.
+    sigma
+        σ of the Gauss-Markov process, in rad/s or m/s².
+    time_s
+        Correlation time T [s].
+    """
     x = dt_s / time_s
     q = np.zeros((3, 3))
     q[:2, :2] = K**2 * np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
-    q[0, 0] += N**2 * dt_s + 2.0 * (sigma * time_s) ** 2 * _integrated(x)
+    q[0, 0] += N**2 * dt_s + 2.0 * (sigma * time_s) ** 2 * _integrated_markov_variance(x)
     q[0, 2] = q[2, 0] = sigma**2 * time_s * math.expm1(-x) ** 2
     q[2, 2] = -(sigma**2) * math.expm1(-2.0 * x)
     return q
 
 
-def _integrated(x: float) -> float:
-    """x - 2(1 - e^-x) + (1 - e^-2x)/2, which begins with x³/3 and would lose its digits where x is small."""
-    if x > SMALL:
+def _integrated_markov_variance(x: float) -> float:
+    """Return x - 2(1 - e^-x) + (1 - e^-2x)/2; a series for small x, where the leading term is x³/3, keeps precision."""
+    if x > SERIES_BELOW:
         return x + 2.0 * math.expm1(-x) - 0.5 * math.expm1(-2.0 * x)
     return math.fsum((-x) ** k * (2.0 - 2.0 ** (k - 1)) / math.factorial(k) for k in range(3, 14))
 
@@ -112,7 +165,7 @@ def _integrated(x: float) -> float:
 def _axis(
     axis: str, terms: Mapping[str, Term], inflation: float, dt_s: float, correlation_time_s: float | None
 ) -> list[str]:
-    """One table: what the numbers are worth, densities, F and Q."""
+    """Return the TOML table of one axis: comments, densities, F and Q."""
     rate, drift, first = ("rad/s", "rad/s^2", "angle") if axis in AXES_OF["gyro"] else ("m/s^2", "m/s^3", "velocity")
     n, b, k = (terms[letter].value * inflation if letter in terms else 0.0 for letter in "NBK")
     time_s = correlation_time_s or (markov_time_s(n, k) if n and k else None)
@@ -133,7 +186,7 @@ def _axis(
             f"correlation_time = {number(time_s)}  # s, T",
         ]
     sigma, size = markov_sigma(b), len(states)
-    own_s = time_s or 1.0  # without the third state no number depends on it
+    own_s = time_s or 1.0  # without the third state, no number depends on this value
     listed = ", ".join(f'"{state}"' for state in states)
     return [
         *lines,
@@ -145,7 +198,7 @@ def _axis(
 
 
 def _remarks(terms: Mapping[str, Term]) -> list[str]:
-    """What stands behind the numbers of one axis."""
+    """Return comments on unknown coefficients and upper bounds of one axis."""
     unknown = [letter for letter in "NBK" if letter not in terms]
     bounds = [letter for letter in "NBK" if letter in terms and terms[letter].bound]
     lines = [f"# not known, counted as 0: {', '.join(unknown)}"] if unknown else []
@@ -153,4 +206,5 @@ def _remarks(terms: Mapping[str, Term]) -> list[str]:
 
 
 def _matrix(rows: Floats) -> str:
+    """Format a matrix as a TOML array."""
     return "[" + ", ".join("[" + ", ".join(f"{x:.9e}" for x in row) + "]" for row in rows.tolist()) + "]"

@@ -1,8 +1,9 @@
-"""What there is to export, and what every format says about it in its comments.
+"""Noise coefficients to export, and the comments that are common to all formats.
 
-A ``Noise`` holds Q N B K R of each axis in SI. From a model file all of them are values; from ``analyze --json`` those
-with status ``estimated`` are values, those with ``upper_bound`` are marked as bounds, the others are absent. Effects
-that have no letter (a line, a bias, …) are kept by name, so that a format can say that it leaves them out.
+A ``Noise`` object holds Q, N, B, K and R of each axis in SI. From a model file, all of them are values. From
+``analyze --json``, those with status ``estimated`` are values, those with ``upper_bound`` are marked as bounds, and
+others are absent. Effects without a letter (a spectral line, a bias, …) are kept by name, so that a comment can name
+them as omitted.
 """
 
 import math
@@ -24,39 +25,55 @@ EFFECT_OF: Final = {
     "K": "rate_random_walk",
     "R": "rate_ramp",
 }
+"""Name of the effect in a noise model for each coefficient."""
 AXES_OF: Final = {"gyro": AXES[:3], "accel": AXES[3:]}
 
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One coefficient of one axis, SI."""
+    """Coefficient of one axis, SI."""
 
     value: float
-    bound: bool = False  # the data show no more than that it is below this value
+    bound: bool = False  # True if the value is an upper bound
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Axis -> letter -> term; axes and letters of which nothing is known are absent."""
+    """Noise coefficients by axis and letter; unknown axes and letters are absent."""
 
     axes: Mapping[str, Mapping[str, Term]]
     sample_rate_hz: float | None
-    source: str  # where the numbers come from, for the head of the file
-    left_out: tuple[str, ...] = ()  # effects without a letter, "gz.sinusoidal"
-    measured: bool = False  # from a recording: what is absent was not seen
-    warnings: tuple[str, ...] = ()  # sentences for the head of the file, ASCII
+    source: str  # origin of the numbers, for the header of the file
+    left_out: tuple[str, ...] = ()  # effects without a letter, such as "gz.sinusoidal"
+    measured: bool = False  # True if the coefficients come from a recording
+    warnings: tuple[str, ...] = ()  # ASCII sentences for the header of the file
 
     def of(self, kind: str, letter: str) -> dict[str, Term]:
-        """One letter on the axes of a kind that have it."""
+        """Return one coefficient of the axes that have it.
+
+        Parameters
+        ----------
+        kind
+            Kind of sensor: gyro or accel.
+        letter
+            Coefficient.
+        """
         return {axis: self.axes[axis][letter] for axis in AXES_OF[kind] if letter in self.axes.get(axis, {})}
 
 
 def from_model(model: NoiseModel, source: str = "noise model") -> Noise:
-    """The coefficients of a model; effects of one name on one axis add as variances.
+    """Return the coefficients of a noise model; the variances of equal effects on one axis are added.
 
     >>> model = NoiseModel.from_toml('sample_rate = 100.0\\n["g*".angle_random_walk]\\nN = 1.5e-4')
     >>> from_model(model).axes["gz"]["N"].value
     0.00015
+
+    Parameters
+    ----------
+    model
+        Noise model.
+    source
+        Origin of the numbers, for the header of the file.
     """
     letters = {effect: letter for letter, effect in EFFECT_OF.items()}
     axes: dict[str, dict[str, Term]] = {}
@@ -75,31 +92,48 @@ def from_model(model: NoiseModel, source: str = "noise model") -> Noise:
 
 
 class _Coefficient(msgspec.Struct):
+    """Coefficient in the JSON of an analysis."""
+
     value: float | None
     hi: float | None
     status: str
 
 
 class _Temperature(msgspec.Struct):
+    """Dependence on temperature in the JSON of an analysis."""
+
     share: float
 
 
 class _Axis(msgspec.Struct):
+    """Axis in the JSON of an analysis."""
+
     coefficients: dict[str, _Coefficient]
     temperature: _Temperature | None = None
 
 
 class _Analysis(msgspec.Struct):
+    """JSON of an analysis, as far as it is used."""
+
     schema: str
     axes: dict[str, _Axis]
     rate: float | None = None
 
 
 def from_analysis(text: bytes | str, source: str = "analysis of a recording") -> Noise:
-    """The coefficients that ``imu-monitor analyze --json`` wrote.
+    """Return the coefficients in the output of ``imu-monitor analyze --json``.
 
-    Raises:
-        ConfigError: not such a file
+    Parameters
+    ----------
+    text
+        JSON text.
+    source
+        Origin of the numbers, for the header of the file.
+
+    Raises
+    ------
+    ConfigError
+        The text is not the JSON of an analysis, or its rate is not valid.
     """
     try:
         found = msgspec.json.decode(text, type=_Analysis)
@@ -129,12 +163,30 @@ def from_analysis(text: bytes | str, source: str = "analysis of a recording") ->
 
 
 def lacking(noise: Noise, text: str) -> ImuError:
-    """The error to raise where the source does not say what a format needs."""
+    """Return the exception for a source that lacks a coefficient: NotReady for a recording, else ConfigError.
+
+    Parameters
+    ----------
+    noise
+        The source.
+    text
+        Message.
+    """
     return NotReady(f"{text}: a longer recording is needed") if noise.measured else ConfigError(text)
 
 
 def head(noise: Noise, inflation: float, mark: str) -> list[str]:
-    """Comments: where the numbers come from, and what was done to them."""
+    """Return comments on the origin of the numbers, the inflation factor and the warnings.
+
+    Parameters
+    ----------
+    noise
+        Coefficients.
+    inflation
+        Factor on N, B and K.
+    mark
+        Comment mark of the format.
+    """
     source = noise.source.encode("ascii", "replace").decode()
     done = "none" if inflation == 1.0 else f"N, B and K are {inflation:g} times those of the source"
     return [
@@ -145,14 +197,24 @@ def head(noise: Noise, inflation: float, mark: str) -> list[str]:
 
 
 def tail(noise: Noise, used: Collection[str], mark: str) -> list[str]:
-    """Comment: what of the source has no place in the format."""
+    """Return a comment that lists the terms of the source that the format cannot represent.
+
+    Parameters
+    ----------
+    noise
+        Coefficients.
+    used
+        Letters that the format represents.
+    mark
+        Comment mark of the format.
+    """
     letters = {letter for terms in noise.axes.values() for letter, term in terms.items() if not term.bound}
     unused = [letter for letter in EFFECT_OF if letter in letters and letter not in used]
     return [f"{mark} not in this file: {', '.join([*unused, *noise.left_out])}"] if unused or noise.left_out else []
 
 
 def number(value: float) -> str:
-    """Seven digits, in a form that YAML 1.1, TOML and MATLAB all read as a float.
+    """Format a number with seven digits so that YAML 1.1, TOML and MATLAB read it as a float.
 
     >>> number(1.5e-4)
     '1.500000e-04'
@@ -161,5 +223,5 @@ def number(value: float) -> str:
 
 
 def text(lines: Iterable[str]) -> str:
-    """The lines as a file."""
+    """Join lines to the text of a file."""
     return "\n".join(lines) + "\n"

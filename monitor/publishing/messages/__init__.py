@@ -1,1 +1,1 @@
-"""Messages on the wire: encoding and decoding."""
+"""Encoding and decoding of the messages that are sent over zenoh."""

@@ -1,8 +1,9 @@
-"""A daemon's messages -> the results they were made of, so that one viewer can draw what another process measured.
+"""Conversion of received messages into result objects, so that a viewer can display the results of another process.
 
-In come typed messages of ``monitor.publishing.messages.remote_device``, out go ``Estimate``, ``Health`` and ``Event`` as the daemon's own
-viewer gets them. What does not travel is absent here too: degrees of freedom and counts of terms are not known, the
-fitted curve is that of the five terms (IEEE Std 952) with the coefficients that were estimated. Pure.
+The input are typed messages of ``monitor.publishing.messages.remote_device``. The output are ``Estimate``, ``Health``
+and ``Event`` objects, as the viewer of the daemon receives them. Messages do not contain degrees of freedom and term
+counts, so these are unknown here. The fitted curve is that of the five terms of IEEE Std 952 with the estimated
+coefficients. The module does no I/O.
 """
 
 from typing import Final
@@ -16,14 +17,33 @@ from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import LETTERS, Coefficients
 from monitor.publishing.messages import remote_device
 
-MOST_TAU: Final = 1000
+MAX_AVERAGING_TIMES: Final = 1000
+"""Largest accepted number of averaging times."""
 
 
 def estimate(allan: remote_device.AllanMessage, noise: remote_device.Noise) -> Estimate:
-    """What the daemon's viewer would draw; ValueError for curves that are none."""
+    """Build an estimate from the messages of a device.
+
+    Parameters
+    ----------
+    allan
+        Allan deviation message.
+    noise
+        Coefficients.
+
+    Raises
+    ------
+    ValueError
+        The averaging times do not increase from above zero, or a curve has another length.
+    """
     tau_s = np.array(allan.tau)
     m = tau_s.size
-    if not 0 < m <= MOST_TAU or not np.all(tau_s > 0) or not np.all(np.diff(tau_s) > 0) or not allan.rate > 0:
+    if (
+        not 0 < m <= MAX_AVERAGING_TIMES
+        or not np.all(tau_s > 0)
+        or not np.all(np.diff(tau_s) > 0)
+        or not allan.rate > 0
+    ):
         raise ValueError("averaging times must rise from above zero")
     deviation, lo, hi = (np.full((m, len(AXES)), np.nan) for _ in range(3))
     for axis, curve in allan.axes.items():
@@ -53,9 +73,16 @@ def estimate(allan: remote_device.AllanMessage, noise: remote_device.Noise) -> E
 
 
 def fitted(tau_s: Floats, coefficients: Coefficients) -> Floats:
-    """[m, 6] Allan variance of the terms that are estimated; NaN on axes that have none.
+    """Return the Allan variance of the estimated terms, shape [m, 6]; NaN on axes without estimated terms.
 
     σ²(τ) = 3Q²/τ² + N²/τ + (2 ln 2/π)B² + K²τ/3 + R²τ²/2, IEEE Std 952-1997, Annex C.
+
+    Parameters
+    ----------
+    tau_s
+        Averaging times [s], shape [m].
+    coefficients
+        Coefficients, shape [5, 6], SI.
     """
     flat = np.ones_like(tau_s)
     terms = np.column_stack([3 / tau_s**2, 1 / tau_s, 2 * np.log(2) / np.pi * flat, tau_s / 3, tau_s**2 / 2])
@@ -65,7 +92,7 @@ def fitted(tau_s: Floats, coefficients: Coefficients) -> Floats:
 
 
 def health(status: remote_device.StatusMessage) -> Health:
-    """As the daemon's viewer shows it."""
+    """Build a health report from a status message."""
     return Health(
         state=remote_device.clean(status.state),
         rate_hz=status.rate,
@@ -83,7 +110,7 @@ def health(status: remote_device.StatusMessage) -> Health:
 
 
 def event(message: remote_device.EventMessage) -> Event:
-    """With what it changed, so that it is marked on the courses."""
+    """Build an event from a message; it includes the changed coefficients, so that they can be marked in plots."""
     axis = message.axis if message.axis in AXES else None
     what = {
         letter: {side: value for side, value in sizes.items() if isinstance(value, float | int)}
@@ -96,6 +123,7 @@ def event(message: remote_device.EventMessage) -> Event:
 
 
 def _column(values: list[float | None], m: int) -> Floats:
+    """Return m values as an array; null becomes NaN."""
     if len(values) != m:
         raise ValueError(f"{len(values)} values for {m} averaging times")
     return np.array([np.nan if value is None else value for value in values])

@@ -1,7 +1,8 @@
-"""Results -> bytes: JSON, each payload with schema, device, time and sample count.
+"""Encoding of results as JSON messages with schema, device, time and sample count.
 
-NaN becomes null, as JSON has no word for it. ``t`` is the Unix time of the newest sample in s. In a status and in the
-answer to a reset it is null before the first sample of a recording, or of a device that stamps its samples itself.
+NaN becomes null, because JSON cannot represent it. ``t`` is the Unix time of the newest sample in seconds. In a status
+and in the reply to a reset it may be null. This is the case before the first sample of a recording or of a device that
+has its own clock.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,31 +34,62 @@ _ENCODER: Final = msgspec.json.Encoder()
 
 
 def allan(device: str, unix_s: float, estimate: Estimate) -> bytes:
-    """``imu/<device>/allan``: deviation and its 95 % interval at each τ, axes that are measured.
+    """Encode ``imu/<device>/allan``: the Allan deviation of each measured axis and its 95 % interval at each τ.
 
-    ``recent``: the same over a span of its own for each τ, max(10 s, 16 τ).
+    ``recent`` holds the same over a shorter time span, max(10 s, 16 τ) for each τ.
+
+    Parameters
+    ----------
+    device
+        Name of the device.
+    unix_s
+        Unix time of the newest sample [s].
+    estimate
+        The estimate.
     """
     tau = _list(estimate.curve.tau_s)
     axes: dict[str, dict[str, Any]] = {axis: _curve(estimate.curve, i) for i, axis in measured_axes(estimate)}
     if estimate.recent is not None:
         for i, axis in measured_axes(estimate):
             axes[axis]["recent"] = _curve(estimate.recent, i)
-    return _encode(topics.ALLAN, device, unix_s, estimate.samples, _window(estimate, tau=tau, axes=axes))
+    return _encode(topics.ALLAN, device, unix_s, estimate.samples, _window_payload(estimate, tau=tau, axes=axes))
 
 
 def coefficients(device: str, unix_s: float, estimate: Estimate) -> bytes:
-    """``imu/<device>/coefficients``: Q N B K R of each measured axis with interval and status."""
+    """Encode ``imu/<device>/coefficients``: Q, N, B, K and R of each measured axis with interval and status.
+
+    Parameters
+    ----------
+    device
+        Name of the device.
+    unix_s
+        Unix time of the newest sample [s].
+    estimate
+        The estimate.
+    """
     axes = {
         axis: coefficient_table(estimate.coefficients, i, bool(estimate.k_or_r[i]))
         for i, axis in measured_axes(estimate)
     }
-    return _encode(topics.COEFFICIENTS, device, unix_s, estimate.samples, _window(estimate, axes=axes))
+    return _encode(topics.COEFFICIENTS, device, unix_s, estimate.samples, _window_payload(estimate, axes=axes))
 
 
 def gap(device: str, unix_s: float, look: ModelGap) -> bytes:
-    """``imu/<device>/gap``: deviations beside those of the model in force, axes that can be judged.
+    """Encode ``imu/<device>/gap``: measured deviations and those of the model in use.
 
-    ``agrees`` is the verdict that stands (null: none yet), see ``agreement``: it changes later than ``gap`` passes.
+    Only axes that can be tested are included.
+
+    ``agrees`` is the current decision (null: none yet), see ``agreement``. It has hysteresis: it changes later than
+    ``gap`` crosses its threshold.
+
+    Parameters
+    ----------
+    device
+        Name of the device.
+    unix_s
+        Unix time of the newest sample [s].
+    look
+        Result of the comparison with the model.
     """
     axes = {
         axis: {
@@ -85,10 +117,21 @@ def gap(device: str, unix_s: float, look: ModelGap) -> bytes:
 
 
 def thermal(device: str, unix_s: float, samples: int, look: ThermalLook) -> bytes:
-    """``imu/<device>/thermal``: the mean of an interval beside what was expected of it; ``t`` is its end.
+    """Encode ``imu/<device>/thermal``: the mean bias of an interval and its prediction; ``t`` is the interval's end.
 
-    ``multi_step`` knows temperature alone, ``one_step`` the bias before too; null where there is no model, and then
-    ``text`` says why.
+    ``multi_step`` is predicted from the temperature alone, ``one_step`` also from the preceding bias. Both are null if
+    there is no model; ``text`` then gives the reason.
+
+    Parameters
+    ----------
+    device
+        Name of the device.
+    unix_s
+        Unix time of the end of the interval [s].
+    samples
+        Number of samples since the start.
+    look
+        Result of the thermal model for the interval.
     """
     axes = {
         axis: {
@@ -107,7 +150,21 @@ def thermal(device: str, unix_s: float, samples: int, look: ThermalLook) -> byte
 
 
 def total(device: str, unix_s: float, samples: int, total: TotalCurve, hadamard: HadamardCurve) -> bytes:
-    """``imu/<device>/total``: total and Hadamard deviation, each with its own τ; axes that are measured."""
+    """Encode ``imu/<device>/total``: total and Hadamard deviation of each measured axis, each with its own τ.
+
+    Parameters
+    ----------
+    device
+        Name of the device.
+    unix_s
+        Unix time of the newest sample [s].
+    samples
+        Number of samples since the start.
+    total
+        Total variance.
+    hadamard
+        Hadamard variance.
+    """
     curves = {
         "total": (total.tau_s, np.sqrt(total.tvar), total.lo, total.hi),
         "hadamard": (hadamard.tau_s, np.sqrt(hadamard.hvar), hadamard.lo, hadamard.hi),
@@ -127,9 +184,16 @@ def total(device: str, unix_s: float, samples: int, total: TotalCurve, hadamard:
 
 
 def coefficient_table(all_axes: Coefficients, axis: int, k_or_r: bool = False) -> dict[str, dict[str, Any]]:
-    """One axis of the coefficients, a table a letter; also what ``analyze --json`` writes.
+    """Return the coefficients of one axis, one table per letter, as in messages and in ``analyze --json``.
 
-    ``k_or_r``: one of these two is there, and which is not known: each has the other's letter in ``or``.
+    Parameters
+    ----------
+    all_axes
+        Coefficients of all axes, shape [5, 6], SI.
+    axis
+        Column of the axis.
+    k_or_r
+        True if either K or R is present and the data do not show which. Each then names the other letter in ``or``.
     """
     other = {"K": "R", "R": "K"} if k_or_r else {}
     return {
@@ -145,7 +209,21 @@ def coefficient_table(all_axes: Coefficients, axis: int, k_or_r: bool = False) -
 
 
 def event(device: str, unix_s: float, samples: int, what: Event, since_s: float | None) -> bytes:
-    """``imu/<device>/event``."""
+    """Encode ``imu/<device>/event``.
+
+    Parameters
+    ----------
+    device
+        Name of the device.
+    unix_s
+        Unix time of the event [s].
+    samples
+        Number of samples since the start.
+    what
+        The event.
+    since_s
+        Unix time at which the reported condition began [s]; None if unknown.
+    """
     payload = {
         "kind": what.kind,
         "axis": what.axis,
@@ -158,12 +236,30 @@ def event(device: str, unix_s: float, samples: int, what: Event, since_s: float 
 
 
 def since_s(unix_s: float, what: Event) -> float | None:
-    """Unix time at which what is told at ``unix_s`` began; None where that is not known."""
+    """Return the Unix time [s] at which the condition reported by an event began; None if unknown.
+
+    Parameters
+    ----------
+    unix_s
+        Unix time of the event [s].
+    what
+        The event.
+    """
     return None if what.since_ns is None else unix_s - (what.t_ns - what.since_ns) / 1e9
 
 
 def status(device: str, unix_s: float | None, health: Health) -> bytes:
-    """``imu/<device>/status``."""
+    """Encode ``imu/<device>/status``.
+
+    Parameters
+    ----------
+    device
+        Name of the device.
+    unix_s
+        Unix time of the newest sample [s]; None before the first sample.
+    health
+        Health of the device.
+    """
     payload = {
         "state": health.state,
         "rate": health.rate_hz,
@@ -186,16 +282,41 @@ def status(device: str, unix_s: float | None, health: Health) -> bytes:
 
 
 def reply(device: str, unix_s: float | None, samples: int, text: str) -> bytes:
-    """Answer of ``imu/<device>/command/<verb>``."""
+    """Encode the reply to ``imu/<device>/command/<verb>``.
+
+    Parameters
+    ----------
+    device
+        Name of the device.
+    unix_s
+        Unix time of the newest sample [s]; None before the first sample.
+    samples
+        Number of samples since the start.
+    text
+        Result of the command, for the user.
+    """
     return _encode(topics.RESET, device, unix_s, samples, {"text": text})
 
 
 def reconciled(
     device: str, unix_s: float, samples: int, result: Mapping[str, Any], status: int, folder: str | None
 ) -> bytes:
-    """Answer of ``imu/<device>/command/reconcile``: the report's own keys, and how it came about.
+    """Encode the reply to ``imu/<device>/command/reconcile``: the keys of the report, exit status and folder.
 
-    ``status`` is the command's exit status, ``folder`` where the whole report is kept, if it is.
+    Parameters
+    ----------
+    device
+        Name of the device.
+    unix_s
+        Unix time of the newest sample [s].
+    samples
+        Number of samples since the start.
+    result
+        The report as a mapping.
+    status
+        Exit status of the command.
+    folder
+        Folder that contains the complete report; None if it was not saved.
     """
     own = {key: value for key, value in result.items() if key not in ("schema", "device", "t", "samples")}
     return _encode(topics.RECONCILE, device, unix_s, samples, {**own, "exit": status, "folder": folder})
@@ -208,7 +329,21 @@ def analysis(
     dynamic: Dynamic | None = None,
     warmth: WithoutTemperature | None = None,
 ) -> bytes:
-    """``analyze --json``: schema imu-monitor/analyze/1, with those of the other curves that were made."""
+    """Encode the output of ``analyze --json``, with the optional curves that were computed.
+
+    Parameters
+    ----------
+    result
+        The analysis.
+    total
+        Total variance.
+    hadamard
+        Hadamard variance.
+    dynamic
+        Dynamic Allan variance.
+    warmth
+        K and R after the temperature-correlated bias has been removed.
+    """
     estimate = result.estimate
     rate_hz = estimate.rate_hz
     tau = _list(estimate.curve.tau_s)
@@ -216,12 +351,20 @@ def analysis(
     for i, axis in measured_axes(estimate):
         axes[axis] = {
             "allan": {"tau": tau, **_curve(estimate.curve, i)},
-            **({"total": _beside(total.tau_s, total.tvar, total.lo, total.hi, i)} if total else {}),
-            **({"hadamard": _beside(hadamard.tau_s, hadamard.hvar, hadamard.lo, hadamard.hi, i)} if hadamard else {}),
+            **({"total": _deviation_of_axis(total.tau_s, total.tvar, total.lo, total.hi, i)} if total else {}),
+            **(
+                {"hadamard": _deviation_of_axis(hadamard.tau_s, hadamard.hvar, hadamard.lo, hadamard.hi, i)}
+                if hadamard
+                else {}
+            ),
             "coefficients": coefficient_table(estimate.coefficients, i, bool(estimate.k_or_r[i])),
             "bandwidth": _number(result.bandwidth_hz[i]),
-            **({"temperature": _dependence(warmth, axis)} if axis in result.axes_of_temperature and warmth else {}),
-            **({"without_temperature": _without(warmth, axis)} if warmth and axis in warmth.models else {}),
+            **(
+                {"temperature": _temperature_dependence(warmth, axis)}
+                if axis in result.axes_of_temperature and warmth
+                else {}
+            ),
+            **({"without_temperature": _without_temperature(warmth, axis)} if warmth and axis in warmth.models else {}),
         }
     payload = {
         "schema": ANALYZE_SCHEMA,
@@ -239,38 +382,49 @@ def analysis(
 
 
 def no_analysis(why: str, samples: int) -> bytes:
-    """``analyze --json`` where the data do not support an answer."""
+    """Encode the output of ``analyze --json`` if the data do not support an estimate.
+
+    Parameters
+    ----------
+    why
+        The reason, for the user.
+    samples
+        Number of samples.
+    """
     return _ENCODER.encode({"schema": ANALYZE_SCHEMA, "samples": samples, "notes": [why], "axes": {}})
 
 
-def _window(estimate: Estimate, **more: Any) -> dict[str, Any]:
+def _window_payload(estimate: Estimate, **more: Any) -> dict[str, Any]:
+    """Return rate, window length and filled part of the window, followed by ``more``."""
     filled_s = estimate.curve.n / estimate.rate_hz
     return {"rate": estimate.rate_hz, "window": estimate.window_s, "filled": filled_s, **more}
 
 
 def _encode(topic: topics.Topic, device: str, unix_s: float | None, samples: int, payload: dict[str, Any]) -> bytes:
+    """Encode a message of a topic."""
     return _ENCODER.encode({"schema": topic.schema(), "device": device, "t": unix_s, "samples": samples, **payload})
 
 
 def measured_axes(estimate: Estimate) -> list[tuple[int, str]]:
-    """Column and name of each axis that has a curve."""
+    """Return the column and name of each axis that has a curve."""
     avar = estimate.curve.avar
     return [(i, axis) for i, axis in enumerate(AXES) if not np.isnan(avar[:, i]).all()]
 
 
 def _curve(curve: AllanCurve, axis: int) -> dict[str, list[float]]:
+    """Return the Allan deviation of one axis with its interval."""
     columns = {"deviation": np.sqrt(curve.avar), "lo": curve.lo, "hi": curve.hi}
     return {name: _list(column[:, axis]) for name, column in columns.items()}
 
 
-def _beside(tau_s: Floats, variance: Floats, lo: Floats, hi: Floats, axis: int) -> dict[str, list[float]]:
-    """Another deviation of one axis."""
+def _deviation_of_axis(tau_s: Floats, variance: Floats, lo: Floats, hi: Floats, axis: int) -> dict[str, list[float]]:
+    """Return another kind of deviation of one axis, with its own averaging times."""
     columns = {"deviation": np.sqrt(variance), "lo": lo, "hi": hi}
     return {"tau": _list(tau_s), **{name: _list(column[:, axis]) for name, column in columns.items()}}
 
 
-def _dependence(warmth: WithoutTemperature, axis: str) -> dict[str, Any]:
-    """The mark of an axis of whose slow variance temperature explains most."""
+def _temperature_dependence(warmth: WithoutTemperature, axis: str) -> dict[str, Any]:
+    """Return the measures of how strongly the bias of an axis depends on temperature."""
     one = warmth.dependences[axis]
     return {
         "share": one.share,
@@ -281,8 +435,8 @@ def _dependence(warmth: WithoutTemperature, axis: str) -> dict[str, Any]:
     }
 
 
-def _without(warmth: WithoutTemperature, axis: str) -> dict[str, Any]:
-    """K and R of an axis whose bias follows temperature, without that."""
+def _without_temperature(warmth: WithoutTemperature, axis: str) -> dict[str, Any]:
+    """Return K and R of an axis after its temperature-correlated bias has been removed."""
     i = AXES.index(axis)
     table = coefficient_table(warmth.coefficients, i, warmth.k_or_r[i])
     return {
@@ -293,6 +447,7 @@ def _without(warmth: WithoutTemperature, axis: str) -> dict[str, Any]:
 
 
 def _motion(motion: Motion, rate_hz: float) -> dict[str, Any]:
+    """Return a detected motion; ``t`` is its start [s] after the first sample."""
     return {
         "kind": motion.kind,
         "axis": motion.axis,
@@ -304,6 +459,7 @@ def _motion(motion: Motion, rate_hz: float) -> dict[str, Any]:
 
 
 def _change(change: Change, rate_hz: float) -> dict[str, Any]:
+    """Return a detected change; ``t`` is its start [s] after the first sample."""
     return {
         "kind": change.kind,
         "axis": AXES[change.axis],
@@ -315,7 +471,7 @@ def _change(change: Change, rate_hz: float) -> dict[str, Any]:
 
 
 def _dynamic(dynamic: Dynamic, axes: Sequence[tuple[int, str]]) -> dict[str, Any]:
-    """Lists by time step; of deviations, in each a list by τ."""
+    """Return the dynamic Allan deviation as lists by time step; deviations hold one list by τ in each."""
     return {
         "window": dynamic.window_s,
         "t": _list(dynamic.t_s),
@@ -341,13 +497,16 @@ def _dynamic(dynamic: Dynamic, axes: Sequence[tuple[int, str]]) -> dict[str, Any
 
 
 def _band(band: Band | None) -> dict[str, float] | None:
+    """Return a predicted bias with its interval; None if there is no model."""
     return None if band is None else {"bias": band.bias, "lo": band.lo, "hi": band.hi}
 
 
 def _number(value: float | np.float64) -> float | None:
+    """Return the value, or None if it is not finite."""
     return float(value) if np.isfinite(value) else None
 
 
 def _list(column: Floats) -> list[float]:
+    """Return an array as a list."""
     result: list[float] = column.tolist()
     return result

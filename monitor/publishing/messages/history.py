@@ -1,8 +1,9 @@
-"""Past results -> JSON of ``imu/<device>/history`` and ``history --json``, and back, for whoever asks another daemon.
+"""Encoding and decoding of past results: the JSON of ``imu/<device>/history`` and ``history --json``.
 
-Lists go by bucket. Of each number ``value`` is the last of its bucket, ``low`` and ``high`` are its extremes. A letter
-has the interval of that last value too, and its status: ``upper_bound`` where it was bounded and never estimated within
-the bucket. NaN becomes null. Seven digits are kept; nine are written, so that what is read is what was kept.
+All lists are indexed by bucket. For each number, ``value`` is the last value of its bucket, and ``low`` and ``high``
+are the extremes. A coefficient also has the interval of its last value and its status. The status is ``upper_bound``
+if the value was bounded and never estimated within the bucket. NaN becomes null. Stored values have seven digits.
+Nine are written, so that the decoded float32 values equal the stored ones exactly.
 """
 
 from collections.abc import Sequence
@@ -22,7 +23,8 @@ from monitor.history.reading import Course, Past
 from monitor.history.sqlite_store import PastEvent
 from monitor.history.time_ranges import Span
 
-POINTS_AT_MOST: Final = 1_000_000
+MAX_BUCKETS: Final = 1_000_000
+"""Largest number of buckets accepted in a message."""
 Numbers = list[float | None]
 State = Literal["ended", "running", "waiting", "lost"]
 _ENCODER: Final = msgspec.json.Encoder()
@@ -30,7 +32,7 @@ _STATUSES: Final = {status: status.name.lower() for status in Status}
 
 
 class Number(msgspec.Struct, frozen=True, kw_only=True):
-    """One number over time."""
+    """Number over time: last value, minimum and maximum of each bucket."""
 
     value: Numbers
     low: Numbers
@@ -38,7 +40,7 @@ class Number(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Letter(Number, frozen=True, kw_only=True):
-    """One coefficient of one axis over time."""
+    """Coefficient of one axis over time, with interval, count and status."""
 
     lo: Numbers
     hi: Numbers
@@ -47,7 +49,7 @@ class Letter(Number, frozen=True, kw_only=True):
 
 
 class Deviation(msgspec.Struct, frozen=True, kw_only=True):
-    """Of one axis: by bucket, in each by τ."""
+    """Deviations of one axis: a list by bucket, each a list by τ."""
 
     value: list[Numbers]
     low: list[Numbers]
@@ -55,14 +57,14 @@ class Deviation(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Deviations(msgspec.Struct, frozen=True, kw_only=True):
-    """All axes."""
+    """Deviations of all axes and their averaging times [s]."""
 
     tau: list[float]
     axes: dict[str, Deviation]
 
 
 class StatusCourse(msgspec.Struct, frozen=True, kw_only=True):
-    """How the device did."""
+    """State and counters of the device over time."""
 
     state: list[State]
     received: list[int]
@@ -76,7 +78,7 @@ class StatusCourse(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EventOfPast(msgspec.Struct, frozen=True, kw_only=True):
-    """Something that happened."""
+    """Event of the device."""
 
     t: float
     kind: str
@@ -89,7 +91,7 @@ class EventOfPast(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class HistoryMessage(msgspec.Struct, frozen=True, kw_only=True):
-    """``imu/<device>/history``."""
+    """Message ``imu/<device>/history``."""
 
     schema: str
     device: str
@@ -108,7 +110,19 @@ class HistoryMessage(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def history(past: Past, asked: Question, unix_s: float, samples: int) -> bytes:
-    """The answer to a question: ``t`` and ``samples`` are of the newest sample and since the start, as everywhere."""
+    """Encode the reply to a history query.
+
+    Parameters
+    ----------
+    past
+        The stored results.
+    asked
+        The query.
+    unix_s
+        Unix time of the newest sample [s].
+    samples
+        Number of samples since the start of the device.
+    """
     payload: dict[str, Any] = {
         "schema": topics.HISTORY.schema(),
         "device": past.device,
@@ -138,14 +152,16 @@ def history(past: Past, asked: Question, unix_s: float, samples: int) -> bytes:
 
 
 def read(payload: bytes) -> Past:
-    """What such a message says.
+    """Decode a history message.
 
-    Raises:
-        ValueError: it is none
+    Raises
+    ------
+    ValueError
+        The payload is not a history message.
     """
     said = msgspec.json.decode(payload, type=HistoryMessage)
     p = len(said.start)
-    if said.schema != topics.HISTORY.schema() or len(said.width) != p or p > POINTS_AT_MOST:
+    if said.schema != topics.HISTORY.schema() or len(said.width) != p or p > MAX_BUCKETS:
         raise ValueError("not an answer of a history")
     columns: dict[str, Course] = {}
     for axis, letters in (said.axes or {}).items():
@@ -186,6 +202,7 @@ def read(payload: bytes) -> Past:
 
 
 def _letter(past: Past, axis: str, letter: str) -> dict[str, Any]:
+    """Encode one coefficient of one axis."""
     value, bound = past.column(f"{axis}.{letter}"), past.column(f"{axis}.{letter}.bound")
     lo, hi = (past.column(f"{axis}.{letter}.{end}") for end in ("lo", "hi"))
     estimated, bounded = value.n > 0, bound.n > 0
@@ -201,7 +218,7 @@ def _letter(past: Past, axis: str, letter: str) -> dict[str, Any]:
 
 
 def _letter_columns(name: str, one: Letter, p: int) -> dict[str, Course]:
-    """A letter's numbers, as they are kept."""
+    """Return the stored columns of one decoded coefficient."""
     n = _integers(one.n, p)
     value, lo, hi = _course(one, p), _floats(one.lo, p), _floats(one.hi, p)
     if len(one.status) != p:
@@ -210,13 +227,14 @@ def _letter_columns(name: str, one: Letter, p: int) -> dict[str, Course]:
     missing = np.full(p, np.nan)
     return {
         name: Course(n, value.low, value.high, value.last),
-        f"{name}.lo": _steady(np.where(only, missing, lo)),
-        f"{name}.hi": _steady(np.where(only, missing, hi)),
-        f"{name}.bound": _steady(np.where(only, hi, missing)),
+        f"{name}.lo": _column_without_extremes(np.where(only, missing, lo)),
+        f"{name}.hi": _column_without_extremes(np.where(only, missing, hi)),
+        f"{name}.bound": _column_without_extremes(np.where(only, hi, missing)),
     }
 
 
 def _deviations(past: Past, axes: Sequence[str]) -> dict[str, Any]:
+    """Encode the deviations of the given axes."""
     taus = past.taus()
     found: dict[str, Any] = {}
     for axis in axes:
@@ -230,30 +248,35 @@ def _deviations(past: Past, axes: Sequence[str]) -> dict[str, Any]:
 
 
 def _deviation_columns(said: Deviations, p: int) -> dict[str, Course]:
+    """Return the stored columns of the decoded deviations."""
     columns = {}
     for axis, one in said.axes.items():
         if axis not in AXES:
             continue
-        value, low, high = (_table(part, p, len(said.tau)) for part in (one.value, one.low, one.high))
+        value, low, high = (_two_dimensional(part, p, len(said.tau)) for part in (one.value, one.low, one.high))
         for i, tau in enumerate(said.tau):
             columns[f"{axis}.sigma.{tau:g}"] = Course(np.isfinite(value[:, i]) * 1, low[:, i], high[:, i], value[:, i])
     return columns
 
 
 def _number(course: Course) -> dict[str, Numbers]:
+    """Encode a number over time."""
     return {"value": _list(course.last), "low": _list(course.low), "high": _list(course.high)}
 
 
 def _course(number: Number, p: int) -> Course:
+    """Return the stored column of a decoded number."""
     low, high, last = (_floats(one, p) for one in (number.low, number.high, number.value))
     return Course((~np.isnan(last)).astype(np.int64), low, high, last)
 
 
-def _steady(last: Floats) -> Course:
+def _column_without_extremes(last: Floats) -> Course:
+    """Return a column whose extremes equal its last values."""
     return Course((~np.isnan(last)).astype(np.int64), last, last, last)
 
 
 def _event(event: PastEvent) -> dict[str, Any]:
+    """Encode an event."""
     return {
         "t": event.t_s,
         "kind": event.kind,
@@ -267,6 +290,7 @@ def _event(event: PastEvent) -> dict[str, Any]:
 
 
 def _read_event(said: EventOfPast) -> PastEvent:
+    """Return the stored form of a decoded event."""
     what = {
         name: {key: np.nan if one is None else one for key, one in sides.items()} for name, sides in said.what.items()
     }
@@ -275,30 +299,33 @@ def _read_event(said: EventOfPast) -> PastEvent:
 
 
 def _list(column: Floats) -> Numbers:
-    """Nine digits: float32 comes back bit for bit."""
+    """Return values with nine digits, which represent every float32 exactly."""
     return [float(f"{one:.9g}") for one in column.tolist()]
 
 
 def _floats(numbers: Numbers, p: int) -> Floats:
+    """Return ``p`` numbers as an array; null becomes NaN."""
     found = np.array([np.nan if one is None else one for one in numbers], np.float64)
     if found.shape != (p,):
         raise ValueError("lists of different lengths")
     return found
 
 
-def _table(rows: Sequence[Numbers], p: int, m: int) -> Floats:
+def _two_dimensional(rows: Sequence[Numbers], p: int, m: int) -> Floats:
+    """Return lists of numbers as an array of shape [p, m]."""
     if len(rows) != p:
         raise ValueError("lists of different lengths")
     return np.array([_floats(row, m) for row in rows]).reshape(p, m)
 
 
 def _singles(columns: Sequence[Floats], p: int) -> Singles:
-    """[p, k] of k columns."""
-    with np.errstate(over="ignore"):  # what no sensor says becomes infinite
+    """Return k columns of length p as a float32 array of shape [p, k]."""
+    with np.errstate(over="ignore"):  # values outside the float32 range, which no sensor produces, become infinite
         return np.array(columns, np.float64).reshape(len(columns), p).T.astype(np.float32)
 
 
 def _integers(numbers: Sequence[int], p: int) -> "np.ndarray[tuple[int], np.dtype[np.int64]]":
+    """Return ``p`` integers as an array."""
     try:
         found = np.array(numbers, np.int64)
     except OverflowError as error:
@@ -309,5 +336,5 @@ def _integers(numbers: Sequence[int], p: int) -> "np.ndarray[tuple[int], np.dtyp
 
 
 def clean(text: str) -> str:
-    """Without control characters: it ends on a terminal."""
+    """Replace control characters by spaces, because the text is shown on a terminal."""
     return "".join(one if one.isprintable() else " " for one in text)

@@ -1,8 +1,8 @@
-"""What a daemon's messages say of one device: payloads of ``monitor.common.topics`` -> typed values.
+"""State of a remote device, decoded from the messages of its daemon.
 
-In comes JSON as ``monitor.publishing.messages.encoding`` writes it, from any daemon on the network; out come numbers in SI, or
-``ValueError`` for what is not such a message. Fields that a newer daemon added are ignored. Texts are freed of control
-characters, as they end on a terminal. Pure.
+JSON messages as ``monitor.publishing.messages.encoding`` writes them, from any daemon on the network, become typed
+values in SI units. Any other payload raises ``ValueError``. Unknown fields of newer daemons are ignored. Control
+characters are removed from text, because it is shown on a terminal. The module does no I/O.
 """
 
 from dataclasses import dataclass
@@ -16,36 +16,37 @@ from monitor.common import topics
 from monitor.estimation.fit.coefficients import LETTERS, Coefficients, Status
 
 STATUSES: Final = {status.name.lower(): status for status in Status}
-QUIET: Final = ("ok", "off")
-"""States of an output that need no word."""
+NORMAL_OUTPUT_STATES: Final = ("ok", "off")
+"""States of an output that are not shown."""
 GONE_S: Final = 1.5
-"""The liveliness token is away and no status (1 Hz) came for so long: who is killed is missed within two seconds."""
-NAMED: Final = 6
-"""Of the limits that are passed."""
+"""Age of the newest message [s] after which a device without liveliness token is gone. The status comes at 1 Hz, so a
+daemon that is killed is reported within two seconds."""
+MAX_NAMED_LIMITS: Final = 6
+"""Largest number of exceeded limits that are listed by name."""
 SILENT_S: Final = 5.0
-"""The token is there, or was never seen, and nothing came for so long."""
-LONGEST_TEXT: Final = 400
-MOST_OUTPUTS: Final = 16
+"""Age of the newest message [s] after which a device is silent, if its token exists or was never seen."""
+MAX_TEXT_LENGTH: Final = 400
+MAX_OUTPUTS: Final = 16
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 
-LARGEST_BYTES: Final = 1_000_000
-"""Of a payload: six axes are some kilobytes."""
+MAX_PAYLOAD_BYTES: Final = 1_000_000
+"""Largest accepted payload; a message of six axes has a few kilobytes."""
 
 
 class Latency(msgspec.Struct, frozen=True):
-    """Receipt to published, s."""
+    """Percentiles of the latency from receipt to publication [s]."""
 
     p50: float | None = None
     p99: float | None = None
 
 
 class StatusMessage(msgspec.Struct, frozen=True):
-    """``imu/<device>/status``."""
+    """Message ``imu/<device>/status``."""
 
     schema: str
     t: float | None
-    """Null before the first sample of a device with times of its own."""
+    """Null before the first sample of a device that has its own clock."""
     state: str
     received: Count
     lost: Count
@@ -61,18 +62,18 @@ class StatusMessage(msgspec.Struct, frozen=True):
 
 
 class Letter(msgspec.Struct, frozen=True):
-    """One coefficient of one axis."""
+    """Coefficient of one axis with interval and status."""
 
     status: str
     value: float | None = None
     lo: float | None = None
     hi: float | None = None
     either: str | None = msgspec.field(name="or", default=None)
-    """The other letter of K and R, where which of the two is there is not known."""
+    """The other letter of K and R, if the data do not show which of the two is present."""
 
 
 class CoefficientsMessage(msgspec.Struct, frozen=True):
-    """``imu/<device>/coefficients``."""
+    """Message ``imu/<device>/coefficients``."""
 
     schema: str
     samples: Count
@@ -83,7 +84,7 @@ class CoefficientsMessage(msgspec.Struct, frozen=True):
 
 
 class EventMessage(msgspec.Struct, frozen=True):
-    """``imu/<device>/event``."""
+    """Message ``imu/<device>/event``."""
 
     schema: str
     t: float
@@ -94,7 +95,7 @@ class EventMessage(msgspec.Struct, frozen=True):
 
 
 class Curve(msgspec.Struct, frozen=True):
-    """Deviations of one axis, SI."""
+    """Deviations of one axis and their intervals, SI."""
 
     deviation: list[float | None]
     lo: list[float | None]
@@ -102,7 +103,7 @@ class Curve(msgspec.Struct, frozen=True):
 
 
 class AllanMessage(msgspec.Struct, frozen=True):
-    """``imu/<device>/allan``."""
+    """Message ``imu/<device>/allan``."""
 
     schema: str
     t: float
@@ -115,13 +116,13 @@ class AllanMessage(msgspec.Struct, frozen=True):
 
 
 class Place(msgspec.Struct, frozen=True):
-    """Where a gap is."""
+    """Range of averaging times of a deviation from the model."""
 
     tau: tuple[float, float]
 
 
 class AxisGapMessage(msgspec.Struct, frozen=True):
-    """One axis beside its model."""
+    """Comparison of one axis with its model."""
 
     gap: float
     where: Place
@@ -129,7 +130,7 @@ class AxisGapMessage(msgspec.Struct, frozen=True):
 
 
 class GapMessage(msgspec.Struct, frozen=True):
-    """``imu/<device>/gap``."""
+    """Message ``imu/<device>/gap``."""
 
     schema: str
     axes: dict[str, AxisGapMessage]
@@ -140,27 +141,27 @@ M = TypeVar("M", StatusMessage, CoefficientsMessage, EventMessage, GapMessage, A
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """The newest coefficients of a device."""
+    """Newest coefficients of a device."""
 
     coefficients: Coefficients
-    axes: tuple[str, ...]  # those that are measured
-    seen_s: float | None  # how much of the window is full
-    either: frozenset[str] = frozenset()  # axes on which K or R is there, which of them not known
+    axes: tuple[str, ...]  # measured axes
+    seen_s: float | None  # filled part of the window [s]
+    either: frozenset[str] = frozenset()  # axes on which either K or R is present and the data do not show which
 
 
 @dataclass(slots=True)
 class Heard:
-    """All that is known of one device; times by the listener's own clock."""
+    """State of a remote device; times are those of the receiver's monotonic clock."""
 
-    key: str  # without the topic
-    heard_s: float  # newest message of any kind
+    key: str  # key of the device, without the topic
+    heard_s: float  # time of the newest message of any topic
     status: StatusMessage | None = None
     noise: Noise | None = None
     gap: GapMessage | None = None
-    there: bool | None = None  # liveliness; None: never told
+    there: bool | None = None  # True if its liveliness token exists; None if unknown
 
     def state(self, now_s: float) -> str:
-        """The daemon's word, or what silence means: gone, silent; present while nothing is known yet."""
+        """Return the state that the daemon reports, or gone, silent or present (no status received yet)."""
         age_s = now_s - self.heard_s
         ended = self.status is not None and self.status.state == "ended"
         if age_s > GONE_S and self.there is False and not ended:
@@ -170,7 +171,7 @@ class Heard:
         return "present" if self.status is None else clean(self.status.state)
 
     def rank(self, now_s: float) -> int:
-        """For sorting, worst first: 0 nothing comes, 1 something is wrong or not there yet, 2 runs, 3 has ended."""
+        """Return the sort key, worst first: 0 no data, 1 a problem or not ready, 2 running, 3 ended."""
         state, status = self.state(now_s), self.status
         if state in ("lost", "gone", "silent"):
             return 0
@@ -178,26 +179,26 @@ class Heard:
             return 3
         if status is None or state != "running":
             return 1
-        well = all(output in QUIET or output.startswith("ok,") for output in status.outputs.values())
+        well = all(output in NORMAL_OUTPUT_STATES or output.startswith("ok,") for output in status.outputs.values())
         well &= not status.text and not status.overflowed and not status.crossed
         return 2 if well and not self.disagreements() else 1
 
     def trouble(self) -> str:
-        """What is wrong, in words; empty while all is well."""
+        """Return a description of all problems; empty if there are none."""
         if self.status is None:
             return ""
         said = [clean(self.status.text)] if self.status.text else []
         outputs = self.status.outputs.items()
-        said += [f"{clean(name)}: {clean(state)}" for name, state in outputs if state not in QUIET]
+        said += [f"{clean(name)}: {clean(state)}" for name, state in outputs if state not in NORMAL_OUTPUT_STATES]
         if self.status.overflowed:
             said.append(f"{self.status.overflowed:,} samples overwritten before they were used: too slow here")
         if crossed := self.status.crossed:
-            more = f" and {len(crossed) - NAMED} more" if len(crossed) > NAMED else ""
-            said.append(f"beyond its limit: {', '.join(clean(one) for one in crossed[:NAMED])}{more}")
+            more = f" and {len(crossed) - MAX_NAMED_LIMITS} more" if len(crossed) > MAX_NAMED_LIMITS else ""
+            said.append(f"beyond its limit: {', '.join(clean(one) for one in crossed[:MAX_NAMED_LIMITS])}{more}")
         return "; ".join([*said, *self.disagreements()])
 
     def disagreements(self) -> list[str]:
-        """Of each axis that disagrees with its model, by how much and where."""
+        """Return one line for each axis that disagrees with its model."""
         found = [] if self.gap is None else [item for item in self.gap.axes.items() if item[1].agrees is False]
         return [
             f"{clean(axis)} disagrees with its model: {one.gap:.3g} σ at τ {one.where.tau[0]:.3g} to "
@@ -207,7 +208,7 @@ class Heard:
 
 
 def split(key: str) -> tuple[str, topics.Topic] | None:
-    """A key -> the device's part and the topic; None for what is no key of ``monitor.common.topics``.
+    """Split a key into the device's part and the topic; None if the topic is not in ``monitor.common.topics``.
 
     >>> split("imu/bench-1/status")
     ('imu/bench-1', Topic(name='status', encoding='application/json', when='1 Hz', kept=1))
@@ -221,9 +222,24 @@ def split(key: str) -> tuple[str, topics.Topic] | None:
 
 
 def read(kind: type[M], topic: topics.Topic, payload: bytes) -> M:
-    """The message of ``payload``; ValueError when it is none of this topic and schema."""
-    if len(payload) > LARGEST_BYTES:
-        raise ValueError(f"{len(payload)} bytes; {LARGEST_BYTES} are the most that is read")
+    """Decode a message and check its schema.
+
+    Parameters
+    ----------
+    kind
+        Type of the message.
+    topic
+        Topic of the message, which defines the expected schema.
+    payload
+        JSON text.
+
+    Raises
+    ------
+    ValueError
+        The payload is too large, is not a message of this type, or has another schema.
+    """
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        raise ValueError(f"{len(payload)} bytes; {MAX_PAYLOAD_BYTES} are the most that is read")
     try:
         found = msgspec.json.decode(payload, type=kind)  # its errors are ValueErrors
     except RecursionError as error:
@@ -234,29 +250,33 @@ def read(kind: type[M], topic: topics.Topic, payload: bytes) -> M:
 
 
 def status(payload: bytes) -> StatusMessage:
-    """Texts cut to what a table can show, so that no device can fill a watcher's memory."""
+    """Decode a status message; text is truncated, so that no device can exhaust the memory of the receiver."""
     found = read(StatusMessage, topics.STATUS, payload)
-    outputs = {name[:LONGEST_TEXT]: said[:LONGEST_TEXT] for name, said in list(found.outputs.items())[:MOST_OUTPUTS]}
+    outputs = {
+        name[:MAX_TEXT_LENGTH]: said[:MAX_TEXT_LENGTH] for name, said in list(found.outputs.items())[:MAX_OUTPUTS]
+    }
     return msgspec.structs.replace(
-        found, state=found.state[:LONGEST_TEXT], text=found.text[:LONGEST_TEXT], outputs=outputs
+        found, state=found.state[:MAX_TEXT_LENGTH], text=found.text[:MAX_TEXT_LENGTH], outputs=outputs
     )
 
 
 def event(payload: bytes) -> EventMessage:
-    """Texts cut like those of a status."""
+    """Decode an event message; text is truncated as in a status message."""
     found = read(EventMessage, topics.EVENT, payload)
     what = {letter: found.what[letter] for letter in LETTERS if letter in found.what}
-    return msgspec.structs.replace(found, kind=found.kind[:LONGEST_TEXT], text=found.text[:LONGEST_TEXT], what=what)
+    return msgspec.structs.replace(
+        found, kind=found.kind[:MAX_TEXT_LENGTH], text=found.text[:MAX_TEXT_LENGTH], what=what
+    )
 
 
 def gap(payload: bytes) -> GapMessage:
-    """Of the axes that there are."""
+    """Decode a gap message; unknown axes are removed."""
     found = read(GapMessage, topics.GAP, payload)
     return msgspec.structs.replace(found, axes={axis: found.axes[axis] for axis in AXES if axis in found.axes})
 
 
 def noise(message: CoefficientsMessage) -> Noise:
-    """Coefficients as arrays [5, 6] of SI; ValueError for a status that is not known."""
+    """Convert coefficients into arrays of shape [5, 6] in SI; an unknown status raises ValueError."""
     value, lo, hi = (np.full((len(LETTERS), len(AXES)), np.nan) for _ in range(3))
     status = np.full(value.shape, Status.UNESTIMATED, np.int8)
     axes = tuple(axis for axis in AXES if axis in message.axes)
@@ -272,7 +292,7 @@ def noise(message: CoefficientsMessage) -> Noise:
 
 
 def clean(text: Any) -> str:
-    """One line without control characters (a terminal would obey them).
+    """Replace control characters by spaces, because a terminal would interpret them.
 
     >>> clean("link\\x1b[2J lost\\nnow")
     'link [2J lost now'
@@ -281,6 +301,7 @@ def clean(text: Any) -> str:
 
 
 def _status(word: str) -> Status:
+    """Return the status with this name; an unknown name raises ValueError."""
     if word not in STATUSES:
         raise ValueError(f'status "{word}"')
     return STATUSES[word]

@@ -1,1 +1,1 @@
-"""Figures as PNG."""
+"""Figures in PNG format."""

@@ -1,8 +1,7 @@
-"""One analysis as one picture, for ``imu-monitor analyze --plot FILE.png``.
+"""Plot of one analysis, for ``imu-monitor analyze --plot FILE.png``.
 
-In comes an ``Estimate``, out goes a file: gyroscopes and accelerometers side by side, the Allan plot with the letters,
-a table of the coefficients below, and, where dynamic curves were made, those below that in the same file.
-matplotlib is imported when a plot is asked for, and draws without a screen.
+Gyroscopes and accelerometers are shown side by side: the Allan plot, a table of the coefficients, and the dynamic
+curves if they were computed. matplotlib is imported when a plot is requested, and draws without a display.
 """
 
 from collections.abc import Collection, Sequence
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import SubFigure
 
-INCHES: Final = (7.2, 7.6)  # of one Allan panel with its table
+INCHES: Final = (7.2, 7.6)  # size of one Allan plot with its table
 DPI: Final = 150
 MISSING: Final = 'matplotlib is not installed: pip install "imu-monitor[plot]"'
 EXPLAINED: Final = (
@@ -53,18 +52,29 @@ def allan_plot(
     marks: Sequence[Mark] = (),
     axes_of_temperature: Collection[str] = (),
 ) -> None:
-    """Write the picture; the ending of ``path`` says the format.
+    """Write the plot; the suffix of ``path`` selects the format.
 
-    Args:
-        estimate: of the whole recording
-        path: file to write
-        title: above all
-        others: other deviations, such as total and Hadamard
-        dynamic: dynamic curves of the same recording, drawn below
-        marks: changes, on their time axis
-        axes_of_temperature: axes that are marked, as temperature explains most of their slow variance
-    Raises:
-        ConfigError: matplotlib is missing or the file cannot be written
+    Parameters
+    ----------
+    estimate
+        Estimate of the whole recording.
+    path
+        File to write.
+    title
+        Title of the figure.
+    others
+        Other deviations, such as total and Hadamard deviation.
+    dynamic
+        Dynamic curves of the same recording, drawn below the table.
+    marks
+        Changes to mark in the dynamic curves.
+    axes_of_temperature
+        Axes to mark because temperature explains most of their slow variance.
+
+    Raises
+    ------
+    ConfigError
+        matplotlib is missing or the file cannot be written.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -78,7 +88,7 @@ def allan_plot(
     rows = [INCHES[1]] if dynamic is None else [INCHES[1], below]
     parts = figure.subfigures(len(rows), len(kinds), squeeze=False, height_ratios=rows)
     for column, kind in enumerate(kinds):
-        _static(parts[0, column], estimate, kind, others, axes_of_temperature)
+        _draw_allan_and_table(parts[0, column], estimate, kind, others, axes_of_temperature)
         if dynamic is not None:
             dynamic_panels(parts[1, column], dynamic, kind, marks)
     figure.suptitle("\n".join([*([title] if title else []), summary(estimate)]), fontsize=12)
@@ -89,13 +99,13 @@ def allan_plot(
 
 
 def kinds_of(estimate: Estimate) -> list[Kind]:
-    """The kinds that are measured; both where nothing is."""
+    """Return the kinds of sensor that are measured; both kinds if none is."""
     present = set(measured_axes(estimate.curve.avar))
     return [kind for kind in KINDS if set(axes_of(kind)) & present] or list(KINDS)
 
 
 def summary(estimate: Estimate) -> str:
-    """How much was recorded, in a line: samples, rate, duration, and what is missing."""
+    """Return one line with the number of samples, rate, duration and number of missing samples."""
     missing = estimate.curve.n - estimate.samples
     gaps = f", {missing:,} missing" if missing > 0 else ""
     seconds = duration(estimate.curve.n / estimate.rate_hz)
@@ -103,7 +113,17 @@ def summary(estimate: Estimate) -> str:
 
 
 def k_or_r(estimate: Estimate, letter: str, axis: str) -> bool:
-    """Whether this is one of two terms of which the data show one, without telling which."""
+    """Return True if this coefficient is one of K and R, and the data do not show which of the two is present.
+
+    Parameters
+    ----------
+    estimate
+        The estimate.
+    letter
+        Coefficient.
+    axis
+        Name of the axis.
+    """
     i, drifts = AXES.index(axis), letter in ("K", "R")
     return (
         drifts
@@ -112,21 +132,21 @@ def k_or_r(estimate: Estimate, letter: str, axis: str) -> bool:
     )
 
 
-def _static(
+def _draw_allan_and_table(
     part: "SubFigure",
     estimate: Estimate,
     kind: Kind,
     others: Sequence[Beside],
     axes_of_temperature: Collection[str],
 ) -> None:
-    """Allan plot and table of one kind."""
+    """Draw the Allan plot and the table of one kind of sensor."""
     curves, table = part.subplots(2, 1, height_ratios=[3.6, 1.75])
     allan_panel(curves, estimate, kind, others)
     _table(table, estimate, kind, axes_of_temperature)
 
 
 def _table(axes: "Axes", estimate: Estimate, kind: Kind, axes_of_temperature: Collection[str]) -> None:
-    """The coefficients of one kind: value, and its interval in small print."""
+    """Draw the table of coefficients: the value, and its interval in small print."""
     axes.axis("off")
     columns = (0.0, 0.46, 0.65, 0.84)
     rows = np.linspace(0.97, 0.19, len(LETTERS) + 1)

@@ -1,8 +1,8 @@
-"""One colour an axis, in every picture: x red, y green, z blue, in shades that colour-blind eyes tell apart.
+"""Colours of the axes in all plots: x red, y green, z blue, in shades that colour-blind readers can distinguish.
 
-Lightness differs as well as hue (deuteranopia and protanopia keep vermilion, bluish green and sky blue
-of Okabe & Ito's palette apart; these are close to them). A gyroscope and an accelerometer of the same
-direction share the colour: they never share a plot.
+The colours differ in lightness as well as in hue. They are close to vermilion, bluish green and sky blue of the
+palette of Okabe & Ito, which remain distinct with deuteranopia and protanopia. A gyroscope and an accelerometer of
+the same direction share a colour, because they never share a plot.
 """
 
 from typing import Final
@@ -21,11 +21,21 @@ BACKGROUND: Final[Colour] = (13, 16, 17)
 FRAME: Final[Colour] = (92, 98, 104)
 MAJOR: Final[Colour] = (48, 53, 57)
 MINOR: Final[Colour] = (23, 27, 29)
-TEXT: Final[Colour] = (236, 239, 242)  # read on the label boxes of the dark and of the light theme
+TEXT: Final[Colour] = (236, 239, 242)  # legible on the label boxes of the dark and the light theme
 TEMPERATURE: Final[Colour] = (236, 180, 72)
 
 
 def mixed(colour: Colour, share: float, ground: Colour = BACKGROUND) -> Colour:
-    """``share`` of a colour over a ground: what a translucent fill would look like."""
+    """Return the mix of a colour and a background, as a translucent fill would appear.
+
+    Parameters
+    ----------
+    colour
+        Colour as red, green and blue, 0 to 255.
+    share
+        Share of the colour, 0 to 1.
+    ground
+        Background colour.
+    """
     r, g, b = (round(share * c + (1 - share) * d) for c, d in zip(colour, ground, strict=True))
     return r, g, b

@@ -1,6 +1,6 @@
-"""What compensation did, as a picture: the drift over time and the Allan curve, a row an axis.
+"""Plot of drift compensation: drift over time and Allan deviation, one row per axis.
 
-matplotlib is imported when a plot is asked for, and draws without a screen.
+matplotlib is imported when a plot is requested, and draws without a display.
 """
 
 from pathlib import Path
@@ -26,10 +26,19 @@ Z95: Final = 1.959964
 
 
 def compensate_plot(result: Result, path: Path) -> None:
-    """Write the picture.
+    """Write the plot.
 
-    Raises:
-        ConfigError: matplotlib is missing or the file cannot be written
+    Parameters
+    ----------
+    result
+        Results of the compensation.
+    path
+        File to write; its suffix selects the format.
+
+    Raises
+    ------
+    ConfigError
+        matplotlib is missing or the file cannot be written.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -52,6 +61,7 @@ def compensate_plot(result: Result, path: Path) -> None:
 
 
 def _drift(panel: "Axes", axis: str, result: Result) -> None:
+    """Draw the means at rest and the predicted drift of one axis."""
     at = AXES.index(axis)
     minutes = np.array([one.end for one in result.intervals]) / result.rate_hz / 60.0
     mean = np.array([one.mean[at] for one in result.intervals])
@@ -72,6 +82,7 @@ def _drift(panel: "Axes", axis: str, result: Result) -> None:
 
 
 def _allan(panel: "Axes", axis: str, one: Axis) -> None:
+    """Draw the Allan deviation of one axis before and after compensation."""
     colour = COLOURS[AXES.index(axis)]
     panel.loglog(one.before.tau_s, UNIT.factor * one.before.allan, color=GREY, lw=1.2, label="before")
     panel.loglog(one.after.tau_s, UNIT.factor * one.after.allan, color=colour, lw=1.5, label="after")

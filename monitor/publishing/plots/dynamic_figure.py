@@ -1,11 +1,11 @@
-"""The dynamic curves of one kind of sensor: Allan surfaces over time, and below them Q(t) … R(t).
+"""Plot of the dynamic Allan deviation of one kind of sensor: heat maps over time, and the coefficients Q(t) … R(t).
 
-In comes a ``Dynamic``; out go two groups of panels with one common time axis, the end of the window. A surface shows
-every τ against time, coloured by the deviation over its own median over time, so that all τ stand in one scale: red is
-more than usual, blue less. Cells whose 95 % interval holds that median are pale: that colour alone says nothing. Of the
-coefficients those are drawn that are estimated for a while on some axis, with their intervals as bands; a line is
-interrupted where there is no estimate. A change is a vertical mark, with a word, through the surface of its axis and,
-in the colour of the axis, through the courses; those too near to each other to be named apart share a word.
+All panels share one time axis, the end of the window. A heat map shows each τ over time, coloured by the deviation
+relative to its median over time, so all τ share one scale. Red is above the median, blue below. Cells whose 95 %
+interval contains the median are pale, because their colour is not significant. Coefficients are drawn if they are
+estimated for some time on some axis, with their intervals as bands. A line is interrupted where there is no estimate.
+A change is a labelled vertical line through the heat map of its axis and, in the colour of the axis, through the
+coefficient panels. Changes too close to each other share a label.
 """
 
 from collections.abc import Sequence
@@ -28,35 +28,42 @@ if TYPE_CHECKING:
 
 SURFACE_INCHES: Final = 1.35
 LINE_INCHES: Final = 1.6
-SPARE_INCHES: Final = 1.2  # title, colour bar, time axis
-SHARE: Final = 0.05  # of the time steps: a letter estimated on fewer has no panel
-PALE: Final = 0.3
-DASHED: Final = (0, (4, 2))
-APART: Final = 0.13  # of the width: words nearer than this would touch
-RATIOS: Final = (1.25, 1.5, 2.0, 3.0, 5.0, 10.0)  # ends of the colour scale; the first that holds most of the cells
-BANDS: Final = 0.9  # of the bands' ends a panel holds so many; the widest would flatten the courses
-WIDE: Final = 3.0  # log scale where a coefficient varies by more than this factor
+SPARE_INCHES: Final = 1.2  # height of title, colour bar and time axis
+MIN_ESTIMATED_SHARE: Final = 0.05  # smallest share of time steps with an estimate for a coefficient to have a panel
+PALE_ALPHA: Final = 0.3
+DASHED_LINE: Final = (0, (4, 2))
+APART: Final = 0.13  # smallest distance between two labels, as a share of the width
+COLOUR_SCALE_RATIOS: Final = (
+    1.25,
+    1.5,
+    2.0,
+    3.0,
+    5.0,
+    10.0,
+)  # possible ends of the colour scale; the first that holds most cells
+BANDS: Final = 0.9  # share of the ends of the bands inside a panel; the widest would determine its scale
+LOG_SCALE_RATIO: Final = 3.0  # ratio of largest to smallest value above which a logarithmic scale is used
 UNITS_S: Final = (("s", 1.0, 600.0), ("min", 60.0, 10_800.0), ("h", 3600.0, 259_200.0), ("d", 86_400.0, np.inf))
 
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A change of one axis."""
+    """Change of one axis to mark in the plot."""
 
-    t_s: float  # since the first sample
+    t_s: float  # time since the first sample
     axis: str
 
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """The unit of a time axis."""
+    """Unit of a time axis."""
 
     name: str
     seconds: float
 
     @classmethod
     def of(cls, span_s: float) -> "Clock":
-        """The unit that suits a span.
+        """Return the unit that suits a time span given in seconds.
 
         >>> Clock.of(7200.0).name, Clock.of(5e5).name
         ('min', 'd')
@@ -65,25 +72,49 @@ class Clock:
 
 
 def letters(dynamic: Dynamic, kind: Kind) -> tuple[str, ...]:
-    """The coefficients that are worth a panel."""
+    """Return the coefficients that are estimated often enough to have a panel.
+
+    Parameters
+    ----------
+    dynamic
+        Dynamic curves.
+    kind
+        Kind of sensor.
+    """
     columns = [AXES.index(axis) for axis in axes_of(kind)]
     share = (dynamic.status[:, :, columns] == Status.ESTIMATED).mean(axis=0).max(axis=1)
-    return tuple(letter for letter, one in zip(LETTERS, share, strict=True) if one >= SHARE)
+    return tuple(letter for letter, one in zip(LETTERS, share, strict=True) if one >= MIN_ESTIMATED_SHARE)
 
 
 def axes_shown(dynamic: Dynamic, kind: Kind) -> tuple[str, ...]:
-    """The axes of a kind that are measured."""
+    """Return the measured axes of a kind of sensor.
+
+    Parameters
+    ----------
+    dynamic
+        Dynamic curves.
+    kind
+        Kind of sensor.
+    """
     return tuple(a for a in axes_of(kind) if bool(np.isfinite(dynamic.deviation[:, :, AXES.index(a)]).any()))
 
 
 def height_inches(dynamic: Dynamic, kind: Kind) -> float:
-    """Of the whole figure."""
+    """Return the height of the figure [inches].
+
+    Parameters
+    ----------
+    dynamic
+        Dynamic curves.
+    kind
+        Kind of sensor.
+    """
     surfaces, lines = len(axes_shown(dynamic, kind)), len(letters(dynamic, kind))
     return SPARE_INCHES + SURFACE_INCHES * surfaces + LINE_INCHES * lines
 
 
 def relative(dynamic: Dynamic) -> Floats:
-    """Deviation over its median over time [T, m, 6]; NaN where there is none, and where the median is 0.
+    """Return the deviation divided by its median over time, shape [T, m, 6]; NaN if missing or if the median is 0.
 
     >>> from monitor.estimation.allan.dynamic_allan import dynamic as of
     >>> steady = of(np.random.default_rng(1).standard_normal((3000, 6)), 10.0, 100.0)
@@ -95,39 +126,51 @@ def relative(dynamic: Dynamic) -> Floats:
 
 
 def dynamic_panels(figure: "Figure | SubFigure", dynamic: Dynamic, kind: Kind, marks: Sequence[Mark] = ()) -> None:
-    """Fill a figure with the panels of one kind; ``marks``: of all kinds, its own are drawn."""
+    """Draw the panels of one kind of sensor.
+
+    Parameters
+    ----------
+    figure
+        Figure to fill.
+    dynamic
+        Dynamic curves.
+    kind
+        Kind of sensor.
+    marks
+        Changes of all axes; those of this kind are drawn.
+    """
     axes, shown = axes_shown(dynamic, kind), letters(dynamic, kind)
     ratios = [SURFACE_INCHES] * len(axes) + [LINE_INCHES] * len(shown)
     panels = figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
     clock = Clock.of(float(dynamic.t_s[-1]))
     edges = _edges(dynamic.t_s) / clock.seconds
-    ratio, mesh = _scale(relative(dynamic)[..., [AXES.index(axis) for axis in axes]]), None
+    ratio, mesh = _colour_scale_end(relative(dynamic)[..., [AXES.index(axis) for axis in axes]]), None
     for panel, axis in zip(panels, axes, strict=False):
-        mesh = _surface(panel, dynamic, axis, edges, ratio)
+        mesh = _draw_heat_map(panel, dynamic, axis, edges, ratio)
     for panel, letter in zip(panels[len(axes) :], shown, strict=True):
-        _course(panel, dynamic, kind, letter, dynamic.t_s / clock.seconds)
+        _draw_coefficient(panel, dynamic, kind, letter, dynamic.t_s / clock.seconds)
     for panel in panels:
         panel.set_xlim(edges[0], edges[-1])
     own = [mark for mark in marks if mark.axis in axes and edges[0] <= mark.t_s / clock.seconds <= edges[-1]]
-    _mark(list(panels), axes, own, clock)
+    _draw_changes(list(panels), axes, own, clock)
     panels[0].set_title(KIND_NAMES[kind], loc="left", fontsize=12)
     panels[-1].set_xlabel(f"time at the end of the window of {dynamic.window_s:.4g} s, {clock.name}")
     figure.align_ylabels(list(panels))
     if mesh is not None:
-        _bar(figure, mesh, list(panels[: len(axes)]), ratio)
+        _draw_colour_bar(figure, mesh, list(panels[: len(axes)]), ratio)
 
 
-def _mark(panels: "Sequence[Axes]", axes: Sequence[str], marks: Sequence[Mark], clock: Clock) -> None:
-    """Vertical lines, and in the surface of their axis what they are."""
+def _draw_changes(panels: "Sequence[Axes]", axes: Sequence[str], marks: Sequence[Mark], clock: Clock) -> None:
+    """Draw changes as vertical lines, with labels in the heat map of their axis."""
     left, right = panels[0].get_xlim()
     apart = APART * (right - left)
     for panel, axis in zip(panels, axes, strict=False):
         times = [mark.t_s / clock.seconds for mark in marks if mark.axis == axis]
         for at in times:
-            panel.axvline(at, color=DARK, linewidth=1.1, linestyle=DASHED)
+            panel.axvline(at, color=DARK, linewidth=1.1, linestyle=DASHED_LINE)
             for course in panels[len(axes) :]:
-                course.axvline(at, color=COLOURS[AXES.index(axis) % 3], linewidth=1.1, linestyle=DASHED)
-        for near in _near(np.clip(times, left + apart / 2.0, right - apart / 2.0).tolist(), apart):
+                course.axvline(at, color=COLOURS[AXES.index(axis) % 3], linewidth=1.1, linestyle=DASHED_LINE)
+        for near in _group_times(np.clip(times, left + apart / 2.0, right - apart / 2.0).tolist(), apart):
             panel.annotate(
                 "change" if len(near) == 1 else f"{len(near)} changes", (sum(near) / len(near), 1.0), (0, -4),
                 xycoords=("data", "axes fraction"), textcoords="offset points",
@@ -136,10 +179,10 @@ def _mark(panels: "Sequence[Axes]", axes: Sequence[str], marks: Sequence[Mark], 
             )  # fmt: skip
 
 
-def _near(times: Sequence[float], apart: float) -> list[list[float]]:
-    """Times in heaps whose middles lie so far apart.
+def _group_times(times: Sequence[float], apart: float) -> list[list[float]]:
+    """Group times so that the means of neighbouring groups are at least ``apart`` apart.
 
-    >>> _near([1.0, 9.0, 1.5, 2.0], 2.0)
+    >>> _group_times([1.0, 9.0, 1.5, 2.0], 2.0)
     [[1.0, 1.5, 2.0], [9.0]]
     """
     heaps = [[time] for time in sorted(times)]
@@ -148,14 +191,14 @@ def _near(times: Sequence[float], apart: float) -> list[list[float]]:
         before, this = heaps[at - 1], heaps[at]
         if sum(this) / len(this) - sum(before) / len(before) < apart:
             heaps[at - 1 : at + 1] = [before + this]
-            at = max(at - 1, 1)  # the heap's middle has moved
+            at = max(at - 1, 1)  # the mean of the group has changed
         else:
             at += 1
     return heaps
 
 
-def _surface(panel: "Axes", dynamic: Dynamic, axis: str, edges: Floats, ratio: float) -> "QuadMesh":
-    """One heat map, time by τ."""
+def _draw_heat_map(panel: "Axes", dynamic: Dynamic, axis: str, edges: Floats, ratio: float) -> "QuadMesh":
+    """Draw the heat map of one axis, time by τ."""
     from matplotlib.ticker import NullLocator
 
     i = AXES.index(axis)
@@ -164,7 +207,7 @@ def _surface(panel: "Axes", dynamic: Dynamic, axis: str, edges: Floats, ratio: f
     median = _median(dynamic)[:, :, i]
     usual = (dynamic.lo[:, :, i] <= median) & (median <= dynamic.hi[:, :, i])
     end = np.log(ratio)
-    pale: Any = np.where(usual.T, PALE, 1.0)  # matplotlib takes an array, its types do not say so
+    pale: Any = np.where(usual.T, PALE_ALPHA, 1.0)  # matplotlib accepts an array, but its type hints do not
     mesh = panel.pcolormesh(
         edges, _edges_of_tau(dynamic.tau_s), colour,
         cmap="RdBu_r", vmin=-end, vmax=end, alpha=pale, rasterized=True, linewidth=0,
@@ -177,11 +220,11 @@ def _surface(panel: "Axes", dynamic: Dynamic, axis: str, edges: Floats, ratio: f
     return mesh
 
 
-def _bar(figure: "Figure | SubFigure", mesh: "QuadMesh", panels: "list[Axes]", ratio: float) -> None:
-    """The colour scale, as factors."""
+def _draw_colour_bar(figure: "Figure | SubFigure", mesh: "QuadMesh", panels: "list[Axes]", ratio: float) -> None:
+    """Draw the colour scale, labelled with factors."""
     from matplotlib.cm import ScalarMappable
 
-    # of its own: the bar of the mesh would be as pale as its cells
+    # A separate mappable is used, because the colour bar of the mesh would be as pale as its cells.
     bar = figure.colorbar(ScalarMappable(mesh.norm, mesh.cmap), ax=panels, aspect=30, pad=0.015, fraction=0.05)
     ticks = [-np.log(ratio), -np.log(ratio) / 2, 0.0, np.log(ratio) / 2, np.log(ratio)]
     bar.set_ticks(ticks, labels=[f"× {np.exp(tick):.2g}" for tick in ticks])
@@ -190,8 +233,8 @@ def _bar(figure: "Figure | SubFigure", mesh: "QuadMesh", panels: "list[Axes]", r
     bar.outline.set_visible(False)
 
 
-def _course(panel: "Axes", dynamic: Dynamic, kind: Kind, letter: str, t: Floats) -> None:
-    """One coefficient of three axes over time."""
+def _draw_coefficient(panel: "Axes", dynamic: Dynamic, kind: Kind, letter: str, t: Floats) -> None:
+    """Draw one coefficient of three axes over time."""
     row, unit = LETTERS.index(letter), COEFFICIENT_UNITS[kind][letter]
     held, ends = [], []
     for axis, colour in zip(axes_of(kind), COLOURS, strict=True):
@@ -201,15 +244,15 @@ def _course(panel: "Axes", dynamic: Dynamic, kind: Kind, letter: str, t: Floats)
             np.where(estimated, part[:, row, i] * unit.factor, np.nan)
             for part in (dynamic.value, dynamic.value_lo, dynamic.value_hi)
         )
-        # hundreds of corners a band: as pixels they cost a report nothing
+        # Bands have hundreds of corners; rasterized, they do not enlarge a report.
         panel.fill_between(t, lo, hi, color=colour, alpha=0.15, linewidth=0, rasterized=True)
         panel.plot(t, value, "-", color=colour, linewidth=1.4, label=axis)
-        alone = _alone(estimated)
+        alone = _isolated(estimated)
         panel.plot(t[alone], value[alone], ".", color=colour, markersize=3.5)
         held.append(value)
         ends.append((lo, hi))
     low, high = np.nanmin(held), np.nanmax(held)
-    if low > 0 and high > WIDE * low:
+    if low > 0 and high > LOG_SCALE_RATIO * low:
         panel.set_yscale("log")
         panel.set_ylim(low / 1.5, high * 1.5)
         plain_ticks(panel)
@@ -226,39 +269,39 @@ def _course(panel: "Axes", dynamic: Dynamic, kind: Kind, letter: str, t: Floats)
     )  # fmt: skip
 
 
-def _alone(there: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Without a neighbour: no line shows it."""
+def _isolated(there: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the points without a neighbour, which no line shows."""
     padded = np.concatenate([[False], there, [False]])
     return np.asarray(there & ~padded[:-2] & ~padded[2:])
 
 
 def _median(dynamic: Dynamic) -> Floats:
-    """Of the deviation over time [1, m, 6]; NaN where it never was."""
+    """Return the median of the deviation over time, shape [1, m, 6]; NaN if there is none."""
     import warnings
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # an axis that is not measured
+        warnings.simplefilter("ignore", RuntimeWarning)  # raised for an axis that is not measured
         median = np.nanmedian(dynamic.deviation, axis=0, keepdims=True)
     return np.asarray(np.where(median > 0.0, median, np.nan))
 
 
-def _scale(ratios: Floats) -> float:
-    """End of the colour scale: holds 95 % of the cells."""
+def _colour_scale_end(ratios: Floats) -> float:
+    """Return the end of the colour scale, which holds 95 % of the cells."""
     with np.errstate(invalid="ignore", divide="ignore"):
         size = np.abs(np.log(ratios))
     size = size[np.isfinite(size)]
-    most = float(np.exp(np.quantile(size, 0.95))) if size.size else RATIOS[0]
-    return next((ratio for ratio in RATIOS if ratio >= most), RATIOS[-1])
+    most = float(np.exp(np.quantile(size, 0.95))) if size.size else COLOUR_SCALE_RATIOS[0]
+    return next((ratio for ratio in COLOUR_SCALE_RATIOS if ratio >= most), COLOUR_SCALE_RATIOS[-1])
 
 
 def _edges(t: Floats) -> Floats:
-    """Edges of the cells around the times, steps being equal."""
+    """Return the edges of the cells around equally spaced times."""
     half = (t[1] - t[0]) / 2.0 if t.size > 1 else t[0] / 40.0
     return np.append(t - half, t[-1] + half)
 
 
 def _edges_of_tau(tau_s: Floats) -> Floats:
-    """Edges of the cells around the τ: in the middle of their logarithms."""
+    """Return the edges of the cells around the τ, at the means of their logarithms."""
     if tau_s.size == 1:
         return np.array([0.7, 1.4]) * float(tau_s[0])
     middle = np.sqrt(tau_s[1:] * tau_s[:-1])

@@ -1,6 +1,6 @@
-"""Bias against temperature as a picture: over time, and one against the other, a row an axis.
+"""Plots of bias and temperature: over time and against each other, one row per axis.
 
-matplotlib is imported when a plot is asked for, and draws without a screen.
+matplotlib is imported when a plot is requested, and draws without a display.
 """
 
 from pathlib import Path
@@ -25,7 +25,20 @@ ROW_INCHES: Final = (11.0, 2.6)
 
 
 def study_plot(study: Study, path: Path) -> None:
-    """Means and the model that was fitted to them."""
+    """Write a plot of interval means and the fitted thermal models.
+
+    Parameters
+    ----------
+    study
+        The fitted models.
+    path
+        File to write; its suffix selects the format.
+
+    Raises
+    ------
+    ConfigError
+        matplotlib is missing or the file cannot be written.
+    """
     rows = [
         (
             axis,
@@ -39,7 +52,20 @@ def study_plot(study: Study, path: Path) -> None:
 
 
 def outlook_plot(outlook: Outlook, path: Path) -> None:
-    """Means and what models of another recording expect, their offset taken out."""
+    """Write a plot of interval means and the predictions of models of another recording, with the offset removed.
+
+    Parameters
+    ----------
+    outlook
+        The predictions.
+    path
+        File to write; its suffix selects the format.
+
+    Raises
+    ------
+    ConfigError
+        matplotlib is missing or the file cannot be written.
+    """
     rows = []
     for axis, one in outlook.judged.items():
         band = Prediction(*(each + one.offset for each in (one.multi_step.bias, one.multi_step.lo, one.multi_step.hi)))
@@ -48,11 +74,7 @@ def outlook_plot(outlook: Outlook, path: Path) -> None:
 
 
 def _draw(rows: list[tuple[str, Means, Prediction, str]], title: str, path: Path) -> None:
-    """Write the picture.
-
-    Raises:
-        ConfigError: matplotlib is missing or the file cannot be written
-    """
+    """Write the plot; raise ConfigError if matplotlib is missing or the file cannot be written."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -74,7 +96,7 @@ def _draw(rows: list[tuple[str, Means, Prediction, str]], title: str, path: Path
         over_time.plot(hours, expected, color=colour, lw=1.4, label=name)
         over_time.set_ylabel(f"{axis} less its mean, {unit.name}")
         over_time.legend(loc="best", fontsize=7.5, frameon=False)
-        _against(against, means.temperature_c, bias, expected, colour)
+        _draw_against_temperature(against, means.temperature_c, bias, expected, colour)
     panels[-1, 0].set_xlabel("time, h")
     panels[-1, 1].set_xlabel("temperature, °C")
     figure.suptitle(title, fontsize=12)
@@ -84,6 +106,9 @@ def _draw(rows: list[tuple[str, Means, Prediction, str]], title: str, path: Path
         raise ConfigError(f"cannot write the plot {path}: {error}") from error
 
 
-def _against(panel: "Axes", temperature_c: Floats, bias: Floats, expected: Floats, colour: str) -> None:
+def _draw_against_temperature(
+    panel: "Axes", temperature_c: Floats, bias: Floats, expected: Floats, colour: str
+) -> None:
+    """Draw bias and prediction against temperature."""
     panel.plot(temperature_c, bias, ".", ms=4, color=GREY)
     panel.plot(temperature_c, expected, color=colour, lw=1.2)

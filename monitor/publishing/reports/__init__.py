@@ -1,1 +1,1 @@
-"""HTML reports, Rerun files and tables of results."""
+"""HTML reports, Rerun recordings and tables of results."""

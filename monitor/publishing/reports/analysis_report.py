@@ -1,9 +1,9 @@
-"""One analysis as one self-contained page, for ``imu-monitor analyze --plot FILE.html``.
+"""Report of one analysis as a self-contained HTML page, for ``imu-monitor analyze --plot FILE.html``.
 
-In comes an ``Analysis``, out goes a file that needs no network: the Allan plot of each kind of sensor as inline SVG,
-the table of coefficients in the field's units with intervals and words, what was recorded, the notes, and the dynamic
-curves where they were made. Surfaces over time are pictures inside the SVG, so that the page stays below a megabyte.
-matplotlib and Jinja2 are imported when a report is asked for.
+The page needs no network. It holds the Allan plot of each kind of sensor as inline SVG and the table of coefficients
+with intervals in the units of the field. It also holds facts about the recording, the notes, and the dynamic curves if
+they were computed. Heat maps are images inside the SVG, so that the page stays below one megabyte. matplotlib and
+Jinja2 are imported when a report is requested.
 """
 
 import io
@@ -41,11 +41,11 @@ if TYPE_CHECKING:
 
 TEMPLATE: Final = "report.html.j2"
 ALLAN_INCHES: Final = (7.2, 5.2)
-WIDE_INCHES: Final = 7.2
-PIXELS_DPI: Final = 80  # of surfaces and bands, which are pictures inside the drawing
-SIMPLER_PX: Final = 0.6  # corners of a line that are less than this beside it are left out
-MISSING: Final = 'matplotlib and Jinja2 are needed: pip install "imu-monitor[plot]"'
-WORDS: Final = {
+DYNAMIC_WIDTH_INCHES: Final = 7.2
+IMAGE_DPI: Final = 80  # resolution of heat maps and bands, which are images inside the SVG
+SIMPLIFY_THRESHOLD_PX: Final = 0.6  # corners of a line closer than this to it are removed
+MISSING_MESSAGE: Final = 'matplotlib and Jinja2 are needed: pip install "imu-monitor[plot]"'
+STATUS_TEXTS: Final = {
     Status.ESTIMATED: "",
     Status.UPPER_BOUND: "upper bound",
     Status.UNESTIMATED: "too few data",
@@ -55,16 +55,16 @@ K_OR_R: Final = "upper bound; K or R"
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One coefficient of one axis, as a person reads it."""
+    """Text of one coefficient of one axis."""
 
     value: str  # "0.516 °/√h", "≤ 3.10 °/h", "—"
     interval: str  # "0.512 … 0.520", or ""
-    word: str  # "upper bound", "too few data", or "" where it is estimated
+    word: str  # "upper bound", "too few data", or "" if it is estimated
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One letter of a table."""
+    """Row of one coefficient in a table."""
 
     letter: str
     name: str
@@ -73,13 +73,13 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What the page shows of one kind of sensor."""
+    """Section of the page for one kind of sensor."""
 
     name: str
-    axes: tuple[tuple[str, str], ...]  # name with its mark, and colour
+    axes: tuple[tuple[str, str], ...]  # name with temperature mark, and colour
     rows: tuple[Row, ...]
     allan: str  # SVG
-    dynamic: str  # SVG, or "" where there are no dynamic curves
+    dynamic: str  # SVG, or "" if there are no dynamic curves
 
 
 def html_report(
@@ -90,10 +90,27 @@ def html_report(
     dynamic: Dynamic | None = None,
     marks: Sequence[Mark] = (),
 ) -> None:
-    """Write the page; arguments as for ``plot.allan_plot``.
+    """Write the page.
 
-    Raises:
-        ConfigError: matplotlib or Jinja2 is missing, or the file cannot be written
+    Parameters
+    ----------
+    analysis
+        The analysis.
+    path
+        File to write.
+    title
+        Title of the page.
+    others
+        Other deviations, such as total and Hadamard deviation.
+    dynamic
+        Dynamic curves of the same recording.
+    marks
+        Changes to mark in the dynamic curves.
+
+    Raises
+    ------
+    ConfigError
+        matplotlib or Jinja2 is missing, or the file cannot be written.
     """
     page = html(analysis, title, others, dynamic, marks)
     try:
@@ -109,12 +126,31 @@ def html(
     dynamic: Dynamic | None = None,
     marks: Sequence[Mark] = (),
 ) -> str:
-    """The page as text."""
+    """Return the page as text.
+
+    Parameters
+    ----------
+    analysis
+        The analysis.
+    title
+        Title of the page.
+    others
+        Other deviations, such as total and Hadamard deviation.
+    dynamic
+        Dynamic curves of the same recording.
+    marks
+        Changes to mark in the dynamic curves.
+
+    Raises
+    ------
+    ConfigError
+        matplotlib or Jinja2 is missing.
+    """
     try:
         import matplotlib.figure as _  # noqa: F401
         from jinja2 import Environment, PackageLoader, StrictUndefined
     except ImportError as error:
-        raise ConfigError(MISSING) from error
+        raise ConfigError(MISSING_MESSAGE) from error
     environment = Environment(
         loader=PackageLoader("monitor.publishing"),
         autoescape=True,
@@ -138,7 +174,7 @@ def html(
 
 
 def facts(analysis: Analysis) -> tuple[tuple[str, str], ...]:
-    """What was recorded: name and value."""
+    """Return names and values that describe the recording."""
     estimate = analysis.estimate
     missing = max(estimate.curve.n - estimate.samples, 0)
     share = f" ({number(100.0 * missing / estimate.curve.n, 2)} %)" if missing else ""
@@ -152,7 +188,15 @@ def facts(analysis: Analysis) -> tuple[tuple[str, str], ...]:
 
 
 def table(estimate: Estimate, kind: Kind) -> tuple[Row, ...]:
-    """The coefficients of one kind."""
+    """Return the table of coefficients of one kind of sensor.
+
+    Parameters
+    ----------
+    estimate
+        The estimate.
+    kind
+        Kind of sensor.
+    """
     return tuple(
         Row(letter, COEFFICIENT_NAMES[kind][letter], tuple(_cell(estimate, letter, axis) for axis in axes_of(kind)))
         for letter in LETTERS
@@ -160,11 +204,12 @@ def table(estimate: Estimate, kind: Kind) -> tuple[Row, ...]:
 
 
 def _cell(estimate: Estimate, letter: str, axis: str) -> Cell:
+    """Return the text of one coefficient of one axis."""
     known = estimate.coefficients
     status = Status(int(known.status[LETTERS.index(letter), AXES.index(axis)]))
     one = reading(known, letter, axis)
     value = one.value if status == Status.UNESTIMATED else f"{one.value} {unit_of(letter, axis).name}"
-    word = K_OR_R if analysis_plot.k_or_r(estimate, letter, axis) else WORDS[status]
+    word = K_OR_R if analysis_plot.k_or_r(estimate, letter, axis) else STATUS_TEXTS[status]
     return Cell(value, one.interval, word)
 
 
@@ -176,14 +221,15 @@ def _part(
     marks: Sequence[Mark],
     axes_of_temperature: Collection[str],
 ) -> Part:
+    """Return the section of one kind of sensor, drawn with simplified lines."""
     import matplotlib
 
-    # a path remembers the threshold from when it was made
-    with matplotlib.rc_context({"path.simplify_threshold": SIMPLER_PX}):
-        return _drawn(estimate, kind, others, dynamic, marks, axes_of_temperature)
+    # A path keeps the threshold that was set when it was created.
+    with matplotlib.rc_context({"path.simplify_threshold": SIMPLIFY_THRESHOLD_PX}):
+        return _draw_part(estimate, kind, others, dynamic, marks, axes_of_temperature)
 
 
-def _drawn(
+def _draw_part(
     estimate: Estimate,
     kind: Kind,
     others: Sequence[Beside],
@@ -191,13 +237,14 @@ def _drawn(
     marks: Sequence[Mark],
     axes_of_temperature: Collection[str],
 ) -> Part:
+    """Draw the figures of one kind of sensor and return its section."""
     from matplotlib.figure import Figure
 
     curves = Figure(figsize=ALLAN_INCHES, layout="constrained")
     allan_panel(curves.subplots(), estimate, kind, others)
     surface = ""
     if dynamic is not None:
-        figure = Figure(figsize=(WIDE_INCHES, height_inches(dynamic, kind)), layout="constrained")
+        figure = Figure(figsize=(DYNAMIC_WIDTH_INCHES, height_inches(dynamic, kind)), layout="constrained")
         dynamic_panels(figure, dynamic, kind, marks)
         surface = _svg(figure, f"{kind}-dynamic")
     names = (marked(axis, axes_of_temperature) for axis in axes_of(kind))
@@ -206,18 +253,16 @@ def _drawn(
 
 
 def _svg(figure: "Figure", salt: str) -> str:
-    """The figure as an SVG element, with names that no other figure of the page uses; the same at every run."""
+    """Return the figure as an SVG element with identifiers unique within the page; the result is reproducible."""
     import matplotlib
 
     text = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": salt}):
-        figure.savefig(
-            text, format="svg", dpi=PIXELS_DPI, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        )
+        figure.savefig(text, format="svg", dpi=IMAGE_DPI, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     element = text.getvalue()[text.getvalue().index("<svg") :]
-    # glyphs and clips are referred to by names that are unique in a figure only
+    # The identifiers of glyphs and clip paths are unique only within a figure.
     element = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{salt}-", element)
-    # as wide as its column, not as its inches
+    # The width of the column replaces the size in inches.
     return re.sub(
         r'(<svg[^>]*?) width="[^"]*"', r"\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", element, count=1), count=1
     )

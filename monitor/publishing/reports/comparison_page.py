@@ -1,9 +1,10 @@
-"""Several recordings of one sensor on one self-contained page: ``report.html`` above the reports of each.
+"""Comparison of several recordings of one sensor as a self-contained HTML page, ``report.html`` above the single
+reports.
 
-In comes a ``Comparison``, out goes text that needs no network: the verdict in a few sentences, a table of axes and
-recordings with links to the single reports, each common effect with the size that every recording gives it drawn beside
-the pooled one, and each effect of some recordings only, with what its absence means in the others. Jinja2 is imported
-when a page is asked for; the same comparison gives the same page.
+The page needs no network. It holds a summary, a table of axes and recordings with links to the single reports, and
+the effects. Each common effect is shown with its size in every recording and its pooled size. Each effect of some
+recordings only is shown with the meaning of its absence in the others. Jinja2 is imported when a page is requested.
+Equal comparisons give equal pages.
 """
 
 from collections.abc import Sequence
@@ -26,15 +27,15 @@ from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison
 
 TEMPLATE: Final = "reconcile_runs.html.j2"
 STRIP_PX: Final = (260.0, 22.0)
-MARGIN: Final = 0.06
-"""Of the span of all intervals, at either end of a strip."""
+STRIP_MARGIN: Final = 0.06
+"""Margin at both ends of a strip, as a share of the span of all intervals."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """One recording of the table on top."""
+    """Row of one recording in the table at the top."""
 
-    name: str  # of its folder, too
+    name: str  # also the name of its folder
     verdict: str  # as in the JSON
     word: str
     length: str
@@ -44,26 +45,26 @@ class Recorded:
 
 @dataclass(frozen=True, slots=True)
 class AxisRow:
-    """One axis in all recordings."""
+    """Row of one axis: its result in all recordings."""
 
     axis: str
     colour: str
-    cells: tuple[tuple[str, str, str], ...]  # verdict, its word, and what was found
+    cells: tuple[tuple[str, str, str], ...]  # result as in the JSON, its text, and what was found
 
 
 @dataclass(frozen=True, slots=True)
 class SizeRow:
-    """A recording's view of a common effect, or that of all."""
+    """Size of a common effect in one recording, or pooled over all recordings."""
 
     name: str
-    cells: tuple[str, ...]  # of each parameter
+    cells: tuple[str, ...]  # text of each parameter
     confidence: str
     strip: str  # SVG
 
 
 @dataclass(frozen=True, slots=True)
 class CommonPart:
-    """What the page shows of one common effect."""
+    """Section of the page for one common effect."""
 
     axis: str
     colour: str
@@ -71,14 +72,14 @@ class CommonPart:
     means: str
     agreement: str
     differ: bool
-    names: tuple[str, ...]  # of the parameters
-    drawn: str  # the parameter of the strips
-    rows: tuple[SizeRow, ...]  # recordings, and last all of them
+    names: tuple[str, ...]  # names of the parameters
+    drawn: str  # parameter shown in the strips
+    rows: tuple[SizeRow, ...]  # one for each recording, and the pooled one last
 
 
 @dataclass(frozen=True, slots=True)
 class SingleRow:
-    """What the page shows of one effect of some recordings."""
+    """Row of one effect that only some recordings have."""
 
     axis: str
     colour: str
@@ -86,14 +87,16 @@ class SingleRow:
     effect: str
     parameters: str
     runs: str
-    elsewhere: tuple[tuple[str, str, str, str], ...]  # recording, meaning as in the JSON and in words, and why
+    elsewhere: tuple[tuple[str, str, str, str], ...]  # recording, meaning as in the JSON and as text, and reason
 
 
 def page(c: Comparison) -> str:
-    """The page as text.
+    """Return the page as text.
 
-    Raises:
-        ConfigError: Jinja2 is missing
+    Raises
+    ------
+    ConfigError
+        Jinja2 is missing.
     """
     try:
         from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -121,6 +124,7 @@ def page(c: Comparison) -> str:
 
 
 def _recorded(c: Comparison) -> list[Recorded]:
+    """Return the rows of the recordings."""
     return [
         Recorded(
             run.name,
@@ -135,6 +139,7 @@ def _recorded(c: Comparison) -> list[Recorded]:
 
 
 def _row(c: Comparison, one: AxisRuns) -> AxisRow:
+    """Return the row of one axis."""
     cells = []
     for run in c.runs:
         result = one.results.get(run.name)
@@ -144,6 +149,7 @@ def _row(c: Comparison, one: AxisRuns) -> AxisRow:
 
 
 def _common(c: Comparison, axis: str, seen: Seen) -> CommonPart:
+    """Return the section of one common effect."""
     names = tuple(seen.parameters)
     drawn = next((name for name, one in seen.parameters.items() if one.freedom), "")
     intervals = [step.parameters[drawn] for step in seen.steps.values() if drawn in step.parameters]
@@ -172,28 +178,30 @@ def _common(c: Comparison, axis: str, seen: Seen) -> CommonPart:
 
 
 def _cells(c: Comparison, axis: str, step: Step, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the text of each parameter."""
     known = {one.name: one.short for one in words.parameters(step, axis, c.baseline)}
     return tuple(known.get(name, "—") for name in names)
 
 
 def _single(c: Comparison, axis: str, seen: Seen) -> SingleRow:
+    """Return the row of one effect that only some recordings have."""
     effect, _, parameters = runs_words.line(seen, axis, c.baseline).partition(": ")
     elsewhere = tuple((a.run, a.meaning, runs_words.MEANINGS[a.meaning], a.because) for a in seen.absent)
     return SingleRow(axis, _colour(axis), seen.kind, effect, parameters, ", ".join(seen.steps), elsewhere)
 
 
 def _ruler(intervals: Sequence[Bounds]) -> Ruler | None:
-    """A linear strip that holds all intervals."""
+    """Return a linear scale that contains all intervals; None if they have no extent."""
     ends = [end for one in intervals for end in (one.lo, one.hi) if end is not None and np.isfinite(end)]
     if not ends or not max(ends) > min(ends):
         return None
     low, high = min(ends), max(ends)
-    more = MARGIN * (high - low)
+    more = STRIP_MARGIN * (high - low)
     return Ruler(low - more, high + more, False, 0.0, STRIP_PX[0])
 
 
 def _strip(one: Bounds | None, ruler: Ruler, colour: str, whole: bool) -> str:
-    """An interval and its value; that of all recordings together is dark and a diamond."""
+    """Return the SVG of an interval and its value; the pooled one is dark and marked with a diamond."""
     wide, middle = STRIP_PX[0], 0.5 * STRIP_PX[1]
     parts = [f'<line x1="0" x2="{wide:g}" y1="{middle:g}" y2="{middle:g}" stroke="#eee"/>']
     if one is not None and one.lo is not None and one.hi is not None and not isinstance(one.value, str):
@@ -207,4 +215,5 @@ def _strip(one: Bounds | None, ruler: Ruler, colour: str, whole: bool) -> str:
 
 
 def _colour(axis: str) -> str:
+    """Return the colour of an axis."""
     return COLOURS[AXES.index(axis) % 3]

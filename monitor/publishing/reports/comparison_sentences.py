@@ -1,6 +1,7 @@
-"""What several recordings show together, in words: page and terminal take their sentences here.
+"""Sentences about a comparison of several recordings, used by the page and the terminal.
 
-In come the types of ``monitor.reconcile.several_recordings.comparison``, out go short texts, with the units and digits of ``reconcile_words``.
+Functions convert the types of ``monitor.reconcile.several_recordings.comparison`` into short text, with the units and
+digits of ``reconcile_sentences``.
 """
 
 from typing import Final
@@ -18,18 +19,18 @@ MEANINGS: Final = {
     "unnamed": "unnamed there",
     "may_differ": "may differ",
 }
-"""What the absence of an effect means, in two or three words."""
+"""Meaning of the absence of an effect in a recording, in two or three words."""
 NO_EFFECTS: Final = "nothing"
 
 
 def summary(c: Comparison) -> str:
-    """What is common and what is not, in a few sentences."""
+    """Return a few sentences on common effects and on effects of some recordings only."""
     model = "the model" if c.fitted_to is None else f"the five classic terms, fitted to {c.fitted_to}"
     if c.verdict == "agrees":
         return f"{len(c.runs)} recordings beside {model}: none differs by more than chance."
-    common = [f"{_named(seen)} ({axis})" for axis, one in c.axes.items() for seen in one.common]
+    common = [f"{_effect_name(seen)} ({axis})" for axis, one in c.axes.items() for seen in one.common]
     single = [
-        f"{_named(seen)} ({axis}, {', '.join(seen.steps)})" for axis, one in c.axes.items() for seen in one.single
+        f"{_effect_name(seen)} ({axis}, {', '.join(seen.steps)})" for axis, one in c.axes.items() for seen in one.single
     ]
     said = [
         f"{len(c.runs)} recordings beside {model}.",
@@ -40,19 +41,30 @@ def summary(c: Comparison) -> str:
 
 
 def line(seen: Seen, axis: str, baseline: NoiseModel) -> str:
-    """An effect with its pooled parameters."""
+    """Return one line with an effect and its pooled parameters.
+
+    Parameters
+    ----------
+    seen
+        Effect in several recordings.
+    axis
+        Name of the axis.
+    baseline
+        Model under test.
+    """
     return words.step_line(seen.step(), axis, baseline)
 
 
 def agreement(seen: Seen) -> str:
-    """Whether its sizes are the same."""
+    """Return whether the sizes of an effect agree between the recordings, with the p-value."""
     if seen.p is None:
         return "nothing to compare"
     return f"sizes {'agree' if seen.consistent else 'differ'} ({probability(seen.p)})"
 
 
 def probability(p: float) -> str:
-    """
+    """Format a p-value.
+
     >>> probability(0.413), probability(2e-5)
     ('p = 0.41', 'p < 0.001')
     """
@@ -60,7 +72,7 @@ def probability(p: float) -> str:
 
 
 def cell(result: AxisResult | None) -> str:
-    """One axis of one recording, beside its verdict."""
+    """Return a short description of one axis in one recording, shown next to its result."""
     if result is None:
         return "not recorded"
     named = f"{len(result.steps)} effect{'' if len(result.steps) == 1 else 's'}" if result.steps else ""
@@ -68,5 +80,6 @@ def cell(result: AxisResult | None) -> str:
     return ", ".join(one for one in (named, left) if one)
 
 
-def _named(seen: Seen) -> str:
+def _effect_name(seen: Seen) -> str:
+    """Return the name of an effect, with a remark if it is a changed term of the model."""
     return words.plain(seen.effect) + (" of another size" if seen.kind == "retuned" else "")

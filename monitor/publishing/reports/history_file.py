@@ -1,7 +1,7 @@
-"""A history as a table in a file: CSV, Parquet, Arrow or .npz, a row a bucket, a column a number, SI.
+"""Export of a history as a table: CSV, Parquet, Arrow or .npz, one row per bucket and one column per number, in SI.
 
-Column names carry the unit, in ASCII: ``gz.N (rad/sqrt(s))``, its extremes ``gz.N low (rad/sqrt(s))`` and ``gz.N high
-(rad/sqrt(s))``. What is missing is empty or NaN. The file appears whole or not at all.
+Column names include the unit in ASCII: ``gz.N (rad/sqrt(s))``, and for the extremes ``gz.N low (rad/sqrt(s))`` and
+``gz.N high (rad/sqrt(s))``. Missing values are empty or NaN. The file is created completely or not at all.
 """
 
 from pathlib import Path
@@ -16,19 +16,30 @@ from monitor.history.bucket import COUNTS, STATES
 from monitor.history.reading import Past
 from monitor.publishing.coefficient_cells import kind_of
 
-UNITS: Final = {
+COEFFICIENT_SI_UNITS: Final = {
     "gyro": {"Q": "rad", "N": "rad/sqrt(s)", "B": "rad/s", "K": "rad/s/sqrt(s)", "R": "rad/s^2", "sigma": "rad/s"},
     "accel": {"Q": "m/s", "N": "m/s/sqrt(s)", "B": "m/s^2", "K": "m/s^2/sqrt(s)", "R": "m/s^3", "sigma": "m/s^2"},
 }
 STATUS_UNITS: Final = {"rate": "Hz", "latency": "s", "memory": "B", "temperature": "degC"}
-STATE_NAMES: Final = "state (" + ", ".join(f"{i} {name}" for i, name in enumerate(STATES)).replace(", ", "; ") + ")"
+STATE_COLUMN_NAME: Final = (
+    "state (" + ", ".join(f"{i} {name}" for i, name in enumerate(STATES)).replace(", ", "; ") + ")"
+)
 
 
 def save(past: Past, path: Path) -> None:
-    """Write it in the format of the path's suffix.
+    """Write a history in the format of the path's suffix.
 
-    Raises:
-        ConfigError: a suffix or place that cannot be written
+    Parameters
+    ----------
+    past
+        The history.
+    path
+        File to write.
+
+    Raises
+    ------
+    ConfigError
+        The suffix is unknown or the file cannot be written.
     """
     columns = table(past)
     begin = format_of(path).writer
@@ -37,7 +48,7 @@ def save(past: Past, path: Path) -> None:
 
 
 def table(past: Past) -> dict[str, Floats]:
-    """Columns by name, [p] each; of numbers that come once a bucket, such as ends of intervals, the last alone."""
+    """Return the columns by name, shape [p] each; interval ends and bounds have only their last value per bucket."""
     columns: dict[str, Floats] = {
         "t (Unix s)": past.start_s.astype(np.float64),
         "width (s)": past.width_s.astype(np.float64),
@@ -52,15 +63,15 @@ def table(past: Past) -> dict[str, Floats]:
         columns[f"{name} n"] = course.n.astype(np.float64)
     for i, name in enumerate(COUNTS):
         columns[f"{name} (samples)"] = past.counts[:, i].astype(np.float64)
-    columns[STATE_NAMES] = past.state.astype(np.float64)
+    columns[STATE_COLUMN_NAME] = past.state.astype(np.float64)
     return columns
 
 
 def unit_of(name: str) -> str:
-    """SI unit of a number of a row.
+    """Return the SI unit of a column of a history row.
 
     >>> unit_of("gz.N.lo"), unit_of("az.sigma.0.1"), unit_of("rate")
     ('rad/sqrt(s)', 'm/s^2', 'Hz')
     """
     axis, _, rest = name.partition(".")
-    return UNITS[kind_of(axis)][rest.split(".")[0]] if rest else STATUS_UNITS[name]
+    return COEFFICIENT_SI_UNITS[kind_of(axis)][rest.split(".")[0]] if rest else STATUS_UNITS[name]

@@ -1,10 +1,10 @@
-"""A reconciliation as one self-contained page for people: ``report.html``.
+"""Report of a reconciliation as a self-contained HTML page, ``report.html``.
 
-In comes a ``Reconciliation``, out goes text that needs no network: the verdict in a sentence, a table of the axes, and
-for every step where measurement and model differed, what was added or retuned and why, its parameters, and every lens
-before and after. Axes of which nothing is to be said show their lenses in one row. Words and units come from
-``reconcile_words``, drawings from ``reconcile_chart``; here it is decided what stands where. Jinja2 is imported when a
-page is asked for; the same reconciliation gives the same page.
+The page needs no network. It holds a summary, a table of the axes, and a section for each step. A section shows where
+measurement and model differed, the added or changed effect with its parameters, and every diagnostic before and after.
+Axes that agree with the model share a table of their diagnostics. Sentences and units come from
+``reconcile_sentences``, drawings from ``reconcile_chart``; this module arranges them. Jinja2 is imported when a page
+is requested. Equal results give equal pages.
 """
 
 from collections.abc import Sequence
@@ -26,20 +26,20 @@ from monitor.reconcile.result import AxisResult, Look, Reconciliation, Score, St
 
 TEMPLATE: Final = "reconcile.html.j2"
 MISSING: Final = 'Jinja2 is needed: pip install "imu-monitor[plot]"'
-WIDE_PX: Final = (840.0, 330.0)  # a place in its view
-WHERE_PX: Final = (500.0, 330.0)  # the same, with
-NEAR_PX: Final = (340.0, 330.0)  # what is round it
-PAIR_PX: Final = (670.0, 230.0)
-ONE_PX: Final = (335.0, 200.0)
+RANGE_PLOT_PX: Final = (840.0, 330.0)  # plot of a range in its diagnostic, without a detail plot
+RANGE_PLOT_WITH_DETAIL_PX: Final = (500.0, 330.0)  # the same plot next to a detail plot
+DETAIL_PLOT_PX: Final = (340.0, 330.0)  # detail plot of the range
+PAIR_PLOT_PX: Final = (670.0, 230.0)
+SINGLE_PLOT_PX: Final = (335.0, 200.0)
 BAR_PX: Final = (240.0, 22.0)
-BAR_ENDS: Final = (0.05, 20.0)  # gap over threshold, at least
-OPEN: Final = "#b3261e"  # a gap above its threshold
-CLOSED: Final = "#1b7f4d"
+BAR_LIMITS: Final = (0.05, 20.0)  # smallest range of gap over threshold on a bar
+ABOVE_THRESHOLD_COLOUR: Final = "#b3261e"  # colour of a gap above its threshold
+BELOW_THRESHOLD_COLOUR: Final = "#1b7f4d"
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One axis of the table on top."""
+    """Row of one axis in the table at the top."""
 
     axis: str
     colour: str
@@ -51,12 +51,12 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class LensRow:
-    """One lens of one step: gaps as people read them."""
+    """Row of one diagnostic in a step, with its gaps as text."""
 
     name: str
     place: str
     before: str
-    after: str  # "" where there is only one model
+    after: str  # "" if there is only one model
     threshold: str
     null95: str
     open_before: bool
@@ -66,24 +66,24 @@ class LensRow:
 
 @dataclass(frozen=True, slots=True)
 class StepPart:
-    """What the page shows of one step."""
+    """Section of the page for one step."""
 
     title: str
     means: str
     because: str
     found: str
-    where: tuple[str, ...]  # SVG: the view, and the part round the place; none where no lens has a picture
+    where: tuple[str, ...]  # SVG: the diagnostic and a detail of the range; empty if no diagnostic has a plot
     parameters: tuple[Parameter, ...]
     confidence: str
     why_not: str
     held_out: str
     lenses: tuple[LensRow, ...]
-    pairs: tuple[str, ...]  # SVG, before beside after
+    pairs: tuple[str, ...]  # SVG of each diagnostic, before and after
 
 
 @dataclass(frozen=True, slots=True)
 class AxisPart:
-    """What the page shows of one axis."""
+    """Section of the page for one axis."""
 
     axis: str
     colour: str
@@ -91,25 +91,34 @@ class AxisPart:
     word: str
     line: str
     steps: tuple[StepPart, ...]
-    left_over: tuple[tuple[str, tuple[str, ...]], ...]  # what, and where as SVG
-    lenses: tuple[LensRow, ...]  # of an axis without steps
+    left_over: tuple[tuple[str, tuple[str, ...]], ...]  # description and SVG of the range
+    lenses: tuple[LensRow, ...]  # only of an axis without steps
     views: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Agreeing:
-    """All axes of which nothing is to be said."""
+    """Section of the page for all axes that agree with the model."""
 
     axes: tuple[tuple[str, str], ...]  # name and colour
-    rows: tuple[tuple[str, tuple[str, ...]], ...]  # lens; gap and threshold of each axis
-    views: tuple[tuple[str, ...], ...]  # SVG, of each axis
+    rows: tuple[tuple[str, tuple[str, ...]], ...]  # diagnostic; gap and threshold of each axis
+    views: tuple[tuple[str, ...], ...]  # SVG of each axis
 
 
 def page(r: Reconciliation, title: str = "") -> str:
-    """The page as text.
+    """Return the page as text.
 
-    Raises:
-        ConfigError: Jinja2 is missing
+    Parameters
+    ----------
+    r
+        Result of the reconciliation.
+    title
+        Title of the page.
+
+    Raises
+    ------
+    ConfigError
+        Jinja2 is missing.
     """
     try:
         from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -134,12 +143,18 @@ def page(r: Reconciliation, title: str = "") -> str:
         agreeing=_agreeing([result for result in results if result.verdict == "agrees"]),
         notes=r.notes,
         model=str(r.model),
-        colours={"dark": DARK, "band": BAND, "place": PLACE, "open": OPEN, "closed": CLOSED},
+        colours={
+            "dark": DARK,
+            "band": BAND,
+            "place": PLACE,
+            "open": ABOVE_THRESHOLD_COLOUR,
+            "closed": BELOW_THRESHOLD_COLOUR,
+        },
     )
 
 
 def facts(r: Reconciliation) -> tuple[tuple[str, str], ...]:
-    """What was compared: name and value."""
+    """Return names and values that describe the recording and the model."""
     return (
         ("rate", f"{r.rate_hz:.6g} Hz"),
         ("samples", f"{r.samples:,}"),
@@ -150,6 +165,7 @@ def facts(r: Reconciliation) -> tuple[tuple[str, str], ...]:
 
 
 def _row(r: Reconciliation, result: AxisResult) -> Row:
+    """Return the row of one axis."""
     did = tuple(
         (step.kind, words.step_line(step, result.axis, r.baseline), words.percent(step.confidence))
         for step in result.steps
@@ -159,12 +175,15 @@ def _row(r: Reconciliation, result: AxisResult) -> Row:
 
 
 def _axis(r: Reconciliation, result: AxisResult) -> AxisPart:
+    """Return the section of one axis."""
     looks = [result.start, *(step.look for step in result.steps)]
     steps = tuple(
         _step(r, result.axis, i, step, before)
         for i, (step, before) in enumerate(zip(result.steps, looks, strict=False), start=1)
     )
-    left = tuple((words.score(one, result.axis), _where(result.end, one, result.axis)) for one in result.left_over)
+    left = tuple(
+        (words.score(one, result.axis), _plots_of_range(result.end, one, result.axis)) for one in result.left_over
+    )
     alone = not result.steps
     return AxisPart(
         result.axis,
@@ -175,32 +194,36 @@ def _axis(r: Reconciliation, result: AxisResult) -> AxisPart:
         steps,
         left,
         _lenses(result.start, None, result.axis) if alone else (),
-        _singles(result) if alone else (),
+        _first_model_plots(result) if alone else (),
     )
 
 
 def _agreeing(results: Sequence[AxisResult]) -> Agreeing:
+    """Return the section of the axes that agree with the model."""
     lenses = list(dict.fromkeys(score.lens for result in results for score in result.start.scores))
     gaps = [{score.lens: _of_threshold(score) for score in result.start.scores} for result in results]
     return Agreeing(
         tuple((result.axis, _colour(result.axis)) for result in results),
         tuple((words.lens_name(lens), tuple(known.get(lens, "—") for known in gaps)) for lens in lenses),
-        tuple(_singles(result) for result in results),
+        tuple(_first_model_plots(result) for result in results),
     )
 
 
-def _singles(result: AxisResult) -> tuple[str, ...]:
-    return tuple(chart([("", view)], result.axis, *ONE_PX) for view in result.start.views)
+def _first_model_plots(result: AxisResult) -> tuple[str, ...]:
+    """Return the plots of all diagnostics of an axis with the first model."""
+    return tuple(chart([("", view)], result.axis, *SINGLE_PLOT_PX) for view in result.start.views)
 
 
 def _of_threshold(score: Score) -> str:
+    """Format a gap and its threshold."""
     return f"{words.gap(score.gap)} of {words.gap(score.threshold)}"
 
 
 def _step(r: Reconciliation, axis: str, count: int, step: Step, before: Look) -> StepPart:
+    """Return the section of one step."""
     after = {view.lens: view for view in step.look.views}
     pairs = tuple(
-        chart([("before", view), ("after", after[view.lens])], axis, *PAIR_PX)
+        chart([("before", view), ("after", after[view.lens])], axis, *PAIR_PLOT_PX)
         for view in before.views
         if view.lens in after
     )
@@ -209,7 +232,7 @@ def _step(r: Reconciliation, axis: str, count: int, step: Step, before: Look) ->
         means=EFFECTS[step.effect].means,
         because=step.because,
         found=words.score(step.found, axis),
-        where=_where(before, step.found, axis),
+        where=_plots_of_range(before, step.found, axis),
         parameters=words.parameters(step, axis, r.baseline),
         confidence=words.percent(step.confidence),
         why_not=words.why_not(step),
@@ -220,35 +243,36 @@ def _step(r: Reconciliation, axis: str, count: int, step: Step, before: Look) ->
 
 
 def _held_out(step: Step) -> str:
-    """Whether the gap also shrank where the effect was not chosen."""
+    """Return how the gap changed on the held-out data, which were not used to choose the effect."""
     before, after = step.held_out_before, step.held_out_after
     if before is None or after is None:
         return f"None: {step.held_out_reason}."
     return f"{words.gap(before.gap)} → {words.gap(after.gap)}, threshold {words.gap(after.threshold)}"
 
 
-def _where(look: Look, found: Score, axis: str) -> tuple[str, ...]:
-    """The picture that shows a place best, and beside it the part round a narrow one."""
+def _plots_of_range(look: Look, found: Score, axis: str) -> tuple[str, ...]:
+    """Return the plot that shows a range best, and a detail plot if the range is narrow."""
     view = view_at(look.views, found.lens, found.where)
     if view is None:
         return ()
     part = near(view, found.where)
     if part is None:
-        return (chart([("", view)], axis, *WIDE_PX, where=found.where),)
-    whole = chart([("", view)], axis, *WHERE_PX, where=replace(found.where, source=None))
-    return whole, chart([("", part)], axis, *NEAR_PX, where=found.where)
+        return (chart([("", view)], axis, *RANGE_PLOT_PX, where=found.where),)
+    whole = chart([("", view)], axis, *RANGE_PLOT_WITH_DETAIL_PX, where=replace(found.where, source=None))
+    return whole, chart([("", part)], axis, *DETAIL_PLOT_PX, where=found.where)
 
 
 def _lenses(before: Look, after: Look | None, axis: str) -> tuple[LensRow, ...]:
-    """Every lens, before and after; of one look the gaps stand under ``before``."""
+    """Return the rows of all diagnostics, before and after a step; without ``after``, only ``before`` is filled."""
     later = {} if after is None else {score.lens: score for score in after.scores}
     pairs = [(score, later.get(score.lens)) for score in before.scores]
     largest = max((words.over_threshold(one) for pair in pairs for one in pair if one is not None), default=1.0)
-    ruler = Ruler(BAR_ENDS[0], max(BAR_ENDS[1], 1.3 * largest), True, 8.0, BAR_PX[0] - 8.0)
+    ruler = Ruler(BAR_LIMITS[0], max(BAR_LIMITS[1], 1.3 * largest), True, 8.0, BAR_PX[0] - 8.0)
     return tuple(_lens(score, other, axis, ruler) for score, other in pairs)
 
 
 def _lens(score: Score, later: Score | None, axis: str, ruler: Ruler) -> LensRow:
+    """Return the row of one diagnostic."""
     deciding = later or score
     return LensRow(
         words.lens_name(score.lens),
@@ -264,7 +288,7 @@ def _lens(score: Score, later: Score | None, axis: str, ruler: Ruler) -> LensRow
 
 
 def _bar(score: Score, later: Score | None, ruler: Ruler) -> str:
-    """Gap over threshold on a logarithmic strip: a ring before, a dot after, a line at the threshold."""
+    """Return the SVG of gap over threshold: a ring before, a dot after, a line at the threshold."""
     wide, high = BAR_PX
     at = [_on_strip(one, ruler) for one in (score, later) if one is not None]
     one = _on_strip(None, ruler)
@@ -277,21 +301,23 @@ def _bar(score: Score, later: Score | None, ruler: Ruler) -> str:
             f'<line x1="{at[0]:.1f}" x2="{at[1]:.1f}" y1="{high / 2:g}" y2="{high / 2:g}" stroke="{GREY}" '
             'stroke-width="2"/>'
         )
-        parts.append(f'<circle cx="{at[0]:.1f}" cy="{high / 2:g}" r="4.5" fill="#fff" stroke="{_tint(score)}" '
+        parts.append(f'<circle cx="{at[0]:.1f}" cy="{high / 2:g}" r="4.5" fill="#fff" stroke="{_gap_colour(score)}" '
                      'stroke-width="2"/>')  # fmt: skip
-    parts.append(f'<circle cx="{at[-1]:.1f}" cy="{high / 2:g}" r="4.8" fill="{_tint(later or score)}"/>')
+    parts.append(f'<circle cx="{at[-1]:.1f}" cy="{high / 2:g}" r="4.8" fill="{_gap_colour(later or score)}"/>')
     return f'<svg class="bar" viewBox="0 0 {wide:g} {high:g}">{"".join(parts)}</svg>'
 
 
 def _on_strip(score: Score | None, ruler: Ruler) -> float:
-    """Pixel of a gap, or of the threshold; a gap of nothing stands at the left end."""
+    """Return the position of a gap, or of the threshold, on a bar [px]; a gap of zero is drawn at the left end."""
     share = 1.0 if score is None else max(words.over_threshold(score), ruler.low)
     return float(ruler.at(np.array([share]))[0])
 
 
-def _tint(score: Score) -> str:
-    return OPEN if score.passes else CLOSED
+def _gap_colour(score: Score) -> str:
+    """Return the colour of a gap: above or below its threshold."""
+    return ABOVE_THRESHOLD_COLOUR if score.passes else BELOW_THRESHOLD_COLOUR
 
 
 def _colour(axis: str) -> str:
+    """Return the colour of an axis."""
     return COLOURS[AXES.index(axis) % 3]

@@ -1,10 +1,10 @@
-"""A reconciliation as a recording for Rerun: ``reconcile.rrd``, with its own layout.
+"""Result of a reconciliation as a Rerun recording, ``reconcile.rrd``, with its own layout.
 
-In comes a ``Reconciliation``, out goes a file. A tab an axis: on the left the steps in words and the gap of every lens
-over its threshold, on the right each logarithmic lens twice, beside the first model and after the steps. The timeline
-``step`` counts models: 0 is the one that was given or fitted first, 1 and on are those after each step, and the panels
-on the right of a pair follow it. Rerun has no logarithmic axes, so plots are drawn as strips by ``rerun_chart``.
-The stream is one of its own. Importing this module imports Rerun.
+Each axis has a tab. On the left are the steps as text and the gap of each diagnostic relative to its threshold. On the
+right, each logarithmic diagnostic is drawn twice, with the first model and after the steps. The timeline ``step`` is
+the index of the model. Index 0 is the model that was given or fitted first, and the others are the models after each
+step. The right plot of a pair follows this timeline. Rerun has no logarithmic axes, so plots are drawn as lines by
+``allan_chart``. The stream is separate from that of the live view. Importing this module imports Rerun.
 
 Entities: ``/<axis>/steps``, ``/<axis>/gap/<lens>``, ``/<axis>/<lens>/before``, ``/<axis>/<lens>/after``, ``/overview``.
 """
@@ -28,11 +28,11 @@ from monitor.reconcile.result import AxisResult, Look, Reconciliation
 
 APPLICATION: Final = "imu-monitor"
 TIMELINE: Final = "step"
-PICTURES: Final = 2  # lenses of an axis that are drawn, the first ones
-BAND: Final = colours.mixed(colours.FRAME, 0.55)
-KEY_X: Final = (8.6, 12.2, 15.4)  # of the names of the curves, above the box
-PLACE: Final = colours.TEMPERATURE  # orange, as on the page
-LINES: Final = (  # of the courses of gaps: more would fill their legend
+MAX_PLOTTED_DIAGNOSTICS: Final = 2  # number of diagnostics drawn per axis; the first ones are used
+BAND_COLOUR: Final = colours.mixed(colours.FRAME, 0.55)
+LEGEND_X: Final = (8.6, 12.2, 15.4)  # positions of the names of the curves, above the box
+RANGE_COLOUR: Final = colours.TEMPERATURE  # orange, as on the HTML page
+GAP_LINE_COLOURS: Final = (  # colours of the gap lines; more lines would not fit into the legend
     (240, 98, 77),
     (45, 190, 130),
     (84, 160, 255),
@@ -45,8 +45,17 @@ LINES: Final = (  # of the courses of gaps: more would fill their legend
 def write_rrd(r: Reconciliation, path: Path) -> None:
     """Write the recording.
 
-    Raises:
-        ConfigError: the file cannot be written
+    Parameters
+    ----------
+    r
+        Result of the reconciliation.
+    path
+        File to write.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be written.
     """
     try:
         path.open("wb").close()
@@ -64,7 +73,7 @@ def write_rrd(r: Reconciliation, path: Path) -> None:
 
 
 def blueprint(r: Reconciliation) -> rrb.Blueprint:
-    """A tab an axis, those with something to say first; the overview where there are several."""
+    """Return the layout: a tab per axis, those that disagree with the model first, and a tab for all axes."""
     axes = sorted(_axes(r), key=lambda axis: r.axes[axis].verdict == "agrees")
     tabs: list[rrb.View | rrb.Container] = [_tab(r.axes[axis]) for axis in axes]
     tabs.append(rrb.TextDocumentView(origin="/overview", contents="$origin", name="All axes"))
@@ -79,7 +88,7 @@ def blueprint(r: Reconciliation) -> rrb.Blueprint:
 
 
 def overview(r: Reconciliation) -> str:
-    """The whole recording in a table."""
+    """Return the overview of all axes as Markdown."""
     rows = []
     for axis in _axes(r):
         result = r.axes[axis]
@@ -95,7 +104,15 @@ def overview(r: Reconciliation) -> str:
 
 
 def steps_text(r: Reconciliation, result: AxisResult) -> str:
-    """What was found on one axis."""
+    """Return the steps and the unexplained remainder of one axis as Markdown.
+
+    Parameters
+    ----------
+    r
+        Result of the reconciliation.
+    result
+        Result of the axis.
+    """
     parts = [f"## {result.axis}: {words.VERDICTS[result.verdict]}", words.verdict_line(result)]
     for count, step in enumerate(result.steps, start=1):
         known = words.parameters(step, result.axis, r.baseline)
@@ -115,19 +132,22 @@ def steps_text(r: Reconciliation, result: AxisResult) -> str:
 
 
 def _axes(r: Reconciliation) -> list[str]:
+    """Return the axes of the result in the usual order."""
     return [axis for axis in AXES if axis in r.axes]
 
 
-def _looks(result: AxisResult) -> list[Look]:
-    """Beside the first model, then after each step; after the last, without the names that were withdrawn."""
+def _looks_by_step(result: AxisResult) -> list[Look]:
+    """Return the diagnostics with the first model and after each step; the last one excludes withdrawn effects."""
     return [result.start, *(step.look for step in result.steps[:-1]), *([result.end] if result.steps else [])]
 
 
 def _lenses(result: AxisResult) -> list[str]:
-    return [view.lens for view in result.start.views if view.log][:PICTURES]
+    """Return the logarithmic diagnostics of an axis that are drawn."""
+    return [view.lens for view in result.start.views if view.log][:MAX_PLOTTED_DIAGNOSTICS]
 
 
 def _tab(result: AxisResult) -> rrb.Container:
+    """Return the tab of one axis."""
     axis, steps = result.axis, len(result.steps)
     text = rrb.TextDocumentView(origin=f"/{axis}/steps", contents="$origin", name="What was found")
     gaps = rrb.TimeSeriesView(
@@ -138,14 +158,17 @@ def _tab(result: AxisResult) -> rrb.Container:
     )
     left = rrb.Vertical(text, gaps, row_shares=[5, 2]) if steps else text
     rows = [
-        rrb.Horizontal(*(_picture(result, lens, when) for when in (("before", "after") if steps else ("before",))))
+        rrb.Horizontal(
+            *(_diagnostic_view(result, lens, when) for when in (("before", "after") if steps else ("before",)))
+        )
         for lens in _lenses(result)
     ]
     name = f"{axis}: {words.VERDICTS[result.verdict]}"
     return rrb.Horizontal(left, rrb.Vertical(*rows), column_shares=[3, 7], name=name)
 
 
-def _picture(result: AxisResult, lens: str, when: str) -> rrb.View:
+def _diagnostic_view(result: AxisResult, lens: str, when: str) -> rrb.View:
+    """Return the view of one diagnostic, before or after the steps."""
     what = words.lens_name(lens)
     what = what[0].upper() + what[1:]
     names = {"before": f"{what}: beside the first model", "after": f"{what}: after the steps"}
@@ -159,53 +182,57 @@ def _picture(result: AxisResult, lens: str, when: str) -> rrb.View:
 
 
 def _axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult) -> None:
+    """Log all entities of one axis."""
     stream.log(f"{result.axis}/steps", _markdown(steps_text(r, result)), static=True)
     for lens in _lenses(result):
         _lens(stream, result, lens)
-    _gaps(stream, result)
+    _log_gaps(stream, result)
 
 
-def _gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
-    """A course a lens, of those with the largest gaps, and the threshold, which is 1 for all."""
-    looks = [{score.lens: words.over_threshold(score) for score in look.scores} for look in _looks(result)]
+def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
+    """Log the gap of each diagnostic relative to its threshold, for the largest gaps, and the threshold, which is 1."""
+    looks = [{score.lens: words.over_threshold(score) for score in look.scores} for look in _looks_by_step(result)]
     path = f"{result.axis}/gap"
     largest = sorted(looks[0], key=lambda lens: -max(look.get(lens, 0.0) for look in looks))
-    for lens, tint in zip(largest, LINES, strict=False):
+    for lens, tint in zip(largest, GAP_LINE_COLOURS, strict=False):
         line = rr.SeriesLines(colors=[tint], widths=[2.0], names=[words.lens_name(lens)])
         stream.log(f"{path}/{lens}", line, static=True)
-        _course(stream, f"{path}/{lens}", [look.get(lens, np.nan) for look in looks])
+        _log_by_step(stream, f"{path}/{lens}", [look.get(lens, np.nan) for look in looks])
     line = rr.SeriesLines(colors=[colours.TEXT], widths=[1.0], names=["threshold"])
     stream.log(f"{path}/threshold", line, static=True)
-    _course(stream, f"{path}/threshold", [1.0] * len(looks))
+    _log_by_step(stream, f"{path}/threshold", [1.0] * len(looks))
 
 
-def _course(stream: rr.RecordingStream, path: str, values: Sequence[float]) -> None:
+def _log_by_step(stream: rr.RecordingStream, path: str, values: Sequence[float]) -> None:
+    """Log values by step."""
     steps = rr.TimeColumn(TIMELINE, sequence=range(len(values)))
     stream.send_columns(path, [steps], rr.Scalars.columns(scalars=np.array(values)))
 
 
 def _lens(stream: rr.RecordingStream, result: AxisResult, lens: str) -> None:
-    """Both pictures of one lens, in one scale."""
+    """Log both plots of one diagnostic with the same scale."""
     axis = result.axis
-    views = [next((view for view in look.views if view.lens == lens), None) for look in _looks(result)]
+    views = [next((view for view in look.views if view.lens == lens), None) for look in _looks_by_step(result)]
     plots = {step: plotted("", view, axis, None) for step, view in enumerate(views) if view is not None}
     every = list(plots.values())
     scale = Scale(decades(plot.x for plot in every), decades([np.array(height_of(every))]))
     for when in ("before", "after") if result.steps else ("before",):
-        _grid(stream, f"{axis}/{lens}/{when}", scale, plots[0], axis)
+        _log_grid(stream, f"{axis}/{lens}/{when}", scale, plots[0], axis)
     stream.reset_time()
-    _curves(stream, f"{axis}/{lens}/before", scale, plots[0], axis, static=True)
-    _places(stream, f"{axis}/{lens}/before", scale, result, lens)
+    _log_curves(stream, f"{axis}/{lens}/before", scale, plots[0], axis, static=True)
+    _log_found_ranges(stream, f"{axis}/{lens}/before", scale, result, lens)
     for step, plot in plots.items() if result.steps else ():
         stream.set_time(TIMELINE, sequence=step)
-        _curves(stream, f"{axis}/{lens}/after", scale, plot, axis, static=False)
+        _log_curves(stream, f"{axis}/{lens}/after", scale, plot, axis, static=False)
 
 
-def _curves(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot, axis: str, static: bool) -> None:
-    """Band, measured curve and what the model expects."""
-    # a band's end that is zero has no logarithm: it lies below the box
+def _log_curves(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot, axis: str, static: bool) -> None:
+    """Log the band, the measured curve and the expected curve."""
+    # A lower end of zero has no logarithm; it is drawn below the box.
     low, high = (scale.place(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
-    fill = rr.LineStrips2D(list(band(low, high)), colors=[BAND], radii=[WIDTH / FILL_STEPS / 2], draw_order=-20.0)
+    fill = rr.LineStrips2D(
+        list(band(low, high)), colors=[BAND_COLOUR], radii=[WIDTH / FILL_STEPS / 2], draw_order=-20.0
+    )
     stream.log(f"{path}/band", fill, static=static)
     colour, at = colours.AXIS_COLOURS[axis], _inside(scale.place(plot.x, plot.measured))
     thin = rr.Radius.ui_points(0.8)
@@ -220,8 +247,8 @@ def _curves(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot, axi
     stream.log(f"{path}/expected", line, static=static)
 
 
-def _places(stream: rr.RecordingStream, path: str, scale: Scale, result: AxisResult, lens: str) -> None:
-    """A frame round each place where this lens found what a step is about."""
+def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, result: AxisResult, lens: str) -> None:
+    """Log a frame around each range in which this diagnostic found a gap."""
     view = next(view for view in result.start.views if view.lens == lens)
     founds = [step.found for step in result.steps] + list(result.left_over)
     marks = [plotted("", view, result.axis, found.where) for found in founds if found.lens == lens]
@@ -231,12 +258,12 @@ def _places(stream: rr.RecordingStream, path: str, scale: Scale, result: AxisRes
     one = 10.0 ** np.array([scale.y[0], scale.y[0]], float)
     ends = [np.clip(scale.place(np.array(bound), one)[:, 0], 0.0, WIDTH) for bound in bounds]
     frames = [np.array([[a, 0], [b, 0], [b, HEIGHT], [a, HEIGHT], [a, 0]]) for a, b in ends]
-    strips = rr.LineStrips2D(frames, colors=[PLACE], radii=rr.Radius.ui_points(0.75), draw_order=-5.0)
+    strips = rr.LineStrips2D(frames, colors=[RANGE_COLOUR], radii=rr.Radius.ui_points(0.75), draw_order=-5.0)
     stream.log(f"{path}/place", strips, static=True)
 
 
-def _grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot, axis: str) -> None:
-    """Frame, decade lines, labels and the key to the curves."""
+def _log_grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot, axis: str) -> None:
+    """Log frame, decade lines, labels and the key to the curves."""
     lines = grid(scale)
     for name, strips, colour, order in (
         ("minor", lines.minor, colours.MINOR, -30.0),
@@ -245,9 +272,9 @@ def _grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot, axis:
     ):
         strip = rr.LineStrips2D(strips, colors=[colour], radii=rr.Radius.ui_points(0.5), draw_order=order)
         stream.log(f"{path}/grid/{name}", strip, static=True)
-    key = [("measured", colours.AXIS_COLOURS[axis]), ("model", colours.TEXT), ("95 %", BAND)]
-    at = [(x, -0.85, name) for x, (name, _) in zip(KEY_X, key, strict=True)]
-    strokes = [np.array([[x - 1.9, -0.42], [x - 1.2, -0.42]]) for x in KEY_X]
+    key = [("measured", colours.AXIS_COLOURS[axis]), ("model", colours.TEXT), ("95 %", BAND_COLOUR)]
+    at = [(x, -0.85, name) for x, (name, _) in zip(LEGEND_X, key, strict=True)]
+    strokes = [np.array([[x - 1.9, -0.42], [x - 1.2, -0.42]]) for x in LEGEND_X]
     strip = rr.LineStrips2D(strokes, colors=[tint for _, tint in key], radii=rr.Radius.ui_points(2.0), draw_order=30.0)
     stream.log(f"{path}/grid/key", strip, static=True)
     labels = [*lines.ticks, (WIDTH / 2, HEIGHT + 0.85, plot.x_label), (2.4, -0.85, plot.y_label), *at]
@@ -262,9 +289,10 @@ def _grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot, axis:
 
 
 def _inside(at: Floats) -> Floats:
-    """A curve that leaves the box runs along its edge."""
+    """Limit a curve to the box; outside values are drawn on its edge."""
     return np.column_stack([at[:, 0], clip(at[:, 1])])
 
 
 def _markdown(text: str) -> rr.TextDocument:
+    """Return a Markdown document."""
     return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)

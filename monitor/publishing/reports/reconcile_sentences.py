@@ -1,8 +1,9 @@
-"""What ``reconcile`` found, in words and in the field's units: page, viewer and terminal take their sentences here.
+"""Sentences and formatted values for the results of ``reconcile``, used by the page, the viewer and the terminal.
 
-In come the types of ``monitor.reconcile.result`` (SI), out go short texts. A unit is chosen by the SI unit and,
-where one SI unit serves for small and large things (rad/s: a bias and a range), by the size of the number. A value is
-written with as many digits as its 95 % interval allows. Nothing here knows HTML, Rerun or a terminal.
+Functions convert the types of ``monitor.reconcile.result`` (SI) into short text. The SI unit selects the unit of the
+field. The size of the number is also considered if one SI unit serves for small and large quantities, such as rad/s
+for a bias and for a range. A value has as many digits as its 95 % interval allows. This module does not depend on
+HTML, Rerun or a terminal.
 """
 
 from collections.abc import Sequence
@@ -32,26 +33,27 @@ VERDICTS: Final = {
     "partly_explained": "partly explained",
     "unexplained": "unexplained",
 }
-LENSES: Final = {"psd": "spectrum", "allan": "Allan deviation"}
-"""Lenses whose name is not a word."""
+"""Text of each result."""
+DIAGNOSTIC_NAMES: Final = {"psd": "spectrum", "allan": "Allan deviation"}
+"""Names of diagnostics that differ from their identifier."""
 GRAVITY: Final = 9.80665  # m/s², standard (CGPM 1901)
-TURN_H: Final = DEGREE * HOUR  # °/h in a rad/s
-SMALL: Final = 0.1  # of a °/s or m/s²: below, sizes of a rate or an acceleration stand in °/h or µg
+DEGREES_PER_HOUR: Final = DEGREE * HOUR  # °/h per rad/s
+SMALL_UNIT_BELOW: Final = 0.1  # °/s or m/s²; below it, a rate or an acceleration is shown in °/h or µg
 _GYRO, _ACCEL = COEFFICIENT_UNITS["gyro"], COEFFICIENT_UNITS["accel"]
-UNITS: Final = {
+FIELD_UNITS: Final = {
     "1": Unit(1.0, ""),
     "rad": _GYRO["Q"],
     "rad/√s": _GYRO["N"],
     "rad/s/√s": _GYRO["K"],
     "rad/s²": _GYRO["R"],
-    "rad/s/°C": Unit(TURN_H, "°/h/°C"),
-    "rad/s/°C²": Unit(TURN_H, "°/h/°C²"),
-    "rad/s per m/s²": Unit(TURN_H * GRAVITY, "°/h/g"),
-    "(rad/s)²/Hz": Unit(TURN_H**2, "(°/h)²/Hz"),
-    "rad²/s²/Hz": Unit(TURN_H**2, "(°/h)²/Hz"),
-    "rad/s/√Hz": Unit(TURN_H, "°/h/√Hz"),
-    "(rad/s)²": Unit(TURN_H**2, "(°/h)²"),
-    "rad²/s²": Unit(TURN_H**2, "(°/h)²"),
+    "rad/s/°C": Unit(DEGREES_PER_HOUR, "°/h/°C"),
+    "rad/s/°C²": Unit(DEGREES_PER_HOUR, "°/h/°C²"),
+    "rad/s per m/s²": Unit(DEGREES_PER_HOUR * GRAVITY, "°/h/g"),
+    "(rad/s)²/Hz": Unit(DEGREES_PER_HOUR**2, "(°/h)²/Hz"),
+    "rad²/s²/Hz": Unit(DEGREES_PER_HOUR**2, "(°/h)²/Hz"),
+    "rad/s/√Hz": Unit(DEGREES_PER_HOUR, "°/h/√Hz"),
+    "(rad/s)²": Unit(DEGREES_PER_HOUR**2, "(°/h)²"),
+    "rad²/s²": Unit(DEGREES_PER_HOUR**2, "(°/h)²"),
     "m/s": _ACCEL["Q"],
     "m/s/√s": _ACCEL["N"],
     "m/s²/√s": _ACCEL["K"],
@@ -64,56 +66,64 @@ UNITS: Final = {
     "(m/s²)²": Unit(MICRO_G**2, "µg²"),
     "m²/s⁴": Unit(MICRO_G**2, "µg²"),
 }
-"""SI unit -> field unit; what is not here (Hz, s, °C) is the field's own."""
-BY_NAME: Final = {"phase": Unit(DEGREE, "°"), "fraction": Unit(100.0, "%")}
-"""Parameters whose unit their SI unit alone does not tell."""
-PLACES: Final = {
+"""Unit of the field for each SI unit; units that are absent (Hz, s, °C) are used as they are."""
+UNITS_BY_NAME: Final = {"phase": Unit(DEGREE, "°"), "fraction": Unit(100.0, "%")}
+"""Units of parameters that their SI unit does not determine."""
+RANGE_FORMATS: Final = {
     "frequency": ("", "Hz"),
     "tau": ("τ = ", "s"),
     "time": ("t = ", "s"),
     "temperature": ("", "°C"),
 }
-ONE_PLACE: Final = 1e-3  # a span narrower than this share of its place is written as one number
-EVEN: Final = 0.1  # interval's sides that differ by less than this share are one ±
+"""Prefix and unit of each kind of range."""
+MIN_RANGE_SHARE: Final = 1e-3  # a range narrower than this share of its position is written as one number
+SYMMETRY_TOLERANCE: Final = 0.1  # sides of an interval that differ by less than this share are written as ±
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One parameter as a person reads it; texts without what is not known are empty."""
+    """Text of one parameter; unknown parts are empty."""
 
     name: str
     value: str  # "30.94", "ax"
-    interval: str  # "30.4 … 31.5": 95 %
+    interval: str  # "30.4 … 31.5", the 95 % interval
     short: str  # "30.94 ± 0.55 °/h", with its unit
     unit: str  # "°/h"
-    given: str  # in the model under test, where that has the effect once
+    given: str  # value in the model under test, if the model has the effect exactly once
 
 
 def field_unit(si: str, size: float) -> Unit:
-    """The unit in which people write something of ``size`` in an SI unit.
+    """Return the unit of the field for a quantity of this size.
 
     >>> field_unit("rad/s", 1e-4).name, field_unit("rad/s", 5.0).name, field_unit("Hz", 17.0).name
     ('°/h', '°/s', 'Hz')
+
+    Parameters
+    ----------
+    si
+        SI unit.
+    size
+        Size of the quantity in the SI unit.
     """
     for kind, unit in (("gyro", "rad/s"), ("accel", "m/s²")):
         if si == unit:
             large = SAMPLE_UNITS[kind]  # type: ignore[index]
-            return DEVIATION_UNITS[kind] if abs(size) * large.factor < SMALL else large  # type: ignore[index]
-    return UNITS.get(si, Unit(1.0, si))
+            return DEVIATION_UNITS[kind] if abs(size) * large.factor < SMALL_UNIT_BELOW else large  # type: ignore[index]
+    return FIELD_UNITS.get(si, Unit(1.0, si))
 
 
 def plain(name: str) -> str:
-    """An effect's or a parameter's name as words."""
+    """Return the name of an effect or a parameter with spaces instead of underscores."""
     return name.replace("_", " ")
 
 
 def lens_name(lens: str) -> str:
-    """A lens' name as words."""
-    return LENSES.get(lens, plain(lens))
+    """Return the name of a diagnostic for the user."""
+    return DIAGNOSTIC_NAMES.get(lens, plain(lens))
 
 
 def percent(share: float) -> str:
-    """A probability; never "100 %".
+    """Format a probability; values near 0 and 1 are written as inequalities.
 
     >>> percent(0.998), percent(0.99999), percent(0.0002)
     ('99.8 %', '> 99.9 %', '< 0.1 %')
@@ -126,21 +136,35 @@ def percent(share: float) -> str:
 
 
 def span(low: float, high: float, unit: str) -> str:
-    """A place along one lens.
+    """Format a range along one diagnostic.
 
     >>> span(17.1, 17.5, "Hz"), span(1800.0, 1800.5, "s")
     ('17.1 … 17.5 Hz', '1800 s')
+
+    Parameters
+    ----------
+    low, high
+        Ends of the range.
+    unit
+        Name of the unit.
     """
-    if not abs(high - low) > ONE_PLACE * max(abs(low), abs(high)):
+    if not abs(high - low) > MIN_RANGE_SHARE * max(abs(low), abs(high)):
         return f"{_short(0.5 * (low + high))} {unit}".rstrip()
     return f"{_short(low)} … {_short(high)} {unit}".rstrip()
 
 
 def place(where: Where, axis: str) -> str:
-    """Where it was, e.g. "17.1 … 17.5 Hz"; "everywhere" where no lens tells a place.
+    """Format the range in which a diagnostic found a gap; "everywhere" if no range is given.
 
     >>> place(Where(tau=(1.0, 4.0), source="ax"), "gz")
     'τ = 1 … 4 s, from ax'
+
+    Parameters
+    ----------
+    where
+        The range.
+    axis
+        Name of the axis, which selects the units.
     """
     found = []
     for name, at in where.found().items():
@@ -150,18 +174,27 @@ def place(where: Where, axis: str) -> str:
             unit = field_unit("rad/s" if kind_of(axis) == "gyro" else "m/s²", max(map(abs, at)))
             found.append(span(at[0] * unit.factor, at[1] * unit.factor, unit.name))
         else:
-            sign, unit_name = PLACES[name]
+            sign, unit_name = RANGE_FORMATS[name]
             found.append(sign + span(*at, unit_name))
     return ", ".join(found) or "everywhere"
 
 
 def score(one: Score, axis: str) -> str:
-    """A gap with its lens and place, in a line."""
+    """Return one line with the diagnostic, its range, its gap and its threshold.
+
+    Parameters
+    ----------
+    one
+        Gap of a diagnostic.
+    axis
+        Name of the axis, which selects the units.
+    """
     return f"{lens_name(one.lens)}, {place(one.where, axis)}: gap {gap(one.gap)}, threshold {gap(one.threshold)}"
 
 
 def gap(size: float) -> str:
-    """
+    """Format the size of a gap.
+
     >>> gap(0.6), gap(41.23), gap(12345.0)
     ('0.60', '41.2', '12300')
     """
@@ -171,13 +204,23 @@ def gap(size: float) -> str:
 
 
 def over_threshold(one: Score) -> float:
-    """A gap as a share of its threshold; 0 where that is no number."""
+    """Return gap divided by threshold; 0 if the ratio is not finite."""
     share = one.gap / one.threshold if one.threshold > 0.0 else 0.0
     return share if isfinite(share) else 0.0
 
 
 def parameters(step: Step, axis: str, baseline: NoiseModel) -> tuple[Parameter, ...]:
-    """All parameters of a step, in its order; beside those of a known effect, what the model under test has."""
+    """Return the text of all parameters of a step; for a changed term, also its value in the model under test.
+
+    Parameters
+    ----------
+    step
+        Step of the reconciliation.
+    axis
+        Name of the axis.
+    baseline
+        Model under test.
+    """
     known = [effect for effect in baseline.effects.get(axis, ()) if effect.name == step.effect]
     given = known[0] if len(known) == 1 and step.kind == "retuned" else None
     return tuple(
@@ -187,13 +230,25 @@ def parameters(step: Step, axis: str, baseline: NoiseModel) -> tuple[Parameter, 
 
 
 def step_line(step: Step, axis: str, baseline: NoiseModel) -> str:
-    """Effect and parameters in a line: "sinusoidal: amplitude 30.94 ± 0.55 °/h, frequency 17.30000 ± 0.00010 Hz"."""
+    """Return one line with an effect and its parameters.
+
+    Example: "sinusoidal: amplitude 30.94 ± 0.55 °/h, frequency 17.30000 ± 0.00010 Hz".
+
+    Parameters
+    ----------
+    step
+        Step of the reconciliation.
+    axis
+        Name of the axis.
+    baseline
+        Model under test.
+    """
     said = [f"{plain(one.name)} {one.short}" for one in parameters(step, axis, baseline)]
     return f"{plain(step.effect)}: {', '.join(said)}" if said else plain(step.effect)
 
 
 def summary(r: Reconciliation) -> str:
-    """The verdict of the whole recording in one or two sentences."""
+    """Return the result of the whole recording in one or two sentences."""
     differ = [axis for axis in AXES if axis in r.axes and r.axes[axis].verdict != "agrees"]
     open_axes = [axis for axis in differ if r.axes[axis].left_over]
     named = [step for axis in differ for step in r.axes[axis].steps]
@@ -211,7 +266,7 @@ def summary(r: Reconciliation) -> str:
 
 
 def verdict_line(result: AxisResult) -> str:
-    """What is known of one axis, in a sentence."""
+    """Return the result of one axis in a sentence."""
     match result.verdict:
         case "agrees":
             return "Model and measurement differ by no more than chance, through every lens."
@@ -224,7 +279,7 @@ def verdict_line(result: AxisResult) -> str:
 
 
 def why_not(step: Step) -> str:
-    """The runners-up with what speaks for them, in a sentence."""
+    """Return a sentence on the effects that were also tried, with their probabilities."""
     if not step.runners_up:
         return "No other effect came near."
     tried = [f"{plain(one.effect)} ({percent(one.confidence)})" for one in step.runners_up]
@@ -232,10 +287,11 @@ def why_not(step: Step) -> str:
 
 
 def _parameter(effect: str, name: str, bounds: Bounds, axis: str, given: Any) -> Parameter:
+    """Return the text of one parameter."""
     if isinstance(bounds.value, str):
         return Parameter(name, bounds.value, "", bounds.value, "", "" if given is None else str(given))
     known = {f.name: f.metadata for f in fields(EFFECTS[effect])}[name]  # type: ignore[arg-type]
-    unit = BY_NAME.get(name) or field_unit(known["units"][0 if kind_of(axis) == "gyro" else 1], bounds.value)
+    unit = UNITS_BY_NAME.get(name) or field_unit(known["units"][0 if kind_of(axis) == "gyro" else 1], bounds.value)
     was = "" if given is None else f"{number(given * unit.factor)} {unit.name}".rstrip()
     value, lo, hi = (None if one is None else one * unit.factor for one in (bounds.value, bounds.lo, bounds.hi))
     assert value is not None
@@ -249,14 +305,15 @@ def _parameter(effect: str, name: str, bounds: Bounds, axis: str, given: Any) ->
 
 
 def _plus_minus(value: float, lo: float, hi: float, texts: Sequence[str]) -> str:
+    """Format a value with ±, or with both ends if its interval is asymmetric."""
     below, above = value - lo, hi - value
-    if abs(above - below) > EVEN * (above + below):
+    if abs(above - below) > SYMMETRY_TOLERANCE * (above + below):
         return f"{texts[0]} ({texts[1]} … {texts[2]})"
     return f"{texts[0]} ± {texts[3]}"
 
 
 def _with_interval(value: float, lo: float, hi: float) -> tuple[str, ...]:
-    """value, lo, hi and half the width, all to the digit that is the second one of the half width."""
+    """Format value, lo, hi and half the width of the interval to the second digit of the half width."""
     half = 0.5 * (hi - lo)
     decimals = 1 - floor(log10(half))
     if 0 <= decimals <= 9 and max(map(abs, (value, lo, hi))) < 1e6:
@@ -267,13 +324,13 @@ def _with_interval(value: float, lo: float, hi: float) -> tuple[str, ...]:
 
 
 def _short(value: float) -> str:
-    """Four digits at most, without zeros at the end."""
+    """Format a number with at most four digits and without trailing zeros."""
     text = f"{value:.4g}" if 1e-4 <= abs(value) < 1e5 or value == 0.0 else number(value)
     return text.replace("-", "−", 1) if value < 0.0 else text
 
 
 def _counted(steps: Sequence[Step]) -> list[str]:
-    """How many effects were added and how many known terms retuned, with their names."""
+    """Return the numbers of added effects and of changed terms, with their names."""
     said = []
     for kind, one, many in (
         ("added", "effect added", "effects added"),
@@ -286,7 +343,8 @@ def _counted(steps: Sequence[Step]) -> list[str]:
 
 
 def _listed(words: Sequence[str]) -> str:
-    """
+    """Join words with commas and "and".
+
     >>> _listed(["gx"]), _listed(["gx", "gy", "gz"])
     ('gx', 'gx, gy and gz')
     """

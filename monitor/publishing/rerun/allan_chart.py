@@ -1,8 +1,8 @@
-"""Geometry of a log-log Allan plot for a viewer that has no logarithmic axes.
+"""Geometry of a log-log Allan plot for a viewer without logarithmic axes.
 
-In come curves in the field's units; out go points and lines in chart units: a box ``WIDTH`` by
-``HEIGHT``, y pointing down as Rerun's 2D view has it, one unit the same length on both axes. The box
-never moves, so the view's bounds are set once; the decades inside it follow the data. Pure NumPy.
+Curves in the units of the field are converted to points and lines in chart units. The chart is a box of ``WIDTH`` by
+``HEIGHT`` with equal units on both axes. The y axis points down, as in Rerun's 2D view. The box is fixed, so the
+bounds of the view are set once. The decades inside the box follow the data. The module does no I/O.
 """
 
 import math
@@ -17,18 +17,26 @@ from drivers.sample import Floats
 WIDTH: Final = 16.0
 HEIGHT: Final = 11.5
 MIN_DECADES: Final = 2.0
-FILL_STEPS: Final = 96  # vertical strokes that fill a band over the width of its curve
+FILL_STEPS: Final = 96  # number of vertical strokes that fill a band over the width of its curve
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Which decades of τ and σ the box shows: whole powers of ten."""
+    """Range of τ and σ shown in the box, as exponents of ten."""
 
     x: tuple[int, int]
     y: tuple[int, int]
 
     def place(self, tau: Floats, sigma: Floats) -> Floats:
-        """[n, 2] chart positions of τ (s) and σ (field unit); NaN where σ is not positive."""
+        """Return chart positions, shape [n, 2]; NaN if σ is not positive.
+
+        Parameters
+        ----------
+        tau
+            Averaging times [s], shape [n].
+        sigma
+            Deviations in the unit of the field, shape [n].
+        """
         with np.errstate(divide="ignore", invalid="ignore"):
             log_tau, log_sigma = np.log10(tau), np.log10(np.where(sigma > 0, sigma, np.nan))
         left, right = self.x
@@ -39,10 +47,17 @@ class Scale:
 
 
 def decades(values: Iterable[Floats], least: int = int(MIN_DECADES)) -> tuple[int, int]:
-    """The whole decades that hold all positive finite numbers, at least ``least`` of them.
+    """Return the exponents of the decades that contain all positive finite numbers.
 
     >>> decades([np.array([0.02, 300.0])])
     (-2, 3)
+
+    Parameters
+    ----------
+    values
+        Arrays of numbers.
+    least
+        Smallest number of decades.
     """
     good = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in values])
     if good.size == 0:
@@ -53,22 +68,29 @@ def decades(values: Iterable[Floats], least: int = int(MIN_DECADES)) -> tuple[in
 
 
 def clip(y: Floats) -> Floats:
-    """Heights kept inside the box: an interval may reach far below the plot."""
+    """Limit heights to the box, because an interval may extend far below the plot."""
     return np.clip(y, 0.0, HEIGHT)
 
 
 def runs(positions: Floats) -> list[Floats]:
-    """The finite stretches of a line, each of two points or more: a NaN breaks it."""
+    """Return the finite sections of a line with at least two points; NaN separates sections."""
     good = np.isfinite(positions).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
     return [positions[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
 
 
 def dashes(line: Floats, length: float = 0.22) -> list[Floats]:
-    """A line [n, 2] as strokes of that length with gaps as long between them.
+    """Divide a line of shape [n, 2] into dashes with gaps of the same length.
 
     >>> [stroke.tolist() for stroke in dashes(np.array([[0.0, 0.0], [4.0, 0.0]]), 1.0)]
     [[[0.0, 0.0], [1.0, 0.0]], [[2.0, 0.0], [3.0, 0.0]]]
+
+    Parameters
+    ----------
+    line
+        Points of the line, shape [n, 2].
+    length
+        Length of dashes and gaps [chart units].
     """
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
     edges = np.arange(0.0, along[-1] + 1e-9, length)
@@ -77,7 +99,13 @@ def dashes(line: Floats, length: float = 0.22) -> list[Floats]:
 
 
 def band(low: Floats, high: Floats) -> Floats:
-    """[FILL_STEPS, 2, 2] vertical strokes side by side that fill the space between two curves."""
+    """Return vertical strokes that fill the area between two curves, shape [FILL_STEPS, 2, 2].
+
+    Parameters
+    ----------
+    low, high
+        Chart positions of the curves, shape [n, 2].
+    """
     good = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
     if int(good.sum()) < 2:
         return np.empty((0, 2, 2))
@@ -89,7 +117,13 @@ def band(low: Floats, high: Floats) -> Floats:
 
 
 def whiskers(low: Floats, high: Floats) -> Floats:
-    """[n, 2, 2] one vertical stroke a point, from the lower to the upper end of its interval."""
+    """Return one vertical stroke per point from the lower to the upper end of its interval, shape [n, 2, 2].
+
+    Parameters
+    ----------
+    low, high
+        Chart positions of the ends, shape [n, 2].
+    """
     good = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
     strokes = np.stack([low[good], high[good]], axis=1)
     strokes[:, :, 1] = clip(strokes[:, :, 1])
@@ -98,7 +132,7 @@ def whiskers(low: Floats, high: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Lines and tick labels of one scale."""
+    """Lines and tick labels of a scale."""
 
     frame: list[Floats]
     major: list[Floats]
@@ -107,9 +141,9 @@ class Grid:
 
 
 def grid(scale: Scale) -> Grid:
-    """Decade lines, fainter lines at 2 … 9, and labels under and left of the box."""
-    x_at, x_minor = _lines(scale.x, WIDTH)
-    y_at, y_minor = _lines(scale.y, HEIGHT)
+    """Return decade lines, fainter lines at 2 … 9, and labels below and to the left of the box."""
+    x_at, x_minor = _line_positions(scale.x, WIDTH)
+    y_at, y_minor = _line_positions(scale.y, HEIGHT)
     flip = HEIGHT
     ticks = [(x, HEIGHT + 0.25, _tick(p)) for x, p in zip(x_at, range(scale.x[0], scale.x[1] + 1), strict=True)]
     ticks += [(-0.75, flip - y - 0.35, _tick(p)) for y, p in zip(y_at, range(scale.y[0], scale.y[1] + 1), strict=True)]
@@ -121,8 +155,8 @@ def grid(scale: Scale) -> Grid:
     )
 
 
-def _lines(span: tuple[int, int], length: float) -> tuple[list[float], list[float]]:
-    """Where the decades of an axis stand, and where 2 … 9 between them."""
+def _line_positions(span: tuple[int, int], length: float) -> tuple[list[float], list[float]]:
+    """Return the positions of the decades along an axis, and of 2 … 9 between them."""
     per_decade = length / (span[1] - span[0])
     at = [i * per_decade for i in range(span[1] - span[0] + 1)]
     between = [a + math.log10(k) * per_decade for a in at[:-1] for k in range(2, 10)]
@@ -130,13 +164,15 @@ def _lines(span: tuple[int, int], length: float) -> tuple[list[float], list[floa
 
 
 def _vertical(x: float) -> Floats:
+    """Return a vertical line across the box."""
     return np.array([[x, 0.0], [x, HEIGHT]])
 
 
 def _horizontal(y: float) -> Floats:
+    """Return a horizontal line across the box."""
     return np.array([[0.0, y], [WIDTH, y]])
 
 
 def _tick(power: int) -> str:
-    """A power of ten as people read it: 0.01, 1, 1000, and 1e6 beyond."""
+    """Format a power of ten: 0.01, 1, 1000, and 1e6 outside 10⁻⁴ to 10⁴."""
     return f"{10.0**power:g}" if -4 <= power <= 4 else f"1e{power}"

@@ -1,8 +1,8 @@
-"""The history of a device's Allan deviations, thinned as it grows: what a live view of them over time shows.
+"""History of a device's Allan deviations in a table of limited size, for a live view over time.
 
-In come estimates; out goes a bounded table of columns, oldest first. A column is the mean (of logarithms) of the
-estimates of a stretch of time. When COLUMNS are there, neighbours are averaged and every column stands for twice the
-time from then on: the whole history stays in view at a cost that does not grow. Pure NumPy.
+Estimates are aggregated into columns, oldest first. Each column is the mean of the logarithms of the estimates in a
+time span. When the table holds COLUMNS columns, neighbouring columns are averaged, and each column then covers twice
+the time. The table therefore covers the whole history at constant memory. The module does no I/O.
 """
 
 import numpy as np
@@ -11,37 +11,46 @@ from drivers.sample import AXES, Floats, Ints
 from monitor.estimation.estimate import Estimate
 
 COLUMNS = 300
-"""Even, so that they pair off."""
-COLUMN_S = 2.0
-"""Of sample time in a column, at first."""
+"""Largest number of columns; it must be even, because columns are merged in pairs."""
+INITIAL_COLUMN_S = 2.0
+"""Initial time span of a column [s], in sample time."""
 
 
 class Surface:
-    """The history of one device. Estimates with other τ, or from an earlier time, begin a new one."""
+    """Allan deviations of one device over time. An estimate with other τ or an earlier time starts a new history."""
 
-    def __init__(self, column_s: float = COLUMN_S) -> None:
-        """``column_s``: seconds a column stands for at first."""
+    def __init__(self, column_s: float = INITIAL_COLUMN_S) -> None:
+        """Create an empty history; ``column_s`` is the initial time span of a column [s]."""
         self._first_s = column_s
-        self._begin(np.empty(0), 0.0)
+        self._reset(np.empty(0), 0.0)
 
-    def _begin(self, tau_s: Floats, wall_s: float) -> None:
+    def _reset(self, tau_s: Floats, wall_s: float) -> None:
+        """Start a new history with these averaging times."""
         self.column_s = self._first_s
         self.tau_s = tau_s  # [m]
-        self.ends_s: list[float] = []  # newest estimate of each column
-        self._columns: list[Floats] = []  # [m, 6] ln of the deviation
-        self._open(wall_s)
+        self.ends_s: list[float] = []  # Unix time of the newest estimate in each column
+        self._columns: list[Floats] = []  # [m, 6] natural logarithm of the deviation
+        self._begin_column(wall_s)
 
-    def _open(self, wall_s: float) -> None:
-        """A new column, from here on."""
+    def _begin_column(self, wall_s: float) -> None:
+        """Start a new column."""
         self._since_s = self._newest_s = wall_s
         self._sums: Floats = np.zeros((self.tau_s.size, len(AXES)))
         self._counts: Ints = np.zeros((self.tau_s.size, len(AXES)), np.int64)
 
     def add(self, wall_s: float, estimate: Estimate) -> bool:
-        """Take one estimate; True when it completes a column."""
+        """Add an estimate, and return True if it completes a column.
+
+        Parameters
+        ----------
+        wall_s
+            Unix time of the estimate [s].
+        estimate
+            The estimate.
+        """
         if wall_s < self._newest_s or not np.array_equal(self.tau_s, estimate.curve.tau_s):
-            self._begin(estimate.curve.tau_s, wall_s)
-        # each τ over a span of its own, where there is such a curve: a change shows at once, and where it happened
+            self._reset(estimate.curve.tau_s, wall_s)
+        # The recent curve uses a separate time span for each τ, so a change appears at once and at the correct time.
         avar = (estimate.recent or estimate.curve).avar
         there = np.isfinite(avar) & (avar > 0.0)
         self._sums[there] += 0.5 * np.log(avar[there])
@@ -51,12 +60,13 @@ class Surface:
             return False
         self.ends_s.append(wall_s)
         self._columns.append(np.where(self._counts > 0, self._sums / np.maximum(self._counts, 1), np.nan))
-        self._open(wall_s)
+        self._begin_column(wall_s)
         if len(self._columns) >= COLUMNS:
-            self._halve()
+            self._merge_pairs()
         return True
 
-    def _halve(self) -> None:
+    def _merge_pairs(self) -> None:
+        """Average neighbouring columns."""
         pairs = np.stack(self._columns).reshape(COLUMNS // 2, 2, self.tau_s.size, len(AXES))
         there = np.isfinite(pairs)
         means = np.where(there, pairs, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
@@ -65,7 +75,7 @@ class Surface:
         self.column_s *= 2.0
 
     def relative(self) -> Floats:
-        """ln of the deviation over its median over time [columns, m, 6]; NaN where there is none."""
+        """Return ln(deviation / median over time), shape [columns, m, 6]; NaN if there is no deviation."""
         whole = np.stack(self._columns) if self._columns else np.empty((0, self.tau_s.size, len(AXES)))
         there = np.isfinite(whole).any(axis=0)
         median = np.full(there.shape, np.nan)

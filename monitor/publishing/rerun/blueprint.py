@@ -1,8 +1,8 @@
-"""What the viewer opens on: is it healthy, what is its noise now, has it changed.
+"""Layout of the Rerun viewer: health, current noise, and changes.
 
-One device fills the window; several get an overview and a tab each. A second tab of a device shows its noise over
-time, a third its bias beside its temperature. The time panel follows the newest sample. Layout only: nothing here knows
-a number. Importing this module imports Rerun.
+A single device fills the window. Several devices have an overview and one tab each. A second tab of a device shows
+its noise over time, a third its bias and temperature. The time panel follows the newest sample. This module defines
+only the layout and handles no data. Importing it imports Rerun.
 """
 
 from collections.abc import Collection, Sequence
@@ -27,14 +27,15 @@ from monitor.publishing.rerun import dynamic_surface
 from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH
 from monitor.publishing.rerun.scene import TIMELINE
 
-RAW_SPAN_S: Final = 30.0  # of raw samples in view, up to the cursor
-LABEL_SHARE: Final = 0.08  # of a plot's width: half a tick's label
-COURSES: Final = ("N", "B")
-DYNAMIC_COURSES: Final = ("N", "B", "K")
-TAUS: Final = 17  # an hour's octaves at 100 Hz: a surface of other τ is a little higher or lower
-BOTH_KINDS: Final = 4  # devices at most whose accelerometers are in the overview too
+RAW_SPAN_S: Final = 30.0  # time span of raw samples in view, up to the cursor
+HALF_LABEL_SHARE: Final = 0.08  # width of half a tick label, as a share of the plot's width
+NOW_COEFFICIENTS: Final = ("N", "B")
+DYNAMIC_COEFFICIENTS: Final = ("N", "B", "K")
+TYPICAL_TAU_COUNT: Final = 17
+"""Octaves of one hour at 100 Hz. A surface with another number of τ has a slightly different height."""
+MAX_DEVICES_WITH_ACCEL: Final = 4  # largest number of devices for which the overview also shows accelerometers
 COLUMNS: Final = 4
-SHORT: Final = {"gyro": "Gyro", "accel": "Accel"}
+SHORT_KIND_NAMES: Final = {"gyro": "Gyro", "accel": "Accel"}
 
 
 def blueprint(
@@ -44,9 +45,20 @@ def blueprint(
     compensated: Collection[str] = (),
     fleet: bool = False,
 ) -> rrb.Blueprint:
-    """The layout for these devices; some have a model in force, a bias held against temperature, or are compensated.
+    """Return the layout for the devices.
 
-    ``fleet``: they are those in detail of many more, and the overview is a table of all.
+    Parameters
+    ----------
+    devices
+        Names of the devices.
+    with_model
+        Devices that are compared with a noise model.
+    with_thermal
+        Devices whose bias is compared with their temperature.
+    compensated
+        Devices whose gyroscope drift is compensated.
+    fleet
+        True if there are many more devices; the overview is then a table of all devices.
     """
     pages = [_device(d, d in with_model, d in with_thermal, d in compensated) for d in devices]
     if fleet:
@@ -64,6 +76,7 @@ def blueprint(
 
 
 def _device(device: str, has_model: bool, has_thermal: bool, compensated: bool) -> rrb.Container:
+    """Return the tabs of one device."""
     left = rrb.Vertical(
         rrb.TextDocumentView(origin=f"/{device}/status", name="Is it healthy?"),
         rrb.TextDocumentView(origin=f"/{device}/coefficients", contents="$origin", name="What is its noise now?"),
@@ -72,7 +85,7 @@ def _device(device: str, has_model: bool, has_thermal: bool, compensated: bool) 
     )
     right = rrb.Vertical(
         rrb.Horizontal(*(_allan(device, kind) for kind in KINDS)),
-        rrb.Horizontal(*(_course(device, kind, letter) for kind in KINDS for letter in COURSES)),
+        rrb.Horizontal(*(_course(device, kind, letter) for kind in KINDS for letter in NOW_COEFFICIENTS)),
         *([rrb.Horizontal(*(_gap(device, kind) for kind in KINDS))] if has_model else []),
         rrb.Horizontal(*(_raw(device, kind) for kind in KINDS), _temperature(device), column_shares=[2, 2, 1]),
         row_shares=[5, 2.2, 1.6, 2.2] if has_model else [5, 2.2, 2.2],
@@ -85,13 +98,13 @@ def _device(device: str, has_model: bool, has_thermal: bool, compensated: bool) 
 
 
 def _thermal(device: str) -> rrb.Container:
-    """Bias of each axis beside what was expected of it, and the temperature."""
+    """Return the tab with the bias of each axis, its prediction, and the temperature."""
     columns = [rrb.Vertical(*(_bias(device, axis) for axis in axes_of(kind))) for kind in KINDS]
     return rrb.Vertical(rrb.Horizontal(*columns), _temperature(device), row_shares=[4, 1], name="Temperature")
 
 
 def _drift(device: str) -> rrb.Container:
-    """Rates before and after, the drift that was taken out, and what was new in each interval."""
+    """Return the tab with rates before and after compensation, the predicted drift, and the innovations."""
     rows = [
         rrb.Horizontal(
             rrb.TimeSeriesView(
@@ -100,19 +113,19 @@ def _drift(device: str) -> rrb.Container:
                 name=f"{axis}: rate as measured, and without drift, {SAMPLE_UNITS['gyro'].name}",
                 plot_legend=rrb.PlotLegend(visible=False),
                 overrides={f"/{device}/samples/{axis}": rr.SeriesLines(colors=[colours.FRAME], widths=[0.75])},
-                axis_x=_last(RAW_SPAN_S),
+                axis_x=_last_seconds(RAW_SPAN_S),
             ),
             rrb.TimeSeriesView(
                 origin=f"/{device}/drift/{axis}",
                 name=f"{axis}: means at rest, and the drift expected, {DEVIATION_UNITS['gyro'].name}",
                 plot_legend=rrb.PlotLegend(visible=False),
-                axis_x=_all_so_far(),
+                axis_x=_until_cursor(),
             ),
             rrb.TimeSeriesView(
                 origin=f"/{device}/innovation/{axis}",
                 name=f"{axis}: innovation, σ",
                 plot_legend=rrb.PlotLegend(visible=False),
-                axis_x=_all_so_far(),
+                axis_x=_until_cursor(),
             ),
             column_shares=[3, 3, 2],
         )
@@ -123,20 +136,21 @@ def _drift(device: str) -> rrb.Container:
 
 
 def _bias(device: str, axis: str) -> rrb.View:
+    """Return the view of the bias of one axis and its prediction."""
     return rrb.TimeSeriesView(
         origin=f"/{device}/thermal/{axis}",
         name=f"{axis}: bias, and what its temperature lets expect, {DEVIATION_UNITS[kind_of(axis)].name}",
         plot_legend=rrb.PlotLegend(visible=False),
-        axis_x=_all_so_far(),
+        axis_x=_until_cursor(),
     )
 
 
 def _dynamic(device: str) -> rrb.Container:
-    """Surfaces of all axes, and below them the courses of the coefficients that change."""
+    """Return the tab with the Allan surfaces of all axes and, below them, coefficients over time."""
     columns = [
         rrb.Vertical(
             *(_surface(device, axis) for axis in axes_of(kind)),
-            rrb.Horizontal(*(_course(device, kind, letter) for letter in DYNAMIC_COURSES)),
+            rrb.Horizontal(*(_course(device, kind, letter) for letter in DYNAMIC_COEFFICIENTS)),
             row_shares=[3, 3, 3, 2.6],
         )
         for kind in KINDS
@@ -145,7 +159,8 @@ def _dynamic(device: str) -> rrb.Container:
 
 
 def _surface(device: str, axis: str) -> rrb.View:
-    x, y = dynamic_surface.bounds(TAUS)
+    """Return the view of the Allan surface of one axis."""
+    x, y = dynamic_surface.bounds(TYPICAL_TAU_COUNT)
     return rrb.Spatial2DView(
         origin=f"/{device}/dynamic/{axis}",
         contents="$origin/**",
@@ -156,7 +171,8 @@ def _surface(device: str, axis: str) -> rrb.View:
 
 
 def _overview(devices: Sequence[str]) -> rrb.Container:
-    kinds = KINDS if len(devices) <= BOTH_KINDS else KINDS[:1]
+    """Return the overview of several devices."""
+    kinds = KINDS if len(devices) <= MAX_DEVICES_WITH_ACCEL else KINDS[:1]
     charts = [_allan(d, kind, f"{d}: ") for kind in kinds for d in devices]
     return rrb.Vertical(
         rrb.Horizontal(
@@ -171,7 +187,7 @@ def _overview(devices: Sequence[str]) -> rrb.Container:
 
 
 def _fleet(devices: Sequence[str]) -> rrb.Container:
-    """The table of all devices, their events, and the Allan plots of those in detail."""
+    """Return the overview of many devices: table, events, and Allan plots of the devices shown in detail."""
     table = rrb.TextDocumentView(origin="/overview", contents="$origin", name="Is it healthy?")
     events = rrb.TextLogView(origin="/overview/events", name="Has it changed?", columns=_log_columns())
     charts = [_allan(device, kind, f"{device}: ") for device in devices for kind in KINDS]
@@ -183,6 +199,7 @@ def _fleet(devices: Sequence[str]) -> rrb.Container:
 
 
 def _allan(device: str, kind: Kind, prefix: str = "") -> rrb.View:
+    """Return the view of the Allan plot of one kind of sensor."""
     paths = [f"+ /{device}/allan/{kind}/**", *(f"+ /{device}/allan/{axis}/**" for axis in axes_of(kind))]
     bounds = rrb.VisualBounds2D(x_range=[-1.6, WIDTH + 0.6], y_range=[-1.3, HEIGHT + 1.7])
     return rrb.Spatial2DView(
@@ -195,58 +212,63 @@ def _allan(device: str, kind: Kind, prefix: str = "") -> rrb.View:
 
 
 def _course(device: str, kind: Kind, letter: str) -> rrb.View:
+    """Return the view of one coefficient over time."""
     unit = COEFFICIENT_UNITS[kind][letter].name
     return rrb.TimeSeriesView(
         origin=f"/{device}/coefficients/{letter}",
         contents=[f"+ $origin/{axis}/**" for axis in axes_of(kind)],
-        name=f"{SHORT[kind]} {letter}, {unit}",
+        name=f"{SHORT_KIND_NAMES[kind]} {letter}, {unit}",
         plot_legend=rrb.PlotLegend(visible=False),
-        axis_x=_all_so_far(),
+        axis_x=_until_cursor(),
     )
 
 
 def _raw(device: str, kind: Kind) -> rrb.View:
+    """Return the view of the raw samples."""
     return rrb.TimeSeriesView(
         origin=f"/{device}/samples",
         contents=[f"+ $origin/{axis}" for axis in axes_of(kind)],
         name=f"{KIND_NAMES[kind]}: samples, {SAMPLE_UNITS[kind].name}",
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
-        axis_x=_last(RAW_SPAN_S),
+        axis_x=_last_seconds(RAW_SPAN_S),
     )
 
 
 def _temperature(device: str) -> rrb.View:
+    """Return the view of the temperature."""
     return rrb.TimeSeriesView(
         origin=f"/{device}/temperature",
         name="Temperature, °C",
         plot_legend=rrb.PlotLegend(visible=False),
-        axis_x=_all_so_far(),
+        axis_x=_until_cursor(),
     )
 
 
 def _gap(device: str, kind: Kind) -> rrb.View:
+    """Return the view of the gap to the model."""
     return rrb.TimeSeriesView(
         origin=f"/{device}/gap",
         contents=["+ $origin/threshold", *(f"+ $origin/{axis}" for axis in axes_of(kind))],
         name=f"{KIND_NAMES[kind]}: gap to the model, σ, and its threshold",
         plot_legend=rrb.PlotLegend(visible=False),
-        axis_x=_all_so_far(),
+        axis_x=_until_cursor(),
     )
 
 
 def _log_columns() -> rrb.TextLogColumns:
-    """The time of the day stands in the text: a column for it would be cut off to the date."""
+    """Return the columns of the event log; the time of day is part of the text, as its column would be cut off."""
     hidden = TimelineColumn(timeline=TIMELINE, visible=False)
     return rrb.TextLogColumns(timeline_columns=[hidden], text_log_columns=["LogLevel", "Body"])
 
 
-def _last(seconds: float) -> rrb.TimeAxis:
-    """The last of it, and room on the right for the label of a tick that stands at the cursor."""
-    first, last = (rr.TimeRangeBoundary.cursor_relative(seconds=s) for s in (-seconds, LABEL_SHARE * seconds))
+def _last_seconds(seconds: float) -> rrb.TimeAxis:
+    """Return a time axis of the last seconds, with space on the right for a tick label at the cursor."""
+    first, last = (rr.TimeRangeBoundary.cursor_relative(seconds=s) for s in (-seconds, HALF_LABEL_SHARE * seconds))
     return rrb.TimeAxis(view_range=rr.TimeRange(first, last))
 
 
-def _all_so_far() -> rrb.TimeAxis:
+def _until_cursor() -> rrb.TimeAxis:
+    """Return a time axis from the beginning to the cursor."""
     now = rr.TimeRangeBoundary.cursor_relative()
     return rrb.TimeAxis(view_range=rr.TimeRange(rr.TimeRangeBoundary.infinite(), now))
 
@@ -259,7 +281,15 @@ def send(
     compensated: Collection[str] = (),
     fleet: bool = False,
 ) -> None:
-    """Make the layout the active one of the stream's viewer."""
+    """Send the layout to the viewer of a stream and activate it.
+
+    Parameters
+    ----------
+    stream
+        Stream of the viewer.
+    devices, with_model, with_thermal, compensated, fleet
+        See ``blueprint``.
+    """
     stream.send_blueprint(
         blueprint(devices, with_model, with_thermal, compensated, fleet), make_active=True, make_default=True
     )

@@ -1,4 +1,4 @@
-"""A bounded queue between the service and a slow output: never blocks, drops its oldest, counts them."""
+"""Bounded queue between the service and a slow output: it never blocks, and drops and counts its oldest items."""
 
 import threading
 from collections import deque
@@ -8,7 +8,7 @@ T = TypeVar("T")
 
 
 class Backlog(Generic[T]):
-    """Holds at most ``limit`` units of weight (bytes); safe between threads.
+    """Queue whose items have a total weight of at most ``limit`` (bytes); thread-safe.
 
     >>> backlog = Backlog[str](limit=2)
     >>> for word in ("a", "b", "c"):
@@ -22,10 +22,18 @@ class Backlog(Generic[T]):
         self._limit = limit
         self._weight = 0
         self._ready = threading.Condition()
-        self.dropped = 0  # since it was made
+        self.dropped = 0  # number of items dropped since creation
 
     def push(self, item: T, weight: int) -> None:
-        """Add the newest; the oldest give way. Returns at once."""
+        """Add an item and drop the oldest items beyond the limit; at least one item is kept. Return at once.
+
+        Parameters
+        ----------
+        item
+            The item.
+        weight
+            Weight of the item, in the unit of the limit.
+        """
         with self._ready:
             self._items.append((item, weight))
             self._weight += weight
@@ -35,7 +43,7 @@ class Backlog(Generic[T]):
             self._ready.notify()
 
     def take(self, timeout_s: float) -> list[T]:
-        """All there is, oldest first; an empty list when nothing came in time."""
+        """Return and remove all items, oldest first; wait up to ``timeout_s`` seconds if there are none."""
         with self._ready:
             if not self._items and timeout_s > 0:
                 self._ready.wait(timeout_s)

@@ -1,9 +1,10 @@
-"""One viewer for many daemons: ``imu-monitor view``.
+"""Viewer for the devices of many daemons: ``imu-monitor view``.
 
-In come messages from zenoh, out go pictures: of all devices one table, those in trouble first, and the events of all;
-of devices in detail what the daemon's own viewer shows: samples, Allan plots, coefficients and their courses. Samples
-and curves are subscribed to for those alone, so that a fleet costs its status and coefficients. Message by message this
-decides nothing: ``Board`` knows the devices, ``rebuilt`` makes results of messages, ``RerunView`` draws in its thread.
+Messages from zenoh are drawn as a table of all devices, those with problems first, and a list of all events. Devices
+selected for detail also have samples, Allan plots and coefficients over time, as in the viewer of a daemon. Samples
+and curves are subscribed to only for these, so the other devices cost only their status and coefficients. ``Board``
+holds the state of the devices, ``decoding`` converts messages into results, and ``RerunView`` draws in its own
+thread.
 """
 
 import threading
@@ -20,17 +21,24 @@ from monitor.publishing.rerun.view import RerunView
 from monitor.publishing.terminal.live_table import Board, note
 from monitor.publishing.zenoh.subscriber import Message, ZenohIn
 
-TAKE_S: Final = 0.1
-TABLE_S: Final = 1.0
-ROWS: Final = 40
-"""Of the table at most: what a screen holds; those left out have least trouble."""
+RECEIVE_TIMEOUT_S: Final = 0.1
+TABLE_PERIOD_S: Final = 1.0
+MAX_ROWS: Final = 40
+"""Largest number of rows of the table, about one screen; the devices left out have the fewest problems."""
 
 
 def detail_key(device: str, keyexpr: str) -> str:
-    """The key of a device as it was named: whole, or below what the key expression begins with.
+    """Return the key of a device that is given in full or relative to the fixed start of a key expression.
 
     >>> detail_key("nose", "imu/**"), detail_key("fleet/a7/nose", "fleet/**"), detail_key("a7/nose", "fleet/**")
     ('imu/nose', 'fleet/a7/nose', 'fleet/a7/nose')
+
+    Parameters
+    ----------
+    device
+        Key of the device, in full or relative.
+    keyexpr
+        Key expression of the subscription.
     """
     fixed = []
     for part in keyexpr.split("/"):
@@ -42,31 +50,45 @@ def detail_key(device: str, keyexpr: str) -> str:
 
 
 class FleetView:
-    """What is heard of all devices, and drawn.
+    """Viewer of all devices that daemons publish.
 
-    Args:
-        arriving: subscriptions, those of the devices in detail among them
-        viewer: draws, its devices are those in detail, by their keys
-        detail: keys of devices in detail
+    Parameters
+    ----------
+    arriving
+        Subscriber, including the topics of devices shown in detail.
+    viewer
+        Viewer whose devices are those shown in detail, named by their keys.
+    detail
+        Keys of the devices shown in detail.
     """
 
     def __init__(self, arriving: ZenohIn, viewer: RerunView, detail: Sequence[str]) -> None:
         self._arriving = arriving
         self._viewer = viewer
         self._detail = frozenset(detail)
-        self._noise: dict[str, remote_device.Noise] = {}  # newest of the devices in detail
+        self._noise: dict[str, remote_device.Noise] = {}  # newest coefficients of devices shown in detail
         self.board = Board()
-        self.malformed = 0  # messages of devices in detail that are not what their key says
+        self.malformed = 0  # number of messages of devices in detail that could not be decoded
 
     def run(self, stop: threading.Event, tell: Callable[[str], None], seconds: float | None = None) -> None:
-        """Until ``stop``; ``tell`` is told where the page is and what is wrong, whenever that changes."""
+        """Process messages until ``stop`` is set.
+
+        Parameters
+        ----------
+        stop
+            Event that ends the method.
+        tell
+            Function called with the address of the page and any problem, whenever one of them changes.
+        seconds
+            Longest duration [s]; None: no limit.
+        """
         end_s = None if seconds is None else time.monotonic() + seconds
         table_s, told = 0.0, ""
         while not stop.is_set() and (end_s is None or time.monotonic() < end_s):
-            for message in self._arriving.take(TAKE_S):
+            for message in self._arriving.take(RECEIVE_TIMEOUT_S):
                 self.take(message)
             now_s = time.monotonic()
-            if now_s - table_s < TABLE_S:
+            if now_s - table_s < TABLE_PERIOD_S:
                 continue
             table_s = now_s
             self.draw(time.time(), now_s)
@@ -77,7 +99,7 @@ class FleetView:
                 tell(said)
 
     def take(self, message: Message) -> None:
-        """One message: to the table, and to the viewer where its device is in detail."""
+        """Process a message: update the table, and the viewer if the device is shown in detail."""
         if message.payload is None:
             self.board.alive(message.key, message.there)
             return
@@ -96,11 +118,20 @@ class FleetView:
             self.malformed += topic not in (topics.STATUS, topics.COEFFICIENTS, topics.GAP)
 
     def draw(self, wall_s: float, now_s: float) -> None:
-        """The table of all devices as it is now."""
+        """Draw the table of all devices.
+
+        Parameters
+        ----------
+        wall_s
+            Unix time of the table [s].
+        now_s
+            Current time on the clock of the messages [s].
+        """
         devices = self.board.devices(now_s)
-        self._viewer.overview(wall_s, fleet_text(devices, now_s, ROWS, note(self.board, self._arriving)))
+        self._viewer.overview(wall_s, fleet_text(devices, now_s, MAX_ROWS, note(self.board, self._arriving)))
 
     def _show(self, device: str, topic: topics.Topic, payload: bytes) -> None:
+        """Pass a message of a device shown in detail to the viewer."""
         if topic is topics.SAMPLES:
             rows = unpack(payload).block
             self._viewer.samples(device, rows.t_ns / 1e9, rows.values, rows.temperature_c)
@@ -117,6 +148,7 @@ class FleetView:
                 self._viewer.health(device, status.t, decoding.health(status))
 
     def _trouble(self) -> str:
+        """Return the problems of the viewer and of the subscriber."""
         viewer = self._viewer.state
         said = [] if viewer in ("ok", "starting") else [f"viewer: {viewer}"]
         if self._arriving.state != "ok":

@@ -1,7 +1,7 @@
-"""The texts of the viewer's panels, as Markdown: is it healthy, and what is its noise now.
+"""Text of the viewer's panels as Markdown: health and current noise.
 
-In come a ``Health`` or an ``Estimate``, out goes text; numbers stand in the field's units. Pure, so
-that what a person reads can be tested without a viewer.
+Functions convert a ``Health`` or an ``Estimate`` into text with the units of the field. They do no I/O, so the text
+can be tested without a viewer.
 """
 
 import math
@@ -29,9 +29,9 @@ from monitor.publishing.coefficient_cells import (
 from monitor.publishing.messages import remote_device
 from monitor.publishing.messages.remote_device import Heard
 
-SHOWN: Final = ("gx", "gy", "gz")
-"""Axes whose white noise stands in the table of a fleet, in °/√h."""
-WORDS: Final = {
+FLEET_AXES: Final = ("gx", "gy", "gz")
+"""Axes whose white noise is shown in the table of all devices [°/√h]."""
+STATE_TEXTS: Final = {
     "running": "RUNNING",
     "waiting": "WAITING for the device",
     "lost": "LOST: the device is gone, trying again",
@@ -40,8 +40,18 @@ WORDS: Final = {
 
 
 def health_text(device: str, health: Health, about: str = "") -> str:
-    """The health panel of one device."""
-    lines = [f"## {WORDS.get(health.state, health.state)}"]
+    """Return the health panel of one device.
+
+    Parameters
+    ----------
+    device
+        Name of the device.
+    health
+        Health of the device.
+    about
+        Short description of the device.
+    """
+    lines = [f"## {STATE_TEXTS.get(health.state, health.state)}"]
     if health.text:
         lines.append(f"**{health.text}**")
     if health.crossed:
@@ -62,7 +72,7 @@ def health_text(device: str, health: Health, about: str = "") -> str:
 
 
 def overview_text(healths: Mapping[str, Health]) -> str:
-    """One line a device: the panel that a fleet opens on."""
+    """Return a table of several devices, one line each."""
     rows = [
         f"| **{name}** | {h.state} | {_rate(h)} | {h.received:,} | {h.lost:,} | {h.bad:,} | {h.text or 'all well'} |"
         for name, h in healths.items()
@@ -72,43 +82,58 @@ def overview_text(healths: Mapping[str, Health]) -> str:
 
 
 def fleet_text(devices: Sequence[Heard], now_s: float, rows: int, note: str = "") -> str:
-    """One line a device, those in trouble first, at most ``rows`` of them; above it how many are in which state."""
+    """Return a table of many devices, those with problems first, with the number of devices in each state above it.
+
+    Parameters
+    ----------
+    devices
+        Devices in the order of their rows.
+    now_s
+        Current time on the clock of the messages [s].
+    rows
+        Largest number of rows.
+    note
+        Line above the table.
+    """
     counts = Counter(one.state(now_s) for one in devices)
-    states = ", ".join(f"**{count:,}** {_cell(state)}" for state, count in counts.most_common())
+    states = ", ".join(f"**{count:,}** {_escape_cell(state)}" for state, count in counts.most_common())
     head = [f"**{len(devices):,}** device{'' if len(devices) == 1 else 's'}{': ' if states else ''}{states}"]
     head[0] += f"; N in {COEFFICIENT_UNITS['gyro']['N'].name}" if devices else ""
     head += [f"**{remote_device.clean(note)}**"] if note else []
     table = [_fleet_row(one, now_s) for one in devices[:rows]]
     if table:
-        columns = [*("device", "state", "rate", "received", "lost", "bad"), *(f"N {axis}" for axis in SHOWN), ""]
+        columns = [*("device", "state", "rate", "received", "lost", "bad"), *(f"N {axis}" for axis in FLEET_AXES), ""]
         table = [f"| {' | '.join(columns)} |", "|:--|:--|" + "--:|" * (len(columns) - 3) + ":--|", *table]
     left = [f"… and {len(devices) - rows:,} more with less trouble"] if len(devices) > rows else []
     return "\n\n".join([*head, *(["\n".join(table)] if table else []), *left])
 
 
 def _fleet_row(one: Heard, now_s: float) -> str:
+    """Return the row of one device."""
     state, status = one.state(now_s), one.status
-    name = _cell(one.key)
-    word = f"**{state.upper()}**" if one.rank(now_s) == 0 else _cell(state)
+    name = _escape_cell(one.key)
+    word = f"**{state.upper()}**" if one.rank(now_s) == 0 else _escape_cell(state)
     noise = [
         "" if one.noise is None else reading(one.noise.coefficients, "N", axis).value.replace("| ", "")
-        for axis in SHOWN
+        for axis in FLEET_AXES
     ]
     if status is None:
         return f"| **{name}** | {word} | | | | | {' | '.join(noise)} | nothing known yet |"
     rate = "—" if status.rate is None else f"{status.rate:.2f} Hz"
-    trouble = _cell(one.trouble()) or ("nothing comes any more" if state in ("gone", "silent") else "")
+    trouble = _escape_cell(one.trouble()) or (
+        f"no data for {now_s - one.heard_s:.1f} s" if state in ("gone", "silent") else ""
+    )
     counts = f"{status.received:,} | {status.lost:,} | {status.bad:,}"
     return f"| **{name}** | {word} | {rate} | {counts} | {' | '.join(noise)} | {trouble} |"
 
 
-def _cell(text: str) -> str:
-    """Text of another process inside a table: it cannot end its cell, nor become a link or a picture."""
+def _escape_cell(text: str) -> str:
+    """Escape text of another process for a table cell, so that it cannot end the cell or form a link or an image."""
     return re.sub(r"([\\`*_\[\]<>!|#])", r"\\\1", remote_device.clean(text))
 
 
 def noise_text(estimate: Estimate) -> str:
-    """The tables of Q N B K R, one a kind of sensor that the device has."""
+    """Return the tables of Q, N, B, K and R, one for each kind of sensor of the device."""
     present = measured_axes(estimate.curve.avar)
     tables = [_noise_table(estimate, kind) for kind in KINDS if set(axes_of(kind)) & set(present)]
     if not tables:
@@ -119,7 +144,7 @@ def noise_text(estimate: Estimate) -> str:
 
 
 def drift_text(look: DriftLook) -> str:
-    """The models that the gyros' drift is expected by, and what is taken out now."""
+    """Return a table of the drift models of the gyroscopes and the drift that is currently removed."""
     unit = DEVIATION_UNITS["gyro"]
     rows = ["| axis | drift now | model | φ₁ | φ₂ | θ₁ |", "|---|---|---|---|---|---|"]
     for at, axis in enumerate(axes_of("gyro")):
@@ -132,7 +157,8 @@ def drift_text(look: DriftLook) -> str:
             rows.append(f"| {axis} | {now} | learning | | | |")
             continue
         parts = [
-            f"{x:.4f}" if there else "" for x, there in zip((*model.phi, model.theta), _entered(model), strict=True)
+            f"{x:.4f}" if there else ""
+            for x, there in zip((*model.phi, model.theta), _coefficients_in_model(model), strict=True)
         ]
         rows.append(f"| {axis} | {now} | {model.name} | {' | '.join(parts)} |")
     head = (
@@ -141,12 +167,13 @@ def drift_text(look: DriftLook) -> str:
     return "\n".join([head, "", *rows])
 
 
-def _entered(model: Arma) -> tuple[bool, bool, bool]:
+def _coefficients_in_model(model: Arma) -> tuple[bool, bool, bool]:
+    """Return which of φ₁, φ₂ and θ₁ are part of the model."""
     return model.order[0] > 0, model.order[0] > 1, model.order[1] > 0
 
 
 def duration(seconds: float) -> str:
-    """A length of time in the two units that tell most.
+    """Format a duration given in seconds with two units.
 
     >>> duration(3725.0), duration(0.5), duration(90.0)
     ('1 h 02 min', '0.500 s', '1 min 30 s')
@@ -163,14 +190,17 @@ def duration(seconds: float) -> str:
 
 
 def _rate(health: Health) -> str:
+    """Format the sample rate."""
     return "—" if health.rate_hz is None else f"{health.rate_hz:.2f} Hz"
 
 
 def _milliseconds(seconds: float | None) -> str:
+    """Format a duration in milliseconds."""
     return "—" if seconds is None else f"{number(seconds * 1e3)} ms"
 
 
 def _noise_table(estimate: Estimate, kind: Kind) -> str:
+    """Return the table of coefficients of one kind of sensor."""
     axes = axes_of(kind)
     lines = [f"| {KIND_NAMES[kind]} | {' | '.join(axes)} |", "|:--|" + "--:|" * len(axes)]
     for letter in LETTERS:

@@ -1,7 +1,8 @@
-"""Points that the viewer draws of the past: few a bucket, and none of its extremes lost. Pure.
+"""Points that the viewer draws for stored history: a few per bucket, including its extremes. The module does no I/O.
 
-A bucket gives its last value, with the interval of that, at its end. An extreme that lies outside of that interval, as
-no chance would explain it, is a point of its own before: the lowest a third into the bucket, the highest two thirds.
+Each bucket yields its last value with its interval, at the end of the bucket. An extreme outside this interval is more
+than chance explains and yields an additional point. The minimum is drawn at one third of the bucket, the maximum at
+two thirds.
 """
 
 from typing import Final
@@ -11,22 +12,25 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.history.reading import Course, Past
 
-NARROW: Final = 1.5
-"""Ends of an interval further than this factor from their value are not drawn: they would hide all else."""
+MAX_INTERVAL_RATIO: Final = 1.5
+"""Intervals whose ends differ from the value by more than this factor are not drawn: they would determine the scale."""
 
 
 def points(past: Past, course: Course, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
-    """Unix times [m] and value, lo, hi [m, 3]; NaN where the course has a gap, and behind its end.
+    """Return Unix times [m] and value, lo and hi [m, 3]; a NaN row separates gaps and follows the last bucket.
 
-    Args:
-        past: whose buckets they are
-        course: a number over its p buckets
-        lo: [p] ends of the interval of each last value; NaN = none
-        hi: [p]
+    Parameters
+    ----------
+    past
+        History that contains the p buckets.
+    course
+        Number over the buckets.
+    lo, hi
+        Ends of the interval of each last value, shape [p]; NaN if there is none.
     """
     start_s, width_s = past.start_s.astype(np.float64), past.width_s.astype(np.float64)
     newest_s = start_s + width_s
-    near = (lo * NARROW > course.last) & (hi < course.last * NARROW)
+    near = (lo * MAX_INTERVAL_RATIO > course.last) & (hi < course.last * MAX_INTERVAL_RATIO)
     lo, hi = np.where(near, lo, np.nan), np.where(near, hi, np.nan)
     ends = [np.fmin(lo, course.last), np.fmax(hi, course.last)]
     parts = [_rows(newest_s, course.last, lo, hi, np.isfinite(course.last))]
@@ -44,5 +48,5 @@ def points(past: Past, course: Course, lo: Floats, hi: Floats) -> tuple[Floats, 
 def _rows(
     t_s: Floats, value: Floats, lo: Floats, hi: Floats, there: "np.ndarray[tuple[int], np.dtype[np.bool_]]"
 ) -> Floats:
-    """[some, 4] of those that are there."""
+    """Return the rows for which ``there`` is True, as time, value, lo and hi, shape [rows, 4]."""
     return np.column_stack([t_s, value, lo, hi])[there]

@@ -1,11 +1,11 @@
-"""What the viewer shows: samples, estimates, events and health as entities of one Rerun stream.
+"""Content of the Rerun viewer: samples, estimates, events and health reports as entities of one stream.
 
-In come results as the service has them (SI), out go batches of columns and drawings under the paths that
-the README lists, on the timeline ``sample_time``. Every call may block in Rerun for as long as a viewer pleases:
-only the viewer's own thread is to call here. Importing this module imports Rerun (half a second).
+Results in SI are logged as columns and drawings under the paths listed in the README, on the timeline ``sample_time``.
+Every call may block in Rerun for as long as the viewer does not read, so only the viewer's own thread may call this
+module. Importing this module imports Rerun (half a second).
 
-Numbers are shown in the field's units. ``/<device>/allan/<axis>`` is a drawing, so the same entity also
-carries tau, deviation, lo and hi in SI for whoever reads the recording with a program.
+Numbers are shown in the units of the field. ``/<device>/allan/<axis>`` is a drawing. The same entity therefore also
+holds tau, deviation, lo and hi in SI, for programs that read the recording.
 """
 
 from collections.abc import Sequence
@@ -54,13 +54,13 @@ from monitor.publishing.rerun.panels import drift_text, health_text, noise_text,
 
 TIMELINE: Final = "sample_time"
 TEMPERATURES_PER_S: Final = 5.0
-BETWEEN: Final = 20
-"""Points on the course of a coefficient from one estimate to the next, where it follows every sample."""
+POINTS_BETWEEN_ESTIMATES: Final = 20
+"""Number of coefficient points between two estimates, if the estimator provides values for every sample."""
 Z95: Final = 1.959964
-PAST_EVENTS: Final = 200
-"""Of those before the view opened, the newest."""
-NARROW: Final = 1.5  # ends of an interval further than this factor from their value are not on the course
-LEVELS: Final = {
+MAX_PAST_EVENTS: Final = 200
+"""Largest number of stored events that are shown."""
+MAX_INTERVAL_RATIO: Final = 1.5  # intervals whose ends differ from the value by more than this factor are not shown
+EVENT_LOG_LEVELS: Final = {
     "link_lost": "ERROR",
     "samples_lost": "WARN",
     "noise_changed": "WARN",
@@ -71,26 +71,36 @@ LEVELS: Final = {
     "drift_unexplained": "WARN",
     "clock_jumped": "WARN",
 }
-"""Event kind -> level of the line in the log; all others are INFO."""
+"""Log level of each kind of event; all others have INFO."""
 
 
 @dataclass
 class _Device:
-    """What has to be kept of one device between two drawings."""
+    """State of one device between two drawings."""
 
     about: str
     scales: dict[Kind, Scale] = field(default_factory=dict)
-    gap: ModelGap | None = None  # the newest
+    gap: ModelGap | None = None  # newest comparison with the model
     surface: Surface = field(default_factory=Surface)
 
 
 class Scene:
-    """Draws on one stream. Not thread-safe; see the module about blocking."""
+    """Writer of results to one Rerun stream. Not thread-safe; calls may block, see the module.
+
+    Parameters
+    ----------
+    stream
+        Stream of the viewer.
+    devices
+        Name and short description of each device.
+    fleet
+        True if there are many more devices, which have only a row in the overview.
+    """
 
     def __init__(
         self, stream: rr.RecordingStream, devices: Sequence[tuple[str, str]] = (), fleet: bool = False
     ) -> None:
-        """``devices``: name and a few words about each; ``fleet``: many more have only a row in the overview."""
+        """Create the state of the devices; nothing is logged yet."""
         self._fleet = fleet
         self._stream = stream
         self._devices = {name: _Device(about) for name, about in devices}
@@ -98,9 +108,14 @@ class Scene:
         self._healths: dict[str, Health] = {}
 
     def show(self, devices: Sequence[tuple[str, str]]) -> None:
-        """From now on these devices; those that it knows go on as they are.
+        """Set the devices to show; known devices keep their state.
 
-        What still comes of one that is not among them any more is drawn.
+        Data of a removed device that still arrive are drawn.
+
+        Parameters
+        ----------
+        devices
+            Name and short description of each device.
         """
         self._shown = {name for name, _ in devices}
         self._healths = {name: health for name, health in self._healths.items() if name in self._shown}
@@ -109,7 +124,7 @@ class Scene:
         self.open()
 
     def open(self) -> None:
-        """What does not change: names, colours and widths of the lines."""
+        """Log what does not change: names, colours and widths of the lines."""
         for device in self._devices:
             for axis in AXES:
                 self._style_axis(device, axis)
@@ -119,15 +134,37 @@ class Scene:
             self._stream.log(f"{device}/gap/threshold", line, static=True)
 
     def samples(self, device: str, wall_s: Floats, values: Floats, temperature_c: Floats) -> None:
-        """Raw samples since the last flush: [n], [n, 6] SI, [n] °C. At most 200 rows/s and axis are drawn."""
+        """Log samples, thinned to at most 200 rows per second and axis.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix times [s], shape [n].
+        values
+            Rates [rad/s] and accelerations [m/s²], shape [n, 6].
+        temperature_c
+            Temperatures [°C], shape [n].
+        """
         for i, axis in enumerate(AXES):
             t, y = extremes(wall_s, values[:, i])
             self._scalars(f"{device}/samples/{axis}", t, y * SAMPLE_UNITS[kind_of(axis)].factor)
         self._scalars(f"{device}/temperature", *means(wall_s, temperature_c, TEMPERATURES_PER_S))
 
     def estimate(self, device: str, wall_s: float, estimate: Estimate) -> None:
-        """The Allan plots and the table of one estimate, and the surface over time whenever it has grown."""
-        self._at(wall_s)
+        """Log the Allan plots and the table of an estimate, and the surface over time if it has a new column.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix time of the estimate [s].
+        estimate
+            The estimate.
+        """
+        self._set_time(wall_s)
         self._stream.log(f"{device}/coefficients", _markdown(noise_text(estimate)))
         for kind in KINDS:
             self._allan(device, kind, estimate)
@@ -136,8 +173,21 @@ class Scene:
             dynamic_surface.draw(self._stream, device, surface)
 
     def courses(self, device: str, wall_s: Floats, estimates: Sequence[Estimate]) -> None:
-        """The course of every coefficient: a point an estimate, with its interval, and the samples between."""
-        looks = [_between(at_s, estimate) for at_s, estimate in zip(np.asarray(wall_s), estimates, strict=True)]
+        """Log coefficients over time: one point with interval per estimate, and the values between the estimates.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix times of the estimates [s].
+        estimates
+            Estimates in order of time.
+        """
+        looks = [
+            _values_between_estimates(at_s, estimate)
+            for at_s, estimate in zip(np.asarray(wall_s), estimates, strict=True)
+        ]
         at = np.concatenate([times for times, _ in looks])
         for row, letter in enumerate(LETTERS):
             for column, axis in enumerate(AXES):
@@ -145,7 +195,7 @@ class Scene:
                 for estimate, (_, value) in zip(estimates, looks, strict=True):
                     between = np.full((len(value), 3), np.nan)
                     between[:, 0] = value[:, row, column]
-                    between[-1] = _course(estimate, row, column)
+                    between[-1] = _value_with_interval(estimate, row, column)
                     parts.append(between)
                 values = np.concatenate(parts)
                 if np.isfinite(values).any():
@@ -153,9 +203,16 @@ class Scene:
                     self._scalars(f"{device}/coefficients/{letter}/{axis}", at, values * factor)
 
     def past(self, device: str, past: Past) -> None:
-        """What was before the view opened: courses of coefficients and temperature with their extremes, and events.
+        """Log the stored history: coefficients and temperature with their extremes, and events.
 
-        Where a bucket was left out, and behind the last one, a course has a gap: what comes is another stretch.
+        Lines have a gap where buckets are missing and after the last bucket, so that live data form a separate line.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        past
+            The history.
         """
         for letter in LETTERS:
             for axis in past.axes():
@@ -168,14 +225,23 @@ class Scene:
         if np.isfinite(temperature.last).any():
             at, values = past_points.points(past, temperature, temperature.last, temperature.last)
             self._scalars(f"{device}/temperature", at, values[:, 0])
-        for event in past.events[-PAST_EVENTS:]:
-            text = f"{said(event.t_s)[:10]}: {event.text}"  # the line has only its time of the day
+        for event in past.events[-MAX_PAST_EVENTS:]:
+            text = f"{said(event.t_s)[:10]}: {event.text}"  # the log line shows only the time of day
             self.event(device, event.t_s, Event(event.kind, round(event.t_s * 1e9), text, event.axis, event.what))
 
     def gaps(self, device: str, wall_s: Floats, looks: Sequence[ModelGap]) -> None:
-        """The course of the gap to the model in force: a line an axis, and the threshold that chance stays below.
+        """Log the gap to the model in use over time: one line per axis, and the threshold.
 
-        The model's own curve is drawn with the next estimate.
+        The curve of the model is drawn with the next estimate.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix times of the comparisons [s].
+        looks
+            Comparisons in order of time.
         """
         self._devices[device].gap = looks[-1]
         highest = [max((one.threshold for one in look.axes.values()), default=np.nan) for look in looks]
@@ -186,20 +252,50 @@ class Scene:
                 self._scalars(f"{device}/gap/{axis}", wall_s, gap)
 
     def thermal(self, device: str, wall_s: Floats, looks: Sequence[ThermalLook]) -> None:
-        """The means of each axis, and what was expected of them with its interval."""
+        """Log the mean bias of each axis and its prediction with interval.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix times of the ends of the intervals [s].
+        looks
+            Results of the thermal model in order of time.
+        """
         for axis in AXES:
             rows = np.array([_thermal(look.axes.get(axis)) for look in looks])
             if np.isfinite(rows).any():
                 self._scalars(f"{device}/thermal/{axis}", wall_s, rows * DEVIATION_UNITS[kind_of(axis)].factor)
 
     def compensated(self, device: str, wall_s: Floats, values: Floats) -> None:
-        """Rates without drift since the last flush: [n], [n, 3] rad/s; thinned like the samples."""
+        """Log drift-compensated rates, thinned like the samples.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix times [s], shape [n].
+        values
+            Rates [rad/s], shape [n, 3].
+        """
         for i, axis in enumerate(axes_of("gyro")):
             t, y = extremes(wall_s, values[:, i])
             self._scalars(f"{device}/compensated/{axis}", t, y * SAMPLE_UNITS["gyro"].factor)
 
     def drift(self, device: str, wall_s: Floats, looks: Sequence[DriftLook]) -> None:
-        """Means at rest beside the drift that was expected, innovations, and the models."""
+        """Log means at rest, predicted drift, innovations, and the table of the models.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix times of the ends of the intervals [s].
+        looks
+            States of the drift compensation in order of time.
+        """
         factor = DEVIATION_UNITS["gyro"].factor
         for i, axis in enumerate(axes_of("gyro")):
             rows = np.array([_drift(look, i) for look in looks])
@@ -207,22 +303,42 @@ class Scene:
                 self._scalars(f"{device}/drift/{axis}", wall_s, rows * factor)
                 new = np.array([look.innovation[i] for look in looks])
                 self._scalars(f"{device}/innovation/{axis}", wall_s, new)
-        self._at(float(wall_s[-1]))
+        self._set_time(float(wall_s[-1]))
         self._stream.log(f"{device}/drift", _markdown(drift_text(looks[-1])))
 
     def event(self, device: str, wall_s: float, event: Event) -> None:
-        """One line in the log of the device, and in that of the overview."""
-        self._at(wall_s)
-        level, at = LEVELS.get(event.kind, "INFO"), _clock_time(wall_s)
+        """Log an event to the device and to the overview, and mark the changed coefficients.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix time of the event [s].
+        event
+            The event.
+        """
+        self._set_time(wall_s)
+        level, at = EVENT_LOG_LEVELS.get(event.kind, "INFO"), _clock_time(wall_s)
         if self._fleet or len(self._shown) > 1:
             self._stream.log("overview/events", rr.TextLog(f"{at}  {device}: {event.text}", level=level))
         if device in self._devices:
             self._stream.log(f"{device}/events", rr.TextLog(f"{at}  {event.text}", level=level))
-            self._mark(device, wall_s, event)
+            self._mark_changes(device, wall_s, event)
 
     def health(self, device: str, wall_s: float, health: Health) -> None:
-        """The health panel of the device, and its row in the overview."""
-        self._at(wall_s)
+        """Log the health panel of a device and update the overview.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix time of the report [s].
+        health
+            Health of the device.
+        """
+        self._set_time(wall_s)
         if device in self._shown:
             self._healths[device] = health
         about = self._devices[device].about
@@ -231,11 +347,20 @@ class Scene:
             self._stream.log("overview", _markdown(overview_text(self._healths)))
 
     def overview(self, wall_s: float, text: str) -> None:
-        """The table of a fleet."""
-        self._at(wall_s)
+        """Log the table of all devices.
+
+        Parameters
+        ----------
+        wall_s
+            Unix time of the table [s].
+        text
+            Table as Markdown.
+        """
+        self._set_time(wall_s)
         self._stream.log("overview", _markdown(text))
 
     def _style_axis(self, device: str, axis: str) -> None:
+        """Log the line styles of one axis."""
         colour = colours.AXIS_COLOURS[axis]
         unit = SAMPLE_UNITS[kind_of(axis)].name
         line = rr.SeriesLines(colors=[colour], widths=[1.0], names=[f"{axis}, {unit}"])
@@ -258,6 +383,7 @@ class Scene:
             self._stream.log(f"{device}/coefficients/{letter}/{axis}/changed", mark, static=True)
 
     def _style_drift(self, device: str, axis: str) -> None:
+        """Log the line styles of the drift compensation of one gyroscope axis."""
         colour = colours.AXIS_COLOURS[axis]
         dim = colours.mixed(colour, 0.45)
         unit = DEVIATION_UNITS["gyro"].name
@@ -269,8 +395,8 @@ class Scene:
         line = rr.SeriesLines(colors=[colour], widths=[1.0], names=[f"{axis}, {SAMPLE_UNITS['gyro'].name}"])
         self._stream.log(f"{device}/compensated/{axis}", line, static=True)
 
-    def _mark(self, device: str, wall_s: float, event: Event) -> None:
-        """A change of a coefficient, on its course: a diamond at the size that it has now."""
+    def _mark_changes(self, device: str, wall_s: float, event: Event) -> None:
+        """Mark changed coefficients with a diamond at their new value."""
         if event.axis is None:
             return
         for letter, sizes in event.what.items():
@@ -280,15 +406,17 @@ class Scene:
                 self._scalars(path, np.array([wall_s]), np.array([sizes["after"]]) * unit.factor)
 
     def _scalars(self, path: str, wall_s: Floats, values: Floats) -> None:
-        """``values`` [n] or [n, series] at ``wall_s`` [n] on the timeline."""
+        """Log ``values`` of shape [n] or [n, series] at the Unix times ``wall_s`` of shape [n]."""
         if wall_s.size:
-            time = rr.TimeColumn(TIMELINE, timestamp=_stamps(wall_s))
+            time = rr.TimeColumn(TIMELINE, timestamp=_timestamps(wall_s))
             self._stream.send_columns(path, [time], rr.Scalars.columns(scalars=values))
 
-    def _at(self, wall_s: float) -> None:
-        self._stream.set_time(TIMELINE, timestamp=_stamps(np.array([wall_s]))[0])
+    def _set_time(self, wall_s: float) -> None:
+        """Set the time of the following log calls."""
+        self._stream.set_time(TIMELINE, timestamp=_timestamps(np.array([wall_s]))[0])
 
     def _allan(self, device: str, kind: Kind, estimate: Estimate) -> None:
+        """Log the Allan plot of one kind of sensor."""
         gap = self._devices[device].gap
         curves = [c for axis in axes_of(kind) if (c := _Curve.of(estimate, axis, gap)) is not None]
         if not curves:
@@ -301,7 +429,7 @@ class Scene:
             self._curve(f"{device}/allan/{curve.axis}", scale, curve)
 
     def _grid(self, path: str, kind: Kind, scale: Scale, axes: Sequence[str]) -> None:
-        """Frame, decade lines, tick labels and the legend."""
+        """Log frame, decade lines, tick labels and legend of a plot."""
         lines = grid(scale)
         for name, strips, colour, order in (
             ("minor", lines.minor, colours.MINOR, -30.0),
@@ -317,7 +445,7 @@ class Scene:
         self._legend(path, axes)
 
     def _legend(self, path: str, axes: Sequence[str]) -> None:
-        """A stroke of its colour and its name for every axis, above the right end of the box."""
+        """Log a stroke and a name for each axis above the right end of the box."""
         ends = [(axis, WIDTH - 2.0 * (len(axes) - 1 - i) - 0.5) for i, axis in enumerate(axes)]
         strokes = [np.array([[x - 1.15, -0.42], [x - 0.5, -0.42]]) for _, x in ends]
         tints = [colours.AXIS_COLOURS[axis] for axis in axes]
@@ -326,6 +454,7 @@ class Scene:
         self._labels(f"{path}/legend", [(x, -0.85, axis) for axis, x in ends])
 
     def _labels(self, path: str, labels: list[tuple[float, float, str]]) -> None:
+        """Log text labels at chart positions."""
         points = rr.Points2D(
             [(x, y) for x, y, _ in labels],
             labels=[text for _, _, text in labels],
@@ -336,7 +465,7 @@ class Scene:
         self._stream.log(path, points)
 
     def _curve(self, path: str, scale: Scale, curve: "_Curve") -> None:
-        """Band, fitted line, intervals and measured points of one axis, and dashed the model in force."""
+        """Log band, fitted line, intervals and measured points of one axis, and the model in use as a dashed line."""
         colour = colours.AXIS_COLOURS[curve.axis]
         low, high = scale.place(curve.tau, curve.lo), scale.place(curve.tau, curve.hi)
         fill = rr.LineStrips2D(
@@ -367,7 +496,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class _Curve:
-    """One axis of an Allan curve where it is measured, in the field's unit."""
+    """Allan curve of one axis at its measured points, in the unit of the field."""
 
     axis: str
     tau: Floats
@@ -375,17 +504,17 @@ class _Curve:
     lo: Floats
     hi: Floats
     fitted: Floats
-    model: Floats  # of the model in force; NaN where there is none
+    model: Floats  # deviation of the model in use; NaN if there is none
     si: dict[str, Floats]
 
     @property
     def shown(self) -> tuple[Floats, ...]:
-        """What the plot's height must hold; an interval may leave it."""
+        """Curves that determine the height of the plot; intervals may extend beyond it."""
         return self.deviation, self.fitted, self.model
 
     @classmethod
     def of(cls, estimate: Estimate, axis: str, gap: ModelGap | None) -> "_Curve | None":
-        """None while the axis has not two points."""
+        """Return the curve of an axis; None if it has fewer than two points."""
         curve, i = estimate.curve, AXES.index(axis)
         rows = np.isfinite(curve.avar[:, i]) & (curve.avar[:, i] > 0)
         if int(rows.sum()) < 2:
@@ -399,33 +528,38 @@ class _Curve:
         return cls(axis, si["tau"], deviation * f, si["lo"] * f, si["hi"] * f, fitted * f, model * f, si)
 
 
-def _between(wall_s: float, estimate: Estimate) -> tuple[Floats, Floats]:
-    """Times and coefficients [n, 5, 6] since the estimate before, where they follow every sample; the last is its own.
+def _values_between_estimates(wall_s: float, estimate: Estimate) -> tuple[Floats, Floats]:
+    """Return times [n] and coefficients [n, 5, 6] since the previous estimate; the last entry is the estimate itself.
 
-    Thinned to BETWEEN points: the eye sees no more, and a viewer bears no more.
+    The entries are thinned to POINTS_BETWEEN_ESTIMATES points. More could not be distinguished and would overload the
+    viewer.
     """
     if estimate.course is None:
         return np.array([wall_s]), np.full((1, 5, 6), np.nan)
-    step = -(-estimate.course.t_ns.size // BETWEEN)
+    step = -(-estimate.course.t_ns.size // POINTS_BETWEEN_ESTIMATES)
     rows = slice((estimate.course.t_ns.size - 1) % step, None, step)
     before_s = (estimate.course.t_ns[-1] - estimate.course.t_ns[rows]) / 1e9
     return wall_s - before_s, estimate.course.value[rows].copy()
 
 
-def _course(estimate: Estimate, row: int, column: int) -> tuple[float, float, float]:
-    """value, lo, hi of one estimated coefficient; a gap where their size would hide all that follows.
+def _value_with_interval(estimate: Estimate, row: int, column: int) -> tuple[float, float, float]:
+    """Return value, lo and hi of an estimated coefficient; NaN for upper bounds and for very wide intervals.
 
-    That are bounds, and the intervals of a device's first seconds.
+    Wide intervals occur in the first seconds of a device and would determine the scale of the plot.
     """
     c = estimate.coefficients
     if c.status[row, column] != Status.ESTIMATED:
         return np.nan, np.nan, np.nan
     value, lo, hi = (float(part[row, column]) for part in (c.value, c.lo, c.hi))
-    return (value, lo, hi) if lo * NARROW > value and hi < value * NARROW else (value, np.nan, np.nan)
+    return (
+        (value, lo, hi)
+        if lo * MAX_INTERVAL_RATIO > value and hi < value * MAX_INTERVAL_RATIO
+        else (value, np.nan, np.nan)
+    )
 
 
 def _thermal(one: AxisThermal | None) -> tuple[float, float, float, float]:
-    """bias, expected, lo, hi: those that an event is judged by."""
+    """Return measured bias, one-step prediction, and the ends of its interval, which events are based on."""
     if one is None:
         return np.nan, np.nan, np.nan, np.nan
     band = one.one_step
@@ -433,24 +567,25 @@ def _thermal(one: AxisThermal | None) -> tuple[float, float, float, float]:
 
 
 def _drift(look: DriftLook, axis: int) -> tuple[float, float, float, float]:
-    """mean at rest, expected, lo, hi."""
+    """Return mean at rest, predicted drift, and the ends of its 95 % interval."""
     expected, wide = float(look.expected[axis]), Z95 * float(look.error[axis])
     return float(look.mean[axis]), expected, expected - wide, expected + wide
 
 
-def _stamps(wall_s: Floats) -> "np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]":
-    """Unix seconds as nanosecond stamps."""
+def _timestamps(wall_s: Floats) -> "np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]":
+    """Convert Unix times in seconds to nanosecond timestamps."""
     return np.round(wall_s * 1e9).astype("datetime64[ns]")
 
 
 def _clock_time(wall_s: float) -> str:
-    """Time of the day in UTC, as the viewer's own time axes have it; its column of dates is too narrow to show one.
+    """Format the time of day in UTC, as on the viewer's time axes; its date column is too narrow to show the time.
 
     >>> _clock_time(1.76e9)
     '08:53:20'
     """
-    return str(np.datetime_as_string(_stamps(np.array([wall_s]))[0], "s")[-8:])
+    return str(np.datetime_as_string(_timestamps(np.array([wall_s]))[0], "s")[-8:])
 
 
 def _markdown(text: str) -> rr.TextDocument:
+    """Return a Markdown document."""
     return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)

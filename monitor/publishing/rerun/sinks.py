@@ -1,13 +1,13 @@
-"""Where the drawing goes: a viewer window, a page in the browser, or a file.
+"""Output of the Rerun stream: a viewer window, a page in the browser, or a file.
 
-In come the viewer's settings, out goes an open ``Output``: a Rerun stream, and the child process that
-belongs to it. ``ViewerTrouble`` says in one line what is wrong; the caller tries again later. The viewer's
-program is started directly (its Python wrapper would leave it alive when killed) and told to listen on
-loopback only, with its usage statistics off. Window and page are the same thing to the daemon: a Rerun
-server in a process of its own, so what it holds in memory is not the daemon's. Importing this imports Rerun.
+``open_output`` returns an ``Output``: a Rerun stream and the child process that belongs to it. ``ViewerTrouble``
+states in one line what is wrong, and the caller repeats the attempt later. The viewer program is started directly,
+because its Python wrapper would leave it running when killed. It listens on the loopback interface only, and its usage
+statistics are off. For the daemon, a window and a page are both a Rerun server in a separate process. The data of the
+viewer therefore do not use the memory of the daemon. Importing this module imports Rerun.
 
-A busy port raises nothing in Rerun, so ports are looked at first: a Rerun server that already listens is
-joined by a window, anything else is trouble; a page moves on to the next free port.
+Rerun raises no error for a port that is in use, so ports are checked first. If a Rerun server listens on the port, it
+is used instead of a new window. Any other listener is an error. For the page, the next free port is used.
 """
 
 import contextlib
@@ -38,27 +38,27 @@ from monitor.publishing.rerun.viewer_settings import ViewerClosed, ViewerSetting
 
 LOOPBACK: Final = "127.0.0.1"
 APPLICATION: Final = "imu-monitor"
-START_S: Final = 20.0  # for a viewer to listen: the first start of a 300 MB program from a cold disk
+START_TIMEOUT_S: Final = 20.0  # timeout for the viewer to listen: the first start of a 300 MB program from a slow disk
 PORTS_TRIED: Final = 20
 CLOSED: Final = "viewer was closed: start `rerun` to look again"
-PROGRAM_MIB: Final = 256  # an empty viewer window holds 125 to 170 MB
-LIVE_FLUSH_S: Final = 0.2  # fluent to the eye; Rerun keeps about 1 kB for every chunk beside its data
-PROBE: Final = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadTables"
+PROGRAM_MIB: Final = 256  # memory of the program itself; an empty viewer window uses 125 to 170 MB
+LIVE_FLUSH_PERIOD_S: Final = 0.2  # appears continuous; Rerun keeps about 1 kB per chunk in addition to the data
+PROBE_METHOD: Final = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadTables"
 
 
 def has_desktop() -> bool:
-    """Whether a window can be opened here at all."""
+    """Return True if this host can open a window."""
     return sys.platform in ("darwin", "win32") or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
 
 
 class Child:
-    """A viewer process, and what it last complained about."""
+    """Viewer process and the last line of its log."""
 
     def __init__(self, arguments: list[str]) -> None:
         self._log: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the child
         quiet = {"RERUN_ANALYTICS": "0", "RERUN_APP_ONLY": "true", "NO_COLOR": "1", "RUST_LOG": "warn"}
         self._process = subprocess.Popen(
-            [*_leash(), str(viewer_program()), *arguments],
+            [*_death_signal_prefix(), str(viewer_program()), *arguments],
             stdin=subprocess.DEVNULL,
             stdout=self._log,
             stderr=self._log,
@@ -71,16 +71,16 @@ class Child:
         return self._process.pid
 
     def trouble(self) -> str | None:
-        """Why the process is gone; None while it lives."""
+        """Return why the process has ended; None if it is running."""
         status = self._process.poll()
-        return None if status is None else f"viewer ended ({status}): {self._last_words()}"
+        return None if status is None else f"viewer ended ({status}): {self._last_log_line()}"
 
     def left(self) -> bool:
-        """Whether it went as a program goes whose window is closed."""
+        """Return True if the process ended normally, as after its window was closed."""
         return self._process.poll() == 0
 
     def end(self, patience_s: float = 0.5) -> None:
-        """Ask it to go, then make it: a stopped process hears nothing but SIGKILL."""
+        """Terminate the process; kill it after ``patience_s`` seconds, because a stopped process needs SIGKILL."""
         with contextlib.suppress(OSError):
             self._process.terminate()
         try:
@@ -95,10 +95,11 @@ class Child:
         self._process.send_signal(number)
 
     def kill(self) -> None:
-        """End it from another thread, whatever it is doing."""
+        """Kill the process; may be called from any thread."""
         self._process.kill()
 
-    def _last_words(self) -> str:
+    def _last_log_line(self) -> str:
+        """Return the last line of the viewer's log."""
         self._log.seek(0)
         lines = self._log.read()[-2000:].decode(errors="replace").strip().splitlines()
         return lines[-1].strip()[:200] if lines else "no message"
@@ -106,18 +107,26 @@ class Child:
 
 @dataclass
 class Output:
-    """An open viewer or file."""
+    """Open viewer or file."""
 
     stream: rr.RecordingStream
     flush_every_s: float
-    url: str = ""  # of the page, or of the Rerun server
+    url: str = ""  # address of the page or of the Rerun server
     child: Child | None = None
-    port: int | None = None  # of the Rerun server; None for a file
-    note: str = ""  # which ports were busy, and what is used in their place
-    lock: IO[bytes] | None = None  # of a file: open while it is written, so that no other process writes it
+    port: int | None = None  # port of the Rerun server; None for a file
+    note: str = ""  # which ports were in use, and which are used instead
+    lock: IO[bytes] | None = None  # open while a file is written, so that no other process writes it
 
     def check(self) -> None:
-        """ViewerTrouble when nobody looks any more, ViewerClosed when that was someone's wish."""
+        """Check that the viewer is still open.
+
+        Raises
+        ------
+        ViewerClosed
+            A user closed the window.
+        ViewerTrouble
+            The viewer ended for another reason.
+        """
         if self.child is not None and self.child.left():
             raise ViewerClosed(CLOSED)
         trouble = self.child.trouble() if self.child is not None else None
@@ -127,18 +136,18 @@ class Output:
             raise ViewerTrouble(trouble)
 
     def confirm(self, patience_s: float) -> bool:
-        """Whether all that was logged got through within ``patience_s``, and the viewer answers.
+        """Return True if all logged data were sent within ``patience_s`` seconds and the viewer answers.
 
-        Getting through alone says little: sockets take in a stopped viewer's next two megabytes.
+        Sending alone is not sufficient: sockets accept two more megabytes for a viewer that is stopped.
         """
         try:
             self.stream.flush(timeout_sec=patience_s)
-        except RuntimeError:  # Rerun's only way to say "timed out" or "connection lost"
+        except RuntimeError:  # Rerun raises it for "timed out" and for "connection lost"
             return False
         return self.port is None or ask(self.port, "/imu.monitor/Ping", patience_s) is not None
 
     def close(self) -> None:
-        """End the viewer that was started here; a file is complete afterwards."""
+        """End the viewer if it was started here; a file is complete afterwards."""
         try:
             if self.child is not None:
                 self.child.end()
@@ -150,7 +159,7 @@ class Output:
 
 
 def viewer_program() -> Path:
-    """The viewer's own program inside the package ``rerun_cli``."""
+    """Return the path of the viewer program in the package ``rerun_cli``."""
     room = Path(rerun_cli.__file__).parent
     names = ("Rerun.app/Contents/MacOS/Rerun", "rerun.exe", "rerun")
     found = next((room / name for name in names if (room / name).is_file()), None)
@@ -159,33 +168,43 @@ def viewer_program() -> Path:
     return found
 
 
-def _leash() -> list[str]:
-    """What makes a program end when the thread that started it does, however that comes: Linux alone has it.
+def _death_signal_prefix() -> list[str]:
+    """Return a command prefix that ends a program when the thread that started it ends (Linux only).
 
-    ``setpriv`` (util-linux) sets it and then becomes the program; without it a killed daemon leaves its viewer.
+    ``setpriv`` (util-linux) sets this and then runs the program. Without it, the viewer outlives a killed daemon.
     """
     setpriv = shutil.which("setpriv") if sys.platform == "linux" else None
     return [] if setpriv is None else [setpriv, "--pdeathsig", "TERM", "--"]
 
 
 def listens(port: int) -> bool:
-    """Whether anyone accepts connections on this port of loopback."""
+    """Return True if a program accepts connections on this port of the loopback interface."""
     with contextlib.suppress(OSError), socket.create_connection((LOOPBACK, port), 0.5):
         return True
     return False
 
 
 def is_rerun(port: int) -> bool:
-    """Whether a Rerun server answers there: it knows the service of its own protocol.
+    """Return True if a Rerun server answers on this port, because it knows the service of Rerun's protocol.
 
-    Any other gRPC server says "unimplemented" (status 12), any other server no gRPC at all.
+    Other gRPC servers answer "unimplemented" (status 12), and other servers do not answer with gRPC.
     """
-    reply = ask(port, PROBE, 1.0)
+    reply = ask(port, PROBE_METHOD, 1.0)
     return reply is not None and "grpc" in reply.get("content-type", "") and reply.get("grpc-status") != "12"
 
 
 def ask(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
-    """Headers of the reply to an empty gRPC call; None when nobody answers in time."""
+    """Return the headers of the reply to an empty gRPC call; None if there is no reply in time.
+
+    Parameters
+    ----------
+    port
+        Port on the loopback interface.
+    path
+        Path of the gRPC method.
+    timeout_s
+        Timeout [s].
+    """
     connection = http.client.HTTPConnection(LOOPBACK, port, timeout=timeout_s)
     headers = {"content-type": "application/grpc-web+proto", "x-grpc-web": "1"}
     try:
@@ -198,7 +217,20 @@ def ask(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
 
 
 def free_port(wanted: int, taken: int | None = None) -> int:
-    """``wanted``, or the next port after it that nobody holds."""
+    """Return the first free port from ``wanted`` on.
+
+    Parameters
+    ----------
+    wanted
+        First port to try.
+    taken
+        Port to skip.
+
+    Raises
+    ------
+    ViewerTrouble
+        PORTS_TRIED ports are in use.
+    """
     for port in range(wanted, min(wanted + PORTS_TRIED, 65536)):
         if port != taken and _bindable(port):
             return port
@@ -206,6 +238,7 @@ def free_port(wanted: int, taken: int | None = None) -> int:
 
 
 def _bindable(port: int) -> bool:
+    """Return True if the port can be bound."""
     with socket.socket() as probe:
         if os.name == "posix":
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -217,7 +250,24 @@ def _bindable(port: int) -> bool:
 
 
 def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[[], bool]) -> Output:
-    """Open what the settings ask for; waits until it listens or ``given_up``. ViewerTrouble says why not."""
+    """Open the output that the settings select, and wait until it listens.
+
+    Parameters
+    ----------
+    settings
+        Settings of the viewer.
+    recording_id
+        Identifier of the recording in Rerun.
+    given_up
+        Function that returns True to stop waiting.
+
+    Raises
+    ------
+    ViewerTrouble
+        The output cannot be opened.
+    ViewerClosed
+        Only an open viewer may be joined, and there is none.
+    """
     if settings.mode.endswith(".rrd"):
         return _open_file(Path(settings.mode), recording_id)
     if settings.mode in ("native", "join") or (settings.mode == "auto" and has_desktop()):
@@ -226,9 +276,10 @@ def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[
 
 
 def _open_file(path: Path, recording_id: str) -> Output:
+    """Open a file and lock it."""
     try:
         if path.exists():
-            check_regular(path)  # opening a FIFO would wait for its reader
+            check_regular(path)  # opening a FIFO would wait for a reader
         lock = path.open("ab")
     except OSError as error:
         raise ViewerTrouble(f"cannot write {path}: {error.strerror}") from error
@@ -243,7 +294,7 @@ def _open_file(path: Path, recording_id: str) -> Output:
             raise ViewerTrouble(f"cannot lock {path}: {error.strerror}") from error
     try:
         stream = _stream(recording_id)
-        # A footer would keep a line about every chunk in memory for as long as the daemon runs.
+        # A footer would keep an entry for every chunk in memory while the daemon runs.
         stream.set_sinks(rr.FileSink(path, write_footer=False))
     except BaseException:
         lock.close()
@@ -252,6 +303,7 @@ def _open_file(path: Path, recording_id: str) -> Output:
 
 
 def _open_native(settings: ViewerSettings, recording_id: str, given_up: Callable[[], bool]) -> Output:
+    """Join the Rerun server on the port, or open a window."""
     port = settings.port
     if listens(port):
         if not is_rerun(port):
@@ -271,6 +323,7 @@ def _open_native(settings: ViewerSettings, recording_id: str, given_up: Callable
 
 
 def _open_web(settings: ViewerSettings, recording_id: str, given_up: Callable[[], bool]) -> Output:
+    """Start a Rerun server with a web page, and open the page if there is a desktop."""
     port = free_port(settings.port)
     web_port = free_port(settings.web_port, taken=port)
     child = Child([
@@ -288,7 +341,7 @@ def _open_web(settings: ViewerSettings, recording_id: str, given_up: Callable[[]
 
 
 def with_program(memory: str) -> str:
-    """What a window is allowed in all, so that ``memory`` is left for data; a share of the machine is as given.
+    """Return the memory limit of a window, increased by the memory of the program; a percentage is not changed.
 
     >>> with_program("256MiB"), with_program("1GiB"), with_program("25%")
     ('512MiB', '1280MiB', '25%')
@@ -301,22 +354,23 @@ def with_program(memory: str) -> str:
 
 
 def server_url(port: int) -> str:
-    """Where a Rerun server on loopback takes and gives recordings."""
+    """Return the address of a Rerun server on the loopback interface."""
     return f"rerun+http://{LOOPBACK}:{port}/proxy"
 
 
 def _connected(port: int, recording_id: str, child: Child | None = None, joined_port: int | None = None) -> Output:
+    """Return an output that is connected to a Rerun server."""
     stream = _stream(recording_id)
     stream.set_sinks(rr.GrpcSink(server_url(port)))
-    return Output(stream, LIVE_FLUSH_S, server_url(port), child, port)
+    return Output(stream, LIVE_FLUSH_PERIOD_S, server_url(port), child, port)
 
 
 def _stream(recording_id: str) -> rr.RecordingStream:
-    """A stream whose rows stand on ``sample_time`` alone, and that is never freed.
+    """Create a stream whose only timeline is ``sample_time`` and which is never freed.
 
-    Freeing one waits for its viewer, with a lock held that every other stream of the process needs: a viewer
-    that is gone at the wrong moment would take the next one along, and keep the process from exiting. One
-    reference more than anyone holds costs a few kilobytes for each viewer that was opened.
+    Freeing a stream waits for its viewer and holds a lock that all streams of the process need. A viewer that ends at
+    that moment would block the next one and the exit of the process. The additional reference made here prevents this
+    and costs a few kilobytes for each viewer that is opened.
     """
     stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(stream))
@@ -326,7 +380,8 @@ def _stream(recording_id: str) -> rr.RecordingStream:
 
 
 def _wait_for(port: int, child: Child, given_up: Callable[[], bool]) -> None:
-    end = time.monotonic() + START_S
+    """Wait until the viewer listens; end it and raise ViewerTrouble if it does not."""
+    end = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < end and not given_up():
         trouble = child.trouble()
         if trouble is not None:
@@ -336,4 +391,4 @@ def _wait_for(port: int, child: Child, given_up: Callable[[], bool]) -> None:
             return
         time.sleep(0.05)
     child.end()
-    raise ViewerTrouble(f"the viewer did not listen on {port} within {START_S:.0f} s")
+    raise ViewerTrouble(f"the viewer did not listen on {port} within {START_TIMEOUT_S:.0f} s")

@@ -1,14 +1,14 @@
-"""The live view: takes results from the service's loop and draws them in Rerun from a thread of its own.
+"""Live view in Rerun: accepts results from the main loop of the service and draws them in a separate thread.
 
-In come samples, estimates, events and health; every call puts them on a backlog and returns. The thread
-opens the viewer, draws what has come five times a second, and once a second asks Rerun whether it
-all got through. A viewer that does not answer (stopped, hung) is ``stalled``: nothing more is drawn until it
-answers, the backlog drops its oldest, and the drops are counted in ``state``. A viewer that is missing,
-cannot start or was closed is said in ``state`` too, and tried again. Nothing here ever raises into the loop.
+Every call adds samples, estimates, events or health reports to a bounded queue and returns at once. The thread opens
+the viewer, draws new data five times a second, and checks once a second that the data have reached the viewer. If the
+viewer does not answer (stopped or hung), the state is ``stalled``: drawing waits, the queue drops its oldest entries,
+and ``state`` reports their number. If the viewer is missing, cannot start or was closed, ``state`` says so and the
+attempt is repeated. No exception reaches the main loop.
 
-Traps of Rerun that shape this file: a logging call blocks for ever on a viewer that does not read; so does
-its exit handler (taken off), and so does freeing a stream (never done, see ``rerun_sinks``); a first import
-takes half a second (done in the thread, and not at all with mode ``none``).
+Properties of Rerun that determine this design: a logging call blocks without limit if the viewer does not read. So
+does the exit handler, which is therefore removed. So does freeing a stream, which is therefore never done (see
+``sinks``). The first import takes half a second, so it is done in the thread, and not at all with mode ``none``.
 """
 
 import importlib
@@ -36,23 +36,26 @@ if TYPE_CHECKING:
     from monitor.publishing.rerun.scene import Scene
     from monitor.publishing.rerun.sinks import Child, Output
 
-BACKLOG_BYTES: Final = 16_000_000  # about 25 s of 16 devices at 1 kHz, six axes
-CHECK_EVERY_S: Final = 1.0  # whether what was drawn has reached the viewer
-PATIENCE_S: Final = 1.0  # for the viewer to answer that
-STALL_S: Final = 2.0  # inside one call of Rerun before it counts as stalled
+BACKLOG_BYTES: Final = 16_000_000  # about 25 s of 16 devices at 1 kHz with six axes
+CONFIRM_PERIOD_S: Final = 1.0  # interval between checks that drawn data have reached the viewer
+PATIENCE_S: Final = 1.0  # timeout of this check
+STALL_TIMEOUT_S: Final = 2.0  # duration of one Rerun call above which the viewer counts as stalled
 RETRY_S: Final = (2.0, 5.0, 15.0, 30.0)
-PLOTS_PER_S: Final = 8.0  # Allan plots drawn, shared by all devices; one a second for each at most
-COURSE_EVERY_S: Final = 5.0  # the points of the coefficient courses are sent together
-COURSE_STEP_S: Final = 1.0  # of sample time between two points of a course
-EARLY_END_S: Final = 10.0  # a window that ends sooner never worked
+PLOTS_PER_S: Final = 8.0  # rate of Allan plots, shared by all devices; at most one per second and device
+POINTS_PERIOD_S: Final = 5.0  # interval at which collected coefficient points are sent
+POINT_INTERVAL_S: Final = 1.0  # interval between two coefficient points, in sample time
+MIN_WINDOW_LIFETIME_S: Final = 10.0  # a window that closes sooner is taken as not working
 MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
 
 Recall = Callable[[str], Past | None]
+"""Function that returns the stored history of a device, or None."""
 Message = tuple[str, "_Samples | _Estimate | _Gap | _Thermal | _Rates | _Drift | _Event | _Health | _Overview"]
 
 
 @dataclass(frozen=True, slots=True)
 class _Samples:
+    """Samples of a batch."""
+
     wall_s: Floats
     values: Floats
     temperature_c: Floats
@@ -60,56 +63,81 @@ class _Samples:
 
 @dataclass(frozen=True, slots=True)
 class _Estimate:
+    """Estimate with its time."""
+
     wall_s: float
     estimate: Estimate
 
 
 @dataclass(frozen=True, slots=True)
 class _Gap:
+    """Comparison with the model, with its time."""
+
     wall_s: float
     gap: ModelGap
 
 
 @dataclass(frozen=True, slots=True)
 class _Rates:
+    """Drift-compensated rates of a batch."""
+
     wall_s: Floats
     values: Floats
 
 
 @dataclass(frozen=True, slots=True)
 class _Drift:
+    """State of the drift compensation, with its time."""
+
     wall_s: float
     look: DriftLook
 
 
 @dataclass(frozen=True, slots=True)
 class _Thermal:
+    """Result of the thermal model, with its time."""
+
     wall_s: float
     look: ThermalLook
 
 
 @dataclass(frozen=True, slots=True)
 class _Event:
+    """Event with its time."""
+
     wall_s: float
     event: Event
 
 
 @dataclass(frozen=True, slots=True)
 class _Health:
+    """Health report with its time."""
+
     wall_s: float
     health: Health
 
 
 @dataclass(frozen=True, slots=True)
 class _Overview:
+    """Table of all devices as Markdown, with its time."""
+
     wall_s: float
     text: str
 
 
 class RerunView:
-    """One viewer for all devices. Called by one thread; every call returns at once.
+    """Viewer of all devices. It must be used by one thread; every call returns at once.
 
-    ``fleet``: the devices are those in detail of many more, whose table comes by ``overview``.
+    Parameters
+    ----------
+    settings
+        Settings of the viewer.
+    devices
+        Devices to show in detail.
+    recall
+        Function that returns the stored history of a device. It is called in the viewer's thread when the viewer opens.
+    fleet
+        True if there are many more devices, which are shown in the table given to ``overview``.
     """
 
     def __init__(
@@ -119,9 +147,9 @@ class RerunView:
         recall: Recall | None = None,
         fleet: bool = False,
     ) -> None:
-        """Opens nothing yet. ``recall``: what is kept of a device, asked for in the viewer's thread when it opens."""
+        """Store the settings; the viewer is opened by ``start``."""
         self._settings = settings
-        self._recall = recall or _nothing
+        self._recall = recall or _no_history
         self._fleet = fleet
         self._devices = tuple(devices)
         self._backlog: Backlog[Message] = Backlog(BACKLOG_BYTES)
@@ -129,26 +157,26 @@ class RerunView:
         self._thread: threading.Thread | None = None
         self._phase = "off"
         self._stalled = False
-        self._inside_since: float | None = None  # monotonic s at which the thread went into Rerun
+        self._inside_since: float | None = None  # monotonic time at which the current Rerun call began [s]
         self._child: Child | None = None
         self._url = ""
         self._recording_id = str(uuid.uuid4())
 
     @property
     def state(self) -> str:
-        """``ok``, or in a few words what is wrong: for the status line."""
+        """``ok``, or a short description of what is wrong; part of the status message."""
         inside = self._inside_since
-        if self._stalled or (inside is not None and time.monotonic() - inside > STALL_S):
+        if self._stalled or (inside is not None and time.monotonic() - inside > STALL_TIMEOUT_S):
             return f"stalled ({self._backlog.dropped} dropped)"
         return self._phase
 
     @property
     def url(self) -> str:
-        """Where to look: the page, the Rerun server, or "" while there is none."""
+        """Address of the web page or of the Rerun server; "" if there is none."""
         return self._url
 
     def start(self) -> None:
-        """Start the thread; trouble shows in ``state`` and is tried again there."""
+        """Start the thread; errors are reported in ``state`` and the attempt is repeated."""
         if self._settings.mode == "none" or self._thread is not None:
             return
         self._phase = "starting"
@@ -156,48 +184,144 @@ class RerunView:
         self._thread.start()
 
     def show(self, devices: Sequence[DeviceInfo]) -> None:
-        """From now on these devices; to be called before anything is said of a new one."""
+        """Set the devices to show; this must be called before data of a new device are passed.
+
+        Parameters
+        ----------
+        devices
+            Devices to show in detail.
+        """
         self._devices = tuple(devices)
 
     def samples(self, device: str, wall_s: Floats, values: Floats, temperature_c: Floats) -> None:
-        """Samples at Unix times ``wall_s`` [n]: [n, 6] rad/s and m/s², [n] °C; NaN = not measured."""
+        """Draw samples.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix times [s], shape [n].
+        values
+            Rates [rad/s] and accelerations [m/s²], shape [n, 6]; NaN if not measured.
+        temperature_c
+            Temperatures [°C], shape [n]; NaN if not measured.
+        """
         weight = wall_s.nbytes + values.nbytes + temperature_c.nbytes
         self._put(device, _Samples(wall_s, values, temperature_c), weight)
 
     def estimate(self, device: str, wall_s: float, estimate: Estimate) -> None:
-        """A refit; of a fast stream of them the viewer draws the newest, once a second."""
+        """Draw an estimate; if estimates arrive faster than once a second, plots show the newest one.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix time of the newest sample [s].
+        estimate
+            The estimate.
+        """
         self._put(device, _Estimate(wall_s, estimate), estimate.curve.avar.nbytes * 8)
 
     def gap(self, device: str, wall_s: float, gap: ModelGap) -> None:
-        """The window beside the model in force."""
+        """Draw a comparison of the window with the model in use.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix time of the newest sample [s].
+        gap
+            Result of the comparison.
+        """
         self._put(device, _Gap(wall_s, gap), 6 * 4 * gap.tau_s.nbytes)
 
     def compensated(self, device: str, wall_s: Floats, values: Floats) -> None:
-        """Rates without drift at Unix times ``wall_s`` [n]: [n, 3] rad/s."""
+        """Draw drift-compensated rates.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix times [s], shape [n].
+        values
+            Rates [rad/s], shape [n, 3].
+        """
         self._put(device, _Rates(wall_s, values), wall_s.nbytes + values.nbytes)
 
     def drift(self, device: str, wall_s: float, look: DriftLook) -> None:
-        """What an interval taught of the gyros' drift."""
+        """Draw the state of the drift compensation after an interval.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix time of the end of the interval [s].
+        look
+            State of the drift compensation.
+        """
         self._put(device, _Drift(wall_s, look), 1000)
 
     def thermal(self, device: str, wall_s: float, look: ThermalLook) -> None:
-        """An interval beside what temperature let expect of it."""
+        """Draw the mean bias of an interval and its prediction from the temperature.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix time of the end of the interval [s].
+        look
+            Result of the thermal model.
+        """
         self._put(device, _Thermal(wall_s, look), 1000)
 
     def event(self, device: str, wall_s: float, event: Event) -> None:
-        """Something happened to a device."""
+        """Draw an event.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix time of the event [s].
+        event
+            The event.
+        """
         self._put(device, _Event(wall_s, event), 1000)
 
     def health(self, device: str, wall_s: float, health: Health) -> None:
-        """How a device does, about once a second."""
+        """Draw a health report, about once a second.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        wall_s
+            Unix time of the report [s].
+        health
+            Health of the device.
+        """
         self._put(device, _Health(wall_s, health), 1000)
 
     def overview(self, wall_s: float, text: str) -> None:
-        """The table of a fleet, as Markdown."""
+        """Draw the table of all devices.
+
+        Parameters
+        ----------
+        wall_s
+            Unix time of the table [s].
+        text
+            Table as Markdown.
+        """
         self._put("", _Overview(wall_s, text), len(text))
 
     def close(self, timeout_s: float = 2.0) -> None:
-        """Draw what is left for at most ``timeout_s``, then end the viewer that was started here."""
+        """Draw the remaining data for at most ``timeout_s`` seconds, then end the viewer if it was started here."""
         thread, self._thread = self._thread, None
         if thread is None:
             return
@@ -206,7 +330,7 @@ class RerunView:
         thread.join(0.75 * timeout_s)
         child = self._child
         if thread.is_alive() and child is not None:
-            child.kill()  # frees the thread from a frozen viewer
+            child.kill()  # releases the thread from a viewer that does not respond
         thread.join(0.25 * timeout_s)
         self._phase = "closed"
 
@@ -216,13 +340,14 @@ class RerunView:
         message: "_Samples | _Estimate | _Gap | _Thermal | _Rates | _Drift | _Event | _Health | _Overview",
         weight: int,
     ) -> None:
+        """Add a message to the queue if the thread has been started."""
         if self._thread is not None:
             self._backlog.push((device, message), weight)
 
-    # ---- the thread ----
+    # ---- methods of the thread ----
 
     def _run(self) -> None:
-        """Open, draw, and open again after a while, until closed."""
+        """Open the viewer and draw; reopen it after failures, until closed."""
         settings, attempt = self._settings, 0
         while not self._closing.is_set():
             started = time.monotonic()
@@ -236,24 +361,26 @@ class RerunView:
                 self._phase = str(trouble)
             except ImportError as missing:
                 self._phase = MISSING if missing.name in ("rerun", "rerun_cli", "rerun_bindings") else str(missing)
-            except Exception as error:  # noqa: BLE001 - a drawing must not end the view: said, and tried again
+            except Exception as error:  # noqa: BLE001 - a drawing error must not end the view; it is reported in state
                 self._phase = f"{type(error).__name__}: {error}"
-            settings, attempt = self._after(settings, started, attempt)
+            settings, attempt = self._wait_and_select_mode(settings, started, attempt)
 
-    def _after(self, settings: ViewerSettings, started: float, attempt: int) -> tuple[ViewerSettings, int]:
-        """Wait before the next try; a window that does not work here gives way to the page."""
+    def _wait_and_select_mode(
+        self, settings: ViewerSettings, started: float, attempt: int
+    ) -> tuple[ViewerSettings, int]:
+        """Wait before the next attempt; if a window does not work on this host, use the web page instead."""
         self._stalled, self._inside_since, self._url = False, None, ""
         lived_s = time.monotonic() - started
         if self._closing.is_set():
             return settings, attempt
         attempt = 0 if lived_s > 60.0 or settings.mode == "join" else attempt + 1
-        if settings.mode == "auto" and lived_s < EARLY_END_S:
+        if settings.mode == "auto" and lived_s < MIN_WINDOW_LIFETIME_S:
             return replace(settings, mode="web"), attempt
         self._closing.wait(RETRY_S[min(attempt, len(RETRY_S) - 1)])
         return settings, attempt
 
     def _show(self, settings: ViewerSettings) -> None:
-        """One viewer, from opening to its end."""
+        """Open a viewer and draw until it ends."""
         from monitor.publishing.rerun import scene as rerun_scene
         from monitor.publishing.rerun import sinks
 
@@ -266,8 +393,8 @@ class RerunView:
             self._child = None
             output.close()
 
-    def _lay_out(self, output: "Output", scene: "Scene", devices: Sequence[DeviceInfo]) -> None:
-        """A place for each device."""
+    def _send_layout(self, output: "Output", scene: "Scene", devices: Sequence[DeviceInfo]) -> None:
+        """Send the layout for the devices and create their entities."""
         from monitor.publishing.rerun import blueprint
 
         blueprint.send(
@@ -281,34 +408,34 @@ class RerunView:
         scene.show([(d.name, d.about) for d in devices])
         self._phase = f"ok, but {output.note}" if output.note else "ok"
 
-    def _begin(self, scene: "Scene", device: str) -> None:
-        """What was, before what comes."""
-        self._inside_since = None  # a disk may be slow; that is not the viewer's fault
+    def _draw_history(self, scene: "Scene", device: str) -> None:
+        """Draw the stored history of a device before its live data."""
+        self._inside_since = None  # a slow disk must not count as a stalled viewer
         past = self._recall(device)
         self._inside_since = time.monotonic()
         if past is not None:
             scene.past(device, past)
 
     def _draw(self, output: "Output", scene: "Scene") -> None:
-        """Draw what comes until closed or nobody looks any more."""
+        """Draw new data until closed; raise ViewerTrouble if the viewer has ended."""
         queue = _Pending(plot_every_s=1.0)
         shown: tuple[DeviceInfo, ...] | None = None
         begun: set[str] = set()
         checked = time.monotonic()
         while True:
             closing = self._closing.is_set()
-            queue.add(self._backlog.take(0.0))  # before it is asked which devices there are: none is unknown then
+            queue.add(self._backlog.take(0.0))  # before the devices are read, so that each message has a known device
             self._inside_since = time.monotonic()
             if self._devices is not shown:
                 shown = self._devices
                 queue.plot_every_s = max(1.0, len(shown) / PLOTS_PER_S)
-                self._lay_out(output, scene, shown)
+                self._send_layout(output, scene, shown)
                 for device in [one.name for one in shown if one.name not in begun]:
                     begun.add(device)
-                    self._begin(scene, device)
+                    self._draw_history(scene, device)
             queue.draw(scene, everything=closing)
             now = time.monotonic()
-            if closing or now - checked > CHECK_EVERY_S:
+            if closing or now - checked > CONFIRM_PERIOD_S:
                 self._confirm(output)
                 checked = time.monotonic()
             self._inside_since = None
@@ -318,7 +445,7 @@ class RerunView:
             self._closing.wait(output.flush_every_s)
 
     def _confirm(self, output: "Output") -> None:
-        """Return when all that was drawn has reached the viewer: bounds what Rerun holds to a second's worth."""
+        """Wait until all drawn data have reached the viewer, which limits the data held by Rerun to one second."""
         while not output.confirm(PATIENCE_S):
             self._stalled = not self._closing.is_set()
             output.check()
@@ -327,17 +454,18 @@ class RerunView:
         self._stalled = False
 
 
-def _nothing(_device: str) -> Past | None:
+def _no_history(_device: str) -> Past | None:
+    """Return None: no history is stored."""
     return None
 
 
 @dataclass
 class _Pending:
-    """What has come since the last drawing, device by device."""
+    """Data received since the last drawing, by device."""
 
     plot_every_s: float
     samples: dict[str, list[_Samples]] = field(default_factory=dict)
-    newest: dict[str, _Estimate] = field(default_factory=dict)  # for the Allan plots
+    newest: dict[str, _Estimate] = field(default_factory=dict)  # newest estimate, for the Allan plots
     course: dict[str, list[_Estimate]] = field(default_factory=dict)
     gaps: dict[str, list[_Gap]] = field(default_factory=dict)
     thermals: dict[str, list[_Thermal]] = field(default_factory=dict)
@@ -346,10 +474,10 @@ class _Pending:
     healths: dict[str, _Health] = field(default_factory=dict)
     events: list[tuple[str, _Event]] = field(default_factory=list)
     overview: _Overview | None = None
-    drawn: dict[tuple[str, str], float] = field(default_factory=dict)  # (what, device) -> monotonic s
+    drawn: dict[tuple[str, str], float] = field(default_factory=dict)  # monotonic time of (plot, device) [s]
 
     def add(self, messages: Sequence[Message]) -> None:
-        """Sort by device and kind; of healths and plots only the newest counts."""
+        """Sort messages by device and kind; only the newest health report and plot of a device are kept."""
         for device, message in messages:
             match message:
                 case _Samples():
@@ -373,7 +501,7 @@ class _Pending:
                     self.overview = message
 
     def draw(self, scene: "Scene", everything: bool) -> None:
-        """Hand all over to the scene; plots and courses when they are due, or ``everything``."""
+        """Pass the data to the scene; plots and coefficient points only when they are due, or if ``everything``."""
         for device, parts in self.samples.items():
             scene.samples(
                 device,
@@ -402,8 +530,8 @@ class _Pending:
         for device, means in self.thermals.items():
             scene.thermal(device, np.array([one.wall_s for one in means]), [one.look for one in means])
         self.thermals.clear()
-        for device in list(self.gaps):  # before the plot, that has the model's curve too
-            if everything or self._due("gap", device, COURSE_STEP_S):
+        for device in list(self.gaps):  # before the plot, which also shows the curve of the model
+            if everything or self._due("gap", device, POINT_INTERVAL_S):
                 looks = self.gaps.pop(device)
                 scene.gaps(device, np.array([g.wall_s for g in looks]), [g.gap for g in looks])
         for device in list(self.newest):
@@ -411,25 +539,28 @@ class _Pending:
                 newest = self.newest.pop(device)
                 scene.estimate(device, newest.wall_s, newest.estimate)
         for device in list(self.course):
-            if everything or self._due("course", device, COURSE_EVERY_S):
+            if everything or self._due("course", device, POINTS_PERIOD_S):
                 points = self.course.pop(device)
                 scene.courses(device, np.array([p.wall_s for p in points]), [p.estimate for p in points])
 
     def _add_to_course(self, device: str, message: _Estimate) -> None:
+        """Add a coefficient point; replace the previous one if it is younger than POINT_INTERVAL_S."""
         points = self.course.setdefault(device, [])
-        if len(points) > 1 and message.wall_s - points[-2].wall_s < COURSE_STEP_S:
-            # the samples between the points stay on the course
+        if len(points) > 1 and message.wall_s - points[-2].wall_s < POINT_INTERVAL_S:
+            # The per-sample values between the points are kept.
             course = joined([part for part in (points.pop().estimate.course, message.estimate.course) if part])
             message = _Estimate(message.wall_s, replace(message.estimate, course=course))
         points.append(message)
 
     def _add_gap(self, device: str, message: _Gap) -> None:
+        """Add a comparison; replace the previous one if it is younger than POINT_INTERVAL_S."""
         looks = self.gaps.setdefault(device, [])
-        if len(looks) > 1 and message.wall_s - looks[-2].wall_s < COURSE_STEP_S:
+        if len(looks) > 1 and message.wall_s - looks[-2].wall_s < POINT_INTERVAL_S:
             looks.pop()
         looks.append(message)
 
     def _due(self, what: str, device: str, every_s: float) -> bool:
+        """Return True at most once per ``every_s`` seconds for each plot and device."""
         now = time.monotonic()
         if now - self.drawn.get((what, device), -np.inf) < every_s:
             return False
@@ -438,9 +569,9 @@ class _Pending:
 
 
 def _load_rerun() -> None:
-    """Import Rerun without its exit handler, which waits for ever for a viewer that does not answer.
+    """Import Rerun and remove its exit handler, which waits without limit for a viewer that does not answer.
 
-    Its own log, read from RUST_LOG at import, would print every closed viewer as an error of the daemon's.
+    Rerun reads RUST_LOG at import. By default its log would report every closed viewer as an error of this process.
     """
     given = os.environ.get("RUST_LOG")
     os.environ["RUST_LOG"] = given or "off"

@@ -1,32 +1,32 @@
-"""What the service says to the viewer's thread: settings, devices, and the one error. Loads no Rerun."""
+"""Settings and errors of the viewer, and descriptions of its devices. This module does not import Rerun."""
 
 from dataclasses import dataclass
 
 
 class ViewerTrouble(Exception):
-    """The viewer cannot be opened, or is gone: one line for people."""
+    """Error: the viewer cannot be opened or has ended; the message is one line for the user."""
 
 
 class ViewerClosed(ViewerTrouble):
-    """Someone closed the window: it is not to be opened again unasked."""
+    """Error: a user closed the window, so it must not be opened again without request."""
 
 
 @dataclass(frozen=True, slots=True)
 class ViewerSettings:
-    """Which viewer, and where."""
+    """Settings of the viewer."""
 
-    mode: str = "auto"  # auto | native | web | none | a path ending in .rrd; join: only a viewer that is open
-    port: int = 9876  # of the Rerun server, loopback
-    web_port: int = 9090  # of the page, loopback
-    memory: str = "256MiB"  # of what the viewer keeps for looking back; the oldest go first
+    mode: str = "auto"  # auto, native, web, none, or a path that ends in .rrd; join: use an open viewer only
+    port: int = 9876  # port of the Rerun server on the loopback interface
+    web_port: int = 9090  # port of the web page on the loopback interface
+    memory: str = "256MiB"  # memory for past data in the viewer; the oldest data are dropped first
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """A device as the viewer presents it."""
+    """Description of a device for the viewer."""
 
     name: str
-    about: str = ""  # a few words: decoder, link, port
-    has_model: bool = False  # one is in force
-    has_thermal: bool = False  # its bias is held against its temperature, once one comes
-    compensated: bool = False  # the drift of its gyros is taken out
+    about: str = ""  # short description: decoder, link, port
+    has_model: bool = False  # True if it is compared with a noise model
+    has_thermal: bool = False  # True if its bias is compared with its temperature, once it is measured
+    compensated: bool = False  # True if its gyroscope drift is compensated

@@ -1,1 +1,1 @@
-"""Tables and texts on the terminal."""
+"""Tables and text for the terminal."""

@@ -1,4 +1,4 @@
-"""What compensation did to a recording, as a table of the terminal and as JSON."""
+"""Results of drift compensation of a recording, as a table for the terminal and as JSON."""
 
 from typing import Any, Final
 
@@ -16,11 +16,20 @@ from monitor.publishing.rerun.panels import duration
 
 SCHEMA: Final = "imu-monitor/compensate/1"
 UNIT: Final = DEVIATION_UNITS["gyro"]
-NAMES: Final = ("phi1", "phi2", "theta1")
+ARMA_COEFFICIENT_NAMES: Final = ("phi1", "phi2", "theta1")
+"""JSON keys of the ARMA coefficients."""
 
 
 def tell(result: Result, console: Console) -> None:
-    """Print what was done."""
+    """Print the results of the compensation.
+
+    Parameters
+    ----------
+    result
+        The results.
+    console
+        Destination.
+    """
     console.print(
         f"{result.recording}: {result.samples} samples at {result.rate_hz:g} Hz, {result.method}; judged on "
         f"{duration(result.judged_s)} at rest, after {duration(result.learned_s)}",
@@ -32,7 +41,7 @@ def tell(result: Result, console: Console) -> None:
     for axis, one in result.axes.items():
         pairs = [(one.before.deviation, one.after.deviation), (one.before.worst_minute, one.after.worst_minute)]
         pairs += list(zip(one.before.drift, one.after.drift, strict=True))
-        rows.add_row(axis, "—" if one.model is None else one.model.name, *(_pair(*pair) for pair in pairs))
+        rows.add_row(axis, "—" if one.model is None else one.model.name, *(_format_pair(*pair) for pair in pairs))
     console.print(Padding(rows, (1, 0)))
     console.print(
         "before → after, at rest; 1 min and more: rms of means over so long, by which heading would go wrong.",
@@ -40,14 +49,14 @@ def tell(result: Result, console: Console) -> None:
     )
     for axis, one in result.axes.items():
         if one.steps or one.left_out:
-            console.print(f"{axis}: {_unexplained(one, result.interval_s)}", highlight=False, soft_wrap=True)
+            console.print(f"{axis}: {_describe_exceptions(one, result.interval_s)}", highlight=False, soft_wrap=True)
     for note in result.notes:
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
     console.print(f"{result.out} written", highlight=False, soft_wrap=True)
 
 
 def to_json(result: Result) -> bytes:
-    """Everything; SI units."""
+    """Encode the results as JSON, in SI units."""
     whole = {
         "schema": SCHEMA,
         "recording": result.recording,
@@ -61,10 +70,11 @@ def to_json(result: Result) -> bytes:
         "axes": {axis: _axis(at, one, result) for at, (axis, one) in enumerate(result.axes.items())},
         "notes": list(result.notes),
     }
-    return msgspec.json.encode(whole, enc_hook=_plain)
+    return msgspec.json.encode(whole, enc_hook=_encode_array)
 
 
 def _axis(at: int, one: Axis, result: Result) -> dict[str, Any]:
+    """Return the results of one axis, which is column ``at`` of the intervals."""
     each = result.intervals
     return {
         "model": None if one.model is None else _model(one.model),
@@ -83,12 +93,13 @@ def _axis(at: int, one: Axis, result: Result) -> dict[str, Any]:
 
 
 def _model(model: Arma) -> dict[str, Any]:
+    """Return the ARMA model with the intervals of its coefficients."""
     values = (*model.phi, model.theta)
     return {
         "order": list(model.order),
         **{
             name: {"value": value, "lo": lo, "hi": hi}
-            for name, value, lo, hi in zip(NAMES, values, model.lo, model.hi, strict=True)
+            for name, value, lo, hi in zip(ARMA_COEFFICIENT_NAMES, values, model.lo, model.hi, strict=True)
             if np.isfinite(lo)
         },
         "variance": model.variance,
@@ -98,6 +109,7 @@ def _model(model: Arma) -> dict[str, Any]:
 
 
 def _rest(one: AtRest) -> dict[str, Any]:
+    """Return the statistics at rest."""
     return {
         "deviation": one.deviation,
         "worst_minute": _number(one.worst_minute),
@@ -106,13 +118,15 @@ def _rest(one: AtRest) -> dict[str, Any]:
     }
 
 
-def _pair(before: float, after: float) -> str:
+def _format_pair(before: float, after: float) -> str:
+    """Format a value before and after compensation."""
     if not (np.isfinite(before) and np.isfinite(after)):
         return "—"
     return f"{number(UNIT.factor * before, 2)} → {number(UNIT.factor * after, 2)}"
 
 
-def _unexplained(one: Axis, interval_s: float) -> str:
+def _describe_exceptions(one: Axis, interval_s: float) -> str:
+    """Describe the intervals that were left out and the steps of the bias."""
     parts = []
     if one.left_out:
         parts.append(f"{one.left_out} intervals of {interval_s:g} s left out, as no drift explains them")
@@ -122,10 +136,12 @@ def _unexplained(one: Axis, interval_s: float) -> str:
 
 
 def _number(x: float) -> float | None:
+    """Return the value, or None if it is not finite."""
     return float(x) if np.isfinite(x) else None
 
 
-def _plain(value: Any) -> Any:
+def _encode_array(value: Any) -> Any:
+    """Convert an array for JSON; values that are not finite become null."""
     if isinstance(value, np.ndarray):
         return [_number(x) for x in value]
     raise TypeError(f"{type(value).__name__} has no JSON")

@@ -1,7 +1,7 @@
-"""Past results for the terminal: what each coefficient was, the course of it, and what happened.
+"""History of a device as text for the terminal: tables of coefficients, sparklines and events.
 
-In comes a ``Past``, out go tables in the field's units. A course is drawn in eight heights, of means; its extremes
-stand beside it, and where the device gave nothing it has a gap. Pure but for the console it prints on.
+Tables have the units of the field. A sparkline shows bucket means with eight heights and a gap where the device gave no
+data; the extremes are printed beside it. The only side effect is printing on the given console.
 """
 
 import math
@@ -20,18 +20,32 @@ from monitor.history.time_ranges import said
 from monitor.publishing.coefficient_cells import KIND_NAMES, KINDS, Kind, axes_of, number, unit_of
 
 LETTERS: Final = ("N", "B", "K")
-"""Of all axes; of one axis all five are shown."""
-HEIGHTS: Final = "▁▂▃▄▅▆▇█"
+"""Coefficients shown for all axes; for a single axis all five are shown."""
+SPARKLINE_HEIGHTS: Final = "▁▂▃▄▅▆▇█"
 GAP: Final = "·"
-WIDTH: Final = 32
-"""Characters of a course."""
-EVENTS: Final = 20
-NONE: Final = "—"
-UNITS: Final = ((86_400, "d"), (3600, "h"), (60, "min"), (1, "s"))
+SPARKLINE_WIDTH: Final = 32
+"""Width of a sparkline [characters]."""
+MAX_EVENTS: Final = 20
+"""Largest number of events that are printed."""
+NO_VALUE: Final = "—"
+WIDTH_UNITS: Final = ((86_400, "d"), (3600, "h"), (60, "min"), (1, "s"))
+"""Units of bucket widths, the largest first."""
 
 
 def tell(past: Past, axes: tuple[str, ...], letters: tuple[str, ...], console: Console) -> None:
-    """Print the summary of a span: a line an axis and letter, then what happened."""
+    """Print the summary of a history: one line per axis and letter, then status and events.
+
+    Parameters
+    ----------
+    past
+        The history.
+    axes
+        Axes to print.
+    letters
+        Coefficients to print.
+    console
+        Destination.
+    """
     console.print(head(past), highlight=False, soft_wrap=True)
     for kind in KINDS:
         shown = [axis for axis in axes_of(kind) if axis in axes and axis in past.axes()]
@@ -43,7 +57,19 @@ def tell(past: Past, axes: tuple[str, ...], letters: tuple[str, ...], console: C
 
 
 def tell_course(past: Past, axis: str, letters: tuple[str, ...], console: Console) -> None:
-    """Print one axis over time: a line a bucket, each letter with its extremes."""
+    """Print one axis over time: one line per bucket, with the extremes of each coefficient.
+
+    Parameters
+    ----------
+    past
+        The history.
+    axis
+        Axis to print.
+    letters
+        Coefficients to print.
+    console
+        Destination.
+    """
     table = _table()
     table.add_column("UTC", no_wrap=True)
     for letter in letters:
@@ -62,10 +88,18 @@ def tell_course(past: Past, axis: str, letters: tuple[str, ...], console: Consol
 
 
 def tell_events(past: Past, console: Console) -> None:
-    """Print the newest events."""
+    """Print the newest MAX_EVENTS events.
+
+    Parameters
+    ----------
+    past
+        The history.
+    console
+        Destination.
+    """
     if not past.events:
         return
-    shown = past.events[-EVENTS:]
+    shown = past.events[-MAX_EVENTS:]
     more = past.events_in_all - len(shown)
     console.print()
     if more > 0:
@@ -76,12 +110,12 @@ def tell_events(past: Past, console: Console) -> None:
 
 
 def head(past: Past) -> str:
-    """Device, span, rows, samples: one line."""
+    """Return one line with device, time range, number of rows and number of samples."""
     samples = int(past.counts[:, COUNTS.index("received")].sum())
     if not len(past):
         return f"{past.device}: no rows between {said(past.span.start_s)} and {said(past.span.end_s)} UTC"
     widths = sorted({int(one) for one in past.width_s})
-    rows = (" and " if len(widths) < 3 else " to ").join(_width(one) for one in (*widths[:1], *widths[1:][-1:]))
+    rows = (" and " if len(widths) < 3 else " to ").join(_format_width(one) for one in (*widths[:1], *widths[1:][-1:]))
     return (
         f"{past.device}: {said(float(past.start_s[0]))[:16]} to {said(float(past.end_s[-1]))[:16]} UTC, "
         f"{len(past):,} rows of {rows}, {samples:,} samples"
@@ -89,7 +123,7 @@ def head(past: Past) -> str:
 
 
 def status_lines(past: Past) -> list[str]:
-    """Temperature, losses, and how long the device was not running."""
+    """Return lines with temperature range, lost samples, and the time during which the device was not running."""
     lines = []
     temperature = past.column("temperature")
     if temperature.n.any():
@@ -106,12 +140,23 @@ def status_lines(past: Past) -> list[str]:
     return lines
 
 
-def sparkline(last: Floats, t_s: Floats, span: tuple[float, float], width: int = WIDTH) -> str:
-    """Values between two moments, in each character the mean of those of its time.
+def sparkline(last: Floats, t_s: Floats, span: tuple[float, float], width: int = SPARKLINE_WIDTH) -> str:
+    """Draw values between two times as text; each character shows the mean of its time interval.
 
     >>> steps = np.arange(8.0)
     >>> sparkline(steps, 60.0 * steps, (0.0, 480.0), 8)
     '▁▂▃▄▅▆▇█'
+
+    Parameters
+    ----------
+    last
+        Values, shape [p]; NaN if missing.
+    t_s
+        Times of the values [s], shape [p].
+    span
+        Start and end of the sparkline [s].
+    width
+        Number of characters.
     """
     there = np.isfinite(last)
     if not there.any() or span[1] <= span[0]:
@@ -120,12 +165,13 @@ def sparkline(last: Floats, t_s: Floats, span: tuple[float, float], width: int =
     count = np.bincount(at, minlength=width)
     means = np.bincount(at, last[there], width)[count > 0] / count[count > 0]
     low, wide = means.min(), np.ptp(means)
-    heights = ((means - low) / wide if wide > 0.0 else np.full(means.size, 0.5)) * len(HEIGHTS)
-    marks = iter([HEIGHTS[min(int(one), len(HEIGHTS) - 1)] for one in heights])
+    heights = ((means - low) / wide if wide > 0.0 else np.full(means.size, 0.5)) * len(SPARKLINE_HEIGHTS)
+    marks = iter([SPARKLINE_HEIGHTS[min(int(one), len(SPARKLINE_HEIGHTS) - 1)] for one in heights])
     return "".join(next(marks) if some else GAP for some in count)
 
 
 def _summary(past: Past, kind: Kind, axes: list[str], letters: tuple[str, ...]) -> Table:
+    """Return a table with first, last, lowest and highest value and a sparkline for each axis and coefficient."""
     table = _table()
     table.add_column(KIND_NAMES[kind], no_wrap=True)
     for name in ("first", "last", "lowest", "highest"):
@@ -139,46 +185,48 @@ def _summary(past: Past, kind: Kind, axes: list[str], letters: tuple[str, ...]) 
             label = Text.assemble((f"{axis} {letter}", "bold"), f"  {unit.name}")
             there = course.last[np.isfinite(course.last)]
             if not there.size:
-                table.add_row(label, NONE, *_bound(past, axis, letter), "")
+                table.add_row(label, NO_VALUE, *_bound(past, axis, letter), "")
                 continue
-            numbers = [float(one) * unit.factor for one in (there[0], there[-1], *_ends(course))]
+            numbers = [float(one) * unit.factor for one in (there[0], there[-1], *_extremes(course))]
             table.add_row(label, *(number(one) for one in numbers), sparkline(course.last, middle_s, span))
     return table
 
 
 def _bound(past: Past, axis: str, letter: str) -> tuple[str, str, str]:
-    """Last and lowest of what was only ever bounded."""
+    """Return the cells of a coefficient that was never estimated: its last upper bound and two dashes."""
     bound, unit = past.column(f"{axis}.{letter}.bound"), unit_of(letter, axis)
     there = bound.last[np.isfinite(bound.last)]
     if not there.size:
-        return NONE, NONE, NONE
-    return f"≤ {number(float(there[-1]) * unit.factor)}", NONE, NONE
+        return NO_VALUE, NO_VALUE, NO_VALUE
+    return f"≤ {number(float(there[-1]) * unit.factor)}", NO_VALUE, NO_VALUE
 
 
 def _cell(past: Past, axis: str, letter: str, p: int) -> str:
-    """A letter in one bucket: its last value and, where they differ, its extremes; or its bound."""
+    """Format a coefficient in one bucket: its last value, and its extremes if they differ, or its upper bound."""
     course, unit = past.column(f"{axis}.{letter}"), unit_of(letter, axis)
     low, high, last = (float(part[p]) * unit.factor for part in (course.low, course.high, course.last))
     if math.isfinite(last):
         alike = number(low) == number(high)
         return number(last) if alike else f"{number(last)} [{number(low)} … {number(high)}]"
     bound = float(past.column(f"{axis}.{letter}.bound").last[p]) * unit.factor
-    return f"≤ {number(bound)}" if math.isfinite(bound) else NONE
+    return f"≤ {number(bound)}" if math.isfinite(bound) else NO_VALUE
 
 
-def _width(seconds: int) -> str:
-    """Of a bucket.
+def _format_width(seconds: int) -> str:
+    """Format the width of a bucket, given in seconds.
 
-    >>> _width(300), _width(21_600), _width(604_800)
+    >>> _format_width(300), _format_width(21_600), _format_width(604_800)
     ('5 min', '6 h', '7 d')
     """
-    unit_s, unit = next((size, name) for size, name in UNITS if seconds % size == 0)
+    unit_s, unit = next((size, name) for size, name in WIDTH_UNITS if seconds % size == 0)
     return f"{seconds // unit_s} {unit}"
 
 
-def _ends(course: Course) -> tuple[float, float]:
+def _extremes(course: Course) -> tuple[float, float]:
+    """Return the minimum and maximum over all buckets."""
     return float(np.nanmin(course.low)), float(np.nanmax(course.high))
 
 
 def _table() -> Table:
+    """Return an empty table without borders."""
     return Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")

@@ -1,9 +1,10 @@
-"""The live table in the terminal: one row a device, those in trouble first.
+"""Live table in the terminal: one row per device, devices with problems first.
 
-In come the payloads of ``monitor.common.topics``, from zenoh (``watch``) or from the daemon this process is (``run``,
-``demo``); out goes something that rich can print at any width. Of a few layouts the fullest that fits is taken: at 160
-columns a device is one line with three digits, at 100 one line with two, narrower it is three lines, an axis each.
-A state has a word and a sign beside its colour. Numbers stand in the field's units of ``monitor.publishing.coefficient_cells``.
+The input are messages of ``monitor.common.topics``, received over zenoh (``watch``) or from this process (``run``,
+``demo``). The output are rich renderables for any width. The most detailed layout that fits is used. At 160 columns a
+device has one line with three digits, at 100 columns one line with two digits, and below that three lines, one per
+axis. Each state has a word and a symbol in addition to its colour. Numbers have the units of
+``monitor.publishing.coefficient_cells``.
 """
 
 import contextlib
@@ -34,22 +35,22 @@ from monitor.publishing.rerun.panels import duration
 from monitor.publishing.terminal.queued_writer import QueuedWriter
 from monitor.publishing.zenoh.subscriber import KEYEXPR, ZenohIn
 
-REFRESH_S: Final = 0.5
+REFRESH_PERIOD_S: Final = 0.5
 DEVICES: Final = 20_000
-"""Known at most; then a new one takes the place of one that has been silent for long, or is passed over."""
+"""Largest number of devices. A further device replaces one that has been silent for FORGET_S, or is ignored."""
 FORGET_S: Final = 600.0
-KEY_LENGTH: Final = 200
-QUIET_S: Final = 5.0
-"""Connected for so long without a word of anyone: said, as access control refuses without saying so."""
+MAX_KEY_LENGTH: Final = 200
+SILENCE_NOTE_S: Final = 5.0
+"""Time without any message after which the note says so, because access control refuses silently."""
 STDOUT: Final = "standard output"
-PLAIN_S: Final = 1.0
-"""Between two tables where output is no terminal."""
+PLAIN_PERIOD_S: Final = 1.0
+"""Interval between two tables if the output is not a terminal."""
 EVENTS: Final = 5
-TROUBLES: Final = 6
-HEADS: Final = 6
-"""Lines of the screen that are no row: summary, note, heads, and those left empty."""
-SHOWN: Final[tuple[tuple[Kind, str], ...]] = (("gyro", "N"), ("gyro", "B"), ("accel", "N"))
-NONE: Final = "—"
+MAX_TROUBLE_LINES: Final = 6
+HEADER_LINES: Final = 6
+"""Lines of the screen without a table row: summary, note, table head and blank lines."""
+TABLE_COEFFICIENTS: Final[tuple[tuple[Kind, str], ...]] = (("gyro", "N"), ("gyro", "B"), ("accel", "N"))
+NO_VALUE: Final = "—"
 K_OR_R: Final = "K or R"
 STATES: Final = {
     "running": ("●", "green"),
@@ -60,54 +61,72 @@ STATES: Final = {
     "silent": ("?", "bold red"),
     "ended": ("■", "cyan"),
 }
-"""State -> its sign and colour."""
-UNKNOWN: Final = ("?", "yellow")
+"""Symbol and colour of each state."""
+UNKNOWN_STATE_STYLE: Final = ("?", "yellow")
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How much of a row is shown."""
+    """Level of detail of the table."""
 
     digits: int
     full_counts: bool
-    stacked: bool  # an axis a line
-    gap: int  # blanks between columns
+    stacked: bool  # True if each axis has a line of its own
+    gap: int  # number of blanks between columns
 
 
 LAYOUTS: Final = (Layout(3, True, False, 2), Layout(3, False, False, 1), Layout(2, False, False, 1))
-NARROW: Final = Layout(3, False, True, 1)
+NARROW_LAYOUT: Final = Layout(3, False, True, 1)
 
 
 class Board:
-    """What is known of each device, from the payloads of ``monitor.common.topics``. Safe between threads.
+    """State of all devices, updated from the messages of ``monitor.common.topics``; thread-safe.
 
-    Args:
-        clock: seconds on the clock of ``table``'s ``now_s``; for the age of messages
+    Parameters
+    ----------
+    clock
+        Clock for the age of messages [s]; it must be the clock of ``now_s`` in ``table``.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self.note = ""  # a line above the table, e.g. who cannot be reached
-        self.malformed = 0  # messages that are not what their key says
-        self.passed_over = 0  # messages of devices that found no room
+        self.note = ""  # line above the table, e.g. which endpoints cannot be reached
+        self.malformed = 0  # number of messages that could not be decoded
+        self.passed_over = 0  # number of messages of devices beyond DEVICES
         self._clock = clock
-        self._devices: OrderedDict[str, Heard] = OrderedDict()  # longest silent first
+        self._devices: OrderedDict[str, Heard] = OrderedDict()  # ordered by the time of the last message, oldest first
         self._events: deque[tuple[str, remote_device.EventMessage]] = deque(maxlen=EVENTS)
         self._lock = threading.Lock()
 
     def take(self, key: str, payload: bytes) -> None:
-        """A message as it was sent; keys of other topics are passed over, malformed payloads counted."""
+        """Process a message; other topics are ignored and malformed payloads are counted.
+
+        Parameters
+        ----------
+        key
+            Key of the message.
+        payload
+            Encoded message.
+        """
         found = remote_device.split(key)
         if found is None:
             return
         device, topic = found
         with self._lock:
             try:
-                self._read(device, topic, payload)
+                self._decode(device, topic, payload)
             except ValueError:
                 self.malformed += 1
 
     def alive(self, key: str, there: bool) -> None:
-        """The liveliness token at ``key`` appeared or went."""
+        """Process the change of a liveliness token.
+
+        Parameters
+        ----------
+        key
+            Key of the token.
+        there
+            True if the token exists.
+        """
         found = remote_device.split(key)
         if found is None or found[1] is not topics.ALIVE:
             return
@@ -116,7 +135,7 @@ class Board:
                 known.there = there
 
     def forget(self, key: str) -> None:
-        """The device of the key has no row any more."""
+        """Remove the row and the events of the device that ``key`` belongs to."""
         found = remote_device.split(key)
         if found is None:
             return
@@ -126,47 +145,51 @@ class Board:
                 self._events.remove(one)
 
     def table(self, now_s: float) -> RenderableType:
-        """All of it, at one moment."""
+        """Return a renderable of the complete table at time ``now_s`` [s]."""
         with self._lock:
-            devices = [copy.copy(one) for one in self._sorted(now_s)]  # drawn later, while messages arrive
+            devices = [
+                copy.copy(one) for one in self._sorted(now_s)
+            ]  # copied, because messages arrive while it is drawn
             parts: list[RenderableType] = [self._summary(devices, now_s)]
             if devices:
                 parts.append(Fleet(devices, now_s))
-            parts += _apart(_troubles(devices, now_s))
+            parts += _with_blank_line(_troubles(devices, now_s))
             if len(devices) == 1 and devices[0].noise is not None:
-                parts += _apart(_detail(devices[0].noise))
+                parts += _with_blank_line(_coefficient_tables(devices[0].noise))
             names = _names(list(self._devices))
-            parts += _apart([_event(names[device], event) for device, event in self._events])
+            parts += _with_blank_line([_event(names[device], event) for device, event in self._events])
         return Group(*parts)
 
     def devices(self, now_s: float) -> list[Heard]:
-        """All that are known, those in trouble first."""
+        """Return all known devices, those with problems first."""
         with self._lock:
             return self._sorted(now_s)
 
     def _sorted(self, now_s: float) -> list[Heard]:
+        """Return the devices sorted by severity and then by key."""
         return sorted(self._devices.values(), key=lambda one: (one.rank(now_s), one.key))
 
-    def _read(self, device: str, topic: topics.Topic, payload: bytes) -> None:
-        """ValueError for a malformed one, which then leaves no trace."""
+    def _decode(self, device: str, topic: topics.Topic, payload: bytes) -> None:
+        """Decode a message and update the device; ValueError if it is malformed, in which case nothing changes."""
         if topic is topics.STATUS:
             status = remote_device.status(payload)
-            if known := self._heard(device):
+            if known := self._update_heard(device):
                 known.status = status
         elif topic is topics.COEFFICIENTS:
             noise = remote_device.noise(remote_device.read(remote_device.CoefficientsMessage, topic, payload))
-            if known := self._heard(device):
+            if known := self._update_heard(device):
                 known.noise = noise
         elif topic is topics.GAP:
             gap = remote_device.gap(payload)
-            if known := self._heard(device):
+            if known := self._update_heard(device):
                 known.gap = gap
         elif topic is topics.EVENT:
             event = remote_device.event(payload)
-            if self._heard(device):
+            if self._update_heard(device):
                 self._events.append((device, event))
 
-    def _heard(self, device: str) -> Heard | None:
+    def _update_heard(self, device: str) -> Heard | None:
+        """Return the state of a device and set the time of its newest message; None if the table is full."""
         known = self._device(device)
         if known is not None:
             known.heard_s = self._clock()
@@ -174,13 +197,13 @@ class Board:
         return known
 
     def _device(self, device: str) -> Heard | None:
-        """The device, from now on known; None where there is no room for another."""
+        """Return the state of a device, which is added if it is new; None if the table is full."""
         known = self._devices.get(device)
         if known is not None:
             return known
         now_s = self._clock()
         full = len(self._devices) >= DEVICES
-        if len(device) > KEY_LENGTH or (full and now_s - next(iter(self._devices.values())).heard_s < FORGET_S):
+        if len(device) > MAX_KEY_LENGTH or (full and now_s - next(iter(self._devices.values())).heard_s < FORGET_S):
             self.passed_over += 1
             return None
         if full:
@@ -188,11 +211,12 @@ class Board:
         return self._devices.setdefault(device, Heard(device, now_s))
 
     def _summary(self, devices: list[Heard], now_s: float) -> Text:
+        """Return the line above the table: number of devices by state, and the note."""
         line = Text("imu-monitor", style="bold")
         counts = Counter(one.state(now_s) for one in devices)
         line.append(f"  {len(devices)} device{'' if len(devices) == 1 else 's'}", style="not bold")
         for state, count in counts.items():
-            sign, colour = STATES.get(state, UNKNOWN)
+            sign, colour = STATES.get(state, UNKNOWN_STATE_STYLE)
             line.append(f"  {sign} {count} {state}", style=f"not bold {colour}")
         if self.malformed:
             line.append(
@@ -206,39 +230,50 @@ class Board:
 
 
 class Fleet:
-    """The table of all devices in the fullest layout that fits, as many rows as the terminal has."""
+    """Renderable of the table in the most detailed layout that fits, limited to the height of the terminal."""
 
     def __init__(self, devices: list[Heard], now_s: float) -> None:
         self._devices = devices
         self._now_s = now_s
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """The table, and how many did not find room."""
-        layout = next((one for one in LAYOUTS if self._fits(one, console, options)), NARROW)
-        room = self._room(layout, console)
+        """Yield the table, and a line with the number of devices that are not shown."""
+        layout = next((one for one in LAYOUTS if self._fits(one, console, options)), NARROW_LAYOUT)
+        room = self._visible_rows(layout, console)
         yield fleet_table(self._devices[:room], self._now_s, layout)
         if len(self._devices) > room:
             yield Text(f"… and {len(self._devices) - room} more with less trouble", style="dim")
 
-    def _room(self, layout: Layout, console: Console) -> int:
-        """Rows that are shown: all of them where the output is no terminal."""
+    def _visible_rows(self, layout: Layout, console: Console) -> int:
+        """Return the number of rows that are shown; all rows if the output is not a terminal."""
         if not console.is_terminal:
             return len(self._devices)
-        return max((console.size.height - EVENTS - TROUBLES - HEADS) // (3 if layout.stacked else 1), 3)
+        return max((console.size.height - EVENTS - MAX_TROUBLE_LINES - HEADER_LINES) // (3 if layout.stacked else 1), 3)
 
     def _fits(self, layout: Layout, console: Console, options: ConsoleOptions) -> bool:
-        table = fleet_table(self._devices[: self._room(layout, console)], self._now_s, layout)
+        """Return True if the table in this layout fits into the width."""
+        table = fleet_table(self._devices[: self._visible_rows(layout, console)], self._now_s, layout)
         return console.measure(table, options=options.update(max_width=10_000)).maximum <= options.max_width
 
 
 def fleet_table(devices: Sequence[Heard], now_s: float, layout: Layout) -> Table:
-    """One row a device."""
+    """Return the table of devices, one row per device.
+
+    Parameters
+    ----------
+    devices
+        Devices in the order of their rows.
+    now_s
+        Current time on the clock of the messages [s].
+    layout
+        Level of detail.
+    """
     table = Table(box=None, padding=(0, layout.gap, 0, 0), pad_edge=False, header_style="bold")
     for head in ("device", "state"):
         table.add_column(head, no_wrap=True)
     for head in ("Hz", "received", "lost", "bad"):
         table.add_column(head, justify="right", no_wrap=True)
-    shown = [pair for pair in SHOWN if any(_measures(one, pair[0]) for one in devices)]
+    shown = [pair for pair in TABLE_COEFFICIENTS if any(_has_axis_of(one, pair[0]) for one in devices)]
     noise = [_noise_column(devices, kind, letter, layout) for kind, letter in shown]
     if layout.stacked and shown:
         noise.insert(0, (Text(), [Text("x\ny\nz" if one.noise else "", style="bold") for one in devices]))
@@ -255,7 +290,7 @@ def fleet_table(devices: Sequence[Heard], now_s: float, layout: Layout) -> Table
 
 
 class LiveTable:
-    """Draws the table of a board as text for a ``QueuedWriter``: again and again on a terminal, else once at the end.
+    """Renderer of the table of a board as text for a ``QueuedWriter``: repeatedly on a terminal, otherwise once.
 
     ``render`` is called by the thread of the writer only. The rich console is used to format text; it writes nothing
     itself.
@@ -275,7 +310,7 @@ class LiveTable:
         self._ended = False
 
     def render(self, lines: Sequence[str], last: bool) -> str:
-        """Return control codes and text that put the lines above the table and redraw the table below them.
+        """Return the text and control codes that print the lines above the table and redraw the table.
 
         Parameters
         ----------
@@ -316,13 +351,31 @@ def watch(
     once_s: float | None = None,
     file: Path | None = None,
 ) -> None:
-    """Show the table until ``stop`` or Ctrl-C; with ``once_s`` listen for so long and print it once.
+    """Show the table until ``stop`` is set or Ctrl-C is pressed.
 
-    A thread writes the table, so that a terminal or pipe that nobody reads neither delays messages nor the end.
+    The table is written by a separate thread. A terminal or pipe that is not read delays neither messages nor the exit.
 
-    Raises:
-        ConfigError: zenoh refuses the key expression, an endpoint or the ``file`` with certificates and passwords
-        OSError: standard output cannot be written
+    Parameters
+    ----------
+    keyexpr
+        Key expression that selects the devices.
+    connect
+        Endpoints of daemons or routers.
+    stop
+        Event that ends the function.
+    console
+        Console that formats the table.
+    once_s
+        Time to collect messages [s], after which the table is printed once. None: show it continuously.
+    file
+        Configuration file of zenoh.
+
+    Raises
+    ------
+    ConfigError
+        zenoh rejects the key expression, an endpoint or the file with certificates and passwords.
+    OSError
+        Standard output cannot be written.
     """
     stop, console = stop or threading.Event(), console or Console()
     board = Board()
@@ -335,14 +388,14 @@ def watch(
                 out.finish(stop)
         elif console.is_terminal:
             with QueuedWriter(
-                cast("TextIO", console.file), STDOUT, LiveTable(console, board).render, REFRESH_S
+                cast("TextIO", console.file), STDOUT, LiveTable(console, board).render, REFRESH_PERIOD_S
             ) as screen:
-                while not stop.wait(REFRESH_S) and screen.error is None:
+                while not stop.wait(REFRESH_PERIOD_S) and screen.error is None:
                     _take(board, arriving)
                     screen.redraw()
         else:
-            with QueuedWriter(cast("TextIO", console.file), STDOUT, limit=1) as out:  # at most one table waits
-                while not stop.wait(PLAIN_S) and out.error is None:
+            with QueuedWriter(cast("TextIO", console.file), STDOUT, limit=1) as out:  # queue at most one table
+                while not stop.wait(PLAIN_PERIOD_S) and out.error is None:
                     _take(board, arriving)
                     with console.capture() as captured:
                         console.print(board.table(time.monotonic()))
@@ -350,7 +403,7 @@ def watch(
 
 
 def _take(board: Board, arriving: ZenohIn) -> None:
-    """Pass all messages that have arrived to the board."""
+    """Pass all received messages to the board."""
     for message in arriving.take(0.0):
         if message.payload is None:
             board.alive(message.key, message.there)
@@ -360,10 +413,18 @@ def _take(board: Board, arriving: ZenohIn) -> None:
 
 
 def note(board: Board, arriving: ZenohIn) -> str:
-    """What is wrong between here and the daemons; empty while all is well."""
+    """Return what is wrong with the connection to the daemons; empty if nothing is.
+
+    Parameters
+    ----------
+    board
+        State of the devices.
+    arriving
+        Subscriber.
+    """
     state, dropped = arriving.state, arriving.dropped
     notes = [state] if state != "ok" else []
-    if state == "ok" and arriving.open_s > QUIET_S and not board.devices(time.monotonic()):
+    if state == "ok" and arriving.open_s > SILENCE_NOTE_S and not board.devices(time.monotonic()):
         notes.append("connected, but nothing comes: no daemon there, or no right to listen")
     notes += [f"{dropped:,} messages dropped: too slow here"] if dropped else []
     return "; ".join(notes)
@@ -373,50 +434,55 @@ def note(board: Board, arriving: ZenohIn) -> str:
 
 
 def _names(keys: Sequence[str]) -> dict[str, str]:
-    """Key -> what a row is called: the last part, where that tells all devices apart and nothing is lost by it."""
+    """Return the display name of each key: its last part if all keys share one prefix, else the whole key."""
     prefixes = {key.rpartition("/")[0] for key in keys}
     short = len(prefixes) == 1
     return {key: remote_device.clean(key.rpartition("/")[2] if short else key) for key in keys}
 
 
 def _state(state: str) -> Text:
-    sign, colour = STATES.get(state, UNKNOWN)
+    """Return the symbol and name of a state in its colour."""
+    sign, colour = STATES.get(state, UNKNOWN_STATE_STYLE)
     return Text(f"{sign} {state}", style=colour)
 
 
 def _counts(one: Heard, layout: Layout) -> list[Text]:
+    """Return the cells of the rate and of the sample counters."""
     if one.status is None:
-        return [Text(NONE, style="dim")] * 4
-    rate = NONE if one.status.rate is None else coefficient_cells.number(one.status.rate, 4)
-    write = _full if layout.full_counts else _short
+        return [Text(NO_VALUE, style="dim")] * 4
+    rate = NO_VALUE if one.status.rate is None else coefficient_cells.number(one.status.rate, 4)
+    write = _format_full_count if layout.full_counts else _format_short_count
     lost, bad = (Text(write(count), style="yellow" if count else "dim") for count in (one.status.lost, one.status.bad))
     return [Text(rate), Text(write(one.status.received)), lost, bad]
 
 
 def _latency(one: Heard) -> Text:
+    """Return the cell of the 99th percentile of the latency [ms]."""
     p99_s = None if one.status is None else one.status.latency.p99
-    return Text(NONE, style="dim") if p99_s is None else Text(coefficient_cells.number(p99_s * 1e3, 2))
+    return Text(NO_VALUE, style="dim") if p99_s is None else Text(coefficient_cells.number(p99_s * 1e3, 2))
 
 
-def _full(count: int) -> str:
+def _format_full_count(count: int) -> str:
+    """Format a count with all digits."""
     return f"{count:,}"
 
 
-def _short(count: int) -> str:
-    """A count in at most five characters.
+def _format_short_count(count: int) -> str:
+    """Format a count with at most five characters.
 
-    >>> _short(9_999), _short(123_456), _short(999_999)
+    >>> _format_short_count(9_999), _format_short_count(123_456), _format_short_count(999_999)
     ('9999', '123k', '1M')
     """
     if count < 10_000:
         return str(count)
-    count = int(float(f"{count:.2e}"))  # rounded first: 999 999 are 1M
+    count = int(float(f"{count:.2e}"))  # rounded first, so that 999 999 becomes 1M
     power = min((len(str(count)) - 1) // 3, 4)
     return f"{count / 1000**power:.3g}{'kMGT'[power - 1]}"
 
 
 def _age(age_s: float) -> str:
-    """
+    """Format an age given in seconds.
+
     >>> _age(0.44), _age(75.0), _age(600.0), _age(90_000.0)
     ('0.4 s', '75 s', '10 min', '25 h')
     """
@@ -427,12 +493,13 @@ def _age(age_s: float) -> str:
     return f"{age_s / 60:.0f} min" if age_s < 7200 else f"{age_s / 3600:.0f} h"
 
 
-def _measures(one: Heard, kind: Kind) -> bool:
+def _has_axis_of(one: Heard, kind: Kind) -> bool:
+    """Return True if the device measures an axis of this kind."""
     return one.noise is not None and bool(set(coefficient_cells.axes_of(kind)) & set(one.noise.axes))
 
 
 def _noise_column(devices: Sequence[Heard], kind: Kind, letter: str, layout: Layout) -> tuple[Text, list[Text]]:
-    """Head and cells of one coefficient on three axes; side by side they stand under each other in every row."""
+    """Return the header and cells of one coefficient on three axes; values are aligned between rows."""
     axes = coefficient_cells.axes_of(kind)
     rows = [[_value(one, letter, axis, layout.digits) for axis in axes] for one in devices]
     unit = coefficient_cells.COEFFICIENT_UNITS[kind][letter].name
@@ -446,7 +513,7 @@ def _noise_column(devices: Sequence[Heard], kind: Kind, letter: str, layout: Lay
 
 
 def _value(one: Heard, letter: str, axis: str, digits: int) -> str:
-    """A coefficient, its bound, a dash where there are too few data, nothing where the axis is not measured."""
+    """Format a coefficient: value, upper bound, a dash if there are too few data, or blank if it is not measured."""
     if one.noise is None or axis not in one.noise.axes:
         return ""
     return coefficient_cells.reading(one.noise.coefficients, letter, axis, digits).value.replace("≤ ", "≤")
@@ -455,31 +522,35 @@ def _value(one: Heard, letter: str, axis: str, digits: int) -> str:
 # --- below the table
 
 
-def _apart(lines: Sequence[RenderableType]) -> list[RenderableType]:
-    """A section with an empty line above it, if there is anything in it."""
+def _with_blank_line(lines: Sequence[RenderableType]) -> list[RenderableType]:
+    """Return the lines with an empty line above them; nothing if there are no lines."""
     return [Text(), *lines] if lines else []
 
 
 def _troubles(devices: Sequence[Heard], now_s: float) -> list[Text]:
-    """What is wrong in words, a line a device."""
+    """Return one line per device with problems."""
     names = _names([one.key for one in devices])
     lines = []
     for one in devices:
         if trouble := one.trouble():
-            sign, colour = STATES.get(one.state(now_s), UNKNOWN)
+            sign, colour = STATES.get(one.state(now_s), UNKNOWN_STATE_STYLE)
             sign = "!" if sign == "●" else sign
             lines.append(Text.assemble((f"{sign} {names[one.key]}  ", colour), trouble))
-    if len(lines) > TROUBLES:
-        lines = [*lines[: TROUBLES - 1], Text(f"… and {len(lines) - TROUBLES + 1} more with trouble", style="dim")]
+    if len(lines) > MAX_TROUBLE_LINES:
+        lines = [
+            *lines[: MAX_TROUBLE_LINES - 1],
+            Text(f"… and {len(lines) - MAX_TROUBLE_LINES + 1} more with trouble", style="dim"),
+        ]
     return lines
 
 
 def _event(name: str, event: remote_device.EventMessage) -> Text:
+    """Return the line of an event."""
     return Text.assemble((f"{_clock_time(event.t)}  ", "dim"), (f"{name}  ", "bold"), remote_device.clean(event.text))
 
 
 def _clock_time(unix_s: float) -> str:
-    """Local time of the day; a recording's own time may be no date at all."""
+    """Format the local time of day; the time of a recording may not be a valid date and is then shown in seconds."""
     try:
         return f"{datetime.fromtimestamp(unix_s).astimezone():%H:%M:%S}"
     except (ValueError, OverflowError, OSError):
@@ -487,25 +558,34 @@ def _clock_time(unix_s: float) -> str:
 
 
 def analysis_table(estimate: Estimate, axes_of_temperature: Collection[str] = ()) -> RenderableType:
-    """Coefficients of every measured axis with their intervals, for ``analyze``.
+    """Return the table of coefficients with intervals for ``analyze``.
 
-    Axes of which temperature explains most of the slow variance are marked.
+    Parameters
+    ----------
+    estimate
+        The estimate.
+    axes_of_temperature
+        Axes to mark because temperature explains most of their slow variance.
     """
     axes = tuple(axis for _, axis in measured_axes(estimate))
     either = tuple(axis for i, axis in measured_axes(estimate) if estimate.k_or_r[i])
-    return Group(*_detail(remote_device.Noise(estimate.coefficients, axes, None), either, axes_of_temperature))
+    return Group(
+        *_coefficient_tables(remote_device.Noise(estimate.coefficients, axes, None), either, axes_of_temperature)
+    )
 
 
-def _detail(
+def _coefficient_tables(
     noise: remote_device.Noise, either: Sequence[str] = (), axes_of_temperature: Collection[str] = ()
 ) -> list[RenderableType]:
-    """Axis by letter with intervals, a table a kind of sensor; ``either``: axes whose drift is K or R."""
+    """Return a table per kind of sensor: axes by coefficients with intervals; ``either`` lists the axes with K or R."""
     seen = "" if noise.seen_s is None else f"last {duration(noise.seen_s)}; "
     known = f"; {K_OR_R}: one of them" if either else ""
     known += (
         f"; {coefficient_cells.TEMPERATURE_MARK} {coefficient_cells.TEMPERATURE_MEANS}" if axes_of_temperature else ""
     )
-    parts: list[RenderableType] = [Text(f"{seen}[95 % interval]; ≤ bound; {NONE} too few data yet{known}", style="dim")]
+    parts: list[RenderableType] = [
+        Text(f"{seen}[95 % interval]; ≤ bound; {NO_VALUE} too few data yet{known}", style="dim")
+    ]
     for kind in coefficient_cells.KINDS:
         if set(coefficient_cells.axes_of(kind)) & set(noise.axes):
             wide, narrow = (detail_table(noise, kind, each, either, axes_of_temperature) for each in (False, True))
@@ -520,7 +600,21 @@ def detail_table(
     either: Sequence[str] = (),
     axes_of_temperature: Collection[str] = (),
 ) -> Table:
-    """The five coefficients of the axes of one kind, intervals beside the values or below them."""
+    """Return the table of the five coefficients for the axes of one kind.
+
+    Parameters
+    ----------
+    noise
+        Coefficients of the device.
+    kind
+        Kind of sensor.
+    stacked
+        True to print intervals below the values; False to print them beside the values.
+    either
+        Axes on which either K or R is present and the data do not show which.
+    axes_of_temperature
+        Axes to mark because temperature explains most of their slow variance.
+    """
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
     table.add_column(coefficient_cells.KIND_NAMES[kind] if not stacked else kind, no_wrap=True)
     for letter in LETTERS:
@@ -536,6 +630,7 @@ def detail_table(
 
 
 def _interval(noise: remote_device.Noise, letter: str, axis: str, between: str, either: bool) -> Text:
+    """Return the cell of one coefficient: value, interval and the mark ``K or R``."""
     one = coefficient_cells.reading(noise.coefficients, letter, axis)
     small = [f"[{one.interval}]"] if one.interval else []
     if either and letter in ("K", "R"):
@@ -544,13 +639,13 @@ def _interval(noise: remote_device.Noise, letter: str, axis: str, between: str, 
 
 
 class Fitting:
-    """The wide table where it fits, else the narrow one."""
+    """Renderable that shows the wide table if it fits, and the narrow one otherwise."""
 
     def __init__(self, wide: Table, narrow: Table) -> None:
         self._wide = wide
         self._narrow = narrow
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """One of the two."""
+        """Yield one of the two tables."""
         needed = console.measure(self._wide, options=options.update(max_width=10_000)).maximum
         yield self._wide if needed <= options.max_width else self._narrow

@@ -22,15 +22,15 @@ from typing import Final, TextIO
 
 from monitor.publishing.rerun.bounded_queue import Backlog
 
-QUEUE_CHARACTERS: Final = 256 * 1024
+MAX_QUEUED_CHARACTERS: Final = 256 * 1024
 """Length of the queued text at most; some 2000 log lines."""
 CHUNK_BYTES: Final = 1024
-"""A single write call; small, so that a slow terminal is told from a blocked one."""
+"""A single write call; small, so that a slow terminal can be distinguished from a blocked one."""
 BLOCKED_S: Final = 2.0
 """A write that takes longer counts as blocked."""
-GATHER_S: Final = 0.05
+FRAME_DELAY_S: Final = 0.05
 """Delay before a frame is drawn, so that results published together appear in one frame."""
-IDLE_S: Final = 1.0
+IDLE_WAIT_S: Final = 1.0
 CLOSE_S: Final = 2.0
 
 Render = Callable[[Sequence[str], bool], str]
@@ -62,7 +62,7 @@ class QueuedWriter:
         place: str,
         render: Render | None = None,
         period_s: float | None = None,
-        limit: int = QUEUE_CHARACTERS,
+        limit: int = MAX_QUEUED_CHARACTERS,
         tell: Callable[[str], None] | None = None,
     ) -> None:
         self.error: Exception | None = None  # of the last write or rendering; None after a successful one
@@ -79,7 +79,7 @@ class QueuedWriter:
         self._reason = ""  # why the newest lines were lost
         self._write_since_s: float | None = None  # monotonic time at which the current write call began
         self._closing = threading.Event()
-        self._given_up = False  # close() has waited in vain
+        self._given_up = False  # True if the thread did not end in time
         self._thread = threading.Thread(target=self._run, name=f"writer of {place}", daemon=True)
 
     def __enter__(self) -> "QueuedWriter":
@@ -150,22 +150,24 @@ class QueuedWriter:
             detach(self._stream)
         return not self._given_up
 
-    # --- the thread
+    # --- methods of the thread
 
     def _run(self) -> None:
+        """Write queued lines and frames until the writer is closed."""
         while True:
-            closing = self._closing.is_set()  # read first: what was queued before close() is written
-            lines = self._queue.take(0.0 if closing else self._period_s or IDLE_S)
+            closing = self._closing.is_set()  # read first, so that lines queued before close() are written
+            lines = self._queue.take(0.0 if closing else self._period_s or IDLE_WAIT_S)
             if self._period_s is not None and not closing:
-                self._closing.wait(GATHER_S)
+                self._closing.wait(FRAME_DELAY_S)
                 lines += self._queue.take(0.0)
-            self._turn([line for line in lines if line], closing)
+            self._process_batch([line for line in lines if line], closing)
             if closing:
                 if rest := self._queue.take(0.0):  # the report of dropped lines
-                    self._turn(rest, closing)
+                    self._process_batch(rest, closing)
                 return
 
-    def _turn(self, lines: list[str], last: bool) -> None:
+    def _process_batch(self, lines: list[str], last: bool) -> None:
+        """Render and write one batch of lines."""
         if not lines and not last and self._period_s is None:
             return
         dropped = self._dropped_lines()
@@ -192,6 +194,7 @@ class QueuedWriter:
             return "".join(lines), error
 
     def _write(self, text: str) -> None:
+        """Write the text in chunks, and count the frames that are lost while the destination is blocked."""
         if self._stream is None or not text:
             return
         self._write_since_s = time.monotonic()
@@ -204,7 +207,7 @@ class QueuedWriter:
             try:
                 left = left[os.write(self._descriptor, left[:CHUNK_BYTES]) :]
             except BlockingIOError:  # another process has made the terminal non-blocking
-                can_write(self._descriptor, IDLE_S)
+                can_write(self._descriptor, IDLE_WAIT_S)
                 continue
             if blocked_s := self._blocked_s():
                 self._lost_frames += self._frames_in(blocked_s)
@@ -228,18 +231,21 @@ class QueuedWriter:
         return blocked_s if blocked_s >= BLOCKED_S else 0.0
 
     def _frames_in(self, blocked_s: float) -> int:
+        """Return the number of frames that would have been drawn in this time."""
         return 0 if self._period_s is None else int(blocked_s / self._period_s)
 
     def _dropped_lines(self) -> int:
+        """Return the number of lines that were dropped or could not be written."""
         return self._queue.dropped + self._lost_lines
 
     def _begin_closing(self) -> None:
+        """Tell the thread to write the remaining lines and stop."""
         self._closing.set()
         self._queue.push("", 0)  # unlike wake(), this is not lost if the thread is not waiting yet
 
 
 class QueuedLines(io.TextIOBase):
-    """Text stream that passes whole lines to a ``QueuedWriter``; stands in for ``sys.stderr``."""
+    """Text stream that passes whole lines to a ``QueuedWriter``; it replaces ``sys.stderr``."""
 
     def __init__(self, writer: QueuedWriter, terminal: bool) -> None:
         self._writer = writer
@@ -251,7 +257,7 @@ class QueuedLines(io.TextIOBase):
         """Queue the lines that are complete; return at once."""
         with self._lock:
             *lines, self._partial = (self._partial + text).split("\n")
-            if len(self._partial) > QUEUE_CHARACTERS:
+            if len(self._partial) > MAX_QUEUED_CHARACTERS:
                 lines, self._partial = [*lines, self._partial], ""
         for line in lines:
             self._writer.put(f"{line}\n")
@@ -280,7 +286,15 @@ def detach(stream: TextIO | None) -> None:
 
 
 def can_write(descriptor: int | None, timeout_s: float = 0.0) -> bool:
-    """Return True if a short write to the descriptor does not block."""
+    """Return True if a short write to the descriptor does not block.
+
+    Parameters
+    ----------
+    descriptor : int or None
+        File descriptor; None counts as writable.
+    timeout_s : float
+        Longest time to wait until it is writable [s].
+    """
     if descriptor is None:
         return True
     poll = select.poll()
@@ -289,10 +303,12 @@ def can_write(descriptor: int | None, timeout_s: float = 0.0) -> bool:
 
 
 def _count(count: int, name: str) -> str:
+    """Format a count with its noun in singular or plural."""
     return f"{count:,} {name}{'' if count == 1 else 's'}"
 
 
 def _reason(error: Exception) -> str:
+    """Return the text of an error for a message."""
     if isinstance(error, OSError):
         return error.strerror or errno.errorcode.get(error.errno or 0, str(error))
     return f"{type(error).__name__}: {error}"

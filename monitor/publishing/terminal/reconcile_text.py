@@ -1,9 +1,9 @@
-"""A reconciliation on the terminal: the verdict, a table of the axes, a line a step, and what is left over.
+"""Result of a reconciliation as text for the terminal: summary, table of axes and steps, and unexplained remainder.
 
-In comes a ``Reconciliation``, out go lines of rich at any width: long ones wrap inside their column. A verdict has a
-sign and a word beside its colour. Words and units come from ``reconcile_words``.
+Lines are rich text for any width; long lines wrap inside their column. Each result has a symbol and a word in
+addition to its colour. Sentences and units come from ``reconcile_sentences``.
 
-Of several recordings: a table of axes and recordings, and a line for each effect that is common or single.
+For several recordings, the output is a table of axes and recordings, and a line for each common or single effect.
 """
 
 from typing import Final
@@ -20,17 +20,25 @@ from monitor.publishing.rerun.panels import duration
 from monitor.reconcile.result import AxisResult, Reconciliation, Step
 from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, Seen
 
-STYLES: Final = {
+RESULT_STYLES: Final = {
     "agrees": ("●", "green"),
     "explained": ("●", "green"),
     "partly_explained": ("◐", "yellow"),
     "unexplained": ("✖", "bold red"),
 }
-"""Verdict -> its sign and colour."""
+"""Symbol and colour of each result."""
 
 
 def tell(r: Reconciliation, console: Console) -> None:
-    """Print it."""
+    """Print the result of a reconciliation.
+
+    Parameters
+    ----------
+    r
+        The result.
+    console
+        Destination.
+    """
     console.print(f"{r.samples} samples at {r.rate_hz:g} Hz, {duration(r.seconds)}", highlight=False)
     console.print(_verdict(r.verdict), Text(words.summary(r)))
     console.print(table(r))
@@ -39,7 +47,7 @@ def tell(r: Reconciliation, console: Console) -> None:
 
 
 def table(r: Reconciliation) -> RenderableType:
-    """A row an axis; below an axis its steps and what is left over."""
+    """Return a table with a row per axis, followed by its steps and its unexplained remainder."""
     rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
     for head, justify in (("axis", "left"), ("verdict", "left"), ("gap", "right"), ("conf.", "right")):
         rows.add_column(head, justify=justify, no_wrap=True)  # type: ignore[arg-type]
@@ -50,7 +58,7 @@ def table(r: Reconciliation) -> RenderableType:
 
 
 def _add(rows: Table, r: Reconciliation, result: AxisResult) -> None:
-    """The axis with its first line, then the others."""
+    """Add an axis to the table: its first line with the name of the axis, then its other lines."""
     lines = [_step(r, result.axis, step) for step in result.steps]
     lines += [("", "", Text(f"left over: {words.score(one, result.axis)}", style="yellow")) for one in result.left_over]
     head = (Text(result.axis, style="bold"), _verdict(result.verdict))
@@ -62,6 +70,7 @@ def _add(rows: Table, r: Reconciliation, result: AxisResult) -> None:
 
 
 def _step(r: Reconciliation, axis: str, step: Step) -> tuple[str, str, Text]:
+    """Return the gap, confidence and description of one step."""
     what = Text.assemble(f"{step.kind} ", words.step_line(step, axis, r.baseline))
     what.highlight_words([words.plain(step.effect)], "bold")
     gap = f"{words.gap(step.before.gap)} → {words.gap(step.after.gap)}"
@@ -69,12 +78,21 @@ def _step(r: Reconciliation, axis: str, step: Step) -> tuple[str, str, Text]:
 
 
 def _verdict(verdict: str) -> Text:
-    sign, style = STYLES[verdict]
+    """Return the symbol and word of a result in its colour."""
+    sign, style = RESULT_STYLES[verdict]
     return Text(f"{sign} {words.VERDICTS[verdict]}", style=style)
 
 
 def tell_runs(c: Comparison, console: Console) -> None:
-    """Print what several recordings show together."""
+    """Print the comparison of several recordings.
+
+    Parameters
+    ----------
+    c
+        The comparison.
+    console
+        Destination.
+    """
     console.print(_verdict(c.verdict), Text(runs_words.summary(c)))
     console.print(Padding(_axes_by_runs(c), (1, 0)))
     for title, found in (("common to all", _common(c)), ("in some only", _single(c))):
@@ -86,6 +104,7 @@ def tell_runs(c: Comparison, console: Console) -> None:
 
 
 def _axes_by_runs(c: Comparison) -> Table:
+    """Return a table of the results by axis and recording."""
     rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
     rows.add_column("axis", no_wrap=True)
     for run in c.runs:
@@ -96,6 +115,7 @@ def _axes_by_runs(c: Comparison) -> Table:
 
 
 def _cell(result: AxisResult | None) -> Text:
+    """Return the cell of one axis in one recording."""
     said = Text(runs_words.cell(result), style="dim")
     return (
         said
@@ -107,6 +127,7 @@ def _cell(result: AxisResult | None) -> Text:
 
 
 def _lines(found: list[tuple[str, Text]]) -> Table:
+    """Return a table of axes and lines."""
     rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, show_header=False)
     rows.add_column(no_wrap=True, style="bold")
     rows.add_column(overflow="fold")
@@ -116,6 +137,7 @@ def _lines(found: list[tuple[str, Text]]) -> Table:
 
 
 def _common(c: Comparison) -> list[tuple[str, Text]]:
+    """Return a line for each effect that all recordings show."""
     found = []
     for axis, one in c.axes.items():
         for seen in one.common:
@@ -126,10 +148,12 @@ def _common(c: Comparison) -> list[tuple[str, Text]]:
 
 
 def _single(c: Comparison) -> list[tuple[str, Text]]:
+    """Return the lines of effects that only some recordings show."""
     return [line for axis, one in c.axes.items() for line in _single_on(c, axis, one)]
 
 
 def _single_on(c: Comparison, axis: str, one: AxisRuns) -> list[tuple[str, Text]]:
+    """Return the lines of effects on one axis that only some recordings show, with reasons for their absence."""
     found = []
     for seen in one.single:
         said = _effect(c, axis, seen)
@@ -143,6 +167,7 @@ def _single_on(c: Comparison, axis: str, one: AxisRuns) -> list[tuple[str, Text]
 
 
 def _effect(c: Comparison, axis: str, seen: Seen) -> Text:
+    """Return the description of an effect, with its name in bold."""
     said = Text(f"{seen.kind} {runs_words.line(seen, axis, c.baseline)}")
     said.highlight_words([words.plain(seen.effect)], "bold")
     return said

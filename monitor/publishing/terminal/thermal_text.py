@@ -1,4 +1,4 @@
-"""Thermal models and what they expect, as tables of the terminal and as JSON."""
+"""Results of thermal model fits and predictions, as tables for the terminal and as JSON."""
 
 import math
 from typing import Any, Final
@@ -28,8 +28,16 @@ DRIFT_WITH_TIME: Final = "temperature only rose or only fell, so a drift with ti
 
 
 def tell(study: Study, console: Console) -> None:
-    """Print what was fitted."""
-    console.print(_head(study.recording, study.interval_s, study.means), highlight=False)
+    """Print the results of a thermal model fit.
+
+    Parameters
+    ----------
+    study
+        The fitted models.
+    console
+        Destination.
+    """
+    console.print(_summary_line(study.recording, study.interval_s, study.means), highlight=False)
     if study.fits:
         rows = _table("axis", "model", "per °C", "late by", "loop", "leaves", "explains", "validated")
         for axis, one in study.fits.items():
@@ -43,23 +51,31 @@ def tell(study: Study, console: Console) -> None:
         )
     one_way = [axis for axis, one in study.fits.items() if not one.both_ways]
     notes = (*study.notes, *notes_on_hysteresis(study), *([ONE_WAY] if one_way else []))
-    _tell_rest(study.refused, notes, console)
+    _print_notes(study.refused, notes, console)
 
 
 def tell_outlook(outlook: Outlook, console: Console) -> None:
-    """Print what models expect of a recording, and how far off they are."""
-    console.print(_head(outlook.recording, outlook.interval_s, outlook.means), highlight=False)
+    """Print the predictions of thermal models for a recording, and their errors.
+
+    Parameters
+    ----------
+    outlook
+        The predictions.
+    console
+        Destination.
+    """
+    console.print(_summary_line(outlook.recording, outlook.interval_s, outlook.means), highlight=False)
     if outlook.judged:
         rows = _table("axis", "rms alone", "multi-step", "offset out", "one-step", "offset", "within 95 %")
         for axis, one in outlook.judged.items():
             each = (one.rms_alone, one.rms, one.rms_moved, one.rms_one_step, one.offset)
-            rows.add_row(axis, *(_size(axis, x) for x in each), f"{100.0 * one.within:.0f} %")
+            rows.add_row(axis, *(_format_deviation(axis, x) for x in each), f"{100.0 * one.within:.0f} %")
         console.print(Padding(rows, (1, 0)))
-    _tell_rest(outlook.refused, outlook.notes, console)
+    _print_notes(outlook.refused, outlook.notes, console)
 
 
 def notes_without(found: WithoutTemperature) -> list[str]:
-    """Return a sentence for each axis of whose slow variation temperature explains most, or of K or R a clear part."""
+    """Return a sentence for each axis whose slow variance, or whose K or R, is largely due to temperature."""
     notes = []
     for axis, one in found.dependences.items():
         fallen = [
@@ -93,7 +109,7 @@ def notes_on_hysteresis(study: Study) -> list[str]:
 
 
 def study_json(study: Study) -> bytes:
-    """Everything that was fitted; SI units."""
+    """Encode the results of a thermal model fit as JSON, in SI units."""
     axes: dict[str, Any] = {}
     for axis, one in study.fits.items():
         model = one.model
@@ -121,12 +137,13 @@ def study_json(study: Study) -> bytes:
 
 
 def outlook_json(outlook: Outlook) -> bytes:
-    """What was expected and what came; SI units."""
-    axes = {axis: _judged(outlook.means[axis], one) for axis, one in outlook.judged.items()}
+    """Encode predictions and measured means as JSON, in SI units."""
+    axes = {axis: _prediction_of_axis(outlook.means[axis], one) for axis, one in outlook.judged.items()}
     return _json(PREDICT_SCHEMA, outlook.recording, outlook.interval_s, axes, outlook.refused, outlook.notes)
 
 
-def _judged(means: Means, one: Judged) -> dict[str, Any]:
+def _prediction_of_axis(means: Means, one: Judged) -> dict[str, Any]:
+    """Return the prediction errors and the predicted and measured bias of one axis."""
     return {
         "rms": one.rms,
         "rms_offset_out": one.rms_moved,
@@ -142,12 +159,14 @@ def _judged(means: Means, one: Judged) -> dict[str, Any]:
 
 
 def _band(one: Prediction) -> dict[str, Any]:
+    """Return a predicted bias with its interval."""
     return {"bias": one.bias, "lo": one.lo, "hi": one.hi}
 
 
 def _json(
     schema: str, recording: str, interval_s: float, axes: dict[str, Any], refused: Any, notes: tuple[str, ...]
 ) -> bytes:
+    """Encode the common keys and the results of the axes."""
     whole = {
         "schema": schema,
         "recording": recording,
@@ -156,16 +175,18 @@ def _json(
         "refused": dict(refused),
         "notes": list(notes),
     }
-    return msgspec.json.encode(whole, enc_hook=_plain)
+    return msgspec.json.encode(whole, enc_hook=_encode_array)
 
 
-def _plain(value: Any) -> Any:
+def _encode_array(value: Any) -> Any:
+    """Convert an array for JSON; values that are not finite become null."""
     if isinstance(value, np.ndarray):
         return [float(x) if np.isfinite(x) else None for x in value]
     raise TypeError(f"{type(value).__name__} has no JSON")
 
 
-def _head(recording: str, interval_s: float, means: Any) -> str:
+def _summary_line(recording: str, interval_s: float, means: Any) -> str:
+    """Return one line with recording, number and width of intervals, and temperature range."""
     first: Means = next(iter(means.values()))
     count = first.bias.size
     warmth = first.temperature_c
@@ -174,31 +195,35 @@ def _head(recording: str, interval_s: float, means: Any) -> str:
 
 
 def _fit_row(axis: str, one: ThermalFit) -> tuple[str, ...]:
+    """Return the cells of one fitted axis."""
     model, best = one.model, one.candidates[0]
     cubic = next((each.validated for each in one.candidates if each.shape == Shape(3, ())), None)
     return (
         model.shape.name,
-        _size(axis, model.slope) if model.shape != Shape(0, ()) else "—",
+        _format_deviation(axis, model.slope) if model.shape != Shape(0, ()) else "—",
         ", ".join(duration(each) for each in model.shape.constants_s) or "—",
-        "—" if not one.hysteresis else _size(axis, one.hysteresis),
-        _size(axis, best.rms),
+        "—" if not one.hysteresis else _format_deviation(axis, one.hysteresis),
+        _format_deviation(axis, best.rms),
         f"{100.0 * one.explained:.0f} %",
-        _size(axis, best.validated) + (f" ({best.validated / cubic:.2g})" if cubic else ""),
+        _format_deviation(axis, best.validated) + (f" ({best.validated / cubic:.2g})" if cubic else ""),
     )
 
 
-def _size(axis: str, si: float) -> str:
+def _format_deviation(axis: str, si: float) -> str:
+    """Format a rate or an acceleration in the unit of the axis."""
     return DEVIATION_UNITS[kind_of(axis)].text(si)
 
 
 def _table(*heads: str) -> Table:
+    """Return an empty table with these column headers."""
     rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
     for head in heads:
         rows.add_column(head, no_wrap=head in ("axis", "model"))
     return rows
 
 
-def _tell_rest(refused: Any, notes: tuple[str, ...], console: Console) -> None:
+def _print_notes(refused: Any, notes: tuple[str, ...], console: Console) -> None:
+    """Print the axes without a model and the notes."""
     for axis, why in refused.items():
         console.print(f"{axis}: {why}", highlight=False, soft_wrap=True)
     for note in notes:

@@ -1,1 +1,1 @@
-"""Publisher, subscriber and queries over zenoh."""
+"""Publisher, subscriber and history queries over zenoh."""

@@ -1,7 +1,7 @@
-"""Histories of other daemons, asked over zenoh: what ``imu-monitor history --connect`` does.
+"""Query of the histories of other daemons over zenoh, as ``imu-monitor history --connect`` does.
 
-A session of its own for one question: a client of the endpoint that is given, closed but for that. An answer that is no
-answer of a history is left out and said; where none comes, the reason is an error.
+Each query uses a session of its own: a client that connects only to the given endpoint. Replies that are not history
+messages are ignored. If there is no valid reply, the reason is raised as an error.
 """
 
 import json
@@ -18,22 +18,37 @@ from monitor.publishing.messages import history
 from monitor.publishing.zenoh.subscriber import listeners
 
 PATIENCE_S: Final = 20.0
+"""Timeout of the query."""
 ERRORS: Final = {2: ConfigError, 3: NotReady}
+"""Exception by the exit status in an error reply."""
 
 
 def ask(
     endpoint: str | None, device: str, parameters: str, prefix: str = "imu", file: Path | None = None
 ) -> list[Past]:
-    """The histories that answer, by device; ``device`` may be ``*``.
+    """Return the histories of all devices that reply, sorted by device.
 
-    Args:
-        endpoint: a daemon or router; None: the first that the file names, or the default
-        prefix: of the daemon's keys
-        file: a zenoh file, with certificates or a password
-    Raises:
-        ConfigError: no endpoint, a file that is wrong, or a question that is
-        LinkUnavailable: nobody is there, lets us in, or answers
-        NotReady: there is nothing in that time
+    Parameters
+    ----------
+    endpoint
+        Endpoint of a daemon or router. None: the first endpoint in the file, or the default.
+    device
+        Name of the device; ``*`` for all devices.
+    parameters
+        Parameters of the selector, see ``monitor.history.query``.
+    prefix
+        Prefix of the daemon's keys.
+    file
+        Configuration file of zenoh, with certificates or a password.
+
+    Raises
+    ------
+    ConfigError
+        The endpoint, the file or the query is not valid.
+    LinkUnavailable
+        No daemon is reachable, accepts the connection or replies.
+    NotReady
+        The time range contains no results.
     """
     import zenoh
 
@@ -45,7 +60,7 @@ def ask(
     except zenoh.ZError as error:
         raise LinkUnavailable(refused([endpoint], config) or f"{masked(endpoint)}: {plain(error)}") from error
     endpoint = masked(endpoint)
-    found, wrong = [], [_wrong(reply.err) for reply in replies if reply.ok is None]
+    found, wrong = [], [_error_of_reply(reply.err) for reply in replies if reply.ok is None]
     for reply in replies:
         if reply.ok is not None:
             try:
@@ -57,8 +72,8 @@ def ask(
     return sorted(found, key=lambda one: one.device)
 
 
-def _wrong(error: Any) -> Exception:
-    """What a daemon said."""
+def _error_of_reply(error: Any) -> Exception:
+    """Convert an error reply of a daemon into an exception."""
     try:
         said = json.loads(bytes(error.payload))
         text, status = history.clean(str(said["error"])[:500]), said.get("exit")

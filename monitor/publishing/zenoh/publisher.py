@@ -1,15 +1,14 @@
-"""Results over zenoh: the keys of ``monitor.common.topics``, presence, commands.
+"""Publisher of results over zenoh: the topics of ``monitor.common.topics``, liveliness tokens and commands.
 
-The session is closed unless the configuration says otherwise: a peer without scouting that listens on loopback only.
-If it cannot open (port busy: any free one is taken and said; anything else: tried again), ``state`` says so, and what
-was to be put is dropped: samples go on. zenoh queues what it sends and drops for a subscriber that does not keep up,
-so ``put`` does not wait for anyone. Who subscribes late can ask for the last values: an advanced publisher keeps them,
-and plain subscribers notice nothing of it.
+By default the session is closed to other hosts: a peer without scouting that listens on the loopback interface only. If
+the port is in use, a free port is used and reported. If the session cannot be opened for another reason, the attempt is
+repeated. ``state`` reports the reason, and messages are dropped meanwhile. The processing of samples continues. zenoh
+queues outgoing messages and drops those of a slow subscriber, so ``put`` never waits. Advanced publishers keep the last
+values for late subscribers, and plain subscribers are not affected.
 
-Queries of ``history`` are answered by the thread that takes them, one a device: a file is read, nothing here waits.
-
-Commands arrive on a queryable whose queries a thread of this class takes from zenoh's channel (a Python callback that
-is alive at exit would hang the process) and hands to the service by a queue; the service's loop answers them.
+Each device has a thread that answers queries of ``history``, because these read a file. A second thread takes commands
+from a queryable and passes them through a queue to the main loop of the service, which answers them. Both threads read
+from channels of zenoh, because a Python callback that is alive at exit would hang the process.
 """
 
 import atexit
@@ -36,16 +35,17 @@ if TYPE_CHECKING:
     from zenoh.ext import AdvancedPublisher
 
 RETRY_S: Final = 2.0
-QUERIES_WAITING: Final = 64
-LOOK_S: Final = 3.0
-"""Between two looks why a router does not let us in."""
-TWIN_S: Final = 10.0
-"""After the last status that another program published under our key, this is said."""
+MAX_QUEUED_QUERIES: Final = 64
+"""Capacity of the queue of commands and of each channel of queries."""
+REFUSAL_CHECK_S: Final = 3.0
+"""Interval between two checks of why a router refuses the connection."""
+DUPLICATE_REPORT_S: Final = 10.0
+"""Time during which a status that another program published under the same key is reported."""
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One query on ``command/<verb>``: to be answered exactly once."""
+    """Query on ``command/<verb>``; it must be answered exactly once, by ``answer`` or ``refuse``."""
 
     device: str
     verb: str
@@ -54,62 +54,77 @@ class Command:
 
 
 Recall = Callable[[str, str], bytes]
-"""Device and a selector's parameters in, past results out; ImuError says why there are none."""
+"""Function that returns the history of a device as a payload, given its name and the parameters of a selector; it
+raises ImuError if there is none."""
 
 
 class ZenohOut:
-    """The daemon's session and what it declares for each device.
+    """Publisher: the zenoh session of the daemon and all its declarations for each device.
 
-    Args:
-        settings: of the session
-        devices: their names
-        recall: answers queries of ``history``; None where none is kept
+    Parameters
+    ----------
+    settings
+        Settings of the session.
+    devices
+        Names of the devices.
+    recall
+        Function that answers queries of ``history``; None if no history is stored.
     """
 
     def __init__(self, settings: ZenohTable, devices: Sequence[str], recall: Recall | None = None) -> None:
         self.settings = settings
         self._recall = recall
-        self._said = "off" if settings.mode == "none" else "not open yet"
-        self._unsent = ""  # why the newest message did not go out
-        self.commands: queue.Queue[Command] = queue.Queue(QUERIES_WAITING)
+        self._session_state = "off" if settings.mode == "none" else "not open yet"
+        self._unsent = ""  # reason why the newest message could not be sent
+        self.commands: queue.Queue[Command] = queue.Queue(MAX_QUEUED_QUERIES)
         self._devices = tuple(devices)
         self._alive: dict[str, bool] = dict.fromkeys(devices, False)
         self._session: zenoh.Session | None = None
-        self._why = ""  # why nobody lets us in, as it was found last
+        self._refusal = ""  # reason found by the newest check why the connection is refused
         self._connect: tuple[str, ...] = settings.connect
         self._publishers: dict[str, zenoh.Publisher | AdvancedPublisher] = {}
         self._tokens: dict[str, Any] = {}
         self._queryables: dict[str, list[Any]] = {}
-        self._twins = _Twins(settings.prefix)
-        self._declaring = threading.Lock()  # the opener declares all devices, the loop those that come or go
-        self._showing = threading.Lock()  # the opener and the loop both show who is alive
+        self._duplicates = _DuplicatePublishers(settings.prefix)
+        self._declaring = threading.Lock()  # the opener declares all devices; the main loop adds and removes devices
+        self._showing = threading.Lock()  # the opener and the main loop both declare liveliness tokens
         self._opener = threading.Thread(target=self._keep_open, name="zenoh open", daemon=True)
         self._takers: list[threading.Thread] = []
         self._closing = threading.Event()
 
     @property
     def state(self) -> str:
-        """``ok``, or what is wrong: for the status."""
+        """``ok``, or a description of what is wrong; part of the status message."""
         session = self._session
         if self._unsent or session is None:
-            return self._unsent or self._said
+            return self._unsent or self._session_state
         if self._connect and alone(session):
-            return f"{self._why or 'nobody at ' + masked(', '.join(self._connect))}; trying again"
-        twins = self._twins.found(time.monotonic())
+            return f"{self._refusal or 'nobody at ' + masked(', '.join(self._connect))}; trying again"
+        twins = self._duplicates.found(time.monotonic())
         if not twins:
-            return self._said
-        return f"{self._said}{'; ' if self._said != 'ok' else ', but '}{twins}"
+            return self._session_state
+        return f"{self._session_state}{'; ' if self._session_state != 'ok' else ', but '}{twins}"
 
     def start(self) -> None:
-        """Open in a thread of its own: a router that is not there must not hold up the samples."""
+        """Open the session in a separate thread, so that a missing router does not delay the samples."""
         if self.settings.mode == "none":
             return
-        # a thread that still takes from zenoh while the interpreter ends would abort the process
+        # A thread that still receives from zenoh while the interpreter exits would abort the process.
         atexit.register(self.close)
         self._opener.start()
 
     def put(self, topic: topics.Topic, device: str, payload: bytes) -> None:
-        """Send, or drop while there is no session."""
+        """Publish a message; it is dropped if there is no session.
+
+        Parameters
+        ----------
+        topic
+            Topic of the message.
+        device
+            Name of the device.
+        payload
+            Encoded message.
+        """
         import zenoh
 
         publisher = self._publishers.get(topic.key(self.settings.prefix, device))
@@ -123,12 +138,20 @@ class ZenohOut:
             self._unsent = ""
 
     def put_on(self, key: str, payload: bytes) -> str:
-        """Send JSON on a key of the user's; "" or why it did not go out."""
+        """Publish JSON under a key that the user has chosen; return "" or the reason why it was not sent.
+
+        Parameters
+        ----------
+        key
+            Key expression.
+        payload
+            JSON text.
+        """
         import zenoh
 
         session = self._session
         if session is None:
-            return f"not sent: zenoh: {self._said}"
+            return f"not sent: zenoh: {self._session_state}"
         try:
             session.put(key, payload, encoding=zenoh.Encoding(topics.JSON), express=True)
         except zenoh.ZError as error:
@@ -136,101 +159,110 @@ class ZenohOut:
         return ""
 
     def alive(self, device: str, flowing: bool) -> None:
-        """Show or take away the device's liveliness token."""
+        """Declare or remove the liveliness token of a device.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        flowing
+            True if samples of the device arrive.
+        """
         if self._alive[device] != flowing:
             self._alive[device] = flowing
-            self._show_alive(device)
+            self._update_token(device)
 
     def add(self, device: str) -> None:
-        """Publish another device too."""
+        """Add a device and declare its keys."""
         with self._declaring:
             self._devices += (device,)
             self._alive[device] = False
             if self._session is not None:
-                with contextlib.suppress(*_zenoh_errors()):  # the session is being closed
+                with contextlib.suppress(*_zenoh_errors()):  # the session may be closing
                     self._declare(self._session, device)
 
     def remove(self, device: str) -> None:
-        """Take a device's keys away."""
+        """Remove a device and undeclare its keys."""
         self.alive(device, False)
-        with self._declaring, contextlib.suppress(*_zenoh_errors()):  # the session is being closed
+        with self._declaring, contextlib.suppress(*_zenoh_errors()):  # the session may be closing
             self._devices = tuple(one for one in self._devices if one != device)
             del self._alive[device]
             keys = {topic.key(self.settings.prefix, device) for topic in topics.TOPICS}
             gone = [self._publishers[key] for key in keys & self._publishers.keys()]
             self._publishers = {key: one for key, one in self._publishers.items() if key not in keys}
-            for one in [*gone, *self._queryables.pop(device, []), *self._twins.remove(device)]:
+            for one in [*gone, *self._queryables.pop(device, []), *self._duplicates.remove(device)]:
                 one.undeclare()
 
     def close(self) -> None:
-        """Close the session, which takes away tokens, and end the threads."""
+        """Close the session, which removes its liveliness tokens, and stop the threads."""
         atexit.unregister(self.close)
         self._closing.set()
         if self._opener.is_alive():
             self._opener.join(RETRY_S)
-        self._end()
+        self._close_session()
 
-    # --- opening
+    # --- opening of the session
 
     def _keep_open(self) -> None:
-        """Thread: open, and then find out why nobody lets us in whenever nobody does."""
+        """Open the session, then check at intervals why the connection is refused (runs in a thread)."""
         errors: tuple[type[Exception], ...] = (*_zenoh_errors(), OSError)
         while not self._closing.is_set():
             try:
                 self._open()
             except errors as error:
-                self._said = f"{self._refused() or plain(error)}; trying again"
-                self._end()
+                self._session_state = f"{self._find_refusal() or plain(error)}; trying again"
+                self._close_session()
                 self._closing.wait(RETRY_S)
             else:
                 break
-        while self._connect and not self._closing.wait(LOOK_S):
+        while self._connect and not self._closing.wait(REFUSAL_CHECK_S):
             session = self._session
-            self._why = self._refused() if session is not None and alone(session) else ""
-        if self._closing.is_set():  # opening took longer than close waits
-            self._end()
+            self._refusal = self._find_refusal() if session is not None and alone(session) else ""
+        if self._closing.is_set():  # close() may have stopped waiting before the session was open
+            self._close_session()
 
-    def _refused(self) -> str:
-        """Why the endpoints do not let us in, "" where simply nobody is there."""
-        with contextlib.suppress(*_zenoh_errors()):  # a file that zenoh refuses: it has said so itself
+    def _find_refusal(self) -> str:
+        """Return why the endpoints refuse the connection; "" if no program listens there."""
+        with contextlib.suppress(*_zenoh_errors()):  # zenoh has reported an invalid file already
             return refused(self._connect, self._configuration(None))
         return ""
 
-    def _end(self) -> None:
-        """Close the session, which ends the threads that take from it."""
+    def _close_session(self) -> None:
+        """Close the session, which stops the threads that receive from it."""
         session, self._session = self._session, None
         self._publishers, self._queryables = {}, {}
-        self._twins.clear()
+        self._duplicates.clear()
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
         with self._showing:
-            self._tokens = {}  # they went with the session
+            self._tokens = {}  # they were removed with the session
         takers, self._takers = self._takers, []
         for taker in takers:
             taker.join(RETRY_S)
 
     def _open(self) -> None:
+        """Open the session and declare all devices."""
         session, said = self._open_session()
         with self._declaring:
             self._session = session
             for device in self._devices:
                 self._declare(session, device)
-            self._said = said
+            self._session_state = said
 
     def _declare(self, session: "zenoh.Session", device: str) -> None:
-        """All keys of a device."""
+        """Declare all keys of a device."""
         keys = {topic: topic.key(self.settings.prefix, device) for topic in topics.TOPICS}
         published = {topic: key for topic, key in keys.items() if topic.when not in ("presence", "query")}
         new = {key: self._publisher(session, topic, key) for topic, key in published.items()}
         self._declare_commands(session, device)
-        self._twins.add(session, device)
+        self._duplicates.add(session, device)
         if self._recall is not None:
             self._declare_history(session, device, self._recall)
         self._publishers = {**self._publishers, **new}
-        self._show_alive(device)
+        self._update_token(device)
 
     def _open_session(self) -> tuple["zenoh.Session", str]:
-        """The session; on a busy port with any free one, and what to say of it."""
+        """Open the session, on a free port if the configured one is in use; return it with the state to report."""
         import zenoh
 
         listen = self.settings.listen
@@ -246,11 +278,11 @@ class ZenohOut:
             return session, f"ok, but {', '.join(listen)} is busy: listening on {', '.join(free)}"
 
     def _configuration(self, listen: tuple[str, ...] | None) -> "zenoh.Config":
-        """Our keys, over the file's where there is one, over those of a closed session."""
+        """Return the configuration: these settings override the file, and the file overrides the closed defaults."""
         own = self.settings
         keys: dict[str, Any] = {
             "mode": own.mode,
-            "listen/endpoints": [] if own.mode == "client" else listen,  # a client listens nowhere
+            "listen/endpoints": [] if own.mode == "client" else listen,  # a client does not listen
             "connect/endpoints": own.connect or None,
         }
         unsaid = {**CLOSED, "listen/endpoints": [topics.ENDPOINT], "timestamping/enabled": True}
@@ -259,11 +291,12 @@ class ZenohOut:
     def _publisher(
         self, session: "zenoh.Session", topic: topics.Topic, key: str
     ) -> "zenoh.Publisher | AdvancedPublisher":
+        """Declare the publisher of a key; an advanced publisher if the topic keeps values."""
         import zenoh
         from zenoh import ext
 
         encoding, drop = zenoh.Encoding(topic.encoding), zenoh.CongestionControl.DROP
-        express = topic.when != "batches"  # results are few and wanted soon; batches of samples may share a packet
+        express = topic.when != "batches"  # results are sent at once; batches of samples may share a packet
         if not topic.kept:
             return session.declare_publisher(key, encoding=encoding, congestion_control=drop, express=express)
         return ext.declare_advanced_publisher(
@@ -276,14 +309,15 @@ class ZenohOut:
             publisher_detection=topic is topics.EVENT,
         )
 
-    # --- presence and commands
+    # --- liveliness and commands
 
-    def _show_alive(self, device: str) -> None:
+    def _update_token(self, device: str) -> None:
+        """Declare or remove the liveliness token of a device to match its state."""
         session = self._session
         if session is None:
             return
         key = topics.ALIVE.key(self.settings.prefix, device)
-        # an error here is the session being closed: the token goes with it
+        # An error here means that the session is closing, which removes the token.
         with self._showing, contextlib.suppress(*_zenoh_errors()):
             if self._alive[device] and device not in self._tokens:
                 self._tokens[device] = session.liveliness().declare_token(key)
@@ -291,50 +325,53 @@ class ZenohOut:
                 self._tokens.pop(device).undeclare()
 
     def _declare_commands(self, session: "zenoh.Session", device: str) -> None:
+        """Declare the queryable of a device's commands and start its thread."""
         import zenoh
 
         key = f"{self.settings.prefix}/{device}/command/*"
-        queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(QUERIES_WAITING))
+        queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(MAX_QUEUED_QUERIES))
         taker = threading.Thread(
             target=self._take_queries, args=(device, queryable), name=f"commands of {device}", daemon=True
         )
         taker.start()
-        self._keep(device, queryable, taker)
+        self._add_queryable(device, queryable, taker)
 
     def _declare_history(self, session: "zenoh.Session", device: str, recall: Recall) -> None:
+        """Declare the queryable of a device's history and start its thread."""
         import zenoh
 
         key = topics.HISTORY.key(self.settings.prefix, device)
-        queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(QUERIES_WAITING))
+        queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(MAX_QUEUED_QUERIES))
         taker = threading.Thread(
-            target=self._remember, args=(device, key, queryable, recall), name=f"history of {device}", daemon=True
+            target=self._answer_history, args=(device, key, queryable, recall), name=f"history of {device}", daemon=True
         )
         taker.start()
-        self._keep(device, queryable, taker)
+        self._add_queryable(device, queryable, taker)
 
-    def _keep(self, device: str, queryable: Any, taker: threading.Thread) -> None:
+    def _add_queryable(self, device: str, queryable: Any, taker: threading.Thread) -> None:
+        """Remember a queryable and its thread."""
         self._queryables.setdefault(device, []).append(queryable)
         self._takers = [*(one for one in self._takers if one.is_alive()), taker]
 
-    def _remember(self, device: str, key: str, queryable: Any, recall: Recall) -> None:
-        """Questions about the past, until the session is closed."""
+    def _answer_history(self, device: str, key: str, queryable: Any, recall: Recall) -> None:
+        """Answer history queries until the session is closed (runs in a thread)."""
         handler = queryable.handler
         while not self._closing.is_set():
             try:
                 query = handler.recv()
             except _zenoh_errors():
                 return
-            answer, _ = _answers(query, key)
-            with contextlib.suppress(*_zenoh_errors()):  # the session was closed meanwhile
+            answer, _ = _reply_functions(query, key)
+            with contextlib.suppress(*_zenoh_errors()):  # the session may have been closed meanwhile
                 try:
                     payload = recall(device, str(query.parameters))
                 except ImuError as error:
-                    _no_answer(query, error)
+                    _reply_error(query, error)
                 else:
                     answer(payload)
 
     def _take_queries(self, device: str, queryable: Any) -> None:
-        """Queries until the session is closed."""
+        """Pass commands to the queue until the session is closed (runs in a thread)."""
         handler = queryable.handler
         while not self._closing.is_set():
             try:
@@ -342,18 +379,18 @@ class ZenohOut:
             except _zenoh_errors():
                 return
             verb = str(query.key_expr).rsplit("/", 1)[-1]
-            key = f"{self.settings.prefix}/{device}/command/{verb}"  # the query's own may stand for many devices
-            command = Command(device, verb, *_answers(query, key))
+            key = f"{self.settings.prefix}/{device}/command/{verb}"  # the key of the query may match several devices
+            command = Command(device, verb, *_reply_functions(query, key))
             try:
                 self.commands.put_nowait(command)
             except queue.Full:
                 command.refuse("busy: too many commands wait")
 
 
-class _Twins:
-    """Other sessions that publish the status of a device under our key.
+class _DuplicatePublishers:
+    """Detector of other sessions that publish the status of a device under the same key.
 
-    Whoever subscribes would get both mixed, and a command would reach both.
+    A subscriber would receive both mixed, and a command would reach both.
 
     Parameters
     ----------
@@ -367,7 +404,7 @@ class _Twins:
         self._heard_s: dict[str, float] = {}
 
     def add(self, session: "zenoh.Session", device: str) -> None:
-        """Listen to what others publish as the status of a device; our own messages do not come."""
+        """Subscribe to the status that other sessions publish for a device; the own messages are excluded."""
         import zenoh
 
         key = topics.STATUS.key(self._prefix, device)
@@ -376,30 +413,30 @@ class _Twins:
         self._subscribers = {**self._subscribers, device: one}
 
     def remove(self, device: str) -> list[Any]:
-        """Forget a device; returns what is to be undeclared."""
+        """Forget a device; return the subscribers to undeclare."""
         self._heard_s.pop(device, None)
         gone = [one for name, one in self._subscribers.items() if name == device]
         self._subscribers = {name: one for name, one in self._subscribers.items() if name != device}
         return gone
 
     def clear(self) -> None:
-        """Forget all; they go with their session."""
+        """Forget all devices; their subscribers are closed with the session."""
         self._subscribers, self._heard_s = {}, {}
 
     def found(self, now_s: float) -> str:
-        """Return one line if another program published a device's status within the last TWIN_S; else ""."""
+        """Return a message if another program published a device's status within DUPLICATE_REPORT_S; else ""."""
         for device, one in self._subscribers.items():
             with contextlib.suppress(*_zenoh_errors()):  # the session is being closed
                 if one.handler.try_recv() is not None:
                     self._heard_s[device] = now_s
-        keys = [f"{self._prefix}/{one}" for one, at_s in self._heard_s.items() if now_s - at_s < TWIN_S]
+        keys = [f"{self._prefix}/{one}" for one, at_s in self._heard_s.items() if now_s - at_s < DUPLICATE_REPORT_S]
         if not keys:
             return ""
         return f"another program publishes {', '.join(sorted(keys))} too; change a device's name, or zenoh.prefix"
 
 
-def _answers(query: Any, key: str) -> tuple[Callable[[bytes], None], Callable[[str], None]]:
-    """Functions that end a query with a result, or with an error."""
+def _reply_functions(query: Any, key: str) -> tuple[Callable[[bytes], None], Callable[[str], None]]:
+    """Return functions that end a query with a result or with an error."""
     import zenoh
 
     def answer(payload: bytes) -> None:
@@ -413,8 +450,8 @@ def _answers(query: Any, key: str) -> tuple[Callable[[bytes], None], Callable[[s
     return answer, refuse
 
 
-def _no_answer(query: Any, error: ImuError) -> None:
-    """End a query with what is wrong, and with the exit status that a command would have."""
+def _reply_error(query: Any, error: ImuError) -> None:
+    """End a query with an error message and the exit status that a command would have."""
     import zenoh
 
     status = 3 if isinstance(error, NotReady) else 2 if isinstance(error, ConfigError) else 1
@@ -424,7 +461,7 @@ def _no_answer(query: Any, error: ImuError) -> None:
 
 
 def _free_port(endpoint: str) -> str:
-    """The same endpoint on a port that is free now; others than tcp/host:port stay as they are."""
+    """Return the endpoint with a port that is free now; endpoints other than tcp/host:port are not changed."""
     match = re.fullmatch(r"tcp/\[?([^\]]+?)\]?:\d+", endpoint)
     if match is None:
         return endpoint
@@ -434,6 +471,7 @@ def _free_port(endpoint: str) -> str:
 
 
 def _zenoh_errors() -> tuple[type[Exception], ...]:
+    """Return the exceptions of zenoh, which is imported only when needed."""
     import zenoh
 
     return (zenoh.ZError,)

@@ -1,16 +1,16 @@
-"""Other daemons' results from zenoh: what ``watch`` listens to.
+"""Subscriber to the results of other daemons over zenoh, as used by ``watch``.
 
-Each endpoint given has a session of its own, closed to all else: a client that listens nowhere and scouts nobody. A
-client and not a peer, as a router passes nothing on between two peers, and daemons are peers; one for each endpoint, as
-a client stays with the first that answers. An endpoint that is not there is tried again. A zenoh file may bring
-certificates, user and password. Raw samples and curves, the bulk of what daemons send, are subscribed to for devices in
-detail alone.
+Each endpoint has its own session: a client that does not listen and does not scout. A client is used because a router
+does not forward data between two peers, and daemons are peers. One session per endpoint is needed because a client
+stays with the first endpoint that answers. A connection that fails is tried again. A zenoh file may supply
+certificates, user and password. Raw samples and curves, the bulk of the data, are subscribed to only for devices
+shown in detail.
 
-Who comes late gets the last values that daemons keep for that, and their last events; of events those too that a
-broken connection kept away. Each subscription ends in a ring of zenoh's that drops its oldest, and a thread of this
-class moves what comes to one backlog (a Python callback that is alive at exit would hang the process). ``take`` gives
-what came, in order of arrival within a topic; nothing here reads a payload. Memory is bounded whatever is sent: zenoh
-takes in no message above ``MESSAGE_BYTES``, and the backlog drops its oldest.
+A late subscriber receives the last values and last events that daemons keep for this purpose. After a broken
+connection, it also receives the missed events. Each subscription ends in a ring of zenoh that drops its oldest
+entries. A thread moves the entries to one common queue, because a Python callback that is registered at exit would
+block the process. ``take`` returns messages in order of arrival within a topic; payloads are not decoded here. Memory
+is bounded: zenoh rejects messages above ``MAX_MESSAGE_BYTES``, and the queue drops its oldest entries.
 """
 
 import threading
@@ -34,27 +34,28 @@ if TYPE_CHECKING:
 
 KEYEXPR: Final = "imu/**"
 TOPICS: Final = (topics.STATUS, topics.COEFFICIENTS, topics.EVENT)
-DETAIL: Final = (topics.SAMPLES, topics.ALLAN, topics.GAP)
-"""Of devices in detail, beside those of all."""
+DETAIL_TOPICS: Final = (topics.SAMPLES, topics.ALLAN, topics.GAP)
+"""Topics of devices shown in detail, in addition to TOPICS."""
 RING_MESSAGES: Final = 4096
 BACKLOG_BYTES: Final = 16_000_000
-MESSAGE_BYTES: Final = 4_000_000
-"""Longest message taken in: batches of samples of a fast replay; all else is a few kilobytes."""
-BEAT_S: Final = 0.25
-"""Between two looks whether an endpoint has gone."""
-TOKENS: Final = 20_000
-LOOK_S: Final = 3.0
-"""Between two looks why an endpoint does not let us in."""
+MAX_MESSAGE_BYTES: Final = 4_000_000
+"""Longest accepted message; batches of samples of a fast replay are the longest, all others have a few kilobytes."""
+CONNECTION_CHECK_S: Final = 0.25
+"""Interval between two checks that an endpoint is still connected."""
+MAX_TOKENS: Final = 20_000
+"""Largest number of liveliness tokens that are remembered per endpoint."""
+REFUSAL_CHECK_S: Final = 3.0
+"""Interval between two checks of why an endpoint refuses the connection."""
 RETRY_S: Final = 1.0
-OPENING_S: Final = 5.0
-"""An endpoint that does not answer is waited for so long at most."""
-REMEMBERED: Final = 20_000
-"""Messages, to know those that come by several endpoints: two seconds of a thousand devices at 10 Hz."""
+CLOSE_TIMEOUT_S: Final = 5.0
+"""Longest time that ``close`` waits for a session that is being opened."""
+MAX_REMEMBERED_MESSAGES: Final = 20_000
+"""Number of messages remembered to remove duplicates from several endpoints: two seconds of 1000 devices at 10 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A payload, or (``payload`` None) that a liveliness token is ``there`` now or is not."""
+    """A received payload; if ``payload`` is None, the change of a liveliness token to ``there``."""
 
     key: str
     payload: bytes | None
@@ -62,16 +63,23 @@ class Message:
 
 
 class ZenohIn:
-    """Subscriptions to the results of any number of daemons.
+    """Subscriber to the results of any number of daemons.
 
-    Args:
-        keyexpr: whose results, e.g. ``imu/**``, ``imu/bench-1``, ``*/*/status``
-        connect: endpoints of daemons or routers; none: the file's, else the one where a daemon listens by default
-        file: a zenoh file for all else (TLS, user and password)
-        detail: keys of devices whose samples and curves are wanted too, e.g. ``imu/bench-1``
+    Parameters
+    ----------
+    keyexpr
+        Key expression that selects devices or topics, e.g. ``imu/**``, ``imu/bench-1``, ``*/*/status``.
+    connect
+        Endpoints of daemons or routers. Empty: those of the file, or the default endpoint of a daemon.
+    file
+        Configuration file of zenoh for all other settings (TLS, user and password).
+    detail
+        Keys of devices whose samples and curves are also received, e.g. ``imu/bench-1``.
 
-    Raises:
-        ConfigError: zenoh refuses the key expression, an endpoint or the file, or anyone may change the file
+    Raises
+    ------
+    ConfigError
+        zenoh rejects the key expression, an endpoint or the file, or other users may modify the file.
     """
 
     def __init__(
@@ -83,78 +91,80 @@ class ZenohIn:
     ) -> None:
         keys = {topic: narrowed(keyexpr, topic) for topic in (*TOPICS, topics.ALIVE)}
         _check_keys(keyexpr, [key for part in keys.values() for key in part])
-        keys |= {topic: tuple(f"{device}/{topic.name}" for device in detail) for topic in DETAIL}
+        keys |= {topic: tuple(f"{device}/{topic.name}" for device in detail) for topic in DETAIL_TOPICS}
         self._backlog: Backlog[Message] = Backlog(BACKLOG_BYTES)
         found = listeners(connect, file)
-        self._once = _Once() if len(found) > 1 else None
-        self._doors = [_Door(endpoint, config, keys, self._push) for endpoint, config in found.items()]
+        self._duplicate_filter = _DuplicateFilter() if len(found) > 1 else None
+        self._sessions = [_EndpointSession(endpoint, config, keys, self._push) for endpoint, config in found.items()]
 
     @property
     def dropped(self) -> int:
-        """Messages that came while nobody took any."""
+        """Number of messages dropped because ``take`` was not called in time."""
         return self._backlog.dropped
 
     @property
     def state(self) -> str:
-        """``ok``, or in a few words who is not there."""
-        absent = {door.endpoint: door.why for door in self._doors if not door.open}
+        """``ok``, or a description of the endpoints that are not connected."""
+        absent = {session.endpoint: session.why for session in self._sessions if not session.open}
         if not absent:
             return "ok"
-        every = ", ".join(door.endpoint for door in self._doors)
+        every = ", ".join(session.endpoint for session in self._sessions)
         reasons = "; ".join(f"{endpoint}: {why}" for endpoint, why in absent.items() if why)
-        if len(absent) == len(self._doors):
+        if len(absent) == len(self._sessions):
             return f"{reasons or 'nobody at ' + every}; trying again"
-        there = f"{len(self._doors) - len(absent)} of {len(self._doors)} there ({every})"
+        there = f"{len(self._sessions) - len(absent)} of {len(self._sessions)} there ({every})"
         return f"{there}; {reasons + '; ' if reasons else ''}trying the rest again"
 
     @property
     def open_s(self) -> float:
-        """For how long every endpoint has been there."""
-        return min(door.open_s for door in self._doors)
+        """Time since which all endpoints have been connected [s]; 0 if one is not."""
+        return min(session.open_s for session in self._sessions)
 
     def start(self) -> None:
-        """Open in threads of their own; returns at once."""
-        for door in self._doors:
-            door.start()
+        """Open the sessions in separate threads and return at once."""
+        for session in self._sessions:
+            session.start()
 
     def take(self, timeout_s: float) -> list[Message]:
-        """What came since the last call; waits up to ``timeout_s`` when nothing did."""
+        """Return the messages received since the last call; wait up to ``timeout_s`` if there are none."""
         return self._backlog.take(timeout_s)
 
     def close(self) -> None:
-        """Close the sessions and end the threads."""
-        for door in self._doors:
-            door.closing.set()
-        for door in self._doors:
-            door.close()
+        """Close the sessions and stop the threads."""
+        for session in self._sessions:
+            session.closing.set()
+        for session in self._sessions:
+            session.close()
         self._backlog.wake()
 
     def _push(self, message: Message, stamp: str) -> None:
-        if self._once is None or self._once.is_new(message.key, stamp):
+        """Add a message to the queue, unless it is a duplicate."""
+        if self._duplicate_filter is None or self._duplicate_filter.is_new(message.key, stamp):
             self._backlog.push(message, 100 + len(message.payload or b""))
 
 
-class _Once:
-    """What several endpoints of one network bring twice, passed on once: by zenoh's time stamps, which are unique."""
+class _DuplicateFilter:
+    """Filter for messages that arrive over several endpoints; duplicates are found by their unique zenoh timestamps."""
 
     def __init__(self) -> None:
         self._seen: OrderedDict[tuple[str, str], None] = OrderedDict()
         self._lock = threading.Lock()
 
     def is_new(self, key: str, stamp: str) -> bool:
+        """Return True if the message has not been seen before, or has no timestamp."""
         if not stamp:
             return True
         with self._lock:
             if (key, stamp) in self._seen:
                 return False
             self._seen[key, stamp] = None
-            if len(self._seen) > REMEMBERED:
+            if len(self._seen) > MAX_REMEMBERED_MESSAGES:
                 self._seen.popitem(last=False)
             return True
 
 
-class _Door:
-    """The session at one endpoint: opened until it opens, in a thread of its own."""
+class _EndpointSession:
+    """Session with one endpoint; a thread opens it and repeats failed attempts."""
 
     def __init__(
         self,
@@ -164,36 +174,40 @@ class _Door:
         push: Callable[[Message, str], None],
     ) -> None:
         self.endpoint = masked(endpoint)
-        self.why = ""  # why it does not let us in, as it was found last; "": nobody is there
+        self.why = ""  # reason found by the newest check why the connection is refused; "" if no program listens there
         self.closing = threading.Event()
         self._endpoint, self._config, self._keys, self._push = endpoint, config, keys, push
         self._session: zenoh.Session | None = None
         self._opener = threading.Thread(target=self._keep_open, name=f"zenoh {self.endpoint}", daemon=True)
         self._takers: list[threading.Thread] = []
-        self._there: set[str] = set()  # keys of tokens
-        self._since_s: float | None = None  # monotonic s since which it is open
+        self._tokens: set[str] = set()  # keys of existing liveliness tokens
+        self._since_s: float | None = None  # monotonic time at which the connection was established [s]
 
     @property
     def open(self) -> bool:
+        """True if the session is open and connected."""
         session = self._session
         return session is not None and not alone(session)
 
     @property
     def open_s(self) -> float:
+        """Time since which the endpoint has been connected [s]; 0 if it is not."""
         since_s = self._since_s
         return 0.0 if since_s is None else time.monotonic() - since_s
 
     def start(self) -> None:
+        """Start the thread that opens the session."""
         self._opener.start()
 
     def close(self) -> None:
+        """Close the session and stop the threads."""
         self.closing.set()
         if self._opener.is_alive():
-            self._opener.join(OPENING_S)
-        self._end()
+            self._opener.join(CLOSE_TIMEOUT_S)
+        self._close_session()
 
     def _keep_open(self) -> None:
-        """Thread: open, and then find out why nobody is there whenever nobody is."""
+        """Open the session, then monitor the connection until closed (runs in a thread)."""
         import zenoh
 
         while not self.closing.is_set():
@@ -201,29 +215,29 @@ class _Door:
                 session = self._session = zenoh.open(self._config)
                 self._subscribe(session)
             except zenoh.ZError:
-                self._end()
+                self._close_session()
                 self.why = why(self._endpoint, self._config)
                 self.closing.wait(RETRY_S)
             else:
                 break
-        self._look_after()
+        self._monitor()
 
-    def _look_after(self) -> None:
-        """Until closed: zenoh reconnects by itself, but takes away no token when it is the endpoint that went."""
-        asked_s = -LOOK_S
-        while not self.closing.wait(BEAT_S):
+    def _monitor(self) -> None:
+        """Monitor the connection until closed. zenoh reconnects by itself, but keeps the tokens of a lost endpoint."""
+        asked_s = -REFUSAL_CHECK_S
+        while not self.closing.wait(CONNECTION_CHECK_S):
             if self.open:
                 self.why, self._since_s = "", self._since_s or time.monotonic()
                 continue
             self._since_s = None
-            while self._there:
-                self._push(Message(self._there.pop(), None, there=False), "")
-            if time.monotonic() - asked_s >= LOOK_S:
+            while self._tokens:
+                self._push(Message(self._tokens.pop(), None, there=False), "")
+            if time.monotonic() - asked_s >= REFUSAL_CHECK_S:
                 self.why = why(self._endpoint, self._config)
                 asked_s = time.monotonic()
 
-    def _end(self) -> None:
-        """Close the session, which ends the threads that take from it."""
+    def _close_session(self) -> None:
+        """Close the session, which stops the threads that receive from it."""
         session, self._session = self._session, None
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
@@ -232,6 +246,7 @@ class _Door:
             taker.join(RETRY_S)
 
     def _subscribe(self, session: "zenoh.Session") -> None:
+        """Subscribe to all keys, each with its own thread."""
         for topic, keys in self._keys.items():
             for key in keys:
                 subscriber = _subscriber(session, topic, key)
@@ -242,32 +257,39 @@ class _Door:
                 self._takers.append(taker)
 
     def _take(self, subscriber: Any, liveliness: bool) -> None:
-        """Thread: ring -> backlog, until the session is closed."""
+        """Move messages from the ring to the queue until the session is closed (runs in a thread)."""
         import zenoh
 
-        handler = subscriber.handler  # the subscriber itself could not be undeclared while it waits
+        handler = subscriber.handler  # while a thread waits on the subscriber itself, it cannot be undeclared
         while not self.closing.is_set():
             try:
                 sample = handler.recv()
             except zenoh.ZError:
-                return  # closed
+                return  # the session is closed
             key, there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
             if liveliness:
                 if not there:
-                    self._there.discard(key)
-                elif len(self._there) < TOKENS:
-                    self._there.add(key)
+                    self._tokens.discard(key)
+                elif len(self._tokens) < MAX_TOKENS:
+                    self._tokens.add(key)
             stamp = "" if liveliness or sample.timestamp is None else str(sample.timestamp)
             self._push(Message(key, None if liveliness else bytes(sample.payload), there), stamp)
 
 
 def narrowed(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
-    """The part of a key expression that ``topic`` of some device can match; a device's own key stands for all of it.
+    """Return the key expressions for the messages of ``topic`` that a key expression selects; a device selects all.
 
     >>> narrowed("imu/**", topics.STATUS), narrowed("imu/bench-1", topics.STATUS)
     (('imu/**/status',), ('imu/bench-1/**/status',))
     >>> narrowed("imu/*/*", topics.STATUS), narrowed("imu/*/status", topics.EVENT)
     (('imu/*/status', 'imu/*/*/**/status'), ())
+
+    Parameters
+    ----------
+    keyexpr
+        Key expression that selects devices or topics.
+    topic
+        Topic of interest.
     """
     parts = keyexpr.split("/")
     if parts[-1] in {known.name for known in topics.TOPICS}:
@@ -279,7 +301,20 @@ def narrowed(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
 
 
 def listeners(connect: Sequence[str], file: Path | None) -> dict[str, "zenoh.Config"]:
-    """Endpoint -> zenoh's configuration of a session there that only listens and asks, see ``ZenohIn``."""
+    """Return the zenoh configuration of a client session for each endpoint (see ``ZenohIn``).
+
+    Parameters
+    ----------
+    connect
+        Endpoints. Empty: those of the file, or the default endpoint of a daemon.
+    file
+        Configuration file of zenoh.
+
+    Raises
+    ------
+    ConfigError
+        An endpoint or the file is not valid, or other users may modify the file.
+    """
     import zenoh
 
     if file is not None and (line := file_permissions.changeable(file)):
@@ -289,7 +324,7 @@ def listeners(connect: Sequence[str], file: Path | None) -> dict[str, "zenoh.Con
     except zenoh.ZError as error:
         text = plain(error)
         raise ConfigError(text if text.startswith(str(file)) else f"{file}: {text}") from error
-    unsaid = {**CLOSED, "transport/link/rx/max_message_size": MESSAGE_BYTES}
+    unsaid = {**CLOSED, "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES}
     found = {}
     for endpoint in dict.fromkeys(connect or theirs or (topics.ENDPOINT,)):
         own = {"mode": "client", "connect/endpoints": [endpoint], "listen/endpoints": []}
@@ -301,7 +336,7 @@ def listeners(connect: Sequence[str], file: Path | None) -> dict[str, "zenoh.Con
 
 
 def _subscriber(session: "zenoh.Session", topic: topics.Topic, key: str) -> Any:
-    """With what daemons keep for those who come late; after a broken connection events that were missed come too."""
+    """Subscribe to a key, including the values that daemons keep for late subscribers and missed events."""
     import zenoh
     from zenoh import ext
 
@@ -315,6 +350,7 @@ def _subscriber(session: "zenoh.Session", topic: topics.Topic, key: str) -> Any:
 
 
 def _check_keys(keyexpr: str, keys: list[str]) -> None:
+    """Raise ConfigError if a key expression is not valid, or if no topic matches it."""
     import zenoh
 
     try:

@@ -9,7 +9,7 @@ from drivers.sample import AXES
 from monitor.estimation.allan.dynamic_allan import Dynamic, dynamic
 from monitor.estimation.fit.coefficients import Status
 from monitor.publishing.plots.allan_figure import COLOURS, DARK
-from monitor.publishing.plots.dynamic_figure import APART, BANDS, Clock, Mark, _near, dynamic_panels, letters
+from monitor.publishing.plots.dynamic_figure import APART, BANDS, Clock, Mark, _group_times, dynamic_panels, letters
 
 
 @pytest.fixture(scope="module")
@@ -68,12 +68,12 @@ def test_words_stay_inside_and_apart(white: Dynamic) -> None:
 
 def test_heaps_lie_apart_whatever_the_times() -> None:
     times = np.random.default_rng(2).random(60) * 100.0
-    heaps = _near(times.tolist(), 8.0)
+    heaps = _group_times(times.tolist(), 8.0)
     assert sorted(time for heap in heaps for time in heap) == sorted(times.tolist())
     middles = [np.mean(heap) for heap in heaps]
     assert len(heaps) > 3
     assert (np.diff(middles) >= 8.0).all()
-    assert _near([], 1.0) == []
+    assert _group_times([], 1.0) == []
     assert APART < 0.5
 
 
