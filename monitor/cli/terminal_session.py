@@ -53,7 +53,7 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
 
     from monitor.daemon.operations.systemd import Unit
     from monitor.daemon.outputs import LogOutput, TableOutput
-    from monitor.daemon.service import STATUS_S, Service
+    from monitor.daemon.service import STATUS_INTERVAL_S, Service
     from monitor.publishing.terminal.live_table import Board, LiveTable
     from monitor.publishing.terminal.queued_writer import QueuedWriter
 
@@ -61,7 +61,7 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
     config = _with_viewer(config, viewer)
     console, board, asked = Console(file=sys.stdout), Board(), threading.Event()
     table, terminal = LiveTable(console), console.is_terminal
-    screen = QueuedWriter(sys.stdout, STDOUT, table.render, STATUS_S if terminal else None, tell=_warn)
+    screen = QueuedWriter(sys.stdout, STDOUT, table.render, STATUS_INTERVAL_S if terminal else None, tell=_warn)
     writers = {"terminal": screen} if terminal else {}
     shared = terminal and _same_file(sys.stdout, sys.stderr)
     if not shared:
