@@ -1,4 +1,6 @@
-"""Configuration of the ``demo`` command: the shipped configuration, optionally with another sensor or further effects."""
+"""Configuration of the ``demo`` command: the shipped configuration, with another sensor or further effects if
+requested.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
