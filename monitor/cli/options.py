@@ -112,7 +112,20 @@ def duration(option: str, text: None) -> None: ...
 @overload
 def duration(option: str, text: str | None) -> float | None: ...
 def duration(option: str, text: str | None) -> float | None:
-    """Seconds, from a number of them or "30min", "1h"."""
+    """Parse a duration such as "90", "30min" or "1h", and return seconds.
+
+    Parameters
+    ----------
+    option : str
+        Name of the option, for the message.
+    text : str or None
+        Duration. None is returned as None.
+
+    Raises
+    ------
+    ConfigError
+        The text is not a duration.
+    """
     from monitor.settings.loading import seconds
 
     try:

@@ -63,9 +63,9 @@ PACKAGES: Final = ("monitor", "drivers")
 PROJECT_FILE: Final = Path(__file__).resolve().parents[2] / "pyproject.toml"
 """Project file of a checkout."""
 TCP_ENDPOINT: Final = re.compile(r"(?:tcp|tls)/\[?([^\]]+?)\]?:(\d+)(?:[?#].*)?")
-"""Zenoh endpoint over TCP or TLS: host and port."""
+"""Regular expression for the host and the port of a zenoh endpoint over TCP or TLS."""
 REQUIREMENT: Final = re.compile(r"([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*\(?([^;)]*)\)?\s*(?:;(.*))?")
-"""Requirement of a package: name, versions and marker."""
+"""Regular expression for the requirement of a package: name, versions and marker."""
 LOOPBACK: Final = ("127.", "::1", "localhost")
 """Beginnings of loopback addresses."""
 

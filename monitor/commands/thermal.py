@@ -75,7 +75,7 @@ def fit(
     """
     values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
     means = _means(values, temperature_c, rate, interval_s or nice_interval(temperature_c.size / rate, rate))
-    interval = next(iter(means.values())).interval_s  # of whole samples
+    interval = next(iter(means.values())).interval_s  # rounded to a whole number of samples
     fits, refused = {}, {}
     for axis, one in means.items():
         try:

@@ -46,9 +46,9 @@ R = TypeVar("R")
 PACKAGE_ROOT: Final = Path(__file__).parents[2]
 """Folder that contains the packages of the program."""
 IDENTIFIER: Final = re.compile(r"\w+")
-"""A name in a list of imported names."""
+"""Regular expression for a name in a list of imported names."""
 IMPORTS: Final = re.compile(r"^ *from (monitor[\w.]*) import (?:\(([^)]*)\)|(.*))", re.MULTILINE)
-"""An import from a module of the package, with the imported names in parentheses or on one line."""
+"""Regular expression for an import from a module of the package, with names in parentheses or on one line."""
 
 
 class IntermediateLibrary(JITCodeLibrary):  # type: ignore[misc]

@@ -115,7 +115,7 @@ def _coefficients(z: float) -> tuple[float, ...]:
     """
     poly = np.polynomial.Polynomial
     x = poly([0.0, 1.0])
-    y, first, second, squares = [x], [poly([1.0])], [poly([0.0])], [poly([1.0])]  # and [y'²]
+    y, first, second, squares = [x], [poly([1.0])], [poly([0.0])], [poly([1.0])]  # coefficients of y, y', y'', y'²
     for k in range(1, CORNISH_FISHER_TERMS):
         square = sum((first[i] * first[k - i] for i in range(1, k)), poly([0.0]))
         r = squares[k - 1] + x * square + sum((y[i] * squares[k - i] for i in range(1, k)), poly([0.0]))

@@ -19,8 +19,8 @@ class Health:
     lost: int  # missing on the wire, or discarded because the frame came too late; excludes rejected frames
     bad: int  # rejected because of a failed check or an impossible value
     overflowed: int  # overwritten in the ring buffer before the worker took them
-    latency_p50_s: float | None  # receipt to published, over the last second
-    latency_p99_s: float | None
+    latency_p50_s: float | None  # median time from reception to publication, over the last second
+    latency_p99_s: float | None  # 99 % quantile of this time
     memory_bytes: int  # of the whole process
     outputs: Mapping[str, str]  # state of each output: "ok" or a description of the problem
     text: str  # message about the device; empty if there is no problem

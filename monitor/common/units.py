@@ -15,10 +15,10 @@ Kind = Literal["gyro", "accel"]
 KINDS: Final[tuple[Kind, Kind]] = ("gyro", "accel")
 KIND_NAMES: Final = {"gyro": "Gyroscopes", "accel": "Accelerometers"}
 
-DEGREE: Final = 180.0 / math.pi  # degrees in a radian
-HOUR: Final = 3600.0  # seconds in an hour
-ROOT_HOUR: Final = 60.0  # √s in a √h
-MICRO_G: Final = 1e6 / 9.80665  # µg in a m/s²
+DEGREE: Final = 180.0 / math.pi  # degrees per radian
+HOUR: Final = 3600.0  # seconds per hour
+ROOT_HOUR: Final = 60.0  # √s per √h
+MICRO_G: Final = 1e6 / 9.80665  # µg per m/s²
 
 
 @dataclass(frozen=True, slots=True)

@@ -68,6 +68,9 @@ class Output:
     No method may block. Every ``unix_s`` is a time in seconds on the timeline of the device's own samples. A recording,
     or a device that stamps its samples itself, may be years away from the host clock, so its timeline is unknown before
     its first sample. Until then no event is passed on, and ``health`` receives None as time.
+
+    Several methods have the same parameters. ``device`` is the name of the device. ``received`` is the number of
+    samples of the device since the start, up to the result.
     """
 
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
@@ -80,34 +83,124 @@ class Output:
         received : int
             Number of samples of the device up to the end of this block, since the start.
         samples : SampleBlock
-            Samples in SI units, with times of the host's monotonic clock.
+            Samples in SI units, with times in nanoseconds.
         offset_ns : int
-            Added to a sample time, gives Unix time in nanoseconds.
+            Offset that converts the times to Unix time, in nanoseconds.
         """
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """Receive a new estimate: Allan curve and noise coefficients."""
+        """Receive a new estimate.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        unix_s : float
+            Time of the newest sample in the window.
+        estimate : Estimate
+            Allan curve and noise coefficients.
+        """
 
     def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
-        """Receive the comparison of the window with the model in force. Not called for a device without a model."""
+        """Receive the comparison of the window with the model in force. Not called for a device without a model.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        unix_s : float
+            Time of the newest sample in the window.
+        gap : ModelGap
+            Comparison of the window with the model.
+        """
 
     def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
-        """Receive the mean of an interval and its prediction from temperature. Not called without a thermal model."""
+        """Receive the mean of an interval and its prediction from temperature. Not called without a thermal model.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        unix_s : float
+            Time of the interval.
+        received : int
+            Number of samples of the device since the start.
+        look : ThermalLook
+            Mean of the interval and its prediction.
+        """
 
     def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
-        """Receive a block of samples without the drift of the gyroscopes; see ``samples`` for the parameters."""
+        """Receive a block of samples without the drift of the gyroscopes.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        received : int
+            Number of samples of the device up to the end of this block, since the start.
+        samples : SampleBlock
+            Compensated samples in SI units, with times in nanoseconds.
+        offset_ns : int
+            Offset that converts the times to Unix time, in nanoseconds.
+        """
 
     def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
-        """Receive the state of the drift compensation after an interval of one second."""
+        """Receive the state of the drift compensation after an interval of one second.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        unix_s : float
+            Time of the interval.
+        look : DriftLook
+            Drift, innovations and models.
+        """
 
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
-        """Receive the total and Hadamard deviations, which are computed step by step and published when complete."""
+        """Receive the total and Hadamard deviations, which are computed step by step and published when complete.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        unix_s : float
+            Time of the newest sample.
+        received : int
+            Number of samples of the device since the start.
+        total : TotalCurve
+            Total deviations.
+        hadamard : HadamardCurve
+            Hadamard deviations.
+        """
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """Receive an event of the device."""
+        """Receive an event of the device.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        unix_s : float
+            Time of the event.
+        received : int
+            Number of samples of the device since the start.
+        event : Event
+            Kind, axis and text of the event.
+        """
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Receive the status, once a second. ``unix_s`` is None while the time on the device's timeline is unknown."""
+        """Receive the status of the device, once a second.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        unix_s : float or None
+            Present time on the device's timeline; None while it is unknown.
+        health : Health
+            Status of the device.
+        """
 
     def gone(self, device: str) -> None:
         """Forget a device that was removed from the configuration. A device with the same name may be added later."""
@@ -262,7 +355,7 @@ class Station:
         if blocks:
             self._newest_ns, self._taken_ns = int(blocks[-1].t_ns[-1]), time.monotonic_ns()
             self._unpublished += blocks
-        happened = self._take_timed_events() + happened  # now that the first sample's time is known
+        happened = self._take_timed_events() + happened  # only now is the time of the first sample known
         self.chain.advance(blocks, self.clock.rate_hz, drain)
         if drain:
             self.chain.flush()
@@ -342,7 +435,15 @@ class Station:
         return health
 
     def health(self, states: dict[str, str], memory_bytes: int) -> Health:
-        """Return the present status of the device; see ``report`` for the parameters."""
+        """Return the present status of the device.
+
+        Parameters
+        ----------
+        states : dict of str to str
+            State of each output of the service, by its name.
+        memory_bytes : int
+            Resident memory of the process.
+        """
         counts, latencies, watch = self.driver.counts, np.array(self._latencies), self.chain.watch
         self._latencies = []
         return Health(
@@ -420,7 +521,7 @@ class Station:
             return newest_ns
         if not self.driver.times_are_unix:
             return now_ns
-        if newest_ns is None:  # only the first of the waiting samples gives a time that is not later than all others
+        if newest_ns is None:  # samples may wait in the ring buffer; only the first time is not ahead of them
             return self.driver.first_t_ns
         return newest_ns + now_ns - self._taken_ns
 

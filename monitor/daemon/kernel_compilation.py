@@ -150,7 +150,7 @@ def prepare(group: Group, tell: Callable[[Progress], None], processes: int | Non
     with _Compilers(group.parts, processes, tell) as compilers:
         for done, part in enumerate(group.parts):
             if not compilers.wait_for(part):
-                tell(Progress(done, len(group.parts), (part.name,)))  # no child has compiled it: this process does
+                tell(Progress(done, len(group.parts), (part.name,)))  # no child has compiled it, so this process does
             part.prepare()
             yield part.name
     if folder is not None:
@@ -307,25 +307,30 @@ def _samples(n: int) -> SampleBlock:
 
 
 def _call_window() -> None:
+    """Call the kernels of the Allan deviation."""
     Estimator(100.0, 1.0).update(_samples(100))
 
 
 def _call_fit() -> None:
+    """Call the kernels of the noise coefficients."""
     estimator = Estimator(100.0, 1.0)
     estimator.update(_samples(100))
     estimator.get()
 
 
 def _call_motion_detection() -> None:
+    """Call the kernels of the motion detection."""
     Watch(100.0, alarms_per_day=0.0).update(_samples(100))
 
 
 def _call_change_detection() -> None:
+    """Call the kernels of the change detection."""
     Watch(100.0).update(_samples(100))
     ChangeDetector(100.0).restart()
 
 
 def _call_compensation() -> None:
+    """Call the kernels of the drift compensation."""
     compensator = Compensator(100.0)
     compensator.update(1e-3 * np.random.default_rng(0).standard_normal((6000, 6)))
     compensator.adopt(0, identify(*compensator.window(0), [(2, 1)]))
@@ -334,6 +339,7 @@ def _call_compensation() -> None:
 
 
 def _call_slow_statistics() -> None:
+    """Call the kernels of the total and Hadamard deviations."""
     estimator = Estimator(100.0, 1.0)
     estimator.update(_samples(100))
     estimator.restart(0, 10)
@@ -342,20 +348,24 @@ def _call_slow_statistics() -> None:
 
 
 def _call_refit() -> None:
+    """Call the kernels of the refit at every sample."""
     Estimator(100.0, 1.0, every_sample=True).update(_samples(100))
 
 
 def _call_temperature_lag() -> None:
+    """Call the kernels of the thermal model."""
     thermal_response.lagged(np.zeros(2), 0.5)
 
 
 def _call_analysis() -> None:
+    """Call the kernels of the analysis of recordings."""
     from monitor.estimation.analysis import analyze  # imported here because the service does not need it
 
     analyze([_samples(100)], 100.0)
 
 
 def _call_reconciliation() -> None:
+    """Call the kernels of the reconciliation."""
     from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
     from monitor.noise.model import NoiseModel
     from monitor.reconcile.reconcile import Recording, reconcile  # imported here because the service does not need it

@@ -1,4 +1,7 @@
-"""Outputs of the daemon: zenoh messages, viewer, history file, log lines and the table in the terminal. None blocks."""
+"""Outputs of the daemon: zenoh messages, viewer, history file, log lines and the table in the terminal. None blocks.
+
+The parameters of all methods are described in ``monitor.daemon.device_worker.Output``.
+"""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final

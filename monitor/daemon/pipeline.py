@@ -151,6 +151,13 @@ class Chain:
 
         The events of these samples were published before the restart. The start of each axis is known from the
         recording, so changes of the noise restart no axis here.
+
+        Parameters
+        ----------
+        samples : SampleBlock
+            Recorded samples, in order of time.
+        rate_hz : float
+            Sample rate.
         """
         self._replaying = True
         self.advance([samples], rate_hz, drain=True)

@@ -15,7 +15,13 @@ from drivers.sample import SampleBlock, block
 
 
 class RingBuffer:
-    """Ring buffer for up to ``capacity`` samples, with 80 bytes for each sample."""
+    """Ring buffer for samples, with 80 bytes for each sample.
+
+    Parameters
+    ----------
+    capacity : int
+        Largest number of samples in the buffer.
+    """
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
@@ -24,7 +30,7 @@ class RingBuffer:
         self._values = np.zeros((capacity, 6))
         self._temperature_c = np.zeros(capacity)
         self._ticks = np.zeros(capacity, np.int64)
-        self._lost = np.zeros(capacity, np.int64)  # samples missing just before each
+        self._lost = np.zeros(capacity, np.int64)  # number of missing samples just before each sample
         self._read = self._written = 0  # samples read and written since the start
         self._lock = threading.Lock()
 

@@ -107,7 +107,7 @@ class Service:
         self.virtual: dict[str, VirtualImu] = {}
         self.recorder = _build_recorder(config)
         self.stations: list[Station] = []
-        self._replayed_devices: set[str] = set()  # devices whose sample times do not come from the host clock
+        self._self_timed_devices: set[str] = set()  # devices whose sample times do not come from the host clock
         for device in config.devices:
             self._register_device(*self._build_device(device))
         self.history = _build_history_writer(config)
@@ -229,11 +229,11 @@ class Service:
     def _load_viewer_history(self, device: str) -> Past | None:
         """Return the stored results that the viewer shows when it opens, or None if there are none.
 
-        The thread of the viewer calls this function. A device that replays a recording has no stored results, because
-        its samples bring their own times.
+        The thread of the viewer calls this function. A device whose samples bring their own times, such as a replayed
+        recording, has no stored results.
         """
         history_s = self.config.viewer.history
-        if self.history is None or history_s is None or device in self._replayed_devices:
+        if self.history is None or history_s is None or device in self._self_timed_devices:
             return None
         assert isinstance(history_s, float)
         now_s = time.time()
@@ -301,7 +301,7 @@ class Service:
         """Add a worker, and its virtual IMU if the device is simulated, to the service."""
         self.stations = [*self.stations, station]
         if station.driver.times_are_unix:
-            self._replayed_devices.add(station.name)
+            self._self_timed_devices.add(station.name)
         if imu is not None:
             self.virtual[station.name] = imu
 
@@ -365,7 +365,7 @@ class Service:
         if self.recorder is not None:
             self.recorder.remove(station.name)
             self._work_until(lambda: self.recorder is None or not self.recorder.has(station.name))
-        self._replayed_devices.discard(station.name)
+        self._self_timed_devices.discard(station.name)
         for output in self.outputs:
             output.gone(station.name)
 

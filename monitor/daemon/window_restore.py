@@ -34,7 +34,7 @@ def rebuild(chain: Chain, tail: Tail, rate_hz: float, window_s: float, offset_ns
     window_s : float
         Length of the window.
     offset_ns : int
-        Added to a sample time of the pipeline, gives Unix time in nanoseconds.
+        Offset that converts the times to Unix time, in nanoseconds.
 
     Returns
     -------
@@ -82,7 +82,7 @@ def known(chain: Chain, before: State, rate_hz: float | None, tick_step: float |
     tick_step : float or None
         Counter ticks from one sample to the next.
     offset_ns : int
-        Added to a sample time of the pipeline, gives Unix time in nanoseconds.
+        Offset that converts the times to Unix time, in nanoseconds.
     """
     tick_step = tick_step or before.tick_step
     if chain.estimator is None:

@@ -18,7 +18,7 @@ from monitor.simulator import DEFAULT_RATE_HZ, effects_of
 P = ParamSpec("P")
 T = TypeVar("T")
 
-DEMO_CONFIG: Final = CONFIG_FOLDER / "demo.toml"
+CONFIG: Final = CONFIG_FOLDER / "demo.toml"
 """Shipped configuration of the demo."""
 
 
@@ -39,7 +39,7 @@ def demo(sensor: str | None = None, effects: Sequence[str] = (), effect_at_s: fl
     ConfigError
         An option has an invalid value. The message of one line begins with the option.
     """
-    config = loading.load(DEMO_CONFIG)
+    config = loading.load(CONFIG)
     (device,) = config.devices
     table = device.link
     assert isinstance(table, VirtualTable)

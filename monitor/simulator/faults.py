@@ -82,8 +82,8 @@ class Draws:
     """Random faults of consecutive samples."""
 
     kind: NDArray[np.int64]  # [n] of Kind
-    where: Floats  # [n] of 0 … 1
-    pulled: NDArray[np.bool_]  # [n] the cable is pulled before this sample
+    where: Floats  # [n] position of the fault in the frame, 0 to 1
+    pulled: NDArray[np.bool_]  # [n] True if the cable is pulled before this sample
 
     def kinds(self) -> list[Kind]:
         """Return the fault of each sample."""

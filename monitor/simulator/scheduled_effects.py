@@ -10,7 +10,7 @@ from monitor.noise.effect import Effect
 from monitor.noise.model import NoiseModel
 
 EFFECT_SYNTAX: Final = re.compile(r"\s*([^.:\s]+)\.([^.:\s]+)\s*:\s*(.*)")
-"""Syntax of an effect: axis, name and parameters."""
+"""Regular expression for an effect: axis, name and parameters."""
 EXAMPLE: Final = "gz.sinusoidal:amplitude=1e-3,frequency=17"
 """Example in the error message."""
 

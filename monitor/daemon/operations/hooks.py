@@ -98,7 +98,7 @@ class Hooks(Output):
         return f"ok, but {held_back}" if held_back else "ok"
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """Run the hooks that match an event."""
+        """Run the hooks that match an event; see ``Output`` for the parameters."""
         wanted = [one for one in self.hooks if _matches(one, device, event.kind)]
         if not wanted:
             return

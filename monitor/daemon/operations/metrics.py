@@ -71,6 +71,8 @@ GAUGES: Final[dict[str, tuple[str, Numbers]]] = {
 class MetricsOutput(Output):
     """Output that keeps the newest values and serves them.
 
+    The parameters of the output methods are described in ``monitor.daemon.device_worker.Output``.
+
     Parameters
     ----------
     settings : Metrics

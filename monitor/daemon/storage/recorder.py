@@ -242,7 +242,7 @@ class Recorder:
         samples : SampleBlock
             Samples in SI units.
         offset_ns : int
-            Added to a sample time, gives Unix time in nanoseconds.
+            Offset that converts the times to Unix time, in nanoseconds.
         """
         track = self._tracks.get((device, "samples"))
         if track is None:
@@ -262,7 +262,7 @@ class Recorder:
         chunks : sequence of Chunk
             Bytes as received from the link.
         offset_ns : int
-            Added to the time of a chunk, gives Unix time in nanoseconds.
+            Offset that converts the times to Unix time, in nanoseconds.
         """
         track = self._tracks.get((device, "raw"))
         if track is not None:
@@ -283,7 +283,15 @@ class Recorder:
                 track.missed += rows
 
     def know(self, device: str, state: State) -> None:
-        """Set the state of the estimate that is recorded with the rows of a device from now on."""
+        """Set the state of the estimate that is recorded with the rows of a device from now on.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        state : State
+            Rate, start of each axis, and values of the fit.
+        """
         self._states[device] = state
 
     def full(self, device: str) -> bool:
