@@ -556,7 +556,7 @@ def _usage(error: TyperException) -> str:
 
 
 def _discard_output() -> None:
-    """Discard the buffered rest of standard output. Writing it at exit would fail again, with a traceback."""
+    """Discard the buffered rest of standard output, whose output at exit would fail again with a traceback."""
     with contextlib.suppress(OSError, ValueError, AttributeError):  # standard output is closed, or is not a file
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())

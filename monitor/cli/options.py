@@ -87,7 +87,7 @@ def tau(text: str) -> "TauGrid":
     Raises
     ------
     ConfigError
-        The text is neither, or a time is outside the supported range.
+        The text is neither the name of a grid nor a list of seconds, or a time is outside the supported range.
     """
     if text in ("octave", "decade10"):
         return text  # type: ignore[return-value]

@@ -1,14 +1,15 @@
 """Hooks: user commands and zenoh messages that are triggered by events.
 
-An event that matches a hook is encoded as JSON. For a zenoh key, it is published at once. For a command, it enters a
-bounded queue. A few threads take entries from this queue, and each runs one command at a time. A command runs without a
-shell. It receives the JSON on its standard input, and nothing of it in its arguments.
+An event that matches a hook is encoded as JSON. If the hook names a zenoh key, the JSON is published immediately. If
+the hook names a command, the JSON enters a bounded queue. A few threads take entries from this queue, and each runs one
+command at a time. A command runs without a shell. It receives the JSON on its standard input, and nothing of it in its
+arguments.
 
 A command that exceeds its time is killed together with its child processes. Only the end of its output is kept. A
 failure is logged, and stays in the status under ``hook`` until a hook succeeds again. The main loop never waits.
 
-For each kind of event and each device, a hook runs at most BURST times in a row and then once in EVERY_S. A faulty line
-that reports losses every second therefore neither starts a thousand programs nor hides the one alarm beside it.
+For each kind of event and each device, a hook runs at most BURST times in a row and then once in EVERY_S. A faulty
+cable that reports losses every second therefore neither starts a thousand programs nor suppresses other alarms.
 Suppressed runs are counted and reported.
 """
 
