@@ -1,7 +1,8 @@
-"""The command line: arguments in, one call, printing. Nothing is decided here.
+"""Command line of the program: parses arguments, calls one function for each command, and prints its result.
 
-Exit status: 0 done; 1 failed while working; 2 what was asked for is wrong, said in one line on standard error; 3
-finished, but the data do not support an answer. Heavy libraries are imported by the command that needs them.
+Exit status: 0 for success, 1 for a failure at run time, 2 for a wrong argument or input file, and 3 if the data do not
+support an answer. With status 2, one line on standard error describes the mistake. Each command imports the heavy
+libraries that it needs.
 """
 
 import contextlib
@@ -26,17 +27,23 @@ from drivers.file_access import real_path
 from monitor.cli import doctor, drift, options, output, terminal_session, warm_up
 from monitor.cli import history as history_command
 
-# before NumPy is imported: matrices are small here and threads of our own share the work, where more would only spin
+# This must precede the import of NumPy. The matrices are small, and the program has its own threads for the work.
+# Additional threads of the linear algebra libraries would only wait actively.
 for _pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_pool, "1")
 
 FAILED: Final = 1
+"""Exit status of a failure at run time."""
 WRONG: Final = 2
+"""Exit status of a wrong argument or input file."""
 NO_ANSWER: Final = 3
+"""Exit status if the data do not support an answer."""
 INTERRUPTED: Final = 128 + signal.SIGINT
+"""Exit status after Ctrl-C."""
 DEBUG: Final = "--debug"
-LONGEST_CAUSE: Final = 300
-"""Characters of an unexpected error's text; libraries write pages."""
+"""Option that prints tracebacks."""
+MAX_CAUSE_CHARS: Final = 300
+"""Largest length of the text of an unexpected error, in characters. Libraries may write pages."""
 
 app = typer.Typer(
     add_completion=False,
@@ -379,6 +386,13 @@ def thermal_predict(
 
 
 def _check_thermal(json: Path | None, plot: Path | None) -> None:
+    """Check the output files of the ``thermal`` commands before the work begins.
+
+    Raises
+    ------
+    ConfigError
+        A file cannot be written, or the picture has another suffix than .png.
+    """
     if plot is not None and plot.suffix != ".png":
         raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
     output.check_place("--json", json)
@@ -413,33 +427,42 @@ def export(
 
 
 def main() -> None:
-    """Run the program with the arguments of the process; every error is one line on standard error and a status.
+    """Run the program with the arguments of the process, and exit with its status.
 
-    ``--debug``, before or behind the name of the command, prints the traceback of an error before its line.
+    Every error is printed as one line on standard error. ``--debug``, before or after the name of the command, prints
+    the traceback of an error before this line.
     """
     arguments, debug = split_debug(sys.argv[1:])
     threading.excepthook = partial(report_failed_thread, debug)
     _ignore_impossible_width(os.environ)
     try:
-        # without its own error pages, typer hands an Exit's status back
+        # without standalone mode, typer returns the status of an Exit
         status = app(args=arguments, prog_name="imu-monitor", standalone_mode=False)
         if sys.stdout is not None:
             sys.stdout.flush()
-    except Exception as error:  # noqa: BLE001 - the last line of defence: said in one line, and how to report it
+    except Exception as error:  # noqa: BLE001 - any other error is printed in one line, with a request to report it
         if debug:
             traceback.print_exc()
         line, status = explain(error)
         if isinstance(error, OSError):
             _discard_output()
-        if not isinstance(error, BrokenPipeError):  # whoever read the output has gone, and hears nothing
+        if not isinstance(error, BrokenPipeError):  # the reader of the output has gone, so a message is useless
             _fail(line, status)
-    if status == INTERRUPTED:  # Ctrl-C, of which typer makes an Exit
+    if status == INTERRUPTED:  # typer converts Ctrl-C to an Exit
         _fail("interrupted", INTERRUPTED)
     sys.exit(status)
 
 
 def report_failed_thread(debug: bool, failed: threading.ExceptHookArgs) -> None:
-    """Say in one line on standard error why a thread ended; with ``debug`` also its traceback."""
+    """Print one line on standard error with the reason why a thread ended.
+
+    Parameters
+    ----------
+    debug : bool
+        True if the traceback is printed as well.
+    failed : threading.ExceptHookArgs
+        Thread and its exception.
+    """
     error = failed.exc_value
     if not isinstance(error, Exception) or sys.stderr is None:
         return
@@ -451,15 +474,17 @@ def report_failed_thread(debug: bool, failed: threading.ExceptHookArgs) -> None:
 
 
 def _ignore_impossible_width(environment: MutableMapping[str, str]) -> None:
-    """Drop sizes of a terminal in which nothing can be printed: a table of no columns would be empty."""
+    """Remove terminal sizes from the environment that leave no space to print: a table of no columns would be empty."""
     for name in ("COLUMNS", "LINES"):
         if not re.fullmatch(r"0*[1-9][0-9]{0,4}", environment.get(name, "")):
             environment.pop(name, None)
 
 
 def split_debug(arguments: Sequence[str]) -> tuple[list[str], bool]:
-    """Return the arguments without ``--debug``, and True if it was among them; ``--`` ends the options.
+    """Return the arguments without ``--debug``, and True if it was among them. ``--`` ends the options.
 
+    Examples
+    --------
     >>> split_debug(["analyze", "a.csv", "--debug"]), split_debug(["analyze", "--", "--debug"])
     ((['analyze', 'a.csv'], True), (['analyze', '--', '--debug'], False))
     """
@@ -493,11 +518,13 @@ def explain(error: Exception) -> tuple[str, int]:
 
 
 def _cause(error: Exception) -> str:
+    """Return the text of an error in one line of limited length."""
     text = " ".join(in_one_line(str(error)).split())
-    return text if len(text) <= LONGEST_CAUSE else f"{text[:LONGEST_CAUSE]} …"
+    return text if len(text) <= MAX_CAUSE_CHARS else f"{text[:MAX_CAUSE_CHARS]} …"
 
 
 def _system_error(error: OSError) -> str:
+    """Return the text of a system error; a missing working directory gets its own message."""
     if error.filename is None:
         try:
             os.getcwd()
@@ -507,7 +534,7 @@ def _system_error(error: OSError) -> str:
 
 
 def _usage(error: TyperException) -> str:
-    """Return what is wrong with the arguments, with what is missing and what is possible."""
+    """Return a message about wrong arguments, with the missing or the possible arguments."""
     text, context = error.format_message(), getattr(error, "ctx", None)
     if isinstance(error, typer.BadParameter) and error.param is not None and not error.message:
         option: Any = error.param
@@ -529,15 +556,16 @@ def _usage(error: TyperException) -> str:
 
 
 def _discard_output() -> None:
-    """Send what is left in the buffer of standard output nowhere: at exit it would fail again, with a traceback."""
-    with contextlib.suppress(OSError, ValueError, AttributeError):  # closed, or not a file
+    """Discard the buffered rest of standard output, whose output at exit would fail again with a traceback."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # standard output is closed, or is not a file
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
 
 
 def _fail(line: str, status: int) -> NoReturn:
+    """Print an error on standard error and exit."""
     if sys.stderr is not None:
-        with contextlib.suppress(OSError, ValueError):  # nobody to say it to: the status stays
+        with contextlib.suppress(OSError, ValueError):  # standard error cannot be written, so only the status remains
             print(f"imu-monitor: {line}", file=sys.stderr, flush=True)  # noqa: T201
     sys.exit(status)

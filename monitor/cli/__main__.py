@@ -1,4 +1,4 @@
-"""``python -m monitor.cli``."""
+"""Entry point of ``python -m monitor.cli``."""
 
 from imu_monitor import main
 

@@ -1,4 +1,4 @@
-"""``doctor``: what was found, as a table or as JSON."""
+"""Command ``doctor``: prints the findings as a table or writes them as JSON."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -8,8 +8,11 @@ import typer
 from monitor.cli import output
 
 SCHEMA: Final = "imu-monitor/doctor/1"
+"""Schema of the JSON."""
 SIGNS: Final = {"well": "[green]✓[/]", "doubt": "[yellow]![/]", "wrong": "[red]✗[/]"}
+"""Sign of each mark in the table."""
 WRONG: Final = 1
+"""Exit status if a finding is wrong."""
 
 
 def doctor(
@@ -34,6 +37,7 @@ def doctor(
 
 
 def _print(findings: list) -> None:  # type: ignore[type-arg]
+    """Print the findings as a table."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table

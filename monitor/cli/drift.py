@@ -1,4 +1,4 @@
-"""Commands on drift: ``compensate``."""
+"""Command ``compensate``: removes the drift of gyroscopes from a recording."""
 
 from pathlib import Path
 from typing import Annotated

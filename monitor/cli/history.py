@@ -1,4 +1,4 @@
-"""Past results: ``history``, from a daemon's file or from a running daemon."""
+"""Command ``history``: prints past results from the file of a daemon or from a running daemon."""
 
 import time
 from collections.abc import Callable
@@ -16,9 +16,10 @@ if TYPE_CHECKING:
     from monitor.history.reading import Past
     from monitor.history.time_ranges import Span
 
-ROWS: Final = 24
-"""Of one axis over time, on a terminal."""
+MAX_TABLE_ROWS: Final = 24
+"""Number of rows in the table of one axis over time."""
 Get = Callable[["Question"], "Past"]
+"""Function that answers a question about the history of a device."""
 
 
 def history(
@@ -55,11 +56,11 @@ def history(
 
     if axis is not None and axis not in AXES:
         raise ConfigError(f'--axis: "{axis}"; possible are {", ".join(AXES)}')
-    _check_places(json, out, plot)
+    _check_output_files(json, out, plot)
     live = connect is not None or zenoh is not None
     if source is not None and live:
         raise ConfigError(f"{source}: either a file's history or --connect, not both")
-    step_s = None if step is None else max(int(_said_of("--step", length, step)), 1)
+    step_s = None if step is None else max(int(_for_option("--step", length, step)), 1)
     axes = AXES if axis is None else (axis,)
     asked = Question(_span(since, until), step_s, WHAT, axes)
     get = _from_daemon(connect, zenoh, prefix, device) if live else _from_file(source, device)
@@ -70,13 +71,19 @@ def history(
     console = Console()
     history_text.tell(past, axes, LETTERS if axis else history_text.LETTERS, console)
     if axis is not None and len(past):
-        few_s = max(width_of(past.span, None, ROWS), past.step_s)
+        few_s = max(width_of(past.span, None, MAX_TABLE_ROWS), past.step_s)
         few = past if few_s == past.step_s else get(Question(asked.span, few_s, ("coefficients", "status"), axes))
         history_text.tell_course(few, axis, LETTERS, console)
 
 
-def _check_places(json: Path | None, out: Path | None, plot: Path | None) -> None:
-    """Files that cannot be written, before anything is asked."""
+def _check_output_files(json: Path | None, out: Path | None, plot: Path | None) -> None:
+    """Check the output files before the history is read.
+
+    Raises
+    ------
+    ConfigError
+        A file cannot be written, or its suffix is not supported.
+    """
     from drivers.recordings.formats import format_of
 
     if plot is not None and plot.suffix != ".png":
@@ -88,7 +95,7 @@ def _check_places(json: Path | None, out: Path | None, plot: Path | None) -> Non
 
 
 def _save(past: "Past", asked: "Question", json: Path | None, out: Path | None, plot: Path | None) -> None:
-    """The same in files."""
+    """Write the results to the requested files."""
     from monitor.publishing.messages import history as history_message
     from monitor.publishing.reports import history_file
 
@@ -105,15 +112,15 @@ def _save(past: "Past", asked: "Question", json: Path | None, out: Path | None, 
 
 
 def _from_file(source: Path | None, name: str | None) -> Get:
-    """Answers from a file, that a daemon may be writing to."""
+    """Return a function that answers from a history file. A daemon may write to the file at the same time."""
     from monitor.history import reading as past
     from monitor.history.sqlite_store import reading
 
     if source is None:
         raise ConfigError("CONFIG.toml or a folder is missing; or --connect ENDPOINT for a running daemon")
-    path = _file(source)
+    path = _history_path(source)
     with reading(path) as reader:
-        device = _one(name, list(reader.devices()), str(path))
+        device = _select_device(name, list(reader.devices()), str(path))
 
     def get(asked: "Question") -> "Past":
         with reading(path) as reader:
@@ -123,18 +130,18 @@ def _from_file(source: Path | None, name: str | None) -> Get:
 
 
 def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> Get:
-    """Answers over zenoh."""
+    """Return a function that answers over zenoh."""
     from monitor.publishing.zenoh.history_query import ask
 
     def get(asked: "Question") -> "Past":
         found = {one.device: one for one in ask(endpoint, name or "*", asked.parameters(), prefix, file)}
-        return found[_one(name, list(found), masked(endpoint or str(file)))]
+        return found[_select_device(name, list(found), masked(endpoint or str(file)))]
 
     return get
 
 
-def _file(source: Path) -> Path:
-    """The file of a configuration, or of a folder."""
+def _history_path(source: Path) -> Path:
+    """Return the path of the history file for a configuration, a folder or the file itself."""
     from monitor.history.sqlite_store import FILE
     from monitor.settings import loading
 
@@ -148,8 +155,16 @@ def _file(source: Path) -> Path:
     return config.storage.folder / FILE
 
 
-def _one(name: str | None, there: list[str], where: str) -> str:
-    """The device that is meant."""
+def _select_device(name: str | None, there: list[str], where: str) -> str:
+    """Return the name of the requested device, or of the only device.
+
+    Raises
+    ------
+    NotReady
+        There is no history yet.
+    ConfigError
+        No device has this name, or a name is needed to choose between devices.
+    """
     from drivers.discovery import nearest
     from drivers.errors import NotReady
 
@@ -165,20 +180,21 @@ def _one(name: str | None, there: list[str], where: str) -> str:
 
 
 def _span(since: str | None, until: str | None) -> "Span | None":
-    """None where neither is said."""
+    """Return the requested time range; None if neither end is given."""
     from monitor.history.time_ranges import Span, moment
 
     if since is None and until is None:
         return None
     now_s = time.time()
-    start_s = float("-inf") if since is None else _said_of("--from", moment, since, now_s)
-    end_s = float("inf") if until is None else _said_of("--to", moment, until, now_s)
+    start_s = float("-inf") if since is None else _for_option("--from", moment, since, now_s)
+    end_s = float("inf") if until is None else _for_option("--to", moment, until, now_s)
     if end_s <= start_s:
         raise ConfigError(f"--to: {until} is not after --from {since}")
     return Span(start_s, end_s, end_in=False)
 
 
-def _said_of(option: str, function: Callable[..., float], *arguments: object) -> float:
+def _for_option(option: str, function: Callable[..., float], *arguments: object) -> float:
+    """Call a function, and prefix a ConfigError with the name of the option."""
     try:
         return function(*arguments)
     except ConfigError as error:

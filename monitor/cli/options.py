@@ -1,4 +1,4 @@
-"""Arguments that are more than a word or a number; ConfigError names the option."""
+"""Options of the commands, and parsers for arguments with a structure. A ConfigError names the option."""
 
 import sys
 from collections.abc import Callable
@@ -24,11 +24,12 @@ if TYPE_CHECKING:
     from monitor.estimation.allan.batch import TauGrid
     from monitor.publishing.exporters import Noise
 
-MOST_AVERAGING_TIMES: Final = 1000
+MAX_AVERAGING_TIMES: Final = 1000
+"""Largest number of averaging times in a list."""
 
 
 def within(quantity: Quantity) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
-    """Return a callback of typer that checks the number of an option against a quantity.
+    """Return a typer callback that checks the number of an option against a quantity.
 
     Raises
     ------
@@ -81,7 +82,13 @@ Last = Annotated[str | None, typer.Option(metavar="S", help="The end of the reco
 
 
 def tau(text: str) -> "TauGrid":
-    """A grid by name, or a list of seconds."""
+    """Parse averaging times: the name of a grid, or a list of seconds.
+
+    Raises
+    ------
+    ConfigError
+        The text is neither the name of a grid nor a list of seconds, or a time is outside the supported range.
+    """
     if text in ("octave", "decade10"):
         return text  # type: ignore[return-value]
     try:
@@ -90,8 +97,8 @@ def tau(text: str) -> "TauGrid":
         raise ConfigError(
             f'--tau: "{in_one_line(text)[:60]}"; possible are octave, decade10, or seconds with commas'
         ) from None
-    if len(listed) > MOST_AVERAGING_TIMES:
-        raise ConfigError(f"--tau: {len(listed)} averaging times; at most {MOST_AVERAGING_TIMES} are possible")
+    if len(listed) > MAX_AVERAGING_TIMES:
+        raise ConfigError(f"--tau: {len(listed)} averaging times; at most {MAX_AVERAGING_TIMES} are possible")
     try:
         return tuple(AVERAGING_TIME_S.check(value) for value in listed)
     except ConfigError as error:
@@ -105,7 +112,20 @@ def duration(option: str, text: None) -> None: ...
 @overload
 def duration(option: str, text: str | None) -> float | None: ...
 def duration(option: str, text: str | None) -> float | None:
-    """Seconds, from a number of them or "30min", "1h"."""
+    """Parse a duration such as "90", "30min" or "1h", and return seconds.
+
+    Parameters
+    ----------
+    option : str
+        Name of the option, for the message.
+    text : str or None
+        Duration. None is returned as None.
+
+    Raises
+    ------
+    ConfigError
+        The text is not a duration.
+    """
     from monitor.settings.loading import seconds
 
     try:
@@ -115,7 +135,13 @@ def duration(option: str, text: str | None) -> float | None:
 
 
 def order(text: str | None) -> "Order | None":
-    """p and q of an ARMA model."""
+    """Parse the orders p and q of an ARMA model.
+
+    Raises
+    ------
+    ConfigError
+        The text is not a supported order.
+    """
     from monitor.drift.compensation.arma import ORDERS
 
     if text is None:
@@ -127,7 +153,14 @@ def order(text: str | None) -> "Order | None":
 
 
 def noise(source: Path) -> "Noise":
-    """What is known of each axis; JSON begins with a brace, as no model does."""
+    """Read noise parameters from a model or from the JSON of ``analyze``. JSON begins with a brace, and a model does
+    not.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, or its content is invalid.
+    """
     from drivers import file_access
     from monitor.noise.model import NoiseModel
     from monitor.publishing.exporters import from_analysis, from_model

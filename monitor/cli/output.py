@@ -1,4 +1,4 @@
-"""What commands print and write: results, and progress on a terminal."""
+"""Output of commands: results on standard output or in files, and progress on a terminal."""
 
 import contextlib
 import sys
@@ -12,17 +12,45 @@ if TYPE_CHECKING:
     from monitor.estimation.analysis import Analysis
 
 Tell = Callable[[str, float | None], None]
-"""Told what is being done, and the share that is done where that is known."""
+"""Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
 
 
 def check_place(option: str, path: Path | None) -> None:
-    """ConfigError before the work where ``write`` could not but fail after it."""
+    """Check before the work begins that ``write`` can create a file.
+
+    Parameters
+    ----------
+    option : str
+        Name of the option, for the message.
+    path : Path or None
+        File to write.
+
+    Raises
+    ------
+    ConfigError
+        The folder does not exist.
+    """
     if path is not None and path != Path("-") and not path.parent.is_dir():
         raise ConfigError(f"{option}: {path}: cannot be written: there is no folder {path.parent}")
 
 
 def write(option: str, path: Path, data: bytes) -> None:
-    """To a file, or to standard output for ``-``."""
+    """Write bytes to a file, or to standard output if the path is ``-``.
+
+    Parameters
+    ----------
+    option : str
+        Name of the option, for the message.
+    path : Path
+        File to write.
+    data : bytes
+        Content.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be written.
+    """
     if path == Path("-"):
         sys.stdout.buffer.write(data)
         sys.stdout.buffer.flush()
@@ -35,7 +63,7 @@ def write(option: str, path: Path, data: bytes) -> None:
 
 @contextlib.contextmanager
 def progress() -> Iterator[Tell]:
-    """A bar on a terminal, nothing where output is piped."""
+    """Show a progress bar on a terminal, or nothing if the output is piped; yield the callback that updates it."""
     from rich.console import Console
     from rich.progress import Progress
 
@@ -49,18 +77,18 @@ def progress() -> Iterator[Tell]:
 
 
 def prepare_kernels(tell: Tell) -> None:
-    """Compile the kernels that analyses of recordings need, by all processors, if they are not kept on disk yet."""
+    """Compile the kernels for the analysis of recordings in parallel, if they are not in the cache on disk."""
     from monitor.daemon import kernel_compilation
 
     for group in kernel_compilation.GROUPS:
         if not kernel_compilation.is_warm(group):
-            with contextlib.suppress(OSError):  # they cannot be kept: each is compiled when it is called
+            with contextlib.suppress(OSError):  # without a cache on disk, each kernel is compiled at its first call
                 for _ in kernel_compilation.prepare(group, lambda progress: tell(str(progress), progress.share)):
                     pass
 
 
 def print_analysis(result: "Analysis") -> None:
-    """Samples, coefficients and notes."""
+    """Print the number of samples, the coefficients and the notes of an analysis."""
     from rich.console import Console
 
     from monitor.publishing.terminal.live_table import analysis_table

@@ -1,6 +1,6 @@
-"""The service in a terminal: its table or log lines, its log, and the signals that end it.
+"""Service in a terminal: live table, log lines, and the signals that stop the service.
 
-Table and log are written by threads (``QueuedWriter``), so that a terminal or pipe that nobody reads delays neither
+Table and log are written by threads (``QueuedWriter``). A terminal or pipe that nobody reads therefore delays neither
 samples nor the end of the process.
 """
 
@@ -24,18 +24,20 @@ if TYPE_CHECKING:
     from monitor.settings.loading import Config
 
 STDOUT: Final = "standard output"
+"""Name of standard output in messages."""
 STDERR: Final = "standard error"
+"""Name of standard error in messages."""
 
 
 def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
-    """Run the service: a table where there is a terminal, else log lines; the last table once more at the end.
+    """Run the service, with a live table in a terminal, or else with log lines and the final table at the end.
 
     Parameters
     ----------
     config : Config
-        What to run.
+        Configuration to run.
     seconds : float or None
-        Duration in seconds; None runs until a signal or the end of all replays.
+        Duration in seconds. None runs until a signal or the end of all replays.
     viewer : str or None
         Viewer mode that replaces the mode of the configuration.
 
@@ -53,7 +55,7 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
 
     from monitor.daemon.operations.systemd import Unit
     from monitor.daemon.outputs import LogOutput, TableOutput
-    from monitor.daemon.service import STATUS_S, Service
+    from monitor.daemon.service import STATUS_INTERVAL_S, Service
     from monitor.publishing.terminal.live_table import Board, LiveTable
     from monitor.publishing.terminal.queued_writer import QueuedWriter
 
@@ -61,13 +63,13 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
     config = _with_viewer(config, viewer)
     console, board, asked = Console(file=sys.stdout), Board(), threading.Event()
     table, terminal = LiveTable(console), console.is_terminal
-    screen = QueuedWriter(sys.stdout, STDOUT, table.render, STATUS_S if terminal else None, tell=_warn)
+    screen = QueuedWriter(sys.stdout, STDOUT, table.render, STATUS_INTERVAL_S if terminal else None, tell=_warn)
     writers = {"terminal": screen} if terminal else {}
     shared = terminal and _same_file(sys.stdout, sys.stderr)
     if not shared:
         writers["log"] = QueuedWriter(sys.stderr, STDERR, tell=_warn)
     with _stderr_through(screen if shared else writers["log"]):
-        _log_as(config)
+        _configure_logging(config)
         for line in config.warnings:
             structlog.get_logger("imu-monitor").warning(line)
         if not shared:
@@ -80,20 +82,20 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
                 asked.set()
                 service.stop()
 
-            # in a terminal it means that the terminal is closed
+            # in a terminal, SIGHUP means that the terminal has been closed
             on_signals(stop, stop if terminal else service.reload)
             table.board = board
             service.run(seconds)
         finally:
             unread = not screen.close()
-        lost = _lost(screen, unread)
+        lost = _table_error(screen, unread)
         if lost is not None and not terminal and asked.is_set():
             structlog.get_logger("imu-monitor").warning("the final table was not written", error=str(lost))
     if lost is not None and not terminal and not asked.is_set():
         raise lost
 
 
-def _lost(screen: "QueuedWriter", unread: bool) -> Exception | None:
+def _table_error(screen: "QueuedWriter", unread: bool) -> Exception | None:
     """Return why the final table is not on standard output, or None if it is."""
     from monitor.publishing.terminal.queued_writer import CLOSE_S
 
@@ -110,7 +112,28 @@ def _lost(screen: "QueuedWriter", unread: bool) -> Exception | None:
 def view(
     keyexpr: str, connect: Sequence[str], file: Path | None, detail: Sequence[str], mode: str, seconds: float | None
 ) -> None:
-    """The viewer of a fleet, until a signal; where its page is, and what is wrong, a line each on standard error."""
+    """Run the viewer of a fleet until a signal, and print its address and its errors on standard error.
+
+    Parameters
+    ----------
+    keyexpr : str
+        Zenoh key expression of the daemons.
+    connect : sequence of str
+        Zenoh endpoints to connect to.
+    file : Path or None
+        Zenoh configuration file.
+    detail : sequence of str
+        Devices that are shown with samples and curves.
+    mode : str
+        Viewer mode.
+    seconds : float or None
+        Duration in seconds. None runs until a signal.
+
+    Raises
+    ------
+    ConfigError
+        The viewer mode is invalid.
+    """
     import threading
 
     from monitor.publishing.rerun.fleet import FleetView, detail_key
@@ -131,7 +154,7 @@ def view(
     on_signals(stop.set)
 
     def say(text: str) -> None:
-        print(text, file=_Lines(), flush=True)
+        print(text, file=_ErrorStream(), flush=True)
 
     log = QueuedWriter(sys.stderr, STDERR, tell=say)
     with _stderr_through(log), contextlib.closing(arriving), contextlib.closing(rerun):
@@ -141,7 +164,20 @@ def view(
 
 
 def with_history(config: "Config", history_s: float | None) -> "Config":
-    """A configuration whose live view opens on so much of what is kept; None: as it says itself."""
+    """Return the configuration with another time span of history in the viewer.
+
+    Parameters
+    ----------
+    config : Config
+        Configuration.
+    history_s : float or None
+        Time span in seconds. None keeps the value of the configuration.
+
+    Raises
+    ------
+    ConfigError
+        The configuration stores no history.
+    """
     import dataclasses
 
     import msgspec
@@ -154,6 +190,7 @@ def with_history(config: "Config", history_s: float | None) -> "Config":
 
 
 def _with_viewer(config: "Config", viewer: str | None) -> "Config":
+    """Return the configuration with another viewer mode; None keeps the mode."""
     import dataclasses
 
     import msgspec
@@ -171,9 +208,9 @@ def _with_viewer(config: "Config", viewer: str | None) -> "Config":
 
 @contextlib.contextmanager
 def _stderr_through(writer: "QueuedWriter") -> Iterator[None]:
-    """Start a writer and put it in place of standard error, for log lines, warnings and tracebacks of threads.
+    """Start a writer and redirect standard error to it, for log lines, warnings and tracebacks of threads.
 
-    If the writer is still blocked at the end, standard error is given up, so that the process can end.
+    If the writer is still blocked at the end, standard error is detached, so that the process can end.
     """
     from monitor.publishing.terminal.queued_writer import QueuedLines, can_write, descriptor_of, detach
 
@@ -196,26 +233,29 @@ def _same_file(one: TextIO | None, other: TextIO | None) -> bool:
 
 
 def _warn(text: str) -> None:
+    """Log a message of a writer as a warning."""
     import structlog
 
     structlog.get_logger("imu-monitor").warning("log", text=text)
 
 
-class _Lines(io.TextIOBase):
-    """Standard error as the log's place: a line that cannot be written (disk full, reader gone) is dropped."""
+class _ErrorStream(io.TextIOBase):
+    """Text stream for the log that forwards to standard error and drops lines that cannot be written."""
 
     def write(self, text: str) -> int:
+        """Write text, or drop it if the disk is full or the reader has gone."""
         with contextlib.suppress(OSError):
             sys.stderr.write(text)
         return len(text)
 
     def flush(self) -> None:
+        """Flush standard error, if it can be written."""
         with contextlib.suppress(OSError):
             sys.stderr.flush()
 
 
-def _log_as(config: "Config") -> None:
-    """Structured lines on standard error."""
+def _configure_logging(config: "Config") -> None:
+    """Configure structlog to write structured lines to standard error."""
     import logging
 
     import structlog
@@ -233,34 +273,44 @@ def _log_as(config: "Config") -> None:
             structlog.processors.JSONRenderer() if json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
         ],
         wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG),
-        logger_factory=structlog.PrintLoggerFactory(cast("TextIO", _Lines())),
+        logger_factory=structlog.PrintLoggerFactory(cast("TextIO", _ErrorStream())),
         cache_logger_on_first_use=True,
     )
 
 
 def _without_secrets(_logger: Any, _method: str, line: "MutableMapping[str, Any]") -> "MutableMapping[str, Any]":
-    """Every text of a log line, whatever brought it there."""
+    """Mask credentials in every text of a log line."""
     return {key: masked(value) if isinstance(value, str) else value for key, value in line.items()}
 
 
 def on_signals(stop: Callable[[], None], hung_up: Callable[[], None] | None = None) -> None:
-    """First SIGINT or SIGTERM: stop in order. A second SIGINT ends at once. SIGHUP: what it means here, if anything."""
+    """Install the signal handlers of a session.
+
+    The first SIGINT or SIGTERM calls ``stop``. A second SIGINT ends the process at once. SIGHUP calls ``hung_up``.
+
+    Parameters
+    ----------
+    stop : callable
+        Starts an orderly stop.
+    hung_up : callable, optional
+        Handles SIGHUP. By default SIGHUP keeps its present handler.
+    """
     import threading
 
     def first(number: int, _frame: Any) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-        # in a thread of its own: the main one may hold the lock of the very event that stop sets
+        # a thread of its own is needed, because the main thread may hold the lock of the event that stop sets
         threading.Thread(target=stop, name="stop", daemon=True).start()
 
     signal.signal(signal.SIGINT, first)
     signal.signal(signal.SIGTERM, first)
     if hung_up is not None:
-        call = hung_up  # in a thread, as above
+        call = hung_up  # runs in a thread for the same reason
         signal.signal(signal.SIGHUP, lambda *_: threading.Thread(target=call, name="hung up", daemon=True).start())
 
 
 def end_on_sigterm() -> None:
-    """SIGTERM ends work as Ctrl-C does: what is half written is removed."""
+    """Let SIGTERM end a command as Ctrl-C does, so that incomplete files are removed."""
 
     def ended(_number: int, _frame: Any) -> NoReturn:
         sys.exit(128 + signal.SIGTERM)

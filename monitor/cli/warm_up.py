@@ -1,4 +1,4 @@
-"""``warm-up``: compiles the numerical kernels before they are needed."""
+"""Command ``warm-up``: compiles the numerical kernels before they are needed."""
 
 import sys
 import time

@@ -1,1 +1,1 @@
-"""The work of each command on recordings and configurations: ``analyze``, ``simulate``, ``reconcile`` and others."""
+"""Commands on recordings and configurations: ``analyze``, ``simulate``, ``reconcile`` and others."""

@@ -1,9 +1,10 @@
-"""One recording from its file to all results that are wanted: ``analyze`` with the threads that pure rooms do without.
+"""Command ``analyze``: reads a recording and computes all requested results, in several threads.
 
-What is always made: curve, fit, motion and changes. Total and Hadamard deviations take four times as long as the Allan
-curve and are made for who draws or writes them, dynamic curves where a window is given. Axes of the curve are done side
-by side, and so are what does not need each other; kernels run without the GIL. Dynamic curves run in the caller's
-thread, so that Ctrl-C ends them at once.
+The curve, the fit, motion and changes are always computed. Total and Hadamard deviations take four times as long as the
+Allan curve, so they are computed only if they are drawn or written. Dynamic curves are computed if a window is given.
+
+Axes of the curve, and results that do not depend on each other, are computed in parallel, because kernels release the
+GIL. Dynamic curves run in the calling thread, so that Ctrl-C ends them at once.
 """
 
 import os
@@ -29,11 +30,19 @@ from monitor.publishing.plots.dynamic_figure import Mark
 from monitor.publishing.terminal.thermal_text import notes_without
 
 Tell = Callable[[str, float | None], None]
-"""Told what is being done, and the share that is done where that is known."""
+"""Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
 
 
 class TooShort(NotReady):
-    """Too few samples for any answer."""
+    """Error for a recording with too few samples for any result.
+
+    Parameters
+    ----------
+    why : str
+        Message.
+    samples : int
+        Number of samples in the recording.
+    """
 
     def __init__(self, why: str, samples: int) -> None:
         super().__init__(why)
@@ -42,35 +51,45 @@ class TooShort(NotReady):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What is wanted of which recording."""
+    """Recording to analyse and results to compute."""
 
     recording: Path
     rate_hz: float | None = None
     tau: TauGrid = "octave"
-    window_s: float | None = None  # of dynamic curves
-    rest: bool = False  # strike out motion
-    others: bool = False  # total and Hadamard deviations too
-    last_s: float | None = None  # the end of the recording alone
+    window_s: float | None = None  # window of dynamic curves; None for no dynamic curves
+    rest: bool = False  # True if motion is excluded
+    others: bool = False  # True if total and Hadamard deviations are computed
+    last_s: float | None = None  # length of the end of the recording that is used; None for all
 
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """All that was made of it."""
+    """Results of an analysis."""
 
     analysis: Analysis
     total: TotalCurve | None = None
     hadamard: HadamardCurve | None = None
     dynamic: Dynamic | None = None
-    lacking: str = ""  # why there are no dynamic curves, where they were wanted
-    warmth: WithoutTemperature | None = None  # what temperature explains, where it explains any axis
+    lacking: str = ""  # reason why requested dynamic curves are missing
+    warmth: WithoutTemperature | None = None  # coefficients without the effect of temperature, if it explains any axis
 
 
 def make(request: Request, tell: Tell = lambda _what, _share: None) -> Results:
-    """Read and analyse.
+    """Read a recording and analyse it.
 
-    Raises:
-        RecordingError, ConfigError: no recording; a τ, rate or window that it does not allow; or not enough memory
-        TooShort: too few samples for any answer
+    Parameters
+    ----------
+    request : Request
+        Recording to analyse and results to compute.
+    tell : callable, optional
+        Progress callback.
+
+    Raises
+    ------
+    RecordingError, ConfigError
+        The recording cannot be read, it does not allow a requested τ, rate or window, or there is not enough memory.
+    TooShort
+        The recording has too few samples for any result.
     """
     try:
         return _make(request, tell)
@@ -82,6 +101,7 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Results:
 
 
 def _make(request: Request, tell: Tell) -> Results:
+    """Read a recording and analyse it, with a pool of threads."""
     tell("reading", None)
     found = load_samples(request.recording, request.rate_hz, request.last_s)
     blocks = list(iter_blocks(found))
@@ -94,9 +114,9 @@ def _make(request: Request, tell: Tell) -> Results:
             raise TooShort(str(error), len(found)) from error
         tell("motion and changes" + (", total and Hadamard deviations" if request.others else ""), None)
         events = pool.submit(events_of, result)
-        others = pool.submit(_others, result, request.tau) if request.others else None
+        others = pool.submit(_total_and_hadamard, result, request.tau) if request.others else None
         warmth = pool.submit(_without_temperature, result, blocks, found.rate_hz)
-        courses, lacking = _courses(result, request, tell)
+        courses, lacking = _dynamic_curves(result, request, tell)
         total, hadamard = others.result() if others else (None, None)
         found_all = events.result()
         without = warmth.result()
@@ -112,10 +132,21 @@ def _make(request: Request, tell: Tell) -> Results:
 
 
 def draw(results: Results, path: Path, title: str) -> None:
-    """The picture, or the page if the name ends in .html.
+    """Draw the results as a picture, or write them as a page if the file name ends in .html.
 
-    Raises:
-        ConfigError: what draws is not installed, or the file cannot be written
+    Parameters
+    ----------
+    results : Results
+        Results to draw.
+    path : Path
+        File to write.
+    title : str
+        Title of the picture or page.
+
+    Raises
+    ------
+    ConfigError
+        The plotting library is not installed, or the file cannot be written.
     """
     result = results.analysis
     beside = besides(results.total, results.hadamard)
@@ -133,15 +164,15 @@ def draw(results: Results, path: Path, title: str) -> None:
 def _without_temperature(
     result: Analysis, blocks: Sequence[SampleBlock], rate_hz: float | None
 ) -> WithoutTemperature | None:
-    """Nothing is worked out where no temperature came, or where it stayed."""
+    """Return the coefficients without the effect of temperature; None if the temperature is missing or constant."""
     if not moved(np.concatenate([samples.temperature_c for samples in blocks])):
         return None
     _, temperature_c, _, _ = with_temperature(blocks, rate_hz)
     return without_temperature(result, temperature_c)
 
 
-def _courses(result: Analysis, request: Request, tell: Tell) -> tuple[Dynamic | None, str]:
-    """Dynamic curves if they are wanted, or why they cannot be made."""
+def _dynamic_curves(result: Analysis, request: Request, tell: Tell) -> tuple[Dynamic | None, str]:
+    """Return the dynamic curves if they are requested, or the reason why they are missing."""
     if request.window_s is None:
         return None, ""
     rate_hz = result.estimate.rate_hz
@@ -154,8 +185,8 @@ def _courses(result: Analysis, request: Request, tell: Tell) -> tuple[Dynamic | 
     return shown, ""
 
 
-def _others(result: Analysis, tau: TauGrid) -> tuple[TotalCurve, HadamardCurve | None]:
-    """Total and Hadamard deviations: octaves, or the τ that were listed as far as they are possible."""
+def _total_and_hadamard(result: Analysis, tau: TauGrid) -> tuple[TotalCurve, HadamardCurve | None]:
+    """Return total and Hadamard deviations on octaves, or at those listed τ that the length of the recording allows."""
     values, rate_hz, theta = result.values, result.estimate.rate_hz, np.where(result.fit.entered, result.fit.theta, 0.0)
     listed = None if isinstance(tau, str) else result.estimate.curve.factors
     short: Ints | None = None if listed is None else listed[3 * listed <= len(values)]

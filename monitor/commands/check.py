@@ -1,8 +1,9 @@
-"""Find all mistakes in a configuration file and in the model files that it names; opens no device.
+"""Command ``check``: finds all mistakes in a configuration file and in the model files that it names. It opens no
+device.
 
-``settings.examine`` reads the configuration. Model files are read here, as the modules that know them stand above the
-settings: the model in force of each device with the limits relative to it, and the model and the effects of each
-simulated sensor.
+``settings.examine`` reads the configuration. Model files are read here, because the modules for models are in a higher
+layer than the settings. The check covers the model in force of each device with its relative limits, and the model and
+the effects of each simulated sensor.
 """
 
 from collections.abc import Iterator
@@ -13,19 +14,21 @@ from monitor.settings.loading import Config, ModelUse, examine
 
 
 def check(path: Path, *, pipe: bool = False) -> tuple[Config | None, list[str]]:
-    """Return the configuration, or None and all that is wrong with it.
+    """Read a configuration file and find all mistakes.
 
     Parameters
     ----------
-    path
+    path : Path
         Configuration file.
-    pipe
-        True if a pipe is read as well, see ``small_file.read``.
+    pipe : bool, optional
+        True if a pipe may be read as well, see ``drivers.file_access.read``.
 
     Returns
     -------
-    tuple
-        The configuration, None if anything is wrong, and one line for each mistake, which begins with the file.
+    config : Config or None
+        Configuration; None if there is any mistake.
+    wrong : list of str
+        One line for each mistake, which begins with the file.
     """
     reading = examine(path, pipe=pipe)
     wrong = [*reading.wrong, *(f"{path}: {use.device}: {line}" for use in reading.models for line in _problems(use))]
@@ -33,7 +36,8 @@ def check(path: Path, *, pipe: bool = False) -> tuple[Config | None, list[str]]:
 
 
 def _problems(use: ModelUse) -> Iterator[str]:
-    # each of them is imported where the configuration has it: most have neither
+    """Yield the mistakes in the model files of a device."""
+    # imported only if needed, because most configurations have neither a model nor a simulated sensor
     try:
         if use.model is not None:
             from monitor.daemon.operations.limits import bounds

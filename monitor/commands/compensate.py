@@ -1,8 +1,9 @@
-"""``compensate``: a recording in, the same recording without the drift of its gyros out, and how much that helped.
+"""Command ``compensate``: writes a recording without the drift of its gyroscopes, and measures the improvement.
 
-``adaptive`` is what the daemon does, sample by sample; ``fixed`` the same without its noise adapting; the others are
-what finished recordings are treated with elsewhere. All are judged on the same stretches at rest: those after the first
-third, from which whatever learns from a whole recording has learned.
+The method ``adaptive`` is the one of the daemon, sample by sample. The method ``fixed`` is the same without adaptation
+of the noise. The other methods are used elsewhere for finished recordings. All are evaluated on the same stretches at
+rest. The first third of these stretches serves the methods that learn from a whole recording, and is excluded from the
+evaluation.
 """
 
 from collections.abc import Callable
@@ -27,33 +28,51 @@ from monitor.drift.compensation.sage_husa import CONFIRMED, LEFT_OUT, STEPPED, U
 from monitor.estimation.regular_grid import with_temperature
 
 METHODS: Final = ("adaptive", "fixed", *VARIANTS)
+"""Names of the methods."""
 GYROS: Final = AXES[:3]
-LEARNED: Final = 1.0 / 3.0
-"""Of what is at rest: there whatever learns from a whole recording does so, and nothing is judged."""
-ROWS: Final = 1 << 16
+"""Gyroscope axes."""
+LEARNING_SHARE: Final = 1.0 / 3.0
+"""Share of the samples at rest that is used for learning and excluded from the evaluation."""
+BLOCK_ROWS: Final = 1 << 16
+"""Number of rows that are written at a time."""
 
 Tell = Callable[[str, float | None], None]
-"""Told what is being done, and the share that is done where that is known."""
+"""Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What is to be compensated."""
+    """Recording to compensate and method to use."""
 
     recording: Path
     out: Path
     method: str = "adaptive"
     rate_hz: float | None = None
-    order: Order | None = None  # of the ARMA model of the drift; None: by criterion
-    last_s: float | None = None  # the end of the recording alone
+    order: Order | None = None  # order of the ARMA model of the drift; None selects it by criterion
+    last_s: float | None = None  # length of the end of the recording that is used; None for all
 
 
 def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
-    """Compensate and write.
+    """Compensate a recording and write the result.
 
-    Raises:
-        ConfigError, RecordingError: no such method, no recording, no gyro in it, or a place that cannot be written
-        NotReady: never at rest long enough; nothing is written
+    Parameters
+    ----------
+    request : Request
+        Recording to compensate and method to use.
+    tell : callable, optional
+        Progress callback.
+
+    Returns
+    -------
+    Result
+        Deviations before and after, for each gyroscope axis.
+
+    Raises
+    ------
+    ConfigError, RecordingError
+        The method is unknown, the recording cannot be read or has no gyroscope axis, or the result cannot be written.
+    NotReady
+        The sensor was never at rest for long enough. Nothing is written.
     """
     if request.method not in METHODS:
         raise ConfigError(f'--method: unknown method "{request.method}"{nearest(request.method, METHODS)}')
@@ -68,16 +87,16 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
     out = _run(live, values, tell)
     intervals = tuple(live.take())
     rest = _at_rest(intervals, len(values), live.interval)
-    learned, judged = _thirds(rest)
+    learned, judged = _split_learning(rest)
     if not judged.any():
         raise NotReady(
             f"{request.recording}: never at rest for {CONFIRMED * live.interval_s:g} s: no drift can be learned from it"
         )
     if request.method in VARIANTS:
-        out = _treated(request.method, values, learned, axes, tell)
+        out = _compensate_offline(request.method, values, learned, axes, tell)
     tell("judging", None)
     judged_axes: dict[str, Axis] = {
-        str(axis): _judge(AXES.index(axis), values, out, learned, judged, live, intervals) for axis in axes
+        str(axis): _evaluate_axis(AXES.index(axis), values, out, learned, judged, live, intervals) for axis in axes
     }
     start_s = 0.0 if found.t_s is None else float(found.t_s[0])
     _write(request.out, found.axes, start_s + np.arange(len(values)) / rate_hz, out, temperature_c, tell)
@@ -97,7 +116,7 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
 
 
 def _run(live: Compensator, values: Floats, tell: Tell) -> Floats:
-    """As the daemon does, but that a model is identified at once when it is due."""
+    """Compensate as the daemon does, except that a model is identified at once when it is due."""
     out = np.empty_like(values)
     size = live.interval
     for start in range(0, len(values), size):
@@ -109,21 +128,24 @@ def _run(live: Compensator, values: Floats, tell: Tell) -> Floats:
 
 
 def _at_rest(intervals: tuple[Interval, ...], n: int, size: int) -> NDArray[np.bool_]:
-    """[n, 3] samples of the intervals that drift was learned from, once a bias was known."""
+    """Return the mask [n, 3] of the samples in intervals that the drift was estimated from, after a bias was known."""
     mask = np.zeros((n, len(GYROS)), dtype=bool)
     for one in intervals:
         mask[one.end - size : one.end] = (one.became == USED) & np.isfinite(one.expected)
     return mask
 
 
-def _thirds(rest: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """The first third of what is at rest, axis by axis, and the rest of it."""
+def _split_learning(rest: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return the masks of the first third of the samples at rest, for each axis, and of the other samples at rest."""
     count = np.cumsum(rest, axis=0)
-    first = count <= LEARNED * count[-1]
+    first = count <= LEARNING_SHARE * count[-1]
     return rest & first, rest & ~first
 
 
-def _treated(method: str, values: Floats, learned: NDArray[np.bool_], axes: tuple[str, ...], tell: Tell) -> Floats:
+def _compensate_offline(
+    method: str, values: Floats, learned: NDArray[np.bool_], axes: tuple[str, ...], tell: Tell
+) -> Floats:
+    """Compensate each axis with a method for finished recordings."""
     out = values.copy()
     for axis in axes:
         at = AXES.index(axis)
@@ -132,7 +154,7 @@ def _treated(method: str, values: Floats, learned: NDArray[np.bool_], axes: tupl
     return out
 
 
-def _judge(
+def _evaluate_axis(
     at: int,
     values: Floats,
     out: Floats,
@@ -141,7 +163,7 @@ def _judge(
     live: Compensator,
     intervals: tuple[Interval, ...],
 ) -> Axis:
-    """One axis, before and after."""
+    """Return the deviations of one axis before and after."""
     before = values[:, at] - np.nanmean(values[learned[:, at], at])
     first = int(np.argmax(judged[:, at]))
     model = live.models[at]
@@ -156,11 +178,11 @@ def _judge(
 
 
 def _write(path: Path, axes: tuple[str, ...], t_s: Floats, out: Floats, temperature_c: Floats, tell: Tell) -> None:
-    """All rows that were recorded, on the grid they were found on."""
+    """Write all recorded rows at their times on the regular grid."""
     there = np.flatnonzero(np.isfinite(out).any(axis=1))
     warm = bool(np.isfinite(temperature_c).any())
     with writing(path, axes, warm) as append:
-        for start in range(0, there.size, ROWS):
-            rows = there[start : start + ROWS]
+        for start in range(0, there.size, BLOCK_ROWS):
+            rows = there[start : start + BLOCK_ROWS]
             append(t_s[rows], out[rows], temperature_c[rows])
             tell("writing", start / there.size)

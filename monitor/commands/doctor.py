@@ -1,12 +1,13 @@
-"""Looks at a machine and a configuration before the service is left alone with them: findings, and what to do.
+"""Command ``doctor``: checks a machine and a configuration for unattended operation, and returns findings with advice.
 
-Each check returns findings and raises nothing: what cannot be found out here says so. No device is opened. What is done
-beside looking: a listening port is bound for a moment, a router is connected to and left, an empty file is made in the
-folder of recordings and removed.
+Each check returns findings and raises no error. If a check cannot determine the state, its finding says so. No device
+is opened. The checks have three side effects: a port is bound for a moment, a connection to a router is opened and
+closed, and an empty file is created in the storage folder and removed.
 
-Disk a day, in bytes: rate · 86400 · SAMPLE_BYTES for each device that is recorded, and RAW_BYTES more a sample where
-raw bytes are kept. SAMPLE_BYTES is what a packed segment of six axes, temperature and counter takes of noise that fills
-a 32-bit float; coarser sensors take less. The results of years are small beside that and not counted.
+The disk use per day, in bytes, is rate · 86400 · SAMPLE_BYTES for each recorded device. Raw bytes add RAW_BYTES for
+each sample. SAMPLE_BYTES is the size of a sample in a packed segment with six axes, temperature and counter, for noise
+that fills a 32-bit float. Sensors with coarser resolution need less. The history of results is small in comparison and
+not counted.
 """
 
 import ctypes
@@ -37,38 +38,50 @@ from monitor.settings.loading import Config, Storage
 Mark = Literal["well", "doubt", "wrong"]
 
 SAMPLE_BYTES: Final = 35.0
-"""Of a sample in a packed segment: 32.5 to 33.3 of a sensor that fills a float, 17 to 23 of one that comes in steps."""
+"""Size of a sample in a packed segment.
+
+It is 32.5 to 33.3 bytes for a sensor that fills a float, and 17 to 23 bytes for a sensor with a coarse resolution.
+"""
 RAW_BYTES: Final = 60.0
-"""Of a sample's frame as it came, about: protocols differ."""
+"""Approximate size of the received frame of a sample. It depends on the protocol."""
 DAY_S: Final = 86400.0
-CONNECT_S: Final = 2.0
+"""One day."""
+CONNECT_TIMEOUT_S: Final = 2.0
+"""Longest wait for a connection."""
 TIME_ERROR: Final = 5
-"""What adjtimex(2) returns while nothing keeps the clock."""
+"""Return value of adjtimex(2) if the clock is not synchronised."""
 CAN_TYPE: Final = "280"
 """ARPHRD_CAN, in /sys/class/net/NAME/type."""
-LAST_PORT: Final = 65535
+MAX_PORT: Final = 65535
+"""Largest port number."""
 UNIT: Final = "imu-monitor.daemon.service"
+"""Name of the systemd unit."""
 PACKAGE: Final = "imu-monitor"
+"""Name of the distribution package."""
 PACKAGES: Final = ("monitor", "drivers")
-"""Of the program; the names are common ones."""
-PROJECT: Final = Path(__file__).resolve().parents[2] / "pyproject.toml"
-TCP: Final = re.compile(r"(?:tcp|tls)/\[?([^\]]+?)\]?:(\d+)(?:[?#].*)?")
+"""Import packages of the program. Their names are common, so other packages may have the same."""
+PROJECT_FILE: Final = Path(__file__).resolve().parents[2] / "pyproject.toml"
+"""Project file of a checkout."""
+TCP_ENDPOINT: Final = re.compile(r"(?:tcp|tls)/\[?([^\]]+?)\]?:(\d+)(?:[?#].*)?")
+"""Regular expression for the host and the port of a zenoh endpoint over TCP or TLS."""
 REQUIREMENT: Final = re.compile(r"([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*\(?([^;)]*)\)?\s*(?:;(.*))?")
+"""Regular expression for the requirement of a package: name, versions and marker."""
 LOOPBACK: Final = ("127.", "::1", "localhost")
+"""Beginnings of loopback addresses."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was looked at."""
+    """Result of one check."""
 
     mark: Mark
     about: str
     text: str
-    do: str = ""  # what to do, where there is something
+    do: str = ""  # advice; empty if nothing is to be done
 
 
 def examine(path: Path | None = None) -> list[Finding]:
-    """The machine, and the configuration where one is named."""
+    """Check the machine, and the configuration if a path is given."""
     found = [*libraries(), *packages(sys.path), *kernels(), *clock(), *unit()]
     if path is None:
         return found
@@ -91,7 +104,7 @@ def examine(path: Path | None = None) -> list[Finding]:
 
 
 def read(path: Path) -> tuple[Config | None, list[Finding]]:
-    """The configuration, and all that is wrong with it."""
+    """Read and check the configuration; return it, or None if it has a mistake, and the findings."""
     config, wrong = check(path, pipe=True)
     if config is None:
         return None, [Finding("wrong", "configuration", line) for line in wrong]
@@ -100,7 +113,17 @@ def read(path: Path) -> tuple[Config | None, list[Finding]]:
 
 
 def permissions(path: Path, about: str = "permissions", secret: bool = True) -> list[Finding]:
-    """Who may write a file that this service obeys, and read one that may hold ``secret`` words."""
+    """Check who may write a file that controls the service, and who may read a file that may contain a password.
+
+    Parameters
+    ----------
+    path : Path
+        File to check.
+    about : str, optional
+        Subject of the finding.
+    secret : bool, optional
+        True if the file may contain a password.
+    """
     try:
         seen = path.stat()
     except OSError as error:
@@ -125,7 +148,15 @@ def permissions(path: Path, about: str = "permissions", secret: bool = True) -> 
 
 
 def device(name: str, driver: Mapping[str, Any]) -> list[Finding]:
-    """What a device is reached by; nothing is opened."""
+    """Check the link of a device without opening it.
+
+    Parameters
+    ----------
+    name : str
+        Name of the device.
+    driver : mapping of str to any
+        Table of its driver in the configuration.
+    """
     about = f"device {name}"
     match driver.get("link"):
         case "serial":
@@ -140,7 +171,15 @@ def device(name: str, driver: Mapping[str, Any]) -> list[Finding]:
 
 
 def serial_port(about: str, port: str) -> list[Finding]:
-    """Is it there, may we read it, does another program hold it."""
+    """Check that a serial port exists, is accessible and is not used by another program.
+
+    Parameters
+    ----------
+    about : str
+        Subject of the finding.
+    port : str
+        Path or URL of the port.
+    """
     if "://" in port:
         return [Finding("well", about, f"{port}: a port of the network or a pattern, not tried from here")]
     path = Path(port)
@@ -163,7 +202,7 @@ def serial_port(about: str, port: str) -> list[Finding]:
 
 
 def holding(port: Path) -> Iterator[str]:
-    """Programs that have a port open, as far as this user can see them."""
+    """Yield the programs that have a port open, as far as this user can see them."""
     wanted = port.resolve()
     for process in Path("/proc").glob("[0-9]*"):
         if process.name == str(os.getpid()):
@@ -172,12 +211,24 @@ def holding(port: Path) -> Iterator[str]:
             open_files = {os.readlink(one) for one in (process / "fd").iterdir()}
             if str(wanted) in open_files:
                 yield f"{(process / 'comm').read_text().strip()} (pid {process.name})"
-        except OSError:  # another user's, or ended
+        except OSError:  # the process belongs to another user, or has ended
             continue
 
 
 def can_interface(about: str, interface: str, channel: str, sysfs: Path = Path("/sys/class/net")) -> list[Finding]:
-    """Is the package there that the interface needs; does the kernel have the bus, and is it up."""
+    """Check that the package for a CAN interface is installed, and that a socketcan interface exists and is up.
+
+    Parameters
+    ----------
+    about : str
+        Subject of the finding.
+    interface : str
+        Interface of python-can.
+    channel : str
+        Channel of the interface.
+    sysfs : Path, optional
+        Folder with the network interfaces of the kernel.
+    """
     if missing := missing_package(interface):
         text, _, command = missing.partition(": ")
         return [Finding("wrong", about, text, command)]
@@ -204,7 +255,7 @@ def can_interface(about: str, interface: str, channel: str, sysfs: Path = Path("
 
 
 def zenoh(config: Config) -> list[Finding]:
-    """Ports to listen on, routers to reach, and the file with what else holds."""
+    """Check the ports to listen on, the routers to connect to, and the zenoh configuration file."""
     own = config.zenoh
     if own.mode == "none":
         return []
@@ -221,12 +272,20 @@ def zenoh(config: Config) -> list[Finding]:
 
 
 def free(about: str, endpoint: str) -> list[Finding]:
-    """Whether a port can be listened on: bound for a moment, and given back."""
-    match = TCP.fullmatch(endpoint)
+    """Check that a port can be listened on, by binding it for a moment.
+
+    Parameters
+    ----------
+    about : str
+        Subject of the finding.
+    endpoint : str
+        Zenoh endpoint.
+    """
+    match = TCP_ENDPOINT.fullmatch(endpoint)
     if match is None:
         return [Finding("well", about, f"{endpoint}: not tried, only TCP ports can be from here")]
-    if int(match[2]) > LAST_PORT:
-        return [Finding("wrong", about, f"{endpoint}: cannot be listened on: ports end at {LAST_PORT}")]
+    if int(match[2]) > MAX_PORT:
+        return [Finding("wrong", about, f"{endpoint}: cannot be listened on: ports end at {MAX_PORT}")]
     try:
         family = socket.AF_INET6 if ":" in match[1] else socket.AF_INET
         with socket.create_server((match[1], int(match[2])), family=family):
@@ -240,14 +299,22 @@ def free(about: str, endpoint: str) -> list[Finding]:
 
 
 def reachable(about: str, endpoint: str) -> list[Finding]:
-    """Whether somebody answers at an endpoint."""
-    match = TCP.fullmatch(endpoint)
+    """Check that a connection to an endpoint can be opened.
+
+    Parameters
+    ----------
+    about : str
+        Subject of the finding.
+    endpoint : str
+        Zenoh endpoint.
+    """
+    match = TCP_ENDPOINT.fullmatch(endpoint)
     if match is None:
         return [Finding("well", about, f"{endpoint}: not tried, only TCP can be from here")]
-    if int(match[2]) > LAST_PORT:
-        return [Finding("wrong", about, f"{endpoint}: nobody answers: ports end at {LAST_PORT}")]
+    if int(match[2]) > MAX_PORT:
+        return [Finding("wrong", about, f"{endpoint}: nobody answers: ports end at {MAX_PORT}")]
     try:
-        with socket.create_connection((match[1], int(match[2])), timeout=CONNECT_S):
+        with socket.create_connection((match[1], int(match[2])), timeout=CONNECT_TIMEOUT_S):
             return [Finding("well", about, f"{endpoint}: somebody answers")]
     except (OSError, UnicodeError) as error:
         text = f"{endpoint}: nobody answers: {getattr(error, 'strerror', None) or error}"
@@ -255,7 +322,7 @@ def reachable(about: str, endpoint: str) -> list[Finding]:
 
 
 def viewer(config: Config) -> list[Finding]:
-    """Whether there is one where one is wanted."""
+    """Check that the viewer is installed, if the configuration uses it."""
     if config.viewer.mode == "none":
         return []
     if find_spec("rerun") is None:
@@ -265,7 +332,7 @@ def viewer(config: Config) -> list[Finding]:
 
 
 def metrics(config: Config) -> list[Finding]:
-    """The library, the port, and who can reach it."""
+    """Check the library and the port for Prometheus, and who can reach the port."""
     own = config.metrics
     if own is None:
         return []
@@ -281,7 +348,7 @@ def metrics(config: Config) -> list[Finding]:
 
 
 def reconcile(config: Config) -> list[Finding]:
-    """Whether ``command/reconcile`` can be answered, if a folder is configured for its reports."""
+    """Check that ``command/reconcile`` can be answered, if a folder is configured for its reports."""
     missing = missing_packages("reconcile")
     if not missing or not any(one.reconcile_folder for one in config.devices):
         return []
@@ -290,7 +357,7 @@ def reconcile(config: Config) -> list[Finding]:
 
 
 def storage(config: Config) -> list[Finding]:
-    """The library, the folder, and room for what is to be kept."""
+    """Check the library for recordings, the storage folder and the free disk space."""
     own = config.storage
     if own is None:
         return [Finding("doubt", "storage", "nothing is kept: a restart begins with empty windows", "[storage] folder")]
@@ -312,7 +379,7 @@ def storage(config: Config) -> list[Finding]:
 
 
 def in_use(own: Storage) -> list[Finding]:
-    """Whether another process records into the folder, or keeps its history there."""
+    """Check whether another process records into the storage folder or writes its history there."""
     wanted = {RECORDING_LOCK: own.record or own.raw, HISTORY_LOCK: own.history}
     holders = sorted({held for name, on in wanted.items() if on and (held := holder(own.folder, name))})
     do = "well if it is this service; else end it, or choose another folder: only one of them records"
@@ -320,8 +387,10 @@ def in_use(own: Storage) -> list[Finding]:
 
 
 def bytes_a_day(config: Config) -> float | None:
-    """What all devices together will fill of the disk; None where the rate of one is not configured.
+    """Return the disk use of all devices per day in bytes; None if the rate of a device is not configured.
 
+    Examples
+    --------
     >>> import dataclasses
     >>> from monitor import settings
     >>> one = settings.load(settings.CONFIG_FOLDER / "demo.toml")
@@ -333,13 +402,25 @@ def bytes_a_day(config: Config) -> float | None:
     if own is None:
         return 0.0
     each = SAMPLE_BYTES * own.record + RAW_BYTES * own.raw
-    rates = [one.rate_hz for one in config.devices if not isinstance(one.link, ReplayLink)]  # that is one already
+    rates = [one.rate_hz for one in config.devices if not isinstance(one.link, ReplayLink)]  # replays are not recorded
     known = [rate for rate in rates if rate is not None]
     return None if len(known) < len(rates) else sum(known) * DAY_S * each
 
 
 def room(own: Storage, a_day: float | None, total: int, available: int) -> list[Finding]:
-    """Whether what is to be kept fits: ``total`` and ``available`` bytes of the disk."""
+    """Check that the data to be kept fit on the disk.
+
+    Parameters
+    ----------
+    own : Storage
+        Settings of the storage.
+    a_day : float or None
+        Disk use per day in bytes; None if unknown.
+    total : int
+        Size of the disk in bytes.
+    available : int
+        Free space of the disk in bytes.
+    """
     allowed = available - (1.0 - own.disk_share) * total
     if a_day is None:
         text = f"{own.folder}: {_gb(available)} free; what a day takes is not known, as rates are found from the data"
@@ -359,7 +440,7 @@ def room(own: Storage, a_day: float | None, total: int, available: int) -> list[
 
 
 def libraries() -> list[Finding]:
-    """Each library against what this version was made for."""
+    """Check the version of each library against the requirements of this program."""
     wanted = list(requirements())
     if not wanted:
         return [Finding("doubt", "libraries", "cannot tell which versions are required: the package is not installed")]
@@ -379,11 +460,11 @@ def libraries() -> list[Finding]:
 
 
 def requirements() -> Iterator[tuple[str, str, bool]]:
-    """Name, versions and whether it is optional, of every library but those of tests."""
+    """Yield name, versions and whether it is optional, for every library except those for tests."""
     try:
         lines = metadata.requires(PACKAGE) or []
     except metadata.PackageNotFoundError:
-        lines = list(_of_project())
+        lines = list(_project_requirements())
     for line in lines:
         match = REQUIREMENT.fullmatch(line.strip())
         if match is None or match[1] == PACKAGE:
@@ -393,12 +474,12 @@ def requirements() -> Iterator[tuple[str, str, bool]]:
             yield match[1], match[2].replace(" ", ""), extra is not None
 
 
-def _of_project() -> Iterator[str]:
-    """The same lines, of a checkout that is not installed."""
+def _project_requirements() -> Iterator[str]:
+    """Yield the requirements of a checkout that is not installed."""
     import tomllib
 
     try:
-        project = tomllib.loads(PROJECT.read_text("utf-8"))["project"]
+        project = tomllib.loads(PROJECT_FILE.read_text("utf-8"))["project"]
     except (OSError, tomllib.TOMLDecodeError, KeyError):
         return
     yield from project["dependencies"]
@@ -407,8 +488,17 @@ def _of_project() -> Iterator[str]:
 
 
 def satisfies(version: str, wanted: str) -> bool:
-    """Whether a version is within bounds like ``>=0.41,<0.42``; a bound of another kind is not judged.
+    """Return True if a version is within bounds like ``>=0.41,<0.42``. Bounds of another kind are ignored.
 
+    Parameters
+    ----------
+    version : str
+        Version of the installed library.
+    wanted : str
+        Bounds, separated by commas.
+
+    Examples
+    --------
     >>> satisfies("0.41.2", ">=0.41,<0.42"), satisfies("0.42.0", ">=0.41,<0.42"), satisfies("2.0rc1", ">=1.9")
     (True, False, True)
     """
@@ -431,7 +521,7 @@ def packages(module_path: Sequence[str]) -> list[Finding]:
 
     Parameters
     ----------
-    module_path
+    module_path : sequence of str
         Folders in the order in which Python searches them, as ``sys.path``.
     """
     own = Path(__file__).resolve().parents[2]
@@ -441,7 +531,7 @@ def packages(module_path: Sequence[str]) -> list[Finding]:
         if folder == own:
             break
         for name in PACKAGES:
-            # a folder without __init__.py is a namespace package, and gives way to a package that is found later
+            # a folder without __init__.py is a namespace package, and a regular package that is found later replaces it
             places = (folder / name / "__init__.py", folder / f"{name}.py")
             foreign = next((one for one in places if one.is_file()), None)
             if foreign is not None:
@@ -454,7 +544,7 @@ def packages(module_path: Sequence[str]) -> list[Finding]:
 
 
 def kernels() -> list[Finding]:
-    """Whether kernels are compiled, and kept from start to start."""
+    """Check that the kernels are compiled and cached on disk."""
     from monitor.common.compiled import cache_folder
     from monitor.daemon.kernel_compilation import SERVICE, is_warm
 
@@ -469,7 +559,7 @@ def kernels() -> list[Finding]:
 
 
 def clock() -> list[Finding]:
-    """Whether something keeps the host's clock: results carry its time."""
+    """Check that the host clock is synchronised, because results carry its time."""
     state = _adjtimex()
     if state is None:
         return [Finding("doubt", "clock", "cannot tell whether it is synchronised: the system does not say")]
@@ -480,7 +570,7 @@ def clock() -> list[Finding]:
 
 
 def unit() -> list[Finding]:
-    """The service under systemd, where it is installed there."""
+    """Check the service under systemd, if it is installed there."""
     if shutil.which("systemctl") is None or not Path("/run/systemd/system").is_dir():
         return []
     command = ["systemctl", "show", UNIT, "--property=LoadState,ActiveState,SubState,NRestarts,UnitFileState"]
@@ -492,8 +582,10 @@ def unit() -> list[Finding]:
 
 
 def unit_state(seen: Mapping[str, str]) -> list[Finding]:
-    """What ``systemctl show`` says of the unit; nothing where there is none.
+    """Return the findings for the output of ``systemctl show``; none if there is no such unit.
 
+    Examples
+    --------
     >>> unit_state({"LoadState": "not-found"})
     []
     """
@@ -510,11 +602,11 @@ def unit_state(seen: Mapping[str, str]) -> list[Finding]:
     return [Finding("doubt", "systemd", text, f"journalctl -u {UNIT} -e; systemctl enable --now {UNIT}")]
 
 
-# --- what these share
+# --- shared functions
 
 
 def _adjtimex() -> int | None:
-    """State of the kernel's clock; None where it cannot be asked."""
+    """Return the state of the kernel clock; None if it cannot be read."""
     try:
         library = ctypes.CDLL(None, use_errno=True)
         question = ctypes.create_string_buffer(512)  # modes = 0: nothing is set
@@ -525,7 +617,7 @@ def _adjtimex() -> int | None:
 
 
 def _has_secret(path: Path) -> bool:
-    """Whether a file reads as if it held a password; it is not said which."""
+    """Return True if a file seems to contain a password."""
     try:
         text = file_access.read(path).decode("utf-8", errors="replace")
     except OSError:
@@ -534,24 +626,29 @@ def _has_secret(path: Path) -> bool:
 
 
 def _numbers(version: str) -> list[int]:
+    """Return the numbers of a version."""
     return [int(part) for part in re.match(r"[\d.]*", version)[0].split(".") if part]  # type: ignore[index]
 
 
 def _same_length(a: list[int], b: list[int]) -> tuple[list[int], list[int]]:
+    """Pad two lists of numbers with zeros to the same length."""
     length = max(len(a), len(b))
     return a + [0] * (length - len(a)), b + [0] * (length - len(b))
 
 
 def _host(endpoint: str) -> str:
-    match = TCP.fullmatch(endpoint)
+    """Return the host of an endpoint; "" if it is not a TCP endpoint."""
+    match = TCP_ENDPOINT.fullmatch(endpoint)
     return match[1] if match else ""
 
 
 def _gb(amount: float) -> str:
+    """Format a number of bytes in gigabytes."""
     return f"{amount / 1e9:.3g} GB"
 
 
 def _user(uid: int) -> str:
+    """Return the name of a user, or its number if it has no name."""
     import pwd
 
     try:
@@ -561,6 +658,7 @@ def _user(uid: int) -> str:
 
 
 def _group(gid: int) -> str:
+    """Return the name of a group, or its number if it has no name."""
     import grp
 
     try:
@@ -570,6 +668,7 @@ def _group(gid: int) -> str:
 
 
 def _read(path: Path) -> str:
+    """Return the content of a file without surrounding white space; "" if it cannot be read."""
     try:
         return path.read_text().strip()
     except OSError:
@@ -577,6 +676,6 @@ def _read(path: Path) -> str:
 
 
 def worst(findings: Iterable[Finding]) -> Mark:
-    """The worst mark of all."""
+    """Return the worst mark of all findings."""
     marks = {one.mark for one in findings}
     return "wrong" if "wrong" in marks else "doubt" if "doubt" in marks else "well"

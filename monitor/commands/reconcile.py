@@ -1,12 +1,11 @@
-"""The work of ``imu-monitor reconcile``: a recording from its file, the comparison in threads, and the folder it
-leaves.
+"""Command ``reconcile``: compares recordings with a noise model, in several threads, and writes the report.
 
-``DIR/`` gets ``report.html``, ``report.json``, ``model.toml`` and ``reconcile.rrd``; each appears whole or not at all.
-Where the data do not support an answer there is ``report.json`` alone, and it says why. Kernels and transforms run
-without the GIL, so that axes and simulated recordings are looked at side by side.
+``DIR/`` receives ``report.html``, ``report.json``, ``model.toml`` and ``reconcile.rrd``. Each file is written
+completely or not at all. If the data do not support an answer, only ``report.json`` is written, and it states the
+reason. Kernels and transforms release the GIL, so that axes and simulated recordings are processed in parallel.
 
-Several recordings are compared with one model, one after the other, each into a folder of its own in ``DIR/``; what
-they have in common and what only some show goes to ``DIR/`` itself.
+Several recordings are compared with one model, one after the other. Each has its own folder in ``DIR/``. The common
+results and the differences are written to ``DIR/`` itself.
 """
 
 import os
@@ -34,47 +33,58 @@ from monitor.reconcile.several_recordings import comparison_report
 from monitor.reconcile.several_recordings.comparison import Comparison, Run, compare
 
 Tell = Callable[[str, float | None], None]
-"""Told what is being done, and the share that is done where that is known."""
+"""Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
 REPORT: Final = "report.json"
+"""File name of the report as JSON."""
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What is to be compared."""
+    """Recording and model to compare."""
 
     recording: Path
-    model: NoiseModel | None  # None: the five terms are fitted first
+    model: NoiseModel | None  # None if the five terms are fitted first
     out: Path
     seed: int = 1
     rate_hz: float | None = None
-    notes: tuple[str, ...] = ()  # what is to be said besides
-    last_s: float | None = None  # the end of the recording alone
+    notes: tuple[str, ...] = ()  # additional notes for the report
+    last_s: float | None = None  # length of the end of the recording that is used; None for all
 
 
 @dataclass(frozen=True, slots=True)
 class RunsRequest:
-    """Several recordings of one sensor, to be compared with one model."""
+    """Several recordings of one sensor, and the model to compare them with."""
 
     recordings: tuple[Path, ...]
-    model: NoiseModel | None  # None: the five terms are fitted to the first recording
+    model: NoiseModel | None  # None if the five terms are fitted to the first recording
     out: Path
     seed: int = 1
     rate_hz: float | None = None
-    last_s: float | None = None  # the end of each alone
+    last_s: float | None = None  # length of the end of each recording that is used; None for all
 
 
 def make(request: Request, tell: Tell = lambda _what, _share: None) -> Reconciliation:
-    """Read, compare, and write the folder.
+    """Compare one recording with a model and write the report.
 
-    Raises:
-        RecordingError, ConfigError: no recording, or a folder that cannot be written
-        NotReady: the data do not support an answer; the folder says why
+    Parameters
+    ----------
+    request : Request
+        Recording and model to compare.
+    tell : callable, optional
+        Progress callback.
+
+    Raises
+    ------
+    RecordingError, ConfigError
+        The recording cannot be read, or the folder cannot be written.
+    NotReady
+        The data do not support an answer. The report states the reason.
     """
     tell("reading", None)
     found = load_samples(request.recording, request.rate_hz, request.last_s)
     check_folder(request.out)
     try:
-        recording, notes = _recording(found)
+        recording, notes = _to_regular_grid(found)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             result = reconcile(recording, request.model, request.seed, pool.map, lambda what: tell(what, None))
     except NotReady as error:
@@ -87,11 +97,21 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Reconcili
 
 
 def make_runs(request: RunsRequest, tell: Tell = lambda _what, _share: None) -> Comparison:
-    """Compare each by itself, then all with each other, and write the folders.
+    """Compare several recordings with a model and with each other, and write the reports.
 
-    Raises:
-        RecordingError, ConfigError: as ``make``; a recording that is given twice
-        NotReady: the first supports no answer where the model was to be fitted to it, or fewer than two do
+    Parameters
+    ----------
+    request : RunsRequest
+        Recordings and model to compare.
+    tell : callable, optional
+        Progress callback.
+
+    Raises
+    ------
+    RecordingError, ConfigError
+        As for ``make``, or a recording is given twice.
+    NotReady
+        Fewer than two recordings support an answer, or the first does not and the model was to be fitted to it.
     """
     named = names(request.recordings)
     _check_recordings(named, request.out)
@@ -102,7 +122,7 @@ def make_runs(request: RunsRequest, tell: Tell = lambda _what, _share: None) -> 
         notes = (f"The model under test are the five terms of {fitted_to}.",) if fitted_to and at > 1 else ()
         one = Request(path, model, request.out / name, request.seed, request.rate_hz, notes, request.last_s)
         try:
-            result = make(one, _told(tell, f"{name}, {at} of {len(named)}"))
+            result = make(one, _tell_for(tell, f"{name}, {at} of {len(named)}"))
         except NotReady as error:
             silent[name] = str(error)
             if model is None:
@@ -122,7 +142,15 @@ def make_runs(request: RunsRequest, tell: Tell = lambda _what, _share: None) -> 
 
 
 def write_runs(result: Comparison, folder: Path) -> None:
-    """What is said of all recordings together."""
+    """Write the report on all recordings together.
+
+    Parameters
+    ----------
+    result : Comparison
+        Comparison of the recordings.
+    folder : Path
+        Folder of the report.
+    """
     from monitor.publishing.reports.comparison_page import page
 
     _write(folder / REPORT, comparison_report.to_json(result))
@@ -131,8 +159,15 @@ def write_runs(result: Comparison, folder: Path) -> None:
 
 
 def names(recordings: Sequence[Path]) -> dict[str, Path]:
-    """Name -> recording: that of the file without its suffix, with a number where two would be the same.
+    """Return a unique name for each recording: the file name without its suffix, and a number if names are equal.
 
+    Raises
+    ------
+    ConfigError
+        A recording is given twice.
+
+    Examples
+    --------
     >>> list(names([Path("a/run.csv"), Path("b/run.csv.gz"), Path("c/warm.npz")]))
     ['run', 'run-2', 'warm']
     """
@@ -149,7 +184,7 @@ def names(recordings: Sequence[Path]) -> dict[str, Path]:
 
 
 def _check_recordings(named: Mapping[str, Path], out: Path) -> None:
-    """Before the first of them is worked on: all are there, and none would be written into."""
+    """Check before the work begins that all recordings exist and that no report would overwrite a recording."""
     for path in named.values():
         if not path.exists():
             raise RecordingError(f"{path}: cannot be read: there is no such file or folder")
@@ -157,12 +192,23 @@ def _check_recordings(named: Mapping[str, Path], out: Path) -> None:
             raise ConfigError(f"--out: {out}: {path} is a recording, and a report would be written into it")
 
 
-def _told(tell: Tell, which: str) -> Tell:
+def _tell_for(tell: Tell, which: str) -> Tell:
+    """Return a progress callback that adds the name of a recording."""
     return lambda what, share: tell(f"{which}: {what}", share)
 
 
 def write(result: Reconciliation, folder: Path, title: str) -> None:
-    """All four files."""
+    """Write the four files of a report.
+
+    Parameters
+    ----------
+    result : Reconciliation
+        Comparison of the recording with the model.
+    folder : Path
+        Folder of the report.
+    title : str
+        Title of the page.
+    """
     from monitor.publishing.reports.reconcile_page import page
 
     _write(folder / REPORT, to_json(result))
@@ -170,32 +216,49 @@ def write(result: Reconciliation, folder: Path, title: str) -> None:
     _write(folder / "report.html", page(result, title).encode())
     try:
         from monitor.publishing.reports.reconcile_rrd import write_rrd
-    except ImportError:  # the viewer's library is optional
+    except ImportError:  # the library of the viewer is optional
         return
     with whole(folder / "reconcile.rrd") as place:
         write_rrd(result, place)
 
 
 def no_answer(why: str, samples: int, schema: str = SCHEMA) -> bytes:
-    """``report.json`` where there is no verdict."""
+    """Return the content of ``report.json`` if there is no verdict.
+
+    Parameters
+    ----------
+    why : str
+        Reason.
+    samples : int
+        Number of samples in the recording.
+    schema : str, optional
+        Schema of the report.
+    """
     return msgspec.json.encode({"schema": schema, "verdict": None, "why": why, "samples": samples})
 
 
 def check_folder(folder: Path) -> None:
-    """Make the folder; ConfigError where it cannot be."""
+    """Create the folder of the report.
+
+    Raises
+    ------
+    ConfigError
+        The folder cannot be created.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"--out: {folder}: cannot be made: {error.strerror}") from error
 
 
-def _recording(found: Samples) -> tuple[Recording, list[str]]:
-    """On a regular grid, in the axes that the file has."""
+def _to_regular_grid(found: Samples) -> tuple[Recording, list[str]]:
+    """Return the recording on a regular grid with the axes of the file, and the notes about it."""
     values, temperature_c, rate_hz, notes = with_temperature(list(iter_blocks(found)), found.rate_hz)
     columns = {axis: np.ascontiguousarray(values[:, AXES.index(axis)], np.float64) for axis in found.axes}
     return Recording(columns, rate_hz, temperature_c), notes
 
 
 def _write(path: Path, data: bytes) -> None:
+    """Write a file completely or not at all."""
     with whole(path) as place:
         place.write_bytes(data)

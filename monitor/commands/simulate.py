@@ -1,9 +1,11 @@
-"""A recording from a model: ``simulate``, the twin of ``analyze``.
+"""Command ``simulate``: writes a recording of a noise model.
 
-The model's series is drawn and written block by block, so that memory does not grow with the length. The file has ``t``
-(s from 0, at the stated rate), the axes that the model names (others are absent, not zero), and ``temperature`` where
-the model or a recording gives one. It appears whole or not at all, and so does the truth beside it: the model, the
-seed, and what was drawn from the seed that the samples do not say.
+The time series is drawn and written block by block, so that the memory does not grow with the length. The file has the
+column ``t`` (seconds from 0, at the nominal rate) and the axes that the model names. Other axes are absent, not zero.
+The column ``temperature`` is present if the model or a recording provides it.
+
+The recording is written completely or not at all, and so is the file with the truth. The truth contains the model, the
+seed, and the values drawn from the seed that the samples do not show.
 """
 
 import tomllib
@@ -25,31 +27,33 @@ from monitor.noise.model import NoiseModel
 from monitor.noise.simulation import Drawn, ModelStream
 
 TRUTH_SCHEMA: Final = "imu-monitor/truth/1"
+"""Schema of the file with the truth."""
 RESULT_SCHEMA: Final = "imu-monitor/simulate/1"
+"""Schema of the result as JSON."""
 ROWS: Final = 1 << 16
-"""Drawn and written at a time."""
+"""Number of rows that are drawn and written at a time."""
 
 Tell = Callable[[str, float | None], None]
-"""Told what is being done, and the share that is done where that is known."""
+"""Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What is to be simulated."""
+    """Recording to simulate."""
 
     model: NoiseModel
     out: Path
     seconds: float
     seed: int
-    rate_hz: float | None = None  # the model's own unless given
-    temperature_from: Path | None = None  # a recording whose temperature is taken instead of the model's
-    truth: bool = False
-    name: str = "the model"  # for messages
+    rate_hz: float | None = None  # None for the rate of the model
+    temperature_from: Path | None = None  # recording whose temperature replaces that of the model
+    truth: bool = False  # True if the truth is written as well
+    name: str = "the model"  # name of the model in messages
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What was written."""
+    """Description of the written recording."""
 
     out: Path
     samples: int
@@ -61,11 +65,11 @@ class Result:
 
     @property
     def seconds(self) -> float:
-        """Length of the recording."""
+        """Length of the recording in seconds."""
         return self.samples / self.rate_hz
 
     def text(self) -> str:
-        """One line for people."""
+        """Return the description in one line of text."""
         columns = " ".join([*self.axes, *(["temperature"] if self.temperature else [])])
         beside = f"; truth in {self.truth}" if self.truth else ""
         return (
@@ -74,7 +78,7 @@ class Result:
         )
 
     def to_json(self) -> bytes:
-        """The same for programs."""
+        """Return the description as JSON."""
         return msgspec.json.encode(
             {
                 "schema": RESULT_SCHEMA,
@@ -91,11 +95,26 @@ class Result:
 
 
 def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
-    """Simulate and write.
+    """Simulate a recording and write it.
 
-    Raises:
-        ConfigError: no rate, no axis, or what the model cannot do at this rate; a place that cannot be written
-        RecordingError: the recording with the temperature is none
+    Parameters
+    ----------
+    request : Request
+        Recording to simulate.
+    tell : callable, optional
+        Progress callback.
+
+    Returns
+    -------
+    Result
+        Description of the written recording.
+
+    Raises
+    ------
+    ConfigError
+        There is no rate or no axis, the model cannot be simulated at this rate, or the file cannot be written.
+    RecordingError
+        The recording with the temperature cannot be read.
     """
     rate_hz = _rate_hz(request)
     n = round(request.seconds * rate_hz)
@@ -126,6 +145,7 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
 
 
 def _write(result: Result, stream: ModelStream, first: Drawn, tell: Tell) -> None:
+    """Write the recording block by block."""
     with writing(result.out, result.axes, result.temperature) as append:
         block, written = first, 0
         while True:
@@ -135,10 +155,11 @@ def _write(result: Result, stream: ModelStream, first: Drawn, tell: Tell) -> Non
             if written == result.samples:
                 break
             block = stream.draw_all(min(ROWS, result.samples - written))
-        tell("finishing the file", None)  # an archive is packed only now
+        tell("finishing the file", None)  # some formats are compressed only at the end
 
 
 def _rate_hz(request: Request) -> float:
+    """Return the requested sample rate, or else the rate of the model."""
     rate_hz = request.rate_hz or request.model.sample_rate_hz
     if rate_hz is None:
         raise ConfigError(f"{request.name}: has no sample_rate; give one with --rate HZ")
@@ -146,10 +167,13 @@ def _rate_hz(request: Request) -> float:
 
 
 def _temperature(request: Request, rate_hz: float, n: int) -> Floats | None:
-    """[≤ n] °C of the recording at the samples' times, straight lines between its own; None: the model's."""
+    """Return the temperature of the recording at the times of the samples, [≤ n] in °C, by linear interpolation.
+
+    None stands for the temperature of the model.
+    """
     if request.temperature_from is None:
         return None
-    found = _recorded(request.temperature_from, request.rate_hz)
+    found = _load_recording(request.temperature_from, request.rate_hz)
     known = np.isfinite(found.temperature_c)
     if not known.any():
         raise ConfigError(f"{request.temperature_from}: has no temperature; the column is temperature, in °C")
@@ -160,8 +184,8 @@ def _temperature(request: Request, rate_hz: float, n: int) -> Floats | None:
     return np.interp(np.arange(length) / rate_hz, t_s[order], temperature_c[order])
 
 
-def _recorded(path: Path, rate_hz: float | None) -> Recording:
-    """At its own rate; where it states none, its rows are as far apart as the samples that ``--rate`` asks for."""
+def _load_recording(path: Path, rate_hz: float | None) -> Recording:
+    """Load the recording with the temperature. If it has no rate, its rows are assumed to have the requested rate."""
     try:
         return load_samples(path)
     except ConfigError:
@@ -171,7 +195,7 @@ def _recorded(path: Path, rate_hz: float | None) -> Recording:
 
 
 def _truth(result: Result, model: NoiseModel, stream: ModelStream) -> bytes:
-    """What the file does not say, as JSON."""
+    """Return the truth as JSON."""
     return msgspec.json.encode(
         {
             "schema": TRUTH_SCHEMA,
@@ -188,7 +212,7 @@ def _truth(result: Result, model: NoiseModel, stream: ModelStream) -> bytes:
 
 
 def _version() -> str | None:
-    """Of this program; None where it runs from a folder without being installed."""
+    """Return the version of this program; None if it runs from a folder without installation."""
     try:
         return version("imu-monitor")
     except PackageNotFoundError:

@@ -1,7 +1,7 @@
-"""``thermal fit`` and ``thermal predict`` on files: a recording in, models of its axes or what they expect out.
+"""Commands ``thermal fit`` and ``thermal predict``: fit thermal models to a recording, and predict the bias of another.
 
-An axis that cannot be answered says why and holds up no other. The model file is JSON; ``predict`` reads what ``fit``
-wrote.
+If an axis cannot be fitted or predicted, the reason is reported, and the other axes are processed. The model file is
+JSON. ``predict`` reads the file that ``fit`` writes.
 """
 
 from collections.abc import Mapping
@@ -25,10 +25,11 @@ from monitor.drift.thermal.thermal_study import Outlook, Study, judge, nice_inte
 from monitor.estimation.regular_grid import with_temperature
 
 SCHEMA: Final = "imu-monitor/thermal-model/1"
+"""Schema of the model file."""
 
 
 class AxisRow(msgspec.Struct):
-    """One axis in a model file."""
+    """Thermal model of one axis in a model file."""
 
     powers: int
     time_constants: list[float]
@@ -40,11 +41,11 @@ class AxisRow(msgspec.Struct):
     covariance: list[list[float]]
     temperature: tuple[float, float]
     equation: dict[str, list[float] | float] | None = None
-    """For other readers; not read back."""
+    """Model in a form for other programs. ``from_file`` does not read it."""
 
 
 class ModelFile(msgspec.Struct):
-    """A model file."""
+    """Content of a model file."""
 
     schema: str
     interval: float
@@ -54,14 +55,27 @@ class ModelFile(msgspec.Struct):
 def fit(
     recording: Path, interval_s: float | None = None, rate_hz: float | None = None, last_s: float | None = None
 ) -> Study:
-    """Means and models of every axis; with ``last_s`` of the recording's end alone.
+    """Fit a thermal model to each axis of a recording.
 
-    Raises:
-        RecordingError, ConfigError: no recording, or none with temperature
+    Parameters
+    ----------
+    recording : Path
+        Recording with temperature.
+    interval_s : float, optional
+        Length of an interval mean in seconds. By default it follows from the length of the recording.
+    rate_hz : float, optional
+        Sample rate, if the recording has none.
+    last_s : float, optional
+        Length in seconds of the end of the recording that is used. By default the whole recording is used.
+
+    Raises
+    ------
+    RecordingError, ConfigError
+        The recording cannot be read, or it has no temperature.
     """
     values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
     means = _means(values, temperature_c, rate, interval_s or nice_interval(temperature_c.size / rate, rate))
-    interval = next(iter(means.values())).interval_s  # of whole samples
+    interval = next(iter(means.values())).interval_s  # rounded to a whole number of samples
     fits, refused = {}, {}
     for axis, one in means.items():
         try:
@@ -74,7 +88,24 @@ def fit(
 def predict(
     recording: Path, models: Mapping[str, ThermalModel], rate_hz: float | None = None, last_s: float | None = None
 ) -> Outlook:
-    """What models of an earlier recording expect of this one."""
+    """Predict the bias of a recording with thermal models of an earlier recording.
+
+    Parameters
+    ----------
+    recording : Path
+        Recording with temperature.
+    models : mapping of str to ThermalModel
+        Thermal model of each axis.
+    rate_hz : float, optional
+        Sample rate, if the recording has none.
+    last_s : float, optional
+        Length in seconds of the end of the recording that is used. By default the whole recording is used.
+
+    Raises
+    ------
+    RecordingError, ConfigError
+        The recording cannot be read, or it has no temperature.
+    """
     values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
     interval = next(iter(models.values())).interval_s
     means = _means(values, temperature_c, rate, interval)
@@ -90,16 +121,18 @@ def predict(
 
 
 def to_file(study: Study) -> bytes:
-    """The model file of all axes that were fitted."""
+    """Return the content of the model file with all axes that were fitted."""
     rows = {axis: _row(one.model) for axis, one in study.fits.items()}
     return msgspec.json.format(msgspec.json.encode(ModelFile(SCHEMA, study.interval_s, rows)), indent=1)
 
 
 def from_file(path: Path) -> dict[str, ThermalModel]:
-    """Models by axis; a pipe is read too.
+    """Read the model of each axis from a file or pipe.
 
-    Raises:
-        ConfigError: what is wrong with the file
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, or its content is invalid.
     """
     try:
         found = msgspec.json.decode(file_access.read(path, pipe=True), type=ModelFile)
@@ -119,6 +152,7 @@ def from_file(path: Path) -> dict[str, ThermalModel]:
 
 
 def _row(model: ThermalModel) -> AxisRow:
+    """Return a model in the form of the model file."""
     return AxisRow(
         powers=model.shape.powers,
         time_constants=list(model.shape.constants_s),
@@ -134,6 +168,7 @@ def _row(model: ThermalModel) -> AxisRow:
 
 
 def _model(path: Path, axis: str, row: AxisRow, interval_s: float) -> ThermalModel:
+    """Check the model of one axis in a model file, and return it."""
     k = len(row.time_constants)
     terms = 1 + row.powers + k
     size = terms + 2 * k
@@ -170,7 +205,7 @@ def _model(path: Path, axis: str, row: AxisRow, interval_s: float) -> ThermalMod
 def _read(
     recording: Path, rate_hz: float | None, last_s: float | None
 ) -> tuple[Floats, Floats, float, tuple[str, ...]]:
-    """Values [n, 6], temperature [n], rate and notes."""
+    """Return values [n, 6], temperature [n] in °C, rate in Hz and notes of a recording."""
     found = load_samples(recording, rate_hz, last_s)
     values, temperature_c, rate, notes = with_temperature(list(iter_blocks(found)), found.rate_hz)
     if not np.isfinite(temperature_c).any():
@@ -179,6 +214,7 @@ def _read(
 
 
 def _means(values: Floats, temperature_c: Floats, rate_hz: float, interval_s: float) -> dict[str, Means]:
+    """Return the interval means of each axis that was recorded."""
     return {
         axis: interval_means(values[:, at], temperature_c, rate_hz, interval_s)
         for at, axis in enumerate(AXES)

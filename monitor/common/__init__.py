@@ -1,1 +1,1 @@
-"""Shared by all packages: units, compiled kernels, zenoh topics, distributions, minimization, locks."""
+"""Modules that all packages share: units, compiled kernels, zenoh topics, distributions, minimization, folder locks."""

@@ -1,15 +1,17 @@
-"""One decorator for every kernel: compiled by Numba at first call, cached on disk, without the GIL.
+"""Decorators for numerical kernels: compile with Numba at the first call, cache on disk, release the GIL.
 
-Where nothing can be kept on disk (a read-only system, a user without a home) it is compiled at every start.
+If no cache folder can be written (a read-only system, a user without a home folder), kernels are compiled at every
+start.
 
-Before it takes cached code Numba asks only whether the kernel's own file has changed; but what the kernel calls from
-other files, and their constants, are compiled into it. So here the stamp of the cache covers all that a file imports.
+Before Numba loads cached code, it checks only whether the kernel's own file has changed. Functions that the kernel
+calls from other files, and their constants, are compiled into it as well. The stamp of the cache therefore covers all
+files that a file imports.
 
-Numba alone optimises each kernel, generates its machine code and makes it callable from Python before another kernel
-can call it, and then does the same again for its copy in the calling kernel. A function four calls below the kernel
-that Python calls goes through LLVM five times. ``Kernel`` leaves this out: functions that other kernels call remain
-intermediate code, which is optimised once, as a part of the kernel that Python calls. This saves a third of the time
-of a first start (``docs/benchmarks.md``). The machine code of the outer kernels is the same.
+Numba by itself optimises each kernel, generates its machine code and makes it callable from Python before another
+kernel can call it. It then does the same again for the copy in the calling kernel. A function four calls below the
+kernel that Python calls goes through LLVM five times. ``Kernel`` avoids this. Functions that other kernels call remain
+intermediate code, which is optimised once, as a part of the kernel that Python calls. This saves a third of the time of
+a first start (``docs/benchmarks.md``). The machine code of the outer kernels is the same.
 """
 
 import contextlib
@@ -26,7 +28,7 @@ from typing import Any, Final, ParamSpec, TypeVar, cast
 
 _masked = "scipy" not in sys.modules
 if _masked:
-    # Numba imports scipy.linalg if it is installed: 17 MB that no kernel here uses
+    # Numba imports scipy.linalg if it is installed, which takes 17 MB that no kernel here uses
     sys.modules["scipy"] = None  # type: ignore[assignment]
 try:
     import numba.np.arraymath
@@ -41,13 +43,16 @@ finally:
 P = ParamSpec("P")
 R = TypeVar("R")
 
-ROOT: Final = Path(__file__).parents[2]
-NAME: Final = re.compile(r"\w+")
+PACKAGE_ROOT: Final = Path(__file__).parents[2]
+"""Folder that contains the packages of the program."""
+IDENTIFIER: Final = re.compile(r"\w+")
+"""Regular expression for a name in a list of imported names."""
 IMPORTS: Final = re.compile(r"^ *from (monitor[\w.]*) import (?:\(([^)]*)\)|(.*))", re.MULTILINE)
+"""Regular expression for an import from a module of the package, with names in parentheses or on one line."""
 
 
 class IntermediateLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """LLVM module that is only linked into others: neither optimised as a whole nor translated to machine code."""
+    """LLVM module that is only linked into others, and neither optimised as a whole nor translated to machine code."""
 
     def _optimize_final_module(self) -> None: ...
 
@@ -56,38 +61,45 @@ class IntermediateLibrary(JITCodeLibrary):  # type: ignore[misc]
 
 
 class IntermediateCompiler(Compiler):  # type: ignore[misc]
-    """Compiles a function to an ``IntermediateLibrary``."""
+    """Compiler that compiles a function to an ``IntermediateLibrary``."""
 
     def __init__(  # type: ignore[no-untyped-def]
         self, typing_context, target_context, library, args, return_type, flags, local_types
     ) -> None:
         library = IntermediateLibrary(target_context.codegen(), "intermediate")
         super().__init__(typing_context, target_context, library, args, return_type, flags, local_types)
-        self.state.targetctx.get_executable = _without_machine_code  # a copy of the context, for this compilation only
+        self.state.targetctx.get_executable = _without_machine_code  # this context serves only this compilation
 
 
 def _without_machine_code(library: Any, description: Any, environment: Any) -> Any:
-    """Return a function object that identifies the compiled function inside Numba; it must never be called."""
+    """Return a function object that identifies the compiled function inside Numba. It must never be called."""
     library._ensure_finalized()  # noqa: SLF001
     return _dynfunc.make_function(description.lookup_module(), description.qualname, "", 0, environment, (library,))
 
 
 class Intermediate(CPUDispatcher):  # type: ignore[misc]
-    """Compiles a function for calls from other kernels."""
+    """Dispatcher that compiles a function for calls from other kernels."""
 
     def __init__(self, function: Callable[..., Any], options: dict[str, bool | str]) -> None:
         super().__init__(function, targetoptions=options, pipeline_class=IntermediateCompiler)
 
     def __call__(self, *_: object) -> Any:
-        """Refuse; there is no machine code to call."""
+        """Raise TypeError, because there is no machine code to call."""
         raise TypeError(f"{self.py_func.__name__} is intermediate code, which only other kernels can call")
 
 
 class Kernel(CPUDispatcher):  # type: ignore[misc]
-    """Function that is compiled at its first call from Python, or as a part of the kernel that calls it.
+    """Dispatcher that compiles a function at its first call from Python, or as a part of a kernel that calls it.
 
-    ``signatures`` lists the argument types that it has been compiled for to be called from Python,
-    ``intermediate.signatures`` those for which it has become a part of other kernels.
+    ``signatures`` lists the argument types for which the function has been compiled to be called from Python.
+    ``intermediate.signatures`` lists the argument types for which it has become a part of other kernels.
+
+    Parameters
+    ----------
+    function : callable
+        Python function to compile.
+    inline : bool
+        True if LLVM must copy the function into every kernel that calls it.
     """
 
     def __init__(self, function: Callable[..., Any], inline: bool) -> None:
@@ -98,26 +110,26 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         self.intermediate = Intermediate(function, options | {"no_cpython_wrapper": True})
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Compile for a call from another kernel; Numba asks this when it infers the types of that kernel.
+        """Compile for a call from another kernel. Numba calls this method when it infers the types of that kernel.
 
-        A constant argument does not count as a type of its own, so that the function is compiled once for all of them.
+        A constant argument is not treated as a type of its own, so the function is compiled once for all constants.
         """
         kws = {name: types.unliteral(one) for name, one in kws.items()}
         return self.intermediate.get_call_template([types.unliteral(one) for one in args], kws)
 
     def get_overload(self, sig: Any) -> Any:
-        """Return what ``get_call_template`` compiled; Numba asks this when it lowers the calling kernel."""
+        """Return the function that ``get_call_template`` compiled. Numba calls this to lower the calling kernel."""
         return self.intermediate.get_overload(sig)
 
     def compile(self, sig: Any) -> Any:
-        """Compile for a call from Python, or load from the disk cache."""
+        """Compile for a call from Python, or load the machine code from the cache on disk."""
         with _no_garbage_collection():
             return super().compile(sig)
 
 
 @contextlib.contextmanager
 def _no_garbage_collection() -> Iterator[None]:
-    """Pause the garbage collector, which takes a tenth of a compilation and finds next to nothing to free."""
+    """Pause the garbage collector, which takes a tenth of the compilation time and frees almost nothing."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -128,21 +140,21 @@ def _no_garbage_collection() -> Iterator[None]:
 
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile in nopython mode. No fast-math: compensated sums must keep their order."""
+    """Compile a function in nopython mode, without fast-math, because compensated sums must keep their order."""
     return _cached(Kernel(function, inline=False), function)
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile as ``compiled`` does, and make LLVM copy the function into every kernel that calls it.
+    """Compile a function as ``compiled`` does, and make LLVM copy it into every kernel that calls it.
 
-    For the body of an inner loop that LLVM alone holds for too long to copy.
+    This decorator is for the body of an inner loop that LLVM would not copy by itself because of its length.
     """
     return _cached(Kernel(function, inline=True), function)
 
 
 def _cached(kernel: Kernel, function: Callable[P, R]) -> Callable[P, R]:
-    """Have machine code of a kernel kept on disk, if there is a folder for it."""
-    with contextlib.suppress(RuntimeError):  # no folder for it
+    """Enable the cache on disk for a kernel, if a cache folder can be written."""
+    with contextlib.suppress(RuntimeError):  # no cache folder can be written
         kernel.enable_caching()
         kept = cast("Any", kernel)._cache._cache_file  # noqa: SLF001
         kept._source_stamp = (kept._source_stamp, stamp(Path(inspect.getfile(function))))  # noqa: SLF001
@@ -150,7 +162,7 @@ def _cached(kernel: Kernel, function: Callable[P, R]) -> Callable[P, R]:
 
 
 def cache_folder() -> Path | None:
-    """Where this machine keeps compiled kernels; None where it cannot."""
+    """Return the folder of compiled kernels on this machine; None if no such folder can be written."""
     kernel: Any = numba.njit(_nothing)
     try:
         kernel.enable_caching()
@@ -165,8 +177,21 @@ def _nothing() -> None: ...
 
 
 @cache
-def stamp(path: Path, root: Path = ROOT) -> str:
-    """Of a file and all that it imports of this package under ``root``, one by the other."""
+def stamp(path: Path, root: Path = PACKAGE_ROOT) -> str:
+    """Return a hash of a file and of all modules of this program that it imports, directly or through others.
+
+    Parameters
+    ----------
+    path : Path
+        Python file.
+    root : Path, optional
+        Folder that contains the package.
+
+    Returns
+    -------
+    str
+        SHA-256 of the contents, in hexadecimal.
+    """
     texts: dict[Path, bytes] = {}
     left = [path]
     while left:
@@ -176,5 +201,5 @@ def stamp(path: Path, root: Path = ROOT) -> str:
             for package, listed, plain in IMPORTS.findall(texts[one].decode()):
                 place = root / package.replace(".", "/")
                 left.append(place.with_suffix(".py"))
-                left += [place / f"{name}.py" for name in NAME.findall(listed or plain)]  # those that are modules
+                left += [place / f"{name}.py" for name in IDENTIFIER.findall(listed or plain)]  # names of modules
     return sha256(b"\0".join(texts[one] for one in sorted(texts))).hexdigest()

@@ -1,7 +1,7 @@
 """Quantiles and tail probabilities of the normal, χ², Student and F distributions, without SciPy.
 
-The service needs few of them, and SciPy would be the second largest package of an installation. The tests compare each
-function with SciPy over the range that its docstring names, to a relative difference of 1e-12.
+The service needs few of these functions, and SciPy would be the second largest package of an installation. The tests
+compare each function with SciPy over the range that its docstring states, to a relative difference of 1e-12.
 """
 
 from functools import lru_cache
@@ -16,27 +16,41 @@ from monitor.common.compiled import compiled
 
 Floats = NDArray[np.float64]
 
-ORDERS: Final = 10
-"""Terms of the Cornish-Fisher expansion of a χ² quantile."""
+CORNISH_FISHER_TERMS: Final = 10
+"""Number of terms in the Cornish-Fisher expansion of a χ² quantile."""
 MIN_ASYMPTOTIC_EDF: Final = 1000.0
-"""From here on the expansion is exact to rounding."""
+"""Smallest number of degrees of freedom for which the expansion is exact to rounding."""
 MIN_EXPANDED_EDF: Final = 30.0
-"""From here on the expansion, below it the power law at zero or Wilson and Hilferty's formula, starts the iteration."""
+"""Smallest number of degrees of freedom for which the iteration starts from the expansion.
+
+Below it, the iteration starts from the power law at zero or from Wilson and Hilferty's formula.
+"""
 MAX_ITERATIONS: Final = 60
-LAST_STEP: Final = 1e-7
-"""After a relative step this small, the result of a Halley or Newton iteration is exact to rounding."""
-TOLERANCE: Final = 1e-15
-"""Of the continued fraction."""
+"""Largest number of Halley or Newton iterations."""
+STEP_TOLERANCE: Final = 1e-7
+"""Relative step at which a Halley or Newton iteration ends. The result is then exact to rounding."""
+FRACTION_TOLERANCE: Final = 1e-15
+"""Relative tolerance of the continued fraction."""
 MIN_ASYMPTOTIC_DF: Final = 1000
-"""From here on four terms of the expansion of Student's quantile are exact to rounding."""
-SMALLEST: Final = 1e-300
+"""Smallest number of degrees of freedom for which four terms of the expansion of Student's quantile are exact to
+rounding.
+"""
+TINY: Final = 1e-300
+"""Value that replaces zeros in the continued fraction."""
 
 _NORMAL: Final = NormalDist()
 
 
 def normal_quantile(probability: float) -> float:
-    """Return the quantile of the standard normal distribution; infinite at 0 and 1.
+    """Return the quantile of the standard normal distribution, which is infinite at 0 and 1.
 
+    Parameters
+    ----------
+    probability : float
+        Lower tail probability, 0 to 1.
+
+    Examples
+    --------
     >>> f"{normal_quantile(0.975):.6f}"
     '1.959964'
     """
@@ -51,14 +65,23 @@ def normal_quantile(probability: float) -> float:
 def chi2_quantile(edf: Floats, probability: float) -> Floats:
     """Return the quantile of χ², which solves P(edf/2, x/2) = probability.
 
-    Halley's iteration on the regularised incomplete gamma function P, from a start that is near enough for two or three
-    steps. From MIN_ASYMPTOTIC_EDF on the Cornish-Fisher expansion is the result.
+    The function uses Halley's iteration on the regularised incomplete gamma function P. The start value is accurate
+    enough for two or three steps. From MIN_ASYMPTOTIC_EDF on, the Cornish-Fisher expansion is the result.
 
     Parameters
     ----------
-    edf : [...] degrees of freedom, from 0.01, need not be whole; NaN and numbers that are not positive give NaN.
-    probability : lower tail, from 0.001 to 0.975. Nearer to one, digits are lost.
+    edf : float64 [...]
+        Degrees of freedom, 0.01 or more, not necessarily whole. NaN and values that are not positive give NaN.
+    probability : float
+        Lower tail probability, from 0.001 to 0.975. Values nearer to one lose digits.
 
+    Returns
+    -------
+    float64 [...]
+        Quantile.
+
+    Examples
+    --------
     >>> chi2_quantile(np.array([1.0, 10.0, 1e6]), 0.975).round(3).tolist()
     [5.024, 20.483, 1002773.701]
     """
@@ -92,8 +115,8 @@ def _coefficients(z: float) -> tuple[float, ...]:
     """
     poly = np.polynomial.Polynomial
     x = poly([0.0, 1.0])
-    y, first, second, squares = [x], [poly([1.0])], [poly([0.0])], [poly([1.0])]  # and [y'²]
-    for k in range(1, ORDERS):
+    y, first, second, squares = [x], [poly([1.0])], [poly([0.0])], [poly([1.0])]  # coefficients of y, y', y'', y'²
+    for k in range(1, CORNISH_FISHER_TERMS):
         square = sum((first[i] * first[k - i] for i in range(1, k)), poly([0.0]))
         r = squares[k - 1] + x * square + sum((y[i] * squares[k - i] for i in range(1, k)), poly([0.0]))
         r = r - sum((y[i] * (second[k - 1 - i] + x * first[k - 1 - i]) for i in range(k)), poly([0.0]))
@@ -108,7 +131,7 @@ def _coefficients(z: float) -> tuple[float, ...]:
 
 
 def _start(a: Floats, z: float, probability: float) -> Floats:
-    """Return a rough quantile of the gamma distribution: of its power law at zero, or by Wilson and Hilferty."""
+    """Return a start value for the gamma quantile, from the power law at zero or from Wilson and Hilferty's formula."""
     logs = np.array([lgamma(one + 1.0) for one in a.tolist()])
     with np.errstate(under="ignore"):
         at_zero = np.exp((np.log(probability) + logs) / a)
@@ -122,7 +145,7 @@ def _refined(a: Floats, x: Floats, probability: float) -> Floats:
     With g = ln x and h(g) = P, h' = x f(x) and h''/h' = a − x.
     """
     logs = np.array([lgamma(one) for one in a.tolist()])
-    open_ = np.flatnonzero(x > 0.0)  # zero where even the quantile underflows
+    open_ = np.flatnonzero(x > 0.0)  # x is zero if the quantile underflows
     for _ in range(MAX_ITERATIONS):
         if not open_.size:
             break
@@ -132,13 +155,13 @@ def _refined(a: Floats, x: Floats, probability: float) -> Floats:
         bend = np.clip(0.5 * newton * (b - at), -0.5, 0.5)
         step = np.clip(newton / (1.0 - bend), -2.0, 2.0)
         x[open_] = at * np.exp(-step)
-        open_ = open_[np.abs(step) > LAST_STEP]
+        open_ = open_[np.abs(step) > STEP_TOLERANCE]
     return x
 
 
 @compiled
 def _series(a, x):  # type: ignore[no-untyped-def]
-    """Return Σ_n x^n / (a (a + 1) … (a + n)): P(a, x) over x^a e^−x / Γ(a). All terms are positive."""
+    """Return Σ_n x^n / (a (a + 1) … (a + n)), which is P(a, x) divided by x^a e^−x / Γ(a). All terms are positive."""
     out = np.empty(a.size)
     for i in range(a.size):
         term = 1.0 / a[i]
@@ -155,20 +178,29 @@ def _series(a, x):  # type: ignore[no-untyped-def]
 
 
 def incomplete_beta(a: float, b: float, x: Floats) -> Floats:
-    """Return the regularised incomplete beta function I_x(a, b), by its continued fraction (DLMF 8.17.22).
+    """Return the regularised incomplete beta function I_x(a, b) by its continued fraction (DLMF 8.17.22).
 
-    It is the tail of F: P(F > f) = I_x(n/2, m/2), x = n/(n + m f), for m and n degrees of freedom.
+    It gives the tail of the F distribution with m and n degrees of freedom: P(F > f) = I_x(n/2, m/2), x = n/(n + m f).
 
     Parameters
     ----------
-    a, b : from 0.5 to 500.
-    x : [...] from 0 to 1.
+    a, b : float
+        Shape parameters, from 0.5 to 500.
+    x : float64 [...]
+        Argument, from 0 to 1.
 
+    Returns
+    -------
+    float64 [...]
+        I_x(a, b).
+
+    Examples
+    --------
     >>> incomplete_beta(2.0, 0.5, np.array([0.0, 0.5, 1.0])).round(6).tolist()
     [0.0, 0.116117, 1.0]
     """
     front = lgamma(a + b) - lgamma(a) - lgamma(b)
-    other = x > (a + 1.0) / (a + b + 2.0)  # where the fraction of the complement converges faster
+    other = x > (a + 1.0) / (a + b + 2.0)  # here the continued fraction of the complement converges faster
     p, q = np.where(other, b, a), np.where(other, a, b)
     y = np.where(other, 1.0 - x, x)
     with np.errstate(divide="ignore", under="ignore"):
@@ -190,26 +222,31 @@ def _fraction(a: Floats, b: Floats, x: Floats) -> Floats:
             d = 1.0 / _away_from_zero(1.0 + numerator * d)
             c = _away_from_zero(1.0 + numerator / c)
             found = found * (c * d)
-        if not (np.abs(c * d - 1.0) > TOLERANCE).any():
+        if not (np.abs(c * d - 1.0) > FRACTION_TOLERANCE).any():
             break
     return found
 
 
 def _away_from_zero(x: Floats) -> Floats:
-    return np.where(np.abs(x) < SMALLEST, SMALLEST, x)
+    """Replace values near zero by TINY, to avoid a division by zero."""
+    return np.where(np.abs(x) < TINY, TINY, x)
 
 
 def student_quantile(df: int, probability: float) -> float:
     """Return the quantile of Student's distribution.
 
-    Newton's iteration on the incomplete beta function; from MIN_ASYMPTOTIC_DF on the expansion of Fisher & Cornish,
-    Technometrics 2, 1960 (Abramowitz & Stegun 26.7.5).
+    The function uses Newton's iteration on the incomplete beta function. From MIN_ASYMPTOTIC_DF on, the result is the
+    expansion of Fisher & Cornish, Technometrics 2, 1960 (Abramowitz & Stegun 26.7.5).
 
     Parameters
     ----------
-    df : degrees of freedom, 1 or more.
-    probability : from 0.975 to 0.999.
+    df : int
+        Degrees of freedom, 1 or more.
+    probability : float
+        Lower tail probability, from 0.975 to 0.999.
 
+    Examples
+    --------
     >>> f"{student_quantile(1, 0.975):.4f} {student_quantile(30, 0.975):.4f}"
     '12.7062 2.0423'
     """
@@ -222,15 +259,16 @@ def student_quantile(df: int, probability: float) -> float:
     for _ in range(MAX_ITERATIONS):
         here = 0.5 * float(incomplete_beta(0.5 * df, 0.5, np.array([df / (df + t * t)]))[0])
         density = exp(scale - 0.5 * (df + 1) * log1p(t * t / df))
-        # the tail is nearly a power of t, so a step of its logarithm goes farther than one of itself
+        # the tail is nearly a power of t, so the iteration converges faster in logarithms
         step = here / (density * t) * log(here / tail)
         t *= exp(min(max(step, -2.0), 2.0))
-        if abs(step) < LAST_STEP:
+        if abs(step) < STEP_TOLERANCE:
             break
     return t
 
 
 def _student_terms(z: float) -> tuple[float, float, float, float]:
+    """Return the coefficients of 1/df, 1/df², 1/df³ and 1/df⁴ in the expansion of Student's quantile."""
     return (
         (z**3 + z) / 4.0,
         (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / 96.0,

@@ -1,10 +1,10 @@
-"""Advisory lock on a storage folder, so that one process at a time writes recordings there, and one the history.
+"""Advisory lock on a storage folder: one process at a time writes recordings there, and one writes the history.
 
-The lock is ``flock`` on a file in the folder. The kernel releases it when its holder ends, in whatever way. The file is
-never deleted. It holds the process id and the host of the holder, for messages. Readers need no lock.
+The lock is ``flock`` on a file in the folder. The kernel releases the lock when its holder ends, in whatever way. The
+file is never deleted. It holds the process id and the host of the holder, for messages. Readers need no lock.
 
-``hold`` takes the lock, or checks that it is still held: if the folder or the lock file is deleted or replaced, the
-lock is gone with it. The descriptor is closed when another program is executed, so hooks and viewers do not inherit it.
+``hold`` takes the lock, or checks that it is still held. If the folder or the lock file is deleted or replaced, the
+lock is lost. The file descriptor is closed when another program is executed, so hooks and viewers do not inherit it.
 """
 
 import contextlib
@@ -20,12 +20,15 @@ from typing import Final
 from drivers.file_access import KINDS, check_folder
 
 RECORDING_LOCK: Final = "recording.lock"
+"""Name of the lock file for recordings."""
 HISTORY_LOCK: Final = "history.lock"
+"""Name of the lock file for the history."""
 NO_LOCKS: Final = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL)
-"""What ``flock`` says on a file system without locks."""
-SECOND_TRY_S: Final = 0.05
-"""``doctor`` holds the lock for a moment while it looks who does."""
+"""Error numbers of ``flock`` on a file system without locks."""
+RETRY_S: Final = 0.05
+"""Pause before the second attempt, because ``doctor`` holds the lock for a moment while it looks for the holder."""
 HOLDER_BYTES: Final = 300
+"""Largest length of the text about the holder in the lock file."""
 
 
 class FolderLock:
@@ -33,17 +36,17 @@ class FolderLock:
 
     Parameters
     ----------
-    folder
-        The folder. ``hold`` makes it if there is none.
-    name
-        Name of the lock file in it.
+    folder : Path
+        Folder to lock. ``hold`` creates it if it does not exist.
+    name : str
+        Name of the lock file in the folder.
     """
 
     def __init__(self, folder: Path, name: str) -> None:
         self.folder = folder
         self.path = folder / name
         self.warning = ""
-        """One line if the file system has no locks; the folder is used without one then."""
+        """Message if the file system has no locks, and the folder is used without a lock; else empty."""
         self._descriptor: int | None = None
 
     def hold(self) -> str:
@@ -52,12 +55,12 @@ class FolderLock:
         Returns
         -------
         str
-            "" if the lock is held; else one line that says which process holds it.
+            "" if the lock is held, else one line that names the process that holds it.
 
         Raises
         ------
         OSError
-            The folder or the lock file cannot be made or opened.
+            The folder or the lock file cannot be created or opened.
         """
         if self._descriptor is not None:
             if self._in_place(self._descriptor):
@@ -65,7 +68,7 @@ class FolderLock:
             self.release()
         check_folder(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
-        descriptor = _opened(self.path)
+        descriptor = _open_lock_file(self.path)
         try:
             free = self._lock(descriptor)
             if free and self._in_place(descriptor):
@@ -83,21 +86,22 @@ class FolderLock:
         return self._descriptor is not None
 
     def release(self) -> None:
-        """Give the lock back; the file stays."""
+        """Release the lock; the file stays."""
         descriptor, self._descriptor = self._descriptor, None
         if descriptor is not None:
             os.close(descriptor)
 
     def _in_place(self, descriptor: int) -> bool:
-        """Return True if the lock file still has its name in the folder."""
+        """Return True if the open lock file is still the file of that name in the folder."""
         try:
             return os.path.samestat(os.stat(self.path, follow_symlinks=False), os.fstat(descriptor))
         except OSError:
             return False
 
     def _lock(self, descriptor: int) -> bool:
+        """Try to lock the file; return True if it succeeds, or if the file system has no locks."""
         self.warning = ""
-        for wait_s in (SECOND_TRY_S, 0.0):
+        for wait_s in (RETRY_S, 0.0):
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -116,14 +120,19 @@ class FolderLock:
 
 
 def holder(folder: Path, name: str) -> str:
-    """Return who holds the lock of a folder; "" if nobody does, or it cannot be found out.
+    """Return a text that names the holder of a folder's lock.
 
     Parameters
     ----------
-    folder
-        The folder.
-    name
-        Name of the lock file in it; it is not made.
+    folder : Path
+        Locked folder.
+    name : str
+        Name of the lock file in the folder. It is not created.
+
+    Returns
+    -------
+    str
+        "" if the lock is free, or if its state cannot be determined.
     """
     try:
         descriptor = os.open(folder / name, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW)
@@ -141,8 +150,15 @@ def holder(folder: Path, name: str) -> str:
         os.close(descriptor)
 
 
-def _opened(path: Path) -> int:
-    # NFS locks only what is open for writing; a FIFO would be waited for without O_NONBLOCK
+def _open_lock_file(path: Path) -> int:
+    """Open or create the lock file.
+
+    Raises
+    ------
+    OSError
+        The file cannot be opened, or it is not a regular file.
+    """
+    # NFS locks only files that are open for writing. Without O_NONBLOCK, opening a FIFO would block.
     flags = os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW
     descriptor = os.open(path, flags, 0o644)
     mode = os.fstat(descriptor).st_mode
@@ -154,14 +170,15 @@ def _opened(path: Path) -> int:
 
 
 def _write_holder(descriptor: int) -> None:
-    # a disk that is full keeps no name: the lock holds all the same, and its holder stays unnamed
+    """Write the process id and the host name into the lock file."""
+    # on a full disk the lock still works, but its holder has no name
     with contextlib.suppress(OSError):
         os.ftruncate(descriptor, 0)
         os.pwrite(descriptor, f"{os.getpid()} {socket.gethostname()}\n".encode(errors="replace"), 0)
 
 
 def _holder(descriptor: int) -> str:
-    """Name the holder by what it wrote into the file."""
+    """Return the name of the holder, as read from the lock file."""
     words = os.pread(descriptor, HOLDER_BYTES, 0).decode(errors="replace").split()
     if len(words) != 2 or not words[0].isdecimal():
         return "another process"

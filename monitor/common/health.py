@@ -1,40 +1,51 @@
-"""How a device does right now: what the status message, the viewer and the terminal show."""
+"""Status of a device for the status message, the viewer and the terminal."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-SAID: Final = 3
-"""Troubles in one sentence."""
+MAX_PROBLEMS: Final = 3
+"""Largest number of problems in the sentence."""
 
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """One device's state at one moment; counts are since the start."""
+    """Status of one device at one moment. Counts are since the start."""
 
     state: str  # running | waiting | lost | ended
     rate_hz: float | None  # measured; None until known
     received: int
-    lost: int  # missing on the wire, or left out as a frame came too late; rejected frames are not among them
-    bad: int  # rejected: failed check, impossible value
-    overflowed: int  # overwritten in the ring before the worker took them
-    latency_p50_s: float | None  # receipt to published, over the last second
-    latency_p99_s: float | None
+    lost: int  # missing on the wire, or discarded because the frame came too late; excludes rejected frames
+    bad: int  # rejected because of a failed check or an impossible value
+    overflowed: int  # overwritten in the ring buffer before the worker took them
+    latency_p50_s: float | None  # median time from reception to publication, over the last second
+    latency_p99_s: float | None  # 99 % quantile of this time
     memory_bytes: int  # of the whole process
-    outputs: Mapping[str, str]  # output -> "ok" or what is wrong with it
-    text: str  # one sentence for people; empty while all is well
+    outputs: Mapping[str, str]  # state of each output: "ok" or a description of the problem
+    text: str  # message about the device; empty if there is no problem
     uptime_s: float
-    repeated: int = 0  # samples that came twice, left out
-    late: int = 0  # samples that came when their place had passed as missing, left out
-    moving: bool = False  # the device is moved just now
-    moved: int = 0  # samples of moving stretches
-    crossed: tuple[str, ...] = ()  # the user's limits that are passed now: "gz N"
+    repeated: int = 0  # samples that were received twice and discarded
+    late: int = 0  # samples that were discarded because they already counted as missing
+    moving: bool = False  # True while the device is in motion
+    moved: int = 0  # number of samples during motion
+    crossed: tuple[str, ...] = ()  # user limits that are crossed now, for example "gz N"
 
 
 def sentence(healths: Mapping[str, Health], outputs: Mapping[str, str], stuck: Sequence[str] = ()) -> str:
-    """How the whole service does, in one line: for systemd.
+    """Return the status of the whole service in one line, for systemd.
 
+    Parameters
+    ----------
+    healths : mapping of str to Health
+        Status of each device by its name.
+    outputs : mapping of str to str
+        State of each output by its name.
+    stuck : sequence of str, optional
+        Names of the devices whose reader is stuck.
+
+    Examples
+    --------
     >>> sentence({}, {"zenoh": "ok", "viewer": "off"})
     '0 devices; all well'
     """
@@ -45,5 +56,5 @@ def sentence(healths: Mapping[str, Health], outputs: Mapping[str, str], stuck: S
     troubles += [f"{name}: beyond its limit: {', '.join(one.crossed)}" for name, one in healths.items() if one.crossed]
     troubles += [f"{name}: its reader is stuck" for name in stuck]
     troubles += [f"{name}: {state}" for name, state in outputs.items() if state not in ("ok", "off")]
-    more = f"; and {len(troubles) - SAID} more" if len(troubles) > SAID else ""
-    return f"{', '.join([count, *said])}; {'; '.join(troubles[:SAID]) or 'all well'}{more}"
+    more = f"; and {len(troubles) - MAX_PROBLEMS} more" if len(troubles) > MAX_PROBLEMS else ""
+    return f"{', '.join([count, *said])}; {'; '.join(troubles[:MAX_PROBLEMS]) or 'all well'}{more}"

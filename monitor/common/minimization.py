@@ -1,7 +1,7 @@
-"""Minimise a function of one or of a few variables.
+"""Minimization of a function of one or a few variables.
 
-``minimize_bfgs`` follows Nocedal & Wright, Numerical Optimization, 2006, algorithm 6.1: forward differences for the
-gradient, a line search for the Wolfe conditions by bisection, and the BFGS update of the inverse of the Hessian.
+``minimize_bfgs`` follows Nocedal & Wright, Numerical Optimization, 2006, algorithm 6.1. It uses forward differences for
+the gradient, a line search for the Wolfe conditions by bisection, and the BFGS update of the inverse of the Hessian.
 ``golden_section`` searches an interval (Kiefer, Proc. Am. Math. Soc. 4, 1953).
 """
 
@@ -14,26 +14,39 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-DIFFERENCE: Final = 2.0**-26
-"""Relative step of a forward difference: the root of the rounding error."""
-DECREASE: Final = 1e-4
-CURVATURE: Final = 0.9
-"""Constants of the Wolfe conditions."""
+FORWARD_DIFFERENCE_STEP: Final = 2.0**-26
+"""Relative step of a forward difference: the square root of the rounding error."""
+WOLFE_DECREASE: Final = 1e-4
+"""Constant of the first Wolfe condition, the sufficient decrease."""
+WOLFE_CURVATURE: Final = 0.9
+"""Constant of the second Wolfe condition, the curvature."""
 MAX_BISECTIONS: Final = 40
+"""Largest number of steps of a line search."""
 MAX_ITERATIONS_PER_VARIABLE: Final = 200
-GOLDEN: Final = (sqrt(5.0) - 1.0) / 2.0
+INVERSE_GOLDEN_RATIO: Final = (sqrt(5.0) - 1.0) / 2.0
+"""Inverse of the golden ratio."""
 
 
 def minimize_bfgs(
     function: Callable[[Floats], float], start: Floats, gradient_tolerance: float
 ) -> tuple[float, Floats]:
-    """Return the value and the place of a local minimum.
+    """Return the value and the position of a local minimum.
 
     Parameters
     ----------
-    function : of [n] variables, smooth.
-    start : [n]
-    gradient_tolerance : the search ends where no component of the gradient is larger, or no step makes it less.
+    function : callable
+        Smooth function of float64 [n].
+    start : float64 [n]
+        Start of the search.
+    gradient_tolerance : float
+        The search ends if no component of the gradient is larger, or if no step decreases the function.
+
+    Returns
+    -------
+    value : float
+        Value of the function at the minimum.
+    x : float64 [n]
+        Position of the minimum.
     """
     x, value = np.array(start, np.float64), function(start)
     slope, inverse = _gradient(function, x, value), np.eye(x.size)
@@ -43,7 +56,7 @@ def minimize_bfgs(
         direction = -inverse @ slope
         if not slope @ direction < 0.0:
             inverse, direction = np.eye(x.size), -slope
-        # the first direction has the size of the gradient, which says nothing of the distance
+        # the length of the first direction is that of the gradient, which does not show the distance to the minimum
         first = 1.0 if iteration else min(1.0, 1.0 / float(np.linalg.norm(slope)))
         found = _line_search(function, x, value, slope, direction, first)
         if found is None:
@@ -63,9 +76,9 @@ def minimize_bfgs(
 def _line_search(
     function: Callable[[Floats], float], x: Floats, value: float, slope: Floats, direction: Floats, step: float
 ) -> tuple[float, float, Floats] | None:
-    """Return step, value and gradient at a point that fulfils the Wolfe conditions, or else the best point with less.
+    """Return step, value and gradient at a point that fulfils the Wolfe conditions, or else at the lowest point found.
 
-    None if no step makes the function less.
+    The result is None if no step decreases the function.
     """
     falling = float(slope @ direction)
     low, high = 0.0, inf
@@ -73,27 +86,27 @@ def _line_search(
     for _ in range(MAX_BISECTIONS):
         there = x + step * direction
         less = function(there)
-        if not less <= value + DECREASE * step * falling:
+        if not less <= value + WOLFE_DECREASE * step * falling:
             high = step
         else:
             new = _gradient(function, there, less)
             if less < value and (best is None or less < best[1]):
                 best = step, less, new
-            if float(new @ direction) >= CURVATURE * falling:
+            if float(new @ direction) >= WOLFE_CURVATURE * falling:
                 return best
             low = step
-        if high - low <= DIFFERENCE * high * 1e-3:
+        if high - low <= FORWARD_DIFFERENCE_STEP * high * 1e-3:
             break
         step = 0.5 * (low + high) if high < inf else 2.0 * step
     return best
 
 
 def _gradient(function: Callable[[Floats], float], x: Floats, value: float) -> Floats:
-    """Return the gradient [n] by forward differences, beside the value at x."""
+    """Return the gradient [n] by forward differences from the value at x."""
     found = np.empty(x.size)
     for i in range(x.size):
         beside = x.copy()
-        beside[i] += DIFFERENCE * max(1.0, abs(float(x[i])))
+        beside[i] += FORWARD_DIFFERENCE_STEP * max(1.0, abs(float(x[i])))
         found[i] = (function(beside) - value) / (beside[i] - x[i])
     return found
 
@@ -101,13 +114,26 @@ def _gradient(function: Callable[[Floats], float], x: Floats, value: float) -> F
 def golden_section(
     function: Callable[[float], float], low: float, high: float, tolerance: float
 ) -> Generator[None, None, tuple[float, float]]:
-    """Return the value and the place of a minimum in an interval; yields after each call of the function.
+    """Return the value and the position of a minimum in an interval; yield after each call of the function.
 
     Parameters
     ----------
-    function : with one minimum between low and high.
-    tolerance : the place is known to so much.
+    function : callable
+        Function of a float, with one minimum between ``low`` and ``high``.
+    low, high : float
+        Ends of the interval.
+    tolerance : float
+        Largest error of the position.
 
+    Returns
+    -------
+    value : float
+        Value of the function at the minimum.
+    position : float
+        Position of the minimum.
+
+    Examples
+    --------
     >>> def run(search):
     ...     while True:
     ...         try:
@@ -118,19 +144,19 @@ def golden_section(
     >>> round(value, 9), round(place, 5)
     (2.0, 1.0)
     """
-    left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+    left, right = high - INVERSE_GOLDEN_RATIO * (high - low), low + INVERSE_GOLDEN_RATIO * (high - low)
     at_left = function(left)
     yield
     at_right = function(right)
     yield
-    for _ in range(max(ceil(log(tolerance / (high - low)) / log(GOLDEN)), 0)):
+    for _ in range(max(ceil(log(tolerance / (high - low)) / log(INVERSE_GOLDEN_RATIO)), 0)):
         if at_left <= at_right:
             high, right, at_right = right, left, at_left
-            left = high - GOLDEN * (high - low)
+            left = high - INVERSE_GOLDEN_RATIO * (high - low)
             at_left = function(left)
         else:
             low, left, at_left = left, right, at_right
-            right = low + GOLDEN * (high - low)
+            right = low + INVERSE_GOLDEN_RATIO * (high - low)
             at_right = function(right)
         yield
     return min((at_left, left), (at_right, right))

@@ -1,6 +1,6 @@
-"""Amounts of a rate in sentences: °/s for gyroscopes, mg or m/s² for accelerometers, two digits, no exponents.
+"""Formatting of rates for text: °/s for gyroscopes, mg or m/s² for accelerometers, two digits, no exponent.
 
-What leaves as a number is SI; this is for people. 1 g = 9.80665 m/s² (CGPM 1901).
+Numbers in messages to programs are in SI units; this module is only for people. 1 g = 9.80665 m/s² (CGPM 1901).
 """
 
 from math import degrees
@@ -9,12 +9,23 @@ from typing import Final
 import numpy as np
 
 MILLI_G: Final = 9.80665e-3
-"""m/s²"""
+"""One thousandth of standard gravity, in m/s²."""
 
 
 def amount(axis: str, si: float, sign: bool = False) -> str:
-    """A rate on an axis of ``AXES``, SI, in the field's unit; ``sign``: a difference.
+    """Format a rate with its unit.
 
+    Parameters
+    ----------
+    axis : str
+        Axis of ``AXES``.
+    si : float
+        Rate in rad/s or m/s².
+    sign : bool, optional
+        True if positive values get a sign, as for a difference.
+
+    Examples
+    --------
     >>> amount("gz", 2.79), amount("ax", -0.0324, sign=True), amount("az", 27.0), amount("gx", 1e-6)
     ('160 °/s', '-3.3 mg', '27 m/s²', '0.000057 °/s')
     """
@@ -26,5 +37,13 @@ def amount(axis: str, si: float, sign: bool = False) -> str:
 
 
 def plain(value: float, sign: bool = False) -> str:
-    """Two significant digits, no exponent."""
+    """Format a number with two significant digits and without an exponent.
+
+    Parameters
+    ----------
+    value : float
+        Number to format.
+    sign : bool, optional
+        True if positive values get a sign.
+    """
     return np.format_float_positional(float(f"{value:.1e}"), trim="-", sign=sign)

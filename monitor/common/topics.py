@@ -1,32 +1,40 @@
-"""The table of all that leaves the process over zenoh: name, key, encoding, rate.
+"""Table of all zenoh topics of the program: name, encoding and rate.
 
-Keys are ``<prefix>/<device>/<name>``; the prefix is ``imu`` unless ``[zenoh] prefix`` says otherwise.
+Keys are ``<prefix>/<device>/<name>``. The prefix is ``imu`` unless ``[zenoh] prefix`` sets another one.
 """
 
 from dataclasses import dataclass
 from typing import Final, Literal
 
 ENDPOINT: Final = "tcp/127.0.0.1:7450"
-"""Where a daemon listens unless it is told otherwise: not 7447, where ROS 2's router listens."""
+"""Default address on which a daemon listens. It is not port 7447, which the router of ROS 2 uses."""
 JSON: Final = "application/json"
 MSGPACK: Final = "application/msgpack"
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One row of the table."""
+    """Row of the table."""
 
     name: str
     encoding: str
     when: Literal["batches", "publish", "rounds", "intervals", "event", "1 Hz", "presence", "query"]
-    kept: int = 0  # messages that a daemon keeps for subscribers that come late
+    kept: int = 0  # number of messages that a daemon keeps for late subscribers
 
     def key(self, prefix: str, device: str) -> str:
-        """The key expression of this topic for one device."""
+        """Return the key expression of this topic for one device.
+
+        Parameters
+        ----------
+        prefix : str
+            Prefix of the daemon's keys.
+        device : str
+            Name of the device, or a wildcard.
+        """
         return f"{prefix}/{device}/{self.name}"
 
     def schema(self) -> str:
-        """The payload's ``schema`` field."""
+        """Return the content of the payload's ``schema`` field."""
         return f"imu-monitor/{self.name.split('/')[-1]}/1"
 
 
@@ -59,3 +67,4 @@ TOPICS: Final = (
     RESET,
     RECONCILE,
 )
+"""All topics."""

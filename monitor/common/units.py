@@ -1,9 +1,8 @@
-"""From SI to the units people know, written once: viewer, terminal, plots and events take them from here.
+"""Conversion from SI units to the units of the field, for viewer, terminal, plots and events.
 
-In comes a number in SI units (rad, m, s); out goes the same number in the field's
-unit, or a short text with the unit beside it. Nothing here computes with field units, and nothing
-elsewhere converts. Factors follow from 1 rad = 180/π °, 1 h = 3600 s (√h = 60 √s) and
-1 g = 9.80665 m/s² (standard gravity, CGPM 1901).
+The functions take a number in SI units (rad, m, s) and return it in the field's unit, or as a short text with the unit.
+No other module converts, and nothing is computed in field units. The factors follow from 1 rad = 180/π °, 1 h = 3600 s
+(√h = 60 √s) and 1 g = 9.80665 m/s² (standard gravity, CGPM 1901).
 """
 
 import math
@@ -16,22 +15,31 @@ Kind = Literal["gyro", "accel"]
 KINDS: Final[tuple[Kind, Kind]] = ("gyro", "accel")
 KIND_NAMES: Final = {"gyro": "Gyroscopes", "accel": "Accelerometers"}
 
-DEGREE: Final = 180.0 / math.pi  # degrees in a radian
-HOUR: Final = 3600.0  # seconds in an hour
-ROOT_HOUR: Final = 60.0  # √s in a √h
-MICRO_G: Final = 1e6 / 9.80665  # µg in a m/s²
+DEGREE: Final = 180.0 / math.pi  # degrees per radian
+HOUR: Final = 3600.0  # seconds per hour
+ROOT_HOUR: Final = 60.0  # √s per √h
+MICRO_G: Final = 1e6 / 9.80665  # µg per m/s²
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """A field unit: multiply an SI number by ``factor`` and write ``name`` beside it."""
+    """Unit of the field with its name and its factor: a value in SI units times ``factor`` is a value in this unit."""
 
     factor: float
     name: str
 
     def text(self, si: float, digits: int = 3) -> str:
-        """The number in this unit, with the unit.
+        """Format a value with this unit.
 
+        Parameters
+        ----------
+        si : float
+            Value in SI units.
+        digits : int, optional
+            Number of significant digits.
+
+        Examples
+        --------
         >>> COEFFICIENT_UNITS["gyro"]["N"].text(1.5e-4)
         '0.516 °/√h'
         """
@@ -54,13 +62,15 @@ COEFFICIENT_UNITS: Final[dict[Kind, dict[str, Unit]]] = {
         "R": Unit(MICRO_G * HOUR, "µg/h"),
     },
 }
-"""Letter -> field unit, of a gyroscope and of an accelerometer."""
+"""Field unit of each noise coefficient, for gyroscopes and accelerometers."""
 
 DEVIATION_UNITS: Final[dict[Kind, Unit]] = {
     "gyro": Unit(DEGREE * HOUR, "°/h"),
     "accel": Unit(MICRO_G, "µg"),
 }
+"""Field unit of Allan deviations."""
 SAMPLE_UNITS: Final[dict[Kind, Unit]] = {"gyro": Unit(DEGREE, "°/s"), "accel": Unit(1.0, "m/s²")}
+"""Field unit of samples."""
 
 COEFFICIENT_NAMES: Final[dict[Kind, dict[str, str]]] = {
     "gyro": {
@@ -78,26 +88,44 @@ COEFFICIENT_NAMES: Final[dict[Kind, dict[str, str]]] = {
         "R": "acceleration ramp",
     },
 }
+"""Name of each noise coefficient, for gyroscopes and accelerometers."""
 
 
 def kind_of(axis: str) -> Kind:
-    """Which kind of sensor an axis of ``AXES`` belongs to."""
+    """Return the kind of sensor to which an axis of ``AXES`` belongs."""
     return "gyro" if axis.startswith("g") else "accel"
 
 
 def axes_of(kind: Kind) -> tuple[str, ...]:
-    """The three axes of a kind, x y z."""
+    """Return the axes x, y, z of a kind of sensor."""
     return AXES[:3] if kind == "gyro" else AXES[3:]
 
 
 def unit_of(letter: str, axis: str) -> Unit:
-    """Field unit of one coefficient on one axis."""
+    """Return the field unit of a noise coefficient.
+
+    Parameters
+    ----------
+    letter : {"Q", "N", "B", "K", "R"}
+        Noise coefficient.
+    axis : str
+        Axis of ``AXES``.
+    """
     return COEFFICIENT_UNITS[kind_of(axis)][letter]
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A number with ``digits`` significant digits, without an exponent where a person reads it easily.
+    """Format a number, without an exponent if it is easy to read without one.
 
+    Parameters
+    ----------
+    value : float
+        Number to format.
+    digits : int, optional
+        Number of significant digits.
+
+    Examples
+    --------
     >>> number(0.51566), number(1234.5), number(2.4e-6), number(float("nan"))
     ('0.516', '1230', '2.40e-6', '—')
     """

@@ -1,1 +1,1 @@
-"""The service: device workers, pipeline, outputs, restart and reload."""
+"""Service process: device workers, processing pipeline, outputs, restart and reload."""

@@ -1,4 +1,7 @@
-"""Identifies models of drift beside the loop: some 50 ms of work that no sample is to wait for."""
+"""Background identification of ARMA drift models.
+
+The identification of one axis takes some 50 ms, and would delay the samples if it ran in the main loop.
+"""
 
 import threading
 
@@ -10,28 +13,31 @@ from monitor.drift.compensation.live_compensation import LiveCompensation
 
 
 class Identifier:
-    """For one device: one axis after the other, each in a thread of its own that ends with it.
+    """Worker that identifies the ARMA models of one device, one axis after the other, each in a thread of its own.
 
-    Args:
-        name: of the threads
-        at_once: work where it is asked, as a recording waits for it
+    Parameters
+    ----------
+    name : str
+        Name of the threads.
+    at_once : bool
+        True if the model is identified in the calling thread. A replayed recording can wait for it.
     """
 
     def __init__(self, name: str, at_once: bool) -> None:
         self._name = name
         self._at_once = at_once
-        self._work: _Work | None = None
+        self._work: _Identification | None = None
 
     def renew(self, live: LiveCompensation) -> None:
-        """Take over what is found, and begin what is due."""
+        """Adopt a model that has been identified, and start the identification of the next axis that is due."""
         if self._work is not None:
             if self._work.thread.is_alive():
                 return
-            if self._work.of is live.compensator:  # it may have begun anew meanwhile
+            if self._work.of is live.compensator:  # the compensator may have been replaced since the thread started
                 live.adopt(self._work.axis, self._work.found)
             self._work = None
         for axis in live.compensator.due:
-            work = _Work(live.compensator, axis, self._name)
+            work = _Identification(live.compensator, axis, self._name)
             if not self._at_once:
                 self._work = work
                 work.thread.start()
@@ -40,8 +46,8 @@ class Identifier:
             live.adopt(axis, work.found)
 
 
-class _Work:
-    """One axis."""
+class _Identification:
+    """Identification of the model of one axis."""
 
     def __init__(self, of: Compensator, axis: int, name: str) -> None:
         self.of, self.axis = of, axis
@@ -50,7 +56,8 @@ class _Work:
         self.thread = threading.Thread(target=self.run, name=name, daemon=True)
 
     def run(self) -> None:
+        """Identify the model; ``found`` stays None if the data do not allow it."""
         try:
             self.found = identify(*self._window)
-        except NotReady:  # all the same, or far too few: asked again later
+        except NotReady:  # values that are all equal, or too few; the identification is repeated later
             self.found = None

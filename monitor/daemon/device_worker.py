@@ -1,7 +1,7 @@
-"""One device inside the service: its reader thread, ring and estimate, and when what of it is published.
+"""Worker of one device: reader thread, ring buffer, processing pipeline and publication of the results.
 
-``work`` is one round of the main loop for this device: take, update, publish what is due. Outputs are called in order
-and none of them waits: each has a queue or drops.
+``Station.work`` is one round of the main loop for the device. It takes the new samples, updates the estimate and
+publishes the results that are due. It calls the outputs in order. No output blocks: each has a queue, or drops data.
 """
 
 import threading
@@ -38,75 +38,196 @@ from monitor.estimation.estimate import Estimate
 from monitor.estimation.window_snapshot import Held
 from monitor.settings.loading import Device, VirtualTable
 
-RING_SECONDS: Final = 10.0
-RING_SAMPLES: Final = (65_536, 1_000_000)
+RING_S: Final = 10.0
+"""Capacity of the ring buffer, in seconds of samples, within the bounds of RING_SAMPLES_RANGE."""
+RING_SAMPLES_RANGE: Final = (65_536, 1_000_000)
+"""Smallest and largest capacity of the ring buffer."""
 PATIENCE_S: Final = 0.002
-SAMPLES_EVERY_S: Final = 0.1
-"""Raw samples travel in batches of at most this long, unless every block is wanted."""
-CHOOSING_S: Final = 0.001
-"""In a round, that choosing a model of temperature may take for a sensor; a recording waits for it, and has longer."""
-CHOOSING_RECORDED_S: Final = 0.02
-CHOOSING_SHARE: Final = 0.02
-"""Of a processor, that it may take for a device."""
-TOTAL_EVERY_S: Final = 0.1
-TOTAL_SHARE: Final = 0.005
-"""Of a processor, that total and Hadamard deviations may take for a device."""
-UNTIMED_KEPT: Final = 100
-"""Events that wait for the first sample's time; the oldest are dropped."""
-SET_S: Final = 1.0
-"""A host's clock that is set by more is told, and so are times that are further from it."""
+"""Pause after which a replayed recording checks again for space in a queue."""
+MAX_BATCH_S: Final = 0.1
+"""Longest time that raw samples are collected before they are published as one batch."""
+MODEL_SELECTION_S: Final = 0.001
+"""Processor time in a round for the selection of a thermal model, for a live sensor."""
+MODEL_SELECTION_REPLAY_S: Final = 0.02
+"""The same for a replayed recording, which waits for the selection and may use more time."""
+MODEL_SELECTION_CPU_SHARE: Final = 0.02
+"""Share of one processor that the selection of a thermal model may use for a device."""
+TOTAL_INTERVAL_S: Final = 0.1
+"""Shortest interval between two steps of the total and Hadamard deviations."""
+TOTAL_CPU_SHARE: Final = 0.005
+"""Share of one processor that the total and Hadamard deviations may use for a device."""
+MAX_UNTIMED_EVENTS: Final = 100
+"""Largest number of events that wait for the time of the first sample. The oldest are dropped."""
+MIN_CLOCK_STEP_S: Final = 1.0
+"""Smallest step of the host clock, and smallest offset of the sample times from it, that is reported."""
 
 
 class Output:
-    """Where a station's results go; no call waits for anyone. What an output does not override it does not show.
+    """Receiver of the results of the devices; a subclass overrides the methods for the results that it uses.
 
-    Every ``unix_s`` is a time on the timeline of the device's own samples. A recording, or a device that stamps its
-    samples itself, may be years away from the host's clock, so its timeline is unknown before its first sample: no
-    event is passed on until then, and ``health`` has None for its time.
+    No method may block. Every ``unix_s`` is a time in seconds on the timeline of the device's own samples. A recording,
+    or a device that stamps its samples itself, may be years away from the host clock, so its timeline is unknown before
+    its first sample. Until then no event is passed on, and ``health`` receives None as time.
+
+    Several methods have the same parameters. ``device`` is the name of the device. ``received`` is the number of
+    samples of the device since the start, up to the result.
     """
 
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
-        """A block, and how many samples had come with it; ``offset_ns`` makes its times Unix time."""
+        """Receive a block of samples.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        received : int
+            Number of samples of the device up to the end of this block, since the start.
+        samples : SampleBlock
+            Samples in SI units, with times in nanoseconds.
+        offset_ns : int
+            Offset that converts the times to Unix time, in nanoseconds.
+        """
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """One refit."""
+        """Receive a new estimate.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        unix_s : float
+            Time of the newest sample in the window.
+        estimate : Estimate
+            Allan curve and noise coefficients.
+        """
 
     def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
-        """The window beside the model in force, with each estimate; never where there is no model."""
+        """Receive the comparison of the window with the model in force. Not called for a device without a model.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        unix_s : float
+            Time of the newest sample in the window.
+        gap : ModelGap
+            Comparison of the window with the model.
+        """
 
     def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
-        """An interval beside what temperature let expect of it; never where none is measured."""
+        """Receive the mean of an interval and its prediction from temperature. Not called without a thermal model.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        unix_s : float
+            Time of the interval.
+        received : int
+            Number of samples of the device since the start.
+        look : ThermalLook
+            Mean of the interval and its prediction.
+        """
 
     def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
-        """As ``samples``, the gyros' drift taken out."""
+        """Receive a block of samples without the drift of the gyroscopes.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        received : int
+            Number of samples of the device up to the end of this block, since the start.
+        samples : SampleBlock
+            Compensated samples in SI units, with times in nanoseconds.
+        offset_ns : int
+            Offset that converts the times to Unix time, in nanoseconds.
+        """
 
     def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
-        """What an interval of a second taught of the gyros' drift."""
+        """Receive the state of the drift compensation after an interval of one second.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        unix_s : float
+            Time of the interval.
+        look : DriftLook
+            Drift, innovations and models.
+        """
 
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
-        """Total and Hadamard deviations, renewed in rounds."""
+        """Receive the total and Hadamard deviations, which are computed step by step and published when complete.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        unix_s : float
+            Time of the newest sample.
+        received : int
+            Number of samples of the device since the start.
+        total : TotalCurve
+            Total deviations.
+        hadamard : HadamardCurve
+            Hadamard deviations.
+        """
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """Something happened."""
+        """Receive an event of the device.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        unix_s : float
+            Time of the event.
+        received : int
+            Number of samples of the device since the start.
+        event : Event
+            Kind, axis and text of the event.
+        """
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Once a second. ``unix_s`` is None while the time on the device's timeline is unknown."""
+        """Receive the status of the device, once a second.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        unix_s : float or None
+            Present time on the device's timeline; None while it is unknown.
+        health : Health
+            Status of the device.
+        """
 
     def gone(self, device: str) -> None:
-        """The device was taken out of the configuration; one of its name may come again."""
+        """Forget a device that was removed from the configuration. A device with the same name may be added later."""
 
 
 class Station:
-    """One device of the service.
+    """Worker of one device of the service.
 
-    Args:
-        device: its settings
-        link: what its samples come by
-        wake: set whenever samples have come
-        ready: which of the estimator's kernels are compiled; samples wait in order until they are
-        recorder: keeps what comes, and has what came before
-    Raises:
-        ConfigError: the model in force is none
+    Parameters
+    ----------
+    device : Device
+        Settings of the device.
+    link : Link
+        Link from which the samples are read.
+    decoder : Decoder
+        Decoder of the device's wire format.
+    wake : threading.Event
+        Set whenever samples have arrived.
+    ready : Ready
+        Flags of the compiled kernels. Samples wait in order until the kernels that the device needs are compiled.
+    recorder : Recorder, optional
+        Records samples and raw bytes, and provides the samples from before a restart.
+
+    Raises
+    ------
+    ConfigError
+        The model in force cannot be read.
     """
 
     def __init__(
@@ -121,11 +242,11 @@ class Station:
         self.device = device
         self.name = device.name
         rate = device.rate_hz or 1000.0
-        low, high = RING_SAMPLES
-        self.ring = RingBuffer(int(min(max(rate * RING_SECONDS, low), high)))
+        low, high = RING_SAMPLES_RANGE
+        self.ring = RingBuffer(int(min(max(rate * RING_S, low), high)))
         self.clock = SampleClock(decoder.timing, device.rate_hz, _arrivals_are_timed(device, link))
         self._recorder = recorder
-        keep = None if recorder is None else self._keep
+        keep = None if recorder is None else self._record_chunks
         self.driver = Driver(device.name, link, decoder, self.clock, self._push, device.axes, device.silence_s, keep)
         self.latest: Estimate | None = None
         self.model = model_of(device)
@@ -134,37 +255,37 @@ class Station:
         self.published = 0  # samples handed to the outputs
         self._wake = wake
         self._ready = ready
-        # a recording is over before its changes could be looked for
+        # a short recording may end before the kernels of the change detection are compiled
         self.waits_for_all = device.refit_s == 0.0 or device.leave_out_motion or isinstance(link, ReplayLink)
         self._patient = link.epoch == "unix"
         self.chain = Chain(device, self.model, ready, self._patient, self.waits_for_all)
-        self._wall = WallClock(time.monotonic_ns(), time.time_ns())
+        self._slewed_clock = WallClock(time.monotonic_ns(), time.time_ns())
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
-        self._batch: list[SampleBlock] = []  # not published yet
+        self._unpublished: list[SampleBlock] = []  # samples that were taken and not published yet
         self._waiting_since_ns = 0
-        self._unpublished_since_ns = 0  # of the oldest sample that was taken and not published yet
+        self._unpublished_since_ns = 0  # arrival of the oldest sample in it
         self._latencies: list[float] = []
         self._started_s = time.monotonic()
-        self._before = State()  # what was known before a restart
-        self._happened: list[Event] = []
-        self._untimed: deque[tuple[str, str]] = deque(maxlen=UNTIMED_KEPT)  # kind and text, see ``_note``
-        self._tail: Tail | None = None  # of the recording, that the window is rebuilt from first
+        self._before = State()  # state of the estimate before a restart
+        self._pending_events: list[Event] = []
+        self._untimed: deque[tuple[str, str]] = deque(maxlen=MAX_UNTIMED_EVENTS)  # kind and text, see ``_store_event``
+        self._tail: Tail | None = None  # end of the recording, until the window has been rebuilt from it
         self._next_s = dict.fromkeys(("refit", "publish", "samples", "total", "thermal"), 0.0)
-        self._refitted = False  # a refit since the last publication
-        self._doubts = (False, False)  # of the configured rate: it is contradicted, it has not been checked yet
-        self._newest_ns: int | None = None  # of the samples that were taken
-        self._taken_ns = 0  # host monotonic, when the newest was taken
+        self._refitted = False  # True if the fit was updated since the last publication
+        self._rate_doubts = (False, False)  # True if the configured rate is contradicted; True if it is not checked yet
+        self._newest_ns: int | None = None  # time of the newest sample that was taken from the ring buffer
+        self._taken_ns = 0  # host monotonic time at which this sample was taken
 
-    # --- life
+    # --- start and stop
 
     def start(self) -> None:
-        """Start reading; where the recording ends less than a window ago, the samples go on from it."""
+        """Start the reader thread; if the recording ended less than a window ago, resume from its end."""
         if self._recorder is not None and not self._patient:
             self._resume(self._recorder.tail(self.name))
         self._thread.start()
 
     def rebuild(self) -> None:
-        """Fill the window from the recording, while samples wait in the ring; to be called in a thread of its own."""
+        """Fill the window from the recording while new samples wait in the ring buffer; call it in a thread."""
         tail = self._tail
         if tail is None:
             return
@@ -175,57 +296,73 @@ class Station:
             text = f"the window could not be rebuilt: {error}"
             self.chain.reset()
         finally:
-            self._happened.append(Event("window_rebuilt", int(tail.newest.samples.t_ns[-1]) - self._offset_ns(), text))
+            self._pending_events.append(
+                Event("window_rebuilt", int(tail.newest.samples.t_ns[-1]) - self._offset_ns(), text)
+            )
             self._tail = None
             self._wake.set()
 
     @property
     def rebuilding(self) -> bool:
-        """Whether the window is still being filled from the recording."""
+        """True while the window is being filled from the recording."""
         return self._tail is not None
 
     def stop(self) -> None:
-        """Stop reading; what is in the ring stays there to be worked off."""
+        """Stop the reader thread. Samples in the ring buffer stay there until ``work`` processes them."""
         self.driver.stop()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for the reader; False when it did not end in time."""
+        """Wait for the reader thread; return False if it does not end within ``timeout_s`` seconds."""
         if self._thread.is_alive():
             self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
     @property
     def ended(self) -> bool:
-        """A replay that has given all it had, and all of it is worked off."""
+        """True if a replay has ended and all its samples have been processed."""
         if self.driver.state != "ended" or self._thread.is_alive() or not self._ready.all.is_set():
             return False
         return not self.chain.waiting and (not self._waiting_since_ns or self.clock.rate_hz is None)
 
     @property
     def turns(self) -> int | None:
-        """Of its reader, see ``Driver.turns``; None where it may stand still: a recording waits for room, and ends."""
+        """Number of read attempts of the reader thread, see ``Driver.turns``.
+
+        None for a replayed recording, whose reader may block while the ring buffer is full, and for a reader that has
+        ended.
+        """
         return None if self._patient or self.driver.state == "ended" else self.driver.turns
 
     # --- one round
 
     def work(self, outputs: Sequence[Output], now_s: float, drain: bool = False) -> None:
-        """Take what came, advance the estimate, publish what is due; all of it when draining."""
+        """Process the new samples and publish the results that are due.
+
+        Parameters
+        ----------
+        outputs : sequence of Output
+            Receivers of the results.
+        now_s : float
+            Present time on the monotonic clock, in seconds.
+        drain : bool, optional
+            True if all samples are to be processed and all results published now, because the device stops.
+        """
         happened = self.driver.take_events()
-        if self._tail is not None:  # the chain is another thread's until the window is rebuilt
-            self._tell(outputs, self._take_noted() + happened)
+        if self._tail is not None:  # until the window is rebuilt, the rebuilding thread owns the pipeline
+            self._publish_events(outputs, self._take_timed_events() + happened)
             return
         blocks = self._take() if drain or self._can_take() else []
         if blocks:
             self._newest_ns, self._taken_ns = int(blocks[-1].t_ns[-1]), time.monotonic_ns()
-            self._batch += blocks
-        happened = self._take_noted() + happened  # now that the first sample's time is known
+            self._unpublished += blocks
+        happened = self._take_timed_events() + happened  # only now is the time of the first sample known
         self.chain.advance(blocks, self.clock.rate_hz, drain)
         if drain:
             self.chain.flush()
         if self.chain.thermal is not None and any(event.kind == "link_back" for event in happened):
             self.chain.thermal.offset_is_new()
         published = self._publish_samples(outputs, now_s, drain)
-        self._tell(outputs, happened + self.chain.take_events())
+        self._publish_events(outputs, happened + self.chain.take_events())
         self._publish_thermal(outputs, now_s)
         published |= self._publish_estimate(outputs, now_s, drain)
         self._publish_total(outputs, now_s)
@@ -234,42 +371,79 @@ class Station:
             self._unpublished_since_ns = 0
 
     def reset(self) -> None:
-        """Empty the window."""
+        """Empty the window, unless it is being rebuilt."""
         if self._tail is None:
             self.chain.reset()
 
     def held(self) -> tuple[Held, Floats] | None:
-        """The samples in the window and their temperature [n], as of now; None while there are none."""
+        """Return a copy of the window and its temperature, float64 [n] in °C; None if the window is empty."""
         return None if self._tail is not None else self.chain.held()
 
     def limit(self, device: Device) -> None:
-        """From now on the limits of these settings, which are otherwise those that it runs with.
+        """Replace the limits by those of new settings. Limits that both settings have keep their state.
 
-        Raises:
-            ConfigError: a limit that cannot be
+        Raises
+        ------
+        ConfigError
+            A limit is relative to a coefficient that the model in force does not have.
         """
         limits = Limits(device.limits, self.model)
         limits.take_over(self._limits)
         self.device, self._limits = device, limits
 
     def announce(self, outputs: Sequence[Output], kind: str, text: str) -> None:
-        """Pass on an event of this moment that the samples do not tell; it waits while their timeline is unknown."""
-        self._note(kind, text)
-        self._tell(outputs, self._take_noted())
+        """Publish an event of the present moment, such as a stopped recording.
+
+        The event waits while the timeline of the device is unknown.
+
+        Parameters
+        ----------
+        outputs : sequence of Output
+            Receivers of the event.
+        kind : str
+            Kind of the event, for example "recording_stopped".
+        text : str
+            Message of the event.
+        """
+        self._store_event(kind, text)
+        self._publish_events(outputs, self._take_timed_events())
 
     def report(self, outputs: Sequence[Output], states: dict[str, str], memory_bytes: int) -> Health:
-        """Tell the outputs how the device does, and ease its wall clock."""
-        self._follow_host(outputs)
-        self._relabel()
+        """Publish the status of the device, and move its slewed clock towards the host clock.
+
+        Parameters
+        ----------
+        outputs : sequence of Output
+            Receivers of the status.
+        states : dict of str to str
+            State of each output of the service, by its name.
+        memory_bytes : int
+            Resident memory of the process.
+
+        Returns
+        -------
+        Health
+            The published status.
+        """
+        self._slew_to_host(outputs)
+        self._update_rate()
         if self._recorder is not None:
-            self._recorder.know(self.name, self._known())
+            self._recorder.know(self.name, self._restart_state())
         health = self.health(states, memory_bytes)
         for output in outputs:
             output.health(self.name, self.now_unix_s(), health)
         return health
 
     def health(self, states: dict[str, str], memory_bytes: int) -> Health:
-        """How the device does now."""
+        """Return the present status of the device.
+
+        Parameters
+        ----------
+        states : dict of str to str
+            State of each output of the service, by its name.
+        memory_bytes : int
+            Resident memory of the process.
+        """
         counts, latencies, watch = self.driver.counts, np.array(self._latencies), self.chain.watch
         self._latencies = []
         return Health(
@@ -293,7 +467,7 @@ class Station:
         )
 
     def unix_s(self, t_ns: int) -> float:
-        """Unix time of a sample time."""
+        """Convert a sample time in nanoseconds to Unix time in seconds."""
         return (t_ns + self._offset_ns()) / 1e9
 
     def now_unix_s(self) -> float | None:
@@ -302,93 +476,98 @@ class Station:
         Returns
         -------
         float or None
-            The time of the newest sample. While the device waits or is lost, time goes on from there. None if the
-            samples bring their own times (a recording, or a decoder that reads times from the payload) and none has
-            come yet: such a timeline cannot be guessed from the host's clock.
+            The time of the newest sample. While the device waits or is lost, the time advances from there with the host
+            clock. None if the samples bring their own times (a recording, or a decoder that reads times from the
+            payload) and no sample has arrived yet. The host clock does not show such a timeline.
         """
         now_ns = self._now_ns()
         return None if now_ns is None else self.unix_s(now_ns)
 
-    # --- going on after a restart
+    # --- restart
 
     def _resume(self, tail: Tail | None) -> None:
-        """Let samples count as missing that came since the recording's end."""
+        """Continue after the end of the recording, so that the samples since then count as missing."""
         if tail is None:
             return
         newest, state = tail.newest.samples, tail.newest.state
         t_ns = int(newest.t_ns[-1]) - self._offset_ns()
-        ago_s = (self._wall.unix_ns(time.monotonic_ns()) - int(newest.t_ns[-1])) / 1e9
+        ago_s = (self._slewed_clock.unix_ns(time.monotonic_ns()) - int(newest.t_ns[-1])) / 1e9
         rate = self.device.rate_hz or state.rate
         if rate is None or not 0.0 <= ago_s <= self.device.window_s:
             text = f"the recording ends {ago_s:.4g} s ago: the window begins anew"
             if ago_s < 0.0:
                 text = "the recording ends after the host's clock: the window begins anew"
-            self._note("window_rebuilt", text)
+            self._store_event("window_rebuilt", text)
             return
         self.clock.resume(Before(t_ns, int(newest.ticks[-1]), rate, state.tick_step))
         self._tail, self._before = tail, state
         if self._recorder is not None:
-            self._recorder.know(self.name, state)  # the next restart may come before anything else is known
+            self._recorder.know(self.name, state)  # the next restart may come before a new estimate exists
 
-    def _known(self) -> State:
-        """What goes into the recording beside the samples."""
+    def _restart_state(self) -> State:
+        """Return the state of the estimate that is recorded together with the samples."""
         if self._tail is not None:
             return self._before
         return window_restore.known(
             self.chain, self._before, self.clock.rate_hz, self.clock.tick_step, self._offset_ns()
         )
 
-    # --- inside
+    # --- private methods
 
     def _now_ns(self) -> int | None:
-        """Present time in the epoch of the samples; None where ``now_unix_s`` is None."""
+        """Return the present time on the timeline of the samples, in nanoseconds; None if it is unknown."""
         newest_ns, now_ns = self._newest_ns, time.monotonic_ns()
         if newest_ns is not None and (self._patient or self.driver.state in ("running", "ended")):
             return newest_ns
         if not self.driver.times_are_unix:
             return now_ns
-        if newest_ns is None:  # samples may wait in the ring; only the first may be stamped without running ahead
+        if newest_ns is None:  # samples may wait in the ring buffer; only the first time is not ahead of them
             return self.driver.first_t_ns
         return newest_ns + now_ns - self._taken_ns
 
-    def _note(self, kind: str, text: str) -> None:
-        """Keep an event of this moment; it is stamped as soon as the time on the device's timeline is known."""
+    def _store_event(self, kind: str, text: str) -> None:
+        """Store an event of the present moment; it gets its time as soon as the device's timeline is known."""
         now_ns = self._now_ns()
         if now_ns is None:
             self._untimed.append((kind, text))
         else:
-            self._happened.append(Event(kind, now_ns, text))
+            self._pending_events.append(Event(kind, now_ns, text))
 
-    def _take_noted(self) -> list[Event]:
-        """Return the events that were noted since the last call, as far as they can be stamped."""
+    def _take_timed_events(self) -> list[Event]:
+        """Return the stored events since the last call, except those that still wait for the device's timeline."""
         now_ns = self._now_ns() if self._untimed else None
         if now_ns is not None:
-            self._happened += [Event(kind, now_ns, text) for kind, text in self._untimed]
+            self._pending_events += [Event(kind, now_ns, text) for kind, text in self._untimed]
             self._untimed.clear()
-        noted, self._happened = self._happened, []
+        noted, self._pending_events = self._pending_events, []
         return noted
 
-    def _follow_host(self, outputs: Sequence[Output]) -> None:
+    def _slew_to_host(self, outputs: Sequence[Output]) -> None:
+        """Move the slewed clock towards the host clock, and publish an event if the host clock was set."""
         now_ns = time.monotonic_ns()
-        set_s = self._wall.follow(now_ns, time.time_ns()) / 1e9
-        if abs(set_s) < SET_S or self.driver.times_are_unix:
+        set_s = self._slewed_clock.follow(now_ns, time.time_ns()) / 1e9
+        if abs(set_s) < MIN_CLOCK_STEP_S or self.driver.times_are_unix:
             return
         text = (
             f"the host's clock was set {'on' if set_s > 0.0 else 'back'} by {abs(set_s):.6g} s; times follow by "
             f"{EASE * 3600.0:g} s an hour, a restart takes the new time over at once"
         )
-        self._tell(outputs, [Event("clock_jumped", now_ns, text)])
+        self._publish_events(outputs, [Event("clock_jumped", now_ns, text)])
 
-    def _keep(self, chunks: Sequence[Chunk]) -> None:
-        """Called by the reader's thread."""
+    def _record_chunks(self, chunks: Sequence[Chunk]) -> None:
+        """Record raw bytes. The reader thread calls this function."""
         if self._recorder is not None:
             self._recorder.chunks(self.name, chunks, self._offset_ns())
 
     def _push(self, samples: SampleBlock) -> None:
-        """Called by the reader's thread. A sensor is never kept waiting; a recording waits for room."""
+        """Record decoded samples and put them into the ring buffer. The reader thread calls this function.
+
+        A live sensor never waits: a full ring buffer overwrites its oldest samples. A replayed recording waits for
+        space.
+        """
         if self._recorder is not None:
-            if self.chain.estimator is None:  # a crash may come before the first report
-                self._recorder.know(self.name, self._known())
+            if self.chain.estimator is None:  # the program may crash before the first status is published
+                self._recorder.know(self.name, self._restart_state())
             self._recorder.samples(self.name, samples, self._offset_ns())
             while self._patient and self._recorder.full(self.name):
                 time.sleep(PATIENCE_S)
@@ -400,29 +579,32 @@ class Station:
         self._wake.set()
 
     def _offset_ns(self) -> int:
-        return 0 if self.driver.times_are_unix else self._wall.offset_ns
+        """Return the offset that makes sample times Unix times, in nanoseconds."""
+        return 0 if self.driver.times_are_unix else self._slewed_clock.offset_ns
 
     def _can_take(self) -> bool:
-        """Until the rate is known and the kernels are compiled, samples wait in the ring."""
+        """Return True if samples may be taken; they wait in the ring buffer until rate and kernels are available."""
         chain = self.chain
         if chain.waiting or self._tail is not None:
             return False
         if chain.estimator is not None or chain.refused:
             return True
-        if self.clock.rate_hz is None:  # times from which no rate can be told must not stop the samples
+        if self.clock.rate_hz is None:  # samples are published even if their times do not show a rate
             return self.ring.room < self.ring.capacity // 2
         return chain.compiled
 
     def _take(self) -> list[SampleBlock]:
+        """Take all samples from the ring buffer."""
         came_ns, self._waiting_since_ns = self._waiting_since_ns, 0
         self._unpublished_since_ns = self._unpublished_since_ns or came_ns
         return self.ring.take()
 
     def _publish_samples(self, outputs: Sequence[Output], now_s: float, drain: bool) -> bool:
-        every_s = min(self.device.publish_s, SAMPLES_EVERY_S)
-        if not self._batch or not (self._due("samples", every_s, now_s) or drain):
+        """Publish the collected samples as a batch if it is due; return True if samples were published."""
+        every_s = min(self.device.publish_s, MAX_BATCH_S)
+        if not self._unpublished or not (self._due("samples", every_s, now_s) or drain):
             return False
-        blocks, self._batch = self._batch, []
+        blocks, self._unpublished = self._unpublished, []
         for samples in unbroken(blocks):
             self.published += len(samples)
             for output in outputs:
@@ -432,7 +614,7 @@ class Station:
         return True
 
     def _publish_compensated(self, outputs: Sequence[Output], live: LiveCompensation, samples: SampleBlock) -> None:
-        """The same samples without drift, and what they taught of it."""
+        """Publish the samples without gyroscope drift, and the state of the drift compensation."""
         at = 0
         while at < len(samples):
             piece = samples[at : at + live.compensator.ahead]
@@ -446,18 +628,20 @@ class Station:
                 output.drift(self.name, self.unix_s(look.t_ns), look)
 
     def _publish_estimate(self, outputs: Sequence[Output], now_s: float, drain: bool) -> bool:
-        # at every sample the course follows by itself: a look before that is published would take its samples away
+        """Update the fit and publish the estimate if it is due; return True if it was published."""
+        # a refit at every sample needs no interval here; ``get`` empties the per-sample history, so it is called only
+        # for a publication
         every_s = self.device.refit_s or self.device.publish_s
-        self._follow_rate(drain)
+        self._check_rate(drain)
         estimator = self.chain.estimator
         if estimator is not None and self.chain.advanced and (self._due("refit", every_s, now_s) or drain):
             fitted = self._ready.fit.is_set()
-            self.chain.advanced = not fitted  # a curve alone is fitted as soon as that can be
+            self.chain.advanced = not fitted  # a curve without coefficients is fitted as soon as the kernels are ready
             try:
                 latest = estimator.get(fitted=fitted)
             except NotReady:
                 return False
-            self.latest = latest.without_coefficients() if any(self._doubts) else latest
+            self.latest = latest.without_coefficients() if any(self._rate_doubts) else latest
             self._refitted = True
         if self.latest is None or not self._refitted:
             return False
@@ -468,51 +652,54 @@ class Station:
             output.estimate(self.name, self.unix_s(self.latest.t_ns), self.latest)
         if self.chain.in_force is not None:
             look = self.chain.in_force.look(self.latest)
-            self._publish_gap(outputs, replace(look, axes={}) if any(self._doubts) else look)
-        self._tell(outputs, self._limits.update(self.latest))
+            self._publish_gap(outputs, replace(look, axes={}) if any(self._rate_doubts) else look)
+        self._publish_events(outputs, self._limits.update(self.latest))
         return True
 
-    def _follow_rate(self, drain: bool) -> None:
-        """Withhold the coefficients while the configured rate is contradicted, or has not been checked yet."""
+    def _check_rate(self, drain: bool) -> None:
+        """Withhold the coefficients while the configured rate is contradicted by the data, or is not checked yet."""
         if drain:
             self.clock.end()
         doubts = (self.clock.contradicted_hz is not None, self.clock.unchecked)
-        if doubts != self._doubts:
-            self._doubts = doubts
-            self._relabel()
-            self.chain.advanced = True  # the newest estimate is to be made anew
+        if doubts != self._rate_doubts:
+            self._rate_doubts = doubts
+            self._update_rate()
+            self.chain.advanced = True  # the newest estimate must be computed again
 
-    def _relabel(self) -> None:
+    def _update_rate(self) -> None:
+        """Pass the best known sample rate to the pipeline."""
         rate_hz = self.clock.rate_hz
         if rate_hz is not None and self._tail is None:
             self.chain.relabel(rate_hz)
 
     def _publish_gap(self, outputs: Sequence[Output], look: ModelGap) -> None:
+        """Publish the comparison of the window with the model in force, and its events."""
         events = self._agreement.update(look)
         look = replace(look, agrees=self._agreement.verdicts)
         for output in outputs:
             output.gap(self.name, self.unix_s(look.t_ns), look)
-        self._tell(outputs, events)
+        self._publish_events(outputs, events)
 
-    def _tell(self, outputs: Sequence[Output], events: Sequence[Event]) -> None:
+    def _publish_events(self, outputs: Sequence[Output], events: Sequence[Event]) -> None:
+        """Publish events."""
         for event in events:
             for output in outputs:
                 output.event(self.name, self.unix_s(event.t_ns), self.driver.counts.received, event)
 
     def _publish_total(self, outputs: Sequence[Output], now_s: float) -> None:
-        """One step of the slow statistics, as often as they may take their share of the time."""
+        """Compute one step of the total and Hadamard deviations, and publish them when complete."""
         estimator = self.chain.estimator
         if estimator is None or not self._ready.all.is_set() or now_s < self._next_s["total"]:
             return
         begun_s = time.perf_counter()
         found = estimator.step()
-        self._next_s["total"] = now_s + max(TOTAL_EVERY_S, (time.perf_counter() - begun_s) / TOTAL_SHARE)
+        self._next_s["total"] = now_s + max(TOTAL_INTERVAL_S, (time.perf_counter() - begun_s) / TOTAL_CPU_SHARE)
         if found is not None:
             for output in outputs:
                 output.total(self.name, self.unix_s(self.chain.newest_ns), self.driver.counts.received, *found)
 
     def _publish_thermal(self, outputs: Sequence[Output], now_s: float) -> None:
-        """Intervals that are over; and a piece of choosing models."""
+        """Publish the finished thermal intervals, and continue the selection of a thermal model."""
         for look in self.chain.take_looks():
             for output in outputs:
                 output.thermal(self.name, self.unix_s(look.t_ns), self.driver.counts.received, look)
@@ -520,22 +707,24 @@ class Station:
         if thermal is None or not thermal.choosing or now_s < self._next_s["thermal"]:
             return
         begun_s = time.perf_counter()
-        until_s = begun_s + (CHOOSING_RECORDED_S if self._patient else CHOOSING_S)
+        until_s = begun_s + (MODEL_SELECTION_REPLAY_S if self._patient else MODEL_SELECTION_S)
         while thermal.step() and time.perf_counter() < until_s:
             pass
         if self._patient:
-            self._wake.set()  # what waits in the ring goes on
+            self._wake.set()  # the waiting samples of the recording can be processed
         else:
-            self._next_s["thermal"] = now_s + (time.perf_counter() - begun_s) / CHOOSING_SHARE
+            self._next_s["thermal"] = now_s + (time.perf_counter() - begun_s) / MODEL_SELECTION_CPU_SHARE
 
     def _due(self, what: str, every_s: float, now_s: float) -> bool:
+        """Return True if a periodic task is due, and schedule its next run."""
         if now_s < self._next_s[what]:
             return False
-        # keep the beat, but do not make up for a pause
+        # keep the period, but do not catch up after a pause
         self._next_s[what] = max(self._next_s[what] + every_s, now_s + 0.5 * every_s)
         return True
 
     def _text(self) -> str:
+        """Return the status message of the device; empty if there is nothing to report."""
         if self._tail is not None and self._ready.all.is_set() and self.driver.state == "running":
             return "the window is being rebuilt from the recording; no sample is lost"
         if self._ready.progress and self.driver.state == "running":
@@ -543,13 +732,13 @@ class Station:
             return f"{self._ready.progress}; {lacking}no sample is lost"
         if not self._ready.fit.is_set() and self.driver.state == "running":
             return "compiling the estimator; no coefficients yet, no sample is lost"
-        lacking = self._lacking_text() if self.driver.state in ("running", "ended") else ""
+        lacking = self._missing_estimate_text() if self.driver.state in ("running", "ended") else ""
         if self.driver.text or self.driver.state != "running":
             return f"{self.driver.text.rstrip('.')}; {lacking}" if lacking else self.driver.text
-        return lacking or self.driver.late_hint or self._wall_text()
+        return lacking or self.driver.late_hint or self._clock_text()
 
-    def _lacking_text(self) -> str:
-        """Return why there are no coefficients; empty if they are there or will come."""
+    def _missing_estimate_text(self) -> str:
+        """Return the reason why there are no coefficients; empty if there are coefficients, or will be."""
         measured_hz = self.clock.contradicted_hz
         if measured_hz is not None:
             return (
@@ -560,16 +749,20 @@ class Station:
             return "no estimate: the times of the samples do not show a rate; set `rate`"
         return self.chain.refused
 
-    def _wall_text(self) -> str:
-        behind_s = 0.0 if self.driver.times_are_unix else self._wall.behind_ns / 1e9
-        if abs(behind_s) < SET_S:
+    def _clock_text(self) -> str:
+        """Return a message about the offset of the sample times from the host clock; empty if the offset is small."""
+        behind_s = 0.0 if self.driver.times_are_unix else self._slewed_clock.behind_ns / 1e9
+        if abs(behind_s) < MIN_CLOCK_STEP_S:
             return ""
         where = "behind" if behind_s > 0.0 else "ahead of"
         return f"times are {abs(behind_s):.6g} s {where} the host's clock, which was set"
 
 
 def _arrivals_are_timed(device: Device, link: Link) -> bool:
-    """Return True if arrival times show the device's rate, and not how fast a file is read or a sensor simulated."""
+    """Return True if arrival times show the sample rate of the device.
+
+    They do not if a file is read or a sensor is simulated faster than in real time.
+    """
     simulated = isinstance(device.link, VirtualTable) and device.link.speed != 1.0
     captured = isinstance(link, ReplayLink) and link.epoch == "monotonic"
     return not simulated and not captured

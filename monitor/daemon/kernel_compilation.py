@@ -1,12 +1,12 @@
-"""Compilation of the numerical kernels, in parts and by processes of its own.
+"""Parallel compilation of the numerical kernels in child processes.
 
 Numba compiles a kernel at its first call and keeps the machine code in a folder on disk. After an installation or an
 upgrade this folder is empty, and compilation takes tens of seconds of processor time. Child processes therefore compile
-the parts side by side, and this process loads each part from disk once it is compiled. The main loop is not held up,
-and the memory that the compiler needs is never taken by the process that runs for months.
+the parts side by side, and this process loads each part from disk once it is compiled. The main loop is not delayed,
+and the memory that the compiler needs is never allocated by the process that runs for months.
 
-A file in the same folder, the stamp, says that every part is there for this version of the program, of Numba and of the
-processor.
+The stamp, a file in the same folder, shows that every part is compiled for this version of the program, of Numba and of
+the processor.
 """
 
 import os
@@ -36,7 +36,7 @@ from monitor.estimation.detection.signal_monitor import Watch
 from monitor.estimation.estimator import Estimator
 
 MAX_PROCESSES: Final = 2
-"""Each takes some 200 MB while it compiles, which a small board has to have."""
+"""Largest number of compiling processes. Each takes some 200 MB, which must be available on a small board too."""
 PROGRAM: Final = (
     sys.executable,
     "-P",
@@ -44,7 +44,9 @@ PROGRAM: Final = (
     "warm-up",
     "--from-stdin",
 )
+"""Command line of a child process."""
 BAR_LENGTH: Final = 12
+"""Length of the progress bar in characters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +55,11 @@ class Part:
 
     Attributes
     ----------
-    name
-        What they compute, in the words of the user.
-    prepare
-        Calls each kernel with every signature that the program uses. It compiles what is not in the cache on disk.
+    name : str
+        Name of the computation, as shown to the user.
+    prepare : callable
+        Calls each kernel with every signature that the program uses. It compiles the kernels that are not in the cache
+        on disk.
     """
 
     name: str
@@ -65,8 +68,19 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far compilation is; ``running`` are the parts that are being compiled just now.
+    """Progress of the compilation.
 
+    Attributes
+    ----------
+    done : int
+        Number of compiled parts.
+    of : int
+        Number of all parts.
+    running : tuple of str
+        Names of the parts that are being compiled.
+
+    Examples
+    --------
     >>> print(Progress(2, 8, ("change detection",)), Progress(2, 8).bar)
     compiling 3 of 8: change detection ███░░░░░░░░░
     """
@@ -76,41 +90,47 @@ class Progress:
     running: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        """One line for people."""
+        """Return the progress as one line of text."""
         return f"compiling {min(self.done + 1, self.of)} of {self.of}: {' and '.join(self.running)}"
 
     @property
     def share(self) -> float:
-        """The part of the work that is done, 0 to 1."""
+        """Share of the parts that are compiled, 0 to 1."""
         return self.done / self.of
 
     @property
     def bar(self) -> str:
-        """``share`` as a bar of characters."""
+        """Text bar that shows ``share``."""
         filled = round(BAR_LENGTH * self.share)
         return "█" * filled + "░" * (BAR_LENGTH - filled)
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Parts that are needed together; a part comes after those whose kernels it uses too."""
+    """Parts that are needed together. A part comes after the parts whose kernels it uses."""
 
     name: str
     parts: tuple[Part, ...]
 
 
 def prepare(group: Group, tell: Callable[[Progress], None], processes: int | None = None) -> Iterator[str]:
-    """Make the kernels of a group ready to be called; yield the name of each part when it is.
+    """Make the kernels of a group ready to be called, and yield the name of each part when it is ready.
 
     Parameters
     ----------
-    group
-        What is needed.
-    tell
-        Called when the compilation of a part begins or ends. Not called if all parts are in the cache on disk.
-    processes
-        How many child processes compile; by default one for each processor, at most ``MAX_PROCESSES``. With 0, or where
-        nothing can be kept on disk, this process compiles by itself.
+    group : Group
+        Parts to prepare.
+    tell : callable
+        Called with a ``Progress`` when the compilation of a part begins or ends. Not called if all parts are in the
+        cache on disk.
+    processes : int, optional
+        Number of child processes that compile. The default is one for each processor, at most ``MAX_PROCESSES``. With
+        0, or if no cache folder can be written, this process compiles by itself.
+
+    Yields
+    ------
+    str
+        Name of the part that is ready.
 
     Raises
     ------
@@ -130,7 +150,7 @@ def prepare(group: Group, tell: Callable[[Progress], None], processes: int | Non
     with _Compilers(group.parts, processes, tell) as compilers:
         for done, part in enumerate(group.parts):
             if not compilers.wait_for(part):
-                tell(Progress(done, len(group.parts), (part.name,)))  # no child has compiled it: this process does
+                tell(Progress(done, len(group.parts), (part.name,)))  # no child has compiled it, so this process does
             part.prepare()
             yield part.name
     if folder is not None:
@@ -144,9 +164,17 @@ def is_warm(group: Group) -> bool:
 
 
 def compile_from_stdin(stdin: IO[str], stdout: IO[str]) -> NoReturn:
-    """Compile the parts whose names come line by line, and answer each line with the same line: the child's side.
+    """Compile the parts whose names arrive line by line, and answer each line with the same line.
 
-    The process ends when its standard input does, even in the middle of a compilation, as its parent has ended then.
+    This function is the child's side of ``prepare``. The process ends when its standard input closes, even in the
+    middle of a compilation, because its parent has ended then.
+
+    Parameters
+    ----------
+    stdin : text file
+        Source of the part names.
+    stdout : text file
+        Receives the name of each compiled part.
     """
     parts = {part.name: part for group in GROUPS for part in group.parts}
     names: queue.SimpleQueue[str] = queue.SimpleQueue()
@@ -165,13 +193,15 @@ def compile_from_stdin(stdin: IO[str], stdout: IO[str]) -> NoReturn:
 
 @dataclass(slots=True)
 class _Job:
+    """Compilation of one part."""
+
     part: Part
     finished: threading.Event = field(default_factory=threading.Event)
     compiled: bool = False
 
 
 class _Compilers:
-    """Child processes, each with a thread that hands it one part after the other."""
+    """Pool of child processes, each with a thread that passes one part after the other to it."""
 
     def __init__(self, parts: Sequence[Part], processes: int, tell: Callable[[Progress], None]) -> None:
         self._jobs = {part.name: _Job(part) for part in parts}
@@ -181,13 +211,13 @@ class _Compilers:
         self._lock = threading.Lock()
         self._children: list[subprocess.Popen[str]] = []
         self._processes = processes
-        self._left = processes  # threads that still take parts
+        self._active_threads = processes  # number of threads that still take parts
 
     def __enter__(self) -> "_Compilers":
         for number in range(self._processes):
             threading.Thread(target=self._work, name=f"compiler {number}", daemon=True).start()
         if not self._processes:
-            self._give_up()
+            self._release_waiting()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -197,49 +227,54 @@ class _Compilers:
                 child.kill()
 
     def wait_for(self, part: Part) -> bool:
-        """Wait until a child has compiled a part; False if none will."""
+        """Wait until a child process has compiled a part; return False if none will."""
         job = self._jobs[part.name]
         job.finished.wait()
         return job.compiled
 
     def _work(self) -> None:
-        with suppress(OSError):  # no process can be started, or it ended: the parts are compiled by this process
+        """Pass parts to a child process until none is left or the child fails."""
+        with suppress(OSError):  # if no child can be started, or it has ended, this process compiles the parts
             pipe = subprocess.PIPE
             child = subprocess.Popen(
                 PROGRAM, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, start_new_session=True
             )
             with child:
                 self._children.append(child)
-                while job := self._next():
-                    job.compiled = _compiled_by(child, job.part)
-                    self._end(job)
+                while job := self._next_job():
+                    job.compiled = _compile_in_child(child, job.part)
+                    self._finish(job)
                     if not job.compiled:
                         break
         with self._lock:
-            self._left -= 1
-            if self._left == 0:
-                self._give_up()
+            self._active_threads -= 1
+            if self._active_threads == 0:
+                self._release_waiting()
 
-    def _give_up(self) -> None:
+    def _release_waiting(self) -> None:
+        """Release the waiting parts, so that this process compiles them."""
         for job in self._waiting:
             job.finished.set()
 
-    def _next(self) -> _Job | None:
+    def _next_job(self) -> _Job | None:
+        """Return the next part to compile; None if no part is left."""
         with self._lock:
             if not self._waiting:
                 return None
             job = self._waiting.pop(0)
             self._running.append(job.part.name)
-        self._say()
+        self._report_progress()
         return job
 
-    def _end(self, job: _Job) -> None:
+    def _finish(self, job: _Job) -> None:
+        """Report the end of the compilation of a part."""
         with self._lock:
             self._running.remove(job.part.name)
-        self._say()
+        self._report_progress()
         job.finished.set()
 
-    def _say(self) -> None:
+    def _report_progress(self) -> None:
+        """Report the progress."""
         with self._lock:
             done = sum(job.compiled for job in self._jobs.values())
             progress = Progress(done, len(self._jobs), tuple(self._running))
@@ -247,7 +282,8 @@ class _Compilers:
             self._tell(progress)
 
 
-def _compiled_by(child: "subprocess.Popen[str]", part: Part) -> bool:
+def _compile_in_child(child: "subprocess.Popen[str]", part: Part) -> bool:
+    """Let a child process compile a part; return True if it has."""
     assert child.stdin is not None
     assert child.stdout is not None
     try:
@@ -258,7 +294,7 @@ def _compiled_by(child: "subprocess.Popen[str]", part: Part) -> bool:
 
 
 def _stamp_file(folder: Path, group: Group) -> Path:
-    """Return the place of the stamp of a group; its name changes with all that the machine code depends on."""
+    """Return the path of the stamp of a group. The file name depends on everything that the machine code depends on."""
     machine = [binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()]
     parts = [part.name for part in group.parts]
     everything = [*parts, stamp(Path(__file__)), numba.__version__, sys.version, *machine]
@@ -266,29 +302,35 @@ def _stamp_file(folder: Path, group: Group) -> Path:
 
 
 def _samples(n: int) -> SampleBlock:
+    """Return a block of ``n`` samples with value zero."""
     return block(np.arange(n, dtype=np.int64), np.zeros((n, 6)))
 
 
 def _call_window() -> None:
+    """Call the kernels of the Allan deviation."""
     Estimator(100.0, 1.0).update(_samples(100))
 
 
 def _call_fit() -> None:
+    """Call the kernels of the noise coefficients."""
     estimator = Estimator(100.0, 1.0)
     estimator.update(_samples(100))
     estimator.get()
 
 
 def _call_motion_detection() -> None:
+    """Call the kernels of the motion detection."""
     Watch(100.0, alarms_per_day=0.0).update(_samples(100))
 
 
 def _call_change_detection() -> None:
+    """Call the kernels of the change detection."""
     Watch(100.0).update(_samples(100))
     ChangeDetector(100.0).restart()
 
 
 def _call_compensation() -> None:
+    """Call the kernels of the drift compensation."""
     compensator = Compensator(100.0)
     compensator.update(1e-3 * np.random.default_rng(0).standard_normal((6000, 6)))
     compensator.adopt(0, identify(*compensator.window(0), [(2, 1)]))
@@ -297,6 +339,7 @@ def _call_compensation() -> None:
 
 
 def _call_slow_statistics() -> None:
+    """Call the kernels of the total and Hadamard deviations."""
     estimator = Estimator(100.0, 1.0)
     estimator.update(_samples(100))
     estimator.restart(0, 10)
@@ -305,23 +348,27 @@ def _call_slow_statistics() -> None:
 
 
 def _call_refit() -> None:
+    """Call the kernels of the refit at every sample."""
     Estimator(100.0, 1.0, every_sample=True).update(_samples(100))
 
 
 def _call_temperature_lag() -> None:
+    """Call the kernels of the thermal model."""
     thermal_response.lagged(np.zeros(2), 0.5)
 
 
 def _call_analysis() -> None:
-    from monitor.estimation.analysis import analyze  # the service does not need it
+    """Call the kernels of the analysis of recordings."""
+    from monitor.estimation.analysis import analyze  # imported here because the service does not need it
 
     analyze([_samples(100)], 100.0)
 
 
 def _call_reconciliation() -> None:
+    """Call the kernels of the reconciliation."""
     from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
     from monitor.noise.model import NoiseModel
-    from monitor.reconcile.reconcile import Recording, reconcile  # the service does not need it
+    from monitor.reconcile.reconcile import Recording, reconcile  # imported here because the service does not need it
 
     model = NoiseModel({"gz": (AngleRandomWalk(N=1e-4), BiasInstability(B=3e-5), RateRandomWalk(K=1e-6))})
     series, rng = model.simulate(4200, 10.0, 1)[:, 2], np.random.default_rng(1)
@@ -332,7 +379,9 @@ def _call_reconciliation() -> None:
 
 
 WINDOW: Final = "Allan deviation"
+"""Name of the part after which a window can be filled."""
 FIT: Final = "noise coefficients"
+"""Name of the part after which coefficients can be fitted."""
 SERVICE: Final = Group(
     "service",
     (
@@ -346,9 +395,10 @@ SERVICE: Final = Group(
         Part("temperature lag", _call_temperature_lag),
     ),
 )
-"""What the running service needs; what it needs first comes first."""
+"""Parts that the running service needs, in the order in which it needs them."""
 _ANALYSIS: Final = Part("analysis of recordings", _call_analysis)
 _RECONCILIATION: Final = Part("reconciliation", _call_reconciliation)
 COMMANDS: Final = Group("commands", (_ANALYSIS,) if missing_packages("reconcile") else (_ANALYSIS, _RECONCILIATION))
-"""What only commands on recordings need. A few kernels of rare cases are compiled when they are called."""
+"""Parts that only the commands on recordings need. A few kernels of rare cases are compiled at their first call."""
 GROUPS: Final = (SERVICE, COMMANDS)
+"""All groups."""

@@ -1,4 +1,7 @@
-"""Adapters: what a station says, as zenoh messages, in the viewer, as log lines, in the terminal. None waits."""
+"""Outputs of the daemon: zenoh messages, viewer, history file, log lines and the table in the terminal. None blocks.
+
+The parameters of all methods are described in ``monitor.daemon.device_worker.Output``.
+"""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
@@ -27,165 +30,173 @@ if TYPE_CHECKING:
     from monitor.publishing.rerun.view import RerunView
 
 PREFIX: Final = "imu"
+"""First part of the keys under which the table in the terminal receives its messages."""
 _log = structlog.get_logger("imu-monitor")
 
 
 class ZenohOutput(Output):
-    """Results as zenoh messages."""
+    """Output that publishes the results as zenoh messages."""
 
     def __init__(self, zenoh: ZenohOut) -> None:
         self._zenoh = zenoh
 
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
-        """One msgpack batch."""
+        """Publish a block as one msgpack batch."""
         self._zenoh.put(topics.SAMPLES, device, pack(device, received, samples, offset_ns))
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """Curve and coefficients."""
+        """Publish the Allan curve and the coefficients."""
         self._zenoh.put(topics.ALLAN, device, encoding.allan(device, unix_s, estimate))
         self._zenoh.put(topics.COEFFICIENTS, device, encoding.coefficients(device, unix_s, estimate))
 
     def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
-        """The window beside the model in force."""
+        """Publish the comparison of the window with the model in force."""
         self._zenoh.put(topics.GAP, device, encoding.gap(device, unix_s, gap))
 
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
-        """Total and Hadamard deviations."""
+        """Publish the total and Hadamard deviations."""
         self._zenoh.put(topics.TOTAL, device, encoding.total(device, unix_s, received, total, hadamard))
 
     def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
-        """One msgpack batch."""
+        """Publish a block of compensated samples as one msgpack batch."""
         schema = topics.COMPENSATED.schema()
         self._zenoh.put(topics.COMPENSATED, device, pack(device, received, samples, offset_ns, schema))
 
     def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
-        """The mean of an interval beside what was expected of it."""
+        """Publish the mean of an interval and its prediction from temperature."""
         self._zenoh.put(topics.THERMAL, device, encoding.thermal(device, unix_s, received, look))
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """One event."""
+        """Publish an event."""
         payload = encoding.event(device, unix_s, received, event, encoding.since_s(unix_s, event))
         self._zenoh.put(topics.EVENT, device, payload)
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Status."""
+        """Publish the status."""
         self._zenoh.put(topics.STATUS, device, encoding.status(device, unix_s, health))
 
 
 class ViewerOutput(Output):
-    """Results into the Rerun viewer."""
+    """Output that shows the results in the Rerun viewer."""
 
     def __init__(self, view: "RerunView") -> None:
         self._view = view
 
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
-        """Raw samples."""
+        """Show raw samples."""
         self._view.samples(device, (samples.t_ns + offset_ns) / 1e9, samples.values, samples.temperature_c)
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """Curve and coefficients."""
+        """Show the Allan curve and the coefficients."""
         self._view.estimate(device, unix_s, estimate)
 
     def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
-        """Courses of the gaps, and the model's curves beside those measured."""
+        """Show the time series of the gaps, and the model's curves with the measured curves."""
         self._view.gap(device, unix_s, gap)
 
     def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
-        """Rates beside those measured."""
+        """Show compensated rates together with the measured rates."""
         self._view.compensated(device, (samples.t_ns + offset_ns) / 1e9, samples.values[:, :3])
 
     def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
-        """Courses of the drift and of its innovations, and the models."""
+        """Show the time series of the drift and of its innovations, and the drift models."""
         self._view.drift(device, unix_s, look)
 
     def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
-        """Courses of the means beside what was expected of them."""
+        """Show the time series of the interval means and their predictions."""
         self._view.thermal(device, unix_s, look)
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """One line of the log."""
+        """Show an event as one line of the log."""
         self._view.event(device, unix_s, event)
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """The health panel. It is not drawn before the first sample's time is known: the viewer has one time axis."""
+        """Show the status, once the time of the first sample is known: the viewer has a single time axis."""
         if unix_s is not None:
             self._view.health(device, unix_s, health)
 
 
 class HistoryOutput(Output):
-    """Results gathered by the minute, and events, for the file that keeps them."""
+    """Output that aggregates the results by the minute, and passes them with the events to the history file.
+
+    Parameters
+    ----------
+    writer : Writer
+        Writer of the history file.
+    """
 
     def __init__(self, writer: Writer) -> None:
-        self.received: dict[str, int] = {}  # samples of each device since the start
+        self.received: dict[str, int] = {}  # number of samples of each device since the start
         self._writer = writer
         self._minutes: dict[str, Minutes] = {}
 
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
-        """Their temperature."""
+        """Aggregate the temperature of the samples."""
         unix_s = (int(samples.t_ns[-1]) + offset_ns) / 1e9
-        self._writer.put(device, self._of(device).temperature(unix_s, samples.temperature_c))
+        self._writer.put(device, self._minutes_of(device).temperature(unix_s, samples.temperature_c))
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """Coefficients, and deviations on a coarse grid."""
-        self._writer.put(device, self._of(device).estimate(unix_s, estimate))
+        """Aggregate the coefficients, and the deviations on a coarse grid."""
+        self._writer.put(device, self._minutes_of(device).estimate(unix_s, estimate))
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """One event."""
+        """Store an event."""
         since_s = None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
-        # plain numbers: an array's own are none to SQLite
+        # SQLite does not accept NumPy scalars, so they are converted to plain numbers
         what = {name: {side: float(one) for side, one in sides.items()} for name, sides in event.what.items()}
         sigma = None if event.sigma is None else float(event.sigma)
         told = PastEvent(unix_s, event.kind, event.text, event.axis, what, since_s, sigma)
         self._writer.tell(device, told)
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Counts and state. Rows are minutes of the samples' own time, so there is none before the first sample."""
+        """Aggregate counts and state, once the time of the first sample is known: rows are minutes of sample time."""
         self.received[device] = health.received
         if unix_s is None:
             return
-        self._writer.put(device, self._of(device).health(unix_s, health))
+        self._writer.put(device, self._minutes_of(device).health(unix_s, health))
 
     def gone(self, device: str) -> None:
-        """A device that was taken out: its minute is as full as it will be."""
+        """Store the last minute of a device that was removed."""
         self.received.pop(device, None)
         minutes = self._minutes.pop(device, None)
         if minutes is not None:
             self._writer.put(device, minutes.end())
 
     def end(self) -> None:
-        """Hand over the minutes that are not full yet."""
+        """Store the present, incomplete minutes of all devices."""
         for device, minutes in self._minutes.items():
             self._writer.put(device, minutes.end())
 
-    def _of(self, device: str) -> Minutes:
+    def _minutes_of(self, device: str) -> Minutes:
+        """Return the aggregation of a device."""
         return self._minutes.setdefault(device, Minutes())
 
 
 class LogOutput(Output):
-    """Events and changes of state as log lines."""
+    """Output that writes events and changes of state as log lines."""
 
     def __init__(self) -> None:
-        self._said: dict[str, tuple[str, str]] = {}
+        self._last_status: dict[str, tuple[str, str]] = {}
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """One line an event."""
+        """Write one line for an event."""
         _log.info(event.kind, device=device, axis=event.axis, text=event.text)
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """A line when the state or its sentence has changed."""
+        """Write a line if the state or its message has changed."""
         now = (health.state, health.text)
-        if self._said.get(device) != now:
-            self._said[device] = now
+        if self._last_status.get(device) != now:
+            self._last_status[device] = now
             say = _log.info if health.state in ("running", "ended") and not health.text else _log.warning
             say("status", device=device, state=health.state, text=health.text, received=health.received)
 
     def gone(self, device: str) -> None:
-        """Its state is news again, should it come back."""
-        self._said.pop(device, None)
+        """Forget the state of a removed device, so that it is logged if the device is added again."""
+        self._last_status.pop(device, None)
 
 
 class TableOutput(Output):
-    """Results for the table in the terminal, the same table that ``watch`` shows of other processes.
+    """Output for the table in the terminal, the same table that ``watch`` shows for other processes.
 
     Parameters
     ----------
@@ -202,23 +213,23 @@ class TableOutput(Output):
         self._gaps: dict[str, tuple[float, ModelGap]] = {}
 
     def viewer_at(self, url: str) -> None:
-        """The line above the table: where the viewer's page is, "" = nowhere."""
+        """Set the line above the table, which shows the address of the viewer's web page; "" removes it."""
         self.board.note = f"viewer: {url}" if url else ""
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """Kept until the table is drawn."""
+        """Keep an estimate until the row of the device is updated."""
         self._latest[device] = (unix_s, estimate)
 
     def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
-        """Kept until the table is drawn."""
+        """Keep a comparison with the model until the row of the device is updated."""
         self._gaps[device] = (unix_s, gap)
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """One of the last lines."""
+        """Add an event to the lines below the table."""
         self.board.take(topics.EVENT.key(PREFIX, device), encoding.event(device, unix_s, received, event, None))
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """One row."""
+        """Update the row of a device."""
         self.board.take(topics.STATUS.key(PREFIX, device), encoding.status(device, unix_s, health))
         if device in self._latest:
             at_s, estimate = self._latest.pop(device)
@@ -229,7 +240,7 @@ class TableOutput(Output):
             self._redraw()
 
     def gone(self, device: str) -> None:
-        """No row."""
+        """Remove the row of a device."""
         self._latest.pop(device, None)
         self._gaps.pop(device, None)
         self.board.forget(topics.STATUS.key(PREFIX, device))

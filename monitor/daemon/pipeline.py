@@ -1,9 +1,10 @@
-"""What the samples of one device go through: is it at rest, what is its noise, what do temperature and drift do.
+"""Processing pipeline of one device: motion detection, noise estimation, thermal model and drift compensation.
 
-Blocks in, in order; the latest results stand in ``estimator``, ``thermal``, ``compensation`` and ``watch``, and what
-was found is taken as events. Nothing is published here, and no clock is read: who owns the chain says when it may
-advance and what is told of it. After a restart of the program the same chain lives through the tail of the recording
-(``relive``), silently.
+Blocks of samples enter in order. The latest results are in ``estimator``, ``thermal``, ``compensation`` and ``watch``.
+Detections are taken as events.
+
+The pipeline publishes nothing and reads no clock. Its owner decides when it may advance and what is published. After a
+restart of the program, ``relive`` replays the end of the recording through the pipeline without events.
 """
 
 from collections import deque
@@ -26,30 +27,46 @@ from monitor.estimation.window_snapshot import Held, Temperatures
 from monitor.noise.model import NoiseModel
 from monitor.settings.loading import Device
 
-PIECE: Final = 512
-"""Samples estimated before it is asked whether the noise has changed: a fast replay brings thousands at once."""
+MAX_PIECE_SAMPLES: Final = 512
+"""Samples that are processed before the noise is tested for a change. A fast replay brings thousands at once."""
 
 
 @dataclass(slots=True)
 class Ready:
-    """Which kernels are compiled, see ``monitor.daemon.kernel_compilation``."""
+    """Flags of the compiled kernels, see ``monitor.daemon.kernel_compilation``.
+
+    Attributes
+    ----------
+    window : threading.Event
+        Set if the kernels of the Allan deviation are compiled.
+    fit : threading.Event
+        Set if the kernels of the noise coefficients are compiled.
+    all : threading.Event
+        Set if all kernels of the service are compiled.
+    """
 
     window: Flag = field(default_factory=Flag)
     fit: Flag = field(default_factory=Flag)
     all: Flag = field(default_factory=Flag)
     progress: str = ""
-    """What is being compiled, one line for people; empty if nothing is."""
+    """Progress of the compilation as one line of text; empty if nothing is being compiled."""
 
 
 class Chain:
-    """The statistics of one device.
+    """Processing pipeline of one device.
 
-    Args:
-        device: its settings
-        model: the model in force, if there is one
-        ready: which kernels are compiled; nothing is compiled in ``advance``, as that would hold up all devices
-        patient: samples wait while a model of temperature is being chosen, as a recording's can
-        needs_all: begin only when all kernels are there
+    Parameters
+    ----------
+    device : Device
+        Settings of the device.
+    model : NoiseModel or None
+        Model in force.
+    ready : Ready
+        Flags of the compiled kernels. ``advance`` compiles nothing, because that would delay all devices.
+    patient : bool
+        True if samples may wait while a thermal model is being selected, as the samples of a recording can.
+    needs_all : bool
+        True if processing begins only when all kernels are compiled.
     """
 
     def __init__(self, device: Device, model: NoiseModel | None, ready: Ready, patient: bool, needs_all: bool) -> None:
@@ -59,13 +76,13 @@ class Chain:
         self.compensation: LiveCompensation | None = None
         self.in_force: ModelInForce | None = None
         self.refused = ""
-        """Why there can be no estimate."""
+        """Reason why no estimate is possible; empty if it is."""
         self.advanced = False
-        """Samples since whoever looks has set it back."""
+        """True if samples were processed since the owner last set this to False."""
         self.since_ns: list[int | None] = [None] * len(AXES)
-        """Time of the first sample that counts, of axes that began anew."""
+        """Time in nanoseconds of the first sample in the window of an axis that was restarted, else None."""
         self.newest_ns = 0
-        """Time of the newest sample that came in; 0 before the first."""
+        """Time of the newest sample that entered the pipeline, in nanoseconds; 0 before the first."""
         self.identifier = Identifier(f"drift of {device.name}", at_once=patient)
         self._device = device
         self._model = model
@@ -73,57 +90,82 @@ class Chain:
         self._patient = patient
         self._needs = ready.all if needs_all else ready.window
         self._temperatures: Temperatures | None = None  # of the samples in the window
-        self._looks: list[ThermalLook] = []  # not taken yet
-        self._handled = 0  # as often as the watch has said it
-        self._pieces: deque[SampleBlock] = deque()  # of a recording, that wait until a model is chosen
-        self._reliving = False
+        self._looks: list[ThermalLook] = []  # thermal intervals that were not taken yet
+        self._handled = 0  # last seen value of ``watch.handled``
+        self._pieces: deque[SampleBlock] = deque()  # samples of a recording that wait for the thermal model
+        self._replaying = False
 
     @property
     def compiled(self) -> bool:
-        """Whether the kernels that it needs to begin are there."""
+        """True if the kernels that the pipeline needs to begin are compiled."""
         return self._needs.is_set()
 
     @property
     def waiting(self) -> bool:
-        """Whether samples wait until a model of temperature is chosen."""
+        """True while samples wait for the selection of a thermal model."""
         return bool(self._pieces)
 
     def advance(self, blocks: Sequence[SampleBlock], rate_hz: float | None, drain: bool) -> None:
-        """Take blocks in; nothing waits when draining. Until a rate is known they leave no trace."""
+        """Process blocks of samples. Until a rate is known they are discarded.
+
+        Parameters
+        ----------
+        blocks : sequence of SampleBlock
+            New samples, in order of time.
+        rate_hz : float or None
+            Sample rate; None if it is unknown.
+        drain : bool
+            True if no sample may wait for the selection of a thermal model.
+        """
         if blocks:
             self.newest_ns = int(blocks[-1].t_ns[-1])
-        if self.estimator is None and (rate_hz is None or not self._begin(rate_hz)):
+        if self.estimator is None and (rate_hz is None or not self._create_estimator(rate_hz)):
             return
         if self.watch is None and self._ready.all.is_set():
-            self._begin_watching()
-        self._pieces += [samples[at : at + PIECE] for samples in blocks for at in range(0, len(samples), PIECE)]
+            self._create_detectors()
+        self._pieces += [
+            samples[at : at + MAX_PIECE_SAMPLES]
+            for samples in blocks
+            for at in range(0, len(samples), MAX_PIECE_SAMPLES)
+        ]
         while self._pieces and (drain or not self._patient or self.thermal is None or not self.thermal.choosing):
             piece = self._pieces.popleft()
-            self._estimate(self.watch.update(piece) if self.watch is not None else [piece])
-            self._restart()
-            self._follow()
+            self._update_estimator(self.watch.update(piece) if self.watch is not None else [piece])
+            self._restart_changed_axes()
+            self._update_thermal()
 
     def flush(self) -> None:
-        """Take in what is held back, when no more will come."""
-        self._estimate(self.watch.flush() if self.watch is not None else [])
-        self._restart()
-        self._follow()
+        """Process the samples that the motion detector still holds back, after the last sample has arrived."""
+        self._update_estimator(self.watch.flush() if self.watch is not None else [])
+        self._restart_changed_axes()
+        self._update_thermal()
 
     def renew(self) -> None:
-        """Where an interval of the compensation has just ended: take models over, and have those that are due found."""
+        """Adopt new drift models and start the identification of those that are due, if an interval has just ended."""
         live = self.compensation
         if live is not None and live.compensator.ahead == live.compensator.interval:
             self.identifier.renew(live)
 
     def relive(self, samples: SampleBlock, rate_hz: float) -> None:
-        """Take a recorded block in; what was found in it was told then, and where an axis began anew is known."""
-        self._reliving = True
+        """Process a recorded block without events, to rebuild the window after a restart.
+
+        The events of these samples were published before the restart. The start of each axis is known from the
+        recording, so changes of the noise restart no axis here.
+
+        Parameters
+        ----------
+        samples : SampleBlock
+            Recorded samples, in order of time.
+        rate_hz : float
+            Sample rate.
+        """
+        self._replaying = True
         self.advance([samples], rate_hz, drain=True)
-        self._reliving = False
+        self._replaying = False
         live = self.compensation
         if live is not None and np.isfinite(samples.values[:, :3]).any():
-            for at in range(0, len(samples), PIECE):
-                live.update(samples[at : at + PIECE])
+            for at in range(0, len(samples), MAX_PIECE_SAMPLES):
+                live.update(samples[at : at + MAX_PIECE_SAMPLES])
             self.identifier.renew(live)
             live.take()
         self.take_events()
@@ -136,7 +178,7 @@ class Chain:
             self.since_ns = [self.newest_ns + 1] * len(AXES)
 
     def relabel(self, rate_hz: float) -> None:
-        """The rate is known better now."""
+        """Set the sample rate to a more accurate value."""
         if self.estimator is None or rate_hz == self.estimator.rate_hz:
             return
         self.estimator.relabel(rate_hz)
@@ -145,24 +187,25 @@ class Chain:
                 one.relabel(rate_hz)
 
     def held(self) -> tuple[Held, Floats] | None:
-        """The samples in the window and their temperature [n], as of now; None while there are none."""
+        """Return a copy of the window and its temperature, float64 [n] in °C; None if the window is empty."""
         if self.estimator is None or self._temperatures is None or not self.estimator.filled:
             return None
         return self.estimator.held(), self._temperatures.newest(self.estimator.filled)
 
     def take_events(self) -> list[Event]:
-        """What was found since the last call."""
+        """Return the events that were detected since the last call."""
         found = [source.take_events() for source in (self.watch, self.thermal, self.compensation) if source is not None]
         return [event for events in found for event in events]
 
     def take_looks(self) -> list[ThermalLook]:
-        """Intervals that were held against temperature since the last call."""
+        """Return the thermal intervals that were completed since the last call."""
         looks, self._looks = self._looks, []
         return looks
 
-    # --- inside
+    # --- private methods
 
-    def _begin(self, rate_hz: float) -> bool:
+    def _create_estimator(self, rate_hz: float) -> bool:
+        """Create the estimator for a sample rate; return False if it cannot be created yet, or not at all."""
         if self.refused or not self.compiled:
             return False
         device = self._device
@@ -171,12 +214,13 @@ class Chain:
             self._temperatures = Temperatures(self.estimator.length)
             if self._model is not None:
                 self.in_force = ModelInForce(self._model, self.estimator.length)
-        except ConfigError as error:  # a list of τ that does not fit the rate found; samples go on
+        except ConfigError as error:  # the configured τ do not suit the measured rate; samples are still published
             self.refused = f"no estimate: {error}"
             return False
         return True
 
-    def _begin_watching(self) -> None:
+    def _create_detectors(self) -> None:
+        """Create the motion and change detection, the thermal model and the drift compensation, as configured."""
         if self.estimator is None:
             return
         device, rate_hz = self._device, self.estimator.rate_hz
@@ -185,7 +229,8 @@ class Chain:
         self.thermal = None if device.thermal_s is None else LiveThermal(rate_hz, device.thermal_s)
         self.compensation = LiveCompensation(rate_hz) if device.compensate else None
 
-    def _estimate(self, blocks: Sequence[SampleBlock]) -> None:
+    def _update_estimator(self, blocks: Sequence[SampleBlock]) -> None:
+        """Update the estimator with blocks of samples."""
         if self.estimator is None or self._temperatures is None:
             return
         for samples in blocks:
@@ -193,18 +238,18 @@ class Chain:
             self._temperatures.push(samples.lost, samples.temperature_c)
             self.advanced = True
 
-    def _restart(self) -> None:
-        """Let axes begin anew whose noise was found changed."""
+    def _restart_changed_axes(self) -> None:
+        """Restart the axes in which a change of the noise was detected."""
         restarts = self.watch.take_restarts() if self.watch is not None else []
-        if self.estimator is None or not self._device.restart or self._reliving:
+        if self.estimator is None or not self._device.restart or self._replaying:
             return
         for restart in restarts:
             self.estimator.restart(restart.axis, restart.samples)
             back_ns = round((restart.samples - 0.5) / self.estimator.rate_hz * 1e9)
             self.since_ns[restart.axis] = self.newest_ns - back_ns
 
-    def _follow(self) -> None:
-        """Hand on what is at rest to the models of temperature."""
+    def _update_thermal(self) -> None:
+        """Pass the samples at rest to the thermal model."""
         if self.watch is None or self.thermal is None:
             return
         if self.watch.handled != self._handled:

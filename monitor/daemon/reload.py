@@ -1,9 +1,11 @@
-"""What another reading of the configuration changes: a file in, what is to be done out; nothing is done here.
+"""Comparison of the running configuration with the configuration file, for a reload without a restart.
 
-Devices are told apart by name. One whose table reads as before, and whose model in force too, goes on untouched; where
-only its limits differ they alone are exchanged; anything else means that it is stopped and begins anew. The log's level
-and the hooks are exchanged as a whole. All other tables are wired once, while the service starts: that they differ is
-said, and they stay as they are. A file with anything wrong in it changes nothing.
+This module reads the file and returns the changes; it applies nothing. Devices are identified by name. A device
+continues if its table and its model in force are unchanged. If only its limits differ, only the limits are replaced.
+After any other change, the device is stopped and started again.
+
+The log level and the hooks are replaced as a whole. All other tables take effect only at the start of the service.
+Changes in them are reported and not applied. A file with any mistake changes nothing.
 """
 
 from collections.abc import Mapping
@@ -16,22 +18,22 @@ from monitor.noise.model import NoiseModel
 from monitor.settings import loading
 from monitor.settings.loading import Config, Device
 
-EXCHANGED: Final = ("device", "hook", "log")
-"""Tables that can be exchanged while the service runs; of ``log`` the level."""
+RELOADABLE_TABLES: Final = ("device", "hook", "log")
+"""Tables that can change while the service runs. Of ``log``, only the level can."""
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """From one configuration to another."""
+    """Changes from the running configuration to the file."""
 
-    config: Config  # that holds from then on
-    removed: tuple[str, ...]  # changed ones too
-    added: tuple[Device, ...]  # changed ones too
-    limited: tuple[Device, ...]  # those of which only the limits differ
-    restart: tuple[str, ...]  # tables that hold only after a restart
+    config: Config  # configuration after the reload
+    removed: tuple[str, ...]  # names of removed and changed devices
+    added: tuple[Device, ...]  # added and changed devices
+    limited: tuple[Device, ...]  # devices in which only the limits differ
+    restart: tuple[str, ...]  # changed tables that take effect only after a restart
 
     def text(self) -> str:
-        """In one sentence."""
+        """Return the changes in one sentence."""
         new = {device.name for device in self.added}
         parts = {
             "added": sorted(new - set(self.removed)),
@@ -46,13 +48,24 @@ class Change:
 
 
 def change(running: Config, models: Mapping[str, NoiseModel | None]) -> Change:
-    """What the file says now, against what runs.
+    """Compare the configuration file with the running configuration.
 
-    Args:
-        running: as it was read from its file
-        models: those in force, of each device, as they were read then
-    Raises:
-        ConfigError: one line: nothing is to be changed
+    Parameters
+    ----------
+    running : Config
+        Running configuration, as read from its file.
+    models : mapping of str to NoiseModel or None
+        Model in force of each device, as read at its start.
+
+    Returns
+    -------
+    Change
+        Changes to apply.
+
+    Raises
+    ------
+    ConfigError
+        The file has a mistake, or the running configuration was not read from a file. Nothing is to be changed.
     """
     if running.path is None:
         raise ConfigError("there is no file to read again")
@@ -68,27 +81,32 @@ def change(running: Config, models: Mapping[str, NoiseModel | None]) -> Change:
             limited.append(device)
     kept = {device.name for device in new.devices} - {device.name for device in added}
     removed = tuple(device.name for device in running.devices if device.name not in kept)
-    restart = _wired(running.table, new.table)
-    return Change(_with(running, new, restart), removed, tuple(added), tuple(limited), restart)
+    restart = _restart_tables(running.table, new.table)
+    return Change(_merge(running, new, restart), removed, tuple(added), tuple(limited), restart)
 
 
 def _by_name(table: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """Return the tables of the devices by name."""
     return {str(one.get("name")): one for one in table.get("device", ())}
 
 
 def _without_limits(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the table of a device without its limits."""
     return {key: value for key, value in table.items() if key != "limit"}
 
 
-def _wired(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, ...]:
-    """Tables that differ and cannot be exchanged."""
-    differ = [key for key in {**old, **new} if key not in EXCHANGED and old.get(key) != new.get(key)]
+def _restart_tables(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of the changed tables that take effect only after a restart."""
+    differ = [key for key in {**old, **new} if key not in RELOADABLE_TABLES and old.get(key) != new.get(key)]
     form = [one.get("log", {}).get("format", "text") for one in (old, new)]
     return (*differ, *(["log.format"] if form[0] != form[1] else []))
 
 
-def _with(running: Config, new: Config, restart: tuple[str, ...]) -> Config:
-    """The new configuration, but for what only a restart makes hold: that is said again at the next reload."""
+def _merge(running: Config, new: Config, restart: tuple[str, ...]) -> Config:
+    """Return the new configuration with the old values of the tables that need a restart.
+
+    The next reload then reports these tables again.
+    """
     table = {key: value for key, value in new.table.items() if key not in restart}
     table |= {key: running.table[key] for key in restart if key in running.table}
     if "log.format" in restart:

@@ -1,7 +1,8 @@
-"""Between a device's reader thread and the worker: one writer, one reader, bounded, the writer never waits.
+"""Ring buffer between the reader thread and the worker of a device, with one writer and one reader.
 
-A full ring overwrites its oldest samples; what was overwritten counts in ``overflowed`` and shows up as ``lost`` of
-the block taken next, so that the gap keeps its length in time. The lock is held for a copy and no longer.
+The writer never waits. A full buffer overwrites its oldest samples. The overwritten samples count in ``overflowed``,
+and in ``lost`` of the next block that is taken, so that the gap keeps its length in time. The lock is held only while
+samples are copied.
 """
 
 import threading
@@ -14,7 +15,13 @@ from drivers.sample import SampleBlock, block
 
 
 class RingBuffer:
-    """Holds up to ``capacity`` samples, 80 bytes each."""
+    """Ring buffer for samples, with 80 bytes for each sample.
+
+    Parameters
+    ----------
+    capacity : int
+        Largest number of samples in the buffer.
+    """
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
@@ -23,23 +30,23 @@ class RingBuffer:
         self._values = np.zeros((capacity, 6))
         self._temperature_c = np.zeros(capacity)
         self._ticks = np.zeros(capacity, np.int64)
-        self._lost = np.zeros(capacity, np.int64)  # samples missing just before each
-        self._read = self._written = 0  # counted since the start
+        self._lost = np.zeros(capacity, np.int64)  # number of missing samples just before each sample
+        self._read = self._written = 0  # samples read and written since the start
         self._lock = threading.Lock()
 
     @property
     def room(self) -> int:
-        """Samples that fit in before the oldest is overwritten."""
+        """Number of samples that fit in before the oldest is overwritten."""
         return self.capacity - (self._written - self._read)
 
     def push(self, samples: SampleBlock) -> None:
-        """Add samples; overwrites the oldest when full."""
+        """Add samples. A full buffer overwrites its oldest samples."""
         with self._lock:
             for start in range(0, len(samples), self.capacity):
                 self._write(samples[start : start + self.capacity])
 
     def take(self) -> list[SampleBlock]:
-        """All samples since the last call, in blocks cut where samples are missing."""
+        """Return all samples since the last call, in blocks that are split where samples are missing."""
         with self._lock:
             n = self._written - self._read
             if n == 0:
@@ -52,6 +59,7 @@ class RingBuffer:
         return [replace(taken[a:b], lost=int(lost[a])) for a, b in pairwise(edges)]
 
     def _write(self, samples: SampleBlock) -> None:
+        """Copy a block of at most ``capacity`` samples into the buffer."""
         n = len(samples)
         overwritten = max(0, self._written + n - self._read - self.capacity)
         if overwritten:

@@ -1,9 +1,13 @@
-"""The daemon: builds and wires everything, runs the loop, stops in order.
+"""Main service of the daemon: starts the device workers and outputs, runs the main loop, and stops in order.
 
-``Service.loop`` is a corridor: take, update, publish, for each device in turn; it decides nothing. It sleeps until a
-reader has pushed samples. An output that cannot start or does not keep up is shown in the status of every device;
-samples go on. systemd, where it asks, is told once all outputs are up or were tried. Stopping: readers first, then what
-is in the rings is worked off and published, then the outputs close.
+In each round, ``Service.loop`` calls every device worker. The worker takes the new samples, updates its estimate and
+publishes the results. Between two rounds the loop sleeps until a reader thread has pushed samples.
+
+An output that cannot start, or that does not keep up, is reported in the status of every device. Sampling continues.
+Under systemd, readiness is signalled as soon as a start of every output has been attempted.
+
+The service stops in three steps: it stops the readers, processes and publishes the samples that are left in the ring
+buffers, and closes the outputs.
 """
 
 import threading
@@ -45,30 +49,42 @@ if TYPE_CHECKING:
     from monitor.publishing.rerun.view import RerunView
     from monitor.simulator import VirtualImu
 
-IDLE_S: Final = 0.05
-PACE_S: Final = 0.02
-"""Between two rounds where no device wants every block published."""
-STATUS_S: Final = 1.0
-STARTING: Final = ("not open yet", "starting")
-"""What outputs say that were not tried yet."""
-READY_S: Final = 30.0
-"""The service counts as started after so long, whatever its outputs do."""
-JOIN_S: Final = 3.0
+MAX_IDLE_S: Final = 0.05
+"""Longest sleep of the main loop if no samples arrive."""
+ROUND_PAUSE_S: Final = 0.02
+"""Pause between two rounds if no device is configured to publish every block."""
+STATUS_INTERVAL_S: Final = 1.0
+"""Interval of the status messages."""
+STARTING_STATES: Final = ("not open yet", "starting")
+"""States of an output before the first attempt to start it."""
+READY_TIMEOUT_S: Final = 30.0
+"""After this time the service reports readiness to systemd, even if an output has not been tried yet."""
+JOIN_TIMEOUT_S: Final = 3.0
+"""Longest wait for a reader thread to end."""
 
 _log = structlog.get_logger("imu-monitor")
 
 
 class Service:
-    """Everything between a configuration and its outputs.
+    """Service that runs all configured devices and outputs.
 
-    Args:
-        config: what to run
-        more: further outputs, e.g. the table in the terminal
-        reconciler: runs ``command/reconcile``
-        unit: where systemd is told how it goes
-        writers: text outputs by name, such as "terminal" and "log"; their states are part of the status
-    Raises:
-        ConfigError: a simulated sensor or a model in force that cannot be
+    Parameters
+    ----------
+    config : Config
+        Configuration to run.
+    more : sequence of Output, optional
+        Further outputs, for example the table in the terminal.
+    reconciler : Reconciler, optional
+        Executes ``command/reconcile``. By default a new ``Reconciler``.
+    unit : Unit, optional
+        Notifies systemd. By default nothing is sent.
+    writers : mapping of str to QueuedWriter, optional
+        Text outputs by name, such as "terminal" and "log". Their states become part of the status.
+
+    Raises
+    ------
+    ConfigError
+        A simulated sensor or a model in force cannot be used.
     """
 
     def __init__(
@@ -89,40 +105,46 @@ class Service:
         self._stop = threading.Event()
         self._reload_asked = False
         self.virtual: dict[str, VirtualImu] = {}
-        self.recorder = _recorder(config)
+        self.recorder = _build_recorder(config)
         self.stations: list[Station] = []
-        self._recorded: set[str] = set()  # devices whose times are not the host's
+        self._self_timed_devices: set[str] = set()  # devices whose sample times do not come from the host clock
         for device in config.devices:
-            self._take_on(*self._built(device))
-        self.history = _history(config)
-        recall = None if self.history is None else self._recall
+            self._register_device(*self._build_device(device))
+        self.history = _build_history_writer(config)
+        recall = None if self.history is None else self._answer_history_query
         self.zenoh = ZenohOut(config.zenoh, [station.name for station in self.stations], recall)
-        self.view = _viewer(config, self._last)
-        self._page = ""  # where the viewer's page is, as it was said last
+        self.view = _build_view(config, self._load_viewer_history)
+        self._viewer_url = ""  # address of the viewer's web page that was announced last
         self.hooks = Hooks(config.hooks, self.zenoh.put_on)
         self.outputs: list[Output] = [ZenohOutput(self.zenoh), self.hooks, *more]
-        self.metrics = _metrics(config)
+        self.metrics = _build_metrics_output(config)
         if self.metrics is not None:
             self.outputs.append(self.metrics)
         if self.view is not None:
             self.outputs.append(ViewerOutput(self.view))
-        self._kept = None if self.history is None else HistoryOutput(self.history)
-        if self._kept is not None:
-            self.outputs.append(self._kept)
+        self._history_output = None if self.history is None else HistoryOutput(self.history)
+        if self._history_output is not None:
+            self.outputs.append(self._history_output)
 
     def stop(self) -> None:
-        """Ask the loop to end; may be called from another thread."""
+        """Request the end of the main loop. May be called from any thread."""
         self._stop.set()
         self._wake.set()
 
     def reload(self) -> None:
-        """Ask the loop to read the configuration again; may be called from another thread."""
+        """Request that the main loop reads the configuration file again. May be called from any thread."""
         self._reload_asked = True
         self._wake.set()
 
     def run(self, seconds: float | None = None) -> None:
-        """Start, loop until stopped (or for so many seconds, or until all replays have ended), stop in order."""
-        threading.Thread(target=self._warm_up, name="warm-up", daemon=True).start()
+        """Start the service, run the main loop, and stop in order.
+
+        Parameters
+        ----------
+        seconds : float, optional
+            Duration in seconds. By default the service runs until ``stop`` is called or all replays have ended.
+        """
+        threading.Thread(target=self._compile_kernels, name="warm-up", daemon=True).start()
         try:
             self._start()
             self.loop(None if seconds is None else time.monotonic() + seconds)
@@ -130,6 +152,7 @@ class Service:
             self._close()
 
     def _start(self) -> None:
+        """Start all outputs, devices and background threads."""
         if self.history is not None:
             self.history.start()
         self.zenoh.start()
@@ -143,19 +166,27 @@ class Service:
             station.start()
         if self.recorder is not None:
             self.recorder.start()
-            threading.Thread(target=self._rebuild, args=(self.stations,), name="rebuild", daemon=True).start()
+            threading.Thread(target=self._rebuild_windows, args=(self.stations,), name="rebuild", daemon=True).start()
 
     def loop(self, until_s: float | None) -> None:
-        """Rounds over all devices; status once a second."""
+        """Run rounds over all devices, and publish the status once a second.
+
+        The loop ends when ``stop`` is called, when all replays have ended, or at the given time.
+
+        Parameters
+        ----------
+        until_s : float or None
+            End of the loop on the monotonic clock, in seconds. None sets no end.
+        """
         status_s = 0.0
         while not self._stop.is_set():
             now_s = time.monotonic()
-            self._work(now_s)
-            self._answer()
-            self._tell_reconciled()
+            self._work_devices(now_s)
+            self._handle_commands()
+            self._publish_reconcile_events()
             if now_s >= status_s:
-                status_s = now_s + STATUS_S
-                self._report()
+                status_s = now_s + STATUS_INTERVAL_S
+                self._publish_status()
             if until_s is not None and now_s >= until_s:
                 return
             if all(station.ended for station in self.stations):
@@ -163,18 +194,19 @@ class Service:
             if self._reload_asked:
                 self._reload_asked = False
                 self._reload()
-            self._wake.wait(IDLE_S)
+            self._wake.wait(MAX_IDLE_S)
             self._wake.clear()
             if not any(station.device.publish_s == 0.0 for station in self.stations):
-                self._stop.wait(PACE_S)
+                self._stop.wait(ROUND_PAUSE_S)
 
-    def _work(self, now_s: float) -> None:
+    def _work_devices(self, now_s: float) -> None:
+        """Process the new samples of every device, and announce on zenoh which devices are running."""
         for station in self.stations:
             station.work(self.outputs, now_s)
             self.zenoh.alive(station.name, station.driver.state == "running")
 
     def states(self) -> dict[str, str]:
-        """Output -> "ok" or what is wrong with it."""
+        """Return the state of each output by its name: "ok", or a text that describes the problem."""
         states = {"zenoh": self.zenoh.state}
         if self.view is not None:
             states["viewer"] = self.view.state
@@ -188,45 +220,51 @@ class Service:
             states["hook"] = self.hooks.state
         return states | {name: writer.state for name, writer in self._writers.items()}
 
-    def _rebuild(self, stations: Sequence[Station]) -> None:
-        """Windows from the recording, as soon as that can be computed."""
+    def _rebuild_windows(self, stations: Sequence[Station]) -> None:
+        """Rebuild the windows of devices from their recordings, as soon as all kernels are compiled."""
         self._ready.all.wait()
         for station in stations:
             station.rebuild()
 
-    def _last(self, device: str) -> Past | None:
-        """What the viewer opens on; called by its thread. A recording that is replayed brings its own past."""
+    def _load_viewer_history(self, device: str) -> Past | None:
+        """Return the stored results that the viewer shows when it opens, or None if there are none.
+
+        The thread of the viewer calls this function. A device whose samples bring their own times, such as a replayed
+        recording, has no stored results.
+        """
         history_s = self.config.viewer.history
-        if self.history is None or history_s is None or device in self._recorded:
+        if self.history is None or history_s is None or device in self._self_timed_devices:
             return None
         assert isinstance(history_s, float)
         now_s = time.time()
         try:
             with reading(self.history.path) as reader:
                 return past.read(reader, device, Span(now_s - history_s, now_s))
-        except (NotReady, RecordingError):  # nothing yet; what is wrong with the file the writer says
+        except (NotReady, RecordingError):  # no results yet; the writer reports errors of the file
             return None
 
-    def _recall(self, device: str, parameters: str) -> bytes:
-        """The answer to a query of a device's history; called by a thread of its own.
+    def _answer_history_query(self, device: str, parameters: str) -> bytes:
+        """Answer a query for the history of a device. Each query calls this function in a thread of its own.
 
-        Raises:
-            ImuError: the question is wrong, or there is nothing to answer it with
+        Raises
+        ------
+        ImuError
+            The query is invalid, or the history has no data to answer it.
         """
         assert self.history is not None
-        assert self._kept is not None
+        assert self._history_output is not None
         asked = question(parameters, time.time())
         with reading(self.history.path) as reader:
             found = past.read(reader, device, asked.span, asked.wants, asked.step_s)
             newest_s = reader.newest_s(device)
-        return history.history(found, asked, newest_s, self._kept.received.get(device, 0))
+        return history.history(found, asked, newest_s, self._history_output.received.get(device, 0))
 
-    def _warm_up(self) -> None:
-        """Beside the loop, so that a first start's compilation holds up neither samples nor status."""
+    def _compile_kernels(self) -> None:
+        """Compile the kernels in a thread, so that a first start delays neither samples nor status."""
         begun_s = time.monotonic()
         flags = {kernel_compilation.WINDOW: self._ready.window, kernel_compilation.FIT: self._ready.fit}
         try:
-            for part in kernel_compilation.prepare(kernel_compilation.SERVICE, self._tell_progress):
+            for part in kernel_compilation.prepare(kernel_compilation.SERVICE, self._show_progress):
                 if part in flags:
                     flags[part].set()
                     self._wake.set()
@@ -236,19 +274,21 @@ class Service:
             _log.warning("compiled kernels cannot be kept, the next start will be slow again", error=str(error))
         finally:
             self._ready.progress = ""
-            # what has failed is compiled by the loop, or ends it; without this it would wait for ever
+            # the main loop compiles the kernels that failed here, or ends with their error; without these flags it
+            # would wait forever
             for flag in (self._ready.window, self._ready.fit, self._ready.all):
                 flag.set()
             self._wake.set()
 
-    def _tell_progress(self, progress: kernel_compilation.Progress) -> None:
+    def _show_progress(self, progress: kernel_compilation.Progress) -> None:
+        """Show the progress of the compilation in the status, and log its begin."""
         if not self._ready.progress:
             _log.info("compiling kernels, as none are kept for this version on this machine")
         self._ready.progress = f"{progress} {progress.bar}"
         self._wake.set()
 
-    def _built(self, device: Device) -> "tuple[Station, VirtualImu | None]":
-        """A device, and the sensor where it is simulated; nothing of it is open."""
+    def _build_device(self, device: Device) -> "tuple[Station, VirtualImu | None]":
+        """Build the worker of a device, and its virtual IMU if the device is simulated, without opening either."""
         link, imu = device.link, None
         if isinstance(link, VirtualTable):
             from monitor.simulator import VirtualImu
@@ -257,21 +297,22 @@ class Service:
             link = imu.link
         return Station(device, link, device.decoder, self._wake, self._ready, self.recorder), imu
 
-    def _take_on(self, station: Station, imu: "VirtualImu | None") -> None:
+    def _register_device(self, station: Station, imu: "VirtualImu | None") -> None:
+        """Add a worker, and its virtual IMU if the device is simulated, to the service."""
         self.stations = [*self.stations, station]
         if station.driver.times_are_unix:
-            self._recorded.add(station.name)
+            self._self_timed_devices.add(station.name)
         if imu is not None:
             self.virtual[station.name] = imu
 
-    # --- another configuration
+    # --- reload of the configuration
 
     def _reload(self) -> None:
-        """What another reading of the file changes; where anything is wrong with it, nothing."""
+        """Read the configuration file again and apply the changes; with any mistake in the file, change nothing."""
         self._unit.reloading()
         try:
             change = reload.change(self.config, {station.name: station.model for station in self.stations})
-            built = [self._built(device) for device in change.added]
+            built = [self._build_device(device) for device in change.added]
         except ConfigError as error:
             _log.error("not reloaded, all goes on as it was", error=str(error))
         else:
@@ -281,9 +322,10 @@ class Service:
             self._unit.ready()
 
     def _apply(self, change: Change, built: "Sequence[tuple[Station, VirtualImu | None]]") -> None:
+        """Apply the changes of a configuration: stop removed devices, exchange limits, and start added devices."""
         leaving = [station for station in self.stations if station.name in change.removed]
         for station in leaving:
-            station.stop()  # all at once: each may take a moment
+            station.stop()  # all devices stop side by side, because each may take a moment
         for station in leaving:
             self._remove(station)
         for device in change.limited:
@@ -292,98 +334,103 @@ class Service:
         self.hooks.hooks = change.config.hooks
         LEVEL.name = change.config.log.level
         for station, imu in built:
-            self._take_on(station, imu)
+            self._register_device(station, imu)
         order = [device.name for device in change.config.devices]
         self.stations.sort(key=lambda station: order.index(station.name))
         if self.view is not None:
-            self.view.show(_shown(change.config.devices))
+            self.view.show(_device_infos(change.config.devices))
         for station, imu in built:
             self._add(station, imu)
 
     def _add(self, station: Station, imu: "VirtualImu | None") -> None:
-        """Start a device while the others run."""
+        """Start an added device while the other devices continue."""
         self.zenoh.add(station.name)
         if self.recorder is not None:
-            self.recorder.add(_origins(self.config.storage, station.device))
+            self.recorder.add(_segment_origins(self.config.storage, station.device))
         if imu is not None:
             imu.start()
         station.start()
         if self.recorder is not None:
-            threading.Thread(target=self._rebuild, args=([station],), name="rebuild", daemon=True).start()
+            threading.Thread(target=self._rebuild_windows, args=([station],), name="rebuild", daemon=True).start()
 
     def _remove(self, station: Station) -> None:
-        """Part with a device that was asked to stop, and publish what it still brought, while the others run."""
+        """Remove a stopped device and publish its remaining samples, while the other devices continue."""
         if station.name in self.virtual:
             self.virtual.pop(station.name).stop()
-        if not self._meanwhile(lambda: station.join(0.0) and not station.rebuilding):
+        if not self._work_until(lambda: station.join(0.0) and not station.rebuilding):
             _log.warning("reader did not end in time", device=station.name)
         station.work(self.outputs, time.monotonic(), drain=True)
         self.stations = [one for one in self.stations if one is not station]
         self.zenoh.remove(station.name)
         if self.recorder is not None:
             self.recorder.remove(station.name)
-            self._meanwhile(lambda: self.recorder is None or not self.recorder.has(station.name))
-        self._recorded.discard(station.name)
+            self._work_until(lambda: self.recorder is None or not self.recorder.has(station.name))
+        self._self_timed_devices.discard(station.name)
         for output in self.outputs:
             output.gone(station.name)
 
-    def _meanwhile(self, done: Callable[[], bool]) -> bool:
-        """Go on with all devices until something is done, JOIN_S at most; whether it is."""
-        until_s = time.monotonic() + JOIN_S
+    def _work_until(self, done: Callable[[], bool]) -> bool:
+        """Process all devices until ``done`` returns True, or for JOIN_TIMEOUT_S; return its last result."""
+        until_s = time.monotonic() + JOIN_TIMEOUT_S
         while not (ended := done()) and time.monotonic() < until_s:
-            self._work(time.monotonic())
-            time.sleep(PACE_S)
+            self._work_devices(time.monotonic())
+            time.sleep(ROUND_PAUSE_S)
         return ended
 
-    # --- telling
+    # --- status and commands
 
-    def _report(self) -> None:
-        self._tell_recording()
+    def _publish_status(self) -> None:
+        """Publish the status of all devices, and notify systemd."""
+        self._publish_recorder_events()
         states, memory = self.states(), memory_bytes()
-        self._tell_page()
+        self._announce_viewer_url()
         healths = {station.name: station.report(self.outputs, states, memory) for station in self.stations}
-        self._tell_unit(healths, states)
+        self._notify_systemd(healths, states)
 
-    def _tell_unit(self, healths: Mapping[str, Health], states: Mapping[str, str]) -> None:
-        """systemd: whether all is up, how it goes, and that the readers move on."""
+    def _notify_systemd(self, healths: Mapping[str, Health], states: Mapping[str, str]) -> None:
+        """Notify systemd of readiness, of the overall status, and that the reader threads make progress."""
         now_s = time.monotonic()
-        tried = not any(state in STARTING for state in states.values()) or now_s - self._started_s > READY_S
+        tried = (
+            not any(state in STARTING_STATES for state in states.values()) or now_s - self._started_s > READY_TIMEOUT_S
+        )
         if tried and not self._unit.told_ready:
             self._unit.ready()
         turns = {station.name: station.turns for station in self.stations}
         stuck = self._unit.alive({name: count for name, count in turns.items() if count is not None}, now_s)
         self._unit.status(sentence(healths, states, stuck))
 
-    def _tell_recording(self) -> None:
+    def _publish_recorder_events(self) -> None:
+        """Publish the events of the recorder."""
         stations = {station.name: station for station in self.stations}
         for told in self.recorder.take() if self.recorder is not None else ():
             if told.device in stations:
                 stations[told.device].announce(self.outputs, told.kind, told.text)
 
-    def _tell_page(self) -> None:
-        """Say where the viewer's page is, once for each place; a window needs no address."""
+    def _announce_viewer_url(self) -> None:
+        """Log the address of the viewer's web page each time it changes. A viewer in a window has no address."""
         url = self.view.url if self.view is not None else ""
         page = url if url.startswith("http://") else ""
-        if page == self._page:
+        if page == self._viewer_url:
             return
-        self._page = page
+        self._viewer_url = page
         if page:
             _log.info("viewer", url=page)
         for output in self.outputs:
             if isinstance(output, TableOutput):
                 output.viewer_at(page)
 
-    def _answer(self) -> None:
-        """Commands that came over zenoh since the last round."""
+    def _handle_commands(self) -> None:
+        """Execute the commands that arrived over zenoh since the last round."""
         stations = {station.name: station for station in self.stations}
         while not self.zenoh.commands.empty():
             command = self.zenoh.commands.get_nowait()
             if command.device in stations:
-                self._obey(command, stations[command.device])
+                self._execute_command(command, stations[command.device])
             else:
                 command.refuse("the device was taken out of the configuration")
 
-    def _obey(self, command: Command, station: Station) -> None:
+    def _execute_command(self, command: Command, station: Station) -> None:
+        """Execute one command for a device, and answer it."""
         match command.verb:
             case "reset":
                 station.reset()
@@ -396,7 +443,7 @@ class Service:
                 command.refuse(f'unknown command "{other}"; known are reset, reconcile')
 
     def _reconcile(self, command: Command, station: Station) -> None:
-        """Hand a copy of the window over; the answer comes from a thread of its own."""
+        """Start a reconciliation with a copy of the window; a thread of its own sends the answer."""
         held = station.held()
         if held is None:
             command.refuse("no samples yet")
@@ -406,19 +453,21 @@ class Service:
         job = Job(station.name, newest_s, received, *held, device.model, device.reconcile_folder)
         self._reconciler.start(job, command)
 
-    def _tell_reconciled(self) -> None:
+    def _publish_reconcile_events(self) -> None:
+        """Publish an event for each reconciliation that has finished."""
         stations = {station.name: station for station in self.stations}
         for finished in self._reconciler.take():
             if finished.device in stations:
                 stations[finished.device].announce(self.outputs, "reconciled", finished.text)
 
     def _close(self) -> None:
+        """Stop the devices, publish their remaining samples, and close all outputs."""
         self._unit.stopping()
         try:
             self._drain()
         finally:
             self._reconciler.close()
-            self._tell_reconciled()
+            self._publish_reconcile_events()
             if self.recorder is not None:
                 self.recorder.close()
             self.hooks.close()
@@ -427,37 +476,38 @@ class Service:
             if self.view is not None:
                 self.view.close()
             self.zenoh.close()
-            if self.history is not None and self._kept is not None:
-                self._kept.end()
+            if self.history is not None and self._history_output is not None:
+                self._history_output.end()
                 self.history.close()
 
     def _drain(self) -> None:
-        """End the readers, and publish what they still brought."""
+        """Stop the readers, and publish the samples that are left in the ring buffers."""
         for station in self.stations:
             station.stop()
         if any(station.waits_for_all for station in self.stations):
-            self._ready.all.wait()  # their samples are still in the ring
+            self._ready.all.wait()  # the samples of these devices are still in the ring buffer
         for imu in self.virtual.values():
             imu.stop()
         for station in self.stations:
-            until_s = time.monotonic() + JOIN_S
-            while not (ended := station.join(PACE_S)) and time.monotonic() < until_s:
-                station.work(self.outputs, time.monotonic())  # a replay waits for room
+            until_s = time.monotonic() + JOIN_TIMEOUT_S
+            while not (ended := station.join(ROUND_PAUSE_S)) and time.monotonic() < until_s:
+                station.work(self.outputs, time.monotonic())  # a replay waits for space in its ring buffer
             if not ended:
                 _log.warning("reader did not end in time", device=station.name)
             station.work(self.outputs, time.monotonic(), drain=True)
             self.zenoh.alive(station.name, False)
-        self._report()
+        self._publish_status()
 
 
-def _recorder(config: Config) -> Recorder | None:
+def _build_recorder(config: Config) -> Recorder | None:
+    """Return the recorder of the service, or None if nothing is to be recorded."""
     storage = config.storage
-    origins = [one for device in config.devices for one in _origins(storage, device)]
+    origins = [one for device in config.devices for one in _segment_origins(storage, device)]
     return Recorder(storage, origins) if storage is not None and origins else None
 
 
-def _origins(storage: Storage | None, device: Device) -> list[Origin]:
-    """What of a device is wanted in the recording; a replay is one already."""
+def _segment_origins(storage: Storage | None, device: Device) -> list[Origin]:
+    """Return the recordings to write for a device: samples, raw bytes, both, or none for a replay."""
     if storage is None or isinstance(device.link, ReplayLink):
         return []
     origins = [origin(device.name, device.axes)] if storage.record else []
@@ -465,10 +515,10 @@ def _origins(storage: Storage | None, device: Device) -> list[Origin]:
 
 
 def memory_bytes() -> int:
-    """Resident memory of this process."""
+    """Return the resident memory of this process, in bytes."""
     try:
         pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
-    except OSError:  # no Linux: the peak is the nearest there is
+    except OSError:  # outside Linux only the peak is available
         import resource
         import sys
 
@@ -479,37 +529,48 @@ def memory_bytes() -> int:
     return pages * resource.getpagesize()
 
 
-def _history(config: Config) -> Writer | None:
+def _build_history_writer(config: Config) -> Writer | None:
+    """Return the writer of the history file, or None if no history is kept."""
     if config.storage is None or not config.storage.history:
         return None
     return Writer(config.storage.folder / FILE, time.time)
 
 
-def _metrics(config: Config) -> "MetricsOutput | None":
+def _build_metrics_output(config: Config) -> "MetricsOutput | None":
+    """Return the output for Prometheus, or None if it is not configured."""
     if config.metrics is None:
         return None
-    from monitor.daemon.operations.metrics import MetricsOutput  # with http.server
+    from monitor.daemon.operations.metrics import MetricsOutput  # imports http.server, so only if it is needed
 
     return MetricsOutput(config.metrics)
 
 
-def _viewer(config: Config, recall: Callable[[str], Past | None]) -> "RerunView | None":
+def _build_view(config: Config, recall: Callable[[str], Past | None]) -> "RerunView | None":
+    """Return the Rerun view, or None if the viewer is switched off."""
     if config.viewer.mode == "none":
         return None
     from monitor.publishing.rerun.view import RerunView
 
     own = config.viewer
-    return RerunView(ViewerSettings(own.mode, own.port, own.web_port, own.memory), _shown(config.devices), recall)
+    return RerunView(
+        ViewerSettings(own.mode, own.port, own.web_port, own.memory), _device_infos(config.devices), recall
+    )
 
 
-def _shown(devices: Sequence[Device]) -> list[DeviceInfo]:
+def _device_infos(devices: Sequence[Device]) -> list[DeviceInfo]:
+    """Return what the viewer needs to know about each device."""
     return [
         DeviceInfo(
-            device.name, _about(device), device.model is not None, device.thermal_s is not None, device.compensate
+            device.name,
+            _source_description(device),
+            device.model is not None,
+            device.thermal_s is not None,
+            device.compensate,
         )
         for device in devices
     ]
 
 
-def _about(device: Device) -> str:
+def _source_description(device: Device) -> str:
+    """Return a short description of the source of a device's samples."""
     return "simulated" if isinstance(device.link, VirtualTable) else device.link.name

@@ -1,8 +1,8 @@
-"""The window after a restart of the program, from the tail of the recording; and what is recorded for that.
+"""Restore of the estimation window after a restart of the program, from the end of the recording.
 
-The samples of the last window go through the same chain again, silently. What cannot be had from them comes from what
-was recorded beside the last ones (``segment.State``): from when on the samples of each axis count, and where the
-iterated fit stood.
+The recorded samples of the last window pass through the same pipeline again, without events. The other values come from
+the state that was recorded with the samples (``segment.State``): the start of each axis, and the values of the iterated
+fit.
 """
 
 from typing import Final
@@ -15,27 +15,48 @@ from drivers.sample import AXES, Ints, SampleBlock, block
 from monitor.daemon.pipeline import Chain
 from monitor.daemon.storage.recorder import Tail
 
-LEAST_S: Final = 600.0
-"""Of the recording, lived through however short the window is: changes are looked for in what is known."""
+MIN_REPLAY_S: Final = 600.0
+"""Shortest part of the recording that is replayed, however short the window is, because change detection needs history.
+"""
 
 
 def rebuild(chain: Chain, tail: Tail, rate_hz: float, window_s: float, offset_ns: int) -> str:
-    """Fill the chain; ``offset_ns`` makes its times Unix time. Returns what was done, as a sentence.
+    """Fill the pipeline with the end of a recording.
 
-    Raises:
-        RecordingError, OSError: a segment that cannot be read any more
+    Parameters
+    ----------
+    chain : Chain
+        Pipeline of the device.
+    tail : Tail
+        End of the recording.
+    rate_hz : float
+        Sample rate.
+    window_s : float
+        Length of the window.
+    offset_ns : int
+        Offset that converts the times to Unix time, in nanoseconds.
+
+    Returns
+    -------
+    str
+        A sentence that describes the result.
+
+    Raises
+    ------
+    RecordingError, OSError
+        A segment can no longer be read.
     """
     state = tail.newest.state
     counted = np.zeros(len(AXES), np.int64)
-    for piece in tail.pieces(max(window_s, LEAST_S)):
+    for piece in tail.pieces(max(window_s, MIN_REPLAY_S)):
         samples = piece.samples
-        counted += _counting(samples, state)
+        counted += _count_since_restart(samples, state)
         t_ns = samples.t_ns - offset_ns
         chain.relive(block(t_ns, samples.values, samples.temperature_c, lost=samples.lost), rate_hz)
     if chain.estimator is None:
         return chain.refused or "nothing could be rebuilt from the recording"
     for axis, unix_s in enumerate(state.since):
-        # what the watch finds again now is what it knew before
+        # changes that are detected in the replay were already known before the restart
         chain.since_ns[axis] = None if unix_s is None else round(unix_s * 1e9) - offset_ns
         if unix_s is not None:
             chain.estimator.restart(axis, int(counted[axis]))
@@ -48,7 +69,21 @@ def rebuild(chain: Chain, tail: Tail, rate_hz: float, window_s: float, offset_ns
 
 
 def known(chain: Chain, before: State, rate_hz: float | None, tick_step: float | None, offset_ns: int) -> State:
-    """What is to be recorded beside the samples now; ``before``: what was known at the start."""
+    """Return the state that is to be recorded with the samples now.
+
+    Parameters
+    ----------
+    chain : Chain
+        Pipeline of the device.
+    before : State
+        State at the start of the program. It is returned with new rates while there is no estimator.
+    rate_hz : float or None
+        Sample rate.
+    tick_step : float or None
+        Counter ticks from one sample to the next.
+    offset_ns : int
+        Offset that converts the times to Unix time, in nanoseconds.
+    """
     tick_step = tick_step or before.tick_step
     if chain.estimator is None:
         return msgspec.structs.replace(before, rate=rate_hz or before.rate, tick_step=tick_step)
@@ -58,8 +93,8 @@ def known(chain: Chain, before: State, rate_hz: float | None, tick_step: float |
     return State(chain.estimator.rate_hz, since, tick_step, sizes, tuple(entered.ravel().tolist()))
 
 
-def _counting(samples: SampleBlock, state: State) -> Ints:
-    """How many samples of a block count for each axis that began anew [6], missing ones before it included."""
+def _count_since_restart(samples: SampleBlock, state: State) -> Ints:
+    """Return the number of samples in a block since the restart of each axis, int64 [6], missing ones included."""
     counting = np.zeros(len(AXES), np.int64)
     for axis, unix_s in enumerate(state.since):
         if unix_s is not None:

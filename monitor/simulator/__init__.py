@@ -1,4 +1,4 @@
-"""A simulated IMU that speaks a real wire format over a real link: model, encoder, faults, and the link's far end."""
+"""Simulated IMU that sends a real wire format over a real link: noise model, encoder, faults and link endpoint."""
 
 from monitor.simulator.scheduled_effects import effects_of
 from monitor.simulator.sensor import DEFAULT_RATE_HZ, ROOM_C, WARM_UP_C, WARM_UP_S, Sensor

@@ -1,6 +1,6 @@
-"""A CAN bus of python-can in this process, whose channel nobody else knows.
+"""Port of a simulated sensor on a virtual CAN bus of python-can, whose random channel name no other program knows.
 
-As on a real bus, pulling the sensor off leaves the bus: the link notices by its silence.
+As on a real bus, disconnecting the sensor leaves the bus in place. The link detects it because no frames arrive.
 """
 
 import secrets
@@ -15,11 +15,19 @@ if TYPE_CHECKING:
     import can
 
 ID_MASK: Final = 0x1FFF_FFFF
+"""Bits of a CAN identifier in the address of a chunk."""
 CLASSIC_BYTES: Final = 8
+"""Largest payload of a classic CAN frame; longer frames are CAN FD."""
 
 
 class CanPort:
-    """A controller on a bus of its own."""
+    """Port with a CAN controller on a bus of its own.
+
+    Parameters
+    ----------
+    silence_s : float
+        Time in seconds without frames after which the link counts as lost.
+    """
 
     def __init__(self, silence_s: float) -> None:
         self._channel = f"imu-monitor-{secrets.token_hex(8)}"
@@ -28,7 +36,7 @@ class CanPort:
         self._plugging = threading.Lock()
 
     def plug(self) -> None:
-        """Join the bus."""
+        """Connect to the bus."""
         import can
 
         with self._plugging:
@@ -36,14 +44,14 @@ class CanPort:
                 self._bus = can.Bus(interface="virtual", channel=self._channel, ignore_config=True)
 
     def unplug(self) -> None:
-        """Leave the bus."""
+        """Disconnect from the bus."""
         with self._plugging:
             bus, self._bus = self._bus, None
             if bus is not None:
                 bus.shutdown()
 
     def send(self, chunks: Sequence[Chunk]) -> int:
-        """One frame a chunk."""
+        """Send each chunk as one frame; return the number of sent chunks."""
         import can
 
         with self._plugging:
@@ -61,5 +69,5 @@ class CanPort:
         return len(chunks)
 
     def close(self) -> None:
-        """Leave the bus for good."""
+        """Disconnect from the bus permanently."""
         self.unplug()

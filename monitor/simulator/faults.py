@@ -1,11 +1,11 @@
-"""What goes wrong on the way from a simulated sensor to its reader, drawn from a seed; pure.
+"""Random faults between a simulated sensor and its reader: lost, repeated, corrupted and truncated samples.
 
-Each sample has at most one fault: it is lost, sent twice, has one bit flipped, or ends before it is whole. What is
-drawn for a sample depends on its number and the seed alone, not on the bursts in which samples go out. A sample of
-several chunks (CAN frames) is hurt in the last of them. A CAN frame with a flipped bit does not arrive: the bus's own
-checksum rejects it.
+Each sample has at most one fault. The fault depends only on the number of the sample and on the seed, not on the bursts
+in which samples are sent. A sample of several chunks (CAN frames) has its fault in the last chunk. A CAN frame with a
+flipped bit does not arrive, because the checksum of the bus rejects it.
 
-``Truth`` counts what was done, so that a test can compare what the reader saw.
+``Truth`` counts the faults, so that a test can compare them with the counts of the reader. The module does no input or
+output.
 """
 
 from dataclasses import dataclass, replace
@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 from drivers.sample import Chunk, Floats
 from monitor.settings.loading import FaultsTable
 
-STREAM: Final = crc32(b"faults")
-DRAWS: Final = 3
-"""Uniform numbers a sample: which fault, where in the frame, whether the cable is pulled."""
+SPAWN_KEY: Final = crc32(b"faults")
+"""Key of the random streams of the faults."""
+DRAWS_PER_SAMPLE: Final = 3
+"""Uniform random numbers for each sample: the fault, its position in the frame, and whether the cable is pulled."""
 
 
 class Kind(IntEnum):
-    """What becomes of one sample, in the order in which the shares are laid end to end."""
+    """Fault of one sample, in the order in which the probabilities are added up."""
 
     LOST = 0
     REPEATED = 1
@@ -36,24 +37,32 @@ class Kind(IntEnum):
 
 @dataclass(slots=True)
 class Truth:
-    """What a simulated sensor did. All samples made = sent + lost + flipped + cut + dropped."""
+    """Counts of a simulated sensor. Samples made = sent + lost + flipped + cut + dropped."""
 
-    sent: int = 0  # whole and right, the repeated ones among them
+    sent: int = 0  # sent without corruption, including repeated samples
     lost: int = 0
     repeated: int = 0
     flipped: int = 0
     cut: int = 0
-    dropped: int = 0  # found no cable, no reader or no time
-    unplugged: int = 0  # times
-    held_s: float = 0.0  # longest time that a burst was held back
+    dropped: int = 0  # not sent because of a pulled cable, a missing reader or lack of time
+    unplugged: int = 0  # number of times that the cable was pulled
+    held_s: float = 0.0  # longest delay of a burst
 
     @property
     def made(self) -> int:
-        """Samples so far."""
+        """Number of samples so far."""
         return self.sent + self.lost + self.flipped + self.cut + self.dropped
 
     def count(self, kind: Kind, out: bool) -> None:
-        """One sample; ``out``: all of it that was to go out found a cable and room."""
+        """Count one sample.
+
+        Parameters
+        ----------
+        kind : Kind
+            Fault of the sample.
+        out : bool
+            True if all chunks that were to be sent have been sent.
+        """
         match kind:
             case _ if not out:
                 self.dropped += 1
@@ -70,58 +79,72 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class Draws:
-    """What becomes of consecutive samples."""
+    """Random faults of consecutive samples."""
 
     kind: NDArray[np.int64]  # [n] of Kind
-    where: Floats  # [n] of 0 … 1
-    pulled: NDArray[np.bool_]  # [n] the cable is pulled before this sample
+    where: Floats  # [n] position of the fault in the frame, 0 to 1
+    pulled: NDArray[np.bool_]  # [n] True if the cable is pulled before this sample
 
     def kinds(self) -> list[Kind]:
-        """Kind of each."""
+        """Return the fault of each sample."""
         return [Kind(kind) for kind in self.kind.tolist()]
 
     def __getitem__(self, rows: slice) -> "Draws":
-        """Those of some samples."""
+        """Return the faults of a part of the samples."""
         return Draws(self.kind[rows], self.where[rows], self.pulled[rows])
 
 
 class Faults:
-    """The faults of one sensor.
+    """Random faults of one sensor.
 
-    Args:
-        table: how often each happens
-        seed: of the sensor
-        carrier: of its wire format
+    Parameters
+    ----------
+    table : FaultsTable
+        Probability of each fault.
+    seed : int
+        Seed of the sensor.
+    carrier : str
+        Carrier of its wire format.
     """
 
     def __init__(self, table: FaultsTable, seed: int, carrier: str) -> None:
         self._edges = np.cumsum([table.lost, table.repeated, table.flipped, table.cut])
-        self._pull = table.unplugged
-        self._framed = carrier == "frames"
+        self._unplug_probability = table.unplugged
+        self._has_checksum = carrier == "frames"
         self._jitter_s = table.jitter
-        # bursts have a generator of their own: how many there are depends on the machine
-        self._rng, self._holds = (
-            np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM, i))) for i in range(2)
+        # bursts have a generator of their own, because their number depends on the machine
+        self._rng, self._delay_rng = (
+            np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(SPAWN_KEY, i))) for i in range(2)
         )
 
     def draw(self, n: int) -> Draws:
-        """For the next ``n`` samples."""
-        u = self._rng.random((n, DRAWS))
-        return Draws(np.searchsorted(self._edges, u[:, 0], "right"), u[:, 1], u[:, 2] < self._pull)
+        """Draw the faults of the next ``n`` samples."""
+        u = self._rng.random((n, DRAWS_PER_SAMPLE))
+        return Draws(np.searchsorted(self._edges, u[:, 0], "right"), u[:, 1], u[:, 2] < self._unplug_probability)
 
     def hold_s(self) -> float:
-        """How long the next burst is held back."""
-        return float(self._holds.uniform(0.0, self._jitter_s)) if self._jitter_s else 0.0
+        """Draw the delay of the next burst, in seconds."""
+        return float(self._delay_rng.uniform(0.0, self._jitter_s)) if self._jitter_s else 0.0
 
     def hurt(self, kind: Kind, where: float, chunks: list[Chunk]) -> list[Chunk]:
-        """What of one sample's chunks goes out."""
+        """Apply a fault to the chunks of one sample, and return the chunks that are sent.
+
+        Parameters
+        ----------
+        kind : Kind
+            Fault of the sample.
+        where : float
+            Position of the fault in the chunk, 0 to 1.
+        chunks : list of Chunk
+            Encoded sample.
+        """
         match kind:
             case Kind.LOST:
                 return []
             case Kind.REPEATED:
                 return [*chunks, *chunks]
             case Kind.FLIPPED:
-                return [*chunks[:-1], *([] if self._framed else [_flipped(chunks[-1], where)])]
+                return [*chunks[:-1], *([] if self._has_checksum else [_flipped(chunks[-1], where)])]
             case Kind.CUT:
                 return [*chunks[:-1], _cut(chunks[-1], where)]
             case _:
@@ -129,7 +152,7 @@ class Faults:
 
 
 def _flipped(chunk: Chunk, where: float) -> Chunk:
-    """One bit is the other."""
+    """Return the chunk with one bit flipped."""
     at, bit = divmod(int(where * 8 * len(chunk.data)), 8)
     data = bytearray(chunk.data)
     data[at] ^= 1 << bit
@@ -137,5 +160,5 @@ def _flipped(chunk: Chunk, where: float) -> Chunk:
 
 
 def _cut(chunk: Chunk, where: float) -> Chunk:
-    """At least the first byte, and not the last."""
+    """Return the chunk truncated: it keeps at least its first byte and loses at least its last."""
     return replace(chunk, data=chunk.data[: 1 + int(where * (len(chunk.data) - 1))])

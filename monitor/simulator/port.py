@@ -1,7 +1,7 @@
-"""The far end of a link: where a simulated sensor is plugged in. One file a carrier, chosen by the wire format.
+"""Ports of simulated sensors: the far end of the link that the service reads, one module for each carrier.
 
-``link`` is the ordinary link that the service reads, and cannot tell from one to a sensor. Nothing is there before
-``plug``; ``plug`` and ``unplug`` may be called from any thread, and twice without harm.
+``link`` is an ordinary link, as for a real sensor. The port exists from ``plug`` to ``unplug``. Both methods may be
+called from any thread, and repeated calls have no effect.
 """
 
 from collections.abc import Sequence
@@ -12,25 +12,39 @@ from drivers.sample import Chunk
 
 
 class Port(Protocol):
-    """Where a simulated sensor sends to."""
+    """Interface of the port to which a simulated sensor sends."""
 
     link: Link
 
     def plug(self) -> None:
-        """Be there; ``LinkUnavailable`` where that cannot be."""
+        """Connect the sensor.
+
+        Raises
+        ------
+        LinkUnavailable
+            The port cannot be opened.
+        """
 
     def unplug(self) -> None:
-        """Be gone, as after a pulled cable."""
+        """Disconnect the sensor, as a pulled cable does."""
 
     def send(self, chunks: Sequence[Chunk]) -> int:
-        """Send without waiting for any reader; how many of the chunks, from the first on, went out whole."""
+        """Send chunks without waiting for a reader; return the number of complete chunks, counted from the first."""
 
     def close(self) -> None:
-        """Be gone for good, and leave nothing."""
+        """Disconnect the sensor permanently and remove all files of the port."""
 
 
 def port_of(carrier: str, silence_s: float) -> Port:
-    """The far end of the link that brings such a carrier."""
+    """Create the port for a carrier.
+
+    Parameters
+    ----------
+    carrier : str
+        Carrier of the wire format: "frames" (CAN), "messages" (zenoh), otherwise bytes (serial).
+    silence_s : float
+        Time in seconds without data after which the link counts as lost.
+    """
     if carrier == "frames":
         from monitor.simulator.can_port import CanPort
 

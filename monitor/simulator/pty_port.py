@@ -1,7 +1,8 @@
-"""A pseudo-terminal: what is written into its master side, the serial link reads from the other.
+"""Port of a simulated sensor on a pseudo-terminal: the sensor writes to the master side, the serial link reads the
+slave.
 
-A link in a temporary folder keeps the port's name the same while it is pulled and put back. What does not fit into the
-terminal's buffer is dropped.
+A symbolic link in a temporary folder keeps the name of the port the same across disconnections. Data that does not fit
+into the buffer of the terminal is dropped.
 """
 
 import contextlib
@@ -19,11 +20,17 @@ from drivers.links import serial_link
 from drivers.sample import Chunk
 
 WAIT_S: Final = 0.01
-"""For room in the terminal's buffer."""
+"""Longest wait for space in the buffer of the terminal."""
 
 
 class PtyPort:
-    """A serial port that is there while it is plugged in."""
+    """Serial port that exists while it is connected.
+
+    Parameters
+    ----------
+    silence_s : float
+        Time in seconds without data after which the link counts as lost.
+    """
 
     def __init__(self, silence_s: float) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="imu-monitor-"))
@@ -33,7 +40,7 @@ class PtyPort:
         self._plugging = threading.Lock()
 
     def plug(self) -> None:
-        """Make the port appear."""
+        """Create the pseudo-terminal and the symbolic link to it."""
         import tty
 
         with self._plugging:
@@ -49,7 +56,7 @@ class PtyPort:
             self._master = master
 
     def unplug(self) -> None:
-        """Make the port go away, as a pulled cable does."""
+        """Remove the port, as a pulled cable does."""
         with self._plugging:
             master, self._master = self._master, None
             self.path.unlink(missing_ok=True)
@@ -57,7 +64,10 @@ class PtyPort:
                 os.close(master)
 
     def send(self, chunks: Sequence[Chunk]) -> int:
-        """What has begun is finished as long as anyone reads."""
+        """Write chunks; return the number of complete chunks, counted from the first.
+
+        Writing continues as long as the reader empties the buffer.
+        """
         written = self._write(b"".join(chunk.data for chunk in chunks))
         return sum(end <= written for end in accumulate(len(chunk.data) for chunk in chunks))
 
@@ -67,6 +77,7 @@ class PtyPort:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _write(self, data: bytes) -> int:
+        """Write bytes until the buffer stays full; return the number of written bytes."""
         view = memoryview(data)
         with self._plugging, contextlib.suppress(BlockingIOError):
             while view and self._master is not None:

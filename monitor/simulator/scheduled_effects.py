@@ -1,4 +1,4 @@
-"""Effects that a running sensor takes on, as people write them: "gz.sinusoidal:amplitude=1e-3,frequency=17"."""
+"""Parser for effects that begin while a simulated sensor runs, such as "gz.sinusoidal:amplitude=1e-3,frequency=17"."""
 
 import json
 import re
@@ -9,22 +9,28 @@ from drivers.errors import ConfigError
 from monitor.noise.effect import Effect
 from monitor.noise.model import NoiseModel
 
-WRITTEN: Final = re.compile(r"\s*([^.:\s]+)\.([^.:\s]+)\s*:\s*(.*)")
+EFFECT_SYNTAX: Final = re.compile(r"\s*([^.:\s]+)\.([^.:\s]+)\s*:\s*(.*)")
+"""Regular expression for an effect: axis, name and parameters."""
 EXAMPLE: Final = "gz.sinusoidal:amplitude=1e-3,frequency=17"
+"""Example in the error message."""
 
 
 def effects_of(text: str) -> list[tuple[str, Effect]]:
-    """The effect on its axis, or on each axis of a kind (``g*``).
+    """Parse an effect, and return it with its axis, or with each axis of a kind (``g*``).
 
-    It is read as a table of a model file is, so that what is wrong is said in the same words.
+    The effect is read like a table of a model file, so that mistakes give the same messages.
 
+    Raises
+    ------
+    ConfigError
+        The text is not a valid effect. The message of one line names the nearest known name.
+
+    Examples
+    --------
     >>> effects_of("gz.angle_random_walk:N=1e-3")
     [('gz', AngleRandomWalk(N=0.001))]
-
-    Raises:
-        ConfigError: one line: what is wrong, and the nearest known name
     """
-    written = WRITTEN.fullmatch(text)
+    written = EFFECT_SYNTAX.fullmatch(text)
     if written is None:
         raise ConfigError(f'"{text}" is no effect; write axis.effect:parameter=value,… as in {EXAMPLE}')
     axis, effect, parameters = written.groups()
@@ -33,6 +39,7 @@ def effects_of(text: str) -> list[tuple[str, Effect]]:
 
 
 def _parameters(text: str, parameters: str) -> Iterator[str]:
+    """Yield the parameters as lines of TOML."""
     given: set[str] = set()
     for part in filter(None, map(str.strip, parameters.split(","))):
         name, equals, value = (word.strip() for word in part.partition("="))
@@ -45,7 +52,7 @@ def _parameters(text: str, parameters: str) -> Iterator[str]:
 
 
 def _toml(value: str) -> str:
-    """A number as such, anything else (an axis) in quotes."""
+    """Return a value in TOML: a number unquoted, and any other value, such as an axis, in quotes."""
     for kind in (int, float):
         try:
             return repr(kind(value))

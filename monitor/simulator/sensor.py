@@ -1,7 +1,7 @@
-"""What a simulated sensor measures and says: samples of a model, encoded, with effects that come while it runs.
+"""Simulated sensor: encoded samples of a noise model, with effects that begin while it runs.
 
-The sensor's own time is its sample's number over the model's rate: counters and time stamps say it, whatever its true
-rate is.
+The sensor's own time is the number of the sample divided by the rate of the model. Its counters and time stamps show
+this time, whatever its true rate is.
 """
 
 import copy
@@ -21,26 +21,29 @@ from monitor.settings.loading import VirtualTable
 from monitor.simulator.scheduled_effects import effects_of
 
 DEFAULT_RATE_HZ: Final = 100.0
+"""Sample rate if the model has none."""
 ROOM_C: Final = 24.0
+"""Temperature at the start if the model has no temperature."""
 WARM_UP_C: Final = 6.0
+"""Rise of the die temperature after the start if the model has no temperature."""
 WARM_UP_S: Final = 300.0
-"""Where the model has no temperature, the die warms by WARM_UP_C with this time constant, as after switching on."""
+"""Time constant of this rise."""
 
 _log = structlog.get_logger("imu-monitor")
 
 
 def check_sensor(table: VirtualTable) -> None:
-    """Check the model and the effects of a simulated sensor; simulates nothing.
+    """Check the model and the effects of a simulated sensor without a simulation.
 
     Parameters
     ----------
-    table
-        Its settings; without a model if ``model`` is empty.
+    table : VirtualTable
+        Settings of the sensor. The model is not checked if ``model`` is empty.
 
     Raises
     ------
     ConfigError
-        With one line for each effect or model that cannot be.
+        The model or an effect is invalid. The message has one line for each mistake.
     """
     wrong: list[str] = []
     coming = []
@@ -67,41 +70,50 @@ def check_sensor(table: VirtualTable) -> None:
 
 
 class Sensor:
-    """One simulated sensor.
+    """Simulated sensor without its link.
 
-    Args:
-        table: model, seed, effects to come
-        decoder: the wire format; a copy of it encodes
-        name: for the log
-    Raises:
-        ConfigError: the model or an effect cannot be
+    Parameters
+    ----------
+    table : VirtualTable
+        Model, seed and effects.
+    decoder : Decoder
+        Wire format. A copy of the decoder encodes the samples.
+    name : str
+        Name of the device, for the log.
+
+    Raises
+    ------
+    ConfigError
+        The model or an effect cannot be used.
     """
 
     def __init__(self, table: VirtualTable, decoder: Decoder, name: str) -> None:
         self._name = name
         self._model = read_model(Path(table.model))
         self.rate_hz = self._model.sample_rate_hz or DEFAULT_RATE_HZ
-        self._coming = [(text, axis, effect) for text in table.effect for axis, effect in effects_of(text)]
-        self._comes_at = round(table.effect_at * self.rate_hz)  # sample
+        self._pending_effects = [(text, axis, effect) for text in table.effect for axis, effect in effects_of(text)]
+        self._effects_begin_at = round(
+            table.effect_at * self.rate_hz
+        )  # number of the sample at which the effects begin
         self._decoder = copy.deepcopy(decoder)
-        self._stream = self._begin(table.seed)
-        self._unix_ns = 0  # of the first sample
+        self._stream = self._create_stream(table.seed)
+        self._unix_ns = 0  # time of the first sample
         self._made = 0
-        self._add_to(self._begin(table.seed))  # what cannot be is said here, before anything starts
+        self._add_effects(self._create_stream(table.seed))  # raises errors of the effects before the sensor starts
 
     def switch_on(self) -> None:
-        """Its clock runs from the first sample: what the simulator has to compile comes before it."""
-        trial = self._begin(0)
-        self._add_to(trial)
+        """Start the clock of the sensor. Kernels of the simulation are compiled before the first sample."""
+        trial = self._create_stream(0)
+        self._add_effects(trial)
         trial.draw_all(1)
         self._unix_ns = time.time_ns()
 
     def skip(self, n: int) -> None:
-        """Samples that nobody will ever ask for: the counter goes on."""
+        """Skip ``n`` samples that are never sent. The counter continues."""
         self._made += n
 
     def frames(self, n: int) -> list[list[Chunk]]:
-        """The chunks of each of the next ``n`` samples."""
+        """Return the chunks of each of the next ``n`` samples."""
         index = np.arange(self._made, self._made + n)
         values, temperature_c = self._measured(n)
         if np.isnan(temperature_c).all():
@@ -109,38 +121,41 @@ class Sensor:
         t_ns = self._unix_ns + np.rint(index * (1e9 / self.rate_hz)).astype(np.int64)
         samples = block(t_ns, values, temperature_c, self._ticks(index))
         self._made += n
-        if self._decoder.carrier == "messages":  # each sample in a message of its own, as each may have its fault
+        if self._decoder.carrier == "messages":  # each sample gets its own message, because each may have a fault
             return [self._decoder.encode(samples[i : i + 1]) for i in range(n)]
         chunks = self._decoder.encode(samples)
         each = len(chunks) // n
         return [chunks[i * each : (i + 1) * each] for i in range(n)]
 
     def _measured(self, n: int) -> tuple[Floats, Floats]:
-        """Values [n, 6] and temperature [n]; the effects to come are there from their sample on."""
-        before = max(self._comes_at - self._made, 0)
-        if not self._coming or before >= n:
+        """Return values [n, 6] and temperature [n]; the effects begin at their sample."""
+        before = max(self._effects_begin_at - self._made, 0)
+        if not self._pending_effects or before >= n:
             drawn = self._stream.draw_all(n)
             return drawn.values, drawn.temperature_c
         parts = [self._stream.draw_all(before)] if before else []
-        self._add_to(self._stream)
+        self._add_effects(self._stream)
         at_s = (self._made + before) / self.rate_hz
-        for text, axis, _ in self._coming:
+        for text, axis, _ in self._pending_effects:
             _log.info("effect added", device=self._name, axis=axis, effect=text, at_s=at_s)
-        self._coming = []
+        self._pending_effects = []
         parts.append(self._stream.draw_all(n - before))
         return np.concatenate([p.values for p in parts]), np.concatenate([p.temperature_c for p in parts])
 
-    def _begin(self, seed: int) -> ModelStream:
+    def _create_stream(self, seed: int) -> ModelStream:
+        """Create the random series of the model."""
         return self._model.stream(self.rate_hz, seed)
 
-    def _add_to(self, stream: ModelStream) -> None:
-        for text, axis, effect in self._coming:
+    def _add_effects(self, stream: ModelStream) -> None:
+        """Add the effects to a random series."""
+        for text, axis, effect in self._pending_effects:
             try:
                 stream.add(axis, effect)
             except ConfigError as error:
                 raise ConfigError(f'effect "{text}": {error}') from error
 
     def _ticks(self, index: Ints) -> Ints:
+        """Return the counter values of samples."""
         timing = self._decoder.timing
         if not isinstance(timing, Counter):
             return np.full(index.size, NO_TICK, np.int64)

@@ -1,8 +1,8 @@
-"""A simulated sensor's life: its samples go out in real time or faster, with faults where asked for, over a real link.
+"""Virtual IMU: a simulated sensor that sends its samples over a real link, in real time or faster, with faults.
 
-The ordinary link reads the other end of ``port`` and cannot tell it from a sensor. A device does not wait for its
-reader: what finds no room is dropped, and its counter shows it. ``unplug`` and ``plug`` pull the cable and put it back.
-``truth`` counts what was done.
+An ordinary link reads the other end of ``port``, as for a real sensor. The sensor does not wait for its reader. Samples
+that cannot be sent are dropped, and the counter shows the gap. ``unplug`` and ``plug`` disconnect and connect the
+cable. ``truth`` counts the samples and their faults.
 """
 
 import threading
@@ -22,48 +22,55 @@ from monitor.simulator.faults import Draws, Faults, Truth
 from monitor.simulator.port import port_of
 from monitor.simulator.sensor import Sensor
 
-STEP_S: Final = 0.01
-"""Samples go out in bursts of this length, as from a USB adapter."""
-BEHIND_S: Final = 1.0
-"""A writer that fell further behind than this goes on from now."""
+BURST_S: Final = 0.01
+"""Length of a burst of samples, as from a USB adapter."""
+MAX_DELAY_S: Final = 1.0
+"""Delay after which the sensor skips samples instead of catching up."""
 
 _log = structlog.get_logger("imu-monitor")
 
 
 class VirtualImu:
-    """One simulated device.
+    """Simulated device with its own thread.
 
-    Args:
-        table: model, seed, speed, effects to come, faults
-        decoder: the wire format
-        name: for the log
-    Raises:
-        ConfigError: the model or an effect cannot be
+    Parameters
+    ----------
+    table : VirtualTable
+        Model, seed, speed, effects and faults.
+    decoder : Decoder
+        Wire format.
+    name : str, optional
+        Name of the device, for the log.
+
+    Raises
+    ------
+    ConfigError
+        The model or an effect cannot be used.
     """
 
     def __init__(self, table: VirtualTable, decoder: Decoder, name: str = "virtual") -> None:
         self.name = name
         self.truth = Truth()
         self.now_s: Callable[[], float] = time.monotonic
-        """Clock that the sensor runs by, in seconds. It may be replaced before ``start``."""
+        """Clock of the simulation, in seconds. It may be replaced before ``start``."""
         self._sensor = Sensor(table, decoder, name)
         self.rate_hz = self._sensor.rate_hz * table.speed
-        """As the sensor states it; its clock may be off."""
+        """Nominal sample rate. The clock of the sensor may deviate from it."""
         self._pace_hz = self.rate_hz * table.faults.clock
         self._faults = Faults(table.faults, table.seed, decoder.carrier)
-        self._away = max(1, round(table.faults.unplugged_for * self._sensor.rate_hz))  # samples
-        self._back_at: int | None = None  # sample before which a pulled cable is put back
+        self._unplugged_samples = max(1, round(table.faults.unplugged_for * self._sensor.rate_hz))  # samples
+        self._back_at: int | None = None  # number of the sample before which the cable is connected again
         self.port = port_of(decoder.carrier, table.silence)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="virtual imu", daemon=True)
 
     @property
     def link(self) -> Link:
-        """What the sensor's samples come by."""
+        """Link that reads the samples of the sensor."""
         return self.port.link
 
     def start(self) -> None:
-        """Plug in and begin to send."""
+        """Connect the cable and start to send."""
         self.plug()
         self._thread.start()
 
@@ -75,33 +82,34 @@ class VirtualImu:
         self.port.close()
 
     def plug(self) -> None:
-        """Put the cable in."""
+        """Connect the cable."""
         self.port.plug()
 
     def unplug(self) -> None:
-        """Pull the cable out."""
+        """Disconnect the cable."""
         self.port.unplug()
 
-    # --- the sensor's own life
+    # --- thread of the sensor
 
     def _run(self) -> None:
+        """Send samples in bursts until the sensor is stopped."""
         self._sensor.switch_on()
         begun_s, made = self.now_s(), 0
-        step_s = max(STEP_S, 0.5 / self._pace_hz)  # a slow sensor is not looked at more often than twice a sample
-        while not self._stop.wait(step_s + self._held_s()):
+        step_s = max(BURST_S, 0.5 / self._pace_hz)  # for a slow sensor, two steps per sample are enough
+        while not self._stop.wait(step_s + self._burst_delay_s()):
             due = int((self.now_s() - begun_s) * self._pace_hz)
-            late = due - made - int(BEHIND_S * self._pace_hz)
-            if late > 0:  # the machine slept: the sensor ran on meanwhile
+            late = due - made - int(MAX_DELAY_S * self._pace_hz)
+            if late > 0:  # the machine was suspended while the sensor would have continued
                 made += late
                 self._sensor.skip(late)
                 self._faults.draw(late)
                 self.truth.dropped += late
             if due > made:
-                self._live(made, due - made)
+                self._make_and_send(made, due - made)
                 made = due
 
-    def _live(self, first: int, n: int) -> None:
-        """Make ``n`` samples, and send those that find a cable."""
+    def _make_and_send(self, first: int, n: int) -> None:
+        """Make ``n`` samples, and send those for which the cable is connected."""
         frames, draws = self._sensor.frames(n), self._faults.draw(n)
         at = 0
         while at < n:
@@ -110,15 +118,16 @@ class VirtualImu:
                 stop = at + int(pulled[0]) if pulled.size else n
                 self._send(frames[at:stop], draws[at:stop])
                 if stop < n:
-                    self._pull(first + stop)
+                    self._unplug_by_fault(first + stop)
             else:
                 stop = min(n, max(at, self._back_at - first))
                 self.truth.dropped += stop - at
                 if first + stop >= self._back_at:
-                    self._put_back()
+                    self._plug_again()
             at = stop
 
     def _send(self, frames: list[list[Chunk]], draws: Draws) -> None:
+        """Apply the faults to samples, send them and count the results."""
         hurt = [
             (kind, self._faults.hurt(kind, where, chunks))
             for kind, where, chunks in zip(draws.kinds(), draws.where.tolist(), frames, strict=True)
@@ -128,19 +137,22 @@ class VirtualImu:
             gone -= len(chunks)
             self.truth.count(kind, out=gone >= 0)
 
-    def _pull(self, index: int) -> None:
+    def _unplug_by_fault(self, index: int) -> None:
+        """Disconnect the cable because of a fault."""
         self.unplug()
         self.truth.unplugged += 1
-        self._back_at = index + self._away
+        self._back_at = index + self._unplugged_samples
 
-    def _put_back(self) -> None:
+    def _plug_again(self) -> None:
+        """Connect the cable again after a fault."""
         self._back_at = None
         try:
             self.plug()
         except LinkUnavailable as error:
             _log.warning("the simulated sensor cannot be plugged in again", device=self.name, error=str(error))
 
-    def _held_s(self) -> float:
+    def _burst_delay_s(self) -> float:
+        """Return the delay of the next burst, in seconds."""
         held_s = self._faults.hold_s()
         self.truth.held_s = max(self.truth.held_s, held_s)
         return held_s

@@ -1,4 +1,6 @@
-"""A zenoh session of the sensor's own that publishes on loopback; the zenoh link connects to it and to nobody else."""
+"""Port of a simulated sensor that publishes over zenoh on the loopback interface; its link connects only to this
+session.
+"""
 
 import socket
 import threading
@@ -14,10 +16,17 @@ if TYPE_CHECKING:
     import zenoh
 
 KEY: Final = "imu-monitor/virtual/samples"
+"""Key of the published samples."""
 
 
 class ZenohPort:
-    """A publisher that is there while it is plugged in."""
+    """Port that publishes over a zenoh session of its own while it is connected.
+
+    Parameters
+    ----------
+    silence_s : float
+        Time in seconds without messages after which the link counts as lost.
+    """
 
     def __init__(self, silence_s: float) -> None:
         self._endpoint = f"tcp/127.0.0.1:{_free_port()}"
@@ -27,7 +36,13 @@ class ZenohPort:
         self._plugging = threading.Lock()
 
     def plug(self) -> None:
-        """Open the session; ``LinkUnavailable`` when another program has taken its port."""
+        """Open the session.
+
+        Raises
+        ------
+        LinkUnavailable
+            Another program uses the network port.
+        """
         import zenoh
 
         with self._plugging:
@@ -47,7 +62,9 @@ class ZenohPort:
                 session.close()  # type: ignore[no-untyped-call]
 
     def send(self, chunks: Sequence[Chunk]) -> int:
-        """One message a chunk; zenoh drops what no reader takes in time."""
+        """Publish each chunk as one message; return the number of published chunks. Zenoh drops messages for slow
+        readers.
+        """
         with self._plugging:
             if self._session is None:
                 return 0
@@ -56,11 +73,12 @@ class ZenohPort:
         return len(chunks)
 
     def close(self) -> None:
-        """Close the session for good."""
+        """Close the session permanently."""
         self.unplug()
 
 
 def _free_port() -> int:
+    """Return a free TCP port of the loopback interface."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         port: int = server.getsockname()[1]
         return port

@@ -1,1 +1,1 @@
-"""Unattended operation: limits, hooks, metrics, systemd and the reconcile command of a running service."""
+"""Unattended operation of the service: limits, hooks, metrics, systemd notification and live reconciliation."""

@@ -1,14 +1,16 @@
-"""What events set off: commands of the user's, and messages on keys of the user's.
+"""Hooks: user commands and zenoh messages that are triggered by events.
 
-An event that a hook waits for becomes JSON. On a zenoh key it is put at once. For a command it goes on a bounded queue,
-from which a few threads take: each runs one command at a time, without a shell, with the JSON on its standard input and
-nothing of it among its arguments. A command that takes too long is killed with all that it started; of what it prints
-only the end is kept. What fails is logged and stands in the status under ``hook`` until something goes well again;
-the loop never waits.
+An event that matches a hook is encoded as JSON. If the hook names a zenoh key, the JSON is published immediately. If
+the hook names a command, the JSON enters a bounded queue. A few threads take entries from this queue, and each runs one
+command at a time. A command runs without a shell. It receives the JSON on its standard input, and nothing of it in its
+arguments.
 
-A hook runs at most BURST times at once and then once in EVERY_S for each kind of event and device, so that a bad line
-that tells of losses every second neither starts a thousand programs nor drowns the one alarm beside it. What is held
-back is counted, and said.
+A command that exceeds its time is killed together with its child processes. Only the end of its output is kept. A
+failure is logged, and stays in the status under ``hook`` until a hook succeeds again. The main loop never waits.
+
+For each kind of event and each device, a hook runs at most BURST times in a row and then once in EVERY_S. A faulty
+cable that reports losses every second therefore neither starts a thousand programs nor suppresses other alarms.
+Suppressed runs are counted and reported.
 """
 
 import os
@@ -31,37 +33,47 @@ from monitor.publishing.messages import encoding
 from monitor.settings.loading import Hook
 
 AT_ONCE: Final = 4
+"""Number of threads, each of which runs one command at a time."""
 WAITING: Final = 100
+"""Capacity of the queue."""
 BURST: Final = 10
+"""Runs that are possible in a row."""
 EVERY_S: Final = 6.0
+"""Interval at which a further run becomes possible."""
 OUTPUT_BYTES: Final = 4096
-"""Of what a command prints, its end."""
-LINE: Final = 200
-"""Characters of its last line that are said."""
-LOOK_S: Final = 0.05
-"""Whether a command has ended is asked so often."""
-LAST_S: Final = 2.0
-"""That commands have left when the service ends."""
-OWN: Final = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
-"""Meant for this process alone."""
+"""Length of the end of a command's output that is kept."""
+MAX_LINE_CHARS: Final = 200
+"""Length of the command's last line in a message, in characters."""
+POLL_S: Final = 0.05
+"""Interval at which the end of a command is checked."""
+CLOSE_TIMEOUT_S: Final = 2.0
+"""Time that commands have left when the service ends."""
+PRIVATE_VARIABLES: Final = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
+"""Environment variables that are meant for this process alone."""
 
 _log = structlog.get_logger("imu-monitor")
 
 
 @dataclass(frozen=True, slots=True)
 class _Job:
+    """Command that is to run for an event."""
+
     hook: Hook
     payload: bytes
-    named: Mapping[str, str]  # variables of the environment
+    named: Mapping[str, str]  # additional environment variables
 
 
 class Hooks(Output):
-    """Runs what is hooked to events.
+    """Output that runs the hooks of events.
 
-    Args:
-        hooks: what to run
-        put: a message on a zenoh key; "" or why it did not go out
-        now: monotonic time in s
+    Parameters
+    ----------
+    hooks : sequence of Hook
+        Configured hooks.
+    put : callable
+        Publishes a message on a zenoh key. It returns "", or the reason why the message was not published.
+    now : callable, optional
+        Monotonic clock in seconds.
     """
 
     def __init__(
@@ -71,24 +83,24 @@ class Hooks(Output):
         self._put = put
         self._now = now
         self._jobs: queue.Queue[_Job | None] = queue.Queue(WAITING)
-        self._allowed: dict[tuple[Hook, str, str], tuple[float, float]] = {}  # runs left, and when that was
+        self._allowed: dict[tuple[Hook, str, str], tuple[float, float]] = {}  # runs left, and the time of that count
         self._threads: list[threading.Thread] = []
         self._closing = threading.Event()
-        self._wrong = ""  # of the newest run
+        self._last_error = ""  # error of the newest run; empty if it succeeded
         self._failed = 0
         self._held_back = 0
 
     @property
     def state(self) -> str:
-        """``ok``, or what went wrong with the newest run."""
+        """Status message: ``ok``, or the error of the newest run."""
         held_back = f"{self._held_back} held back, too many at once" if self._held_back else ""
-        if self._wrong:
-            return "; ".join(filter(None, [f"{self._wrong} ({self._failed} failed since the start)", held_back]))
+        if self._last_error:
+            return "; ".join(filter(None, [f"{self._last_error} ({self._failed} failed since the start)", held_back]))
         return f"ok, but {held_back}" if held_back else "ok"
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """Set off what waits for this."""
-        wanted = [one for one in self.hooks if _waits(one, device, event.kind)]
+        """Run the hooks that match an event; see ``Output`` for the parameters."""
+        wanted = [one for one in self.hooks if _matches(one, device, event.kind)]
         if not wanted:
             return
         payload = encoding.event(device, unix_s, received, event, encoding.since_s(unix_s, event))
@@ -98,28 +110,29 @@ class Hooks(Output):
                 self._held_back += 1
                 continue
             if hook.key is not None:
-                self._told(hook.key, self._put(hook.key, payload))
+                self._log_result(hook.key, self._put(hook.key, payload))
             if hook.command:
                 self._start(_Job(hook, payload + b"\n", named))
 
     def close(self) -> None:
-        """Let what waits and runs end, for LAST_S; then kill it."""
+        """Let queued and running commands end within CLOSE_TIMEOUT_S, then kill them."""
         for _ in self._threads:
             try:
                 self._jobs.put_nowait(None)
-            except queue.Full:  # more waits than can still be done
+            except queue.Full:  # more commands are queued than can still run
                 break
-        until_s = time.monotonic() + LAST_S
+        until_s = time.monotonic() + CLOSE_TIMEOUT_S
         for thread in self._threads:
             thread.join(max(0.0, until_s - time.monotonic()))
         self._closing.set()
         for thread in self._threads:
-            thread.join(LAST_S)
+            thread.join(CLOSE_TIMEOUT_S)
         self._threads = []
 
-    # --- inside
+    # --- private methods
 
     def _may_run(self, hook: Hook, kind: str, device: str) -> bool:
+        """Return True if the rate limit of a hook allows a run now, and count the run."""
         now_s = self._now()
         left, at_s = self._allowed.get((hook, kind, device), (float(BURST), now_s))
         left = min(float(BURST), left + (now_s - at_s) / EVERY_S)
@@ -128,39 +141,59 @@ class Hooks(Output):
         return may
 
     def _start(self, job: _Job) -> None:
+        """Queue a command, and start the threads if they do not run yet."""
         try:
             while len(self._threads) < AT_ONCE:
-                thread = threading.Thread(target=self._take, name=f"hooks {len(self._threads)}", daemon=True)
+                thread = threading.Thread(target=self._run_queued, name=f"hooks {len(self._threads)}", daemon=True)
                 thread.start()
                 self._threads.append(thread)
-        except RuntimeError as error:  # the system gives no more threads
-            self._told(job.hook.command[0], f"cannot be started: {error}")
+        except RuntimeError as error:  # the system allows no more threads
+            self._log_result(job.hook.command[0], f"cannot be started: {error}")
         try:
             self._jobs.put_nowait(job)
         except queue.Full:
             self._held_back += 1
 
-    def _take(self) -> None:
-        """A thread: one command after the other."""
+    def _run_queued(self) -> None:
+        """Run queued commands one after the other, in a thread."""
         while not self._closing.is_set() and (job := self._jobs.get()) is not None:
-            self._told(job.hook.command[0], run(job.hook, job.payload, job.named, self._closing.is_set))
+            self._log_result(job.hook.command[0], run(job.hook, job.payload, job.named, self._closing.is_set))
 
-    def _told(self, what: str, wrong: str) -> None:
+    def _log_result(self, what: str, wrong: str) -> None:
+        """Log the result of a run and keep its error for the status."""
         if wrong:
             self._failed += 1
             _log.warning("hook", hook=what, error=wrong)
         else:
             _log.debug("hook", hook=what)
-        self._wrong = f"{Path(what).name}: {wrong}" if wrong else ""
+        self._last_error = f"{Path(what).name}: {wrong}" if wrong else ""
 
 
-def _waits(hook: Hook, device: str, kind: str) -> bool:
+def _matches(hook: Hook, device: str, kind: str) -> bool:
+    """Return True if a hook matches the device and the kind of an event."""
     return ("*" in hook.on or kind in hook.on) and (not hook.devices or device in hook.devices)
 
 
 def run(hook: Hook, payload: bytes, named: Mapping[str, str], ending: Callable[[], bool]) -> str:
-    """Run the command of a hook to its end; "" or what went wrong. ``ending``: whether it is to be killed now."""
-    environment = {name: value for name, value in os.environ.items() if name not in OWN}
+    """Run the command of a hook to its end.
+
+    Parameters
+    ----------
+    hook : Hook
+        Hook with its command and its time limit.
+    payload : bytes
+        Standard input of the command.
+    named : mapping of str to str
+        Additional environment variables.
+    ending : callable
+        Returns True if the command is to be killed now.
+
+    Returns
+    -------
+    str
+        "" if the command succeeded, else a description of the error.
+    """
+    environment = {name: value for name, value in os.environ.items() if name not in PRIVATE_VARIABLES}
     try:
         process = subprocess.Popen(
             hook.command,
@@ -168,23 +201,25 @@ def run(hook: Hook, payload: bytes, named: Mapping[str, str], ending: Callable[[
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             env={**environment, **named},
-            start_new_session=True,  # a group of its own, that can be killed as a whole
+            start_new_session=True,  # a process group of its own can be killed as a whole
         )
     except (OSError, ValueError) as error:
         return f"cannot be started: {getattr(error, 'strerror', None) or error}"
     try:
         with _Pipes(process, payload) as pipes:
-            return _followed(process, pipes, hook.timeout_s, ending)
-    except OSError as error:  # out of file descriptors
+            return _wait_for_end(process, pipes, hook.timeout_s, ending)
+    except OSError as error:  # no file descriptors are left
         return f"killed: {error.strerror or error}"
     finally:
         if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)  # not waited for yet: the number is still its own
+            os.killpg(process.pid, signal.SIGKILL)  # the process was not reaped yet, so the id is still its own
             process.wait()
 
 
-def _followed(process: "subprocess.Popen[bytes]", pipes: "_Pipes", timeout_s: float, ending: Callable[[], bool]) -> str:
-    """To its end, or until it is to be killed; "" or what went wrong."""
+def _wait_for_end(
+    process: "subprocess.Popen[bytes]", pipes: "_Pipes", timeout_s: float, ending: Callable[[], bool]
+) -> str:
+    """Wait for the end of a command, or kill it; return "" or a description of the error."""
     until_s = time.monotonic() + timeout_s
     while process.poll() is None:
         pipes.move()
@@ -200,7 +235,7 @@ def _followed(process: "subprocess.Popen[bytes]", pipes: "_Pipes", timeout_s: fl
 
 
 class _Pipes:
-    """Both ends of a command, moved without waiting for either: one that neither reads nor writes holds up nobody."""
+    """Non-blocking pipes to a command, so that a command that neither reads nor writes delays nothing."""
 
     def __init__(self, process: "subprocess.Popen[bytes]", payload: bytes) -> None:
         assert process.stdin is not None
@@ -222,38 +257,45 @@ class _Pipes:
             pipe.close()
 
     def move(self) -> None:
-        """What can be moved now, or within LOOK_S."""
-        for key, _ in self._selector.select(LOOK_S):
+        """Transfer the data that can be transferred within POLL_S."""
+        for key, _ in self._selector.select(POLL_S):
             if key.fileobj is self._in:
                 self._write()
             else:
                 self._read()
 
     def drain(self) -> None:
-        """What is still in the pipe of a command that has ended; what it left running may go on writing."""
+        """Read what is left in the pipe after the command has ended, within limits: its child processes may go on
+        writing.
+        """
         for _ in range(16):
             if self._out.closed or not self._read():
                 return
 
     def last_line(self) -> str:
-        """``: `` and the last line it printed, as far as it can be said; "" of none."""
+        """Return ``: `` and the last line that the command printed, with unprintable characters replaced; "" if there
+        is none.
+        """
         lines = self._tail.decode("utf-8", "replace").strip().splitlines()
-        said = "".join(letter if letter.isprintable() else "�" for letter in lines[-1])[-LINE:] if lines else ""
+        said = (
+            "".join(letter if letter.isprintable() else "�" for letter in lines[-1])[-MAX_LINE_CHARS:] if lines else ""
+        )
         return f": {said}" if said else ""
 
     def _write(self) -> None:
+        """Write as much of the payload as the pipe accepts."""
         try:
             self._left = self._left[os.write(self._in.fileno(), self._left) :]
         except BlockingIOError:
             return
-        except BrokenPipeError:  # it does not want to know
+        except BrokenPipeError:  # the command has closed its standard input
             self._left = self._left[:0]
         if not self._left:
             self._selector.unregister(self._in)
             self._in.close()
 
     def _read(self) -> bool:
-        """Whether there may be more."""
+        """Read the pipe once; return True if there may be more data."""
         try:
             data = os.read(self._out.fileno(), OUTPUT_BYTES)
         except BlockingIOError:

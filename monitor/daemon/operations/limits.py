@@ -1,14 +1,15 @@
-"""The user's limits: when a coefficient has passed one, and when it is back. Estimates in, events out.
+"""User limits on noise coefficients: detects when a coefficient crosses a limit and when it returns.
 
-A number alone passes a limit by chance every now and then; so what counts is its interval. An upper limit is passed
-when ``lo`` is above it, a lower one when ``hi`` is below it: there the ``hi`` of an upper bound counts as well. The
-interval has to be beyond at every look while samples of ``hold_s`` came; then the event is ``limit_crossed``. It is
-over, ``limit_back``, when the value itself has been back as long: between the two the verdict stays as it is. An upper
-bound is back under an upper limit when its ``hi`` is, since nothing less is shown. A look without an answer, as after
-an axis began anew, shows neither, and the time begins again.
+A single value crosses a limit by chance from time to time, so the confidence interval decides. An upper limit is
+crossed if ``lo`` is above it. A lower limit is crossed if ``hi`` is below it, and the ``hi`` of an upper bound counts
+as well. The event ``limit_crossed`` is raised if every estimate during ``hold_s`` of samples is beyond the limit.
 
-The time held is counted in samples, not by a clock: what is missing proves nothing, and a recording is judged as it was
-lived. Pure: no clock, no thread.
+The event ``limit_back`` is raised when the value itself has been back for the same time. In between, the state does not
+change. An upper bound is back under an upper limit when its ``hi`` is, because the data do not show a smaller value. An
+estimate without a value, as after the restart of an axis, counts for neither, and the hold time starts again.
+
+The hold time is counted in samples, not by a clock. Missing samples are no evidence, and a replayed recording gives the
+same events as the live sensor. The module uses no clock and no thread.
 """
 
 from collections.abc import Sequence
@@ -27,39 +28,44 @@ from monitor.publishing.exporters.noise import from_model
 from monitor.settings.loading import Device, Limit
 
 CROSSED: Final = "limit_crossed"
+"""Kind of the event for a crossed limit."""
 BACK: Final = "limit_back"
+"""Kind of the event for the return from a crossed limit."""
 Z95: Final = 1.959964
+"""Two-sided 95 % quantile of the standard normal distribution."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """One limit of one letter on one axis."""
+    """Limit of one coefficient on one axis."""
 
     axis: str
     letter: str
     limit: float  # SI unit of letter and axis
-    upper: bool  # else a lower one
+    upper: bool  # True for an upper limit, False for a lower limit
     hold_s: float
-    times_model: float | None = None  # what it was made from
+    times_model: float | None = None  # factor on the model's coefficient from which the limit was computed
 
     @property
     def place(self) -> str:
-        """``gz N``."""
+        """Axis and letter, for example ``gz N``."""
         return f"{self.axis} {self.letter}"
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
-    """What a look says of one coefficient; NaN where it says nothing."""
+class _Measured:
+    """Coefficient of one estimate with its interval; NaN if the estimate has no value."""
 
     value: float
     lo: float
     hi: float
 
     def beyond(self, bound: Bound) -> bool:
+        """Return True if the interval is beyond the limit."""
         return self.lo > bound.limit if bound.upper else self.hi < bound.limit
 
     def back(self, bound: Bound) -> bool:
+        """Return True if the value is back within the limit."""
         if not bound.upper:
             return self.value >= bound.limit
         return (self.value if isfinite(self.value) else self.hi) <= bound.limit
@@ -67,15 +73,26 @@ class _Seen:
 
 @dataclass(slots=True)
 class _State:
+    """State of one limit."""
+
     crossed: bool = False
-    since: tuple[int, int] | None = None  # samples and t_ns of the first look that contradicts it
+    since: tuple[int, int] | None = None  # samples and t_ns of the first estimate that contradicts ``crossed``
 
 
 class Limits:
-    """All limits of one device.
+    """State of all limits of one device.
 
-    Raises:
-        ConfigError: a limit relative to a model that does not have the letter on the axis
+    Parameters
+    ----------
+    limits : sequence of Limit
+        Limits from the settings of the device.
+    model : NoiseModel or None
+        Model in force, for limits relative to it.
+
+    Raises
+    ------
+    ConfigError
+        A limit is relative to a coefficient that the model does not have on that axis.
     """
 
     def __init__(self, limits: Sequence[Limit], model: NoiseModel | None) -> None:
@@ -83,21 +100,22 @@ class Limits:
 
     @property
     def crossed(self) -> tuple[str, ...]:
-        """Those that are passed now: ``gz N``."""
+        """Limits that are crossed now, for example ``gz N``."""
         return tuple(bound.place for bound, state in self.states.items() if state.crossed)
 
     def take_over(self, other: "Limits") -> None:
-        """Go on where other limits were: a bound that both have keeps its state."""
+        """Copy the states of the limits that ``other`` has as well."""
         for bound in self.states:
             self.states[bound] = other.states.get(bound, self.states[bound])
 
     def update(self, estimate: Estimate) -> list[Event]:
-        """One look; the events that it brings."""
-        events = (self._look(bound, state, estimate) for bound, state in self.states.items())
+        """Test all limits against a new estimate, and return the resulting events."""
+        events = (self._test_bound(bound, state, estimate) for bound, state in self.states.items())
         return [event for event in events if event is not None]
 
-    def _look(self, bound: Bound, state: _State, estimate: Estimate) -> Event | None:
-        seen = _seen(bound, estimate)
+    def _test_bound(self, bound: Bound, state: _State, estimate: Estimate) -> Event | None:
+        """Test one limit against an estimate; return an event if its state changes."""
+        seen = _measured(bound, estimate)
         if not (seen.back(bound) if state.crossed else seen.beyond(bound)):
             state.since = None
             return None
@@ -111,10 +129,12 @@ class Limits:
 
 
 def model_of(device: Device) -> NoiseModel | None:
-    """The model in force, where there is one; its limits can be held against it.
+    """Read the model in force of a device; return None if it has none.
 
-    Raises:
-        ConfigError: there is none at its place, it is none, or a limit is relative to what it does not have
+    Raises
+    ------
+    ConfigError
+        The model cannot be read, or a limit is relative to a coefficient that the model does not have.
     """
     model = None if device.model is None else read_model(device.model)
     try:
@@ -125,10 +145,19 @@ def model_of(device: Device) -> NoiseModel | None:
 
 
 def bounds(limits: Sequence[Limit], model: NoiseModel | None) -> list[Bound]:
-    """A bound for each axis, of each limit.
+    """Return a bound for each axis of each limit.
 
-    Raises:
-        ConfigError: relative to a model that does not have the letter on the axis
+    Parameters
+    ----------
+    limits : sequence of Limit
+        Limits from the settings of a device.
+    model : NoiseModel or None
+        Model in force.
+
+    Raises
+    ------
+    ConfigError
+        A limit is relative to a coefficient that the model does not have on that axis.
     """
     known = {} if model is None else from_model(model).axes
     found, wrong = [], []
@@ -153,14 +182,16 @@ def bounds(limits: Sequence[Limit], model: NoiseModel | None) -> list[Bound]:
     return found
 
 
-def _seen(bound: Bound, estimate: Estimate) -> _Seen:
+def _measured(bound: Bound, estimate: Estimate) -> _Measured:
+    """Return the coefficient of a bound from an estimate."""
     table, at = estimate.coefficients, (LETTERS.index(bound.letter), AXES.index(bound.axis))
     if Status(int(table.status[at])) == Status.UNESTIMATED:
-        return _Seen(float("nan"), float("nan"), float("nan"))
-    return _Seen(float(table.value[at]), float(table.lo[at]), float(table.hi[at]))
+        return _Measured(float("nan"), float("nan"), float("nan"))
+    return _Measured(float(table.value[at]), float(table.lo[at]), float(table.hi[at]))
 
 
-def _event(bound: Bound, seen: _Seen, crossed: bool, t_ns: int, since_ns: int) -> Event:
+def _event(bound: Bound, seen: _Measured, crossed: bool, t_ns: int, since_ns: int) -> Event:
+    """Return the event for a limit that was crossed or is back."""
     what = {"value": seen.value, "lo": seen.lo, "hi": seen.hi, "limit": bound.limit}
     kind = CROSSED if crossed else BACK
     return Event(
@@ -168,15 +199,16 @@ def _event(bound: Bound, seen: _Seen, crossed: bool, t_ns: int, since_ns: int) -
     )
 
 
-def _sigma(bound: Bound, seen: _Seen) -> float | None:
-    """How many standard errors value and limit are apart, on the side of the limit; None of a bound."""
+def _sigma(bound: Bound, seen: _Measured) -> float | None:
+    """Return the distance of value and limit in standard errors; None for an upper bound."""
     if not isfinite(seen.value):
         return None
     error = (seen.value - seen.lo if seen.value > bound.limit else seen.hi - seen.value) / Z95
     return abs(seen.value - bound.limit) / error if error > 0.0 else None
 
 
-def _text(bound: Bound, seen: _Seen, crossed: bool) -> str:
+def _text(bound: Bound, seen: _Measured, crossed: bool) -> str:
+    """Return the message of the event."""
     unit, name = unit_of(bound.letter, bound.axis), COEFFICIENT_NAMES[kind_of(bound.axis)][bound.letter]
     measured = unit.text(seen.value) if isfinite(seen.value) else f"at most {unit.text(seen.hi)}"
     limit = f"{unit.text(bound.limit)}, its {'upper' if bound.upper else 'lower'} limit"

@@ -1,14 +1,15 @@
-"""``command/reconcile``: what the live window says, through the same command that reads recordings.
+"""Reconciliation of the live window: answers ``command/reconcile`` with the command that also reads recordings.
 
-In comes a copy of a window and the query that asked for it; out goes an answer to the query, and a sentence for the
-device's events. A thread of its own for each query writes the samples as a recording into a temporary folder, runs
-``imu-monitor reconcile`` on it in a child process (of low priority, ended after LIMIT_S), and passes its JSON on.
-Nothing waits for it: a fit takes seconds to minutes, and in this process it would hold up every sample. At most one at
-a time for each device.
+A request consists of a copy of the window and a zenoh query. The result is an answer to the query, and an event of the
+device. For each query, a thread writes the samples as a recording into a temporary folder and runs ``imu-monitor
+reconcile`` on it in a child process. It then passes the JSON of the child on. The child has a low priority and is
+killed after TIMEOUT_S. Nothing waits for it. A fit takes seconds to minutes, and in this process it would delay every
+sample. Each device has at most one reconciliation at a time.
 
-The query cannot say where the report goes, as anyone on the network may send one: it is kept in a folder of its own
-below the device's ``reconcile_folder``, or not at all. Outcomes: the result with ``exit`` 0; with ``exit`` 3 where the
-data do not support an answer, and the result says why; else an error in one line.
+The query cannot choose the folder of the report, because anyone on the network may send a query. The report is kept in
+a new folder inside the device's ``reconcile_folder``, or not at all. The possible answers are a result with ``exit`` 0,
+a result with ``exit`` 3 if the data do not support an answer, and an error in one line. A result with ``exit`` 3 states
+the reason.
 """
 
 import contextlib
@@ -34,48 +35,60 @@ from monitor.publishing.messages import encoding
 from monitor.publishing.zenoh.publisher import Command
 
 PROGRAM: Final = (sys.executable, "-P", str(Path(__file__).resolve().parents[3] / "imu_monitor.py"), "reconcile")
-"""By its path and without its folder on the module path: whatever else is named ``monitor``, this one is run."""
-LIMIT_S: Final = 900.0
+"""Command of the child process, with the path of the program and without its folder on the module path.
+
+A foreign module with the name ``monitor`` is therefore never run.
+"""
+TIMEOUT_S: Final = 900.0
+"""Time after which the child process is killed."""
 NICE: Final = 10
-"""Added to the niceness of the daemon: an unprivileged process cannot lower the niceness of its children."""
+"""Increase of the child's niceness over the daemon's. An unprivileged process cannot lower the niceness of its
+children.
+"""
 LARGEST_NICENESS: Final = 19
 SEED: Final = 1
+"""Seed of the simulated recordings."""
 DONE: Final = 0
+"""Exit status of a successful reconciliation."""
 NO_ANSWER: Final = 3
-"""Exit status where the data do not support an answer; the result says why."""
-JOIN_S: Final = 3.0
+"""Exit status if the data do not support an answer. The result states the reason."""
+JOIN_TIMEOUT_S: Final = 3.0
+"""Longest wait for a thread when the service ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One window to look into."""
+    """Copy of a window that is to be reconciled."""
 
     device: str
-    unix_s: float  # of its newest sample
-    samples: int  # received until then
+    unix_s: float  # time of the newest sample
+    samples: int  # number of samples received up to the newest one
     window: Held
-    temperature_c: Floats  # [n] of the window
-    model: Path | None
-    folder: Path | None  # where reports are kept
+    temperature_c: Floats  # [n] of the samples in the window
+    model: Path | None  # model under test
+    folder: Path | None  # folder for reports; None if they are not kept
 
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """What became of a job, in a sentence."""
+    """Result of a reconciliation in one sentence."""
 
     device: str
     text: str
 
 
 class Reconciler:
-    """All such queries of a service.
+    """Runner of the reconciliations of all devices.
 
-    Args:
-        program: what is run, before the recording's path and the options
-        limit_s: how long it may take
+    Parameters
+    ----------
+    program : sequence of str, optional
+        Command that is run, before the path of the recording and the options.
+    limit_s : float, optional
+        Time in seconds after which the command is killed.
     """
 
-    def __init__(self, program: Sequence[str] = PROGRAM, limit_s: float = LIMIT_S) -> None:
+    def __init__(self, program: Sequence[str] = PROGRAM, limit_s: float = TIMEOUT_S) -> None:
         self._program = tuple(program)
         self._limit_s = limit_s
         self._running: dict[str, threading.Thread] = {}
@@ -84,7 +97,15 @@ class Reconciler:
         self._closing = threading.Event()
 
     def start(self, job: Job, command: Command) -> None:
-        """Begin, or refuse while one of this device runs; returns at once."""
+        """Start a reconciliation and return at once. The command is refused while another one runs for the device.
+
+        Parameters
+        ----------
+        job : Job
+            Window to reconcile.
+        command : Command
+            Query that receives the answer.
+        """
         before = self._running.get(job.device)
         if before is not None and before.is_alive():
             command.refuse("busy: reconcile runs already for this device")
@@ -95,7 +116,7 @@ class Reconciler:
         thread.start()
 
     def take(self) -> list[Finished]:
-        """What has finished since the last call."""
+        """Return the results since the last call."""
         found = []
         with contextlib.suppress(queue.Empty):
             while True:
@@ -103,18 +124,19 @@ class Reconciler:
         return found
 
     def close(self) -> None:
-        """End what still runs; its queries are refused."""
+        """Kill the running reconciliations and refuse their queries."""
         self._closing.set()
         for child in list(self._children.values()):
             _kill(child)
         for thread in self._running.values():
-            thread.join(JOIN_S)
+            thread.join(JOIN_TIMEOUT_S)
 
-    # --- the thread of one query
+    # --- thread of one query
 
     def _run(self, job: Job, command: Command) -> None:
+        """Reconcile a window and answer its query."""
         try:
-            result, status, folder = self._result(job)
+            result, status, folder = self._reconcile(job)
         except (OSError, RuntimeError) as error:
             command.refuse(str(error))
             self._finished.put(Finished(job.device, f"reconcile failed: {error}"))
@@ -122,8 +144,14 @@ class Reconciler:
         command.answer(encoding.reconciled(job.device, job.unix_s, job.samples, result, status, folder))
         self._finished.put(Finished(job.device, said(result, status)))
 
-    def _result(self, job: Job) -> tuple[dict[str, Any], int, str | None]:
-        """What the command said, its exit status, where the report is; RuntimeError: in one line why there is none."""
+    def _reconcile(self, job: Job) -> tuple[dict[str, Any], int, str | None]:
+        """Return the JSON result, the exit status and the folder of the report, or None if the report is not kept.
+
+        Raises
+        ------
+        RuntimeError
+            The command gave no result.
+        """
         with tempfile.TemporaryDirectory(prefix="imu-monitor-") as temporary:
             path, folder = Path(temporary) / f"{job.device}.npz", Path(temporary) / "report"
             if job.folder is not None:
@@ -134,7 +162,7 @@ class Reconciler:
             options = ["--out", str(folder), "--json", "-", "--seed", str(SEED)]
             if job.model is not None:
                 options += ["--model", str(job.model)]
-            status, output, errors = self._child(job.device, [*self._program, str(path), *options])
+            status, output, errors = self._run_child(job.device, [*self._program, str(path), *options])
         if status not in (DONE, NO_ANSWER):
             lines = errors.decode("utf-8", "replace").strip().splitlines()
             raise RuntimeError(lines[-1] if lines else f"reconcile ended with status {status}")
@@ -144,15 +172,15 @@ class Reconciler:
             raise RuntimeError(f"reconcile gave no result that can be read: {error}") from error
         return result, status, None if job.folder is None else str(folder)
 
-    def _child(self, device: str, arguments: list[str]) -> tuple[int, bytes, bytes]:
-        """Status, standard output and error of the program."""
+    def _run_child(self, device: str, arguments: list[str]) -> tuple[int, bytes, bytes]:
+        """Run the program; return its exit status, standard output and standard error."""
         pipe = subprocess.PIPE
         child = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, start_new_session=True)
         self._children[device] = child
         try:
             with contextlib.suppress(ProcessLookupError):
                 os.setpriority(os.PRIO_PROCESS, child.pid, min(os.nice(0) + NICE, LARGEST_NICENESS))
-            if self._closing.is_set():  # it began while the others were ended
+            if self._closing.is_set():  # the child was started while ``close`` killed the others
                 _kill(child)
             output, errors = child.communicate(timeout=self._limit_s)
         except subprocess.TimeoutExpired:
@@ -167,7 +195,15 @@ class Reconciler:
 
 
 def write(path: Path, job: Job) -> None:
-    """The window as a recording: axes and temperature that were measured, at the window's rate."""
+    """Write a window as a recording with its measured axes, its temperature and its rate.
+
+    Parameters
+    ----------
+    path : Path
+        File to write, in the format of ``numpy.savez``.
+    job : Job
+        Window to write.
+    """
     values = job.window.values()
     columns = {axis: values[:, i] for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()}
     if not np.isnan(job.temperature_c).all():
@@ -176,26 +212,38 @@ def write(path: Path, job: Job) -> None:
 
 
 def said(result: dict[str, Any], status: int = DONE) -> str:
-    """The verdict and the names in a sentence.
+    """Return the verdict and the changes of the model in one sentence.
 
+    Parameters
+    ----------
+    result : dict
+        JSON result of ``imu-monitor reconcile``.
+    status : int, optional
+        Exit status of the command.
+
+    Examples
+    --------
     >>> said({"verdict": "explained", "axes": {"gz": {"steps": [
     ...     {"kind": "added", "effect": "sinusoidal", "confidence": 0.998}]}}})
     'reconcile: explained: gz sinusoidal added (0.998)'
     """
     if status == NO_ANSWER:
         return f"reconcile: no answer: {result.get('why', 'too little data')}"
-    steps = [_step(axis, step) for axis, found in result.get("axes", {}).items() for step in found.get("steps", ())]
+    steps = [
+        _step_text(axis, step) for axis, found in result.get("axes", {}).items() for step in found.get("steps", ())
+    ]
     verdict = str(result.get("verdict")).replace("_", " ")
     return f"reconcile: {verdict}" + (f": {', '.join(steps)}" if steps else "")
 
 
-def _step(axis: str, step: dict[str, Any]) -> str:
+def _step_text(axis: str, step: dict[str, Any]) -> str:
+    """Return one change of the model as text."""
     confidence = step.get("confidence")
     sure = f" ({confidence:.3f})" if isinstance(confidence, float) else ""
     return f"{axis} {step.get('effect')} {step.get('kind')}{sure}"
 
 
 def _kill(child: "subprocess.Popen[bytes]") -> None:
-    """With all that it started."""
+    """Kill a child process and all processes that it started."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(child.pid, signal.SIGKILL)

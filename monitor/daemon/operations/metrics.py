@@ -1,9 +1,11 @@
-"""Numbers for Prometheus: the newest of each device, as text over HTTP, where ``[metrics] listen`` says so.
+"""Prometheus metrics over HTTP: the newest values of each device, if ``[metrics] listen`` is set.
 
-The loop leaves the newest health and estimate of each device here and goes on; a scrape reads what lies there, in a
-thread of the server's. So a scrape costs the loop nothing, and one that hangs holds up only itself: it is ended after
-TIMEOUT_S, and of more than AT_ONCE the next is turned away. A port that is taken is tried again, and said. All numbers
-are SI; a coefficient that the data only bound has ``hi`` and no value, one without an answer has nothing.
+The main loop stores the newest health and estimate of each device and continues. A thread of the server answers each
+scrape from the stored values, so a scrape does not delay the main loop. A scrape that hangs is ended after TIMEOUT_S.
+If AT_ONCE scrapes are active, the next one is rejected. If the port is in use, the output reports it and tries again.
+
+All values are in SI units. A coefficient with an upper bound only has ``hi`` and no value. A coefficient that could not
+be estimated has no entry.
 """
 
 import socketserver
@@ -27,16 +29,26 @@ if TYPE_CHECKING:
     from prometheus_client.core import Metric
 
 RETRY_S: Final = 5.0
+"""Interval between two attempts to listen."""
 TIMEOUT_S: Final = 10.0
+"""Time after which a scrape is ended."""
 AT_ONCE: Final = 8
+"""Largest number of concurrent scrapes."""
 PAUSE_S: Final = 0.1
+"""Pause after a connection that could not be accepted."""
 PATH: Final = "/metrics"
+"""Path of the metrics in the URL."""
 MISSING: Final = 'prometheus-client is not installed: pip install "imu-monitor[metrics]"'
+"""Status message if the library is not installed."""
 STATES: Final = ("running", "waiting", "lost", "ended")
+"""States of a device."""
 UNITS: Final = "gyroscopes Q rad, N rad/√s, B rad/s, K rad/s/√s, R rad/s²; accelerometers with m/s for rad"
+"""Text about the units of the coefficients."""
 
 Rows = Mapping[tuple[str, ...], float | None]
+"""Values of one metric by the values of its labels; None if unknown."""
 Numbers = Callable[[Health], float | None]
+"""Function that reads one value from the health of a device."""
 
 COUNTERS: Final[dict[str, tuple[str, Numbers]]] = {
     "received": ("Samples received", lambda one: one.received),
@@ -46,28 +58,32 @@ COUNTERS: Final[dict[str, tuple[str, Numbers]]] = {
     "repeated": ("Samples that came twice and were left out", lambda one: one.repeated),
     "late": ("Samples that came after their place had passed", lambda one: one.late),
 }
-"""``imu_monitor_samples_<name>_total``, by device."""
+"""Counters ``imu_monitor_samples_<name>_total`` for each device: description and value."""
 GAUGES: Final[dict[str, tuple[str, Numbers]]] = {
     "sample_rate_hertz": ("Measured rate of samples", lambda one: one.rate_hz),
     "uptime_seconds": ("Since the device was started", lambda one: one.uptime_s),
     "moving": ("1 while the device is moved", lambda one: float(one.moving)),
     "limits_crossed": ("Limits of the user that are passed now", lambda one: float(len(one.crossed))),
 }
-"""``imu_monitor_<name>``, by device."""
+"""Gauges ``imu_monitor_<name>`` for each device: description and value."""
 
 
 class MetricsOutput(Output):
-    """Keeps the newest numbers, and serves them.
+    """Output that keeps the newest values and serves them.
 
-    Args:
-        settings: where; port 0 is any that is free
+    The parameters of the output methods are described in ``monitor.daemon.device_worker.Output``.
+
+    Parameters
+    ----------
+    settings : Metrics
+        Address to listen on. Port 0 stands for any free port.
     """
 
     def __init__(self, settings: Metrics) -> None:
         self._settings = settings
         self.state = "starting"
         self.port = 0
-        """Listened on; 0 while there is none."""
+        """Port of the server; 0 while it does not listen."""
         self._healths: dict[str, Health] = {}
         self._estimates: dict[str, Estimate] = {}
         self._events: Counter[tuple[str, str]] = Counter()
@@ -75,33 +91,33 @@ class MetricsOutput(Output):
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="metrics", daemon=True)
 
-    # --- from the loop
+    # --- called by the main loop
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """Kept until the next."""
+        """Keep the newest estimate of a device."""
         self._estimates[device] = estimate
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """Counted."""
+        """Count an event."""
         self._events[device, event.kind] += 1
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Kept until the next."""
+        """Keep the newest health of a device."""
         self._healths[device] = health
 
     def gone(self, device: str) -> None:
-        """Its numbers are no longer given."""
+        """Remove the values of a device."""
         self._healths.pop(device, None)
         self._estimates.pop(device, None)
         for key in [key for key in self._events if key[0] == device]:
             del self._events[key]
 
     def start(self) -> None:
-        """Listen, in a thread; trouble shows in ``state`` and is tried again there."""
+        """Start the server in a thread. It reports errors in ``state`` and tries again."""
         self._thread.start()
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop the server."""
         self._closing.set()
         server = self._server
         if server is not None:
@@ -109,20 +125,21 @@ class MetricsOutput(Output):
         if self._thread.is_alive():
             self._thread.join(RETRY_S)
 
-    # --- what is served
+    # --- called by the registry of the client library
 
     def collect(self) -> "Iterator[Metric]":
-        """All numbers at one moment, as the client library's registry asks for them."""
+        """Yield all metrics at one moment."""
         healths, estimates = dict(self._healths), dict(self._estimates)
-        yield from _of_devices(healths)
-        yield from _of_process(healths)
-        yield from _coefficients(estimates)
+        yield from _device_metrics(healths)
+        yield from _process_metrics(healths)
+        yield from _coefficient_metrics(estimates)
         told: Rows = {key: float(count) for key, count in dict(self._events).items()}
-        yield _labelled("events", "Events told", ("device", "kind"), told, counter=True)
+        yield _metric("events", "Events told", ("device", "kind"), told, counter=True)
 
-    # --- the thread
+    # --- server thread
 
     def _run(self) -> None:
+        """Serve scrapes until closed, and retry while the port cannot be used."""
         try:
             from prometheus_client import CollectorRegistry
         except ImportError:
@@ -146,7 +163,10 @@ class MetricsOutput(Output):
 
 
 class _Server(socketserver.ThreadingTCPServer):
-    """One thread a scrape; not http.server's own, which asks the network for this machine's name first."""
+    """Server with one thread for each scrape.
+
+    The server class of http.server is not used, because it first asks the network for the name of this machine.
+    """
 
     allow_reuse_address = True
     daemon_threads = True
@@ -162,7 +182,7 @@ class _Server(socketserver.ThreadingTCPServer):
         super().__init__(address, _Scrape)
 
     def get_request(self) -> Any:
-        """The next; where there are no file descriptors for it, not at full speed again and again."""
+        """Accept the next connection; if there are no file descriptors left, pause before the next attempt."""
         try:
             return super().get_request()
         except OSError:
@@ -170,35 +190,35 @@ class _Server(socketserver.ThreadingTCPServer):
             raise
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """A thread, or the door where too many are inside."""
+        """Start a thread for a scrape, or reject the scrape if too many are active."""
         if not self.room.acquire(blocking=False):
             self.shutdown_request(request)
             return
         try:
             super().process_request(request, client_address)
-        except RuntimeError:  # the system gives no more threads
+        except RuntimeError:  # the system allows no more threads
             self.room.release()
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """In the thread."""
+        """Answer a scrape in its thread."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self.room.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Whoever asked has gone: nothing to say, and nobody to say it to."""
+        """Ignore the error of a connection that its client has closed."""
 
 
 class _Scrape(BaseHTTPRequestHandler):
-    """One request."""
+    """Handler of one scrape."""
 
     timeout = TIMEOUT_S
     server: _Server
 
     def do_GET(self) -> None:
-        """The numbers, in the form that is asked for."""
+        """Send the metrics in the format that the client accepts."""
         from prometheus_client.exposition import choose_encoder
 
         if self.path.partition("?")[0] != PATH:
@@ -213,39 +233,41 @@ class _Scrape(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *arguments: Any) -> None:  # noqa: A002 - the library's name
-        """A scrape every few seconds is not worth a line."""
+        """Log nothing, because there is a scrape every few seconds."""
 
 
-def _of_devices(healths: Mapping[str, Health]) -> "Iterator[Metric]":
+def _device_metrics(healths: Mapping[str, Health]) -> "Iterator[Metric]":
+    """Yield the metrics of all devices."""
     for name, (words, number) in COUNTERS.items():
         rows: Rows = {(device,): number(one) for device, one in healths.items()}
-        yield _labelled(f"samples_{name}", words, ("device",), rows, counter=True)
+        yield _metric(f"samples_{name}", words, ("device",), rows, counter=True)
     for name, (words, number) in GAUGES.items():
-        yield _labelled(name, words, ("device",), {(device,): number(one) for device, one in healths.items()})
+        yield _metric(name, words, ("device",), {(device,): number(one) for device, one in healths.items()})
     states: Rows = {(device, state): float(one.state == state) for device, one in healths.items() for state in STATES}
-    yield _labelled("state", "1 for the state that the device is in", ("device", "state"), states)
+    yield _metric("state", "1 for the state that the device is in", ("device", "state"), states)
     latencies: dict[tuple[str, ...], float | None] = {}
     for device, one in healths.items():
         latencies |= {(device, "0.5"): one.latency_p50_s, (device, "0.99"): one.latency_p99_s}
     words = "Receipt to published, over the last second"
-    yield _labelled("latency_seconds", words, ("device", "quantile"), latencies)
+    yield _metric("latency_seconds", words, ("device", "quantile"), latencies)
 
 
-def _of_process(healths: Mapping[str, Health]) -> "Iterator[Metric]":
-    """What every device says alike."""
+def _process_metrics(healths: Mapping[str, Health]) -> "Iterator[Metric]":
+    """Yield the metrics of the process, which are the same in the health of every device."""
     if not healths:
         return
     newest = list(healths.values())[-1]
-    yield _labelled("memory_bytes", "Resident memory of the service", (), {(): newest.memory_bytes})
+    yield _metric("memory_bytes", "Resident memory of the service", (), {(): newest.memory_bytes})
     well: Rows = {
         (output,): float(state == "ok" or state.startswith("ok,"))
         for output, state in newest.outputs.items()
         if state != "off"
     }
-    yield _labelled("output_up", "1 while the output works", ("output",), well)
+    yield _metric("output_up", "1 while the output works", ("output",), well)
 
 
-def _coefficients(estimates: Mapping[str, Estimate]) -> "Iterator[Metric]":
+def _coefficient_metrics(estimates: Mapping[str, Estimate]) -> "Iterator[Metric]":
+    """Yield the metrics of the noise coefficients."""
     for name, words in (
         ("value", "of the window"),
         ("lo", "lower end of its 95 % interval"),
@@ -258,19 +280,19 @@ def _coefficients(estimates: Mapping[str, Estimate]) -> "Iterator[Metric]":
             for row, letter in enumerate(LETTERS)
         }
         words = f"Coefficient of IEEE Std 952, {words}; SI: {UNITS}"
-        yield _labelled(
+        yield _metric(
             "coefficient" if name == "value" else f"coefficient_{name}", words, ("device", "axis", "letter"), rows
         )
 
 
-def _labelled(
+def _metric(
     name: str,
     words: str,
     labels: tuple[str, ...],
     rows: Rows,
     counter: bool = False,
 ) -> "Metric":
-    """One family; what is not known has no row."""
+    """Return one metric with its labels. Unknown values have no row."""
     from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
     kind = CounterMetricFamily if counter else GaugeMetricFamily

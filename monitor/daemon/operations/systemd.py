@@ -1,12 +1,12 @@
-"""What systemd is told: ready, how it goes, still alive, reloading, stopping; by datagrams on NOTIFY_SOCKET.
+"""Notification of systemd by datagrams on NOTIFY_SOCKET: ready, status, watchdog, reloading and stopping.
 
-Without that variable nothing is told and nothing is different. A datagram that cannot be sent is dropped: systemd's
-watchdog is the one who acts on silence.
+Without that variable nothing is sent, and the service behaves the same. A datagram that cannot be sent is dropped. In
+that case the watchdog of systemd acts.
 
-``alive`` is the point: WATCHDOG=1 goes out only from the loop, and only while every reader of a sensor moves on: it
-reads, times out or tries to open its link. A loop that hangs or a reader that is stuck in a driver ends the beat, and
-systemd restarts the service. A device that is not there does not: its reader tries again and again. Protocol:
-sd_notify(3), sd_watchdog_enabled(3).
+``alive`` sends WATCHDOG=1. The main loop calls it, and it sends the message only while every reader of a sensor makes
+progress. A reader makes progress if it reads, times out or tries to open its link. If the main loop hangs or a reader
+is stuck in a driver, the messages stop, and systemd restarts the service. A missing device does not stop them, because
+its reader tries again and again. The protocol is described in sd_notify(3) and sd_watchdog_enabled(3).
 """
 
 import contextlib
@@ -16,35 +16,46 @@ import time
 from collections.abc import Mapping, MutableMapping
 from typing import Final
 
-STUCK_S: Final = 20.0
-"""That a reader may stand still at the least: pauses between attempts last 5 s, and an attempt may wait for a host."""
-BEATS: Final = 3.0
-"""In the time after which systemd gives up."""
+MIN_STUCK_S: Final = 20.0
+"""Shortest time without progress after which a reader counts as stuck.
+
+Pauses between two attempts last 5 s, and an attempt may wait for a network host.
+"""
+BEATS_PER_TIMEOUT: Final = 3.0
+"""Number of watchdog messages in the time after which systemd restarts the service."""
 VARIABLES: Final = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
+"""Environment variables of the protocol."""
 
 
 class Unit:
-    """This process as a unit of systemd.
+    """Connection of this process to systemd.
 
-    Args:
-        address: of the socket, a path or "@name"; "": none
-        watchdog_s: systemd gives up after so long without a sign; None: it does not watch
-        stuck_s: a reader that stands still for longer is stuck; STUCK_S or half of ``watchdog_s``
+    Parameters
+    ----------
+    address : str, optional
+        Address of the socket, a path or "@name". With "" nothing is sent.
+    watchdog_s : float, optional
+        Watchdog timeout of systemd in seconds. None if the watchdog is off.
+    stuck_s : float, optional
+        Time in seconds without progress after which a reader counts as stuck. The default is the larger of MIN_STUCK_S
+        and half of ``watchdog_s``.
     """
 
     def __init__(self, address: str = "", watchdog_s: float | None = None, stuck_s: float | None = None) -> None:
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
         self._watchdog_s = watchdog_s
-        self._stuck_s = stuck_s or max(STUCK_S, 0.5 * (watchdog_s or 0.0))
+        self._stuck_s = stuck_s or max(MIN_STUCK_S, 0.5 * (watchdog_s or 0.0))
         self._said = ""
         self._ready = False
         self._next_beat_s = 0.0
-        self._turns: dict[str, tuple[int, float]] = {}  # of each reader, and since when it has had so many
+        self._turns: dict[str, tuple[int, float]] = {}  # read attempts of each reader, and the time of the last change
 
     @classmethod
     def of(cls, environment: MutableMapping[str, str]) -> "Unit":
-        """As the environment says; its variables are taken out, as they are not meant for children.
+        """Create a unit from the environment, and remove its variables, because they are not meant for child processes.
 
+        Examples
+        --------
         >>> environment = {"NOTIFY_SOCKET": "/run/notify", "WATCHDOG_USEC": "60000000", "HOME": "/"}
         >>> Unit.of(environment).watched, environment
         (True, {'HOME': '/'})
@@ -56,40 +67,48 @@ class Unit:
 
     @property
     def watched(self) -> bool:
-        """Whether systemd waits for signs of life."""
+        """True if the watchdog of systemd is on."""
         return self._watchdog_s is not None
 
     @property
     def told_ready(self) -> bool:
-        """Whether it has been told that the service is up."""
+        """True if readiness has been sent."""
         return self._ready
 
     def ready(self) -> None:
-        """The service is up, or has reloaded."""
+        """Report that the service has started or has finished a reload."""
         self._ready = True
         self._send("READY=1")
 
     def status(self, sentence: str) -> None:
-        """How it goes, in one sentence; said again only when it is another one."""
+        """Send the status in one sentence, if it has changed."""
         line = " ".join(sentence.split())
         if line != self._said:
             self._said = line
             self._send(f"STATUS={line}")
 
     def reloading(self) -> None:
-        """The configuration is read again; ``ready`` ends it."""
+        """Report that a reload has begun; ``ready`` ends it."""
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def stopping(self) -> None:
-        """The service ends."""
+        """Report that the service is stopping."""
         self._send("STOPPING=1")
 
     def alive(self, turns: Mapping[str, int], now_s: float) -> list[str]:
-        """A sign of life if one is due and every reader moves on; those that are stuck.
+        """Send a watchdog message if it is due and no reader is stuck.
 
-        Args:
-            turns: of each reader, how often it has read or tried to
-            now_s: monotonic
+        Parameters
+        ----------
+        turns : mapping of str to int
+            Number of read attempts of each reader.
+        now_s : float
+            Present time on the monotonic clock, in seconds.
+
+        Returns
+        -------
+        list of str
+            Names of the stuck readers.
         """
         self._turns = {
             name: self._turns[name] if self._turns.get(name, (-1, 0.0))[0] == count else (count, now_s)
@@ -97,11 +116,12 @@ class Unit:
         }
         stuck = [name for name, (_, since_s) in self._turns.items() if now_s - since_s > self._stuck_s]
         if self._watchdog_s is not None and not stuck and now_s >= self._next_beat_s:
-            self._next_beat_s = now_s + self._watchdog_s / BEATS
+            self._next_beat_s = now_s + self._watchdog_s / BEATS_PER_TIMEOUT
             self._send("WATCHDOG=1")
         return stuck
 
     def _send(self, text: str) -> None:
+        """Send a datagram, if there is a socket."""
         if not self._address:
             return
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:

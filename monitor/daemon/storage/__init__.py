@@ -1,1 +1,1 @@
-"""Recordings that the service writes, and how long they are kept."""
+"""Recorder of the service, and retention of its recordings."""

@@ -1,18 +1,19 @@
-"""The daemon's own recordings: samples as received and decoded, and the bytes they came in where that is wanted.
+"""Recorder of the daemon: writes the decoded samples of each device, and optionally its raw bytes, to segment files.
 
-Readers' threads hand over blocks and chunks, which wait in bounded queues; one thread appends them to segments twice a
-second and has the disk keep them once a second, begins a new segment when one is as long as it may be, packs those that
-have ended, and deletes the oldest by age and while the disk is fuller than it may be. So a slow disk delays no sample;
-what does not fit a queue is counted and becomes a hole of the recording.
+The reader threads put blocks and chunks into bounded queues. One thread appends them to segments twice a second, and
+flushes the files to disk once a second. It begins a new segment when the present one has its full length, and packs
+finished segments. It deletes the oldest segments by age, and while the disk is too full. A slow disk therefore delays
+no sample. Samples that do not fit into the queue are counted, and leave a gap in the recording.
 
-A disk that is full or read-only stops the recording, with an event; everything else goes on, and recording is tried
-again every few seconds. After a crash the newest segment is read up to its last whole batch (``Recorder.tail``), so
-that the daemon goes on from there.
+A full or read-only disk stops the recording, and an event reports it. The rest of the service continues. The recorder
+tries again every few seconds. After a crash, the newest segment can be read up to its last complete batch
+(``Recorder.tail``), so that the daemon resumes from there.
 
-One process at a time records into a folder (``FolderLock``). While another one does, nothing is written or deleted, and
-``state`` says which process it is. When that process ends this one goes on: rows that the other has recorded are left
-out, and the rows between the two are still in the queue. In every round the thread checks that the file that it writes
-still has its name and its size. A file that was deleted, renamed, replaced or cut ends there, and a new one is begun.
+Only one process at a time records into a folder (``FolderLock``). While another process holds the lock, nothing is
+written or deleted, and ``state`` names that process. When it ends, this process continues. Rows that the other process
+has recorded are left out, and later rows are still in the queue. In every round the thread checks that its open file
+still has its name and size. If another program has deleted, renamed, replaced or truncated the file, the recorder
+begins a new one.
 """
 
 import contextlib
@@ -38,30 +39,39 @@ from monitor.daemon.storage import retention
 from monitor.settings.loading import Storage
 
 WRITE_S: Final = 0.5
-"""Between two batches of a device: a crash costs no more than this, a power cut no more than SYNC_S."""
-SYNC_S: Final = 1.0
+"""Interval between two batches of a device: the most that a crash loses. A power failure loses up to SYNC_INTERVAL_S.
+"""
+SYNC_INTERVAL_S: Final = 1.0
+"""Interval between two flushes of the files to disk."""
 RETRY_S: Final = 5.0
+"""Interval between two attempts to record after an error."""
 TIDY_S: Final = 30.0
-PACKING_S: Final = 0.1
-"""Of packing in one round, between which batches are written."""
+"""Interval between two checks for segments to delete."""
+MAX_PACKING_S: Final = 0.1
+"""Longest time for packing in one round, so that batches are written in between."""
 QUEUE_BYTES: Final = 16_000_000
-"""Of one device, that wait for the disk: three minutes at 1 kHz."""
-RESOLUTION_NS: Final = 1000
-"""Of Unix times in a recording, a little more than it is."""
-SAME_NS: Final = 500_000_000
-"""Two rows with the same count that are no further apart are the same sample, as two processes received it."""
+"""Capacity of the queue of one device: three minutes of samples at 1 kHz."""
+TIME_RESOLUTION_NS: Final = 1000
+"""Upper bound of the resolution of Unix times in a recording."""
+MAX_SAME_SAMPLE_NS: Final = 500_000_000
+"""Two rows with the same counter value are the same sample, received by two processes, if their times differ by less.
+"""
 SAMPLE_BYTES: Final = 80
-CHUNK_BYTES: Final = 100
-"""What a chunk takes beside its bytes."""
-RAW: Final = "raw"
-ADVICE: Final = "end it, or choose another folder in [storage]"
+"""Memory that one sample occupies in a queue."""
+CHUNK_OVERHEAD_BYTES: Final = 100
+"""Memory that a chunk occupies in a queue, in addition to its bytes."""
+RAW_FOLDER: Final = "raw"
+"""Name of the folder for raw bytes, inside the folder of a device."""
+FOLDER_IN_USE_ADVICE: Final = "end it, or choose another folder in [storage]"
+"""Second half of the message about a folder that another process uses."""
 
 Opening = Callable[[Path, Origin], SegmentWriter]
+"""Function that opens a new segment."""
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """Something that happened to the recording of a device."""
+    """Event in the recording of a device."""
 
     device: str
     kind: str  # recording_stopped | recording_back
@@ -70,14 +80,14 @@ class Told:
 
 @dataclass(frozen=True, slots=True)
 class Tail:
-    """The end of a recording, to go on from."""
+    """End of an existing recording, from which the daemon resumes after a restart."""
 
     origin: Origin
     paths: tuple[Path, ...]  # oldest first
     newest: Piece
 
     def pieces(self, span_s: float) -> Iterator[Piece]:
-        """The last ``span_s``, oldest first; nothing of another mounting."""
+        """Yield the last ``span_s`` seconds of the recording, oldest first, as far as the mounting is the same."""
         begin_ns = int(self.newest.samples.t_ns[-1]) - round(span_s * 1e9)
         for path in self._since(begin_ns):
             for piece in segment.read_samples(path):
@@ -85,6 +95,7 @@ class Tail:
                     yield piece
 
     def _since(self, begin_ns: int) -> list[Path]:
+        """Return the newest segments with the same axis mounting, back to the one that contains ``begin_ns``."""
         chosen: deque[Path] = deque()
         for path in reversed(self.paths):
             try:
@@ -103,28 +114,28 @@ class Tail:
 
 @dataclass(slots=True)
 class _Track:
-    """One folder of segments: the samples of a device, or its raw bytes."""
+    """Recording of one kind for one device: its folder, open segment and queue."""
 
     origin: Origin
     folder: Path
     writer: SegmentWriter | None = None
     began_s: float = 0.0  # Unix time of the open segment's first row
-    number: int | None = None  # of the newest segment; None: not looked for yet
-    waiting: deque[SampleBlock | Chunk] = field(default_factory=deque)  # Unix times
-    bytes: int = 0  # that wait
-    held: list[SampleBlock | Chunk] = field(default_factory=list)  # being written
-    dropped: int = 0  # rows before the oldest that waits, missing ones included
+    number: int | None = None  # of the newest segment; None until the folder has been searched
+    waiting: deque[SampleBlock | Chunk] = field(default_factory=deque)  # queue, with Unix times
+    bytes: int = 0  # memory that the queue occupies
+    held: list[SampleBlock | Chunk] = field(default_factory=list)  # taken from the queue and being written
+    dropped: int = 0  # rows that were dropped before the oldest in the queue, missing samples included
     rows: int = 0  # rows or chunks in the open segment
     missed: int = 0  # rows that are not in the recording
-    unsynced: bool = False
-    trouble: str = ""
-    stopped_s: float = 0.0
-    leaving: bool = False  # the device is no more: what waits is written, and that is all
+    unsynced: bool = False  # True if rows were written since the last flush to disk
+    trouble: str = ""  # reason why recording has stopped; empty while it works
+    stopped_s: float = 0.0  # monotonic time of the last failure
+    leaving: bool = False  # True if the device was removed: its queue is written, and then the track is deleted
 
 
 @dataclass(frozen=True, slots=True)
 class _Newest:
-    """The newest row of a recording."""
+    """Newest row of a recording."""
 
     t_ns: int  # Unix
     tick: int = NO_TICK
@@ -132,12 +143,16 @@ class _Newest:
 
 
 class Recorder:
-    """Writes what all devices bring.
+    """Recorder of the samples and raw bytes of all devices.
 
-    Args:
-        storage: where, and how long it is kept
-        origins: what is recorded: device and kind, see ``segment.Origin``
-        opening: begins a segment; tests give slow and broken disks
+    Parameters
+    ----------
+    storage : Storage
+        Folder, limits of age and disk use, and segment length.
+    origins : sequence of Origin
+        Recordings to write, each with its device and kind, see ``segment.Origin``.
+    opening : callable, optional
+        Opens a segment. Tests pass functions that simulate slow and broken disks.
     """
 
     def __init__(self, storage: Storage, origins: Sequence[Origin], opening: Opening = SegmentWriter) -> None:
@@ -145,22 +160,22 @@ class Recorder:
         self._opening = opening
         self._tracks = {(one.device, one.kind): _Track(one, self.folder(one)) for one in origins}
         self._states: dict[str, State] = {}
-        self._lock = threading.Lock()  # held for moments: readers' threads wait for it
-        self._told: deque[Told] = deque(maxlen=1000)
+        self._lock = threading.Lock()  # held only briefly, because reader threads wait for it
+        self._events: deque[Told] = deque(maxlen=1000)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._tidied_s = self._synced_s = -TIDY_S
         self._packing: Iterator[None] | None = None
         self._to_pack: deque[Path] = deque()
-        self._full = ""  # why the disk takes no more
+        self._full = ""  # message if the disk is too full
         self._folder_lock = FolderLock(storage.folder, RECORDING_LOCK)
-        self._excluded = ""  # why nothing is recorded in the folder at all
-        self._excluded_s = 0.0
-        self._other = False  # because another process records there
-        self._note = ""  # the newest thing that happened to a file
+        self._lock_failure = ""  # message if the lock on the folder is not held
+        self._lock_failed_s = 0.0  # monotonic time of the last attempt to take the lock
+        self._other_process = False  # True if another process holds the lock
+        self._note = ""  # message about the last change of a file by another program
 
     def add(self, origins: Sequence[Origin]) -> None:
-        """Record another device too."""
+        """Start to record a further device."""
         with self._lock:
             self._tracks = {
                 **self._tracks,
@@ -168,26 +183,26 @@ class Recorder:
             }
 
     def remove(self, device: str) -> None:
-        """Record a device no more, once what waits of it is written; ``has`` tells when."""
+        """Stop recording a device after its queue has been written. ``has`` returns False when that is done."""
         for track in self._tracks.values():
             track.leaving |= track.origin.device == device
 
     def has(self, device: str) -> bool:
-        """Whether something of the device is recorded, or waits to be."""
+        """Return True while a device is recorded, or its queue is not written yet."""
         return any(name == device for name, _ in self._tracks)
 
     def folder(self, origin: Origin) -> Path:
-        """Where the segments of a device are."""
+        """Return the folder for the segments of a recording."""
         own = self._storage.folder / origin.device
-        return own if origin.kind == "samples" else own / RAW
+        return own if origin.kind == "samples" else own / RAW_FOLDER
 
     @property
     def state(self) -> str:
-        """``ok``, or what is wrong: for the status."""
+        """Status message: ``ok``, or a description of the problem."""
         if self._thread.ident is not None and not self._thread.is_alive() and not self._closing.is_set():
             return "recording ended by a fault of the program"
-        if self._excluded:
-            return self._excluded
+        if self._lock_failure:
+            return self._lock_failure
         wrong = sorted({track.trouble for track in self._tracks.values() if track.trouble})
         if wrong:
             return wrong[0]
@@ -198,76 +213,105 @@ class Recorder:
 
     @property
     def missed(self) -> int:
-        """Samples and chunks that are not in the recording."""
+        """Number of samples and chunks that are missing in the recordings."""
         return sum(track.missed for track in self._tracks.values())
 
     def take(self) -> list[Told]:
-        """What happened since the last call."""
-        return [self._told.popleft() for _ in range(len(self._told))]
+        """Return the events since the last call."""
+        return [self._events.popleft() for _ in range(len(self._events))]
 
     def start(self) -> None:
-        """Start writing."""
+        """Start the writer thread."""
         self._thread.start()
 
     def close(self, timeout_s: float = 10.0) -> None:
-        """Write what waits and end the files; a disk that hangs is waited for no longer than ``timeout_s``."""
+        """Write the queues and close the files. If the disk hangs, return after ``timeout_s`` seconds."""
         self._closing.set()
         if self._thread.is_alive():
             self._thread.join(timeout_s)
 
-    # --- from the readers' threads
+    # --- called by the reader threads
 
     def samples(self, device: str, samples: SampleBlock, offset_ns: int) -> None:
-        """A block; ``offset_ns`` makes its times Unix time."""
+        """Queue a block of samples for the recording.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        samples : SampleBlock
+            Samples in SI units.
+        offset_ns : int
+            Offset that converts the times to Unix time, in nanoseconds.
+        """
         track = self._tracks.get((device, "samples"))
         if track is None:
             return
         if offset_ns:
             t_ns = samples.t_ns + offset_ns
             samples = block(t_ns, samples.values, samples.temperature_c, samples.ticks, samples.lost)
-        self._wait(track, [samples])
+        self._enqueue(track, [samples])
 
     def chunks(self, device: str, chunks: Sequence[Chunk], offset_ns: int) -> None:
-        """Bytes as they came; ``offset_ns`` makes their times Unix time."""
+        """Queue received bytes for the recording.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        chunks : sequence of Chunk
+            Bytes as received from the link.
+        offset_ns : int
+            Offset that converts the times to Unix time, in nanoseconds.
+        """
         track = self._tracks.get((device, "raw"))
         if track is not None:
-            self._wait(track, [replace(one, t_ns=one.t_ns + offset_ns) if offset_ns else one for one in chunks])
+            self._enqueue(track, [replace(one, t_ns=one.t_ns + offset_ns) if offset_ns else one for one in chunks])
 
-    def _wait(self, track: _Track, more: Sequence[SampleBlock | Chunk]) -> None:
-        """Queue, and drop the oldest where there is no room."""
+    def _enqueue(self, track: _Track, more: Sequence[SampleBlock | Chunk]) -> None:
+        """Append to the queue of a track, and drop the oldest entries if it is full."""
         with self._lock:
             track.waiting.extend(more)
             track.bytes += sum(_size(one) for one in more)
             while track.bytes > QUEUE_BYTES and len(track.waiting) > 1:
                 gone = track.waiting.popleft()
                 track.bytes -= _size(gone)
-                if self._other:  # another process records: what is missing is found once that has ended
+                if self._other_process:  # another process records; missing rows are found after it has ended
                     continue
                 rows = len(gone) if isinstance(gone, SampleBlock) else 1
                 track.dropped += rows + (gone.lost if isinstance(gone, SampleBlock) else 0)
                 track.missed += rows
 
     def know(self, device: str, state: State) -> None:
-        """What is written with the rows from now on."""
+        """Set the state of the estimate that is recorded with the rows of a device from now on.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        state : State
+            Rate, start of each axis, and values of the fit.
+        """
         self._states[device] = state
 
     def full(self, device: str) -> bool:
-        """Whether a recording that is replayed had better wait."""
+        """Return True if a replayed recording should wait, because the queue of its device is filling up."""
         track = self._tracks.get((device, "samples"))
-        return track is not None and not self._excluded and track.bytes > QUEUE_BYTES // 4
+        return track is not None and not self._lock_failure and track.bytes > QUEUE_BYTES // 4
 
     # --- after a restart
 
     def tail(self, device: str) -> Tail | None:
-        """What was recorded of a device before this start; None where there is nothing to go on from.
+        """Return the end of a device's recording from before this start, or None if there is nothing to resume from.
 
-        To be called before anything is written. What is no segment is passed over and stays for people to look at.
+        This method must be called before anything is written. Files that are not valid segments are skipped and left in
+        place.
         """
         track = self._tracks.get((device, "samples"))
         if track is None:
             return None
         if self._thread.ident is None:
-            self._hold_folder()  # from here on nobody else adds to what is found now
+            self._acquire_folder()  # with the lock, no other process adds to the segments that are found now
         paths = segment.segments(track.folder)
         while paths:
             path = paths[-1]
@@ -282,73 +326,74 @@ class Recorder:
             paths.pop()
         return None
 
-    # --- the thread
+    # --- writer thread
 
     def _run(self) -> None:
+        """Write, flush, delete and pack in rounds until the recorder is closed."""
         closing = False
         while not closing:
-            held = self._hold_folder()
+            held = self._acquire_folder()
             closing = self._closing.wait(WRITE_S)
             for track in self._tracks.values():
-                leaving = track.leaving  # before what waits is looked at: nothing comes after it
+                leaving = track.leaving  # read before the queue: nothing is added after it has been set
                 if held:
-                    self._check(track)
+                    self._end_if_changed(track)
                     self._write(track)
                 if leaving:
-                    self._leave(track)
+                    self._remove_track(track)
             if held and not closing:
                 self._sync()
-                self._tidy()
+                self._delete_old()
                 self._pack()
         for track in self._tracks.values():
             self._end(track)
         self._folder_lock.release()
 
-    def _hold_folder(self) -> bool:
-        """Take the lock on the folder, or check that it is still held; False while nothing is to be written."""
-        if self._excluded and time.monotonic() - self._excluded_s < RETRY_S:
+    def _acquire_folder(self) -> bool:
+        """Take the lock on the folder, or check that it is still held; return False if nothing may be written."""
+        if self._lock_failure and time.monotonic() - self._lock_failed_s < RETRY_S:
             return False
         try:
             holder = self._folder_lock.hold()
         except OSError as error:
             why = f"{self._storage.folder}: {error.strerror or error}; recording stopped, trying again"
         else:
-            why = holder and f"{holder}; nothing is recorded here until it ends; {ADVICE}"
-            self._other |= bool(holder)
+            why = holder and f"{holder}; nothing is recorded here until it ends; {FOLDER_IN_USE_ADVICE}"
+            self._other_process |= bool(holder)
         if why:
-            self._exclude(why)
-        elif self._excluded:
-            self._include()
+            self._suspend(why)
+        elif self._lock_failure:
+            self._resume()
         return not why
 
-    def _exclude(self, why: str) -> None:
-        """Write nothing, and begin a new file when that is over."""
+    def _suspend(self, why: str) -> None:
+        """Close all files and write nothing until the lock is held again."""
         self._packing = None
         self._to_pack.clear()
         for track in self._tracks.values():
             self._end(track, pack=False)
-            track.number = None  # somebody else may number files meanwhile
-            if not self._excluded:
-                self._told.append(Told(track.origin.device, "recording_stopped", why))
-        self._excluded, self._excluded_s = why, time.monotonic()
+            track.number = None  # another process may create segments in the meantime
+            if not self._lock_failure:
+                self._events.append(Told(track.origin.device, "recording_stopped", why))
+        self._lock_failure, self._lock_failed_s = why, time.monotonic()
 
-    def _include(self) -> None:
-        """Go on, without the rows that another process has recorded meanwhile."""
+    def _resume(self) -> None:
+        """Continue to record, without the rows that another process has recorded in the meantime."""
         for track in self._tracks.values():
-            if self._other:
-                self._leave_out_recorded(track)
+            if self._other_process:
+                self._drop_recorded_rows(track)
             text = f"recording goes on; {track.missed} rows are missing in it"
-            self._told.append(Told(track.origin.device, "recording_back", text))
-        self._excluded, self._other = "", False
+            self._events.append(Told(track.origin.device, "recording_back", text))
+        self._lock_failure, self._other_process = "", False
 
-    def _leave_out_recorded(self, track: _Track) -> None:
-        """Drop rows up to the newest that is in the folder; rows that are missing after it are a hole."""
-        newest = _newest_in(track)
+    def _drop_recorded_rows(self, track: _Track) -> None:
+        """Drop queued rows that are already in the folder; missing rows after these become a gap of the recording."""
+        newest = _find_newest(track)
         with self._lock:
             waiting = [*track.held, *track.waiting]
             if newest is not None:
                 end_ns = _time_of(newest, waiting)
-                waiting = [part for one in waiting for part in _after(one, end_ns)]
+                waiting = [part for one in waiting for part in _rows_after(one, end_ns)]
                 if waiting and isinstance(first := waiting[0], SampleBlock):
                     gap_s = (int(first.t_ns[0]) - end_ns) / 1e9
                     lost = max(round(gap_s * newest.rate_hz) - 1, 0) if newest.rate_hz else 0
@@ -357,8 +402,8 @@ class Recorder:
             track.waiting = deque(waiting)
             track.bytes = sum(_size(one) for one in waiting)
 
-    def _check(self, track: _Track) -> None:
-        """End a file that another program has changed; the next row begins a new one."""
+    def _end_if_changed(self, track: _Track) -> None:
+        """Close a file that another program has changed; the next row begins a new file."""
         change = "" if track.writer is None else track.writer.change()
         if not change:
             return
@@ -368,41 +413,41 @@ class Recorder:
             writer.abandon()
         except OSError as error:
             change = f"{change} ({error.strerror or error})"
-        known = segment.segments(track.folder)  # there may be other files now; none of them is packed unasked
+        known = segment.segments(track.folder)  # files of another program may be among them, and are not packed
         track.number = max(track.number or 0, segment.number_of(known[-1]) if known else 0)
         self._note = f"{writer.path} {change} while it was written, with {track.rows} rows in it; a new one is begun"
-        self._told.append(Told(track.origin.device, "recording_stopped", self._note))
-        self._told.append(Told(track.origin.device, "recording_back", "recording goes on in a new file"))
+        self._events.append(Told(track.origin.device, "recording_stopped", self._note))
+        self._events.append(Told(track.origin.device, "recording_back", "recording goes on in a new file"))
 
-    def _leave(self, track: _Track) -> None:
-        """End the file of a device that is no more."""
+    def _remove_track(self, track: _Track) -> None:
+        """Close the file of a removed device and delete its track."""
         self._end(track)
         with self._lock:
             self._tracks = {key: one for key, one in self._tracks.items() if one is not track}
 
     def _write(self, track: _Track) -> None:
-        """Append what waits; where that fails it goes on waiting, as far as there is room."""
+        """Append the queue of a track to its segment. If that fails, the rows wait, as far as the queue has space."""
         if self._full:
-            self._stop(track, self._full)
+            self._report_failure(track, self._full)
         if track.trouble and (self._full or time.monotonic() - track.stopped_s < RETRY_S):
             return
         if not track.held:
-            self._hold(track)
+            self._take_queue(track)
         if not track.held:
             return
         try:
             self._append(track)
-        except ConfigError as error:  # no pyarrow
-            self._stop(track, str(error))
+        except ConfigError as error:  # pyarrow is not installed
+            self._report_failure(track, str(error))
         except OSError as error:
-            self._stop(track, f"{track.folder}: {error.strerror or error}; recording stopped, trying again")
+            self._report_failure(track, f"{track.folder}: {error.strerror or error}; recording stopped, trying again")
             self._end(track)
         else:
             track.held = []
-            self._go_on(track)
+            self._report_recovery(track)
 
-    def _hold(self, track: _Track) -> None:
-        """Take what waits; what was dropped before it is a hole of the recording."""
+    def _take_queue(self, track: _Track) -> None:
+        """Take the queue of a track for writing; rows that were dropped before it become a gap of the recording."""
         with self._lock:
             track.held = list(track.waiting)
             track.waiting.clear()
@@ -412,6 +457,7 @@ class Recorder:
             track.held[0] = replace(track.held[0], lost=track.held[0].lost + dropped)
 
     def _append(self, track: _Track) -> None:
+        """Append the taken rows to the open segment, and begin a new segment if the present one has its full length."""
         began_s = _time_s(track.held[0])
         if track.writer is not None and began_s - track.began_s >= self._storage.segment_s:
             self._end(track)
@@ -428,6 +474,7 @@ class Recorder:
         track.unsynced = True
 
     def _begin(self, track: _Track, began_s: float) -> None:
+        """Open the next segment of a track."""
         check_folder(track.folder)
         track.folder.mkdir(parents=True, exist_ok=True)
         if track.number is None:
@@ -442,18 +489,20 @@ class Recorder:
         track.began_s, track.rows = began_s, 0
 
     def _end(self, track: _Track, pack: bool = True) -> None:
+        """Close the open segment of a track, and queue it for packing."""
         writer, track.writer = track.writer, None
         if writer is None:
             return
         try:
             writer.close()
         except OSError as error:
-            self._stop(track, f"{writer.path}: {error.strerror or error}; recording stopped, trying again")
+            self._report_failure(track, f"{writer.path}: {error.strerror or error}; recording stopped, trying again")
         if pack:
             self._to_pack.append(writer.path)
 
     def _sync(self) -> None:
-        if time.monotonic() - self._synced_s < SYNC_S - WRITE_S / 2:
+        """Flush the open segments to disk once a second."""
+        if time.monotonic() - self._synced_s < SYNC_INTERVAL_S - WRITE_S / 2:
             return
         self._synced_s = time.monotonic()
         for track in self._tracks.values():
@@ -463,12 +512,14 @@ class Recorder:
             try:
                 track.writer.sync()
             except OSError as error:
-                self._stop(track, f"{track.folder}: {error.strerror or error}; recording stopped, trying again")
+                self._report_failure(
+                    track, f"{track.folder}: {error.strerror or error}; recording stopped, trying again"
+                )
                 self._end(track)
 
     def _pack(self) -> None:
-        """A piece of packing."""
-        until_s = time.monotonic() + PACKING_S
+        """Pack finished segments for a short time."""
+        until_s = time.monotonic() + MAX_PACKING_S
         while time.monotonic() < until_s and (self._packing is not None or self._to_pack):
             try:
                 if self._packing is None:
@@ -477,12 +528,12 @@ class Recorder:
             except StopIteration:
                 self._packing = None
             except (RecordingError, ConfigError, OSError):
-                self._packing = None  # it stays as it was: larger, and as readable
+                self._packing = None  # the segment stays unpacked: it is larger, but can still be read
 
-    # --- room
+    # --- deletion of old segments
 
-    def _tidy(self) -> None:
-        """Delete what is too old, and the oldest while the disk is fuller than it may be."""
+    def _delete_old(self) -> None:
+        """Delete segments that are too old, and the oldest segments while the disk is too full."""
         if time.monotonic() - self._tidied_s < (RETRY_S if self._full else TIDY_S):
             return
         self._tidied_s = time.monotonic()
@@ -493,32 +544,46 @@ class Recorder:
         except OSError as error:
             self._full = f"{self._storage.folder}: {error.strerror or error}; recording stopped, trying again"
 
-    # --- trouble
+    # --- errors
 
-    def _stop(self, track: _Track, why: str) -> None:
+    def _report_failure(self, track: _Track, why: str) -> None:
+        """Store the reason why the recording of a track has stopped, and queue an event if it had worked until now."""
         if not track.trouble:
-            self._told.append(Told(track.origin.device, "recording_stopped", why))
+            self._events.append(Told(track.origin.device, "recording_stopped", why))
         track.trouble = why
         track.stopped_s = time.monotonic()
 
-    def _go_on(self, track: _Track) -> None:
+    def _report_recovery(self, track: _Track) -> None:
+        """Queue an event if the recording of a track works again."""
         if track.trouble:
             track.trouble = ""
             text = f"recording goes on; {track.missed} rows are missing in it"
-            self._told.append(Told(track.origin.device, "recording_back", text))
+            self._events.append(Told(track.origin.device, "recording_back", text))
 
 
 def origin(device: str, axes: AxisMap, kind: segment.Kind = "samples", carrier: str = "", decoder: str = "") -> Origin:
-    """What a device's segments are of."""
+    """Return the description of a device's segments.
+
+    Parameters
+    ----------
+    device : str
+        Name of the device.
+    axes : AxisMap
+        Mounting of the sensor axes.
+    kind : {"samples", "raw"}, optional
+        Content of the segments.
+    carrier, decoder : str, optional
+        Carrier and decoder of the raw bytes.
+    """
     measured = zip(axes.source, axes.sign, strict=True)
     mounting = " ".join(f"{'-' if sign < 0.0 else ''}{AXES[at]}" for at, sign in measured)
     return Origin(device, kind, mounting, carrier, decoder)
 
 
-def _newest_in(track: _Track) -> _Newest | None:
+def _find_newest(track: _Track) -> _Newest | None:
     """Return the newest row in the folder of a track; None if there is none."""
     for path in reversed(segment.segments(track.folder)):
-        with contextlib.suppress(RecordingError, ConfigError, OSError):  # what is no segment is passed over
+        with contextlib.suppress(RecordingError, ConfigError, OSError):  # files that are no segments are skipped
             if track.origin.kind == "raw":
                 last = deque(segment.read_chunks(path), maxlen=1)
                 if last:
@@ -532,31 +597,34 @@ def _newest_in(track: _Track) -> _Newest | None:
 
 
 def _time_of(newest: _Newest, waiting: Sequence[SampleBlock | Chunk]) -> int:
-    """Return the time of a recorded row in the rows that wait [Unix ns]; its own time if it is not found among them.
+    """Return the time of a recorded row on the clock of the queued rows, in Unix nanoseconds.
 
-    Two processes give a sample times that differ by some ms. The device's counter tells which sample it is.
+    Two processes give a sample times that differ by some ms. The device's counter identifies the sample. If no queued
+    row has the same counter value, the recorded time is returned.
     """
     for one in waiting if newest.tick != NO_TICK else ():
         if isinstance(one, SampleBlock):
-            found = np.flatnonzero((one.ticks == newest.tick) & (np.abs(one.t_ns - newest.t_ns) < SAME_NS))
+            found = np.flatnonzero((one.ticks == newest.tick) & (np.abs(one.t_ns - newest.t_ns) < MAX_SAME_SAMPLE_NS))
             if found.size:
                 return int(one.t_ns[found[-1]])
     return newest.t_ns
 
 
-def _after(one: SampleBlock | Chunk, t_ns: int) -> list[SampleBlock | Chunk]:
-    """Rows later than a time: all of a block, some or none."""
+def _rows_after(one: SampleBlock | Chunk, t_ns: int) -> list[SampleBlock | Chunk]:
+    """Return the rows later than a time: a whole block, a part of it, or nothing."""
     if isinstance(one, Chunk):
         return [one] if one.t_ns > t_ns else []
-    later = np.flatnonzero(one.t_ns > t_ns + RESOLUTION_NS)
+    later = np.flatnonzero(one.t_ns > t_ns + TIME_RESOLUTION_NS)
     return [one[int(later[0]) :]] if later.size else []
 
 
 def _size(one: SampleBlock | Chunk) -> int:
+    """Return the memory that a block or chunk occupies in a queue, in bytes."""
     if isinstance(one, SampleBlock):
         return SAMPLE_BYTES * len(one)
-    return CHUNK_BYTES + len(one.data) + len(one.attachment)
+    return CHUNK_OVERHEAD_BYTES + len(one.data) + len(one.attachment)
 
 
 def _time_s(one: SampleBlock | Chunk) -> float:
+    """Return the time of the first row of a block or chunk, in Unix seconds."""
     return float(one.t_ns[0] if isinstance(one, SampleBlock) else one.t_ns) / 1e9

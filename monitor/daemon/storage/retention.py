@@ -1,4 +1,4 @@
-"""How long recordings are kept: by age, and by how full the disk is. Deletes segments, the oldest first."""
+"""Retention of recordings: deletes the oldest segments by age, and while the disk is too full."""
 
 import shutil
 from collections import deque
@@ -9,36 +9,58 @@ from typing import Final
 
 from drivers.recordings import segment
 
-NEWEST_KEPT: Final = 2
-"""Segments of a folder that are never deleted: the window is rebuilt from them."""
+MIN_KEPT_SEGMENTS: Final = 2
+"""Number of newest segments in a folder that are never deleted, because the window is rebuilt from them."""
 
 
 def delete_old(folders: Sequence[Path], keep_s: float, segment_s: float) -> None:
     """Delete segments that ended more than ``keep_s`` before the newest of their folder began.
 
-    Two clocks have to say so: the times in the names, and how many segments of ``segment_s`` at most came after. The
-    first alone would delete a year for a host's clock that is set wrong once, the second for many short segments.
+    Two measures of age must agree: the times in the file names, and the number of later segments times ``segment_s``.
+    With the first alone, a host clock that is set wrong once would delete a year of data. With the second alone, many
+    short segments would count as old.
+
+    Parameters
+    ----------
+    folders : sequence of Path
+        Folders of segments.
+    keep_s : float
+        Age in seconds up to which segments are kept.
+    segment_s : float
+        Largest length of a segment in seconds.
     """
     for folder in folders:
         known = segment.segments(folder)
-        for at, (path, after) in enumerate(pairwise(known[: 1 - NEWEST_KEPT])):
-            by_name_s = segment.began_s(known[-1]) - segment.began_s(after)  # it ended where the next began
+        for at, (path, after) in enumerate(pairwise(known[: 1 - MIN_KEPT_SEGMENTS])):
+            by_name_s = segment.began_s(known[-1]) - segment.began_s(after)  # a segment ends where the next begins
             by_number_s = (len(known) - 1 - at) * segment_s
             if min(by_name_s, by_number_s) > keep_s:
                 _delete(path)
 
 
 def make_room(folder: Path, folders: Sequence[Path], share: float) -> str:
-    """Delete the oldest segments while more than ``share`` of the disk of ``folder`` is taken.
+    """Delete the oldest segments while more than ``share`` of the disk is in use.
 
-    Returns "" where there is room then, else in a sentence why not.
+    Parameters
+    ----------
+    folder : Path
+        Folder whose disk is measured. Nothing is done if it does not exist.
+    folders : sequence of Path
+        Folders of segments.
+    share : float
+        Largest share of the disk that may be in use, 0 to 1.
+
+    Returns
+    -------
+    str
+        "" if the share is not exceeded any more, else a message with the reason.
     """
     if not folder.is_dir():
         return ""
     olds: deque[Path] | None = None
     while (taken := taken_share(folder)) > share:
         if olds is None:
-            every = [path for one in folders for path in segment.segments(one)[:-NEWEST_KEPT]]
+            every = [path for one in folders for path in segment.segments(one)[:-MIN_KEPT_SEGMENTS]]
             olds = deque(sorted(every, key=segment.began_s))
         if not olds:
             return (
@@ -50,12 +72,12 @@ def make_room(folder: Path, folders: Sequence[Path], share: float) -> str:
 
 
 def _delete(path: Path) -> None:
-    """Delete a file; a directory that has the name of a segment stays."""
+    """Delete a file. A directory with the name of a segment is left in place."""
     if not path.is_dir() or path.is_symlink():
         path.unlink(missing_ok=True)
 
 
 def taken_share(folder: Path) -> float:
-    """Of the disk, as seen by whoever is not root."""
+    """Return the share of the disk of ``folder`` that is in use, 0 to 1, as seen by users other than root."""
     usage = shutil.disk_usage(folder)
     return 1.0 - usage.free / usage.total

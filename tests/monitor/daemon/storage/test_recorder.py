@@ -282,7 +282,7 @@ def lived(tmp_path: Path, tick_step: float | None = 1.0) -> Station:
         before._push(rows(first, 50, start_ns=mono_ns - 6000 * 10_000_000))
         before.work([], first / 100.0)
     before.work([], 100.0, drain=True)
-    keeper.know("bench", msgspec.structs.replace(before._known(), tick_step=tick_step))
+    keeper.know("bench", msgspec.structs.replace(before._restart_state(), tick_step=tick_step))
     wait_for(lambda: sum(len(piece.samples) for piece in written(tmp_path / "bench")) == 6000)
     before._push(rows(6000, 1, start_ns=mono_ns - 6000 * 10_000_000))  # with what is known at last
     before.work([], 101.0, drain=True)
@@ -309,7 +309,7 @@ def test_the_window_after_a_restart_is_the_one_before(tmp_path: Path) -> None:
     np.testing.assert_allclose(new.coefficients.hi, old.coefficients.hi, rtol=1e-6)
     np.testing.assert_array_equal(new.coefficients.status, old.coefficients.status)
     assert after.chain.watch is not None
-    (event,) = after._happened
+    (event,) = after._pending_events
     assert event.kind == "window_rebuilt"
     assert event.text == "30 s of the window were rebuilt from the recording"
 
@@ -384,7 +384,7 @@ def test_what_the_samples_cannot_go_on_from_begins_anew(tmp_path, axes, older_s:
     after.rebuild()
     assert after.chain.estimator is None
     assert after._can_take() is False or after.ring.room == after.ring.capacity
-    texts = [event.text for event in after._happened]
+    texts = [event.text for event in after._pending_events]
     assert texts == [] if reason is None else reason in texts[0]
 
 
@@ -474,14 +474,14 @@ def test_a_second_recorder_deletes_nothing(tmp_path: Path, monkeypatch) -> None:
         (tmp_path / "bench" / segment.segment_name(i, 1.0e9)).write_bytes(b"old")
     (tmp_path / "bench" / "00000099_x.arrows.part").write_bytes(b"of the first")
     monkeypatch.setattr(room.retention, "taken_share", lambda _: 0.99)
-    monkeypatch.setattr(first, "_tidy", lambda: None)
+    monkeypatch.setattr(first, "_delete_old", lambda: None)
     before = sorted(path.name for path in tmp_path.rglob("*"))
     second = Recorder(Storage(tmp_path, keep_s=10.0, segment_s=10.0), [SAMPLES])
     second.start()
     second.samples("bench", rows(0, 100), 0)
     wait_for(lambda: "in use" in second.state)
-    rounds = second._excluded_s
-    wait_for(lambda: second._excluded_s != rounds)
+    rounds = second._lock_failed_s
+    wait_for(lambda: second._lock_failed_s != rounds)
     second.close()
     assert sorted(path.name for path in tmp_path.rglob("*")) == before
     first.close()
