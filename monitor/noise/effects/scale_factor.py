@@ -1,4 +1,4 @@
-"""A scale factor that is wrong."""
+"""Scale factor error."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -27,15 +27,17 @@ class ScaleFactor(Transform):
     )
 
     def reshape(self, spectrum: Spectrum) -> Spectrum:
-        """Times f²."""
+        """Return the spectrum times f²."""
         return spectrum.scaled(self.factor)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Scaling":
-        """A multiplication."""
+        """Return a multiplying transform."""
         return _Scaling(self.factor)
 
 
 class _Scaling(Running):
+    """Running multiplication by a factor."""
+
     def __init__(self, factor: float) -> None:
         self._factor = factor
 
