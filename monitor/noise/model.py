@@ -108,6 +108,7 @@ class NoiseModel:
 
     @property
     def _clock(self) -> SampleRateError:
+        """Return the sample rate error of the model, or one of ratio 1."""
         return next((e for _, e in self if isinstance(e, SampleRateError)), SampleRateError(ratio=1.0))
 
     # --- second moments

@@ -29,7 +29,8 @@ AXIS_KEYS: Final = (*AXES, *WILDCARDS)
 TOP_LEVEL_KEYS: Final = ("sample_rate", "temperature")
 """Other keys of a model file."""
 
-Placed = tuple[tuple[str, ...], tuple[Effect, ...]]  # axes, and the effects of each of them
+Placed = tuple[tuple[str, ...], tuple[Effect, ...]]
+"""Names of axes, and the effects that each of them has."""
 
 
 def read(text: str) -> tuple[list[Placed], float | None, Temperature | None]:

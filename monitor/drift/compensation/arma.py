@@ -26,6 +26,7 @@ from monitor.common.compiled import compiled
 from monitor.common.minimization import minimize_bfgs
 
 Order = tuple[int, int]
+"""Order (p, q) of an ARMA model."""
 _Triple = tuple[float, float, float]
 
 ORDERS: Final[tuple[Order, ...]] = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1))
@@ -68,12 +69,9 @@ class Arma:
     mean: float = 0.0  # μ, rad/s
     white: float = 0.0  # variance of v, (rad/s)²
     order: Order = (2, 1)
-    lo: tuple[float, float, float] = (
-        np.nan,
-        np.nan,
-        np.nan,
-    )  # lower limits of the 95 % intervals of φ1, φ2, θ1; NaN = not computed
-    hi: tuple[float, float, float] = (np.nan, np.nan, np.nan)  # upper limits
+    # limits of the 95 % intervals of φ1, φ2, θ1; NaN = not computed
+    lo: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+    hi: tuple[float, float, float] = (np.nan, np.nan, np.nan)
     likelihood: float = np.nan  # logarithm of the likelihood
     bic: float = np.nan
     count: int = 0  # number of values used for the identification

@@ -80,13 +80,13 @@ def in_motion(rate: Floats, truth: Floats, rate_hz: float) -> InMotion:
     >>> round(one.delay_s, 4)
     0.02
     """
-    apart = np.where(np.isfinite(rate), rate - truth, 0.0)
+    difference = np.where(np.isfinite(rate), rate - truth, 0.0)
     slope = np.gradient(truth) * rate_hz
     moved = float(slope @ slope)
     return InMotion(
         error=_rms(rate - truth),
-        delay_s=-float(apart @ slope) / moved if moved > 0.0 else np.nan,
-        angle=_rms(np.cumsum(apart) / rate_hz),
+        delay_s=-float(difference @ slope) / moved if moved > 0.0 else np.nan,
+        angle=_rms(np.cumsum(difference) / rate_hz),
     )
 
 
@@ -96,8 +96,8 @@ def _span_means(x: Floats, samples: int) -> Floats:
     if not count:
         return np.zeros(0)
     rows = x[: count * samples].reshape(count, samples)
-    there = np.isfinite(rows).sum(axis=1)
-    rows = rows[2 * there >= samples]
+    known_count = np.isfinite(rows).sum(axis=1)
+    rows = rows[2 * known_count >= samples]
     return np.nanmean(rows, axis=1) if len(rows) else np.zeros(0)
 
 

@@ -49,8 +49,7 @@ learned, and the rates are hardly changed.
 MAX_BIAS_RAD_S: Final = 0.35
 """Largest mean rate of a gyro at rest: 0.35 rad/s is 20 °/s."""
 MAX_GAP_INTERVALS: Final = 100_000
-"""Largest number of intervals predicted across a gap. After a longer gap the prediction holds no information in any
-case."""
+"""Largest number of intervals predicted across a gap. After a longer gap, the prediction holds no information."""
 
 BLOCK_NUMBER, COUNT, ORIGIN, SUM, SQUARES = range(5)
 """Columns of ``State.waiting``: number of the block, number of samples, origin of the sums, sum and sum of squares."""
@@ -81,7 +80,7 @@ class State(NamedTuple):
     samples: Floats  # [3] number of samples in these blocks
     table: Floats  # [rows, 2] gains of all filters
     first: Ints  # [filters + 1] first row of each filter in the table
-    verdicts: Ints  # [2, SLOTS] scratch: block numbers, and 1 if the block is in motion
+    decisions: Ints  # [2, SLOTS] scratch: block numbers, and 1 if the block is in motion
     episodes: Floats  # [SLOTS, 5] scratch, not used
 
 
@@ -313,7 +312,7 @@ def _initial_state(rate_hz: float, adapts: bool) -> State:
         samples=np.zeros(GYROS),
         table=table,
         first=first,
-        verdicts=np.zeros((2, SLOTS), np.int64),
+        decisions=np.zeros((2, SLOTS), np.int64),
         episodes=np.zeros((SLOTS, 5)),
     )
 
@@ -326,11 +325,11 @@ def _advance(values, index, size, s, out, outcomes):  # type: ignore[no-untyped-
     while i < n:
         number = (index + i) // size
         end = min(n, (number + 1) * size - index)
-        verdicts = motion_kernel.advance(
-            values[i:end], index + i, size, False, s.rest, s.verdicts[0], s.verdicts[1], s.episodes
+        decisions = motion_kernel.advance(
+            values[i:end], index + i, size, False, s.rest, s.decisions[0], s.decisions[1], s.episodes
         )
-        for v in range(verdicts[0]):
-            filled += _apply_rest_decision(s.verdicts[0, v], s.verdicts[1, v] > 0, s, outcomes[filled])
+        for v in range(decisions[0]):
+            filled += _apply_rest_decision(s.decisions[0, v], s.decisions[1, v] > 0, s, outcomes[filled])
         slot = number % SLOTS
         if s.waiting[slot, 0, BLOCK_NUMBER] != number:
             _begin_block(number, s.waiting[slot], s.sums[slot])

@@ -50,8 +50,11 @@ MIN_LEVEL_MEMORY, MAX_LEVEL_MEMORY = 40, 1000
 these limits."""
 
 X, P = 0, 3
+"""First columns of the state and of its covariance."""
 PHI1, PHI2, G1, VARIANCE, LEVEL = range(12, 17)
+"""Columns of the model: φ1, φ2, G1, variance of a, and variance of the steps of the level."""
 S, R, SCATTER, SCATTER_COUNT, COUNT, OUTLIER_RUN, LAST_OUTLIER, GUARD_LEFT, ADAPTIVE, IDENTIFIED = range(17, 27)
+"""Columns of the noise estimate, in the order of ROW_SIZE."""
 ROW_SIZE: Final = 27
 """Number of columns of a row.
 

@@ -58,29 +58,28 @@ def interval_means(values: Floats, temperature_c: Floats, rate_hz: float, interv
     length = max(round(interval_s * rate_hz), 1)
     n = values.size // length
     bias, error = _row_means(values[: n * length].reshape(n, length))
-    warmth, _ = _row_means(temperature_c[: n * length].reshape(n, length))
-    return Means(length / rate_hz, bias, error, warmth)
+    mean_temperature_c, _ = _row_means(temperature_c[: n * length].reshape(n, length))
+    return Means(length / rate_hz, bias, error, mean_temperature_c)
 
 
 def _row_means(rows: Floats) -> tuple[Floats, Floats]:
     """Return the mean [n] and the standard error [n] of each row [n, length]; NaN if fewer than MOSTLY are known."""
-    there = np.isfinite(rows)
-    count = there.sum(axis=1)
-    few = count < max(MOSTLY * rows.shape[1], 1.0)
-    origin = (
-        np.nanmedian(rows) if there.any() else 0.0
-    )  # subtracted to preserve the digits of a mean of 9.81 with noise of 1e-4
-    mean = origin + np.where(there, rows - origin, 0.0).sum(axis=1) / np.maximum(count, 1)
+    known_samples = np.isfinite(rows)
+    count = known_samples.sum(axis=1)
+    too_few = count < max(MOSTLY * rows.shape[1], 1.0)
+    # The origin is subtracted to preserve the digits of a mean of 9.81 with noise of 1e-4.
+    origin = np.nanmedian(rows) if known_samples.any() else 0.0
+    mean = origin + np.where(known_samples, rows - origin, 0.0).sum(axis=1) / np.maximum(count, 1)
     size = rows.shape[1] // PARTS
     error = np.full(count.size, np.nan)
     if size:
         shape = (count.size, PARTS, size)
-        inside = there[:, : PARTS * size].reshape(shape).sum(axis=2)
-        part = np.where(there, rows - mean[:, None], 0.0)[:, : PARTS * size].reshape(shape).sum(axis=2)
+        inside = known_samples[:, : PARTS * size].reshape(shape).sum(axis=2)
+        part = np.where(known_samples, rows - mean[:, None], 0.0)[:, : PARTS * size].reshape(shape).sum(axis=2)
         with np.errstate(invalid="ignore", divide="ignore"):
-            apart = np.diff(part / inside, axis=1)
-            both = np.isfinite(apart)
-            square = np.where(both, apart, 0.0) ** 2
+            differences = np.diff(part / inside, axis=1)
+            both = np.isfinite(differences)
+            square = np.where(both, differences, 0.0) ** 2
             error = np.sqrt(0.5 * square.sum(axis=1) / both.sum(axis=1) / PARTS)
-    mean[few], error[few] = np.nan, np.nan
+    mean[too_few], error[too_few] = np.nan, np.nan
     return mean, error

@@ -56,9 +56,8 @@ class LiveThermal:
 
     def update(self, samples: SampleBlock) -> list[ThermalLook]:
         """Return the intervals with a temperature that have ended with these samples."""
-        lost = (
-            samples.lost if self._has_temperature else 0
-        )  # samples missing before the first temperature belong to no interval
+        # Samples that are missing before the first temperature belong to no interval.
+        lost = samples.lost if self._has_temperature else 0
         self._has_temperature = self._has_temperature or bool(np.isfinite(samples.temperature_c).any())
         if not self._has_temperature:
             return []

@@ -58,12 +58,15 @@ class AxisThermal:
 
 @dataclass(frozen=True, slots=True)
 class _Row:
+    """Bias, standard error and temperature of one interval."""
+
     bias: float
     error: float
     temperature_c: float
 
     @property
     def known(self) -> bool:
+        """True if bias and temperature are both known."""
         return bool(np.isfinite(self.bias) and np.isfinite(self.temperature_c))
 
 

@@ -65,13 +65,11 @@ class Recursion:
         near = np.multiply.outer(
             np.exp([-LOG_TIME_CONSTANT_STEP, 0.0, LOG_TIME_CONSTANT_STEP]), np.asarray(shape.constants_s)
         )
-        self._decays = np.exp(
-            -model.interval_s / near
-        )  # [3, k] for slightly shorter, exact and slightly longer time constants
+        # [3, k] for slightly shorter, exact and slightly longer time constants
+        self._decays = np.exp(-model.interval_s / near)
         moved = [responses(Shape(0, tuple(one)), excess, model.interval_s, began=True)[-1, 1:] for one in near]
-        self._lags, self._initial_responses = np.hsplit(
-            np.array(moved).reshape(3, 2 * k), 2
-        )  # each [3, k], after the last interval
+        # each [3, k], after the last interval
+        self._lags, self._initial_responses = np.hsplit(np.array(moved).reshape(3, 2 * k), 2)
         self._excess = float(excess[-1])
         self._row, self._bias = rows[-1], float(means.bias[-1]) if means.known[-1] else np.nan
         white, z, _ = whitened(rows, np.where(means.known, means.bias, 0.0), means.known, model.phi)

@@ -52,16 +52,12 @@ class RunningMeans:
         size = length // PARTS
         self._length = length
         self._max_empty = longest
-        self._edges = [
-            *(size * k for k in range(1, PARTS)),
-            size * PARTS,
-            length,
-        ]  # the last edge ends the remainder, which belongs to no part
+        # The last edge ends the remainder of the interval, which belongs to no part.
+        self._edges = [*(size * k for k in range(1, PARTS)), size * PARTS, length]
         self._rows = np.empty((GATHERED, TEMPERATURE_COLUMN + 1))
         self._buffered = 0
-        self._origin = np.full(
-            TEMPERATURE_COLUMN + 1, np.nan
-        )  # subtracted to preserve the digits of a mean of 9.81 with noise of 1e-4
+        # The origin is subtracted to preserve the digits of a mean of 9.81 with noise of 1e-4.
+        self._origin = np.full(TEMPERATURE_COLUMN + 1, np.nan)
         self._end = 0  # end of the last finished interval, in samples
         self._begin()
 
@@ -77,7 +73,7 @@ class RunningMeans:
         lost : int
             Number of samples that are missing before the first row.
         """
-        over = self._skip_missing(lost) if lost else []
+        finished = self._skip_missing(lost) if lost else []
         at = 0
         while at < len(values):
             count = min(len(values) - at, GATHERED - self._buffered, self._edges[self._part] - self._position)
@@ -86,8 +82,8 @@ class RunningMeans:
             self._rows[rows, TEMPERATURE_COLUMN] = temperature_c[at : at + count]
             self._buffered += count
             at += count
-            over += self._advance(count)
-        return over
+            finished += self._advance(count)
+        return finished
 
     def forget(self) -> None:
         """Discard the axes of the current interval, but keep its temperature."""
@@ -127,33 +123,35 @@ class RunningMeans:
 
     def _skip_missing(self, lost: int) -> list[Interval]:
         """Advance over missing samples, and return the intervals that have ended."""
-        over: list[Interval] = []
+        finished: list[Interval] = []
         while lost and self._position:
             count = min(lost, self._edges[self._part] - self._position)
             lost -= count
             if self._buffered:
                 self._sum_buffer()
-            over += self._advance(count)
+            finished += self._advance(count)
         if not lost:
-            return over
+            return finished
         whole, self._position = divmod(lost, self._length)
         nothing = np.full(TEMPERATURE_COLUMN, np.nan)
         for left in range(min(whole, self._max_empty) - 1, -1, -1):
-            over.append(Interval(nothing, nothing, np.nan, self._end + (whole - left) * self._length))
+            finished.append(Interval(nothing, nothing, np.nan, self._end + (whole - left) * self._length))
         self._end += whole * self._length
         while self._part < PARTS and self._position >= self._edges[self._part]:
             self._part += 1
-        return over
+        return finished
 
     def _interval(self) -> Interval:
         """Return the means and standard errors of the interval that has just ended."""
         count = self._count.sum(axis=0)
-        few = count < max(MOSTLY * self._length, 1.0)
+        too_few = count < max(MOSTLY * self._length, 1.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = self._origin + self._sum.sum(axis=0) / count
-            apart = np.diff(self._sum[:PARTS, :TEMPERATURE_COLUMN] / self._count[:PARTS, :TEMPERATURE_COLUMN], axis=0)
-            both = np.isfinite(apart)
-            square = np.where(both, apart, 0.0) ** 2
+            differences = np.diff(
+                self._sum[:PARTS, :TEMPERATURE_COLUMN] / self._count[:PARTS, :TEMPERATURE_COLUMN], axis=0
+            )
+            both = np.isfinite(differences)
+            square = np.where(both, differences, 0.0) ** 2
             error = np.sqrt(0.5 * square.sum(axis=0) / both.sum(axis=0) / PARTS)
-        mean[few], error[few[:TEMPERATURE_COLUMN]] = np.nan, np.nan
+        mean[too_few], error[too_few[:TEMPERATURE_COLUMN]] = np.nan, np.nan
         return Interval(mean[:TEMPERATURE_COLUMN], error, float(mean[TEMPERATURE_COLUMN]), self._end)

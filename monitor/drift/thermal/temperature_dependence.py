@@ -389,8 +389,8 @@ def _loop_width(bias: Floats, x: Floats, direction: Floats) -> float:
             inside = (grid >= x[order[0]]) & (grid <= x[order[-1]])
             legs[float(direction[leg[0]])].append(np.where(inside, np.interp(grid, x[order], bias[order]), np.nan))
     rising, falling = (_mean_of_legs(each, grid.size) for each in (legs[1.0], legs[-1.0]))
-    apart = np.abs(rising - falling)
-    return float(np.nanmax(apart)) if np.isfinite(apart).any() else 0.0
+    difference = np.abs(rising - falling)
+    return float(np.nanmax(difference)) if np.isfinite(difference).any() else 0.0
 
 
 def _mean_of_legs(legs: list[Floats], n: int) -> Floats:

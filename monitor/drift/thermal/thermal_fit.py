@@ -197,9 +197,13 @@ def check(means: Means) -> None:
             f"{count} intervals of {means.interval_s:g} s with bias and temperature; {MIN_INTERVALS} are the least "
             f"that anything can be said of: record longer, or take a shorter interval"
         )
-    warmth = means.temperature_c[means.known]
-    swing = float(np.ptp(warmth))
-    noise = float(np.median(np.abs(np.diff(warmth, 2)))) / 6.0**0.5 / 0.6745 if warmth.size > 2 else 0.0
+    known_temperature_c = means.temperature_c[means.known]
+    swing = float(np.ptp(known_temperature_c))
+    noise = (
+        float(np.median(np.abs(np.diff(known_temperature_c, 2)))) / 6.0**0.5 / 0.6745
+        if known_temperature_c.size > 2
+        else 0.0
+    )
     least = max(MIN_SWING_C, MIN_SWING_SIGMAS * noise)
     if swing < least:
         raise NotReady(
@@ -375,8 +379,8 @@ def _cross_validated_error(means: Means, excess: Floats, one: _ShapeFit) -> floa
         used[lo:hi] = False
         columns = one.columns if lo else responses(one.shape, excess, means.interval_s)
         x, z, _ = whitened(columns, np.where(used, means.bias, 0.0), used, one.phi)
-        apart = (means.bias - columns @ solved(x, z))[lo:hi]
-        square += float((apart[means.known[lo:hi]] ** 2).sum())
+        differences = (means.bias - columns @ solved(x, z))[lo:hi]
+        square += float((differences[means.known[lo:hi]] ** 2).sum())
     return float((square / means.known.sum()) ** 0.5)
 
 

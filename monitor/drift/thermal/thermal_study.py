@@ -87,16 +87,16 @@ def judge(model: ThermalModel, means: Means) -> Judged:
         Interval means of bias (rad/s or m/s²) and temperature (°C).
     """
     multi, known = predicted(model, means.temperature_c), means.known
-    apart = means.bias - multi.bias
-    offset = float(apart[known].mean())
+    residual = means.bias - multi.bias
+    offset = float(residual[known].mean())
     one = predicted(model, means.temperature_c, means.bias - offset)
     inside = (means.bias >= multi.lo) & (means.bias <= multi.hi)
     return Judged(
         multi,
         Prediction(one.bias + offset, one.lo + offset, one.hi + offset),
         offset,
-        _rms(apart[known]),
-        _rms(apart[known] - offset),
+        _rms(residual[known]),
+        _rms(residual[known] - offset),
         _rms((means.bias - offset - one.bias)[known]),
         _rms(means.bias[known] - means.bias[known].mean()),
         float(inside[known].mean()),

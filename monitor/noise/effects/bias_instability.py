@@ -39,6 +39,7 @@ MAX_SAMPLED_FACTOR: Final = 128
 continuous form by less than 1e-4."""
 
 _MIDPOINT_COUNT: Final = 8192
+"""Points of the midpoint rule."""
 
 
 @dataclass(frozen=True, slots=True)

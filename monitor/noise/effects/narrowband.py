@@ -40,6 +40,7 @@ class Narrowband(Source):
 
     @property
     def _decay(self) -> complex:
+        """Return 1/T_c − iω of the complex process, 1/s."""
         return pi * self.bandwidth - 2j * pi * self.frequency
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:

@@ -31,6 +31,7 @@ class PoissonSteps(Source):
 
     @property
     def _equivalent_random_walk(self) -> RateRandomWalk:
+        """Return the rate random walk with the same second moments."""
         return RateRandomWalk(K=self.rate**0.5 * self.height)
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
