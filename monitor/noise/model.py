@@ -77,13 +77,14 @@ class NoiseModel:
             raise ConfigError(f"sample_rate_error: a recording has one clock, but ratio is {given}")
 
     def __iter__(self) -> Iterator[tuple[str, Effect]]:
-        """(axis, effect) of each effect, in the order of the axes."""
+        """Yield axis and effect of each effect, in the order of the axes."""
         for axis in AXES:
             for effect in self.effects.get(axis, ()):
                 yield axis, effect
 
     def __add__(self, other: "NoiseModel") -> "NoiseModel":
-        """All effects of both; sample rate and temperature of the first that has one."""
+        """Return a model with the effects of both. Sample rate and temperature come from the first
+        model that has them."""
         if not isinstance(other, NoiseModel):
             return NotImplemented
         added = {

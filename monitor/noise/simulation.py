@@ -65,7 +65,7 @@ class ModelStream:
         self._rate_hz = rate_hz
         self._true_hz = rate_hz * model.rate_ratio
         self._seed = seed
-        self._count = 0  # samples drawn so far
+        self._count = 0  # number of samples drawn so far
         self._occurrences: Counter[tuple[str, str]] = Counter()
         self._truths: list[tuple[str, Effect, Series | Running]] = []
         self._temperature = self._temperature_series(temperature_c)
@@ -179,7 +179,7 @@ class _AxisSimulator:
     def __init__(self) -> None:
         self.white: list[Series] = []
         self.others: list[Series] = []
-        self.steps: list[tuple[int, float]] = []  # first sample, ratio
+        self.steps: list[tuple[int, float]] = []  # (index of the first sample, ratio)
         self.leaks: list[Leak] = []
         self.leaks_out = False
         self._chain: list[tuple[int, Running]] = []  # (position in ORDER, transform), sorted

@@ -65,7 +65,7 @@ class Arma:
 
     phi: tuple[float, float]  # φ1 and φ2; 0 for coefficients that the order does not have
     theta: float
-    variance: float  # of a, (rad/s)²
+    variance: float  # variance of a, (rad/s)²
     mean: float = 0.0  # μ, rad/s
     white: float = 0.0  # variance of v, (rad/s)²
     order: Order = (2, 1)
@@ -370,7 +370,7 @@ def _profile_likelihood(
             u[order[0]] = atanh(value)
         elif order[0] == 1 or which == 1:
             u[which] = atanh(value)
-        else:  # φ1 = r1 (1 − φ2): |φ1| < 1 − φ2
+        else:  # φ1 = r1 (1 − φ2), so |φ1| < 1 − φ2
             highest = 1.0 - abs(value)
             phi2 = (
                 -MAX_PARTIAL_AUTOCORRELATION

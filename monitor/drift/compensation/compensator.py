@@ -260,7 +260,7 @@ class Compensator:
             except NotReady:  # The means are all equal or too few. The identification is repeated later.
                 self.adopt(axis, None)
 
-    # --- inside
+    # --- results of intervals
 
     def _history(self, axis: int) -> tuple[Floats, Floats]:
         """Return the remembered means and their scatter, oldest first."""

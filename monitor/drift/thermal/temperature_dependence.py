@@ -39,7 +39,7 @@ MAIN_SHARE: Final = 0.5
 MAX_MEANS: Final = 150
 """Largest number of means. More are averaged in groups, because the cost of the test grows with their cube."""
 MIN_FREE: Final = 4
-"""Degrees of freedom that a regression must leave."""
+"""Smallest number of degrees of freedom that a regression must leave."""
 MAX_LIKELIHOOD_LOSS: Final = 2.0
 """Largest difference of the log restricted likelihood to the best noise model, for a plausible noise model."""
 WALK_RATIOS: Final = (0.0, *np.geomspace(1e-3, 1e3, 9).tolist())
@@ -57,13 +57,13 @@ PLAY_WIDTHS: Final = (0.05, 0.1, 0.2, 0.35)
 LOOP_POWERS: Final = 4
 """Number of terms of the difference between heating and cooling."""
 FOLDS: Final = 6
-"""Parts of the means for cross-validation; successive means belong to different parts."""
+"""Parts of the means for cross-validation. Successive means belong to different parts."""
 MIN_NEW_SHARE: Final = 1e-4
 """Smallest part of a regressor that the other regressors must leave unexplained. A regressor with less is dropped."""
 CURVE_ORDER: Final = 3
-"""Orders of the polynomial in temperature, for the test of dependence and the test of hysteresis."""
+"""Order of the polynomial in temperature for the test of dependence."""
 HYSTERESIS_CURVE_ORDER: Final = 5
-"""Orders of the polynomial in temperature."""
+"""Order of the polynomial in temperature for the test of hysteresis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class TemperatureDependence:
 class Hysteresis:
     """Difference of the bias between heating and cooling."""
 
-    size: float  # largest difference of the bias at one temperature, a drift in between included; rad/s or m/s²
+    size: float  # largest difference of the bias at one temperature, including a drift in between; rad/s or m/s²
     p_value: float  # p-value of the hypothesis of no difference
 
     @property
@@ -99,9 +99,9 @@ class Hysteresis:
 class _Regression:
     """F test of one set of regressors."""
 
-    p_value: float  # the largest among the plausible noise models
+    p_value: float  # largest p-value among the plausible noise models
     likelihood: float  # logarithm, for the most likely noise model; comparable between regressions of the same means
-    smooth: Floats  # [m] the known means less their estimated white noise
+    smooth: Floats  # [m] known means minus their estimated white noise
     noise: tuple[float, float]  # ratio and correlation of the most likely noise model
 
 
@@ -202,11 +202,11 @@ def find_hysteresis(means: Means) -> Hysteresis | None:
         return None
     curve, loops = _polynomial(x, HYSTERESIS_CURVE_ORDER), _hysteresis_regressors(x, direction)
     drifting = np.hstack([_linear_drift(x.size), curve])
-    # one lag or one play operator leaves more degrees of freedom than a sum of four, which counts with few means
+    # A single lag or play operator leaves more degrees of freedom than a sum of four. This matters with few means.
     parts = [loops[name][:, [at]] for name in ("lag", "play") for at in range(loops[name].shape[1])]
     tests = [_regression(pooled.bias, drifting, each, pooled.known) for each in (*loops.values(), *parts)]
     p_values = [one.p_value for one in tests if one is not None]
-    # within one cycle a drift and a loop are nearly collinear, so the size is that of a fit without a drift
+    # Within one cycle, a drift and a loop are nearly collinear, so the size is taken from a fit without a drift.
     fits = [_regression(pooled.bias, curve, each, pooled.known) for each in (*loops.values(), *parts)]
     best = max((one for one in fits if one is not None), key=lambda one: one.likelihood, default=None)
     if not p_values or best is None:
@@ -305,7 +305,7 @@ def _regression(y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray) 
     diagonal = np.abs(triangles[:, np.arange(terms), np.arange(terms)])
     likelihood = -0.5 * (free * np.log(left) + log_determinants) - np.log(np.maximum(diagonal, 1e-300)).sum(axis=1)
     unexplained = left / (left + gained)
-    # of F = gained / (terms - at) / (left / free)
+    # p-value of F = gained / (terms - at) / (left / free)
     p_values = incomplete_beta(0.5 * free, 0.5 * (terms - at), unexplained)
     best = int(likelihood.argmax())
     plausible = likelihood >= likelihood[best] - MAX_LIKELIHOOD_LOSS

@@ -56,11 +56,10 @@ MAX_ERROR_RATIO: Final = 1.05
 """Largest cross-validated error of an accepted form, relative to the error of a constant. The value above one allows
 for chance."""
 LAG_AICC_MARGIN: Final = 6.0
-"""Margins in AICc that a lag, and a power beyond the third, must gain. With few means, noise sometimes looks like
-either, and a wrong choice causes large errors."""
+"""Margin in AICc that a lag must gain. With few means, noise sometimes looks like a lag, and a wrong choice causes
+large errors."""
 CURVE_AICC_MARGIN: Final = 10.0
-"""AICc by which a lag, and a power beyond the third, have to win: of so few means noise looks like either now and then,
-and both are wrong by much where they are."""
+"""Margin in AICc that a power beyond the third must gain, for the same reason."""
 MIN_SWING_C: Final = 0.1
 """Smallest range of temperature for a fit, °C."""
 MIN_SWING_SIGMAS: Final = 5.0
@@ -93,8 +92,8 @@ class ThermalFit:
     aicc: float  # only differences between fits of the same means are meaningful
     step: float = 0.0  # step of the offset (after minus before), if one was fitted; rad/s or m/s²
     hysteresis: float | None = None  # largest difference between heating and cooling at one temperature, rad/s or m/s²;
-    # 0 if noise explains the difference; None if temperature went one way, or if the test was not made
-    hysteresis_p: float | None = None  # p-value of no difference between heating and cooling
+    # 0 if noise explains the difference; None if temperature moved in one direction only, or if there was no test
+    hysteresis_p: float | None = None  # p-value of the hypothesis of no difference between heating and cooling
 
 
 T = TypeVar("T")
@@ -174,8 +173,8 @@ class _ShapeFit:
     """Least-squares fit of one form of the model."""
 
     shape: Shape
-    columns: Floats  # [n, terms + k]
-    sizes: Floats  # [terms + k]
+    columns: Floats  # [n, terms + k] regressors
+    sizes: Floats  # [terms + k] coefficients
     phi: float
     sigma: float
     rms: float

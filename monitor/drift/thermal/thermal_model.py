@@ -68,7 +68,7 @@ class Prediction:
     """Predicted mean of each interval."""
 
     bias: Floats  # [n] rad/s or m/s²
-    lo: Floats  # [n] 95 % interval of the mean that is measured
+    lo: Floats  # [n] 95 % prediction interval of the measured mean
     hi: Floats  # [n]
 
 

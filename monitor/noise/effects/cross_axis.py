@@ -9,7 +9,7 @@ from monitor.noise.effect import GYROS, Leak, parameter, source_axis
 
 @dataclass(frozen=True, slots=True)
 class CrossAxis(Leak):
-    """y += c·x, where x is the measurement of the axis ``source`` without leaks (IEEE Std 1293: cross-axis
+    """Leak y += c·x, where x is the measurement of the axis ``source`` without leaks (IEEE Std 1293: cross-axis
     sensitivity).
 
     >>> CrossAxis(source="gx", coefficient=0.02).check_axis("gx")

@@ -15,8 +15,10 @@ from monitor.noise.effect import Block, Series, Source, parameter
 class ExponentiallyCorrelated(Source):
     """Markov noise of IEEE Std 952 annex C for samples: autocovariance σ²φ^|n|, φ = exp(−τ0/T_c).
 
-    σ²(τ) = σ²(1 − φ²)[n − 3φ − nφ² + 4φ^(n+1) − φ^(2n+1)] / [n²(1 − φ)²(1 − φ²)] with n = τ/τ0,
-    S(f) = σ²τ0(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²).
+    The closed forms, with n = τ/τ0, are:
+
+        σ²(τ) = σ²(1 − φ²)[n − 3φ − nφ² + 4φ^(n+1) − φ^(2n+1)] / [n²(1 − φ)²(1 − φ²)]
+        S(f) = σ²τ0(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²)
 
     >>> noise = ExponentiallyCorrelated(sigma=1.0, correlation_time=10.0)
     >>> print(f"{noise.avar(np.array([18.9]), 1e-3)[0]:.3f}")

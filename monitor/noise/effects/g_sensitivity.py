@@ -9,8 +9,9 @@ from monitor.noise.effect import ACCELEROMETERS, GYROS, Leak, parameter, source_
 
 @dataclass(frozen=True, slots=True)
 class GSensitivity(Leak):
-    """ω += c·a, where a is the measurement of the accelerometer ``source`` without leaks (IEEE Std 952: g-sensitive
-    drift).
+    """Leak of acceleration ω += c·a (IEEE Std 952: g-sensitive drift).
+
+    a is the measurement of the accelerometer ``source`` without leaks.
 
     >>> GSensitivity(source="az", coefficient=1e-5).check_axis("ax")
     Traceback (most recent call last):

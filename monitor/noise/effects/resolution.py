@@ -16,7 +16,7 @@ below exp(−2π²·0.6²) = 8·10⁻⁴."""
 
 @dataclass(frozen=True, slots=True)
 class Resolution(Transform):
-    """y = x rounded to whole steps.
+    """Rounding to whole steps.
 
     If neighbouring samples differ by more than a step, rounding adds independent errors of variance step²/12 (Widrow &
     Kollár, Quantization Noise, 2008): S(f) + step²τ0/12, σ²(τ) + step²τ0/(12τ). This requires an Allan deviation at τ0

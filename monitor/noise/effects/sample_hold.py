@@ -13,7 +13,7 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class SampleHold(Transform):
-    """Each sample repeats, with probability h, the sample before.
+    """Random repetition of samples: each sample repeats, with probability h, the sample before.
 
     The age of the value that is read has a geometric distribution. On average, the output is the input through G = (1 −
     h)/(1 − h/z). The remainder is noise whose correlation decays as hⁿ. With V the mean square of (1 − |G|²) S,

@@ -17,7 +17,7 @@ NOISE_SIGMAS: Final = 6.0
 
 @dataclass(frozen=True, slots=True)
 class Saturation(Transform):
-    """y = x clipped at ± limit.
+    """Clipping at the range: y = x clipped at ± limit.
 
     If level, lines and six standard deviations of the noise of an hour stay within the range, nothing is clipped.
     Spectrum and Allan variance are then unchanged. Otherwise there is no closed form, and they are NaN.

@@ -12,7 +12,7 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class ScaleFactor(Transform):
-    """y = f·x: σ²(τ) and S(f) of the axis times f² (IEEE Std 952, scale factor).
+    """Factor on the measurement of the axis, y = f·x: σ²(τ) and S(f) times f² (IEEE Std 952, scale factor).
 
     >>> from monitor.noise.spectrum import white
     >>> float(ScaleFactor(factor=2.0).reshape(white(1.0, 0.01)).allan(np.array([0.01]))[0])

@@ -18,10 +18,11 @@ error."""
 
 @dataclass(frozen=True, slots=True)
 class Sinusoidal(Source):
-    """A sin(2πft + φ), IEEE Std 952 annex C, for samples: σ²(τ) = A² sin⁴(πfτ)/(m² sin²(πfτ0)), m = τ/τ0.
+    """Sinusoid A sin(2πft + φ) of IEEE Std 952 annex C.
 
-    The textbook form A² sin⁴(πfτ)/(πfτ)² is its limit for τ0 → 0. The spectrum is a line of A²/4 at ±f and has no
-    density. If the phase is absent, it is drawn at random from the seed.
+    For samples, σ²(τ) = A² sin⁴(πfτ)/(m² sin²(πfτ0)), m = τ/τ0. The textbook form A² sin⁴(πfτ)/(πfτ)² is its limit for
+    τ0 → 0. The spectrum is a line of A²/4 at ±f and has no density. If the phase is absent, it is drawn at random from
+    the seed.
 
     >>> line = Sinusoidal(amplitude=1.0, frequency=25.0)
     >>> [round(float(x), 6) for x in line.avar(np.array([0.01, 0.02, 0.04]), 0.01)]

@@ -11,7 +11,7 @@ from monitor.noise.effect import Block, Series, Source, parameter
 
 @dataclass(frozen=True, slots=True)
 class TemperatureBias(Source):
-    """b = c (T − T_r) + q (T − T_r)²: the polynomial of the error model of IEEE Std 952, to second order.
+    """Polynomial of second order in temperature, as in the error model of IEEE Std 952: b = c (T − T_r) + q (T − T_r)².
 
     Its Allan variance and spectrum depend on the temperature, which the effect does not contain. They are NaN.
 

@@ -13,10 +13,11 @@ from monitor.noise.effect import Block, Series, Source, parameter
 
 @dataclass(frozen=True, slots=True)
 class TemperatureLag(Source):
-    """b = c (T_l − T_r), where T_l follows the measured T by dT_l/dt = (T − T_l)/τ (Newton's law of cooling).
+    """Bias that follows temperature with a first-order lag (Newton's law of cooling): b = c (T_l − T_r), dT_l/dt = (T −
+    T_l)/τ.
 
-    The part that causes the bias is assumed to have the first temperature when the series begins. The temperature is
-    constant between samples. Allan variance and spectrum depend on the temperature and are NaN.
+    T_l is the lagged temperature. It starts at the first temperature of the series. The temperature is constant between
+    samples. Allan variance and spectrum depend on the temperature and are NaN.
 
     >>> lag = TemperatureLag(coefficient=1e-4, reference=25.0, time_constant=60.0)
     >>> bool(np.isnan(lag.avar(np.array([1.0]), 0.01)[0]))

@@ -13,7 +13,7 @@ from monitor.noise.effect import Block, Series, Source, parameter
 
 @dataclass(frozen=True, slots=True)
 class TurnOnTransient(Source):
-    """A exp(−t/τ) from the first sample on: the warm-up term of the drift model of IEEE Std 952.
+    """Exponential transient A exp(−t/τ) from the first sample on: the warm-up term of the drift model of IEEE Std 952.
 
     The transient occurs once. Its Allan variance and spectrum therefore depend on the length of the recording and are
     NaN.
