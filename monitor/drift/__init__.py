@@ -1,1 +1,1 @@
-"""What the bias does, and taking it out: bias against temperature, drift compensated while the carrier may move."""
+"""Drift of the bias: models of bias against temperature, and compensation of gyro drift while the carrier moves."""

@@ -1,1 +1,1 @@
-"""What an IMU's noise is: effects with their Allan variance, spectrum and time series."""
+"""Noise models of an IMU: effects with their Allan variance, spectrum and time series."""

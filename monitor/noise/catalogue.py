@@ -1,4 +1,4 @@
-"""Noise models by name: one of the shipped catalogue in ``config/models``, or a file of one's own."""
+"""Noise models by name: from the catalogue in ``config/models``, or from a user's file."""
 
 from pathlib import Path
 
@@ -9,10 +9,12 @@ from monitor.settings.loading import model_path
 
 
 def read_model(path: Path) -> NoiseModel:
-    """The model in a file.
+    """Return the model in a file.
 
-    Raises:
-        ConfigError: one line: the file, the place in it, what is wrong
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read or is not valid. Each line names the file and the place in it.
     """
     try:
         return NoiseModel.from_toml(file_access.read(path).decode("utf-8"))
@@ -25,9 +27,18 @@ def read_model(path: Path) -> NoiseModel:
 
 
 def load(name: str, folder: Path) -> NoiseModel:
-    """The model of that name in the catalogue, or in that file; relative paths begin at ``folder``.
+    """Return a model of the catalogue by its name, or the model in a file.
 
-    Raises:
-        ConfigError: there is none, with the nearest name; or what is wrong with it
+    Parameters
+    ----------
+    name : str
+        Name in the catalogue, or path of a file.
+    folder : Path
+        Folder at which relative paths begin.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such model, or if it is not valid.
     """
     return read_model(model_path(name, folder))

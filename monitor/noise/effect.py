@@ -1,16 +1,19 @@
-"""What an effect of an IMU's noise is: a frozen dataclass of parameters with units, and the physics in one place.
+"""Base classes of the effects of a noise model: frozen dataclasses of parameters with units, with the physics in one
+place.
 
-Four kinds. A ``Source`` adds to the rate of its axis; it answers for the sampled series it simulates, so that fit,
-simulator and comparison share one physics: ``avar`` is the overlapping Allan variance of samples ``tau0_s`` apart,
-``psd`` their two-sided spectrum up to half the sample rate. A ``Leak`` adds what another axis measures. ``NoiseStep``
-changes the size of white noise. A ``Transform`` acts on the sum; ``monitor.noise.effects.ORDER`` says in which order.
+There are four kinds of effects. A ``Source`` adds to the rate of its axis. Its ``avar`` and ``psd`` describe the
+sampled series that it simulates, so that fit, simulation and comparison use the same physics. ``avar`` is the
+overlapping Allan variance of samples ``tau0_s`` apart, and ``psd`` is their two-sided spectrum up to half the sample
+rate. A ``Leak`` adds a share of the measurement of another axis. ``NoiseStep`` changes the size of white noise. A
+``Transform`` acts on the sum, in the order of ``monitor.noise.effects.ORDER``.
 
-``start`` begins an endless series: a ``Series`` adds its next samples to a block, a ``Running`` transform changes a
-block in place. Both depend on their random generator and on the index of the sample only, never on how the series is
-cut into blocks, and their memory does not grow. ``truth`` says what was drawn that the parameters do not say.
+``start`` begins an endless series. A ``Series`` adds its next samples to a block, and a ``Running`` transform changes a
+block in place. Both depend only on their random generator and on the index of the sample, not on how the series is
+divided into blocks. Their memory does not grow. ``truth`` returns the randomly drawn values that the parameters do not
+contain.
 
-Where a variance depends on more than the model (the length of the recording, the temperature) it is NaN, not a guess.
-No effect opens anything, reads a clock or keeps global random state.
+If a variance depends on more than the model, such as the length of the recording or the temperature, it is NaN. No
+effect does I/O, reads a clock or keeps global random state.
 """
 
 from abc import ABC, abstractmethod
@@ -28,77 +31,95 @@ from drivers.sample import AXES, Floats
 from monitor.noise.spectrum import Spectrum
 
 QUANTITIES: Final = {"s": DELAY_S, "Hz": EFFECT_FREQUENCY_HZ, "1/s": EFFECT_FREQUENCY_HZ}
-"""Unit of a parameter -> its quantity; PARAMETER for all others."""
-MOST_EVENTS: Final = 1000.0
-"""Random events in a sample at the most, on average; each takes time and memory."""
+"""Unit of a parameter -> its quantity. All other parameters use PARAMETER."""
+MAX_EVENTS_PER_SAMPLE: Final = 1000.0
+"""Largest mean number of random events per sample. Each event takes time and memory."""
 GYROS, ACCELEROMETERS = AXES[:3], AXES[3:]
 
 
 @dataclass(slots=True)
 class Block:
-    """The samples that are being made."""
+    """Block of samples that is being simulated."""
 
-    first: int  # index of the first sample since the stream began
-    temperature_c: Floats  # [n] °C; NaN = the model has none
-    scratch: Floats  # [n] anyone's, until their call returns
+    first: int  # index of the first sample, counted from the start of the stream
+    temperature_c: Floats  # [n] °C; NaN if the model has no temperature
+    scratch: Floats  # [n] work array, free for use during a call
 
 
 class Series(ABC):
-    """A time series that goes on for as long as it is asked."""
+    """Endless time series of a source."""
 
     @abstractmethod
     def add(self, values: Floats, block: Block) -> None:
-        """Add the next ``values.size`` samples (at least one), in the unit of the axis."""
+        """Add the next ``values.size`` samples (at least one) to the values, in the unit of the axis.
+
+        Parameters
+        ----------
+        values : ndarray, shape (n,), float64
+            Sum of the sources of the axis. It is updated in place.
+        block : Block
+            Index, temperature and work array of the block.
+        """
 
     def draw(self, n: int, first: int = 0) -> Floats:
-        """The next ``n`` samples by themselves, the first of them the stream's sample ``first``; no temperature."""
+        """Return the next samples of this series alone, without a temperature.
+
+        Parameters
+        ----------
+        n : int
+            Number of samples.
+        first : int
+            Index of the first sample, counted from the start of the stream.
+        """
         values = np.zeros(n)
         if n:
             self.add(values, Block(first, np.full(n, np.nan), np.empty(n)))
         return values
 
     def truth(self) -> dict[str, Any]:
-        """What was drawn from the seed so far and the parameters do not say; nothing for plain noise."""
+        """Return the randomly drawn values so far that the parameters do not contain; empty for plain noise."""
         return {}
 
 
 class Running(ABC):
-    """A transform at work on one axis."""
+    """Transform that runs on one axis."""
 
     @abstractmethod
     def apply(self, values: Floats) -> None:
-        """Transform the next ``values.size`` samples in place."""
+        """Transform the next values [n] in place."""
 
     def truth(self) -> dict[str, Any]:
-        """What was drawn from the seed so far and the parameters do not say."""
+        """Return the randomly drawn values so far that the parameters do not contain."""
         return {}
 
 
 class Effect(ABC):
-    """One named effect on one axis.
+    """Named effect on one axis.
 
-    Raises:
-        ConfigError: a parameter is no finite number or outside what its field allows
+    Raises
+    ------
+    ConfigError
+        If a parameter is not a finite number, or outside the range of its field.
     """
 
     __slots__ = ()
 
     name: ClassVar[str]
-    means: ClassVar[str]  # one sentence for people
+    means: ClassVar[str]  # one sentence that explains the effect to users
 
     def __post_init__(self) -> None:
         for f in fields(self):  # type: ignore[arg-type]
-            _check(self.name, f.name, getattr(self, f.name), f.metadata)
+            _check_parameter(self.name, f.name, getattr(self, f.name), f.metadata)
 
     def check_axis(self, axis: str) -> None:  # noqa: B027 - most effects may be on any axis
-        """ConfigError when the effect cannot be on that axis."""
+        """Raise ConfigError if the effect cannot be on that axis."""
 
     def check_rate(self, rate_hz: float) -> None:  # noqa: B027 - most effects have no frequency
-        """ConfigError when samples at that rate cannot show the effect."""
+        """Raise ConfigError if samples at ``rate_hz`` cannot show the effect."""
 
 
 class Source(Effect):
-    """Adds to the rate."""
+    """Effect that adds to the rate."""
 
     __slots__ = ()
 
@@ -106,26 +127,51 @@ class Source(Effect):
 
     @abstractmethod
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """Allan variance (unit² of the axis) at averaging times ``tau_s`` of samples ``tau0_s`` apart."""
+        """Return the overlapping Allan variance in the squared unit of the axis.
+
+        Parameters
+        ----------
+        tau_s : ndarray, float64
+            Averaging times, s.
+        tau0_s : float
+            Sample interval, s.
+        """
 
     @abstractmethod
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """Two-sided spectral density, unit²/Hz, for 0 < f ≤ 1/(2 τ0); a line or a slope has none."""
+        """Return the two-sided spectral density in unit²/Hz; zero for a spectral line or a slope.
+
+        Parameters
+        ----------
+        f_hz : ndarray, float64
+            Frequencies, 0 < f ≤ 1/(2 τ0), Hz.
+        tau0_s : float
+            Sample interval, s.
+        """
 
     @abstractmethod
     def start(self, rate_hz: float, rng: np.random.Generator) -> Series:
-        """Begin a series sampled at ``rate_hz``."""
+        """Return a new series.
+
+        Parameters
+        ----------
+        rate_hz : float
+            True sample rate, Hz.
+        rng : numpy.random.Generator
+            Generator of this effect alone.
+        """
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Density, lines and slope together, as transforms take them."""
+        """Return density, lines and slope in the form that transforms use; ``tau0_s`` is the sample interval in
+        seconds."""
         return Spectrum(lambda f: self.psd(f, tau0_s), lambda tau: self.avar(tau, tau0_s), tau0_s)
 
 
 class Leak(Effect):
-    """Adds ``coefficient`` times what the axis ``source`` measures.
+    """Effect that adds ``coefficient`` times the measurement of the axis ``source``.
 
-    What leaks is the source axis as it would read by itself: its own sources through its own transforms, before
-    anything leaked into it. Axes that leak into each other therefore need no order, and nothing goes round in circles.
+    The measurement of the source axis consists of its own sources through its own transforms, without leaks into it.
+    Axes that leak into each other therefore need no order, and there is no circular dependence.
     """
 
     __slots__ = ()
@@ -135,17 +181,26 @@ class Leak(Effect):
 
 
 class Transform(Effect):
-    """Acts on all that stands before it."""
+    """Effect that acts on the sum of all sources and leaks, after the transforms that precede it."""
 
     __slots__ = ()
 
     @abstractmethod
     def reshape(self, spectrum: Spectrum) -> Spectrum:
-        """Spectrum and Allan variance after it; NaN where there is no closed form and no integral."""
+        """Return the spectrum and Allan variance after the transform; NaN if there is neither a closed form nor an
+        integral."""
 
     @abstractmethod
     def start(self, rate_hz: float, rng: np.random.Generator) -> Running:
-        """Begin to act on samples at ``rate_hz``."""
+        """Return a new running transform.
+
+        Parameters
+        ----------
+        rate_hz : float
+            True sample rate, Hz.
+        rng : numpy.random.Generator
+            Generator of this effect alone.
+        """
 
 
 def parameter(
@@ -158,15 +213,22 @@ def parameter(
     optional: bool = False,
     most: float = inf,
 ) -> Any:
-    """A dataclass field with its units on the two kinds of axes, and what it may be: by default a number ≥ 0.
+    """Return a dataclass field with its units and its allowed range. The default range is all numbers ≥ 0.
 
-    Args:
-        gyro_unit, accelerometer_unit: SI; "1" for a bare number
-        signed: negative values too
-        positive: not zero
-        whole: no fraction
-        optional: may be absent (None)
-        most: not above this
+    Parameters
+    ----------
+    gyro_unit, accelerometer_unit : str
+        SI units on the two kinds of axes; "1" for a dimensionless number.
+    signed : bool
+        True if negative values are allowed.
+    positive : bool
+        True if zero is not allowed.
+    whole : bool
+        True if only whole numbers are allowed.
+    optional : bool
+        True if the parameter may be absent (None).
+    most : float
+        Largest allowed value.
     """
     metadata = {
         "units": (gyro_unit, accelerometer_unit),
@@ -180,22 +242,37 @@ def parameter(
 
 
 def source_axis() -> Any:
-    """A dataclass field that names another axis."""
+    """Return a dataclass field that names another axis."""
     return field(metadata={"units": ("axis", "axis"), "axis": True})
 
 
 def units(effect: type[Effect]) -> Mapping[str, tuple[str, str]]:
-    """Unit of every parameter of an effect: on a gyroscope, on an accelerometer."""
+    """Return the units of every parameter of an effect: on a gyroscope, and on an accelerometer."""
     return {f.name: f.metadata["units"] for f in fields(effect)}  # type: ignore[arg-type]
 
 
 def required(effect: type[Effect]) -> tuple[str, ...]:
-    """Parameters that a model file must give."""
+    """Return the parameters that a model file must give."""
     return tuple(f.name for f in fields(effect) if f.default is MISSING)  # type: ignore[arg-type]
 
 
 def below_nyquist(effect: Effect, parameter: str, rate_hz: float) -> None:
-    """ConfigError when a frequency is not below half the sample rate."""
+    """Check that a frequency is below half the sample rate.
+
+    Parameters
+    ----------
+    effect : Effect
+        Effect to check.
+    parameter : str
+        Name of the parameter, in Hz.
+    rate_hz : float
+        Sample rate, Hz.
+
+    Raises
+    ------
+    ConfigError
+        If the frequency is not below half the sample rate.
+    """
     value = getattr(effect, parameter)
     if not value < 0.5 * rate_hz:
         raise ConfigError(
@@ -204,23 +281,48 @@ def below_nyquist(effect: Effect, parameter: str, rate_hz: float) -> None:
 
 
 def check_event_rate(effect: Effect, events_hz: float, rate_hz: float) -> None:
-    """ConfigError when random events come more often than can be simulated."""
-    if events_hz > MOST_EVENTS * rate_hz:
+    """Check that random events are rare enough for a simulation.
+
+    Parameters
+    ----------
+    effect : Effect
+        Effect to check.
+    events_hz : float
+        Mean number of events per second.
+    rate_hz : float
+        Sample rate, Hz.
+
+    Raises
+    ------
+    ConfigError
+        If there are more than MAX_EVENTS_PER_SAMPLE events per sample.
+    """
+    if events_hz > MAX_EVENTS_PER_SAMPLE * rate_hz:
         raise ConfigError(
-            f"{effect.name}: {events_hz:g} events a second at {rate_hz:g} Hz; at most {MOST_EVENTS:g} in a sample are "
-            "possible"
+            f"{effect.name}: {events_hz:g} events a second at {rate_hz:g} Hz; "
+            f"at most {MAX_EVENTS_PER_SAMPLE:g} in a sample are possible"
         )
 
 
 def first_sample(time_s: float, rate_hz: float) -> int:
-    """Index of the first sample at or after a time; a millionth of a sample is rounding."""
+    """Return the index of the first sample at or after a time, with a tolerance of a millionth of a sample for
+    rounding.
+
+    Parameters
+    ----------
+    time_s : float
+        Time since the start, s.
+    rate_hz : float
+        Sample rate, Hz.
+    """
     return ceil(time_s * rate_hz - 1e-6)
 
 
-def _check(effect: str, name: str, value: Any, allows: Mapping[str, Any]) -> None:
+def _check_parameter(effect: str, name: str, value: Any, allows: Mapping[str, Any]) -> None:
+    """Raise ConfigError if a value is not allowed for a parameter."""
     if allows.get("axis"):
         if value not in AXES:
-            raise ConfigError(f"{effect}: {name} must be one of {', '.join(AXES)}, is {value!r}{_near(value)}")
+            raise ConfigError(f"{effect}: {name} must be one of {', '.join(AXES)}, is {value!r}{_suggestion(value)}")
         return
     if value is None and allows["optional"]:
         return
@@ -239,5 +341,6 @@ def _check(effect: str, name: str, value: Any, allows: Mapping[str, Any]) -> Non
         raise ConfigError(f"{effect}: {name} must be a whole number, is {value!r}")
 
 
-def _near(value: Any) -> str:
+def _suggestion(value: Any) -> str:
+    """Return the hint with the nearest axis name, if the value is a string."""
     return nearest(value, AXES) if isinstance(value, str) else ""

@@ -1,8 +1,9 @@
-"""Processes whose correlation decays by one factor a sample, real or turning: what three effects have in common.
+"""Allan variance and spectrum of processes with a geometric, real or complex autocorrelation.
 
-Autocovariance σ² Re φ^|n| with φ = exp(−(1/T_c − iω) τ0). Real φ is first-order Gauss–Markov noise, and a random
-telegraph has the same second moments; a turning φ is a resonance. Allan variance and spectrum are closed forms, exact
-for the samples. Near φ = 1 the closed form of σ² cancels to nothing in double precision, and its series takes over.
+The autocovariance is σ² Re φ^|n| with φ = exp(−(1/T_c − iω) τ0). With a real φ, the process is first-order Gauss–Markov
+noise, and a random telegraph signal has the same second moments. With a complex φ, it is a resonance. The closed forms
+of Allan variance and spectrum are exact for the samples. Near φ = 1, the closed form of σ² suffers from cancellation in
+double precision, and its series is used instead.
 """
 
 from typing import Final
@@ -12,39 +13,67 @@ from numpy.typing import NDArray
 
 from drivers.sample import Floats
 
-NEAR_ZERO: Final = 1e-3
-"""|τ(1/T_c − iω)| below which the series stands: there it is true to 2.5·10⁻⁴ of σ², the closed form to 10⁻⁷."""
+MAX_SERIES_ARGUMENT: Final = 1e-3
+"""Largest |τ(1/T_c − iω)| for which the series is used. At this value, the series has an error of 2.5·10⁻⁴ of σ², and
+the closed form one of 10⁻⁷."""
 
 
 def avar(sigma: float, decay: complex, tau_s: Floats, tau0_s: float) -> Floats:
-    """σ² Re{[n(1 − φ²) − φ(1 − q)(3 − q)] / (n²(1 − φ)²)}, q = φⁿ, n = τ/τ0; ``decay`` = 1/T_c − iω, 1/s.
+    """Return the overlapping Allan variance σ² Re{[n(1 − φ²) − φ(1 − q)(3 − q)] / (n²(1 − φ)²)}, q = φⁿ, n = τ/τ0.
 
     Zhang, "Allan variance of time series models for measurement data", Metrologia 45 (2008) 549, rearranged.
 
+    Parameters
+    ----------
+    sigma : float
+        Standard deviation of the process.
+    decay : complex
+        1/T_c − iω, 1/s.
+    tau_s : ndarray, float64
+        Averaging times, s.
+    tau0_s : float
+        Sample interval, s.
+
+    Examples
+    --------
     >>> tau = np.array([1.89])
     >>> print(f"{avar(0.5**0.5, 1.0, tau, 1e-4)[0] ** 0.5:.3f}")  # peak of the deviation: 0.437 q √T_c
     0.437
     """
     n = np.asarray(tau_s, np.float64) / tau0_s
     x = np.asarray(n * (decay * tau0_s), np.complex128)
-    near = np.abs(x) < NEAR_ZERO
+    near = np.abs(x) < MAX_SERIES_ARGUMENT
     found = np.where(near, _series(n, x), _closed(np.where(near, 1.0, n), decay * tau0_s))
     return np.asarray(sigma**2 * found)
 
 
 def _closed(n: Floats, step: complex) -> Floats:
+    """Return the closed form for σ = 1."""
     phi, d, u = np.exp(-step), -np.expm1(-step), -np.expm1(-n * step)
     return np.asarray(np.real((n * d * (1.0 + phi) - phi * u * (2.0 + u)) / (n * d) ** 2))
 
 
 def _series(n: Floats, x: NDArray[np.complex128]) -> Floats:
-    # a correlation that falls as k is that of random walk, as k² that of a slope of random size
+    """Return the series about φ = 1 for σ = 1."""
+    # A correlation that decreases as k belongs to a random walk, one that decreases as k² to a slope of random size.
     return np.asarray(np.real(2.0 / 3.0 * x * (1.0 + 0.5 / n**2) - 0.5 * x**2 + 7.0 / 30.0 * x**3))
 
 
 def psd(sigma: float, decay: complex, f_hz: Floats, tau0_s: float) -> Floats:
-    """σ²τ0 Re{(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²)}, two-sided."""
+    """Return the two-sided spectrum σ²τ0 Re{(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²)}.
+
+    Parameters
+    ----------
+    sigma : float
+        Standard deviation of the process.
+    decay : complex
+        1/T_c − iω, 1/s.
+    f_hz : ndarray, float64
+        Frequencies, Hz.
+    tau0_s : float
+        Sample interval, s.
+    """
     phi, d = np.exp(-decay * tau0_s), -np.expm1(-decay * tau0_s)
-    # 1 − 2φ cos θ + φ² = (1 − φ)² + 4φ sin²(θ/2), which does not cancel
+    # 1 − 2φ cos θ + φ² = (1 − φ)² + 4φ sin²(θ/2), a form without cancellation
     below = d**2 + 4.0 * phi * np.sin(np.pi * f_hz * tau0_s) ** 2
     return np.asarray(sigma**2 * tau0_s * np.real(d * (1.0 + phi) / below))

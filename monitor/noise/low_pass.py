@@ -1,4 +1,4 @@
-"""Digital Butterworth low-pass of samples."""
+"""Digital Butterworth low-pass filter for samples."""
 
 import numpy as np
 
@@ -8,11 +8,24 @@ from monitor.noise.effect import Running
 
 
 def butterworth(order: int, cutoff_hz: float, rate_hz: float) -> Floats:
-    """Return the sections [n, 5] b0 b1 b2 a1 a2 of a digital Butterworth low-pass; each has a gain of one at zero.
+    """Return the second-order sections [n, 5] of a digital Butterworth low-pass: b0, b1, b2, a1, a2, with unit gain at
+    f = 0.
 
-    Its poles in the s plane are on a circle at angles θ from the negative real axis: each pair makes a section of
-    s² + 2 cos θ s + 1, an odd order one of s + 1. The bilinear transform puts s = (1 − z⁻¹)/(1 + z⁻¹) / tan(πf_c/f_s).
+    In the s plane, the poles lie on a circle at angles θ from the negative real axis. Each pair gives a section of s² +
+    2 cos θ s + 1, and an odd order adds one of s + 1. The bilinear transform sets s = (1 − z⁻¹)/(1 + z⁻¹) /
+    tan(πf_c/f_s).
 
+    Parameters
+    ----------
+    order : int
+        Order of the filter.
+    cutoff_hz : float
+        Frequency of half power, Hz.
+    rate_hz : float
+        Sample rate, Hz.
+
+    Examples
+    --------
     >>> butterworth(1, 25.0, 100.0).round(9).tolist()
     [[0.5, 0.5, 0.0, -0.0, 0.0]]
     """
@@ -27,11 +40,12 @@ def butterworth(order: int, cutoff_hz: float, rate_hz: float) -> Floats:
 
 
 class LowPass(Running):
-    """A low-pass that has settled at its first sample.
+    """Low-pass filter that is settled at its first sample.
 
     Parameters
     ----------
-    sections : [n, 5] as ``butterworth`` returns them.
+    sections : ndarray, shape (n, 5)
+        Sections as ``butterworth`` returns them.
     """
 
     def __init__(self, sections: Floats) -> None:
@@ -50,7 +64,7 @@ class LowPass(Running):
 
 @compiled
 def _run(values, sections, state):  # type: ignore[no-untyped-def]
-    """Filter values [n] in place, direct form II transposed; state [sections, 2] goes on from call to call."""
+    """Filter values [n] in place, in direct form II transposed; state [sections, 2] continues from call to call."""
     for i in range(sections.shape[0]):
         b0, b1, b2, a1, a2 = sections[i]
         one, two = state[i]

@@ -1,11 +1,11 @@
-"""NoiseModel: the effects of each axis, as one object that is fitted, simulated and compared.
+"""Noise model of an IMU: the effects of each axis in one object, for fit, simulation and comparison.
 
-Sources and leaks of an axis add; its transforms act on the sum in the order of ``ORDER``. ``avar`` and ``psd`` are
-those of the whole axis: linear transforms and leaks included, closed forms where they exist and one integral where a
-filter came in between. Where they depend on what a model does not hold (temperature, the length of a recording, where
-between two steps a rate lies) they are NaN.
+Sources and leaks of an axis add up. Its transforms act on the sum in the order of ``ORDER``. ``avar`` and ``psd``
+describe the whole axis, including linear transforms and leaks. They use closed forms where these exist, and one
+integral after a filter. They are NaN if they depend on something that a model does not contain, such as temperature,
+the length of a recording, or the position of a rate between two quantisation steps.
 
-Text and back is in ``model_file``, time series are in ``stream``.
+``model_file`` converts a model to text and back. ``simulation`` generates time series.
 """
 
 from collections.abc import Iterator, Mapping
@@ -34,13 +34,22 @@ if TYPE_CHECKING:
 class NoiseModel:
     """Effects of each axis; an axis that is not named has none.
 
-    Args:
-        effects: axis -> its effects
-        sample_rate_hz: the rate to simulate at where nobody says another
-        temperature: to simulate where no recording gives one
-    Raises:
-        ConfigError: unknown axis, an effect that cannot be on its axis, two different sample rate errors
+    Parameters
+    ----------
+    effects : mapping of str to tuple of Effect
+        Axis -> its effects.
+    sample_rate_hz : float or None
+        Default sample rate of a simulation, Hz.
+    temperature : Temperature or None
+        Simulated temperature, used if no recording provides one.
 
+    Raises
+    ------
+    ConfigError
+        If an axis is unknown, an effect cannot be on its axis, or two sample rate errors differ.
+
+    Examples
+    --------
     >>> from monitor.noise.effects import AngleRandomWalk, Bias
     >>> model = NoiseModel({"gz": (AngleRandomWalk(N=1e-4),)}) + NoiseModel({"gz": (Bias(value=0.1),)})
     >>> print(model)
@@ -68,13 +77,14 @@ class NoiseModel:
             raise ConfigError(f"sample_rate_error: a recording has one clock, but ratio is {given}")
 
     def __iter__(self) -> Iterator[tuple[str, Effect]]:
-        """(axis, effect) of each effect, in the order of the axes."""
+        """Yield axis and effect of each effect, in the order of the axes."""
         for axis in AXES:
             for effect in self.effects.get(axis, ()):
                 yield axis, effect
 
     def __add__(self, other: "NoiseModel") -> "NoiseModel":
-        """All effects of both; sample rate and temperature of the first that has one."""
+        """Return a model with the effects of both. Sample rate and temperature come from the first
+        model that has them."""
         if not isinstance(other, NoiseModel):
             return NotImplemented
         added = {
@@ -89,30 +99,59 @@ class NoiseModel:
 
     @property
     def sources(self) -> Mapping[str, tuple[Source, ...]]:
-        """Of each axis the effects that add."""
+        """Return the sources of each axis."""
         return {axis: tuple(e for e in effects if isinstance(e, Source)) for axis, effects in self.effects.items()}
 
     @property
     def rate_ratio(self) -> float:
-        """True sample rate over the stated one."""
+        """Return the true sample rate divided by the stated one."""
         return self._clock.ratio
 
     @property
     def _clock(self) -> SampleRateError:
+        """Return the sample rate error of the model, or one of ratio 1."""
         return next((e for _, e in self if isinstance(e, SampleRateError)), SampleRateError(ratio=1.0))
 
     # --- second moments
 
     def avar(self, axis: str, tau_s: Floats, tau0_s: float) -> Floats:
-        """Overlapping Allan variance of one axis, unit², of samples stated to be ``tau0_s`` apart; NaN: not known."""
+        """Return the overlapping Allan variance of one axis in unit²; NaN = not known.
+
+        Parameters
+        ----------
+        axis : str
+            Name of the axis.
+        tau_s : ndarray, float64
+            Averaging times, s.
+        tau0_s : float
+            Stated sample interval, s.
+        """
         return self.spectrum(axis, tau0_s).allan(np.asarray(tau_s, np.float64))
 
     def psd(self, axis: str, f_hz: Floats, tau0_s: float) -> Floats:
-        """Two-sided spectrum of one axis, unit²/Hz, up to half the sample rate; lines and slopes have no density."""
+        """Return the two-sided spectrum of one axis in unit²/Hz, up to half the sample rate, without lines and slopes.
+
+        Parameters
+        ----------
+        axis : str
+            Name of the axis.
+        f_hz : ndarray, float64
+            Frequencies, Hz.
+        tau0_s : float
+            Stated sample interval, s.
+        """
         return self.spectrum(axis, tau0_s).density(np.asarray(f_hz, np.float64))
 
     def spectrum(self, axis: str, tau0_s: float) -> Spectrum:
-        """Density, lines and slope of one axis as measured."""
+        """Return density, lines and slope of one axis as measured.
+
+        Parameters
+        ----------
+        axis : str
+            Name of the axis.
+        tau0_s : float
+            Stated sample interval, s.
+        """
         true_s = tau0_s / self.rate_ratio
         leaking: dict[str, float] = {}
         for effect in self.effects.get(axis, ()):
@@ -124,7 +163,7 @@ class NoiseModel:
         return self._clock.restated(self._measured(axis, total))
 
     def _own(self, axis: str, tau0_s: float) -> Spectrum:
-        """Of the axis' own sources."""
+        """Return the spectrum of the axis' own sources."""
         effects = self.effects.get(axis, ())
         stepped = any(isinstance(effect, NoiseStep) for effect in effects)
         total = nothing(tau0_s)
@@ -135,23 +174,33 @@ class NoiseModel:
         return total
 
     def _measured(self, axis: str, spectrum: Spectrum) -> Spectrum:
+        """Return the spectrum after all transforms of the axis."""
         for transform in self.transforms(axis):
             spectrum = transform.reshape(spectrum)
         return spectrum
 
     def transforms(self, axis: str) -> list[Transform]:
-        """The transforms of an axis in the order in which they act."""
+        """Return the transforms of an axis in the order in which they act."""
         found = [effect for effect in self.effects.get(axis, ()) if isinstance(effect, Transform)]
         return sorted(found, key=lambda transform: ORDER.index(type(transform)))
 
     # --- time series
 
     def check(self, rate_hz: float, *, temperature: bool = True) -> None:
-        """ConfigError when the model cannot be simulated at a stated rate.
+        """Check that the model can be simulated at a stated rate.
 
-        Args:
-            rate_hz: stated sample rate
-            temperature: whether a temperature is at hand, from the model or from a recording
+        Parameters
+        ----------
+        rate_hz : float
+            Stated sample rate, Hz.
+        temperature : bool
+            True if a temperature is available, from the model or from a recording.
+
+        Raises
+        ------
+        ConfigError
+            If a frequency is at or above half the sample rate, a source axis has no effects, a noise step has no white
+            noise, or a required temperature is missing.
         """
         for axis, effect in self:
             with model_file.placed(f"{axis}.{effect.name}"):
@@ -166,29 +215,50 @@ class NoiseModel:
                     raise ConfigError("no temperature: the model has no [temperature], and no recording gives one")
 
     def stream(self, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> "ModelStream":
-        """Begin an endless series of six axes; the same for the same rate and seed.
+        """Return an endless series of six axes. The same rate and seed give the same series.
 
-        Args:
-            rate_hz: sample rate as the recording will state it
-            seed: any whole number
-            temperature_c: [n] a recording's temperature, instead of the model's; held at its last value beyond its end
-        Raises:
-            ConfigError: a frequency at or above half the sample rate, a source axis without effects, a noise step
-                without noise, no temperature where one is needed
+        Parameters
+        ----------
+        rate_hz : float
+            Sample rate that the recording will state, Hz.
+        seed : int
+            Seed of the random generators.
+        temperature_c : ndarray, shape (n,), or None
+            Temperature of a recording in °C, used instead of the model's. Its last value continues beyond its end.
+
+        Raises
+        ------
+        ConfigError
+            If a frequency is at or above half the sample rate, a source axis has no effects, a noise step has no white
+            noise, or a required temperature is missing.
         """
         from monitor.noise.simulation import ModelStream
 
         return ModelStream(self, rate_hz, seed, temperature_c)
 
     def simulate(self, n: int, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> Floats:
-        """The first ``n`` samples [n, 6] of ``stream``, rad/s and m/s²."""
+        """Return the first ``n`` samples [n, 6] of ``stream``, in rad/s and m/s².
+
+        Parameters
+        ----------
+        n : int
+            Number of samples.
+        rate_hz, seed, temperature_c
+            As in ``stream``.
+        """
         return self.stream(rate_hz, seed, temperature_c).draw(n)
 
     # --- text
 
     @classmethod
     def from_toml(cls, text: str) -> "NoiseModel":
-        """Read a model file's text; ConfigError says in one line what is wrong with it."""
+        """Read a model from the text of a model file.
+
+        Raises
+        ------
+        ConfigError
+            If the text is not valid. The message names the place in the file.
+        """
         effects, rate_hz, temperature = model_file.read(text)
         model = cls(sample_rate_hz=rate_hz, temperature=temperature)
         for axes, given in effects:
@@ -198,5 +268,5 @@ class NoiseModel:
         return model
 
     def to_toml(self) -> str:
-        """The model as text that ``from_toml`` reads back to an equal model."""
+        """Return the model as text; ``from_toml`` reads it back to an equal model."""
         return model_file.write(self)

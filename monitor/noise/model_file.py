@@ -1,8 +1,8 @@
-"""Model files: TOML to effects and back, and a table for people.
+"""Model files: conversion of TOML text to effects and back, and a table for display.
 
-A model file has ``sample_rate`` (Hz), optionally ``[temperature]``, and one table an axis, in it one table an effect,
-or an array of tables where an effect occurs twice; ``g*`` and ``a*`` stand for all axes of a kind. What is wrong in it
-is a ConfigError of one line that names the place and the nearest known word. Parameters that are absent stay absent.
+A model file has ``sample_rate`` (Hz), optionally ``[temperature]``, and one table per axis. Each axis has one table per
+effect, or an array of tables if an effect occurs twice. ``g*`` and ``a*`` stand for all axes of a kind. An error in the
+file raises a ConfigError of one line, which names the place and the nearest known word. Absent parameters stay absent.
 """
 
 import contextlib
@@ -23,38 +23,48 @@ if TYPE_CHECKING:
     from monitor.noise.model import NoiseModel
 
 WILDCARDS: Final = {"g*": AXES[:3], "a*": AXES[3:]}
-KNOWN: Final = (*AXES, *WILDCARDS)
-KEYS: Final = ("sample_rate", "temperature")
+"""Keys that stand for all axes of a kind."""
+AXIS_KEYS: Final = (*AXES, *WILDCARDS)
+"""Keys of a model file that name axes."""
+TOP_LEVEL_KEYS: Final = ("sample_rate", "temperature")
+"""Other keys of a model file."""
 
-Placed = tuple[tuple[str, ...], tuple[Effect, ...]]  # axes, their effects
+Placed = tuple[tuple[str, ...], tuple[Effect, ...]]
+"""Names of axes, and the effects that each of them has."""
 
 
 def read(text: str) -> tuple[list[Placed], float | None, Temperature | None]:
-    """Effects, sample rate in Hz and temperature of a model file's text; ConfigError has a line for each mistake."""
+    """Return the effects, the sample rate in Hz and the temperature of a model file's text.
+
+    Raises
+    ------
+    ConfigError
+        If the text is not valid, with one line for each mistake.
+    """
     tables = toml_text.tables(text)
-    wrong: list[str] = []
+    mistakes: list[str] = []
     rate_hz = tables.pop("sample_rate", None)
     if rate_hz is not None:
-        with _collecting(wrong):
+        with _collect_errors(mistakes):
             if isinstance(rate_hz, bool) or not isinstance(rate_hz, int | float):
                 raise ConfigError(f"sample_rate must be a number of Hz, is {rate_hz!r}")
             with placed("sample_rate"):
                 RATE_HZ.check(rate_hz)
     temperature = None
-    with _collecting(wrong):
+    with _collect_errors(mistakes):
         given = tables.pop("temperature", None)
         temperature = None if given is None else Temperature.from_table(given)
     effects: list[Placed] = []
     for axis, given in tables.items():
-        with _collecting(wrong):
-            effects.append((WILDCARDS.get(axis, (axis,)), tuple(_effects(axis, given, wrong))))
-    if wrong:
-        raise ConfigError(*wrong)
+        with _collect_errors(mistakes):
+            effects.append((WILDCARDS.get(axis, (axis,)), tuple(_parse_axis(axis, given, mistakes))))
+    if mistakes:
+        raise ConfigError(*mistakes)
     return effects, None if rate_hz is None else float(rate_hz), temperature
 
 
 def write(model: "NoiseModel") -> str:
-    """The text of a model file."""
+    """Return the text of a model file."""
     lines = [] if model.sample_rate_hz is None else [f"sample_rate = {float(model.sample_rate_hz)!r}"]
     if model.temperature is not None:
         lines += ["", "[temperature]", *_assignments(model.temperature)]
@@ -69,20 +79,23 @@ def write(model: "NoiseModel") -> str:
 
 
 def table(model: "NoiseModel") -> str:
-    """A line an effect: axis, name, parameters with units; rate and temperature above."""
+    """Return a table for display, with one line per effect: axis, name, and parameters with units.
+
+    Sample rate and temperature stand above the table.
+    """
     head = [] if model.sample_rate_hz is None else [f"sample rate {model.sample_rate_hz:g} Hz"]
     if model.temperature is not None:
-        known = [(name, value) for name, value in _given(model.temperature)]
+        known = [(name, value) for name, value in _set_fields(model.temperature)]
         head.append("temperature " + ", ".join(f"{name} = {value:g} {UNITS[name]}" for name, value in known))
     rows = [("axis", "effect", "parameters")]
-    rows += [(axis, effect.name, _said(axis, effect)) for axis, effect in model]
+    rows += [(axis, effect.name, _format_parameters(axis, effect)) for axis, effect in model]
     width = max(len(name) for _, name, _ in rows)
     return "\n".join([*head, *(f"{axis:4}  {name:{width}}  {said}" for axis, name, said in rows)])
 
 
 @contextlib.contextmanager
 def placed(place: str) -> Iterator[None]:
-    """Say in a ConfigError where in the file its cause is."""
+    """Add the place in the file to a ConfigError that is raised inside the context."""
     try:
         yield
     except ConfigError as error:
@@ -90,26 +103,28 @@ def placed(place: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _collecting(wrong: list[str]) -> Iterator[None]:
-    """Note a mistake and go on, so that every one is told."""
+def _collect_errors(mistakes: list[str]) -> Iterator[None]:
+    """Collect a ConfigError and continue, so that all mistakes are reported together."""
     try:
         yield
     except ConfigError as error:
-        wrong += error.lines
+        mistakes += error.lines
 
 
-def _said(axis: str, effect: Effect) -> str:
+def _format_parameters(axis: str, effect: Effect) -> str:
+    """Return the parameters of an effect with their units."""
     kind = 0 if axis in GYROS else 1
     unit = {name: pair[kind] for name, pair in units(type(effect)).items()}
     words = {"1": "", "axis": ""}
     said = [
         f"{name} = {value if isinstance(value, str) else format(value, 'g')} {words.get(unit[name], unit[name])}"
-        for name, value in _given(effect)
+        for name, value in _set_fields(effect)
     ]
     return ", ".join(one.rstrip() for one in said)
 
 
-def _given(table: Any) -> Iterator[tuple[str, Any]]:
+def _set_fields(table: Any) -> Iterator[tuple[str, Any]]:
+    """Yield name and value of the fields that are not None."""
     for f in fields(table):
         value = getattr(table, f.name)
         if value is not None:
@@ -117,37 +132,42 @@ def _given(table: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _assignments(table: Any) -> Iterator[str]:
-    for name, value in _given(table):
+    """Yield the TOML lines of the fields."""
+    for name, value in _set_fields(table):
         if isinstance(value, str):
             yield f'{name} = "{value}"'
         else:
             yield f"{name} = {value if isinstance(value, int) else float(value)!r}"
 
 
-def _effects(axis: str, effects: Any, wrong: list[str]) -> Iterator[Effect]:
-    if axis not in KNOWN:
+def _parse_axis(axis: str, effects: Any, mistakes: list[str]) -> Iterator[Effect]:
+    """Yield the effects of one axis, and collect the mistakes."""
+    if axis not in AXIS_KEYS:
         what = "axis" if isinstance(effects, dict) else "key"
-        raise ConfigError(f'unknown {what} "{axis}"{nearest(axis, (*KNOWN, *KEYS))}')
+        raise ConfigError(f'unknown {what} "{axis}"{nearest(axis, (*AXIS_KEYS, *TOP_LEVEL_KEYS))}')
     if not isinstance(effects, dict):
         raise ConfigError(f"{axis} must be a table of effects, such as [{axis}.angle_random_walk]")
     for name, given in effects.items():
         if name not in EFFECTS:
-            wrong.append(f'{axis}: unknown effect "{name}"{nearest(name, tuple(EFFECTS))}')
+            mistakes.append(f'{axis}: unknown effect "{name}"{nearest(name, tuple(EFFECTS))}')
             continue
         for parameters in given if isinstance(given, list) else [given]:
-            with _collecting(wrong):
-                yield _effect(f"{axis}.{name}", EFFECTS[name], parameters)
+            with _collect_errors(mistakes):
+                yield _parse_effect(f"{axis}.{name}", EFFECTS[name], parameters)
 
 
-def _effect(place: str, effect: type[Effect], parameters: Any) -> Effect:
+def _parse_effect(place: str, effect: type[Effect], parameters: Any) -> Effect:
+    """Return the effect of one table."""
     known = tuple(units(effect))
     if not isinstance(parameters, dict):
         raise ConfigError(f"{place} must be a table with {', '.join(known)}")
-    wrong = [f'{place}: unknown parameter "{name}"{nearest(name, known)}' for name in parameters if name not in known]
-    # a misspelt parameter is missing, too, which needs no second line
-    wrong = wrong or [f"{place}: {name} is missing" for name in required(effect) if name not in parameters]
-    if wrong:
-        raise ConfigError(*wrong)
+    mistakes = [
+        f'{place}: unknown parameter "{name}"{nearest(name, known)}' for name in parameters if name not in known
+    ]
+    # A misspelt parameter is also missing, but one line is enough.
+    mistakes = mistakes or [f"{place}: {name} is missing" for name in required(effect) if name not in parameters]
+    if mistakes:
+        raise ConfigError(*mistakes)
     with placed(place):
         return effect(**parameters)
-    raise AssertionError  # the context manager never swallows
+    raise AssertionError  # not reached: the context manager does not suppress exceptions

@@ -1,7 +1,7 @@
-"""Things that happen at random samples: gaps and sizes drawn a batch at a time, told by the sample they fall on.
+"""Events at random samples: gaps and sizes that are drawn in batches, and returned by sample index.
 
-Batches have one length, so the events do not depend on the blocks in which they are asked for. The first few are
-kept for the truth beside the data; all are counted.
+All batches have one length, so the events do not depend on the division into blocks. The first events are listed with
+their times for the truth of a simulation. All events are counted.
 """
 
 from collections.abc import Callable
@@ -11,19 +11,26 @@ import numpy as np
 
 from drivers.sample import Floats, Ints
 
-BATCH: Final = 64
-LISTED: Final = 1000
-"""Events whose times the truth lists; later ones are counted only."""
+BATCH_SIZE: Final = 64
+"""Events that are drawn at once."""
+MAX_LISTED_EVENTS: Final = 1000
+"""Largest number of events whose times are listed. Later events are only counted."""
 
 
 class Events:
-    """Events in order.
+    """Random events in the order of time.
 
-    Args:
-        gaps: draws the gaps of a batch, in samples; inf = never
-        sizes: draws the sizes of a batch
-        rate_hz: for the times in ``truth``
-        before: where the first gap begins; -1 where gaps are whole and the first sample may be an event
+    Parameters
+    ----------
+    gaps : callable
+        Draws the gaps of a batch, in samples; inf = no event.
+    sizes : callable
+        Draws the sizes of a batch.
+    rate_hz : float
+        Sample rate in Hz, for the times in ``truth``.
+    before : float
+        Sample index at which the first gap begins. It is -1 if gaps are whole numbers and the first sample may be an
+        event.
     """
 
     def __init__(
@@ -34,16 +41,31 @@ class Events:
         before: float = 0.0,
     ) -> None:
         self._gaps, self._sizes, self._rate_hz = gaps, sizes, rate_hz
-        self._next, self._size = before + gaps(BATCH).cumsum(), sizes(BATCH)
-        self._begun: int | None = None
+        self._next, self._size = before + gaps(BATCH_SIZE).cumsum(), sizes(BATCH_SIZE)
+        self._first_index: int | None = None
         self.count = 0
         self._listed: list[tuple[float, float]] = []
 
     def take(self, first: int, n: int) -> tuple[Ints, Floats]:
-        """Sample, counted from ``first``, and size of each event before sample ``first + n``; in order of time."""
-        if self._begun is None:
-            self._begun = first
-        end = first - self._begun + n - 1  # an event between two samples shows at the later one
+        """Return the events before sample ``first + n`` that have not been returned yet.
+
+        Parameters
+        ----------
+        first : int
+            Index of the first sample of the block.
+        n : int
+            Number of samples of the block.
+
+        Returns
+        -------
+        indices : ndarray, int64
+            Sample of each event, counted from ``first``.
+        sizes : ndarray, float64
+            Size of each event.
+        """
+        if self._first_index is None:
+            self._first_index = first
+        end = first - self._first_index + n - 1  # an event between two samples is visible at the later one
         taken, sizes = [], []
         while True:
             k = int(np.searchsorted(self._next, end, "right"))
@@ -52,15 +74,18 @@ class Events:
             self._next, self._size = self._next[k:], self._size[k:]
             if self._next.size:
                 break
-            self._next = taken[-1][-1] + self._gaps(BATCH).cumsum()
-            self._size = self._sizes(BATCH)
+            self._next = taken[-1][-1] + self._gaps(BATCH_SIZE).cumsum()
+            self._size = self._sizes(BATCH_SIZE)
         when, size = np.concatenate(taken), np.concatenate(sizes)
         self.count += when.size
-        for one in range(min(when.size, LISTED - len(self._listed))):
-            self._listed.append(((self._begun + float(when[one])) / self._rate_hz, float(size[one])))
-        return np.ceil(when - (first - self._begun)).astype(np.int64), size
+        for one in range(min(when.size, MAX_LISTED_EVENTS - len(self._listed))):
+            self._listed.append(((self._first_index + float(when[one])) / self._rate_hz, float(size[one])))
+        return np.ceil(when - (first - self._first_index)).astype(np.int64), size
 
     def truth(self, size: str | None = None) -> dict[str, Any]:
-        """Count, and times in seconds since the stream began of the first LISTED; with ``size``, their sizes too."""
+        """Return the number of events, and the times of the listed events in seconds since the start of the stream.
+
+        If ``size`` is given, the sizes of the listed events are returned under this key.
+        """
         times: dict[str, Any] = {"count": self.count, "times": [time for time, _ in self._listed]}
         return times if size is None else times | {size: [height for _, height in self._listed]}

@@ -1,11 +1,14 @@
-"""A model's time series: endless, in blocks of any size, the same however it is cut.
+"""Simulation of the time series of a noise model: endless, in blocks of any size, independent of the division into
+blocks.
 
-Blocks are made in pieces that fit the processor's cache. Within a piece every axis sums its own sources (white noise
-first, so that a noise step multiplies nothing else), then each axis that leaks into others is transformed by itself,
-then leaks are added, and the sums are transformed. Everything is simulated at the true sample rate.
+Blocks are simulated in pieces that fit the processor's cache. Within a piece, every axis sums its own sources. White
+noise comes first, because a noise step multiplies only white noise. Next, each axis that leaks into others is
+transformed by itself. Then the leaks are added, and the sums are transformed. Everything is simulated at the true
+sample rate.
 
-Every effect of every axis draws from its own random generator, seeded by the stream's seed, the names of axis and
-effect, and which of its name on the axis it is: adding or leaving out an effect changes no other series.
+Every effect of every axis has its own random generator. Its seed is formed from the seed of the stream, the names of
+axis and effect, and the number of earlier effects of the same name on the axis. Adding or removing an effect therefore
+changes no other series.
 """
 
 import copy
@@ -28,25 +31,32 @@ from monitor.noise.model import NoiseModel
 from monitor.noise.model_file import placed
 from monitor.noise.temperature import Recorded
 
-PIECE: Final = 2048
-"""Samples made at once: six axes of them and what they are made of stay in a core's own cache."""
+PIECE_SAMPLES: Final = 2048
+"""Samples simulated at once. Six axes of them, with their work arrays, stay in the cache of a processor core."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """Simulated samples."""
+    """Simulated samples with their temperature."""
 
     values: Floats  # [n, 6] in AXES order, rad/s and m/s²
-    temperature_c: Floats  # [n] °C; NaN where the model has none
+    temperature_c: Floats  # [n] °C; NaN if the model has no temperature
 
 
 class ModelStream:
-    """A model's series from its first sample on; axes without effects are zero.
+    """Endless simulated series of a model; axes without effects are zero.
 
-    Args:
-        model, rate_hz, seed, temperature_c: as of ``NoiseModel.stream``
-    Raises:
-        ConfigError: the model cannot be simulated at that rate
+    Parameters
+    ----------
+    model : NoiseModel
+        Model to simulate.
+    rate_hz, seed, temperature_c
+        As in ``NoiseModel.stream``.
+
+    Raises
+    ------
+    ConfigError
+        If the model cannot be simulated at that rate.
     """
 
     def __init__(self, model: NoiseModel, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> None:
@@ -55,34 +65,43 @@ class ModelStream:
         self._rate_hz = rate_hz
         self._true_hz = rate_hz * model.rate_ratio
         self._seed = seed
-        self._count = 0  # samples drawn so far
+        self._count = 0  # number of samples drawn so far
         self._occurrences: Counter[tuple[str, str]] = Counter()
         self._truths: list[tuple[str, Effect, Series | Running]] = []
-        self._temperature = self._warmth(temperature_c)
-        self._axes = {axis: _Axis() for axis in AXES}
+        self._temperature = self._temperature_series(temperature_c)
+        self._axes = {axis: _AxisSimulator() for axis in AXES}
         for axis, effect in model:
             self._begin(axis, effect)
 
     def draw(self, n: int) -> Floats:
-        """The next ``n`` samples [n, 6] in rad/s and m/s²."""
+        """Return the next ``n`` samples [n, 6] in rad/s and m/s²."""
         return self.draw_all(n).values
 
     def draw_all(self, n: int) -> Drawn:
-        """The next ``n`` samples with their temperature."""
+        """Return the next ``n`` samples with their temperature."""
         drawn = Drawn(np.empty((n, len(AXES))), np.full(n, np.nan))
-        for begin in range(0, n, PIECE):
-            piece = slice(begin, min(begin + PIECE, n))
+        for begin in range(0, n, PIECE_SAMPLES):
+            piece = slice(begin, min(begin + PIECE_SAMPLES, n))
             self._advance(drawn.values[piece], drawn.temperature_c[piece])
         return drawn
 
     def add(self, axis: str, effect: Effect) -> None:
-        """Add an effect from the next sample on, at no cost that grows with what was drawn.
+        """Add an effect from the next sample on, at a cost that does not depend on the samples drawn so far.
 
-        A ``time`` still counts from the stream's first sample; what begins of itself (a walk, a ramp, a transient)
+        A parameter ``time`` still counts from the first sample of the stream. A random walk, a ramp or a transient
         begins now.
 
-        Raises:
-            ConfigError: the effect cannot be on that axis, at that rate, or in a stream that runs (a sample rate error)
+        Parameters
+        ----------
+        axis : str
+            Name of the axis.
+        effect : Effect
+            Effect to add.
+
+        Raises
+        ------
+        ConfigError
+            If the effect cannot be on that axis, at that rate, or in a running stream (a sample rate error).
         """
         if axis not in AXES:
             raise ConfigError(f'unknown axis "{axis}"{nearest(axis, AXES)}')
@@ -94,24 +113,27 @@ class ModelStream:
         self._begin(axis, effect)
 
     def truth(self) -> dict[str, dict[str, list[dict[str, Any]]]]:
-        """Axis -> effect -> what was drawn so far, for each of that name: phases, counts, times in s from the start.
+        """Return the randomly drawn values so far: axis -> effect -> one dictionary for each effect of that name.
 
-        Effects of which the parameters say all are left out. Ready for JSON.
+        The values are phases, counts, and times in s from the start, ready for JSON. Effects that their parameters
+        describe completely are left out.
         """
-        told: dict[str, dict[str, list[dict[str, Any]]]] = {}
+        truths: dict[str, dict[str, list[dict[str, Any]]]] = {}
         for axis, effect, one in self._truths:
             truth = one.truth()
             if truth:
-                told.setdefault(axis, {}).setdefault(effect.name, []).append(truth)
-        return told
+                truths.setdefault(axis, {}).setdefault(effect.name, []).append(truth)
+        return truths
 
-    def _warmth(self, recorded_c: Floats | None) -> Series | None:
+    def _temperature_series(self, recorded_c: Floats | None) -> Series | None:
+        """Return the series of the temperature: recorded, from the model, or None."""
         if recorded_c is not None:
             return Recorded(recorded_c)
         generator = self._model.temperature
         return None if generator is None else generator.start(self._true_hz, self._rng("temperature", "", 0))
 
     def _begin(self, axis: str, effect: Effect) -> None:
+        """Start an effect on an axis."""
         occurrence = self._occurrences[axis, effect.name]
         self._occurrences[axis, effect.name] += 1
         line = self._axes[axis]
@@ -133,10 +155,12 @@ class ModelStream:
             raise TypeError(f"{effect.name} is no source, leak, noise step or transform")
 
     def _rng(self, axis: str, effect: str, occurrence: int) -> np.random.Generator:
+        """Return the random generator of one effect."""
         key = (crc32(axis.encode()), crc32(effect.encode()), occurrence)
         return np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=key))
 
     def _advance(self, values: Floats, temperature_c: Floats) -> None:
+        """Simulate the next piece of all axes into ``values`` [n, 6] and ``temperature_c`` [n]."""
         n = temperature_c.size
         block = Block(self._count, temperature_c, np.empty(n))
         if self._temperature is not None:
@@ -149,25 +173,27 @@ class ModelStream:
         self._count += n
 
 
-class _Axis:
-    """What runs on one axis."""
+class _AxisSimulator:
+    """Running effects of one axis."""
 
     def __init__(self) -> None:
         self.white: list[Series] = []
         self.others: list[Series] = []
-        self.steps: list[tuple[int, float]] = []  # first sample, ratio
+        self.steps: list[tuple[int, float]] = []  # (index of the first sample, ratio)
         self.leaks: list[Leak] = []
         self.leaks_out = False
-        self._chain: list[tuple[int, Running]] = []  # (place in ORDER, transform), sorted
-        self._alone: list[tuple[int, Running]] = []  # the same on the axis' own sources; used where leaks come in
+        self._chain: list[tuple[int, Running]] = []  # (position in ORDER, transform), sorted
+        self._alone: list[
+            tuple[int, Running]
+        ] = []  # copies that act on the axis' own sources only; used if other axes leak into this one
 
     @property
     def alone(self) -> bool:
-        """Whether the axis by itself is needed, or may come to be needed while its transforms carry on a state."""
+        """True if the measurement without leaks is needed now, or may be needed later by transforms with a state."""
         return self.leaks_out or bool(self.leaks)
 
     def insert(self, place: int, running: Running) -> None:
-        """Put a transform behind those of its place."""
+        """Insert a transform after the others at its position in ORDER."""
         if self.leaks:
             self._alone.append((place, copy.deepcopy(running)))
             self._alone.sort(key=lambda one: one[0])
@@ -175,13 +201,13 @@ class _Axis:
         self._chain.sort(key=lambda one: one[0])
 
     def leak(self, leak: Leak) -> None:
-        """From here on the axis as measured is no longer the axis by itself."""
+        """Add a leak into this axis. From now on, its measurement differs from its measurement without leaks."""
         if not self.leaks:
             self._alone = copy.deepcopy(self._chain)
         self.leaks.append(leak)
 
     def sum(self, block: Block, n: int) -> Floats:
-        """The axis' own sources."""
+        """Return the sum [n] of the axis' own sources."""
         values = np.zeros(n)
         for series in self.white:
             series.add(values, block)
@@ -192,22 +218,24 @@ class _Axis:
         return values
 
     def measure_alone(self, own: Floats) -> Floats:
-        """What the axis reads by itself: transformed in place where nothing leaks in, else a copy."""
+        """Return the measurement without leaks. It is computed in place if nothing leaks into the
+        axis, else on a copy."""
         if not self.leaks:
-            return _through(self._chain, own)
-        return _through(self._alone, own.copy())
+            return _apply_transforms(self._chain, own)
+        return _apply_transforms(self._alone, own.copy())
 
     def measure(self, own: Floats, alone: dict[str, Floats]) -> Floats:
-        """What the axis reads."""
+        """Return the measurement of the axis with all leaks."""
         if self.leaks:
             for leak in self.leaks:
                 own += leak.coefficient * alone[leak.source]
         elif self.leaks_out:
-            return own  # transformed already
-        return _through(self._chain, own)
+            return own  # already transformed by ``measure_alone``
+        return _apply_transforms(self._chain, own)
 
 
-def _through(chain: list[tuple[int, Running]], values: Floats) -> Floats:
+def _apply_transforms(chain: list[tuple[int, Running]], values: Floats) -> Floats:
+    """Apply all transforms to the values in place, and return the values."""
     for _, running in chain:
         running.apply(values)
     return values

@@ -1,16 +1,18 @@
-"""The second moments of one axis: what density, lines and slope its sampled series has, and their Allan variance.
+"""Second moments of one axis: density, lines and slope of its sampled series, and the Allan variance that follows.
 
-A ``Spectrum`` starts as what a source states of itself. Spectra add; a gain scales, a filter multiplies density and
-lines and leaves a slope as it is (beyond its delay). As long as no filter came in between, the Allan variance is the
-sum of the sources' own closed forms; after one it is one integral over the density, plus lines and slope.
+A ``Spectrum`` is created from the closed forms of a source. Spectra can be added. A gain scales a spectrum. A filter
+multiplies its density and its lines, and does not change its slope. Without a filter, the Allan variance is the sum of
+the closed forms of the sources. After a filter, it is one integral over the density, plus the contributions of lines
+and slope.
 
-The integral, of samples τ0 apart with m = τ/τ0,
+The integral, for samples τ0 apart with m = τ/τ0, is
 
-    σ²(τ) = 4 ∫ S(f) sin⁴(πfτ) / (m² sin²(πfτ0)) df   from 0 to 1/(2 τ0),
+    σ²(τ) = 4 ∫ S(f) sin⁴(πfτ) / (m² sin²(πfτ0)) df   from 0 to 1/(2 τ0).
 
-is taken on a grid in log f, finer round narrow peaks. Below 0.1/τ the kernel is smooth, and the trapezoidal rule does.
-Above, sin⁴ = 3/8 − cos(2πfτ)/2 + cos(4πfτ)/8, and each cosine is integrated exactly against the piecewise linear rest,
-so that no τ asks for a finer grid. Errors stay below 3·10⁻⁴ for the effects of this package.
+It is computed on a grid in log f, which is finer around narrow peaks. Below 0.1/τ the kernel is smooth, and the
+trapezoidal rule suffices. Above, sin⁴ = 3/8 − cos(2πfτ)/2 + cos(4πfτ)/8, and each cosine is integrated exactly against
+the piecewise linear remainder. No τ therefore needs a finer grid. Errors stay below 3·10⁻⁴ for the effects of this
+package.
 """
 
 from collections.abc import Callable
@@ -22,29 +24,30 @@ import numpy as np
 from drivers.sample import Floats
 
 Curve = Callable[[Floats], Floats]
+"""Function of frequency (Hz) or averaging time (s)."""
 
-PER_DECADE: Final = 400
-"""Points of the grid in frequency."""
+POINTS_PER_DECADE: Final = 400
+"""Points of the frequency grid per decade."""
 BELOW: Final = 1e-5
-"""The grid begins at this over the longest τ: of a random walk, 3·10⁻⁵ of σ² lies below."""
-SMOOTH: Final = 0.1
-"""Of 1/τ: up to here the kernel is smooth on the grid."""
+"""Lower end of the frequency grid, times the longest τ. For a random walk, 3·10⁻⁵ of σ² lies below it."""
+MAX_SMOOTH_CYCLES: Final = 0.1
+"""Largest f·τ at which the kernel is smooth on the grid."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spectrum:
     """Second moments of a sampled series."""
 
-    density: Curve  # f (Hz) -> two-sided, unit²/Hz, without lines and slope
-    closed: Curve | None  # τ (s) -> unit², all of it; None after a filter
-    tau0_s: float
+    density: Curve  # f (Hz) -> two-sided density, unit²/Hz, without lines and slope
+    closed: Curve | None  # τ (s) -> Allan variance, unit², including lines and slope; None after a filter
+    tau0_s: float  # sample interval, s
     lines: tuple[tuple[float, float], ...] = ()  # (Hz, mean square in unit²) of sinusoids
-    slope: float = 0.0  # root of the summed squares of constant slopes, unit/s
-    level: float = 0.0  # sum of what is constant, unit
-    peaks: tuple[tuple[float, float], ...] = ()  # (centre, width) in Hz of what is narrower than an octave
+    slope: float = 0.0  # root of the sum of squares of constant slopes, unit/s
+    level: float = 0.0  # sum of the constant biases, unit
+    peaks: tuple[tuple[float, float], ...] = ()  # (centre, width) in Hz of peaks narrower than an octave
 
     def __add__(self, other: "Spectrum") -> "Spectrum":
-        """Of the sum of two independent series."""
+        """Return the spectrum of the sum of two independent series."""
         one, two = self.closed, other.closed
         return Spectrum(
             lambda f: self.density(f) + other.density(f),
@@ -57,7 +60,7 @@ class Spectrum:
         )
 
     def scaled(self, factor: float) -> "Spectrum":
-        """Of the series times ``factor``."""
+        """Return the spectrum of the series times ``factor``."""
         power, closed = factor**2, self.closed
         return replace(
             self,
@@ -69,7 +72,15 @@ class Spectrum:
         )
 
     def filtered(self, gain: Curve, around: tuple[tuple[float, float], ...] = ()) -> "Spectrum":
-        """Of the series through a filter of squared response ``gain`` that passes what is constant."""
+        """Return the spectrum of the series after a filter that passes constants.
+
+        Parameters
+        ----------
+        gain : callable
+            Squared magnitude response as a function of frequency in Hz.
+        around : tuple of (float, float)
+            Centres and widths in Hz of narrow peaks of the filter.
+        """
         return replace(
             self,
             density=lambda f: gain(f) * self.density(f),
@@ -79,11 +90,11 @@ class Spectrum:
         )
 
     def without_lines(self) -> "Spectrum":
-        """Noise alone."""
+        """Return the spectrum without its lines."""
         return replace(self, lines=())
 
     def allan(self, tau_s: Floats) -> Floats:
-        """Overlapping Allan variance, unit²."""
+        """Return the overlapping Allan variance in unit² at averaging times in seconds."""
         if self.closed is not None:
             return self.closed(tau_s)
         total = allan_of_density(self.density, tau_s, self.tau0_s, self.peaks)
@@ -93,39 +104,82 @@ class Spectrum:
         return total
 
     def mean_square(self, lowest_hz: float, gain: Curve | None = None) -> float:
-        """2 ∫ S gain df from ``lowest_hz`` to half the sample rate, and the lines; unit²."""
+        """Return 2 ∫ S gain df from ``lowest_hz`` to half the sample rate, plus the lines, in unit².
+
+        Parameters
+        ----------
+        lowest_hz : float
+            Lower end of the integral, Hz.
+        gain : callable or None
+            Weight as a function of frequency in Hz; None = 1.
+        """
         f = frequencies(lowest_hz, self.tau0_s, self.peaks)
         weighted = self.density(f) if gain is None else self.density(f) * gain(f)
         lines = sum(size * (1.0 if gain is None else float(gain(np.array([f]))[0])) for f, size in self.lines)
-        return 2.0 * _log_trapezoid(weighted, f) + lines
+        return 2.0 * _integrate_log_trapezoid(weighted, f) + lines
 
 
 def white(mean_square: float, tau0_s: float) -> Spectrum:
-    """Of independent samples: S = σ²τ0, σ²(τ) = σ²τ0/τ (IEEE Std 952 eq. C.18–C.19)."""
+    """Return the spectrum of independent samples: S = σ²τ0, σ²(τ) = σ²τ0/τ (IEEE Std 952 eq. C.18–C.19).
+
+    Parameters
+    ----------
+    mean_square : float
+        Variance σ² of a sample, unit².
+    tau0_s : float
+        Sample interval, s.
+    """
     power = mean_square * tau0_s
     return Spectrum(lambda f: np.full_like(f, power), lambda tau: power / tau, tau0_s)
 
 
 def nothing(tau0_s: float) -> Spectrum:
-    """Of an axis without effects."""
+    """Return the spectrum of an axis without effects."""
     return Spectrum(np.zeros_like, np.zeros_like, tau0_s)
 
 
 def unknown(tau0_s: float) -> Spectrum:
-    """Of what has no stationary second moments, or none that are known: NaN."""
+    """Return a spectrum of NaN, for a series without known stationary second moments."""
     return Spectrum(_nan, _nan, tau0_s)
 
 
 def allan_of_line(f_hz: float, mean_square: float, tau_s: Floats, tau0_s: float) -> Floats:
-    """Sinusoidal noise of IEEE Std 952 annex C, as sampled: A² sin⁴(πfτ)/(m² sin²(πfτ0)), A² = 2·mean square."""
+    """Return the Allan variance of a sampled sinusoid: A² sin⁴(πfτ)/(m² sin²(πfτ0)), A² = 2·mean square.
+
+    This is the sinusoidal noise of IEEE Std 952 annex C for samples.
+
+    Parameters
+    ----------
+    f_hz : float
+        Frequency, Hz.
+    mean_square : float
+        Mean square of the sinusoid, unit².
+    tau_s : ndarray, float64
+        Averaging times, s.
+    tau0_s : float
+        Sample interval, s.
+    """
     m = tau_s / tau0_s
     ratio = np.sin(np.pi * f_hz * tau_s) ** 2 / (m * np.sin(np.pi * f_hz * tau0_s))
     return np.asarray(2.0 * mean_square * ratio**2)
 
 
 def allan_of_density(density: Curve, tau_s: Floats, tau0_s: float, peaks: tuple[tuple[float, float], ...]) -> Floats:
-    """The integral of the module's head at each τ.
+    """Return the Allan variance of a spectral density by the integral of the module's docstring.
 
+    Parameters
+    ----------
+    density : callable
+        Two-sided density in unit²/Hz as a function of frequency in Hz.
+    tau_s : ndarray, float64
+        Averaging times, s.
+    tau0_s : float
+        Sample interval, s.
+    peaks : tuple of (float, float)
+        Centres and widths of narrow peaks, Hz.
+
+    Examples
+    --------
     >>> tau = np.array([0.01, 0.02, 1.0, 50.0])
     >>> flat = allan_of_density(lambda f: np.full_like(f, 4.0), tau, 0.01, ())
     >>> bool(np.all(np.abs(flat * tau / 4.0 - 1.0) < 3e-4))
@@ -134,49 +188,61 @@ def allan_of_density(density: Curve, tau_s: Floats, tau0_s: float, peaks: tuple[
     tau = np.atleast_1d(np.asarray(tau_s, np.float64))
     f = frequencies(BELOW / float(tau.max()), tau0_s, peaks)
     rest = density(f) / np.sin(np.pi * f * tau0_s) ** 2
-    found = [_allan(float(t), f, rest, tau0_s) for t in tau]
+    found = [_allan_variance_at(float(t), f, rest, tau0_s) for t in tau]
     return np.reshape(found, np.shape(tau_s))
 
 
 def frequencies(lowest_hz: float, tau0_s: float, peaks: tuple[tuple[float, float], ...]) -> Floats:
-    """The grid, Hz: even in log f up to half the sample rate, and finer round peaks."""
+    """Return the frequency grid in Hz: uniform in log f up to half the sample rate, and finer around peaks.
+
+    Parameters
+    ----------
+    lowest_hz : float
+        Lower end of the grid, Hz.
+    tau0_s : float
+        Sample interval, s.
+    peaks : tuple of (float, float)
+        Centres and widths of narrow peaks, Hz.
+    """
     nyquist = 0.5 / tau0_s
-    # linear in the upper half decade, where the kernel at τ0 bends
+    # The upper part is also linear, because the kernel at τ0 is curved there.
     parts = [
-        np.geomspace(lowest_hz, nyquist, max(2, round(PER_DECADE * np.log10(nyquist / lowest_hz)))),
-        np.linspace(0.1 * nyquist, nyquist, 2 * PER_DECADE),
+        np.geomspace(lowest_hz, nyquist, max(2, round(POINTS_PER_DECADE * np.log10(nyquist / lowest_hz)))),
+        np.linspace(0.1 * nyquist, nyquist, 2 * POINTS_PER_DECADE),
     ]
-    away = np.geomspace(1e-3, 1e3, 2 * PER_DECADE)
+    away = np.geomspace(1e-3, 1e3, 2 * POINTS_PER_DECADE)
     for centre, width in peaks:
         parts += [centre + width * away, centre - width * away, np.array([centre])]
     f = np.unique(np.concatenate(parts))
     return np.asarray(f[(f >= lowest_hz) & (f <= nyquist)])
 
 
-def _allan(tau: float, f: Floats, rest: Floats, tau0_s: float) -> float:
-    split = int(np.clip(np.searchsorted(f, SMOOTH / tau), 1, f.size - 1))
+def _allan_variance_at(tau: float, f: Floats, rest: Floats, tau0_s: float) -> float:
+    """Return the Allan variance at one averaging time; ``rest`` is the density divided by sin²(πfτ0)."""
+    split = int(np.clip(np.searchsorted(f, MAX_SMOOTH_CYCLES / tau), 1, f.size - 1))
     low = slice(0, split + 1)
-    total = _log_trapezoid(rest[low] * np.sin(np.pi * f[low] * tau) ** 4, f[low])
+    total = _integrate_log_trapezoid(rest[low] * np.sin(np.pi * f[low] * tau) ** 4, f[low])
     f, rest = f[split:], rest[split:]
     steps = np.diff(f)
     flat = float((0.5 * steps * (rest[1:] + rest[:-1])).sum())
     slopes = np.diff(rest) / steps
-    total += 0.375 * flat - 0.5 * _cosine(2.0 * np.pi * tau, f, rest, slopes)
-    total += 0.125 * _cosine(4.0 * np.pi * tau, f, rest, slopes)
+    total += 0.375 * flat - 0.5 * _integrate_cosine(2.0 * np.pi * tau, f, rest, slopes)
+    total += 0.125 * _integrate_cosine(4.0 * np.pi * tau, f, rest, slopes)
     return 4.0 * total * (tau0_s / tau) ** 2
 
 
-def _cosine(omega: float, f: Floats, rest: Floats, slopes: Floats) -> float:
-    """∫ rest cos(ωf) df of a piecewise linear function, exactly."""
+def _integrate_cosine(omega: float, f: Floats, rest: Floats, slopes: Floats) -> float:
+    """Return ∫ rest cos(ωf) df, exact for a piecewise linear function."""
     ends = rest[-1] * np.sin(omega * f[-1]) - rest[0] * np.sin(omega * f[0])
     return float(ends / omega + (slopes * np.diff(np.cos(omega * f))).sum() / omega**2)
 
 
-def _log_trapezoid(values: Floats, f: Floats) -> float:
-    """∫ values df by the trapezoidal rule in ln f."""
+def _integrate_log_trapezoid(values: Floats, f: Floats) -> float:
+    """Return ∫ values df by the trapezoidal rule in ln f."""
     g = values * f
     return float((0.5 * np.diff(np.log(f)) * (g[1:] + g[:-1])).sum())
 
 
 def _nan(x: Floats) -> Floats:
+    """Return NaN for every x."""
     return np.full_like(x, np.nan)

@@ -1,7 +1,7 @@
-"""The temperature of a simulated sensor: a steady swing, as of day and night, plus a slow wander.
+"""Temperature of a simulated sensor: a periodic swing, such as day and night, plus slow random wander.
 
-T(t) = mean + swing sin(2πt/period) + first-order Gauss–Markov noise of deviation ``wander`` and correlation time
-``wander_time``. Where a recording has its own temperature, that stands instead.
+T(t) = mean + swing sin(2πt/period) + first-order Gauss–Markov noise of standard deviation ``wander`` and correlation
+time ``wander_time``. If a recording has its own temperature, it is used instead.
 """
 
 from dataclasses import dataclass, fields
@@ -19,22 +19,30 @@ from monitor.noise.effects.exponentially_correlated import ExponentiallyCorrelat
 from monitor.noise.effects.sinusoidal import Sinusoidal
 
 UNITS: Final = {"mean": "°C", "swing": "°C", "period": "s", "wander": "°C", "wander_time": "s"}
+"""Parameter of a temperature -> its unit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Temperature:
-    """What a model file's ``[temperature]`` says; a swing needs its period, a wander its time.
+    """Parameters of the table ``[temperature]`` of a model file. A swing needs its period, and a wander its time.
 
+    Raises
+    ------
+    ConfigError
+        If a parameter is not allowed, or if one of a pair is missing.
+
+    Examples
+    --------
     >>> Temperature(mean=25.0, swing=3.0)
     Traceback (most recent call last):
     drivers.errors.ConfigError: temperature: swing needs a period
     """
 
-    mean: float
-    swing: float | None = None
-    period: float | None = None
-    wander: float | None = None
-    wander_time: float | None = None
+    mean: float  # °C
+    swing: float | None = None  # °C, amplitude of the periodic part
+    period: float | None = None  # s
+    wander: float | None = None  # °C, standard deviation of the random part
+    wander_time: float | None = None  # s, correlation time of the random part
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -60,7 +68,13 @@ class Temperature:
 
     @classmethod
     def from_table(cls, table: object) -> "Temperature":
-        """From a parsed ``[temperature]``; ConfigError when it is no such table."""
+        """Return the temperature of a parsed ``[temperature]`` table.
+
+        Raises
+        ------
+        ConfigError
+            If the table is not valid.
+        """
         if not isinstance(table, dict):
             raise ConfigError(f"temperature must be a table with {', '.join(UNITS)}")
         for name in table:
@@ -71,7 +85,15 @@ class Temperature:
         return cls(**table)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> Series:
-        """Begin a series in °C."""
+        """Return a new series in °C.
+
+        Parameters
+        ----------
+        rate_hz : float
+            Sample rate, Hz.
+        rng : numpy.random.Generator
+            Generator of the temperature alone.
+        """
         parts: list[Series] = []
         if self.swing is not None and self.period is not None:
             swing = Sinusoidal(amplitude=self.swing, frequency=1.0 / self.period, phase=0.0)
@@ -84,12 +106,19 @@ class Temperature:
 
 
 class Recorded(Series):
-    """A recording's temperature, held at its last value beyond its end; values that are missing are those before.
+    """Temperature of a recording.
 
-    Args:
-        temperature_c: [n] °C
-    Raises:
-        ConfigError: no value at all
+    A missing value is replaced by the value before, and the last value continues beyond the end.
+
+    Parameters
+    ----------
+    temperature_c : ndarray, shape (n,)
+        Temperature in °C; NaN = missing.
+
+    Raises
+    ------
+    ConfigError
+        If there is no value at all.
     """
 
     def __init__(self, temperature_c: Floats) -> None:
@@ -101,12 +130,22 @@ class Recorded(Series):
         self._values = given[known[np.maximum(before, 0)]]
 
     def add(self, values: Floats, block: Block) -> None:
-        """Add the temperature."""
+        """Add the next temperatures to the values [n].
+
+        Parameters
+        ----------
+        values : ndarray, shape (n,), float64
+            Temperature in °C. It is updated in place.
+        block : Block
+            Index of the block.
+        """
         index = np.arange(block.first, block.first + values.size)
         values += self._values[np.minimum(index, self._values.size - 1)]
 
 
 class _Generated(Series):
+    """Simulated temperature: a mean and the sum of its parts."""
+
     def __init__(self, mean: float, parts: list[Series]) -> None:
         self._mean, self._parts = mean, parts
 

@@ -1,15 +1,16 @@
-"""ARMA(p, q) of a drift at rest, p ≤ 2, q ≤ 1: exact likelihood, order by criterion, intervals.
+"""ARMA(p, q) models of a drift at rest, p ≤ 2 and q ≤ 1: exact likelihood, choice of the order, confidence intervals.
 
     x_k = φ1 x_{k−1} + φ2 x_{k−2} + a_k + θ1 a_{k−1},    z_k = μ + x_k + v_k
 
-z are means over intervals; v is what white noise leaves of a mean, of a variance that the scatter within the intervals
-tells beforehand (0 where z is the process itself, as in the paper behind this). In state space by Green's function
-(Pandit & Wu 1983; Yuan et al. 2010), the state is the process and what it expects next:
+z are means over intervals. v is the remaining white noise of a mean. Its variance is known beforehand from the scatter
+within the intervals. It is 0 if z is the process itself, as in the paper on which this is based. The state-space form
+uses Green's function (Pandit & Wu 1983; Yuan et al. 2010). The state holds the process and its one-step prediction:
 
     X_k = [x_k, x̂_{k+1|k}],  X_k = A X_{k−1} + B a_k,  A = [[0, 1], [φ2, φ1]],  B = [G0, G1]ᵀ,  G0 = 1, G1 = φ1 + θ1
 
-The likelihood is a Kalman filter's, so intervals may be missing; μ is the one of generalised least squares. Roots are
-kept stable and invertible by writing the coefficients through partial autocorrelations (Monahan 1984).
+The likelihood is computed by a Kalman filter, so intervals may be missing. μ is the generalised least-squares estimate.
+The coefficients are written as functions of partial autocorrelations, which keeps the model stable and invertible
+(Monahan 1984).
 """
 
 from collections.abc import Sequence
@@ -25,98 +26,110 @@ from monitor.common.compiled import compiled
 from monitor.common.minimization import minimize_bfgs
 
 Order = tuple[int, int]
-Triple = tuple[float, float, float]
+"""Order (p, q) of an ARMA model."""
+_Triple = tuple[float, float, float]
 
 ORDERS: Final[tuple[Order, ...]] = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1))
-"""p and q to choose among; the paper has (2, 1). The first says that nothing but white noise is seen."""
-FEWEST: Final = 30
-"""Known values that anything can be said of."""
-NEAREST: Final = 0.99999
-"""Of a partial autocorrelation to one."""
+"""Orders (p, q) to choose from. The paper uses (2, 1). The order (0, 0) means that only white noise is visible."""
+MIN_VALUES: Final = 30
+"""Smallest number of known values for an identification."""
+MAX_PARTIAL_AUTOCORRELATION: Final = 0.99999
+"""Largest absolute value of a partial autocorrelation."""
 HALF_CHI2: Final = 1.920729
 """Half of the 95 % quantile of χ² with one degree of freedom."""
-MOST: Final = 3
-"""Coefficients of the highest order: with fewer nothing can nearly cancel in two ways."""
-APART: Final = 0.1
-"""Of partial autocorrelations: maxima nearer to each other are one."""
-BISECTIONS: Final = 6
-"""Of the last step outwards."""
-FIRST: Final = {
+MAX_COEFFICIENTS: Final = 3
+"""Number of coefficients of the highest order. With fewer coefficients, a root cannot nearly cancel θ in two ways."""
+MIN_MAXIMA_DISTANCE: Final = 0.1
+"""Smallest difference of the partial autocorrelations of two distinct maxima of the likelihood."""
+BISECTION_STEPS: Final = 6
+"""Bisections of the last step of a search for the end of a confidence interval."""
+START_PARTIAL_AUTOCORRELATIONS: Final = {
     0: ((),),
     1: ((0.3,), (0.9,), (0.99,)),
     2: ((0.5, 0.0), (0.9, 0.0), (0.99, 0.0), (0.9, -0.5), (0.3, 0.4)),
 }
-"""Partial autocorrelations to begin from."""
-FIRST_MOVING: Final = (-0.9, -0.5, 0.0, 0.5)
-SHARES: Final = (1e-3, 0.03, 0.5)
-"""Of the variance of z, where part of it is white: variances of a to begin from."""
+"""Start values of the partial autocorrelations, by p."""
+START_THETAS: Final = (-0.9, -0.5, 0.0, 0.5)
+"""Start values of the partial autocorrelation of the moving-average part."""
+START_VARIANCE_SHARES: Final = (1e-3, 0.03, 0.5)
+"""Start values of the variance of a, as shares of the variance of z. They are used if a part of z is white noise."""
 
 
 @dataclass(frozen=True, slots=True)
 class Arma:
-    """One process.
+    """Parameters of one identified ARMA process.
 
     >>> Arma((0.5, 0.3), -0.2, 1.0).green
     (1.0, 0.3)
     """
 
-    phi: tuple[float, float]  # 0 where the order has none
+    phi: tuple[float, float]  # φ1 and φ2; 0 for coefficients that the order does not have
     theta: float
-    variance: float  # of a, (rad/s)²
+    variance: float  # variance of a, (rad/s)²
     mean: float = 0.0  # μ, rad/s
-    white: float = 0.0  # variance of v
+    white: float = 0.0  # variance of v, (rad/s)²
     order: Order = (2, 1)
-    lo: tuple[float, float, float] = (np.nan, np.nan, np.nan)  # 95 % of φ1, φ2, θ1
+    # limits of the 95 % intervals of φ1, φ2, θ1; NaN = not computed
+    lo: tuple[float, float, float] = (np.nan, np.nan, np.nan)
     hi: tuple[float, float, float] = (np.nan, np.nan, np.nan)
-    likelihood: float = np.nan  # logarithm
+    likelihood: float = np.nan  # logarithm of the likelihood
     bic: float = np.nan
-    count: int = 0  # values it was identified from
+    count: int = 0  # number of values used for the identification
 
     @property
     def green(self) -> tuple[float, float]:
-        """G0 and G1."""
+        """Return the first two values G0 and G1 of Green's function."""
         return 1.0, self.phi[0] + self.theta
 
     @property
     def spread(self) -> float:
-        """Standard deviation of x in the long run; infinite for a random walk."""
+        """Return the stationary standard deviation of x in rad/s; infinite for a random walk."""
         return sqrt(self.variance * stationary(*self.phi, self.theta)[0])
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Return the name of the model for display."""
         return f"ARMA({self.order[0]}, {self.order[1]})" if self.order != (0, 0) else "constant"
 
 
 def identify(z: Floats, white: float = 0.0, orders: Sequence[Order] = ORDERS, intervals: bool = False) -> Arma:
-    """The order with the least BIC (Schwarz 1978), and its parameters.
+    """Return the model of the order with the least BIC (Schwarz 1978).
 
-    Args:
-        z: [n] rad/s; NaN = missing
-        white: variance of v, (rad/s)²
-        intervals: of the coefficients too, which takes ten times as long
-    Raises:
-        NotReady: fewer than FEWEST values, or all the same
+    Parameters
+    ----------
+    z : ndarray, shape (n,)
+        Interval means in rad/s; NaN = missing.
+    white : float
+        Variance of the white noise v of a mean, (rad/s)².
+    orders : sequence of (p, q)
+        Orders to choose from.
+    intervals : bool
+        True if the confidence intervals of the coefficients are computed too. This takes ten times as long.
+
+    Raises
+    ------
+    NotReady
+        If fewer than MIN_VALUES values are known, or if all values are equal.
     """
     known = z[np.isfinite(z)]
-    if known.size < FEWEST:
-        raise NotReady(f"{known.size} values; {FEWEST} are needed to identify a drift")
+    if known.size < MIN_VALUES:
+        raise NotReady(f"{known.size} values; {MIN_VALUES} are needed to identify a drift")
     origin, scale = float(np.median(known)), float(known.std())
     if not scale > 0.0:
         raise NotReady("all values are the same")
     unit = (z - origin) / scale
     share = white / scale**2
-    best = min((_fitted(unit, share, order) for order in orders), key=lambda one: one[0])
-    found = _arma(unit, share, origin, scale, best)
+    best = min((_fit_order(unit, share, order) for order in orders), key=lambda one: one[0])
+    found = _to_model(unit, share, origin, scale, best)
     if not intervals:
         return found
-    lo, hi = _interval(unit, share, *best[1:])
+    lo, hi = _confidence_intervals(unit, share, *best[1:])
     return replace(found, lo=lo, hi=hi)
 
 
 @compiled
-def _forward(p11, p12, p22, phi1, phi2, g1, variance):  # type: ignore[no-untyped-def]
-    """A P Aᵀ + variance B Bᵀ, as p11, p12, p22."""
+def _propagate_covariance(p11, p12, p22, phi1, phi2, g1, variance):  # type: ignore[no-untyped-def]
+    """Return A P Aᵀ + variance B Bᵀ as its elements p11, p12, p22."""
     return (
         p22 + variance,
         phi2 * p12 + phi1 * p22 + g1 * variance,
@@ -126,7 +139,15 @@ def _forward(p11, p12, p22, phi1, phi2, g1, variance):  # type: ignore[no-untype
 
 @compiled
 def stationary(phi1, phi2, theta):  # type: ignore[no-untyped-def]
-    """P of the state in the long run, for a of variance 1."""
+    """Return the stationary covariance of the state for a of variance 1, as its elements p11, p12, p22.
+
+    Parameters
+    ----------
+    phi1, phi2 : float
+        Autoregressive coefficients φ1 and φ2.
+    theta : float
+        Moving-average coefficient θ1.
+    """
     g1 = phi1 + theta
     more = phi2 * phi2 + 2.0 * phi1 * phi2 * g1 / (1.0 - phi2) + g1 * g1
     p22 = more / (1.0 - phi2 * phi2 - phi1 * phi1 - 2.0 * phi1 * phi1 * phi2 / (1.0 - phi2))
@@ -135,11 +156,34 @@ def stationary(phi1, phi2, theta):  # type: ignore[no-untyped-def]
 
 @compiled
 def innovations(z, phi1, phi2, theta, variance, white):  # type: ignore[no-untyped-def]
-    """Values that are there, Σ log S, Σ ε²/S of z about its mean, and that mean, of an exact Kalman filter."""
+    """Run the exact Kalman filter and return the sums of the likelihood.
+
+    Parameters
+    ----------
+    z : ndarray, shape (n,)
+        Values; NaN = missing.
+    phi1, phi2, theta : float
+        Coefficients φ1, φ2 and θ1.
+    variance : float
+        Variance of a, in the squared unit of z.
+    white : float
+        Variance of v, in the squared unit of z.
+
+    Returns
+    -------
+    count : int
+        Number of known values.
+    log_determinant : float
+        Σ log S over the innovation variances S.
+    square : float
+        Σ ε²/S of z about its mean.
+    mean : float
+        Generalised least-squares estimate of the mean.
+    """
     g1 = phi1 + theta
     p11, p12, p22 = stationary(phi1, phi2, theta)
     p11, p12, p22 = p11 * variance, p12 * variance, p22 * variance
-    x1 = x2 = o1 = o2 = 0.0  # of z, and of a series of ones, whose sizes together give the mean
+    x1 = x2 = o1 = o2 = 0.0  # The filter runs on z and on a series of ones. Both together give the mean.
     count, logs, zz, zo, oo = 0, 0.0, 0.0, 0.0, 0.0
     for k in range(z.size):
         if z[k] == z[k]:
@@ -153,23 +197,27 @@ def innovations(z, phi1, phi2, theta, variance, white):  # type: ignore[no-untyp
             p11, p12 = white * gain1, white * gain2
         x1, x2 = x2, phi2 * x1 + phi1 * x2
         o1, o2 = o2, phi2 * o1 + phi1 * o2
-        p11, p12, p22 = _forward(p11, p12, p22, phi1, phi2, g1, variance)
+        p11, p12, p22 = _propagate_covariance(p11, p12, p22, phi1, phi2, g1, variance)
     mean = zo / oo if oo > 0.0 else 0.0
     return count, logs, zz - mean * zo, mean
 
 
-_Tried = tuple[float, Order, Floats]  # BIC, order, parameters of the search
+_OrderFit = tuple[float, Order, Floats]  # BIC, order, search parameters
 
 
-def _fitted(z: Floats, white: float, order: Order) -> _Tried:
-    """Most likely parameters of one order: partial autocorrelations and θ through atanh, ln variance where v is."""
+def _fit_order(z: Floats, white: float, order: Order) -> _OrderFit:
+    """Return the most likely parameters of one order.
+
+    The search uses atanh of the partial autocorrelations and of θ. The logarithm of the variance is added if v is not
+    zero.
+    """
     count = int(np.isfinite(z).sum())
     free = sum(order) + (white > 0.0 and order != (0, 0))
 
     def loss(u: Floats) -> float:
-        return -_likelihood(z, white, order, u)
+        return -_log_likelihood(z, white, order, u)
 
-    starts = _starts(white, order)
+    starts = _start_parameters(white, order)
     tried = sorted(((loss(u), i) for i, u in enumerate(starts)))
     best, at = tried[0][0], starts[tried[0][1]]
     if free:
@@ -180,18 +228,19 @@ def _fitted(z: Floats, white: float, order: Order) -> _Tried:
     return 2.0 * best + (free + 2) * log(count), order, at
 
 
-def _starts(white: float, order: Order) -> list[Floats]:
+def _start_parameters(white: float, order: Order) -> list[Floats]:
+    """Return the start points of the search."""
     return [
         np.array([*map(atanh, partial), *((atanh(theta),) if order[1] else ()), *((log(share),) if share else ())])
-        for partial in FIRST[order[0]]
-        for theta in (FIRST_MOVING if order[1] else (0.0,))
-        for share in (SHARES if white > 0.0 and order != (0, 0) else (0.0,))
+        for partial in START_PARTIAL_AUTOCORRELATIONS[order[0]]
+        for theta in (START_THETAS if order[1] else (0.0,))
+        for share in (START_VARIANCE_SHARES if white > 0.0 and order != (0, 0) else (0.0,))
     ]
 
 
-def _likelihood(z: Floats, white: float, order: Order, u: Floats) -> float:
-    """Logarithm, with the mean and, where there is no v, the variance at their best."""
-    phi1, phi2, theta, variance = _natural(order, u, white)
+def _log_likelihood(z: Floats, white: float, order: Order, u: Floats) -> float:
+    """Return the log likelihood, maximised over the mean and, if v is zero, over the variance."""
+    phi1, phi2, theta, variance = _model_coefficients(order, u, white)
     count, logs, square, _ = innovations(z, phi1, phi2, theta, variance, white)
     if white > 0.0 and order != (0, 0):
         return float(-0.5 * (count * log(2.0 * pi) + logs + square))
@@ -199,9 +248,12 @@ def _likelihood(z: Floats, white: float, order: Order, u: Floats) -> float:
     return float(-0.5 * (count * (log(2.0 * pi * size) + 1.0) + logs))
 
 
-def _natural(order: Order, u: Floats, white: float) -> tuple[float, float, float, float]:
-    """φ1, φ2, θ1 and the variance of a (1 where it comes of itself)."""
-    partial = [max(min(tanh(one), NEAREST), -NEAREST) for one in u[: order[0] + order[1]].tolist()]
+def _model_coefficients(order: Order, u: Floats, white: float) -> tuple[float, float, float, float]:
+    """Return φ1, φ2, θ1 and the variance of a; the variance is 1 if the likelihood determines it directly."""
+    partial = [
+        max(min(tanh(one), MAX_PARTIAL_AUTOCORRELATION), -MAX_PARTIAL_AUTOCORRELATION)
+        for one in u[: order[0] + order[1]].tolist()
+    ]
     phi1 = phi2 = 0.0
     if order[0] == 1:
         phi1 = partial[0]
@@ -212,10 +264,10 @@ def _natural(order: Order, u: Floats, white: float) -> tuple[float, float, float
     return phi1, phi2, theta, exp(min(max(float(u[-1]), -60.0), 60.0)) if free else 1.0
 
 
-def _arma(z: Floats, white: float, origin: float, scale: float, best: _Tried) -> Arma:
-    """In the units of what was measured, with intervals."""
+def _to_model(z: Floats, white: float, origin: float, scale: float, best: _OrderFit) -> Arma:
+    """Return the fitted order as a model in the units of the measurement."""
     bic, order, u = best
-    phi1, phi2, theta, variance = _natural(order, u, white)
+    phi1, phi2, theta, variance = _model_coefficients(order, u, white)
     seen = white if order != (0, 0) else 0.0
     count, _, square, mean = innovations(z, phi1, phi2, theta, variance, seen)
     if seen == 0.0:
@@ -228,50 +280,58 @@ def _arma(z: Floats, white: float, origin: float, scale: float, best: _Tried) ->
         mean=origin + scale * mean,
         white=(variance if nothing else white) * scale**2,
         order=order,
-        likelihood=_likelihood(z, white, order, u) - count * log(scale),
+        likelihood=_log_likelihood(z, white, order, u) - count * log(scale),
         bic=bic + 2.0 * count * log(scale),
         count=count,
     )
 
 
-def _interval(z: Floats, white: float, order: Order, u: Floats) -> tuple[Triple, Triple]:
-    """95 % of φ1, φ2, θ1 where the likelihood, at its best in all the others, has fallen by half of χ²(1)'s quantile.
+def _confidence_intervals(z: Floats, white: float, order: Order, u: Floats) -> tuple[_Triple, _Triple]:
+    """Return the 95 % intervals of φ1, φ2 and θ1 by the profile likelihood.
 
-    Where a root nearly cancels θ the likelihood has a long ridge, on which its curvature tells too little, or two tops:
-    then the interval reaches from one to the other.
+    An interval ends where the likelihood, maximised over all other parameters, has fallen by half of the quantile of
+    χ²(1). If a root nearly cancels θ, the likelihood has a long ridge or two maxima. Its curvature is then no measure
+    of the uncertainty, and the interval covers both maxima.
     """
     there = (order[0] > 0, order[0] > 1, order[1] > 0)
-    tops = _tops(z, white, order, u)
-    best = max(_likelihood(z, white, order, one) for one in tops)
+    tops = _likelihood_maxima(z, white, order, u)
+    best = max(_log_likelihood(z, white, order, one) for one in tops)
     nothing = (np.nan, np.nan)
-    ends = [[_ends(z, white, order, one, i, best) if there[i] else nothing for i in range(3)] for one in tops]
+    ends = [[_interval_ends(z, white, order, one, i, best) if there[i] else nothing for i in range(3)] for one in tops]
     lo, hi = np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]
     return (float(lo[0]), float(lo[1]), float(lo[2])), (float(hi[0]), float(hi[1]), float(hi[2]))
 
 
-def _tops(z: Floats, white: float, order: Order, u: Floats) -> list[Floats]:
-    """The maxima of the likelihood that are nearly as high as the highest, which is first."""
+def _likelihood_maxima(z: Floats, white: float, order: Order, u: Floats) -> list[Floats]:
+    """Return the maxima of the likelihood that are nearly as high as the highest, with the fitted one first."""
     found = [u]
-    if sum(order) == MOST:
-        for start in _starts(white, order):
-            _, one = minimize_bfgs(lambda u: -_likelihood(z, white, order, u), start, 0.1)
-            if all(np.abs(np.tanh(one[:MOST]) - np.tanh(other[:MOST])).max() > APART for other in found):
+    if sum(order) == MAX_COEFFICIENTS:
+        for start in _start_parameters(white, order):
+            _, one = minimize_bfgs(lambda u: -_log_likelihood(z, white, order, u), start, 0.1)
+            if all(
+                np.abs(np.tanh(one[:MAX_COEFFICIENTS]) - np.tanh(other[:MAX_COEFFICIENTS])).max() > MIN_MAXIMA_DISTANCE
+                for other in found
+            ):
                 found.append(one)
-    best = max(_likelihood(z, white, order, one) for one in found)
-    return [one for one in found if best - _likelihood(z, white, order, one) < HALF_CHI2]
+    best = max(_log_likelihood(z, white, order, one) for one in found)
+    return [one for one in found if best - _log_likelihood(z, white, order, one) < HALF_CHI2]
 
 
-def _ends(z: Floats, white: float, order: Order, u: Floats, which: int, top: float) -> tuple[float, float]:
-    """Both ends of one coefficient's interval about one maximum, where the highest is ``top``."""
-    value = _natural(order, u, white)[which]
-    limits = (-NEAREST, NEAREST) if which or order[0] < 2 else (-2.0 * NEAREST, 2.0 * NEAREST)
+def _interval_ends(z: Floats, white: float, order: Order, u: Floats, which: int, top: float) -> tuple[float, float]:
+    """Return both ends of the interval of one coefficient about one maximum; ``top`` is the highest log likelihood."""
+    value = _model_coefficients(order, u, white)[which]
+    limits = (
+        (-MAX_PARTIAL_AUTOCORRELATION, MAX_PARTIAL_AUTOCORRELATION)
+        if which or order[0] < 2
+        else (-2.0 * MAX_PARTIAL_AUTOCORRELATION, 2.0 * MAX_PARTIAL_AUTOCORRELATION)
+    )
     found = []
     for limit in limits:
-        inside, outside, near = value, limit, _others(order, u, which)
+        inside, outside, near = value, limit, _free_parameters(order, u, which)
         step = max(abs(limit - value) / 64.0, 1e-9)
-        while abs(inside - limit) > 1e-9:  # outwards, each time further
+        while abs(inside - limit) > 1e-9:  # The search moves outwards with growing steps.
             further = inside + np.sign(limit - value) * min(step, abs(limit - inside))
-            fallen, moved = _profile(z, white, order, which, float(further), near)
+            fallen, moved = _profile_likelihood(z, white, order, which, float(further), near)
             if top - fallen > HALF_CHI2:
                 outside = float(further)
                 break
@@ -279,9 +339,9 @@ def _ends(z: Floats, white: float, order: Order, u: Floats, which: int, top: flo
         else:
             found.append(float(limit))
             continue
-        for _ in range(BISECTIONS):
+        for _ in range(BISECTION_STEPS):
             middle = 0.5 * (inside + outside)
-            fallen, moved = _profile(z, white, order, which, middle, near)
+            fallen, moved = _profile_likelihood(z, white, order, which, middle, near)
             if top - fallen > HALF_CHI2:
                 outside = middle
             else:
@@ -290,14 +350,19 @@ def _ends(z: Floats, white: float, order: Order, u: Floats, which: int, top: flo
     return found[0], found[1]
 
 
-def _others(order: Order, u: Floats, which: int) -> Floats:
-    """What is free when one coefficient is held: ``u`` without it; beside φ1, φ2 by its place in what is stable."""
+def _free_parameters(order: Order, u: Floats, which: int) -> Floats:
+    """Return ``u`` without the parameter that is fixed with one coefficient.
+
+    φ1 is replaced by a parameter that describes φ2 by its position in the region of stable models.
+    """
     held = order[0] if which == 2 else which
     return np.delete(u, held)
 
 
-def _profile(z: Floats, white: float, order: Order, which: int, value: float, near: Floats) -> tuple[float, Floats]:
-    """The likelihood with one coefficient held, and where the others have it at its best."""
+def _profile_likelihood(
+    z: Floats, white: float, order: Order, which: int, value: float, near: Floats
+) -> tuple[float, Floats]:
+    """Return the log likelihood with one coefficient fixed, maximised over the others, and the place of the maximum."""
 
     def full(free: Floats) -> Floats:
         u = np.insert(free, order[0] if which == 2 else which, 0.0)
@@ -305,14 +370,20 @@ def _profile(z: Floats, white: float, order: Order, which: int, value: float, ne
             u[order[0]] = atanh(value)
         elif order[0] == 1 or which == 1:
             u[which] = atanh(value)
-        else:  # φ1 = r1 (1 − φ2): |φ1| < 1 − φ2
+        else:  # φ1 = r1 (1 − φ2), so |φ1| < 1 − φ2
             highest = 1.0 - abs(value)
-            phi2 = -NEAREST + 0.5 * (1.0 + tanh(float(u[1]))) * (highest + NEAREST) * NEAREST
+            phi2 = (
+                -MAX_PARTIAL_AUTOCORRELATION
+                + 0.5
+                * (1.0 + tanh(float(u[1])))
+                * (highest + MAX_PARTIAL_AUTOCORRELATION)
+                * MAX_PARTIAL_AUTOCORRELATION
+            )
             u[1] = atanh(phi2)
-            u[0] = atanh(max(min(value / (1.0 - phi2), NEAREST), -NEAREST))
+            u[0] = atanh(max(min(value / (1.0 - phi2), MAX_PARTIAL_AUTOCORRELATION), -MAX_PARTIAL_AUTOCORRELATION))
         return u
 
     if not near.size:
-        return _likelihood(z, white, order, full(near)), near
-    least, place = minimize_bfgs(lambda free: -_likelihood(z, white, order, full(free)), near, 1e-2)
+        return _log_likelihood(z, white, order, full(near)), near
+    least, place = minimize_bfgs(lambda free: -_log_likelihood(z, white, order, full(free)), near, 1e-2)
     return -least, place

@@ -1,4 +1,4 @@
-"""What compensation made of a recording."""
+"""Results of the compensation of a recording."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,27 +11,27 @@ from monitor.drift.compensation.compensator import Interval
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """One gyro axis at rest, on samples that taught nothing before they were compensated."""
+    """Compensation of one gyro axis, evaluated at rest on samples that were not used for learning before."""
 
-    model: Arma | None  # of its drift, as identified last; None: not enough at rest
-    before: AtRest  # the mean of the first third taken out
-    after: AtRest
-    left_out: int  # intervals that no drift explains
-    steps: int  # of the bias
+    model: Arma | None  # last identified model of the drift; None if there was too little rest
+    before: AtRest  # without compensation, minus the mean of the first third
+    after: AtRest  # with compensation
+    left_out: int  # number of rejected intervals, which no drift explains
+    steps: int  # number of steps of the bias
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What was done."""
+    """Compensation of one recording."""
 
     recording: str
-    out: Path
+    out: Path  # compensated recording
     method: str
     rate_hz: float
     samples: int
     interval_s: float
-    learned_s: float  # at rest, in the first third
-    judged_s: float  # at rest, after it
+    learned_s: float  # time at rest in the first third, s
+    judged_s: float  # time at rest after the first third, s
     intervals: tuple[Interval, ...]
     axes: Mapping[str, Axis]
     notes: tuple[str, ...]

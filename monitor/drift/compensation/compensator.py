@@ -1,13 +1,15 @@
-"""Drift taken out of a gyro's rate, sample by sample, while the carrier may move.
+"""Removal of the drift of three gyro axes from the measured rate, sample by sample, while the carrier may move.
 
-One measured rate z = ω + drift + noise, and two things to be known of it. At rest ω is nothing: there, and only there,
-the drift is learned, from means over intervals (``sage_husa`` on an ``arma`` model). In motion it is predicted, and
-what is left of z is followed by filters that let motion pass (``manoeuvre``). A single filter of both would have to
-share out every slow change between them; that rest is known is worth more than any share.
+The measured rate is z = ω + drift + noise. At rest the true rate ω is zero, so the drift is learned only there, from
+means over intervals (``sage_husa``, with the model of ``arma``). In motion the drift is predicted, and the remaining
+rate is smoothed by filters that follow motion (``motion_filter_bank``). A single filter for both would have to divide
+every slow change between drift and motion. The knowledge that the carrier is at rest is more reliable than any such
+division.
 
-Whether a sample is of rest is known some blocks after it (``estimate.rest``), so what an interval taught holds from the
-second block after it on, 0.5 s at most rates. The rate itself comes out at once: with sample k, of samples up to k. It
-is the same however the stream is cut. Accelerometers pass as they are; they take part in telling rest.
+The decision whether a sample was taken at rest follows some blocks later (``motion_kernel``). The result of an interval
+therefore applies from the second block after it, which is 0.5 s at most rates. The compensated rate has no such delay:
+sample k depends on the samples up to k. The output does not depend on how the stream is divided into blocks.
+Accelerometer values are not changed. They are used to detect rest.
 """
 
 from collections.abc import Sequence
@@ -26,80 +28,93 @@ from monitor.estimation.detection import motion_kernel
 from monitor.estimation.detection.motion_detection import block_size
 
 GYROS: Final = 3
-BLOCKS: Final = 4
-"""Of ``estimate.rest`` in an interval: 1 s, at rates below 32 Hz longer."""
-ENOUGH: Final = 2
-"""Of them at rest."""
+"""Number of gyro axes. They are the first columns of the samples."""
+BLOCKS_PER_INTERVAL: Final = 4
+"""Blocks of the motion detector in an interval. An interval lasts 1 s, and longer at rates below 32 Hz."""
+MIN_REST_BLOCKS: Final = 2
+"""Blocks at rest that an interval needs to count as at rest."""
 SLOTS: Final = 4
-"""Blocks whose verdict is awaited."""
+"""Blocks that can wait for a rest decision."""
 REMEMBERED: Final = 2048
-"""Intervals that a model is identified from."""
-FIRST: Final = 60
-"""Intervals at rest after which a model is identified; then when there are half as many more, and every so many as are
-remembered at the latest."""
-LOUD: Final = (0.02,) * 3 + (0.3,) * 3
-"""rad/s and m/s²: rms about the mean of a block that is no rest for certain, whatever the sensor has got used to: a car
-that drives all day. Nothing is learned then, and rates come out nearly as they came in."""
-LARGEST: Final = 0.35
-"""rad/s, 20 °/s: no gyro's mean at rest is beyond."""
-LONGEST_GAP: Final = 100_000
-"""Intervals predicted over: after more nothing is known any more in any case."""
+"""Intervals that are kept to identify a model."""
+MIN_IDENTIFICATION_INTERVALS: Final = 60
+"""Intervals at rest before a first model is identified. The next identification follows after half as many more, and
+after at most REMEMBERED more."""
+MAX_REST_RMS: Final = (0.02,) * 3 + (0.3,) * 3
+"""Largest rms of a block at rest about its mean, in rad/s and m/s².
 
-NUMBER, COUNT, ORIGIN, SUM, SQUARES = range(5)
-"""Columns of ``waiting``: number of the block, samples, what sums are about, sums."""
-MEAN, EXPECTED, ERROR, BECAME, DRIFT_ERROR, SCATTER = range(6)
-"""Columns of what an interval taught: its mean (NaN = not at rest), what was expected, the deviation of that difference
-that was expected, what became of it, the standard error of what was expected, and the variance of the mean by the
-scatter within."""
+The limit holds whatever the motion detector has learned, for example in a car that drives all day. Above it nothing is
+learned, and the rates are hardly changed.
+"""
+MAX_BIAS_RAD_S: Final = 0.35
+"""Largest mean rate of a gyro at rest: 0.35 rad/s is 20 °/s."""
+MAX_GAP_INTERVALS: Final = 100_000
+"""Largest number of intervals predicted across a gap. After a longer gap, the prediction holds no information."""
+
+BLOCK_NUMBER, COUNT, ORIGIN, SUM, SQUARES = range(5)
+"""Columns of ``State.waiting``: number of the block, number of samples, origin of the sums, sum and sum of squares."""
+MEAN, EXPECTED, INNOVATION_STD, OUTCOME, EXPECTED_ERROR, SCATTER = range(6)
+"""Columns of the result of an interval.
+
+MEAN is the measured mean, NaN if the interval was not at rest. EXPECTED is the predicted drift and INNOVATION_STD the
+predicted standard deviation of their difference. OUTCOME is one of the outcomes of ``sage_husa``. EXPECTED_ERROR is the
+standard error of the prediction. SCATTER is the variance of the mean, estimated from the scatter within the interval.
+"""
 
 
 class State(NamedTuple):
-    """All that is remembered; arrays only."""
+    """Complete state of the compensator, in arrays that compiled code can use."""
 
     rest: motion_kernel.State
-    current: Ints  # [1] interval being filled; -1 = none yet
-    learned: Ints  # [3] intervals at rest that filters learned from
-    row: Floats  # [3 axes, …] of sage_husa
-    bias: Floats  # [3] that is taken out now; NaN = not known yet
-    bank: Floats  # [3, filters + 1, 5]
-    ages: Ints  # [3, filters, 2]
-    feedback: Floats  # [3, 1]
-    waiting: Floats  # [SLOTS, 6, 5] blocks without a verdict
-    sums: Floats  # [SLOTS, 3, filters + 1, 2] of ``follow``, for each
-    means: Floats  # [3, BLOCKS] of blocks at rest in the interval; NaN = not at rest
-    followed: Floats  # [3, filters + 1, 2] sums of those blocks
-    samples: Floats  # [3] how many they are of
-    table: Floats  # gains
-    first: Ints
-    verdicts: Ints  # [3, 4] scratch: blocks, whether they move; episodes are not used
-    episodes: Floats
+    current: Ints  # [1] number of the current interval; -1 = none yet
+    learned: Ints  # [3] intervals at rest from which the filters learned their noise
+    row: Floats  # [3, ROW_SIZE] one row of ``sage_husa`` for each axis
+    bias: Floats  # [3] rad/s, bias that is subtracted now; NaN = not known yet
+    bank: Floats  # [3, filters + 1, 5] columns as in ``motion_filter_bank``
+    ages: Ints  # [3, filters, 2] columns as in ``motion_filter_bank``
+    feedback: Floats  # [3, 1] difference of input and output that is still to be fed back
+    waiting: Floats  # [SLOTS, 6, 5] sums of the blocks that wait for a rest decision
+    sums: Floats  # [SLOTS, 3, filters + 1, 2] sums of ``follow`` for each of these blocks
+    means: Floats  # [3, BLOCKS_PER_INTERVAL] rad/s, means of the blocks of the interval; NaN = not at rest
+    followed: Floats  # [3, filters + 1, 2] sums of ``follow`` over the blocks at rest
+    samples: Floats  # [3] number of samples in these blocks
+    table: Floats  # [rows, 2] gains of all filters
+    first: Ints  # [filters + 1] first row of each filter in the table
+    decisions: Ints  # [2, SLOTS] scratch: block numbers, and 1 if the block is in motion
+    episodes: Floats  # [SLOTS, 5] scratch, not used
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """What an interval taught of the drift of three gyro axes, rad/s."""
+    """Result of one interval for three gyro axes, in rad/s."""
 
-    end: int  # index of the sample after its last, missing ones counted
+    end: int  # index of the first sample after the interval; missing samples count
     mean: Floats  # [3] measured at rest; NaN = in motion
-    expected: Floats  # [3]
-    error: Floats  # [3] standard deviation that mean less expected should have
-    became: Ints  # [3] NOT_SEEN, USED, LEFT_OUT, STEPPED of sage_husa
-    known: Floats  # [3] standard error of what was expected
+    expected: Floats  # [3] predicted drift; NaN = not known yet
+    error: Floats  # [3] predicted standard deviation of ``mean - expected``
+    became: Ints  # [3] NOT_SEEN, USED, LEFT_OUT or STEPPED of ``sage_husa``
+    known: Floats  # [3] standard error of ``expected``
 
     @property
     def innovation(self) -> Floats:
-        """[3] mean less expected in standard deviations."""
+        """Return the normalised innovation [3]: measured minus expected mean, in predicted standard deviations."""
         return (self.mean - self.expected) / self.error
 
 
 class Compensator:
-    """Three gyro axes of one sensor.
+    """Drift compensator of the three gyro axes of one sensor.
 
-    Args:
-        rate_hz: samples a second
-        adapts: noise of the drift is estimated as time goes on; else as it was identified
-        orders: ARMA orders to choose among
+    Parameters
+    ----------
+    rate_hz : float
+        Sample rate in Hz.
+    adapts : bool
+        True if the noise of the drift is estimated continuously. False if it stays as the identification found it.
+    orders : sequence of (p, q)
+        ARMA orders to choose from.
 
+    Examples
+    --------
     >>> one = Compensator(100.0)
     >>> still = np.random.default_rng(0).normal(0.0, 1e-3, (3000, 6)) + 0.02
     >>> out = np.concatenate([one.update(still[k : k + 50]) for k in range(0, 3000, 50)])
@@ -112,132 +127,172 @@ class Compensator:
         self.size = block_size(rate_hz)
         self.models: list[Arma | None] = [None] * GYROS
         self._orders = tuple(orders)
-        self._state = _state(rate_hz, adapts)
-        self.came = 0  # samples, missing ones included
-        self._means = np.full((GYROS, REMEMBERED), np.nan)  # a ring of intervals
+        self._state = _initial_state(rate_hz, adapts)
+        self.came = 0  # samples received, including missing ones
+        self._means = np.full((GYROS, REMEMBERED), np.nan)  # ring buffer of interval means
         self._scatter = np.full((GYROS, REMEMBERED), np.nan)
-        self._kept = 0
+        self._interval_count = 0
         self._at_rest = np.zeros(GYROS, np.int64)
-        self._due = np.full(GYROS, FIRST)
-        self._taught: list[Interval] = []
+        self._next_identification = np.full(GYROS, MIN_IDENTIFICATION_INTERVALS)
+        self._finished_intervals: list[Interval] = []
 
     @property
     def interval(self) -> int:
-        """Samples of a mean that the drift is learned from."""
-        return BLOCKS * self.size
+        """Return the number of samples in an interval."""
+        return BLOCKS_PER_INTERVAL * self.size
 
     @property
     def interval_s(self) -> float:
-        """The same in seconds."""
+        """Return the length of an interval in seconds."""
         return self.interval / self.rate_hz
 
     @property
     def bias(self) -> Floats:
-        """[3] rad/s that is taken out now; NaN = not known yet."""
+        """Return the bias [3] in rad/s that is subtracted now; NaN means that it is not known yet."""
         return self._state.bias.copy()
 
     @property
     def error(self) -> Floats:
-        """[3] standard error of that."""
+        """Return the standard error [3] of the bias in rad/s; NaN means that the bias is not known yet."""
         known = [sage_husa.drift(row)[1] ** 0.5 for row in self._state.row]
         return np.where(np.isnan(self._state.bias), np.nan, known)
 
     def update(self, values: Floats, lost: int = 0) -> Floats:
-        """Consecutive samples [n, 6] in SI, NaN = missing, ``lost`` more before them; the same, drift taken out.
+        """Return consecutive samples with the drift of the gyros removed.
 
-        Until a bias is known, and where a sample is missing, a gyro's rate comes out as it came in.
+        A gyro rate is not changed until the bias is known, or if the sample is missing.
+
+        Parameters
+        ----------
+        values : ndarray, shape (n, 6), float64
+            Samples in rad/s and m/s², in the order of AXES; NaN = missing.
+        lost : int
+            Number of samples that are missing before the first row.
+
+        Returns
+        -------
+        ndarray, shape (n, 6), float64
+            The samples in the same units, with unchanged accelerometer values.
         """
         if lost:
             for axis in range(GYROS):
                 coast(self._state.bank[axis], self._state.ages[axis], lost)
             self.came += lost
         out = np.array(values, dtype=np.float64, order="C")
-        # always contiguous and read-only, as each layout and access flag would be compiled anew
+        # Numba compiles one version per memory layout and access flag, so the array is always contiguous and read-only.
         values = np.ascontiguousarray(values, np.float64).view()
         values.flags.writeable = False
-        # after a hole, verdicts on all blocks that waited come at once, and each may end an interval
-        taught = np.empty((len(values) // self.interval + 2 + SLOTS, 1 + 6 * GYROS))
-        filled = _advance(values, self.came, self.size, self._state, out, taught)
+        # After a gap, all waiting blocks are decided at once, and each of them may end an interval.
+        outcomes = np.empty((len(values) // self.interval + 2 + SLOTS, 1 + 6 * GYROS))
+        filled = _advance(values, self.came, self.size, self._state, out, outcomes)
         self.came += len(values)
         for k in range(filled):
-            self._learn(taught[k])
+            self._record_interval(outcomes[k])
         return out
 
     def take(self) -> list[Interval]:
-        """What the intervals since the last call taught."""
-        taught, self._taught = self._taught, []
-        return taught
+        """Return the results of the intervals that have ended since the last call."""
+        outcomes, self._finished_intervals = self._finished_intervals, []
+        return outcomes
 
     # --- identification
 
     @property
     def ahead(self) -> int:
-        """Samples to the end of the interval: where models change there, they change at the same samples however the
-        stream is cut."""
+        """Return the number of samples to the end of the interval.
+
+        If models change only there, they change at the same sample however the stream is divided into blocks.
+        """
         return self.interval - self.came % self.interval
 
     @property
     def due(self) -> tuple[int, ...]:
-        """Axes of which there is enough new to identify a model."""
-        return tuple(np.flatnonzero(self._at_rest >= self._due).tolist())
+        """Return the indices of the axes that have enough new intervals to identify a model."""
+        return tuple(np.flatnonzero(self._at_rest >= self._next_identification).tolist())
 
     def window(self, axis: int) -> tuple[Floats, float]:
-        """Means that a model of an axis is to be identified from, oldest first, and their white noise's variance."""
-        z, scatter = self._remembered(axis)
+        """Return the interval means from which the model of an axis is to be identified.
+
+        Parameters
+        ----------
+        axis : int
+            Index of the gyro axis, 0 to 2.
+
+        Returns
+        -------
+        means : ndarray, shape (n,)
+            Interval means in rad/s, oldest first; NaN = not at rest.
+        white : float
+            Variance of the white noise of a mean, (rad/s)².
+        """
+        z, scatter = self._history(axis)
         white = float(np.nanmean(scatter)) if np.isfinite(scatter).any() else 0.0
         return z, white
 
     def adopt(self, axis: int, model: Arma | None) -> None:
-        """Take a model over, and go through what is remembered again with it; None: none was found, ask later."""
-        self._due[axis] = self._at_rest[axis] + min(max(self._at_rest[axis], FIRST) // 2, REMEMBERED)
+        """Use a new model for an axis, and filter all remembered intervals again with it.
+
+        Parameters
+        ----------
+        axis : int
+            Index of the gyro axis, 0 to 2.
+        model : Arma or None
+            The identified model. None means that no model was found, so the identification is repeated later.
+        """
+        self._next_identification[axis] = self._at_rest[axis] + min(
+            max(self._at_rest[axis], MIN_IDENTIFICATION_INTERVALS) // 2, REMEMBERED
+        )
         if model is None:
             return
         self.models[axis] = model
         row = self._state.row[axis]
         count = row[sage_husa.COUNT]
         sage_husa.adopt(row, model)
-        sage_husa.again(row, *self._remembered(axis), _least(self._state.rest.open, axis))
-        row[sage_husa.COUNT] = count  # each interval once
-        _renew(axis, self._state.row, self._state.bias, self._state.bank)
+        sage_husa.again(row, *self._history(axis), _min_variance(self._state.rest.open, axis))
+        row[sage_husa.COUNT] = count  # The repeated intervals are not counted a second time.
+        _update_bias(axis, self._state.row, self._state.bias, self._state.bank)
 
     def identify(self) -> None:
-        """Models of all axes that are due."""
+        """Identify the models of all axes that are due."""
         for axis in self.due:
             try:
                 self.adopt(axis, identify(*self.window(axis), self._orders))
-            except NotReady:  # all the same, or far too few: asked again later
+            except NotReady:  # The means are all equal or too few. The identification is repeated later.
                 self.adopt(axis, None)
 
-    # --- inside
+    # --- results of intervals
 
-    def _remembered(self, axis: int) -> tuple[Floats, Floats]:
-        count = min(self._kept, REMEMBERED)
-        order = np.arange(self._kept - count, self._kept) % REMEMBERED
+    def _history(self, axis: int) -> tuple[Floats, Floats]:
+        """Return the remembered means and their scatter, oldest first."""
+        count = min(self._interval_count, REMEMBERED)
+        order = np.arange(self._interval_count - count, self._interval_count) % REMEMBERED
         return self._means[axis][order], self._scatter[axis][order]
 
-    def _learn(self, taught: Floats) -> None:
-        columns = taught[1:].reshape(GYROS, 6)
-        at = self._kept % REMEMBERED
-        became = columns[:, BECAME]
-        self._means[became == sage_husa.STEPPED] = np.nan  # what was before belongs to another level
+    def _record_interval(self, outcomes: Floats) -> None:
+        """Record the result of one interval in the history."""
+        columns = outcomes[1:].reshape(GYROS, 6)
+        at = self._interval_count % REMEMBERED
+        became = columns[:, OUTCOME]
+        self._means[became == sage_husa.STEPPED] = np.nan  # The older means belong to the bias before the step.
         used = (became == sage_husa.USED) | (became == sage_husa.STEPPED)
         self._means[:, at] = np.where(used, columns[:, MEAN], np.nan)
         self._scatter[:, at] = np.where(used, columns[:, SCATTER], np.nan)
-        self._kept += 1
+        self._interval_count += 1
         self._at_rest += used
-        self._taught.append(
+        self._finished_intervals.append(
             Interval(
-                int(taught[0] + 1) * self.interval,
+                int(outcomes[0] + 1) * self.interval,
                 columns[:, MEAN].copy(),
                 columns[:, EXPECTED].copy(),
-                columns[:, ERROR].copy(),
-                columns[:, BECAME].astype(np.int64),
-                columns[:, DRIFT_ERROR].copy(),
+                columns[:, INNOVATION_STD].copy(),
+                columns[:, OUTCOME].astype(np.int64),
+                columns[:, EXPECTED_ERROR].copy(),
             )
         )
 
 
-def _state(rate_hz: float, adapts: bool) -> State:
+def _initial_state(rate_hz: float, adapts: bool) -> State:
+    """Return the state before the first sample."""
     each = memories(rate_hz)
     table, first = gains(each)
     filters = each.size
@@ -252,45 +307,45 @@ def _state(rate_hz: float, adapts: bool) -> State:
         feedback=np.zeros((GYROS, 1)),
         waiting=np.full((SLOTS, len(AXES), 5), -1.0),
         sums=np.zeros((SLOTS, GYROS, filters + 1, 2)),
-        means=np.full((GYROS, BLOCKS), np.nan),
+        means=np.full((GYROS, BLOCKS_PER_INTERVAL), np.nan),
         followed=np.zeros((GYROS, filters + 1, 2)),
         samples=np.zeros(GYROS),
         table=table,
         first=first,
-        verdicts=np.zeros((2, SLOTS), np.int64),
+        decisions=np.zeros((2, SLOTS), np.int64),
         episodes=np.zeros((SLOTS, 5)),
     )
 
 
 @compiled
-def _advance(values, index, size, s, out, taught):  # type: ignore[no-untyped-def]
-    """Consecutive rows; what intervals taught is filled in. Returns how many did."""
+def _advance(values, index, size, s, out, outcomes):  # type: ignore[no-untyped-def]
+    """Process consecutive rows, write the results of finished intervals, and return their number."""
     keep = 0.5 / (2 << (s.ages.shape[1] - 1))
     filled, i, n = 0, 0, values.shape[0]
     while i < n:
         number = (index + i) // size
         end = min(n, (number + 1) * size - index)
-        verdicts = motion_kernel.advance(
-            values[i:end], index + i, size, False, s.rest, s.verdicts[0], s.verdicts[1], s.episodes
+        decisions = motion_kernel.advance(
+            values[i:end], index + i, size, False, s.rest, s.decisions[0], s.decisions[1], s.episodes
         )
-        for v in range(verdicts[0]):
-            filled += _judged(s.verdicts[0, v], s.verdicts[1, v] > 0, s, taught[filled])
+        for v in range(decisions[0]):
+            filled += _apply_rest_decision(s.decisions[0, v], s.decisions[1, v] > 0, s, outcomes[filled])
         slot = number % SLOTS
-        if s.waiting[slot, 0, NUMBER] != number:
+        if s.waiting[slot, 0, BLOCK_NUMBER] != number:
             _begin_block(number, s.waiting[slot], s.sums[slot])
         for a in range(GYROS):
-            _take_out(values[i:end, a], a, s.sums[slot, a], s, keep, out[i:end, a])
+            _subtract_drift(values[i:end, a], a, s.sums[slot, a], s, keep, out[i:end, a])
         for a in range(len(AXES)):
-            _add(values[i:end, a], s.waiting[slot, a])
+            _accumulate(values[i:end, a], s.waiting[slot, a])
         i = end
     return filled
 
 
 @compiled
 def _begin_block(number, waiting, sums):  # type: ignore[no-untyped-def]
-    """A slot is for another block now."""
+    """Assign a slot to a new block and clear its sums."""
     for a in range(len(AXES)):
-        waiting[a, NUMBER] = number
+        waiting[a, BLOCK_NUMBER] = number
         for column in range(COUNT, SQUARES + 1):
             waiting[a, column] = 0.0
     for a in range(GYROS):
@@ -299,8 +354,8 @@ def _begin_block(number, waiting, sums):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _take_out(z, axis, sums, s, keep, out):  # type: ignore[no-untyped-def]
-    """Samples of one gyro axis without its drift; NaN = missing."""
+def _subtract_drift(z, axis, sums, s, keep, out):  # type: ignore[no-untyped-def]
+    """Remove the drift from samples of one gyro axis; NaN = missing."""
     bank, ages, feedback = s.bank[axis], s.ages[axis], s.feedback[axis]
     bias = s.bias[axis] if s.bias[axis] == s.bias[axis] else 0.0
     trusted = s.learned[axis] >= LEAST
@@ -316,8 +371,8 @@ def _take_out(z, axis, sums, s, keep, out):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _add(values, sums):  # type: ignore[no-untyped-def]
-    """To the sums of a block; NaN = missing."""
+def _accumulate(values, sums):  # type: ignore[no-untyped-def]
+    """Add values to the sums of a block; NaN values are skipped."""
     for k in range(values.size):
         if values[k] != values[k]:
             continue
@@ -330,23 +385,23 @@ def _add(values, sums):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _judged(number, moves, s, taught):  # type: ignore[no-untyped-def]
-    """A verdict has become final: the interval learns from the block; one that is over is told. Returns whether."""
-    interval = number // BLOCKS
+def _apply_rest_decision(number, moves, s, outcomes):  # type: ignore[no-untyped-def]
+    """Apply the final rest decision on a block, and return True if this ended the previous interval."""
+    interval = number // BLOCKS_PER_INTERVAL
     over = s.current[0] >= 0 and interval > s.current[0]
     if over:
-        _over(s, taught)
-        for _ in range(min(interval - s.current[0] - 1, LONGEST_GAP)):
+        _finish_interval(s, outcomes)
+        for _ in range(min(interval - s.current[0] - 1, MAX_GAP_INTERVALS)):
             for a in range(GYROS):
-                _forward(a, s)
+                _predict_next_interval(a, s)
     s.current[0] = interval
     slot = number % SLOTS
-    if moves or s.waiting[slot, 0, NUMBER] != number or _loud(s.waiting[slot]):
+    if moves or s.waiting[slot, 0, BLOCK_NUMBER] != number or _exceeds_rest_limits(s.waiting[slot]):
         return over
     for a in range(GYROS):
         count = s.waiting[slot, a, COUNT]
         if count > 0.0:
-            s.means[a, number % BLOCKS] = s.waiting[slot, a, ORIGIN] + s.waiting[slot, a, SUM] / count
+            s.means[a, number % BLOCKS_PER_INTERVAL] = s.waiting[slot, a, ORIGIN] + s.waiting[slot, a, SUM] / count
             s.samples[a] += count
             for j in range(s.followed.shape[1]):
                 s.followed[a, j, 0] += s.sums[slot, a, j, 0]
@@ -355,43 +410,48 @@ def _judged(number, moves, s, taught):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _loud(waiting):  # type: ignore[no-untyped-def]
-    """Whether a block is no rest for certain."""
+def _exceeds_rest_limits(waiting):  # type: ignore[no-untyped-def]
+    """Return True if a block exceeds the limits of rest, whatever the motion detector has learned."""
     for a in range(len(AXES)):
         n = waiting[a, COUNT]
         if n == 0.0:
             continue
         mean = waiting[a, SUM] / n
-        if waiting[a, SQUARES] / n - mean * mean > LOUD[a] ** 2:
+        if waiting[a, SQUARES] / n - mean * mean > MAX_REST_RMS[a] ** 2:
             return True
-        if a < GYROS and abs(waiting[a, ORIGIN] + mean) > LARGEST:
+        if a < GYROS and abs(waiting[a, ORIGIN] + mean) > MAX_BIAS_RAD_S:
             return True
     return False
 
 
 @compiled
-def _over(s, taught):  # type: ignore[no-untyped-def]
-    """The interval is over: drift and filters learn from it, and the drift is predicted for the next."""
-    taught[0] = s.current[0]
+def _finish_interval(s, outcomes):  # type: ignore[no-untyped-def]
+    """End the interval: update drift and filters with it, and predict the drift of the next interval."""
+    outcomes[0] = s.current[0]
     for a in range(GYROS):
-        told = taught[1 + 6 * a : 7 + 6 * a]
+        outcome = outcomes[1 + 6 * a : 7 + 6 * a]
         known = s.bias[a] == s.bias[a]
         for column in range(6):
-            told[column] = np.nan
-        told[EXPECTED], told[BECAME] = s.bias[a], sage_husa.NOT_SEEN
+            outcome[column] = np.nan
+        outcome[EXPECTED], outcome[OUTCOME] = s.bias[a], sage_husa.NOT_SEEN
         if known:
-            told[DRIFT_ERROR] = np.sqrt(sage_husa.drift(s.row[a])[1])
-        count, mean, scatter = _mean(s.means[a])
-        if count >= ENOUGH:
-            variance, became = sage_husa.measure(s.row[a], mean, scatter, _least(s.rest.open, a))
-            told[MEAN], told[ERROR], told[BECAME], told[SCATTER] = mean, np.sqrt(variance), became, scatter
+            outcome[EXPECTED_ERROR] = np.sqrt(sage_husa.drift(s.row[a])[1])
+        count, mean, scatter = _interval_mean(s.means[a])
+        if count >= MIN_REST_BLOCKS:
+            variance, became = sage_husa.measure(s.row[a], mean, scatter, _min_variance(s.rest.open, a))
+            outcome[MEAN], outcome[INNOVATION_STD], outcome[OUTCOME], outcome[SCATTER] = (
+                mean,
+                np.sqrt(variance),
+                became,
+                scatter,
+            )
             if known and became == sage_husa.USED:
                 s.learned[a] += 1
                 learn(s.bank[a], s.followed[a], s.samples[a], s.learned[a])
         else:
             sage_husa.not_seen(s.row[a])
-        _forward(a, s)
-        for b in range(BLOCKS):
+        _predict_next_interval(a, s)
+        for b in range(BLOCKS_PER_INTERVAL):
             s.means[a, b] = np.nan
         for j in range(s.followed.shape[1]):
             s.followed[a, j, 0] = s.followed[a, j, 1] = 0.0
@@ -399,10 +459,13 @@ def _over(s, taught):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _mean(means):  # type: ignore[no-untyped-def]
-    """Blocks at rest of an interval, their mean, and the variance that half differences of neighbours give it."""
+def _interval_mean(means):  # type: ignore[no-untyped-def]
+    """Return the number of blocks at rest in an interval, their mean, and the variance of the mean.
+
+    The variance comes from half the differences of neighbouring blocks.
+    """
     count, total, apart, pairs = 0, 0.0, 0.0, 0
-    for b in range(BLOCKS):
+    for b in range(BLOCKS_PER_INTERVAL):
         if means[b] == means[b]:
             count, total = count + 1, total + means[b]
             if b and means[b - 1] == means[b - 1]:
@@ -411,22 +474,22 @@ def _mean(means):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _least(blocks, axis):  # type: ignore[no-untyped-def]
-    """Variance of an interval's mean that rounding may hide; ``blocks`` is ``rest_kernel.State.open``."""
-    return blocks[axis, motion_kernel.STEP] ** 2 / 12.0 / BLOCKS + motion_kernel.NOTHING
+def _min_variance(blocks, axis):  # type: ignore[no-untyped-def]
+    """Return the variance of an interval mean that rounding may hide; ``blocks`` is ``motion_kernel.State.open``."""
+    return blocks[axis, motion_kernel.STEP] ** 2 / 12.0 / BLOCKS_PER_INTERVAL + motion_kernel.NOTHING
 
 
 @compiled
-def _forward(axis, s):  # type: ignore[no-untyped-def]
-    """To the next interval, once a level is confirmed."""
+def _predict_next_interval(axis, s):  # type: ignore[no-untyped-def]
+    """Predict the drift of the next interval, if a level is confirmed."""
     if s.row[axis, sage_husa.COUNT] >= sage_husa.CONFIRMED:
         sage_husa.forward(s.row[axis])
-        _renew(axis, s.row, s.bias, s.bank)
+        _update_bias(axis, s.row, s.bias, s.bank)
 
 
 @compiled
-def _renew(axis, rows, biases, banks):  # type: ignore[no-untyped-def]
-    """What is expected of the drift is what is taken out from now on; what filters follow moves with it."""
+def _update_bias(axis, rows, biases, banks):  # type: ignore[no-untyped-def]
+    """Subtract the predicted drift from now on, and shift the filters by its change."""
     now = sage_husa.drift(rows[axis])[0]
     before = biases[axis] if biases[axis] == biases[axis] else 0.0
     shift(banks[axis], now - before)

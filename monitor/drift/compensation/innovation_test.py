@@ -1,45 +1,47 @@
-"""Whether innovations are as large as they should be: the test that a drift's model still holds.
+"""Test of the innovations of a drift model: detection of a model that no longer fits.
 
-A mean of ε²/S over the last intervals is about χ² over its freedom while the model holds. Beyond a limit that chance
-passes next to never the model does not, whatever the noise was estimated as since; told once, until it holds again.
+While the model fits, the mean of ε²/S over the last intervals follows a χ² distribution divided by its degrees of
+freedom. If the mean exceeds LIMIT, the model does not fit, even with its adapted noise. The change is reported once,
+and again only after the model has fitted in between.
 """
 
 from collections import deque
 from typing import Final
 
 INTERVALS: Final = 64
+"""Intervals over which the squared innovations are averaged."""
 CHANCE: Final = 1e-8
-"""Of a look that chance passes the limit; looks overlap."""
+"""Probability that noise alone exceeds the limit in one evaluation. Successive evaluations overlap."""
 LIMIT: Final = 2.327393746165351
-"""The quantile of χ² with INTERVALS degrees of freedom that CHANCE exceeds, over INTERVALS."""
-AGAIN: Final = 1.3
-"""Below this the model holds again."""
+"""Quantile of χ² with INTERVALS degrees of freedom that is exceeded with probability CHANCE, divided by INTERVALS."""
+RESET_LIMIT: Final = 1.3
+"""Mean square below which the model fits again."""
 
 
 class Innovations:
-    """Of one axis."""
+    """Innovation test of one axis."""
 
     def __init__(self) -> None:
         self._squares: deque[float] = deque(maxlen=INTERVALS)
-        self._told = False
+        self._exceeded = False
 
     @property
     def mean_square(self) -> float:
-        """Of ε²/S over the last intervals; NaN before there are so many."""
+        """Return the mean of ε²/S over the last INTERVALS intervals; NaN if there are fewer."""
         return sum(self._squares) / INTERVALS if len(self._squares) == INTERVALS else float("nan")
 
     def update(self, innovation: float) -> bool:
-        """One more ε/√S; whether the model has just ceased to hold."""
+        """Add a normalised innovation ε/√S, and return True if the model has just ceased to fit."""
         self._squares.append(innovation**2)
         now = self.mean_square
-        if self._told and now < AGAIN:
-            self._told = False
-        if self._told or not now > LIMIT:
+        if self._exceeded and now < RESET_LIMIT:
+            self._exceeded = False
+        if self._exceeded or not now > LIMIT:
             return False
-        self._told = True
+        self._exceeded = True
         return True
 
     def forget(self) -> None:
-        """A new model, or a new level."""
+        """Discard all innovations, after a change of the model or of the level."""
         self._squares.clear()
-        self._told = False
+        self._exceeded = False

@@ -1,8 +1,8 @@
-"""The compensation of one device while its samples come: blocks in, the same blocks without their gyros' drift out.
+"""Live drift compensation of one device: the samples of a stream without the drift of their gyros.
 
-What every interval at rest has taught is told as a ``DriftLook``; a model that no longer holds, and a bias that
-stepped, as an event. Models are identified by the caller, beside the stream, as that takes some 50 ms: the
-compensator's ``due`` says of which axes, ``adopt`` takes them over.
+Each interval produces a ``DriftLook``. An event reports a model that no longer fits, or a step of the bias. The caller
+identifies the models beside the stream, because an identification takes some 50 ms. The property ``due`` of the
+compensator names the axes, and ``adopt`` takes the identified models.
 """
 
 from dataclasses import dataclass
@@ -19,70 +19,87 @@ from monitor.drift.compensation.sage_husa import STEPPED, USED
 from monitor.estimation.detection.signal_monitor import OTHER_RATE
 
 KIND: Final = "drift_unexplained"
+"""Kind of the events of this module."""
 
 
 @dataclass(frozen=True, slots=True)
 class DriftLook:
-    """One interval, of three gyro axes, rad/s."""
+    """Result of one interval for three gyro axes, in rad/s."""
 
-    t_ns: int  # of its last sample
+    t_ns: int  # time of the last sample
     interval_s: float
-    mean: Floats  # [3] measured at rest; NaN = in motion, or left out
-    expected: Floats  # [3] the drift that was taken out; NaN = not known yet
-    error: Floats  # [3] standard error of that
-    innovation: Floats  # [3] ε/√S
-    models: tuple[Arma | None, ...]
+    mean: Floats  # [3] measured at rest; NaN = in motion, or rejected
+    expected: Floats  # [3] drift that was subtracted; NaN = not known yet
+    error: Floats  # [3] standard error of ``expected``
+    innovation: Floats  # [3] normalised innovation ε/√S; NaN = not used
+    models: tuple[Arma | None, ...]  # one model per axis; None = not identified yet
 
 
 class LiveCompensation:
-    """The gyros of one device.
+    """Drift compensation of the gyros of one device.
 
-    Args:
-        rate_hz: samples a second
+    Parameters
+    ----------
+    rate_hz : float
+        Sample rate in Hz.
     """
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
         self._events: list[Event] = []
         self._looks: list[DriftLook] = []
-        self._begin()
+        self._reset()
 
     def update(self, samples: SampleBlock) -> SampleBlock:
-        """The block, drift taken out; times, temperature and accelerometers as they are."""
+        """Return the block with the drift of its gyros removed; times, temperature and accelerations stay the same."""
         values = self.compensator.update(samples.values, samples.lost)
         newest_ns = int(samples.t_ns[-1])
         for interval in self.compensator.take():
             t_ns = newest_ns - round((self.compensator.came - interval.end) / self._rate_hz * 1e9)
-            self._look(interval, t_ns)
+            self._publish(interval, t_ns)
         return block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
 
     def take(self) -> list[DriftLook]:
-        """Intervals since the last call."""
+        """Return the results of the intervals that have ended since the last call."""
         looks, self._looks = self._looks, []
         return looks
 
     def take_events(self) -> list[Event]:
-        """What no model explains, since the last call."""
+        """Return the events since the last call: steps of the bias, and models that no longer fit."""
         events, self._events = self._events, []
         return events
 
     def adopt(self, axis: int, model: Arma | None) -> None:
-        """A model that was identified; None: none was found."""
+        """Use a newly identified model for an axis.
+
+        Parameters
+        ----------
+        axis : int
+            Index of the gyro axis, 0 to 2.
+        model : Arma or None
+            The identified model. None means that no model was found.
+        """
         self.compensator.adopt(axis, model)
         if model is not None:
             self._innovations[axis].forget()
 
     def relabel(self, rate_hz: float) -> None:
-        """The rate is known better; if it is another one, all that was learned was of other times."""
+        """Set a better estimate of the sample rate in Hz.
+
+        If the rate differs by more than OTHER_RATE, the compensation starts anew, because its intervals had another
+        length.
+        """
         if abs(rate_hz / self._rate_hz - 1.0) > OTHER_RATE:
             self._rate_hz = rate_hz
-            self._begin()
+            self._reset()
 
-    def _begin(self) -> None:
+    def _reset(self) -> None:
+        """Start the compensation anew at the current sample rate."""
         self.compensator = Compensator(self._rate_hz)
         self._innovations = [Innovations() for _ in range(GYROS)]
 
-    def _look(self, interval: Interval, t_ns: int) -> None:
+    def _publish(self, interval: Interval, t_ns: int) -> None:
+        """Append the result of an interval and its events."""
         used = interval.became == USED
         self._looks.append(
             DriftLook(
@@ -98,20 +115,22 @@ class LiveCompensation:
         for at in range(GYROS):
             if interval.became[at] == STEPPED:
                 self._innovations[at].forget()
-                self._events.append(_stepped(AXES[at], float(interval.mean[at] - interval.expected[at]), t_ns))
+                self._events.append(_step_event(AXES[at], float(interval.mean[at] - interval.expected[at]), t_ns))
                 continue
             known = used[at] and np.isfinite(interval.expected[at])
             if known and self._innovations[at].update(float(interval.innovation[at])):
                 since_ns = t_ns - round(INTERVALS * self.compensator.interval_s * 1e9)
-                self._events.append(_left(AXES[at], self._innovations[at].mean_square, t_ns, since_ns))
+                self._events.append(_misfit_event(AXES[at], self._innovations[at].mean_square, t_ns, since_ns))
 
 
-def _stepped(axis: str, size: float, t_ns: int) -> Event:
+def _step_event(axis: str, size: float, t_ns: int) -> Event:
+    """Return the event of a step of the bias by ``size`` rad/s."""
     text = f"{axis}: the bias has stepped by {amount(axis, size, sign=True)} and stayed; it is taken out from now on"
     return Event(KIND, t_ns, text, axis, {"bias": {"size": size}})
 
 
-def _left(axis: str, mean_square: float, t_ns: int, since_ns: int) -> Event:
+def _misfit_event(axis: str, mean_square: float, t_ns: int, since_ns: int) -> Event:
+    """Return the event of innovations whose mean square is too large."""
     text = (
         f"{axis}: the drift does not go as its model lets expect: squared innovations are {mean_square:.1f} times as "
         f"large as they should be"

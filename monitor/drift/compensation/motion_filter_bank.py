@@ -1,17 +1,20 @@
-"""The rate of a carrier that may move at any moment: a bank of filters on the "current" statistical model.
+"""Rate of a carrier that may move at any time: a bank of filters with the "current" statistical model.
 
-Zhou & Kumar 1984, with the one-step prediction as the mean of the acceleration (Yuan et al. 2010): state [ω, ω̇],
-transition [[1, T], [0, 1]], process noise 2ασ_a² ∫ over T. With that mean the manoeuvre frequency α and the variance
-σ_a² enter by their product alone; while αT ≪ 1 that is white noise of intensity 2ασ_a² in ω̈. In units of one sample,
-and of the noise of the measured rate, one number q is left, and with it the gains: a filter of ``memory`` samples.
+Each filter follows Zhou & Kumar 1984, with the one-step prediction as the mean of the acceleration (Yuan et al. 2010).
+The state is [ω, ω̇], the transition is [[1, T], [0, 1]], and the process noise is 2ασ_a² ∫ over T. With this mean, the
+manoeuvre frequency α and the variance σ_a² enter only as a product. While αT ≪ 1, the product acts as white noise of
+intensity 2ασ_a² in ω̈. In units of one sample and of the noise of the measured rate, a single number q remains. It
+determines the gains, and with them a filter of ``memory`` samples.
 
-σ_a² adapts with the motion: filters with memories of 2, 4, 8, … samples run side by side, and at every sample the one
-with the least estimated error is taken, or the measured rate itself. By Mallows' C_p (Technometrics 15, 1973) the mean
-square error of a linear filter is its own variance of noise plus what its residual has grown by; both are learned at
-rest, where the rate is known to be nothing, so neither white noise nor any model of the noise is assumed. A residual
-beyond GATE deviations bars a filter at once, and makes it begin anew when it stays.
+σ_a² adapts to the motion. Filters with memories of 2, 4, 8, … samples run in parallel. At every sample the output comes
+from the filter with the least estimated error, or from the measured rate itself. By Mallows' C_p (Technometrics 15,
+1973), the mean square error of a linear filter is its own noise variance plus the growth of its residual. Both are
+learned at rest, where the rate is known to be zero. The method therefore assumes neither white noise nor any other
+noise model. A residual beyond GATE standard deviations excludes a filter immediately, and resets the filter if it
+persists.
 
-Where filters take turns, angle would get lost: what has not come out yet is fed back, slowly.
+Changes between filters would lose angle. The difference between input and output is therefore accumulated and fed back
+slowly.
 """
 
 from math import inf, log2, sqrt
@@ -22,61 +25,66 @@ import numpy as np
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled, inlined
 
-LONGEST_S: Final = 10.0
-"""Memory of the slowest filter."""
-RECENT: Final = 64.0
-"""Samples over which a residual is averaged, exponentially."""
+MAX_MEMORY_S: Final = 10.0
+"""Memory of the slowest filter in seconds."""
+RESIDUAL_MEMORY: Final = 64.0
+"""Time constant of the exponential average of a residual, in samples."""
 GATE: Final = 5.0
-"""Standard deviations of a residual at rest."""
-BARRED: Final = 3
-"""Samples beyond the gate, one after the other, after which a filter begins anew."""
-SETTLED: Final = (6, 48)
-"""Memories, and samples at the least, after which a filter that began anew has its steady gains."""
+"""Largest residual, in standard deviations at rest."""
+MAX_GATE_EXCEEDANCES: Final = 3
+"""Successive samples beyond the gate after which a filter is reset."""
+SETTLING_SAMPLES: Final = (6, 48)
+"""Age at which a filter has reached its steady gains after a reset: a multiple of its memory, and a
+minimum in samples."""
 LEAST: Final = 5
-"""Intervals at rest before filters are trusted."""
-LEARNED: Final = 60
-"""Intervals at rest that noise is averaged over, exponentially."""
-DIFFUSE: Final = 1e12
-"""Variance of a state of which nothing is known, over that of a sample."""
+"""Intervals at rest before the output of the filters is used."""
+NOISE_MEMORY_INTERVALS: Final = 60
+"""Time constant of the exponential average of the noise, in intervals at rest."""
+DIFFUSE_VARIANCE: Final = 1e12
+"""Variance of an unknown state, relative to the variance of a sample."""
 
-RATE, SLOPE, RESIDUAL, NOISE, REST = range(5)
-"""Columns of ``bank``: ω and ω̇ a sample, mean square residual of late, variance of the estimate and mean square
-residual at rest. The first row is the measured rate itself: of it only NOISE is used."""
-AGE, FAR = range(2)
-"""Columns of ``ages``: samples since a filter began, samples beyond the gate in a row."""
+RATE, SLOPE, RESIDUAL, NOISE, REST_RESIDUAL = range(5)
+"""Columns of ``bank``: ω, ω̇ per sample, recent mean square residual, variance of the estimate at rest, and mean square
+residual at rest. The first row is the measured rate itself. Only its NOISE is used."""
+AGE, EXCEEDANCES = range(2)
+"""Columns of ``ages``: samples since the reset of a filter, and successive samples beyond the gate."""
 
 
 def memories(rate_hz: float) -> Ints:
-    """Samples: 2, 4, 8, … up to about LONGEST_S.
+    """Return the filter memories in samples: 2, 4, 8, … up to about MAX_MEMORY_S.
 
     >>> memories(4.0).tolist()
     [2, 4, 8, 16, 32]
     """
-    return np.asarray(2 ** np.arange(1, max(round(log2(LONGEST_S * rate_hz)), 1) + 1), dtype=np.int64)
+    return np.asarray(2 ** np.arange(1, max(round(log2(MAX_MEMORY_S * rate_hz)), 1) + 1), dtype=np.int64)
 
 
 def intensity(memory: int) -> float:
-    """2ασ_a² in units of one sample and of the measured variance, for which noise falls by ``memory`` in variance.
+    """Return the noise intensity 2ασ_a² of a filter that reduces the noise variance by the factor ``memory``.
 
-    The gain of the steady filter is about √2 q^¼, and the variance it leaves 3/4 of that.
+    The result is in units of one sample and of the measured variance. The gain of the steady filter is about √2 q^¼,
+    and the remaining variance is 3/4 of the gain.
     """
     return (4.0 / (3.0 * memory) / sqrt(2.0)) ** 4
 
 
 def gains(each: Ints) -> tuple[Floats, Ints]:
-    """Gains [rows, 2] of ω and ω̇ by age, one filter behind the other, and where each begins [filters + 1].
+    """Return the gains [rows, 2] of ω and ω̇ by age, and the first row of each filter [filters + 1].
 
-    The last row of a filter is its steady gain.
+    The filters follow one another in the table. The last row of a filter holds its steady gains. ``each`` holds the
+    memories in samples.
     """
-    tables = [_gains(intensity(int(memory)), max(SETTLED[0] * int(memory), SETTLED[1])) for memory in each]
+    tables = [
+        _gains(intensity(int(memory)), max(SETTLING_SAMPLES[0] * int(memory), SETTLING_SAMPLES[1])) for memory in each
+    ]
     return np.concatenate(tables), np.cumsum([0, *(len(one) for one in tables)])
 
 
 @compiled
 def _gains(q, rows):  # type: ignore[no-untyped-def]
-    """Of a filter that knows nothing at first: the Riccati recursion."""
+    """Return the gains [rows, 2] of a filter with an unknown initial state by the Riccati recursion."""
     out = np.empty((rows, 2))
-    p00, p01, p11 = DIFFUSE, 0.0, DIFFUSE
+    p00, p01, p11 = DIFFUSE_VARIANCE, 0.0, DIFFUSE_VARIANCE
     for k in range(rows):
         s = p00 + 1.0
         g0, g1 = p00 / s, p01 / s
@@ -88,17 +96,30 @@ def _gains(q, rows):  # type: ignore[no-untyped-def]
 
 @inlined
 def follow(z, bank, ages, table, first, sums, feedback, keep):  # type: ignore[no-untyped-def]
-    """One sample of one axis.
+    """Process one sample of one axis, and return the filtered rate.
 
-    Args:
-        z: measured rate, its bias taken out
-        bank: [filters + 1, 5], ages: [filters, 2]
-        table, first: of ``gains``
-        sums: [filters + 1, 2] of squares of the estimate and of the residual, for what may turn out to be rest
-        feedback: [1] angle that has not come out yet, in samples
-        keep: share of it that comes out with a sample
-    Returns:
-        The rate.
+    Parameters
+    ----------
+    z : float
+        Measured rate minus the bias, rad/s.
+    bank : ndarray, shape (filters + 1, 5)
+        State of the filters. It is updated in place.
+    ages : ndarray, shape (filters, 2), int64
+        Ages and gate exceedances of the filters. They are updated in place.
+    table, first : ndarray
+        Gains and first rows as ``gains`` returns them.
+    sums : ndarray, shape (filters + 1, 2)
+        Sums of the squares of estimate and residual, in case the sample turns out to be at rest. They are updated in
+        place.
+    feedback : ndarray, shape (1,)
+        Accumulated difference of input and output, in rad/s times samples. It is updated in place.
+    keep : float
+        Share of the feedback that is added to the output in each sample.
+
+    Returns
+    -------
+    float
+        Filtered rate, rad/s.
     """
     least, rate = bank[0, NOISE], z
     sums[0, 0] += z * z
@@ -111,19 +132,19 @@ def follow(z, bank, ages, table, first, sums, feedback, keep):  # type: ignore[n
         bank[j + 1, RATE] = now
         bank[j + 1, SLOPE] += table[at, 1] * new
         square = (now - z) * (now - z)
-        usual = bank[j + 1, REST]
+        usual = bank[j + 1, REST_RESIDUAL]
         gate = GATE * GATE * usual if usual > 0.0 else inf
         bounded = min(square, gate)
-        recent = bank[j + 1, RESIDUAL] + (bounded - bank[j + 1, RESIDUAL]) / RECENT
+        recent = bank[j + 1, RESIDUAL] + (bounded - bank[j + 1, RESIDUAL]) / RESIDUAL_MEMORY
         bank[j + 1, RESIDUAL] = recent
         sums[j + 1, 0] += now * now
         sums[j + 1, 1] += bounded
         if square > gate:
-            ages[j, FAR] += 1
-            if ages[j, FAR] >= BARRED:
-                bank[j + 1, RATE], bank[j + 1, SLOPE], ages[j, AGE], ages[j, FAR] = z, 0.0, 1, 0
+            ages[j, EXCEEDANCES] += 1
+            if ages[j, EXCEEDANCES] >= MAX_GATE_EXCEEDANCES:
+                bank[j + 1, RATE], bank[j + 1, SLOPE], ages[j, AGE], ages[j, EXCEEDANCES] = z, 0.0, 1, 0
             continue
-        ages[j, FAR] = 0
+        ages[j, EXCEEDANCES] = 0
         error = bank[j + 1, NOISE] + recent - usual
         if error < least:
             least, rate = error, now
@@ -134,10 +155,22 @@ def follow(z, bank, ages, table, first, sums, feedback, keep):  # type: ignore[n
 
 @compiled
 def coast(bank, ages, samples):  # type: ignore[no-untyped-def]
-    """So many samples are missing: filters go on along their slopes, those of a shorter memory begin anew."""
+    """Advance the filters over missing samples.
+
+    Filters predict along their slopes. Filters with a memory shorter than the gap are reset.
+
+    Parameters
+    ----------
+    bank : ndarray, shape (filters + 1, 5)
+        State of the filters. It is updated in place.
+    ages : ndarray, shape (filters, 2), int64
+        Ages and gate exceedances of the filters. They are updated in place.
+    samples : int
+        Number of missing samples.
+    """
     for j in range(ages.shape[0]):
         if samples >= 2 << j:
-            ages[j, AGE] = ages[j, FAR] = 0
+            ages[j, AGE] = ages[j, EXCEEDANCES] = 0
             bank[j + 1, SLOPE] = 0.0
         else:
             bank[j + 1, RATE] += samples * bank[j + 1, SLOPE]
@@ -145,15 +178,35 @@ def coast(bank, ages, samples):  # type: ignore[no-untyped-def]
 
 @compiled
 def shift(bank, by):  # type: ignore[no-untyped-def]
-    """The bias is known to be larger by so much."""
+    """Correct the filters after the estimate of the bias has changed.
+
+    Parameters
+    ----------
+    bank : ndarray, shape (filters + 1, 5)
+        State of the filters. It is updated in place.
+    by : float
+        Increase of the bias, rad/s.
+    """
     for j in range(1, bank.shape[0]):
         bank[j, RATE] -= by
 
 
 @compiled
 def learn(bank, sums, count, intervals):  # type: ignore[no-untyped-def]
-    """An interval has turned out to be rest, one of so many: ``count`` samples whose sums these are."""
-    share = max(1.0 / LEARNED, 1.0 / intervals)
+    """Update the noise at rest with an interval that was at rest.
+
+    Parameters
+    ----------
+    bank : ndarray, shape (filters + 1, 5)
+        State of the filters. It is updated in place.
+    sums : ndarray, shape (filters + 1, 2)
+        Sums of ``follow`` over the samples of the interval.
+    count : float
+        Number of these samples.
+    intervals : int
+        Number of intervals at rest so far, including this one.
+    """
+    share = max(1.0 / NOISE_MEMORY_INTERVALS, 1.0 / intervals)
     for j in range(bank.shape[0]):
         bank[j, NOISE] += share * (sums[j, 0] / count - bank[j, NOISE])
-        bank[j, REST] += share * (sums[j, 1] / count - bank[j, REST])
+        bank[j, REST_RESIDUAL] += share * (sums[j, 1] / count - bank[j, REST_RESIDUAL])

@@ -1,7 +1,7 @@
-"""What others take drift and noise out of a finished recording with, on one interface: for comparison.
+"""Published methods that remove drift and noise from a finished recording, with one interface, for comparison.
 
-All three learn from samples at rest and then treat the recording as one signal; none knows of motion. They need the
-future (``emd``, ``wavelet``), or a signal that looks like the noise at rest (``ar``).
+All three methods learn from samples at rest and then treat the recording as one signal. None of them detects motion.
+``emd`` and ``wavelet`` need future samples. ``ar`` needs a signal that is similar to the noise at rest.
 """
 
 from collections.abc import Callable
@@ -13,36 +13,56 @@ from drivers.errors import ConfigError, NotReady
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
 
-HIGHEST: Final = 8
-"""Order of an autoregression."""
-LEAST: Final = 100
-"""Samples at rest to learn from."""
+MAX_ORDER: Final = 8
+"""Highest order of an autoregression."""
+MIN_REST_SAMPLES: Final = 100
+"""Smallest number of samples at rest."""
 PIECE, OVERLAP = 16_384, 4_096
-"""Samples of one decomposition into modes, and of the cross-fade to the next: its memory grows with its length."""
-AT_ONCE: Final = 2
-"""Lag by which the autocorrelation of a noise mode has fallen below 1/e."""
+"""Samples of one empirical mode decomposition, and of the cross-fade to the next one. The decomposition is made in
+pieces because its memory grows with its length."""
+MAX_NOISE_LAG: Final = 2
+"""Lag in samples by which the autocorrelation of a noise mode has fallen below 1/e."""
 WAVELET: Final = "db4"
-MOST_DOUBLINGS: Final = 60
-DEEPEST: Final = 8
-"""Levels of a wavelet decomposition."""
+"""Name of the wavelet in PyWavelets."""
+MAX_DOUBLINGS: Final = 60
+"""Largest number of iterations of the doubling algorithm."""
+MAX_LEVELS: Final = 8
+"""Highest number of levels of a wavelet decomposition."""
 SIGMA_OF_MAD: Final = 0.6745
-MISSING: Final = 'EMD-signal and PyWavelets are not installed: pip install "imu-monitor[denoise]"'
+"""Median of the absolute value of standard normal noise. The median absolute deviation over this number is σ."""
+MISSING_PACKAGES: Final = 'EMD-signal and PyWavelets are not installed: pip install "imu-monitor[denoise]"'
+"""Message for a missing optional package."""
 
 Variant = Callable[[Floats, Floats], Floats]
-"""A rate [n] less the mean at rest, and samples at rest [m] to learn from, less the same: the rate without noise."""
+"""Function of a rate [n] and of samples at rest [m], both minus the mean at rest; it returns the rate [n] without
+noise."""
 
 
 def compensated(x: Floats, learned: Floats, variant: Variant) -> Floats:
-    """A rate [n] of one axis by a variant; NaN = missing, and stays so.
+    """Return the rate of one axis without drift and noise.
 
-    Args:
-        learned: [m] rate at rest, in order
-    Raises:
-        NotReady: too few samples at rest
+    Parameters
+    ----------
+    x : ndarray, shape (n,)
+        Rate in rad/s; NaN = missing. Missing samples stay missing.
+    learned : ndarray, shape (m,)
+        Rate at rest in rad/s, in the order of time.
+    variant : callable
+        One of the VARIANTS.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Compensated rate in rad/s.
+
+    Raises
+    ------
+    NotReady
+        If there are too few samples at rest.
     """
     rest = learned[np.isfinite(learned)]
-    if rest.size < LEAST:
-        raise NotReady(f"{rest.size} samples at rest; {LEAST} are needed to learn from")
+    if rest.size < MIN_REST_SAMPLES:
+        raise NotReady(f"{rest.size} samples at rest; {MIN_REST_SAMPLES} are needed to learn from")
     mean = float(rest.mean())
     there = np.isfinite(x)
     whole = np.interp(np.arange(x.size), np.flatnonzero(there), x[there]) - mean
@@ -51,22 +71,58 @@ def compensated(x: Floats, learned: Floats, variant: Variant) -> Floats:
 
 
 def ar(x: Floats, learned: Floats) -> Floats:
-    """Autoregression (Yule–Walker), order by BIC; Kalman filter with the variance at rest as measuring noise."""
-    return _filtered(x, *_autoregression(learned), float(learned.var()))
+    """Filter with an autoregressive model: Yule–Walker equations, order by BIC, Kalman filter.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n,)
+        Rate in rad/s without its mean at rest.
+    learned : ndarray, shape (m,)
+        Rate at rest in rad/s without its mean. Its variance is the measurement noise of the filter.
+    """
+    return _kalman_filtered(x, *_autoregression(learned), float(learned.var()))
 
 
 def emd(x: Floats, learned: Floats) -> Floats:
-    """Empirical modes (Huang et al. 1998); those whose autocorrelation drops at once are filtered as in ``ar``."""
-    return _in_pieces(x, _modes_filtered)
+    """Filter the noise modes of an empirical mode decomposition (Huang et al. 1998).
+
+    The modes whose autocorrelation falls within MAX_NOISE_LAG samples are filtered as in ``ar``.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n,)
+        Rate in rad/s without its mean at rest.
+    learned : ndarray, shape (m,)
+        Not used.
+
+    Raises
+    ------
+    ConfigError
+        If EMD-signal is not installed.
+    """
+    return _process_pieces(x, _filter_noise_modes)
 
 
 def wavelet(x: Floats, learned: Floats) -> Floats:
-    """Soft shrinkage by the universal threshold (Donoho & Johnstone 1994), noise told level by level from rest."""
+    """Shrink wavelet coefficients softly by the universal threshold (Donoho & Johnstone 1994).
+
+    Parameters
+    ----------
+    x : ndarray, shape (n,)
+        Rate in rad/s without its mean at rest.
+    learned : ndarray, shape (m,)
+        Rate at rest in rad/s without its mean. It gives the noise of each level.
+
+    Raises
+    ------
+    ConfigError
+        If PyWavelets is not installed.
+    """
     try:
         import pywt
     except ImportError as error:
-        raise ConfigError(MISSING) from error
-    depth = min(DEEPEST, pywt.dwt_max_level(min(x.size, learned.size), WAVELET))
+        raise ConfigError(MISSING_PACKAGES) from error
+    depth = min(MAX_LEVELS, pywt.dwt_max_level(min(x.size, learned.size), WAVELET))
     parts = pywt.wavedec(x, WAVELET, level=depth)
     quiet = pywt.wavedec(learned, WAVELET, level=depth)
     for at in range(1, depth + 1):
@@ -76,9 +132,9 @@ def wavelet(x: Floats, learned: Floats) -> Floats:
 
 
 def _autoregression(x: Floats) -> tuple[Floats, float]:
-    """Coefficients [p ≥ 1] and the variance of what is new."""
+    """Return the coefficients [p ≥ 1] of an autoregression and the variance of its innovations."""
     n = x.size
-    most = min(HIGHEST, n // 10)
+    most = min(MAX_ORDER, n // 10)
     covariance = np.array([float(x[: n - k] @ x[k:]) / n for k in range(most + 1)])
     best = (np.inf, np.zeros(1), float(covariance[0]))
     for p in range(1, most + 1):
@@ -89,27 +145,27 @@ def _autoregression(x: Floats) -> tuple[Floats, float]:
     return best[1], best[2]
 
 
-def _filtered(x: Floats, phi: Floats, new: float, measuring: float) -> Floats:
-    """The steady Kalman filter of z = autoregression + white noise."""
+def _kalman_filtered(x: Floats, phi: Floats, new: float, measuring: float) -> Floats:
+    """Return the steady-state Kalman estimate of an autoregression measured in white noise."""
     p = phi.size
     step = np.zeros((p, p))
     step[0], step[1:, :-1] = phi, np.eye(p - 1)
     unit = max(measuring, 1e-300)
     before = _steady_covariance(step, new / unit)
-    return np.asarray(_run(x, phi, before[:, 0] / (before[0, 0] + 1.0)))
+    return np.asarray(_run_filter(x, phi, before[:, 0] / (before[0, 0] + 1.0)))
 
 
 def _steady_covariance(step: Floats, new: float) -> Floats:
-    """Return the steady covariance of a Kalman filter's prediction.
+    """Return the steady-state covariance of a Kalman filter's prediction.
 
-    The state's step [p, p] is given, ``new`` is the variance that its first element gains, and the first element is
-    measured with a variance of one. The structure-preserving doubling algorithm (Chu, Fan, Lin & Wang, Int. J. Control
-    77, 2004) converges quadratically.
+    ``step`` is the transition matrix [p, p], and ``new`` is the variance added to the first element in each step. The
+    first element is measured with a variance of one. The structure-preserving doubling algorithm (Chu, Fan, Lin & Wang,
+    Int. J. Control 77, 2004) converges quadratically.
     """
     p = step.shape[0]
     a, g, h = step.T.copy(), np.zeros((p, p)), np.zeros((p, p))
     g[0, 0], h[0, 0] = 1.0, new
-    for _ in range(MOST_DOUBLINGS):
+    for _ in range(MAX_DOUBLINGS):
         inner = np.linalg.solve(np.eye(p) + g @ h, np.hstack([a, g]))
         more = a.T @ h @ inner[:, :p]
         g = g + a @ inner[:, p:] @ a.T
@@ -121,7 +177,8 @@ def _steady_covariance(step: Floats, new: float) -> Floats:
 
 
 @compiled
-def _run(x, phi, gain):  # type: ignore[no-untyped-def]
+def _run_filter(x, phi, gain):  # type: ignore[no-untyped-def]
+    """Run the filter with a constant gain [p] over x [n], and return its estimates [n]."""
     p = phi.size
     state, out = np.zeros(p), np.empty(x.size)
     for k in range(x.size):
@@ -138,31 +195,33 @@ def _run(x, phi, gain):  # type: ignore[no-untyped-def]
     return out
 
 
-def _modes_filtered(x: Floats) -> Floats:
+def _filter_noise_modes(x: Floats) -> Floats:
+    """Return the sum of the modes of x [n], with the noise modes filtered."""
     try:
         from PyEMD import EMD
     except ImportError as error:
-        raise ConfigError(MISSING) from error
+        raise ConfigError(MISSING_PACKAGES) from error
     out = np.zeros(x.size)
     for mode in EMD().emd(x):
-        if _drops_at_once(mode):
-            out += _filtered(mode, *_autoregression(mode), float(mode.var()))
+        if _is_noise(mode):
+            out += _kalman_filtered(mode, *_autoregression(mode), float(mode.var()))
         else:
             out += mode
     return out
 
 
-def _drops_at_once(mode: Floats) -> bool:
+def _is_noise(mode: Floats) -> bool:
+    """Return True if the autocorrelation of a mode falls below 1/e within MAX_NOISE_LAG samples."""
     centred = mode - mode.mean()
     power = float(centred @ centred)
     if not power > 0.0:
         return False
-    lags = range(1, AT_ONCE + 1)
+    lags = range(1, MAX_NOISE_LAG + 1)
     return any(float(centred[:-k] @ centred[k:]) < power / np.e for k in lags if k < mode.size)
 
 
-def _in_pieces(x: Floats, work: Callable[[Floats], Floats]) -> Floats:
-    """Overlapping pieces, worked on one by one and faded into each other."""
+def _process_pieces(x: Floats, work: Callable[[Floats], Floats]) -> Floats:
+    """Process overlapping pieces of x [n] one by one, and cross-fade them."""
     out = np.zeros(x.size)
     rise = (np.arange(OVERLAP) + 0.5) / OVERLAP
     start, end = 0, 0
@@ -181,3 +240,4 @@ def _in_pieces(x: Floats, work: Callable[[Floats], Floats]) -> Floats:
 
 
 VARIANTS: Final[dict[str, Variant]] = {"ar": ar, "emd": emd, "wavelet": wavelet}
+"""Methods by name."""

@@ -1,1 +1,1 @@
-"""Bias against temperature: model, fit, online update and prediction."""
+"""Models of bias against temperature: fit, online update and prediction."""

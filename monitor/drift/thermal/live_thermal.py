@@ -1,10 +1,10 @@
-"""The bias–temperature models of one device while its samples come.
+"""Live models of bias against temperature for one device.
 
-Comes in: blocks in order, moving samples struck out (NaN). Goes out: at the end of every interval a ``ThermalLook``,
-what was measured on each axis beside what was expected of it; and what temperature does not explain. Until a first
-temperature has come nothing is kept and nothing is worked out.
+The input consists of blocks of samples in order, with NaN for samples in motion. At the end of every interval, a
+``ThermalLook`` holds the measured and the predicted mean of each axis. Changes that temperature does not explain are
+reported as events. Nothing is stored or computed before the first temperature has been received.
 
-``update`` takes a few ms at the end of an interval; ``step`` chooses models piece by piece, in the time between.
+``update`` takes a few ms at the end of an interval. ``step`` chooses models in small pieces between the intervals.
 """
 
 from collections.abc import Mapping
@@ -22,52 +22,57 @@ from monitor.drift.thermal.running_interval_means import Interval, RunningMeans
 from monitor.estimation.detection.signal_monitor import OTHER_RATE
 
 KIND: Final = "temperature_unexplained"
+"""Kind of the events of this module."""
 
 
 @dataclass(frozen=True, slots=True)
 class ThermalLook:
-    """One interval of all axes that were ever measured."""
+    """Interval means and predictions of all axes that have been measured."""
 
-    t_ns: int  # its end
+    t_ns: int  # end of the interval
     interval_s: float
-    temperature_c: float  # °C, its mean
-    axes: Mapping[str, AxisThermal]  # in AXES order
+    temperature_c: float  # mean of the interval, °C
+    axes: Mapping[str, AxisThermal]  # axis -> result, in the order of AXES
 
 
 class LiveThermal:
-    """Interval means and models of one device.
+    """Interval means and thermal models of one device.
 
-    Args:
-        rate_hz: samples a second
-        interval_s: of a mean; at least PARTS samples
+    Parameters
+    ----------
+    rate_hz : float
+        Sample rate in Hz.
+    interval_s : float
+        Length of an interval in seconds. An interval has at least PARTS samples.
     """
 
     def __init__(self, rate_hz: float, interval_s: float) -> None:
-        self._wanted_s = interval_s
+        self._requested_interval_s = interval_s
         self._events: list[Event] = []
         self._rate_hz = rate_hz
-        self._warm = False  # a temperature has come
-        self._came = 0  # samples since then, missing ones included
-        self._begin()
+        self._has_temperature = False  # True after the first temperature
+        self._sample_count = 0  # samples since the first temperature, including missing ones
+        self._reset()
 
     def update(self, samples: SampleBlock) -> list[ThermalLook]:
-        """The intervals that are over with these samples and have a temperature."""
-        lost = samples.lost if self._warm else 0  # what was missing before the first belongs to no interval
-        self._warm = self._warm or bool(np.isfinite(samples.temperature_c).any())
-        if not self._warm:
+        """Return the intervals with a temperature that have ended with these samples."""
+        # Samples that are missing before the first temperature belong to no interval.
+        lost = samples.lost if self._has_temperature else 0
+        self._has_temperature = self._has_temperature or bool(np.isfinite(samples.temperature_c).any())
+        if not self._has_temperature:
             return []
-        self._came += lost + len(samples)
+        self._sample_count += lost + len(samples)
         over = self._means.update(samples.values, samples.temperature_c, lost)
-        looks = [self._enter(one, int(samples.t_ns[-1])) for one in over]
+        looks = [self._process_interval(one, int(samples.t_ns[-1])) for one in over]
         return [look for look in looks if np.isfinite(look.temperature_c) and look.axes]
 
     @property
     def choosing(self) -> bool:
-        """Whether ``step`` has something to do."""
+        """True if ``step`` has work to do."""
         return any(one.choosing for one in self._axes.values())
 
     def step(self) -> bool:
-        """One piece of choosing a model, about a ms; False when there is nothing to choose."""
+        """Do one piece of the choice of a model, about 1 ms, and return False if there is nothing to do."""
         for axis, one in self._axes.items():
             if one.step():
                 self._events += [self._event(axis, found) for found in one.take()]
@@ -75,44 +80,50 @@ class LiveThermal:
         return False
 
     def take_events(self) -> list[Event]:
-        """What temperature does not explain, since the last call."""
+        """Return the events since the last call: changes of the bias that temperature does not explain."""
         events, self._events = self._events, []
         return events
 
     def offset_is_new(self) -> None:
-        """The sensor was laid down another way, or started anew: what this interval has of before counts no more."""
+        """Learn new offsets after the sensor was moved or restarted, and discard the current interval."""
         self._means.forget()
         for one in self._axes.values():
             one.offset_is_new()
 
     def relabel(self, rate_hz: float) -> None:
-        """The rate is known better; if it is another one, intervals had another length."""
+        """Set a better estimate of the sample rate in Hz.
+
+        If the rate differs by more than OTHER_RATE, the models start anew, because the intervals had another length.
+        """
         if abs(rate_hz / self._rate_hz - 1.0) > OTHER_RATE:
             self._rate_hz = rate_hz
-            self._begin()
+            self._reset()
 
-    def _begin(self) -> None:
-        length = max(round(self._wanted_s * self._rate_hz), PARTS)
+    def _reset(self) -> None:
+        """Start anew at the current sample rate."""
+        length = max(round(self._requested_interval_s * self._rate_hz), PARTS)
         self._interval_s = length / self._rate_hz
         self._means = RunningMeans(length, KEPT)
         self._axes: dict[str, Following] = {}
-        self._warm, self._came = False, 0
+        self._has_temperature, self._sample_count = False, 0
         self._t_ns = 0  # end of the last interval
 
-    def _enter(self, interval: Interval, newest_ns: int) -> ThermalLook:
-        t_ns = newest_ns - round((self._came - interval.end) / self._rate_hz * 1e9)
+    def _process_interval(self, interval: Interval, newest_ns: int) -> ThermalLook:
+        """Update the models of all axes with an interval; ``newest_ns`` is the time of the newest sample."""
+        t_ns = newest_ns - round((self._sample_count - interval.end) / self._rate_hz * 1e9)
         axes: dict[str, AxisThermal] = {}
         for at, axis in enumerate(AXES):
             bias, error = float(interval.bias[at]), float(interval.error[at])
             if axis not in self._axes:
                 if not np.isfinite(bias):
-                    continue  # not measured so far
+                    continue  # The axis has not been measured yet.
                 self._axes[axis] = Following(self._interval_s)
             axes[axis] = self._axes[axis].update(bias, error, interval.temperature_c)
         self._t_ns = t_ns
         return ThermalLook(t_ns, self._interval_s, interval.temperature_c, axes)
 
     def _event(self, axis: str, found: Unexplained) -> Event:
+        """Return the event of an unexplained change."""
         size = amount(axis, found.size, sign=True)
         text = (
             f"{axis} is {size} off what its temperature lets expect: {found.outside} of the last {found.of} means "

@@ -1,17 +1,18 @@
-"""One axis whose model follows its intervals: predicted before it is believed, chosen anew as the record grows.
+"""Online model of bias against temperature for one axis: each interval is predicted before it is used for the fit.
 
-Each interval is predicted by the model that knows those before it, multi-step and one-step, and only then enters the
-fit: ``Recursion`` renews the sizes. Form and time constants are chosen anew whenever GROWN times as many intervals are
-known as at the last choice; that takes up to a second, so ``step`` does a piece of it at a time, on the intervals that
-were there when it began.
+The model of the earlier intervals predicts each interval, multi-step and one-step. Only then is the interval used, and
+``Recursion`` updates the coefficients. Form and time constants are chosen again when the number of known intervals has
+grown by the factor GROWN. A choice takes up to a second. ``step`` therefore does one piece of it at a time, on the
+intervals that were known at its start.
 
-Intervals that stay outside of what was expected of them are a doubt, and while they do no choice is begun: a form that
-makes room for them would explain them away; nor do those far outside enter the fit. A doubt is settled by two choices,
-without and with a step of the offset where it began, and lags are looked for in any case: late heat is what a first
-turn of temperature looks like. If temperature explains the same without a step, the model is the new one and nothing is
-told. If not, that is told, and the bias before counts from then on as if it had had the new offset all along: what is
-known of temperature stays, and the new level is what is expected. In the same way a new offset is learned where the
-sensor was laid down another way or started anew, and nothing is told.
+Intervals that stay outside their prediction are a suspected change (``residual_alarm``). Until it is resolved, no
+routine choice is started, because a new form could fit the change and hide it. Intervals far outside their prediction
+are not used for the fit either. Two fits resolve the suspicion, without and with a step of the offset at its beginning.
+Both include lags, because delayed heat looks like a change at the first reversal of temperature. If temperature
+explains the intervals without a step, the new model is used and nothing is reported. Otherwise the change is reported.
+The earlier intervals are then shifted to the new offset, so that the known dependence on temperature is kept and the
+new level is expected. After the sensor has been moved or restarted, the new offset is learned in the same way, but not
+reported.
 """
 
 from collections import deque
@@ -30,45 +31,52 @@ from monitor.drift.thermal.thermal_fit import Pieces, fitting
 from monitor.drift.thermal.thermal_model import ThermalModel
 
 KEPT: Final = 1000
-"""Intervals: a week of ten minutes each."""
+"""Largest number of intervals that are kept: a week of ten minutes each."""
 GROWN: Final = 1.25
-"""Times as many intervals as at the last choice."""
+"""Growth of the number of known intervals after which the model is chosen again."""
 LEARNED: Final = 3
-"""Intervals that tell a new offset."""
+"""Intervals that determine a new offset."""
 SURE: Final = 10.0
-"""Of AICc, that a step must gain before it is one: where it began was picked by its intervals."""
+"""Gain in AICc above which a step is accepted. The margin is needed because the intervals themselves determined the
+position of the step."""
 NEW_OFFSET: Final = "it was handled, or started anew: its new offset is being learned"
+"""Text for intervals without a prediction after a change of the offset."""
 
 
 @dataclass(frozen=True, slots=True)
 class AxisThermal:
-    """One interval of one axis."""
+    """One interval of one axis, with its prediction."""
 
-    bias: float  # rad/s or m/s²; NaN where too little was there
-    error: float  # its standard error
-    multi_step: Band | None  # from temperature alone; None where there is no model yet
-    one_step: Band | None  # and from the bias before
-    model: str  # its form
-    slope: float  # bias per °C, in the end; NaN without a model
-    text: str  # why nothing was expected
+    bias: float  # rad/s or m/s²; NaN if too few samples are known
+    error: float  # standard error of ``bias``
+    multi_step: Band | None  # prediction from temperature only; None if there is no model yet
+    one_step: Band | None  # prediction from temperature and from the bias before
+    model: str  # name of the form of the model
+    slope: float  # bias per °C after all lags have settled; NaN without a model
+    text: str  # reason why there is no prediction
 
 
 @dataclass(frozen=True, slots=True)
 class _Row:
+    """Bias, standard error and temperature of one interval."""
+
     bias: float
     error: float
     temperature_c: float
 
     @property
     def known(self) -> bool:
+        """True if bias and temperature are both known."""
         return bool(np.isfinite(self.bias) and np.isfinite(self.temperature_c))
 
 
 class Following:
-    """The model of one axis and the intervals that it is made from.
+    """Online model of one axis and the intervals from which it is fitted.
 
-    Args:
-        interval_s: their length
+    Parameters
+    ----------
+    interval_s : float
+        Length of an interval in seconds.
     """
 
     def __init__(self, interval_s: float) -> None:
@@ -77,46 +85,56 @@ class Following:
         self._recursion: Recursion | None = None
         self._suspicion = Suspicion()
         self._work: Pieces[None] | None = None
-        self._came = 0  # intervals since the start
-        self._known = 0  # those of them that were measured
-        self._next = 0  # so many at the next choice
-        self._learning: list[float] | None = None  # what intervals are off by, since the offset is another
-        self._since = 0  # intervals that had come when it became so
-        self._told: list[Unexplained] = []
-        self._why = ""  # there is no model
+        self._interval_count = 0  # intervals since the start
+        self._known_count = 0  # intervals with a known bias and temperature
+        self._next_choice = 0  # number of known intervals at the next choice
+        self._offset_differences: list[float] | None = None  # residuals since the offset changed; None if it did not
+        self._new_offset_at = 0  # number of intervals at the change of the offset
+        self._settled: list[Unexplained] = []
+        self._missing_reason = ""  # reason why there is no model
 
     def update(self, bias: float, error: float, temperature_c: float) -> AxisThermal:
-        """The next interval, and what was expected of it."""
+        """Add an interval, and return it with its prediction.
+
+        Parameters
+        ----------
+        bias : float
+            Mean of the interval in rad/s or m/s²; NaN = not measured.
+        error : float
+            Standard error of ``bias``.
+        temperature_c : float
+            Mean temperature of the interval in °C; NaN = not measured.
+        """
         row = _Row(bias, error, temperature_c)
-        self._came += 1
-        self._known += row.known
+        self._interval_count += 1
+        self._known_count += row.known
         self._rows.append(row)
         if self._recursion is None:
             if self._work is None:
                 self._begin(self._choose())
-            return AxisThermal(bias, error, None, None, "", np.nan, self._why)
+            return AxisThermal(bias, error, None, None, "", np.nan, self._missing_reason)
         multi_step, one_step = self._recursion.expect(temperature_c)
         model = self._recursion.model
-        if self._learning is not None:
+        if self._offset_differences is not None:
             self._recursion.update(temperature_c, np.nan)
             if row.known:
-                self._learn(self._learning, bias - multi_step.bias)
+                self._add_offset_difference(self._offset_differences, bias - multi_step.bias)
             return AxisThermal(bias, error, None, None, model.shape.name, model.slope, NEW_OFFSET)
         found = self._suspicion.update(bias if row.known else np.nan, multi_step, one_step)
         self._recursion.update(temperature_c, np.nan if row.known and self._suspicion.far else bias)
         if found is not None:
-            self._begin(self._settle(found))
-        elif self._known >= self._next and self._work is None and self._suspicion.clear:
+            self._begin(self._test_for_step(found))
+        elif self._known_count >= self._next_choice and self._work is None and self._suspicion.clear:
             self._begin(self._choose())
         return AxisThermal(bias, error, multi_step, one_step, model.shape.name, model.slope, "")
 
     @property
     def choosing(self) -> bool:
-        """Whether ``step`` has something to do."""
+        """True if ``step`` has work to do."""
         return self._work is not None
 
     def step(self) -> bool:
-        """One piece of a choice, about a ms; False when there is nothing to choose."""
+        """Do one piece of a choice, about 1 ms, and return False if there is nothing to do."""
         if self._work is None:
             return False
         try:
@@ -126,73 +144,74 @@ class Following:
         return True
 
     def take(self) -> list[Unexplained]:
-        """What temperature does not explain, settled since the last call."""
-        told, self._told = self._told, []
+        """Return the changes that temperature does not explain, confirmed since the last call."""
+        told, self._settled = self._settled, []
         return told
 
     def offset_is_new(self) -> None:
-        """What comes has an offset that says nothing of temperature: learn it."""
+        """Learn a new offset of the bias, because the old one no longer applies."""
         self._work = None
         self._suspicion.forget()
         if self._recursion is None:
-            self._rows.clear()  # nothing to tell the new level by
+            self._rows.clear()  # Without a model, the new offset cannot be determined.
         else:
-            self._learning, self._since = [], self._came
+            self._offset_differences, self._new_offset_at = [], self._interval_count
 
     def _begin(self, work: Pieces[None]) -> None:
-        """What was begun before knew less, and is left."""
+        """Start new work. Unfinished earlier work is discarded, because it used fewer intervals."""
         self._work = work
         self.step()
 
     def _choose(self) -> Pieces[None]:
-        """The model anew; where nothing can be chosen, what is there stays."""
-        self._next = ceil(GROWN * self._known)
-        self._why = "the model is being chosen"
+        """Choose the model again, and keep the present one if the intervals do not suffice."""
+        self._next_choice = ceil(GROWN * self._known_count)
+        self._missing_reason = "the model is being chosen"
         try:
             chosen = yield from fitting(self._means())
         except NotReady as error:
-            self._why = str(error)
+            self._missing_reason = str(error)
         else:
             self._recursion = Recursion(chosen.model, self._means())
 
-    def _settle(self, doubt: Unexplained) -> Pieces[None]:
-        """Whether it is temperature, by another model, or a step of the offset."""
-        means, came, since = self._means(), self._came, len(self._rows) - doubt.since
-        self._next = ceil(GROWN * self._known)
+    def _test_for_step(self, doubt: Unexplained) -> Pieces[None]:
+        """Decide whether another model of temperature or a step of the offset explains a suspected change."""
+        means, came, since = self._means(), self._interval_count, len(self._rows) - doubt.since
+        self._next_choice = ceil(GROWN * self._known_count)
         size, model = doubt.size, None
         try:
             without = yield from fitting(means, lags=True)
             stepped = yield from fitting(means, since, lags=True)
         except NotReady:
-            pass  # of these alone nothing can be chosen: what was there before stays
+            pass  # The intervals do not suffice for a choice. The present model is kept.
         else:
             if without.aicc - stepped.aicc < SURE:
                 self._recursion = Recursion(without.model, self._means())
                 return
             size, model = stepped.step, stepped.model
-        since = doubt.since + self._came - came
-        self._shift(size, since, model)
-        self._told.append(replace(doubt, size=size, since=since))
+        since = doubt.since + self._interval_count - came
+        self._shift_history(size, since, model)
+        self._settled.append(replace(doubt, size=size, since=since))
 
-    def _learn(self, apart: list[float], by: float) -> None:
+    def _add_offset_difference(self, apart: list[float], by: float) -> None:
+        """Add a residual, and determine the new offset when there are enough."""
         apart.append(by)
         if len(apart) == LEARNED:
             self._begin(self._settle_offset(float(np.mean(apart))))
 
     def _settle_offset(self, size: float) -> Pieces[None]:
-        """The new offset: as a model of all intervals has it, or as the one before does."""
+        """Determine the new offset, by a fit to all intervals if possible, else by the mean residual."""
         model = None
         try:
-            stepped = yield from fitting(self._means(), len(self._rows) - (self._came - self._since))
+            stepped = yield from fitting(self._means(), len(self._rows) - (self._interval_count - self._new_offset_at))
         except NotReady:
-            pass  # the size that the mean told stays
+            pass  # The mean residual is used.
         else:
             size, model = stepped.step, stepped.model
-        self._learning = None
-        self._shift(size, self._came - self._since, model)
+        self._offset_differences = None
+        self._shift_history(size, self._interval_count - self._new_offset_at, model)
 
-    def _shift(self, by: float, last: int, model: ThermalModel | None) -> None:
-        """Rows before the last so many as if they had had the offset of these; the model anew, or another one."""
+    def _shift_history(self, by: float, last: int, model: ThermalModel | None) -> None:
+        """Shift the bias of all but the last intervals by the step of the offset, and fit the model again."""
         before = max(len(self._rows) - last, 0)
         moved = [_Row(row.bias + by, row.error, row.temperature_c) for row in islice(self._rows, before)]
         self._rows = deque([*moved, *islice(self._rows, before, None)], maxlen=KEPT)
@@ -200,5 +219,6 @@ class Following:
             self._recursion = Recursion(model or self._recursion.model, self._means())
 
     def _means(self) -> Means:
+        """Return the kept intervals as arrays."""
         bias, error, temperature_c = np.array([(r.bias, r.error, r.temperature_c) for r in self._rows]).T
         return Means(self._interval_s, bias, error, temperature_c)

@@ -1,13 +1,13 @@
-"""The sizes of a model as intervals come: recursive least squares, form, time constants and φ as they were chosen.
+"""Recursive least squares: update of the coefficients of a thermal model with each interval.
 
-What all intervals so far say of the sizes is held as the triangle R of a QR decomposition of their white rows, beside
-those of what they measured; an interval is one more row, and R is made triangular again (Golub & Van Loan, Matrix
-Computations, 6.5): the same sizes as least squares of the whole record, to rounding, at a cost that does not grow with
-it. The derivatives by the time constants go along as columns that take no part in the sizes, for what is not known of
-the time constants belongs into the intervals of a prediction.
+The form, the time constants and φ stay as they were chosen. The triangle R of a QR decomposition holds the information
+of all intervals: their whitened rows beside their whitened values. A new interval is one more row, and R is made
+triangular again (Golub & Van Loan, Matrix Computations, 6.5). The coefficients agree with least squares over the whole
+record up to rounding, and the cost does not grow with the record. The derivatives by the time constants are further
+columns. They do not affect the coefficients, but the uncertainty of the time constants widens the prediction intervals.
 
-An interval whose temperature is missing is taken to have that of the one before; a fit of the whole record, which knows
-what came after, takes what lies between.
+If the temperature of an interval is missing, the temperature of the interval before is used. A fit of the whole record
+interpolates instead, because it also has the later temperatures.
 """
 
 from dataclasses import dataclass, replace
@@ -18,29 +18,40 @@ from drivers.sample import Floats
 from monitor.common.distributions import student_quantile
 from monitor.drift.thermal.interval_means import Means
 from monitor.drift.thermal.thermal_fit import whitened
-from monitor.drift.thermal.thermal_model import STEP, ThermalModel, bent, covariance, derivatives, expected, whole
+from monitor.drift.thermal.thermal_model import (
+    LOG_TIME_CONSTANT_STEP,
+    ThermalModel,
+    bent,
+    covariance,
+    derivatives,
+    expected,
+    whole,
+)
 from monitor.drift.thermal.thermal_response import Shape, responses
 
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """What is expected of one mean, rad/s or m/s², and its 95 % interval."""
+    """Predicted mean of one interval and its 95 % prediction interval, rad/s or m/s²."""
 
     bias: float
     lo: float
     hi: float
 
     def side(self, bias: float) -> int:
-        """1 above the interval, −1 below, 0 inside, or where nothing was measured."""
+        """Return 1 if the bias lies above the interval, −1 if below, and 0 if inside or not measured."""
         return int(bias > self.hi) - int(bias < self.lo)
 
 
 class Recursion:
-    """A model that follows.
+    """Thermal model with coefficients that are updated recursively.
 
-    Args:
-        model: form, time constants, φ and reference; its sizes are made anew
-        means: the intervals so far, from the first that the model shall know
+    Parameters
+    ----------
+    model : ThermalModel
+        Model with the form, the time constants, φ and the reference to use. Its coefficients are computed again.
+    means : Means
+        The intervals so far, from the first one that the model is to use.
     """
 
     def __init__(self, model: ThermalModel, means: Means) -> None:
@@ -51,32 +62,38 @@ class Recursion:
         excess = whole(means.temperature_c) - model.reference_c
         columns = responses(shape, excess, model.interval_s, began=True)
         rows = np.hstack([columns, derivatives(shape, excess, model.interval_s)])
-        near = np.multiply.outer(np.exp([-STEP, 0.0, STEP]), np.asarray(shape.constants_s))
-        self._decays = np.exp(-model.interval_s / near)  # [3, k] of constants a little shorter, as they are, longer
+        near = np.multiply.outer(
+            np.exp([-LOG_TIME_CONSTANT_STEP, 0.0, LOG_TIME_CONSTANT_STEP]), np.asarray(shape.constants_s)
+        )
+        # [3, k] for slightly shorter, exact and slightly longer time constants
+        self._decays = np.exp(-model.interval_s / near)
         moved = [responses(Shape(0, tuple(one)), excess, model.interval_s, began=True)[-1, 1:] for one in near]
-        self._lags, self._left = np.hsplit(np.array(moved).reshape(3, 2 * k), 2)  # each [3, k], after the last
+        # each [3, k], after the last interval
+        self._lags, self._initial_responses = np.hsplit(np.array(moved).reshape(3, 2 * k), 2)
         self._excess = float(excess[-1])
         self._row, self._bias = rows[-1], float(means.bias[-1]) if means.known[-1] else np.nan
         white, z, _ = whitened(rows, np.where(means.known, means.bias, 0.0), means.known, model.phi)
-        self._triangle = _triangle(np.hstack([white, z[:, None]]))
+        self._triangle = _upper_triangle(np.hstack([white, z[:, None]]))
         self._count = int(means.known.sum())
-        self.model = self._sized(float(np.nanmin(means.temperature_c)), float(np.nanmax(means.temperature_c)))
+        self.model = self._with_current_coefficients(
+            float(np.nanmin(means.temperature_c)), float(np.nanmax(means.temperature_c))
+        )
 
     @property
     def free(self) -> int:
-        """Degrees of freedom of what the model leaves."""
+        """Return the degrees of freedom of the residuals."""
         taken = self._terms + 2 * self._k + (self._model.phi > 0.0)
         return max(self._count - taken, 1)
 
     def expect(self, temperature_c: float) -> tuple[Band, Band]:
-        """Multi-step and one-step, of the next interval, whose temperature is known and whose bias is not.
+        """Return the multi-step and the one-step prediction of the next interval from its temperature in °C.
 
-        The intervals are Student's, as the scatter is known from few intervals at first.
+        The prediction intervals use Student's t distribution, because few intervals determine the scatter at first.
         """
         model = self.model
         excess = np.array([self._excess, temperature_c - model.reference_c if np.isfinite(temperature_c) else np.nan])
         excess[1] = excess[0] if np.isnan(excess[1]) else excess[1]
-        row, _, _ = self._next(float(excess[1]), model.ends)
+        row, _, _ = self._next_row(float(excess[1]), model.ends)
         rows = np.stack([self._row, row])
         sizes = np.concatenate([model.sizes, model.start])
         own = sizes.size
@@ -90,35 +107,43 @@ class Recursion:
         return both[0], both[1]
 
     def update(self, temperature_c: float, bias: float) -> None:
-        """One interval more; NaN = not measured."""
+        """Add an interval.
+
+        Parameters
+        ----------
+        temperature_c : float
+            Mean temperature in °C; NaN = not measured.
+        bias : float
+            Mean bias in rad/s or m/s²; NaN = not measured.
+        """
         model = self.model
         known = bool(np.isfinite(temperature_c) and np.isfinite(bias))
         excess = temperature_c - model.reference_c if np.isfinite(temperature_c) else self._excess
-        row, lags, left = self._next(excess, None)
+        row, lags, left = self._next_row(excess, None)
         if known:
             follows = np.isfinite(self._bias)
             white = row - model.phi * self._row if follows else row * (1.0 - model.phi**2) ** 0.5
             z = bias - model.phi * self._bias if follows else bias * (1.0 - model.phi**2) ** 0.5
             stacked = np.vstack([self._triangle, np.append(white, z)])
-            self._triangle = _triangle(stacked)
+            self._triangle = _upper_triangle(stacked)
             self._count += 1
-        self._row, self._lags, self._left, self._excess = row, lags, left, excess
+        self._row, self._lags, self._initial_responses, self._excess = row, lags, left, excess
         self._bias = bias if known else np.nan
         if known:
             lowest, highest = min(model.lowest_c, temperature_c), max(model.highest_c, temperature_c)
-            self.model = self._sized(lowest, highest)
+            self.model = self._with_current_coefficients(lowest, highest)
 
-    def _next(self, excess: float, ends: tuple[float, float] | None) -> tuple[Floats, Floats, Floats]:
-        """The next row, with its derivatives; lags and what is left of the start after it."""
+    def _next_row(self, excess: float, ends: tuple[float, float] | None) -> tuple[Floats, Floats, Floats]:
+        """Return the next row with its derivatives, and the lags and initial-state responses after it."""
         lags = self._decays * self._lags + (1.0 - self._decays) * excess
-        left = self._left * self._decays
+        left = self._initial_responses * self._decays
         shape = replace(self._model.shape, constants_s=())
         first = responses(shape, np.array([excess]), self._model.interval_s, ends=ends)[0]
-        by = [(one[2] - one[0]) / (2.0 * STEP) for one in (lags, left)]
+        by = [(one[2] - one[0]) / (2.0 * LOG_TIME_CONSTANT_STEP) for one in (lags, left)]
         return np.concatenate([first, lags[1], left[1], *by]), lags, left
 
-    def _sized(self, lowest_c: float, highest_c: float) -> ThermalModel:
-        """The model with the sizes of all intervals so far."""
+    def _with_current_coefficients(self, lowest_c: float, highest_c: float) -> ThermalModel:
+        """Return the model with coefficients from all intervals so far."""
         own = self._terms + self._k
         x, z = self._triangle[:, :own], self._triangle[:, -1]
         scale = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
@@ -137,5 +162,6 @@ class Recursion:
         )
 
 
-def _triangle(rows: Floats) -> Floats:
+def _upper_triangle(rows: Floats) -> Floats:
+    """Return the factor R of the QR decomposition of the rows."""
     return np.asarray(np.linalg.qr(rows, mode="r"))

@@ -1,8 +1,9 @@
-"""When a bias leaves what temperature lets expect, and hardly by chance: one axis, interval by interval.
+"""Alarm for a bias that leaves its prediction from temperature more often than by chance, for one axis.
 
-Every interval is predicted one step ahead before it enters the fit, so if the model is true, one in forty lies above
-its 95 % interval and one in forty below, each on its own. OUTSIDE of the last OF known intervals on one side of theirs
-are a doubt, which ``following`` settles: docs/thermal.md has how often one is told of a true model, counted.
+Every interval is predicted one step ahead before it is used for the fit. If the model is true, one in forty intervals
+lies above its 95 % prediction interval and one in forty below, independently. If OUTSIDE of the last OF known intervals
+lie outside on the same side, a change is suspected. ``online_thermal_model`` resolves the suspicion. docs/thermal.md
+has the measured rate of false alarms.
 """
 
 from collections import deque
@@ -16,69 +17,86 @@ from monitor.drift.thermal.recursive_least_squares import Band
 from monitor.drift.thermal.thermal_model import Z95
 
 OUTSIDE: Final = 4
+"""Intervals outside their prediction on one side that raise a suspicion, and the number of intervals that are
+considered."""
 OF: Final = 6
-FAR: Final = 2.0
-"""Half widths of the interval: what is further out waits for its fellows before a fit believes it."""
+FAR_HALF_WIDTHS: Final = 2.0
+"""Distance from the prediction, in half widths of its interval, above which an interval is not used for the fit until
+others confirm it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unexplained:
-    """A bias that temperature does not explain."""
+    """Change of a bias that temperature does not explain."""
 
-    size: float  # measured less what temperature lets expect, mean since it began; rad/s or m/s²
-    outside: int  # intervals outside of theirs, on one side
-    of: int  # of so many
-    since: int  # intervals from the first of them to the last, missing ones included
-    sigma: float  # how far outside all of them are together, standard deviations
+    size: float  # mean of measured minus predicted since the change began; rad/s or m/s²
+    outside: int  # number of intervals outside their prediction, on one side
+    of: int  # number of intervals considered
+    since: int  # intervals since the first one outside, including missing ones
+    sigma: float  # combined deviation of these intervals, in standard deviations
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
+class _Residual:
+    """Residual of one interval."""
+
     at: int  # number of the interval
-    side: int
-    apart: float  # of the multi-step estimate
-    z: float  # of the one-step estimate
+    side: int  # 1 above the prediction interval, -1 below, 0 inside
+    apart: float  # residual of the multi-step prediction
+    z: float  # normalised residual of the one-step prediction
 
 
 class Suspicion:
-    """Keeps the last intervals of one axis."""
+    """Detector of unexplained changes of one axis, from its last intervals."""
 
     def __init__(self) -> None:
-        self._seen: deque[_Seen] = deque(maxlen=OF)  # known ones
-        self._came = 0
+        self._recent: deque[_Residual] = deque(maxlen=OF)  # only intervals with a known bias
+        self._interval_count = 0
 
     @property
     def clear(self) -> bool:
-        """The last interval was inside, and at most one of those before was not: they may shape a model."""
-        return not (self._seen and self._seen[-1].side) and all(self._outside(side) < 2 for side in (-1, 1))
+        """True if the last interval was inside its prediction and at most one interval on each side was outside.
+
+        The intervals may then be used to choose a model.
+        """
+        return not (self._recent and self._recent[-1].side) and all(self._count_outside(side) < 2 for side in (-1, 1))
 
     @property
     def far(self) -> bool:
-        """The last interval was so far outside that it is no chance, though it may be a mistake."""
-        return bool(self._seen) and abs(self._seen[-1].z) > FAR * Z95
+        """True if the last interval was so far outside that it must not be used for the fit yet."""
+        return bool(self._recent) and abs(self._recent[-1].z) > FAR_HALF_WIDTHS * Z95
 
     def update(self, bias: float, multi_step: Band, one_step: Band) -> Unexplained | None:
-        """One interval beside what was expected of it; NaN = not measured."""
-        self._came += 1
+        """Add an interval with its predictions, and return the change if one is now suspected.
+
+        Parameters
+        ----------
+        bias : float
+            Measured mean in rad/s or m/s²; NaN = not measured.
+        multi_step, one_step : Band
+            Predictions of the interval.
+        """
+        self._interval_count += 1
         if not np.isfinite(bias):
             return None
         half = max(0.5 * (one_step.hi - one_step.lo), 1e-300)
         z = Z95 * (bias - one_step.bias) / half
-        self._seen.append(_Seen(self._came, one_step.side(bias), bias - multi_step.bias, z))
-        side = self._seen[-1].side
-        if not side or self._outside(side) < OUTSIDE:
+        self._recent.append(_Residual(self._interval_count, one_step.side(bias), bias - multi_step.bias, z))
+        side = self._recent[-1].side
+        if not side or self._count_outside(side) < OUTSIDE:
             return None
-        part = list(dropwhile(lambda one: one.side != side, self._seen))
+        part = list(dropwhile(lambda one: one.side != side, self._recent))
         size = float(np.mean([one.apart for one in part]))
         together = float(abs(sum(one.z for one in part))) / len(part) ** 0.5
-        outside, of, since = self._outside(side), len(self._seen), self._came - part[0].at + 1
+        outside, of, since = self._count_outside(side), len(self._recent), self._interval_count - part[0].at + 1
         found = Unexplained(size, outside, of, since, together)
-        self._seen.clear()
+        self._recent.clear()
         return found
 
     def forget(self) -> None:
-        """What was is no witness any more."""
-        self._seen.clear()
+        """Discard the residual history."""
+        self._recent.clear()
 
-    def _outside(self, side: int) -> int:
-        return sum(one.side == side for one in self._seen)
+    def _count_outside(self, side: int) -> int:
+        """Return the number of recent intervals outside on one side."""
+        return sum(one.side == side for one in self._recent)

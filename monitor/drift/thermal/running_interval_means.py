@@ -1,8 +1,9 @@
-"""Interval means of samples as they come: those that ``interval_means`` makes of a whole recording, sums alone kept.
+"""Interval means of live samples, equal to those of ``interval_means`` for a whole recording.
 
-Comes in: blocks in order, with how many samples are missing before each. Goes out: every interval when it is over. An
-interval is so many samples, missing ones included; rows are gathered up to a part of an interval before they are
-summed, so how samples were cut into blocks makes no difference.
+Only sums are stored. Blocks of samples must arrive in order, with the number of missing samples before each block.
+Every interval is returned when it ends. An interval has a fixed number of samples, including missing ones. Rows are
+buffered up to the end of a part of an interval before they are summed, so the means do not depend on how the stream is
+divided into blocks.
 """
 
 from dataclasses import dataclass
@@ -14,28 +15,33 @@ from drivers.sample import AXES, Floats
 from monitor.drift.thermal.interval_means import MOSTLY, PARTS
 
 GATHERED: Final = 1024
-"""Rows at most before they are summed."""
-WARMTH: Final = len(AXES)
-"""Column of the temperature, after those of the axes."""
+"""Largest number of rows in the buffer."""
+TEMPERATURE_COLUMN: Final = len(AXES)
+"""Column of the temperature, after the columns of the axes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
     """Means of one interval."""
 
-    bias: Floats  # [6] rad/s and m/s²; NaN where too little was there
-    error: Floats  # [6] standard error of each
-    temperature_c: float  # NaN where too little was there
-    end: int  # samples since the start that were over with it, missing ones included
+    bias: Floats  # [6] rad/s and m/s²; NaN if too few samples are known
+    error: Floats  # [6] standard error of each mean
+    temperature_c: float  # °C; NaN if too few samples are known
+    end: int  # index of the first sample after the interval; missing samples count
 
 
 class RunningMeans:
     """Means of successive intervals.
 
-    Args:
-        length: samples an interval, PARTS at least
-        longest: empty intervals at most that one hole leaves; more would say no more
+    Parameters
+    ----------
+    length : int
+        Samples per interval, at least PARTS.
+    longest : int
+        Largest number of empty intervals that are returned for one gap. More would hold no information.
 
+    Examples
+    --------
     >>> means = RunningMeans(50)
     >>> ramp = np.repeat(np.arange(100.0)[:, None], 6, axis=1)
     >>> [(one.bias[0].item(), one.temperature_c) for one in means.update(ramp, np.full(100, 25.0), 0)]
@@ -45,88 +51,107 @@ class RunningMeans:
     def __init__(self, length: int, longest: int = 1000) -> None:
         size = length // PARTS
         self._length = length
-        self._longest = longest
-        self._edges = [*(size * k for k in range(1, PARTS)), size * PARTS, length]  # what is left over has no part
-        self._rows = np.empty((GATHERED, WARMTH + 1))
-        self._filled = 0
-        self._origin = np.full(WARMTH + 1, np.nan)  # a mean of 9.81 with noise of 1e-4 keeps its digits
-        self._end = 0  # of the intervals that are over
+        self._max_empty = longest
+        # The last edge ends the remainder of the interval, which belongs to no part.
+        self._edges = [*(size * k for k in range(1, PARTS)), size * PARTS, length]
+        self._rows = np.empty((GATHERED, TEMPERATURE_COLUMN + 1))
+        self._buffered = 0
+        # The origin is subtracted to preserve the digits of a mean of 9.81 with noise of 1e-4.
+        self._origin = np.full(TEMPERATURE_COLUMN + 1, np.nan)
+        self._end = 0  # end of the last finished interval, in samples
         self._begin()
 
     def update(self, values: Floats, temperature_c: Floats, lost: int) -> list[Interval]:
-        """The intervals that are over: of ``lost`` missing samples, then values [n, 6] and temperature [n] in °C."""
-        over = self._skip(lost) if lost else []
+        """Add samples and return the intervals that have ended.
+
+        Parameters
+        ----------
+        values : ndarray, shape (n, 6)
+            Samples in rad/s and m/s²; NaN = missing.
+        temperature_c : ndarray, shape (n,)
+            Temperature in °C; NaN = missing.
+        lost : int
+            Number of samples that are missing before the first row.
+        """
+        finished = self._skip_missing(lost) if lost else []
         at = 0
         while at < len(values):
-            count = min(len(values) - at, GATHERED - self._filled, self._edges[self._part] - self._place)
-            rows = slice(self._filled, self._filled + count)
-            self._rows[rows, :WARMTH] = values[at : at + count]
-            self._rows[rows, WARMTH] = temperature_c[at : at + count]
-            self._filled += count
+            count = min(len(values) - at, GATHERED - self._buffered, self._edges[self._part] - self._position)
+            rows = slice(self._buffered, self._buffered + count)
+            self._rows[rows, :TEMPERATURE_COLUMN] = values[at : at + count]
+            self._rows[rows, TEMPERATURE_COLUMN] = temperature_c[at : at + count]
+            self._buffered += count
             at += count
-            over += self._pass(count)
-        return over
+            finished += self._advance(count)
+        return finished
 
     def forget(self) -> None:
-        """What the interval so far says of the axes; its temperature stays."""
-        self._rows[: self._filled, :WARMTH] = np.nan
-        self._sum[:, :WARMTH], self._count[:, :WARMTH] = 0.0, 0
+        """Discard the axes of the current interval, but keep its temperature."""
+        self._rows[: self._buffered, :TEMPERATURE_COLUMN] = np.nan
+        self._sum[:, :TEMPERATURE_COLUMN], self._count[:, :TEMPERATURE_COLUMN] = 0.0, 0
 
     def _begin(self) -> None:
-        self._place = self._part = 0
-        self._sum = np.zeros((PARTS + 1, WARMTH + 1))
-        self._count = np.zeros((PARTS + 1, WARMTH + 1), np.int64)
+        """Clear the sums for a new interval."""
+        self._position = self._part = 0
+        self._sum = np.zeros((PARTS + 1, TEMPERATURE_COLUMN + 1))
+        self._count = np.zeros((PARTS + 1, TEMPERATURE_COLUMN + 1), np.int64)
 
-    def _pass(self, count: int) -> list[Interval]:
-        """So many samples have passed: sum up at a part's end, and close at an interval's."""
-        self._place += count
-        if self._filled == GATHERED or self._place == self._edges[self._part]:
-            self._gather()
-        while self._part < PARTS and self._place == self._edges[self._part]:
+    def _advance(self, count: int) -> list[Interval]:
+        """Advance by ``count`` samples; sum the buffer at the end of a part, and return the
+        interval if it has ended."""
+        self._position += count
+        if self._buffered == GATHERED or self._position == self._edges[self._part]:
+            self._sum_buffer()
+        while self._part < PARTS and self._position == self._edges[self._part]:
             self._part += 1
-        if self._place < self._length:
+        if self._position < self._length:
             return []
         self._end += self._length
-        closed = self._closed()
+        closed = self._interval()
         self._begin()
         return [closed]
 
-    def _gather(self) -> None:
-        rows, self._filled = self._rows[: self._filled], 0
+    def _sum_buffer(self) -> None:
+        """Add the buffered rows to the sums of the current part."""
+        rows, self._buffered = self._rows[: self._buffered], 0
         there = np.isfinite(rows)
         new = there.any(axis=0) & np.isnan(self._origin)
         if new.any():
-            self._origin[new] = rows[there.argmax(axis=0), np.arange(WARMTH + 1)][new]
+            self._origin[new] = rows[there.argmax(axis=0), np.arange(TEMPERATURE_COLUMN + 1)][new]
         self._sum[self._part] += np.where(there, rows - self._origin, 0.0).sum(axis=0)
         self._count[self._part] += there.sum(axis=0)
 
-    def _skip(self, lost: int) -> list[Interval]:
-        over: list[Interval] = []
-        while lost and self._place:
-            count = min(lost, self._edges[self._part] - self._place)
+    def _skip_missing(self, lost: int) -> list[Interval]:
+        """Advance over missing samples, and return the intervals that have ended."""
+        finished: list[Interval] = []
+        while lost and self._position:
+            count = min(lost, self._edges[self._part] - self._position)
             lost -= count
-            if self._filled:
-                self._gather()
-            over += self._pass(count)
+            if self._buffered:
+                self._sum_buffer()
+            finished += self._advance(count)
         if not lost:
-            return over
-        whole, self._place = divmod(lost, self._length)
-        nothing = np.full(WARMTH, np.nan)
-        for left in range(min(whole, self._longest) - 1, -1, -1):
-            over.append(Interval(nothing, nothing, np.nan, self._end + (whole - left) * self._length))
+            return finished
+        whole, self._position = divmod(lost, self._length)
+        nothing = np.full(TEMPERATURE_COLUMN, np.nan)
+        for left in range(min(whole, self._max_empty) - 1, -1, -1):
+            finished.append(Interval(nothing, nothing, np.nan, self._end + (whole - left) * self._length))
         self._end += whole * self._length
-        while self._part < PARTS and self._place >= self._edges[self._part]:
+        while self._part < PARTS and self._position >= self._edges[self._part]:
             self._part += 1
-        return over
+        return finished
 
-    def _closed(self) -> Interval:
+    def _interval(self) -> Interval:
+        """Return the means and standard errors of the interval that has just ended."""
         count = self._count.sum(axis=0)
-        few = count < max(MOSTLY * self._length, 1.0)
+        too_few = count < max(MOSTLY * self._length, 1.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = self._origin + self._sum.sum(axis=0) / count
-            apart = np.diff(self._sum[:PARTS, :WARMTH] / self._count[:PARTS, :WARMTH], axis=0)
-            both = np.isfinite(apart)
-            square = np.where(both, apart, 0.0) ** 2
+            differences = np.diff(
+                self._sum[:PARTS, :TEMPERATURE_COLUMN] / self._count[:PARTS, :TEMPERATURE_COLUMN], axis=0
+            )
+            both = np.isfinite(differences)
+            square = np.where(both, differences, 0.0) ** 2
             error = np.sqrt(0.5 * square.sum(axis=0) / both.sum(axis=0) / PARTS)
-        mean[few], error[few[:WARMTH]] = np.nan, np.nan
-        return Interval(mean[:WARMTH], error, float(mean[WARMTH]), self._end)
+        mean[too_few], error[too_few[:TEMPERATURE_COLUMN]] = np.nan, np.nan
+        return Interval(mean[:TEMPERATURE_COLUMN], error, float(mean[TEMPERATURE_COLUMN]), self._end)

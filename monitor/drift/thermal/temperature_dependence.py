@@ -4,19 +4,19 @@ A random walk correlates with a temperature ramp by chance, so ordinary regressi
 on temperature. Both tests are therefore generalised least squares under a null hypothesis of correlated noise: white
 noise of the interval means plus a random walk whose increments may be correlated themselves (a smooth drift). The
 ratio of the two and the correlation of the increments are not known. An F test is made for every pair on a grid, and
-the least significant result counts among the pairs whose restricted likelihood (Harville, J. Am. Stat. Assoc. 72,
-1977) is within PLAUSIBLE of the best. The measured rates of false statements are in docs/thermal.md.
+the least significant result counts among the pairs whose log restricted likelihood (Harville, J. Am. Stat. Assoc. 72,
+1977) is within MAX_LIKELIHOOD_LOSS of the best. The measured false positive rates are in docs/thermal.md.
 
 ``find_dependence`` tests a cubic polynomial in temperature, alone and with each description of hysteresis.
 ``find_hysteresis`` tests the descriptions of hysteresis beside a polynomial of order 5. The descriptions are:
 
 - differences between heating and cooling that vanish at the ends of the temperature range;
-- first-order lags, for heat that reaches the sensor late;
+- first-order lags, for heat that reaches the sensor with a delay;
 - play operators, whose sum is the Prandtl-Ishlinskii model of rate-independent hysteresis (Visintin, Differential
   Models of Hysteresis, 1994, chapter III).
 
-Where temperature rose and fell, a constant drift with time belongs to the null hypothesis. Where it went one way, such
-a drift cannot be told from a dependence on temperature, and ``one_way`` is True.
+If temperature rose and fell, a constant drift with time belongs to the null hypothesis. If temperature moved in one
+direction only, such a drift cannot be distinguished from a dependence on temperature, and ``one_way`` is True.
 """
 
 from collections.abc import Mapping
@@ -34,88 +34,94 @@ from monitor.drift.thermal.thermal_response import lagged
 
 SIGNIFICANCE: Final = 0.01
 """Largest p-value of a dependence or a hysteresis that is reported, after Bonferroni's correction."""
-MOST: Final = 0.5
-"""Share of the variance of the means from which on temperature explains most of it."""
+MAIN_SHARE: Final = 0.5
+"""Share of the variance of the means above which temperature explains most of it."""
 MAX_MEANS: Final = 150
-"""More means than this are averaged in groups: the cost of the test grows with their cube."""
+"""Largest number of means. More are averaged in groups, because the cost of the test grows with their cube."""
 MIN_FREE: Final = 4
-"""Degrees of freedom that a regression must leave."""
-PLAUSIBLE: Final = 2.0
-"""Difference of the logarithm of the restricted likelihood."""
+"""Smallest number of degrees of freedom that a regression must leave."""
+MAX_LIKELIHOOD_LOSS: Final = 2.0
+"""Largest difference of the log restricted likelihood to the best noise model, for a plausible noise model."""
 WALK_RATIOS: Final = (0.0, *np.geomspace(1e-3, 1e3, 9).tolist())
-"""Variance that the random walk gains in an interval over the white variance of a mean."""
+"""Variance that the random walk gains in an interval, divided by the white variance of a mean."""
 INCREMENT_CORRELATIONS: Final = (0.0, 0.5, 0.8, 0.95)
-"""Of successive increments of the random walk."""
-REVERSAL: Final = 0.05
+"""Correlations of successive increments of the random walk."""
+MIN_REVERSAL_SHARE: Final = 0.05
 """Share of the temperature range by which temperature must return to have changed its direction."""
-NOISE_REVERSAL: Final = 3.0
-"""Standard errors of a mean of temperature, likewise."""
+MIN_REVERSAL_SIGMAS: Final = 3.0
+"""Standard errors of a mean of temperature by which temperature must return to have changed its direction."""
 LAG_INTERVALS: Final = (1.0, 2.5, 6.0, 15.0)
 """Time constants of the lags, in intervals."""
 PLAY_WIDTHS: Final = (0.05, 0.1, 0.2, 0.35)
 """Half widths of the play operators, as shares of the temperature range."""
 LOOP_POWERS: Final = 4
-"""Terms of the difference between heating and cooling."""
+"""Number of terms of the difference between heating and cooling."""
 FOLDS: Final = 6
-"""Parts of the means for cross-validation; successive means belong to different parts."""
-DEPENDENT: Final = 1e-4
-"""A regressor of which less than this share is new is left out."""
-CURVE: Final = 3
-HYSTERESIS_CURVE: Final = 5
-"""Orders of the polynomial in temperature."""
+"""Parts of the means for cross-validation. Successive means belong to different parts."""
+MIN_NEW_SHARE: Final = 1e-4
+"""Smallest part of a regressor that the other regressors must leave unexplained. A regressor with less is dropped."""
+CURVE_ORDER: Final = 3
+"""Order of the polynomial in temperature for the test of dependence."""
+HYSTERESIS_CURVE_ORDER: Final = 5
+"""Order of the polynomial in temperature for the test of hysteresis."""
 
 
 @dataclass(frozen=True, slots=True)
 class TemperatureDependence:
-    """The part of an axis' slow variation that temperature explains."""
+    """Significant dependence of the slow variation of an axis on temperature."""
 
-    share: float  # of the variance of the interval means, cross-validated
-    p_value: float  # of no dependence
+    share: float  # explained share of the variance of the interval means, cross-validated
+    p_value: float  # p-value of the hypothesis of no dependence
     form: str  # "cubic", or "cubic with hysteresis"
     one_way: bool  # True if temperature only rose or only fell
     interval_s: float
 
     @property
     def explains_most(self) -> bool:
-        """True if the greater part of the slow variance is temperature."""
-        return self.share >= MOST
+        """True if temperature explains the greater part of the slow variance."""
+        return self.share >= MAIN_SHARE
 
 
 @dataclass(frozen=True, slots=True)
 class Hysteresis:
-    """The difference between heating and cooling."""
+    """Difference of the bias between heating and cooling."""
 
-    size: float  # largest difference of the bias at one temperature, a drift in between included; rad/s or m/s²
-    p_value: float  # of no difference
+    size: float  # largest difference of the bias at one temperature, including a drift in between; rad/s or m/s²
+    p_value: float  # p-value of the hypothesis of no difference
 
     @property
     def significant(self) -> bool:
-        """True if noise does not explain the difference."""
+        """True if noise alone does not explain the difference."""
         return self.p_value < SIGNIFICANCE
 
 
 @dataclass(frozen=True, slots=True)
 class _Regression:
-    p_value: float  # the largest among the plausible noise models
-    likelihood: float  # logarithm, of the most likely noise model; comparable between regressions of the same means
-    smooth: Floats  # [m] the known means less their estimated white noise
+    """F test of one set of regressors."""
+
+    p_value: float  # largest p-value among the plausible noise models
+    likelihood: float  # logarithm, for the most likely noise model; comparable between regressions of the same means
+    smooth: Floats  # [m] known means minus their estimated white noise
     noise: tuple[float, float]  # ratio and correlation of the most likely noise model
 
 
 def heating_direction(temperature_c: Floats) -> Floats:
     """Return +1 where temperature last rose and -1 where it last fell, 0 everywhere if it did neither.
 
-    A reversal counts if it exceeds REVERSAL of the range and NOISE_REVERSAL standard errors of a mean.
+    A reversal counts if it exceeds MIN_REVERSAL_SHARE of the range and MIN_REVERSAL_SIGMAS standard errors of a mean.
 
     Parameters
     ----------
-    temperature_c : [n] °C, without missing values.
+    temperature_c : ndarray, shape (n,)
+        Temperature in °C, without missing values.
 
+    Examples
+    --------
     >>> heating_direction(np.array([0.0, 1.0, 2.0, 2.0, 1.0, 0.0])).tolist()
     [1.0, 1.0, 1.0, -1.0, -1.0, -1.0]
     """
     noise = float(np.median(np.abs(np.diff(temperature_c, 2)))) / 6.0**0.5 / 0.6745 if temperature_c.size > 2 else 0.0
-    threshold = max(REVERSAL * float(np.ptp(temperature_c)), NOISE_REVERSAL * noise)
+    threshold = max(MIN_REVERSAL_SHARE * float(np.ptp(temperature_c)), MIN_REVERSAL_SIGMAS * noise)
     direction = np.zeros(temperature_c.size)
     highest = lowest = 0
     now = 0.0
@@ -142,21 +148,25 @@ def find_dependence(means: Means) -> TemperatureDependence | None:
 
     Parameters
     ----------
-    means : interval means of bias (rad/s or m/s²) and temperature, of which temperature moved.
+    means : Means
+        Interval means of bias (rad/s or m/s²) and temperature (°C). Temperature must vary.
 
     Returns
     -------
-    The dependence with the largest share among the significant ones, or None if noise explains the bias.
+    TemperatureDependence or None
+        The dependence with the largest share among the significant ones, or None if noise explains the bias.
     """
     pooled = _pooled(means)
     known, y = pooled.known, pooled.bias
     x, direction = _scaled(pooled)
-    one_way = not _turned(direction)
-    curve = _polynomial(x, CURVE)
+    one_way = not _rose_and_fell(direction)
+    curve = _polynomial(x, CURVE_ORDER)
     regressors = {"cubic": [curve]}
     if not one_way:
-        regressors["cubic with hysteresis"] = [np.hstack([curve, each]) for each in _loops(x, direction).values()]
-    nuisance = np.zeros((x.size, 0)) if one_way else _time(x.size)
+        regressors["cubic with hysteresis"] = [
+            np.hstack([curve, each]) for each in _hysteresis_regressors(x, direction).values()
+        ]
+    nuisance = np.zeros((x.size, 0)) if one_way else _linear_drift(x.size)
     count = sum(len(each) for each in regressors.values())
     found: TemperatureDependence | None = None
     for form, candidates in regressors.items():
@@ -168,7 +178,7 @@ def find_dependence(means: Means) -> TemperatureDependence | None:
             if p_value >= SIGNIFICANCE:
                 continue
             share = _validated_share(y, nuisance, columns, known, tested.noise)
-            if found is None or share > found.share + 0.01:  # the simpler form has precedence
+            if found is None or share > found.share + 0.01:  # a simpler form has precedence
                 found = TemperatureDependence(share, p_value, form, one_way, means.interval_s)
     return found
 
@@ -178,28 +188,30 @@ def find_hysteresis(means: Means) -> Hysteresis | None:
 
     Parameters
     ----------
-    means : interval means of bias (rad/s or m/s²) and temperature, of which temperature moved.
+    means : Means
+        Interval means of bias (rad/s or m/s²) and temperature (°C). Temperature must vary.
 
     Returns
     -------
-    The size and its p-value, or None if temperature went one way or the means are too few.
+    Hysteresis or None
+        The difference and its p-value. None if temperature moved in one direction only, or if there are too few means.
     """
     pooled = _pooled(means)
     x, direction = _scaled(pooled)
-    if not _turned(direction):
+    if not _rose_and_fell(direction):
         return None
-    curve, loops = _polynomial(x, HYSTERESIS_CURVE), _loops(x, direction)
-    drifting = np.hstack([_time(x.size), curve])
-    # one lag or one play operator leaves more degrees of freedom than a sum of four, which counts with few means
+    curve, loops = _polynomial(x, HYSTERESIS_CURVE_ORDER), _hysteresis_regressors(x, direction)
+    drifting = np.hstack([_linear_drift(x.size), curve])
+    # A single lag or play operator leaves more degrees of freedom than a sum of four. This matters with few means.
     parts = [loops[name][:, [at]] for name in ("lag", "play") for at in range(loops[name].shape[1])]
     tests = [_regression(pooled.bias, drifting, each, pooled.known) for each in (*loops.values(), *parts)]
     p_values = [one.p_value for one in tests if one is not None]
-    # within one cycle a drift and a loop are nearly collinear, so the size is that of a fit without a drift
+    # Within one cycle, a drift and a loop are nearly collinear, so the size is taken from a fit without a drift.
     fits = [_regression(pooled.bias, curve, each, pooled.known) for each in (*loops.values(), *parts)]
     best = max((one for one in fits if one is not None), key=lambda one: one.likelihood, default=None)
     if not p_values or best is None:
         return None
-    size = _opening(best.smooth, x[pooled.known], direction[pooled.known])
+    size = _loop_width(best.smooth, x[pooled.known], direction[pooled.known])
     return Hysteresis(size, min(len(p_values) * min(p_values), 1.0))
 
 
@@ -224,26 +236,28 @@ def _pooled(means: Means) -> Means:
 
 
 def _scaled(means: Means) -> tuple[Floats, Floats]:
-    """Return temperature scaled to -1 … 1, and its direction."""
+    """Return temperature scaled to -1 … 1, and the direction of its change."""
     temperature_c = whole(means.temperature_c)
     lowest, swing = float(temperature_c.min()), float(np.ptp(temperature_c))
     return 2.0 * (temperature_c - lowest) / swing - 1.0, heating_direction(temperature_c)
 
 
-def _turned(direction: Floats) -> bool:
-    """Return True if temperature rose and fell for three means or more each."""
+def _rose_and_fell(direction: Floats) -> bool:
+    """Return True if temperature rose for three means or more, and fell for three means or more."""
     return min(int((direction > 0.0).sum()), int((direction < 0.0).sum())) >= 3
 
 
 def _polynomial(x: Floats, order: int) -> Floats:
+    """Return the powers [n, order] of x, from the first on."""
     return np.stack([x**power for power in range(1, order + 1)], axis=1)
 
 
-def _time(n: int) -> Floats:
+def _linear_drift(n: int) -> Floats:
+    """Return a linear drift with time [n, 1] from -1 to 1."""
     return np.linspace(-1.0, 1.0, n)[:, None]
 
 
-def _loops(x: Floats, direction: Floats) -> Mapping[str, Floats]:
+def _hysteresis_regressors(x: Floats, direction: Floats) -> Mapping[str, Floats]:
     """Return the regressors [n, k] of each description of hysteresis."""
     return {
         "direction": np.stack([direction * (1.0 - x**2) * x**power for power in range(LOOP_POWERS)], axis=1),
@@ -253,7 +267,7 @@ def _loops(x: Floats, direction: Floats) -> Mapping[str, Floats]:
 
 
 def _play(x: Floats, half_width: float) -> Floats:
-    """Return the play operator: an output that is dragged along by x at a distance of half_width.
+    """Return the play operator of x: an output that follows x at a distance of at most half_width.
 
     >>> _play(np.array([0.0, 1.0, 0.0, -1.0]), 0.25).tolist()
     [0.0, 0.75, 0.25, -0.75]
@@ -267,7 +281,7 @@ def _play(x: Floats, half_width: float) -> Floats:
 
 
 def _regression(y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray) -> _Regression | None:
-    """Return the F test of the tested regressors beside the nuisance ones, or None if the means are too few."""
+    """Return the F test of the tested regressors beside the nuisance regressors, or None if there are too few means."""
     if int(known.sum()) <= MIN_FREE + 1:
         return None
     whiteners, log_determinants = _whiteners(known.tobytes())
@@ -276,7 +290,7 @@ def _regression(y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray) 
     columns = columns - columns.mean(axis=0)
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     _, r = np.linalg.qr(columns / scale)
-    new = np.flatnonzero(np.abs(np.diag(r)) > DEPENDENT)
+    new = np.flatnonzero(np.abs(np.diag(r)) > MIN_NEW_SHARE)
     q, _ = np.linalg.qr((columns / scale)[:, new])
     at = int((new < own).sum())
     count, terms = whiteners.shape[1], new.size
@@ -291,10 +305,10 @@ def _regression(y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray) 
     diagonal = np.abs(triangles[:, np.arange(terms), np.arange(terms)])
     likelihood = -0.5 * (free * np.log(left) + log_determinants) - np.log(np.maximum(diagonal, 1e-300)).sum(axis=1)
     unexplained = left / (left + gained)
-    # of F = gained / (terms - at) / (left / free)
+    # p-value of F = gained / (terms - at) / (left / free)
     p_values = incomplete_beta(0.5 * free, 0.5 * (terms - at), unexplained)
     best = int(likelihood.argmax())
-    plausible = likelihood >= likelihood[best] - PLAUSIBLE
+    plausible = likelihood >= likelihood[best] - MAX_LIKELIHOOD_LOSS
     sizes = np.linalg.solve(triangles[best, :terms, :terms], triangles[best, :terms, terms])
     white = whiteners[best].T @ (whiteners[best] @ (values - q @ sizes))
     full = float((-0.5 * (count * np.log(left) + log_determinants)).max())
@@ -304,7 +318,7 @@ def _regression(y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray) 
 def _validated_share(
     y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray, noise: tuple[float, float]
 ) -> float:
-    """Return the share of the variance of the means that regressors predict which were fitted to the other means."""
+    """Return the share of the variance of the means that a fit to the other means predicts."""
     columns = np.hstack([nuisance, tested])[known]
     columns = columns - columns.mean(axis=0)
     columns /= np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
@@ -365,8 +379,8 @@ def _toeplitz(row: Floats) -> Floats:
     return np.asarray(row[np.abs(at[:, None] - at)])
 
 
-def _opening(bias: Floats, x: Floats, direction: Floats) -> float:
-    """Return the largest difference between the legs of heating and those of cooling at one temperature."""
+def _loop_width(bias: Floats, x: Floats, direction: Floats) -> float:
+    """Return the largest difference between heating and cooling at one temperature."""
     grid = np.linspace(-0.95, 0.95, 39)
     legs: dict[float, list[Floats]] = {1.0: [], -1.0: []}
     for leg in np.split(np.arange(x.size), np.flatnonzero(np.diff(direction)) + 1):
@@ -375,12 +389,12 @@ def _opening(bias: Floats, x: Floats, direction: Floats) -> float:
             inside = (grid >= x[order[0]]) & (grid <= x[order[-1]])
             legs[float(direction[leg[0]])].append(np.where(inside, np.interp(grid, x[order], bias[order]), np.nan))
     rising, falling = (_mean_of_legs(each, grid.size) for each in (legs[1.0], legs[-1.0]))
-    apart = np.abs(rising - falling)
-    return float(np.nanmax(apart)) if np.isfinite(apart).any() else 0.0
+    difference = np.abs(rising - falling)
+    return float(np.nanmax(difference)) if np.isfinite(difference).any() else 0.0
 
 
 def _mean_of_legs(legs: list[Floats], n: int) -> Floats:
-    """Return the mean [n] of the legs that reach each temperature, NaN where none does."""
+    """Return the mean [n] of the legs at each temperature, NaN where there is no leg."""
     rows = np.array(legs).reshape(len(legs), n)
     there = np.isfinite(rows)
     with np.errstate(invalid="ignore"):

@@ -1,13 +1,14 @@
-"""Axes whose slow variation is temperature, and K and R after removing what temperature explains of the bias.
+"""Dependence of the slow variation on temperature, and the coefficients K and R without the temperature part of the
+bias.
 
-The input is an analysis and the temperature on its grid. Each axis is tested for a dependence of its bias on
-temperature against a null hypothesis of correlated noise (``drift.temperature_dependence``), whatever the status of its
-coefficients. The bias of a dependent axis is fitted to temperature as ``thermal fit`` does. The modelled bias is drawn
-smoothly through the middles of the intervals, because steps and corners would be noise of their own, and subtracted
-from the samples. Curve and coefficients are then computed again. Axes without a significant dependence stay as they are
-and are not named.
+The input is an analysis and the temperature on its grid. The bias of each axis is tested for a dependence on
+temperature against a null hypothesis of correlated noise (``temperature_dependence``), whatever the status of its
+coefficients. The bias of a dependent axis is fitted to temperature as in ``thermal fit``. The modelled bias is
+interpolated smoothly between the middles of the intervals, because steps and corners would add noise, and subtracted
+from the samples. The Allan deviation and the coefficients are then computed again. Axes without a significant
+dependence stay unchanged and are not reported.
 
-A model can follow a part of a random walk by chance, so a share of a few percent of K or R means nothing.
+A model can follow a part of a random walk by chance. A share of a few percent of K or R is therefore not significant.
 """
 
 from collections.abc import Mapping
@@ -20,7 +21,7 @@ from drivers.errors import NotReady
 from drivers.sample import AXES, Floats
 from monitor.drift.thermal.interval_means import interval_means
 from monitor.drift.thermal.temperature_dependence import TemperatureDependence, find_dependence
-from monitor.drift.thermal.thermal_fit import LEAST_C, check, fitted
+from monitor.drift.thermal.thermal_fit import MIN_SWING_C, check, fitted
 from monitor.drift.thermal.thermal_model import predicted
 from monitor.drift.thermal.thermal_study import nice_interval
 from monitor.estimation.allan.batch import EachAxis
@@ -28,27 +29,40 @@ from monitor.estimation.analysis import Analysis, refitted
 from monitor.estimation.fit.coefficients import LETTERS, Coefficients, Status
 
 SLOW: Final = ("K", "R")
+"""Letters of the coefficients of slow variation."""
 
 
 @dataclass(frozen=True, slots=True)
 class WithoutTemperature:
-    """The dependence of each axis on temperature, and the coefficients with temperature taken out of the bias."""
+    """Dependence of each axis on temperature, and the coefficients after its removal from the bias."""
 
-    models: Mapping[str, str]  # axis -> form of its model; axes that temperature explains something of
+    models: Mapping[str, str]  # axis -> form of its model, for the axes with a fitted model
     before: Coefficients
     coefficients: Coefficients
-    k_or_r: tuple[bool, ...]  # [6] as in ``Estimate``
-    dependences: Mapping[str, TemperatureDependence] = field(default_factory=dict)  # significant ones, by axis
+    k_or_r: tuple[bool, ...]  # [6] per axis, as in ``Estimate``
+    dependences: Mapping[str, TemperatureDependence] = field(default_factory=dict)  # significant dependences by axis
 
     @property
     def axes_of_temperature(self) -> tuple[str, ...]:
-        """Axes of which temperature explains most of the slow variance."""
+        """Return the axes of which temperature explains most of the slow variance."""
         return tuple(axis for axis, one in self.dependences.items() if one.explains_most)
 
     def share(self, letter: str, axis: str) -> float | None:
-        """Of the letter's variance that was temperature: 1 − after²/before², at least; None where it was not there.
+        """Return the share of a coefficient's variance that temperature explains: 1 − after²/before².
 
-        Where the rest is only bounded, the bound stands for it.
+        If only an upper bound is known after the removal, the result is a lower bound of the share.
+
+        Parameters
+        ----------
+        letter : str
+            Letter of the coefficient, one of LETTERS.
+        axis : str
+            Name of the axis.
+
+        Returns
+        -------
+        float or None
+            The share, at least 0. None if the coefficient was not estimated before, or not determined after.
         """
         at = LETTERS.index(letter), AXES.index(axis)
         if self.before.status[at] != Status.ESTIMATED or self.coefficients.status[at] == Status.UNESTIMATED:
@@ -58,20 +72,44 @@ class WithoutTemperature:
         return max(1.0 - (after / float(self.before.value[at])) ** 2, 0.0)
 
     def matters(self, letter: str, axis: str) -> bool:
-        """Whether the letter is another one: what is left lies below its interval before."""
+        """Return True if the coefficient has changed significantly: its new upper limit lies below its old interval.
+
+        Parameters
+        ----------
+        letter : str
+            Letter of the coefficient, one of LETTERS.
+        axis : str
+            Name of the axis.
+        """
         at = LETTERS.index(letter), AXES.index(axis)
         return self.share(letter, axis) is not None and bool(self.coefficients.hi[at] < self.before.lo[at])
 
 
 def moved(temperatures_c: Floats) -> bool:
-    """Whether temperature [n] is there and moved enough for a question."""
+    """Return True if temperature [n] in °C is known and varied by more than MIN_SWING_C."""
     return (
-        bool(np.isfinite(temperatures_c).any()) and float(np.ptp(temperatures_c[np.isfinite(temperatures_c)])) > LEAST_C
+        bool(np.isfinite(temperatures_c).any())
+        and float(np.ptp(temperatures_c[np.isfinite(temperatures_c)])) > MIN_SWING_C
     )
 
 
 def without_temperature(result: Analysis, temperature_c: Floats, each: EachAxis = map) -> WithoutTemperature | None:
-    """Return the same analysis with temperature [n] in °C taken out, or None if no axis depends on temperature."""
+    """Return the coefficients of an analysis without the temperature part of the bias.
+
+    Parameters
+    ----------
+    result : Analysis
+        Analysis of a recording.
+    temperature_c : ndarray, shape (n,)
+        Temperature of each sample, °C.
+    each : callable
+        Replacement for ``map``, which may run in parallel.
+
+    Returns
+    -------
+    WithoutTemperature or None
+        None if no axis depends on temperature.
+    """
     rate_hz = result.estimate.rate_hz
     interval_s = nice_interval(len(result.values) / rate_hz, rate_hz)
     values, models, dependences = result.values, dict[str, str](), dict[str, TemperatureDependence]()
@@ -102,13 +140,26 @@ def without_temperature(result: Analysis, temperature_c: Floats, each: EachAxis 
 
 
 def drawn(course: Floats, length: int, n: int) -> Floats:
-    """Values of intervals of so many samples as a smooth course of n samples, about zero; straight beyond the ends.
+    """Interpolate interval values by a smooth curve of n samples with zero mean.
 
+    The curve is a natural cubic spline through the middles of the intervals, and linear beyond them.
+
+    Parameters
+    ----------
+    course : ndarray, shape (intervals,)
+        Value of each interval, at least two.
+    length : int
+        Samples per interval.
+    n : int
+        Number of samples.
+
+    Examples
+    --------
     >>> drawn(np.array([1.0, 3.0, 5.0]), 2, 6).tolist()
     [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
     """
     bend = _natural_spline(course)
-    at = (np.arange(n) + 0.5) / length - 0.5  # in intervals, 0 = middle of the first
+    at = (np.arange(n) + 0.5) / length - 0.5  # in intervals, 0 = middle of the first interval
     left = np.clip(at.astype(np.int64), 0, course.size - 2)
     right = left + 1
     t = np.clip(at, 0.0, course.size - 1.0) - left

@@ -1,17 +1,18 @@
-"""Bias against temperature: which model, how large, how sure.
+"""Fit of a bias model against temperature: choice of its form, its coefficients and their uncertainty.
 
-Polynomials and difference equations (``heat``) are fitted to interval means by least squares of the whole course: an
-equation's own outputs are fed back, never measured ones, so that noise in the means does not pull its roots towards
-zero. What the model leaves, r_n, may know of the one before: r_n = φ r_{n−1} + e_n. Among all forms the one with the
-least AICc (Hurvich & Tsai, Biometrika 76, 1989) is taken; it is what leave-one-out validation tends to (Stone, J. R.
-Stat. Soc. B 39, 1977) and needs no samples set aside, of which there are few. A validated error stands beside: that of
-BLOCKS parts of the record, each predicted from the others. A form that predicts them worse than a constant is not
-taken, as slow heating leaves one end of a polynomial to itself; lags and high powers have to win by a margin.
+Polynomials and difference equations (``thermal_response``) are fitted to interval means by least squares over the whole
+record. The outputs of a difference equation are fed back, not the measured values, so that noise in the means does not
+bias its roots towards zero. The residuals may be correlated: r_n = φ r_{n−1} + e_n. The form with the least AICc is
+chosen (Hurvich & Tsai, Biometrika 76, 1989). AICc asymptotically agrees with leave-one-out cross-validation (Stone, J.
+R. Stat. Soc. B 39, 1977) and needs no separate samples, of which there are few. A cross-validated error is given too,
+over FOLDS parts of the record that are each predicted from the others. A form that predicts them worse than a constant
+is rejected, because slow heating leaves one end of a polynomial unconstrained. Lags and powers beyond the third need a
+margin in AICc.
 
-The search takes some 50 ms to a second, and ``fitting`` does it in pieces of less than a millisecond.
+The search takes some 50 ms to a second. ``fitting`` divides it into pieces of less than a millisecond.
 
-After Wang et al., bias modelling of MEMS gyroscopes under small temperature changes (72 h, means of 1 h), with a
-constant, which the paper has not, and fed-back outputs.
+The method follows Wang et al., bias modelling of MEMS gyroscopes under small temperature changes (72 h, means of 1 h).
+The constant and the fed-back outputs are additions to the paper.
 """
 
 from collections.abc import Generator, Iterator
@@ -29,76 +30,84 @@ from monitor.drift.thermal.temperature_dependence import find_hysteresis
 from monitor.drift.thermal.thermal_model import ThermalModel, covariance, slopes, whole
 from monitor.drift.thermal.thermal_response import Shape, responses, solved
 
-FEWEST: Final = 12
-"""Intervals that anything can be said of."""
-POWERS: Final = 5
+MIN_INTERVALS: Final = 12
+"""Smallest number of intervals for a fit."""
+MAX_POWER: Final = 5
 """Highest order of a polynomial."""
 CUBIC: Final = 3
-MEMORY: Final = 3
+"""Highest order of a polynomial that needs no margin in AICc."""
+MAX_LAGS: Final = 3
 """Highest order of a difference equation."""
-ENOUGH: Final = 8
-"""Intervals for k² of memory: more lags than that follow what wanders by itself."""
-SLOWEST: Final = 0.25
-"""Of the record: a longer time constant is not told from a drift."""
-FASTEST: Final = 0.5
-"""Of an interval: a shorter one is none."""
-APART: Final = 2.0
-"""Ratio of two time constants: nearer ones only make a difference of two large sizes."""
-GRID: Final = 20
-"""Time constants of a first look."""
-PHI: Final = (0.0, 0.3, 0.6, 0.8, 0.9, 0.97)
-BLOCKS: Final = 6
-"""Parts of the record that are predicted from the others."""
-WORSE: Final = 1.05
-"""Of the validated error of a constant: what chance lets a form be worse."""
-LAG_WINS: Final = 6.0
-CURVE_WINS: Final = 10.0
-"""AICc by which a lag, and a power beyond the third, have to win: of so few means noise looks like either now and then,
-and both are wrong by much where they are."""
-LEAST_C: Final = 0.1
-"""Swing of temperature that anything can be said of."""
-CLEAR: Final = 5.0
-"""Standard errors of a mean of temperature: less has hardly moved."""
-ONE_WAY: Final = 0.1
-"""Of all movement: if less goes the other way, temperature only rose, or only fell."""
-GOLDEN: Final = 0.6180339887498949
+INTERVALS_PER_SQUARED_LAGS: Final = 8
+"""Intervals that k lags need for each k². With fewer intervals, the lags follow a random walk of the bias."""
+MAX_TIME_CONSTANT_SHARE: Final = 0.25
+"""Longest time constant as a share of the record. A longer one cannot be distinguished from a drift."""
+MIN_TIME_CONSTANT_INTERVALS: Final = 0.5
+"""Shortest time constant in intervals. A shorter one has no effect."""
+MIN_TIME_CONSTANT_RATIO: Final = 2.0
+"""Smallest ratio of two time constants. Closer ones only form a difference of two large coefficients."""
+GRID_POINTS: Final = 20
+"""Number of time constants on the first grid."""
+PHI_VALUES: Final = (0.0, 0.3, 0.6, 0.8, 0.9, 0.97)
+"""Values of φ to choose from."""
+FOLDS: Final = 6
+"""Parts of the record that are each predicted from the others."""
+MAX_ERROR_RATIO: Final = 1.05
+"""Largest cross-validated error of an accepted form, relative to the error of a constant. The value above one allows
+for chance."""
+LAG_AICC_MARGIN: Final = 6.0
+"""Margin in AICc that a lag must gain. With few means, noise sometimes looks like a lag, and a wrong choice causes
+large errors."""
+CURVE_AICC_MARGIN: Final = 10.0
+"""Margin in AICc that a power beyond the third must gain, for the same reason."""
+MIN_SWING_C: Final = 0.1
+"""Smallest range of temperature for a fit, °C."""
+MIN_SWING_SIGMAS: Final = 5.0
+"""Smallest range of temperature, in standard errors of a mean of temperature."""
+MIN_REVERSE_SHARE: Final = 0.1
+"""Smallest share of the total temperature movement in the lesser direction. Below it, temperature only rose or only
+fell."""
+GOLDEN_RATIO: Final = 0.6180339887498949
+"""Step of the golden-section search."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One form that was tried."""
+    """One form of the model that was fitted."""
 
     shape: Shape
-    aicc: float  # above that of the one that was taken; below it where a margin was not reached
-    rms: float  # of what it leaves, multi-step, rad/s or m/s²
-    validated: float  # the same on parts that were predicted from the others
+    aicc: float  # difference to the chosen form; negative if a margin was not reached
+    rms: float  # rms of the multi-step residuals, rad/s or m/s²
+    validated: float  # cross-validated rms, rad/s or m/s²
 
 
 @dataclass(frozen=True, slots=True)
 class ThermalFit:
-    """The model of one axis, and what it was chosen from."""
+    """Model of one axis, and the candidates from which it was chosen."""
 
     model: ThermalModel
-    candidates: tuple[Candidate, ...]  # the one that was taken, and the others by their AICc
-    both_ways: bool  # temperature rose and fell
-    explained: float  # share of the variance of the means
-    aicc: float  # of the model; only differences between fits of the same means say anything
-    step: float = 0.0  # of the offset, where one was asked for: after it less before
+    candidates: tuple[Candidate, ...]  # the chosen form first, then the others by AICc
+    both_ways: bool  # True if temperature rose and fell
+    explained: float  # explained share of the variance of the means
+    aicc: float  # only differences between fits of the same means are meaningful
+    step: float = 0.0  # step of the offset (after minus before), if one was fitted; rad/s or m/s²
     hysteresis: float | None = None  # largest difference between heating and cooling at one temperature, rad/s or m/s²;
-    # 0 if noise explains the difference; None if temperature went one way, or if the test was not made
-    hysteresis_p: float | None = None  # p-value of no difference between heating and cooling
+    # 0 if noise explains the difference; None if temperature moved in one direction only, or if there was no test
+    hysteresis_p: float | None = None  # p-value of the hypothesis of no difference between heating and cooling
 
 
 T = TypeVar("T")
 Pieces = Generator[None, None, T]
-"""Work that pauses: each ``next`` does one piece, and what it makes comes with the end."""
+"""Generator that does one piece of the work at each ``next``, and returns the result at its end."""
 
 
 def fitted(means: Means) -> ThermalFit:
     """Choose and fit a model, and test whether heating and cooling differ.
 
-    Raises:
-        NotReady: too few intervals, or temperature hardly moved
+    Raises
+    ------
+    NotReady
+        If there are too few intervals, or if temperature hardly moved.
     """
     found = finished(fitting(means))
     loop = find_hysteresis(means) if found.both_ways else None
@@ -108,7 +117,7 @@ def fitted(means: Means) -> ThermalFit:
 
 
 def finished(pieces: Pieces[T]) -> T:
-    """All of the work at once."""
+    """Run all pieces and return the result."""
     try:
         while True:
             next(pieces)
@@ -118,33 +127,41 @@ def finished(pieces: Pieces[T]) -> T:
 
 
 def fitting(means: Means, since: int | None = None, lags: bool = False) -> Pieces[ThermalFit]:
-    """Choose and fit, one least squares at a time.
+    """Choose and fit a model, with one least-squares fit in each piece.
 
-    Args:
-        since: from this interval on the bias may have another offset, which is one size more
-        lags: look for them also where temperature went one way
-    Raises:
-        NotReady: too few intervals, or temperature hardly moved; with the first piece
+    Parameters
+    ----------
+    means : Means
+        Interval means of bias (rad/s or m/s²) and temperature (°C).
+    since : int or None
+        Index of the interval from which the bias may have another offset. The step is one more coefficient.
+    lags : bool
+        True if lags are fitted even if temperature moved in one direction only.
+
+    Raises
+    ------
+    NotReady
+        If there are too few intervals, or if temperature hardly moved. The first piece raises it.
     """
     check(means)
-    excess, reference_c = _excess(means)
+    excess, reference_c = _temperature_difference(means)
     both_ways = _both_ways(means.temperature_c)
     tried = []
     for shape in _shapes(means, both_ways or lags):
-        tried.append((yield from _best(means, excess, shape, since)))
-    tried.sort(key=lambda one: one.aicc + _margin(one.shape))
+        tried.append((yield from _fit_shape(means, excess, shape, since)))
+    tried.sort(key=lambda one: one.aicc + _aicc_margin(one.shape))
     errors = []
     for one in tried:
         yield
-        errors.append(_validated(_less(means, since, one.step), excess, one))
+        errors.append(_cross_validated_error(_without_step(means, since, one.step), excess, one))
     alone = next(error for one, error in zip(tried, errors, strict=True) if one.shape == Shape(0, ()))
-    at = next(i for i, error in enumerate(errors) if error <= WORSE * alone)
+    at = next(i for i, error in enumerate(errors) if error <= MAX_ERROR_RATIO * alone)
     best = tried.pop(at)
     kept = [(best, errors.pop(at)), *zip(tried, errors, strict=True)]
     candidates = tuple(Candidate(one.shape, one.aicc - best.aicc, one.rms, error) for one, error in kept)
     yield
-    means = _less(means, since, best.step)
-    model = _model(means, excess, reference_c, best)
+    means = _without_step(means, since, best.step)
+    model = _to_model(means, excess, reference_c, best)
     known = means.known
     left = means.bias[known] - (best.columns @ best.sizes)[known]
     explained = 1.0 - float(np.var(left) / np.var(means.bias[known]))
@@ -152,10 +169,12 @@ def fitting(means: Means, since: int | None = None, lags: bool = False) -> Piece
 
 
 @dataclass(frozen=True, slots=True)
-class _Tried:
+class _ShapeFit:
+    """Least-squares fit of one form of the model."""
+
     shape: Shape
-    columns: Floats  # [n, terms + k]
-    sizes: Floats  # [terms + k]
+    columns: Floats  # [n, terms + k] regressors
+    sizes: Floats  # [terms + k] coefficients
     phi: float
     sigma: float
     rms: float
@@ -164,17 +183,27 @@ class _Tried:
 
 
 def check(means: Means) -> None:
-    """Raise NotReady if the means are too few, or if temperature or bias hardly moved."""
+    """Check that the means suffice for a fit.
+
+    Raises
+    ------
+    NotReady
+        If the means are too few, or if temperature or bias hardly moved.
+    """
     count = int(means.known.sum())
-    if count < FEWEST:
+    if count < MIN_INTERVALS:
         raise NotReady(
-            f"{count} intervals of {means.interval_s:g} s with bias and temperature; {FEWEST} are the least that "
-            f"anything can be said of: record longer, or take a shorter interval"
+            f"{count} intervals of {means.interval_s:g} s with bias and temperature; {MIN_INTERVALS} are the least "
+            f"that anything can be said of: record longer, or take a shorter interval"
         )
-    warmth = means.temperature_c[means.known]
-    swing = float(np.ptp(warmth))
-    noise = float(np.median(np.abs(np.diff(warmth, 2)))) / 6.0**0.5 / 0.6745 if warmth.size > 2 else 0.0
-    least = max(LEAST_C, CLEAR * noise)
+    known_temperature_c = means.temperature_c[means.known]
+    swing = float(np.ptp(known_temperature_c))
+    noise = (
+        float(np.median(np.abs(np.diff(known_temperature_c, 2)))) / 6.0**0.5 / 0.6745
+        if known_temperature_c.size > 2
+        else 0.0
+    )
+    least = max(MIN_SWING_C, MIN_SWING_SIGMAS * noise)
     if swing < least:
         raise NotReady(
             f"temperature hardly moved: by {swing:.2g} °C in {count * means.interval_s / 3600.0:.3g} h, and "
@@ -184,86 +213,96 @@ def check(means: Means) -> None:
         raise NotReady("the bias is the same in all intervals")
 
 
-def _margin(shape: Shape) -> float:
+def _aicc_margin(shape: Shape) -> float:
+    """Return the margin in AICc that a form must gain."""
     if shape.memory:
-        return LAG_WINS
-    return CURVE_WINS if shape.powers > CUBIC else 0.0
+        return LAG_AICC_MARGIN
+    return CURVE_AICC_MARGIN if shape.powers > CUBIC else 0.0
 
 
-def _excess(means: Means) -> tuple[Floats, float]:
+def _temperature_difference(means: Means) -> tuple[Floats, float]:
+    """Return temperature minus the reference [n] and the reference, in °C."""
     known = whole(means.temperature_c)
     reference_c = round(float(known.mean()), 2)
     return known - reference_c, reference_c
 
 
 def _both_ways(temperature_c: Floats) -> bool:
-    """Whether temperature rose and fell by more than ONE_WAY of its movement, its noise apart."""
+    """Return True if temperature, smoothed over three intervals, moved both ways by more than MIN_REVERSE_SHARE."""
     smooth = np.convolve(np.pad(whole(temperature_c), 1, mode="edge"), np.full(3, 1.0 / 3.0), mode="valid")
     moved = np.diff(smooth)
     up, down = float(moved[moved > 0.0].sum()), float(-moved[moved < 0.0].sum())
-    return min(up, down) > ONE_WAY * (up + down)
+    return min(up, down) > MIN_REVERSE_SHARE * (up + down)
 
 
 def _shapes(means: Means, lags: bool) -> Iterator[Shape]:
-    """Forms that so many intervals can tell."""
+    """Yield the forms that the number of intervals allows."""
     count = int(means.known.sum())
-    for powers in range(POWERS + 1):
+    for powers in range(MAX_POWER + 1):
         if powers + 3 < count / 2:
             yield Shape(powers, ())
-    for k in range(1, MEMORY + 1):
+    for k in range(1, MAX_LAGS + 1):
         for powers in (0, 1):
-            if lags and ENOUGH * k**2 < count:
+            if lags and INTERVALS_PER_SQUARED_LAGS * k**2 < count:
                 yield Shape(powers, tuple(means.interval_s * 2.0**i for i in range(k)))
 
 
-def _best(means: Means, excess: Floats, shape: Shape, since: int | None) -> Pieces[_Tried]:
-    """The form with its best time constants and φ."""
-    best = yield from _with_phi(means, excess, shape, PHI[0], since)
-    for phi in PHI[1:]:
-        other = yield from _with_phi(means, excess, shape, phi, since)
+def _fit_shape(means: Means, excess: Floats, shape: Shape, since: int | None) -> Pieces[_ShapeFit]:
+    """Fit a form with its best time constants and the best φ."""
+    best = yield from _fit_time_constants(means, excess, shape, PHI_VALUES[0], since)
+    for phi in PHI_VALUES[1:]:
+        other = yield from _fit_time_constants(means, excess, shape, phi, since)
         best = min(best, other, key=lambda one: one.aicc)
     return best
 
 
-def _with_phi(means: Means, excess: Floats, shape: Shape, phi: float, since: int | None) -> Pieces[_Tried]:
-    """Time constants: from a grid one after the other, each beside those found, then once more between neighbours."""
+def _fit_time_constants(means: Means, excess: Floats, shape: Shape, phi: float, since: int | None) -> Pieces[_ShapeFit]:
+    """Fit a form with a given φ and its best time constants.
+
+    The time constants are chosen one after the other from a grid, then refined by golden-section search.
+    """
     k = shape.memory
-    fastest, slowest = FASTEST * means.interval_s, SLOWEST * means.interval_s * excess.size
-    grid = np.geomspace(fastest, slowest, GRID)
+    fastest, slowest = (
+        MIN_TIME_CONSTANT_INTERVALS * means.interval_s,
+        MAX_TIME_CONSTANT_SHARE * means.interval_s * excess.size,
+    )
+    grid = np.geomspace(fastest, slowest, GRID_POINTS)
     ratio = float(grid[1] / grid[0])
     constants: tuple[float, ...] = ()
 
-    def of(each: tuple[float, ...]) -> Pieces[_Tried]:
+    def evaluate(each: tuple[float, ...]) -> Pieces[_ShapeFit]:
         yield
-        return _tried(means, excess, replace(shape, constants_s=tuple(sorted(each))), phi, since)
+        return _fit_sizes(means, excess, replace(shape, constants_s=tuple(sorted(each))), phi, since)
 
-    def room(at: int) -> tuple[float, float]:
-        """How far a time constant may go: to its neighbours on the grid, and not near the others."""
+    def bounds(at: int) -> tuple[float, float]:
+        """Return the limits of a time constant: its neighbours on the grid, at a distance from the other constants."""
         one, others = constants[at], (*constants[:at], *constants[at + 1 :])
-        below = max((APART * other for other in others if other < one), default=fastest)
-        above = min((other / APART for other in others if other > one), default=slowest)
+        below = max((MIN_TIME_CONSTANT_RATIO * other for other in others if other < one), default=fastest)
+        above = min((other / MIN_TIME_CONSTANT_RATIO for other in others if other > one), default=slowest)
         return max(one / ratio, fastest, min(below, one)), min(one * ratio, slowest, max(above, one))
 
     for _ in range(k):
-        free = [one for one in grid.tolist() if all(max(one / c, c / one) >= APART for c in constants)]
+        free = [
+            one for one in grid.tolist() if all(max(one / c, c / one) >= MIN_TIME_CONSTANT_RATIO for c in constants)
+        ]
         looks = []
         for one in free:
-            looks.append((yield from of((*constants, one))).aicc)
+            looks.append((yield from evaluate((*constants, one))).aicc)
         constants = (*constants, free[int(np.argmin(looks))])
     for _ in range(2 if k > 1 else min(k, 1)):
         for at in range(k):
-            lo, hi = room(at)
+            lo, hi = bounds(at)
             for _ in range(10):
-                a, b = hi * (lo / hi) ** GOLDEN, lo * (hi / lo) ** GOLDEN
-                below = yield from of((*constants[:at], a, *constants[at + 1 :]))
-                above = yield from of((*constants[:at], b, *constants[at + 1 :]))
+                a, b = hi * (lo / hi) ** GOLDEN_RATIO, lo * (hi / lo) ** GOLDEN_RATIO
+                below = yield from evaluate((*constants[:at], a, *constants[at + 1 :]))
+                above = yield from evaluate((*constants[:at], b, *constants[at + 1 :]))
                 lo, hi = (lo, b) if below.aicc < above.aicc else (a, hi)
             constants = (*constants[:at], (lo * hi) ** 0.5, *constants[at + 1 :])
-    return (yield from of(constants))
+    return (yield from evaluate(constants))
 
 
-def _tried(means: Means, excess: Floats, shape: Shape, phi: float, since: int | None = None) -> _Tried:
-    """Sizes by least squares of what is new in each interval."""
+def _fit_sizes(means: Means, excess: Floats, shape: Shape, phi: float, since: int | None = None) -> _ShapeFit:
+    """Fit the coefficients by least squares on the whitened rows."""
     known = means.known
     columns = responses(shape, excess, means.interval_s, began=True)
     own = columns.shape[1]
@@ -280,18 +319,42 @@ def _tried(means: Means, excess: Floats, shape: Shape, phi: float, since: int | 
     rms = float(np.sqrt(np.mean((y - columns @ sizes)[known] ** 2)))
     sigma = (square / max(count - free + 1, 1)) ** 0.5
     step = 0.0 if since is None else float(sizes[own])
-    return _Tried(shape, columns[:, :own], sizes[:own], phi, sigma, rms, aicc, step)
+    return _ShapeFit(shape, columns[:, :own], sizes[:own], phi, sigma, rms, aicc, step)
 
 
-def _less(means: Means, since: int | None, step: float) -> Means:
-    """As if the offset had always been that of before."""
+def _without_step(means: Means, since: int | None, step: float) -> Means:
+    """Return the means with the step of the offset removed."""
     if since is None:
         return means
     return replace(means, bias=means.bias - step * (np.arange(means.bias.size) >= since))
 
 
 def whitened(columns: Floats, y: Floats, known: np.ndarray, phi: float) -> tuple[Floats, Floats, int]:
-    """Rows less φ times the row before where that is known; the first after a hole in the measure of the others."""
+    """Return rows and values with the correlation φ of the residuals removed.
+
+    Each row is reduced by φ times the row before, if that row is known. The first row after a gap is scaled to the same
+    variance.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (n, m)
+        Regressors.
+    y : ndarray, shape (n,)
+        Values in rad/s or m/s².
+    known : ndarray, shape (n,), bool
+        True where the value is known.
+    phi : float
+        Correlation of successive residuals.
+
+    Returns
+    -------
+    columns : ndarray, shape (known, m)
+        Whitened regressors of the known rows.
+    y : ndarray, shape (known,)
+        Whitened values.
+    fresh : int
+        Number of rows without a known row before.
+    """
     follows = known[1:] & known[:-1]
     x, z = columns.copy(), y.copy()
     x[1:] -= phi * follows[:, None] * columns[:-1]
@@ -302,24 +365,26 @@ def whitened(columns: Floats, y: Floats, known: np.ndarray, phi: float) -> tuple
     return (x * weight[:, None])[known], (z * weight)[known], int(first.sum())
 
 
-def _validated(means: Means, excess: Floats, one: _Tried) -> float:
-    """Deviation of parts of the record from what the others let expect, the form and its time constants as they are.
+def _cross_validated_error(means: Means, excess: Floats, one: _ShapeFit) -> float:
+    """Return the rms error over parts of the record, each predicted from the others with the same form and time
+    constants.
 
-    What lags had left behind at the start, only the first part knows: it is predicted as if there were nothing.
+    The initial state of the lags is known from the first part only. This part is predicted with settled lags.
     """
-    edges = np.linspace(0, excess.size, BLOCKS + 1).astype(np.int64)
+    edges = np.linspace(0, excess.size, FOLDS + 1).astype(np.int64)
     square = 0.0
     for lo, hi in pairwise(edges.tolist()):
         used = means.known.copy()
         used[lo:hi] = False
         columns = one.columns if lo else responses(one.shape, excess, means.interval_s)
         x, z, _ = whitened(columns, np.where(used, means.bias, 0.0), used, one.phi)
-        apart = (means.bias - columns @ solved(x, z))[lo:hi]
-        square += float((apart[means.known[lo:hi]] ** 2).sum())
+        differences = (means.bias - columns @ solved(x, z))[lo:hi]
+        square += float((differences[means.known[lo:hi]] ** 2).sum())
     return float((square / means.known.sum()) ** 0.5)
 
 
-def _model(means: Means, excess: Floats, reference_c: float, one: _Tried) -> ThermalModel:
+def _to_model(means: Means, excess: Floats, reference_c: float, one: _ShapeFit) -> ThermalModel:
+    """Return the model of a fitted form, with the covariance of its coefficients."""
     k = one.shape.memory
     terms = one.sizes.size - k
     model = ThermalModel(

@@ -1,8 +1,9 @@
-"""A model of bias against temperature: its sizes, how sure they are, and what it expects of intervals to come.
+"""Model of bias against temperature: its coefficients, their uncertainty, and predictions of interval means.
 
-A multi-step estimate knows temperature alone; a one-step estimate also knows the bias measured one interval before.
-Intervals are those of the mean that is measured: they hold what the fit does not know of sizes and time constants, and
-the scatter of the means. ``thermal`` chooses and fits models, ``recursion`` lets their sizes follow what comes.
+A multi-step prediction uses temperature only. A one-step prediction also uses the bias measured one interval before.
+The prediction intervals apply to the measured mean. They include the uncertainty of coefficients and time constants,
+and the scatter of the means. ``thermal_fit`` chooses and fits models, and ``recursive_least_squares`` updates their
+coefficients with new intervals.
 """
 
 from dataclasses import dataclass
@@ -13,41 +14,44 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.drift.thermal.thermal_response import Shape, equation, outside, responses
 
-STEP: Final = 1e-3
-"""Of the logarithm of a time constant, for its derivative."""
+LOG_TIME_CONSTANT_STEP: Final = 1e-3
+"""Step of the logarithm of a time constant for its numerical derivative."""
 Z95: Final = 1.959964
+"""Two-sided 95 % quantile of the standard normal distribution."""
 
 
 @dataclass(frozen=True, slots=True)
 class ThermalModel:
-    """The bias of one axis as a function of temperature and its past."""
+    """Bias of one axis as a function of temperature and its history."""
 
     shape: Shape
     interval_s: float
-    reference_c: float  # temperature at which the constant holds
-    sizes: Floats  # [terms] constant, powers, lags: rad/s (m/s²) by powers of °C
-    start: Floats  # [k] what each lag had left behind when the fit began
-    phi: float  # of what is left, from one interval to the next
-    sigma: float  # rad/s (m/s²): deviation of what no interval knows before
-    covariance: Floats  # of sizes, start and logarithms of the time constants
-    lowest_c: float
-    highest_c: float
+    reference_c: float  # °C, reference temperature, at which the constant applies
+    sizes: Floats  # [terms] coefficients of constant, powers and lags: rad/s (m/s²) per power of °C
+    start: Floats  # [k] initial state of each lag at the start of the fit, rad/s (m/s²)
+    phi: float  # correlation of the residuals of successive intervals
+    sigma: float  # rad/s (m/s²), standard deviation of the one-step residuals
+    covariance: Floats  # covariance of sizes, start and logarithms of the time constants
+    lowest_c: float  # °C, lowest temperature of the fit
+    highest_c: float  # °C, highest temperature of the fit
 
     @property
     def spread(self) -> float:
-        """Deviation of what the model leaves of a mean."""
+        """Return the standard deviation of the multi-step residuals, rad/s or m/s²."""
         return float(self.sigma / (1.0 - self.phi**2) ** 0.5)
 
     @property
     def slope(self) -> float:
-        """Bias per °C, in the end, from the coldest to the warmest of the fit."""
+        """Return the mean slope of the bias in rad/s or m/s² per °C over the temperatures of the fit, with settled
+        lags."""
         (lo, hi), powers = self.ends, np.arange(1, self.shape.powers + 1)
         chords = (hi**powers - lo**powers) / (hi - lo)
         return float(self.sizes[1 : 1 + self.shape.powers] @ chords + self.sizes[1 + self.shape.powers :].sum())
 
     @property
     def equation(self) -> dict[str, list[float] | float] | None:
-        """a, b and c of its difference equation in T − reference; None of a polynomial that bends."""
+        """Return the coefficients a, b and c of the difference equation in T − reference; None for a polynomial of
+        order 2 or more."""
         if self.shape.powers > 1:
             return None
         a, b, c = equation(self.shape, self.sizes, self.interval_s)
@@ -55,30 +59,39 @@ class ThermalModel:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """The coldest and the warmest of the fit less the reference, °C."""
+        """Return the lowest and the highest temperature of the fit minus the reference, °C."""
         return self.lowest_c - self.reference_c, self.highest_c - self.reference_c
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """What a model expects of each interval."""
+    """Predicted mean of each interval."""
 
     bias: Floats  # [n] rad/s or m/s²
-    lo: Floats  # [n] 95 % interval of the mean that is measured
-    hi: Floats
+    lo: Floats  # [n] 95 % prediction interval of the measured mean
+    hi: Floats  # [n]
 
 
 def predicted(
     model: ThermalModel, temperature_c: Floats, measured: Floats | None = None, began: bool = False
 ) -> Prediction:
-    """Multi-step from temperature [n] alone, or one-step beside the biases measured [n] until the interval before.
+    """Predict the interval means, multi-step or one-step.
 
-    Args:
-        began: the first interval is the first of the fit, whose start is known; else temperature is taken to have been
-            long what it is at first, and intervals are as wide as not knowing that asks for
+    Nothing is known beyond the temperatures of the fit. The model continues along its chord there, and the change along
+    the chord widens the prediction interval.
 
-    Beyond the temperatures of the fit nothing is known: the model goes on along its chord, and as much as that changes
-    it by is added to the interval.
+    Parameters
+    ----------
+    model : ThermalModel
+        Fitted model.
+    temperature_c : ndarray, shape (n,)
+        Mean temperature of each interval, °C; NaN = missing.
+    measured : ndarray, shape (n,), or None
+        Measured bias of each interval, rad/s or m/s². Each value is used for the prediction of the next interval. None
+        selects the multi-step prediction from temperature only.
+    began : bool
+        True if the first interval is the first one of the fit, whose initial state is known. If False, temperature is
+        assumed to have been constant before, and the prediction intervals include the uncertainty of this assumption.
     """
     excess = whole(temperature_c) - model.reference_c
     columns = responses(model.shape, excess, model.interval_s, began=True, ends=model.ends)
@@ -99,14 +112,29 @@ def predicted(
 def expected(
     model: ThermalModel, excess: Floats, columns: Floats, sizes: Floats, bends: Floats, measured: Floats | None
 ) -> tuple[Floats, Floats]:
-    """Bias [n] and the variance [n] of a measured mean about it, of intervals that follow each other.
+    """Return the expected bias of successive intervals, and the variance of a measured mean about it.
 
-    Args:
-        excess: [n] T − reference, °C
-        columns: [n, terms + k] of ``responses``
-        sizes: [terms + k] of the columns
-        bends: [n, k] of ``slopes``
-        measured: [n] what is measured, of which each but the last is known to the next; None: multi-step
+    Parameters
+    ----------
+    model : ThermalModel
+        Fitted model.
+    excess : ndarray, shape (n,)
+        T − reference, °C.
+    columns : ndarray, shape (n, terms + k)
+        Regressors of ``responses``.
+    sizes : ndarray, shape (terms + k,)
+        Coefficients of the columns.
+    bends : ndarray, shape (n, k)
+        Derivatives of ``slopes``.
+    measured : ndarray, shape (n,), or None
+        Measured bias, rad/s or m/s². Each value except the last is known to the next interval. None selects multi-step.
+
+    Returns
+    -------
+    bias : ndarray, shape (n,)
+        Expected bias, rad/s or m/s².
+    variance : ndarray, shape (n,)
+        Variance of the measured mean, in the squared unit.
     """
     bias = columns @ sizes
     rows = np.hstack([columns, bends])
@@ -123,33 +151,72 @@ def expected(
 
 
 def whole(temperature_c: Floats) -> Floats:
-    """Without holes: lags need to know what temperature was meanwhile."""
+    """Return the temperature [n] with gaps interpolated, because the lags depend on the temperature within the gaps."""
     there = np.flatnonzero(np.isfinite(temperature_c))
     return np.interp(np.arange(temperature_c.size), there, temperature_c[there])
 
 
 def covariance(rows: Floats, sigma: float) -> Floats:
-    """Of what is multiplied by the columns of white rows [n, m] of so large a deviation."""
+    """Return the covariance [m, m] of least-squares coefficients.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (n, m)
+        Whitened regressors.
+    sigma : float
+        Standard deviation of the whitened residuals.
+    """
     scale = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
     scaled = rows / scale
     return np.asarray(sigma**2 * np.linalg.pinv(scaled.T @ scaled, rcond=1e-10) / np.outer(scale, scale))
 
 
 def slopes(model: ThermalModel, excess: Floats, sizes: Floats) -> Floats:
-    """Derivatives [n, k] of the bias by the logarithm of each time constant, at these sizes of columns."""
+    """Return the derivatives [n, k] of the bias with respect to the logarithm of each time constant.
+
+    Parameters
+    ----------
+    model : ThermalModel
+        Fitted model.
+    excess : ndarray, shape (n,)
+        T − reference, °C.
+    sizes : ndarray, shape (terms + k,)
+        Coefficients of the columns.
+    """
     return bent(model.shape, derivatives(model.shape, excess, model.interval_s), sizes)
 
 
 def derivatives(shape: Shape, excess: Floats, interval_s: float) -> Floats:
-    """Of each lag [n, k] and of what each left behind [n, k], by the logarithm of its own time constant: [n, 2 k]."""
+    """Return the derivatives [n, 2 k] of the lags and of their initial-state responses by the logarithm of their time
+    constants.
+
+    Parameters
+    ----------
+    shape : Shape
+        Form of the model.
+    excess : ndarray, shape (n,)
+        T − reference, °C.
+    interval_s : float
+        Length of an interval, s.
+    """
     less, more = (
         responses(Shape(0, tuple(one * np.exp(by) for one in shape.constants_s)), excess, interval_s, began=True)
-        for by in (-STEP, STEP)
+        for by in (-LOG_TIME_CONSTANT_STEP, LOG_TIME_CONSTANT_STEP)
     )
-    return np.asarray((more - less)[:, 1:] / (2.0 * STEP))
+    return np.asarray((more - less)[:, 1:] / (2.0 * LOG_TIME_CONSTANT_STEP))
 
 
 def bent(shape: Shape, of_each: Floats, sizes: Floats) -> Floats:
-    """What ``derivatives`` are together at these sizes [terms + k]: [n, k]."""
+    """Return the derivatives [n, k] of the bias by the logarithms of the time constants, from those of the columns.
+
+    Parameters
+    ----------
+    shape : Shape
+        Form of the model.
+    of_each : ndarray, shape (n, 2 k)
+        Derivatives of the columns, from ``derivatives``.
+    sizes : ndarray, shape (terms + k,)
+        Coefficients of the columns.
+    """
     k, first = shape.memory, 1 + shape.powers
     return np.asarray(of_each[:, :k] * sizes[first : first + k] + of_each[:, k:] * sizes[first + k :])

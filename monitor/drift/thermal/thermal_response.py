@@ -1,16 +1,16 @@
-"""What a bias makes of temperature, as a sum of responses that are linear in their sizes.
+"""Response of a bias to temperature, as a sum of terms that are linear in their coefficients.
 
-A **lag** is heat that reaches the sensor late: L_n = p L_{n−1} + (1 − p) T_n, p = exp(−Δt/τ). Resistances and
-capacities of heat have real, positive time constants only, so a difference equation
+A **lag** describes heat that reaches the sensor with a delay: L_n = p L_{n−1} + (1 − p) T_n, p = exp(−Δt/τ). Thermal
+resistances and capacitances have only real, positive time constants. A difference equation
 
     Y_n + a_1 Y_{n−1} + … + a_k Y_{n−k} = b_0 T_n + … + b_m T_{n−m} + c
 
-whose roots are p_1 … p_k is k lags side by side, each of its own size; m = k − 1, or m = k where some of the bias
-follows at once. It is stable by construction. Each root also leaves p^n, what the time before the first interval left
-behind.
+with roots p_1 … p_k is therefore a sum of k lags, each with its own coefficient. m = k − 1, or m = k if a part of the
+bias follows without delay. The equation is stable by construction. Each root also has an initial-state response p^n,
+the effect of the time before the first interval.
 
-A **polynomial** in T is the established alternative: no memory. Outside the temperatures of its fit it goes on
-along the chord between their ends, as a power would run away.
+A **polynomial** in T is the established alternative without memory. Outside the temperatures of its fit it continues
+along the chord between the ends, because a power would diverge.
 """
 
 from dataclasses import dataclass
@@ -23,19 +23,19 @@ from monitor.common.compiled import compiled
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """What is not linear: the form of the model."""
+    """Form of the model: its nonlinear parameters."""
 
-    powers: int  # of T − reference, at once
+    powers: int  # order of the polynomial in T − reference, which acts without delay
     constants_s: tuple[float, ...]  # time constants of the lags, s
 
     @property
     def memory(self) -> int:
-        """Order k of the difference equation; 0 for a polynomial."""
+        """Return the order k of the difference equation; 0 for a polynomial."""
         return len(self.constants_s)
 
     @property
     def name(self) -> str:
-        """For people.
+        """Return the name of the form for display.
 
         >>> Shape(0, ()).name, Shape(3, ()).name, Shape(0, (3600.0,)).name, Shape(1, (60.0, 600.0)).name
         ('constant', 'polynomial 3', 'difference 1, 0', 'difference 2, 2')
@@ -46,20 +46,39 @@ class Shape:
 
 
 def roots(shape: Shape, interval_s: float) -> Floats:
-    """p of each lag."""
+    """Return the root p of each lag.
+
+    Parameters
+    ----------
+    shape : Shape
+        Form of the model.
+    interval_s : float
+        Length of an interval, s.
+    """
     return np.exp(-interval_s / np.asarray(shape.constants_s, dtype=np.float64))
 
 
 def responses(
     shape: Shape, excess_c: Floats, interval_s: float, began: bool = False, ends: tuple[float, float] | None = None
 ) -> Floats:
-    """Columns [n, terms]: one, powers of T − reference, lags, and what was left behind at the start.
+    """Return the regressors [n, terms]: one, powers of T − reference, lags, and initial-state responses.
 
-    Args:
-        excess_c: [n] T − reference, °C, without holes
-        ends: T − reference of the coldest and the warmest that was fitted, °C; beyond them powers are chords
-        began: each lag has a start of its own, as the temperature before is not known; else it was what it is at first
+    Parameters
+    ----------
+    shape : Shape
+        Form of the model.
+    excess_c : ndarray, shape (n,)
+        T − reference, °C, without gaps.
+    interval_s : float
+        Length of an interval, s.
+    began : bool
+        True if each lag has an initial state of its own, because the temperature before is not known. False if
+        temperature is assumed to have been constant before.
+    ends : (float, float) or None
+        Lowest and highest T − reference of the fit, °C. Beyond them, powers continue along their chord.
 
+    Examples
+    --------
     >>> responses(Shape(1, ()), np.array([0.0, 2.0]), 60.0).tolist()
     [[1.0, 0.0], [1.0, 2.0]]
     """
@@ -74,11 +93,20 @@ def responses(
 
 
 def outside(excess_c: Floats, ends: tuple[float, float]) -> Floats:
-    """How far each is beyond the ends, °C."""
+    """Return how far each temperature lies beyond the ends, °C.
+
+    Parameters
+    ----------
+    excess_c : ndarray, shape (n,)
+        T − reference, °C.
+    ends : (float, float)
+        Lowest and highest T − reference of the fit, °C.
+    """
     return excess_c - np.clip(excess_c, *ends)
 
 
 def _power(x: Floats, power: int, ends: tuple[float, float] | None) -> Floats:
+    """Return a power of x, continued along its chord beyond the ends."""
     if ends is None or ends[1] <= ends[0]:
         return np.asarray(x**power)
     chord = (ends[1] ** power - ends[0] ** power) / (ends[1] - ends[0])
@@ -87,7 +115,15 @@ def _power(x: Floats, power: int, ends: tuple[float, float] | None) -> Floats:
 
 @compiled
 def lagged(x, p):  # type: ignore[no-untyped-def]
-    """L_n = p L_{n−1} + (1 − p) x_n, settled at the first."""
+    """Return a first-order lag of x, L_n = p L_{n−1} + (1 − p) x_n, settled at the first value.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n,)
+        Input.
+    p : float
+        Root of the lag, 0 < p < 1.
+    """
     out = np.empty(x.size)
     level = x[0]
     for k in range(x.size):
@@ -97,21 +133,42 @@ def lagged(x, p):  # type: ignore[no-untyped-def]
 
 
 def solved(columns: Floats, y: Floats) -> Floats:
-    """Sizes [terms] by least squares, columns scaled so that units do not matter."""
+    """Return the least-squares coefficients [terms].
+
+    The columns are scaled, so that their units have no effect.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (n, terms)
+        Regressors.
+    y : ndarray, shape (n,)
+        Values.
+    """
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     found = np.linalg.lstsq(columns / scale, y, rcond=1e-10)[0]
     return np.asarray(found / scale)
 
 
 def equation(shape: Shape, sizes: Floats, interval_s: float) -> tuple[Floats, Floats, float]:
-    """a [k], b [m + 1] and c of the difference equation in T − reference.
+    """Return the coefficients a [k], b [m + 1] and c of the difference equation in T − reference.
 
+    Parameters
+    ----------
+    shape : Shape
+        Form of the model.
+    sizes : ndarray, shape (terms,)
+        Coefficients of constant, powers and lags.
+    interval_s : float
+        Length of an interval, s.
+
+    Examples
+    --------
     >>> a, b, c = equation(Shape(0, (1.0 / np.log(2.0),)), np.array([3.0, 10.0]), 1.0)
     >>> a.round(12).tolist(), b.round(12).tolist(), round(c, 12)
     ([-0.5], [5.0], 1.5)
     """
     p = roots(shape, interval_s)
-    whole = np.poly(p) if p.size else np.ones(1)  # [k + 1], 1 and a
+    whole = np.poly(p) if p.size else np.ones(1)  # [k + 1] 1, followed by a
     b = np.zeros(whole.size)
     if shape.powers:
         b += sizes[1] * whole

@@ -1,4 +1,4 @@
-"""What was fitted in one recording, and what models expect of another."""
+"""Thermal models fitted in one recording, and their predictions for another recording."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,40 +11,62 @@ from monitor.drift.thermal.interval_means import Means
 from monitor.drift.thermal.thermal_fit import ThermalFit
 from monitor.drift.thermal.thermal_model import Prediction, ThermalModel, predicted
 
-INTERVALS: Final = 72
-"""In a recording, unless an interval is given: the number of the paper, 72 h by the hour."""
-NICE_S: Final = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 20, 30, 60, 120, 300, 600, 900, 1200, 1800, 3600, 7200, 14400)
+DEFAULT_INTERVALS: Final = 72
+"""Number of intervals in a recording, if no interval is given. The paper uses 72 h in intervals of 1 h."""
+ROUND_INTERVALS_S: Final = (
+    0.1,
+    0.2,
+    0.5,
+    1,
+    2,
+    5,
+    10,
+    15,
+    20,
+    30,
+    60,
+    120,
+    300,
+    600,
+    900,
+    1200,
+    1800,
+    3600,
+    7200,
+    14400,
+)
+"""Round lengths of an interval in seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """What was fitted in one recording."""
+    """Thermal models fitted in one recording."""
 
     recording: str
     interval_s: float
     means: Mapping[str, Means]
     fits: Mapping[str, ThermalFit]
-    refused: Mapping[str, str]  # axis -> why
+    refused: Mapping[str, str]  # axis -> reason why no model was fitted
     notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A model beside the means of a recording."""
+    """Comparison of a model with the means of a recording."""
 
     multi_step: Prediction
     one_step: Prediction
-    offset: float  # mean of measured less multi-step: a bias changes from one start to the next
-    rms: float  # of measured less multi-step, rad/s or m/s²
-    rms_moved: float  # the same once the offset is taken out
-    rms_one_step: float
-    rms_alone: float  # of measured about its mean
-    within: float  # share of means inside the multi-step interval
+    offset: float  # mean of measured minus multi-step; a bias changes from one start to the next
+    rms: float  # rms of measured minus multi-step, rad/s or m/s²
+    rms_moved: float  # rms of measured minus multi-step minus offset
+    rms_one_step: float  # rms of measured minus one-step
+    rms_alone: float  # rms of measured about its mean
+    within: float  # share of means inside the multi-step prediction interval
 
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """What models expect of a recording."""
+    """Predictions of models for a recording."""
 
     recording: str
     interval_s: float
@@ -55,18 +77,26 @@ class Outlook:
 
 
 def judge(model: ThermalModel, means: Means) -> Judged:
-    """A model beside means that did not choose it."""
+    """Compare a model with means that were not used for its fit.
+
+    Parameters
+    ----------
+    model : ThermalModel
+        Fitted model.
+    means : Means
+        Interval means of bias (rad/s or m/s²) and temperature (°C).
+    """
     multi, known = predicted(model, means.temperature_c), means.known
-    apart = means.bias - multi.bias
-    offset = float(apart[known].mean())
+    residual = means.bias - multi.bias
+    offset = float(residual[known].mean())
     one = predicted(model, means.temperature_c, means.bias - offset)
     inside = (means.bias >= multi.lo) & (means.bias <= multi.hi)
     return Judged(
         multi,
         Prediction(one.bias + offset, one.lo + offset, one.hi + offset),
         offset,
-        _rms(apart[known]),
-        _rms(apart[known] - offset),
+        _rms(residual[known]),
+        _rms(residual[known] - offset),
         _rms((means.bias - offset - one.bias)[known]),
         _rms(means.bias[known] - means.bias[known].mean()),
         float(inside[known].mean()),
@@ -74,14 +104,24 @@ def judge(model: ThermalModel, means: Means) -> Judged:
 
 
 def nice_interval(seconds: float, rate_hz: float) -> float:
-    """A round interval of which a recording has about INTERVALS.
+    """Return a round interval length in seconds that divides a recording into about DEFAULT_INTERVALS intervals.
 
+    Parameters
+    ----------
+    seconds : float
+        Length of the recording in seconds.
+    rate_hz : float
+        Sample rate in Hz.
+
+    Examples
+    --------
     >>> nice_interval(72 * 3600.0, 100.0), nice_interval(8784.0, 4.16), nice_interval(60.0, 100.0)
     (3600, 120, 0.5)
     """
-    most = max(seconds / INTERVALS, 1.0 / rate_hz) * 1.01
-    return max((one for one in NICE_S if 1.0 / rate_hz <= one <= most), default=1.0 / rate_hz)
+    most = max(seconds / DEFAULT_INTERVALS, 1.0 / rate_hz) * 1.01
+    return max((one for one in ROUND_INTERVALS_S if 1.0 / rate_hz <= one <= most), default=1.0 / rate_hz)
 
 
 def _rms(x: Floats) -> float:
+    """Return the rms of x."""
     return float(np.sqrt(np.mean(x**2)))

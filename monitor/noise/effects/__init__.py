@@ -1,4 +1,7 @@
-"""One effect a file. ``EFFECTS`` lists them by the name that model files use, ``ORDER`` is the order of transforms."""
+"""Effects of a noise model, one per file.
+
+``EFFECTS`` lists them by their name in model files. ``ORDER`` is the order in which transforms act.
+"""
 
 from typing import Final
 
@@ -37,7 +40,8 @@ ORDER: Final[tuple[type[Transform], ...]] = (
     Resolution,
     SampleHold,
 )
-"""Transforms act in this order, wherever they stand in the model; two of one kind in the order of the model."""
+"""Order in which transforms act, whatever their order in the model. Two transforms of one kind act in the order of the
+model."""
 
 _ALL: Final[tuple[type[Effect], ...]] = (
     Bias,
@@ -62,6 +66,7 @@ _ALL: Final[tuple[type[Effect], ...]] = (
     *ORDER,
 )
 EFFECTS: Final[dict[str, type[Effect]]] = {effect.name: effect for effect in _ALL}
+"""Name of an effect in model files -> its class."""
 
 __all__ = [
     "EFFECTS",

@@ -1,4 +1,4 @@
-"""The sensor's own low-pass."""
+"""Low-pass filter of the sensor."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -14,8 +14,8 @@ from monitor.noise.spectrum import Spectrum
 class BandwidthLimit(Transform):
     """Butterworth low-pass, digital by the bilinear transform: |H|² = 1/(1 + (tan(πfτ0)/tan(πf_cτ0))^(2n)).
 
-    Butterworth, "On the theory of filter amplifiers", 1930. The Allan variance behind it is an integral over the
-    spectrum. The filter begins settled at its first sample, so that gravity is no transient.
+    Butterworth, "On the theory of filter amplifiers", 1930. The Allan variance after the filter is an integral over the
+    spectrum. The filter starts in its settled state at the first sample, so that gravity causes no transient.
 
     >>> from monitor.noise.spectrum import white
     >>> half = BandwidthLimit(cutoff=10.0, order=2).reshape(white(1.0, 0.01)).density(np.array([10.0]))
@@ -30,23 +30,23 @@ class BandwidthLimit(Transform):
     means: ClassVar[str] = "The sensor's own filter lets slow motion through and damps what is fast, noise too."
 
     def check_rate(self, rate_hz: float) -> None:
-        """Its cutoff must be below half the sample rate."""
+        """Raise ConfigError if the cutoff is not below half the sample rate."""
         below_nyquist(self, "cutoff", rate_hz)
 
     def reshape(self, spectrum: Spectrum) -> Spectrum:
-        """Times |H|²."""
+        """Return the spectrum times |H|²."""
         tau0_s = spectrum.tau0_s
         corner = np.tan(np.pi * self.cutoff * tau0_s)
 
         def gain(f_hz: Floats) -> Floats:
-            # at half the sample rate the tangent is 1e16: over to infinity, and the gain is zero
+            # At half the sample rate the tangent is 1e16. Its power overflows to infinity, and the gain is zero.
             with np.errstate(over="ignore"):
                 return np.asarray(1.0 / (1.0 + (np.tan(np.pi * f_hz * tau0_s) / corner) ** (2 * int(self.order))))
 
         return spectrum.filtered(gain)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> Running:
-        """Settled at the first sample."""
-        from monitor.noise.low_pass import LowPass, butterworth  # with Numba, which only samples need
+        """Return the filter, which settles at the first sample."""
+        from monitor.noise.low_pass import LowPass, butterworth  # imports Numba, which only simulation needs
 
         return LowPass(butterworth(int(self.order), self.cutoff, rate_hz))

@@ -1,4 +1,4 @@
-"""A constant bias."""
+"""Constant bias."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -12,7 +12,7 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class Bias(Source):
-    """A constant: no Allan variance, no spectrum; an accelerometer's share of gravity belongs here too.
+    """Constant bias, without Allan variance or spectrum. The share of gravity on an accelerometer is also a bias.
 
     >>> Bias(value=9.8).spectrum(0.01).level
     9.8
@@ -24,23 +24,25 @@ class Bias(Source):
     means: ClassVar[str] = "What the sensor reads when it should read zero."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """Zero at every τ."""
+        """Return zero for every τ."""
         return np.zeros_like(tau_s)
 
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """Zero above f = 0."""
+        """Return zero for every frequency above 0."""
         return np.zeros_like(f_hz)
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """A level and nothing else."""
+        """Return a spectrum that has only a constant level."""
         return replace(Source.spectrum(self, tau0_s), level=self.value)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Constant":
-        """The same value for ever."""
+        """Return a constant series."""
         return _Constant(self.value)
 
 
 class _Constant(Series):
+    """Series of one value."""
+
     def __init__(self, value: float) -> None:
         self._value = value
 

@@ -1,4 +1,4 @@
-"""A step of the bias."""
+"""Step of the bias."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -11,9 +11,9 @@ from monitor.noise.effect import Block, Series, Source, first_sample, parameter
 
 @dataclass(frozen=True, slots=True)
 class BiasStep(Source):
-    """Zero before ``time``, ``height`` from the first sample at or after it.
+    """Step of the bias: zero before ``time``, ``height`` from the first sample at or after ``time``.
 
-    It happens once, so its Allan variance and spectrum depend on the length of the recording: NaN.
+    The step occurs once. Its Allan variance and spectrum therefore depend on the length of the recording and are NaN.
 
     >>> bool(np.isnan(BiasStep(time=60.0, height=1e-3).avar(np.array([1.0]), 0.01)[0]))
     True
@@ -26,19 +26,21 @@ class BiasStep(Source):
     means: ClassVar[str] = "The bias jumps once and stays there, as after a knock."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """NaN: it depends on the length of the recording."""
+        """Return NaN, because the Allan variance depends on the length of the recording."""
         return np.full_like(tau_s, np.nan)
 
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """NaN: it depends on the length of the recording."""
+        """Return NaN, because the spectrum depends on the length of the recording."""
         return np.full_like(f_hz, np.nan)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Step":
-        """``time`` counts from the stream's first sample."""
+        """Return a series in which ``time`` counts from the first sample of the stream."""
         return _Step(first_sample(self.time, rate_hz), self.height)
 
 
 class _Step(Series):
+    """Series with one step at a sample index."""
+
     def __init__(self, index: int, height: float) -> None:
         self._index, self._height = index, height
 

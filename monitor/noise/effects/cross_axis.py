@@ -1,4 +1,4 @@
-"""One axis that leaks into another of its kind."""
+"""Cross-axis sensitivity: leak from another axis of the same kind."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -9,7 +9,8 @@ from monitor.noise.effect import GYROS, Leak, parameter, source_axis
 
 @dataclass(frozen=True, slots=True)
 class CrossAxis(Leak):
-    """y += c·x, with x as the axis ``source`` measures it by itself (IEEE Std 1293: cross-axis sensitivity).
+    """Leak y += c·x, where x is the measurement of the axis ``source`` without leaks (IEEE Std 1293: cross-axis
+    sensitivity).
 
     >>> CrossAxis(source="gx", coefficient=0.02).check_axis("gx")
     Traceback (most recent call last):
@@ -23,7 +24,7 @@ class CrossAxis(Leak):
     means: ClassVar[str] = "The axis is not square to its neighbour and reads a little of it."
 
     def check_axis(self, axis: str) -> None:
-        """From another axis of the same kind."""
+        """Raise ConfigError if the source is the same axis or an axis of the other kind."""
         if self.source == axis:
             raise ConfigError(f"{self.name}: source must be another axis than {axis} itself")
         if (self.source in GYROS) != (axis in GYROS):

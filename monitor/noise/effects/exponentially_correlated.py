@@ -1,4 +1,4 @@
-"""Exponentially correlated noise: first-order Gauss–Markov."""
+"""Exponentially correlated noise (first-order Gauss–Markov process)."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -13,10 +13,12 @@ from monitor.noise.effect import Block, Series, Source, parameter
 
 @dataclass(frozen=True, slots=True)
 class ExponentiallyCorrelated(Source):
-    """Markov noise of IEEE Std 952 annex C, as sampled: autocovariance σ²φ^|n|, φ = exp(−τ0/T_c).
+    """Markov noise of IEEE Std 952 annex C for samples: autocovariance σ²φ^|n|, φ = exp(−τ0/T_c).
 
-    σ²(τ) = σ²(1 − φ²)[n − 3φ − nφ² + 4φ^(n+1) − φ^(2n+1)] / [n²(1 − φ)²(1 − φ²)] with n = τ/τ0,
-    S(f) = σ²τ0(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²).
+    The closed forms, with n = τ/τ0, are:
+
+        σ²(τ) = σ²(1 − φ²)[n − 3φ − nφ² + 4φ^(n+1) − φ^(2n+1)] / [n²(1 − φ)²(1 − φ²)]
+        S(f) = σ²τ0(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²)
 
     >>> noise = ExponentiallyCorrelated(sigma=1.0, correlation_time=10.0)
     >>> print(f"{noise.avar(np.array([18.9]), 1e-3)[0]:.3f}")
@@ -30,20 +32,20 @@ class ExponentiallyCorrelated(Source):
     means: ClassVar[str] = "The bias wanders and comes back, and forgets where it was after a correlation time."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """The closed form above."""
+        """Return the Allan variance by the closed form of the class docstring."""
         return gauss_markov.avar(self.sigma, 1.0 / self.correlation_time, tau_s, tau0_s)
 
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """The closed form above."""
+        """Return the spectrum by the closed form of the class docstring."""
         return gauss_markov.psd(self.sigma, 1.0 / self.correlation_time, f_hz, tau0_s)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_GaussMarkov":
-        """A stationary series."""
+        """Return a stationary series."""
         return _GaussMarkov(self.sigma, 1.0 / (self.correlation_time * rate_hz), rng)
 
 
 class _GaussMarkov(Series):
-    """x ← φx + σ√(1 − φ²) w."""
+    """Series of the recursion x ← φx + σ√(1 − φ²) w."""
 
     def __init__(self, sigma: float, step: float, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -53,12 +55,12 @@ class _GaussMarkov(Series):
 
     def add(self, values: Floats, block: Block) -> None:
         white = self._rng.standard_normal(out=block.scratch)
-        self._state = _follow(values, white, self._phi, self._drive, self._state)
+        self._state = _add_gauss_markov(values, white, self._phi, self._drive, self._state)
 
 
 @compiled
-def _follow(values, white, phi, drive, state):  # type: ignore[no-untyped-def]
-    """Add the process; its state is given back."""
+def _add_gauss_markov(values, white, phi, drive, state):  # type: ignore[no-untyped-def]
+    """Add the process to the values [n], and return its state."""
     for k in range(values.size):
         values[k] += state
         state = phi * state + drive * white[k]

@@ -1,4 +1,4 @@
-"""Acceleration that leaks into a gyroscope."""
+"""g-sensitivity: leak of acceleration into a gyroscope."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -9,7 +9,9 @@ from monitor.noise.effect import ACCELEROMETERS, GYROS, Leak, parameter, source_
 
 @dataclass(frozen=True, slots=True)
 class GSensitivity(Leak):
-    """ω += c·a, with a as the accelerometer ``source`` measures it by itself (IEEE Std 952: g-sensitive drift).
+    """Leak of acceleration ω += c·a (IEEE Std 952: g-sensitive drift).
+
+    a is the measurement of the accelerometer ``source`` without leaks.
 
     >>> GSensitivity(source="az", coefficient=1e-5).check_axis("ax")
     Traceback (most recent call last):
@@ -23,7 +25,7 @@ class GSensitivity(Leak):
     means: ClassVar[str] = "The gyroscope feels acceleration: gravity and vibration shift its reading."
 
     def check_axis(self, axis: str) -> None:
-        """On a gyroscope, from an accelerometer."""
+        """Raise ConfigError if the axis is not a gyroscope, or the source not an accelerometer."""
         if axis not in GYROS:
             raise ConfigError(f"{self.name}: belongs on a gyroscope, not on {axis}")
         if self.source not in ACCELEROMETERS:

@@ -1,4 +1,4 @@
-"""A step of the noise."""
+"""Step of the white noise."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -8,10 +8,10 @@ from monitor.noise.effect import Effect, parameter
 
 @dataclass(frozen=True, slots=True)
 class NoiseStep(Effect):
-    """The angle random walk of the axis is multiplied by ``ratio`` from the first sample at or after ``time``.
+    """Factor ``ratio`` on the angle random walk of the axis, from the first sample at or after ``time``.
 
-    Two of them multiply. It happens once, so the Allan variance and the spectrum of such an axis depend on the
-    length of the recording: NaN.
+    The factors of two noise steps multiply. A step occurs once. The Allan variance and spectrum of its axis therefore
+    depend on the length of the recording and are NaN.
 
     >>> NoiseStep(time=600.0, ratio=2.0).name
     'noise_step'

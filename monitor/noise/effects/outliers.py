@@ -1,4 +1,4 @@
-"""Outliers: single samples that are wrong."""
+"""Outliers: single samples with a large error."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -12,9 +12,10 @@ from monitor.noise.random_events import Events
 
 @dataclass(frozen=True, slots=True)
 class Outliers(Source):
-    """A share p of the samples, each by itself, has a Gaussian error of deviation s added: Tukey's contaminated noise.
+    """Tukey's contaminated noise: each sample has, with probability p, an additional Gaussian error of standard
+    deviation s.
 
-    Independent samples of variance ps²: S(f) = ps²τ0, σ²(τ) = ps²τ0/τ.
+    The errors are independent samples of variance ps²: S(f) = ps²τ0, σ²(τ) = ps²τ0/τ.
 
     >>> print(f"{Outliers(fraction=1e-4, scale=0.1).avar(np.array([1.0]), 0.01)[0]:.6g}")
     1e-08
@@ -27,19 +28,21 @@ class Outliers(Source):
     means: ClassVar[str] = "Single samples are far off, the next ones are right again."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """ps²τ0/τ."""
+        """Return the Allan variance ps²τ0/τ."""
         return self.fraction * self.scale**2 * tau0_s / tau_s
 
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """ps²τ0."""
+        """Return ps²τ0 for every frequency."""
         return np.full_like(f_hz, self.fraction * self.scale**2 * tau0_s)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Isolated":
-        """Gaps between outliers are geometric: what a toss at every sample gives."""
+        """Return a series of outliers with geometric gaps, which correspond to an independent draw for every sample."""
         return _Isolated(self.fraction, self.scale, rate_hz, rng)
 
 
 class _Isolated(Series):
+    """Series of isolated errors."""
+
     def __init__(self, fraction: float, scale: float, rate_hz: float, rng: np.random.Generator) -> None:
         def gaps(n: int) -> Floats:
             if fraction == 0.0:

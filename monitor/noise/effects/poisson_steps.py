@@ -1,4 +1,4 @@
-"""Jumps at random times."""
+"""Steps of the bias at random times."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,9 +14,9 @@ from monitor.noise.random_events import Events
 
 @dataclass(frozen=True, slots=True)
 class PoissonSteps(Source):
-    """Gaussian jumps, λ a second on average: a compound Poisson process (Cox & Miller, Theory of Stochastic Processes).
+    """Compound Poisson process: Gaussian steps, λ per second on average (Cox & Miller, Theory of Stochastic Processes).
 
-    Its increments are independent, so its second moments are those of rate random walk with K² = λh².
+    Its increments are independent. Its second moments therefore equal those of rate random walk with K² = λh².
 
     >>> jumps = PoissonSteps(rate=0.01, height=1e-4)
     >>> print(f"{jumps.avar(np.array([300.0]), 0.01)[0]:.6g}")
@@ -30,38 +30,41 @@ class PoissonSteps(Source):
     means: ClassVar[str] = "Now and then the bias jumps to a new place and stays there."
 
     @property
-    def _walk(self) -> RateRandomWalk:
+    def _equivalent_random_walk(self) -> RateRandomWalk:
+        """Return the rate random walk with the same second moments."""
         return RateRandomWalk(K=self.rate**0.5 * self.height)
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """That of rate random walk, K² = λh²."""
-        return self._walk.avar(tau_s, tau0_s)
+        """Return the Allan variance of rate random walk with K² = λh²."""
+        return self._equivalent_random_walk.avar(tau_s, tau0_s)
 
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """That of rate random walk, K² = λh²."""
-        return self._walk.psd(f_hz, tau0_s)
+        """Return the spectrum of rate random walk with K² = λh²."""
+        return self._equivalent_random_walk.psd(f_hz, tau0_s)
 
     def check_rate(self, rate_hz: float) -> None:
-        """Steps must not be more than can be simulated."""
+        """Raise ConfigError if the steps are too frequent for a simulation."""
         check_event_rate(self, self.rate, rate_hz)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Jumps":
-        """Starts at zero."""
+        """Return a series that starts at zero."""
         return _Jumps(self.rate / rate_hz, self.height, rate_hz, rng)
 
 
 class _Jumps(Series):
+    """Series of random steps."""
+
     def __init__(self, rate: float, height: float, rate_hz: float, rng: np.random.Generator) -> None:
         gap = 1.0 / rate if rate > 0.0 else np.inf
         self._events = Events(lambda n: rng.exponential(gap, n), lambda n: height * rng.standard_normal(n), rate_hz)
-        self._place = 0.0
+        self._level = 0.0
 
     def add(self, values: Floats, block: Block) -> None:
         when, heights = self._events.take(block.first, values.size)
         edges = [0, *when.tolist(), values.size]
         for jump, (begin, end) in zip([0.0, *heights.tolist()], pairwise(edges), strict=True):
-            self._place += jump
-            values[begin:end] += self._place
+            self._level += jump
+            values[begin:end] += self._level
 
     def truth(self) -> dict[str, Any]:
         return self._events.truth("heights")

@@ -1,4 +1,4 @@
-"""Quantization noise Q: white noise of the angle, seen in the rate as its differences."""
+"""Quantization noise Q: white noise of the angle, which appears in the rate as its differences."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -11,7 +11,7 @@ from monitor.noise.effect import Block, Series, Source, parameter
 
 @dataclass(frozen=True, slots=True)
 class QuantizationNoise(Source):
-    """IEEE Std 952 eq. C.14–C.15: σ²(τ) = 3Q²/τ², S(f) = 4Q²/τ0 sin²(πfτ0).
+    """White noise of the angle, IEEE Std 952 eq. C.14–C.15: σ²(τ) = 3Q²/τ², S(f) = 4Q²/τ0 sin²(πfτ0).
 
     >>> print(f"{QuantizationNoise(Q=2e-6).avar(np.array([0.1]), 0.01)[0]:.6g}")
     1.2e-09
@@ -25,23 +25,25 @@ class QuantizationNoise(Source):
     )
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """3Q²/τ²."""
+        """Return the Allan variance 3Q²/τ²."""
         return 3.0 * self.Q**2 / tau_s**2
 
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """4Q²/τ0 sin²(πfτ0)."""
+        """Return 4Q²/τ0 sin²(πfτ0)."""
         return 4.0 * self.Q**2 / tau0_s * np.sin(np.pi * f_hz * tau0_s) ** 2
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Differences":
-        """Differences of white angle noise."""
+        """Return a series of differences of white angle noise."""
         return _Differences(self.Q, rate_hz, rng)
 
 
 class _Differences(Series):
+    """Series of differences of white noise."""
+
     def __init__(self, Q: float, rate_hz: float, rng: np.random.Generator) -> None:
         self._rng = rng
         self._scale = Q * rate_hz
-        self._angle = self._scale * float(rng.standard_normal())  # over the sample time
+        self._angle = self._scale * float(rng.standard_normal())  # last angle error divided by the sample interval
 
     def add(self, values: Floats, block: Block) -> None:
         angles = self._rng.standard_normal(out=block.scratch)

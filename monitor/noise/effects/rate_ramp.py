@@ -1,4 +1,4 @@
-"""Rate ramp R: a constant slope."""
+"""Rate ramp R: constant slope of the bias."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -12,7 +12,7 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class RateRamp(Source):
-    """IEEE Std 952 eq. C.32: σ²(τ) = R²τ²/2. Deterministic, so it has no noise spectrum.
+    """Constant slope, IEEE Std 952 eq. C.32: σ²(τ) = R²τ²/2. It is deterministic and has no noise spectrum.
 
     >>> float(RateRamp(R=2e-6).avar(np.array([1000.0]), 0.01)[0])
     2e-06
@@ -24,23 +24,25 @@ class RateRamp(Source):
     means: ClassVar[str] = "The bias moves steadily in one direction, as while a sensor warms up."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """R²τ²/2."""
+        """Return the Allan variance R²τ²/2."""
         return 0.5 * (self.R * tau_s) ** 2
 
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """Zero: a slope taken out of a series leaves nothing."""
+        """Return zero, because a series without its slope is zero."""
         return np.zeros_like(f_hz)
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """A slope and nothing else."""
+        """Return a spectrum that has only a slope."""
         return replace(Source.spectrum(self, tau0_s), slope=self.R)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Slope":
-        """A slope that starts at zero."""
+        """Return a ramp that starts at zero."""
         return _Slope(self.R / rate_hz)
 
 
 class _Slope(Series):
+    """Series with a constant slope."""
+
     def __init__(self, step: float) -> None:
         self._step = step
         self._count = 0

@@ -1,4 +1,4 @@
-"""Rate random walk K: white noise, integrated."""
+"""Rate random walk K: integrated white noise."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -12,10 +12,10 @@ from monitor.noise.effect import Block, Series, Source, parameter
 
 @dataclass(frozen=True, slots=True)
 class RateRandomWalk(Source):
-    """IEEE Std 952 eq. C.28–C.29, S(f) = K²/(2πf)² and σ²(τ) = K²τ/3, as sampled.
+    """Integrated white noise, IEEE Std 952 eq. C.28–C.29, S(f) = K²/(2πf)² and σ²(τ) = K²τ/3, for samples.
 
-    Summing independent steps of variance K²τ0 gives S(f) = K²τ0²/(4 sin²(πfτ0)) and, m = τ/τ0,
-    σ² = K²τ/3 · (1 + 1/(2m²)): the continuous forms but for the first few samples.
+    The sum of independent steps of variance K²τ0 has S(f) = K²τ0²/(4 sin²(πfτ0)) and, with m = τ/τ0, σ² = K²τ/3 · (1 +
+    1/(2m²)). These differ from the continuous forms only for clusters of few samples.
 
     >>> print(f"{RateRandomWalk(K=3e-6).avar(np.array([1e4]), 0.01)[0]:.6g}")
     3e-08
@@ -27,32 +27,34 @@ class RateRandomWalk(Source):
     means: ClassVar[str] = "The bias itself takes random steps and never returns: worse the longer one averages."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """K²τ/3 (1 + τ0²/(2τ²))."""
+        """Return the Allan variance K²τ/3 (1 + τ0²/(2τ²))."""
         return self.K**2 / 3.0 * (tau_s + 0.5 * tau0_s**2 / tau_s)
 
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """K²τ0²/(4 sin²(πfτ0))."""
+        """Return K²τ0²/(4 sin²(πfτ0))."""
         return (0.5 * self.K * tau0_s / np.sin(np.pi * f_hz * tau0_s)) ** 2
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Walk":
-        """A walk that starts at zero."""
-        return _Walk(self.K / rate_hz**0.5, rng)
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_RandomWalk":
+        """Return a random walk that starts at zero."""
+        return _RandomWalk(self.K / rate_hz**0.5, rng)
 
 
-class _Walk(Series):
+class _RandomWalk(Series):
+    """Series of a random walk."""
+
     def __init__(self, step: float, rng: np.random.Generator) -> None:
         self._step = step
         self._rng = rng
-        self._place = 0.0
+        self._level = 0.0
 
     def add(self, values: Floats, block: Block) -> None:
         steps = self._rng.standard_normal(out=block.scratch)
-        self._place = _walk(values, steps, self._step, self._place)
+        self._level = _add_random_walk(values, steps, self._step, self._level)
 
 
 @compiled
-def _walk(values, steps, step, place):  # type: ignore[no-untyped-def]
-    """Add the running sum; the order of its additions does not depend on the blocks."""
+def _add_random_walk(values, steps, step, place):  # type: ignore[no-untyped-def]
+    """Add the running sum to the values [n] and return it; the order of additions does not depend on the blocks."""
     for k in range(values.size):
         place += step * steps[k]
         values[k] += place

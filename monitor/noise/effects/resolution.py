@@ -1,4 +1,4 @@
-"""The least significant bit."""
+"""Resolution of the output: rounding to the least significant bit."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Final
@@ -9,17 +9,19 @@ from drivers.sample import Floats
 from monitor.noise.effect import Running, Transform, parameter
 from monitor.noise.spectrum import Spectrum, unknown, white
 
-WIDE: Final = 0.6
-"""Allan deviation at τ0, in steps, above which rounding is white: its harmonics are below exp(−2π²·0.6²) = 8·10⁻⁴."""
+MIN_DEVIATION_STEPS: Final = 0.6
+"""Smallest Allan deviation at τ0, in steps, for which the rounding error is white. The harmonics of the error are then
+below exp(−2π²·0.6²) = 8·10⁻⁴."""
 
 
 @dataclass(frozen=True, slots=True)
 class Resolution(Transform):
-    """y = x rounded to whole steps.
+    """Rounding to whole steps.
 
-    Where neighbouring samples differ by more than a step, rounding adds independent errors of variance step²/12
-    (Widrow & Kollár, Quantization Noise, 2008): S(f) + step²τ0/12, σ²(τ) + step²τ0/(12τ). That holds where the Allan
-    deviation at τ0 is at least 0.6 steps. Below, the output depends on where between two steps the rate lies: NaN.
+    If neighbouring samples differ by more than a step, rounding adds independent errors of variance step²/12 (Widrow &
+    Kollár, Quantization Noise, 2008): S(f) + step²τ0/12, σ²(τ) + step²τ0/(12τ). This requires an Allan deviation at τ0
+    of at least 0.6 steps. Below, the output depends on the position of the rate between two steps, and the result is
+    NaN.
 
     >>> one = white(1.0, 0.01)
     >>> [round(float(Resolution(step=x).reshape(one).allan(np.array([1.0]))[0]), 6) for x in (1.2, 3.0)]
@@ -32,17 +34,23 @@ class Resolution(Transform):
     means: ClassVar[str] = "The output moves in steps of one least significant bit."
 
     def reshape(self, spectrum: Spectrum) -> Spectrum:
-        """Plus white noise of variance step²/12, where that holds."""
+        """Return the spectrum plus white noise of variance step²/12, or NaN if the Allan deviation is too small."""
         tau0_s = spectrum.tau0_s
         deviation = float(spectrum.allan(np.array([tau0_s]))[0]) ** 0.5
-        return spectrum + white(self.step**2 / 12.0, tau0_s) if deviation >= WIDE * self.step else unknown(tau0_s)
+        return (
+            spectrum + white(self.step**2 / 12.0, tau0_s)
+            if deviation >= MIN_DEVIATION_STEPS * self.step
+            else unknown(tau0_s)
+        )
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Rounding":
-        """A rounding."""
+        """Return a rounding transform."""
         return _Rounding(self.step)
 
 
 class _Rounding(Running):
+    """Running rounding to whole steps."""
+
     def __init__(self, step: float) -> None:
         self._step = step
 

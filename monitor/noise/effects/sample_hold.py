@@ -1,4 +1,4 @@
-"""Samples that repeat the one before."""
+"""Repeated samples: some samples repeat the one before."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -13,12 +13,12 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class SampleHold(Transform):
-    """A share h of the samples, tossed for each by itself, repeats the sample before.
+    """Random repetition of samples: each sample repeats, with probability h, the sample before.
 
-    With the age of the value that is read being geometric, what is read is on average the input through
-    G = (1 − h)/(1 − h/z), and the rest is noise that decays as hⁿ: with V the mean square of (1 − |G|²) S,
-    S_out(f) = |G|² S + V τ0 (1 − h²)/|1 − h/z|². Exact for any input of stationary increments. The Allan variance is an
-    integral over that spectrum.
+    The age of the value that is read has a geometric distribution. On average, the output is the input through G = (1 −
+    h)/(1 − h/z). The remainder is noise whose correlation decays as hⁿ. With V the mean square of (1 − |G|²) S,
+    S_out(f) = |G|² S + V τ0 (1 − h²)/|1 − h/z|². This is exact for any input with stationary increments. The Allan
+    variance is an integral over this spectrum.
 
     >>> from monitor.noise.spectrum import white
     >>> held = SampleHold(fraction=0.5).reshape(white(1.0, 0.01))
@@ -32,7 +32,7 @@ class SampleHold(Transform):
     means: ClassVar[str] = "Some samples are not new: the value before is sent once more."
 
     def reshape(self, spectrum: Spectrum) -> Spectrum:
-        """As the class says."""
+        """Return the spectrum by the formula of the class docstring."""
         h, tau0_s = self.fraction, spectrum.tau0_s
 
         def squared(f_hz: Floats) -> Floats:
@@ -42,7 +42,7 @@ class SampleHold(Transform):
             return (1.0 - h) ** 2 / squared(f_hz)
 
         lowest = 1e-7 / tau0_s
-        # 1 − |G|², without cancellation at low f
+        # The mean square of 1 − |G|² is computed without cancellation at low f.
         lost = (
             spectrum.mean_square(lowest, lambda f: 4.0 * h * np.sin(np.pi * f * tau0_s) ** 2 / squared(f))
             + spectrum.slope**2 * tau0_s**2 * h / (1.0 - h) ** 2
@@ -51,28 +51,31 @@ class SampleHold(Transform):
         return spectrum.filtered(gain, around=((0.0, (1.0 - h) / (2.0 * np.pi * tau0_s)),)) + rest
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Holding":
-        """The first sample is always new."""
+        """Return a transform whose first sample is always new."""
         return _Holding(self.fraction, rng)
 
 
 class _Holding(Running):
+    """Running transform that repeats samples at random."""
+
     def __init__(self, fraction: float, rng: np.random.Generator) -> None:
         self._fraction = fraction
         self._rng = rng
         self._last = np.nan
-        self._held = 0
+        self._repeat_count = 0
 
     def apply(self, values: Floats) -> None:
         tosses = self._rng.random(values.size)
-        self._last, held = _hold(values, tosses, self._fraction, self._last)
-        self._held += held
+        self._last, held = _repeat_samples(values, tosses, self._fraction, self._last)
+        self._repeat_count += held
 
     def truth(self) -> dict[str, Any]:
-        return {"count": self._held}
+        return {"count": self._repeat_count}
 
 
 @compiled
-def _hold(values, tosses, fraction, last):  # type: ignore[no-untyped-def]
+def _repeat_samples(values, tosses, fraction, last):  # type: ignore[no-untyped-def]
+    """Repeat samples in place at random, and return the last value and the number of repeated samples."""
     held = 0
     for k in range(values.size):
         if tosses[k] < fraction and not np.isnan(last):

@@ -1,4 +1,4 @@
-"""A sample rate that is not what the recording says."""
+"""Error of the stated sample rate of a recording."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -14,10 +14,12 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class SampleRateError(Transform):
-    """True rate over stated rate, of the whole recording: by substitution σ²(τ) ← σ²(τ/r), S(f) ← r·S(rf).
+    """Ratio r of the true to the stated sample rate of the whole recording: σ²(τ) ← σ²(τ/r), S(f) ← r·S(rf) by
+    substitution.
 
-    Every effect of every axis is simulated at the true rate, and nothing is resampled: the samples are right, only the
-    clock is not. Stated on any axis it holds for all; stated twice it must be the same.
+    Every effect of every axis is simulated at the true rate, and nothing is resampled. The samples are correct and only
+    the clock is wrong. The effect applies to all axes, whichever axis names it. If it is named twice, the ratios must
+    be equal.
 
     >>> from monitor.noise.spectrum import white
     >>> stated = SampleRateError(ratio=2.0).restated(white(1.0, 0.005))
@@ -31,16 +33,16 @@ class SampleRateError(Transform):
     means: ClassVar[str] = "The clock is off: what happens at one frequency is seen at another."
 
     def check_rate(self, rate_hz: float) -> None:
-        """The true rate must not be far from every rate that is supported."""
+        """Raise ConfigError if the ratio is outside the supported range."""
         if not RATE_RATIO.supports(self.ratio):
             raise ConfigError(f"{self.name}: ratio must be {RATE_RATIO.range_text()}, is {self.ratio!r}")
 
     def reshape(self, spectrum: Spectrum) -> Spectrum:
-        """As it is: samples do not change, and ``restated`` relabels them once all transforms have acted."""
+        """Return the spectrum unchanged; ``restated`` converts its time scale after all transforms."""
         return spectrum
 
     def restated(self, spectrum: Spectrum) -> Spectrum:
-        """The spectrum of samples at the true rate, in the time that the recording states."""
+        """Return the spectrum of samples at the true rate, converted to the time scale that the recording states."""
         r, closed = self.ratio, spectrum.closed
         return Spectrum(
             lambda f: r * spectrum.density(r * f),
@@ -52,11 +54,13 @@ class SampleRateError(Transform):
             tuple((f / r, width / r) for f, width in spectrum.peaks),
         )
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Untouched":
-        """Nothing to do."""
-        return _Untouched()
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Unchanged":
+        """Return a transform that does nothing."""
+        return _Unchanged()
 
 
-class _Untouched(Running):
+class _Unchanged(Running):
+    """Transform that returns its input."""
+
     def apply(self, values: Floats) -> None:
-        """Samples are what they are."""
+        """Leave the values unchanged."""

@@ -1,4 +1,4 @@
-"""The end of the range."""
+"""Saturation at the end of the range."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Final
@@ -9,17 +9,18 @@ from drivers.sample import Floats
 from monitor.noise.effect import Running, Transform, parameter
 from monitor.noise.spectrum import Spectrum, unknown
 
-WITHIN_S: Final = 3600.0
-"""Noise and slope of this long decide whether the range is ever left."""
-SIGMAS: Final = 6.0
+OBSERVATION_S: Final = 3600.0
+"""Time in seconds over which noise and slope must stay within the range."""
+NOISE_SIGMAS: Final = 6.0
+"""Standard deviations of the noise that must stay within the range."""
 
 
 @dataclass(frozen=True, slots=True)
 class Saturation(Transform):
-    """y = x clipped at ± limit.
+    """Clipping at the range: y = x clipped at ± limit.
 
-    Where level, lines and six deviations of an hour's noise stay within the range, nothing is clipped, and spectrum
-    and Allan variance are unchanged. Elsewhere there is no closed form: NaN.
+    If level, lines and six standard deviations of the noise of an hour stay within the range, nothing is clipped.
+    Spectrum and Allan variance are then unchanged. Otherwise there is no closed form, and they are NaN.
 
     >>> from monitor.noise.spectrum import white
     >>> [float(Saturation(limit=x).reshape(white(1.0, 0.01)).allan(np.array([1.0]))[0]) for x in (10.0, 1.0)]
@@ -32,18 +33,20 @@ class Saturation(Transform):
     means: ClassVar[str] = "Beyond its range the sensor reads the end of the range."
 
     def reshape(self, spectrum: Spectrum) -> Spectrum:
-        """Unchanged as long as the range is not left within an hour."""
+        """Return the spectrum unchanged if the series stays within the range for an hour, else NaN."""
         steady = abs(spectrum.level) + sum((2.0 * size) ** 0.5 for _, size in spectrum.lines)
-        steady += spectrum.slope * WITHIN_S
-        noise = spectrum.without_lines().mean_square(1.0 / max(WITHIN_S, 4.0 * spectrum.tau0_s)) ** 0.5
-        return spectrum if steady + SIGMAS * noise < self.limit else unknown(spectrum.tau0_s)
+        steady += spectrum.slope * OBSERVATION_S
+        noise = spectrum.without_lines().mean_square(1.0 / max(OBSERVATION_S, 4.0 * spectrum.tau0_s)) ** 0.5
+        return spectrum if steady + NOISE_SIGMAS * noise < self.limit else unknown(spectrum.tau0_s)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Clipping":
-        """A clip."""
+        """Return a clipping transform."""
         return _Clipping(self.limit)
 
 
 class _Clipping(Running):
+    """Running clipping at ± limit."""
+
     def __init__(self, limit: float) -> None:
         self._limit = limit
 

@@ -1,4 +1,4 @@
-"""A scale factor that is wrong."""
+"""Scale factor error."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -12,7 +12,7 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class ScaleFactor(Transform):
-    """y = f·x: σ²(τ) and S(f) of the axis times f² (IEEE Std 952, scale factor).
+    """Factor on the measurement of the axis, y = f·x: σ²(τ) and S(f) times f² (IEEE Std 952, scale factor).
 
     >>> from monitor.noise.spectrum import white
     >>> float(ScaleFactor(factor=2.0).reshape(white(1.0, 0.01)).allan(np.array([0.01]))[0])
@@ -27,15 +27,17 @@ class ScaleFactor(Transform):
     )
 
     def reshape(self, spectrum: Spectrum) -> Spectrum:
-        """Times f²."""
+        """Return the spectrum times f²."""
         return spectrum.scaled(self.factor)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Scaling":
-        """A multiplication."""
+        """Return a multiplying transform."""
         return _Scaling(self.factor)
 
 
 class _Scaling(Running):
+    """Running multiplication by a factor."""
+
     def __init__(self, factor: float) -> None:
         self._factor = factor
 

@@ -1,4 +1,4 @@
-"""A sinusoid: a motor, the mains, a fan."""
+"""Sinusoidal noise, for example of a motor, the mains or a fan."""
 
 from dataclasses import dataclass, replace
 from math import cos, floor, pi, sin
@@ -11,16 +11,18 @@ from monitor.common.compiled import compiled
 from monitor.noise.effect import Block, Series, Source, below_nyquist, parameter
 from monitor.noise.spectrum import Spectrum, allan_of_line
 
-RENEWED: Final = 64
-"""The rotation that makes the sinusoid begins anew at every so many samples: rounding does not add up."""
+RENEWAL_SAMPLES: Final = 64
+"""Samples after which the rotation that generates the sinusoid starts from an exact value. This limits the rounding
+error."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sinusoidal(Source):
-    """A sin(2πft + φ), IEEE Std 952 annex C, as sampled: σ²(τ) = A² sin⁴(πfτ)/(m² sin²(πfτ0)), m = τ/τ0.
+    """Sinusoid A sin(2πft + φ) of IEEE Std 952 annex C.
 
-    The textbook A² sin⁴(πfτ)/(πfτ)² is its limit for τ0 → 0. Its spectrum is a line of A²/4 at ±f and has no density.
-    A phase that is absent is drawn from the seed.
+    For samples, σ²(τ) = A² sin⁴(πfτ)/(m² sin²(πfτ0)), m = τ/τ0. The textbook form A² sin⁴(πfτ)/(πfτ)² is its limit for
+    τ0 → 0. The spectrum is a line of A²/4 at ±f and has no density. If the phase is absent, it is drawn at random from
+    the seed.
 
     >>> line = Sinusoidal(amplitude=1.0, frequency=25.0)
     >>> [round(float(x), 6) for x in line.avar(np.array([0.01, 0.02, 0.04]), 0.01)]
@@ -35,50 +37,52 @@ class Sinusoidal(Source):
     means: ClassVar[str] = "A steady oscillation at one frequency: a line in the spectrum, waves in the Allan curve."
 
     def check_rate(self, rate_hz: float) -> None:
-        """Its frequency must be below half the sample rate."""
+        """Raise ConfigError if the frequency is not below half the sample rate."""
         below_nyquist(self, "frequency", rate_hz)
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """A² sin⁴(πfτ)/(m² sin²(πfτ0))."""
+        """Return the Allan variance A² sin⁴(πfτ)/(m² sin²(πfτ0))."""
         return allan_of_line(self.frequency, 0.5 * self.amplitude**2, tau_s, tau0_s)
 
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """Zero: a line has power, but no density."""
+        """Return zero, because a line has power but no density."""
         return np.zeros_like(f_hz)
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """One line."""
+        """Return a spectrum that has only one line."""
         return replace(Source.spectrum(self, tau0_s), lines=((self.frequency, 0.5 * self.amplitude**2),))
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Line":
-        """A sinusoid that counts its time from the stream's first sample."""
+        """Return a sinusoid whose time counts from the first sample of the stream."""
         drawn = self.phase is None
         phase = float(rng.uniform(0.0, 2.0 * pi)) if self.phase is None else self.phase
         return _Line(self.amplitude, self.frequency / rate_hz, phase, drawn)
 
 
 class _Line(Series):
+    """Series of a sinusoid."""
+
     def __init__(self, amplitude: float, step: float, phase: float, drawn: bool) -> None:
         self._amplitude, self._step, self._phase, self._drawn = amplitude, step, phase, drawn
 
     def add(self, values: Floats, block: Block) -> None:
-        _turn(values, block.first, self._amplitude, self._step, self._phase)
+        _add_sinusoid(values, block.first, self._amplitude, self._step, self._phase)
 
     def truth(self) -> dict[str, Any]:
         return {"phase": self._phase} if self._drawn else {}
 
 
 @compiled
-def _turn(values, first, amplitude, step, phase):  # type: ignore[no-untyped-def]
-    """Add A sin(2π·step·k + phase) for k = first, …; ``step`` is in cycles a sample."""
+def _add_sinusoid(values, first, amplitude, step, phase):  # type: ignore[no-untyped-def]
+    """Add A sin(2π·step·k + phase) for k = first, …; ``step`` is in cycles per sample."""
     c, s = cos(2.0 * pi * step), sin(2.0 * pi * step)
-    k = first - first % RENEWED
+    k = first - first % RENEWAL_SAMPLES
     while k < first + values.size:
         cycles = step * k
         angle = 2.0 * pi * (cycles - floor(cycles)) + phase
         x, y = amplitude * cos(angle), amplitude * sin(angle)
-        for i in range(k, min(k + RENEWED, first + values.size)):
+        for i in range(k, min(k + RENEWAL_SAMPLES, first + values.size)):
             if i >= first:
                 values[i - first] += y
             x, y = c * x - s * y, s * x + c * y
-        k += RENEWED
+        k += RENEWAL_SAMPLES

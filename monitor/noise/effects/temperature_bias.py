@@ -1,4 +1,4 @@
-"""A bias that follows temperature at once."""
+"""Bias that depends on temperature without delay."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -11,9 +11,9 @@ from monitor.noise.effect import Block, Series, Source, parameter
 
 @dataclass(frozen=True, slots=True)
 class TemperatureBias(Source):
-    """b = c (T − T_r) + q (T − T_r)²: the polynomial of IEEE Std 952's error model, to second order.
+    """Polynomial of second order in temperature, as in the error model of IEEE Std 952: b = c (T − T_r) + q (T − T_r)².
 
-    Its Allan variance and spectrum are those of the temperature, which is not the effect's to know: NaN.
+    Its Allan variance and spectrum depend on the temperature, which the effect does not contain. They are NaN.
 
     >>> bool(np.isnan(TemperatureBias(coefficient=1e-4, reference=25.0).psd(np.array([1.0]), 0.01)[0]))
     True
@@ -28,19 +28,21 @@ class TemperatureBias(Source):
     uses_temperature: ClassVar[bool] = True
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """NaN: it depends on the temperature."""
+        """Return NaN, because the Allan variance depends on the temperature."""
         return np.full_like(tau_s, np.nan)
 
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """NaN: it depends on the temperature."""
+        """Return NaN, because the spectrum depends on the temperature."""
         return np.full_like(f_hz, np.nan)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Following":
-        """A function of each sample's temperature."""
-        return _Following(self.coefficient, self.quadratic or 0.0, self.reference)
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_TemperaturePolynomial":
+        """Return a series that is a function of the temperature of each sample."""
+        return _TemperaturePolynomial(self.coefficient, self.quadratic or 0.0, self.reference)
 
 
-class _Following(Series):
+class _TemperaturePolynomial(Series):
+    """Series of a polynomial in temperature."""
+
     def __init__(self, linear: float, quadratic: float, reference_c: float) -> None:
         self._linear, self._quadratic, self._reference_c = linear, quadratic, reference_c
 

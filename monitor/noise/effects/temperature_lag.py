@@ -1,4 +1,4 @@
-"""A bias that follows temperature with a delay."""
+"""Bias that depends on temperature with a delay."""
 
 from dataclasses import dataclass
 from math import expm1
@@ -13,10 +13,11 @@ from monitor.noise.effect import Block, Series, Source, parameter
 
 @dataclass(frozen=True, slots=True)
 class TemperatureLag(Source):
-    """b = c (T_l − T_r), where T_l follows the measured T by dT_l/dt = (T − T_l)/τ: Newton's law of cooling.
+    """Bias that follows temperature with a first-order lag (Newton's law of cooling): b = c (T_l − T_r), dT_l/dt = (T −
+    T_l)/τ.
 
-    The part that causes the bias is taken to have settled at the first temperature when the series begins. Between
-    samples the temperature is held. Allan variance and spectrum depend on the temperature: NaN.
+    T_l is the lagged temperature. It starts at the first temperature of the series. The temperature is constant between
+    samples. Allan variance and spectrum depend on the temperature and are NaN.
 
     >>> lag = TemperatureLag(coefficient=1e-4, reference=25.0, time_constant=60.0)
     >>> bool(np.isnan(lag.avar(np.array([1.0]), 0.01)[0]))
@@ -32,31 +33,35 @@ class TemperatureLag(Source):
     uses_temperature: ClassVar[bool] = True
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """NaN: it depends on the temperature."""
+        """Return NaN, because the Allan variance depends on the temperature."""
         return np.full_like(tau_s, np.nan)
 
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """NaN: it depends on the temperature."""
+        """Return NaN, because the spectrum depends on the temperature."""
         return np.full_like(f_hz, np.nan)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Lagging":
-        """Settled at the first temperature."""
+        """Return a series that is settled at the first temperature."""
         return _Lagging(self.coefficient, self.reference, -expm1(-1.0 / (self.time_constant * rate_hz)))
 
 
 class _Lagging(Series):
+    """Series of a first-order lag of the temperature."""
+
     def __init__(self, coefficient: float, reference_c: float, share: float) -> None:
         self._coefficient, self._reference_c, self._share = coefficient, reference_c, share
-        self._inside_c: float | None = None
+        self._lagged_c: float | None = None
 
     def add(self, values: Floats, block: Block) -> None:
-        inside = float(block.temperature_c[0]) if self._inside_c is None else self._inside_c
-        self._inside_c = _lag(values, block.temperature_c, inside, self._coefficient, self._reference_c, self._share)
+        inside = float(block.temperature_c[0]) if self._lagged_c is None else self._lagged_c
+        self._lagged_c = _add_lagged_bias(
+            values, block.temperature_c, inside, self._coefficient, self._reference_c, self._share
+        )
 
 
 @compiled
-def _lag(values, temperature, inside, coefficient, reference, share):  # type: ignore[no-untyped-def]
-    """Add the bias of the temperature inside, which is given back."""
+def _add_lagged_bias(values, temperature, inside, coefficient, reference, share):  # type: ignore[no-untyped-def]
+    """Add the bias of the lagged temperature to the values [n], and return that temperature in °C."""
     for k in range(values.size):
         values[k] += coefficient * (inside - reference)
         inside += share * (temperature[k] - inside)

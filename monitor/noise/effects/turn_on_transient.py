@@ -1,4 +1,4 @@
-"""A transient after switching on."""
+"""Transient after switching on."""
 
 from dataclasses import dataclass
 from math import exp
@@ -13,9 +13,10 @@ from monitor.noise.effect import Block, Series, Source, parameter
 
 @dataclass(frozen=True, slots=True)
 class TurnOnTransient(Source):
-    """A exp(−t/τ) from the first sample on: the warm-up term of IEEE Std 952's drift model.
+    """Exponential transient A exp(−t/τ) from the first sample on: the warm-up term of the drift model of IEEE Std 952.
 
-    It happens once, so its Allan variance and spectrum depend on the length of the recording: NaN.
+    The transient occurs once. Its Allan variance and spectrum therefore depend on the length of the recording and are
+    NaN.
 
     >>> bool(np.isnan(TurnOnTransient(amplitude=1e-3, time_constant=60.0).avar(np.array([1.0]), 0.01)[0]))
     True
@@ -28,29 +29,32 @@ class TurnOnTransient(Source):
     means: ClassVar[str] = "After switching on the bias runs in, quickly at first, then ever more slowly."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """NaN: it depends on the length of the recording."""
+        """Return NaN, because the Allan variance depends on the length of the recording."""
         return np.full_like(tau_s, np.nan)
 
     def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """NaN: it depends on the length of the recording."""
+        """Return NaN, because the spectrum depends on the length of the recording."""
         return np.full_like(f_hz, np.nan)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Decay":
-        """Begins at its first sample, also where it is added to a running stream."""
+        """Return a transient that begins at its first sample, even if it is added to a running stream."""
         return _Decay(self.amplitude, 1.0 / (self.time_constant * rate_hz))
 
 
 class _Decay(Series):
+    """Series of an exponential decay."""
+
     def __init__(self, amplitude: float, step: float) -> None:
         self._amplitude, self._step = amplitude, step
         self._count = 0
 
     def add(self, values: Floats, block: Block) -> None:
-        _decay(values, self._count, self._amplitude, self._step)
+        _add_decay(values, self._count, self._amplitude, self._step)
         self._count += values.size
 
 
 @compiled
-def _decay(values, first, amplitude, step):  # type: ignore[no-untyped-def]
+def _add_decay(values, first, amplitude, step):  # type: ignore[no-untyped-def]
+    """Add amplitude · exp(−step · k) for k = first, … to the values [n]."""
     for k in range(values.size):
         values[k] += amplitude * exp(-step * (first + k))
