@@ -14,7 +14,7 @@ from drivers.errors import ConfigError
 from drivers.links import replay_link
 from drivers.links.loopback_link import LoopbackLink
 from drivers.sample import block, join
-from monitor import settings
+from monitor import settings, station
 from monitor.chain import Ready
 from monitor.estimate.coefficients import Status
 from monitor.settings import Device
@@ -553,7 +553,8 @@ def test_bias_is_held_against_temperature():
     assert last.slope == pytest.approx(2e-3, rel=0.3)
 
 
-def test_choosing_a_model_holds_no_round_up():
+def test_choosing_a_model_holds_no_round_up(monkeypatch):
+    monkeypatch.setattr(station, "CHOOSING_S", 0.0)  # a step each time, however fast the machine is
     rig = Rig(thermal_s=1.0)
     follow_temperature(rig, 14.0)
     assert rig.station.chain.thermal.choosing
@@ -562,13 +563,15 @@ def test_choosing_a_model_holds_no_round_up():
     assert rig.station._can_take()  # a sensor never waits
 
 
-def test_a_recording_waits_for_its_model():
+def test_a_recording_waits_for_its_model(monkeypatch):
     rig = Rig(thermal_s=1.0, link=LoopbackLink(epoch="unix"))
     index = np.arange(4000)
     warmth = 25.0 + np.sin(2.0 * np.pi * index / 5000.0)
     values = 1e-3 * np.random.default_rng(1).standard_normal((4000, 6)) + 2e-3 * (warmth - 25.0)[:, None]
     rig.station._push(block(index * 10_000_000, values, warmth, index))  # as fast as can be
-    rig.work(1000.0)
+    with monkeypatch.context() as slow:
+        slow.setattr(station, "CHOOSING_RECORDED_S", 0.0)  # a step each time, however fast the machine is
+        rig.work(1000.0)
     assert rig.station.chain.thermal.choosing
     assert 12 <= len(rig.caught.thermals) <= 20
     assert not rig.station._can_take()
