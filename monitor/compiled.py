@@ -8,8 +8,8 @@ other files, and their constants, are compiled into it. So here the stamp of the
 Numba alone optimises each kernel, generates its machine code and makes it callable from Python before another kernel
 can call it, and then does the same again for its copy in the calling kernel. A function four calls below the kernel
 that Python calls goes through LLVM five times. ``Kernel`` leaves this out: functions that other kernels call remain
-intermediate code, which is optimised once, as a part of the kernel that Python calls. This saves a third of the time
-of a first start (``docs/benchmarks.md``). The machine code of the outer kernels is the same.
+intermediate code, which is optimised once, as a part of the kernel that Python calls. This saves more than a quarter of
+the time of a first start (``docs/benchmarks.md``). The machine code of the outer kernels is the same.
 """
 
 import contextlib

@@ -16,7 +16,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import IO, Final, NoReturn
@@ -115,7 +115,7 @@ def prepare(group: Group, tell: Callable[[Progress], None], processes: int | Non
     Raises
     ------
     OSError
-        The cache cannot be written, for example on a full disk.
+        The cache cannot be written, for example on a full disk, or what ``tell`` raises.
     """
     if is_warm(group):
         for part in group.parts:
@@ -126,7 +126,7 @@ def prepare(group: Group, tell: Callable[[Progress], None], processes: int | Non
     if folder is None:
         processes = 0
     elif processes is None:
-        processes = min(len(os.sched_getaffinity(0)), MAX_PROCESSES)
+        processes = min(_processors(), MAX_PROCESSES)
     with _Compilers(group.parts, processes, tell) as compilers:
         for done, part in enumerate(group.parts):
             if not compilers.wait_for(part):
@@ -166,7 +166,7 @@ def compile_from_stdin(stdin: IO[str], stdout: IO[str]) -> NoReturn:
 @dataclass(slots=True)
 class _Job:
     part: Part
-    finished: threading.Event = field(default_factory=threading.Event)
+    finished: bool = False
     compiled: bool = False
 
 
@@ -179,6 +179,7 @@ class _Compilers:
         self._running: list[str] = []
         self._tell = tell
         self._lock = threading.Lock()
+        self._changes: queue.SimpleQueue[Progress] = queue.SimpleQueue()
         self._children: list[subprocess.Popen[str]] = []
         self._processes = processes
         self._left = processes  # threads that still take parts
@@ -197,32 +198,43 @@ class _Compilers:
                 child.kill()
 
     def wait_for(self, part: Part) -> bool:
-        """Wait until a child has compiled a part; False if none will."""
+        """Wait until a child has compiled a part; False if none will. Progress is told meanwhile, by this thread."""
         job = self._jobs[part.name]
-        job.finished.wait()
+        while not (job.finished and self._changes.empty()):
+            progress = self._changes.get()
+            if progress.running:
+                self._tell(progress)
         return job.compiled
 
     def _work(self) -> None:
-        with suppress(OSError):  # no process can be started, or it ended: the parts are compiled by this process
-            pipe = subprocess.PIPE
-            child = subprocess.Popen(
-                PROGRAM, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, start_new_session=True
-            )
-            with child:
-                self._children.append(child)
-                while job := self._next():
+        try:
+            with suppress(OSError):  # no process can be started, or it ended: the parts are compiled by this process
+                self._hand_out_parts()
+        finally:
+            with self._lock:
+                self._left -= 1
+                if self._left == 0:
+                    self._give_up()
+
+    def _hand_out_parts(self) -> None:
+        pipe = subprocess.PIPE
+        child = subprocess.Popen(
+            PROGRAM, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, start_new_session=True
+        )
+        with child:
+            self._children.append(child)
+            while job := self._next():
+                try:
                     job.compiled = _compiled_by(child, job.part)
+                finally:
                     self._end(job)
-                    if not job.compiled:
-                        break
-        with self._lock:
-            self._left -= 1
-            if self._left == 0:
-                self._give_up()
+                if not job.compiled:
+                    break
 
     def _give_up(self) -> None:
         for job in self._waiting:
-            job.finished.set()
+            job.finished = True
+        self._put_progress()
 
     def _next(self) -> _Job | None:
         with self._lock:
@@ -230,21 +242,18 @@ class _Compilers:
                 return None
             job = self._waiting.pop(0)
             self._running.append(job.part.name)
-        self._say()
-        return job
+            self._put_progress()
+            return job
 
     def _end(self, job: _Job) -> None:
         with self._lock:
             self._running.remove(job.part.name)
-        self._say()
-        job.finished.set()
+            job.finished = True
+            self._put_progress()
 
-    def _say(self) -> None:
-        with self._lock:
-            done = sum(job.compiled for job in self._jobs.values())
-            progress = Progress(done, len(self._jobs), tuple(self._running))
-        if progress.running:
-            self._tell(progress)
+    def _put_progress(self) -> None:
+        done = sum(job.compiled for job in self._jobs.values())
+        self._changes.put(Progress(done, len(self._jobs), tuple(self._running)))
 
 
 def _compiled_by(child: "subprocess.Popen[str]", part: Part) -> bool:
@@ -255,6 +264,12 @@ def _compiled_by(child: "subprocess.Popen[str]", part: Part) -> bool:
         return child.stdout.readline().rstrip("\n") == part.name
     except OSError:
         return False
+
+
+def _processors() -> int:
+    """Return how many processors this process may use, or how many there are where the system does not tell."""
+    affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def _stamp_file(folder: Path, group: Group) -> Path:
