@@ -8,6 +8,7 @@ advance and what is told of it. After a restart of the program the same chain li
 
 from collections import deque
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from threading import Event as Flag
 from typing import Final
@@ -16,6 +17,7 @@ import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Event, Floats, SampleBlock
+from monitor.compiled import interpreted
 from monitor.drift.live import LiveThermal, ThermalLook
 from monitor.drift.live_compensation import LiveCompensation
 from monitor.estimate.estimator import Estimator
@@ -26,19 +28,30 @@ from monitor.identifier import Identifier
 from monitor.noise.model import NoiseModel
 from monitor.settings import Device
 
+MAX_INTERPRETED_HZ: Final = 250.0
+"""Samples a second, of all devices, that Python can take while kernels are compiled: half a millisecond each."""
 PIECE: Final = 512
 """Samples estimated before it is asked whether the noise has changed: a fast replay brings thousands at once."""
 
 
 @dataclass(slots=True)
 class Ready:
-    """Which kernels are compiled, see ``monitor.kernels``."""
+    """Which kernels are compiled, see ``monitor.kernels``, and who need not wait for them."""
 
     window: Flag = field(default_factory=Flag)
     fit: Flag = field(default_factory=Flag)
     all: Flag = field(default_factory=Flag)
     progress: str = ""
     """What is being compiled, one line for people; empty if nothing is."""
+    interpretable_hz: float = MAX_INTERPRETED_HZ
+    """Rate of samples that Python can still take on, see ``interpreted``."""
+
+    def interpret(self, rate_hz: float) -> bool:
+        """Return True if the samples of one more device of this rate can go through interpreted kernels."""
+        if rate_hz > self.interpretable_hz:
+            return False
+        self.interpretable_hz -= rate_hz
+        return True
 
 
 class Chain:
@@ -49,10 +62,13 @@ class Chain:
         model: the model in force, if there is one
         ready: which kernels are compiled; nothing is compiled in ``advance``, as that would hold up all devices
         patient: samples wait while a model of temperature is being chosen, as a recording's can
-        needs_all: begin only when all kernels are there
+        needs_all: begin only when all kernels can be called
+        live: samples come at the device's rate, so that at a low rate kernels can be interpreted at first
     """
 
-    def __init__(self, device: Device, model: NoiseModel | None, ready: Ready, patient: bool, needs_all: bool) -> None:
+    def __init__(
+        self, device: Device, model: NoiseModel | None, ready: Ready, patient: bool, needs_all: bool, live: bool
+    ) -> None:
         self.estimator: Estimator | None = None
         self.watch: Watch | None = None
         self.thermal: LiveThermal | None = None
@@ -72,16 +88,33 @@ class Chain:
         self._ready = ready
         self._patient = patient
         self._needs = ready.all if needs_all else ready.window
+        self._live = live
+        self._interprets = False
         self._temperatures: Temperatures | None = None  # of the samples in the window
         self._looks: list[ThermalLook] = []  # not taken yet
         self._handled = 0  # as often as the watch has said it
         self._pieces: deque[SampleBlock] = deque()  # of a recording, that wait until a model is chosen
         self._reliving = False
 
+    def can_begin(self, rate_hz: float) -> bool:
+        """Return True if the kernels that it needs to begin are compiled, or can be interpreted until they are."""
+        if not self._interprets and not self._needs.is_set():
+            self._interprets = self._live and self._ready.interpret(rate_hz)
+        return self._interprets or self._needs.is_set()
+
     @property
-    def compiled(self) -> bool:
-        """Whether the kernels that it needs to begin are there."""
-        return self._needs.is_set()
+    def can_fit(self) -> bool:
+        """Whether coefficients can be had."""
+        return self._interprets or self._ready.fit.is_set()
+
+    @property
+    def can_watch(self) -> bool:
+        """Whether all kernels that samples go through can be called."""
+        return self._interprets or self._ready.all.is_set()
+
+    def interpreted(self) -> AbstractContextManager[None]:
+        """Return the context in which the kernels are to be called."""
+        return interpreted() if self._interprets and not self._ready.all.is_set() else nullcontext()
 
     @property
     def waiting(self) -> bool:
@@ -94,7 +127,7 @@ class Chain:
             self.newest_ns = int(blocks[-1].t_ns[-1])
         if self.estimator is None and (rate_hz is None or not self._begin(rate_hz)):
             return
-        if self.watch is None and self._ready.all.is_set():
+        if self.watch is None and self.can_watch:
             self._begin_watching()
         self._pieces += [samples[at : at + PIECE] for samples in blocks for at in range(0, len(samples), PIECE)]
         while self._pieces and (drain or not self._patient or self.thermal is None or not self.thermal.choosing):
@@ -112,7 +145,9 @@ class Chain:
     def renew(self) -> None:
         """Where an interval of the compensation has just ended: take models over, and have those that are due found."""
         live = self.compensation
-        if live is not None and live.compensator.ahead == live.compensator.interval:
+        if live is None or not self._ready.all.is_set():  # models are found by a thread, which would compile
+            return
+        if live.compensator.ahead == live.compensator.interval:
             self.identifier.renew(live)
 
     def relive(self, samples: SampleBlock, rate_hz: float) -> None:
@@ -163,7 +198,7 @@ class Chain:
     # --- inside
 
     def _begin(self, rate_hz: float) -> bool:
-        if self.refused or not self.compiled:
+        if self.refused or not self.can_begin(rate_hz):
             return False
         device = self._device
         try:

@@ -10,6 +10,8 @@ can call it, and then does the same again for its copy in the calling kernel. A 
 that Python calls goes through LLVM five times. ``Kernel`` leaves this out: functions that other kernels call remain
 intermediate code, which is optimised once, as a part of the kernel that Python calls. This saves more than a quarter of
 the time of a first start (``docs/benchmarks.md``). The machine code of the outer kernels is the same.
+
+Until the kernels are compiled, a thread can let Python interpret them (``interpreted``).
 """
 
 import contextlib
@@ -18,11 +20,14 @@ import inspect
 import os
 import re
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar, cast
+
+import numpy as np
 
 _masked = "scipy" not in sys.modules
 if _masked:
@@ -109,10 +114,35 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         """Return what ``get_call_template`` compiled; Numba asks this when it lowers the calling kernel."""
         return self.intermediate.get_overload(sig)
 
+    def _compile_for_args(self, *args: Any, **kws: Any) -> Any:
+        """Return what is called with arguments of these types; Numba asks this when no machine code is loaded."""
+        if getattr(_thread, "interprets", False):
+            return self.py_func
+        return super()._compile_for_args(*args, **kws)
+
     def compile(self, sig: Any) -> Any:
         """Compile for a call from Python, or load from the disk cache."""
         with _no_garbage_collection():
             return super().compile(sig)
+
+
+_thread = threading.local()
+
+
+@contextlib.contextmanager
+def interpreted() -> Iterator[None]:
+    """Let Python interpret the kernels that this thread calls and that are not compiled yet.
+
+    The results are the same but for the last digit of exponentials. A call takes some hundred times as long, but does not
+    wait for the compiler. Nothing is slower once the kernel is compiled.
+    """
+    before = getattr(_thread, "interprets", False)
+    _thread.interprets = True
+    try:
+        with np.errstate(all="ignore"):  # as in machine code, where NaN and overflow pass in silence
+            yield
+    finally:
+        _thread.interprets = before
 
 
 @contextlib.contextmanager

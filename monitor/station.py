@@ -137,7 +137,8 @@ class Station:
         # a recording is over before its changes could be looked for
         self.waits_for_all = device.refit_s == 0.0 or device.leave_out_motion or isinstance(link, ReplayLink)
         self._patient = link.epoch == "unix"
-        self.chain = Chain(device, self.model, ready, self._patient, self.waits_for_all)
+        live = device.refit_s != 0.0 and _arrivals_are_timed(device, link) and not isinstance(link, ReplayLink)
+        self.chain = Chain(device, self.model, ready, self._patient, self.waits_for_all, live)
         self._wall = WallClock(time.monotonic_ns(), time.time_ns())
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
         self._batch: list[SampleBlock] = []  # not published yet
@@ -210,6 +211,10 @@ class Station:
 
     def work(self, outputs: Sequence[Output], now_s: float, drain: bool = False) -> None:
         """Take what came, advance the estimate, publish what is due; all of it when draining."""
+        with self.chain.interpreted():
+            self._work(outputs, now_s, drain)
+
+    def _work(self, outputs: Sequence[Output], now_s: float, drain: bool) -> None:
         happened = self.driver.take_events()
         if self._tail is not None:  # the chain is another thread's until the window is rebuilt
             self._tell(outputs, self._take_noted() + happened)
@@ -409,7 +414,7 @@ class Station:
             return True
         if self.clock.rate_hz is None:  # times from which no rate can be told must not stop the samples
             return self.ring.room < self.ring.capacity // 2
-        return chain.compiled
+        return chain.can_begin(self.clock.rate_hz)
 
     def _take(self) -> list[SampleBlock]:
         came_ns, self._waiting_since_ns = self._waiting_since_ns, 0
@@ -449,7 +454,7 @@ class Station:
         self._follow_rate(drain)
         estimator = self.chain.estimator
         if estimator is not None and self.chain.advanced and (self._due("refit", every_s, now_s) or drain):
-            fitted = self._ready.fit.is_set()
+            fitted = self.chain.can_fit
             self.chain.advanced = not fitted  # a curve alone is fitted as soon as that can be
             try:
                 latest = estimator.get(fitted=fitted)
@@ -537,9 +542,9 @@ class Station:
         if self._tail is not None and self._ready.all.is_set() and self.driver.state == "running":
             return "the window is being rebuilt from the recording; no sample is lost"
         if self._ready.progress and self.driver.state == "running":
-            lacking = "" if self._ready.fit.is_set() else "no coefficients yet, "
+            lacking = "" if self.chain.can_fit else "no coefficients yet, "
             return f"{self._ready.progress}; {lacking}no sample is lost"
-        if not self._ready.fit.is_set() and self.driver.state == "running":
+        if not self.chain.can_fit and self.driver.state == "running":
             return "compiling the estimator; no coefficients yet, no sample is lost"
         lacking = self._lacking_text() if self.driver.state in ("running", "ended") else ""
         if self.driver.text or self.driver.state != "running":

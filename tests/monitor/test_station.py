@@ -194,7 +194,7 @@ def test_no_sample_is_missing_from_the_courses_that_are_published():
 
 
 def test_a_fit_at_every_sample_waits_for_its_kernels():
-    ready = Ready()
+    ready = Ready(interpretable_hz=0.0)
     ready.window.set()
     rig = Rig(refit_s=0.0, publish_s=0.0, ready=ready)
     rig.bring(300)
@@ -458,7 +458,7 @@ def test_captured_bytes_and_fast_simulations_have_no_times_of_arrival(tmp_path):
 
 
 def test_a_replay_has_ended_when_its_samples_are_fitted():
-    rig = Rig(ready=Ready())
+    rig = Rig(ready=Ready(interpretable_hz=0.0))
     rig.bring(300)
     rig.work(1000.0)
     rig.station.driver.state = "ended"
@@ -476,6 +476,35 @@ def test_a_replay_has_ended_when_its_samples_are_fitted():
     rig.bring(10)
     rig.work(1003.0)
     assert rig.station.chain.watch is not None
+
+
+def test_at_a_low_rate_everything_is_there_before_the_kernels_are_compiled():
+    rig = Rig(rate=100.0, ready=Ready())
+    rig.bring(300)
+    rig.work(1000.0)
+    assert rig.caught.estimates[-1][1].coefficients.status.max() > 0
+    assert rig.station.chain.watch is not None
+    rig.station.driver.state = "running"
+    rig.ready.progress = "compiling 2 of 8: fit"
+    assert rig.station.health({}, 0).text == "compiling 2 of 8: fit; no sample is lost"
+
+
+@pytest.mark.parametrize("setting", [{"rate": 1000.0}, {"refit_s": 0.0}])
+def test_a_high_rate_or_a_fit_at_every_sample_waits_for_compiled_kernels(setting):
+    rig = Rig(ready=Ready(), **setting)
+    rig.bring(300)
+    rig.work(1000.0)
+    assert rig.caught.blocks == []
+
+
+def test_devices_are_interpreted_until_their_rates_add_up_to_the_limit():
+    ready = Ready(interpretable_hz=250.0)
+    rigs = [Rig(rate=100.0, ready=ready) for _ in range(3)]
+    for rig in rigs:
+        rig.bring(300)
+        rig.work(1000.0)
+        rig.work(1001.0)
+    assert [len(rig.caught.blocks) for rig in rigs] == [1, 1, 0]
 
 
 def test_samples_whose_rate_cannot_be_told_go_on():
