@@ -133,8 +133,8 @@ _thread = threading.local()
 def interpreted() -> Iterator[None]:
     """Let Python interpret the kernels that this thread calls and that are not compiled yet.
 
-    The results are the same but for the last digit of exponentials. A call takes some hundred times as long, but does not
-    wait for the compiler. Nothing is slower once the kernel is compiled.
+    The results are the same but for the last digit of exponentials. A call takes some hundred times as long, but does
+    not wait for the compiler. Nothing is slower once the kernel is compiled.
     """
     before = getattr(_thread, "interprets", False)
     _thread.interprets = True
