@@ -258,7 +258,8 @@ class Station:
         # a short recording may end before the kernels of the change detection are compiled
         self.waits_for_all = device.refit_s == 0.0 or device.leave_out_motion or isinstance(link, ReplayLink)
         self._patient = link.epoch == "unix"
-        self.chain = Chain(device, self.model, ready, self._patient, self.waits_for_all)
+        live = device.refit_s != 0.0 and _arrivals_are_timed(device, link) and not isinstance(link, ReplayLink)
+        self.chain = Chain(device, self.model, ready, self._patient, self.waits_for_all, live)
         self._slewed_clock = WallClock(time.monotonic_ns(), time.time_ns())
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
         self._unpublished: list[SampleBlock] = []  # samples that were taken and not published yet
@@ -347,6 +348,10 @@ class Station:
         drain : bool, optional
             True if all samples are to be processed and all results published now, because the device stops.
         """
+        with self.chain.interpreted():
+            self._work(outputs, now_s, drain)
+
+    def _work(self, outputs: Sequence[Output], now_s: float, drain: bool) -> None:
         happened = self.driver.take_events()
         if self._tail is not None:  # until the window is rebuilt, the rebuilding thread owns the pipeline
             self._publish_events(outputs, self._take_timed_events() + happened)
@@ -591,7 +596,7 @@ class Station:
             return True
         if self.clock.rate_hz is None:  # samples are published even if their times do not show a rate
             return self.ring.room < self.ring.capacity // 2
-        return chain.compiled
+        return chain.can_begin(self.clock.rate_hz)
 
     def _take(self) -> list[SampleBlock]:
         """Take all samples from the ring buffer."""
@@ -635,7 +640,7 @@ class Station:
         self._check_rate(drain)
         estimator = self.chain.estimator
         if estimator is not None and self.chain.advanced and (self._due("refit", every_s, now_s) or drain):
-            fitted = self._ready.fit.is_set()
+            fitted = self.chain.can_fit
             self.chain.advanced = not fitted  # a curve without coefficients is fitted as soon as the kernels are ready
             try:
                 latest = estimator.get(fitted=fitted)
@@ -728,9 +733,9 @@ class Station:
         if self._tail is not None and self._ready.all.is_set() and self.driver.state == "running":
             return "the window is being rebuilt from the recording; no sample is lost"
         if self._ready.progress and self.driver.state == "running":
-            lacking = "" if self._ready.fit.is_set() else "no coefficients yet, "
+            lacking = "" if self.chain.can_fit else "no coefficients yet, "
             return f"{self._ready.progress}; {lacking}no sample is lost"
-        if not self._ready.fit.is_set() and self.driver.state == "running":
+        if not self.chain.can_fit and self.driver.state == "running":
             return "compiling the estimator; no coefficients yet, no sample is lost"
         lacking = self._missing_estimate_text() if self.driver.state in ("running", "ended") else ""
         if self.driver.text or self.driver.state != "running":

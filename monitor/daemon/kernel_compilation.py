@@ -16,7 +16,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import IO, Final, NoReturn
@@ -135,7 +135,7 @@ def prepare(group: Group, tell: Callable[[Progress], None], processes: int | Non
     Raises
     ------
     OSError
-        The cache cannot be written, for example on a full disk.
+        The cache cannot be written, for example on a full disk, or what ``tell`` raises.
     """
     if is_warm(group):
         for part in group.parts:
@@ -146,7 +146,7 @@ def prepare(group: Group, tell: Callable[[Progress], None], processes: int | Non
     if folder is None:
         processes = 0
     elif processes is None:
-        processes = min(len(os.sched_getaffinity(0)), MAX_PROCESSES)
+        processes = min(_processors(), MAX_PROCESSES)
     with _Compilers(group.parts, processes, tell) as compilers:
         for done, part in enumerate(group.parts):
             if not compilers.wait_for(part):
@@ -196,7 +196,7 @@ class _Job:
     """Compilation of one part."""
 
     part: Part
-    finished: threading.Event = field(default_factory=threading.Event)
+    finished: bool = False
     compiled: bool = False
 
 
@@ -209,6 +209,7 @@ class _Compilers:
         self._running: list[str] = []
         self._tell = tell
         self._lock = threading.Lock()
+        self._changes: queue.SimpleQueue[Progress] = queue.SimpleQueue()
         self._children: list[subprocess.Popen[str]] = []
         self._processes = processes
         self._active_threads = processes  # number of threads that still take parts
@@ -227,34 +228,52 @@ class _Compilers:
                 child.kill()
 
     def wait_for(self, part: Part) -> bool:
-        """Wait until a child process has compiled a part; return False if none will."""
+        """Wait until a child process has compiled a part, and report the progress meanwhile.
+
+        Returns
+        -------
+        bool
+            False if no child process will compile the part.
+        """
         job = self._jobs[part.name]
-        job.finished.wait()
+        while not (job.finished and self._changes.empty()):
+            progress = self._changes.get()
+            if progress.running:
+                self._tell(progress)
         return job.compiled
 
     def _work(self) -> None:
+        """Run one child process. If it cannot be started or has ended, this process compiles the remaining parts."""
+        try:
+            with suppress(OSError):
+                self._pass_parts_to_child()
+        finally:
+            with self._lock:
+                self._active_threads -= 1
+                if self._active_threads == 0:
+                    self._release_waiting()
+
+    def _pass_parts_to_child(self) -> None:
         """Pass parts to a child process until none is left or the child fails."""
-        with suppress(OSError):  # if no child can be started, or it has ended, this process compiles the parts
-            pipe = subprocess.PIPE
-            child = subprocess.Popen(
-                PROGRAM, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, start_new_session=True
-            )
-            with child:
-                self._children.append(child)
-                while job := self._next_job():
+        pipe = subprocess.PIPE
+        child = subprocess.Popen(
+            PROGRAM, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, start_new_session=True
+        )
+        with child:
+            self._children.append(child)
+            while job := self._next_job():
+                try:
                     job.compiled = _compile_in_child(child, job.part)
+                finally:
                     self._finish(job)
-                    if not job.compiled:
-                        break
-        with self._lock:
-            self._active_threads -= 1
-            if self._active_threads == 0:
-                self._release_waiting()
+                if not job.compiled:
+                    break
 
     def _release_waiting(self) -> None:
         """Release the waiting parts, so that this process compiles them."""
         for job in self._waiting:
-            job.finished.set()
+            job.finished = True
+        self._put_progress()
 
     def _next_job(self) -> _Job | None:
         """Return the next part to compile; None if no part is left."""
@@ -263,23 +282,20 @@ class _Compilers:
                 return None
             job = self._waiting.pop(0)
             self._running.append(job.part.name)
-        self._report_progress()
-        return job
+            self._put_progress()
+            return job
 
     def _finish(self, job: _Job) -> None:
         """Report the end of the compilation of a part."""
         with self._lock:
             self._running.remove(job.part.name)
-        self._report_progress()
-        job.finished.set()
+            job.finished = True
+            self._put_progress()
 
-    def _report_progress(self) -> None:
-        """Report the progress."""
-        with self._lock:
-            done = sum(job.compiled for job in self._jobs.values())
-            progress = Progress(done, len(self._jobs), tuple(self._running))
-        if progress.running:
-            self._tell(progress)
+    def _put_progress(self) -> None:
+        """Queue the progress for the thread that waits."""
+        done = sum(job.compiled for job in self._jobs.values())
+        self._changes.put(Progress(done, len(self._jobs), tuple(self._running)))
 
 
 def _compile_in_child(child: "subprocess.Popen[str]", part: Part) -> bool:
@@ -291,6 +307,12 @@ def _compile_in_child(child: "subprocess.Popen[str]", part: Part) -> bool:
         return child.stdout.readline().rstrip("\n") == part.name
     except OSError:
         return False
+
+
+def _processors() -> int:
+    """Return the number of processors that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)  # missing on macOS
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def _stamp_file(folder: Path, group: Group) -> Path:

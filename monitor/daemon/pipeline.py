@@ -9,6 +9,7 @@ restart of the program, ``relive`` replays the end of the recording through the 
 
 from collections import deque
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from threading import Event as Flag
 from typing import Final
@@ -17,6 +18,7 @@ import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Event, Floats, SampleBlock
+from monitor.common.compiled import interpreted
 from monitor.daemon.arma_worker import Identifier
 from monitor.drift.compensation.live_compensation import LiveCompensation
 from monitor.drift.thermal.live_thermal import LiveThermal, ThermalLook
@@ -27,6 +29,8 @@ from monitor.estimation.window_snapshot import Held, Temperatures
 from monitor.noise.model import NoiseModel
 from monitor.settings.loading import Device
 
+MAX_INTERPRETED_HZ: Final = 250.0
+"""Maximum total sample rate of the devices whose kernels are interpreted. A sample takes up to 0.8 ms."""
 MAX_PIECE_SAMPLES: Final = 512
 """Samples that are processed before the noise is tested for a change. A fast replay brings thousands at once."""
 
@@ -43,6 +47,8 @@ class Ready:
         Set if the kernels of the noise coefficients are compiled.
     all : threading.Event
         Set if all kernels of the service are compiled.
+
+    Until then, the kernels of devices with low sample rates are interpreted by Python.
     """
 
     window: Flag = field(default_factory=Flag)
@@ -50,6 +56,15 @@ class Ready:
     all: Flag = field(default_factory=Flag)
     progress: str = ""
     """Progress of the compilation as one line of text; empty if nothing is being compiled."""
+    interpretable_hz: float = MAX_INTERPRETED_HZ
+    """Total sample rate of further devices whose kernels can be interpreted."""
+
+    def reserve_interpreter(self, rate_hz: float) -> bool:
+        """Return True if the kernels of one more device of this sample rate can be interpreted."""
+        if rate_hz > self.interpretable_hz:
+            return False
+        self.interpretable_hz -= rate_hz
+        return True
 
 
 class Chain:
@@ -66,10 +81,14 @@ class Chain:
     patient : bool
         True if samples may wait while a thermal model is being selected, as the samples of a recording can.
     needs_all : bool
-        True if processing begins only when all kernels are compiled.
+        True if processing begins only when all kernels can be called.
+    live : bool
+        True if samples arrive at the device's sample rate, so that kernels can be interpreted at a low rate.
     """
 
-    def __init__(self, device: Device, model: NoiseModel | None, ready: Ready, patient: bool, needs_all: bool) -> None:
+    def __init__(
+        self, device: Device, model: NoiseModel | None, ready: Ready, patient: bool, needs_all: bool, live: bool
+    ) -> None:
         self.estimator: Estimator | None = None
         self.watch: Watch | None = None
         self.thermal: LiveThermal | None = None
@@ -89,16 +108,33 @@ class Chain:
         self._ready = ready
         self._patient = patient
         self._needs = ready.all if needs_all else ready.window
+        self._live = live
+        self._interprets = False
         self._temperatures: Temperatures | None = None  # of the samples in the window
         self._looks: list[ThermalLook] = []  # thermal intervals that were not taken yet
         self._handled = 0  # last seen value of ``watch.handled``
         self._pieces: deque[SampleBlock] = deque()  # samples of a recording that wait for the thermal model
         self._replaying = False
 
+    def can_begin(self, rate_hz: float) -> bool:
+        """Return True if the kernels that the pipeline needs to begin are compiled or can be interpreted."""
+        if not self._interprets and not self._needs.is_set():
+            self._interprets = self._live and self._ready.reserve_interpreter(rate_hz)
+        return self._interprets or self._needs.is_set()
+
     @property
-    def compiled(self) -> bool:
-        """True if the kernels that the pipeline needs to begin are compiled."""
-        return self._needs.is_set()
+    def can_fit(self) -> bool:
+        """True if the kernels of the noise coefficients can be called."""
+        return self._interprets or self._ready.fit.is_set()
+
+    @property
+    def can_detect(self) -> bool:
+        """True if the kernels of the motion and change detection can be called."""
+        return self._interprets or self._ready.all.is_set()
+
+    def interpreted(self) -> AbstractContextManager[None]:
+        """Return the context in which the kernels are to be called."""
+        return interpreted() if self._interprets and not self._ready.all.is_set() else nullcontext()
 
     @property
     def waiting(self) -> bool:
@@ -121,7 +157,7 @@ class Chain:
             self.newest_ns = int(blocks[-1].t_ns[-1])
         if self.estimator is None and (rate_hz is None or not self._create_estimator(rate_hz)):
             return
-        if self.watch is None and self._ready.all.is_set():
+        if self.watch is None and self.can_detect:
             self._create_detectors()
         self._pieces += [
             samples[at : at + MAX_PIECE_SAMPLES]
@@ -143,7 +179,9 @@ class Chain:
     def renew(self) -> None:
         """Adopt new drift models and start the identification of those that are due, if an interval has just ended."""
         live = self.compensation
-        if live is not None and live.compensator.ahead == live.compensator.interval:
+        if live is None or not self._ready.all.is_set():  # another thread identifies the models and would compile
+            return
+        if live.compensator.ahead == live.compensator.interval:
             self.identifier.renew(live)
 
     def relive(self, samples: SampleBlock, rate_hz: float) -> None:
@@ -206,7 +244,7 @@ class Chain:
 
     def _create_estimator(self, rate_hz: float) -> bool:
         """Create the estimator for a sample rate; return False if it cannot be created yet, or not at all."""
-        if self.refused or not self.compiled:
+        if self.refused or not self.can_begin(rate_hz):
             return False
         device = self._device
         try:

@@ -30,15 +30,14 @@ def said(step):
 rate_hz, window_s, every = float(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])
 said("interpreter")
 import numpy as np
-import scipy.special
-said("NumPy and SciPy")
+said("NumPy")
 import numba
 said("Numba")
 from drivers.sample import block
 from monitor import kernels
 from monitor.estimate.estimator import Estimator
 said("drivers and monitor.estimation")
-for _ in kernels.prepare(kernels.SERVICE, print, processes=0):
+for _ in kernels.prepare(kernels.SERVICE, lambda _: None, processes=0):
     pass
 said("compiled kernels")
 estimator = Estimator(rate_hz, window_s)

@@ -62,6 +62,30 @@ def test_every_part_is_ready_in_its_order_whatever_becomes_of_the_children(
 
 
 @pytest.mark.usefixtures("_empty_cache")
+@pytest.mark.parametrize("processes", [0, 1, 2])
+def test_progress_that_cannot_be_written_ends_the_compilation_with_its_error(
+    monkeypatch: pytest.MonkeyPatch, processes: int
+) -> None:
+    monkeypatch.setattr(kernel_compilation, "PROGRAM", (sys.executable, "-c", ANSWERS_ALL))
+
+    def tell(_progress: Progress) -> None:
+        raise BrokenPipeError(32, "Broken pipe")
+
+    calls: list[str] = []
+    with pytest.raises(BrokenPipeError):
+        list(kernel_compilation.prepare(group_of(calls, "abcd"), tell, processes))
+    assert calls == []
+
+
+@pytest.mark.usefixtures("_empty_cache")
+def test_processors_are_counted_where_the_system_has_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "sched_getaffinity")  # as on macOS
+    monkeypatch.setattr(kernel_compilation, "PROGRAM", (sys.executable, "-c", ANSWERS_ALL))
+    calls: list[str] = []
+    assert list(kernel_compilation.prepare(group_of(calls, "ab"), lambda _: None)) == ["a", "b"]
+
+
+@pytest.mark.usefixtures("_empty_cache")
 def test_a_program_that_cannot_be_started_leaves_the_compilation_to_this_process(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
