@@ -1,4 +1,4 @@
-"""Makes every picture of the viewer and of the plots that the documentation shows: ``python -m tests.experiments.pictures``.
+"""Make every picture of the viewer and of the plots in the documentation: ``python -m tests.experiments.pictures``.
 
 Nothing is drawn by hand. The shipped model ``consumer-mems``, with the temperature of a sensor that warms up, is
 simulated into a recording; ``Service`` replays an hour of it sixty times as fast into a native viewer without a

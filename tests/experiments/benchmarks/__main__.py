@@ -1,4 +1,4 @@
-"""All benchmarks one after the other, with short settings: ``python -m tests.experiments.benchmarks``; a few minutes."""
+"""All benchmarks with short settings, in a few minutes: ``python -m tests.experiments.benchmarks``."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Frames a second of every decoder, found by listing the folder: ``python tests/experiments/benchmarks/bench_decoders.py``.
+"""Frames per second of every decoder: ``python -m tests.experiments.benchmarks.bench_decoders``.
 
 Byte streams are fed in 4 KiB chunks, frames and messages 100 at a time; and all of them ten samples and one at
 a time, as a sensor of 1 kHz and one of 100 Hz deliver them. ``encode`` makes the bytes; the best of three runs counts.

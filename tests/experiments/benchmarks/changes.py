@@ -1,6 +1,6 @@
 """How often the change detector errs, how soon it finds, and what it names: simulated years and onsets.
 
-    python -m tests.experiments.benchmarks.changes [rate false delays steps cost] [--years 0.3] [--repeats 120] [--seed 0]
+    python -m tests.experiments.benchmarks.changes [rate false delays steps cost] [--years 0.3]
 
 Every alarm counted is one of the real detector on real sample series; nothing is scaled but what says so. Intervals
 are 95 %: of counts by Poisson (Garwood), of shares by √(p(1 − p)/n). A delay is from the onset to the alarm; the event

@@ -1,4 +1,4 @@
-"""Processor time to compile the service's kernels where nothing is cached: ``python -m tests.experiments.benchmarks.cold_compile``.
+"""Processor time to compile the kernels: ``python -m tests.experiments.benchmarks.cold_compile``.
 
 The program runs the warm-up of the service in this process with an empty, temporary cache folder. It prints the
 processor time until each stage of the warm-up is ready, and the number of compilations and their processor time per

@@ -1,8 +1,8 @@
 """Do the intervals hold what they promise? Simulates records of known noise and counts.
 
-    python -m tests.experiments.benchmarks.coverage --json coverage.jsonl                   # all cells of 45 min and 3 h, 20 minutes
-    python -m tests.experiments.benchmarks.coverage --json coverage.jsonl --records 120     # fewer; more can be added later
-    python -m tests.experiments.benchmarks.coverage --json coverage.jsonl --records 0 --page docs/statistics.md      # only tables
+    python -m tests.experiments.benchmarks.coverage --json coverage.jsonl                # all cells, 20 minutes
+    python -m tests.experiments.benchmarks.coverage --json coverage.jsonl --records 120  # fewer
+    python -m tests.experiments.benchmarks.coverage --json coverage.jsonl --records 0 --page docs/statistics.md
 
 Counted for each cell (a noise and a length of record at 100 Hz), in percent with the 95 % interval of Wilson:
 

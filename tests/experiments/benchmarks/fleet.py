@@ -5,7 +5,7 @@ the daemons connect by turns, and one at the root, where the watcher is. Where i
 namespace of its own, so that the counters of ``lo`` are of nothing else.
 
     python -m tests.experiments.benchmarks.fleet [--daemons 50] [--seconds 30] [--rate 10] [--publish "1 Hz"]
-    python -m tests.experiments.benchmarks.fleet --settings        bytes a second by topic, of one device at several settings
+    python -m tests.experiments.benchmarks.fleet --settings    bytes/s by topic, for several settings
 """
 
 import argparse

@@ -1,10 +1,11 @@
 """``reconcile`` beside its nearest peers on the blind set: names right, false names, processor seconds an axis.
 
-    python -m tests.experiments.benchmarks.peers --seeds 4 --level plain --out peers.jsonl     # runs what the file lacks, then prints
+    python -m tests.experiments.benchmarks.peers --seeds 4 --level plain --out peers.jsonl
     python -m tests.experiments.benchmarks.peers --report peers.jsonl                          # prints again
 
 Each peer gets what a user has, the recording and the baseline model, and gives names of effects that the model lacks.
-They are scored as those of ``reconcile`` are (``tests.experiments.blind.score``), but for their confidences and intervals.
+They are scored as those of ``reconcile`` are (``tests.experiments.blind.score``), without their confidences and
+intervals.
 
 - *GMWM ranking*: all nested models of WN, QN, RW, DR and up to three AR1 are ranked for each axis by itself, and the
   terms of the best one that the baseline has not are names. As there is no flicker among them, AR1 have to stand for

@@ -2,7 +2,7 @@
 
 python -m tests.experiments.blind --set singles --level plain --seeds 4 --jobs 2 --out plain.jsonl   # run and print
 python -m tests.experiments.blind --report plain.jsonl faint.jsonl                                   # print again
-python -m tests.experiments.blind --set singles --level faint --only outliers --write cases          # only make the files
+python -m tests.experiments.blind --set singles --level faint --only outliers --write cases  # only make the files
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""``python -m tests.experiments.fuzz [TARGET …] --inputs N --seed S``: each target in a process of its own, and how it went.
+"""Run each fuzz target in its own process: ``python -m tests.experiments.fuzz [TARGET …] --inputs N --seed S``.
 
 One line a target: inputs, inputs a second, coverage (edges between branches of drivers and monitor that were reached),
 findings. Each finding's input is left in ``--out``. Exit status 1 where there is one.

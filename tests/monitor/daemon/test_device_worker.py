@@ -14,6 +14,7 @@ from drivers.errors import ConfigError
 from drivers.links import replay_link
 from drivers.links.loopback_link import LoopbackLink
 from drivers.sample import block, join
+from monitor.daemon import device_worker
 from monitor.daemon.device_worker import Station
 from monitor.daemon.pipeline import Ready
 from monitor.estimation.fit.coefficients import Status
@@ -583,7 +584,7 @@ def test_bias_is_held_against_temperature():
 
 
 def test_choosing_a_model_holds_no_round_up(monkeypatch):
-    monkeypatch.setattr(station, "CHOOSING_S", 0.0)  # a step each time, however fast the machine is
+    monkeypatch.setattr(device_worker, "MODEL_SELECTION_S", 0.0)  # a step each time, however fast the machine is
     rig = Rig(thermal_s=1.0)
     follow_temperature(rig, 14.0)
     assert rig.station.chain.thermal.choosing
@@ -599,7 +600,7 @@ def test_a_recording_waits_for_its_model(monkeypatch):
     values = 1e-3 * np.random.default_rng(1).standard_normal((4000, 6)) + 2e-3 * (warmth - 25.0)[:, None]
     rig.station._push(block(index * 10_000_000, values, warmth, index))  # as fast as can be
     with monkeypatch.context() as slow:
-        slow.setattr(station, "CHOOSING_RECORDED_S", 0.0)  # a step each time, however fast the machine is
+        slow.setattr(device_worker, "MODEL_SELECTION_REPLAY_S", 0.0)  # a step each time, however fast the machine is
         rig.work(1000.0)
     assert rig.station.chain.thermal.choosing
     assert 12 <= len(rig.caught.thermals) <= 20

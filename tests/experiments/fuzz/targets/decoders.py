@@ -1,7 +1,8 @@
 """Every decoder of the folder, with the ``SampleClock`` behind it.
 
 Streams: a programme of raw bytes, frames with a check that holds around any payload, damaged and cut ones, repeats.
-What comes out must be the same for two cuts of the stream, and each sample one that ``tests.experiments.fuzz.formats`` finds.
+What comes out must be the same for two cuts of the stream, and each sample one that
+``tests.experiments.fuzz.formats`` finds.
 Frames and messages: one by one or all at once must make no difference.
 """
 
