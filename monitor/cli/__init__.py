@@ -117,10 +117,10 @@ def check(
 ) -> None:
     """Read the file and say all that is wrong with it; opens nothing."""
     from monitor.commands.check import check as check_configuration
-    from monitor.settings import loading
+    from monitor.common.config_files import CONFIG_FOLDER
 
     if print_defaults:
-        typer.echo((loading.CONFIG_FOLDER / "defaults.toml").read_text("utf-8"), nl=False)
+        typer.echo((CONFIG_FOLDER / "defaults.toml").read_text("utf-8"), nl=False)
         return
     if config is None:
         raise ConfigError("CONFIG.toml is missing; --print-defaults prints one to start from")

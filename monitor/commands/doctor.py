@@ -54,7 +54,7 @@ CAN_TYPE: Final = "280"
 """ARPHRD_CAN, in /sys/class/net/NAME/type."""
 MAX_PORT: Final = 65535
 """Largest port number."""
-UNIT: Final = "imu-monitor.daemon.service"
+UNIT: Final = "imu-monitor.service"
 """Name of the systemd unit."""
 PACKAGE: Final = "imu-monitor"
 """Name of the distribution package."""
@@ -392,8 +392,9 @@ def bytes_a_day(config: Config) -> float | None:
     Examples
     --------
     >>> import dataclasses
-    >>> from monitor import settings
-    >>> one = settings.load(settings.CONFIG_FOLDER / "demo.toml")
+    >>> from monitor.common.config_files import CONFIG_FOLDER
+    >>> from monitor.settings.loading import load
+    >>> one = load(CONFIG_FOLDER / "demo.toml")
     >>> kept = Storage(Path("kept"))
     >>> bytes_a_day(dataclasses.replace(one, storage=kept)) == one.devices[0].rate_hz * DAY_S * SAMPLE_BYTES
     True

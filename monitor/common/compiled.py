@@ -22,8 +22,8 @@ import inspect
 import os
 import re
 import sys
-import threading
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -128,7 +128,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
 
     def _compile_for_args(self, *args: Any, **kws: Any) -> Any:
         """Return the function to call for these arguments. Numba calls this if no machine code for them is loaded."""
-        if getattr(_thread, "interprets", False):
+        if _interprets.get():
             return self.py_func
         return super()._compile_for_args(*args, **kws)
 
@@ -138,7 +138,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
             return super().compile(sig)
 
 
-_thread = threading.local()
+_interprets = ContextVar("interprets", default=False)  # each thread has its own
 
 
 @contextlib.contextmanager
@@ -148,13 +148,12 @@ def interpreted() -> Iterator[None]:
     The results agree except for the last digit of exponentials. A call takes about a hundred times as long, but it does
     not wait for the compiler. Compiled kernels are not affected.
     """
-    before = getattr(_thread, "interprets", False)
-    _thread.interprets = True
+    token = _interprets.set(True)
     try:
         with np.errstate(all="ignore"):  # compiled code does not report NaN and overflow either
             yield
     finally:
-        _thread.interprets = before
+        _interprets.reset(token)
 
 
 @contextlib.contextmanager

@@ -4,8 +4,8 @@ from pathlib import Path
 
 from drivers import file_access
 from drivers.errors import ConfigError
+from monitor.common.config_files import model_path
 from monitor.noise.model import NoiseModel
-from monitor.settings.loading import model_path
 
 
 def read_model(path: Path) -> NoiseModel:

@@ -28,6 +28,7 @@ from drivers.links.base import Filtering, Link
 from drivers.quantities import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ
 from drivers.sample import AXES, KINDS
 from drivers.zenoh.session import configuration, plain, secret_files
+from monitor.common.config_files import model_path
 from monitor.common.topics import ENDPOINT
 from monitor.settings import file_permissions, toml_text
 from monitor.settings.schema import (
@@ -46,7 +47,6 @@ from monitor.settings.schema import (
 from monitor.settings.value_conversion import WRONG, convert, neutral, shown
 
 __all__ = [
-    "CONFIG_FOLDER",
     "Config",
     "Device",
     "DeviceTable",
@@ -60,7 +60,6 @@ __all__ = [
     "VirtualTable",
     "ZenohTable",
     "load",
-    "model_path",
     "period",
     "read",
     "seconds",
@@ -70,8 +69,6 @@ __all__ = [
 T = TypeVar("T", bound=msgspec.Struct)
 T_co = TypeVar("T_co", bound=msgspec.Struct, covariant=True)
 
-CONFIG_FOLDER: Final = Path(__file__).resolve().parents[2] / "config"
-"""The data package beside this one: example configurations, models, DBC files."""
 UNITS_S: Final = {"": 1.0, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 WINDOW_SAMPLES: Final = (100, 10_000_000)
 WINDOW_LONGEST_S: Final = 40 * 86400.0
@@ -581,21 +578,6 @@ class _Reader:
         except ConfigError as error:
             self.wrong += [f"{at}: {line}" for line in error.lines]
             return None
-
-
-def model_path(name: str, folder: Path) -> Path:
-    """The shipped model of that name, or the file of that path; relative ones begin at ``folder``.
-
-    Raises:
-        ConfigError: neither, with the nearest name
-    """
-    models = CONFIG_FOLDER / "models"
-    shipped = models / f"{name}.toml"
-    path = shipped if file_access.is_file(shipped) else folder / file_access.path(name)
-    if os.path.exists(path) and not path.is_dir():
-        return path  # whatever else it is, its reader says
-    names = sorted(file.stem for file in models.glob("*.toml"))
-    raise ConfigError(f'no model "{name}", neither a file nor one of those shipped{discovery.nearest(name, names)}')
 
 
 def zenoh_file_secrets(path: Path) -> tuple[Path, ...]:

@@ -10,9 +10,11 @@ from typing import Final, ParamSpec, TypeVar
 import msgspec
 
 from drivers.errors import ConfigError
+from monitor.common import config_files
+from monitor.common.config_files import CONFIG_FOLDER
 from monitor.noise.catalogue import read_model
 from monitor.settings import loading
-from monitor.settings.loading import CONFIG_FOLDER, Config, VirtualTable
+from monitor.settings.loading import Config, VirtualTable
 from monitor.simulator import DEFAULT_RATE_HZ, effects_of
 
 P = ParamSpec("P")
@@ -44,7 +46,7 @@ def demo(sensor: str | None = None, effects: Sequence[str] = (), effect_at_s: fl
     table = device.link
     assert isinstance(table, VirtualTable)
     given = {
-        "model": None if sensor is None else str(_for_option("--sensor", loading.model_path, sensor, Path.cwd())),
+        "model": None if sensor is None else str(_for_option("--sensor", config_files.model_path, sensor, Path.cwd())),
         "effect": tuple(effects) or None,
         "effect_at": effect_at_s,
     }

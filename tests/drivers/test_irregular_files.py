@@ -16,6 +16,7 @@ from drivers.links import replay_link
 from drivers.recordings import load_samples, segment, writing
 from drivers.zenoh.session import configuration
 from monitor.commands import thermal
+from monitor.common import config_files
 from monitor.history import sqlite_store
 from monitor.noise.catalogue import read_model
 from monitor.publishing.zenoh.subscriber import listeners
@@ -129,7 +130,7 @@ def test_a_part_file_in_the_way_of_a_new_one(tmp_path: Path) -> None:
     [
         ("configuration", loading.load),
         ("model", read_model),
-        ("model name", lambda path: loading.model_path(str(path), path.parent)),
+        ("model name", lambda path: config_files.model_path(str(path), path.parent)),
         ("zenoh file", lambda path: listeners((), path)),
     ],
 )
@@ -229,10 +230,10 @@ def test_a_socket_or_device_on_the_command_line_is_status_2_and_one_line(command
 
 
 def test_a_configuration_and_a_model_from_a_pipe(tmp_path: Path) -> None:
-    text = (loading.CONFIG_FOLDER / "demo.toml").read_text()
+    text = (config_files.CONFIG_FOLDER / "demo.toml").read_text()
     done = finished(["check", "/dev/stdin"], input=text)
     assert (done.returncode, done.stderr) == (0, "")
-    model = (loading.CONFIG_FOLDER / "models" / "consumer-mems.toml").read_text()
+    model = (config_files.CONFIG_FOLDER / "models" / "consumer-mems.toml").read_text()
     for name in ("/dev/stdin", "-"):
         done = finished(["export", name, "--format", "kalibr"], input=model)
         assert (done.returncode, done.stderr) == (0, "")

@@ -40,6 +40,7 @@ import numpy as np
 from drivers.recordings import save_samples
 from drivers.sample import Floats
 from monitor.commands.reconcile import Request, make
+from monitor.common import config_files
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
 from monitor.history.minute_aggregation import Minutes
@@ -59,7 +60,7 @@ from monitor.simulator.demo import demo
 from tests.monitor.publishing.made import estimate, true_coefficients
 
 SIZE = (1600, 1000)
-MODEL = loading.CONFIG_FOLDER / "models" / "consumer-mems.toml"
+MODEL = config_files.CONFIG_FOLDER / "models" / "consumer-mems.toml"
 T0 = 1_763_705_400.0  # Unix s of the first sample: 2025-11-21 06:10 UTC
 HOUR_S = 3600.0
 SPARE_S = 900.0  # of the recording beyond the hour, so that it still runs when the service is stopped
@@ -184,7 +185,7 @@ def temperature(out: Path, folder: Path) -> Path:
     """The tab with bias beside temperature, of two days on which gz stepped once."""
     path = out / "viewer-temperature.png"
     source = folder / "warm.npz"
-    model = read_model(loading.CONFIG_FOLDER / "models" / "stim300.toml") + NoiseModel.from_toml(WARM)
+    model = read_model(config_files.CONFIG_FOLDER / "models" / "stim300.toml") + NoiseModel.from_toml(WARM)
     n = round(WARM_S * WARM_HZ)
     drawn = model.stream(WARM_HZ, 1).draw_all(n)
     save_samples(source, T0 + np.arange(n) / WARM_HZ, drawn.values, drawn.temperature_c)
@@ -204,7 +205,9 @@ def drift(out: Path, folder: Path) -> Path:
     source = folder / "turned.npz"
     n = round(TURNED_S * 100.0)
     t_s = np.arange(n) / 100.0
-    values = read_model(loading.CONFIG_FOLDER / "models" / "adis16470.toml").stream(100.0, 1).draw_all(n).values.copy()
+    values = (
+        read_model(config_files.CONFIG_FOLDER / "models" / "adis16470.toml").stream(100.0, 1).draw_all(n).values.copy()
+    )
     for axis, since_s in enumerate(TURNS_S):
         turning = (t_s >= since_s) & (t_s < since_s + 60.0)
         values[turning, axis] += np.radians(1.0) * np.sin(2.0 * np.pi * (t_s[turning] - since_s) / 20.0)
@@ -224,7 +227,7 @@ def compensation(out: Path, folder: Path) -> Path:
     """What ``imu-monitor compensate --plot`` makes of three hours of a sensor at rest."""
     path, source = out / "compensate.png", folder / "still.npz"
     n = 1_080_000
-    values = read_model(loading.CONFIG_FOLDER / "models" / "adis16470.toml").stream(100.0, 2).draw_all(n).values
+    values = read_model(config_files.CONFIG_FOLDER / "models" / "adis16470.toml").stream(100.0, 2).draw_all(n).values
     save_samples(source, np.arange(n) / 100.0, values)
     arguments = ["compensate", str(source), "--out", str(folder / "out.npz"), "--plot", str(path)]
     subprocess.run([sys.executable, "-m", "monitor.cli", *arguments], check=True)

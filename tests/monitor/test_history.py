@@ -12,6 +12,7 @@ import pytest
 
 from drivers.recordings import save_samples
 from drivers.sample import Event, SampleBlock
+from monitor.common.config_files import CONFIG_FOLDER
 from monitor.daemon.device_worker import Output
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
@@ -22,7 +23,6 @@ from monitor.history.time_ranges import Span, said
 from monitor.noise.catalogue import read_model
 from monitor.publishing.messages import history
 from monitor.settings import loading
-from monitor.settings.loading import CONFIG_FOLDER
 from tests.support.ports import free_endpoint
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 from tests.support.zenoh_sessions import session

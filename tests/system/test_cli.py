@@ -24,8 +24,9 @@ import pytest
 from drivers.recordings import save_samples
 from drivers.sample import AXES
 from monitor.cli import main, report_failed_thread
+from monitor.common.config_files import CONFIG_FOLDER
 from monitor.noise.catalogue import read_model
-from monitor.settings.loading import CONFIG_FOLDER, load
+from monitor.settings.loading import load
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
 PROGRAM = [sys.executable, "-m", "monitor.cli"]

@@ -15,10 +15,11 @@ import zenoh
 from drivers.recordings import load_samples
 from drivers.sample import AXES, Event
 from monitor.common import topics
+from monitor.common.config_files import CONFIG_FOLDER
 from monitor.daemon.operations.live_reconcile import Reconciler
 from monitor.daemon.service import Service
 from monitor.estimation.detection.model_gap import ModelGap
-from monitor.settings.loading import CONFIG_FOLDER, Config, VirtualTable, ZenohTable
+from monitor.settings.loading import Config, VirtualTable, ZenohTable
 from monitor.simulator.demo import demo
 from tests.support.paced_sensor import follow_reader
 from tests.support.ports import free_endpoint

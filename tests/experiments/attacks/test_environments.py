@@ -19,8 +19,8 @@ import pytest
 
 import imu_monitor
 from drivers.sample import AXES
+from monitor.common.config_files import CONFIG_FOLDER
 from monitor.daemon.operations import live_reconcile
-from monitor.settings.loading import CONFIG_FOLDER
 
 ROOT: Final = Path(imu_monitor.__file__).resolve().parent
 SCRIPT: Final = "import sys\nfrom imu_monitor import main\nsys.exit(main())\n"

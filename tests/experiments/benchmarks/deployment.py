@@ -23,8 +23,8 @@ import psutil
 
 from drivers.decoders import vectornav_binary
 from drivers.sample import block
+from monitor.common import config_files
 from monitor.noise.catalogue import read_model
-from monitor.settings import loading
 
 WARM_S = 25.0
 DEVICE = """
@@ -55,7 +55,7 @@ class Sensors:
         self.ports = [folder / f"tty{i}" for i in range(count)]
         self._masters = [self._plug(port) for port in self.ports]
         n = round(rate_hz * seconds)
-        model = read_model(loading.CONFIG_FOLDER / "models" / "consumer-mems.toml")
+        model = read_model(config_files.CONFIG_FOLDER / "models" / "consumer-mems.toml")
         values = model.stream(float(rate_hz), 1).draw_all(n).values
         ticks = np.arange(n, dtype=np.int64) * (1_000_000_000 // rate_hz)
         encoder = vectornav_binary.build(vectornav_binary.Settings())

@@ -1,9 +1,10 @@
 """What the benchmarks of the whole service share: sensors in one process, the daemon in another, a subscriber here.
 
-``python -m tests.experiments.benchmarks.rig FOLDER DEVICES RATE SECONDS`` is the process of the
-sensors. It opens a pseudo-terminal for each, linked as FOLDER/tty<i>, encodes all frames beforehand, waits for a line on standard input, writes a frame
-to each device every 1/RATE s, and leaves in FOLDER how many it wrote to each and when (monotonic ns, as seen by every
-process of the machine). A pseudo-terminal that is full is waited for and counted: a port would have lost bytes.
+``python -m tests.experiments.benchmarks.rig FOLDER DEVICES RATE SECONDS`` is the process of the sensors. It opens a
+pseudo-terminal for each, linked as FOLDER/tty<i>, encodes all frames beforehand, waits for a line on standard input,
+writes a frame to each device every 1/RATE s, and leaves in FOLDER how many it wrote to each and when (monotonic ns,
+as seen by every process of the machine). A pseudo-terminal that is full is waited for and counted: a port would have
+lost bytes.
 """
 
 import contextlib

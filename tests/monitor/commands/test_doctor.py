@@ -21,11 +21,12 @@ from drivers.sample import block
 from monitor.commands import doctor
 from monitor.commands.doctor import SAMPLE_BYTES, Finding, bytes_a_day, examine, room, satisfies, worst
 from monitor.common.compiled import cache_folder
+from monitor.common.config_files import CONFIG_FOLDER
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, FolderLock
 from monitor.daemon.storage.recorder import origin
 from monitor.noise.catalogue import read_model
 from monitor.settings import loading
-from monitor.settings.loading import CONFIG_FOLDER, Storage
+from monitor.settings.loading import Storage
 from tests.support.waiting import PATIENCE_S
 
 QUIET = '[zenoh]\nmode = "none"\n[viewer]\nmode = "none"\n'

@@ -20,12 +20,13 @@ from drivers.errors import LinkUnavailable, NotReady
 from drivers.links import zenoh_link
 from drivers.zenoh.session import configuration
 from monitor.common import topics
+from monitor.common.config_files import CONFIG_FOLDER
 from monitor.publishing.messages import encoding
 from monitor.publishing.zenoh.history_query import ask
 from monitor.publishing.zenoh.publisher import ZenohOut
 from monitor.publishing.zenoh.subscriber import ZenohIn
 from monitor.settings import loading
-from monitor.settings.loading import CONFIG_FOLDER, ZenohTable
+from monitor.settings.loading import ZenohTable
 from tests.monitor.publishing import made
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for

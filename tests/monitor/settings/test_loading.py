@@ -18,9 +18,9 @@ from drivers.decoders.vectornav_ascii import VectornavAsciiDecoder
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
 from monitor.commands.check import check
+from monitor.common.config_files import CONFIG_FOLDER, model_path
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH
 from monitor.settings.loading import (
-    CONFIG_FOLDER,
     WINDOW_SAMPLES,
     DeviceTable,
     LogTable,
@@ -28,7 +28,6 @@ from monitor.settings.loading import (
     VirtualTable,
     ZenohTable,
     load,
-    model_path,
     period,
     read,
     seconds,

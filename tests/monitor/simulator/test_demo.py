@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import ConfigError
-from monitor.settings.loading import CONFIG_FOLDER, WINDOW_SAMPLES, VirtualTable, load
+from monitor.common.config_files import CONFIG_FOLDER
+from monitor.settings.loading import WINDOW_SAMPLES, VirtualTable, load
 from monitor.simulator.demo import CONFIG, demo
 
 SHIPPED = sorted(path.stem for path in (CONFIG_FOLDER / "models").glob("*.toml"))

@@ -11,7 +11,8 @@ import pytest
 from drivers.driver import Driver
 from drivers.sample import SampleBlock
 from drivers.timing.sample_clock import SampleClock
-from monitor.settings.loading import CONFIG_FOLDER, FaultsTable, VirtualTable
+from monitor.common.config_files import CONFIG_FOLDER
+from monitor.settings.loading import FaultsTable, VirtualTable
 from monitor.simulator import VirtualImu
 from monitor.simulator.can_port import CanPort
 from monitor.simulator.faults import Faults, Kind

@@ -11,7 +11,8 @@ from drivers.decoders import stim300, vectornav_binary, xsens_mtdata2
 from drivers.driver import Driver
 from drivers.errors import ConfigError
 from drivers.timing.sample_clock import SampleClock
-from monitor.settings.loading import CONFIG_FOLDER, VirtualTable
+from monitor.common.config_files import CONFIG_FOLDER
+from monitor.settings.loading import VirtualTable
 from monitor.simulator import VirtualImu
 from tests.support.paced_sensor import follow_reader, is_open
 from tests.support.waiting import PATIENCE_S, wait_for

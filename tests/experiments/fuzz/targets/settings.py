@@ -18,6 +18,7 @@ import msgspec
 from drivers.decoders import dbc
 from drivers.errors import ConfigError
 from drivers.sample import Chunk
+from monitor.common import config_files
 from monitor.noise import model_file
 from monitor.noise.catalogue import read_model
 from monitor.noise.model import NoiseModel
@@ -29,7 +30,7 @@ from tests.experiments.fuzz.target import target
 from tests.experiments.fuzz.targets.decoders import SECOND_DATABASE, SECOND_SIGNALS
 from tests.experiments.fuzz.targets.files import folder
 
-CONFIG: Final = loading.CONFIG_FOLDER
+CONFIG: Final = config_files.CONFIG_FOLDER
 LINES_AT_MOST: Final = 2000
 
 

@@ -13,14 +13,14 @@ import pytest
 from drivers.errors import LinkLost
 from drivers.links.base import Carrier
 from drivers.sample import Chunk
+from monitor.common.config_files import CONFIG_FOLDER
 from monitor.daemon.operations.systemd import Unit
 from monitor.daemon.service import Service
 from monitor.settings import loading
-from monitor.settings.loading import CONFIG_FOLDER
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
 
-UNIT = CONFIG_FOLDER / "systemd" / "imu-monitor.daemon.service"
+UNIT = CONFIG_FOLDER / "systemd" / "imu-monitor.service"
 DEVICE = '[[device]]\nname = "{name}"\nrate = 100.0\ndriver = {{ link = "virtual" }}\n'
 
 

@@ -12,10 +12,10 @@ from scipy.linalg import expm
 from scipy.optimize import minimize_scalar
 
 from drivers.errors import ConfigError, NotReady
+from monitor.common.config_files import CONFIG_FOLDER
 from monitor.noise.model import NoiseModel
 from monitor.publishing import exporters
 from monitor.publishing.exporters.kalman import MARKOV_PEAK, MARKOV_PEAK_AT, process_noise, transition
-from monitor.settings.loading import CONFIG_FOLDER
 
 MODEL = """
 sample_rate = 200.0
