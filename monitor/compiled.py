@@ -20,8 +20,8 @@ import inspect
 import os
 import re
 import sys
-import threading
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -116,7 +116,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
 
     def _compile_for_args(self, *args: Any, **kws: Any) -> Any:
         """Return what is called with arguments of these types; Numba asks this when no machine code is loaded."""
-        if getattr(_thread, "interprets", False):
+        if _interprets.get():
             return self.py_func
         return super()._compile_for_args(*args, **kws)
 
@@ -126,7 +126,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
             return super().compile(sig)
 
 
-_thread = threading.local()
+_interprets = ContextVar("interprets", default=False)  # each thread has its own
 
 
 @contextlib.contextmanager
@@ -136,13 +136,12 @@ def interpreted() -> Iterator[None]:
     The results are the same but for the last digit of exponentials. A call takes some hundred times as long, but does
     not wait for the compiler. Nothing is slower once the kernel is compiled.
     """
-    before = getattr(_thread, "interprets", False)
-    _thread.interprets = True
+    token = _interprets.set(True)
     try:
         with np.errstate(all="ignore"):  # as in machine code, where NaN and overflow pass in silence
             yield
     finally:
-        _thread.interprets = before
+        _interprets.reset(token)
 
 
 @contextlib.contextmanager
