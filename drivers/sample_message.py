@@ -67,10 +67,10 @@ class Batch:
     block: SampleBlock  # t_ns are Unix times
 
 
-def pack(device: str, samples: int, rows: SampleBlock, offset_ns: int = 0, schema: str = SCHEMA) -> bytes:
+def pack(device: str, samples: int, rows: SampleBlock, offset_ns: Ints | int = 0, schema: str = SCHEMA) -> bytes:
     """The message of these rows; ``samples`` counts since the start, these included.
 
-    ``offset_ns`` is added to ``t_ns`` to make it Unix time. Axes without any value are left out; a block
+    ``offset_ns`` [n] is added to ``t_ns`` to make it Unix time. Axes without any value are left out; a block
     of nothing but NaN keeps all six.
     """
     table = np.column_stack((rows.values, rows.temperature_c))

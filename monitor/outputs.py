@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from drivers.sample import Event, SampleBlock
+from drivers.sample import Event, Ints, SampleBlock
 from drivers.sample_message import pack
 from monitor import topics
 from monitor.drift.live import ThermalLook
@@ -36,7 +36,7 @@ class ZenohOutput(Output):
     def __init__(self, zenoh: ZenohOut) -> None:
         self._zenoh = zenoh
 
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """One msgpack batch."""
         self._zenoh.put(topics.SAMPLES, device, pack(device, received, samples, offset_ns))
 
@@ -53,7 +53,7 @@ class ZenohOutput(Output):
         """Total and Hadamard deviations."""
         self._zenoh.put(topics.TOTAL, device, message.total(device, unix_s, received, total, hadamard))
 
-    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """One msgpack batch."""
         schema = topics.COMPENSATED.schema()
         self._zenoh.put(topics.COMPENSATED, device, pack(device, received, samples, offset_ns, schema))
@@ -78,7 +78,7 @@ class ViewerOutput(Output):
     def __init__(self, view: "RerunView") -> None:
         self._view = view
 
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Raw samples."""
         self._view.samples(device, (samples.t_ns + offset_ns) / 1e9, samples.values, samples.temperature_c)
 
@@ -90,7 +90,7 @@ class ViewerOutput(Output):
         """Courses of the gaps, and the model's curves beside those measured."""
         self._view.gap(device, unix_s, gap)
 
-    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Rates beside those measured."""
         self._view.compensated(device, (samples.t_ns + offset_ns) / 1e9, samples.values[:, :3])
 
@@ -120,9 +120,9 @@ class HistoryOutput(Output):
         self._writer = writer
         self._minutes: dict[str, Minutes] = {}
 
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Their temperature."""
-        unix_s = (int(samples.t_ns[-1]) + offset_ns) / 1e9
+        unix_s = float((samples.t_ns + offset_ns)[-1]) / 1e9
         self._writer.put(device, self._of(device).temperature(unix_s, samples.temperature_c))
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:

@@ -31,7 +31,7 @@ from drivers.errors import ConfigError, RecordingError
 from drivers.recording import segment
 from drivers.recording.segment import Origin, Piece, SegmentWriter, State
 from drivers.recording.table import PART
-from drivers.sample import AXES, NO_TICK, Chunk, SampleBlock, block
+from drivers.sample import AXES, NO_TICK, Chunk, Ints, SampleBlock, block
 from drivers.small_file import check_folder
 from monitor import retention
 from monitor.folder_lock import RECORDING_LOCK, FolderLock
@@ -217,12 +217,12 @@ class Recorder:
 
     # --- from the readers' threads
 
-    def samples(self, device: str, samples: SampleBlock, offset_ns: int) -> None:
-        """A block; ``offset_ns`` makes its times Unix time."""
+    def samples(self, device: str, samples: SampleBlock, offset_ns: Ints | int) -> None:
+        """A block; ``offset_ns`` [n] makes its times Unix time."""
         track = self._tracks.get((device, "samples"))
         if track is None:
             return
-        if offset_ns:
+        if not isinstance(offset_ns, int) or offset_ns:
             t_ns = samples.t_ns + offset_ns
             samples = block(t_ns, samples.values, samples.temperature_c, samples.ticks, samples.lost)
         self._wait(track, [samples])

@@ -20,7 +20,7 @@ from drivers.errors import ImuError, NotReady
 from drivers.links.base import Link
 from drivers.links.replay_link import ReplayLink
 from drivers.recording.segment import State
-from drivers.sample import Chunk, Event, Floats, SampleBlock, unbroken
+from drivers.sample import Chunk, Event, Floats, Ints, SampleBlock, unbroken
 from monitor import rebuilding
 from monitor.chain import Chain, Ready
 from monitor.drift.live import ThermalLook
@@ -65,8 +65,8 @@ class Output:
     event is passed on until then, and ``health`` has None for its time.
     """
 
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
-        """A block, and how many samples had come with it; ``offset_ns`` makes its times Unix time."""
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
+        """A block, and how many samples had come with it; ``offset_ns`` [n] makes its times Unix time."""
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         """One refit."""
@@ -77,7 +77,7 @@ class Output:
     def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
         """An interval beside what temperature let expect of it; never where none is measured."""
 
-    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """As ``samples``, the gyros' drift taken out."""
 
     def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
@@ -171,12 +171,14 @@ class Station:
             return
         rate_hz = self.clock.rate_hz or tail.newest.state.rate or 0.0
         try:
-            text = rebuilding.rebuild(self.chain, tail, rate_hz, self.device.window_s, self._offset_ns())
+            offset_ns = self._offset_ns(time.monotonic_ns())
+            text = rebuilding.rebuild(self.chain, tail, rate_hz, self.device.window_s, offset_ns)
         except (ImuError, OSError) as error:
             text = f"the window could not be rebuilt: {error}"
             self.chain.reset()
         finally:
-            self._happened.append(Event("window_rebuilt", int(tail.newest.samples.t_ns[-1]) - self._offset_ns(), text))
+            t_ns = int(tail.newest.samples.t_ns[-1]) - self._offset_ns(time.monotonic_ns())
+            self._happened.append(Event("window_rebuilt", t_ns, text))
             self._tail = None
             self._wake.set()
 
@@ -299,7 +301,7 @@ class Station:
 
     def unix_s(self, t_ns: int) -> float:
         """Unix time of a sample time."""
-        return (t_ns + self._offset_ns()) / 1e9
+        return (t_ns + self._offset_ns(t_ns)) / 1e9
 
     def now_unix_s(self) -> float | None:
         """Return the present time on the timeline of the device's samples, in Unix seconds.
@@ -321,8 +323,9 @@ class Station:
         if tail is None:
             return
         newest, state = tail.newest.samples, tail.newest.state
-        t_ns = int(newest.t_ns[-1]) - self._offset_ns()
-        ago_s = (self._wall.unix_ns(time.monotonic_ns()) - int(newest.t_ns[-1])) / 1e9
+        now_ns = time.monotonic_ns()
+        t_ns = int(newest.t_ns[-1]) - self._offset_ns(now_ns)
+        ago_s = (self._wall.unix_ns(now_ns) - int(newest.t_ns[-1])) / 1e9
         rate = self.device.rate_hz or state.rate
         if rate is None or not 0.0 <= ago_s <= self.device.window_s:
             text = f"the recording ends {ago_s:.4g} s ago: the window begins anew"
@@ -339,7 +342,8 @@ class Station:
         """What goes into the recording beside the samples."""
         if self._tail is not None:
             return self._before
-        return rebuilding.known(self.chain, self._before, self.clock.rate_hz, self.clock.tick_step, self._offset_ns())
+        offset_ns = self._offset_ns(self.chain.newest_ns)
+        return rebuilding.known(self.chain, self._before, self.clock.rate_hz, self.clock.tick_step, offset_ns)
 
     # --- inside
 
@@ -385,14 +389,14 @@ class Station:
     def _keep(self, chunks: Sequence[Chunk]) -> None:
         """Called by the reader's thread."""
         if self._recorder is not None:
-            self._recorder.chunks(self.name, chunks, self._offset_ns())
+            self._recorder.chunks(self.name, chunks, self._offset_ns(chunks[0].t_ns) if chunks else 0)
 
     def _push(self, samples: SampleBlock) -> None:
         """Called by the reader's thread. A sensor is never kept waiting; a recording waits for room."""
         if self._recorder is not None:
             if self.chain.estimator is None:  # a crash may come before the first report
                 self._recorder.know(self.name, self._known())
-            self._recorder.samples(self.name, samples, self._offset_ns())
+            self._recorder.samples(self.name, samples, self._offsets_ns(samples))
             while self._patient and self._recorder.full(self.name):
                 time.sleep(PATIENCE_S)
         while self._patient and self.ring.room < len(samples) < self.ring.capacity:
@@ -402,8 +406,12 @@ class Station:
             self._waiting_since_ns = time.monotonic_ns()
         self._wake.set()
 
-    def _offset_ns(self) -> int:
-        return 0 if self.driver.times_are_unix else self._wall.offset_ns
+    def _offset_ns(self, t_ns: int) -> int:
+        return 0 if self.driver.times_are_unix else self._wall.offset_ns(t_ns)
+
+    def _offsets_ns(self, samples: SampleBlock) -> Ints | int:
+        """Of each sample, so that their Unix times increase even if the host's clock was set back."""
+        return 0 if self.driver.times_are_unix else self._wall.offsets_ns(samples.t_ns)
 
     def _can_take(self) -> bool:
         """Until the rate is known and the kernels are compiled, samples wait in the ring."""
@@ -429,7 +437,7 @@ class Station:
         for samples in unbroken(blocks):
             self.published += len(samples)
             for output in outputs:
-                output.samples(self.name, self.published, samples, self._offset_ns())
+                output.samples(self.name, self.published, samples, self._offsets_ns(samples))
             if self.chain.compensation is not None and np.isfinite(samples.values[:, :3]).any():
                 self._publish_compensated(outputs, self.chain.compensation, samples)
         return True
@@ -443,7 +451,7 @@ class Station:
             without = live.update(piece)
             self.chain.renew()
             for output in outputs:
-                output.compensated(self.name, self.published - len(samples) + at, without, self._offset_ns())
+                output.compensated(self.name, self.published - len(samples) + at, without, self._offsets_ns(without))
         for look in live.take():
             for output in outputs:
                 output.drift(self.name, self.unix_s(look.t_ns), look)

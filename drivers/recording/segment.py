@@ -326,12 +326,14 @@ def _batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any
     ``mapped`` leaves rows that are not looked at on the disk.
     """
     pa = library(path)
-    with _reading(path), open_regular(path) as file:
+    with _reading(path), open_regular(path) as file:  # once: the daemon may replace it by a packed one meanwhile
+        count = _regular_batches(file)
+        file.seek(0)
         reader = pa.ipc.open_stream(_mapped(pa, file) if mapped else file)
         found = _origin(path, reader.schema)
         if found.kind != kind:
             raise RecordingError(f"{path}: a segment of {found.kind}, where one of {kind} is read")
-        for _ in range(_regular_batches(path)):
+        for _ in range(count):
             try:
                 batch, meta = reader.read_next_batch_with_custom_metadata()
                 batch.validate(full=not mapped)
@@ -341,15 +343,14 @@ def _batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any
                 yield batch, meta
 
 
-def _regular_batches(path: Path) -> int:
+def _regular_batches(file: IO[bytes]) -> int:
     """Number of batches before the first one whose stated size is not that of a batch of the daemon."""
     count = 0
-    with open_regular(path) as file:
-        for size in batch_sizes(file):
-            large = max(size.rows * ROW_BYTES, sum(size.buffers), size.body_bytes) > MAX_BATCH_BYTES
-            if large or size.dictionary:  # the daemon writes no dictionaries
-                break
-            count += 1
+    for size in batch_sizes(file):
+        large = max(size.rows * ROW_BYTES, sum(size.buffers), size.body_bytes) > MAX_BATCH_BYTES
+        if large or size.dictionary:  # the daemon writes no dictionaries
+            break
+        count += 1
     return count
 
 
