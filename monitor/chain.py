@@ -108,12 +108,19 @@ class Chain:
         return self._interprets or self._ready.fit.is_set()
 
     @property
+    def fits_slowly(self) -> bool:
+        """Whether a fit takes a tenth of a second, as its kernels are interpreted."""
+        return self._interprets and not self._ready.fit.is_set()
+
+    @property
     def can_watch(self) -> bool:
         """Whether all kernels that samples go through can be called."""
         return self._interprets or self._ready.all.is_set()
 
-    def interpreted(self) -> AbstractContextManager[None]:
-        """Return the context in which the kernels are to be called."""
+    def interpreted(self, rate_hz: float | None) -> AbstractContextManager[None]:
+        """Return the context in which the kernels are to be called; until a rate is known none is called."""
+        if rate_hz is not None and self.estimator is None:
+            self.can_begin(rate_hz)
         return interpreted() if self._interprets and not self._ready.all.is_set() else nullcontext()
 
     @property

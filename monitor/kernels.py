@@ -44,6 +44,8 @@ PROGRAM: Final = (
     "warm-up",
     "--from-stdin",
 )
+NICENESS: Final = 5
+"""Of the child processes: samples come first."""
 BAR_LENGTH: Final = 12
 
 
@@ -222,6 +224,7 @@ class _Compilers:
             PROGRAM, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, start_new_session=True
         )
         with child:
+            os.setpriority(os.PRIO_PROCESS, child.pid, NICENESS)
             self._children.append(child)
             while job := self._next():
                 try:

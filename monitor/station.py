@@ -51,6 +51,8 @@ CHOOSING_SHARE: Final = 0.02
 TOTAL_EVERY_S: Final = 0.1
 TOTAL_SHARE: Final = 0.005
 """Of a processor, that total and Hadamard deviations may take for a device."""
+SLOW_REFIT_S: Final = 1.0
+"""Between two fits while their kernels are interpreted: compilation needs the processors."""
 UNTIMED_KEPT: Final = 100
 """Events that wait for the first sample's time; the oldest are dropped."""
 SET_S: Final = 1.0
@@ -213,7 +215,7 @@ class Station:
 
     def work(self, outputs: Sequence[Output], now_s: float, drain: bool = False) -> None:
         """Take what came, advance the estimate, publish what is due; all of it when draining."""
-        with self.chain.interpreted():
+        with self.chain.interpreted(self.clock.rate_hz):
             self._work(outputs, now_s, drain)
 
     def _work(self, outputs: Sequence[Output], now_s: float, drain: bool) -> None:
@@ -468,6 +470,8 @@ class Station:
                 latest = estimator.get(fitted=fitted)
             except NotReady:
                 return False
+            if self.chain.fits_slowly:
+                self._next_s["refit"] = max(self._next_s["refit"], now_s + SLOW_REFIT_S)
             self.latest = latest.without_coefficients() if any(self._doubts) else latest
             self._refitted = True
         if self.latest is None or not self._refitted:
