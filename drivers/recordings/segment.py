@@ -380,12 +380,15 @@ def _batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any
     If ``mapped`` is True, the file is mapped into memory, so that unused rows are not read from the disk.
     """
     pa = import_pyarrow(path)
+    # The file is opened only once, because the daemon may replace it by a packed one meanwhile.
     with _arrow_errors(path), open_regular(path) as file:
+        count = _regular_batches(file)
+        file.seek(0)
         reader = pa.ipc.open_stream(_memory_map(pa, file) if mapped else file)
         found = _origin(path, reader.schema)
         if found.kind != kind:
             raise RecordingError(f"{path}: a segment of {found.kind}, where one of {kind} is read")
-        for _ in range(_regular_batches(path)):
+        for _ in range(count):
             try:
                 batch, meta = reader.read_next_batch_with_custom_metadata()
                 batch.validate(full=not mapped)
@@ -395,15 +398,14 @@ def _batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any
                 yield batch, meta
 
 
-def _regular_batches(path: Path) -> int:
+def _regular_batches(file: IO[bytes]) -> int:
     """Return the number of batches before the first one whose stated size the daemon would not write."""
     count = 0
-    with open_regular(path) as file:
-        for size in batch_sizes(file):
-            large = max(size.rows * ROW_BYTES, sum(size.buffers), size.body_bytes) > MAX_BATCH_BYTES
-            if large or size.dictionary:  # the daemon writes no dictionaries
-                break
-            count += 1
+    for size in batch_sizes(file):
+        large = max(size.rows * ROW_BYTES, sum(size.buffers), size.body_bytes) > MAX_BATCH_BYTES
+        if large or size.dictionary:  # the daemon writes no dictionaries
+            break
+        count += 1
     return count
 
 

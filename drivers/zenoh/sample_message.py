@@ -66,7 +66,7 @@ class Batch:
     block: SampleBlock  # t_ns are Unix times
 
 
-def pack(device: str, samples: int, rows: SampleBlock, offset_ns: int = 0, schema: str = SCHEMA) -> bytes:
+def pack(device: str, samples: int, rows: SampleBlock, offset_ns: Ints | int = 0, schema: str = SCHEMA) -> bytes:
     """Encode samples as one message.
 
     Parameters

@@ -19,7 +19,7 @@ from drivers.errors import ImuError, NotReady
 from drivers.links.base import Link
 from drivers.links.replay_link import ReplayLink
 from drivers.recordings.segment import State
-from drivers.sample import Chunk, Event, Floats, SampleBlock, unbroken
+from drivers.sample import Chunk, Event, Floats, Ints, SampleBlock, unbroken
 from drivers.timing.sample_clock import Before, SampleClock
 from monitor.common.health import Health
 from monitor.daemon import window_restore
@@ -56,6 +56,8 @@ TOTAL_INTERVAL_S: Final = 0.1
 """Shortest interval between two steps of the total and Hadamard deviations."""
 TOTAL_CPU_SHARE: Final = 0.005
 """Share of one processor that the total and Hadamard deviations may use for a device."""
+INTERPRETED_REFIT_S: Final = 1.0
+"""Minimum time between fits while their kernels are interpreted, because the compilation needs the processors."""
 MAX_UNTIMED_EVENTS: Final = 100
 """Largest number of events that wait for the time of the first sample. The oldest are dropped."""
 MIN_CLOCK_STEP_S: Final = 1.0
@@ -73,7 +75,7 @@ class Output:
     samples of the device since the start, up to the result.
     """
 
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Receive a block of samples.
 
         Parameters
@@ -84,7 +86,7 @@ class Output:
             Number of samples of the device up to the end of this block, since the start.
         samples : SampleBlock
             Samples in SI units, with times in nanoseconds.
-        offset_ns : int
+        offset_ns : array of int64, shape (n,), or int
             Offset that converts the times to Unix time, in nanoseconds.
         """
 
@@ -129,7 +131,7 @@ class Output:
             Mean of the interval and its prediction.
         """
 
-    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Receive a block of samples without the drift of the gyroscopes.
 
         Parameters
@@ -140,7 +142,7 @@ class Output:
             Number of samples of the device up to the end of this block, since the start.
         samples : SampleBlock
             Compensated samples in SI units, with times in nanoseconds.
-        offset_ns : int
+        offset_ns : array of int64, shape (n,), or int
             Offset that converts the times to Unix time, in nanoseconds.
         """
 
@@ -292,14 +294,14 @@ class Station:
             return
         rate_hz = self.clock.rate_hz or tail.newest.state.rate or 0.0
         try:
-            text = window_restore.rebuild(self.chain, tail, rate_hz, self.device.window_s, self._offset_ns())
+            offset_ns = self._offset_ns(time.monotonic_ns())
+            text = window_restore.rebuild(self.chain, tail, rate_hz, self.device.window_s, offset_ns)
         except (ImuError, OSError) as error:
             text = f"the window could not be rebuilt: {error}"
             self.chain.reset()
         finally:
-            self._pending_events.append(
-                Event("window_rebuilt", int(tail.newest.samples.t_ns[-1]) - self._offset_ns(), text)
-            )
+            t_ns = int(tail.newest.samples.t_ns[-1]) - self._offset_ns(time.monotonic_ns())
+            self._pending_events.append(Event("window_rebuilt", t_ns, text))
             self._tail = None
             self._wake.set()
 
@@ -348,7 +350,7 @@ class Station:
         drain : bool, optional
             True if all samples are to be processed and all results published now, because the device stops.
         """
-        with self.chain.interpreted():
+        with self.chain.interpreted(self.clock.rate_hz):
             self._work(outputs, now_s, drain)
 
     def _work(self, outputs: Sequence[Output], now_s: float, drain: bool) -> None:
@@ -473,7 +475,7 @@ class Station:
 
     def unix_s(self, t_ns: int) -> float:
         """Convert a sample time in nanoseconds to Unix time in seconds."""
-        return (t_ns + self._offset_ns()) / 1e9
+        return (t_ns + self._offset_ns(t_ns)) / 1e9
 
     def now_unix_s(self) -> float | None:
         """Return the present time on the timeline of the device's samples, in Unix seconds.
@@ -495,8 +497,9 @@ class Station:
         if tail is None:
             return
         newest, state = tail.newest.samples, tail.newest.state
-        t_ns = int(newest.t_ns[-1]) - self._offset_ns()
-        ago_s = (self._slewed_clock.unix_ns(time.monotonic_ns()) - int(newest.t_ns[-1])) / 1e9
+        now_ns = time.monotonic_ns()
+        t_ns = int(newest.t_ns[-1]) - self._offset_ns(now_ns)
+        ago_s = (self._slewed_clock.unix_ns(now_ns) - int(newest.t_ns[-1])) / 1e9
         rate = self.device.rate_hz or state.rate
         if rate is None or not 0.0 <= ago_s <= self.device.window_s:
             text = f"the recording ends {ago_s:.4g} s ago: the window begins anew"
@@ -513,9 +516,8 @@ class Station:
         """Return the state of the estimate that is recorded together with the samples."""
         if self._tail is not None:
             return self._before
-        return window_restore.known(
-            self.chain, self._before, self.clock.rate_hz, self.clock.tick_step, self._offset_ns()
-        )
+        offset_ns = self._offset_ns(self.chain.newest_ns)
+        return window_restore.known(self.chain, self._before, self.clock.rate_hz, self.clock.tick_step, offset_ns)
 
     # --- private methods
 
@@ -562,7 +564,7 @@ class Station:
     def _record_chunks(self, chunks: Sequence[Chunk]) -> None:
         """Record raw bytes. The reader thread calls this function."""
         if self._recorder is not None:
-            self._recorder.chunks(self.name, chunks, self._offset_ns())
+            self._recorder.chunks(self.name, chunks, self._offset_ns(chunks[0].t_ns) if chunks else 0)
 
     def _push(self, samples: SampleBlock) -> None:
         """Record decoded samples and put them into the ring buffer. The reader thread calls this function.
@@ -573,7 +575,7 @@ class Station:
         if self._recorder is not None:
             if self.chain.estimator is None:  # the program may crash before the first status is published
                 self._recorder.know(self.name, self._restart_state())
-            self._recorder.samples(self.name, samples, self._offset_ns())
+            self._recorder.samples(self.name, samples, self._offsets_ns(samples))
             while self._patient and self._recorder.full(self.name):
                 time.sleep(PATIENCE_S)
         while self._patient and self.ring.room < len(samples) < self.ring.capacity:
@@ -583,9 +585,13 @@ class Station:
             self._waiting_since_ns = time.monotonic_ns()
         self._wake.set()
 
-    def _offset_ns(self) -> int:
-        """Return the offset that makes sample times Unix times, in nanoseconds."""
-        return 0 if self.driver.times_are_unix else self._slewed_clock.offset_ns
+    def _offset_ns(self, t_ns: int) -> int:
+        """Return the difference of Unix time and a time of the samples, in nanoseconds."""
+        return 0 if self.driver.times_are_unix else self._slewed_clock.offset_ns(t_ns)
+
+    def _offsets_ns(self, samples: SampleBlock) -> Ints | int:
+        """Return the same for each sample. The Unix times increase even if the host's clock was set back."""
+        return 0 if self.driver.times_are_unix else self._slewed_clock.offsets_ns(samples.t_ns)
 
     def _can_take(self) -> bool:
         """Return True if samples may be taken; they wait in the ring buffer until rate and kernels are available."""
@@ -613,7 +619,7 @@ class Station:
         for samples in unbroken(blocks):
             self.published += len(samples)
             for output in outputs:
-                output.samples(self.name, self.published, samples, self._offset_ns())
+                output.samples(self.name, self.published, samples, self._offsets_ns(samples))
             if self.chain.compensation is not None and np.isfinite(samples.values[:, :3]).any():
                 self._publish_compensated(outputs, self.chain.compensation, samples)
         return True
@@ -627,7 +633,7 @@ class Station:
             without = live.update(piece)
             self.chain.renew()
             for output in outputs:
-                output.compensated(self.name, self.published - len(samples) + at, without, self._offset_ns())
+                output.compensated(self.name, self.published - len(samples) + at, without, self._offsets_ns(without))
         for look in live.take():
             for output in outputs:
                 output.drift(self.name, self.unix_s(look.t_ns), look)
@@ -646,6 +652,8 @@ class Station:
                 latest = estimator.get(fitted=fitted)
             except NotReady:
                 return False
+            if self.chain.fits_slowly:
+                self._next_s["refit"] = max(self._next_s["refit"], now_s + INTERPRETED_REFIT_S)
             self.latest = latest.without_coefficients() if any(self._rate_doubts) else latest
             self._refitted = True
         if self.latest is None or not self._refitted:

@@ -45,6 +45,8 @@ PROGRAM: Final = (
     "--from-stdin",
 )
 """Command line of a child process."""
+NICENESS: Final = 5
+"""Niceness of the child processes. The processing of samples has priority."""
 BAR_LENGTH: Final = 12
 """Length of the progress bar in characters."""
 
@@ -260,6 +262,7 @@ class _Compilers:
             PROGRAM, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, start_new_session=True
         )
         with child:
+            os.setpriority(os.PRIO_PROCESS, child.pid, NICENESS)
             self._children.append(child)
             while job := self._next_job():
                 try:

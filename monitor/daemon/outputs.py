@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from drivers.sample import Event, SampleBlock
+from drivers.sample import Event, Ints, SampleBlock
 from drivers.zenoh.sample_message import pack
 from monitor.common import topics
 from monitor.common.health import Health
@@ -40,7 +40,7 @@ class ZenohOutput(Output):
     def __init__(self, zenoh: ZenohOut) -> None:
         self._zenoh = zenoh
 
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Publish a block as one msgpack batch."""
         self._zenoh.put(topics.SAMPLES, device, pack(device, received, samples, offset_ns))
 
@@ -57,7 +57,7 @@ class ZenohOutput(Output):
         """Publish the total and Hadamard deviations."""
         self._zenoh.put(topics.TOTAL, device, encoding.total(device, unix_s, received, total, hadamard))
 
-    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Publish a block of compensated samples as one msgpack batch."""
         schema = topics.COMPENSATED.schema()
         self._zenoh.put(topics.COMPENSATED, device, pack(device, received, samples, offset_ns, schema))
@@ -82,7 +82,7 @@ class ViewerOutput(Output):
     def __init__(self, view: "RerunView") -> None:
         self._view = view
 
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Show raw samples."""
         self._view.samples(device, (samples.t_ns + offset_ns) / 1e9, samples.values, samples.temperature_c)
 
@@ -94,7 +94,7 @@ class ViewerOutput(Output):
         """Show the time series of the gaps, and the model's curves with the measured curves."""
         self._view.gap(device, unix_s, gap)
 
-    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Show compensated rates together with the measured rates."""
         self._view.compensated(device, (samples.t_ns + offset_ns) / 1e9, samples.values[:, :3])
 
@@ -130,9 +130,9 @@ class HistoryOutput(Output):
         self._writer = writer
         self._minutes: dict[str, Minutes] = {}
 
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Aggregate the temperature of the samples."""
-        unix_s = (int(samples.t_ns[-1]) + offset_ns) / 1e9
+        unix_s = float((samples.t_ns + offset_ns)[-1]) / 1e9
         self._writer.put(device, self._minutes_of(device).temperature(unix_s, samples.temperature_c))
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:

@@ -128,12 +128,25 @@ class Chain:
         return self._interprets or self._ready.fit.is_set()
 
     @property
+    def fits_slowly(self) -> bool:
+        """True if the kernels of the fit are interpreted. A fit then takes about 0.1 s."""
+        return self._interprets and not self._ready.fit.is_set()
+
+    @property
     def can_detect(self) -> bool:
         """True if the kernels of the motion and change detection can be called."""
         return self._interprets or self._ready.all.is_set()
 
-    def interpreted(self) -> AbstractContextManager[None]:
-        """Return the context in which the kernels are to be called."""
+    def interpreted(self, rate_hz: float | None) -> AbstractContextManager[None]:
+        """Return the context in which the kernels are to be called.
+
+        Parameters
+        ----------
+        rate_hz : float or None
+            Sample rate; None if it is unknown. No kernel is called before it is known.
+        """
+        if rate_hz is not None and self.estimator is None:
+            self.can_begin(rate_hz)
         return interpreted() if self._interprets and not self._ready.all.is_set() else nullcontext()
 
     @property

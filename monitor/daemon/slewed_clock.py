@@ -1,64 +1,84 @@
-"""Unix time of samples from the monotonic clock, slewed when the host clock is set.
+"""Unix time of samples, from the monotonic clock, slewed towards the host's clock.
 
-The host clock is read once, and the monotonic clock carries its time on. When NTP or an operator sets the host clock,
-the recording must not get a gap. Therefore the difference is removed slowly, by at most EASE of the elapsed time.
+NTP or an operator may set the host's clock. A recording must not get a gap from that. A difference is therefore removed
+at a rate of at most EASE. The offset between the two clocks is a continuous, piecewise linear function of the monotonic
+time with slopes of at most EASE. Unix times therefore increase from sample to sample, in whatever order they are
+computed.
 """
 
 from typing import Final
 
+import numpy as np
+
+from drivers.sample import Ints
+
 EASE: Final = 5e-4
-"""Largest slew rate: a correction of 0.5 ms per second."""
+"""Maximum rate of a correction: 0.5 ms per second."""
+MAX_KNOTS: Final = 100
+"""Number of corrections that are kept. With one correction per second, they cover samples of the last minute."""
 
 
 class WallClock:
-    """Conversion from monotonic nanoseconds to Unix nanoseconds, with slewing.
+    """Conversion of monotonic time to Unix time, in nanoseconds.
 
     Parameters
     ----------
-    monotonic_ns : int
-        Present time of the monotonic clock.
-    unix_ns : int
-        Present Unix time of the host clock.
+    monotonic_ns, unix_ns : int
+        Both clocks at the same moment.
 
     Examples
     --------
     >>> wall = WallClock(monotonic_ns=5_000_000_000, unix_ns=1_700_000_000_000_000_000)
     >>> wall.unix_ns(6_000_000_000)
     1700000001000000000
-    >>> wall.follow(6_000_000_000, 1_700_000_003_000_000_000)   # the host was set on by two seconds
+    >>> wall.follow(6_000_000_000, 1_700_000_003_000_000_000)   # the host clock was set forward by 2 s
     2000000000
-    >>> wall.unix_ns(6_000_000_000)
-    1700000001000500000
+    >>> wall.unix_ns(7_000_000_000)
+    1700000002000500000
     """
 
     def __init__(self, monotonic_ns: int, unix_ns: int) -> None:
-        self.offset_ns = unix_ns - monotonic_ns
-        self._host_ns = self.offset_ns  # offset of the host clock at the last call of ``follow``
+        self._host_ns = unix_ns - monotonic_ns  # offset of the host's clock at the last call of ``follow``
         self._followed_ns = monotonic_ns
+        # [n, 3] start of each correction, offset at the start, and remaining correction. The array is replaced and never
+        # changed in place, because the reader threads use it as well.
+        self._knots: Ints = np.array([[monotonic_ns, self._host_ns, 0]], np.int64)
 
     @property
     def behind_ns(self) -> int:
-        """Offset of the host clock from these times, in nanoseconds; positive if the host clock is ahead."""
-        return self._host_ns - self.offset_ns
+        """Lead of the host's clock over these times, in nanoseconds."""
+        return self._host_ns - self.offset_ns(self._followed_ns)
 
     def follow(self, monotonic_ns: int, unix_ns: int) -> int:
-        """Slew towards the host clock, and return the step of the host clock since the last call, in nanoseconds.
+        """Start to slew towards the host's clock. Call this about once a second.
 
-        This method should be called about once a second.
-
-        Parameters
-        ----------
-        monotonic_ns : int
-            Present time of the monotonic clock.
-        unix_ns : int
-            Present Unix time of the host clock.
+        Returns
+        -------
+        int
+            Step of the host's clock since the last call, in nanoseconds.
         """
-        most = int(EASE * max(monotonic_ns - self._followed_ns, 0))
         before_ns, self._host_ns = self._host_ns, unix_ns - monotonic_ns
-        self.offset_ns += max(-most, min(most, self.behind_ns))
-        self._followed_ns = monotonic_ns
+        begun_ns, offset_ns, correction_ns = self._knots[-1].tolist()
+        self._followed_ns = max(monotonic_ns, begun_ns)
+        if offset_ns + correction_ns != self._host_ns:
+            now_ns = self.offset_ns(self._followed_ns)
+            knot = np.array([[self._followed_ns, now_ns, self._host_ns - now_ns]], np.int64)
+            kept = self._knots[:-1] if self._followed_ns == begun_ns else self._knots
+            self._knots = np.concatenate([kept[1 - MAX_KNOTS :], knot])
         return self._host_ns - before_ns
 
+    def offset_ns(self, monotonic_ns: int) -> int:
+        """Return the difference of Unix and monotonic time at a monotonic time."""
+        return int(self.offsets_ns(np.array([monotonic_ns], np.int64))[0])
+
+    def offsets_ns(self, monotonic_ns: Ints) -> Ints:
+        """Return the difference of Unix and monotonic time at each of the monotonic times [n]."""
+        knots = self._knots
+        begun_ns, offset_ns, correction_ns = knots[np.searchsorted(knots[1:, 0], monotonic_ns, side="right")].T
+        most_ns = (EASE * np.maximum(monotonic_ns - begun_ns, 0)).astype(np.int64)
+        offsets: Ints = offset_ns + np.clip(correction_ns, -most_ns, most_ns)
+        return offsets
+
     def unix_ns(self, monotonic_ns: int) -> int:
-        """Return the Unix time of a monotonic time, in nanoseconds."""
-        return monotonic_ns + self.offset_ns
+        """Return the Unix time of a monotonic time."""
+        return monotonic_ns + self.offset_ns(monotonic_ns)

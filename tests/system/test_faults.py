@@ -80,7 +80,8 @@ def goes_on(run: Running) -> None:
     before = run.station("healthy").published
     newest_ns = caught.estimates["healthy"].t_ns if "healthy" in caught.estimates else 0
     wait_for(lambda: run.station("healthy").published >= before + 50, "samples of the healthy device")
-    wait_for(lambda: caught.estimates["healthy"].t_ns > newest_ns, "estimates of the healthy device")
+    newer = lambda: "healthy" in caught.estimates and caught.estimates["healthy"].t_ns > newest_ns  # noqa: E731
+    wait_for(newer, "estimates of the healthy device")
     wait_for(lambda: caught.healths["healthy"].state == "running", "its status")
 
 

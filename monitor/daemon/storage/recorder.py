@@ -33,7 +33,7 @@ from drivers.file_access import check_folder
 from drivers.recordings import segment
 from drivers.recordings.segment import Origin, Piece, SegmentWriter, State
 from drivers.recordings.table import PART
-from drivers.sample import AXES, NO_TICK, Chunk, SampleBlock, block
+from drivers.sample import AXES, NO_TICK, Chunk, Ints, SampleBlock, block
 from monitor.common.folder_lock import RECORDING_LOCK, FolderLock
 from monitor.daemon.storage import retention
 from monitor.settings.loading import Storage
@@ -232,7 +232,7 @@ class Recorder:
 
     # --- called by the reader threads
 
-    def samples(self, device: str, samples: SampleBlock, offset_ns: int) -> None:
+    def samples(self, device: str, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Queue a block of samples for the recording.
 
         Parameters
@@ -241,13 +241,13 @@ class Recorder:
             Name of the device.
         samples : SampleBlock
             Samples in SI units.
-        offset_ns : int
+        offset_ns : array of int64, shape (n,), or int
             Offset that converts the times to Unix time, in nanoseconds.
         """
         track = self._tracks.get((device, "samples"))
         if track is None:
             return
-        if offset_ns:
+        if not isinstance(offset_ns, int) or offset_ns:
             t_ns = samples.t_ns + offset_ns
             samples = block(t_ns, samples.values, samples.temperature_c, samples.ticks, samples.lost)
         self._enqueue(track, [samples])

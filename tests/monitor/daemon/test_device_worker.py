@@ -490,6 +490,20 @@ def test_at_a_low_rate_everything_is_there_before_the_kernels_are_compiled():
     assert rig.station.health({}, 0).text == "compiling 2 of 8: fit; no sample is lost"
 
 
+def test_interpreted_fits_come_once_a_second_and_compiled_ones_as_configured():
+    ready = Ready()
+    rig = Rig(rate=100.0, ready=ready)
+    for i in range(40):
+        rig.bring(10)
+        rig.work(1000.0 + 0.1 * i)
+    assert 4 <= len(rig.caught.estimates) <= 5
+    ready.fit.set()
+    for i in range(40, 80):
+        rig.bring(10)
+        rig.work(1000.0 + 0.1 * i)
+    assert len(rig.caught.estimates) >= 34
+
+
 @pytest.mark.parametrize("setting", [{"rate": 1000.0}, {"refit_s": 0.0}])
 def test_a_high_rate_or_a_fit_at_every_sample_waits_for_compiled_kernels(setting):
     rig = Rig(ready=Ready(), **setting)

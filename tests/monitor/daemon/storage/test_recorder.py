@@ -5,7 +5,9 @@ import os
 import shutil
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import IO
 
 import msgspec
 import numpy as np
@@ -125,6 +127,30 @@ def test_a_segment_that_was_cut_is_read_up_to_the_cut(tmp_path: Path, cut: int) 
     assert newest.samples.ticks[-1] == len(back) - 1
     list(segment.pack(path))
     np.testing.assert_array_equal(join([piece.samples for piece in segment.read_samples(path)]).values, back.values)
+
+
+@pytest.mark.parametrize("read", [segment.read_samples, segment.newest])
+def test_a_segment_that_is_packed_while_it_is_opened_is_read_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[Path], object]
+) -> None:
+    path = tmp_path / segment.segment_name(1, 1.7e9)
+    writer = SegmentWriter(path, SAMPLES)
+    for first in range(0, 100, 10):
+        writer.samples([rows(first, 10)], State())
+    writer.close()
+    opened = segment.open_regular
+
+    def open_then_pack(name: Path) -> IO[bytes]:
+        file = opened(name)
+        monkeypatch.setattr(segment, "open_regular", opened)
+        list(segment.pack(path))
+        return file
+
+    monkeypatch.setattr(segment, "open_regular", open_then_pack)
+    found = read(path)
+    pieces = [found] if isinstance(found, segment.Piece) else list(found)  # type: ignore[call-overload]
+    assert segment.origin(path).packed
+    assert pieces[-1].samples.ticks[-1] == 99
 
 
 def rows_of(n: int) -> np.ndarray:
