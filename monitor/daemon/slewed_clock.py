@@ -40,7 +40,7 @@ class WallClock:
     def __init__(self, monotonic_ns: int, unix_ns: int) -> None:
         self._host_ns = unix_ns - monotonic_ns  # offset of the host's clock at the last call of ``follow``
         self._followed_ns = monotonic_ns
-        # [n, 3] start of each correction, offset at the start, and remaining correction. The array is replaced and never
+        # [n, 3] start of each correction, offset at the start, and remaining correction. The array is replaced, never
         # changed in place, because the reader threads use it as well.
         self._knots: Ints = np.array([[monotonic_ns, self._host_ns, 0]], np.int64)
 
