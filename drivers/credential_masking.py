@@ -18,7 +18,7 @@ _NAMED_SECRET: Final = re.compile(
 )
 
 
-def masked(text: str) -> str:
+def mask_secrets(text: str) -> str:
     """Return the text with each secret replaced by three stars.
 
     >>> masked("rfc2217://bench:hunter2@10.0.0.7:4000 is busy")
@@ -35,4 +35,4 @@ def has_secret(text: str) -> bool:
     >>> has_secret('password: "x"'), has_secret('listen_private_key: "key.pem"'), has_secret("password: null")
     (True, False, False)
     """
-    return masked(text) != text
+    return mask_secrets(text) != text

@@ -17,7 +17,7 @@ FileOrName = Annotated[str, msgspec.Meta(extra={"file": "or name"})]
 """Settings key that names a file in the folder of the configuration file, or something shipped with the program."""
 
 
-def names(package: ModuleType, suffix: str = "") -> tuple[str, ...]:
+def list_modules(package: ModuleType, suffix: str = "") -> tuple[str, ...]:
     """Return the sorted names of the modules of a package that end with a suffix.
 
     Parameters
@@ -36,7 +36,7 @@ def names(package: ModuleType, suffix: str = "") -> tuple[str, ...]:
     return tuple(sorted(n.removesuffix(suffix) for n in found if n != "base" and n.endswith(suffix)))
 
 
-def load(package: ModuleType, name: str, suffix: str = "") -> ModuleType:
+def import_module(package: ModuleType, name: str, suffix: str = "") -> ModuleType:
     """Import one module of a package.
 
     Parameters
@@ -53,13 +53,13 @@ def load(package: ModuleType, name: str, suffix: str = "") -> ModuleType:
     ConfigError
         There is no such module. The text lists all names, the most similar one first.
     """
-    known = names(package, suffix)
+    known = list_modules(package, suffix)
     if name not in known:
-        raise ConfigError(f'unknown name "{name}"{possible(name, known)}')
+        raise ConfigError(f'unknown name "{name}"{format_choices(name, known)}')
     return importlib.import_module(f"{package.__name__}.{name}{suffix}")
 
 
-def nearest(word: str, known: Sequence[str]) -> str:
+def format_suggestion(word: str, known: Sequence[str]) -> str:
     """Return the end of an error message about an unknown word.
 
     Parameters
@@ -78,7 +78,7 @@ def nearest(word: str, known: Sequence[str]) -> str:
     return f'; did you mean "{close[0]}"?' if close else f"; known are {', '.join(known)}"
 
 
-def possible(word: str, known: Sequence[str]) -> str:
+def format_choices(word: str, known: Sequence[str]) -> str:
     """Return the end of an error message about an unknown word: a list of all known words, the most similar one first.
 
     Parameters

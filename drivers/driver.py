@@ -15,10 +15,10 @@ from typing import Final, Literal
 
 import numpy as np
 
-from drivers.decoders.base import CountingLate, Decoder
+from drivers.decoders.base import Decoder, LateFrameCounter
 from drivers.errors import ConfigError, LinkEnded, LinkError, LinkLost
 from drivers.links.base import Link
-from drivers.sample import AXES, Chunk, Event, Given, SampleBlock, block
+from drivers.sample import AXES, Chunk, Event, SampleBlock, SenderTiming, make_block
 from drivers.timing.sample_clock import SampleClock
 
 READ_TIMEOUT_S: Final = 0.2
@@ -27,7 +27,7 @@ MIN_RETRY_PAUSE_S: Final = 0.1
 """Pause before the first attempt to open a lost link again. The pause doubles with each attempt."""
 MAX_RETRY_PAUSE_S: Final = 5.0
 """Longest pause between two attempts to open a link."""
-UNDECODED_BYTES: Final = 2000
+MAX_UNDECODED_BYTES: Final = 2000
 """Received bytes without a sample after which the status names the probable cause, a wrong baud rate or decoder."""
 MIN_UNDECODED_S: Final = 3.0
 """A running device is lost if its bytes hold no sample for this time and for ten sample periods."""
@@ -54,7 +54,7 @@ class AxisMap:
         if self == AxisMap():
             return samples
         values = samples.values[:, self.source] * np.array(self.sign)
-        return block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
+        return make_block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
 
 
 @dataclass(slots=True)
@@ -108,8 +108,8 @@ class Driver:
         self.counts = Counts()
         self.state: State = "waiting"
         self.text = f"waiting for {link.name}"
-        self.turns = 0  # number of reads and attempts to open; it does not increase while the driver is blocked
-        self.times_are_unix = link.epoch == "unix" or isinstance(decoder.timing, Given)
+        self.iterations = 0  # number of reads and attempts to open; it does not increase while the driver is blocked
+        self.times_are_unix = link.epoch == "unix" or isinstance(decoder.timing, SenderTiming)
         self.first_t_ns: int | None = None
         """Time of the first sample since the start; None before the first sample."""
         self._push = push
@@ -119,7 +119,7 @@ class Driver:
         self._events: deque[Event] = deque(maxlen=MAX_QUEUED_EVENTS)
         self._stop = threading.Event()
         self._undecoded_bytes = 0
-        self._counts_late = decoder if isinstance(decoder, CountingLate) else None
+        self._counts_late = decoder if isinstance(decoder, LateFrameCounter) else None
         self._left_out_reported = 0  # samples left out by the decoder that have been reported as gaps
         self._last_data_s = 0.0
         self._last_sample_s = 0.0
@@ -155,7 +155,7 @@ class Driver:
         pause_s = MIN_RETRY_PAUSE_S
         while not self._stop.is_set():
             received = self.counts.received
-            self.turns += 1
+            self.iterations += 1
             try:
                 opening_ns = time.monotonic_ns()
                 self.link.open()
@@ -179,10 +179,10 @@ class Driver:
 
     def step(self) -> None:
         """Read once, and decode, time-stamp and pass on the samples."""
-        self.turns += 1
+        self.iterations += 1
         asked_ns = time.monotonic_ns()
         chunks = self.link.read(READ_TIMEOUT_S)
-        self._tell_lost()
+        self._report_lost()
         if chunks is None:
             if not self.times_are_unix:
                 self.clock.link_idle(asked_ns)
@@ -200,12 +200,12 @@ class Driver:
             # missing samples were left out by the decoder, or were sent in messages that did not arrive
             left_out = min(one.lost, self._left_out() - self._left_out_reported)
             self._left_out_reported += left_out
-            for stamped in self.clock.stamp(one):
+            for stamped in self.clock.assign_times(one):
                 self._count(stamped, left_out)
                 self._push(self._axes.apply(stamped))
                 left_out = 0  # they are missing before the first row
         self._count_left_out()
-        self._tell_lost()
+        self._report_lost()
         self._events.extend(self.clock.take_events())
         if self.state != "running":
             self._handle_recovery()
@@ -232,7 +232,7 @@ class Driver:
             self._unreported_samples += stamped.lost
             self._unreported_gaps += 1
 
-    def _tell_lost(self) -> None:
+    def _report_lost(self) -> None:
         """Report missing samples, at most once a second, so that a bad line does not hide other events."""
         if not self._unreported_samples or time.monotonic() - self._last_report_s < LOSS_REPORT_INTERVAL_S:
             return
@@ -253,7 +253,7 @@ class Driver:
         self._undecoded_bytes += size
         mute_s = self._last_data_s - self._last_sample_s
         patience_s = max(MIN_UNDECODED_S, 10.0 / (self.clock.rate_hz or 10.0))
-        if self._undecoded_bytes < UNDECODED_BYTES or (self.state == "running" and mute_s < patience_s):
+        if self._undecoded_bytes < MAX_UNDECODED_BYTES or (self.state == "running" and mute_s < patience_s):
             return
         why = self.decoder.hint or "wrong baud rate, or another protocol than the configured one"
         self.text = f"{self.link.name}: {self._undecoded_bytes} bytes and no sample in them; {why}"
@@ -286,7 +286,7 @@ class Driver:
         self._events.append(Event(kind, t_ns, text))
 
 
-def axis_map(table: dict[str, str]) -> AxisMap:
+def parse_axis_map(table: dict[str, str]) -> AxisMap:
     """Return the axis map of the table ``[device.axes]``, for example ``{"gz": "-gy"}``.
 
     Parameters

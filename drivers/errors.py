@@ -16,7 +16,7 @@ no I/O is a bug.
 
 from typing import Final
 
-LONGEST: Final = 2000
+MAX_TEXT_CHARACTERS: Final = 2000
 """Maximum length of the text of an error in characters. The text may quote received data."""
 
 
@@ -27,17 +27,17 @@ class ImuError(Exception):
     """
 
     def __str__(self) -> str:
-        return in_one_line(super().__str__())
+        return format_one_line(super().__str__())
 
 
-def in_one_line(text: str) -> str:
+def format_one_line(text: str) -> str:
     """Return the text in one line without control characters, cut after LONGEST characters.
 
     >>> in_one_line("no key \\x1b[2J\\nhere")
     'no key  [2J here'
     """
-    text = "".join(c if c.isprintable() else " " for c in text[: LONGEST + 1].strip())
-    return text if len(text) <= LONGEST else f"{text[:LONGEST]} …"
+    text = "".join(c if c.isprintable() else " " for c in text[: MAX_TEXT_CHARACTERS + 1].strip())
+    return text if len(text) <= MAX_TEXT_CHARACTERS else f"{text[:MAX_TEXT_CHARACTERS]} …"
 
 
 class ConfigError(ImuError, ValueError):
@@ -55,10 +55,10 @@ class ConfigError(ImuError, ValueError):
     @property
     def lines(self) -> tuple[str, ...]:
         """Lines of the message, one for each mistake."""
-        return tuple(in_one_line(str(line)) for line in self.args)
+        return tuple(format_one_line(str(line)) for line in self.args)
 
     def __str__(self) -> str:
-        return in_one_line("; ".join(self.lines))
+        return format_one_line("; ".join(self.lines))
 
 
 class LinkError(ImuError, OSError):

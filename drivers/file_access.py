@@ -10,9 +10,9 @@ import stat
 from pathlib import Path
 from typing import IO, Final
 
-MOST_BYTES: Final = 32_000_000
+MAX_BYTES: Final = 32_000_000
 """Maximum size of a file that ``read`` accepts. The largest CAN databases of whole vehicles have some megabytes."""
-KINDS: Final = {
+FILE_KINDS: Final = {
     stat.S_IFIFO: "a FIFO",
     stat.S_IFSOCK: "a socket",
     stat.S_IFDIR: "a directory",
@@ -22,7 +22,7 @@ KINDS: Final = {
 """Names of the kinds of files that are not regular, for error messages."""
 
 
-def path(name: str) -> Path:
+def expand_user(name: str) -> Path:
     """Return the path for a name as users write it.
 
     A leading ``~`` is replaced by the home folder if the user exists.
@@ -99,11 +99,11 @@ def check_folder(path: Path) -> None:
     except FileNotFoundError:
         return
     if not stat.S_ISDIR(mode):
-        kind = KINDS.get(stat.S_IFMT(mode), "a file")
+        kind = FILE_KINDS.get(stat.S_IFMT(mode), "a file")
         raise OSError(errno.ENOTDIR, f"is {kind}, not a folder", str(path))
 
 
-def read(path: Path, *, pipe: bool = False) -> bytes:
+def read_small_file(path: Path, *, pipe: bool = False) -> bytes:
     """Read a whole small file.
 
     Parameters
@@ -125,9 +125,9 @@ def read(path: Path, *, pipe: bool = False) -> bytes:
         The file cannot be read, is not a regular file, or is larger than MOST_BYTES.
     """
     with path.open("rb") if pipe and _is_fifo(path) else open_regular(path) as file:
-        data = file.read(MOST_BYTES + 1)
-    if len(data) > MOST_BYTES:
-        raise OSError(errno.EFBIG, f"more than {MOST_BYTES // 1_000_000} MB", str(path))
+        data = file.read(MAX_BYTES + 1)
+    if len(data) > MAX_BYTES:
+        raise OSError(errno.EFBIG, f"more than {MAX_BYTES // 1_000_000} MB", str(path))
     return data
 
 
@@ -142,6 +142,6 @@ def _is_fifo(path: Path) -> bool:
 def _check_mode(path: Path, mode: int) -> None:
     """Raise OSError if the mode is not that of a regular file."""
     if not stat.S_ISREG(mode):
-        kind = KINDS.get(stat.S_IFMT(mode), "something else")
+        kind = FILE_KINDS.get(stat.S_IFMT(mode), "something else")
         number = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL
         raise OSError(number, f"is {kind}, not a regular file", str(path))

@@ -117,11 +117,11 @@ SIZE_BYTES: Final = Quantity("byte", 1e6, 1e15)
 
 # --- counts and factors
 
-SHARE: Final = Quantity("", 0.0, 1.0)
+FRACTION: Final = Quantity("", 0.0, 1.0)
 POSITIVE_SHARE: Final = Quantity("", 1e-6, 1.0)
 PERCENT: Final = Quantity("%", 1.0, 100.0)
 SEED: Final = Quantity("", 0, (1 << 63) - 1)
-SAMPLES: Final = Quantity("samples", 1, 10_000_000_000)
+SAMPLE_COUNT: Final = Quantity("samples", 1, 10_000_000_000)
 """Length of a simulated recording."""
 COUNTER_MODULUS: Final = Quantity("counts", 2, 1 << 62)
 """Number of counts after which a device counter starts again at 0."""
@@ -141,7 +141,7 @@ CLOCK_RATIO: Final = Quantity("", 0.5, 2.0)
 INFLATION: Final = Quantity("", 1.0, 1e6)
 SCALE: Final = Quantity("", 1e-15, 1e15, signed=True)
 """Factor from the numbers of a device to a unit."""
-TIMES: Final = Quantity("times", 1e-6, 1e6)
+NOISE_RATIO: Final = Quantity("times", 1e-6, 1e6)
 """Ratio of two amounts of noise."""
 
 # --- what a sensor measures
@@ -157,7 +157,7 @@ FIT_NUMBER: Final = Quantity("", 0.0, 1e30, signed=True)
 TEMPERATURE_C: Final = Quantity("°C", -273.15, 2_000.0)
 
 
-def out_of_range(value: Any, kind: Any) -> Iterator[tuple[str, str]]:
+def find_out_of_range(value: Any, kind: Any) -> Iterator[tuple[str, str]]:
     """Find the numbers in a value that are outside the range of the quantity named in its type.
 
     Parameters
@@ -175,10 +175,10 @@ def out_of_range(value: Any, kind: Any) -> Iterator[tuple[str, str]]:
     yield from _out_of_range(value, inspect.type_info(kind), "")
 
 
-def range_problems(settings: msgspec.Struct) -> Iterator[str]:
+def describe_range_errors(settings: msgspec.Struct) -> Iterator[str]:
     """Yield a line for each number of a struct that is out of range. The line begins with the name of the key."""
     for field in msgspec.structs.fields(settings):
-        for place, text in out_of_range(getattr(settings, field.name), field.type):
+        for place, text in find_out_of_range(getattr(settings, field.name), field.type):
             yield f"{field.encode_name}{place}: {text}"
 
 
@@ -190,7 +190,7 @@ def check_settings(settings: msgspec.Struct) -> None:
     ConfigError
         Numbers are outside the supported ranges, one line for each. A line begins with the name of the key.
     """
-    if wrong := list(range_problems(settings)):
+    if wrong := list(describe_range_errors(settings)):
         raise ConfigError(*wrong)
 
 

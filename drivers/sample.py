@@ -63,7 +63,7 @@ class SampleBlock:
         )
 
 
-def block(
+def make_block(
     t_ns: Ints,
     values: Floats,
     temperature_c: Floats | None = None,
@@ -94,12 +94,12 @@ def block(
 
 
 @dataclass(frozen=True, slots=True)
-class Arrival:
+class ArrivalTiming:
     """Timing of a wire format without a counter: sample times are estimated from arrival times by regression."""
 
 
 @dataclass(frozen=True, slots=True)
-class Counter:
+class CounterTiming:
     """Timing of a wire format whose frames carry a counter.
 
     ``modulus`` is the number of counts after which the counter starts again at 0. ``tick_s`` is the length of one count
@@ -111,13 +111,13 @@ class Counter:
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
+class SenderTiming:
     """Timing of a wire format whose payload carries Unix times. ``Chunk.t_ns`` is not used."""
 
 
-Timing = Arrival | Counter | Given
+Timing = ArrivalTiming | CounterTiming | SenderTiming
 
-KINDS: Final = (
+EVENT_KINDS: Final = (
     "link_lost",
     "link_back",
     "samples_lost",
@@ -148,14 +148,14 @@ class Event:
     t_ns: int
     text: str
     axis: str | None = None
-    what: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # by coefficient, e.g. value and limit
+    values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # by coefficient, e.g. value and limit
     since_ns: int | None = None  # time at which the condition began
     sigma: float | None = None  # significance in standard errors
 
 
-def join(blocks: Sequence[SampleBlock]) -> SampleBlock:
+def concatenate_blocks(blocks: Sequence[SampleBlock]) -> SampleBlock:
     """Concatenate blocks into one. The ``lost`` counts of all blocks are added up before the first sample."""
-    return block(
+    return make_block(
         np.concatenate([b.t_ns for b in blocks]),
         np.concatenate([b.values for b in blocks]),
         np.concatenate([b.temperature_c for b in blocks]),
@@ -164,10 +164,10 @@ def join(blocks: Sequence[SampleBlock]) -> SampleBlock:
     )
 
 
-def unbroken(blocks: Sequence[SampleBlock]) -> list[SampleBlock]:
+def merge_contiguous_blocks(blocks: Sequence[SampleBlock]) -> list[SampleBlock]:
     """Join blocks between which no samples are missing. A new block begins only where samples are missing."""
     edges = [*(i for i, one in enumerate(blocks) if i == 0 or one.lost), len(blocks)]
-    return [blocks[a] if b - a == 1 else join(blocks[a:b]) for a, b in pairwise(edges)]
+    return [blocks[a] if b - a == 1 else concatenate_blocks(blocks[a:b]) for a, b in pairwise(edges)]
 
 
 def seconds_to_ns(seconds: Floats) -> Ints:

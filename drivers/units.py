@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from typing import Final, TypeVar
 
-from drivers.discovery import possible
+from drivers.discovery import format_choices
 from drivers.errors import ConfigError
 
 G0: Final = 9.80665
@@ -149,5 +149,5 @@ def _look_up(table: Mapping[str, T], unit: str, quantity: str) -> T:
     # Unicode has two characters for the prefix micro, and keyboards and fonts produce either of them
     name = unit.strip().replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
     if name not in table:
-        raise ConfigError(f'"{unit}" is no unit of {quantity}{possible(name, tuple(table))}')
+        raise ConfigError(f'"{unit}" is no unit of {quantity}{format_choices(name, tuple(table))}')
     return table[name]

@@ -17,15 +17,15 @@ import typer
 import drivers.decoders
 from drivers import discovery
 from drivers.recordings import FORMATS
-from drivers.sample import KINDS, block
-from drivers.zenoh.sample_message import pack
+from drivers.sample import EVENT_KINDS, make_block
+from drivers.zenoh.sample_message import encode_samples
 from monitor.cli import app
 from monitor.common import topics
 from monitor.noise.catalogue import read_model
 from monitor.noise.model import NoiseModel
 from monitor.publishing.messages import encoding
 from monitor.publishing.rerun.sinks import server_url
-from monitor.publishing.zenoh.publisher import ZenohOut
+from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.settings import loading
 from monitor.settings.loading import ZenohTable
 from tests.monitor.publishing.made import estimate
@@ -142,7 +142,7 @@ def test_the_keys_are_those_that_are_published() -> None:
 
 def test_the_kinds_of_events_are_those_that_a_hook_may_wait_for() -> None:
     (row,) = re.findall(r"^\| `imu/<device>/event` \|.*$", section(README, "zenoh"), re.M)
-    assert sorted(re.findall(r"`(\w+)`", row)) == sorted(KINDS)
+    assert sorted(re.findall(r"`(\w+)`", row)) == sorted(EVENT_KINDS)
     made = re.compile(
         r'(?:Event\(|Told\([\w.]+, |_event\(|announce\([\w.]+, |^(?:KIND|CROSSED|BACK): Final = )"([a-z]+_[a-z_]+)"',
         re.M,
@@ -152,11 +152,11 @@ def test_the_kinds_of_events_are_those_that_a_hook_may_wait_for() -> None:
         kind for path in sources if "Event" in path.read_text("utf-8") for kind in made.findall(path.read_text("utf-8"))
     }
     assert len(said) > 5
-    assert said <= set(KINDS)
+    assert said <= set(EVENT_KINDS)
 
 
 def test_the_protocols_are_those_that_are_decoded() -> None:
-    assert sorted(first_cells(section(README, "Protocols"))) == sorted(discovery.names(drivers.decoders))
+    assert sorted(first_cells(section(README, "Protocols"))) == sorted(discovery.list_modules(drivers.decoders))
 
 
 def test_every_kind_of_recording_is_named() -> None:
@@ -232,7 +232,7 @@ def test_every_name_on_a_walk_is_defined(page: Path, heading: str) -> None:
 # --- programs
 
 
-def first_line(stdout: IO[str], publish: "list[tuple[topics.Topic, bytes]]", zenoh: ZenohOut) -> str:
+def first_line(stdout: IO[str], publish: "list[tuple[topics.Topic, bytes]]", zenoh: ZenohPublisher) -> str:
     """What a program prints first, while results are published ten times a second."""
     with selectors.DefaultSelector() as selector:
         selector.register(stdout, selectors.EVENT_READ)
@@ -254,12 +254,12 @@ def test_a_subscriber_as_printed_prints_what_is_published(page: Path, word: str)
     endpoint = free_endpoint()
     [program] = [text for text in fences(page, "python") if "declare_subscriber" in text]
     assert PRINTED_BY in program
-    rows = block(np.arange(2) * 10_000_000, np.tile([0.1, 0.2, 0.3, 0.0, 0.0, 9.81], (2, 1)))
+    rows = make_block(np.arange(2) * 10_000_000, np.tile([0.1, 0.2, 0.3, 0.0, 0.0, 9.81], (2, 1)))
     results = [
         (topics.COEFFICIENTS, encoding.coefficients("bench-1", 1.76e9, estimate())),
-        (topics.SAMPLES, pack("bench-1", 2, rows)),
+        (topics.SAMPLES, encode_samples("bench-1", 2, rows)),
     ]
-    zenoh = ZenohOut(ZenohTable(listen=(endpoint,)), ["bench-1"])
+    zenoh = ZenohPublisher(ZenohTable(listen=(endpoint,)), ["bench-1"])
     zenoh.start()
     try:
         wait_for(lambda: zenoh.state == "ok")

@@ -18,19 +18,19 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import NO_TICK, Chunk, Floats, Ints, SampleBlock, block
-from drivers.sample import Arrival as Arrival  # noqa: PLC0414 - re-exported for decoders
-from drivers.sample import Counter as Counter  # noqa: PLC0414 - re-exported for decoders
-from drivers.sample import Given as Given  # noqa: PLC0414 - re-exported for decoders
+from drivers.sample import NO_TICK, Chunk, Floats, Ints, SampleBlock, make_block
+from drivers.sample import ArrivalTiming as ArrivalTiming  # noqa: PLC0414 - re-exported for decoders
+from drivers.sample import CounterTiming as CounterTiming  # noqa: PLC0414 - re-exported for decoders
+from drivers.sample import SenderTiming as SenderTiming  # noqa: PLC0414 - re-exported for decoders
 from drivers.sample import Timing as Timing  # noqa: PLC0414 - re-exported for decoders
 
-GYRO_LIMIT: Final = 1000.0
+MAX_GYRO_RAD_S: Final = 1000.0
 """Largest plausible angular rate in rad/s. No MEMS gyroscope turns this fast (the widest range sold is 4000 °/s = 70
 rad/s).
 """
-ACCEL_LIMIT: Final = 10_000.0
+MAX_ACCEL_M_S2: Final = 10_000.0
 """Largest plausible acceleration in m/s², about 1000 g. It is above every inertial-grade MEMS range."""
-LIMITS: Final = np.repeat([GYRO_LIMIT, ACCEL_LIMIT], 3)
+VALUE_LIMITS: Final = np.repeat([MAX_GYRO_RAD_S, MAX_ACCEL_M_S2], 3)
 """Largest plausible values [6] in the order of ``AXES``."""
 TEMPERATURE_LIMITS_C: Final = (-100.0, 300.0)
 """Lowest and highest plausible temperature."""
@@ -71,7 +71,7 @@ class Decoder(Protocol):
 
 
 @runtime_checkable
-class Addressed(Protocol):
+class AddressFilter(Protocol):
     """Interface of a decoder that reads only chunks with certain addresses."""
 
     @property
@@ -80,7 +80,7 @@ class Addressed(Protocol):
 
 
 @runtime_checkable
-class CountingLate(Protocol):
+class LateFrameCounter(Protocol):
     """Interface of a decoder that joins several frames to one sample, and tells late frames from missing ones."""
 
     @property
@@ -95,7 +95,7 @@ class CountingLate(Protocol):
         """Delay of the late frames and the remedy, for the status; "" if no frame has been late for a while."""
 
 
-class Rows:
+class BlockBuilder:
     """Collector of decoded rows. It splits them into blocks where frames were rejected."""
 
     def __init__(self) -> None:
@@ -139,7 +139,7 @@ class Rows:
         if good.size and good.all() and not bad_before.any():  # fast path for nearly all calls
             carried, self._missing = self._missing, bad_after
             self.bad += bad_after
-            return [block(t_ns, values, _valid_temperatures(temperature_c), ticks, carried)]
+            return [make_block(t_ns, values, _valid_temperatures(temperature_c), ticks, carried)]
         kept = np.flatnonzero(good)
         # places lost before each kept row: rejected frames plus implausible rows since the last kept one
         places = np.cumsum(bad_before + ~good)
@@ -156,7 +156,7 @@ class Rows:
         temperature_c = _valid_temperatures(temperature_c)
         cuts = np.flatnonzero(missing[1:]) + 1
         return [
-            block(t_ns[rows], values[rows], temperature_c[rows], ticks[rows], int(missing[at]))
+            make_block(t_ns[rows], values[rows], temperature_c[rows], ticks[rows], int(missing[at]))
             for at, rows in zip((0, *cuts), np.split(kept, cuts), strict=True)
         ]
 
@@ -167,7 +167,7 @@ def plausible(values: Floats) -> NDArray[np.bool_]:
     A plausible row has at least one measured axis. None of its values is infinite or above the range of a MEMS IMU.
     """
     size = np.abs(values)
-    too_large: NDArray[np.bool_] = np.any(size > LIMITS, axis=1)
+    too_large: NDArray[np.bool_] = np.any(size > VALUE_LIMITS, axis=1)
     absent: NDArray[np.bool_] = np.all(np.isnan(values), axis=1)
     return ~(too_large | absent)
 
@@ -210,9 +210,9 @@ REJECT: Final = -1
 Match = Callable[[bytes, int], int]
 """Function (buffer, offset of a sync) that returns the length of the valid frame there, NEED_MORE, or REJECT."""
 
-MUTE_BYTES: Final = 2000
+MAX_BYTES_WITHOUT_FRAME: Final = 2000
 """Bytes without a valid frame after which a hint is given. No supported frame is as long."""
-QUIET_FRAMES: Final = 1000
+HINT_FRAMES: Final = 1000
 """Number of good frames after a rejected one until the hint about it ends."""
 
 
@@ -255,19 +255,19 @@ class FrameBuffer:
         self._skipped_bytes = 0  # bytes skipped since the last frame
         self._rejected = 0  # candidates rejected since the last frame
         self._last_rejected = -(1 << 62)  # stream offset of the last rejected candidate
-        self._frames_since_reject = QUIET_FRAMES  # number of good frames since the last rejected one
+        self._frames_since_reject = HINT_FRAMES  # number of good frames since the last rejected one
 
     @property
     def mute(self) -> bool:
         """True if many bytes have arrived without a valid frame."""
-        return self._skipped_bytes >= MUTE_BYTES
+        return self._skipped_bytes >= MAX_BYTES_WITHOUT_FRAME
 
     @property
     def hint(self) -> str:
         """Reason for rejected or missing frames; "" if there is none."""
         if self.mute:
             return f"{self._skipped_bytes} bytes without a valid frame: is the baud rate right, and the decoder?"
-        if self._frames_since_reject < QUIET_FRAMES:
+        if self._frames_since_reject < HINT_FRAMES:
             return "frames fail their check: bytes are lost or damaged on the line"
         return ""
 
@@ -282,7 +282,7 @@ class FrameBuffer:
         while True:
             start = buffer.find(self.sync, at)
             if self.sync != self._initial_sync:
-                mute = at + MUTE_BYTES - self._skipped_bytes
+                mute = at + MAX_BYTES_WITHOUT_FRAME - self._skipped_bytes
                 if mute <= len(buffer) and not at <= start < mute:
                     self._skipped_bytes += mute - at
                     at, self.sync = mute, self._initial_sync
@@ -353,7 +353,7 @@ class FrameBuffer:
         return arrived
 
 
-def invalid(values: Floats) -> Floats:
+def nan_to_infinity(values: Floats) -> Floats:
     """Replace NaN by infinity, for formats in which every number sent is a measurement."""
     return np.where(np.isnan(values), np.inf, values)
 
@@ -374,7 +374,7 @@ def quantize(values: Floats, step: float, bits: int) -> Ints:
     return np.clip(np.rint(np.nan_to_num(values / step, nan=0.0)), -top, top - 1).astype(np.int64)
 
 
-def one_chunk_each(frames: Sequence[bytes], t_ns: Ints) -> list[Chunk]:
+def chunk_per_sample(frames: Sequence[bytes], t_ns: Ints) -> list[Chunk]:
     """Return one chunk per sample.
 
     Parameters
@@ -387,7 +387,7 @@ def one_chunk_each(frames: Sequence[bytes], t_ns: Ints) -> list[Chunk]:
     return [Chunk(data, t) for data, t in zip(frames, t_ns.tolist(), strict=True)]
 
 
-def xor(data: bytes) -> int:
+def xor_checksum(data: bytes) -> int:
     """Return the exclusive or of all bytes. One long integer is folded in halves, which takes 1 µs for a sentence.
 
     >>> xor(b"VNRRG,8") == 0x4B

@@ -18,7 +18,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from drivers.decoders.base import QUIET_FRAMES, Decoder, DecoderSettings, Given, Rows, Timing
+from drivers.decoders.base import HINT_FRAMES, BlockBuilder, Decoder, DecoderSettings, SenderTiming, Timing
 from drivers.errors import DecodeError
 from drivers.sample import NO_TICK, Chunk, SampleBlock
 
@@ -62,11 +62,11 @@ class Ros2ImuDecoder:
     carrier: ClassVar[str] = "messages"
 
     def __init__(self) -> None:
-        self.timing: Timing = Given()
+        self.timing: Timing = SenderTiming()
         self.bad = 0  # number of rejected messages
         self.hint = ""
         self._messages_since_reject = 0  # number of messages since the last rejected one
-        self._rows = Rows()
+        self._rows = BlockBuilder()
         self._lost_in_rows = 0  # lost messages that ``Rows`` has counted as bad
         self._lost = 0  # messages lost before the next one
         self._sequence: int | None = None
@@ -109,7 +109,7 @@ class Ros2ImuDecoder:
             np.array(missing, np.int64),
             rejected,
         )
-        if self._messages_since_reject >= QUIET_FRAMES:
+        if self._messages_since_reject >= HINT_FRAMES:
             self.hint = ""
         self.bad = self._rows.bad - self._lost_in_rows
         return blocks

@@ -12,10 +12,10 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from drivers.decoders.base import QUIET_FRAMES, Decoder, DecoderSettings, Given, Rows, Timing
+from drivers.decoders.base import HINT_FRAMES, BlockBuilder, Decoder, DecoderSettings, SenderTiming, Timing
 from drivers.errors import DecodeError
 from drivers.sample import Chunk, SampleBlock
-from drivers.zenoh.sample_message import pack, unpack
+from drivers.zenoh.sample_message import decode_samples, encode_samples
 
 MAX_GAP_SAMPLES: Final = 1_000_000_000
 """Largest gap in samples. A larger jump of the count, eleven days at 1 kHz, indicates another count and not a loss."""
@@ -31,11 +31,11 @@ class SamplesDecoder:
     carrier: ClassVar[str] = "messages"
 
     def __init__(self) -> None:
-        self.timing: Timing = Given()
+        self.timing: Timing = SenderTiming()
         self.bad = 0  # rejected messages and implausible rows
         self.hint = ""
         self._messages_since_reject = 0  # number of messages since the last rejected one
-        self._rows = Rows()
+        self._rows = BlockBuilder()
         self._rejected = 0  # messages
         self._received: int | None = None  # count of the publisher in its last message
         self._lost = 0  # rows missing before the next block
@@ -58,7 +58,7 @@ class SamplesDecoder:
                 self._rejected += 1
                 self.hint = str(error)
                 self._messages_since_reject = 0
-        if self._messages_since_reject >= QUIET_FRAMES:
+        if self._messages_since_reject >= HINT_FRAMES:
             self.hint = ""
         self.bad = self._rejected + self._rows.bad
         return found
@@ -66,11 +66,11 @@ class SamplesDecoder:
     def encode(self, samples: SampleBlock) -> list[Chunk]:
         """Return one message with these samples."""
         self._encoded += len(samples)
-        return [Chunk(pack("encoded", self._encoded, samples), int(samples.t_ns[-1]))]
+        return [Chunk(encode_samples("encoded", self._encoded, samples), int(samples.t_ns[-1]))]
 
     def _message(self, data: bytes) -> list[SampleBlock]:
         """Return the samples of one message, with the losses before it."""
-        batch = unpack(data)
+        batch = decode_samples(data)
         rows = batch.block
         self._lost = min(self._lost + rows.lost + self._skipped(batch.samples, len(rows)), MAX_GAP_SAMPLES)
         blocks = self._rows.blocks(

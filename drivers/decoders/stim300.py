@@ -27,16 +27,16 @@ from numpy.typing import NDArray
 from drivers.decoders.base import (
     NEED_MORE,
     REJECT,
+    BlockBuilder,
     Decoder,
     DecoderSettings,
     FrameBuffer,
-    Rows,
-    one_chunk_each,
+    chunk_per_sample,
     quantize,
 )
 from drivers.errors import ConfigError
-from drivers.quantities import RATE_HZ, range_problems
-from drivers.sample import Chunk, Counter, Floats, Ints, SampleBlock, Timing
+from drivers.quantities import RATE_HZ, describe_range_errors
+from drivers.sample import Chunk, CounterTiming, Floats, Ints, SampleBlock, Timing
 from drivers.units import DEGREE, G0
 
 ACCEL_PART, INCL_PART, TEMPERATURE_PART, AUX_PART = 1, 2, 4, 8
@@ -50,14 +50,14 @@ IDENTIFIERS: Final = {
 """Bit mask of the parts in addition to the gyro, by identifier."""
 
 
-def size(parts: int) -> int:
+def datagram_size(parts: int) -> int:
     """Return the length of a datagram with these parts in bytes, with CRC but without CR LF."""
     sensors = 1 + (parts & (ACCEL_PART | INCL_PART)).bit_count()
     warm = sensors if parts & TEMPERATURE_PART else 0
     return 1 + 10 * sensors + 7 * warm + (4 if parts & AUX_PART else 0) + 1 + 2 + 4
 
 
-SIZES: Final = {identifier: size(parts) for identifier, parts in IDENTIFIERS.items()}
+SIZES: Final = {identifier: datagram_size(parts) for identifier, parts in IDENTIFIERS.items()}
 LONGEST: Final = max(SIZES.values())
 
 ACCEL_BITS: Final = {"2g": 21, "5g": 20, "10g": 19, "30g": 18, "80g": 16}
@@ -99,7 +99,7 @@ class Stim300Decoder:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self.timing: Timing = Counter(256, 1.0 / 2000.0)
+        self.timing: Timing = CounterTiming(256, 1.0 / 2000.0)
         rate = settings.rate or 1.0
         self._gyro_step = DEGREE * (rate / 2**21 if settings.gyro_output == "increment" else 1 / 2**14)
         bits = ACCEL_BITS[settings.accelerometer_range]
@@ -107,7 +107,7 @@ class Stim300Decoder:
         self._accel_step = rate / 2 ** (bits + 3) if increment else G0 / 2**bits
         wanted = b"" if settings.identifier == "auto" else bytes([settings.identifier])
         self._buffer = FrameBuffer(wanted, self._match, LONGEST)
-        self._rows = Rows()
+        self._rows = BlockBuilder()
         self._status = 0
 
     @property
@@ -149,10 +149,10 @@ class Stim300Decoder:
     def _read(self, data: NDArray[np.uint8], parts: int) -> tuple[Floats, Floats]:
         """Return values [n, 6], infinite where the status byte shows an error, and temperatures [n] in °C."""
         values = np.full((len(data), 6), np.nan)
-        values[:, :3] = triples(data, 1) * self._gyro_step
+        values[:, :3] = read_int24(data, 1) * self._gyro_step
         status = data[:, 10]
         if parts & ACCEL_PART:
-            values[:, 3:] = triples(data, 11) * self._accel_step
+            values[:, 3:] = read_int24(data, 11) * self._accel_step
             status = status | data[:, 20]
         values[status & ERROR_BITS != 0] = np.inf
         self._status = int(status[-1]) & ERROR_BITS
@@ -172,7 +172,7 @@ class Stim300Decoder:
             return REJECT
         if len(buffer) < at + length:
             return NEED_MORE
-        if not crc_holds(buffer[at : at + length]):
+        if not has_valid_crc(buffer[at : at + length]):
             return REJECT
         self._buffer.sync = buffer[at : at + 1]
         return length
@@ -199,7 +199,7 @@ class Stim300Decoder:
             data[:, at + 6] = np.where(np.isnan(samples.temperature_c), CHANNEL_ERROR, 0)
         data[:, -3] = samples.ticks & 0xFF
         tail = b"\r\n" if self._settings.crlf else b""
-        return one_chunk_each([row + crc(row) + tail for row in map(bytes, data)], samples.t_ns)
+        return chunk_per_sample([row + datagram_crc(row) + tail for row in map(bytes, data)], samples.t_ns)
 
 
 def _temperature_at(parts: int) -> int:
@@ -207,7 +207,7 @@ def _temperature_at(parts: int) -> int:
     return 1 + 10 * (1 + (parts & (ACCEL_PART | INCL_PART)).bit_count())
 
 
-def triples(data: NDArray[np.uint8], at: int) -> Ints:
+def read_int24(data: NDArray[np.uint8], at: int) -> Ints:
     """Return signed 24-bit big-endian integers [n, 3].
 
     Parameters
@@ -230,13 +230,13 @@ def _put(data: NDArray[np.uint8], at: int, values: Floats, step: float) -> None:
     data[:, at + 9] = np.where(np.isnan(values).any(axis=1), CHANNEL_ERROR, 0)
 
 
-def crc(body: bytes) -> bytes:
+def datagram_crc(body: bytes) -> bytes:
     """Return the four CRC bytes of a datagram."""
     mirrored = zlib.crc32(bytes(-len(body) % 4), zlib.crc32(body.translate(BIT_REVERSAL))) ^ 0xFFFFFFFF
     return mirrored.to_bytes(4, "little").translate(BIT_REVERSAL)
 
 
-def crc_holds(frame: bytes) -> bool:
+def has_valid_crc(frame: bytes) -> bool:
     """Return True if the CRC of a complete datagram is correct."""
     mirrored = frame.translate(BIT_REVERSAL)
     stated = int.from_bytes(mirrored[-4:], "little")
@@ -262,7 +262,7 @@ def build(settings: Settings) -> Decoder:
 
 def _problems(settings: Settings) -> Iterator[str]:
     """Yield a line for each mistake in the settings."""
-    yield from range_problems(settings)
+    yield from describe_range_errors(settings)
     if settings.identifier != "auto" and settings.identifier not in IDENTIFIERS:
         known = ", ".join(f"0x{identifier:02X}" for identifier in sorted(IDENTIFIERS))
         yield f"identifier: {settings.identifier}; possible are auto, {known}"

@@ -20,23 +20,23 @@ import numpy as np
 
 from drivers import units
 from drivers.decoders.base import (
-    QUIET_FRAMES,
+    HINT_FRAMES,
+    BlockBuilder,
     Decoder,
     DecoderSettings,
-    Rows,
-    one_chunk_each,
-    xor,
+    chunk_per_sample,
+    xor_checksum,
 )
-from drivers.discovery import possible
+from drivers.discovery import format_choices
 from drivers.errors import ConfigError
-from drivers.quantities import COUNTER_MODULUS, HEADER_LINES, SCALE, range_problems
-from drivers.sample import AXES, NO_TICK, Arrival, Chunk, Counter, Floats, SampleBlock, Timing
+from drivers.quantities import COUNTER_MODULUS, HEADER_LINES, SCALE, describe_range_errors
+from drivers.sample import AXES, NO_TICK, ArrivalTiming, Chunk, CounterTiming, Floats, SampleBlock, Timing
 
-LONGEST: Final = 4096
+MAX_LINE_BYTES: Final = 4096
 """Maximum length of a line in bytes. A longer text without a line end is noise and is dropped."""
 OVERLONG_LINE: Final = b"\0"
 """Replacement for an overlong line. It is bad, since it is not a number."""
-OVERLONG_HINT: Final = f"more than {LONGEST} bytes without a line end: is the baud rate right?"
+OVERLONG_HINT: Final = f"more than {MAX_LINE_BYTES} bytes without a line end: is the baud rate right?"
 SKIP: Final = "-"
 COLUMNS: Final = (*AXES, "temperature", "t", "counter", SKIP)
 TICK_S: Final = 1e-9
@@ -91,9 +91,9 @@ class TextDecoder:
         self.timing: Timing = _timing(settings, self._tick)
         self._comment = settings.comment.encode()
         self._delimiter = settings.delimiter.encode()
-        self._rows = Rows()
+        self._rows = BlockBuilder()
         self._last_error = ""
-        self._lines_since_bad = QUIET_FRAMES  # number of good lines since the last bad one
+        self._lines_since_bad = HINT_FRAMES  # number of good lines since the last bad one
         self.reset()
 
     @property
@@ -104,7 +104,7 @@ class TextDecoder:
     @property
     def hint(self) -> str:
         """Description of the last bad line, while it is recent."""
-        return self._last_error if self._lines_since_bad < QUIET_FRAMES else ""
+        return self._last_error if self._lines_since_bad < HINT_FRAMES else ""
 
     def reset(self) -> None:
         """Forget an incomplete line. The next line is a first line again."""
@@ -132,11 +132,11 @@ class TextDecoder:
         *lines, rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
         if lines and self._overlong:
             lines[0], self._overlong = OVERLONG_LINE, False
-        lines = [OVERLONG_LINE if len(line) > LONGEST else line.strip() for line in lines]
+        lines = [OVERLONG_LINE if len(line) > MAX_LINE_BYTES else line.strip() for line in lines]
         if lines and not self._first_line_ended:
             self._first_line_ended = True
             lines[0] = lines[0] if self._first_is_whole(lines[0]) else b""
-        if len(rest) > LONGEST:
+        if len(rest) > MAX_LINE_BYTES:
             rest, self._overlong = b"", True
             self._note_bad_line(OVERLONG_HINT)
         self._rest = rest
@@ -228,7 +228,7 @@ class TextDecoder:
                 values[:, axis] = scaled[:, self._at[name]]
         temperature_c = scaled[:, self._at["temperature"]] if "temperature" in self._at else np.full(n, np.nan)
         ticks = np.full(n, NO_TICK, np.int64)
-        if isinstance(self.timing, Counter):
+        if isinstance(self.timing, CounterTiming):
             counts = scaled[:, self._at["t" if "t" in self._at else "counter"]]
             bad |= ~(np.abs(counts) < float(UNWRAPPED_TICKS))  # missing or implausible clock value
             ticks = np.rint(np.where(bad, 0.0, counts)).astype(np.int64) % self.timing.modulus
@@ -254,9 +254,9 @@ class TextDecoder:
             for row in table.tolist()
         ]
         if self._settings.nmea:
-            bodies = [b"$%b*%02X" % (body, xor(body)) for body in bodies]
+            bodies = [b"$%b*%02X" % (body, xor_checksum(body)) for body in bodies]
         lines = [body + b"\r\n" for body in bodies]
-        return one_chunk_each([b"\r\n" + lines[0], *lines[1:]], samples.t_ns)
+        return chunk_per_sample([b"\r\n" + lines[0], *lines[1:]], samples.t_ns)
 
 
 def _number(field: bytes) -> float:
@@ -272,7 +272,7 @@ def _nmea_body(line: bytes) -> bytes | None:
     start, star = line.rfind(b"$") + 1, line.rfind(b"*")
     body, stated = line[start:star], line[star + 1 :]
     try:
-        return body if 0 < start <= star and len(stated) == 2 and int(stated, 16) == xor(body) else None
+        return body if 0 < start <= star and len(stated) == 2 and int(stated, 16) == xor_checksum(body) else None
     except ValueError:
         return None
 
@@ -298,8 +298,8 @@ def _timing(settings: Settings, tick: int) -> Timing:
     """Return the timing according to the columns."""
     if "t" in settings.columns:
         wraps = settings.time_unit in ("ms", "us")
-        return Counter(DEVICE_WRAP * tick if wraps else UNWRAPPED_TICKS, TICK_S)
-    return Counter(settings.counter_modulus) if "counter" in settings.columns else Arrival()
+        return CounterTiming(DEVICE_WRAP * tick if wraps else UNWRAPPED_TICKS, TICK_S)
+    return CounterTiming(settings.counter_modulus) if "counter" in settings.columns else ArrivalTiming()
 
 
 def build(settings: Settings) -> Decoder:
@@ -320,7 +320,7 @@ def _problems(settings: Settings) -> Iterator[str]:
     given = [name for name in settings.columns if name != SKIP]
     for name in given:
         if name not in COLUMNS:
-            yield f'columns: unknown column "{name}"{possible(name, COLUMNS)}'
+            yield f'columns: unknown column "{name}"{format_choices(name, COLUMNS)}'
     if len(given) != len(set(given)):
         yield "columns: a name stands there twice"
     if not set(given) & set(AXES):
@@ -329,8 +329,8 @@ def _problems(settings: Settings) -> Iterator[str]:
         yield 'columns: give one of t and counter, and "-" for the other'
     for name in settings.scale:
         if name not in COLUMNS:
-            yield f"scale.{name}: unknown column{possible(name, COLUMNS)}"
-    yield from range_problems(settings)
+            yield f"scale.{name}: unknown column{format_choices(name, COLUMNS)}"
+    yield from describe_range_errors(settings)
     for key, look_up, axis in (
         ("gyro_unit", units.rate_factor, "gx"),
         ("accel_unit", units.acceleration_factor, "ax"),

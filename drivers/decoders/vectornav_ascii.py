@@ -22,16 +22,16 @@ import numpy as np
 from drivers.decoders.base import (
     NEED_MORE,
     REJECT,
+    BlockBuilder,
     Decoder,
     DecoderSettings,
     FrameBuffer,
-    Rows,
     Unmeasured,
-    invalid,
-    one_chunk_each,
-    xor,
+    chunk_per_sample,
+    nan_to_infinity,
+    xor_checksum,
 )
-from drivers.sample import Arrival, Chunk, Floats, SampleBlock, Timing
+from drivers.sample import ArrivalTiming, Chunk, Floats, SampleBlock, Timing
 
 LONGEST: Final = 256
 """Maximum length of a sentence in bytes. The longest sentence of the manual is under 200."""
@@ -58,11 +58,11 @@ class VectornavAsciiDecoder:
     carrier: ClassVar[str] = "bytes"
 
     def __init__(self, settings: Settings) -> None:
-        self.timing: Timing = Arrival()
+        self.timing: Timing = ArrivalTiming()
         self._wanted = b"" if settings.sentence == "auto" else f"${settings.sentence},".encode()
         self._sentence = self._wanted
         self._buffer = FrameBuffer(b"$VN", match, LONGEST)
-        self._rows = Rows()
+        self._rows = BlockBuilder()
         self._unwanted_sentences = 0  # number of sentences since the last wanted one
 
     @property
@@ -97,7 +97,7 @@ class VectornavAsciiDecoder:
         axes, width, warm = COLUMNS.get(self._sentence, COLUMNS[b"$VNIMU,"])
         table = numbers([f[7 : f.rindex(b"*")] for f in frames.data], width)
         temperature_c = Unmeasured.temperature(len(rows)) if warm is None else table[:, warm].copy()
-        values = invalid(table[:, axes])
+        values = nan_to_infinity(table[:, axes])
         ticks = Unmeasured.ticks(len(rows))
         return self._rows.blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before, bad_after)
 
@@ -117,8 +117,8 @@ class VectornavAsciiDecoder:
             else:
                 parts = ["VNYMR", *["+000.000"] * 3, *magnetic, *parts]
             body = ",".join(parts).encode()
-            frames.append(b"$%b*%02X\r\n" % (body, xor(body)))
-        return one_chunk_each(frames, samples.t_ns)
+            frames.append(b"$%b*%02X\r\n" % (body, xor_checksum(body)))
+        return chunk_per_sample(frames, samples.t_ns)
 
 
 def numbers(bodies: list[bytes], width: int) -> Floats:
@@ -176,7 +176,7 @@ def match(buffer: bytes, at: int) -> int:
     body = buffer[at + 1 : star]
     stated = buffer[star + 1 : end - 1].removesuffix(b"\r")
     if len(stated) == 2:
-        return end - at if b"%02X" % xor(body) == stated else REJECT
+        return end - at if b"%02X" % xor_checksum(body) == stated else REJECT
     return end - at if b"%04X" % binascii.crc_hqx(body, 0) == stated else REJECT
 
 

@@ -26,15 +26,15 @@ from numpy.typing import NDArray
 from drivers.decoders.base import (
     NEED_MORE,
     REJECT,
+    BlockBuilder,
     Decoder,
     DecoderSettings,
     FrameBuffer,
     Frames,
-    Rows,
-    invalid,
-    one_chunk_each,
+    chunk_per_sample,
+    nan_to_infinity,
 )
-from drivers.sample import NO_TICK, Arrival, Chunk, Counter, Floats, SampleBlock, Timing
+from drivers.sample import NO_TICK, ArrivalTiming, Chunk, CounterTiming, Floats, SampleBlock, Timing
 
 FIELD_SIZES: Final = {
     1: (8, 8, 8, 12, 16, 12, 24, 12, 12, 24, 20, 28, 2, 4, 8),
@@ -159,9 +159,9 @@ class VectornavBinaryDecoder:
     def __init__(self, settings: Settings) -> None:
         self._compensated = settings.compensated
         self._counts = settings.clock == "time_startup"
-        self.timing: Timing = Counter(TICKS, 1e-9) if self._counts else Arrival()
+        self.timing: Timing = CounterTiming(TICKS, 1e-9) if self._counts else ArrivalTiming()
         self._buffer = FrameBuffer(b"\xfa", self._match, LONGEST)
-        self._rows = Rows()
+        self._rows = BlockBuilder()
         self._time_missing = False
 
     @property
@@ -210,9 +210,9 @@ class VectornavBinaryDecoder:
         for form, at in groups:
             got = np.frombuffer(b"".join([frames.data[i] for i in at]), form.row)
             if "gyro" in form.names:
-                values[at, :3] = invalid(_as_float64(got["gyro"]))
+                values[at, :3] = nan_to_infinity(_as_float64(got["gyro"]))
             if "accel" in form.names:
-                values[at, 3:] = invalid(_as_float64(got["accel"]))
+                values[at, 3:] = nan_to_infinity(_as_float64(got["accel"]))
             if "temperature" in form.names:
                 temperature_c[at] = _as_float64(got["temperature"])
             if "time" in form.names and self._counts:
@@ -251,7 +251,7 @@ class VectornavBinaryDecoder:
             rows["temperature"] = samples.temperature_c
         inner = [header + row.tobytes()[1 + len(header) : -2] for row in rows]
         frames = [b"\xfa" + part + binascii.crc_hqx(part, 0).to_bytes(2, "big") for part in inner]
-        return one_chunk_each(frames, samples.t_ns)
+        return chunk_per_sample(frames, samples.t_ns)
 
 
 def _as_float64(numbers: NDArray[np.float32]) -> Floats:

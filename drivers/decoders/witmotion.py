@@ -21,17 +21,17 @@ import numpy as np
 from drivers.decoders.base import (
     NEED_MORE,
     REJECT,
+    BlockBuilder,
     Decoder,
     DecoderSettings,
     FrameBuffer,
     Frames,
-    Rows,
     Unmeasured,
-    one_chunk_each,
+    chunk_per_sample,
     quantize,
 )
 from drivers.quantities import FULL_SCALE, check_settings
-from drivers.sample import Arrival, Chunk, Floats, Ints, SampleBlock, Timing
+from drivers.sample import ArrivalTiming, Chunk, Floats, Ints, SampleBlock, Timing
 from drivers.units import DEGREE, G0
 
 ACCEL, RATE = 0x51, 0x52
@@ -72,7 +72,7 @@ class WitmotionDecoder:
 
     def __init__(self, settings: Settings) -> None:
         self._bluetooth = settings.packet == "bluetooth"
-        self.timing: Timing = Arrival()
+        self.timing: Timing = ArrivalTiming()
         self._accel_step = settings.accelerometer_range * G0 / 2**15
         self._gyro_step = settings.gyro_range * DEGREE / 2**15
         self._temperature_step, self._temperature_offset = TEMPERATURE[settings.temperature]
@@ -80,7 +80,7 @@ class WitmotionDecoder:
             self._buffer = FrameBuffer(b"\x55", match_bluetooth, BLUETOOTH_LENGTH + 2)
         else:
             self._buffer = FrameBuffer(b"\x55", match_uart, UART_LENGTH)
-        self._rows = Rows()
+        self._rows = BlockBuilder()
         self._harmless_rejects = 0  # number of rejected packets that cost no sample
         self._pairs = Pairs()
 
@@ -142,18 +142,18 @@ class WitmotionDecoder:
         accel = quantize(samples.values[:, 3:], self._accel_step, 16)
         if self._bluetooth:
             words = np.hstack([accel, gyro, np.zeros((n, 3), np.int64)]).astype("<i2")
-            return one_chunk_each([HEADERS[0] + row.tobytes() for row in words], samples.t_ns)
+            return chunk_per_sample([HEADERS[0] + row.tobytes() for row in words], samples.t_ns)
         excess = samples.temperature_c - self._temperature_offset
         warm = quantize(np.nan_to_num(excess), self._temperature_step, 16)[:, None]
         frames = [
-            packet(ACCEL, first.tobytes()) + packet(RATE, second.tobytes())
+            encode_packet(ACCEL, first.tobytes()) + encode_packet(RATE, second.tobytes())
             for first, second in zip(
                 np.hstack([accel, warm]).astype("<i2"),
                 np.hstack([gyro, np.zeros((n, 1), np.int64)]).astype("<i2"),
                 strict=True,
             )
         ]
-        return one_chunk_each(frames, samples.t_ns)
+        return chunk_per_sample(frames, samples.t_ns)
 
 
 class Pairs:
@@ -215,7 +215,7 @@ class Pairs:
         return missing, int(np.maximum(holes - missing, 0).sum())
 
 
-def packet(kind: int, data: bytes) -> bytes:
+def encode_packet(kind: int, data: bytes) -> bytes:
     """Return an 11-byte packet.
 
     Parameters

@@ -25,15 +25,15 @@ from numpy.typing import NDArray
 from drivers.decoders.base import (
     NEED_MORE,
     REJECT,
+    BlockBuilder,
     Decoder,
     DecoderSettings,
     FrameBuffer,
     Frames,
-    Rows,
-    invalid,
-    one_chunk_each,
+    chunk_per_sample,
+    nan_to_infinity,
 )
-from drivers.sample import NO_TICK, Arrival, Chunk, Counter, Floats, Ints, SampleBlock, Timing
+from drivers.sample import NO_TICK, ArrivalTiming, Chunk, CounterTiming, Floats, Ints, SampleBlock, Timing
 
 SYNC: Final = b"\xfa\xff\x36"
 MAX_PAYLOAD: Final = 2048
@@ -126,14 +126,14 @@ class XsensMtdata2Decoder:
         self._settings = settings
         # (timing, DID, size of the counter in bytes)
         clocks: dict[str, tuple[Timing, int, int]] = {
-            "sample_time_fine": (Counter(1 << 32, 1e-4), SAMPLE_TIME_FINE, 4),
-            "packet_counter": (Counter(1 << 16), PACKET_COUNTER, 2),
-            "arrival": (Arrival(), 0, 0),
+            "sample_time_fine": (CounterTiming(1 << 32, 1e-4), SAMPLE_TIME_FINE, 4),
+            "packet_counter": (CounterTiming(1 << 16), PACKET_COUNTER, 2),
+            "arrival": (ArrivalTiming(), 0, 0),
         }
         self.timing, self._clock, self._clock_size = clocks[settings.clock]
         self._accel, self._gyro = (ACCEL_HR, GYRO_HR) if settings.high_rate else (ACCEL, GYRO)
         self._buffer = FrameBuffer(SYNC, match, LONGEST)
-        self._rows = Rows()
+        self._rows = BlockBuilder()
         self._temperature_c = np.nan
         self._clock_missing = False
 
@@ -164,7 +164,7 @@ class XsensMtdata2Decoder:
         values = np.full((n, 6), np.nan)
         temperature_c = np.full(n, np.nan)
         ticks = np.full(n, NO_TICK, np.int64)
-        for form, at, packets in alike(frames.data):
+        for form, at, packets in group_by_layout(frames.data):
             if form is None:
                 values[at] = np.inf
             else:
@@ -192,7 +192,7 @@ class XsensMtdata2Decoder:
         """Read values, temperatures and ticks of the packets of one layout into the rows ``at``."""
         for kind, axes in ((self._gyro, slice(0, 3)), (self._accel, slice(3, 6))):
             if found := form.find(kind, 3):
-                values[at, axes] = invalid(numbers(packets, *found, 3))
+                values[at, axes] = nan_to_infinity(numbers(packets, *found, 3))
         if found := form.find(TEMPERATURE, 1):
             temperature_c[at] = numbers(packets, *found, 1)[:, 0]
         if self._clock and (offset := form.find_integer(self._clock, self._clock_size)):
@@ -219,12 +219,12 @@ class XsensMtdata2Decoder:
                 payload += struct.pack(">HBf", TEMPERATURE, 4, temperature_c)
             for did, triple in ((self._accel, row[3:]), (self._gyro, row[:3])):
                 if not np.isnan(triple).all():
-                    payload += struct.pack(">HB", did | kind, 3 * SIZES[kind]) + written(triple, kind)
-            frames.append(message(payload))
-        return one_chunk_each(frames, samples.t_ns)
+                    payload += struct.pack(">HB", did | kind, 3 * SIZES[kind]) + encode_numbers(triple, kind)
+            frames.append(encode_message(payload))
+        return chunk_per_sample(frames, samples.t_ns)
 
 
-def alike(frames: list[bytes]) -> list[tuple[Layout | None, NDArray[np.intp], NDArray[np.uint8]]]:
+def group_by_layout(frames: list[bytes]) -> list[tuple[Layout | None, NDArray[np.intp], NDArray[np.uint8]]]:
     """Group frames by layout. Most often there is one group.
 
     Returns
@@ -275,7 +275,7 @@ def numbers(packets: NDArray[np.uint8], at: int, did: int, count: int) -> Floats
     return data.view(">f8").astype(np.float64)
 
 
-def written(triple: Floats, kind: int) -> bytes:
+def encode_numbers(triple: Floats, kind: int) -> bytes:
     """Encode three numbers, clipped to the range of the format.
 
     Parameters
@@ -296,7 +296,7 @@ def written(triple: Floats, kind: int) -> bytes:
     return b"".join(struct.pack(">Ih", x & 0xFFFFFFFF, x >> 32) for x in whole)
 
 
-def message(payload: bytes) -> bytes:
+def encode_message(payload: bytes) -> bytes:
     """Return an MTData2 message with this payload."""
     n = len(payload)
     head = b"\xff\x36" + (bytes([n]) if n < 0xFF else b"\xff" + n.to_bytes(2, "big"))

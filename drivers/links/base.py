@@ -60,7 +60,7 @@ class Link(Protocol):
 
 
 @runtime_checkable
-class Filtering(Protocol):
+class AddressFilteringLink(Protocol):
     """Interface of a link that can filter by address."""
 
     def accept(self, addresses: Sequence[int]) -> None:

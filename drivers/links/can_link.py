@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import msgspec
 
-from drivers.discovery import possible
+from drivers.discovery import format_choices
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.extras import check_extra
 from drivers.links.base import Carrier, Link, LinkSettings
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     import can
 
 DEFAULT_DECODER: Final = "dbc"
-BATCH: Final = 1000
+MAX_FRAMES: Final = 1000
 """Maximum number of frames per read: 65 ms of a fully loaded bus at 1 Mbit/s."""
 NEXT_FRAME_WAIT_S: Final = 0.0005
 """Wait for the next frame after a frame.
@@ -185,7 +185,7 @@ class CanLink:
         """Return all received frames, after waiting up to ``wait_s`` seconds for the first."""
         chunks: list[Chunk] = []
         until = math.inf
-        for _ in range(BATCH):
+        for _ in range(MAX_FRAMES):
             message = self._receive(NEXT_FRAME_WAIT_S if chunks else wait_s)
             if message is None:
                 break
@@ -338,5 +338,5 @@ def build(settings: Settings) -> Link:
 
     if settings.interface not in VALID_INTERFACES:
         known = sorted(VALID_INTERFACES)
-        raise ConfigError(f'interface: "{settings.interface}"{possible(settings.interface, known)}')
+        raise ConfigError(f'interface: "{settings.interface}"{format_choices(settings.interface, known)}')
     return CanLink(settings)

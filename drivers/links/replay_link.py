@@ -30,15 +30,15 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated, Any, BinaryIO, Final, Literal, cast
 
 from drivers import file_access
-from drivers.discovery import FilePath, possible
+from drivers.discovery import FilePath, format_choices
 from drivers.errors import ConfigError, LinkEnded, LinkLost, LinkUnavailable, RecordingError
 from drivers.extras import check_extra
 from drivers.links.base import Carrier, Link, LinkSettings
-from drivers.quantities import BYTE_RATE, RATE_HZ, REPLAY_SPEED, range_problems
+from drivers.quantities import BYTE_RATE, RATE_HZ, REPLAY_SPEED, describe_range_errors
 from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples, segment
 from drivers.recordings.table import T_LIMIT_S
 from drivers.sample import EXTENDED_ID, Chunk
-from drivers.zenoh.sample_message import pack
+from drivers.zenoh.sample_message import encode_samples
 
 if TYPE_CHECKING:
     import can
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 DEFAULT_DECODER: Final = "samples"
 CAN_LOGS: Final = (".asc", ".blf", ".log", ".trc")
 CAPTURES: Final = (".bin", ".raw", ".txt")
-BATCH: Final = 1000
+BATCH_CHUNKS: Final = 1000
 BATCH_BYTES: Final = 1_000_000
 """A read returns at most BATCH chunks and at most one chunk more than this size. Each read therefore ends, and none
 holds hours of a recording.
@@ -120,7 +120,7 @@ class ReplayLink:
 
     def __init__(self, settings: Settings, kind: Kind, pace: float) -> None:
         self._settings = settings
-        self._path = file_access.path(settings.path)
+        self._path = file_access.expand_user(settings.path)
         self._kind: Kind = kind
         self._pace = pace  # seconds of the file per second; inf = no waiting
         self.carrier: Carrier = _raw_carrier(self._path) if kind == "raw" else CARRIERS[kind]
@@ -179,7 +179,12 @@ class ReplayLink:
         """Return all chunks that are due by now."""
         chunks: list[Chunk] = []
         size = 0
-        while self._next is not None and self._due(self._next) <= now_s and len(chunks) < BATCH and size < BATCH_BYTES:
+        while (
+            self._next is not None
+            and self._due(self._next) <= now_s
+            and len(chunks) < BATCH_CHUNKS
+            and size < BATCH_BYTES
+        ):
             chunks.append(self._next[1])
             size += len(self._next[1].data)
             self._fetch_next()
@@ -235,7 +240,7 @@ def _messages(recording: Recording, rows: int) -> Iterator[Timed]:
         given += len(samples)
         start_ns = int(samples.t_ns[0]) if start_ns is None else start_ns
         newest_ns = int(samples.t_ns[-1])
-        yield (newest_ns - start_ns) * 1e-9, Chunk(pack("replay", given, samples), newest_ns)
+        yield (newest_ns - start_ns) * 1e-9, Chunk(encode_samples("replay", given, samples), newest_ns)
 
 
 # --- CAN logs ------------------------------------------------------------------------------------
@@ -456,7 +461,7 @@ def _relative_times(chunks: Iterator[Chunk]) -> Iterator[Timed]:
 
 def _raw_segments(path: Path) -> list[Path]:
     """Return the segments of raw bytes in a folder, oldest first, or the one segment that is named."""
-    return segment.segments(path) if path.is_dir() else [path]
+    return segment.list_segments(path) if path.is_dir() else [path]
 
 
 def _is_raw(path: Path) -> bool:
@@ -465,14 +470,14 @@ def _is_raw(path: Path) -> bool:
     if not found or not segment.NAME.fullmatch(found[-1].name):
         return False
     try:
-        return segment.origin(found[-1]).kind == "raw"
+        return segment.read_metadata(found[-1]).kind == "raw"
     except (OSError, RecordingError):
         return False
 
 
 def _raw_carrier(path: Path) -> Carrier:
     """Return the carrier of the newest segment. Raise ConfigError if it is unknown."""
-    carrier = segment.origin(_raw_segments(path)[-1]).carrier
+    carrier = segment.read_metadata(_raw_segments(path)[-1]).carrier
     known: tuple[Carrier, ...] = ("bytes", "frames", "messages")
     for one in known:
         if one == carrier:
@@ -531,7 +536,7 @@ def _kind(path: Path) -> Kind:
     if suffix in FORMATS:
         return "recording"
     known = (*FORMATS, *CAN_LOGS, *CAPTURES)
-    raise ConfigError(f'path: "{path}" is nothing to replay by its suffix{possible(suffix, known)}')
+    raise ConfigError(f'path: "{path}" is nothing to replay by its suffix{format_choices(suffix, known)}')
 
 
 def _plain_suffix(path: Path) -> str:
@@ -574,7 +579,7 @@ def build(settings: Settings) -> Link:
     ConfigError
         The speed is invalid, or the file cannot be replayed.
     """
-    path = file_access.path(settings.path)
+    path = file_access.expand_user(settings.path)
     wrong = list(_problems(settings))
     try:
         _check_path(path)
@@ -602,7 +607,7 @@ def _check_path(path: Path) -> None:
 
 def _problems(settings: Settings) -> Iterator[str]:
     """Yield a line for each mistake in the settings."""
-    yield from range_problems(settings)
+    yield from describe_range_errors(settings)
     if isinstance(settings.speed, str) and settings.speed not in PACES:
         yield f'speed: "{settings.speed}"; possible are recorded, max, or a factor without quotes'
 

@@ -22,18 +22,18 @@ import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from drivers.credential_masking import masked
-from drivers.discovery import possible
+from drivers.credential_masking import mask_secrets
+from drivers.discovery import format_choices
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
-from drivers.quantities import BIT_RATE, READ_TIMEOUT_S, range_problems
+from drivers.quantities import BIT_RATE, READ_TIMEOUT_S, describe_range_errors
 from drivers.sample import Chunk
 
 if TYPE_CHECKING:
     import serial
 
 DEFAULT_DECODER: Final = ""
-READ_SIZE: Final = 4096
+READ_BYTES: Final = 4096
 """Maximum number of bytes per read, more than 10 ms at 3 Mbit/s. At higher rates the reader does not wait."""
 STOP_BITS: Final = (1.0, 1.5, 2.0)
 SCHEMES: Final = ("socket", "rfc2217", "loop", "spy", "alt", "hwgrep", "cp2110")
@@ -69,7 +69,7 @@ class SerialLink:
         self._buffer_filling = False  # True if the last read was so large that the next one must not wait
         self._closing = threading.Event()
         self._in_use = threading.Lock()  # held while the port is read, opened or closed
-        self.name = f"{masked(settings.port)} at {settings.baudrate} baud"
+        self.name = f"{mask_secrets(settings.port)} at {settings.baudrate} baud"
 
     def open(self) -> None:
         """Open the port. Raise ``LinkUnavailable`` with the reason and the remedy if it cannot be opened."""
@@ -93,7 +93,7 @@ class SerialLink:
                     **({"exclusive": True} if s.exclusive else {}),
                 )
             except (OSError, ValueError, NotImplementedError) as error:
-                raise LinkUnavailable(masked(_why_not_open(s.port, error))) from error
+                raise LinkUnavailable(mask_secrets(_why_not_open(s.port, error))) from error
             self._closing.clear()
 
     def read(self, timeout_s: float) -> list[Chunk] | None:
@@ -107,7 +107,7 @@ class SerialLink:
                     return [Chunk(data, time.monotonic_ns())]
                 if time.monotonic() >= deadline:
                     return None
-        raise LinkLost(f"{masked(self._settings.port)}: the link is closed")
+        raise LinkLost(f"{mask_secrets(self._settings.port)}: the link is closed")
 
     def close(self) -> None:
         """Close the port after a waiting ``read`` has ended."""
@@ -125,7 +125,7 @@ class SerialLink:
         """Read the bytes that arrive within the read timeout. Raise LinkLost if the device is gone."""
         try:
             if not _has_file_number(port):
-                data: bytes = port.read(READ_SIZE)
+                data: bytes = port.read(READ_BYTES)
                 return data
             until_s = time.monotonic() + self._settings.read_timeout
             data = port.read(1)
@@ -133,12 +133,12 @@ class SerialLink:
                 if not self._buffer_filling:
                     self._closing.wait(max(0.0, until_s - time.monotonic()))
                 with contextlib.suppress(BlockingIOError):  # no more bytes have arrived
-                    data += os.read(port.fileno(), READ_SIZE)
-            self._buffer_filling = len(data) > READ_SIZE // 2
+                    data += os.read(port.fileno(), READ_BYTES)
+            self._buffer_filling = len(data) > READ_BYTES // 2
         except OSError as error:
             self._drop_port()
             raise LinkLost(
-                f"{masked(self._settings.port)}: the device is gone (unplugged, switched off, or read by "
+                f"{mask_secrets(self._settings.port)}: the device is gone (unplugged, switched off, or read by "
                 f"another program): {_one_line(error)}"
             ) from error
         return data
@@ -205,10 +205,10 @@ def _problems(settings: Settings) -> Iterator[str]:
     if not settings.port:
         yield 'port: empty; it is a port ("/dev/ttyUSB0") or a URL ("socket://host:port")'
     elif found and scheme.lower() not in SCHEMES and not _has_handler(scheme.lower()):
-        yield f'port: "{settings.port}" has an unknown kind of URL "{scheme}"{possible(scheme, SCHEMES)}'
+        yield f'port: "{settings.port}" has an unknown kind of URL "{scheme}"{format_choices(scheme, SCHEMES)}'
     if settings.stopbits not in STOP_BITS:
         yield f"stopbits: {settings.stopbits:g}; possible are 1, 1.5, 2"
-    yield from range_problems(settings)
+    yield from describe_range_errors(settings)
 
 
 def _has_handler(scheme: str) -> bool:

@@ -21,13 +21,13 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import msgspec
 
-from drivers.credential_masking import masked
+from drivers.credential_masking import mask_secrets
 from drivers.discovery import FilePath
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.sample import Chunk
-from drivers.zenoh.connection_errors import refused
-from drivers.zenoh.session import CLOSED, configuration, endpoints, plain
+from drivers.zenoh.connection_errors import explain_refusals
+from drivers.zenoh.session import DEFAULT_CONFIGURATION, configuration, endpoints, format_error
 
 if TYPE_CHECKING:
     import zenoh
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 DEFAULT_DECODER: Final = "samples"
 MAX_MESSAGES: Final = 4096
 """Maximum number of messages that wait to be read: four seconds at 1 kHz."""
-WAITING_BYTES: Final = 128_000_000
+MAX_QUEUED_BYTES: Final = 128_000_000
 """Maximum size of all messages that wait to be read: twice the longest message that a session accepts."""
 
 
@@ -91,7 +91,7 @@ class ZenohLink:
                 subscriber: Any = session.declare_subscriber(self._settings.key, channel)
             except zenoh.ZError as error:
                 self._close_session()
-                raise LinkUnavailable(f"{self.name}: cannot subscribe: {plain(error)}") from error
+                raise LinkUnavailable(f"{self.name}: cannot subscribe: {format_error(error)}") from error
             self._clear_waiting()
             self._running = True
             self._receiver = threading.Thread(
@@ -145,7 +145,7 @@ class ZenohLink:
         """Queue the newest chunk and drop the oldest ones above the limits."""
         self._waiting.append(chunk)
         self._waiting_bytes += len(chunk.data)
-        while len(self._waiting) > 1 and (self._waiting_bytes > WAITING_BYTES or len(self._waiting) > MAX_MESSAGES):
+        while len(self._waiting) > 1 and (self._waiting_bytes > MAX_QUEUED_BYTES or len(self._waiting) > MAX_MESSAGES):
             self._waiting_bytes -= len(self._waiting.popleft().data)
 
     def _close_session(self) -> None:
@@ -166,12 +166,11 @@ class ZenohLink:
         """Return one line with the reason why the session cannot be opened."""
         config = _configuration(self._settings)
         places = endpoints(config)
-        nobody = (
-            f"nobody at {masked(', '.join(places)) or '(connect is empty)'}; start the router or the publisher there"
-        )
+        shown = mask_secrets(", ".join(places)) or "(connect is empty)"
+        nobody = f"nobody at {shown}; start the router or the publisher there"
         if config.get_json("mode") == '"client"':
-            return f"{self.name}: {refused(places, config) or nobody}"
-        return f"{self.name}: check the endpoints of listen and connect: {plain(error)}"
+            return f"{self.name}: {explain_refusals(places, config) or nobody}"
+        return f"{self.name}: check the endpoints of listen and connect: {format_error(error)}"
 
 
 def _chunk(sample: Any, t_ns: int) -> Chunk:
@@ -189,7 +188,7 @@ def _configuration(settings: Settings) -> "zenoh.Config":
     }
     config = configuration(own, settings.config)
     if settings.mode is None and not settings.listen and len(endpoints(config)) == 1:
-        return configuration(own, settings.config, {**CLOSED, "mode": "client"})
+        return configuration(own, settings.config, {**DEFAULT_CONFIGURATION, "mode": "client"})
     return config
 
 
@@ -207,11 +206,11 @@ def build(settings: Settings) -> Link:
     try:
         zenoh.KeyExpr(settings.key)
     except zenoh.ZError as error:
-        wrong.append(f'key: "{settings.key}": {plain(error)}')
+        wrong.append(f'key: "{settings.key}": {format_error(error)}')
     try:
         _configuration(settings)
     except zenoh.ZError as error:
-        wrong.append(f"zenoh settings: {plain(error)}")
+        wrong.append(f"zenoh settings: {format_error(error)}")
     if wrong:
         raise ConfigError(*wrong)
     return ZenohLink(settings)

@@ -22,16 +22,24 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import ConfigError, RecordingError, in_one_line
+from drivers.errors import ConfigError, RecordingError, format_one_line
 from drivers.file_access import check_regular
 from drivers.quantities import DURATION_S, RATE_HZ
 from drivers.recordings import memory_check
-from drivers.recordings.formats import FORMATS, format_of, is_recording
+from drivers.recordings.formats import FORMATS, format_for_path, is_recording
 from drivers.recordings.table import EXAMPLE_HEADER, T_LIMIT_S, Table
-from drivers.recordings.writing import save_samples, writing
-from drivers.sample import AXES, Floats, SampleBlock, block
+from drivers.recordings.writing import open_recording_writer, save_samples
+from drivers.sample import AXES, Floats, SampleBlock, make_block
 
-__all__ = ["FORMATS", "Recording", "is_recording", "iter_blocks", "load_samples", "save_samples", "writing"]
+__all__ = [
+    "FORMATS",
+    "Recording",
+    "is_recording",
+    "iter_blocks",
+    "load_samples",
+    "open_recording_writer",
+    "save_samples",
+]
 
 TIME_RESOLUTION_S: Final = 1e-6
 """Slightly more than the resolution of Unix times in a float64."""
@@ -105,7 +113,7 @@ def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]
     """
     for start in range(0, len(recording), rows):
         part = slice(start, min(start + rows, len(recording)))
-        yield block(_times_ns(recording, part), recording.values[part], recording.temperature_c[part])
+        yield make_block(_times_ns(recording, part), recording.values[part], recording.temperature_c[part])
 
 
 def _error_text(path: Path, error: RecordingError | OSError) -> str:
@@ -121,7 +129,7 @@ def _error_text(path: Path, error: RecordingError | OSError) -> str:
 def _load_file(path: Path, rate_hz: float | None) -> Recording:
     """Read one file."""
     _check_content(path)
-    return _assemble(path, format_of(path).read(path), rate_hz)
+    return _assemble(path, format_for_path(path).read(path), rate_hz)
 
 
 def _check_content(path: Path) -> None:
@@ -170,7 +178,7 @@ def _recording(
     for array in (t_s, values, temperature_c):
         if array is not None:
             array.flags.writeable = False
-    return Recording(t_s, values, temperature_c, rate_hz, axes, tuple(map(in_one_line, notes)))
+    return Recording(t_s, values, temperature_c, rate_hz, axes, tuple(map(format_one_line, notes)))
 
 
 def _common_length(path: Path, columns: Mapping[str, Floats]) -> int:
@@ -254,7 +262,7 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
         raise RecordingError(f"{path}: no recordings in this folder; known are {' '.join(FORMATS)}")
     parts: list[Recording] = []  # newest first
     notes: list[str] = []
-    free, taken = memory_check.free_bytes(), 0
+    free, taken = memory_check.available_bytes(), 0
     if last_s is None:
         _check_folder(path, segments, free)
     for segment in reversed(segments):
@@ -265,7 +273,7 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
             continue
         parts.append(part)
         taken += part.values.nbytes + 2 * part.temperature_c.nbytes
-        memory_check.check(path, taken, free)
+        memory_check.check_memory(path, taken, free)
         notes += [f"{segment.name}: {note}" for note in reversed(part.notes)]
         if last_s is not None and _duration_s(parts) > last_s:
             break
@@ -280,7 +288,7 @@ def _check_folder(path: Path, segments: Sequence[Path], free: int | None) -> Non
     for segment in segments:
         try:
             _check_content(segment)
-            rows += format_of(segment).count_rows(segment)
+            rows += format_for_path(segment).count_rows(segment)
         except (RecordingError, OSError):
             continue  # left out, with a note, when it is read
         size_bytes += segment.stat().st_size

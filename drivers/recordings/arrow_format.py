@@ -17,7 +17,15 @@ from drivers.errors import ConfigError, RecordingError
 from drivers.file_access import open_regular
 from drivers.recordings import memory_check
 from drivers.recordings.arrow_messages import batch_sizes, buffer_count, check_buffers
-from drivers.recordings.table import BATCH_ROWS, PART, Append, Table, check_width, chosen_columns, looks_like
+from drivers.recordings.table import (
+    BATCH_ROWS,
+    PARTIAL_SUFFIX,
+    Append,
+    Table,
+    check_width,
+    choose_columns,
+    describe_content,
+)
 from drivers.sample import Floats
 
 METADATA_KEY: Final = b"imu-monitor"
@@ -45,7 +53,7 @@ def import_pyarrow(path: Path) -> Any:
     try:
         import pyarrow as pa
     except ImportError as error:
-        whole = Path(str(path).removesuffix(PART))
+        whole = Path(str(path).removesuffix(PARTIAL_SUFFIX))
         raise ConfigError(f'{whole}: {whole.suffix} needs pyarrow: pip install "imu-monitor[arrow]"') from error
     return pa
 
@@ -100,7 +108,7 @@ def _parquet(path: Path) -> Iterator[Any]:
         except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
             raise RecordingError(
                 f"{path}: is no whole Parquet file ({_first_line(error)}); its index stands at the end, "
-                f"so one that is cut off cannot be read{looks_like(path)}"
+                f"so one that is cut off cannot be read{describe_content(path)}"
             ) from error
 
 
@@ -108,11 +116,11 @@ def _checked_parquet(path: Path, file: Any, notes: list[str]) -> tuple[dict[str,
     """Return the columns to read and the number of rows, after checking both against the limits."""
     check_width(path, file.metadata.num_columns)
     schema = file.schema_arrow
-    chosen = chosen_columns(path, schema.names, notes)
+    chosen = choose_columns(path, schema.names, notes)
     _check_types(path, schema, chosen)
     rows = int(file.metadata.num_rows)
     stated = sum(file.metadata.row_group(i).num_rows for i in range(file.metadata.num_row_groups))
-    memory_check.limit_of(path).check_rows(max(rows, stated))
+    memory_check.read_limit(path).check_rows(max(rows, stated))
     return chosen, rows
 
 
@@ -144,7 +152,7 @@ def read_ipc(path: Path) -> Table:
     with open_regular(path) as file:
         schema = _ipc_schema(path, file)
         own = METADATA_KEY in (schema.metadata or {})
-        chosen = chosen_columns(path, [name for name in schema.names if not (own and name in SEGMENT_COLUMNS)], notes)
+        chosen = choose_columns(path, [name for name in schema.names if not (own and name in SEGMENT_COLUMNS)], notes)
         count, _ = _checked_ipc(path, start, schema, chosen)
         if not _has_end_mark(path, start > 0):
             notes.append("The end mark is missing: the file is cut off and was read up to the cut.")
@@ -189,7 +197,7 @@ def _ipc_schema(path: Path, file: Any) -> Any:
         schema.names, schema.metadata  # noqa: B018 - raises for names that are not UTF-8
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise RecordingError(
-            f"{path}: is no Arrow IPC file or stream ({_first_line(error)}){looks_like(path)}"
+            f"{path}: is no Arrow IPC file or stream ({_first_line(error)}){describe_content(path)}"
         ) from error
     return schema
 
@@ -203,7 +211,7 @@ def _checked_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str])
         for field in schema
         for count in (buffer_count(pa, field.type),)
     ]
-    limit = memory_check.limit_of(path)
+    limit = memory_check.read_limit(path)
     batches = rows = dictionaries = 0
     with open_regular(path) as file:
         for size in batch_sizes(file, start):

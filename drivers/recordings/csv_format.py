@@ -33,8 +33,8 @@ from drivers.recordings.table import (
     Columns,
     Table,
     check_width,
-    chosen_columns,
-    looks_like,
+    choose_columns,
+    describe_content,
 )
 from drivers.sample import AXES, Floats
 
@@ -74,7 +74,7 @@ def count_rows(path: Path) -> int:
     RecordingError, ConfigError
         The file exceeds a limit of ``drivers.recordings.memory_check``. Reading stops at the limit.
     """
-    limit = memory_check.limit_of(path)
+    limit = memory_check.read_limit(path)
     lines = unpacked = 0
     with open_regular(path) as file:
         for text in _whole_lines(_decompressed(file, []), []):
@@ -106,7 +106,7 @@ def read_csv(path: Path) -> Table:
             what = notes[-1] if notes else "It has no line at all."
             raise RecordingError(f"{path}: has not one whole line, expected {EXAMPLE_HEADER}. {what}")
         names = _column_names(path, head)
-        chosen = chosen_columns(path, names, notes, f" in line {head.number}")
+        chosen = choose_columns(path, names, notes, f" in line {head.number}")
         use = [names.index(name) for name in chosen.values()]
         parts = list(_parse_pieces(path, head, texts, names, use, bad))
     rows = np.concatenate(parts) if parts else np.empty((0, len(use)))
@@ -235,7 +235,9 @@ def _has_axis(line: bytes) -> bool:
 def _column_names(path: Path, head: _Header) -> list[str]:
     """Return the column names of the header line. Raise RecordingError if it is not a header."""
     if b"\0" in head.line or not head.line:
-        raise RecordingError(f"{path}: is no CSV text; the first line would be {EXAMPLE_HEADER}{looks_like(path)}")
+        raise RecordingError(
+            f"{path}: is no CSV text; the first line would be {EXAMPLE_HEADER}{describe_content(path)}"
+        )
     text = head.line.decode("utf-8", errors="replace")
     for separator, word in ((";", "semicolons"), ("\t", "tabs")):
         if separator in text and "," not in text:

@@ -18,7 +18,7 @@ from drivers.recordings.arrow_format import (
 )
 from drivers.recordings.csv_format import csv_gz_writer, csv_writer, read_csv
 from drivers.recordings.npz_format import npz_writer, read_npz
-from drivers.recordings.table import Table, Writer, looks_like
+from drivers.recordings.table import Table, Writer, describe_content
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ FORMATS: Final[Mapping[str, Format]] = {
 """Suffixes of recordings, with the format of each."""
 
 
-def format_of(path: Path) -> Format:
+def format_for_path(path: Path) -> Format:
     """Return the format for the suffix of a path.
 
     Raises
@@ -53,7 +53,9 @@ def format_of(path: Path) -> Format:
     """
     suffix = _suffix(path)
     if not suffix:
-        raise ConfigError(f"{path}: not the suffix of a recording; known are {' '.join(FORMATS)}{looks_like(path)}")
+        raise ConfigError(
+            f"{path}: not the suffix of a recording; known are {' '.join(FORMATS)}{describe_content(path)}"
+        )
     return FORMATS[suffix]
 
 

@@ -72,7 +72,7 @@ class ReadLimit:
                 f"{self.path}: at least {rows} rows in a file of {self.size_bytes} bytes are no measured samples; "
                 f"the limit is {MIN_ROW_LIMIT} rows, or {MAX_ROWS_PER_BYTE} rows per byte in a larger file"
             )
-        check(self.path, rows * ROW_BYTES, self.free)
+        check_memory(self.path, rows * ROW_BYTES, self.free)
 
     def check_unpacked(self, unpacked_bytes: int) -> None:
         """Check the number of bytes that have been unpacked so far.
@@ -90,7 +90,7 @@ class ReadLimit:
             )
 
 
-def limit_of(path: Path) -> ReadLimit:
+def read_limit(path: Path) -> ReadLimit:
     """Return the limits on a file, with the memory that is available now.
 
     Raises
@@ -98,10 +98,10 @@ def limit_of(path: Path) -> ReadLimit:
     OSError
         There is no such file.
     """
-    return ReadLimit(path, path.stat().st_size, free_bytes())
+    return ReadLimit(path, path.stat().st_size, available_bytes())
 
 
-def free_bytes() -> int | None:
+def available_bytes() -> int | None:
     """Return the memory that is available to this process in bytes.
 
     This is the minimum of the available memory of the system, of its control groups (container or service limits) and
@@ -146,7 +146,7 @@ def process_bytes(statm: Path = STATM) -> int | None:
     return min(left) if left else None
 
 
-def check(path: Path, needed_bytes: int, free: int | None) -> None:
+def check_memory(path: Path, needed_bytes: int, free: int | None) -> None:
     """Check the size of samples against the available memory.
 
     Parameters

@@ -29,7 +29,16 @@ from numpy.typing import NDArray
 from drivers.errors import RecordingError
 from drivers.file_access import open_regular
 from drivers.recordings import memory_check
-from drivers.recordings.table import ALIASES, COLUMNS, Append, Columns, Table, check_width, chosen_columns, looks_like
+from drivers.recordings.table import (
+    ALIASES,
+    COLUMNS,
+    Append,
+    Columns,
+    Table,
+    check_width,
+    choose_columns,
+    describe_content,
+)
 from drivers.sample import Floats
 
 LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # PKWARE APPNOTE 4.3.7
@@ -97,7 +106,7 @@ def count_rows(path: Path) -> int:
         if not _has_index(path, file):
             return 0  # a truncated archive is measured while it is read
         with _open_archive(path, file) as archive:
-            return _checked_rows(path, archive, chosen_columns(path, _keys(archive), []))
+            return _checked_rows(path, archive, choose_columns(path, _keys(archive), []))
 
 
 def read_npz(path: Path) -> Table:
@@ -114,7 +123,7 @@ def read_npz(path: Path) -> Table:
     with _Archive(path) as file:
         if _has_index(path, file):
             with _open_archive(path, file) as archive:
-                chosen = chosen_columns(path, _keys(archive), notes)
+                chosen = choose_columns(path, _keys(archive), notes)
                 _checked_rows(path, archive, chosen)
                 columns = {name: _npz_column(path, archive, key) for name, key in chosen.items()}
                 return Table(columns, _npz_rate(path, archive, notes), notes)
@@ -129,7 +138,7 @@ def read_npz(path: Path) -> Table:
 def _has_index(path: Path, file: IO[bytes]) -> bool:
     """Return True for a zip archive with its index, False for one without. Raise RecordingError for any other file."""
     if file.read(len(LOCAL_MAGIC)) != LOCAL_MAGIC:
-        raise RecordingError(f"{path}: is no .npz file (a zip archive with one array a column){looks_like(path)}")
+        raise RecordingError(f"{path}: is no .npz file (a zip archive with one array a column){describe_content(path)}")
     file.seek(0)
     whole = zipfile.is_zipfile(file)
     file.seek(0)
@@ -157,7 +166,7 @@ def _member(archive: zipfile.ZipFile, key: str) -> zipfile.ZipInfo:
 
 def _checked_rows(path: Path, archive: zipfile.ZipFile, chosen: Mapping[str, str]) -> int:
     """Return the rows of the longest column, after checking all columns against the file size and the memory."""
-    limit = memory_check.limit_of(path)
+    limit = memory_check.read_limit(path)
     rows = 0
     for key in chosen.values():
         header = _header(path, archive, key)
@@ -267,7 +276,7 @@ def _single_rate(fs: NDArray[Any], notes: list[str]) -> float | None:
 
 def _table_of_recovered(path: Path, arrays: Mapping[str, NDArray[Any]], cut: str | None, notes: list[str]) -> Table:
     """Return recovered arrays as a ``Table``. The truncated column is padded with NaN."""
-    chosen = chosen_columns(path, list(arrays), notes)
+    chosen = choose_columns(path, list(arrays), notes)
     columns = {}
     for name, key in chosen.items():
         if arrays[key].ndim != 1:
@@ -287,7 +296,7 @@ def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
     Return the arrays in order, and the name of the truncated array if there is one. Arrays with unknown names are
     empty.
     """
-    limit = memory_check.limit_of(path)
+    limit = memory_check.read_limit(path)
     arrays: dict[str, NDArray[Any]] = {}
     unpacked = members = 0
     with open_regular(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:

@@ -32,8 +32,8 @@ from drivers.quantities import COUNTER_STEP, RATE_HZ
 from drivers.recordings.arrow_format import METADATA_KEY, SEGMENT_COLUMNS, import_pyarrow
 from drivers.recordings.arrow_messages import batch_sizes
 from drivers.recordings.memory_check import ROW_BYTES
-from drivers.recordings.table import BATCH_ROWS, PART, T_LIMIT_S
-from drivers.sample import AXES, Chunk, SampleBlock, block, join, ns_to_seconds, seconds_to_ns
+from drivers.recordings.table import BATCH_ROWS, PARTIAL_SUFFIX, T_LIMIT_S
+from drivers.sample import AXES, Chunk, SampleBlock, concatenate_blocks, make_block, ns_to_seconds, seconds_to_ns
 
 SUFFIX: Final = ".arrows"
 NAME: Final = re.compile(r"(\d{8})_[0-9TZ-]+\.arrows")
@@ -47,7 +47,7 @@ MAX_LOST_SAMPLES: Final = 10**11
 Kind = Literal["samples", "raw"]
 
 
-class Origin(msgspec.Struct, frozen=True):
+class SegmentMetadata(msgspec.Struct, frozen=True):
     """Source of the data in a segment."""
 
     device: str
@@ -59,7 +59,7 @@ class Origin(msgspec.Struct, frozen=True):
     schema: str = SCHEMA
 
 
-class State(msgspec.Struct, frozen=True):
+class DaemonState(msgspec.Struct, frozen=True):
     """State of the daemon at the end of a batch, from which a later run continues."""
 
     rate: float | None = None  # Hz
@@ -72,11 +72,11 @@ class State(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class SegmentPiece:
     """Consecutive samples from one batch of a segment."""
 
     samples: SampleBlock  # t_ns are Unix times
-    state: State
+    state: DaemonState
 
 
 class SegmentWriter:
@@ -95,18 +95,18 @@ class SegmentWriter:
         Writing to the disk failed. Every method can raise it. Batches that were complete stay readable.
     """
 
-    def __init__(self, path: Path, origin: Origin) -> None:
+    def __init__(self, path: Path, origin: SegmentMetadata) -> None:
         self.path = path
         self._pa = import_pyarrow(path)
         self._schema = _schema(self._pa, origin)
-        self._state = State()
-        self._temporary_path = path.with_name(path.name + PART)
+        self._state = DaemonState()
+        self._temporary_path = path.with_name(path.name + PARTIAL_SUFFIX)
         self._temporary_path.unlink(missing_ok=True)  # left by a program that was killed
         self._file: IO[bytes] = self._temporary_path.open("xb", buffering=0)
         self._writer = self._pa.ipc.new_stream(self._file, self._schema)
         self._valid_bytes = 0  # length in bytes of all complete batches
 
-    def samples(self, blocks: Sequence[SampleBlock], state: State) -> None:
+    def samples(self, blocks: Sequence[SampleBlock], state: DaemonState) -> None:
         """Write one batch of samples.
 
         Parameters
@@ -126,7 +126,7 @@ class SegmentWriter:
         """Flush the written data to the disk, so that they survive a power failure."""
         os.fdatasync(self._file.fileno())
 
-    def change(self) -> str:
+    def external_change(self) -> str:
         """Return how another program has changed the file that is being written; "" if it has not."""
         try:
             named = os.stat(self.path if self._valid_bytes else self._temporary_path, follow_symlinks=False)
@@ -191,7 +191,7 @@ def segment_name(number: int, unix_s: float) -> str:
     return f"{number:08d}_{when}{SUFFIX}"
 
 
-def began_s(path: Path) -> float:
+def segment_start_s(path: Path) -> float:
     """Return the Unix time in the name of a segment in whole seconds; 0 if the name contains none.
 
     >>> began_s(Path("00000042_2023-11-14T22-13-20Z.arrows"))
@@ -203,20 +203,20 @@ def began_s(path: Path) -> float:
         return 0.0
 
 
-def segments(folder: Path) -> list[Path]:
+def list_segments(folder: Path) -> list[Path]:
     """Return the segments of a folder, oldest first. The list is empty if there is no such folder."""
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if NAME.fullmatch(path.name))
 
 
-def number_of(path: Path) -> int:
+def segment_number(path: Path) -> int:
     """Return the number of a segment in its folder; 0 if the name is not that of a segment."""
     found = NAME.fullmatch(path.name)
     return int(found[1]) if found else 0
 
 
-def origin(path: Path) -> Origin:
+def read_metadata(path: Path) -> SegmentMetadata:
     """Return the source of the data in a segment.
 
     Raises
@@ -229,7 +229,7 @@ def origin(path: Path) -> Origin:
         return _origin(path, pa.ipc.open_stream(file).schema)
 
 
-def newest(path: Path) -> Piece | None:
+def read_last_piece(path: Path) -> SegmentPiece | None:
     """Read the last piece of a segment that is no longer written; None if the segment is empty.
 
     The file is mapped into memory, so that the other batches are not read.
@@ -244,7 +244,7 @@ def newest(path: Path) -> Piece | None:
     return pieces[-1] if pieces else None
 
 
-def read_samples(path: Path) -> Iterator[Piece]:
+def read_samples(path: Path) -> Iterator[SegmentPiece]:
     """Yield the pieces of a segment of samples, up to a truncation.
 
     Raises
@@ -256,19 +256,19 @@ def read_samples(path: Path) -> Iterator[Piece]:
         yield from _pieces(batch, meta)
 
 
-def _pieces(batch: Any, meta: Any) -> Iterator[Piece]:
+def _pieces(batch: Any, meta: Any) -> Iterator[SegmentPiece]:
     """Yield the samples of a batch, split where samples are missing. Yield nothing if the values are implausible."""
     columns = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in batch.schema.names}
     values = np.column_stack([columns[axis] for axis in AXES])
     if not _is_plausible(columns) or np.isinf(values).any():
         return
     state = _state(meta)
-    rows = block(seconds_to_ns(columns["t"]), values, columns["temperature"].copy(), columns["ticks"].copy())
+    rows = make_block(seconds_to_ns(columns["t"]), values, columns["temperature"].copy(), columns["ticks"].copy())
     lost = columns["lost"]
     edges = [0, *(np.flatnonzero(lost[1:]) + 1).tolist(), len(rows)]
     for a, b in pairwise(edges):
         part = rows[a:b]
-        yield Piece(block(part.t_ns, part.values, part.temperature_c, part.ticks, int(lost[a])), state)
+        yield SegmentPiece(make_block(part.t_ns, part.values, part.temperature_c, part.ticks, int(lost[a])), state)
 
 
 def _is_plausible(columns: Mapping[str, Any]) -> bool:
@@ -281,16 +281,16 @@ def _is_plausible(columns: Mapping[str, Any]) -> bool:
     return bool(whole and (np.abs(columns["t"]) < T_LIMIT_S).all() and ((lost >= 0) & (lost <= MAX_LOST_SAMPLES)).all())
 
 
-def _state(meta: Any) -> State:
+def _state(meta: Any) -> DaemonState:
     """Return the state in the metadata of a batch; an empty state if it cannot be read."""
     try:
-        found = msgspec.json.decode(meta.get(b"state", b"{}"), type=State) if meta else State()
+        found = msgspec.json.decode(meta.get(b"state", b"{}"), type=DaemonState) if meta else DaemonState()
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return State()
+        return DaemonState()
     sizes = len(found.theta) == len(found.entered) and len(found.theta) in (0, 5 * len(AXES))
     rate = found.rate is None or RATE_HZ.supports(found.rate)
     step = found.tick_step is None or COUNTER_STEP.supports(found.tick_step)
-    return found if sizes and len(found.since) == len(AXES) and rate and step else State()
+    return found if sizes and len(found.since) == len(AXES) and rate and step else DaemonState()
 
 
 def read_chunks(path: Path) -> Iterator[Chunk]:
@@ -310,7 +310,7 @@ def read_chunks(path: Path) -> Iterator[Chunk]:
                     yield Chunk(data, t_ns, address, attachment)
 
 
-def pack(path: Path) -> Iterator[None]:
+def compress_segment(path: Path) -> Iterator[None]:
     """Write a segment that has ended again with compression, and replace the original at the end.
 
     The generator yields after each batch, so that the caller can spread the work.
@@ -323,11 +323,11 @@ def pack(path: Path) -> Iterator[None]:
         The disk is full. The original segment is unchanged.
     """
     pa = import_pyarrow(path)
-    own = origin(path)
+    own = read_metadata(path)
     if own.packed:
         return
     schema = _schema(pa, msgspec.structs.replace(own, packed=True))
-    part = path.with_name(path.name + PART)
+    part = path.with_name(path.name + PARTIAL_SUFFIX)
     options = pa.ipc.IpcWriteOptions(compression="zstd")
     try:
         part.unlink(missing_ok=True)
@@ -434,12 +434,12 @@ class _arrow_errors:  # noqa: N801 - used like a function
             raise RecordingError(f"{self._path}: is no segment of a recording ({first})") from error
 
 
-def _origin(path: Path, schema: Any) -> Origin:
+def _origin(path: Path, schema: Any) -> SegmentMetadata:
     """Return the source of a segment from its schema. Raise RecordingError if it is not a segment."""
     meta = (schema.metadata or {}).get(METADATA_KEY)
     if meta is None:
         raise RecordingError(f"{path}: is no segment of a recording: nothing says which device it is of")
-    found = msgspec.json.decode(meta, type=Origin)
+    found = msgspec.json.decode(meta, type=SegmentMetadata)
     if found.schema != SCHEMA:
         raise RecordingError(f'{path}: schema "{found.schema[:64]}" is not {SCHEMA}')
     if not schema.equals(_schema(import_pyarrow(path), found), check_metadata=False):
@@ -447,7 +447,7 @@ def _origin(path: Path, schema: Any) -> Origin:
     return found
 
 
-def _schema(pa: Any, of: Origin) -> Any:
+def _schema(pa: Any, of: SegmentMetadata) -> Any:
     """Return the schema of a segment."""
     if of.kind == "samples":
         fields = [(name, pa.float64()) for name in ("t", *AXES, "temperature")]
@@ -459,7 +459,7 @@ def _schema(pa: Any, of: Origin) -> Any:
 
 def _sample_batch(pa: Any, schema: Any, blocks: Sequence[SampleBlock]) -> Any:
     """Return blocks of samples as one record batch."""
-    rows = join(blocks)
+    rows = concatenate_blocks(blocks)
     lost = np.zeros(len(rows), np.int64)
     at = 0
     for one in blocks:

@@ -33,7 +33,7 @@ T_LIMIT_S: Final = 4.6e9
 A larger number is not a time in seconds.
 """
 
-PART: Final = ".part"
+PARTIAL_SUFFIX: Final = ".part"
 """Suffix that is appended to a file name while the file is being written."""
 
 Columns = Mapping[str, Floats]
@@ -77,7 +77,7 @@ def check_width(path: Path, columns: int) -> None:
         )
 
 
-def chosen_columns(path: Path, names: Sequence[str], notes: list[str], where: str = "") -> dict[str, str]:
+def choose_columns(path: Path, names: Sequence[str], notes: list[str], where: str = "") -> dict[str, str]:
     """Choose the known columns of a file.
 
     Parameters
@@ -112,13 +112,13 @@ def chosen_columns(path: Path, names: Sequence[str], notes: list[str], where: st
             chosen.setdefault(name, alias)
     if not any(axis in chosen for axis in AXES):
         raise RecordingError(
-            f"{path}: no axis among its columns ({listed(names)}){where}; "
-            f"a recording has some of {' '.join(AXES)}, in rad/s and m/s²{looks_like(path)}"
+            f"{path}: no axis among its columns ({format_names(names)}){where}; "
+            f"a recording has some of {' '.join(AXES)}, in rad/s and m/s²{describe_content(path)}"
         )
     used = {*chosen.values(), "fs"}
     others = [name for name in names if name not in used]
     if others:
-        notes.append(f"Other columns were left aside: {listed(others)}.")
+        notes.append(f"Other columns were left aside: {format_names(others)}.")
     return chosen
 
 
@@ -138,7 +138,7 @@ CONTENTS: Final = (
 """First bytes of files, the kind of such a file, and the suffixes under which a reader expects it."""
 
 
-def looks_like(path: Path) -> str:
+def describe_content(path: Path) -> str:
     """Return the end of a message that describes the content of a file and the remedy.
 
     The text is empty if the content matches the suffix, or if the kind of content is unknown.
@@ -160,7 +160,7 @@ def looks_like(path: Path) -> str:
     return ""
 
 
-def listed(names: Sequence[str], most: int = 12) -> str:
+def format_names(names: Sequence[str], most: int = 12) -> str:
     """Return names as a list for a message, shortened and without control characters.
 
     Parameters

@@ -13,8 +13,8 @@ from typing import Protocol
 import numpy as np
 
 from drivers.errors import ConfigError, RecordingError
-from drivers.recordings.formats import format_of
-from drivers.recordings.table import PART, T_LIMIT_S, listed
+from drivers.recordings.formats import format_for_path
+from drivers.recordings.table import PARTIAL_SUFFIX, T_LIMIT_S, format_names
 from drivers.sample import AXES, Floats
 
 
@@ -36,7 +36,7 @@ class AppendSamples(Protocol):
 
 
 @contextmanager
-def writing(path: Path, axes: Sequence[str], temperature: bool) -> Iterator[AppendSamples]:
+def open_recording_writer(path: Path, axes: Sequence[str], temperature: bool) -> Iterator[AppendSamples]:
     """Write a recording in blocks of rows, in the format of the path's suffix.
 
     Parameters
@@ -57,11 +57,11 @@ def writing(path: Path, axes: Sequence[str], temperature: bool) -> Iterator[Appe
     """
     unknown = [axis for axis in axes if axis not in AXES]
     if unknown or not axes:
-        what = f"unknown axis {listed(unknown)}" if unknown else "no axis has a value"
+        what = f"unknown axis {format_names(unknown)}" if unknown else "no axis has a value"
         raise RecordingError(f"{path}: {what}; axes are {' '.join(AXES)}")
-    begin = format_of(path).writer
+    begin = format_for_path(path).writer
     names = ["t", *axes, *(["temperature"] if temperature else [])]
-    with whole(path) as part, begin(part, names) as append_columns:
+    with atomic_write_path(path) as part, begin(part, names) as append_columns:
 
         def append(t_s: Floats, values: Floats, temperature_c: Floats | None = None) -> None:
             _check(path, t_s, values, temperature_c)
@@ -106,12 +106,12 @@ def save_samples(
     if axes is None:
         axes = [axis for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()]
     temperature = temperature_c is not None and not np.isnan(temperature_c).all()
-    with writing(path, axes, temperature) as append:
+    with open_recording_writer(path, axes, temperature) as append:
         append(t_s, values, temperature_c)
 
 
 @contextmanager
-def whole(path: Path) -> Iterator[Path]:
+def atomic_write_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path that is renamed to ``path`` at the end, and removed after an exception.
 
     Raises
@@ -123,7 +123,7 @@ def whole(path: Path) -> Iterator[Path]:
         raise ConfigError(f"{path}: cannot be written: there is no folder {path.parent}")
     if path.is_dir():  # report this before the work rather than after it
         raise ConfigError(f"{path}: cannot be written: it is a folder")
-    part = path.with_name(path.name + PART)
+    part = path.with_name(path.name + PARTIAL_SUFFIX)
     try:
         if part.exists() and not part.is_file():  # opening a FIFO would wait for its reader
             part.unlink()

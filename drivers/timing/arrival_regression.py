@@ -37,7 +37,7 @@ STANDARD_RATES_HZ: Final = np.array([
 # fmt: on
 
 
-class Line:
+class ArrivalRegression:
     """Least-squares line of time on sample index with exponential forgetting.
 
     The sums are kept relative to the newest point.
@@ -133,7 +133,7 @@ class Line:
         return self._t0 + self._mt + (index - self._x0 - self._mx) * period
 
 
-def made_rate(measured_hz: float) -> float:
+def snap_to_standard_rate(measured_hz: float) -> float:
     """Return the nearest standard rate in Hz if it is within STANDARD_RATE_TOLERANCE of the measured rate.
 
     Otherwise return the measured rate rounded to 5 digits.

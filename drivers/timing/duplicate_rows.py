@@ -17,9 +17,9 @@ from drivers.sample import Event, Floats, Ints
 
 Mask = NDArray[np.bool_]
 
-NS: Final = 1e9
+NS_PER_S: Final = 1e9
 """Nanoseconds per second."""
-FRESH: Final = 20
+MIN_NEW_KEYS: Final = 20
 """Minimum number of rows with a new key. With fewer rows, no row is called a repeat."""
 MAX_SHARED_FRACTION: Final = 0.05
 """Maximum fraction of rows that share a key with another row but differ in values. Above it, keys are too coarse."""
@@ -29,11 +29,11 @@ SEARCH_ROWS: Final = 256
 """Number of earlier rows that are searched for a repeat."""
 STEP_TOLERANCE: Final = 0.25
 """Tolerance as a fraction of a period. Times this close to a whole number of periods form a steady sequence."""
-EVENT_S: Final = 1.0
+MIN_EVENT_INTERVAL_S: Final = 1.0
 """Shortest time between two events of one kind."""
 
 
-class Repeats:
+class DuplicateDetector:
     """Detector of rows that repeat an earlier row.
 
     Parameters
@@ -72,7 +72,7 @@ class Repeats:
             steps = np.diff(keys)
             fresh = bool((steps > 0).all() if self._ordered else (steps != 0).all())
         newest = int(keys[-1])
-        if self._ordered and newest > self._last - NS:  # a clock set back by more than a second restarts
+        if self._ordered and newest > self._last - NS_PER_S:  # a clock set back by more than a second restarts
             newest = max(self._last, newest if n == 1 else int(keys.max()))
         self._last = newest
         if fresh:
@@ -87,7 +87,7 @@ class Repeats:
         same = ((first == second) | (np.isnan(first) & np.isnan(second))).all(axis=1)
         self._update_shared_fraction(n - len(row), int((~same).sum()))
         self._remember(keys, values)
-        if self._fresh < FRESH or self._shared > MAX_SHARED_FRACTION * (self._fresh + self._shared):
+        if self._fresh < MIN_NEW_KEYS or self._shared > MAX_SHARED_FRACTION * (self._fresh + self._shared):
             return None, 0
         repeats = np.zeros(n, np.bool_)
         repeats[row[same] - at] = True
@@ -143,14 +143,14 @@ def steady_order(t_ns: Ints, period_s: float) -> Ints | None:
         return None
     order = np.argsort(t_ns, kind="stable")
     moved = np.flatnonzero(order != np.arange(len(order)))
-    steps = np.diff(t_ns[order]) / (NS * period_s)
+    steps = np.diff(t_ns[order]) / (NS_PER_S * period_s)
     touched = np.unique(np.clip(np.concatenate([moved - 1, moved]), 0, len(steps) - 1))
     whole = np.rint(steps[touched])
     steady = (whole >= 1.0) & (np.abs(steps[touched] - whole) < STEP_TOLERANCE)
     return order if bool(steady.all()) else None
 
 
-class Telling:
+class EventRateLimiter:
     """Rate limiter for events: passes at most one event of each kind in EVENT_S of sample time.
 
     Events that are held back are summed up in the next one.
@@ -188,7 +188,7 @@ class Telling:
     def tell_due(self, t_ns: int) -> None:
         """Report the events that have been held back for EVENT_S at the time ``t_ns``."""
         for (kind, what), (at_ns, text, n) in [*self._held_back.items()] if self._held_back else ():
-            if kind not in self._last or abs(t_ns - self._last[kind]) >= EVENT_S * NS:
+            if kind not in self._last or abs(t_ns - self._last[kind]) >= MIN_EVENT_INTERVAL_S * NS_PER_S:
                 del self._held_back[(kind, what)]
                 self._last[kind] = t_ns
                 more = f", and {n} more of the kind within a second" if n and "{n}" not in text else ""

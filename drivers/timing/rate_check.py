@@ -10,7 +10,7 @@ docs/decisions/rate-is-a-label.md and docs/decisions/contradicted-rate.md. The m
 
 from typing import Final
 
-from drivers.timing.arrival_regression import made_rate
+from drivers.timing.arrival_regression import snap_to_standard_rate
 
 AGREEMENT_LIMIT: Final = 0.005
 """Relative difference up to which two rates agree. N and K are then off by a quarter of a percent at most."""
@@ -67,4 +67,4 @@ class RateCheck:
         if difference <= max(AGREEMENT_LIMIT, uncertainty):
             self.rate_hz = self.configured_hz
         elif self.rate_hz == self.configured_hz or abs(measured_hz / self.rate_hz - 1.0) > UPDATE_THRESHOLD:
-            self.rate_hz = made_rate(measured_hz)
+            self.rate_hz = snap_to_standard_rate(measured_hz)

@@ -32,10 +32,17 @@ from typing import Final
 import numpy as np
 
 from drivers.quantities import RATE_HZ
-from drivers.sample import NO_TICK, Counter, Event, Floats, Given, Ints, SampleBlock, Timing, block
+from drivers.sample import NO_TICK, CounterTiming, Event, Floats, Ints, SampleBlock, SenderTiming, Timing, make_block
 from drivers.timing.arrival_bound import ArrivalBound
-from drivers.timing.arrival_regression import MIN_SAMPLES, MIN_SPAN_S, Line, made_rate
-from drivers.timing.duplicate_rows import NS, SEARCH_ROWS, STEP_TOLERANCE, Repeats, Telling, steady_order
+from drivers.timing.arrival_regression import MIN_SAMPLES, MIN_SPAN_S, ArrivalRegression, snap_to_standard_rate
+from drivers.timing.duplicate_rows import (
+    NS_PER_S,
+    SEARCH_ROWS,
+    STEP_TOLERANCE,
+    DuplicateDetector,
+    EventRateLimiter,
+    steady_order,
+)
 from drivers.timing.rate_check import RateCheck
 
 CATCH_UP_S: Final = 3.0
@@ -51,7 +58,7 @@ PERIOD_TOLERANCE: Final = 0.05
 """Plausible relative error of the sample period when the missing samples of a gap are compared with a time."""
 MAX_RESUME_DELAY_S: Final = 10.0
 """Assumed maximum read delay of the last sample that was recorded before a restart."""
-LONG_S: Final = 3600.0
+FORWARD_JUMP_S: Final = 3600.0
 """A step of given times beyond this time is reported as an event as well."""
 MAX_RATE_HZ: Final = 32_000.0
 """No inertial sensor is read faster.
@@ -84,7 +91,7 @@ MAX_LATENESS_RATIO: Final = 8.0
 
 
 @dataclass(frozen=True, slots=True)
-class Before:
+class LastSample:
     """Last sample before a restart of the program."""
 
     t_ns: int  # in the epoch of the device's times
@@ -115,17 +122,17 @@ class SampleClock:
         self._stamped = 0  # samples
         self._stamped_s = 0.0  # from the first sample to the newest, by their original times
         self._ended = self._resumed = False
-        self.repeated = 0
+        self.repeated_rows = 0
         """Rows left out because they repeat earlier rows."""
-        self.late = 0
+        self.late_rows = 0
         """Rows left out because their places had been reported as missing."""
-        self._telling = Telling()
-        self._repeats = Repeats(ordered=isinstance(timing, Given))
+        self._telling = EventRateLimiter()
+        self._repeats = DuplicateDetector(ordered=isinstance(timing, SenderTiming))
         self._missing_t_ns: deque[int] = deque(
             maxlen=SEARCH_ROWS
         )  # times in ns of samples that were reported as missing
         self._carried_lost = 0  # missing samples before rows that were left out
-        self._line = Line()
+        self._line = ArrivalRegression()
         self._origin_ns: int | None = None  # origin of seconds, as a float64 of Unix time resolves only 240 ns
         self._last_t_ns = -(1 << 62)
         self._index = 0.0  # samples since the line's start, missing ones included
@@ -133,7 +140,7 @@ class SampleClock:
         self._delay: _Delay | None = None
         self._tick: int | None = None  # last counter value
         self._tick_step = _CounterStep()
-        self._device_line = Line()  # device clock against sample index, if the length of a tick is known
+        self._device_line = ArrivalRegression()  # device clock against sample index, if the length of a tick is known
         self._device_s = self._device_index = 0.0
         self._went_back = False
         self._given_steps: deque[float] = deque(maxlen=STEP_HISTORY)  # s
@@ -143,14 +150,14 @@ class SampleClock:
         self._idle_ns: int | None = None  # the link held no data at this time
         self._earlier_hz: float | None = None  # rate before a restart of the program, used until the line shows one
 
-    def resume(self, before: Before) -> None:
+    def resume(self, before: LastSample) -> None:
         """Continue from the last sample that was recorded before a restart. The samples since then are missing."""
         self._resumed = True
         self._earlier_hz = self._nominal_hz or before.rate_hz
         self._last_t_ns = self._arrived_ns = before.t_ns
         self._origin_ns = before.t_ns
         self._bound.start(-MAX_RESUME_DELAY_S)
-        if isinstance(self._timing, Given):
+        if isinstance(self._timing, SenderTiming):
             self._line.add(self._index, 0.0, self._earlier_hz)
         if before.tick != NO_TICK and before.tick_step is not None:
             self._tick = before.tick
@@ -174,7 +181,7 @@ class SampleClock:
         if self._nominal_hz or not self._line.settled():
             return self._nominal_hz or self._earlier_hz
         measured = self._line.rate_hz()
-        return made_rate(measured) if measured and RATE_HZ.supports(measured) else None
+        return snap_to_standard_rate(measured) if measured and RATE_HZ.supports(measured) else None
 
     @property
     def measured_hz(self) -> float | None:
@@ -187,7 +194,7 @@ class SampleClock:
         return self._check.measured_hz if self._check is not None and self._check.contradicted else None
 
     @property
-    def unchecked(self) -> bool:
+    def rate_check_pending(self) -> bool:
         """True if samples have arrived but the check of the nominal rate has not been made yet."""
         if self._check is None or self._check.measured_hz is not None or self._ended:
             return False
@@ -196,14 +203,14 @@ class SampleClock:
         few, many = RATE_CHECK_SAMPLES
         if self._stamped > many or (self._stamped > few and self._stamped_s > RATE_CHECK_S):
             return False
-        return self._arrivals_are_timed or isinstance(self._timing, Given) or self._device_line.count > 0
+        return self._arrivals_are_timed or isinstance(self._timing, SenderTiming) or self._device_line.count > 0
 
     def end(self) -> None:
         """Compare the rates with the available samples, since no more samples will arrive."""
         if self._check is None or self._ended:
             return
         self._ended = True
-        line = self._line if isinstance(self._timing, Given) else self._device_line
+        line = self._line if isinstance(self._timing, SenderTiming) else self._device_line
         found = line.measured(final=True) if self._check.measured_hz is None else None
         if found is not None:
             self._check.update(*found)
@@ -223,7 +230,7 @@ class SampleClock:
         """
         self._idle_ns = t_ns
 
-    def stamp(self, samples: SampleBlock) -> list[SampleBlock]:
+    def assign_times(self, samples: SampleBlock) -> list[SampleBlock]:
         """Give samples their times.
 
         Parameters
@@ -250,32 +257,34 @@ class SampleClock:
             self._check.update(*found)
         return stamped
 
-    def _rate_line(self) -> Line:
+    def _rate_line(self) -> ArrivalRegression:
         """Return the line that shows the rate of the device, preferably by the clock of the device. It may be empty."""
-        timed = self._arrivals_are_timed or isinstance(self._timing, Given)
+        timed = self._arrivals_are_timed or isinstance(self._timing, SenderTiming)
         return self._line if timed and not self._device_line.count else self._device_line
 
     def _stamp(self, samples: SampleBlock) -> list[SampleBlock]:
         """Determine missing samples and times according to the timing of the wire format."""
-        if isinstance(self._timing, Given):
+        if isinstance(self._timing, SenderTiming):
             return self._use_given_times(samples)
         if self._paused and self.rate_hz is None:
-            self._line = Line()  # the number of missing samples is unknown, so a line cannot span the pause
-        if isinstance(self._timing, Counter) and (samples.ticks != NO_TICK).all():
+            self._line = (
+                ArrivalRegression()
+            )  # the number of missing samples is unknown, so a line cannot span the pause
+        if isinstance(self._timing, CounterTiming) and (samples.ticks != NO_TICK).all():
             return self._place_on_line(samples, self._counted_gaps(samples, self._timing))
         self._tick = None  # samples without a counter value interrupt the count
         return self._place_on_line(samples, self._arrival_gaps(samples))
 
     def _seconds(self, t_ns: int) -> float:
         """Return the seconds since the first sample."""
-        return (t_ns - (self._origin_ns or 0)) / NS
+        return (t_ns - (self._origin_ns or 0)) / NS_PER_S
 
     # --- repeated and late rows
 
     def _remove_repeats(self, samples: SampleBlock) -> SampleBlock | None:
         """Remove rows that repeat an earlier row; None if no row remains."""
-        given = isinstance(self._timing, Given)
-        if not given and (not isinstance(self._timing, Counter) or (samples.ticks == NO_TICK).any()):
+        given = isinstance(self._timing, SenderTiming)
+        if not given and (not isinstance(self._timing, CounterTiming) or (samples.ticks == NO_TICK).any()):
             return samples
         keys, word = (samples.t_ns, "time") if given else (samples.ticks, "count")
         repeats, shared = self._repeats.find(keys, samples.values)
@@ -286,13 +295,13 @@ class SampleClock:
         if repeats is None:
             return samples
         n = int(repeats.sum())
-        self.repeated += n
+        self.repeated_rows += n
         self._event("samples_repeated", t_ns, f"{{n}} rows repeat others, {word} and values; left out", n)
         return self._select_rows(samples, np.flatnonzero(~repeats))
 
     def _sort_given_times(self, samples: SampleBlock | None) -> SampleBlock | None:
         """Sort rows of one block by their given times, and remove rows whose places were reported as missing."""
-        if samples is None or not isinstance(self._timing, Given):
+        if samples is None or not isinstance(self._timing, SenderTiming):
             return samples
         t = samples.t_ns
         if not self._line.count or (t[0] >= self._last_t_ns and (len(t) == 1 or (np.diff(t) >= 0).all())):
@@ -306,7 +315,7 @@ class SampleClock:
                 return None
             t = samples.t_ns
         steps = np.diff(t)
-        order = None if (steps < -JUMP_S * NS).any() else steady_order(t, period_s)
+        order = None if (steps < -JUMP_S * NS_PER_S).any() else steady_order(t, period_s)
         if order is None:
             return samples
         n = int((steps < 0).sum())
@@ -317,13 +326,13 @@ class SampleClock:
         """Remove rows whose places were reported as missing; None if no row remains."""
         holes = np.array(self._missing_t_ns)
         far = np.abs(samples.t_ns[:, None] - holes)
-        late = (samples.t_ns < self._last_t_ns) & (far.min(axis=1) < STEP_TOLERANCE * period_s * NS)
+        late = (samples.t_ns < self._last_t_ns) & (far.min(axis=1) < STEP_TOLERANCE * period_s * NS_PER_S)
         if not late.any():
             return samples
         filled = set(far[late].argmin(axis=1).tolist())
         self._missing_t_ns = deque((t for i, t in enumerate(self._missing_t_ns) if i not in filled), maxlen=SEARCH_ROWS)
         n = int(late.sum())
-        self.late += n
+        self.late_rows += n
         text = "{n} samples came after later ones, their places passed on as missing; left out"
         self._event("clock_jumped", int(samples.t_ns[-1]), text, n)
         return self._select_rows(samples, np.flatnonzero(~late))
@@ -334,7 +343,9 @@ class SampleClock:
             self._carried_lost += samples.lost
             return None
         lost, self._carried_lost = samples.lost + self._carried_lost, 0
-        return block(samples.t_ns[rows], samples.values[rows], samples.temperature_c[rows], samples.ticks[rows], lost)
+        return make_block(
+            samples.t_ns[rows], samples.values[rows], samples.temperature_c[rows], samples.ticks[rows], lost
+        )
 
     # --- times given by the sender
 
@@ -346,25 +357,27 @@ class SampleClock:
         np.subtract(t[1:], t[:-1], out=steps[1:])
         shortest, longest = int(steps.min()), int(steps.max())
         jumps = np.zeros(0, np.int64)
-        if shortest < 0 or longest > LONG_S * NS:
+        if shortest < 0 or longest > FORWARD_JUMP_S * NS_PER_S:
             self._report_jumps(t, steps)
-            jumps = np.flatnonzero((steps < -JUMP_S * NS) | (steps > LONG_S * NS))
+            jumps = np.flatnonzero((steps < -JUMP_S * NS_PER_S) | (steps > FORWARD_JUMP_S * NS_PER_S))
         period_s = self._given_period_s(steps)
         missing = np.zeros(len(samples), np.int64)
         if period_s:
-            missing = self._given_gaps(steps / NS, period_s)
+            missing = self._given_gaps(steps / NS_PER_S, period_s)
         missing[0] = max(int(missing[0]), samples.lost)
         index = self._index + np.cumsum(missing + 1)
         # a line must not contain a jump
         at = int(jumps[-1]) if jumps.size else 0
         if jumps.size:
-            self._line = Line()
+            self._line = ArrivalRegression()
         for row in (at, len(samples) - 1):
             self._line.add(float(index[row]), self._seconds(int(t[row])))
         self._index, self._last_t_ns = float(index[-1]), int(t[-1])
         if period_s and missing.any():
             for row in np.flatnonzero((missing > 0) & (missing <= SEARCH_ROWS)).tolist():
-                places = np.arange(1, missing[row] + 1) * min(period_s * NS, float(1 << 54))  # 2 years: within int64
+                places = np.arange(1, missing[row] + 1) * min(
+                    period_s * NS_PER_S, float(1 << 54)
+                )  # 2 years: within int64
                 self._missing_t_ns.extend((t[row] - np.rint(places)).astype(np.int64).tolist())
         return _split_at_gaps(samples, t, missing)
 
@@ -374,18 +387,18 @@ class SampleClock:
             return self._line.period_s()
         if rate := self._nominal_hz or self._earlier_hz:
             return 1.0 / rate
-        return _typical_period_s(steps) if steps.sum() > MIN_SPAN_S * NS else None
+        return _typical_period_s(steps) if steps.sum() > MIN_SPAN_S * NS_PER_S else None
 
     def _report_jumps(self, t: Ints, steps: Ints) -> None:
         """Report times that went back or jumped ahead."""
-        back = steps < (-JUMP_S * NS if self._went_back else 0.0)  # jitter back and forth is reported once
+        back = steps < (-JUMP_S * NS_PER_S if self._went_back else 0.0)  # jitter back and forth is reported once
         if back.any():
             at = int(np.argmax(back))
-            self._event("clock_jumped", int(t[at]), f"time went back by {-steps[at] / NS:.6g} s")
+            self._event("clock_jumped", int(t[at]), f"time went back by {-steps[at] / NS_PER_S:.6g} s")
             self._went_back = True
-        if (steps > LONG_S * NS).any():
+        if (steps > FORWARD_JUMP_S * NS_PER_S).any():
             at = int(np.argmax(steps))
-            self._event("clock_jumped", int(t[at]), f"time went on by {steps[at] / NS:.6g} s at one step")
+            self._event("clock_jumped", int(t[at]), f"time went on by {steps[at] / NS_PER_S:.6g} s at one step")
 
     def _given_gaps(self, steps_s: Floats, period_s: float) -> Ints:
         """Return the missing samples [n] before each row; all zero unless most steps are one period long.
@@ -413,10 +426,10 @@ class SampleClock:
 
     # --- missing samples
 
-    def _counted_gaps(self, samples: SampleBlock, counter: Counter) -> Ints:
+    def _counted_gaps(self, samples: SampleBlock, counter: CounterTiming) -> Ints:
         """Return the missing samples [n] before each row according to the counter of the device."""
         arrived_ns = int(samples.t_ns[-1])
-        elapsed_s = (arrived_ns - self._arrived_ns) / NS
+        elapsed_s = (arrived_ns - self._arrived_ns) / NS_PER_S
         first = self._tick is None
         previous = int(samples.ticks[0]) if self._tick is None else self._tick
         steps = np.empty(len(samples), np.int64)
@@ -438,7 +451,7 @@ class SampleClock:
         elif self._has_jumped(missing, steps, counter, arrived_ns):
             ahead = int(steps.max())
             moved = f"back by {counter.modulus - ahead}" if 2 * ahead > counter.modulus else f"on by {ahead}"
-            self._device_line = Line()
+            self._device_line = ArrivalRegression()
             text = f"counter went {moved} ticks within {elapsed_s:.3f} s"
             self._event("clock_jumped", int(samples.t_ns[0]), text)
             at = int(np.argmax(steps))
@@ -459,7 +472,7 @@ class SampleClock:
         self._device_index += samples
         self._device_line.add(self._device_index, self._device_s)
 
-    def _hidden_wraps(self, steps: Ints, size: float | None, counter: Counter, arrived_ns: int) -> int:
+    def _hidden_wraps(self, steps: Ints, size: float | None, counter: CounterTiming, arrived_ns: int) -> int:
         """Return how often a short counter wrapped unseen during a pause of the link or a delay not caught up."""
         if size is None:
             return 0
@@ -470,13 +483,13 @@ class SampleClock:
         counted = int(np.rint(steps / size).sum())
         if self._paused:
             self._delay = None
-            elapsed_s = (arrived_ns - self._arrived_ns) / NS
+            elapsed_s = (arrived_ns - self._arrived_ns) / NS_PER_S
             turns = max(0, round((elapsed_s * rate - counted) / turn))
         else:
             turns = round(self._gap_from_delay(arrived_ns, counted, turn / 2.0) / turn)
         return turns if turns * counter.modulus < MAX_STEP_TICKS else 0
 
-    def _ticks_a_sample(self, counter: Counter) -> float | None:
+    def _ticks_a_sample(self, counter: CounterTiming) -> float | None:
         """Return the ticks per sample; None if they are unknown."""
         seen = self._tick_step.usual()
         if counter.tick_s is None or self._nominal_hz is None:
@@ -500,7 +513,7 @@ class SampleClock:
             waited[at] = np.diff(moved, prepend=-1 - before) - 1
         return np.where(waited >= MIN_STUCK_SAMPLES, waited, 0)
 
-    def _has_jumped(self, missing: Ints, steps: Ints, counter: Counter, arrived_ns: int) -> bool:
+    def _has_jumped(self, missing: Ints, steps: Ints, counter: CounterTiming, arrived_ns: int) -> bool:
         """Return True if more samples are missing than can have been sent in the elapsed time of the host.
 
         The time begins at the earliest time at which the last sample can have been taken. Its arrival time is not used,
@@ -539,7 +552,7 @@ class SampleClock:
         missing[0] = samples.lost
         arrived_ns = int(samples.t_ns[-1])
         if self._paused:
-            elapsed_s = (arrived_ns - self._arrived_ns) / NS
+            elapsed_s = (arrived_ns - self._arrived_ns) / NS_PER_S
             missing[0] = max(samples.lost, self._missing_samples_in(elapsed_s, len(samples)))
             self._paused, self._delay = False, None
             return missing
@@ -572,9 +585,9 @@ class SampleClock:
         index, arrived_s = self._index + counted, self._seconds(arrived_ns)
         behind_s = arrived_s - self._line.at(index)
         if self._delay is None:
-            pause_s = (arrived_ns - self._arrived_ns) / NS - counted * period_s
+            pause_s = (arrived_ns - self._arrived_ns) / NS_PER_S - counted * period_s
             if pause_s > least_s and behind_s > least_s:
-                self._delay = _Delay(arrived_ns, behind_s, Line())
+                self._delay = _Delay(arrived_ns, behind_s, ArrivalRegression())
                 self._delay.line.add(index, arrived_s, self._nominal_hz)
             return 0
         delay = self._delay
@@ -583,7 +596,7 @@ class SampleClock:
         if delay.least_s < least_s:  # caught up: the host was late
             self._delay = None
             return 0
-        if arrived_ns - delay.since_ns < CATCH_UP_S * NS:
+        if arrived_ns - delay.since_ns < CATCH_UP_S * NS_PER_S:
             return 0
         hole = min(round(delay.least_s / max(period_s, 1.0 / MAX_RATE_HZ)), MAX_GAP_SAMPLES)
         delay.line.move(hole)
@@ -609,13 +622,13 @@ class SampleClock:
             # the last sample of a chunk has waited for the shortest time
             self._line.add(self._index, arrived_s, self._nominal_hz)
         self._bound.update(passed, arrived_s, self._certain_period_s())
-        period_s = self._line.period_s() or 1.0 / NS  # the first samples of an unknown rate are at least in order
+        period_s = self._line.period_s() or 1.0 / NS_PER_S  # the first samples of an unknown rate are at least in order
         # no sample is newer than its arrival, apart from the scatter of the line
         newest_s = min(self._line.at(self._index), arrived_s + JUMP_S)
         t_s = newest_s - (self._index - index) * period_s
         if t_s[0] < -MAX_OFFSET_S or t_s[-1] > MAX_OFFSET_S:  # arrivals decades apart must stay within int64
             t_s = np.clip(t_s, -MAX_OFFSET_S, MAX_OFFSET_S)
-        t_ns = np.rint(t_s * NS).astype(np.int64) + (self._origin_ns or 0)
+        t_ns = np.rint(t_s * NS_PER_S).astype(np.int64) + (self._origin_ns or 0)
         if t_ns[0] <= self._last_t_ns or (t_ns[1:] <= t_ns[:-1]).any():
             # the line was corrected backwards, or is coarser than a period far from its origin: keep the order
             order = np.arange(len(samples))
@@ -634,7 +647,7 @@ class _Delay:
 
     since_ns: int  # first late arrival, or the arrival at which a gap was last reported
     least_s: float  # minimum lag of all arrivals since then relative to the line
-    line: Line  # fitted to all arrivals since the first late one
+    line: ArrivalRegression  # fitted to all arrivals since the first late one
 
 
 class _CounterStep:
@@ -671,7 +684,7 @@ class _CounterStep:
         return steps[:0] if usual is None else steps[np.abs(steps / usual - 1.0) < STEP_TOLERANCE]
 
 
-def _is_slower(line: Line, period_s: float) -> bool:
+def _is_slower(line: ArrivalRegression, period_s: float) -> bool:
     """Return True if the points of a line show with certainty a longer period than ``period_s``."""
     found = line.measured()
     return found is not None and found[0] * period_s < 1.0 - found[1]
@@ -682,7 +695,7 @@ def _typical_period_s(steps: Ints) -> float | None:
 
     The estimate is the median of steady steps, or the mean of other steps.
     """
-    forward = steps[steps > 0] / NS
+    forward = steps[steps > 0] / NS_PER_S
     if not forward.size:
         return None
     low, middle, high = np.quantile(forward, [0.1, 0.5, 0.9])
@@ -694,6 +707,8 @@ def _split_at_gaps(samples: SampleBlock, t_ns: Ints, missing: Ints) -> list[Samp
     cuts = np.flatnonzero(missing[1:]) + 1
     edges = [0, *cuts.tolist(), len(samples)]
     return [
-        block(t_ns[a:b].copy(), samples.values[a:b], samples.temperature_c[a:b], samples.ticks[a:b], int(missing[a]))
+        make_block(
+            t_ns[a:b].copy(), samples.values[a:b], samples.temperature_c[a:b], samples.ticks[a:b], int(missing[a])
+        )
         for a, b in pairwise(edges)
     ]

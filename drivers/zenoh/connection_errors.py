@@ -13,7 +13,7 @@ import ssl
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from drivers.credential_masking import masked
+from drivers.credential_masking import mask_secrets
 
 if TYPE_CHECKING:
     import zenoh
@@ -33,7 +33,7 @@ _TLS_REASONS: Final = {
 }
 
 
-def refused(endpoints: Sequence[str], config: "zenoh.Config") -> str:
+def explain_refusals(endpoints: Sequence[str], config: "zenoh.Config") -> str:
     """Return the reasons why endpoints refuse a connection, without the endpoints for which no reason is found.
 
     Parameters
@@ -43,11 +43,11 @@ def refused(endpoints: Sequence[str], config: "zenoh.Config") -> str:
     config
         Configuration of the session.
     """
-    found = [(endpoint, why(endpoint, config)) for endpoint in endpoints]
-    return "; ".join(f"{masked(endpoint)}: {reason}" for endpoint, reason in found if reason)
+    found = [(endpoint, explain_refusal(endpoint, config)) for endpoint in endpoints]
+    return "; ".join(f"{mask_secrets(endpoint)}: {reason}" for endpoint, reason in found if reason)
 
 
-def why(endpoint: str, config: "zenoh.Config", timeout_s: float = TIMEOUT_S) -> str:
+def explain_refusal(endpoint: str, config: "zenoh.Config", timeout_s: float = TIMEOUT_S) -> str:
     """Return the reason why an endpoint refuses a connection, in one line without the endpoint; "" if none is found.
 
     Parameters

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import DecodeError
-from drivers.sample import AXES, Floats, Ints, SampleBlock, block, ns_to_seconds, seconds_to_ns
+from drivers.sample import AXES, Floats, Ints, SampleBlock, make_block, ns_to_seconds, seconds_to_ns
 
 SCHEMA: Final = "imu-monitor/samples/1"
 SCHEMAS: Final = (SCHEMA, "imu-monitor/compensated/1")
@@ -66,7 +66,9 @@ class Batch:
     block: SampleBlock  # t_ns are Unix times
 
 
-def pack(device: str, samples: int, rows: SampleBlock, offset_ns: Ints | int = 0, schema: str = SCHEMA) -> bytes:
+def encode_samples(
+    device: str, samples: int, rows: SampleBlock, offset_ns: Ints | int = 0, schema: str = SCHEMA
+) -> bytes:
     """Encode samples as one message.
 
     Parameters
@@ -103,7 +105,7 @@ def pack(device: str, samples: int, rows: SampleBlock, offset_ns: Ints | int = 0
     )
 
 
-def unpack(data: bytes) -> Batch:
+def decode_samples(data: bytes) -> Batch:
     """Decode the samples of one message.
 
     Raises
@@ -126,7 +128,7 @@ def unpack(data: bytes) -> Batch:
             temperature_c = column.copy()
         elif name in AXES:
             values[:, AXES.index(name)] = column
-    rows = block(t_ns, values, temperature_c, lost=payload.lost)
+    rows = make_block(t_ns, values, temperature_c, lost=payload.lost)
     return Batch(payload.device, payload.samples, rows)
 
 

@@ -10,13 +10,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from drivers.credential_masking import masked
+from drivers.credential_masking import mask_secrets
 from drivers.file_access import check_regular
 
 if TYPE_CHECKING:
     import zenoh
 
-CLOSED: Final[Mapping[str, Any]] = {
+DEFAULT_CONFIGURATION: Final[Mapping[str, Any]] = {
     "mode": "peer",
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
@@ -49,7 +49,7 @@ PUBLIC_FILES: Final = (
 
 
 def configuration(
-    own: Mapping[str, Any], file: str | Path | None = None, unsaid: Mapping[str, Any] = CLOSED
+    own: Mapping[str, Any], file: str | Path | None = None, unsaid: Mapping[str, Any] = DEFAULT_CONFIGURATION
 ) -> "zenoh.Config":
     """Return the configuration of a session.
 
@@ -84,7 +84,7 @@ def configuration(
     return config
 
 
-def plain(error: Exception) -> str:
+def format_error(error: Exception) -> str:
     """Return the text of a zenoh error in one line.
 
     Positions in zenoh's source code and quoted file contents are removed. zenoh quotes a line of a file that it cannot
@@ -98,10 +98,10 @@ def plain(error: Exception) -> str:
         r"\2 \3, \4 \5: \1",
         text,
     )
-    return masked(" ".join(text.split()))
+    return mask_secrets(" ".join(text.split()))
 
 
-def alone(session: "zenoh.Session") -> bool:
+def is_unconnected(session: "zenoh.Session") -> bool:
     """Return True if the session has no connection; False once it is closed."""
     import zenoh
 

@@ -21,7 +21,7 @@ from typing import Annotated, Any, Final, NoReturn
 import typer
 from typer.exceptions import TyperException
 
-from drivers.errors import ConfigError, ImuError, NotReady, RecordingError, in_one_line
+from drivers.errors import ConfigError, ImuError, NotReady, RecordingError, format_one_line
 from drivers.extras import check_extra
 from drivers.file_access import real_path
 from monitor.cli import doctor, drift, options, output, terminal_session, warm_up
@@ -85,7 +85,7 @@ def demo(
     viewer: Viewer = None,
 ) -> None:
     """The whole service on a simulated MEMS IMU that speaks a real wire format over a pseudo-terminal."""
-    from monitor.simulator.demo import demo as configuration
+    from monitor.simulator.demo import demo_config as configuration
 
     terminal_session.serve(
         configuration(sensor, effect or (), options.duration("--effect-at", effect_at)), seconds, viewer
@@ -201,12 +201,14 @@ def analyze(
         with output.progress() as tell:
             output.prepare_kernels(tell)
             results = offline.make(wanted, tell)
-    except offline.TooShort as error:
+    except offline.TooFewSamples as error:
         if json is not None:
-            output.write("--json", json, encoding.no_analysis(str(error), error.samples) + b"\n")
+            output.write("--json", json, encoding.encode_failed_analysis(str(error), error.samples) + b"\n")
         raise
     if json is not None:
-        payload = encoding.analysis(results.analysis, results.total, results.hadamard, results.dynamic, results.warmth)
+        payload = encoding.analysis(
+            results.analysis, results.total, results.hadamard, results.dynamic, results.without_temperature
+        )
         output.write("--json", json, payload + b"\n")
     if plot is not None:
         offline.draw(results, plot, recording.name)
@@ -235,14 +237,14 @@ def simulate(
 ) -> None:
     """A recording from a model, of any length; it appears whole or not at all."""
     from monitor.commands import simulate as simulation
-    from monitor.noise.catalogue import load
+    from monitor.noise.catalogue import load_model
 
     length_s = options.duration("--seconds", seconds)
     output.check_place("--json", json)
     for option, path in (("--json", json), ("--temperature-from", temperature_from)):
         if path is not None and real_path(path) == real_path(out):
             raise ConfigError(f"{option}: {path} is what --out writes; another name is needed")
-    noise = load(model, Path.cwd())
+    noise = load_model(model, Path.cwd())
     request = simulation.Request(noise, out, length_s, seed, rate, temperature_from, truth, model)
     terminal_session.end_on_sigterm()
     with output.progress() as tell:
@@ -277,26 +279,26 @@ def reconcile(
     from rich.console import Console
 
     from monitor.commands import reconcile as reconciling
-    from monitor.noise.catalogue import load
+    from monitor.noise.catalogue import load_model
     from monitor.publishing.terminal import reconcile_text as text
     from monitor.reconcile import report
     from monitor.reconcile.several_recordings import comparison_report
 
     last_s = options.duration("--last", last)
     output.check_place("--json", json)
-    tested = None if model is None else load(model, Path.cwd())
+    tested = None if model is None else load_model(model, Path.cwd())
     several = len(recordings) > 1
     terminal_session.end_on_sigterm()
     try:
         with output.progress() as tell:
             output.prepare_kernels(tell)
             if several:
-                every = reconciling.RunsRequest(tuple(recordings), tested, out, seed, rate, last_s)
-                runs = reconciling.make_runs(every, tell)
-                data, show = comparison_report.to_json(runs), partial(text.tell_runs, runs)
+                every = reconciling.ComparisonRequest(tuple(recordings), tested, out, seed, rate, last_s)
+                runs = reconciling.compare_recordings(every, tell)
+                data, show = comparison_report.encode_comparison(runs), partial(text.tell_runs, runs)
             else:
                 one = reconciling.make(reconciling.Request(recordings[0], tested, out, seed, rate, last_s=last_s), tell)
-                data, show = report.to_json(one), partial(text.tell, one)
+                data, show = report.encode_report(one), partial(text.tell, one)
     except NotReady:
         if json is not None:
             output.write("--json", json, (out / reconciling.REPORT).read_bytes() + b"\n")
@@ -496,7 +498,7 @@ def explain(error: Exception) -> tuple[str, int]:
     """Return the line for standard error and the exit status of an error that ended a command."""
     match error:
         case TyperException():
-            return in_one_line(_usage(error)), WRONG
+            return format_one_line(_usage(error)), WRONG
         case ConfigError() | RecordingError():
             return str(error), WRONG
         case NotReady():
@@ -506,7 +508,7 @@ def explain(error: Exception) -> tuple[str, int]:
         case typer.Abort():
             return "interrupted", INTERRUPTED
         case OSError():
-            return in_one_line(_system_error(error)), FAILED
+            return format_one_line(_system_error(error)), FAILED
         case MemoryError():
             why = f" ({cause})" if (cause := _cause(error)) else ""
             return f"not enough memory{why}; read less at once, e.g. the end of a recording with --last 1h", FAILED
@@ -519,7 +521,7 @@ def explain(error: Exception) -> tuple[str, int]:
 
 def _cause(error: Exception) -> str:
     """Return the text of an error in one line of limited length."""
-    text = " ".join(in_one_line(str(error)).split())
+    text = " ".join(format_one_line(str(error)).split())
     return text if len(text) <= MAX_CAUSE_CHARS else f"{text[:MAX_CAUSE_CHARS]} …"
 
 

@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from drivers.credential_masking import masked
+from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
 from monitor.cli import options, output
 
 if TYPE_CHECKING:
-    from monitor.history.query import Question
-    from monitor.history.reading import Past
-    from monitor.history.time_ranges import Span
+    from monitor.history.query import HistoryQuery
+    from monitor.history.reading import HistoryTable
+    from monitor.history.time_ranges import TimeRange
 
 MAX_TABLE_ROWS: Final = 24
 """Number of rows in the table of one axis over time."""
-Get = Callable[["Question"], "Past"]
+Get = Callable[["HistoryQuery"], "HistoryTable"]
 """Function that answers a question about the history of a device."""
 
 
@@ -48,10 +48,10 @@ def history(
     from rich.console import Console
 
     from drivers.sample import AXES
-    from monitor.estimation.fit.coefficients import LETTERS
-    from monitor.history.query import WHAT, Question
-    from monitor.history.reading import step as width_of
-    from monitor.history.time_ranges import length
+    from monitor.estimation.fit.coefficients import SYMBOLS
+    from monitor.history.query import PARTS, HistoryQuery
+    from monitor.history.reading import bucket_width_s as width_of
+    from monitor.history.time_ranges import parse_duration_s
     from monitor.publishing.terminal import history_text
 
     if axis is not None and axis not in AXES:
@@ -60,20 +60,20 @@ def history(
     live = connect is not None or zenoh is not None
     if source is not None and live:
         raise ConfigError(f"{source}: either a file's history or --connect, not both")
-    step_s = None if step is None else max(int(_for_option("--step", length, step)), 1)
+    step_s = None if step is None else max(int(_for_option("--step", parse_duration_s, step)), 1)
     axes = AXES if axis is None else (axis,)
-    asked = Question(_span(since, until), step_s, WHAT, axes)
+    asked = HistoryQuery(_span(since, until), step_s, PARTS, axes)
     get = _from_daemon(connect, zenoh, prefix, device) if live else _from_file(source, device)
     past = get(asked)
     _save(past, asked, json, out, plot)
     if json == Path("-"):
         return
     console = Console()
-    history_text.tell(past, axes, LETTERS if axis else history_text.LETTERS, console)
+    history_text.tell(past, axes, SYMBOLS if axis else history_text.LETTERS, console)
     if axis is not None and len(past):
         few_s = max(width_of(past.span, None, MAX_TABLE_ROWS), past.step_s)
-        few = past if few_s == past.step_s else get(Question(asked.span, few_s, ("coefficients", "status"), axes))
-        history_text.tell_course(few, axis, LETTERS, console)
+        few = past if few_s == past.step_s else get(HistoryQuery(asked.span, few_s, ("coefficients", "status"), axes))
+        history_text.tell_course(few, axis, SYMBOLS, console)
 
 
 def _check_output_files(json: Path | None, out: Path | None, plot: Path | None) -> None:
@@ -84,24 +84,24 @@ def _check_output_files(json: Path | None, out: Path | None, plot: Path | None) 
     ConfigError
         A file cannot be written, or its suffix is not supported.
     """
-    from drivers.recordings.formats import format_of
+    from drivers.recordings.formats import format_for_path
 
     if plot is not None and plot.suffix != ".png":
         raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
     for option, place in (("--json", json), ("--out", out), ("--plot", plot)):
         output.check_place(option, place)
     if out is not None:
-        format_of(out)
+        format_for_path(out)
 
 
-def _save(past: "Past", asked: "Question", json: Path | None, out: Path | None, plot: Path | None) -> None:
+def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: Path | None, plot: Path | None) -> None:
     """Write the results to the requested files."""
     from monitor.publishing.messages import history as history_message
     from monitor.publishing.reports import history_file
 
     if json is not None:
         newest_s = float(past.end_s[-1]) if len(past) else past.span.end_s
-        payload = history_message.history(past, asked, newest_s, int(past.counts[:, 0].sum()))
+        payload = history_message.encode_history(past, asked, newest_s, int(past.counts[:, 0].sum()))
         output.write("--json", json, payload + b"\n")
     if out is not None:
         history_file.save(past, out)
@@ -114,45 +114,45 @@ def _save(past: "Past", asked: "Question", json: Path | None, out: Path | None, 
 def _from_file(source: Path | None, name: str | None) -> Get:
     """Return a function that answers from a history file. A daemon may write to the file at the same time."""
     from monitor.history import reading as past
-    from monitor.history.sqlite_store import reading
+    from monitor.history.sqlite_store import open_history
 
     if source is None:
         raise ConfigError("CONFIG.toml or a folder is missing; or --connect ENDPOINT for a running daemon")
     path = _history_path(source)
-    with reading(path) as reader:
+    with open_history(path) as reader:
         device = _select_device(name, list(reader.devices()), str(path))
 
-    def get(asked: "Question") -> "Past":
-        with reading(path) as reader:
-            return past.read(reader, device, asked.span, asked.wants, asked.step_s)
+    def get(asked: "HistoryQuery") -> "HistoryTable":
+        with open_history(path) as reader:
+            return past.read_history(reader, device, asked.span, asked.selects, asked.step_s)
 
     return get
 
 
 def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> Get:
     """Return a function that answers over zenoh."""
-    from monitor.publishing.zenoh.history_query import ask
+    from monitor.publishing.zenoh.history_query import query_histories
 
-    def get(asked: "Question") -> "Past":
-        found = {one.device: one for one in ask(endpoint, name or "*", asked.parameters(), prefix, file)}
-        return found[_select_device(name, list(found), masked(endpoint or str(file)))]
+    def get(asked: "HistoryQuery") -> "HistoryTable":
+        found = {one.device: one for one in query_histories(endpoint, name or "*", asked.parameters(), prefix, file)}
+        return found[_select_device(name, list(found), mask_secrets(endpoint or str(file)))]
 
     return get
 
 
 def _history_path(source: Path) -> Path:
     """Return the path of the history file for a configuration, a folder or the file itself."""
-    from monitor.history.sqlite_store import FILE
+    from monitor.history.sqlite_store import FILE_NAME
     from monitor.settings import loading
 
     if source.is_dir():
-        return source / FILE
-    if source.name == FILE:
+        return source / FILE_NAME
+    if source.name == FILE_NAME:
         return source
     config = loading.load(source, pipe=True)
     if config.storage is None:
         raise ConfigError(f"{source}: keeps no history; [storage] folder is missing")
-    return config.storage.folder / FILE
+    return config.storage.folder / FILE_NAME
 
 
 def _select_device(name: str | None, there: list[str], where: str) -> str:
@@ -165,7 +165,7 @@ def _select_device(name: str | None, there: list[str], where: str) -> str:
     ConfigError
         No device has this name, or a name is needed to choose between devices.
     """
-    from drivers.discovery import nearest
+    from drivers.discovery import format_suggestion
     from drivers.errors import NotReady
 
     if not there:
@@ -175,22 +175,22 @@ def _select_device(name: str | None, there: list[str], where: str) -> str:
     if name is None:
         raise ConfigError(f"{where}: history of {len(there)} devices; choose with --device: {', '.join(there)}")
     if name not in there:
-        raise ConfigError(f'--device: "{name}"{nearest(name, there)}')
+        raise ConfigError(f'--device: "{name}"{format_suggestion(name, there)}')
     return name
 
 
-def _span(since: str | None, until: str | None) -> "Span | None":
+def _span(since: str | None, until: str | None) -> "TimeRange | None":
     """Return the requested time range; None if neither end is given."""
-    from monitor.history.time_ranges import Span, moment
+    from monitor.history.time_ranges import TimeRange, parse_time
 
     if since is None and until is None:
         return None
     now_s = time.time()
-    start_s = float("-inf") if since is None else _for_option("--from", moment, since, now_s)
-    end_s = float("inf") if until is None else _for_option("--to", moment, until, now_s)
+    start_s = float("-inf") if since is None else _for_option("--from", parse_time, since, now_s)
+    end_s = float("inf") if until is None else _for_option("--to", parse_time, until, now_s)
     if end_s <= start_s:
         raise ConfigError(f"--to: {until} is not after --from {since}")
-    return Span(start_s, end_s, end_in=False)
+    return TimeRange(start_s, end_s, end_included=False)
 
 
 def _for_option(option: str, function: Callable[..., float], *arguments: object) -> float:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Final, overload
 
 import typer
 
-from drivers.errors import ConfigError, in_one_line
+from drivers.errors import ConfigError, format_one_line
 from drivers.quantities import (
     AVERAGING_TIME_S,
     DURATION_S,
@@ -22,7 +22,7 @@ from drivers.quantities import (
 if TYPE_CHECKING:
     from monitor.drift.compensation.arma import Order
     from monitor.estimation.allan.batch import TauGrid
-    from monitor.publishing.exporters import Noise
+    from monitor.publishing.exporters import NoiseCoefficients
 
 MAX_AVERAGING_TIMES: Final = 1000
 """Largest number of averaging times in a list."""
@@ -95,7 +95,7 @@ def tau(text: str) -> "TauGrid":
         listed = tuple(float(part) for part in text.split(","))
     except ValueError:
         raise ConfigError(
-            f'--tau: "{in_one_line(text)[:60]}"; possible are octave, decade10, or seconds with commas'
+            f'--tau: "{format_one_line(text)[:60]}"; possible are octave, decade10, or seconds with commas'
         ) from None
     if len(listed) > MAX_AVERAGING_TIMES:
         raise ConfigError(f"--tau: {len(listed)} averaging times; at most {MAX_AVERAGING_TIMES} are possible")
@@ -152,7 +152,7 @@ def order(text: str | None) -> "Order | None":
     raise ConfigError(f'--order: "{text}"; possible are {" ".join(f"{p},{q}" for p, q in ORDERS)}')
 
 
-def noise(source: Path) -> "Noise":
+def noise(source: Path) -> "NoiseCoefficients":
     """Read noise parameters from a model or from the JSON of ``analyze``. JSON begins with a brace, and a model does
     not.
 
@@ -166,7 +166,7 @@ def noise(source: Path) -> "Noise":
     from monitor.publishing.exporters import from_analysis, from_model
 
     try:
-        text = sys.stdin.buffer.read() if source == Path("-") else file_access.read(source, pipe=True)
+        text = sys.stdin.buffer.read() if source == Path("-") else file_access.read_small_file(source, pipe=True)
         if text.lstrip().startswith(b"{"):
             return from_analysis(text, source.name)
         return from_model(NoiseModel.from_toml(text.decode()), source.name)

@@ -83,7 +83,9 @@ def prepare_kernels(tell: Tell) -> None:
     for group in kernel_compilation.GROUPS:
         if not kernel_compilation.is_warm(group):
             with contextlib.suppress(OSError):  # without a cache on disk, each kernel is compiled at its first call
-                for _ in kernel_compilation.prepare(group, lambda progress: tell(str(progress), progress.share)):
+                for _ in kernel_compilation.prepare_kernels(
+                    group, lambda progress: tell(str(progress), progress.share)
+                ):
                     pass
 
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TextIO, cast
 
-from drivers.credential_masking import masked
+from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -53,15 +53,15 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
     import structlog
     from rich.console import Console
 
-    from monitor.daemon.operations.systemd import Unit
+    from monitor.daemon.operations.systemd import SystemdNotifier
     from monitor.daemon.outputs import LogOutput, TableOutput
     from monitor.daemon.service import STATUS_INTERVAL_S, Service
-    from monitor.publishing.terminal.live_table import Board, LiveTable
+    from monitor.publishing.terminal.live_table import DeviceStates, LiveTable
     from monitor.publishing.terminal.queued_writer import QueuedWriter
 
-    unit = Unit.of(os.environ)
+    unit = SystemdNotifier.from_environment(os.environ)
     config = _with_viewer(config, viewer)
-    console, board, asked = Console(file=sys.stdout), Board(), threading.Event()
+    console, board, asked = Console(file=sys.stdout), DeviceStates(), threading.Event()
     table, terminal = LiveTable(console), console.is_terminal
     screen = QueuedWriter(sys.stdout, STDOUT, table.render, STATUS_INTERVAL_S if terminal else None, tell=_warn)
     writers = {"terminal": screen} if terminal else {}
@@ -140,7 +140,7 @@ def view(
     from monitor.publishing.rerun.view import RerunView
     from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
     from monitor.publishing.terminal.queued_writer import QueuedWriter
-    from monitor.publishing.zenoh.subscriber import ZenohIn
+    from monitor.publishing.zenoh.subscriber import ZenohSubscriber
     from monitor.settings import loading
 
     try:
@@ -148,7 +148,7 @@ def view(
     except ConfigError as error:
         raise ConfigError(f"--viewer: {error}") from None
     keys = tuple(dict.fromkeys(detail_key(device, keyexpr) for device in detail))
-    arriving = ZenohIn(keyexpr, connect, file, keys)
+    arriving = ZenohSubscriber(keyexpr, connect, file, keys)
     rerun = RerunView(ViewerSettings(mode=mode), [DeviceInfo(key, "over zenoh") for key in keys], fleet=True)
     stop = threading.Event()
     on_signals(stop.set)
@@ -280,7 +280,7 @@ def _configure_logging(config: "Config") -> None:
 
 def _without_secrets(_logger: Any, _method: str, line: "MutableMapping[str, Any]") -> "MutableMapping[str, Any]":
     """Mask credentials in every text of a log line."""
-    return {key: masked(value) if isinstance(value, str) else value for key, value in line.items()}
+    return {key: mask_secrets(value) if isinstance(value, str) else value for key, value in line.items()}
 
 
 def on_signals(stop: Callable[[], None], hung_up: Callable[[], None] | None = None) -> None:

@@ -33,7 +33,7 @@ def warm_up(from_stdin: Annotated[bool, typer.Option("--from-stdin", hidden=True
                 typer.echo(progress, err=True)
 
         for group in cold:
-            for _ in kernel_compilation.prepare(group, tell):
+            for _ in kernel_compilation.prepare_kernels(group, tell):
                 pass
     parts = sum(len(group.parts) for group in cold)
     done = f"compiled {parts} parts in {time.monotonic() - begun_s:.0f} s" if cold else "nothing to compile"

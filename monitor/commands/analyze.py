@@ -18,22 +18,22 @@ import numpy as np
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings import iter_blocks, load_samples
 from drivers.sample import AXES, Ints, SampleBlock
-from monitor.drift.thermal.temperature_share import WithoutTemperature, moved, without_temperature
+from monitor.drift.thermal.temperature_share import TemperatureShare, remove_temperature, temperature_varied
 from monitor.estimation.allan.batch import TauGrid
-from monitor.estimation.allan.dynamic_allan import Dynamic, dynamic
+from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.allan.hadamard import HadamardCurve, hadamard_curve
 from monitor.estimation.allan.total import TotalCurve, total_curve
-from monitor.estimation.analysis import Analysis, analyze, events_of
-from monitor.estimation.regular_grid import with_temperature
-from monitor.publishing.plots.allan_figure import besides
-from monitor.publishing.plots.dynamic_figure import Mark
-from monitor.publishing.terminal.thermal_text import notes_without
+from monitor.estimation.analysis import Analysis, analyze, detect_events
+from monitor.estimation.regular_grid import resample_with_temperature
+from monitor.publishing.plots.allan_figure import other_deviations
+from monitor.publishing.plots.dynamic_figure import ChangeMark
+from monitor.publishing.terminal.thermal_text import temperature_notes
 
-Tell = Callable[[str, float | None], None]
+ProgressCallback = Callable[[str, float | None], None]
 """Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
 
 
-class TooShort(NotReady):
+class TooFewSamples(NotReady):
     """Error for a recording with too few samples for any result.
 
     Parameters
@@ -57,8 +57,8 @@ class Request:
     rate_hz: float | None = None
     tau: TauGrid = "octave"
     window_s: float | None = None  # window of dynamic curves; None for no dynamic curves
-    rest: bool = False  # True if motion is excluded
-    others: bool = False  # True if total and Hadamard deviations are computed
+    exclude_motion: bool = False  # True if motion is excluded
+    total_and_hadamard: bool = False  # True if total and Hadamard deviations are computed
     last_s: float | None = None  # length of the end of the recording that is used; None for all
 
 
@@ -69,12 +69,14 @@ class Results:
     analysis: Analysis
     total: TotalCurve | None = None
     hadamard: HadamardCurve | None = None
-    dynamic: Dynamic | None = None
+    dynamic: DynamicAllan | None = None
     lacking: str = ""  # reason why requested dynamic curves are missing
-    warmth: WithoutTemperature | None = None  # coefficients without the effect of temperature, if it explains any axis
+    without_temperature: TemperatureShare | None = (
+        None  # coefficients without the effect of temperature, if it explains any axis
+    )
 
 
-def make(request: Request, tell: Tell = lambda _what, _share: None) -> Results:
+def make(request: Request, tell: ProgressCallback = lambda _what, _share: None) -> Results:
     """Read a recording and analyse it.
 
     Parameters
@@ -100,7 +102,7 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Results:
         ) from error
 
 
-def _make(request: Request, tell: Tell) -> Results:
+def _make(request: Request, tell: ProgressCallback) -> Results:
     """Read a recording and analyse it, with a pool of threads."""
     tell("reading", None)
     found = load_samples(request.recording, request.rate_hz, request.last_s)
@@ -109,18 +111,18 @@ def _make(request: Request, tell: Tell) -> Results:
     try:
         tell("curve and fit", None)
         try:
-            result = analyze(blocks, found.rate_hz, request.tau, found.notes, pool.map, request.rest)
+            result = analyze(blocks, found.rate_hz, request.tau, found.notes, pool.map, request.exclude_motion)
         except NotReady as error:
-            raise TooShort(str(error), len(found)) from error
-        tell("motion and changes" + (", total and Hadamard deviations" if request.others else ""), None)
-        events = pool.submit(events_of, result)
-        others = pool.submit(_total_and_hadamard, result, request.tau) if request.others else None
+            raise TooFewSamples(str(error), len(found)) from error
+        tell("motion and changes" + (", total and Hadamard deviations" if request.total_and_hadamard else ""), None)
+        events = pool.submit(detect_events, result)
+        others = pool.submit(_total_and_hadamard, result, request.tau) if request.total_and_hadamard else None
         warmth = pool.submit(_without_temperature, result, blocks, found.rate_hz)
         courses, lacking = _dynamic_curves(result, request, tell)
         total, hadamard = others.result() if others else (None, None)
         found_all = events.result()
         without = warmth.result()
-        said = [] if without is None else notes_without(without)
+        said = [] if without is None else temperature_notes(without)
         found_all = replace(
             found_all,
             notes=(*found_all.notes, *said, *([lacking] if lacking else [])),
@@ -149,8 +151,8 @@ def draw(results: Results, path: Path, title: str) -> None:
         The plotting library is not installed, or the file cannot be written.
     """
     result = results.analysis
-    beside = besides(results.total, results.hadamard)
-    marks = [Mark(change.since / result.estimate.rate_hz, AXES[change.axis]) for change in result.changes]
+    beside = other_deviations(results.total, results.hadamard)
+    marks = [ChangeMark(change.since / result.estimate.rate_hz, AXES[change.axis]) for change in result.changes]
     if path.suffix == ".html":
         from monitor.publishing.reports.analysis_report import html_report
 
@@ -163,21 +165,21 @@ def draw(results: Results, path: Path, title: str) -> None:
 
 def _without_temperature(
     result: Analysis, blocks: Sequence[SampleBlock], rate_hz: float | None
-) -> WithoutTemperature | None:
+) -> TemperatureShare | None:
     """Return the coefficients without the effect of temperature; None if the temperature is missing or constant."""
-    if not moved(np.concatenate([samples.temperature_c for samples in blocks])):
+    if not temperature_varied(np.concatenate([samples.temperature_c for samples in blocks])):
         return None
-    _, temperature_c, _, _ = with_temperature(blocks, rate_hz)
-    return without_temperature(result, temperature_c)
+    _, temperature_c, _, _ = resample_with_temperature(blocks, rate_hz)
+    return remove_temperature(result, temperature_c)
 
 
-def _dynamic_curves(result: Analysis, request: Request, tell: Tell) -> tuple[Dynamic | None, str]:
+def _dynamic_curves(result: Analysis, request: Request, tell: ProgressCallback) -> tuple[DynamicAllan | None, str]:
     """Return the dynamic curves if they are requested, or the reason why they are missing."""
     if request.window_s is None:
         return None, ""
     rate_hz = result.estimate.rate_hz
     try:
-        shown = dynamic(
+        shown = compute_dynamic_allan(
             result.values, rate_hz, request.window_s, request.tau, progress=lambda share: tell("dynamic curves", share)
         )
     except NotReady as error:

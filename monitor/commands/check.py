@@ -40,10 +40,10 @@ def _problems(use: ModelUse) -> Iterator[str]:
     # imported only if needed, because most configurations have neither a model nor a simulated sensor
     try:
         if use.model is not None:
-            from monitor.daemon.operations.limits import bounds
+            from monitor.daemon.operations.limits import make_bounds
             from monitor.noise.catalogue import read_model
 
-            bounds(use.limits, read_model(use.model))
+            make_bounds(use.limits, read_model(use.model))
     except ConfigError as error:
         yield from error.lines
     try:

@@ -14,20 +14,20 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.discovery import nearest
+from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings import iter_blocks, load_samples
-from drivers.recordings.writing import writing
+from drivers.recordings.writing import open_recording_writer
 from drivers.sample import AXES, Floats
-from monitor.drift.compensation.arma import ORDERS, Order, identify
-from monitor.drift.compensation.compensation_result import Axis, Result
-from monitor.drift.compensation.compensation_score import at_rest
-from monitor.drift.compensation.compensator import Compensator, Interval
-from monitor.drift.compensation.reference_methods import VARIANTS, compensated
-from monitor.drift.compensation.sage_husa import CONFIRMED, LEFT_OUT, STEPPED, USED
-from monitor.estimation.regular_grid import with_temperature
+from monitor.drift.compensation.arma import ORDERS, Order, fit_arma
+from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
+from monitor.drift.compensation.compensation_score import score_at_rest
+from monitor.drift.compensation.compensator import Compensator, DriftInterval
+from monitor.drift.compensation.reference_methods import REFERENCE_METHODS, apply_reference_method
+from monitor.drift.compensation.sage_husa import MIN_CONFIRMED_INTERVALS, REJECTED, STEPPED, USED
+from monitor.estimation.regular_grid import resample_with_temperature
 
-METHODS: Final = ("adaptive", "fixed", *VARIANTS)
+METHODS: Final = ("adaptive", "fixed", *REFERENCE_METHODS)
 """Names of the methods."""
 GYROS: Final = AXES[:3]
 """Gyroscope axes."""
@@ -36,7 +36,7 @@ LEARNING_SHARE: Final = 1.0 / 3.0
 BLOCK_ROWS: Final = 1 << 16
 """Number of rows that are written at a time."""
 
-Tell = Callable[[str, float | None], None]
+ProgressCallback = Callable[[str, float | None], None]
 """Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
 
 
@@ -52,7 +52,7 @@ class Request:
     last_s: float | None = None  # length of the end of the recording that is used; None for all
 
 
-def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
+def make(request: Request, tell: ProgressCallback = lambda _what, _share: None) -> CompensationResult:
     """Compensate a recording and write the result.
 
     Parameters
@@ -75,63 +75,64 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
         The sensor was never at rest for long enough. Nothing is written.
     """
     if request.method not in METHODS:
-        raise ConfigError(f'--method: unknown method "{request.method}"{nearest(request.method, METHODS)}')
+        raise ConfigError(f'--method: unknown method "{request.method}"{format_suggestion(request.method, METHODS)}')
     tell("reading", None)
     found = load_samples(request.recording, request.rate_hz, request.last_s)
     axes = tuple(axis for axis in GYROS if axis in found.axes)
     if not axes:
         raise ConfigError(f"{request.recording}: no gyro axis in it; columns gx, gy, gz in rad/s are needed")
-    values, temperature_c, rate_hz, notes = with_temperature(list(iter_blocks(found)), found.rate_hz)
+    values, temperature_c, rate_hz, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
     orders = ORDERS if request.order is None else (request.order,)
     live = Compensator(rate_hz, adapts=request.method != "fixed", orders=orders)
     out = _run(live, values, tell)
-    intervals = tuple(live.take())
-    rest = _at_rest(intervals, len(values), live.interval)
+    intervals = tuple(live.take_intervals())
+    rest = _at_rest(intervals, len(values), live.interval_samples)
     learned, judged = _split_learning(rest)
     if not judged.any():
         raise NotReady(
-            f"{request.recording}: never at rest for {CONFIRMED * live.interval_s:g} s: no drift can be learned from it"
+            f"{request.recording}: never at rest for {MIN_CONFIRMED_INTERVALS * live.interval_s:g} s: "
+            "no drift can be learned from it"
         )
-    if request.method in VARIANTS:
+    if request.method in REFERENCE_METHODS:
         out = _compensate_offline(request.method, values, learned, axes, tell)
     tell("judging", None)
-    judged_axes: dict[str, Axis] = {
+    judged_axes: dict[str, AxisCompensation] = {
         str(axis): _evaluate_axis(AXES.index(axis), values, out, learned, judged, live, intervals) for axis in axes
     }
     start_s = 0.0 if found.t_s is None else float(found.t_s[0])
     _write(request.out, found.axes, start_s + np.arange(len(values)) / rate_hz, out, temperature_c, tell)
-    return Result(
+    return CompensationResult(
         recording=request.recording.name,
         out=request.out,
         method=request.method,
         rate_hz=rate_hz,
         samples=len(values),
         interval_s=live.interval_s,
-        learned_s=float(learned.any(axis=1).sum() / rate_hz),
-        judged_s=float(judged.any(axis=1).sum() / rate_hz),
+        learning_rest_s=float(learned.any(axis=1).sum() / rate_hz),
+        evaluated_rest_s=float(judged.any(axis=1).sum() / rate_hz),
         intervals=intervals,
         axes=judged_axes,
         notes=(*found.notes, *notes),
     )
 
 
-def _run(live: Compensator, values: Floats, tell: Tell) -> Floats:
+def _run(live: Compensator, values: Floats, tell: ProgressCallback) -> Floats:
     """Compensate as the daemon does, except that a model is identified at once when it is due."""
     out = np.empty_like(values)
-    size = live.interval
+    size = live.interval_samples
     for start in range(0, len(values), size):
-        out[start : start + size] = live.update(values[start : start + size])
+        out[start : start + size] = live.compensate(values[start : start + size])
         live.identify()
         if start % (256 * size) == 0:
             tell("compensating", start / len(values))
     return out
 
 
-def _at_rest(intervals: tuple[Interval, ...], n: int, size: int) -> NDArray[np.bool_]:
+def _at_rest(intervals: tuple[DriftInterval, ...], n: int, size: int) -> NDArray[np.bool_]:
     """Return the mask [n, 3] of the samples in intervals that the drift was estimated from, after a bias was known."""
     mask = np.zeros((n, len(GYROS)), dtype=bool)
     for one in intervals:
-        mask[one.end - size : one.end] = (one.became == USED) & np.isfinite(one.expected)
+        mask[one.end - size : one.end] = (one.outcome == USED) & np.isfinite(one.expected)
     return mask
 
 
@@ -143,14 +144,14 @@ def _split_learning(rest: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray
 
 
 def _compensate_offline(
-    method: str, values: Floats, learned: NDArray[np.bool_], axes: tuple[str, ...], tell: Tell
+    method: str, values: Floats, learned: NDArray[np.bool_], axes: tuple[str, ...], tell: ProgressCallback
 ) -> Floats:
     """Compensate each axis with a method for finished recordings."""
     out = values.copy()
     for axis in axes:
         at = AXES.index(axis)
         tell(f"{method} {axis}", None)
-        out[:, at] = compensated(values[:, at], values[learned[:, at], at], VARIANTS[method])
+        out[:, at] = apply_reference_method(values[:, at], values[learned[:, at], at], REFERENCE_METHODS[method])
     return out
 
 
@@ -161,27 +162,29 @@ def _evaluate_axis(
     learned: NDArray[np.bool_],
     judged: NDArray[np.bool_],
     live: Compensator,
-    intervals: tuple[Interval, ...],
-) -> Axis:
+    intervals: tuple[DriftInterval, ...],
+) -> AxisCompensation:
     """Return the deviations of one axis before and after."""
     before = values[:, at] - np.nanmean(values[learned[:, at], at])
     first = int(np.argmax(judged[:, at]))
     model = live.models[at]
-    became = np.array([one.became[at] for one in intervals])
-    return Axis(
-        model=None if model is None else identify(*live.window(at), [model.order], intervals=True),
-        before=at_rest(np.where(judged[:, at], before, np.nan)[first:], live.rate_hz),
-        after=at_rest(np.where(judged[:, at], out[:, at], np.nan)[first:], live.rate_hz),
-        left_out=int((became == LEFT_OUT).sum()),
+    became = np.array([one.outcome[at] for one in intervals])
+    return AxisCompensation(
+        model=None if model is None else fit_arma(*live.identification_data(at), [model.order], intervals=True),
+        uncompensated=score_at_rest(np.where(judged[:, at], before, np.nan)[first:], live.rate_hz),
+        compensated=score_at_rest(np.where(judged[:, at], out[:, at], np.nan)[first:], live.rate_hz),
+        rejected_intervals=int((became == REJECTED).sum()),
         steps=int((became == STEPPED).sum()),
     )
 
 
-def _write(path: Path, axes: tuple[str, ...], t_s: Floats, out: Floats, temperature_c: Floats, tell: Tell) -> None:
+def _write(
+    path: Path, axes: tuple[str, ...], t_s: Floats, out: Floats, temperature_c: Floats, tell: ProgressCallback
+) -> None:
     """Write all recorded rows at their times on the regular grid."""
     there = np.flatnonzero(np.isfinite(out).any(axis=1))
     warm = bool(np.isfinite(temperature_c).any())
-    with writing(path, axes, warm) as append:
+    with open_recording_writer(path, axes, warm) as append:
         for start in range(0, there.size, BLOCK_ROWS):
             rows = there[start : start + BLOCK_ROWS]
             append(t_s[rows], out[rows], temperature_c[rows])

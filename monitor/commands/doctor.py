@@ -32,7 +32,7 @@ from drivers.extras import missing_packages
 from drivers.links.can_link import missing_package
 from drivers.links.replay_link import ReplayLink
 from monitor.commands.check import check
-from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, holder
+from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, lock_holder
 from monitor.settings.loading import Config, Storage
 
 Mark = Literal["well", "doubt", "wrong"]
@@ -194,14 +194,14 @@ def serial_port(about: str, port: str) -> list[Finding]:
         group = _group(seen.st_gid)
         text = f"{port}: {_user(os.geteuid())} may not read and write it; its group {group} may"
         return [Finding("wrong", about, text, f"sudo usermod -aG {group} {_user(os.geteuid())}, and log in again")]
-    holders = list(holding(path))
+    holders = list(processes_using(path))
     if holders:
         text = f"{port}: held by {', '.join(holders)}"
         return [Finding("doubt", about, text, "if that is not the service itself, end it: a port has one reader")]
     return [Finding("well", about, f"{port}: there, may be read, held by no program that can be seen from here")]
 
 
-def holding(port: Path) -> Iterator[str]:
+def processes_using(port: Path) -> Iterator[str]:
     """Yield the programs that have a port open, as far as this user can see them."""
     wanted = port.resolve()
     for process in Path("/proc").glob("[0-9]*"):
@@ -259,7 +259,7 @@ def zenoh(config: Config) -> list[Finding]:
     own = config.zenoh
     if own.mode == "none":
         return []
-    found = [one for endpoint in own.listen or () if own.mode != "client" for one in free("zenoh", endpoint)]
+    found = [one for endpoint in own.listen or () if own.mode != "client" for one in port_is_free("zenoh", endpoint)]
     found += [one for endpoint in own.connect for one in reachable("zenoh", endpoint)]
     for endpoint in own.listen or ():
         host = _host(endpoint)
@@ -271,7 +271,7 @@ def zenoh(config: Config) -> list[Finding]:
     return found
 
 
-def free(about: str, endpoint: str) -> list[Finding]:
+def port_is_free(about: str, endpoint: str) -> list[Finding]:
     """Check that a port can be listened on, by binding it for a moment.
 
     Parameters
@@ -340,7 +340,7 @@ def metrics(config: Config) -> list[Finding]:
         text = "metrics.listen is set, and prometheus-client is not installed"
         return [Finding("wrong", "metrics", text, 'pip install "imu-monitor[metrics]"')]
     host = f"[{own.host}]" if ":" in own.host else own.host
-    found = free("metrics", f"tcp/{host}:{own.port}")
+    found = port_is_free("metrics", f"tcp/{host}:{own.port}")
     if not own.host.startswith(LOOPBACK):
         text = f"{own.host}: whoever reaches this machine may read the numbers"
         found.append(Finding("doubt", "metrics", text, "listen on 127.0.0.1, and let a local agent forward them"))
@@ -375,13 +375,13 @@ def storage(config: Config) -> list[Finding]:
         text = f"{own.folder}: cannot be written: {error.strerror or error}"
         return [*found, Finding("wrong", "storage", text, f"make it, and have {_user(os.geteuid())} own it")]
     found += in_use(own)
-    return [*found, *room(own, bytes_a_day(config), usage.total, usage.free)]
+    return [*found, *disk_space(own, bytes_a_day(config), usage.total, usage.free)]
 
 
 def in_use(own: Storage) -> list[Finding]:
     """Check whether another process records into the storage folder or writes its history there."""
     wanted = {RECORDING_LOCK: own.record or own.raw, HISTORY_LOCK: own.history}
-    holders = sorted({held for name, on in wanted.items() if on and (held := holder(own.folder, name))})
+    holders = sorted({held for name, on in wanted.items() if on and (held := lock_holder(own.folder, name))})
     do = "well if it is this service; else end it, or choose another folder: only one of them records"
     return [Finding("doubt", "storage", f"{own.folder}: in use by {one}", do) for one in holders]
 
@@ -408,7 +408,7 @@ def bytes_a_day(config: Config) -> float | None:
     return None if len(known) < len(rates) else sum(known) * DAY_S * each
 
 
-def room(own: Storage, a_day: float | None, total: int, available: int) -> list[Finding]:
+def disk_space(own: Storage, a_day: float | None, total: int, available: int) -> list[Finding]:
     """Check that the data to be kept fit on the disk.
 
     Parameters
@@ -620,7 +620,7 @@ def _adjtimex() -> int | None:
 def _has_secret(path: Path) -> bool:
     """Return True if a file seems to contain a password."""
     try:
-        text = file_access.read(path).decode("utf-8", errors="replace")
+        text = file_access.read_small_file(path).decode("utf-8", errors="replace")
     except OSError:
         return False
     return re.search(r"(?i)\b(password|secret|private_key_base64)\b[\"']?\s*[:=]", text) is not None

@@ -22,17 +22,17 @@ from drivers.errors import ConfigError, NotReady, RecordingError
 from drivers.file_access import real_path
 from drivers.recordings import FORMATS, iter_blocks, load_samples
 from drivers.recordings import Recording as Samples
-from drivers.recordings.writing import whole
+from drivers.recordings.writing import atomic_write_path
 from drivers.sample import AXES
-from monitor.estimation.regular_grid import with_temperature
+from monitor.estimation.regular_grid import resample_with_temperature
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.reconcile import Recording, reconcile
-from monitor.reconcile.report import SCHEMA, to_json
+from monitor.reconcile.report import SCHEMA, encode_report
 from monitor.reconcile.result import Reconciliation
 from monitor.reconcile.several_recordings import comparison_report
-from monitor.reconcile.several_recordings.comparison import Comparison, Run, compare
+from monitor.reconcile.several_recordings.comparison import Comparison, NamedResult, compare
 
-Tell = Callable[[str, float | None], None]
+ProgressCallback = Callable[[str, float | None], None]
 """Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
 REPORT: Final = "report.json"
 """File name of the report as JSON."""
@@ -52,7 +52,7 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
-class RunsRequest:
+class ComparisonRequest:
     """Several recordings of one sensor, and the model to compare them with."""
 
     recordings: tuple[Path, ...]
@@ -63,7 +63,7 @@ class RunsRequest:
     last_s: float | None = None  # length of the end of each recording that is used; None for all
 
 
-def make(request: Request, tell: Tell = lambda _what, _share: None) -> Reconciliation:
+def make(request: Request, tell: ProgressCallback = lambda _what, _share: None) -> Reconciliation:
     """Compare one recording with a model and write the report.
 
     Parameters
@@ -96,7 +96,7 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Reconcili
     return result
 
 
-def make_runs(request: RunsRequest, tell: Tell = lambda _what, _share: None) -> Comparison:
+def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = lambda _what, _share: None) -> Comparison:
     """Compare several recordings with a model and with each other, and write the reports.
 
     Parameters
@@ -113,10 +113,10 @@ def make_runs(request: RunsRequest, tell: Tell = lambda _what, _share: None) -> 
     NotReady
         Fewer than two recordings support an answer, or the first does not and the model was to be fitted to it.
     """
-    named = names(request.recordings)
+    named = unique_names(request.recordings)
     _check_recordings(named, request.out)
     check_folder(request.out)
-    model, runs, silent = request.model, list[Run](), dict[str, str]()
+    model, runs, silent = request.model, list[NamedResult](), dict[str, str]()
     fitted_to = next(iter(named)) if model is None else None
     for at, (name, path) in enumerate(named.items(), start=1):
         notes = (f"The model under test are the five terms of {fitted_to}.",) if fitted_to and at > 1 else ()
@@ -129,7 +129,7 @@ def make_runs(request: RunsRequest, tell: Tell = lambda _what, _share: None) -> 
                 break
             continue
         model = result.baseline
-        runs.append(Run(name, result))
+        runs.append(NamedResult(name, result))
     if len(runs) < 2:
         why = "; ".join(f"{name}: {said}" for name, said in silent.items())
         why = f"two recordings at least are compared with each other, and {len(runs)} can be: {why}"
@@ -153,12 +153,12 @@ def write_runs(result: Comparison, folder: Path) -> None:
     """
     from monitor.publishing.reports.comparison_page import page
 
-    _write(folder / REPORT, comparison_report.to_json(result))
+    _write(folder / REPORT, comparison_report.encode_comparison(result))
     _write(folder / "model.toml", result.model.to_toml().encode())
     _write(folder / "report.html", page(result).encode())
 
 
-def names(recordings: Sequence[Path]) -> dict[str, Path]:
+def unique_names(recordings: Sequence[Path]) -> dict[str, Path]:
     """Return a unique name for each recording: the file name without its suffix, and a number if names are equal.
 
     Raises
@@ -192,7 +192,7 @@ def _check_recordings(named: Mapping[str, Path], out: Path) -> None:
             raise ConfigError(f"--out: {out}: {path} is a recording, and a report would be written into it")
 
 
-def _tell_for(tell: Tell, which: str) -> Tell:
+def _tell_for(tell: ProgressCallback, which: str) -> ProgressCallback:
     """Return a progress callback that adds the name of a recording."""
     return lambda what, share: tell(f"{which}: {what}", share)
 
@@ -211,14 +211,14 @@ def write(result: Reconciliation, folder: Path, title: str) -> None:
     """
     from monitor.publishing.reports.reconcile_page import page
 
-    _write(folder / REPORT, to_json(result))
+    _write(folder / REPORT, encode_report(result))
     _write(folder / "model.toml", result.model.to_toml().encode())
     _write(folder / "report.html", page(result, title).encode())
     try:
         from monitor.publishing.reports.reconcile_rrd import write_rrd
     except ImportError:  # the library of the viewer is optional
         return
-    with whole(folder / "reconcile.rrd") as place:
+    with atomic_write_path(folder / "reconcile.rrd") as place:
         write_rrd(result, place)
 
 
@@ -253,12 +253,12 @@ def check_folder(folder: Path) -> None:
 
 def _to_regular_grid(found: Samples) -> tuple[Recording, list[str]]:
     """Return the recording on a regular grid with the axes of the file, and the notes about it."""
-    values, temperature_c, rate_hz, notes = with_temperature(list(iter_blocks(found)), found.rate_hz)
+    values, temperature_c, rate_hz, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
     columns = {axis: np.ascontiguousarray(values[:, AXES.index(axis)], np.float64) for axis in found.axes}
     return Recording(columns, rate_hz, temperature_c), notes
 
 
 def _write(path: Path, data: bytes) -> None:
     """Write a file completely or not at all."""
-    with whole(path) as place:
+    with atomic_write_path(path) as place:
         place.write_bytes(data)

@@ -19,12 +19,12 @@ import msgspec
 import numpy as np
 
 from drivers.errors import ConfigError
-from drivers.quantities import SAMPLES
-from drivers.recordings import Recording, load_samples, writing
-from drivers.recordings.writing import whole
+from drivers.quantities import SAMPLE_COUNT
+from drivers.recordings import Recording, load_samples, open_recording_writer
+from drivers.recordings.writing import atomic_write_path
 from drivers.sample import AXES, Floats
 from monitor.noise.model import NoiseModel
-from monitor.noise.simulation import Drawn, ModelStream
+from monitor.noise.simulation import ModelStream, SimulatedSamples
 
 TRUTH_SCHEMA: Final = "imu-monitor/truth/1"
 """Schema of the file with the truth."""
@@ -119,7 +119,7 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
     rate_hz = _rate_hz(request)
     n = round(request.seconds * rate_hz)
     try:
-        SAMPLES.check(n)
+        SAMPLE_COUNT.check(n)
     except ConfigError as error:
         raise ConfigError(f"{request.seconds:g} s at {rate_hz:g} Hz: {error}") from None
     axes = tuple(axis for axis in AXES if axis in request.model.effects)
@@ -131,22 +131,22 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
         stream = request.model.stream(rate_hz, request.seed, temperature_c)
     except ConfigError as error:
         raise ConfigError(f"{request.name}: {error}") from error
-    first = stream.draw_all(min(n, ROWS))
+    first = stream.draw_with_temperature(min(n, ROWS))
     temperature = not bool(np.isnan(first.temperature_c).all())
     truth = request.out.with_name(request.out.name + ".truth.json") if request.truth else None
     result = Result(request.out, n, rate_hz, request.seed, axes, temperature, truth)
     if truth is None:
         _write(result, stream, first, tell)
     else:
-        with whole(truth) as part:
+        with atomic_write_path(truth) as part:
             _write(result, stream, first, tell)
             part.write_bytes(_truth(result, request.model, stream))
     return result
 
 
-def _write(result: Result, stream: ModelStream, first: Drawn, tell: Tell) -> None:
+def _write(result: Result, stream: ModelStream, first: SimulatedSamples, tell: Tell) -> None:
     """Write the recording block by block."""
-    with writing(result.out, result.axes, result.temperature) as append:
+    with open_recording_writer(result.out, result.axes, result.temperature) as append:
         block, written = first, 0
         while True:
             append(np.arange(written, written + len(block.values)) / result.rate_hz, block.values, block.temperature_c)
@@ -154,7 +154,7 @@ def _write(result: Result, stream: ModelStream, first: Drawn, tell: Tell) -> Non
             tell("simulating", written / result.samples)
             if written == result.samples:
                 break
-            block = stream.draw_all(min(ROWS, result.samples - written))
+            block = stream.draw_with_temperature(min(ROWS, result.samples - written))
         tell("finishing the file", None)  # some formats are compressed only at the end
 
 

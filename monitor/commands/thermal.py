@@ -17,12 +17,17 @@ from drivers.errors import ConfigError, NotReady
 from drivers.quantities import DURATION_S, FIT_NUMBER
 from drivers.recordings import iter_blocks, load_samples
 from drivers.sample import AXES, Floats
-from monitor.drift.thermal.interval_means import Means, interval_means
-from monitor.drift.thermal.thermal_fit import fitted
+from monitor.drift.thermal.interval_means import IntervalMeans, compute_interval_means
+from monitor.drift.thermal.thermal_fit import fit_thermal_model
 from monitor.drift.thermal.thermal_model import ThermalModel
-from monitor.drift.thermal.thermal_response import Shape
-from monitor.drift.thermal.thermal_study import Outlook, Study, judge, nice_interval
-from monitor.estimation.regular_grid import with_temperature
+from monitor.drift.thermal.thermal_response import ThermalModelForm
+from monitor.drift.thermal.thermal_study import (
+    ThermalFitReport,
+    ThermalPredictionReport,
+    compare_with_means,
+    round_interval_s,
+)
+from monitor.estimation.regular_grid import resample_with_temperature
 
 SCHEMA: Final = "imu-monitor/thermal-model/1"
 """Schema of the model file."""
@@ -54,7 +59,7 @@ class ModelFile(msgspec.Struct):
 
 def fit(
     recording: Path, interval_s: float | None = None, rate_hz: float | None = None, last_s: float | None = None
-) -> Study:
+) -> ThermalFitReport:
     """Fit a thermal model to each axis of a recording.
 
     Parameters
@@ -74,20 +79,20 @@ def fit(
         The recording cannot be read, or it has no temperature.
     """
     values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
-    means = _means(values, temperature_c, rate, interval_s or nice_interval(temperature_c.size / rate, rate))
+    means = _means(values, temperature_c, rate, interval_s or round_interval_s(temperature_c.size / rate, rate))
     interval = next(iter(means.values())).interval_s  # rounded to a whole number of samples
     fits, refused = {}, {}
     for axis, one in means.items():
         try:
-            fits[axis] = fitted(one)
+            fits[axis] = fit_thermal_model(one)
         except NotReady as error:
             refused[axis] = str(error)
-    return Study(recording.name, interval, means, fits, refused, notes)
+    return ThermalFitReport(recording.name, interval, means, fits, refused, notes)
 
 
 def predict(
     recording: Path, models: Mapping[str, ThermalModel], rate_hz: float | None = None, last_s: float | None = None
-) -> Outlook:
+) -> ThermalPredictionReport:
     """Predict the bias of a recording with thermal models of an earlier recording.
 
     Parameters
@@ -116,11 +121,11 @@ def predict(
         elif one.known.sum() < 2:
             refused[axis] = f"fewer than two intervals of {interval:g} s"
         else:
-            judged[axis] = judge(models[axis], one)
-    return Outlook(recording.name, interval, means, judged, refused, notes)
+            judged[axis] = compare_with_means(models[axis], one)
+    return ThermalPredictionReport(recording.name, interval, means, judged, refused, notes)
 
 
-def to_file(study: Study) -> bytes:
+def to_file(study: ThermalFitReport) -> bytes:
     """Return the content of the model file with all axes that were fitted."""
     rows = {axis: _row(one.model) for axis, one in study.fits.items()}
     return msgspec.json.format(msgspec.json.encode(ModelFile(SCHEMA, study.interval_s, rows)), indent=1)
@@ -135,7 +140,7 @@ def from_file(path: Path) -> dict[str, ThermalModel]:
         The file cannot be read, or its content is invalid.
     """
     try:
-        found = msgspec.json.decode(file_access.read(path, pipe=True), type=ModelFile)
+        found = msgspec.json.decode(file_access.read_small_file(path, pipe=True), type=ModelFile)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -157,8 +162,8 @@ def _row(model: ThermalModel) -> AxisRow:
         powers=model.shape.powers,
         time_constants=list(model.shape.constants_s),
         reference=model.reference_c,
-        sizes=model.sizes.tolist(),
-        start=model.start.tolist(),
+        sizes=model.coefficients.tolist(),
+        start=model.initial_state.tolist(),
         phi=model.phi,
         sigma=model.sigma,
         covariance=model.covariance.tolist(),
@@ -189,11 +194,11 @@ def _model(path: Path, axis: str, row: AxisRow, interval_s: float) -> ThermalMod
         if not right:
             raise ConfigError(f"{path}: axes.{axis}: {text}")
     return ThermalModel(
-        shape=Shape(row.powers, tuple(row.time_constants)),
+        shape=ThermalModelForm(row.powers, tuple(row.time_constants)),
         interval_s=interval_s,
         reference_c=row.reference,
-        sizes=np.array(row.sizes),
-        start=np.array(row.start),
+        coefficients=np.array(row.sizes),
+        initial_state=np.array(row.start),
         phi=row.phi,
         sigma=row.sigma,
         covariance=np.array(row.covariance, dtype=np.float64),
@@ -207,16 +212,16 @@ def _read(
 ) -> tuple[Floats, Floats, float, tuple[str, ...]]:
     """Return values [n, 6], temperature [n] in °C, rate in Hz and notes of a recording."""
     found = load_samples(recording, rate_hz, last_s)
-    values, temperature_c, rate, notes = with_temperature(list(iter_blocks(found)), found.rate_hz)
+    values, temperature_c, rate, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
     if not np.isfinite(temperature_c).any():
         raise ConfigError(f"{recording}: no temperature in it; a column temp or temperature, in °C, is needed")
     return values, temperature_c, rate, (*found.notes, *notes)
 
 
-def _means(values: Floats, temperature_c: Floats, rate_hz: float, interval_s: float) -> dict[str, Means]:
+def _means(values: Floats, temperature_c: Floats, rate_hz: float, interval_s: float) -> dict[str, IntervalMeans]:
     """Return the interval means of each axis that was recorded."""
     return {
-        axis: interval_means(values[:, at], temperature_c, rate_hz, interval_s)
+        axis: compute_interval_means(values[:, at], temperature_c, rate_hz, interval_s)
         for at, axis in enumerate(AXES)
         if np.isfinite(values[:, at]).any()
     }

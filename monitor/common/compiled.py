@@ -52,7 +52,7 @@ PACKAGE_ROOT: Final = Path(__file__).parents[2]
 """Folder that contains the packages of the program."""
 IDENTIFIER: Final = re.compile(r"\w+")
 """Regular expression for a name in a list of imported names."""
-IMPORTS: Final = re.compile(r"^ *from (monitor[\w.]*) import (?:\(([^)]*)\)|(.*))", re.MULTILINE)
+IMPORT_STATEMENT: Final = re.compile(r"^ *from (monitor[\w.]*) import (?:\(([^)]*)\)|(.*))", re.MULTILINE)
 """Regular expression for an import from a module of the package, with names in parentheses or on one line."""
 
 
@@ -186,7 +186,7 @@ def _cached(kernel: Kernel, function: Callable[P, R]) -> Callable[P, R]:
     with contextlib.suppress(RuntimeError):  # no cache folder can be written
         kernel.enable_caching()
         kept = cast("Any", kernel)._cache._cache_file  # noqa: SLF001
-        kept._source_stamp = (kept._source_stamp, stamp(Path(inspect.getfile(function))))  # noqa: SLF001
+        kept._source_stamp = (kept._source_stamp, source_hash(Path(inspect.getfile(function))))  # noqa: SLF001
     return cast("Callable[P, R]", kernel)
 
 
@@ -206,7 +206,7 @@ def _nothing() -> None: ...
 
 
 @cache
-def stamp(path: Path, root: Path = PACKAGE_ROOT) -> str:
+def source_hash(path: Path, root: Path = PACKAGE_ROOT) -> str:
     """Return a hash of a file and of all modules of this program that it imports, directly or through others.
 
     Parameters
@@ -227,7 +227,7 @@ def stamp(path: Path, root: Path = PACKAGE_ROOT) -> str:
         one = left.pop()
         if one not in texts and one.is_file():
             texts[one] = one.read_bytes()
-            for package, listed, plain in IMPORTS.findall(texts[one].decode()):
+            for package, listed, plain in IMPORT_STATEMENT.findall(texts[one].decode()):
                 place = root / package.replace(".", "/")
                 left.append(place.with_suffix(".py"))
                 left += [place / f"{name}.py" for name in IDENTIFIER.findall(listed or plain)]  # names of modules

@@ -27,8 +27,10 @@ def model_path(name: str, folder: Path) -> Path:
     """
     models = CONFIG_FOLDER / "models"
     shipped = models / f"{name}.toml"
-    path = shipped if file_access.is_file(shipped) else folder / file_access.path(name)
+    path = shipped if file_access.is_file(shipped) else folder / file_access.expand_user(name)
     if os.path.exists(path) and not path.is_dir():
         return path  # the reader reports a file that is no model
     names = sorted(file.stem for file in models.glob("*.toml"))
-    raise ConfigError(f'no model "{name}", neither a file nor one of those shipped{discovery.nearest(name, names)}')
+    raise ConfigError(
+        f'no model "{name}", neither a file nor one of those shipped{discovery.format_suggestion(name, names)}'
+    )

@@ -17,13 +17,13 @@ import time
 from pathlib import Path
 from typing import Final
 
-from drivers.file_access import KINDS, check_folder
+from drivers.file_access import FILE_KINDS, check_folder
 
 RECORDING_LOCK: Final = "recording.lock"
 """Name of the lock file for recordings."""
 HISTORY_LOCK: Final = "history.lock"
 """Name of the lock file for the history."""
-NO_LOCKS: Final = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL)
+LOCKS_UNSUPPORTED_ERRNOS: Final = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL)
 """Error numbers of ``flock`` on a file system without locks."""
 RETRY_S: Final = 0.05
 """Pause before the second attempt, because ``doctor`` holds the lock for a moment while it looks for the holder."""
@@ -107,7 +107,7 @@ class FolderLock:
             except BlockingIOError:
                 time.sleep(wait_s)
             except OSError as error:
-                if error.errno not in NO_LOCKS:
+                if error.errno not in LOCKS_UNSUPPORTED_ERRNOS:
                     raise
                 self.warning = (
                     f"{self.folder}: this file system has no locks ({error.strerror}); make sure that no other "
@@ -119,7 +119,7 @@ class FolderLock:
         return False
 
 
-def holder(folder: Path, name: str) -> str:
+def lock_holder(folder: Path, name: str) -> str:
     """Return a text that names the holder of a folder's lock.
 
     Parameters
@@ -164,7 +164,7 @@ def _open_lock_file(path: Path) -> int:
     mode = os.fstat(descriptor).st_mode
     if not stat.S_ISREG(mode):
         os.close(descriptor)
-        kind = KINDS.get(stat.S_IFMT(mode), "something else")
+        kind = FILE_KINDS.get(stat.S_IFMT(mode), "something else")
         raise OSError(errno.EINVAL, f"{path.name} in it is {kind}, not a regular file", str(path))
     return descriptor
 

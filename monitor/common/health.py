@@ -32,7 +32,7 @@ class Health:
     crossed: tuple[str, ...] = ()  # user limits that are crossed now, for example "gz N"
 
 
-def sentence(healths: Mapping[str, Health], outputs: Mapping[str, str], stuck: Sequence[str] = ()) -> str:
+def format_service_status(healths: Mapping[str, Health], outputs: Mapping[str, str], stuck: Sequence[str] = ()) -> str:
     """Return the status of the whole service in one line, for systemd.
 
     Parameters

@@ -12,7 +12,7 @@ MILLI_G: Final = 9.80665e-3
 """One thousandth of standard gravity, in m/s²."""
 
 
-def amount(axis: str, si: float, sign: bool = False) -> str:
+def format_rate(axis: str, si: float, sign: bool = False) -> str:
     """Format a rate with its unit.
 
     Parameters

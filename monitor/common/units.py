@@ -43,7 +43,7 @@ class Unit:
         >>> COEFFICIENT_UNITS["gyro"]["N"].text(1.5e-4)
         '0.516 °/√h'
         """
-        return f"{number(si * self.factor, digits)} {self.name}"
+        return f"{format_number(si * self.factor, digits)} {self.name}"
 
 
 COEFFICIENT_UNITS: Final[dict[Kind, dict[str, Unit]]] = {
@@ -91,7 +91,7 @@ COEFFICIENT_NAMES: Final[dict[Kind, dict[str, str]]] = {
 """Name of each noise coefficient, for gyroscopes and accelerometers."""
 
 
-def kind_of(axis: str) -> Kind:
+def sensor_kind(axis: str) -> Kind:
     """Return the kind of sensor to which an axis of ``AXES`` belongs."""
     return "gyro" if axis.startswith("g") else "accel"
 
@@ -111,10 +111,10 @@ def unit_of(letter: str, axis: str) -> Unit:
     axis : str
         Axis of ``AXES``.
     """
-    return COEFFICIENT_UNITS[kind_of(axis)][letter]
+    return COEFFICIENT_UNITS[sensor_kind(axis)][letter]
 
 
-def number(value: float, digits: int = 3) -> str:
+def format_number(value: float, digits: int = 3) -> str:
     """Format a number, without an exponent if it is easy to read without one.
 
     Parameters

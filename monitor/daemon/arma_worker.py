@@ -7,12 +7,12 @@ import threading
 
 from drivers.errors import NotReady
 from drivers.sample import Floats
-from monitor.drift.compensation.arma import Arma, identify
+from monitor.drift.compensation.arma import ArmaModel, fit_arma
 from monitor.drift.compensation.compensator import Compensator
 from monitor.drift.compensation.live_compensation import LiveCompensation
 
 
-class Identifier:
+class ArmaWorker:
     """Worker that identifies the ARMA models of one device, one axis after the other, each in a thread of its own.
 
     Parameters
@@ -28,22 +28,22 @@ class Identifier:
         self._at_once = at_once
         self._work: _Identification | None = None
 
-    def renew(self, live: LiveCompensation) -> None:
+    def update(self, live: LiveCompensation) -> None:
         """Adopt a model that has been identified, and start the identification of the next axis that is due."""
         if self._work is not None:
             if self._work.thread.is_alive():
                 return
             if self._work.of is live.compensator:  # the compensator may have been replaced since the thread started
-                live.adopt(self._work.axis, self._work.found)
+                live.set_model(self._work.axis, self._work.found)
             self._work = None
-        for axis in live.compensator.due:
+        for axis in live.compensator.axes_due:
             work = _Identification(live.compensator, axis, self._name)
             if not self._at_once:
                 self._work = work
                 work.thread.start()
                 return
             work.run()
-            live.adopt(axis, work.found)
+            live.set_model(axis, work.found)
 
 
 class _Identification:
@@ -51,13 +51,13 @@ class _Identification:
 
     def __init__(self, of: Compensator, axis: int, name: str) -> None:
         self.of, self.axis = of, axis
-        self.found: Arma | None = None
-        self._window: tuple[Floats, float] = of.window(axis)
+        self.found: ArmaModel | None = None
+        self._window: tuple[Floats, float] = of.identification_data(axis)
         self.thread = threading.Thread(target=self.run, name=name, daemon=True)
 
     def run(self) -> None:
         """Identify the model; ``found`` stays None if the data do not allow it."""
         try:
-            self.found = identify(*self._window)
+            self.found = fit_arma(*self._window)
         except NotReady:  # values that are all equal, or too few; the identification is repeated later
             self.found = None

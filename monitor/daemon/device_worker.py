@@ -18,24 +18,24 @@ from drivers.driver import Driver
 from drivers.errors import ImuError, NotReady
 from drivers.links.base import Link
 from drivers.links.replay_link import ReplayLink
-from drivers.recordings.segment import State
-from drivers.sample import Chunk, Event, Floats, Ints, SampleBlock, unbroken
-from drivers.timing.sample_clock import Before, SampleClock
+from drivers.recordings.segment import DaemonState
+from drivers.sample import Chunk, Event, Floats, Ints, SampleBlock, merge_contiguous_blocks
+from drivers.timing.sample_clock import LastSample, SampleClock
 from monitor.common.health import Health
 from monitor.daemon import window_restore
-from monitor.daemon.operations.limits import Limits, model_of
-from monitor.daemon.pipeline import Chain, Ready
+from monitor.daemon.operations.limits import LimitMonitor, read_model_in_force
+from monitor.daemon.pipeline import DevicePipeline, KernelReadiness
 from monitor.daemon.ring_buffer import RingBuffer
-from monitor.daemon.slewed_clock import EASE, WallClock
-from monitor.daemon.storage.recorder import Recorder, Tail
-from monitor.drift.compensation.live_compensation import DriftLook, LiveCompensation
-from monitor.drift.thermal.live_thermal import ThermalLook
+from monitor.daemon.slewed_clock import MAX_SLEW_RATE, SlewedClock
+from monitor.daemon.storage.recorder import Recorder, RecordingTail
+from monitor.drift.compensation.live_compensation import DriftUpdate, LiveCompensation
+from monitor.drift.thermal.live_thermal import ThermalUpdate
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
-from monitor.estimation.detection.model_agreement import Agreement
+from monitor.estimation.detection.model_agreement import ModelAgreement
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.window_snapshot import Held
+from monitor.estimation.window_snapshot import WindowSnapshot
 from monitor.settings.loading import Device, VirtualTable
 
 RING_S: Final = 10.0
@@ -103,7 +103,7 @@ class Output:
             Allan curve and noise coefficients.
         """
 
-    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
+    def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
         """Receive the comparison of the window with the model in force. Not called for a device without a model.
 
         Parameters
@@ -116,7 +116,7 @@ class Output:
             Comparison of the window with the model.
         """
 
-    def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
+    def thermal(self, device: str, unix_s: float, received: int, look: ThermalUpdate) -> None:
         """Receive the mean of an interval and its prediction from temperature. Not called without a thermal model.
 
         Parameters
@@ -146,7 +146,7 @@ class Output:
             Offset that converts the times to Unix time, in nanoseconds.
         """
 
-    def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
+    def drift(self, device: str, unix_s: float, look: DriftUpdate) -> None:
         """Receive the state of the drift compensation after an interval of one second.
 
         Parameters
@@ -204,11 +204,11 @@ class Output:
             Status of the device.
         """
 
-    def gone(self, device: str) -> None:
+    def device_removed(self, device: str) -> None:
         """Forget a device that was removed from the configuration. A device with the same name may be added later."""
 
 
-class Station:
+class DeviceWorker:
     """Worker of one device of the service.
 
     Parameters
@@ -238,7 +238,7 @@ class Station:
         link: Link,
         decoder: Decoder,
         wake: threading.Event,
-        ready: Ready,
+        ready: KernelReadiness,
         recorder: Recorder | None = None,
     ) -> None:
         self.device = device
@@ -251,9 +251,9 @@ class Station:
         keep = None if recorder is None else self._record_chunks
         self.driver = Driver(device.name, link, decoder, self.clock, self._push, device.axes, device.silence_s, keep)
         self.latest: Estimate | None = None
-        self.model = model_of(device)
-        self._agreement = Agreement()
-        self._limits = Limits(device.limits, self.model)
+        self.model = read_model_in_force(device)
+        self._agreement = ModelAgreement()
+        self._limits = LimitMonitor(device.limits, self.model)
         self.published = 0  # samples handed to the outputs
         self._wake = wake
         self._ready = ready
@@ -261,18 +261,18 @@ class Station:
         self.waits_for_all = device.refit_s == 0.0 or device.leave_out_motion or isinstance(link, ReplayLink)
         self._patient = link.epoch == "unix"
         live = device.refit_s != 0.0 and _arrivals_are_timed(device, link) and not isinstance(link, ReplayLink)
-        self.chain = Chain(device, self.model, ready, self._patient, self.waits_for_all, live)
-        self._slewed_clock = WallClock(time.monotonic_ns(), time.time_ns())
+        self.chain = DevicePipeline(device, self.model, ready, self._patient, self.waits_for_all, live)
+        self._slewed_clock = SlewedClock(time.monotonic_ns(), time.time_ns())
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
         self._unpublished: list[SampleBlock] = []  # samples that were taken and not published yet
         self._waiting_since_ns = 0
         self._unpublished_since_ns = 0  # arrival of the oldest sample in it
         self._latencies: list[float] = []
         self._started_s = time.monotonic()
-        self._before = State()  # state of the estimate before a restart
+        self._before = DaemonState()  # state of the estimate before a restart
         self._pending_events: list[Event] = []
         self._untimed: deque[tuple[str, str]] = deque(maxlen=MAX_UNTIMED_EVENTS)  # kind and text, see ``_store_event``
-        self._tail: Tail | None = None  # end of the recording, until the window has been rebuilt from it
+        self._tail: RecordingTail | None = None  # end of the recording, until the window has been rebuilt from it
         self._next_s = dict.fromkeys(("refit", "publish", "samples", "total", "thermal"), 0.0)
         self._refitted = False  # True if the fit was updated since the last publication
         self._rate_doubts = (False, False)  # True if the configured rate is contradicted; True if it is not checked yet
@@ -295,7 +295,7 @@ class Station:
         rate_hz = self.clock.rate_hz or tail.newest.state.rate or 0.0
         try:
             offset_ns = self._offset_ns(time.monotonic_ns())
-            text = window_restore.rebuild(self.chain, tail, rate_hz, self.device.window_s, offset_ns)
+            text = window_restore.restore_window(self.chain, tail, rate_hz, self.device.window_s, offset_ns)
         except (ImuError, OSError) as error:
             text = f"the window could not be rebuilt: {error}"
             self.chain.reset()
@@ -328,13 +328,13 @@ class Station:
         return not self.chain.waiting and (not self._waiting_since_ns or self.clock.rate_hz is None)
 
     @property
-    def turns(self) -> int | None:
+    def read_attempts(self) -> int | None:
         """Number of read attempts of the reader thread, see ``Driver.turns``.
 
         None for a replayed recording, whose reader may block while the ring buffer is full, and for a reader that has
         ended.
         """
-        return None if self._patient or self.driver.state == "ended" else self.driver.turns
+        return None if self._patient or self.driver.state == "ended" else self.driver.iterations
 
     # --- one round
 
@@ -367,7 +367,7 @@ class Station:
         if drain:
             self.chain.flush()
         if self.chain.thermal is not None and any(event.kind == "link_back" for event in happened):
-            self.chain.thermal.offset_is_new()
+            self.chain.thermal.learn_new_offset()
         published = self._publish_samples(outputs, now_s, drain)
         self._publish_events(outputs, happened + self.chain.take_events())
         self._publish_thermal(outputs, now_s)
@@ -382,11 +382,11 @@ class Station:
         if self._tail is None:
             self.chain.reset()
 
-    def held(self) -> tuple[Held, Floats] | None:
+    def window_snapshot(self) -> tuple[WindowSnapshot, Floats] | None:
         """Return a copy of the window and its temperature, float64 [n] in °C; None if the window is empty."""
-        return None if self._tail is not None else self.chain.held()
+        return None if self._tail is not None else self.chain.window_snapshot()
 
-    def limit(self, device: Device) -> None:
+    def set_limits(self, device: Device) -> None:
         """Replace the limits by those of new settings. Limits that both settings have keep their state.
 
         Raises
@@ -394,11 +394,11 @@ class Station:
         ConfigError
             A limit is relative to a coefficient that the model in force does not have.
         """
-        limits = Limits(device.limits, self.model)
+        limits = LimitMonitor(device.limits, self.model)
         limits.take_over(self._limits)
         self.device, self._limits = device, limits
 
-    def announce(self, outputs: Sequence[Output], kind: str, text: str) -> None:
+    def publish_event(self, outputs: Sequence[Output], kind: str, text: str) -> None:
         """Publish an event of the present moment, such as a stopped recording.
 
         The event waits while the timeline of the device is unknown.
@@ -415,7 +415,7 @@ class Station:
         self._store_event(kind, text)
         self._publish_events(outputs, self._take_timed_events())
 
-    def report(self, outputs: Sequence[Output], states: dict[str, str], memory_bytes: int) -> Health:
+    def publish_status(self, outputs: Sequence[Output], states: dict[str, str], memory_bytes: int) -> Health:
         """Publish the status of the device, and move its slewed clock towards the host clock.
 
         Parameters
@@ -435,7 +435,7 @@ class Station:
         self._slew_to_host(outputs)
         self._update_rate()
         if self._recorder is not None:
-            self._recorder.know(self.name, self._restart_state())
+            self._recorder.set_state(self.name, self._restart_state())
         health = self.health(states, memory_bytes)
         for output in outputs:
             output.health(self.name, self.now_unix_s(), health)
@@ -451,7 +451,7 @@ class Station:
         memory_bytes : int
             Resident memory of the process.
         """
-        counts, latencies, watch = self.driver.counts, np.array(self._latencies), self.chain.watch
+        counts, latencies, watch = self.driver.counts, np.array(self._latencies), self.chain.signal_monitor
         self._latencies = []
         return Health(
             state=self.driver.state,
@@ -466,8 +466,8 @@ class Station:
             outputs=dict(states),
             text=self._text(),
             uptime_s=time.monotonic() - self._started_s,
-            repeated=self.clock.repeated,
-            late=self.clock.late + counts.late,
+            repeated=self.clock.repeated_rows,
+            late=self.clock.late_rows + counts.late,
             moving=watch is not None and watch.moving,
             moved=watch.moved_samples if watch is not None else 0,
             crossed=self._limits.crossed,
@@ -492,7 +492,7 @@ class Station:
 
     # --- restart
 
-    def _resume(self, tail: Tail | None) -> None:
+    def _resume(self, tail: RecordingTail | None) -> None:
         """Continue after the end of the recording, so that the samples since then count as missing."""
         if tail is None:
             return
@@ -507,12 +507,12 @@ class Station:
                 text = "the recording ends after the host's clock: the window begins anew"
             self._store_event("window_rebuilt", text)
             return
-        self.clock.resume(Before(t_ns, int(newest.ticks[-1]), rate, state.tick_step))
+        self.clock.resume(LastSample(t_ns, int(newest.ticks[-1]), rate, state.tick_step))
         self._tail, self._before = tail, state
         if self._recorder is not None:
-            self._recorder.know(self.name, state)  # the next restart may come before a new estimate exists
+            self._recorder.set_state(self.name, state)  # the next restart may come before a new estimate exists
 
-    def _restart_state(self) -> State:
+    def _restart_state(self) -> DaemonState:
         """Return the state of the estimate that is recorded together with the samples."""
         if self._tail is not None:
             return self._before
@@ -552,12 +552,12 @@ class Station:
     def _slew_to_host(self, outputs: Sequence[Output]) -> None:
         """Move the slewed clock towards the host clock, and publish an event if the host clock was set."""
         now_ns = time.monotonic_ns()
-        set_s = self._slewed_clock.follow(now_ns, time.time_ns()) / 1e9
+        set_s = self._slewed_clock.slew_to(now_ns, time.time_ns()) / 1e9
         if abs(set_s) < MIN_CLOCK_STEP_S or self.driver.times_are_unix:
             return
         text = (
             f"the host's clock was set {'on' if set_s > 0.0 else 'back'} by {abs(set_s):.6g} s; times follow by "
-            f"{EASE * 3600.0:g} s an hour, a restart takes the new time over at once"
+            f"{MAX_SLEW_RATE * 3600.0:g} s an hour, a restart takes the new time over at once"
         )
         self._publish_events(outputs, [Event("clock_jumped", now_ns, text)])
 
@@ -574,9 +574,9 @@ class Station:
         """
         if self._recorder is not None:
             if self.chain.estimator is None:  # the program may crash before the first status is published
-                self._recorder.know(self.name, self._restart_state())
+                self._recorder.set_state(self.name, self._restart_state())
             self._recorder.samples(self.name, samples, self._offsets_ns(samples))
-            while self._patient and self._recorder.full(self.name):
+            while self._patient and self._recorder.is_queue_filling(self.name):
                 time.sleep(PATIENCE_S)
         while self._patient and self.ring.room < len(samples) < self.ring.capacity:
             time.sleep(PATIENCE_S)
@@ -598,7 +598,7 @@ class Station:
         chain = self.chain
         if chain.waiting or self._tail is not None:
             return False
-        if chain.estimator is not None or chain.refused:
+        if chain.estimator is not None or chain.refusal_reason:
             return True
         if self.clock.rate_hz is None:  # samples are published even if their times do not show a rate
             return self.ring.room < self.ring.capacity // 2
@@ -616,7 +616,7 @@ class Station:
         if not self._unpublished or not (self._due("samples", every_s, now_s) or drain):
             return False
         blocks, self._unpublished = self._unpublished, []
-        for samples in unbroken(blocks):
+        for samples in merge_contiguous_blocks(blocks):
             self.published += len(samples)
             for output in outputs:
                 output.samples(self.name, self.published, samples, self._offsets_ns(samples))
@@ -628,10 +628,10 @@ class Station:
         """Publish the samples without gyroscope drift, and the state of the drift compensation."""
         at = 0
         while at < len(samples):
-            piece = samples[at : at + live.compensator.ahead]
+            piece = samples[at : at + live.compensator.samples_to_interval_end]
             at += len(piece)
             without = live.update(piece)
-            self.chain.renew()
+            self.chain.update_drift_models()
             for output in outputs:
                 output.compensated(self.name, self.published - len(samples) + at, without, self._offsets_ns(without))
         for look in live.take():
@@ -663,8 +663,8 @@ class Station:
         self._refitted = False
         for output in outputs:
             output.estimate(self.name, self.unix_s(self.latest.t_ns), self.latest)
-        if self.chain.in_force is not None:
-            look = self.chain.in_force.look(self.latest)
+        if self.chain.model_in_force is not None:
+            look = self.chain.model_in_force.compare(self.latest)
             self._publish_gap(outputs, replace(look, axes={}) if any(self._rate_doubts) else look)
         self._publish_events(outputs, self._limits.update(self.latest))
         return True
@@ -673,7 +673,7 @@ class Station:
         """Withhold the coefficients while the configured rate is contradicted by the data, or is not checked yet."""
         if drain:
             self.clock.end()
-        doubts = (self.clock.contradicted_hz is not None, self.clock.unchecked)
+        doubts = (self.clock.contradicted_hz is not None, self.clock.rate_check_pending)
         if doubts != self._rate_doubts:
             self._rate_doubts = doubts
             self._update_rate()
@@ -683,14 +683,14 @@ class Station:
         """Pass the best known sample rate to the pipeline."""
         rate_hz = self.clock.rate_hz
         if rate_hz is not None and self._tail is None:
-            self.chain.relabel(rate_hz)
+            self.chain.set_rate(rate_hz)
 
     def _publish_gap(self, outputs: Sequence[Output], look: ModelGap) -> None:
         """Publish the comparison of the window with the model in force, and its events."""
         events = self._agreement.update(look)
         look = replace(look, agrees=self._agreement.verdicts)
         for output in outputs:
-            output.gap(self.name, self.unix_s(look.t_ns), look)
+            output.model_gap(self.name, self.unix_s(look.t_ns), look)
         self._publish_events(outputs, events)
 
     def _publish_events(self, outputs: Sequence[Output], events: Sequence[Event]) -> None:
@@ -705,7 +705,7 @@ class Station:
         if estimator is None or not self._ready.all.is_set() or now_s < self._next_s["total"]:
             return
         begun_s = time.perf_counter()
-        found = estimator.step()
+        found = estimator.step_slow_statistics()
         self._next_s["total"] = now_s + max(TOTAL_INTERVAL_S, (time.perf_counter() - begun_s) / TOTAL_CPU_SHARE)
         if found is not None:
             for output in outputs:
@@ -713,7 +713,7 @@ class Station:
 
     def _publish_thermal(self, outputs: Sequence[Output], now_s: float) -> None:
         """Publish the finished thermal intervals, and continue the selection of a thermal model."""
-        for look in self.chain.take_looks():
+        for look in self.chain.take_thermal_intervals():
             for output in outputs:
                 output.thermal(self.name, self.unix_s(look.t_ns), self.driver.counts.received, look)
         thermal = self.chain.thermal
@@ -760,7 +760,7 @@ class Station:
             )
         if self.chain.estimator is None and self.published and self.clock.rate_hz is None:
             return "no estimate: the times of the samples do not show a rate; set `rate`"
-        return self.chain.refused
+        return self.chain.refusal_reason
 
     def _clock_text(self) -> str:
         """Return a message about the offset of the sample times from the host clock; empty if the offset is small."""

@@ -26,13 +26,13 @@ import numpy as np
 from llvmlite import binding
 
 from drivers.extras import missing_packages
-from drivers.sample import SampleBlock, block
-from monitor.common.compiled import cache_folder, stamp
-from monitor.drift.compensation.arma import identify
+from drivers.sample import SampleBlock, make_block
+from monitor.common.compiled import cache_folder, source_hash
+from monitor.drift.compensation.arma import fit_arma
 from monitor.drift.compensation.compensator import Compensator
 from monitor.drift.thermal import thermal_response
 from monitor.estimation.detection.change_detection import ChangeDetector
-from monitor.estimation.detection.signal_monitor import Watch
+from monitor.estimation.detection.signal_monitor import SignalMonitor
 from monitor.estimation.estimator import Estimator
 
 MAX_PROCESSES: Final = 2
@@ -52,7 +52,7 @@ BAR_LENGTH: Final = 12
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class KernelPart:
     """Kernels that are compiled together.
 
     Attributes
@@ -108,14 +108,16 @@ class Progress:
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class KernelGroup:
     """Parts that are needed together. A part comes after the parts whose kernels it uses."""
 
     name: str
-    parts: tuple[Part, ...]
+    parts: tuple[KernelPart, ...]
 
 
-def prepare(group: Group, tell: Callable[[Progress], None], processes: int | None = None) -> Iterator[str]:
+def prepare_kernels(
+    group: KernelGroup, tell: Callable[[Progress], None], processes: int | None = None
+) -> Iterator[str]:
     """Make the kernels of a group ready to be called, and yield the name of each part when it is ready.
 
     Parameters
@@ -159,7 +161,7 @@ def prepare(group: Group, tell: Callable[[Progress], None], processes: int | Non
         _stamp_file(folder, group).touch()
 
 
-def is_warm(group: Group) -> bool:
+def is_warm(group: KernelGroup) -> bool:
     """Return True if all kernels of a group are in the cache on disk, for this program, Numba and processor."""
     folder = cache_folder()
     return folder is not None and _stamp_file(folder, group).is_file()
@@ -197,7 +199,7 @@ def compile_from_stdin(stdin: IO[str], stdout: IO[str]) -> NoReturn:
 class _Job:
     """Compilation of one part."""
 
-    part: Part
+    part: KernelPart
     finished: bool = False
     compiled: bool = False
 
@@ -205,7 +207,7 @@ class _Job:
 class _Compilers:
     """Pool of child processes, each with a thread that passes one part after the other to it."""
 
-    def __init__(self, parts: Sequence[Part], processes: int, tell: Callable[[Progress], None]) -> None:
+    def __init__(self, parts: Sequence[KernelPart], processes: int, tell: Callable[[Progress], None]) -> None:
         self._jobs = {part.name: _Job(part) for part in parts}
         self._waiting = list(self._jobs.values())
         self._running: list[str] = []
@@ -229,7 +231,7 @@ class _Compilers:
             for child in self._children:
                 child.kill()
 
-    def wait_for(self, part: Part) -> bool:
+    def wait_for(self, part: KernelPart) -> bool:
         """Wait until a child process has compiled a part, and report the progress meanwhile.
 
         Returns
@@ -301,7 +303,7 @@ class _Compilers:
         self._changes.put(Progress(done, len(self._jobs), tuple(self._running)))
 
 
-def _compile_in_child(child: "subprocess.Popen[str]", part: Part) -> bool:
+def _compile_in_child(child: "subprocess.Popen[str]", part: KernelPart) -> bool:
     """Let a child process compile a part; return True if it has."""
     assert child.stdin is not None
     assert child.stdout is not None
@@ -318,17 +320,17 @@ def _processors() -> int:
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
-def _stamp_file(folder: Path, group: Group) -> Path:
+def _stamp_file(folder: Path, group: KernelGroup) -> Path:
     """Return the path of the stamp of a group. The file name depends on everything that the machine code depends on."""
     machine = [binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()]
     parts = [part.name for part in group.parts]
-    everything = [*parts, stamp(Path(__file__)), numba.__version__, sys.version, *machine]
+    everything = [*parts, source_hash(Path(__file__)), numba.__version__, sys.version, *machine]
     return folder / f"{group.name}-{sha256(' '.join(everything).encode()).hexdigest()[:16]}.warm"
 
 
 def _samples(n: int) -> SampleBlock:
     """Return a block of ``n`` samples with value zero."""
-    return block(np.arange(n, dtype=np.int64), np.zeros((n, 6)))
+    return make_block(np.arange(n, dtype=np.int64), np.zeros((n, 6)))
 
 
 def _call_window() -> None:
@@ -345,21 +347,21 @@ def _call_fit() -> None:
 
 def _call_motion_detection() -> None:
     """Call the kernels of the motion detection."""
-    Watch(100.0, alarms_per_day=0.0).update(_samples(100))
+    SignalMonitor(100.0, alarms_per_day=0.0).update(_samples(100))
 
 
 def _call_change_detection() -> None:
     """Call the kernels of the change detection."""
-    Watch(100.0).update(_samples(100))
+    SignalMonitor(100.0).update(_samples(100))
     ChangeDetector(100.0).restart()
 
 
 def _call_compensation() -> None:
     """Call the kernels of the drift compensation."""
     compensator = Compensator(100.0)
-    compensator.update(1e-3 * np.random.default_rng(0).standard_normal((6000, 6)))
-    compensator.adopt(0, identify(*compensator.window(0), [(2, 1)]))
-    compensator.update(np.zeros((1, 6)), lost=1)
+    compensator.compensate(1e-3 * np.random.default_rng(0).standard_normal((6000, 6)))
+    compensator.set_model(0, fit_arma(*compensator.identification_data(0), [(2, 1)]))
+    compensator.compensate(np.zeros((1, 6)), lost=1)
     _ = compensator.error
 
 
@@ -368,7 +370,7 @@ def _call_slow_statistics() -> None:
     estimator = Estimator(100.0, 1.0)
     estimator.update(_samples(100))
     estimator.restart(0, 10)
-    while estimator.step() is None:  # total and Hadamard deviation
+    while estimator.step_slow_statistics() is None:  # total and Hadamard deviation
         pass
 
 
@@ -379,7 +381,7 @@ def _call_refit() -> None:
 
 def _call_temperature_lag() -> None:
     """Call the kernels of the thermal model."""
-    thermal_response.lagged(np.zeros(2), 0.5)
+    thermal_response.first_order_lag(np.zeros(2), 0.5)
 
 
 def _call_analysis() -> None:
@@ -407,23 +409,25 @@ WINDOW: Final = "Allan deviation"
 """Name of the part after which a window can be filled."""
 FIT: Final = "noise coefficients"
 """Name of the part after which coefficients can be fitted."""
-SERVICE: Final = Group(
+SERVICE: Final = KernelGroup(
     "service",
     (
-        Part(WINDOW, _call_window),
-        Part("motion detection", _call_motion_detection),
-        Part(FIT, _call_fit),
-        Part("change detection", _call_change_detection),
-        Part("drift compensation", _call_compensation),
-        Part("total and Hadamard deviation", _call_slow_statistics),
-        Part("refit at every sample", _call_refit),
-        Part("temperature lag", _call_temperature_lag),
+        KernelPart(WINDOW, _call_window),
+        KernelPart("motion detection", _call_motion_detection),
+        KernelPart(FIT, _call_fit),
+        KernelPart("change detection", _call_change_detection),
+        KernelPart("drift compensation", _call_compensation),
+        KernelPart("total and Hadamard deviation", _call_slow_statistics),
+        KernelPart("refit at every sample", _call_refit),
+        KernelPart("temperature lag", _call_temperature_lag),
     ),
 )
 """Parts that the running service needs, in the order in which it needs them."""
-_ANALYSIS: Final = Part("analysis of recordings", _call_analysis)
-_RECONCILIATION: Final = Part("reconciliation", _call_reconciliation)
-COMMANDS: Final = Group("commands", (_ANALYSIS,) if missing_packages("reconcile") else (_ANALYSIS, _RECONCILIATION))
+_ANALYSIS: Final = KernelPart("analysis of recordings", _call_analysis)
+_RECONCILIATION: Final = KernelPart("reconciliation", _call_reconciliation)
+COMMANDS: Final = KernelGroup(
+    "commands", (_ANALYSIS,) if missing_packages("reconcile") else (_ANALYSIS, _RECONCILIATION)
+)
 """Parts that only the commands on recordings need. A few kernels of rare cases are compiled at their first call."""
 GROUPS: Final = (SERVICE, COMMANDS)
 """All groups."""

@@ -9,22 +9,22 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from drivers.sample import Event, Ints, SampleBlock
-from drivers.zenoh.sample_message import pack
+from drivers.zenoh.sample_message import encode_samples
 from monitor.common import topics
 from monitor.common.health import Health
 from monitor.daemon.device_worker import Output
-from monitor.drift.compensation.live_compensation import DriftLook
-from monitor.drift.thermal.live_thermal import ThermalLook
+from monitor.drift.compensation.live_compensation import DriftUpdate
+from monitor.drift.thermal.live_thermal import ThermalUpdate
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
-from monitor.history.minute_aggregation import Minutes
-from monitor.history.sqlite_store import PastEvent
-from monitor.history.writer import Writer
+from monitor.history.minute_aggregation import MinuteAggregator
+from monitor.history.sqlite_store import StoredEvent
+from monitor.history.writer import HistoryWriter
 from monitor.publishing.messages import encoding
-from monitor.publishing.terminal.live_table import Board
-from monitor.publishing.zenoh.publisher import ZenohOut
+from monitor.publishing.terminal.live_table import DeviceStates
+from monitor.publishing.zenoh.publisher import ZenohPublisher
 
 if TYPE_CHECKING:
     from monitor.publishing.rerun.view import RerunView
@@ -37,19 +37,19 @@ _log = structlog.get_logger("imu-monitor")
 class ZenohOutput(Output):
     """Output that publishes the results as zenoh messages."""
 
-    def __init__(self, zenoh: ZenohOut) -> None:
+    def __init__(self, zenoh: ZenohPublisher) -> None:
         self._zenoh = zenoh
 
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Publish a block as one msgpack batch."""
-        self._zenoh.put(topics.SAMPLES, device, pack(device, received, samples, offset_ns))
+        self._zenoh.put(topics.SAMPLES, device, encode_samples(device, received, samples, offset_ns))
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         """Publish the Allan curve and the coefficients."""
-        self._zenoh.put(topics.ALLAN, device, encoding.allan(device, unix_s, estimate))
+        self._zenoh.put(topics.ALLAN, device, encoding.encode_allan(device, unix_s, estimate))
         self._zenoh.put(topics.COEFFICIENTS, device, encoding.coefficients(device, unix_s, estimate))
 
-    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
+    def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
         """Publish the comparison of the window with the model in force."""
         self._zenoh.put(topics.GAP, device, encoding.gap(device, unix_s, gap))
 
@@ -60,15 +60,15 @@ class ZenohOutput(Output):
     def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Publish a block of compensated samples as one msgpack batch."""
         schema = topics.COMPENSATED.schema()
-        self._zenoh.put(topics.COMPENSATED, device, pack(device, received, samples, offset_ns, schema))
+        self._zenoh.put(topics.COMPENSATED, device, encode_samples(device, received, samples, offset_ns, schema))
 
-    def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
+    def thermal(self, device: str, unix_s: float, received: int, look: ThermalUpdate) -> None:
         """Publish the mean of an interval and its prediction from temperature."""
         self._zenoh.put(topics.THERMAL, device, encoding.thermal(device, unix_s, received, look))
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Publish an event."""
-        payload = encoding.event(device, unix_s, received, event, encoding.since_s(unix_s, event))
+        payload = encoding.event(device, unix_s, received, event, encoding.event_start_s(unix_s, event))
         self._zenoh.put(topics.EVENT, device, payload)
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
@@ -90,7 +90,7 @@ class ViewerOutput(Output):
         """Show the Allan curve and the coefficients."""
         self._view.estimate(device, unix_s, estimate)
 
-    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
+    def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
         """Show the time series of the gaps, and the model's curves with the measured curves."""
         self._view.gap(device, unix_s, gap)
 
@@ -98,11 +98,11 @@ class ViewerOutput(Output):
         """Show compensated rates together with the measured rates."""
         self._view.compensated(device, (samples.t_ns + offset_ns) / 1e9, samples.values[:, :3])
 
-    def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
+    def drift(self, device: str, unix_s: float, look: DriftUpdate) -> None:
         """Show the time series of the drift and of its innovations, and the drift models."""
         self._view.drift(device, unix_s, look)
 
-    def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
+    def thermal(self, device: str, unix_s: float, received: int, look: ThermalUpdate) -> None:
         """Show the time series of the interval means and their predictions."""
         self._view.thermal(device, unix_s, look)
 
@@ -125,51 +125,51 @@ class HistoryOutput(Output):
         Writer of the history file.
     """
 
-    def __init__(self, writer: Writer) -> None:
+    def __init__(self, writer: HistoryWriter) -> None:
         self.received: dict[str, int] = {}  # number of samples of each device since the start
         self._writer = writer
-        self._minutes: dict[str, Minutes] = {}
+        self._minutes: dict[str, MinuteAggregator] = {}
 
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Aggregate the temperature of the samples."""
         unix_s = float((samples.t_ns + offset_ns)[-1]) / 1e9
-        self._writer.put(device, self._minutes_of(device).temperature(unix_s, samples.temperature_c))
+        self._writer.put_row(device, self._minutes_of(device).temperature(unix_s, samples.temperature_c))
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         """Aggregate the coefficients, and the deviations on a coarse grid."""
-        self._writer.put(device, self._minutes_of(device).estimate(unix_s, estimate))
+        self._writer.put_row(device, self._minutes_of(device).estimate(unix_s, estimate))
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Store an event."""
         since_s = None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
         # SQLite does not accept NumPy scalars, so they are converted to plain numbers
-        what = {name: {side: float(one) for side, one in sides.items()} for name, sides in event.what.items()}
+        what = {name: {side: float(one) for side, one in sides.items()} for name, sides in event.values.items()}
         sigma = None if event.sigma is None else float(event.sigma)
-        told = PastEvent(unix_s, event.kind, event.text, event.axis, what, since_s, sigma)
-        self._writer.tell(device, told)
+        told = StoredEvent(unix_s, event.kind, event.text, event.axis, what, since_s, sigma)
+        self._writer.put_event(device, told)
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Aggregate counts and state, once the time of the first sample is known: rows are minutes of sample time."""
         self.received[device] = health.received
         if unix_s is None:
             return
-        self._writer.put(device, self._minutes_of(device).health(unix_s, health))
+        self._writer.put_row(device, self._minutes_of(device).health(unix_s, health))
 
-    def gone(self, device: str) -> None:
+    def device_removed(self, device: str) -> None:
         """Store the last minute of a device that was removed."""
         self.received.pop(device, None)
         minutes = self._minutes.pop(device, None)
         if minutes is not None:
-            self._writer.put(device, minutes.end())
+            self._writer.put_row(device, minutes.flush())
 
     def end(self) -> None:
         """Store the present, incomplete minutes of all devices."""
         for device, minutes in self._minutes.items():
-            self._writer.put(device, minutes.end())
+            self._writer.put_row(device, minutes.flush())
 
-    def _minutes_of(self, device: str) -> Minutes:
+    def _minutes_of(self, device: str) -> MinuteAggregator:
         """Return the aggregation of a device."""
-        return self._minutes.setdefault(device, Minutes())
+        return self._minutes.setdefault(device, MinuteAggregator())
 
 
 class LogOutput(Output):
@@ -190,7 +190,7 @@ class LogOutput(Output):
             say = _log.info if health.state in ("running", "ended") and not health.text else _log.warning
             say("status", device=device, state=health.state, text=health.text, received=health.received)
 
-    def gone(self, device: str) -> None:
+    def device_removed(self, device: str) -> None:
         """Forget the state of a removed device, so that it is logged if the device is added again."""
         self._last_status.pop(device, None)
 
@@ -206,7 +206,7 @@ class TableOutput(Output):
         Called once a second for each device; asks another thread to draw the table.
     """
 
-    def __init__(self, board: Board, redraw: Callable[[], None] | None = None) -> None:
+    def __init__(self, board: DeviceStates, redraw: Callable[[], None] | None = None) -> None:
         self.board = board
         self._redraw = redraw
         self._latest: dict[str, tuple[float, Estimate]] = {}
@@ -220,27 +220,31 @@ class TableOutput(Output):
         """Keep an estimate until the row of the device is updated."""
         self._latest[device] = (unix_s, estimate)
 
-    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
+    def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
         """Keep a comparison with the model until the row of the device is updated."""
         self._gaps[device] = (unix_s, gap)
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Add an event to the lines below the table."""
-        self.board.take(topics.EVENT.key(PREFIX, device), encoding.event(device, unix_s, received, event, None))
+        self.board.process_message(
+            topics.EVENT.key(PREFIX, device), encoding.event(device, unix_s, received, event, None)
+        )
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Update the row of a device."""
-        self.board.take(topics.STATUS.key(PREFIX, device), encoding.status(device, unix_s, health))
+        self.board.process_message(topics.STATUS.key(PREFIX, device), encoding.status(device, unix_s, health))
         if device in self._latest:
             at_s, estimate = self._latest.pop(device)
-            self.board.take(topics.COEFFICIENTS.key(PREFIX, device), encoding.coefficients(device, at_s, estimate))
+            self.board.process_message(
+                topics.COEFFICIENTS.key(PREFIX, device), encoding.coefficients(device, at_s, estimate)
+            )
         if device in self._gaps:
-            self.board.take(topics.GAP.key(PREFIX, device), encoding.gap(device, *self._gaps.pop(device)))
+            self.board.process_message(topics.GAP.key(PREFIX, device), encoding.gap(device, *self._gaps.pop(device)))
         if self._redraw is not None:
             self._redraw()
 
-    def gone(self, device: str) -> None:
+    def device_removed(self, device: str) -> None:
         """Remove the row of a device."""
         self._latest.pop(device, None)
         self._gaps.pop(device, None)
-        self.board.forget(topics.STATUS.key(PREFIX, device))
+        self.board.remove(topics.STATUS.key(PREFIX, device))

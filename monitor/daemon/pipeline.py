@@ -19,13 +19,13 @@ import numpy as np
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Event, Floats, SampleBlock
 from monitor.common.compiled import interpreted
-from monitor.daemon.arma_worker import Identifier
+from monitor.daemon.arma_worker import ArmaWorker
 from monitor.drift.compensation.live_compensation import LiveCompensation
-from monitor.drift.thermal.live_thermal import LiveThermal, ThermalLook
-from monitor.estimation.detection.model_gap import ModelInForce
-from monitor.estimation.detection.signal_monitor import Watch
+from monitor.drift.thermal.live_thermal import LiveThermal, ThermalUpdate
+from monitor.estimation.detection.model_gap import ModelComparison
+from monitor.estimation.detection.signal_monitor import SignalMonitor
 from monitor.estimation.estimator import Estimator
-from monitor.estimation.window_snapshot import Held, Temperatures
+from monitor.estimation.window_snapshot import TemperatureRing, WindowSnapshot
 from monitor.noise.model import NoiseModel
 from monitor.settings.loading import Device
 
@@ -36,7 +36,7 @@ MAX_PIECE_SAMPLES: Final = 512
 
 
 @dataclass(slots=True)
-class Ready:
+class KernelReadiness:
     """Flags of the compiled kernels, see ``monitor.daemon.kernel_compilation``.
 
     Attributes
@@ -67,7 +67,7 @@ class Ready:
         return True
 
 
-class Chain:
+class DevicePipeline:
     """Processing pipeline of one device.
 
     Parameters
@@ -87,14 +87,20 @@ class Chain:
     """
 
     def __init__(
-        self, device: Device, model: NoiseModel | None, ready: Ready, patient: bool, needs_all: bool, live: bool
+        self,
+        device: Device,
+        model: NoiseModel | None,
+        ready: KernelReadiness,
+        patient: bool,
+        needs_all: bool,
+        live: bool,
     ) -> None:
         self.estimator: Estimator | None = None
-        self.watch: Watch | None = None
+        self.signal_monitor: SignalMonitor | None = None
         self.thermal: LiveThermal | None = None
         self.compensation: LiveCompensation | None = None
-        self.in_force: ModelInForce | None = None
-        self.refused = ""
+        self.model_in_force: ModelComparison | None = None
+        self.refusal_reason = ""
         """Reason why no estimate is possible; empty if it is."""
         self.advanced = False
         """True if samples were processed since the owner last set this to False."""
@@ -102,7 +108,7 @@ class Chain:
         """Time in nanoseconds of the first sample in the window of an axis that was restarted, else None."""
         self.newest_ns = 0
         """Time of the newest sample that entered the pipeline, in nanoseconds; 0 before the first."""
-        self.identifier = Identifier(f"drift of {device.name}", at_once=patient)
+        self.identifier = ArmaWorker(f"drift of {device.name}", at_once=patient)
         self._device = device
         self._model = model
         self._ready = ready
@@ -110,8 +116,8 @@ class Chain:
         self._needs = ready.all if needs_all else ready.window
         self._live = live
         self._interprets = False
-        self._temperatures: Temperatures | None = None  # of the samples in the window
-        self._looks: list[ThermalLook] = []  # thermal intervals that were not taken yet
+        self._temperatures: TemperatureRing | None = None  # of the samples in the window
+        self._looks: list[ThermalUpdate] = []  # thermal intervals that were not taken yet
         self._handled = 0  # last seen value of ``watch.handled``
         self._pieces: deque[SampleBlock] = deque()  # samples of a recording that wait for the thermal model
         self._replaying = False
@@ -170,7 +176,7 @@ class Chain:
             self.newest_ns = int(blocks[-1].t_ns[-1])
         if self.estimator is None and (rate_hz is None or not self._create_estimator(rate_hz)):
             return
-        if self.watch is None and self.can_detect:
+        if self.signal_monitor is None and self.can_detect:
             self._create_detectors()
         self._pieces += [
             samples[at : at + MAX_PIECE_SAMPLES]
@@ -179,25 +185,25 @@ class Chain:
         ]
         while self._pieces and (drain or not self._patient or self.thermal is None or not self.thermal.choosing):
             piece = self._pieces.popleft()
-            self._update_estimator(self.watch.update(piece) if self.watch is not None else [piece])
+            self._update_estimator(self.signal_monitor.update(piece) if self.signal_monitor is not None else [piece])
             self._restart_changed_axes()
             self._update_thermal()
 
     def flush(self) -> None:
         """Process the samples that the motion detector still holds back, after the last sample has arrived."""
-        self._update_estimator(self.watch.flush() if self.watch is not None else [])
+        self._update_estimator(self.signal_monitor.flush() if self.signal_monitor is not None else [])
         self._restart_changed_axes()
         self._update_thermal()
 
-    def renew(self) -> None:
+    def update_drift_models(self) -> None:
         """Adopt new drift models and start the identification of those that are due, if an interval has just ended."""
         live = self.compensation
         if live is None or not self._ready.all.is_set():  # another thread identifies the models and would compile
             return
-        if live.compensator.ahead == live.compensator.interval:
-            self.identifier.renew(live)
+        if live.compensator.samples_to_interval_end == live.compensator.interval_samples:
+            self.identifier.update(live)
 
-    def relive(self, samples: SampleBlock, rate_hz: float) -> None:
+    def replay(self, samples: SampleBlock, rate_hz: float) -> None:
         """Process a recorded block without events, to rebuild the window after a restart.
 
         The events of these samples were published before the restart. The start of each axis is known from the
@@ -217,10 +223,10 @@ class Chain:
         if live is not None and np.isfinite(samples.values[:, :3]).any():
             for at in range(0, len(samples), MAX_PIECE_SAMPLES):
                 live.update(samples[at : at + MAX_PIECE_SAMPLES])
-            self.identifier.renew(live)
+            self.identifier.update(live)
             live.take()
         self.take_events()
-        self.take_looks()
+        self.take_thermal_intervals()
 
     def reset(self) -> None:
         """Empty the window."""
@@ -228,27 +234,31 @@ class Chain:
             self.estimator.reset()
             self.since_ns = [self.newest_ns + 1] * len(AXES)
 
-    def relabel(self, rate_hz: float) -> None:
+    def set_rate(self, rate_hz: float) -> None:
         """Set the sample rate to a more accurate value."""
         if self.estimator is None or rate_hz == self.estimator.rate_hz:
             return
-        self.estimator.relabel(rate_hz)
-        for one in (self.watch, self.thermal, self.compensation):
+        self.estimator.set_rate(rate_hz)
+        for one in (self.signal_monitor, self.thermal, self.compensation):
             if one is not None:
-                one.relabel(rate_hz)
+                one.set_rate(rate_hz)
 
-    def held(self) -> tuple[Held, Floats] | None:
+    def window_snapshot(self) -> tuple[WindowSnapshot, Floats] | None:
         """Return a copy of the window and its temperature, float64 [n] in °C; None if the window is empty."""
         if self.estimator is None or self._temperatures is None or not self.estimator.filled:
             return None
-        return self.estimator.held(), self._temperatures.newest(self.estimator.filled)
+        return self.estimator.copy_window(), self._temperatures.newest(self.estimator.filled)
 
     def take_events(self) -> list[Event]:
         """Return the events that were detected since the last call."""
-        found = [source.take_events() for source in (self.watch, self.thermal, self.compensation) if source is not None]
+        found = [
+            source.take_events()
+            for source in (self.signal_monitor, self.thermal, self.compensation)
+            if source is not None
+        ]
         return [event for events in found for event in events]
 
-    def take_looks(self) -> list[ThermalLook]:
+    def take_thermal_intervals(self) -> list[ThermalUpdate]:
         """Return the thermal intervals that were completed since the last call."""
         looks, self._looks = self._looks, []
         return looks
@@ -257,16 +267,16 @@ class Chain:
 
     def _create_estimator(self, rate_hz: float) -> bool:
         """Create the estimator for a sample rate; return False if it cannot be created yet, or not at all."""
-        if self.refused or not self.can_begin(rate_hz):
+        if self.refusal_reason or not self.can_begin(rate_hz):
             return False
         device = self._device
         try:
             self.estimator = Estimator(rate_hz, device.window_s, device.tau, every_sample=device.refit_s == 0.0)
-            self._temperatures = Temperatures(self.estimator.length)
+            self._temperatures = TemperatureRing(self.estimator.length)
             if self._model is not None:
-                self.in_force = ModelInForce(self._model, self.estimator.length)
+                self.model_in_force = ModelComparison(self._model, self.estimator.length)
         except ConfigError as error:  # the configured τ do not suit the measured rate; samples are still published
-            self.refused = f"no estimate: {error}"
+            self.refusal_reason = f"no estimate: {error}"
             return False
         return True
 
@@ -276,7 +286,7 @@ class Chain:
             return
         device, rate_hz = self._device, self.estimator.rate_hz
         wanted = device.thermal_s is not None
-        self.watch = Watch(rate_hz, device.leave_out_motion, device.alarms_per_day, keep_still=wanted)
+        self.signal_monitor = SignalMonitor(rate_hz, device.leave_out_motion, device.alarms_per_day, keep_still=wanted)
         self.thermal = None if device.thermal_s is None else LiveThermal(rate_hz, device.thermal_s)
         self.compensation = LiveCompensation(rate_hz) if device.compensate else None
 
@@ -291,7 +301,7 @@ class Chain:
 
     def _restart_changed_axes(self) -> None:
         """Restart the axes in which a change of the noise was detected."""
-        restarts = self.watch.take_restarts() if self.watch is not None else []
+        restarts = self.signal_monitor.take_restarts() if self.signal_monitor is not None else []
         if self.estimator is None or not self._device.restart or self._replaying:
             return
         for restart in restarts:
@@ -301,10 +311,10 @@ class Chain:
 
     def _update_thermal(self) -> None:
         """Pass the samples at rest to the thermal model."""
-        if self.watch is None or self.thermal is None:
+        if self.signal_monitor is None or self.thermal is None:
             return
-        if self.watch.handled != self._handled:
-            self._handled = self.watch.handled
-            self.thermal.offset_is_new()
-        for samples in self.watch.take_still():
+        if self.signal_monitor.handled != self._handled:
+            self._handled = self.signal_monitor.handled
+            self.thermal.learn_new_offset()
+        for samples in self.signal_monitor.take_samples_at_rest():
             self._looks += self.thermal.update(samples)

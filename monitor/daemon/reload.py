@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from drivers.errors import ConfigError
-from monitor.daemon.operations.limits import model_of
+from monitor.daemon.operations.limits import read_model_in_force
 from monitor.noise.model import NoiseModel
 from monitor.settings import loading
 from monitor.settings.loading import Config, Device
@@ -23,7 +23,7 @@ RELOADABLE_TABLES: Final = ("device", "hook", "log")
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class ConfigChange:
     """Changes from the running configuration to the file."""
 
     config: Config  # configuration after the reload
@@ -47,7 +47,7 @@ class Change:
         return "; ".join(said) or "no device changed"
 
 
-def change(running: Config, models: Mapping[str, NoiseModel | None]) -> Change:
+def compare_with_file(running: Config, models: Mapping[str, NoiseModel | None]) -> ConfigChange:
     """Compare the configuration file with the running configuration.
 
     Parameters
@@ -73,7 +73,7 @@ def change(running: Config, models: Mapping[str, NoiseModel | None]) -> Change:
     old_tables, new_tables = _by_name(running.table), _by_name(new.table)
     added, limited = [], []
     for device in new.devices:
-        model = model_of(device)
+        model = read_model_in_force(device)
         before, now = old_tables.get(device.name), new_tables[device.name]
         if before is None or _without_limits(before) != _without_limits(now) or models.get(device.name) != model:
             added.append(device)
@@ -82,7 +82,7 @@ def change(running: Config, models: Mapping[str, NoiseModel | None]) -> Change:
     kept = {device.name for device in new.devices} - {device.name for device in added}
     removed = tuple(device.name for device in running.devices if device.name not in kept)
     restart = _restart_tables(running.table, new.table)
-    return Change(_merge(running, new, restart), removed, tuple(added), tuple(limited), restart)
+    return ConfigChange(_merge(running, new, restart), removed, tuple(added), tuple(limited), restart)
 
 
 def _by_name(table: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:

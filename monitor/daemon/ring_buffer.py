@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from drivers.sample import SampleBlock, block
+from drivers.sample import SampleBlock, make_block
 
 
 class RingBuffer:
@@ -53,7 +53,7 @@ class RingBuffer:
                 return []
             at = np.arange(self._read, self._written) % self.capacity
             self._read = self._written
-            taken = block(self._t_ns[at], self._values[at], self._temperature_c[at], self._ticks[at])
+            taken = make_block(self._t_ns[at], self._values[at], self._temperature_c[at], self._ticks[at])
             lost = self._lost[at]
         edges = [0, *(np.flatnonzero(lost[1:]) + 1).tolist(), n]
         return [replace(taken[a:b], lost=int(lost[a])) for a, b in pairwise(edges)]

@@ -20,28 +20,28 @@ import structlog
 
 from drivers.errors import ConfigError, NotReady, RecordingError
 from drivers.links.replay_link import ReplayLink
-from drivers.recordings.segment import Origin
-from monitor.common.health import Health, sentence
+from drivers.recordings.segment import SegmentMetadata
+from monitor.common.health import Health, format_service_status
 from monitor.daemon import kernel_compilation, reload
-from monitor.daemon.device_worker import Output, Station
+from monitor.daemon.device_worker import DeviceWorker, Output
 from monitor.daemon.operations.hooks import Hooks
 from monitor.daemon.operations.live_reconcile import Job, Reconciler
 from monitor.daemon.operations.log_level import LEVEL
-from monitor.daemon.operations.systemd import Unit
+from monitor.daemon.operations.systemd import SystemdNotifier
 from monitor.daemon.outputs import HistoryOutput, TableOutput, ViewerOutput, ZenohOutput
-from monitor.daemon.pipeline import Ready
-from monitor.daemon.reload import Change
+from monitor.daemon.pipeline import KernelReadiness
+from monitor.daemon.reload import ConfigChange
 from monitor.daemon.storage.recorder import Recorder, origin
 from monitor.history import reading as past
-from monitor.history.query import question
-from monitor.history.reading import Past
-from monitor.history.sqlite_store import FILE, reading
-from monitor.history.time_ranges import Span
-from monitor.history.writer import Writer
+from monitor.history.query import parse_query
+from monitor.history.reading import HistoryTable
+from monitor.history.sqlite_store import FILE_NAME, open_history
+from monitor.history.time_ranges import TimeRange
+from monitor.history.writer import HistoryWriter
 from monitor.publishing.messages import encoding, history
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
 from monitor.publishing.terminal.queued_writer import QueuedWriter
-from monitor.publishing.zenoh.publisher import Command, ZenohOut
+from monitor.publishing.zenoh.publisher import Command, ZenohPublisher
 from monitor.settings.loading import Config, Device, Storage, VirtualTable
 
 if TYPE_CHECKING:
@@ -92,36 +92,36 @@ class Service:
         config: Config,
         more: Sequence[Output] = (),
         reconciler: Reconciler | None = None,
-        unit: Unit | None = None,
+        unit: SystemdNotifier | None = None,
         writers: Mapping[str, QueuedWriter] | None = None,
     ) -> None:
         self.config = config
         self._writers = dict(writers or {})
-        self._unit = unit or Unit()
+        self._unit = unit or SystemdNotifier()
         self._started_s = time.monotonic()
         self._reconciler = reconciler or Reconciler()
         self._wake = threading.Event()
-        self._ready = Ready()
+        self._ready = KernelReadiness()
         self._stop = threading.Event()
         self._reload_asked = False
         self.virtual: dict[str, VirtualImu] = {}
         self.recorder = _build_recorder(config)
-        self.stations: list[Station] = []
+        self.workers: list[DeviceWorker] = []
         self._self_timed_devices: set[str] = set()  # devices whose sample times do not come from the host clock
         for device in config.devices:
             self._register_device(*self._build_device(device))
         self.history = _build_history_writer(config)
         recall = None if self.history is None else self._answer_history_query
-        self.zenoh = ZenohOut(config.zenoh, [station.name for station in self.stations], recall)
-        self.view = _build_view(config, self._load_viewer_history)
+        self.zenoh = ZenohPublisher(config.zenoh, [station.name for station in self.workers], recall)
+        self.viewer = _build_view(config, self._load_viewer_history)
         self._viewer_url = ""  # address of the viewer's web page that was announced last
-        self.hooks = Hooks(config.hooks, self.zenoh.put_on)
+        self.hooks = Hooks(config.hooks, self.zenoh.put_key)
         self.outputs: list[Output] = [ZenohOutput(self.zenoh), self.hooks, *more]
         self.metrics = _build_metrics_output(config)
         if self.metrics is not None:
             self.outputs.append(self.metrics)
-        if self.view is not None:
-            self.outputs.append(ViewerOutput(self.view))
+        if self.viewer is not None:
+            self.outputs.append(ViewerOutput(self.viewer))
         self._history_output = None if self.history is None else HistoryOutput(self.history)
         if self._history_output is not None:
             self.outputs.append(self._history_output)
@@ -158,15 +158,15 @@ class Service:
         self.zenoh.start()
         if self.metrics is not None:
             self.metrics.start()
-        if self.view is not None:
-            self.view.start()
+        if self.viewer is not None:
+            self.viewer.start()
         for imu in self.virtual.values():
             imu.start()
-        for station in self.stations:
+        for station in self.workers:
             station.start()
         if self.recorder is not None:
             self.recorder.start()
-            threading.Thread(target=self._rebuild_windows, args=(self.stations,), name="rebuild", daemon=True).start()
+            threading.Thread(target=self._rebuild_windows, args=(self.workers,), name="rebuild", daemon=True).start()
 
     def loop(self, until_s: float | None) -> None:
         """Run rounds over all devices, and publish the status once a second.
@@ -189,27 +189,27 @@ class Service:
                 self._publish_status()
             if until_s is not None and now_s >= until_s:
                 return
-            if all(station.ended for station in self.stations):
+            if all(station.ended for station in self.workers):
                 return
             if self._reload_asked:
                 self._reload_asked = False
                 self._reload()
             self._wake.wait(MAX_IDLE_S)
             self._wake.clear()
-            if not any(station.device.publish_s == 0.0 for station in self.stations):
+            if not any(station.device.publish_s == 0.0 for station in self.workers):
                 self._stop.wait(ROUND_PAUSE_S)
 
     def _work_devices(self, now_s: float) -> None:
         """Process the new samples of every device, and announce on zenoh which devices are running."""
-        for station in self.stations:
+        for station in self.workers:
             station.work(self.outputs, now_s)
-            self.zenoh.alive(station.name, station.driver.state == "running")
+            self.zenoh.set_alive(station.name, station.driver.state == "running")
 
     def states(self) -> dict[str, str]:
         """Return the state of each output by its name: "ok", or a text that describes the problem."""
         states = {"zenoh": self.zenoh.state}
-        if self.view is not None:
-            states["viewer"] = self.view.state
+        if self.viewer is not None:
+            states["viewer"] = self.viewer.state
         if self.recorder is not None:
             states["recording"] = self.recorder.state
         if self.history is not None:
@@ -220,13 +220,13 @@ class Service:
             states["hook"] = self.hooks.state
         return states | {name: writer.state for name, writer in self._writers.items()}
 
-    def _rebuild_windows(self, stations: Sequence[Station]) -> None:
+    def _rebuild_windows(self, stations: Sequence[DeviceWorker]) -> None:
         """Rebuild the windows of devices from their recordings, as soon as all kernels are compiled."""
         self._ready.all.wait()
         for station in stations:
             station.rebuild()
 
-    def _load_viewer_history(self, device: str) -> Past | None:
+    def _load_viewer_history(self, device: str) -> HistoryTable | None:
         """Return the stored results that the viewer shows when it opens, or None if there are none.
 
         The thread of the viewer calls this function. A device whose samples bring their own times, such as a replayed
@@ -238,8 +238,8 @@ class Service:
         assert isinstance(history_s, float)
         now_s = time.time()
         try:
-            with reading(self.history.path) as reader:
-                return past.read(reader, device, Span(now_s - history_s, now_s))
+            with open_history(self.history.path) as reader:
+                return past.read_history(reader, device, TimeRange(now_s - history_s, now_s))
         except (NotReady, RecordingError):  # no results yet; the writer reports errors of the file
             return None
 
@@ -253,18 +253,18 @@ class Service:
         """
         assert self.history is not None
         assert self._history_output is not None
-        asked = question(parameters, time.time())
-        with reading(self.history.path) as reader:
-            found = past.read(reader, device, asked.span, asked.wants, asked.step_s)
+        asked = parse_query(parameters, time.time())
+        with open_history(self.history.path) as reader:
+            found = past.read_history(reader, device, asked.span, asked.selects, asked.step_s)
             newest_s = reader.newest_s(device)
-        return history.history(found, asked, newest_s, self._history_output.received.get(device, 0))
+        return history.encode_history(found, asked, newest_s, self._history_output.received.get(device, 0))
 
     def _compile_kernels(self) -> None:
         """Compile the kernels in a thread, so that a first start delays neither samples nor status."""
         begun_s = time.monotonic()
         flags = {kernel_compilation.WINDOW: self._ready.window, kernel_compilation.FIT: self._ready.fit}
         try:
-            for part in kernel_compilation.prepare(kernel_compilation.SERVICE, self._show_progress):
+            for part in kernel_compilation.prepare_kernels(kernel_compilation.SERVICE, self._show_progress):
                 if part in flags:
                     flags[part].set()
                     self._wake.set()
@@ -287,7 +287,7 @@ class Service:
         self._ready.progress = f"{progress} {progress.bar}"
         self._wake.set()
 
-    def _build_device(self, device: Device) -> "tuple[Station, VirtualImu | None]":
+    def _build_device(self, device: Device) -> "tuple[DeviceWorker, VirtualImu | None]":
         """Build the worker of a device, and its virtual IMU if the device is simulated, without opening either."""
         link, imu = device.link, None
         if isinstance(link, VirtualTable):
@@ -295,11 +295,11 @@ class Service:
 
             imu = VirtualImu(link, device.decoder, device.name)
             link = imu.link
-        return Station(device, link, device.decoder, self._wake, self._ready, self.recorder), imu
+        return DeviceWorker(device, link, device.decoder, self._wake, self._ready, self.recorder), imu
 
-    def _register_device(self, station: Station, imu: "VirtualImu | None") -> None:
+    def _register_device(self, station: DeviceWorker, imu: "VirtualImu | None") -> None:
         """Add a worker, and its virtual IMU if the device is simulated, to the service."""
-        self.stations = [*self.stations, station]
+        self.workers = [*self.workers, station]
         if station.driver.times_are_unix:
             self._self_timed_devices.add(station.name)
         if imu is not None:
@@ -311,38 +311,38 @@ class Service:
         """Read the configuration file again and apply the changes; with any mistake in the file, change nothing."""
         self._unit.reloading()
         try:
-            change = reload.change(self.config, {station.name: station.model for station in self.stations})
+            change = reload.compare_with_file(self.config, {station.name: station.model for station in self.workers})
             built = [self._build_device(device) for device in change.added]
         except ConfigError as error:
             _log.error("not reloaded, all goes on as it was", error=str(error))
         else:
             self._apply(change, built)
             (_log.warning if change.restart else _log.info)("reloaded", text=change.text())
-        if self._unit.told_ready:
+        if self._unit.ready_sent:
             self._unit.ready()
 
-    def _apply(self, change: Change, built: "Sequence[tuple[Station, VirtualImu | None]]") -> None:
+    def _apply(self, change: ConfigChange, built: "Sequence[tuple[DeviceWorker, VirtualImu | None]]") -> None:
         """Apply the changes of a configuration: stop removed devices, exchange limits, and start added devices."""
-        leaving = [station for station in self.stations if station.name in change.removed]
+        leaving = [station for station in self.workers if station.name in change.removed]
         for station in leaving:
             station.stop()  # all devices stop side by side, because each may take a moment
         for station in leaving:
             self._remove(station)
         for device in change.limited:
-            next(station for station in self.stations if station.name == device.name).limit(device)
+            next(station for station in self.workers if station.name == device.name).set_limits(device)
         self.config = change.config
         self.hooks.hooks = change.config.hooks
         LEVEL.name = change.config.log.level
         for station, imu in built:
             self._register_device(station, imu)
         order = [device.name for device in change.config.devices]
-        self.stations.sort(key=lambda station: order.index(station.name))
-        if self.view is not None:
-            self.view.show(_device_infos(change.config.devices))
+        self.workers.sort(key=lambda station: order.index(station.name))
+        if self.viewer is not None:
+            self.viewer.set_devices(_device_infos(change.config.devices))
         for station, imu in built:
             self._add(station, imu)
 
-    def _add(self, station: Station, imu: "VirtualImu | None") -> None:
+    def _add(self, station: DeviceWorker, imu: "VirtualImu | None") -> None:
         """Start an added device while the other devices continue."""
         self.zenoh.add(station.name)
         if self.recorder is not None:
@@ -353,21 +353,21 @@ class Service:
         if self.recorder is not None:
             threading.Thread(target=self._rebuild_windows, args=([station],), name="rebuild", daemon=True).start()
 
-    def _remove(self, station: Station) -> None:
+    def _remove(self, station: DeviceWorker) -> None:
         """Remove a stopped device and publish its remaining samples, while the other devices continue."""
         if station.name in self.virtual:
             self.virtual.pop(station.name).stop()
         if not self._work_until(lambda: station.join(0.0) and not station.rebuilding):
             _log.warning("reader did not end in time", device=station.name)
         station.work(self.outputs, time.monotonic(), drain=True)
-        self.stations = [one for one in self.stations if one is not station]
+        self.workers = [one for one in self.workers if one is not station]
         self.zenoh.remove(station.name)
         if self.recorder is not None:
             self.recorder.remove(station.name)
-            self._work_until(lambda: self.recorder is None or not self.recorder.has(station.name))
+            self._work_until(lambda: self.recorder is None or not self.recorder.is_recording(station.name))
         self._self_timed_devices.discard(station.name)
         for output in self.outputs:
-            output.gone(station.name)
+            output.device_removed(station.name)
 
     def _work_until(self, done: Callable[[], bool]) -> bool:
         """Process all devices until ``done`` returns True, or for JOIN_TIMEOUT_S; return its last result."""
@@ -384,7 +384,7 @@ class Service:
         self._publish_recorder_events()
         states, memory = self.states(), memory_bytes()
         self._announce_viewer_url()
-        healths = {station.name: station.report(self.outputs, states, memory) for station in self.stations}
+        healths = {station.name: station.publish_status(self.outputs, states, memory) for station in self.workers}
         self._notify_systemd(healths, states)
 
     def _notify_systemd(self, healths: Mapping[str, Health], states: Mapping[str, str]) -> None:
@@ -393,22 +393,22 @@ class Service:
         tried = (
             not any(state in STARTING_STATES for state in states.values()) or now_s - self._started_s > READY_TIMEOUT_S
         )
-        if tried and not self._unit.told_ready:
+        if tried and not self._unit.ready_sent:
             self._unit.ready()
-        turns = {station.name: station.turns for station in self.stations}
-        stuck = self._unit.alive({name: count for name, count in turns.items() if count is not None}, now_s)
-        self._unit.status(sentence(healths, states, stuck))
+        turns = {station.name: station.read_attempts for station in self.workers}
+        stuck = self._unit.send_watchdog({name: count for name, count in turns.items() if count is not None}, now_s)
+        self._unit.status(format_service_status(healths, states, stuck))
 
     def _publish_recorder_events(self) -> None:
         """Publish the events of the recorder."""
-        stations = {station.name: station for station in self.stations}
-        for told in self.recorder.take() if self.recorder is not None else ():
+        stations = {station.name: station for station in self.workers}
+        for told in self.recorder.take_events() if self.recorder is not None else ():
             if told.device in stations:
-                stations[told.device].announce(self.outputs, told.kind, told.text)
+                stations[told.device].publish_event(self.outputs, told.kind, told.text)
 
     def _announce_viewer_url(self) -> None:
         """Log the address of the viewer's web page each time it changes. A viewer in a window has no address."""
-        url = self.view.url if self.view is not None else ""
+        url = self.viewer.url if self.viewer is not None else ""
         page = url if url.startswith("http://") else ""
         if page == self._viewer_url:
             return
@@ -421,7 +421,7 @@ class Service:
 
     def _handle_commands(self) -> None:
         """Execute the commands that arrived over zenoh since the last round."""
-        stations = {station.name: station for station in self.stations}
+        stations = {station.name: station for station in self.workers}
         while not self.zenoh.commands.empty():
             command = self.zenoh.commands.get_nowait()
             if command.device in stations:
@@ -429,7 +429,7 @@ class Service:
             else:
                 command.refuse("the device was taken out of the configuration")
 
-    def _execute_command(self, command: Command, station: Station) -> None:
+    def _execute_command(self, command: Command, station: DeviceWorker) -> None:
         """Execute one command for a device, and answer it."""
         match command.verb:
             case "reset":
@@ -442,9 +442,9 @@ class Service:
             case other:
                 command.refuse(f'unknown command "{other}"; known are reset, reconcile')
 
-    def _reconcile(self, command: Command, station: Station) -> None:
+    def _reconcile(self, command: Command, station: DeviceWorker) -> None:
         """Start a reconciliation with a copy of the window; a thread of its own sends the answer."""
-        held = station.held()
+        held = station.window_snapshot()
         if held is None:
             command.refuse("no samples yet")
             return
@@ -455,10 +455,10 @@ class Service:
 
     def _publish_reconcile_events(self) -> None:
         """Publish an event for each reconciliation that has finished."""
-        stations = {station.name: station for station in self.stations}
+        stations = {station.name: station for station in self.workers}
         for finished in self._reconciler.take():
             if finished.device in stations:
-                stations[finished.device].announce(self.outputs, "reconciled", finished.text)
+                stations[finished.device].publish_event(self.outputs, "reconciled", finished.text)
 
     def _close(self) -> None:
         """Stop the devices, publish their remaining samples, and close all outputs."""
@@ -473,8 +473,8 @@ class Service:
             self.hooks.close()
             if self.metrics is not None:
                 self.metrics.close()
-            if self.view is not None:
-                self.view.close()
+            if self.viewer is not None:
+                self.viewer.close()
             self.zenoh.close()
             if self.history is not None and self._history_output is not None:
                 self._history_output.end()
@@ -482,20 +482,20 @@ class Service:
 
     def _drain(self) -> None:
         """Stop the readers, and publish the samples that are left in the ring buffers."""
-        for station in self.stations:
+        for station in self.workers:
             station.stop()
-        if any(station.waits_for_all for station in self.stations):
+        if any(station.waits_for_all for station in self.workers):
             self._ready.all.wait()  # the samples of these devices are still in the ring buffer
         for imu in self.virtual.values():
             imu.stop()
-        for station in self.stations:
+        for station in self.workers:
             until_s = time.monotonic() + JOIN_TIMEOUT_S
             while not (ended := station.join(ROUND_PAUSE_S)) and time.monotonic() < until_s:
                 station.work(self.outputs, time.monotonic())  # a replay waits for space in its ring buffer
             if not ended:
                 _log.warning("reader did not end in time", device=station.name)
             station.work(self.outputs, time.monotonic(), drain=True)
-            self.zenoh.alive(station.name, False)
+            self.zenoh.set_alive(station.name, False)
         self._publish_status()
 
 
@@ -506,7 +506,7 @@ def _build_recorder(config: Config) -> Recorder | None:
     return Recorder(storage, origins) if storage is not None and origins else None
 
 
-def _segment_origins(storage: Storage | None, device: Device) -> list[Origin]:
+def _segment_origins(storage: Storage | None, device: Device) -> list[SegmentMetadata]:
     """Return the recordings to write for a device: samples, raw bytes, both, or none for a replay."""
     if storage is None or isinstance(device.link, ReplayLink):
         return []
@@ -529,11 +529,11 @@ def memory_bytes() -> int:
     return pages * resource.getpagesize()
 
 
-def _build_history_writer(config: Config) -> Writer | None:
+def _build_history_writer(config: Config) -> HistoryWriter | None:
     """Return the writer of the history file, or None if no history is kept."""
     if config.storage is None or not config.storage.history:
         return None
-    return Writer(config.storage.folder / FILE, time.time)
+    return HistoryWriter(config.storage.folder / FILE_NAME, time.time)
 
 
 def _build_metrics_output(config: Config) -> "MetricsOutput | None":
@@ -545,7 +545,7 @@ def _build_metrics_output(config: Config) -> "MetricsOutput | None":
     return MetricsOutput(config.metrics)
 
 
-def _build_view(config: Config, recall: Callable[[str], Past | None]) -> "RerunView | None":
+def _build_view(config: Config, recall: Callable[[str], HistoryTable | None]) -> "RerunView | None":
     """Return the Rerun view, or None if the viewer is switched off."""
     if config.viewer.mode == "none":
         return None

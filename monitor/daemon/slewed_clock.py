@@ -12,13 +12,13 @@ import numpy as np
 
 from drivers.sample import Ints
 
-EASE: Final = 5e-4
+MAX_SLEW_RATE: Final = 5e-4
 """Maximum rate of a correction: 0.5 ms per second."""
 MAX_KNOTS: Final = 100
 """Number of corrections that are kept. With one correction per second, they cover samples of the last minute."""
 
 
-class WallClock:
+class SlewedClock:
     """Conversion of monotonic time to Unix time, in nanoseconds.
 
     Parameters
@@ -49,7 +49,7 @@ class WallClock:
         """Lead of the host's clock over these times, in nanoseconds."""
         return self._host_ns - self.offset_ns(self._followed_ns)
 
-    def follow(self, monotonic_ns: int, unix_ns: int) -> int:
+    def slew_to(self, monotonic_ns: int, unix_ns: int) -> int:
         """Start to slew towards the host's clock. Call this about once a second.
 
         Returns
@@ -75,7 +75,7 @@ class WallClock:
         """Return the difference of Unix and monotonic time at each of the monotonic times [n]."""
         knots = self._knots
         begun_ns, offset_ns, correction_ns = knots[np.searchsorted(knots[1:, 0], monotonic_ns, side="right")].T
-        most_ns = (EASE * np.maximum(monotonic_ns - begun_ns, 0)).astype(np.int64)
+        most_ns = (MAX_SLEW_RATE * np.maximum(monotonic_ns - begun_ns, 0)).astype(np.int64)
         offsets: Ints = offset_ns + np.clip(correction_ns, -most_ns, most_ns)
         return offsets
 

@@ -10,17 +10,17 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from drivers.recordings.segment import State
-from drivers.sample import AXES, Ints, SampleBlock, block
-from monitor.daemon.pipeline import Chain
-from monitor.daemon.storage.recorder import Tail
+from drivers.recordings.segment import DaemonState
+from drivers.sample import AXES, Ints, SampleBlock, make_block
+from monitor.daemon.pipeline import DevicePipeline
+from monitor.daemon.storage.recorder import RecordingTail
 
 MIN_REPLAY_S: Final = 600.0
 """Shortest part of the recording that is replayed, however short the window is, because change detection needs history.
 """
 
 
-def rebuild(chain: Chain, tail: Tail, rate_hz: float, window_s: float, offset_ns: int) -> str:
+def restore_window(chain: DevicePipeline, tail: RecordingTail, rate_hz: float, window_s: float, offset_ns: int) -> str:
     """Fill the pipeline with the end of a recording.
 
     Parameters
@@ -52,9 +52,9 @@ def rebuild(chain: Chain, tail: Tail, rate_hz: float, window_s: float, offset_ns
         samples = piece.samples
         counted += _count_since_restart(samples, state)
         t_ns = samples.t_ns - offset_ns
-        chain.relive(block(t_ns, samples.values, samples.temperature_c, lost=samples.lost), rate_hz)
+        chain.replay(make_block(t_ns, samples.values, samples.temperature_c, lost=samples.lost), rate_hz)
     if chain.estimator is None:
-        return chain.refused or "nothing could be rebuilt from the recording"
+        return chain.refusal_reason or "nothing could be rebuilt from the recording"
     for axis, unix_s in enumerate(state.since):
         # changes that are detected in the replay were already known before the restart
         chain.since_ns[axis] = None if unix_s is None else round(unix_s * 1e9) - offset_ns
@@ -63,12 +63,14 @@ def rebuild(chain: Chain, tail: Tail, rate_hz: float, window_s: float, offset_ns
     if state.theta:
         shape = (-1, len(AXES))
         theta = np.array(state.theta, np.float64).reshape(shape)
-        chain.estimator.start_from(np.array(state.entered).reshape(shape), theta)
+        chain.estimator.restore_fit(np.array(state.entered).reshape(shape), theta)
     filled_s = chain.estimator.filled / chain.estimator.rate_hz
     return f"{filled_s:.6g} s of the window were rebuilt from the recording"
 
 
-def known(chain: Chain, before: State, rate_hz: float | None, tick_step: float | None, offset_ns: int) -> State:
+def known(
+    chain: DevicePipeline, before: DaemonState, rate_hz: float | None, tick_step: float | None, offset_ns: int
+) -> DaemonState:
     """Return the state that is to be recorded with the samples now.
 
     Parameters
@@ -87,13 +89,13 @@ def known(chain: Chain, before: State, rate_hz: float | None, tick_step: float |
     tick_step = tick_step or before.tick_step
     if chain.estimator is None:
         return msgspec.structs.replace(before, rate=rate_hz or before.rate, tick_step=tick_step)
-    entered, theta = chain.estimator.fitted()
+    entered, theta = chain.estimator.fit_state()
     since = tuple(None if t_ns is None else (t_ns + offset_ns) / 1e9 for t_ns in chain.since_ns)
     sizes = tuple(None if np.isnan(size) else float(size) for size in theta.ravel())
-    return State(chain.estimator.rate_hz, since, tick_step, sizes, tuple(entered.ravel().tolist()))
+    return DaemonState(chain.estimator.rate_hz, since, tick_step, sizes, tuple(entered.ravel().tolist()))
 
 
-def _count_since_restart(samples: SampleBlock, state: State) -> Ints:
+def _count_since_restart(samples: SampleBlock, state: DaemonState) -> Ints:
     """Return the number of samples in a block since the restart of each axis, int64 [6], missing ones included."""
     counting = np.zeros(len(AXES), np.int64)
     for axis, unix_s in enumerate(state.since):

@@ -20,21 +20,28 @@ import numpy as np
 from drivers.errors import NotReady
 from drivers.sample import Floats, Ints, SampleBlock
 from monitor.estimation import analysis_notes
-from monitor.estimation.allan.batch import EachAxis, TauGrid, cluster_sizes, overlapping, slope, slopes
+from monitor.estimation.allan.batch import (
+    EachAxis,
+    TauGrid,
+    cluster_sizes,
+    overlapping_avar,
+    slope_of_recording,
+    slope_per_tau,
+)
 from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.allan.uncertainty import intervals, table
+from monitor.estimation.allan.uncertainty import covariance_table, intervals
 from monitor.estimation.detection.change_detection import Change, ChangeDetector
-from monitor.estimation.detection.line_detection import lines, outliers
-from monitor.estimation.detection.motion_detection import Motion, find
+from monitor.estimation.detection.line_detection import detect_lines, outlier_share
+from monitor.estimation.detection.motion_detection import Motion, detect_motion
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.bandwidth import LowPass, find_low_pass, is_contradicted, power, with_bandwidth
+from monitor.estimation.fit.bandwidth import LowPass, find_low_pass, is_contradicted, power_spectrum, with_bandwidth
 from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, design, fit
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
-from monitor.estimation.regular_grid import on_grid
+from monitor.estimation.regular_grid import resample_to_grid
 
-FEWEST: Final = 50
+MIN_SAMPLES: Final = 50
 """Minimum number of samples. With fewer samples, the command exits with status 3."""
-CHUNK: Final = 65_536
+DETECTOR_CHUNK_ROWS: Final = 65_536
 """Number of rows passed to the change detector at a time."""
 
 
@@ -50,7 +57,7 @@ class Analysis:
     bandwidth_hz: Floats  # [6] bandwidth of the sensor; NaN if the curve does not show one
     motions: tuple[Motion, ...] = ()
     changes: tuple[Change, ...] = ()
-    struck: bool = False  # True if the samples in motion have been removed from ``values``
+    motion_removed: bool = False  # True if the samples in motion have been removed from ``values``
     axes_of_temperature: tuple[str, ...] = ()  # axes whose slow variance is mostly explained by temperature
 
 
@@ -86,9 +93,9 @@ def analyze(
     ConfigError
         If none of the listed τ is possible.
     """
-    values, rate, found = on_grid(blocks, rate_hz)
-    if len(values) < FEWEST:
-        raise NotReady(f"{len(values)} samples; at least {FEWEST} are needed to say anything")
+    values, rate, found = resample_to_grid(blocks, rate_hz)
+    if len(values) < MIN_SAMPLES:
+        raise NotReady(f"{len(values)} samples; at least {MIN_SAMPLES} are needed to say anything")
     motions: tuple[Motion, ...] = ()
     if rest:
         values, motions = _without_motion(values, rate)
@@ -102,11 +109,11 @@ def analyze(
     few = [f"{len(curve.tau_s)} averaging times are too few to fit five terms; at least {MIN_ROWS} are needed"]
     said = few if len(curve.tau_s) < MIN_ROWS else analysis_notes.of_fit(curve, fitted, filters, rate)
     return Analysis(
-        estimate, estimate.window_s, (*notes, *found, *said), values, fitted, bandwidth_hz, motions, struck=rest
+        estimate, estimate.window_s, (*notes, *found, *said), values, fitted, bandwidth_hz, motions, motion_removed=rest
     )
 
 
-def events_of(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analysis:
+def detect_events(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analysis:
     """Add motion, noise changes, spectral lines and outliers to an analysis and to its notes.
 
     Parameters
@@ -119,24 +126,24 @@ def events_of(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analysis:
     rate = result.estimate.rate_hz
     moving = np.zeros(len(result.values), np.bool_)
     motions, notes = result.motions, list(result.notes)
-    if not result.struck:
-        moving, listed = find(result.values, rate)
+    if not result.motion_removed:
+        moving, listed = detect_motion(result.values, rate)
         motions = tuple(listed)
         notes += analysis_notes.of_motions(motions, rate, struck=False)
     detector = ChangeDetector(rate, alarms_per_day)
-    for begin in range(0, len(result.values), CHUNK):
-        rows, struck = result.values[begin : begin + CHUNK], moving[begin : begin + CHUNK]
+    for begin in range(0, len(result.values), DETECTOR_CHUNK_ROWS):
+        rows, struck = result.values[begin : begin + DETECTOR_CHUNK_ROWS], moving[begin : begin + DETECTOR_CHUNK_ROWS]
         detector.update(np.where(struck[:, None], np.nan, rows) if struck.any() else rows)
     changes = tuple(sorted(detector.take(), key=lambda change: change.since))
     notes += analysis_notes.of_changes(changes, rate)
-    found = lines(result.values, moving, rate, result.estimate.curve)
-    moved = bool(motions) and not result.struck
-    notes = analysis_notes.explained(notes, result.estimate.curve, result.fit, found, moved)
-    notes += analysis_notes.of_departures(found, outliers(result.values, moving))
+    found = detect_lines(result.values, moving, rate, result.estimate.curve)
+    moved = bool(motions) and not result.motion_removed
+    notes = analysis_notes.replace_guessed_causes(notes, result.estimate.curve, result.fit, found, moved)
+    notes += analysis_notes.of_departures(found, outlier_share(result.values, moving))
     return replace(result, notes=tuple(notes), motions=motions, changes=changes)
 
 
-def refitted(result: Analysis, values: Floats, each: EachAxis = map) -> Fit:
+def refit(result: Analysis, values: Floats, each: EachAxis = map) -> Fit:
     """Fit other samples at the averaging times of an analysis.
 
     Parameters
@@ -154,10 +161,10 @@ def refitted(result: Analysis, values: Floats, each: EachAxis = map) -> Fit:
 
 def _without_motion(values: Floats, rate_hz: float) -> tuple[Floats, tuple[Motion, ...]]:
     """Return the samples with those in motion replaced by NaN, and the episodes of motion."""
-    moving, motions = find(values, rate_hz)
+    moving, motions = detect_motion(values, rate_hz)
     left = len(values) - int(moving.sum())
-    if left < FEWEST:
-        raise NotReady(f"{left} samples at rest; at least {FEWEST} are needed to say anything")
+    if left < MIN_SAMPLES:
+        raise NotReady(f"{left} samples at rest; at least {MIN_SAMPLES} are needed to say anything")
     return np.where(moving[:, None], np.nan, values) if moving.any() else values, tuple(motions)
 
 
@@ -166,12 +173,14 @@ def _fit_curve(
 ) -> tuple[AllanCurve, Fit, list[LowPass | None]]:
     """Return the Allan curve with its intervals, the fit, and the low-pass of each axis that shows one."""
     n = len(values)
-    avar, terms = overlapping(values, factors, each)
-    columns, covariances = design(factors, rate_hz), table(n, factors)
-    measured = MeasuredCurve(avar, terms, slope(values) * rate_hz, slopes(values, factors) * rate_hz)
+    avar, terms = overlapping_avar(values, factors, each)
+    columns, covariances = design(factors, rate_hz), covariance_table(n, factors)
+    measured = MeasuredCurve(
+        avar, terms, slope_of_recording(values) * rate_hz, slope_per_tau(values, factors) * rate_hz
+    )
     found = fit(columns, covariances, avar, terms, slope=measured.slope, slopes=measured.slopes)
     filters = [
-        find_low_pass(columns, covariances, measured.axis(axis), power(values[:, axis]))
+        find_low_pass(columns, covariances, measured.axis(axis), power_spectrum(values[:, axis]))
         if is_contradicted(found, axis)
         else None
         for axis in range(values.shape[1])

@@ -12,10 +12,10 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import AXES, Floats
-from monitor.common.rates import amount, plain
+from monitor.common.rates import format_rate, plain
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.detection.change_detection import Change
-from monitor.estimation.detection.line_detection import OUTLIER_SIGMA, Line, added
+from monitor.estimation.detection.line_detection import OUTLIER_SIGMA, Line, line_share
 from monitor.estimation.detection.motion_detection import Motion
 from monitor.estimation.fit.bandwidth import LowPass
 from monitor.estimation.fit.coefficient_fit import Fit
@@ -29,9 +29,9 @@ MAX_NOTES: Final = 10
 """Maximum number of notes of one kind."""
 DEPARTURE_SIGMA: Final = 3.0
 """Distance from the fit, in standard deviations, beyond which an averaging time departs from it."""
-SAME: Final = 0.01
+LINE_FREQUENCY_TOLERANCE: Final = 0.01
 """Lines on several axes are reported as one if their frequencies differ by less than this share."""
-FAR_SHARE: Final = 0.001
+MIN_OUTLIER_SHARE: Final = 0.001
 """Shares of outliers up to this value are not reported."""
 MIN_EXPLAINING_SHARE: Final = 0.05
 """A line explains a departure of the curve if it contributes at least this share of the Allan variance there."""
@@ -121,12 +121,12 @@ def of_quantization(curve: AllanCurve, fit: Fit, found: Sequence[Line]) -> list[
     axes: dict[str, list[str]] = {}
     for one, name in _line_names(found).items():
         estimated = fit.coefficients.status[Q, one.axis] == Status.ESTIMATED
-        if estimated and float(np.nanmax(added(one, curve)[:Q_ROWS], initial=0.0)) >= MIN_Q_SHARE:
+        if estimated and float(np.nanmax(line_share(one, curve)[:Q_ROWS], initial=0.0)) >= MIN_Q_SHARE:
             _append_axis(axes, AXES[one.axis], f"quantization noise may be {name}")
     return [f"{', '.join(those)}: {text}" for text, those in axes.items()]
 
 
-def explained(
+def replace_guessed_causes(
     notes: Sequence[str], curve: AllanCurve, fit: Fit, found: Sequence[Line], moved: bool = False
 ) -> list[str]:
     """Replace the guessed causes of misfits with the causes found by the search for lines and motion.
@@ -206,11 +206,11 @@ def of_departures(found: Sequence[Line], far: Floats) -> list[str]:
     groups = _group_by_frequency(found)
     notes = []
     for here in groups[:MAX_NOTES]:
-        sizes = [f"{AXES[one.axis]} {amount(AXES[one.axis], one.amplitude)}" for one in here]
+        sizes = [f"{AXES[one.axis]} {format_rate(AXES[one.axis], one.amplitude)}" for one in here]
         notes.append(f"{_line_name(here[0])}: {', '.join(sizes)}")
     left = [one for here in groups[MAX_NOTES:] for one in here]
     notes += _count_omitted(MAX_NOTES + len(left), "lines")
-    shares = [f"{AXES[i]} {100.0 * far[i]:.2g} %" for i in np.flatnonzero(far > FAR_SHARE).tolist()]
+    shares = [f"{AXES[i]} {100.0 * far[i]:.2g} %" for i in np.flatnonzero(far > MIN_OUTLIER_SHARE).tolist()]
     if shares:
         notes.append(
             f"outliers beyond {OUTLIER_SIGMA:g} σ of the other samples: {', '.join(shares)} of all; "
@@ -225,7 +225,7 @@ def _group_by_frequency(found: Sequence[Line]) -> list[list[Line]]:
     left = sorted(found, key=lambda one: -one.share)
     while left:
         at_hz = left[0].frequency_hz
-        groups.append([one for one in left if abs(one.frequency_hz / at_hz - 1.0) < SAME])
+        groups.append([one for one in left if abs(one.frequency_hz / at_hz - 1.0) < LINE_FREQUENCY_TOLERANCE])
         left = [one for one in left if one not in groups[-1]]
     return groups
 
@@ -283,7 +283,7 @@ def _group_by_line(names: Mapping[Line, str], curve: AllanCurve, runs: Mapping[i
     found: dict[str, dict[int, Run]] = {}
     for i, (first, last) in runs.items():
         shares = {
-            name: float(np.nanmax(added(one, curve)[first : last + 1], initial=0.0))
+            name: float(np.nanmax(line_share(one, curve)[first : last + 1], initial=0.0))
             for one, name in names.items()
             if one.axis == i
         }

@@ -12,18 +12,20 @@ from monitor.estimation.fit.coefficients import Coefficients, Status
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class CoefficientHistory:
     """Coefficients after each of n consecutive samples."""
 
     t_ns: Ints  # [n] host monotonic clock, nanoseconds
     value: Floats  # [n, 5, 6] Q N B K R in SI; NaN where not estimated
 
 
-def joined(courses: Collection[Course]) -> Course | None:
+def concatenate_histories(courses: Collection[CoefficientHistory]) -> CoefficientHistory | None:
     """Concatenate courses. Return None if there are none."""
     if not courses:
         return None
-    return Course(np.concatenate([part.t_ns for part in courses]), np.concatenate([part.value for part in courses]))
+    return CoefficientHistory(
+        np.concatenate([part.t_ns for part in courses]), np.concatenate([part.value for part in courses])
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +40,8 @@ class Estimate:
     fitted: Floats  # [m, 6] Allan variance of the fitted model at curve.tau_s; NaN without a fit, or outside it
     coefficients: Coefficients
     k_or_r: NDArray[np.bool_]  # [6] True if the window drifts, but random walk and ramp cannot be distinguished
-    recent: AllanCurve | None = None  # same τ, each over its own shorter span; see ``window.quick_spans``
-    course: Course | None = None  # since the previous estimate, if a fit at every sample is requested
+    display_curve: AllanCurve | None = None  # same τ, each over its own shorter span; see ``window.quick_spans``
+    history: CoefficientHistory | None = None  # since the previous estimate, if a fit at every sample is requested
 
     def without_coefficients(self) -> "Estimate":
         """Return a copy with the curve alone: no fit, and every coefficient unestimated."""
@@ -50,5 +52,5 @@ class Estimate:
             fitted=np.full_like(self.fitted, np.nan),
             coefficients=Coefficients(nothing, nothing, nothing, np.full(shape, Status.UNESTIMATED, np.int8)),
             k_or_r=np.zeros_like(self.k_or_r),
-            course=None,
+            history=None,
         )

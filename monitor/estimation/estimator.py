@@ -23,20 +23,20 @@ from drivers.sample import Floats, Ints, SampleBlock
 from monitor.estimation.allan.batch import TauGrid, cluster_sizes
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.live_total_hadamard import SlowStatistics
+from monitor.estimation.allan.live_total_hadamard import LiveTotalHadamard
 from monitor.estimation.allan.total import TotalCurve
-from monitor.estimation.allan.uncertainty import AxisTables, SpanDegreesOfFreedom, Table, intervals
-from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_spans
-from monitor.estimation.estimate import Course, Estimate
-from monitor.estimation.estimate import joined as joined_courses
-from monitor.estimation.fit.bandwidth import LowPass, is_contradicted, power, search_low_pass, with_bandwidth
-from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, concatenate_fits, design, fit, nothing_fitted
-from monitor.estimation.fit.continuous_refit import Refit
-from monitor.estimation.window_snapshot import Held, copy_window
+from monitor.estimation.allan.uncertainty import AxisCovarianceTables, CovarianceTable, SpanDegreesOfFreedom, intervals
+from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, display_spans
+from monitor.estimation.estimate import CoefficientHistory, Estimate
+from monitor.estimation.estimate import concatenate_histories as joined_courses
+from monitor.estimation.fit.bandwidth import LowPass, is_contradicted, power_spectrum, search_low_pass, with_bandwidth
+from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, concatenate_fits, design, empty_fit, fit
+from monitor.estimation.fit.continuous_refit import ContinuousRefit
+from monitor.estimation.window_snapshot import WindowSnapshot, copy_window
 
 SETTLING_FITS: Final = 10
 """Number of successive fits after which a fit has converged. Each fit leaves a quarter of the remaining error."""
-FEWEST: Final = 8
+MIN_SAMPLES: Final = 8
 """Minimum number of samples for an estimate. It gives three τ with a few terms each."""
 SPECTRUM_SAMPLES: Final = 65_536
 """Number of newest samples whose spectrum is tested for a low-pass filter."""
@@ -69,23 +69,25 @@ class Estimator:
         length = min(max(round(window_s * rate_hz), MIN_LENGTH), MAX_LENGTH)
         self.window_s = length / rate_hz
         factors = cluster_sizes(length, rate_hz, tau)
-        spans = quick_spans(factors, rate_hz, length)
+        spans = display_spans(factors, rate_hz, length)
         self._m = factors.size
         # the first m rows are fitted, the next m rows are only displayed
         rows, lengths = np.tile(factors, 2), np.concatenate([np.full(self._m, length), spans])
         self._window = AllanWindow(length, rows, lengths)
         self._factors = factors
         self._design = design(factors, rate_hz)
-        self._tables = AxisTables(factors, length)
+        self._tables = AxisCovarianceTables(factors, length)
         self._spans = SpanDegreesOfFreedom(factors, spans, self._design.columns)
         self._entered: NDArray[np.bool_] = np.zeros((5, 6), np.bool_)
         self._lengths = np.zeros(6, np.int64)  # samples of each axis since its last restart, limited to the window
-        self._refit = Refit(self._window, self._m, self._tables) if every_sample else None
-        self._course: deque[Course] = deque()
+        self._refit = ContinuousRefit(self._window, self._m, self._tables) if every_sample else None
+        self._course: deque[CoefficientHistory] = deque()
         self._course_samples = 0  # total number of samples in ``_course``
-        self._total_hadamard = SlowStatistics(self._window)
+        self._total_hadamard = LiveTotalHadamard(self._window)
         self._theta = np.full((5, 6), np.nan)  # squared coefficients of the newest fit
-        self._contradicting: list[tuple[Table, MeasuredCurve] | None] = [None] * 6  # curves that contradict their fit
+        self._contradicting: list[tuple[CovarianceTable, MeasuredCurve] | None] = [
+            None
+        ] * 6  # curves that contradict their fit
         self._low_passes: list[LowPass | None] = [None] * 6
         self._search_axis = 0  # axis whose low-pass filter is being searched for
         self._search: Generator[None, None, LowPass | None] | None = None
@@ -107,7 +109,7 @@ class Estimator:
         """Number of samples in the full window."""
         return self._window.length
 
-    def held(self) -> Held:
+    def copy_window(self) -> WindowSnapshot:
         """Return a copy of the samples in the window."""
         return copy_window(self._window, self.rate_hz)
 
@@ -123,7 +125,9 @@ class Estimator:
             self._window.update(samples.values)
             self._lengths += len(samples)
         else:
-            self._course.append(Course(samples.t_ns, self._refit.update(self._design, samples.values, self._lengths)))
+            self._course.append(
+                CoefficientHistory(samples.t_ns, self._refit.update(self._design, samples.values, self._lengths))
+            )
             self._course_samples += len(samples)
             while self._course_samples - len(self._course[0].t_ns) >= COURSE_SAMPLES:
                 self._course_samples -= len(self._course.popleft().t_ns)
@@ -148,20 +152,20 @@ class Estimator:
         samples : int
             Number of newest samples to keep.
         """
-        self._window.forget(axis, samples)
+        self._window.discard(axis, samples)
         self._lengths[axis] = min(samples, self._lengths[axis])
         self._entered[:, axis], self._theta[:, axis] = False, np.nan
         if self._refit is not None:
             self._refit.restart(axis)
 
-    def fitted(self) -> tuple[NDArray[np.bool_], Floats]:
+    def fit_state(self) -> tuple[NDArray[np.bool_], Floats]:
         """Return the terms in the newest fit and the squared coefficients θ in SI, both of shape (5, 6).
 
         ``start_from`` accepts both as the start of the next fit.
         """
         return (self._entered if self._refit is None else self._refit.entered).copy(), self._theta.copy()
 
-    def start_from(self, entered: NDArray[np.bool_], theta: Floats) -> None:
+    def restore_fit(self, entered: NDArray[np.bool_], theta: Floats) -> None:
         """Start the next fit from a fit made before a restart of the program, and repeat it until it has converged.
 
         Terms use hysteresis: the threshold to drop a term is lower than the threshold to add it. A live fit otherwise
@@ -175,11 +179,11 @@ class Estimator:
             Squared coefficients Q², N², B², K², R² in SI.
         """
         self._entered, self._theta = entered.copy(), theta.copy()
-        if self._window.n >= FEWEST:
+        if self._window.n >= MIN_SAMPLES:
             for _ in range(SETTLING_FITS):
                 self.get()
 
-    def relabel(self, rate_hz: float) -> None:
+    def set_rate(self, rate_hz: float) -> None:
         """Set a more accurate sample rate. The clusters of samples stay the same; τ and the units change."""
         self.rate_hz = rate_hz
         self.window_s = self._window.length / rate_hz
@@ -199,11 +203,11 @@ class Estimator:
             If the window holds fewer than ``FEWEST`` samples.
         """
         n = self._window.n
-        if n < FEWEST:
-            raise NotReady(f"{n} of at least {FEWEST} samples")
+        if n < MIN_SAMPLES:
+            raise NotReady(f"{n} of at least {MIN_SAMPLES} samples")
         avar, terms = self._window.avar(), self._window.terms()
         own, recent = slice(0, self._m), slice(self._m, None)
-        result = self._fit(avar[own], terms[own]) if fitted else nothing_fitted(avar[own])
+        result = self._fit(avar[own], terms[own]) if fitted else empty_fit(avar[own])
         curve = self._curve(avar[own], terms[own], result.edf, n)
         quick_edf = self._spans.edf(result.theta, self.rate_hz, terms[recent])
         quick = self._curve(avar[recent], terms[recent], quick_edf, n)
@@ -215,7 +219,7 @@ class Estimator:
             result.k_or_r, quick, course,
         )  # fmt: skip
 
-    def step(self) -> tuple[TotalCurve, HadamardCurve] | None:
+    def step_slow_statistics(self) -> tuple[TotalCurve, HadamardCurve] | None:
         """Run one step of the slow computations.
 
         These are the total and Hadamard deviations (see ``live_total_hadamard``) and the search for the low-pass of the
@@ -282,7 +286,7 @@ class Estimator:
             odd = self._contradicting[self._search_axis]
             if odd is not None:
                 self._search = search_low_pass(
-                    self._design, *odd, power(self._window.newest(self._search_axis, SPECTRUM_SAMPLES))
+                    self._design, *odd, power_spectrum(self._window.newest(self._search_axis, SPECTRUM_SAMPLES))
                 )
                 return
             self._low_passes[self._search_axis] = None

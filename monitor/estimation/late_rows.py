@@ -37,7 +37,7 @@ MIN_STRETCH_RATIO: Final = 4
 """A distance is usable if at least one in this many rows begins a stretch without a gap."""
 
 
-def truly_missing(t_ns: Ints, rows: Ints, claimed: Ints, breaks: Ints) -> Ints:
+def count_missing_samples(t_ns: Ints, rows: Ints, claimed: Ints, breaks: Ints) -> Ints:
     """Return the number of samples that are missing before each gap. The other samples claimed by the clock were late.
 
     Parameters

@@ -18,14 +18,14 @@ import numpy as np
 
 from drivers.errors import ConfigError, NotReady, RecordingError
 from drivers.quantities import RATE_HZ
-from drivers.sample import AXES, Floats, Given, Ints, SampleBlock
-from drivers.timing.arrival_regression import made_rate
-from drivers.timing.duplicate_rows import NS
-from drivers.timing.sample_clock import JUMP_S, LONG_S, SampleClock
-from monitor.common.rates import amount, plain
-from monitor.estimation.detection.repeated_samples import stale_share
-from monitor.estimation.detection.resolution import QuantizationStep, coarse
-from monitor.estimation.late_rows import truly_missing
+from drivers.sample import AXES, Floats, Ints, SampleBlock, SenderTiming
+from drivers.timing.arrival_regression import snap_to_standard_rate
+from drivers.timing.duplicate_rows import NS_PER_S
+from drivers.timing.sample_clock import FORWARD_JUMP_S, JUMP_S, SampleClock
+from monitor.common.rates import format_rate, plain
+from monitor.estimation.detection.repeated_samples import repeated_share
+from monitor.estimation.detection.resolution import QuantizationStep, find_coarse_axes
+from monitor.estimation.late_rows import count_missing_samples
 
 MIN_RATE_DEVIATION: Final = 0.002
 """Relative deviation of the stated rate from the time stamps that is reported if the time stamps are that accurate."""
@@ -33,11 +33,11 @@ LARGE_RATE_DEVIATION: Final = 0.02
 """Relative deviation of the stated rate from the time stamps that is always reported."""
 STEP_TOLERANCE: Final = 0.02
 """Relative difference up to which time steps count as equal."""
-NOTES: Final = 10
+MAX_CLOCK_NOTES: Final = 10
 """Maximum number of notes of the clock; the remaining ones are counted."""
 MIN_REPEATED_SHARE: Final = 0.01
 """Shares of repeated rows below this value are not reported."""
-LONGEST_HOLE: Final = 1_000_000
+MAX_GAP_SAMPLES: Final = 1_000_000
 """Longest gap in samples that is kept at full length, at 48 bytes per sample.
 
 One missing sample stands for a longer pause. It keeps terms from reaching across the pause.
@@ -52,7 +52,7 @@ UNEVEN_STEP_SHARE: Final = 0.5
 """Share of a period. Time steps are reported as uneven if the outer fifth of them deviates by more than this."""
 
 
-def on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Floats, float, list[str]]:
+def resample_to_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Floats, float, list[str]]:
     """Place the samples of a recording on a grid of constant rate, with NaN for missing samples.
 
     Parameters
@@ -76,7 +76,9 @@ def on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Float
     return values, rate, [*notes, *_value_notes(values), *_missing_notes(lost, rate)]
 
 
-def with_temperature(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Floats, Floats, float, list[str]]:
+def resample_with_temperature(
+    blocks: Sequence[SampleBlock], rate_hz: float | None
+) -> tuple[Floats, Floats, float, list[str]]:
     """Do the same as ``on_grid`` and also return the temperature.
 
     Parameters
@@ -99,7 +101,7 @@ def with_temperature(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tu
     """
     stamped, lost, rate, notes = _stamp(blocks, rate_hz)
     values = _place_on_grid(stamped, lost)
-    missing = np.where(lost > LONGEST_HOLE, 1, lost).tolist()
+    missing = np.where(lost > MAX_GAP_SAMPLES, 1, lost).tolist()
     parts = [
         part
         for samples, hole in zip(stamped, missing, strict=True)
@@ -111,44 +113,46 @@ def with_temperature(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tu
 
 def _stamp(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[list[SampleBlock], Ints, float, list[str]]:
     """Return the stamped blocks, the missing samples before each block, the rate, and the notes on the time stamps."""
-    clock = SampleClock(Given(), rate_hz)
-    stamped = [one for samples in blocks for one in clock.stamp(samples)]
+    clock = SampleClock(SenderTiming(), rate_hz)
+    stamped = [one for samples in blocks for one in clock.assign_times(samples)]
     clock_notes = [event.text for event in clock.take_events(ended=True)]
     t_ns = np.concatenate([samples.t_ns for samples in stamped])
     lost, late = _count_missing(stamped, t_ns)
     steps = np.diff(t_ns)
     progress = _count_and_time(stamped, t_ns, lost, steps)
     rate = rate_hz or _mean_rate(progress)
-    notes = clock_notes[:NOTES] + (
-        [f"and {len(clock_notes) - NOTES} more notes on the times"] if len(clock_notes) > NOTES else []
+    notes = clock_notes[:MAX_CLOCK_NOTES] + (
+        [f"and {len(clock_notes) - MAX_CLOCK_NOTES} more notes on the times"]
+        if len(clock_notes) > MAX_CLOCK_NOTES
+        else []
     )
     return stamped, lost, rate, notes + _step_notes(steps, progress, rate) + _late_notes(late)
 
 
 def _value_notes(values: Floats) -> list[str]:
     """Format the notes on repeated rows and on coarse resolution."""
-    return _repeated_notes(values) + _resolution_notes(coarse(values))
+    return _repeated_notes(values) + _resolution_notes(find_coarse_axes(values))
 
 
 def _count_missing(stamped: Sequence[SampleBlock], t_ns: Ints) -> tuple[Ints, int]:
     """Return the samples missing before each block, and the number of gaps that were only late samples."""
     lost = np.array([samples.lost for samples in stamped], np.int64)
-    short = (lost > 0) & (lost <= LONGEST_HOLE)
+    short = (lost > 0) & (lost <= MAX_GAP_SAMPLES)
     rows = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])
     short &= rows > 0  # the time before the first sample is unknown
     if not short.any():
         return lost, 0
     steps = np.diff(t_ns)
-    jumps = np.flatnonzero((steps < -JUMP_S * NS) | (steps > LONG_S * NS)) + 1
-    breaks = np.concatenate([rows[lost > LONGEST_HOLE], jumps])
+    jumps = np.flatnonzero((steps < -JUMP_S * NS_PER_S) | (steps > FORWARD_JUMP_S * NS_PER_S)) + 1
+    breaks = np.concatenate([rows[lost > MAX_GAP_SAMPLES], jumps])
     missing = lost.copy()
-    missing[short] = truly_missing(t_ns, rows[short], lost[short], breaks)
+    missing[short] = count_missing_samples(t_ns, rows[short], lost[short], breaks)
     return missing, int((short & (missing == 0)).sum())
 
 
 def _place_on_grid(stamped: Sequence[SampleBlock], lost: Ints) -> Floats:
     """Return all rows in one array [n, 6] with NaN for missing samples, without a copy if the blocks are contiguous."""
-    missing = np.where(lost > LONGEST_HOLE, 1, lost)
+    missing = np.where(lost > MAX_GAP_SAMPLES, 1, lost)
     if not missing.any() and (whole := _contiguous([samples.values for samples in stamped])) is not None:
         return whole
     values = np.empty((int(missing.sum()) + sum(len(samples) for samples in stamped), 6))
@@ -186,7 +190,7 @@ def _address(array: Floats) -> int:
 
 def _missing_notes(lost: Ints, rate_hz: float) -> list[str]:
     """Format the notes on long pauses and on missing samples."""
-    long, short = lost[lost > LONGEST_HOLE], lost[(lost > 0) & (lost <= LONGEST_HOLE)]
+    long, short = lost[lost > MAX_GAP_SAMPLES], lost[(lost > 0) & (lost <= MAX_GAP_SAMPLES)]
     notes = [f"a pause of {n / rate_hz:.6g} s is too long to keep in place; no term reaches across" for n in long]
     if short.size:
         samples = "1 sample is" if short.sum() == 1 else f"{short.sum()} samples are"
@@ -207,7 +211,7 @@ def _late_notes(late: int) -> list[str]:
 
 def _repeated_notes(values: Floats) -> list[str]:
     """Format the note on rows that repeat the previous one."""
-    share = stale_share(values)
+    share = repeated_share(values)
     if share < MIN_REPEATED_SHARE:
         return []
     percent = 100.0 * share
@@ -218,7 +222,7 @@ def _resolution_notes(found: Sequence[QuantizationStep]) -> list[str]:
     """Format the notes on coarse resolution, grouped by unit and step size."""
     alike: dict[str, list[QuantizationStep]] = {}
     for one in found:
-        alike.setdefault(amount(AXES[one.axis], one.step), []).append(one)
+        alike.setdefault(format_rate(AXES[one.axis], one.step), []).append(one)
     notes = []
     for size, those in alike.items():
         axes = ", ".join(AXES[one.axis] for one in those)
@@ -242,7 +246,7 @@ def _step_notes(steps: Ints, progress: tuple[Floats, Floats] | None, rate_hz: fl
     if abs(mean_hz / rate_hz - 1.0) < min(max(MIN_RATE_DEVIATION, RATE_SIGMA * known), LARGE_RATE_DEVIATION):
         return uneven
     if _is_even(steps):
-        step_s = float(steps.mean()) / NS
+        step_s = float(steps.mean()) / NS_PER_S
         return [f"the rate used is {rate_hz:g} Hz, but the times step by {step_s:.6g} s, {1.0 / step_s:.6g} Hz"]
     return [*uneven, f"the rate used is {rate_hz:g} Hz, but by the times {mean_hz:.5g} samples came a second"]
 
@@ -251,14 +255,14 @@ def _uneven_notes(steps: Ints, rate_hz: float) -> list[str]:
     """Format the note on uneven time steps, or on the resolution of the time stamps that causes them."""
     if _is_even(steps):
         return []
-    low, middle, high = (np.quantile(steps, [0.1, 0.5, 0.9]) / NS).tolist()
+    low, middle, high = (np.quantile(steps, [0.1, 0.5, 0.9]) / NS_PER_S).tolist()
     alike = middle > 0.0 and high - low <= STEP_TOLERANCE * middle
     if alike or max(1.0 / rate_hz - low, high - 1.0 / rate_hz) <= UNEVEN_STEP_SHARE / rate_hz:
         return []
     unit_s = _unit_s(steps)
     if unit_s > UNEVEN_STEP_SHARE / rate_hz:
         return [f"times have a resolution of {unit_s:.3g} s; samples are taken to be even"]
-    worst_s = float(steps[steps < LONG_S * NS].max()) / NS
+    worst_s = float(steps[steps < FORWARD_JUMP_S * NS_PER_S].max()) / NS_PER_S
     return [
         f"times step unevenly: by {middle:.3g} s in the median, {high:.3g} s at 90 %, {worst_s:.3g} s at worst; "
         "samples are taken to be even"
@@ -280,7 +284,7 @@ def _unit_s(steps: Ints) -> float:
         return 0.0
     unit = float(on[on < 1.5 * on.min()].mean())  # a third of a second is not a whole number of nanoseconds
     whole = np.abs(steps / unit - np.rint(steps / unit)) < UNIT_TOLERANCE
-    return unit / NS if whole.all() else 0.0
+    return unit / NS_PER_S if whole.all() else 0.0
 
 
 def _count_and_time(
@@ -295,14 +299,14 @@ def _count_and_time(
     missing = np.cumsum(np.concatenate([[0], lost[1:]]))
     low, high = int(steps.min(initial=0)), int(steps.max(initial=0))
     jumps = np.zeros(0, np.int64)
-    if low <= -JUMP_S * NS or high >= LONG_S * NS:
-        jumps = np.flatnonzero((steps <= -JUMP_S * NS) | (steps >= LONG_S * NS)) + 1
+    if low <= -JUMP_S * NS_PER_S or high >= FORWARD_JUMP_S * NS_PER_S:
+        jumps = np.flatnonzero((steps <= -JUMP_S * NS_PER_S) | (steps >= FORWARD_JUMP_S * NS_PER_S)) + 1
     # the time and the samples that a jump skips are not counted
     over = np.concatenate([[0], np.cumsum(steps[jumps - 1])])[np.searchsorted(jumps, rows, "right")]
     at_jumps = np.where(np.isin(jumps, starts), lost[np.searchsorted(starts, jumps, "right") - 1], 0) + 1
     left_out = np.concatenate([[0], np.cumsum(at_jumps)])[np.searchsorted(jumps, rows, "right")]
     came = rows + missing[np.searchsorted(starts, rows, "right") - 1] - left_out
-    passed_s = (t_ns[rows] - t_ns[0] - over) / NS
+    passed_s = (t_ns[rows] - t_ns[0] - over) / NS_PER_S
     return (came.astype(np.float64), passed_s) if came[-1] > 0 and passed_s[-1] > 0.0 else None
 
 
@@ -319,7 +323,7 @@ def _mean_rate(progress: tuple[Floats, Floats] | None) -> float:
     """Return the rate of a recording without a stated rate."""
     if progress is None:
         raise NotReady("the times of the recording do not go on, so that its rate is unknown; state it with --rate HZ")
-    rate_hz = made_rate(_rate(*progress)[0])
+    rate_hz = snap_to_standard_rate(_rate(*progress)[0])
     try:
         return RATE_HZ.check(rate_hz)
     except ConfigError as error:

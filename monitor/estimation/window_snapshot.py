@@ -36,7 +36,7 @@ MAX_GRID_DIVISOR: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class WindowSnapshot:
     """Copy of the phase in a window at one moment. The copy is quick; ``values`` takes longer."""
 
     phase: Ints  # [n + 1, 6 or more] modulo 2⁶⁴, oldest first
@@ -57,7 +57,7 @@ class Held:
         return np.column_stack(columns)
 
 
-def copy_window(window: AllanWindow, rate_hz: float) -> Held:
+def copy_window(window: AllanWindow, rate_hz: float) -> WindowSnapshot:
     """Return a copy of the current content of a window.
 
     Parameters
@@ -67,11 +67,11 @@ def copy_window(window: AllanWindow, rate_hz: float) -> Held:
     rate_hz : float
         Sample rate in Hz.
     """
-    phase, missing, first, unit = window.ring()
+    phase, missing, first, unit = window.view_ring()
     end = first + window.n + 1
     # the window may wrap around the end of the ring
     rows = [slice(first, min(end, len(phase))), slice(0, max(end - len(phase), 0))]
-    return Held(
+    return WindowSnapshot(
         np.concatenate([phase[one] for one in rows]), np.concatenate([missing[one] for one in rows]), unit, rate_hz
     )
 
@@ -125,7 +125,7 @@ def _snap_to_grid(levels: Floats) -> Floats:
     return levels
 
 
-class Temperatures:
+class TemperatureRing:
     """Ring of the newest temperatures of a device, at 4 bytes per sample.
 
     Parameters

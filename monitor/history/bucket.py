@@ -27,13 +27,13 @@ Singles = NDArray[np.float32]
 STATES: Final = ("ended", "running", "waiting", "lost")
 """States ordered from best to worst; a row holds the worst state of its bucket."""
 COUNTS: Final = ("received", "lost", "bad", "overflowed")
-NUMBERS_AT_MOST: Final = 4096
+MAX_COLUMNS: Final = 4096
 """Largest number of columns in a row; a device has about two hundred."""
 _MAX_N: Final = 2**32 - 1
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class HistoryRow:
     """Statistics of k numbers in the bucket from ``start_s`` to ``start_s + width_s``."""
 
     start_s: int  # Unix time, a multiple of width_s
@@ -53,7 +53,7 @@ class Row:
         return self.start_s + self.width_s
 
 
-class Extremes:
+class RunningExtremes:
     """Running count, minimum, maximum and last value of k numbers.
 
     >>> seen = Extremes(("a", "b"))
@@ -65,30 +65,30 @@ class Extremes:
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self.names = names
-        self.n: Ints = np.zeros(len(names), np.int64)
-        self.low: Singles = np.full(len(names), np.nan, np.float32)
-        self.high: Singles = self.low.copy()
-        self.last: Singles = self.low.copy()
+        self.count: Ints = np.zeros(len(names), np.int64)
+        self.minimum: Singles = np.full(len(names), np.nan, np.float32)
+        self.maximum: Singles = self.minimum.copy()
+        self.last: Singles = self.minimum.copy()
 
     def add(self, numbers: Floats) -> None:
         """Update the statistics with one value of each number ([k], SI); NaN marks a missing value."""
         with np.errstate(over="ignore"):
             single = numbers.astype(np.float32)
         there = ~np.isnan(single)
-        self.n += there
-        np.fmin(self.low, single, out=self.low)
-        np.fmax(self.high, single, out=self.high)
+        self.count += there
+        np.fmin(self.minimum, single, out=self.minimum)
+        np.fmax(self.maximum, single, out=self.maximum)
         np.copyto(self.last, single, where=there)
 
 
-def joined(
+def concatenate_columns(
     start_s: int,
     width_s: int,
     newest_s: float,
-    parts: Sequence[Extremes],
+    parts: Sequence[RunningExtremes],
     counts: tuple[int, int, int, int],
     state: int,
-) -> Row:
+) -> HistoryRow:
     """Concatenate the statistics of several sources into one row.
 
     Parameters
@@ -106,21 +106,21 @@ def joined(
     state
         Index of the worst state in STATES.
     """
-    return Row(
+    return HistoryRow(
         start_s,
         width_s,
         newest_s,
         tuple(name for part in parts for name in part.names),
-        np.concatenate([part.n for part in parts]),
-        np.concatenate([part.low for part in parts]),
-        np.concatenate([part.high for part in parts]),
+        np.concatenate([part.count for part in parts]),
+        np.concatenate([part.minimum for part in parts]),
+        np.concatenate([part.maximum for part in parts]),
         np.concatenate([part.last for part in parts]),
         counts,
         state,
     )
 
 
-def chosen(row: Row, names: tuple[str, ...]) -> Row:
+def select_columns(row: HistoryRow, names: tuple[str, ...]) -> HistoryRow:
     """Return the row with its columns selected and reordered.
 
     Parameters
@@ -135,7 +135,7 @@ def chosen(row: Row, names: tuple[str, ...]) -> Row:
     index = _column_indices(row.names, names)
     n = np.append(row.n, 0)[index]
     low, high, last = (np.append(part, np.float32(np.nan))[index] for part in (row.low, row.high, row.last))
-    return Row(row.start_s, row.width_s, row.newest_s, names, n, low, high, last, row.counts, row.state)
+    return HistoryRow(row.start_s, row.width_s, row.newest_s, names, n, low, high, last, row.counts, row.state)
 
 
 @lru_cache(maxsize=64)
@@ -145,7 +145,7 @@ def _column_indices(names: tuple[str, ...], wanted: tuple[str, ...]) -> NDArray[
     return np.array([at.get(name, -1) for name in wanted], np.int64)
 
 
-def merged(rows: Sequence[Row], start_s: int, width_s: int) -> Row:
+def merge_rows(rows: Sequence[HistoryRow], start_s: int, width_s: int) -> HistoryRow:
     """Merge rows into one; the last value of a number comes from the newest row that has the number.
 
     Parameters
@@ -161,11 +161,11 @@ def merged(rows: Sequence[Row], start_s: int, width_s: int) -> Row:
     names = rows[0].names
     if any(row.names is not names and row.names != names for row in rows):
         names = tuple(dict.fromkeys(name for row in rows for name in row.names))
-        rows = [chosen(row, names) for row in rows]
+        rows = [select_columns(row, names) for row in rows]
     n = np.stack([row.n for row in rows])
     newest = len(rows) - 1 - np.argmax(n[::-1] > 0, axis=0)  # a number without values takes the NaN of any row
     counts = tuple(sum(each) for each in zip(*(row.counts for row in rows), strict=True))
-    return Row(
+    return HistoryRow(
         start_s,
         width_s,
         rows[-1].newest_s,
@@ -179,7 +179,7 @@ def merged(rows: Sequence[Row], start_s: int, width_s: int) -> Row:
     )
 
 
-def pack(row: Row) -> bytes:
+def pack_statistics(row: HistoryRow) -> bytes:
     """Return the statistics of a row as compressed bytes, without the column names."""
     low = row.low.view(np.uint32)
     n = np.minimum(row.n, _MAX_N).astype(np.uint32)
@@ -187,7 +187,7 @@ def pack(row: Row) -> bytes:
     return zlib.compress(words.view(np.uint8).reshape(-1, 4).T.tobytes(), 6)
 
 
-def unpack(data: bytes, count: int) -> tuple[Ints, Singles, Singles, Singles]:
+def unpack_statistics(data: bytes, count: int) -> tuple[Ints, Singles, Singles, Singles]:
     """Return the count, minimum, maximum and last value of each number in packed bytes.
 
     Parameters
@@ -207,7 +207,7 @@ def unpack(data: bytes, count: int) -> tuple[Ints, Singles, Singles, Singles]:
         raw = zlib.decompressobj().decompress(data, size + 1)
     except zlib.error as error:
         raise RecordingError(f"a row cannot be read: {error}") from error
-    if len(raw) != size or count > NUMBERS_AT_MOST:
+    if len(raw) != size or count > MAX_COLUMNS:
         raise RecordingError(f"a row of {count} numbers has {len(raw)} bytes, not {size}")
     bytes_of = np.frombuffer(raw, np.uint8).reshape(4, -1).T
     words = np.ascontiguousarray(bytes_of).view("<u4").reshape(4, count).astype(np.uint32)

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from drivers.sample import AXES, Floats
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
 
 TAU_S: Final = tuple(float(f"{one}e{power}") for power in range(-4, 6) for one in (1, 3))
 """Averaging times of stored deviations [s], from 0.1 ms to 300 000 s; each window covers a part of them."""
-HEALTH: Final = ("rate", "latency", "memory")
+HEALTH_COLUMNS: Final = ("rate", "latency", "memory")
 """Sample rate [Hz], 99th percentile of the latency from receipt to publication [s], memory of the process [bytes]."""
-TEMPERATURE: Final = ("temperature",)
+TEMPERATURE_COLUMNS: Final = ("temperature",)
 """Mean temperature of a batch [°C]."""
 VALUE_SUFFIXES: Final = ("", ".lo", ".hi", ".bound")
 TAU_MATCH_RATIO: Final = 1.02
@@ -30,7 +30,7 @@ MAX_TAU_RATIO: Final = 2.5
 """Largest ratio of neighbouring averaging times between which deviations are interpolated."""
 
 
-class Numbers:
+class ColumnConverter:
     """Converter of estimates with one set of axes and averaging times into column values.
 
     Parameters
@@ -46,22 +46,22 @@ class Numbers:
         at, below, above, share = _interpolation_points(self._tau_s)
         self._below, self._above = np.array(below, np.intp), np.array(above, np.intp)
         self._share = share[:, None]
-        columns, rows = len(AXES), len(LETTERS)
+        columns, rows = len(AXES), len(SYMBOLS)
         self._letters = np.array([row * columns + axis for row in range(rows) for axis in self._axes], np.intp)
         axes = [AXES[i] for i in self._axes]
         self.names = (
-            *(f"{axis}.{letter}{part}" for part in VALUE_SUFFIXES for letter in LETTERS for axis in axes),
+            *(f"{axis}.{letter}{part}" for part in VALUE_SUFFIXES for letter in SYMBOLS for axis in axes),
             *(f"{axis}.sigma.{TAU_S[i]:g}" for i in at for axis in axes),
         )
         self._letter_count = len(self._letters)
 
-    def fit(self, estimate: Estimate) -> bool:
+    def is_compatible(self, estimate: Estimate) -> bool:
         """Return True if an estimate has the same measured axes and averaging times as the first one."""
         tau_s = estimate.curve.tau_s
         same = tau_s is self._tau_s or np.array_equal(tau_s, self._tau_s)
         return same and bool((_measured(estimate) == self._measured).all())
 
-    def of(self, estimate: Estimate) -> Floats:
+    def convert(self, estimate: Estimate) -> Floats:
         """Return the column values of an estimate ([k], SI) in the order of ``names``; NaN marks a missing value."""
         c, m = estimate.coefficients, self._letter_count
         status, hi = c.status.take(self._letters), c.hi.take(self._letters)

@@ -13,29 +13,29 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.common.health import Health
 from monitor.estimation.estimate import Estimate
-from monitor.history.bucket import STATES, Extremes, Row, joined
-from monitor.history.columns import HEALTH, TEMPERATURE, Numbers
+from monitor.history.bucket import STATES, HistoryRow, RunningExtremes, concatenate_columns
+from monitor.history.columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS, ColumnConverter
 
 MINUTE_S: Final = 60
 LATE_TOLERANCE_S: Final = 5.0
 """Tolerance for results that arrive out of order: batches and estimates of the same time are not reported together."""
 
 
-class Minutes:
+class MinuteAggregator:
     """Aggregator of one device's results within the current minute."""
 
     def __init__(self) -> None:
-        self._numbers: Numbers | None = None
+        self._numbers: ColumnConverter | None = None
         self._start_s: int | None = None
         self._newest_s = 0.0
-        self._estimates: Extremes | None = None
-        self._health = Extremes(HEALTH)
-        self._temperature = Extremes(TEMPERATURE)
+        self._estimates: RunningExtremes | None = None
+        self._health = RunningExtremes(HEALTH_COLUMNS)
+        self._temperature = RunningExtremes(TEMPERATURE_COLUMNS)
         self._previous_counters = (0, 0, 0, 0)  # counters at the last report, since the start of the device
         self._counts = (0, 0, 0, 0)  # increments within this minute
         self._state = 0
 
-    def estimate(self, unix_s: float, estimate: Estimate) -> Row | None:
+    def estimate(self, unix_s: float, estimate: Estimate) -> HistoryRow | None:
         """Add an estimate, and return the previous row if the estimate begins a new one.
 
         Parameters
@@ -46,18 +46,18 @@ class Minutes:
             The estimate.
         """
         full = self._advance(unix_s)
-        if self._numbers is None or not self._numbers.fit(estimate):
-            self._numbers = Numbers(estimate)
+        if self._numbers is None or not self._numbers.is_compatible(estimate):
+            self._numbers = ColumnConverter(estimate)
         if self._estimates is not None and self._estimates.names != self._numbers.names:
             start_s = self._start_s
             full = self._close_row()  # the store merges both rows of this minute
             self._start_s, self._newest_s = start_s, unix_s
         if self._estimates is None:
-            self._estimates = Extremes(self._numbers.names)
-        self._estimates.add(self._numbers.of(estimate))
+            self._estimates = RunningExtremes(self._numbers.names)
+        self._estimates.add(self._numbers.convert(estimate))
         return full
 
-    def temperature(self, unix_s: float, temperature_c: Floats) -> Row | None:
+    def temperature(self, unix_s: float, temperature_c: Floats) -> HistoryRow | None:
         """Add the mean temperature of a batch, and return the previous row if a new one begins.
 
         Parameters
@@ -74,7 +74,7 @@ class Minutes:
         self._temperature.add(np.array([there.mean()]))
         return full
 
-    def health(self, unix_s: float, health: Health) -> Row | None:
+    def health(self, unix_s: float, health: Health) -> HistoryRow | None:
         """Add a health report, and return the previous row if a new one begins.
 
         Parameters
@@ -98,26 +98,32 @@ class Minutes:
         self._state = max(self._state, worst)
         return full
 
-    def end(self) -> Row | None:
+    def flush(self) -> HistoryRow | None:
         """Return the current, incomplete row and close it; None if there were no results."""
         return self._close_row() if self._start_s is not None else None
 
-    def _advance(self, unix_s: float) -> Row | None:
+    def _advance(self, unix_s: float) -> HistoryRow | None:
         """Advance to the minute of ``unix_s``, and return the row of the previous minute if it is complete."""
         start_s = int(unix_s // MINUTE_S) * MINUTE_S
         if self._start_s is not None and self._start_s - LATE_TOLERANCE_S <= unix_s < self._start_s + MINUTE_S:
             self._newest_s = max(self._newest_s, min(unix_s, self._start_s + MINUTE_S))
             return None
-        full = self.end()
+        full = self.flush()
         self._start_s, self._newest_s = start_s, unix_s
         return full
 
-    def _close_row(self) -> Row:
+    def _close_row(self) -> HistoryRow:
         """Close the current row and return it."""
         parts = [part for part in (self._estimates, self._health, self._temperature) if part is not None]
-        parts = [part for part in parts if part.n.any()]
+        parts = [part for part in parts if part.count.any()]
         assert self._start_s is not None
-        row = joined(self._start_s, MINUTE_S, self._newest_s, parts or [self._health], self._counts, self._state)
-        self._estimates, self._health, self._temperature = None, Extremes(HEALTH), Extremes(TEMPERATURE)
+        row = concatenate_columns(
+            self._start_s, MINUTE_S, self._newest_s, parts or [self._health], self._counts, self._state
+        )
+        self._estimates, self._health, self._temperature = (
+            None,
+            RunningExtremes(HEALTH_COLUMNS),
+            RunningExtremes(TEMPERATURE_COLUMNS),
+        )
         self._counts, self._state, self._start_s = (0, 0, 0, 0), 0, None
         return row

@@ -10,19 +10,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from drivers.discovery import nearest
+from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
 from drivers.sample import AXES
-from monitor.estimation.fit.coefficients import LETTERS
-from monitor.history.columns import HEALTH, TEMPERATURE
-from monitor.history.time_ranges import Span, length, zenoh_span
+from monitor.estimation.fit.coefficients import SYMBOLS
+from monitor.history.columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS
+from monitor.history.time_ranges import TimeRange, parse_duration_s, parse_zenoh_range
 
 COEFFICIENTS: Final = "coefficients"
 DEVIATIONS: Final = "deviations"
 STATUS: Final = "status"
 EVENTS: Final = "events"
-WHAT: Final = (COEFFICIENTS, DEVIATIONS, STATUS, EVENTS)
-UNASKED: Final = (COEFFICIENTS, STATUS, EVENTS)
+PARTS: Final = (COEFFICIENTS, DEVIATIONS, STATUS, EVENTS)
+DEFAULT_PARTS: Final = (COEFFICIENTS, STATUS, EVENTS)
 """Parts returned by default; deviations would be larger than all other parts together."""
 PARAMETER_NAMES: Final = ("_time", "step", "what", "axis", "letter")
 MAX_PARAMETERS_LENGTH: Final = 1000
@@ -31,16 +31,16 @@ _PART: Final = re.compile(r"([^=;]+)(?:=((?:[\[\]][^\[\]]*[\[\]])|[^;]*))?(?:;|$
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
+class HistoryQuery:
     """A query: time range, bucket width and the requested parts, axes and letters."""
 
-    span: Span | None = None  # None: the last day of the stored history
+    span: TimeRange | None = None  # None: the last day of the stored history
     step_s: int | None = None  # None: chosen by the reader
-    what: tuple[str, ...] = UNASKED
+    what: tuple[str, ...] = DEFAULT_PARTS
     axes: tuple[str, ...] = AXES
-    letters: tuple[str, ...] = LETTERS
+    letters: tuple[str, ...] = SYMBOLS
 
-    def wants(self, name: str) -> bool:
+    def selects(self, name: str) -> bool:
         """Return True if the query requests the column ``name`` (see ``columns``).
 
         >>> Question(axes=("gz",)).wants("gz.N.lo"), Question(axes=("gz",)).wants("gx.N"), Question().wants("rate")
@@ -48,7 +48,7 @@ class Question:
         """
         axis, _, rest = name.partition(".")
         if not rest:
-            return STATUS in self.what and name in (*HEALTH, *TEMPERATURE)
+            return STATUS in self.what and name in (*HEALTH_COLUMNS, *TEMPERATURE_COLUMNS)
         if axis not in self.axes:
             return False
         letter = rest.split(".")[0]
@@ -61,7 +61,7 @@ class Question:
         '_time=[1970-01-01T00:00:00.000000Z..[;step=900s;what=status;axis=gz;letter=Q,N,B,K,R'
         """
         parts = {
-            "_time": "" if self.span is None else self.span.zenoh(),
+            "_time": "" if self.span is None else self.span.to_zenoh(),
             "step": "" if self.step_s is None else f"{self.step_s}s",
             "what": ",".join(self.what),
             "axis": ",".join(self.axes),
@@ -70,7 +70,7 @@ class Question:
         return ";".join(f"{key}={value}" for key, value in parts.items() if value)
 
 
-def question(parameters: str, now_s: float) -> Question:
+def parse_query(parameters: str, now_s: float) -> HistoryQuery:
     """Parse the parameters of a zenoh selector.
 
     >>> question("_time=[now(-2h);30m];axis=gz;what=coefficients", 7200.0).span
@@ -91,16 +91,16 @@ def question(parameters: str, now_s: float) -> Question:
     given = _split(parameters)
     for key in given:
         if key not in PARAMETER_NAMES and not key.startswith("_"):
-            raise ConfigError(f'"{key[:40]}": unknown parameter{nearest(key, PARAMETER_NAMES)}')
-    step_s = length(given["step"]) if given.get("step") else None
+            raise ConfigError(f'"{key[:40]}": unknown parameter{format_suggestion(key, PARAMETER_NAMES)}')
+    step_s = parse_duration_s(given["step"]) if given.get("step") else None
     if step_s is not None and not 1.0 <= step_s <= 1e10:
         raise ConfigError(f"step: {step_s:g} s; possible are 1 s and more")
-    return Question(
-        zenoh_span(given["_time"], now_s) if given.get("_time") else None,
+    return HistoryQuery(
+        parse_zenoh_range(given["_time"], now_s) if given.get("_time") else None,
         None if step_s is None else int(step_s),
-        _parse_list("what", given.get("what", ""), WHAT) or UNASKED,
+        _parse_list("what", given.get("what", ""), PARTS) or DEFAULT_PARTS,
         _parse_list("axis", given.get("axis", ""), AXES) or AXES,
-        _parse_list("letter", given.get("letter", ""), LETTERS) or LETTERS,
+        _parse_list("letter", given.get("letter", ""), SYMBOLS) or SYMBOLS,
     )
 
 
@@ -116,5 +116,5 @@ def _parse_list(key: str, text: str, known: tuple[str, ...]) -> tuple[str, ...]:
     words = [word.strip() for word in text.split(",") if word.strip()]
     for word in words:
         if word not in known:
-            raise ConfigError(f'{key}: "{word[:40]}"{nearest(word, known)}')
+            raise ConfigError(f'{key}: "{word[:40]}"{format_suggestion(word, known)}')
     return tuple(one for one in known if one in words)

@@ -15,13 +15,13 @@ import numpy as np
 
 from drivers.errors import NotReady
 from drivers.sample import Floats, Ints
-from monitor.history.bucket import Row, Singles, chosen, merged
-from monitor.history.sqlite_store import PastEvent, Reader
-from monitor.history.time_ranges import Span
+from monitor.history.bucket import HistoryRow, Singles, merge_rows, select_columns
+from monitor.history.sqlite_store import HistoryReader, StoredEvent
+from monitor.history.time_ranges import TimeRange
 
 DEFAULT_POINTS: Final = 1000
 """Approximate number of buckets in a table; at most twice as many if old and new rows differ in width."""
-EVENTS: Final = 1000
+MAX_EVENTS: Final = 1000
 DAY_S: Final = 86_400
 BUCKET_WIDTHS_S: Final = (
     *(60, 300, 900, 1800, 3600, 10_800, 21_600, 43_200),
@@ -31,11 +31,11 @@ BUCKET_WIDTHS_S: Final = (
 
 
 @dataclass(frozen=True, slots=True)
-class Past:
+class HistoryTable:
     """History of one device: k numbers in p buckets, ordered by time."""
 
     device: str
-    span: Span  # the requested time range, clipped to the stored one
+    span: TimeRange  # the requested time range, clipped to the stored one
     step_s: int  # width of the buckets, except where the stored rows are wider
     start_s: Ints  # [p] Unix time
     width_s: Ints  # [p]
@@ -46,7 +46,7 @@ class Past:
     last: Singles
     counts: Ints  # [p, 4] increments of bucket.COUNTS within each bucket
     state: Ints  # [p] index of the worst of bucket.STATES
-    events: tuple[PastEvent, ...]  # the newest events
+    events: tuple[StoredEvent, ...]  # the newest events
     events_in_all: int  # number of events in the time range
 
     def __len__(self) -> int:
@@ -57,14 +57,14 @@ class Past:
         """Unix time at which each bucket ends [s], shape [p]."""
         return self.start_s + self.width_s
 
-    def column(self, name: str) -> "Course":
+    def column(self, name: str) -> "ColumnStatistics":
         """Return one number over time; all values are missing if the table has no column of this name."""
         if name not in self.names:
             nothing: Floats = np.full(len(self), np.nan)
-            return Course(np.zeros(len(self), np.int64), nothing, nothing, nothing)
+            return ColumnStatistics(np.zeros(len(self), np.int64), nothing, nothing, nothing)
         at = self.names.index(name)
         parts = [np.asarray(part[:, at], np.float64) for part in (self.low, self.high, self.last)]
-        return Course(self.n[:, at], *parts)
+        return ColumnStatistics(self.n[:, at], *parts)
 
     def axes(self) -> tuple[str, ...]:
         """Return the axes that have at least one column."""
@@ -78,7 +78,7 @@ class Past:
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class ColumnStatistics:
     """One number over p buckets."""
 
     n: Ints  # [p] count of values
@@ -87,14 +87,14 @@ class Course:
     last: Floats
 
 
-def read(
-    reader: Reader,
+def read_history(
+    reader: HistoryReader,
     device: str,
-    span: Span | None,
+    span: TimeRange | None,
     wanted: Callable[[str], bool] = lambda _name: True,
     step_s: int | None = None,
     points: int = DEFAULT_POINTS,
-) -> Past:
+) -> HistoryTable:
     """Read the history of a device as a table.
 
     Parameters
@@ -119,28 +119,35 @@ def read(
     RecordingError
         A row cannot be read.
     """
-    held = reader.held(device)
+    held = reader.stored_range(device)
     if held is None:
         raise NotReady(f"{device}: no history yet")
-    span = bounded(span or Span(held[1] - 86_400.0, held[1]), held)
-    step_s = step(replace(span, start_s=max(span.start_s, held[0]), end_s=min(span.end_s, held[1])), step_s, points)
-    parts: dict[tuple[int, int], list[Row]] = {}
+    span = clip_to_stored(span or TimeRange(held[1] - 86_400.0, held[1]), held)
+    step_s = bucket_width_s(
+        replace(span, start_s=max(span.start_s, held[0]), end_s=min(span.end_s, held[1])), step_s, points
+    )
+    parts: dict[tuple[int, int], list[HistoryRow]] = {}
     names: dict[tuple[str, ...], tuple[str, ...]] = {}
     for key, rows in groupby(reader.rows(device, span), key=lambda row: _bucket(row, step_s)):
-        one = merged(list(rows), *key)
+        one = merge_rows(list(rows), *key)
         if one.names not in names:
             names[one.names] = tuple(name for name in one.names if wanted(name))
-        parts.setdefault(key, []).append(chosen(one, names[one.names]))
-    found = [merged(part, *key) for key, part in sorted(parts.items())]
-    events, in_all = reader.events(device, span, EVENTS)
+        parts.setdefault(key, []).append(select_columns(one, names[one.names]))
+    found = [merge_rows(part, *key) for key, part in sorted(parts.items())]
+    events, in_all = reader.events(device, span, MAX_EVENTS)
     if not found and not events:
         raise NotReady(f"{device}: nothing in that time; kept are {_format_range(held)}")
-    return table(device, span, step_s, found, events, in_all)
+    return build_table(device, span, step_s, found, events, in_all)
 
 
-def table(
-    device: str, span: Span, step_s: int, rows: Sequence[Row], events: Sequence[PastEvent], events_in_all: int
-) -> Past:
+def build_table(
+    device: str,
+    span: TimeRange,
+    step_s: int,
+    rows: Sequence[HistoryRow],
+    events: Sequence[StoredEvent],
+    events_in_all: int,
+) -> HistoryTable:
     """Arrange rows as a table.
 
     Parameters
@@ -159,9 +166,9 @@ def table(
         Number of events in the time range, including those not in ``events``.
     """
     names = tuple(dict.fromkeys(name for row in rows for name in row.names))
-    rows = [chosen(row, names) for row in rows]
+    rows = [select_columns(row, names) for row in rows]
     shape = (len(rows), len(names))
-    return Past(
+    return HistoryTable(
         device,
         span,
         step_s,
@@ -179,7 +186,7 @@ def table(
     )
 
 
-def step(span: Span, step_s: int | None = None, points: int = DEFAULT_POINTS) -> int:
+def bucket_width_s(span: TimeRange, step_s: int | None = None, points: int = DEFAULT_POINTS) -> int:
     """Return the bucket width [s]: the smallest permitted one for this number of points, at least ``step_s``.
 
     >>> step(Span(0.0, 86_400.0)), step(Span(0.0, 5 * 31_536_000.0)), step(Span(0.0, 3600.0), 900)
@@ -201,7 +208,7 @@ def step(span: Span, step_s: int | None = None, points: int = DEFAULT_POINTS) ->
     )
 
 
-def bounded(span: Span, held: tuple[float, float]) -> Span:
+def clip_to_stored(span: TimeRange, held: tuple[float, float]) -> TimeRange:
     """Clip a time range to the stored one, extended by one day, because events may lie outside the rows.
 
     Parameters
@@ -215,7 +222,7 @@ def bounded(span: Span, held: tuple[float, float]) -> Span:
     return replace(span, start_s=min(start_s, end_s), end_s=max(start_s, end_s))
 
 
-def _bucket(row: Row, step_s: int) -> tuple[int, int]:
+def _bucket(row: HistoryRow, step_s: int) -> tuple[int, int]:
     """Return the start and width [s] of the bucket that contains a row."""
     width_s = max(row.width_s, step_s)
     return row.start_s // width_s * width_s, width_s
@@ -223,6 +230,6 @@ def _bucket(row: Row, step_s: int) -> tuple[int, int]:
 
 def _format_range(held: tuple[float, float]) -> str:
     """Format the stored time range for a message."""
-    from monitor.history.time_ranges import said
+    from monitor.history.time_ranges import format_utc
 
-    return f"{said(held[0])} to {said(held[1])} UTC"
+    return f"{format_utc(held[0])} to {format_utc(held[1])} UTC"

@@ -29,20 +29,20 @@ import msgspec
 
 from drivers.errors import RecordingError
 from drivers.file_access import check_folder, check_regular
-from monitor.history.bucket import NUMBERS_AT_MOST, STATES, Row, merged, pack, unpack
-from monitor.history.time_ranges import Span
+from monitor.history.bucket import MAX_COLUMNS, STATES, HistoryRow, merge_rows, pack_statistics, unpack_statistics
+from monitor.history.time_ranges import TimeRange
 
-FILE: Final = "history.sqlite"
+FILE_NAME: Final = "history.sqlite"
 VERSION: Final = 1
 APPLICATION: Final = 0x494D5548  # "IMUH"
 DAY_S: Final = 86_400
 LEVELS: Final = ((60, 7 * DAY_S), (900, 90 * DAY_S), (21_600, None))
 """Width of the rows of a level [s], and the age at which they are merged into the next level [s]; None: never."""
-EVENTS_AT_MOST: Final = 20_000
+MAX_EVENTS: Final = 20_000
 """Largest number of events per device."""
 EVENT_THINNING_SPANS_S: Final = (DAY_S, 30 * DAY_S, 365 * DAY_S)
 MAX_TEXT_LENGTH: Final = 2000
-BUSY_S: Final = 5.0
+BUSY_TIMEOUT_S: Final = 5.0
 CACHE_KIB: Final = 2048
 SCHEMA: Final = """
 CREATE TABLE device (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
@@ -60,13 +60,13 @@ CREATE TABLE event (
 CREATE INDEX event_time ON event (device, t);
 """
 TABLES: Final = frozenset({"device", "layout", "row", "event"})
-BESIDE: Final = ("-wal", "-shm", "-journal")
+SQLITE_SUFFIXES: Final = ("-wal", "-shm", "-journal")
 """Suffixes of the files that SQLite keeps next to a database."""
 DELETED: Final = "was deleted or renamed"
 REPLACED: Final = "was replaced by another file"
 EMPTIED: Final = "was emptied"
 CHANGED: Final = "was changed by another program"
-MOVE: Final = "move it away, and a new one is begun"
+MOVE_HINT: Final = "move it away, and a new one is begun"
 _FIELDS: Final = "start, width, newest, layout, received, lost, bad, overflowed, state, numbers"
 
 
@@ -75,7 +75,7 @@ _FileState = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class PastEvent:
+class StoredEvent:
     """An event of a device, as it is stored."""
 
     t_s: float  # Unix time
@@ -85,14 +85,14 @@ class PastEvent:
     what: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     since_s: float | None = None  # Unix time at which the reported condition began
     sigma: float | None = None
-    stands_for: int = 1  # number of events it represents: itself, and deleted earlier events of its kind
+    represented_events: int = 1  # number of events it represents: itself, and deleted earlier events of its kind
 
 
 class UnusableHistory(RecordingError):
     """Error: the history file is damaged or holds something else."""
 
 
-class Store:
+class HistoryStore:
     """Writer of a history file; it must be used by one thread only.
 
     Parameters
@@ -116,7 +116,7 @@ class Store:
         path.touch()  # the file needs an inode that can be compared before SQLite opens it
         before = os.stat(path)
         self._files = _file_states(path)
-        self._db = sqlite3.connect(path, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
+        self._db = sqlite3.connect(path, timeout=BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False)
         self._devices: dict[str, int] = {}
         self._layouts = _LayoutCache(self._db)
         self._version = -1
@@ -132,10 +132,10 @@ class Store:
 
     def _prepare(self) -> None:
         """Create the tables if the file is empty, and set the options of the connection."""
-        if not check(self._db, self.path):
+        if not is_history(self._db, self.path):
             self._db.execute("PRAGMA journal_mode = WAL")
             with self._transaction():
-                if not check(self._db, self.path):  # another process may have created the tables meanwhile
+                if not is_history(self._db, self.path):  # another process may have created the tables meanwhile
                     for statement in SCHEMA.split(";"):
                         self._db.execute(statement)
                     self._db.execute(f"PRAGMA application_id = {APPLICATION}")
@@ -144,7 +144,7 @@ class Store:
         self._db.execute("PRAGMA synchronous = FULL")
         self._db.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
 
-    def add(self, rows: Sequence[tuple[str, Row]], events: Sequence[tuple[str, PastEvent]] = ()) -> None:
+    def add(self, rows: Sequence[tuple[str, HistoryRow]], events: Sequence[tuple[str, StoredEvent]] = ()) -> None:
         """Write rows and events in one transaction.
 
         Parameters
@@ -168,7 +168,7 @@ class Store:
                 self._put_event(self._device_id(device), event)
         self._files = _file_states(self.path)
 
-    def thin(self, now_s: float, at_most: int = 100) -> int:
+    def merge_old_rows(self, now_s: float, at_most: int = 100) -> int:
         """Merge rows that are old enough, and return the number of merged buckets; 0 if nothing is due.
 
         Parameters
@@ -199,7 +199,7 @@ class Store:
             self._files = _file_states(self.path)
         return done
 
-    def change(self) -> str:
+    def external_change(self) -> str:
         """Return what another program has done to the file since its last use by this store; "" if nothing.
 
         SQLite does not detect such changes: it would continue to write to a file that has been deleted.
@@ -231,24 +231,24 @@ class Store:
 
     # --- rows
 
-    def _put(self, device: int, row: Row) -> None:
+    def _put(self, device: int, row: HistoryRow) -> None:
         """Merge a row into the stored row of its bucket, or into the wider row that contains the bucket."""
         for width_s, _ in LEVELS[::-1]:
             start_s = row.start_s // width_s * width_s
             held = self._stored_row(device, width_s, start_s)
             if held is not None and width_s >= row.width_s:
-                row = merged([held, row], start_s, width_s)
+                row = merge_rows([held, row], start_s, width_s)
                 break
         self._write(device, row)
 
-    def _stored_row(self, device: int, width_s: int, start_s: int) -> Row | None:
+    def _stored_row(self, device: int, width_s: int, start_s: int) -> HistoryRow | None:
         """Return the stored row of a bucket; None if there is none."""
         found = self._db.execute(
             f"SELECT {_FIELDS} FROM row WHERE device = ? AND width = ? AND start = ?", (device, width_s, start_s)
         ).fetchone()
         return None if found is None else self._layouts.row(found)
 
-    def _write(self, device: int, row: Row) -> None:
+    def _write(self, device: int, row: HistoryRow) -> None:
         """Insert a row, or replace the stored row of the same bucket."""
         self._db.execute(
             f"INSERT OR REPLACE INTO row (device, {_FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -260,7 +260,7 @@ class Store:
                 self._layouts.id(row.names),
                 *row.counts,
                 row.state,
-                pack(row),
+                pack_statistics(row),
             ),
         )
 
@@ -286,13 +286,13 @@ class Store:
             found = self._db.execute(f"SELECT {_FIELDS} FROM row WHERE {where} ORDER BY start", bucket).fetchall()
             rows = [self._layouts.row(one) for one in found]
             held = self._stored_row(device, wider_s, start_s)
-            self._write(device, merged([*([held] if held else []), *rows], start_s, wider_s))
+            self._write(device, merge_rows([*([held] if held else []), *rows], start_s, wider_s))
             self._db.execute(f"DELETE FROM row WHERE {where}", bucket)
         return True
 
     # --- events
 
-    def _put_event(self, device: int, event: PastEvent) -> None:
+    def _put_event(self, device: int, event: StoredEvent) -> None:
         """Insert an event."""
         self._db.execute(
             "INSERT INTO event (device, t, kind, axis, since, sigma, stands_for, what, text)"
@@ -304,7 +304,7 @@ class Store:
                 event.axis,
                 event.since_s,
                 event.sigma,
-                event.stands_for,
+                event.represented_events,
                 _encode_values(event.what),
                 event.text[:MAX_TEXT_LENGTH],
             ),
@@ -312,12 +312,12 @@ class Store:
 
     def _thin_events(self, device: int) -> int:
         """Thin the events of a device by day, month and year until half of the limit remains; 0 if they are few."""
-        if self._count_events(device) <= EVENTS_AT_MOST:
+        if self._count_events(device) <= MAX_EVENTS:
             return 0
         for span_s in EVENT_THINNING_SPANS_S:
             with self._transaction():
                 self._thin_events_by_span(device, span_s)
-            if self._count_events(device) <= EVENTS_AT_MOST // 2:
+            if self._count_events(device) <= MAX_EVENTS // 2:
                 break
         return 1
 
@@ -388,7 +388,7 @@ class Store:
             raise
 
 
-class Reader:
+class HistoryReader:
     """Reader of a history file; all its results belong to one moment. Created by ``reading``."""
 
     def __init__(self, db: sqlite3.Connection, path: Path) -> None:
@@ -400,7 +400,7 @@ class Reader:
         """Return the names of all devices in the file, sorted."""
         return tuple(name for (name,) in self._db.execute("SELECT name FROM device ORDER BY name"))
 
-    def held(self, device: str) -> tuple[float, float] | None:
+    def stored_range(self, device: str) -> tuple[float, float] | None:
         """Return the start and end of the stored rows of a device (Unix time [s]); None if there are no rows."""
         return _stored_span(self._db, self._id(device))
 
@@ -410,7 +410,7 @@ class Reader:
         found = [self._db.execute(query, (self._id(device), width_s)).fetchone() for width_s, _ in LEVELS]
         return max((one[0] for one in found if one is not None), default=math.nan)
 
-    def rows(self, device: str, span: Span) -> Iterator[Row]:
+    def rows(self, device: str, span: TimeRange) -> Iterator[HistoryRow]:
         """Iterate over the rows that overlap a time range: the widest level first, each level in order of time.
 
         Parameters
@@ -427,10 +427,10 @@ class Reader:
             )
             for one in found:
                 row = self._layouts.row(one)
-                if span.touches(row.start_s, row.end_s):
+                if span.overlaps(row.start_s, row.end_s):
                     yield row
 
-    def events(self, device: str, span: Span, at_most: int) -> tuple[list[PastEvent], int]:
+    def events(self, device: str, span: TimeRange, at_most: int) -> tuple[list[StoredEvent], int]:
         """Return the newest events in a time range, in order of time, and the number of all events in it.
 
         Parameters
@@ -450,9 +450,9 @@ class Reader:
             (*bounds, at_most + 2),  # events exactly at the ends may be excluded by the time range
         ).fetchall()
         events = [
-            PastEvent(t, kind, text, axis, _decode_values(what), since, sigma, stands_for)
+            StoredEvent(t, kind, text, axis, _decode_values(what), since, sigma, stands_for)
             for t, kind, text, axis, what, since, sigma, stands_for in found
-            if span.holds(t)
+            if span.contains(t)
         ]
         (count,) = self._db.execute(f"SELECT count(*) FROM event WHERE {where}", bounds).fetchone()
         return events[:at_most][::-1], max(int(count), len(events[:at_most]))
@@ -464,7 +464,7 @@ class Reader:
 
 
 @contextlib.contextmanager
-def reading(path: Path) -> Iterator[Reader]:
+def open_history(path: Path) -> Iterator[HistoryReader]:
     """Open a history file for reading, without changing it.
 
     Raises
@@ -481,10 +481,10 @@ def reading(path: Path) -> Iterator[Reader]:
         raise RecordingError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
     try:
         with _damage_as_unusable(path), contextlib.closing(_open_read_only(path)) as db:
-            if not check(db, path):
+            if not is_history(db, path):
                 raise RecordingError(f"{path}: nothing is in it yet")
             db.execute("BEGIN")
-            yield Reader(db, path)
+            yield HistoryReader(db, path)
     except sqlite3.OperationalError as error:
         raise RecordingError(f"{path}: cannot be read: {error}") from error
 
@@ -502,7 +502,7 @@ def _stored_span(db: sqlite3.Connection, device: int) -> tuple[float, float] | N
     return (float(min(starts)), float(max(ends))) if starts else None
 
 
-def check(db: sqlite3.Connection, path: Path) -> bool:
+def is_history(db: sqlite3.Connection, path: Path) -> bool:
     """Return True if the database is a history, and False if it is empty.
 
     Parameters
@@ -531,7 +531,7 @@ def check(db: sqlite3.Connection, path: Path) -> bool:
         return False
     tables = {name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if missing := sorted(TABLES - tables):
-        raise UnusableHistory(f"{path}: damaged: it has no table {', '.join(missing)}; {MOVE}")
+        raise UnusableHistory(f"{path}: damaged: it has no table {', '.join(missing)}; {MOVE_HINT}")
     return True
 
 
@@ -557,7 +557,7 @@ class _LayoutCache:
             self._ids[names] = int(found)
         return self._ids[names]
 
-    def row(self, found: Sequence[Any]) -> Row:
+    def row(self, found: Sequence[Any]) -> HistoryRow:
         """Convert the selected database columns into a row."""
         start, width, newest, layout, received, lost, bad, overflowed, state, data = found
         whole = (start, width, layout, received, lost, bad, overflowed, state)
@@ -567,12 +567,12 @@ class _LayoutCache:
             raise RecordingError(f"a row of {width} s in state {state}")
         if layout not in self._names:
             text = self._db.execute("SELECT names FROM layout WHERE id = ?", (layout,)).fetchone()
-            if text is None or len(text[0]) > 64 * NUMBERS_AT_MOST:
+            if text is None or len(text[0]) > 64 * MAX_COLUMNS:
                 raise RecordingError(f"a row names numbers ({layout}) that are not known")
             self._names[layout] = tuple(text[0].split())
         names = self._names[layout]
         counts = (received, lost, bad, overflowed)
-        return Row(start, width, newest, names, *unpack(data, len(names)), counts, state)
+        return HistoryRow(start, width, newest, names, *unpack_statistics(data, len(names)), counts, state)
 
 
 def _open_read_only(path: Path) -> sqlite3.Connection:
@@ -581,7 +581,9 @@ def _open_read_only(path: Path) -> sqlite3.Connection:
     if not Path(f"{path}-wal").exists():
         options.append("mode=ro&immutable=1")
     for option in options:
-        db = sqlite3.connect(f"{path.resolve().as_uri()}?{option}", uri=True, timeout=BUSY_S, isolation_level=None)
+        db = sqlite3.connect(
+            f"{path.resolve().as_uri()}?{option}", uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None
+        )
         try:
             db.execute("SELECT count(*) FROM sqlite_master").fetchone()
         except sqlite3.OperationalError:
@@ -609,7 +611,7 @@ def _file_states(path: Path) -> tuple[_FileState | None, _FileState | None]:
 
 def _check_files(path: Path) -> None:
     """Raise OSError if the file, or a file that SQLite keeps next to it, is not a regular file."""
-    for end in ("", *BESIDE):
+    for end in ("", *SQLITE_SUFFIXES):
         with contextlib.suppress(FileNotFoundError):
             check_regular(Path(f"{path}{end}"))
 
@@ -624,9 +626,9 @@ def _damage_as_unusable(path: Path) -> Iterator[None]:
     except RecordingError as error:
         if str(error).startswith(str(path)):
             raise
-        raise UnusableHistory(f"{path}: damaged: {error}; {MOVE}") from error
+        raise UnusableHistory(f"{path}: damaged: {error}; {MOVE_HINT}") from error
     except (sqlite3.DatabaseError, msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise UnusableHistory(f"{path}: damaged: {error}; {MOVE}") from error
+        raise UnusableHistory(f"{path}: damaged: {error}; {MOVE_HINT}") from error
 
 
 def _clamp_time(t_s: float) -> float:

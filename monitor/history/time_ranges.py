@@ -35,7 +35,7 @@ _NOW: Final = re.compile(r"now\(\s*([+-]?)\s*([^)]*)\)")
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
+class TimeRange:
     """A time range from ``start_s`` to ``end_s`` in Unix seconds; an open end is infinite.
 
     >>> Span(10.0, 20.0).holds(20.0), Span(10.0, 20.0, end_in=False).holds(20.0)
@@ -44,24 +44,24 @@ class Span:
 
     start_s: float
     end_s: float
-    start_in: bool = True  # True if the range includes its start
-    end_in: bool = True  # True if the range includes its end
+    start_included: bool = True  # True if the range includes its start
+    end_included: bool = True  # True if the range includes its end
 
-    def holds(self, t_s: float) -> bool:
+    def contains(self, t_s: float) -> bool:
         """Return True if the time range contains ``t_s``."""
-        after = t_s >= self.start_s if self.start_in else t_s > self.start_s
-        before = t_s <= self.end_s if self.end_in else t_s < self.end_s
+        after = t_s >= self.start_s if self.start_included else t_s > self.start_s
+        before = t_s <= self.end_s if self.end_included else t_s < self.end_s
         return after and before
 
-    def zenoh(self) -> str:
+    def to_zenoh(self) -> str:
         """Return the range in the notation of zenoh; ends before 1970 are left open, as no results are older."""
         ends = [
             "" if not 0.0 <= one < MAX_DATE_S else f"{datetime.fromtimestamp(one, UTC):%Y-%m-%dT%H:%M:%S.%fZ}"
             for one in (self.start_s, self.end_s)
         ]
-        return f"{'[' if self.start_in else ']'}{'..'.join(ends)}{']' if self.end_in else '['}"
+        return f"{'[' if self.start_included else ']'}{'..'.join(ends)}{']' if self.end_included else '['}"
 
-    def touches(self, start_s: float, end_s: float) -> bool:
+    def overlaps(self, start_s: float, end_s: float) -> bool:
         """Return True if the range overlaps the row from ``start_s`` (included) to ``end_s`` (excluded).
 
         >>> Span(60.0, 120.0).touches(0.0, 60.0), Span(60.0, 120.0).touches(120.0, 180.0)
@@ -74,11 +74,11 @@ class Span:
         end_s
             End of the row, Unix time [s].
         """
-        before = start_s <= self.end_s if self.end_in else start_s < self.end_s
+        before = start_s <= self.end_s if self.end_included else start_s < self.end_s
         return before and end_s > self.start_s
 
 
-def zenoh_span(text: str, now_s: float) -> Span:
+def parse_zenoh_range(text: str, now_s: float) -> TimeRange:
     """Parse the ``_time`` parameter of a zenoh selector.
 
     >>> zenoh_span("[now(-1h)..now()]", 7200.0)
@@ -114,10 +114,10 @@ def zenoh_span(text: str, now_s: float) -> Span:
         raise ConfigError(f'_time: "{_short(text)}" has no end; write [<start>..<end>] or [<start>;<duration>]')
     if end_s < start_s:
         raise ConfigError(f'_time: "{_short(text)}" ends before it begins')
-    return Span(start_s, end_s, start_in, end_in)
+    return TimeRange(start_s, end_s, start_in, end_in)
 
 
-def moment(text: str, now_s: float) -> float:
+def parse_time(text: str, now_s: float) -> float:
     """Parse a time as a user writes it, and return Unix time [s].
 
     >>> moment("-1d", 90_000.0), moment("1970-01-02", 0.0), moment("1970-01-01T00:01:30Z", 0.0)
@@ -145,7 +145,7 @@ def moment(text: str, now_s: float) -> float:
     return _instant(text)
 
 
-def length(text: str) -> float:
+def parse_duration_s(text: str) -> float:
     """Parse a duration above zero, and return it in seconds.
 
     >>> length("15min"), length("1d"), length("90")
@@ -162,7 +162,7 @@ def length(text: str) -> float:
     return seconds
 
 
-def said(t_s: float) -> str:
+def format_utc(t_s: float) -> str:
     """Format a Unix time [s] as date and time in UTC.
 
     >>> said(90.0)

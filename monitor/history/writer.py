@@ -29,26 +29,35 @@ import structlog
 
 from drivers.errors import RecordingError
 from monitor.common.folder_lock import HISTORY_LOCK, FolderLock
-from monitor.history.bucket import Row
-from monitor.history.sqlite_store import BESIDE, DELETED, EMPTIED, MOVE, REPLACED, PastEvent, Store, UnusableHistory
+from monitor.history.bucket import HistoryRow
+from monitor.history.sqlite_store import (
+    DELETED,
+    EMPTIED,
+    MOVE_HINT,
+    REPLACED,
+    SQLITE_SUFFIXES,
+    HistoryStore,
+    StoredEvent,
+    UnusableHistory,
+)
 
-WAITING_AT_MOST: Final = 4096
+QUEUE_CAPACITY: Final = 4096
 """Capacity of the queue in rows and events: three days of a full disk with one device, about 12 MB."""
 RETRY_S: Final = 5.0
 CHECK_S: Final = 10.0
 """Interval between two checks that the file still exists, if there is nothing to write."""
-ASIDE_AT_MOST: Final = 10
+MAX_RENAMED_FILES: Final = 10
 """Largest number of renamed files; beyond it, an unusable file is left in place until a user intervenes."""
 BATCH_SIZE: Final = 256
 MERGES_PER_STEP: Final = 50
 CLOSE_TIMEOUT_S: Final = 10.0
-ASIDE: Final = ".aside-"
+RENAMED_SUFFIX: Final = ".aside-"
 """Separator between the name of a history file and the time at which it was renamed."""
 
 _log = structlog.get_logger("imu-monitor")
 
 
-class Writer:
+class HistoryWriter:
     """Background writer of one history file.
 
     Parameters
@@ -71,11 +80,11 @@ class Writer:
         self._resumed_devices: set[str] | None = (
             None  # devices whose first row has been discarded; None: discard nothing
         )
-        self._waiting: deque[tuple[str, Row | PastEvent]] = deque()
+        self._waiting: deque[tuple[str, HistoryRow | StoredEvent]] = deque()
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._closing = threading.Event()
-        self._store: Store | None = None
+        self._store: HistoryStore | None = None
         self._thread = threading.Thread(target=self._run, name="history", daemon=True)
 
     @property
@@ -91,7 +100,7 @@ class Writer:
         """Start the thread."""
         self._thread.start()
 
-    def put(self, device: str, row: Row | None) -> None:
+    def put_row(self, device: str, row: HistoryRow | None) -> None:
         """Queue a row for writing.
 
         Parameters
@@ -104,7 +113,7 @@ class Writer:
         if row is not None:
             self._push(device, row)
 
-    def tell(self, device: str, event: PastEvent) -> None:
+    def put_event(self, device: str, event: StoredEvent) -> None:
         """Queue an event for writing.
 
         Parameters
@@ -125,22 +134,22 @@ class Writer:
             if self._thread.is_alive():
                 _log.warning("history did not end in time", path=str(self.path))
 
-    def _push(self, device: str, what: Row | PastEvent) -> None:
+    def _push(self, device: str, what: HistoryRow | StoredEvent) -> None:
         """Add an item to the queue; drop and count it if the queue is full."""
         with self._lock:
             if self._discards(device, what):
                 return
-            if len(self._waiting) >= WAITING_AT_MOST:
+            if len(self._waiting) >= QUEUE_CAPACITY:
                 self.dropped += 1
             else:
                 self._waiting.append((device, what))
         self._wake.set()
 
-    def _discards(self, device: str, what: Row | PastEvent) -> bool:
+    def _discards(self, device: str, what: HistoryRow | StoredEvent) -> bool:
         """Return True if another process stores this item."""
         if self._excluded:
             return True
-        if self._resumed_devices is None or device in self._resumed_devices or isinstance(what, PastEvent):
+        if self._resumed_devices is None or device in self._resumed_devices or isinstance(what, StoredEvent):
             return False
         self._resumed_devices.add(device)
         return True
@@ -174,11 +183,15 @@ class Writer:
             self._resume()
             store = self._current_store()
             while batch := self._next_batch():
-                rows = [(device, what) for device, what in batch if isinstance(what, Row)]
-                events = [(device, what) for device, what in batch if isinstance(what, PastEvent)]
+                rows = [(device, what) for device, what in batch if isinstance(what, HistoryRow)]
+                events = [(device, what) for device, what in batch if isinstance(what, StoredEvent)]
                 store.add(rows, events)
                 self._remove_written(len(batch))
-            while store.thin(self._now_s(), MERGES_PER_STEP) and not self._waiting and not self._closing.is_set():
+            while (
+                store.merge_old_rows(self._now_s(), MERGES_PER_STEP)
+                and not self._waiting
+                and not self._closing.is_set()
+            ):
                 pass
         except UnusableHistory as error:
             self._close_store()
@@ -208,13 +221,13 @@ class Writer:
             with self._lock:
                 self._excluded, self._resumed_devices = False, set()
 
-    def _current_store(self) -> Store:
+    def _current_store(self) -> HistoryStore:
         """Return the open store; reopen it if another program has changed the file."""
-        change = "" if self._store is None else self._store.change()
+        change = "" if self._store is None else self._store.external_change()
         if change:
             self._close_store()
         if self._store is None:
-            self._store = Store(self.path)
+            self._store = HistoryStore(self.path)
         if change in (DELETED, EMPTIED):
             self._set_note(f"{self.path} {change}; a new one was begun")
         elif change == REPLACED:
@@ -223,25 +236,32 @@ class Writer:
 
     def _move_aside(self, error: UnusableHistory) -> bool:
         """Rename an unusable file, and return True if a new one can be created."""
-        taken = {one.name for one in self.path.parent.iterdir() if one.name.startswith(f"{self.path.name}{ASIDE}")}
-        if sum(not name.endswith(BESIDE) for name in taken) >= ASIDE_AT_MOST:
-            self._set_error(f"{error}; {ASIDE_AT_MOST} such files are kept already: look at {self.path.name}{ASIDE}*")
+        taken = {
+            one.name for one in self.path.parent.iterdir() if one.name.startswith(f"{self.path.name}{RENAMED_SUFFIX}")
+        }
+        if sum(not name.endswith(SQLITE_SUFFIXES) for name in taken) >= MAX_RENAMED_FILES:
+            self._set_error(
+                f"{error}; {MAX_RENAMED_FILES} such files are kept already: look at {self.path.name}{RENAMED_SUFFIX}*"
+            )
             return False
         when = datetime.fromtimestamp(self._now_s(), UTC)
-        name = f"{self.path.name}{ASIDE}{when:%Y-%m-%dT%H-%M-%SZ}"
+        name = f"{self.path.name}{RENAMED_SUFFIX}{when:%Y-%m-%dT%H-%M-%SZ}"
         name = next(one for one in chain([name], (f"{name}.{i}" for i in count(2))) if one not in taken)
         try:
-            for end in (*BESIDE, ""):  # SQLite would use the old companion files for a new database of the same name
+            for end in (
+                *SQLITE_SUFFIXES,
+                "",
+            ):  # SQLite would use the old companion files for a new database of the same name
                 with contextlib.suppress(FileNotFoundError):
                     os.rename(f"{self.path}{end}", self.path.with_name(f"{name}{end}"))
         except OSError as failed:
             self._set_error(f"{error}; it cannot be moved: {_error_text(failed)}")
             return False
-        why = str(error).removesuffix(f"; {MOVE}")
+        why = str(error).removesuffix(f"; {MOVE_HINT}")
         self._set_note(f"{why}; it was moved to {name}, and a new one was begun")
         return True
 
-    def _next_batch(self) -> list[tuple[str, Row | PastEvent]]:
+    def _next_batch(self) -> list[tuple[str, HistoryRow | StoredEvent]]:
         """Return the next items of the queue without removing them."""
         with self._lock:
             return [self._waiting[i] for i in range(min(BATCH_SIZE, len(self._waiting)))]

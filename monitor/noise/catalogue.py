@@ -17,7 +17,7 @@ def read_model(path: Path) -> NoiseModel:
         If the file cannot be read or is not valid. Each line names the file and the place in it.
     """
     try:
-        return NoiseModel.from_toml(file_access.read(path).decode("utf-8"))
+        return NoiseModel.from_toml(file_access.read_small_file(path).decode("utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
@@ -26,7 +26,7 @@ def read_model(path: Path) -> NoiseModel:
         raise ConfigError(*(f"{path}: {line}" for line in error.lines)) from error
 
 
-def load(name: str, folder: Path) -> NoiseModel:
+def load_model(name: str, folder: Path) -> NoiseModel:
     """Return a model of the catalogue by its name, or the model in a file.
 
     Parameters

@@ -24,7 +24,7 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from drivers.discovery import nearest
+from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
 from drivers.quantities import DELAY_S, EFFECT_FREQUENCY_HZ, PARAMETER
 from drivers.sample import AXES, Floats
@@ -38,7 +38,7 @@ GYROS, ACCELEROMETERS = AXES[:3], AXES[3:]
 
 
 @dataclass(slots=True)
-class Block:
+class SampleBlockContext:
     """Block of samples that is being simulated."""
 
     first: int  # index of the first sample, counted from the start of the stream
@@ -46,11 +46,11 @@ class Block:
     scratch: Floats  # [n] work array, free for use during a call
 
 
-class Series(ABC):
+class NoiseSeries(ABC):
     """Endless time series of a source."""
 
     @abstractmethod
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         """Add the next ``values.size`` samples (at least one) to the values, in the unit of the axis.
 
         Parameters
@@ -73,7 +73,7 @@ class Series(ABC):
         """
         values = np.zeros(n)
         if n:
-            self.add(values, Block(first, np.full(n, np.nan), np.empty(n)))
+            self.add(values, SampleBlockContext(first, np.full(n, np.nan), np.empty(n)))
         return values
 
     def truth(self) -> dict[str, Any]:
@@ -81,7 +81,7 @@ class Series(ABC):
         return {}
 
 
-class Running(ABC):
+class RunningTransform(ABC):
     """Transform that runs on one axis."""
 
     @abstractmethod
@@ -105,7 +105,7 @@ class Effect(ABC):
     __slots__ = ()
 
     name: ClassVar[str]
-    means: ClassVar[str]  # one sentence that explains the effect to users
+    description: ClassVar[str]  # one sentence that explains the effect to users
 
     def __post_init__(self) -> None:
         for f in fields(self):  # type: ignore[arg-type]
@@ -150,7 +150,7 @@ class Source(Effect):
         """
 
     @abstractmethod
-    def start(self, rate_hz: float, rng: np.random.Generator) -> Series:
+    def start(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Return a new series.
 
         Parameters
@@ -186,12 +186,12 @@ class Transform(Effect):
     __slots__ = ()
 
     @abstractmethod
-    def reshape(self, spectrum: Spectrum) -> Spectrum:
+    def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum and Allan variance after the transform; NaN if there is neither a closed form nor an
         integral."""
 
     @abstractmethod
-    def start(self, rate_hz: float, rng: np.random.Generator) -> Running:
+    def start(self, rate_hz: float, rng: np.random.Generator) -> RunningTransform:
         """Return a new running transform.
 
         Parameters
@@ -246,17 +246,17 @@ def source_axis() -> Any:
     return field(metadata={"units": ("axis", "axis"), "axis": True})
 
 
-def units(effect: type[Effect]) -> Mapping[str, tuple[str, str]]:
+def parameter_units(effect: type[Effect]) -> Mapping[str, tuple[str, str]]:
     """Return the units of every parameter of an effect: on a gyroscope, and on an accelerometer."""
     return {f.name: f.metadata["units"] for f in fields(effect)}  # type: ignore[arg-type]
 
 
-def required(effect: type[Effect]) -> tuple[str, ...]:
+def required_parameters(effect: type[Effect]) -> tuple[str, ...]:
     """Return the parameters that a model file must give."""
     return tuple(f.name for f in fields(effect) if f.default is MISSING)  # type: ignore[arg-type]
 
 
-def below_nyquist(effect: Effect, parameter: str, rate_hz: float) -> None:
+def check_below_nyquist(effect: Effect, parameter: str, rate_hz: float) -> None:
     """Check that a frequency is below half the sample rate.
 
     Parameters
@@ -343,4 +343,4 @@ def _check_parameter(effect: str, name: str, value: Any, allows: Mapping[str, An
 
 def _suggestion(value: Any) -> str:
     """Return the hint with the nearest axis name, if the value is a string."""
-    return nearest(value, AXES) if isinstance(value, str) else ""
+    return format_suggestion(value, AXES) if isinstance(value, str) else ""

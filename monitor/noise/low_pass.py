@@ -4,10 +4,10 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import Running
+from monitor.noise.effect import RunningTransform
 
 
-def butterworth(order: int, cutoff_hz: float, rate_hz: float) -> Floats:
+def butterworth_sections(order: int, cutoff_hz: float, rate_hz: float) -> Floats:
     """Return the second-order sections [n, 5] of a digital Butterworth low-pass: b0, b1, b2, a1, a2, with unit gain at
     f = 0.
 
@@ -39,7 +39,7 @@ def butterworth(order: int, cutoff_hz: float, rate_hz: float) -> Floats:
     return np.array(sections)
 
 
-class LowPass(Running):
+class LowPass(RunningTransform):
     """Low-pass filter that is settled at its first sample.
 
     Parameters

@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drivers.discovery import nearest
+from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Floats
 from monitor.noise import model_file
 from monitor.noise.effect import Effect, Leak, Source, Transform
-from monitor.noise.effects import ORDER
+from monitor.noise.effects import TRANSFORM_ORDER
 from monitor.noise.effects.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.noise_step import NoiseStep
 from monitor.noise.effects.sample_rate_error import SampleRateError
-from monitor.noise.spectrum import Spectrum, nothing, unknown
+from monitor.noise.spectrum import Spectrum, undefined_spectrum, zero_spectrum
 from monitor.noise.temperature import Temperature
 
 if TYPE_CHECKING:
@@ -67,9 +67,9 @@ class NoiseModel:
     def __post_init__(self) -> None:
         for axis, effects in self.effects.items():
             if axis not in AXES:
-                raise ConfigError(f'unknown axis "{axis}"{nearest(axis, AXES)}')
+                raise ConfigError(f'unknown axis "{axis}"{format_suggestion(axis, AXES)}')
             for effect in effects:
-                with model_file.placed(f"{axis}.{effect.name}"):
+                with model_file.error_location(f"{axis}.{effect.name}"):
                     effect.check_axis(axis)
         ratios = sorted({effect.ratio for _, effect in self if isinstance(effect, SampleRateError)})
         if len(ratios) > 1:
@@ -95,7 +95,7 @@ class NoiseModel:
         return NoiseModel(added, self.sample_rate_hz or other.sample_rate_hz, self.temperature or other.temperature)
 
     def __str__(self) -> str:
-        return model_file.table(self)
+        return model_file.format_table(self)
 
     @property
     def sources(self) -> Mapping[str, tuple[Source, ...]]:
@@ -126,7 +126,7 @@ class NoiseModel:
         tau0_s : float
             Stated sample interval, s.
         """
-        return self.spectrum(axis, tau0_s).allan(np.asarray(tau_s, np.float64))
+        return self.spectrum(axis, tau0_s).avar(np.asarray(tau_s, np.float64))
 
     def psd(self, axis: str, f_hz: Floats, tau0_s: float) -> Floats:
         """Return the two-sided spectrum of one axis in unit²/Hz, up to half the sample rate, without lines and slopes.
@@ -166,23 +166,23 @@ class NoiseModel:
         """Return the spectrum of the axis' own sources."""
         effects = self.effects.get(axis, ())
         stepped = any(isinstance(effect, NoiseStep) for effect in effects)
-        total = nothing(tau0_s)
+        total = zero_spectrum(tau0_s)
         for effect in effects:
             if isinstance(effect, Source):
                 once = stepped and isinstance(effect, AngleRandomWalk)
-                total += unknown(tau0_s) if once else effect.spectrum(tau0_s)
+                total += undefined_spectrum(tau0_s) if once else effect.spectrum(tau0_s)
         return total
 
     def _measured(self, axis: str, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum after all transforms of the axis."""
         for transform in self.transforms(axis):
-            spectrum = transform.reshape(spectrum)
+            spectrum = transform.transform_spectrum(spectrum)
         return spectrum
 
     def transforms(self, axis: str) -> list[Transform]:
         """Return the transforms of an axis in the order in which they act."""
         found = [effect for effect in self.effects.get(axis, ()) if isinstance(effect, Transform)]
-        return sorted(found, key=lambda transform: ORDER.index(type(transform)))
+        return sorted(found, key=lambda transform: TRANSFORM_ORDER.index(type(transform)))
 
     # --- time series
 
@@ -203,7 +203,7 @@ class NoiseModel:
             noise, or a required temperature is missing.
         """
         for axis, effect in self:
-            with model_file.placed(f"{axis}.{effect.name}"):
+            with model_file.error_location(f"{axis}.{effect.name}"):
                 effect.check_rate(rate_hz * self.rate_ratio)
                 if isinstance(effect, Leak) and not self.effects.get(effect.source):
                     raise ConfigError(f"the model has no effect on its source {effect.source}")
@@ -259,7 +259,7 @@ class NoiseModel:
         ConfigError
             If the text is not valid. The message names the place in the file.
         """
-        effects, rate_hz, temperature = model_file.read(text)
+        effects, rate_hz, temperature = model_file.parse_model(text)
         model = cls(sample_rate_hz=rate_hz, temperature=temperature)
         for axes, given in effects:
             model += cls(dict.fromkeys(axes, given))
@@ -269,4 +269,4 @@ class NoiseModel:
 
     def to_toml(self) -> str:
         """Return the model as text; ``from_toml`` reads it back to an equal model."""
-        return model_file.write(self)
+        return model_file.format_model(self)

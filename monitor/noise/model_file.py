@@ -10,13 +10,13 @@ from collections.abc import Iterator
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Final
 
-from drivers.discovery import nearest
+from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
 from drivers.quantities import RATE_HZ
 from drivers.sample import AXES
-from monitor.noise.effect import GYROS, Effect, required, units
+from monitor.noise.effect import GYROS, Effect, parameter_units, required_parameters
 from monitor.noise.effects import EFFECTS
-from monitor.noise.temperature import UNITS, Temperature
+from monitor.noise.temperature import TEMPERATURE_UNITS, Temperature
 from monitor.settings import toml_text
 
 if TYPE_CHECKING:
@@ -29,11 +29,11 @@ AXIS_KEYS: Final = (*AXES, *WILDCARDS)
 TOP_LEVEL_KEYS: Final = ("sample_rate", "temperature")
 """Other keys of a model file."""
 
-Placed = tuple[tuple[str, ...], tuple[Effect, ...]]
+AxisEffects = tuple[tuple[str, ...], tuple[Effect, ...]]
 """Names of axes, and the effects that each of them has."""
 
 
-def read(text: str) -> tuple[list[Placed], float | None, Temperature | None]:
+def parse_model(text: str) -> tuple[list[AxisEffects], float | None, Temperature | None]:
     """Return the effects, the sample rate in Hz and the temperature of a model file's text.
 
     Raises
@@ -48,13 +48,13 @@ def read(text: str) -> tuple[list[Placed], float | None, Temperature | None]:
         with _collect_errors(mistakes):
             if isinstance(rate_hz, bool) or not isinstance(rate_hz, int | float):
                 raise ConfigError(f"sample_rate must be a number of Hz, is {rate_hz!r}")
-            with placed("sample_rate"):
+            with error_location("sample_rate"):
                 RATE_HZ.check(rate_hz)
     temperature = None
     with _collect_errors(mistakes):
         given = tables.pop("temperature", None)
         temperature = None if given is None else Temperature.from_table(given)
-    effects: list[Placed] = []
+    effects: list[AxisEffects] = []
     for axis, given in tables.items():
         with _collect_errors(mistakes):
             effects.append((WILDCARDS.get(axis, (axis,)), tuple(_parse_axis(axis, given, mistakes))))
@@ -63,7 +63,7 @@ def read(text: str) -> tuple[list[Placed], float | None, Temperature | None]:
     return effects, None if rate_hz is None else float(rate_hz), temperature
 
 
-def write(model: "NoiseModel") -> str:
+def format_model(model: "NoiseModel") -> str:
     """Return the text of a model file."""
     lines = [] if model.sample_rate_hz is None else [f"sample_rate = {float(model.sample_rate_hz)!r}"]
     if model.temperature is not None:
@@ -78,7 +78,7 @@ def write(model: "NoiseModel") -> str:
     return "\n".join(lines).lstrip() + "\n"
 
 
-def table(model: "NoiseModel") -> str:
+def format_table(model: "NoiseModel") -> str:
     """Return a table for display, with one line per effect: axis, name, and parameters with units.
 
     Sample rate and temperature stand above the table.
@@ -86,7 +86,9 @@ def table(model: "NoiseModel") -> str:
     head = [] if model.sample_rate_hz is None else [f"sample rate {model.sample_rate_hz:g} Hz"]
     if model.temperature is not None:
         known = [(name, value) for name, value in _set_fields(model.temperature)]
-        head.append("temperature " + ", ".join(f"{name} = {value:g} {UNITS[name]}" for name, value in known))
+        head.append(
+            "temperature " + ", ".join(f"{name} = {value:g} {TEMPERATURE_UNITS[name]}" for name, value in known)
+        )
     rows = [("axis", "effect", "parameters")]
     rows += [(axis, effect.name, _format_parameters(axis, effect)) for axis, effect in model]
     width = max(len(name) for _, name, _ in rows)
@@ -94,7 +96,7 @@ def table(model: "NoiseModel") -> str:
 
 
 @contextlib.contextmanager
-def placed(place: str) -> Iterator[None]:
+def error_location(place: str) -> Iterator[None]:
     """Add the place in the file to a ConfigError that is raised inside the context."""
     try:
         yield
@@ -114,7 +116,7 @@ def _collect_errors(mistakes: list[str]) -> Iterator[None]:
 def _format_parameters(axis: str, effect: Effect) -> str:
     """Return the parameters of an effect with their units."""
     kind = 0 if axis in GYROS else 1
-    unit = {name: pair[kind] for name, pair in units(type(effect)).items()}
+    unit = {name: pair[kind] for name, pair in parameter_units(type(effect)).items()}
     words = {"1": "", "axis": ""}
     said = [
         f"{name} = {value if isinstance(value, str) else format(value, 'g')} {words.get(unit[name], unit[name])}"
@@ -144,12 +146,12 @@ def _parse_axis(axis: str, effects: Any, mistakes: list[str]) -> Iterator[Effect
     """Yield the effects of one axis, and collect the mistakes."""
     if axis not in AXIS_KEYS:
         what = "axis" if isinstance(effects, dict) else "key"
-        raise ConfigError(f'unknown {what} "{axis}"{nearest(axis, (*AXIS_KEYS, *TOP_LEVEL_KEYS))}')
+        raise ConfigError(f'unknown {what} "{axis}"{format_suggestion(axis, (*AXIS_KEYS, *TOP_LEVEL_KEYS))}')
     if not isinstance(effects, dict):
         raise ConfigError(f"{axis} must be a table of effects, such as [{axis}.angle_random_walk]")
     for name, given in effects.items():
         if name not in EFFECTS:
-            mistakes.append(f'{axis}: unknown effect "{name}"{nearest(name, tuple(EFFECTS))}')
+            mistakes.append(f'{axis}: unknown effect "{name}"{format_suggestion(name, tuple(EFFECTS))}')
             continue
         for parameters in given if isinstance(given, list) else [given]:
             with _collect_errors(mistakes):
@@ -158,16 +160,20 @@ def _parse_axis(axis: str, effects: Any, mistakes: list[str]) -> Iterator[Effect
 
 def _parse_effect(place: str, effect: type[Effect], parameters: Any) -> Effect:
     """Return the effect of one table."""
-    known = tuple(units(effect))
+    known = tuple(parameter_units(effect))
     if not isinstance(parameters, dict):
         raise ConfigError(f"{place} must be a table with {', '.join(known)}")
     mistakes = [
-        f'{place}: unknown parameter "{name}"{nearest(name, known)}' for name in parameters if name not in known
+        f'{place}: unknown parameter "{name}"{format_suggestion(name, known)}'
+        for name in parameters
+        if name not in known
     ]
     # A misspelt parameter is also missing, but one line is enough.
-    mistakes = mistakes or [f"{place}: {name} is missing" for name in required(effect) if name not in parameters]
+    mistakes = mistakes or [
+        f"{place}: {name} is missing" for name in required_parameters(effect) if name not in parameters
+    ]
     if mistakes:
         raise ConfigError(*mistakes)
-    with placed(place):
+    with error_location(place):
         return effect(**parameters)
     raise AssertionError  # not reached: the context manager does not suppress exceptions

@@ -17,7 +17,7 @@ MAX_LISTED_EVENTS: Final = 1000
 """Largest number of events whose times are listed. Later events are only counted."""
 
 
-class Events:
+class RandomEvents:
     """Random events in the order of time.
 
     Parameters

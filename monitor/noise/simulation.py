@@ -19,24 +19,33 @@ from zlib import crc32
 
 import numpy as np
 
-from drivers.discovery import nearest
+from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Floats
-from monitor.noise.effect import Block, Effect, Leak, Running, Series, Source, Transform, first_sample
-from monitor.noise.effects import ORDER
+from monitor.noise.effect import (
+    Effect,
+    Leak,
+    NoiseSeries,
+    RunningTransform,
+    SampleBlockContext,
+    Source,
+    Transform,
+    first_sample,
+)
+from monitor.noise.effects import TRANSFORM_ORDER
 from monitor.noise.effects.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.noise_step import NoiseStep
 from monitor.noise.effects.sample_rate_error import SampleRateError
 from monitor.noise.model import NoiseModel
-from monitor.noise.model_file import placed
-from monitor.noise.temperature import Recorded
+from monitor.noise.model_file import error_location
+from monitor.noise.temperature import RecordedTemperature
 
 PIECE_SAMPLES: Final = 2048
 """Samples simulated at once. Six axes of them, with their work arrays, stay in the cache of a processor core."""
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class SimulatedSamples:
     """Simulated samples with their temperature."""
 
     values: Floats  # [n, 6] in AXES order, rad/s and m/s²
@@ -67,7 +76,7 @@ class ModelStream:
         self._seed = seed
         self._count = 0  # number of samples drawn so far
         self._occurrences: Counter[tuple[str, str]] = Counter()
-        self._truths: list[tuple[str, Effect, Series | Running]] = []
+        self._truths: list[tuple[str, Effect, NoiseSeries | RunningTransform]] = []
         self._temperature = self._temperature_series(temperature_c)
         self._axes = {axis: _AxisSimulator() for axis in AXES}
         for axis, effect in model:
@@ -75,11 +84,11 @@ class ModelStream:
 
     def draw(self, n: int) -> Floats:
         """Return the next ``n`` samples [n, 6] in rad/s and m/s²."""
-        return self.draw_all(n).values
+        return self.draw_with_temperature(n).values
 
-    def draw_all(self, n: int) -> Drawn:
+    def draw_with_temperature(self, n: int) -> SimulatedSamples:
         """Return the next ``n`` samples with their temperature."""
-        drawn = Drawn(np.empty((n, len(AXES))), np.full(n, np.nan))
+        drawn = SimulatedSamples(np.empty((n, len(AXES))), np.full(n, np.nan))
         for begin in range(0, n, PIECE_SAMPLES):
             piece = slice(begin, min(begin + PIECE_SAMPLES, n))
             self._advance(drawn.values[piece], drawn.temperature_c[piece])
@@ -104,7 +113,7 @@ class ModelStream:
             If the effect cannot be on that axis, at that rate, or in a running stream (a sample rate error).
         """
         if axis not in AXES:
-            raise ConfigError(f'unknown axis "{axis}"{nearest(axis, AXES)}')
+            raise ConfigError(f'unknown axis "{axis}"{format_suggestion(axis, AXES)}')
         if isinstance(effect, SampleRateError):
             raise ConfigError(f"{axis}.{effect.name}: the clock of a stream that runs cannot change")
         model = self._model + NoiseModel({axis: (effect,)})
@@ -125,10 +134,10 @@ class ModelStream:
                 truths.setdefault(axis, {}).setdefault(effect.name, []).append(truth)
         return truths
 
-    def _temperature_series(self, recorded_c: Floats | None) -> Series | None:
+    def _temperature_series(self, recorded_c: Floats | None) -> NoiseSeries | None:
         """Return the series of the temperature: recorded, from the model, or None."""
         if recorded_c is not None:
-            return Recorded(recorded_c)
+            return RecordedTemperature(recorded_c)
         generator = self._model.temperature
         return None if generator is None else generator.start(self._true_hz, self._rng("temperature", "", 0))
 
@@ -147,9 +156,9 @@ class ModelStream:
             line.leak(effect)
             self._axes[effect.source].leaks_out = True
         elif isinstance(effect, Transform):
-            with placed(f"{axis}.{effect.name}"):
+            with error_location(f"{axis}.{effect.name}"):
                 running = effect.start(self._true_hz, self._rng(axis, effect.name, occurrence))
-            line.insert(ORDER.index(type(effect)), running)
+            line.insert(TRANSFORM_ORDER.index(type(effect)), running)
             self._truths.append((axis, effect, running))
         else:
             raise TypeError(f"{effect.name} is no source, leak, noise step or transform")
@@ -162,7 +171,7 @@ class ModelStream:
     def _advance(self, values: Floats, temperature_c: Floats) -> None:
         """Simulate the next piece of all axes into ``values`` [n, 6] and ``temperature_c`` [n]."""
         n = temperature_c.size
-        block = Block(self._count, temperature_c, np.empty(n))
+        block = SampleBlockContext(self._count, temperature_c, np.empty(n))
         if self._temperature is not None:
             temperature_c[:] = 0.0
             self._temperature.add(temperature_c, block)
@@ -177,14 +186,14 @@ class _AxisSimulator:
     """Running effects of one axis."""
 
     def __init__(self) -> None:
-        self.white: list[Series] = []
-        self.others: list[Series] = []
+        self.white: list[NoiseSeries] = []
+        self.others: list[NoiseSeries] = []
         self.steps: list[tuple[int, float]] = []  # (index of the first sample, ratio)
         self.leaks: list[Leak] = []
         self.leaks_out = False
-        self._chain: list[tuple[int, Running]] = []  # (position in ORDER, transform), sorted
+        self._chain: list[tuple[int, RunningTransform]] = []  # (position in ORDER, transform), sorted
         self._alone: list[
-            tuple[int, Running]
+            tuple[int, RunningTransform]
         ] = []  # copies that act on the axis' own sources only; used if other axes leak into this one
 
     @property
@@ -192,7 +201,7 @@ class _AxisSimulator:
         """True if the measurement without leaks is needed now, or may be needed later by transforms with a state."""
         return self.leaks_out or bool(self.leaks)
 
-    def insert(self, place: int, running: Running) -> None:
+    def insert(self, place: int, running: RunningTransform) -> None:
         """Insert a transform after the others at its position in ORDER."""
         if self.leaks:
             self._alone.append((place, copy.deepcopy(running)))
@@ -206,7 +215,7 @@ class _AxisSimulator:
             self._alone = copy.deepcopy(self._chain)
         self.leaks.append(leak)
 
-    def sum(self, block: Block, n: int) -> Floats:
+    def sum(self, block: SampleBlockContext, n: int) -> Floats:
         """Return the sum [n] of the axis' own sources."""
         values = np.zeros(n)
         for series in self.white:
@@ -234,7 +243,7 @@ class _AxisSimulator:
         return _apply_transforms(self._chain, own)
 
 
-def _apply_transforms(chain: list[tuple[int, Running]], values: Floats) -> Floats:
+def _apply_transforms(chain: list[tuple[int, RunningTransform]], values: Floats) -> Floats:
     """Apply all transforms to the values in place, and return the values."""
     for _, running in chain:
         running.apply(values)

@@ -28,7 +28,7 @@ Curve = Callable[[Floats], Floats]
 
 POINTS_PER_DECADE: Final = 400
 """Points of the frequency grid per decade."""
-BELOW: Final = 1e-5
+MIN_FREQUENCY_CYCLES: Final = 1e-5
 """Lower end of the frequency grid, times the longest τ. For a random walk, 3·10⁻⁵ of σ² lies below it."""
 MAX_SMOOTH_CYCLES: Final = 0.1
 """Largest f·τ at which the kernel is smooth on the grid."""
@@ -39,7 +39,7 @@ class Spectrum:
     """Second moments of a sampled series."""
 
     density: Curve  # f (Hz) -> two-sided density, unit²/Hz, without lines and slope
-    closed: Curve | None  # τ (s) -> Allan variance, unit², including lines and slope; None after a filter
+    closed_form_avar: Curve | None  # τ (s) -> Allan variance, unit², including lines and slope; None after a filter
     tau0_s: float  # sample interval, s
     lines: tuple[tuple[float, float], ...] = ()  # (Hz, mean square in unit²) of sinusoids
     slope: float = 0.0  # root of the sum of squares of constant slopes, unit/s
@@ -48,7 +48,7 @@ class Spectrum:
 
     def __add__(self, other: "Spectrum") -> "Spectrum":
         """Return the spectrum of the sum of two independent series."""
-        one, two = self.closed, other.closed
+        one, two = self.closed_form_avar, other.closed_form_avar
         return Spectrum(
             lambda f: self.density(f) + other.density(f),
             None if one is None or two is None else lambda tau: one(tau) + two(tau),
@@ -61,11 +61,11 @@ class Spectrum:
 
     def scaled(self, factor: float) -> "Spectrum":
         """Return the spectrum of the series times ``factor``."""
-        power, closed = factor**2, self.closed
+        power, closed = factor**2, self.closed_form_avar
         return replace(
             self,
             density=lambda f: power * self.density(f),
-            closed=None if closed is None else lambda tau: power * closed(tau),
+            closed_form_avar=None if closed is None else lambda tau: power * closed(tau),
             lines=tuple((f, power * size) for f, size in self.lines),
             slope=abs(factor) * self.slope,
             level=factor * self.level,
@@ -84,7 +84,7 @@ class Spectrum:
         return replace(
             self,
             density=lambda f: gain(f) * self.density(f),
-            closed=None,
+            closed_form_avar=None,
             lines=tuple((f, float(gain(np.array([f]))[0]) * size) for f, size in self.lines),
             peaks=self.peaks + around,
         )
@@ -93,10 +93,10 @@ class Spectrum:
         """Return the spectrum without its lines."""
         return replace(self, lines=())
 
-    def allan(self, tau_s: Floats) -> Floats:
+    def avar(self, tau_s: Floats) -> Floats:
         """Return the overlapping Allan variance in unit² at averaging times in seconds."""
-        if self.closed is not None:
-            return self.closed(tau_s)
+        if self.closed_form_avar is not None:
+            return self.closed_form_avar(tau_s)
         total = allan_of_density(self.density, tau_s, self.tau0_s, self.peaks)
         total += 0.5 * (self.slope * tau_s) ** 2
         for f_hz, mean_square in self.lines:
@@ -113,13 +113,13 @@ class Spectrum:
         gain : callable or None
             Weight as a function of frequency in Hz; None = 1.
         """
-        f = frequencies(lowest_hz, self.tau0_s, self.peaks)
+        f = frequency_grid(lowest_hz, self.tau0_s, self.peaks)
         weighted = self.density(f) if gain is None else self.density(f) * gain(f)
         lines = sum(size * (1.0 if gain is None else float(gain(np.array([f]))[0])) for f, size in self.lines)
         return 2.0 * _integrate_log_trapezoid(weighted, f) + lines
 
 
-def white(mean_square: float, tau0_s: float) -> Spectrum:
+def white_noise_spectrum(mean_square: float, tau0_s: float) -> Spectrum:
     """Return the spectrum of independent samples: S = σ²τ0, σ²(τ) = σ²τ0/τ (IEEE Std 952 eq. C.18–C.19).
 
     Parameters
@@ -133,12 +133,12 @@ def white(mean_square: float, tau0_s: float) -> Spectrum:
     return Spectrum(lambda f: np.full_like(f, power), lambda tau: power / tau, tau0_s)
 
 
-def nothing(tau0_s: float) -> Spectrum:
+def zero_spectrum(tau0_s: float) -> Spectrum:
     """Return the spectrum of an axis without effects."""
     return Spectrum(np.zeros_like, np.zeros_like, tau0_s)
 
 
-def unknown(tau0_s: float) -> Spectrum:
+def undefined_spectrum(tau0_s: float) -> Spectrum:
     """Return a spectrum of NaN, for a series without known stationary second moments."""
     return Spectrum(_nan, _nan, tau0_s)
 
@@ -186,13 +186,13 @@ def allan_of_density(density: Curve, tau_s: Floats, tau0_s: float, peaks: tuple[
     True
     """
     tau = np.atleast_1d(np.asarray(tau_s, np.float64))
-    f = frequencies(BELOW / float(tau.max()), tau0_s, peaks)
+    f = frequency_grid(MIN_FREQUENCY_CYCLES / float(tau.max()), tau0_s, peaks)
     rest = density(f) / np.sin(np.pi * f * tau0_s) ** 2
     found = [_allan_variance_at(float(t), f, rest, tau0_s) for t in tau]
     return np.reshape(found, np.shape(tau_s))
 
 
-def frequencies(lowest_hz: float, tau0_s: float, peaks: tuple[tuple[float, float], ...]) -> Floats:
+def frequency_grid(lowest_hz: float, tau0_s: float, peaks: tuple[tuple[float, float], ...]) -> Floats:
     """Return the frequency grid in Hz: uniform in log f up to half the sample rate, and finer around peaks.
 
     Parameters

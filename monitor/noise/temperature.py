@@ -10,15 +10,15 @@ from typing import Final
 
 import numpy as np
 
-from drivers.discovery import nearest
+from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
 from drivers.quantities import DURATION_S, TEMPERATURE_C
 from drivers.sample import Floats
-from monitor.noise.effect import Block, Series
+from monitor.noise.effect import NoiseSeries, SampleBlockContext
 from monitor.noise.effects.exponentially_correlated import ExponentiallyCorrelated
 from monitor.noise.effects.sinusoidal import Sinusoidal
 
-UNITS: Final = {"mean": "°C", "swing": "°C", "period": "s", "wander": "°C", "wander_time": "s"}
+TEMPERATURE_UNITS: Final = {"mean": "°C", "swing": "°C", "period": "s", "wander": "°C", "wander_time": "s"}
 """Parameter of a temperature -> its unit."""
 
 
@@ -76,15 +76,17 @@ class Temperature:
             If the table is not valid.
         """
         if not isinstance(table, dict):
-            raise ConfigError(f"temperature must be a table with {', '.join(UNITS)}")
+            raise ConfigError(f"temperature must be a table with {', '.join(TEMPERATURE_UNITS)}")
         for name in table:
-            if name not in UNITS:
-                raise ConfigError(f'temperature: unknown parameter "{name}"{nearest(name, tuple(UNITS))}')
+            if name not in TEMPERATURE_UNITS:
+                raise ConfigError(
+                    f'temperature: unknown parameter "{name}"{format_suggestion(name, tuple(TEMPERATURE_UNITS))}'
+                )
         if "mean" not in table:
             raise ConfigError("temperature: mean is missing")
         return cls(**table)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> Series:
+    def start(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Return a new series in °C.
 
         Parameters
@@ -94,7 +96,7 @@ class Temperature:
         rng : numpy.random.Generator
             Generator of the temperature alone.
         """
-        parts: list[Series] = []
+        parts: list[NoiseSeries] = []
         if self.swing is not None and self.period is not None:
             swing = Sinusoidal(amplitude=self.swing, frequency=1.0 / self.period, phase=0.0)
             swing.check_rate(rate_hz)
@@ -105,7 +107,7 @@ class Temperature:
         return _Generated(self.mean, parts)
 
 
-class Recorded(Series):
+class RecordedTemperature(NoiseSeries):
     """Temperature of a recording.
 
     A missing value is replaced by the value before, and the last value continues beyond the end.
@@ -129,7 +131,7 @@ class Recorded(Series):
         before = np.searchsorted(known, np.arange(given.size), "right") - 1
         self._values = given[known[np.maximum(before, 0)]]
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         """Add the next temperatures to the values [n].
 
         Parameters
@@ -143,13 +145,13 @@ class Recorded(Series):
         values += self._values[np.minimum(index, self._values.size - 1)]
 
 
-class _Generated(Series):
+class _Generated(NoiseSeries):
     """Simulated temperature: a mean and the sum of its parts."""
 
-    def __init__(self, mean: float, parts: list[Series]) -> None:
+    def __init__(self, mean: float, parts: list[NoiseSeries]) -> None:
         self._mean, self._parts = mean, parts
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         values += self._mean
         for part in self._parts:
             part.add(values, block)

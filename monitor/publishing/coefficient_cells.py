@@ -1,4 +1,4 @@
-"""Formatting of coefficients for tables, in the units of the field; it also re-exports ``monitor.common.units``."""
+"""Formatting of coefficients for tables, in the units of the field."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -8,47 +8,10 @@ import numpy as np
 
 from drivers.sample import AXES
 from monitor.common.units import (
-    COEFFICIENT_NAMES,
-    COEFFICIENT_UNITS,
-    DEGREE,
-    DEVIATION_UNITS,
-    HOUR,
-    KIND_NAMES,
-    KINDS,
-    MICRO_G,
-    SAMPLE_UNITS,
-    Kind,
-    Unit,
-    axes_of,
-    kind_of,
-    number,
+    format_number,
     unit_of,
 )
-from monitor.estimation.fit.coefficients import LETTERS, Coefficients, Status
-
-__all__ = [
-    "COEFFICIENT_NAMES",
-    "COEFFICIENT_UNITS",
-    "DEGREE",
-    "DEVIATION_UNITS",
-    "HOUR",
-    "KINDS",
-    "KIND_NAMES",
-    "MICRO_G",
-    "SAMPLE_UNITS",
-    "TEMPERATURE_MARK",
-    "TEMPERATURE_MEANS",
-    "Kind",
-    "Reading",
-    "Unit",
-    "axes_of",
-    "kind_of",
-    "marked",
-    "measured_axes",
-    "number",
-    "reading",
-    "unit_of",
-]
+from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
 
 TEMPERATURE_MARK: Final = "†"
 TEMPERATURE_MEANS: Final = "its slow part is temperature"
@@ -56,7 +19,7 @@ TEMPERATURE_MEANS: Final = "its slow part is temperature"
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class CoefficientText:
     """Text of one coefficient of one axis in a table: value, interval and unit."""
 
     value: str  # "0.516"; "≤ 2.10" for an upper bound; "—" if it is not estimated
@@ -64,7 +27,7 @@ class Reading:
     unit: str
 
 
-def reading(coefficients: Coefficients, letter: str, axis: str, digits: int = 3) -> Reading:
+def format_coefficient(coefficients: Coefficients, letter: str, axis: str, digits: int = 3) -> CoefficientText:
     """Format one coefficient in the unit of the field.
 
     Parameters
@@ -78,19 +41,21 @@ def reading(coefficients: Coefficients, letter: str, axis: str, digits: int = 3)
     digits
         Number of significant digits.
     """
-    at = LETTERS.index(letter), AXES.index(axis)
+    at = SYMBOLS.index(letter), AXES.index(axis)
     unit = unit_of(letter, axis)
     value, lo, hi = (float(a[at]) * unit.factor for a in (coefficients.value, coefficients.lo, coefficients.hi))
     match Status(int(coefficients.status[at])):
         case Status.ESTIMATED:
-            return Reading(number(value, digits), f"{number(lo, digits)} … {number(hi, digits)}", unit.name)
+            return CoefficientText(
+                format_number(value, digits), f"{format_number(lo, digits)} … {format_number(hi, digits)}", unit.name
+            )
         case Status.UPPER_BOUND:
-            return Reading(f"≤ {number(hi, digits)}", "", unit.name)
+            return CoefficientText(f"≤ {format_number(hi, digits)}", "", unit.name)
         case Status.UNESTIMATED:
-            return Reading("—", "", unit.name)
+            return CoefficientText("—", "", unit.name)
 
 
-def marked(axis: str, axes_of_temperature: Collection[str]) -> str:
+def mark_temperature_axis(axis: str, axes_of_temperature: Collection[str]) -> str:
     """Return the name of an axis, with TEMPERATURE_MARK if temperature explains most of its slow variance.
 
     >>> marked("gy", ("gy", "gz")), marked("gx", ("gy", "gz"))

@@ -19,11 +19,26 @@ from monitor.noise.effects import (
     TemperatureLag,
     TurnOnTransient,
 )
-from monitor.reconcile.diagnostics.gap import Null, scores
-from monitor.reconcile.likelihood.effect_terms import COURSE, NATURAL, NOISE, size
+from monitor.reconcile.diagnostics.gap import NullDistribution, score_findings
+from monitor.reconcile.likelihood.effect_terms import (
+    DETERMINISTIC_SIZE_PARAMETERS,
+    NATURAL_DIAGNOSTIC,
+    NOISE_SIZE_PARAMETERS,
+    size,
+)
 from monitor.reconcile.likelihood.hypothesis import Z95, Hypothesis, shape_bounds, size_bounds
 from monitor.reconcile.preparation.axis import Axis
-from monitor.reconcile.result import AxisResult, Bounds, Kind, Look, RunnerUp, Score, Step, Verdict, Where
+from monitor.reconcile.result import (
+    AxisResult,
+    Decision,
+    DiagnosticSnapshot,
+    Location,
+    ParameterInterval,
+    ReconciliationStep,
+    RunnerUp,
+    Score,
+    StepKind,
+)
 from monitor.reconcile.search.search import Round, Search
 from monitor.reconcile.search.trials import RETUNE, Trial
 
@@ -44,7 +59,9 @@ MIN_RUNNER_UP_CONFIDENCE: Final = 0.001
 """Smallest confidence of an alternative effect that is reported."""
 
 
-def described(search: Search, null: Mapping[str, Null], final: Mapping[str, Null]) -> AxisResult:
+def describe_axis(
+    search: Search, null: Mapping[str, NullDistribution], final: Mapping[str, NullDistribution]
+) -> AxisResult:
     """Return the result of one axis.
 
     Parameters
@@ -56,10 +73,12 @@ def described(search: Search, null: Mapping[str, Null], final: Mapping[str, Null
     final : mapping of str to Null
         Null distributions under the extended model, which decide which differences are left over.
     """
-    looks = [Look(scores(one.seen, null), one.views) for one in search.rounds]
-    end = Look(scores(search.seen, final), search.views)
-    looks.append(end if search.before is None else Look(scores(search.before[1], null), search.before[0]))
-    steps: list[Step] = []
+    looks = [DiagnosticSnapshot(score_findings(one.seen, null), one.views) for one in search.rounds]
+    end = DiagnosticSnapshot(score_findings(search.seen, final), search.views)
+    looks.append(
+        end if search.before is None else DiagnosticSnapshot(score_findings(search.before[1], null), search.before[0])
+    )
+    steps: list[ReconciliationStep] = []
     left = sorted(range(search.state.given, len(search.state.effects)))
     for at, one in enumerate(search.rounds):
         last = one.state.effects[-1]
@@ -77,7 +96,7 @@ def described(search: Search, null: Mapping[str, Null], final: Mapping[str, Null
     )
 
 
-def _noise_floor_score(search: Search, look: Look) -> tuple[Score, ...]:
+def _noise_floor_score(search: Search, look: DiagnosticSnapshot) -> tuple[Score, ...]:
     """Score the white noise floor after a low-pass filter that was found.
 
     No effect produces this noise, so it is reported as left over if it is larger than chance. Its gap is the gap that
@@ -91,19 +110,26 @@ def _noise_floor_score(search: Search, look: Look) -> tuple[Score, ...]:
     most = max(one.seen["psd"].gain for one in search.rounds)
     gain = max(min(state.likely.log_likelihood - without.log_likelihood, most), 0.0)
     psd = next(score for score in look.scores if score.lens == "psd")
-    place = Where(frequency=(limit.cutoff, 0.5 * axis.rate_hz))
+    place = Location(frequency=(limit.cutoff, 0.5 * axis.rate_hz))
     score = Score("psd", place, (2.0 * gain) ** 0.5, psd.null95, psd.threshold)
     return (score,) if score.passes else ()
 
 
-def _axis_decision(steps: bool, left: bool) -> Verdict:
+def _axis_decision(steps: bool, left: bool) -> Decision:
     """Return the decision for an axis from the presence of steps and of differences that are left."""
     if left:
         return "partly_explained" if steps else "unexplained"
     return "explained" if steps else "agrees"
 
 
-def _describe_step(search: Search, search_round: Round, index: int, kind: Kind, before: Look, after: Look) -> Step:
+def _describe_step(
+    search: Search,
+    search_round: Round,
+    index: int,
+    kind: StepKind,
+    before: DiagnosticSnapshot,
+    after: DiagnosticSnapshot,
+) -> ReconciliationStep:
     """Return the result of one step of the search."""
     effect = search.state.effects[index]
     score = _triggering_score(effect, kind, before)
@@ -118,7 +144,7 @@ def _describe_step(search: Search, search_round: Round, index: int, kind: Kind, 
     confidence, others = _confidence_and_runners_up(effect.name if kind == "added" else RETUNE, search_round.trials)
     if kind == "retuned" and search_round.trials[0].name != RETUNE:  # the size changed together with an added effect
         confidence, others = _resize_confidence(search.state, index), ()
-    return Step(
+    return ReconciliationStep(
         found=score,
         kind=kind,
         effect=effect.name,
@@ -135,13 +161,13 @@ def _describe_step(search: Search, search_round: Round, index: int, kind: Kind, 
     )
 
 
-def _triggering_score(effect: Effect, kind: Kind, before: Look) -> Score:
+def _triggering_score(effect: Effect, kind: StepKind, before: DiagnosticSnapshot) -> Score:
     """Return the score that led to an effect.
 
     This is the natural diagnostic of the effect if it passes its threshold, otherwise the strongest diagnostic.
     """
     passing = [score for score in before.scores if score.passes] or list(before.scores)
-    natural = NATURAL.get(effect.name) if kind == "added" else "psd"
+    natural = NATURAL_DIAGNOSTIC.get(effect.name) if kind == "added" else "psd"
     for score in passing:
         if score.lens == natural:
             return score
@@ -182,38 +208,40 @@ def _resize_confidence(state: Hypothesis, index: int) -> float:
     return erf(abs(log(now / before)) * now / error / 2.0**0.5)
 
 
-def _parameters_with_bounds(axis: Axis, state: Hypothesis, index: int, trial: Trial, kind: Kind) -> dict[str, Bounds]:
+def _parameters_with_bounds(
+    axis: Axis, state: Hypothesis, index: int, trial: Trial, kind: StepKind
+) -> dict[str, ParameterInterval]:
     """Return the parameters of an effect with their 95 % intervals."""
     effect = state.effects[index]
     if kind == "added" and trial.bounds and trial.name == effect.name:
         return dict(trial.bounds)
-    found: dict[str, Bounds] = {}
+    found: dict[str, ParameterInterval] = {}
     if isinstance(effect, Leak):
-        found["source"] = Bounds(effect.source)
-    named = (NOISE | COURSE).get(type(effect))
+        found["source"] = ParameterInterval(effect.source)
+    named = (NOISE_SIZE_PARAMETERS | DETERMINISTIC_SIZE_PARAMETERS).get(type(effect))
     if named is not None:
         found[named] = size_bounds(state.likely, index)
     if isinstance(effect, TemperatureBias):
-        found["reference"] = Bounds(effect.reference)
+        found["reference"] = ParameterInterval(effect.reference)
         if effect.quadratic is not None:
             found["quadratic"] = _quadratic_bounds(state, index)
     for shape in SHAPE_PARAMETERS.get(type(effect), ()) if kind == "added" else ():
         found[shape] = shape_bounds(axis, state, index, shape)
     if isinstance(effect, BandwidthLimit):
-        found["order"] = Bounds(float(effect.order))
+        found["order"] = ParameterInterval(float(effect.order))
     if isinstance(effect, Sinusoidal) and effect.phase is not None and effect.amplitude > 0.0:
         # fitting the frequency as well doubles the phase error at the start of a recording (Rife & Boorstyn 1974)
         error = 2.0 * Z95 * state.likely.error(index) / effect.amplitude
-        found["phase"] = Bounds(effect.phase, effect.phase - error, effect.phase + error)
+        found["phase"] = ParameterInterval(effect.phase, effect.phase - error, effect.phase + error)
     return found
 
 
-def _quadratic_bounds(state: Hypothesis, index: int) -> Bounds:
+def _quadratic_bounds(state: Hypothesis, index: int) -> ParameterInterval:
     """Return the quadratic temperature coefficient with its 95 % interval."""
     place = next(place for at, place in state.likely.courses if at == index)
     value = float(state.likely.fitted.beta[place.start + 1])
     error = Z95 * float(state.likely.fitted.beta_covariance[place.start + 1, place.start + 1]) ** 0.5
-    return Bounds(value, value - error, value + error)
+    return ParameterInterval(value, value - error, value + error)
 
 
 EVIDENCE_TEXT: Final = {
@@ -232,7 +260,7 @@ EVIDENCE_TEXT: Final = {
 
 
 def _justification(
-    effect: Effect, kind: Kind, score: Score, after: Score, others: tuple[RunnerUp, ...], trial: Trial
+    effect: Effect, kind: StepKind, score: Score, after: Score, others: tuple[RunnerUp, ...], trial: Trial
 ) -> str:
     """Return the sentence that justifies a step."""
     where = _location_text(score)

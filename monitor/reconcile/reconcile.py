@@ -30,18 +30,22 @@ from monitor.noise.effects import (
     SampleRateError,
 )
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.description import described
-from monitor.reconcile.diagnostics.diagnostics import sight
-from monitor.reconcile.diagnostics.gap import Findings, Null, look, nulls
-from monitor.reconcile.likelihood.effect_terms import resized
-from monitor.reconcile.likelihood.hypothesis import believed
-from monitor.reconcile.preparation.axis import Axis, Courses, Effects
-from monitor.reconcile.preparation.prepare import FEWEST, prepared, without_sources
-from monitor.reconcile.preparation.sample_rate_test import PRICE as CLOCK_PRICE
-from monitor.reconcile.preparation.sample_rate_test import Clock, restated, wrong_clock
-from monitor.reconcile.result import AxisResult, Reconciliation, Score, Step, Verdict, Where
-from monitor.reconcile.search.candidates import PRICE
-from monitor.reconcile.search.search import Search, search
+from monitor.reconcile.description import describe_axis
+from monitor.reconcile.diagnostics.diagnostics import whiten_axis
+from monitor.reconcile.diagnostics.gap import Findings, NullDistribution, null_distributions, run_diagnostics
+from monitor.reconcile.likelihood.effect_terms import with_size
+from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes
+from monitor.reconcile.preparation.axis import Axis, Effects, RegressorCache
+from monitor.reconcile.preparation.prepare import MIN_SAMPLES, prepare_axes, without_sources
+from monitor.reconcile.preparation.sample_rate_test import SAMPLE_RATE_PENALTY_NATS as CLOCK_PRICE
+from monitor.reconcile.preparation.sample_rate_test import (
+    SampleRateErrorEstimate,
+    detect_sample_rate_error,
+    in_stated_time,
+)
+from monitor.reconcile.result import AxisResult, Decision, Location, Reconciliation, ReconciliationStep, Score
+from monitor.reconcile.search.candidates import PENALTY_NATS
+from monitor.reconcile.search.search import Search, search_axis
 
 SIMULATED_RECORDINGS: Final = 6
 """Number of simulated recordings that determine a null distribution: with six axes, 36 gains for each diagnostic."""
@@ -78,7 +82,7 @@ class Recording:
 def diagnose_simulations(
     model: NoiseModel,
     template: Recording,
-    courses: Courses,
+    courses: RegressorCache,
     seed: int,
     each: MapFunction = map,
     runs: int = SIMULATED_RECORDINGS,
@@ -108,21 +112,24 @@ def diagnose_simulations(
     dict of str to list of Findings
         For each axis, the findings of each simulated recording.
     """
-    effects = effects_of(model, template)
+    effects = effects_by_axis(model, template)
     wanted = [name for name in template.values if only is None or name in only]
 
     def one(run: int) -> dict[str, Findings]:
         drawn = model.simulate(template.samples, template.rate_hz, seed + run, template.temperature_c)
         raw = {axis: drawn[:, AXES.index(axis)] for axis in template.values}
         rng = np.random.default_rng(seed + run)
-        axes = prepared(raw, template.rate_hz, effects, template.temperature_c, courses, rng)
-        return {name: look(sight(axes[name], believed(axes[name], effects[name]).likely)) for name in wanted}
+        axes = prepare_axes(raw, template.rate_hz, effects, template.temperature_c, courses, rng)
+        return {
+            name: run_diagnostics(whiten_axis(axes[name], fit_with_given_sizes(axes[name], effects[name]).likely))
+            for name in wanted
+        }
 
     seen = list(each(one, range(runs)))
     return {axis: [run[axis] for run in seen] for axis in wanted}
 
 
-def smooth(temperature_c: Floats) -> Floats:
+def smooth_temperature(temperature_c: Floats) -> Floats:
     """Return the temperature with missing samples interpolated and with thermometer noise averaged out.
 
     Parameters
@@ -144,7 +151,7 @@ def smooth(temperature_c: Floats) -> Floats:
     return np.asarray((sums[2 * half + 1 :] - sums[: -2 * half - 1]) / (2 * half + 1) + whole[0])
 
 
-def effects_of(model: NoiseModel, recording: Recording) -> dict[str, Effects]:
+def effects_by_axis(model: NoiseModel, recording: Recording) -> dict[str, Effects]:
     """Return the effects of each recorded axis without constant biases.
 
     A constant bias is not compared, because the mean of each axis is always free.
@@ -172,14 +179,14 @@ class SearchResults:
     """Results of the search on all axes of one recording."""
 
     searches: dict[str, Search]
-    clock: Clock | None
+    clock: SampleRateErrorEstimate | None
 
 
 def search_all_axes(
     recording: Recording,
     model: NoiseModel,
-    null: Mapping[str, Mapping[str, Null]],
-    courses: Courses,
+    null: Mapping[str, Mapping[str, NullDistribution]],
+    courses: RegressorCache,
     seed: int,
     each: MapFunction,
 ) -> SearchResults:
@@ -203,16 +210,18 @@ def search_all_axes(
     each : callable
         Function with the signature of ``map`` that distributes the axes.
     """
-    effects = effects_of(model, recording)
+    effects = effects_by_axis(model, recording)
     rng = np.random.default_rng(seed)
-    axes = prepared(recording.values, recording.rate_hz, effects, recording.temperature_c, courses, rng)
-    clock = wrong_clock(axes, effects)
+    axes = prepare_axes(recording.values, recording.rate_hz, effects, recording.temperature_c, courses, rng)
+    clock = detect_sample_rate_error(axes, effects)
     if clock is not None:
         ratio = float(clock.ratio.value)
-        effects = {name: tuple(restated(effect, ratio) for effect in of_axis) for name, of_axis in effects.items()}
+        effects = {
+            name: tuple(in_stated_time(effect, ratio) for effect in of_axis) for name, of_axis in effects.items()
+        }
 
     def one(name: str) -> Search:
-        return search(axes[name], effects[name], null[name], np.random.default_rng([seed, AXES.index(name)]))
+        return search_axis(axes[name], effects[name], null[name], np.random.default_rng([seed, AXES.index(name)]))
 
     found = dict(zip(axes, each(one, axes), strict=True))
     for name, innocent in _reversed_leak_sources(found, null).items():
@@ -253,14 +262,14 @@ def reconcile(
     NotReady
         If there are too few samples or no axis can be compared with the model.
     """
-    recording, notes = usable(recording, model)
-    courses = Courses(recording.samples, recording.rate_hz, recording.temperature_c)
+    recording, notes = select_usable_axes(recording, model)
+    courses = RegressorCache(recording.samples, recording.rate_hz, recording.temperature_c)
     if model is None:
         tell("fitting the five terms")
-    tested = model or five_terms(recording, courses, seed)
+    tested = model or fit_five_terms(recording, courses, seed)
     tell("simulating the model")
     simulated = diagnose_simulations(tested, recording, courses, seed, each)
-    null = nulls(simulated, len(simulated))
+    null = null_distributions(simulated, len(simulated))
     tell("looking for what is missing")
     found = search_all_axes(recording, tested, null, courses, seed, each)
     rounds = {name: one for name, one in found.searches.items() if one.rounds}
@@ -272,26 +281,26 @@ def reconcile(
         simulated |= diagnose_simulations(
             augmented, recording, courses, seed + SIMULATED_RECORDINGS, each, only=changed
         )
-        final = nulls(simulated, len(simulated))
+        final = null_distributions(simulated, len(simulated))
     tell("writing down")
-    axes = {name: described(one, null[name], final[name]) for name, one in found.searches.items()}
+    axes = {name: describe_axis(one, null[name], final[name]) for name, one in found.searches.items()}
     if found.clock is not None:
         axes = add_sample_rate_step(axes, found.clock, null)
     return Reconciliation(
-        verdict=overall([one.verdict for one in axes.values()]),
+        verdict=combine_decisions([one.verdict for one in axes.values()]),
         axes=axes,
         baseline=tested,
         model=augmented,
         fitted_first=model is None,
         rate_hz=recording.rate_hz,
         samples=recording.samples,
-        seconds=recording.samples / recording.rate_hz,
+        duration_s=recording.samples / recording.rate_hz,
         seed=seed,
         notes=notes,
     )
 
 
-def usable(recording: Recording, model: NoiseModel | None) -> tuple[Recording, tuple[str, ...]]:
+def select_usable_axes(recording: Recording, model: NoiseModel | None) -> tuple[Recording, tuple[str, ...]]:
     """Select the axes that can be compared.
 
     Parameters
@@ -313,15 +322,15 @@ def usable(recording: Recording, model: NoiseModel | None) -> tuple[Recording, t
     NotReady
         If there are too few samples or no axis is left.
     """
-    if recording.samples < FEWEST:
+    if recording.samples < MIN_SAMPLES:
         raise NotReady(
-            f"{recording.samples} samples; {FEWEST} are the least that anything can be said of "
-            f"({FEWEST / recording.rate_hz:.0f} s at {recording.rate_hz:g} Hz)"
+            f"{recording.samples} samples; {MIN_SAMPLES} are the least that anything can be said of "
+            f"({MIN_SAMPLES / recording.rate_hz:.0f} s at {recording.rate_hz:g} Hz)"
         )
     notes, kept = [], {}
     for name, y in recording.values.items():
         there = y[np.isfinite(y)]
-        if there.size < FEWEST or there.size < MIN_VALID_FRACTION * y.size:
+        if there.size < MIN_SAMPLES or there.size < MIN_VALID_FRACTION * y.size:
             notes.append(f"{name}: {there.size} of {y.size} samples are there; left out")
         elif np.ptp(there) == 0.0:
             notes.append(f"{name}: all samples are the same; left out")
@@ -333,11 +342,11 @@ def usable(recording: Recording, model: NoiseModel | None) -> tuple[Recording, t
         raise NotReady("no axis to compare: " + "; ".join(notes))
     warmth = recording.temperature_c
     if warmth is not None:
-        warmth = smooth(warmth) if np.isfinite(warmth).any() else None
+        warmth = smooth_temperature(warmth) if np.isfinite(warmth).any() else None
     return Recording(kept, recording.rate_hz, warmth), tuple(notes)
 
 
-def five_terms(recording: Recording, courses: Courses, seed: int) -> NoiseModel:
+def fit_five_terms(recording: Recording, courses: RegressorCache, seed: int) -> NoiseModel:
     """Fit the terms Q, N, B, K and R to each axis and keep the terms that the data support.
 
     Parameters
@@ -357,16 +366,16 @@ def five_terms(recording: Recording, courses: Courses, seed: int) -> NoiseModel:
     start = (QuantizationNoise(Q=1.0), AngleRandomWalk(N=1.0), BiasInstability(B=1.0), RateRandomWalk(K=1.0))
     rng = np.random.default_rng(seed)
     none: dict[str, Effects] = dict.fromkeys(recording.values, ())
-    axes = prepared(recording.values, recording.rate_hz, none, recording.temperature_c, courses, rng)
+    axes = prepare_axes(recording.values, recording.rate_hz, none, recording.temperature_c, courses, rng)
     return NoiseModel({name: _fit_terms(axis, start) for name, axis in axes.items()}, recording.rate_hz)
 
 
 def _fit_terms(axis: Axis, start: Effects) -> Effects:
     """Fit the classic terms to one axis and drop each term that gains too little likelihood."""
     scale = float(np.sqrt(np.mean(axis.coefficients**2)))
-    best = axis.fit([resized(effect, scale) for effect in start])
+    best = axis.fit([with_size(effect, scale) for effect in start])
     with_ramp = axis.fit((*best.effects, RateRamp(R=scale)))
-    if with_ramp.log_likelihood - best.log_likelihood > PRICE["rate_ramp"]:
+    if with_ramp.log_likelihood - best.log_likelihood > PENALTY_NATS["rate_ramp"]:
         best = with_ramp
     for at in range(len(best.effects) - 1, -1, -1):
         effect = best.effects[at]
@@ -394,14 +403,14 @@ def add_found_effects(model: NoiseModel, found: SearchResults) -> NoiseModel:
         if not one.rounds:
             continue
         bias = tuple(effect for effect in model.effects.get(name, ()) if isinstance(effect, Bias))
-        effects[name] = bias + tuple(restated(effect, 1.0 / ratio) for effect in one.state.effects)
+        effects[name] = bias + tuple(in_stated_time(effect, 1.0 / ratio) for effect in one.state.effects)
     if found.clock is not None:
         effects[found.clock.axis] = (*effects[found.clock.axis], SampleRateError(ratio=ratio))
     return NoiseModel(effects, model.sample_rate_hz, model.temperature)
 
 
 def add_sample_rate_step(
-    axes: Mapping[str, AxisResult], clock: Clock, null: Mapping[str, Mapping[str, Null]]
+    axes: Mapping[str, AxisResult], clock: SampleRateErrorEstimate, null: Mapping[str, Mapping[str, NullDistribution]]
 ) -> dict[str, AxisResult]:
     """Return the results with a step for the wrong sample rate, on the axis that shows the error most clearly.
 
@@ -416,12 +425,12 @@ def add_sample_rate_step(
     """
     one = axes[clock.axis]
     half = abs(clock.frequency[1] - clock.frequency[0])
-    where = Where(frequency=(min(clock.frequency) - 0.01 * half, max(clock.frequency) + 0.01 * half))
+    where = Location(frequency=(min(clock.frequency) - 0.01 * half, max(clock.frequency) + 0.01 * half))
     limit = null[clock.axis]["lines"]
     before, null95, threshold = (float(np.sqrt(2.0 * x)) for x in (clock.gain, limit.null95, limit.threshold))
     after = next(score for score in one.start.scores if score.lens == "lines")
     score = Score("lines", where, before, null95, threshold)
-    step = Step(
+    step = ReconciliationStep(
         found=score,
         kind="added",
         effect=SampleRateError.name,
@@ -445,7 +454,7 @@ def add_sample_rate_step(
     return {**axes, clock.axis: replace(one, steps=(step, *one.steps), verdict=verdict)}
 
 
-def overall(verdicts: Iterable[Verdict]) -> Verdict:
+def combine_decisions(verdicts: Iterable[Decision]) -> Decision:
     """Combine the decisions of all axes into the decision for the recording."""
     every = set(verdicts)
     if every <= {"agrees"}:
@@ -456,7 +465,7 @@ def overall(verdicts: Iterable[Verdict]) -> Verdict:
 
 
 def _reversed_leak_sources(
-    found: Mapping[str, Search], null: Mapping[str, Mapping[str, Null]]
+    found: Mapping[str, Search], null: Mapping[str, Mapping[str, NullDistribution]]
 ) -> dict[str, frozenset[str]]:
     """Return, for each axis, the sources whose leak is wrongly assumed because the true leak has the opposite
     direction."""

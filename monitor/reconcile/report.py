@@ -16,21 +16,21 @@ from typing import Any, Final
 import msgspec
 
 from drivers.sample import AXES
-from monitor.reconcile.result import AxisResult, Bounds, Reconciliation, Score, Step, Where
+from monitor.reconcile.result import AxisResult, Location, ParameterInterval, Reconciliation, ReconciliationStep, Score
 
 SCHEMA: Final = "imu-monitor/reconcile/1"
 """Name and version of the JSON schema."""
 _JSON_ENCODER: Final = msgspec.json.Encoder()
 
 
-def to_json(r: Reconciliation) -> bytes:
+def encode_report(r: Reconciliation) -> bytes:
     """Encode a reconciliation as JSON, with the axes in the order of ``AXES``."""
     return _JSON_ENCODER.encode({
         "schema": SCHEMA,
         "verdict": r.verdict,
         "rate": _finite_or_none(r.rate_hz),
         "samples": int(r.samples),
-        "seconds": _finite_or_none(r.seconds),
+        "seconds": _finite_or_none(r.duration_s),
         "seed": int(r.seed),
         "fitted_first": bool(r.fitted_first),
         "notes": r.notes,
@@ -48,7 +48,7 @@ def _axis_entry(result: AxisResult) -> dict[str, Any]:
     }
 
 
-def _step_entry(step: Step) -> dict[str, Any]:
+def _step_entry(step: ReconciliationStep) -> dict[str, Any]:
     """Return the report entry of one step."""
     held_out = _gap_entry(step.held_out_before, step.held_out_after)
     return {
@@ -91,13 +91,13 @@ def _score_entry(score: Score) -> dict[str, Any]:
     }
 
 
-def _where_entry(where: Where) -> dict[str, Any]:
+def _where_entry(where: Location) -> dict[str, Any]:
     """Return the report entry of a location."""
     found = where.found().items()
     return {name: place if isinstance(place, str) else [_finite_or_none(end) for end in place] for name, place in found}
 
 
-def _bounds_entry(bounds: Bounds) -> dict[str, Any]:
+def _bounds_entry(bounds: ParameterInterval) -> dict[str, Any]:
     """Return the report entry of a parameter."""
     if isinstance(bounds.value, str):
         return {"value": bounds.value}

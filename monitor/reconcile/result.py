@@ -13,14 +13,14 @@ from typing import Literal
 from drivers.sample import Floats
 from monitor.noise.model import NoiseModel
 
-Verdict = Literal["agrees", "explained", "partly_explained", "unexplained"]
+Decision = Literal["agrees", "explained", "partly_explained", "unexplained"]
 """Decision for an axis or a recording."""
-Kind = Literal["added", "retuned"]
+StepKind = Literal["added", "retuned"]
 """Kind of a step: an effect was added, or the size of a known effect was changed."""
 
 
 @dataclass(frozen=True, slots=True)
-class Where:
+class Location:
     """Location of a difference. A dimension that the diagnostic does not resolve is None."""
 
     frequency: tuple[float, float] | None = None  # Hz
@@ -41,7 +41,7 @@ class Score:
     """Difference between measurement and model in one diagnostic, and the location of its maximum."""
 
     lens: str
-    where: Where
+    where: Location
     gap: float  # 0 = perfect agreement
     null95: float  # 95 of 100 recordings of a true model stay below this gap in this diagnostic
     threshold: float  # 99 of 100 recordings of a true model stay below it in all diagnostics, at all places and axes
@@ -53,7 +53,7 @@ class Score:
 
 
 @dataclass(frozen=True, slots=True)
-class Bounds:
+class ParameterInterval:
     """Value of a parameter with its 95 % interval. The name of a source axis has no interval."""
 
     value: float | str
@@ -70,7 +70,7 @@ class RunnerUp:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class PlotData:
     """Plot data of one axis for one diagnostic."""
 
     lens: str
@@ -87,21 +87,21 @@ class View:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class DiagnosticSnapshot:
     """Scores and plot data of an axis, compared with one model."""
 
     scores: tuple[Score, ...]  # one for each diagnostic
-    views: tuple[View, ...]  # one for each diagnostic that has a plot
+    views: tuple[PlotData, ...]  # one for each diagnostic that has a plot
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class ReconciliationStep:
     """Effect that was added, or an effect of the model whose size was changed."""
 
     found: Score  # difference that led to this step
-    kind: Kind
+    kind: StepKind
     effect: str
-    parameters: Mapping[str, Bounds]
+    parameters: Mapping[str, ParameterInterval]
     confidence: float
     runners_up: tuple[RunnerUp, ...]
     before: Score
@@ -110,7 +110,7 @@ class Step:
     held_out_after: Score | None
     held_out_reason: str  # why there is no held-out gap; empty if there is a held-out gap
     because: str  # one sentence of justification that a person can check
-    look: Look  # comparison after the step
+    look: DiagnosticSnapshot  # comparison after the step
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,24 +118,24 @@ class AxisResult:
     """Result of the search on one axis."""
 
     axis: str
-    verdict: Verdict
-    start: Look  # comparison with the given model, or with the five terms
-    steps: tuple[Step, ...]
+    verdict: Decision
+    start: DiagnosticSnapshot  # comparison with the given model, or with the five terms
+    steps: tuple[ReconciliationStep, ...]
     left_over: tuple[Score, ...]
-    end: Look  # comparison with the model that contains everything that was found
+    end: DiagnosticSnapshot  # comparison with the model that contains everything that was found
 
 
 @dataclass(frozen=True, slots=True)
 class Reconciliation:
     """Result of the comparison of one recording with a model."""
 
-    verdict: Verdict
+    verdict: Decision
     axes: Mapping[str, AxisResult]  # in AXES order
     baseline: NoiseModel  # the model that was given, or the five terms fitted first
     model: NoiseModel  # with everything that was found
     fitted_first: bool  # True if no model was given and the five terms were fitted
     rate_hz: float
     samples: int
-    seconds: float
+    duration_s: float
     seed: int
     notes: tuple[str, ...] = field(default=())

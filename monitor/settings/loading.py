@@ -21,13 +21,13 @@ import msgspec
 import drivers.decoders
 import drivers.links
 from drivers import discovery, file_access
-from drivers.decoders.base import Addressed, Decoder
-from drivers.driver import AxisMap, axis_map
-from drivers.errors import ConfigError, in_one_line
-from drivers.links.base import Filtering, Link
+from drivers.decoders.base import AddressFilter, Decoder
+from drivers.driver import AxisMap, parse_axis_map
+from drivers.errors import ConfigError, format_one_line
+from drivers.links.base import AddressFilteringLink, Link
 from drivers.quantities import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ
-from drivers.sample import AXES, KINDS
-from drivers.zenoh.session import configuration, plain, secret_files
+from drivers.sample import AXES, EVENT_KINDS
+from drivers.zenoh.session import configuration, format_error, secret_files
 from monitor.common.config_files import model_path
 from monitor.common.topics import ENDPOINT
 from monitor.settings import file_permissions, toml_text
@@ -228,7 +228,7 @@ def read(path: Path, *, pipe: bool = False) -> tuple[Config | None, list[str]]:
 def examine(path: Path, *, pipe: bool = False) -> Reading:
     """Read a configuration file and find all that is wrong with it; opens nothing."""
     try:
-        text = file_access.read(path, pipe=pipe).decode("utf-8")
+        text = file_access.read_small_file(path, pipe=pipe).decode("utf-8")
     except FileNotFoundError:
         return Reading(None, [f"{path}: no such file; imu-monitor check --print-defaults prints one to start from"])
     except (OSError, UnicodeDecodeError) as error:
@@ -241,7 +241,7 @@ def examine(path: Path, *, pipe: bool = False) -> Reading:
     config = reader.config(table)
     reader.trust(path)
     if config is None or reader.wrong:
-        return Reading(None, [in_one_line(f"{path}: {line}") for line in reader.wrong], tuple(reader.models))
+        return Reading(None, [format_one_line(f"{path}: {line}") for line in reader.wrong], tuple(reader.models))
     warnings = tuple(f"{path}: {line}" for line in reader.warnings)
     return Reading(replace(config, path=path, table=table, warnings=warnings), [], tuple(reader.models))
 
@@ -292,7 +292,7 @@ class _Reader:
             return None
         shown = msgspec.structs.replace(viewer.table, history=history_s)
         if shown.mode.endswith(".rrd"):
-            shown = msgspec.structs.replace(shown, mode=str(self._folder / file_access.path(shown.mode)))
+            shown = msgspec.structs.replace(shown, mode=str(self._folder / file_access.expand_user(shown.mode)))
         known = tuple(device for device in devices if device is not None)
         return Config(known, zenoh, shown, log, storage, hooks, metrics)
 
@@ -340,9 +340,9 @@ class _Reader:
             filled = self.fill(HookTable, one, at)
             table = filled.table
             timeout_s = self._try(f"{at}.timeout", seconds, table.timeout) if filled.sound("timeout") else None
-            for key, said, known in (("on", table.on, (*KINDS, "*")), ("devices", table.devices, devices)):
+            for key, said, known in (("on", table.on, (*EVENT_KINDS, "*")), ("devices", table.devices, devices)):
                 for word in (word for word in said if word not in known):
-                    self.wrong.append(f'{at}.{key}: "{word}"{discovery.possible(word, known)}')
+                    self.wrong.append(f'{at}.{key}: "{word}"{discovery.format_choices(word, known)}')
             if not table.on and filled.sound("on"):
                 self.wrong.append(f'{at}.on: empty; write kinds of events, or ["*"]')
             if not table.command and table.key is None and filled.sound("command", "key"):
@@ -422,7 +422,7 @@ class _Reader:
         publish_s = (
             self._try(f"{at}: publish", period, entry.publish, "every block") if filled.sound("publish") else None
         )
-        axes = self._try(f"{at}: axes", axis_map, entry.axes)
+        axes = self._try(f"{at}: axes", parse_axis_map, entry.axes)
         link, decoder, silence_s = None, None, 0.0
         if filled.sound("driver"):
             link, decoder, silence_s = self.driver(entry.driver, f"{at}: driver")
@@ -452,10 +452,10 @@ class _Reader:
         link_name = keys.pop("link", None)
         decoder_name = keys.pop("decoder", "")
         options = keys.pop("decoder_options", {})
-        known = sorted({*discovery.names(drivers.links, "_link"), "virtual"} - {"loopback"})
+        known = sorted({*discovery.list_modules(drivers.links, "_link"), "virtual"} - {"loopback"})
         if link_name not in known:
             said = "missing" if link_name is None else shown(link_name)
-            self.wrong.append(f"{at}.link: {said}{discovery.possible(str(link_name or ''), known)}")
+            self.wrong.append(f"{at}.link: {said}{discovery.format_choices(str(link_name or ''), known)}")
             if decoder_name:
                 self.decoder(decoder_name, options, at)
             return None, None, 0.0
@@ -473,7 +473,7 @@ class _Reader:
         if name == "virtual":
             table = self._virtual(keys, at)
             return table, table.silence, "", "vectornav_binary"
-        module = discovery.load(drivers.links, name, "_link")
+        module = discovery.import_module(drivers.links, name, "_link")
         filled = self.fill(module.Settings, keys, at)
         link: Link | None = self._build(module, filled, at)
         if link is None:
@@ -501,12 +501,12 @@ class _Reader:
 
     def decoder(self, name: Any, options: Any, at: str) -> tuple[Decoder | None, str]:
         """The decoder, and what it reads ("": unknown); None where it is unknown or its options are wrong."""
-        known = discovery.names(drivers.decoders)
+        known = discovery.list_modules(drivers.decoders)
         if not name or name not in known:
             said = shown(name) if name else "missing"
-            self.wrong.append(f"{at}.decoder: {said}{discovery.possible(str(name), known)}")
+            self.wrong.append(f"{at}.decoder: {said}{discovery.format_choices(str(name), known)}")
             return None, ""
-        module = discovery.load(drivers.decoders, name)
+        module = discovery.import_module(drivers.decoders, name)
         if not isinstance(options, dict):
             self.wrong.append(f"{at}.decoder_options: expected a table, got {shown(options)}")
             return None, _carrier_of(module)
@@ -534,7 +534,7 @@ class _Reader:
         for key, value in table.items():
             if key not in fields:
                 wrong.append(key)
-                self.wrong.append(f"{dot}{key}: unknown key{discovery.nearest(key, tuple(fields))}")
+                self.wrong.append(f"{dot}{key}: unknown key{discovery.format_suggestion(key, tuple(fields))}")
                 continue
             converted, problems = convert(value, fields[key].type, self._path)
             if not problems:
@@ -561,7 +561,7 @@ class _Reader:
         wanted = (info.extra or {}).get("file") if isinstance(info, msgspec.inspect.Metadata) else None
         if not wanted or not value:
             return value
-        path = self._folder / file_access.path(value)
+        path = self._folder / file_access.expand_user(value)
         there = os.path.exists(path)  # false for a name that no file can have
         if wanted == "exists" and not there:
             raise ValueError(f"{path}: no such file")
@@ -569,7 +569,7 @@ class _Reader:
 
     def _path(self, kind: type, value: Any) -> Any:
         if kind is Path and isinstance(value, str):
-            return self._folder / file_access.path(value)
+            return self._folder / file_access.expand_user(value)
         raise ValueError("not a path")
 
     def _try(self, at: str, function: Any, *arguments: Any) -> Any:
@@ -591,7 +591,7 @@ def zenoh_file_secrets(path: Path) -> tuple[Path, ...]:
     try:
         return secret_files(configuration({}, path))
     except zenoh.ZError as error:
-        text = plain(error)
+        text = format_error(error)
         raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from error
 
 
@@ -654,7 +654,7 @@ def viewer_mode(mode: str) -> str:
     modes = ("auto", "native", "web", "none")
     if mode in modes or mode.endswith(".rrd"):
         return mode
-    raise ConfigError(f'"{mode}"{discovery.possible(mode, modes)}, or a file ending in .rrd')
+    raise ConfigError(f'"{mode}"{discovery.format_choices(mode, modes)}, or a file ending in .rrd')
 
 
 def _shortened(value: object) -> str:
@@ -714,7 +714,7 @@ def _axes(pattern: str) -> tuple[str, ...]:
     """
     if pattern in (*AXES, "g*", "a*", "*"):
         return tuple(axis for axis in AXES if fnmatch(axis, pattern))
-    raise ConfigError(f'"{pattern}"{discovery.possible(pattern, (*AXES, "g*", "a*", "*"))}')
+    raise ConfigError(f'"{pattern}"{discovery.format_choices(pattern, (*AXES, "g*", "a*", "*"))}')
 
 
 def _command(words: list[str], folder: Path) -> tuple[str, ...]:
@@ -725,7 +725,7 @@ def _command(words: list[str], folder: Path) -> tuple[str, ...]:
         raise ConfigError(f'"{words[0]}" is no path; write where the program is, e.g. "/usr/bin/{words[0]}"')
     if any("\0" in word for word in words):
         raise ConfigError("a word with a NUL character cannot be handed to a program")
-    path = folder / file_access.path(words[0])
+    path = folder / file_access.expand_user(words[0])
     if not file_access.is_file(path):
         raise ConfigError(f"{path}: no such file")
     if not os.access(path, os.X_OK):
@@ -735,12 +735,14 @@ def _command(words: list[str], folder: Path) -> tuple[str, ...]:
 
 def _narrow(link: object, decoder: object) -> None:
     """A link that can leave things out brings only what its decoder reads."""
-    if isinstance(link, Filtering) and isinstance(decoder, Addressed):
+    if isinstance(link, AddressFilteringLink) and isinstance(decoder, AddressFilter):
         link.accept(decoder.addresses)
 
 
 def _decoders_of(carrier: str) -> list[str]:
-    modules = [(name, discovery.load(drivers.decoders, name)) for name in discovery.names(drivers.decoders)]
+    modules = [
+        (name, discovery.import_module(drivers.decoders, name)) for name in discovery.list_modules(drivers.decoders)
+    ]
     return [name for name, module in modules if _carrier_of(module) == carrier]
 
 

@@ -16,7 +16,7 @@ from monitor.common.topics import ENDPOINT
 Coefficient = Annotated[float, quantities.COEFFICIENT.meta]
 Duration = Annotated[float, quantities.DURATION_S.meta]
 Port = Annotated[int, quantities.PORT.meta]
-Share = Annotated[float, quantities.SHARE.meta]
+Share = Annotated[float, quantities.FRACTION.meta]
 ZenohKey = Annotated[
     str,
     msgspec.Meta(
@@ -64,7 +64,7 @@ class LimitTable(_Table, frozen=True, kw_only=True):
     above: Coefficient | None = None
     """SI unit of letter and axis, as in a model file."""
     below: Coefficient | None = None
-    times_model: Annotated[float, quantities.TIMES.meta] | None = None
+    times_model: Annotated[float, quantities.NOISE_RATIO.meta] | None = None
     """Too much is so many times what the model in force says."""
     hold: Duration | str = "1min"
     """It has to be beyond, or back, for so long."""

@@ -13,8 +13,8 @@ from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 import msgspec
 from msgspec import inspect
 
-from drivers.discovery import nearest, possible
-from drivers.quantities import Quantity, out_of_range
+from drivers.discovery import format_choices, format_suggestion
+from drivers.quantities import Quantity, find_out_of_range
 
 WRONG: Final = object()
 """Stands for a value that cannot be converted."""
@@ -55,7 +55,7 @@ def convert(value: Any, kind: Any, hook: Hook) -> tuple[Any, list[Problem]]:
     except (msgspec.ValidationError, ValueError):
         problems = []
         return _rest(value, kind, hook, problems), problems or [("", message(value, kind))]
-    problems = list(out_of_range(converted, kind))
+    problems = list(find_out_of_range(converted, kind))
     return (WRONG if problems else converted), problems
 
 
@@ -113,7 +113,9 @@ def _rest(value: Any, kind: Any, hook: Hook, problems: list[Problem]) -> Any:
         parts = {f"[{i}]": (one, get_args(container)[0]) for i, one in enumerate(value)}
     elif isinstance(container, type) and issubclass(container, msgspec.Struct):
         fields = {field.encode_name: field for field in msgspec.structs.fields(container)}
-        problems += [(f".{key}", f"unknown key{nearest(key, tuple(fields))}") for key in value if key not in fields]
+        problems += [
+            (f".{key}", f"unknown key{format_suggestion(key, tuple(fields))}") for key in value if key not in fields
+        ]
         problems += [(f".{key}", "missing") for key, field in fields.items() if field.required and key not in value]
         parts = {f".{key}": (one, fields[key].type) for key, one in value.items() if key in fields}
     else:
@@ -207,4 +209,4 @@ def _ranked(value: Any, words: list[Any]) -> str:
     if isinstance(value, int | float) and all(isinstance(word, int | float) for word in words) and math.isfinite(value):
         words = sorted(words, key=lambda word: abs(word - value))
         return f"; possible are {', '.join(map(str, words))}"
-    return possible(value if isinstance(value, str) else "", [str(word) for word in words])
+    return format_choices(value if isinstance(value, str) else "", [str(word) for word in words])

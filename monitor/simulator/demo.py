@@ -15,16 +15,16 @@ from monitor.common.config_files import CONFIG_FOLDER
 from monitor.noise.catalogue import read_model
 from monitor.settings import loading
 from monitor.settings.loading import Config, VirtualTable
-from monitor.simulator import DEFAULT_RATE_HZ, effects_of
+from monitor.simulator import DEFAULT_RATE_HZ, parse_effects
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
-CONFIG: Final = CONFIG_FOLDER / "demo.toml"
+DEMO_CONFIG: Final = CONFIG_FOLDER / "demo.toml"
 """Shipped configuration of the demo."""
 
 
-def demo(sensor: str | None = None, effects: Sequence[str] = (), effect_at_s: float | None = None) -> Config:
+def demo_config(sensor: str | None = None, effects: Sequence[str] = (), effect_at_s: float | None = None) -> Config:
     """Return the configuration of ``demo``.
 
     Parameters
@@ -41,7 +41,7 @@ def demo(sensor: str | None = None, effects: Sequence[str] = (), effect_at_s: fl
     ConfigError
         An option has an invalid value. The message of one line begins with the option.
     """
-    config = loading.load(CONFIG)
+    config = loading.load(DEMO_CONFIG)
     (device,) = config.devices
     table = device.link
     assert isinstance(table, VirtualTable)
@@ -53,7 +53,7 @@ def demo(sensor: str | None = None, effects: Sequence[str] = (), effect_at_s: fl
     table = msgspec.structs.replace(table, **{key: value for key, value in given.items() if value is not None})
     rate_hz = _for_option("--sensor", read_model, Path(table.model)).sample_rate_hz or DEFAULT_RATE_HZ
     for text in effects:
-        _for_option("--effect", effects_of, text)
+        _for_option("--effect", parse_effects, text)
     window_s = min(device.window_s, loading.WINDOW_SAMPLES[1] / rate_hz)
     # the sensor's own model is in force, so that the viewer shows when the sensor no longer agrees with it
     device = replace(device, link=table, rate_hz=rate_hz, window_s=window_s, model=Path(table.model))

@@ -25,7 +25,7 @@ DRAWS_PER_SAMPLE: Final = 3
 """Uniform random numbers for each sample: the fault, its position in the frame, and whether the cable is pulled."""
 
 
-class Kind(IntEnum):
+class FaultKind(IntEnum):
     """Fault of one sample, in the order in which the probabilities are added up."""
 
     LOST = 0
@@ -36,7 +36,7 @@ class Kind(IntEnum):
 
 
 @dataclass(slots=True)
-class Truth:
+class FaultCounts:
     """Counts of a simulated sensor. Samples made = sent + lost + flipped + cut + dropped."""
 
     sent: int = 0  # sent without corruption, including repeated samples
@@ -53,7 +53,7 @@ class Truth:
         """Number of samples so far."""
         return self.sent + self.lost + self.flipped + self.cut + self.dropped
 
-    def count(self, kind: Kind, out: bool) -> None:
+    def count(self, kind: FaultKind, out: bool) -> None:
         """Count one sample.
 
         Parameters
@@ -66,32 +66,32 @@ class Truth:
         match kind:
             case _ if not out:
                 self.dropped += 1
-            case Kind.LOST:
+            case FaultKind.LOST:
                 self.lost += 1
-            case Kind.FLIPPED:
+            case FaultKind.FLIPPED:
                 self.flipped += 1
-            case Kind.CUT:
+            case FaultKind.CUT:
                 self.cut += 1
             case _:
                 self.sent += 1
-                self.repeated += kind is Kind.REPEATED
+                self.repeated += kind is FaultKind.REPEATED
 
 
 @dataclass(frozen=True, slots=True)
-class Draws:
+class DrawnFaults:
     """Random faults of consecutive samples."""
 
     kind: NDArray[np.int64]  # [n] of Kind
     where: Floats  # [n] position of the fault in the frame, 0 to 1
     pulled: NDArray[np.bool_]  # [n] True if the cable is pulled before this sample
 
-    def kinds(self) -> list[Kind]:
+    def kinds(self) -> list[FaultKind]:
         """Return the fault of each sample."""
-        return [Kind(kind) for kind in self.kind.tolist()]
+        return [FaultKind(kind) for kind in self.kind.tolist()]
 
-    def __getitem__(self, rows: slice) -> "Draws":
+    def __getitem__(self, rows: slice) -> "DrawnFaults":
         """Return the faults of a part of the samples."""
-        return Draws(self.kind[rows], self.where[rows], self.pulled[rows])
+        return DrawnFaults(self.kind[rows], self.where[rows], self.pulled[rows])
 
 
 class Faults:
@@ -117,16 +117,16 @@ class Faults:
             np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(SPAWN_KEY, i))) for i in range(2)
         )
 
-    def draw(self, n: int) -> Draws:
+    def draw(self, n: int) -> DrawnFaults:
         """Draw the faults of the next ``n`` samples."""
         u = self._rng.random((n, DRAWS_PER_SAMPLE))
-        return Draws(np.searchsorted(self._edges, u[:, 0], "right"), u[:, 1], u[:, 2] < self._unplug_probability)
+        return DrawnFaults(np.searchsorted(self._edges, u[:, 0], "right"), u[:, 1], u[:, 2] < self._unplug_probability)
 
-    def hold_s(self) -> float:
+    def draw_delay_s(self) -> float:
         """Draw the delay of the next burst, in seconds."""
         return float(self._delay_rng.uniform(0.0, self._jitter_s)) if self._jitter_s else 0.0
 
-    def hurt(self, kind: Kind, where: float, chunks: list[Chunk]) -> list[Chunk]:
+    def apply_fault(self, kind: FaultKind, where: float, chunks: list[Chunk]) -> list[Chunk]:
         """Apply a fault to the chunks of one sample, and return the chunks that are sent.
 
         Parameters
@@ -139,13 +139,13 @@ class Faults:
             Encoded sample.
         """
         match kind:
-            case Kind.LOST:
+            case FaultKind.LOST:
                 return []
-            case Kind.REPEATED:
+            case FaultKind.REPEATED:
                 return [*chunks, *chunks]
-            case Kind.FLIPPED:
+            case FaultKind.FLIPPED:
                 return [*chunks[:-1], *([] if self._has_checksum else [_flipped(chunks[-1], where)])]
-            case Kind.CUT:
+            case FaultKind.CUT:
                 return [*chunks[:-1], _cut(chunks[-1], where)]
             case _:
                 return chunks

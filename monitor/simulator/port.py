@@ -35,7 +35,7 @@ class Port(Protocol):
         """Disconnect the sensor permanently and remove all files of the port."""
 
 
-def port_of(carrier: str, silence_s: float) -> Port:
+def create_port(carrier: str, silence_s: float) -> Port:
     """Create the port for a carrier.
 
     Parameters

@@ -15,7 +15,7 @@ EXAMPLE: Final = "gz.sinusoidal:amplitude=1e-3,frequency=17"
 """Example in the error message."""
 
 
-def effects_of(text: str) -> list[tuple[str, Effect]]:
+def parse_effects(text: str) -> list[tuple[str, Effect]]:
     """Parse an effect, and return it with its axis, or with each axis of a kind (``g*``).
 
     The effect is read like a table of a model file, so that mistakes give the same messages.

@@ -14,15 +14,15 @@ import structlog
 
 from drivers.decoders.base import Decoder
 from drivers.errors import ConfigError
-from drivers.sample import NO_TICK, Chunk, Counter, Floats, Ints, block
+from drivers.sample import NO_TICK, Chunk, CounterTiming, Floats, Ints, make_block
 from monitor.noise.catalogue import read_model
 from monitor.noise.simulation import ModelStream
 from monitor.settings.loading import VirtualTable
-from monitor.simulator.scheduled_effects import effects_of
+from monitor.simulator.scheduled_effects import parse_effects
 
 DEFAULT_RATE_HZ: Final = 100.0
 """Sample rate if the model has none."""
-ROOM_C: Final = 24.0
+AMBIENT_C: Final = 24.0
 """Temperature at the start if the model has no temperature."""
 WARM_UP_C: Final = 6.0
 """Rise of the die temperature after the start if the model has no temperature."""
@@ -49,7 +49,7 @@ def check_sensor(table: VirtualTable) -> None:
     coming = []
     for text in table.effect:
         try:
-            coming += [(text, axis, effect) for axis, effect in effects_of(text)]
+            coming += [(text, axis, effect) for axis, effect in parse_effects(text)]
         except ConfigError as error:
             wrong += error.lines
     try:
@@ -69,7 +69,7 @@ def check_sensor(table: VirtualTable) -> None:
         raise ConfigError(*wrong)
 
 
-class Sensor:
+class SimulatedSensor:
     """Simulated sensor without its link.
 
     Parameters
@@ -91,7 +91,7 @@ class Sensor:
         self._name = name
         self._model = read_model(Path(table.model))
         self.rate_hz = self._model.sample_rate_hz or DEFAULT_RATE_HZ
-        self._pending_effects = [(text, axis, effect) for text in table.effect for axis, effect in effects_of(text)]
+        self._pending_effects = [(text, axis, effect) for text in table.effect for axis, effect in parse_effects(text)]
         self._effects_begin_at = round(
             table.effect_at * self.rate_hz
         )  # number of the sample at which the effects begin
@@ -105,7 +105,7 @@ class Sensor:
         """Start the clock of the sensor. Kernels of the simulation are compiled before the first sample."""
         trial = self._create_stream(0)
         self._add_effects(trial)
-        trial.draw_all(1)
+        trial.draw_with_temperature(1)
         self._unix_ns = time.time_ns()
 
     def skip(self, n: int) -> None:
@@ -117,9 +117,9 @@ class Sensor:
         index = np.arange(self._made, self._made + n)
         values, temperature_c = self._measured(n)
         if np.isnan(temperature_c).all():
-            temperature_c = ROOM_C + WARM_UP_C * -np.expm1(-index / (self.rate_hz * WARM_UP_S))
+            temperature_c = AMBIENT_C + WARM_UP_C * -np.expm1(-index / (self.rate_hz * WARM_UP_S))
         t_ns = self._unix_ns + np.rint(index * (1e9 / self.rate_hz)).astype(np.int64)
-        samples = block(t_ns, values, temperature_c, self._ticks(index))
+        samples = make_block(t_ns, values, temperature_c, self._ticks(index))
         self._made += n
         if self._decoder.carrier == "messages":  # each sample gets its own message, because each may have a fault
             return [self._decoder.encode(samples[i : i + 1]) for i in range(n)]
@@ -131,15 +131,15 @@ class Sensor:
         """Return values [n, 6] and temperature [n]; the effects begin at their sample."""
         before = max(self._effects_begin_at - self._made, 0)
         if not self._pending_effects or before >= n:
-            drawn = self._stream.draw_all(n)
+            drawn = self._stream.draw_with_temperature(n)
             return drawn.values, drawn.temperature_c
-        parts = [self._stream.draw_all(before)] if before else []
+        parts = [self._stream.draw_with_temperature(before)] if before else []
         self._add_effects(self._stream)
         at_s = (self._made + before) / self.rate_hz
         for text, axis, _ in self._pending_effects:
             _log.info("effect added", device=self._name, axis=axis, effect=text, at_s=at_s)
         self._pending_effects = []
-        parts.append(self._stream.draw_all(n - before))
+        parts.append(self._stream.draw_with_temperature(n - before))
         return np.concatenate([p.values for p in parts]), np.concatenate([p.temperature_c for p in parts])
 
     def _create_stream(self, seed: int) -> ModelStream:
@@ -157,7 +157,7 @@ class Sensor:
     def _ticks(self, index: Ints) -> Ints:
         """Return the counter values of samples."""
         timing = self._decoder.timing
-        if not isinstance(timing, Counter):
+        if not isinstance(timing, CounterTiming):
             return np.full(index.size, NO_TICK, np.int64)
         ticks = index if timing.tick_s is None else np.rint(index / (self.rate_hz * timing.tick_s)).astype(np.int64)
         result: Ints = ticks % timing.modulus

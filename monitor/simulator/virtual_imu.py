@@ -18,9 +18,9 @@ from drivers.errors import LinkUnavailable
 from drivers.links.base import Link
 from drivers.sample import Chunk
 from monitor.settings.loading import VirtualTable
-from monitor.simulator.faults import Draws, Faults, Truth
-from monitor.simulator.port import port_of
-from monitor.simulator.sensor import Sensor
+from monitor.simulator.faults import DrawnFaults, FaultCounts, Faults
+from monitor.simulator.port import create_port
+from monitor.simulator.sensor import SimulatedSensor
 
 BURST_S: Final = 0.01
 """Length of a burst of samples, as from a USB adapter."""
@@ -50,17 +50,17 @@ class VirtualImu:
 
     def __init__(self, table: VirtualTable, decoder: Decoder, name: str = "virtual") -> None:
         self.name = name
-        self.truth = Truth()
+        self.truth = FaultCounts()
         self.now_s: Callable[[], float] = time.monotonic
         """Clock of the simulation, in seconds. It may be replaced before ``start``."""
-        self._sensor = Sensor(table, decoder, name)
+        self._sensor = SimulatedSensor(table, decoder, name)
         self.rate_hz = self._sensor.rate_hz * table.speed
         """Nominal sample rate. The clock of the sensor may deviate from it."""
         self._pace_hz = self.rate_hz * table.faults.clock
         self._faults = Faults(table.faults, table.seed, decoder.carrier)
         self._unplugged_samples = max(1, round(table.faults.unplugged_for * self._sensor.rate_hz))  # samples
         self._back_at: int | None = None  # number of the sample before which the cable is connected again
-        self.port = port_of(decoder.carrier, table.silence)
+        self.port = create_port(decoder.carrier, table.silence)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="virtual imu", daemon=True)
 
@@ -126,10 +126,10 @@ class VirtualImu:
                     self._plug_again()
             at = stop
 
-    def _send(self, frames: list[list[Chunk]], draws: Draws) -> None:
+    def _send(self, frames: list[list[Chunk]], draws: DrawnFaults) -> None:
         """Apply the faults to samples, send them and count the results."""
         hurt = [
-            (kind, self._faults.hurt(kind, where, chunks))
+            (kind, self._faults.apply_fault(kind, where, chunks))
             for kind, where, chunks in zip(draws.kinds(), draws.where.tolist(), frames, strict=True)
         ]
         gone = self.port.send([chunk for _, chunks in hurt for chunk in chunks])
@@ -153,6 +153,6 @@ class VirtualImu:
 
     def _burst_delay_s(self) -> float:
         """Return the delay of the next burst, in seconds."""
-        held_s = self._faults.hold_s()
+        held_s = self._faults.draw_delay_s()
         self.truth.held_s = max(self.truth.held_s, held_s)
         return held_s

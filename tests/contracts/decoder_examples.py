@@ -113,7 +113,7 @@ LISTED = (
     Example("samples", {}, 1e-15, 1e-14, 1e-14),
 )
 
-NAMES = discovery.names(decoders)
+NAMES = discovery.list_modules(decoders)
 EXAMPLES = tuple(e for e in LISTED if e.name in NAMES) + tuple(
     Example(name) for name in NAMES if name not in {e.name for e in LISTED}
 )

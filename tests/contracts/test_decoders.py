@@ -11,7 +11,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.decoders.base import Decoder
-from drivers.sample import NO_TICK, Arrival, Chunk, Counter, Given, SampleBlock, block, join
+from drivers.sample import (
+    NO_TICK,
+    ArrivalTiming,
+    Chunk,
+    CounterTiming,
+    SampleBlock,
+    SenderTiming,
+    concatenate_blocks,
+    make_block,
+)
 from tests.contracts.decoder_examples import EXAMPLES, NAMES, Example
 
 N = 16
@@ -38,10 +47,10 @@ def made(decoder: Decoder, n: int = N, seed: int = 7) -> SampleBlock:
     rng = np.random.default_rng(seed)
     values = rng.normal(0.0, 0.5, (n, 6)) + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.8])
     ticks = np.full(n, NO_TICK, np.int64)
-    if isinstance(decoder.timing, Counter):
+    if isinstance(decoder.timing, CounterTiming):
         step = 1 if decoder.timing.tick_s is None else max(round(5e-4 / decoder.timing.tick_s), 1)
         ticks = (decoder.timing.modulus - (n // 2) * step + np.arange(n) * step) % decoder.timing.modulus
-    return block(np.arange(1, n + 1) * STEP_NS, values, rng.normal(25.0, 1.0, n), ticks)
+    return make_block(np.arange(1, n + 1) * STEP_NS, values, rng.normal(25.0, 1.0, n), ticks)
 
 
 def one_by_one(samples: SampleBlock) -> list[SampleBlock]:
@@ -87,14 +96,14 @@ def seen(blocks: list[SampleBlock]) -> tuple[list[list[float]], list[str], list[
     """Values, temperatures, ticks and all that was lost: what no cut of the bytes may change."""
     if not blocks:
         return [], [], [], 0
-    all_of = join(blocks)
+    all_of = concatenate_blocks(blocks)
     return all_of.values.tolist(), [repr(t) for t in all_of.temperature_c], all_of.ticks.tolist(), all_of.lost
 
 
 def clean(example: Example, folder: Path, samples: SampleBlock) -> list[list[float]]:
     """The values that come back when nothing happens on the way, sample by sample."""
     decoder = example.build(folder)
-    got = join(feed(decoder, [flat(chunks_of(decoder, samples))]))
+    got = concatenate_blocks(feed(decoder, [flat(chunks_of(decoder, samples))]))
     assert len(got) == len(samples)
     return got.values.tolist()
 
@@ -110,7 +119,7 @@ def test_every_decoder_is_tried() -> None:
 @every_decoder
 def test_encode_then_feed_gives_back_the_samples_to_half_a_bit(example: Example, decoder: Decoder) -> None:
     samples = made(decoder)
-    got = join(feed(decoder, [list(decoder.encode(samples))]))
+    got = concatenate_blocks(feed(decoder, [list(decoder.encode(samples))]))
     steps = np.repeat([example.gyro_step, example.accel_step], 3)
     error = np.abs(got.values - samples.values).max(axis=0)
     assert (error <= 0.5 * steps * (1 + 1e-6)).all(), error / steps
@@ -121,19 +130,19 @@ def test_encode_then_feed_gives_back_the_samples_to_half_a_bit(example: Example,
         assert degrees <= 0.5 * example.temperature_step * (1 + 1e-6)
     assert got.lost == decoder.bad == 0
     assert decoder.hint == ""
-    if isinstance(decoder.timing, Counter):
+    if isinstance(decoder.timing, CounterTiming):
         assert got.ticks.tolist() == samples.ticks.tolist()
         assert np.diff(got.ticks).min() < 0, "the counter did not wrap"
-    if isinstance(decoder.timing, Arrival):
+    if isinstance(decoder.timing, ArrivalTiming):
         assert (got.ticks == NO_TICK).all()
-    if isinstance(decoder.timing, Given):
+    if isinstance(decoder.timing, SenderTiming):
         assert got.t_ns.tolist() == samples.t_ns.tolist()
 
 
 @every_decoder
 def test_samples_arrive_with_the_chunk_that_completes_them(decoder: Decoder) -> None:
     samples = made(decoder)
-    got = join(feed(decoder, [flat(chunks_of(decoder, samples))]))
+    got = concatenate_blocks(feed(decoder, [flat(chunks_of(decoder, samples))]))
     assert got.t_ns.tolist() == samples.t_ns.tolist()
 
 

@@ -16,8 +16,8 @@ from scipy.signal import welch
 import monitor.noise.effects as folder
 from drivers.errors import ConfigError
 from drivers.sample import AXES
-from monitor.noise.effect import Effect, Leak, Source, Transform, required, units
-from monitor.noise.effects import EFFECTS, ORDER, NoiseStep
+from monitor.noise.effect import Effect, Leak, Source, Transform, parameter_units, required_parameters
+from monitor.noise.effects import EFFECTS, TRANSFORM_ORDER, NoiseStep
 from monitor.noise.model import NoiseModel
 from tests.contracts.effect_examples import AXIS, RATE_HZ, effect, example, model, without
 
@@ -65,14 +65,14 @@ def test_every_file_of_the_folder_is_listed():
 def test_says_what_it_is(name):
     kind = EFFECTS[name]
     assert kind.name == name
-    assert kind.means.endswith(".")
-    assert kind.means.count("\n") == 0
-    assert kind.means[:-1].count(". ") == 0
-    assert all(gyro and accelerometer for gyro, accelerometer in units(kind).values())
+    assert kind.description.endswith(".")
+    assert kind.description.count("\n") == 0
+    assert kind.description[:-1].count(". ") == 0
+    assert all(gyro and accelerometer for gyro, accelerometer in parameter_units(kind).values())
     assert inspect.getdoc(inspect.getmodule(kind))
     assert ">>>" in inspect.getdoc(kind)
     assert issubclass(kind, (Source, Leak, Transform, NoiseStep))
-    assert issubclass(kind, Transform) == (kind in ORDER)
+    assert issubclass(kind, Transform) == (kind in TRANSFORM_ORDER)
 
 
 def test_each_effect_has_a_variance_or_a_series_to_compare_with():
@@ -120,7 +120,7 @@ def test_simulated_spectrum_is_the_stated_one(name):
 @pytest.mark.parametrize("name", EXACT)
 def test_series_is_the_one_written_down_a_second_time(name):
     n = 5000
-    drawn = model(name).stream(RATE_HZ, 3).draw_all(n)
+    drawn = model(name).stream(RATE_HZ, 3).draw_with_temperature(n)
     base = without(name).simulate(n, RATE_HZ, 3)[:, COLUMN]
     expected = example(name).exact(base, np.arange(n) / RATE_HZ, drawn.temperature_c)
     np.testing.assert_allclose(drawn.values[:, COLUMN], expected, rtol=1e-9, atol=1e-12)
@@ -133,8 +133,8 @@ def test_series_is_the_one_written_down_a_second_time(name):
 def test_any_cut_into_blocks_gives_the_same_series(name, cuts):
     n = 4500  # longer than what a stream makes at once
     stream = model(name).stream(RATE_HZ, 5)
-    pieces = [stream.draw_all(size) for size in [*cuts, max(0, n - sum(cuts))]]
-    whole = model(name).stream(RATE_HZ, 5).draw_all(max(n, sum(cuts)))
+    pieces = [stream.draw_with_temperature(size) for size in [*cuts, max(0, n - sum(cuts))]]
+    whole = model(name).stream(RATE_HZ, 5).draw_with_temperature(max(n, sum(cuts)))
     np.testing.assert_array_equal(np.concatenate([piece.values for piece in pieces]), whole.values)
     np.testing.assert_array_equal(np.concatenate([piece.temperature_c for piece in pieces]), whole.temperature_c)
 
@@ -169,7 +169,7 @@ def test_is_read_back_as_it_was_written(name):
     assert NoiseModel.from_toml(written) == model(name)
     assert NoiseModel.from_toml(written).to_toml() == written
     assert name in str(model(name))
-    for parameter, (unit, _) in units(EFFECTS[name]).items():
+    for parameter, (unit, _) in parameter_units(EFFECTS[name]).items():
         if getattr(effect(name), parameter) is not None and unit not in ("1", "axis"):
             assert f"{parameter} = " in str(model(name))
             assert unit in str(model(name))
@@ -177,7 +177,7 @@ def test_is_read_back_as_it_was_written(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_may_be_absent_stays_absent(name):
-    given_ = {key: example(name).parameters.get(key, 0.3) for key in required(EFFECTS[name])}
+    given_ = {key: example(name).parameters.get(key, 0.3) for key in required_parameters(EFFECTS[name])}
     bare = without(name) + NoiseModel({AXIS: (EFFECTS[name](**given_),)})
     assert NoiseModel.from_toml(bare.to_toml()) == bare
 
@@ -193,7 +193,7 @@ def test_truth_is_ready_for_json_and_the_same_for_the_same_seed(name):
 
 
 def parameters(name: str, **changed: object) -> dict[str, object]:
-    return {**{key: example(name).parameters.get(key, 0.3) for key in units(EFFECTS[name])}, **changed}
+    return {**{key: example(name).parameters.get(key, 0.3) for key in parameter_units(EFFECTS[name])}, **changed}
 
 
 NUMBERS = [(name, f.name) for name in NAMES for f in fields(EFFECTS[name]) if not f.metadata.get("axis")]
@@ -229,8 +229,8 @@ def test_refuses_what_is_out_of_bounds(name, parameter):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_missing_parameter_is_named(name):
-    for parameter in required(EFFECTS[name]):
-        rest = [key for key in required(EFFECTS[name]) if key != parameter]
+    for parameter in required_parameters(EFFECTS[name]):
+        rest = [key for key in required_parameters(EFFECTS[name]) if key != parameter]
         lines = [f'{key} = "az"' if key == "source" else f"{key} = 0.3" for key in rest]
         with pytest.raises(ConfigError, match=f"^gz.{name}: {parameter} is missing$"):
             NoiseModel.from_toml("\n".join([f"[gz.{name}]", *lines]))

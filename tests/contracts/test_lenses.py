@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from monitor.reconcile.diagnostics.diagnostics import LENSES, Finding, Sight
-from monitor.reconcile.diagnostics.gap import look, nulls
-from monitor.reconcile.preparation.cosine_bins import series, transform
+from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS, Finding, WhitenedAxis
+from monitor.reconcile.diagnostics.gap import null_distributions, run_diagnostics
+from monitor.reconcile.preparation.cosine_bins import cosine_transform, inverse_cosine_transform
 from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, N, axes, correlated, seen, time_s, walk, warmth, white
 
-NAMES = sorted(LENSES)
+NAMES = sorted(DIAGNOSTICS)
 n = 6000
 SIGMA = N * RATE_HZ**0.5
 RUNS = 240
 OTHER = correlated(n, np.random.default_rng(99_999), 1e-2, 1.0)
 
 
-def beside_white(y: np.ndarray) -> Sight:
+def beside_white(y: np.ndarray) -> WhitenedAxis:
     """A series beside white noise of its own size."""
     return seen(axes({"gx": OTHER, "gz": y}, (WHITE,), warmth(n))["gz"], (WHITE,))
 
@@ -35,7 +35,7 @@ def findings(first: int, runs: int) -> list[dict[str, Finding]]:
         rng = np.random.default_rng(seed)
         y = white(n, rng) + walk(n, rng)
         one = axes({"gx": OTHER, "gz": y}, {"gx": (WHITE,), "gz": (WHITE, WALK)}, warmth(n))["gz"]
-        found.append(dict(look(seen(one, (WHITE, WALK)))))
+        found.append(dict(run_diagnostics(seen(one, (WHITE, WALK)))))
     return found
 
 
@@ -44,7 +44,7 @@ def all_nulls(name: str) -> np.ndarray:
     """null95 of a lens, nats, as often as three axes of six recordings each give one."""
     found = findings(0, 108)
     parts = [found[at : at + 18] for at in range(0, 108, 18)]
-    each = [nulls({axis: part[k::3] for k, axis in enumerate(("gx", "gy", "gz"))}, 3) for part in parts]
+    each = [null_distributions({axis: part[k::3] for k, axis in enumerate(("gx", "gy", "gz"))}, 3) for part in parts]
     return np.array([null[axis][name].null95 for null in each for axis in null])
 
 
@@ -72,9 +72,9 @@ def impulses(apart: int) -> np.ndarray:
 
 def flat() -> np.ndarray:
     """White noise whose slow half hardly moves the level."""
-    coefficients = transform(white(n, np.random.default_rng(2)))
+    coefficients = cosine_transform(white(n, np.random.default_rng(2)))
     coefficients[: n // 2] *= 0.2
-    return series(coefficients)
+    return inverse_cosine_transform(coefficients)
 
 
 def without(column: np.ndarray) -> np.ndarray:
@@ -86,9 +86,9 @@ def without(column: np.ndarray) -> np.ndarray:
 
 EQUAL: dict[str, Callable[[], np.ndarray]] = {
     "values": lambda: white(n, np.random.default_rng(4)),
-    "psd": lambda: series(signs(n - 1)),
+    "psd": lambda: inverse_cosine_transform(signs(n - 1)),
     "lines": impulse,
-    "autocorrelation": lambda: series(signs(n - 1)),
+    "autocorrelation": lambda: inverse_cosine_transform(signs(n - 1)),
     "level": flat,
     "temperature": lambda: without(warmth(n) - 25.0),
     "other_axes": lambda: without(OTHER),
@@ -114,19 +114,19 @@ HIDDEN: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 def test_every_lens_is_here():
-    assert set(EQUAL) == set(HIDDEN) == set(LENSES)
+    assert set(EQUAL) == set(HIDDEN) == set(DIAGNOSTICS)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_data_that_equal_the_expectation_have_no_gap(name):
-    found = LENSES[name](beside_white(EQUAL[name]()))
+    found = DIAGNOSTICS[name](beside_white(EQUAL[name]()))
     assert 0.0 <= found.gain < 0.2 * null95(name)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_it_is_there_for_is_seen(name):
     y = white(n, np.random.default_rng(8))
-    found, before = LENSES[name](beside_white(HIDDEN[name](y))), LENSES[name](beside_white(y))
+    found, before = DIAGNOSTICS[name](beside_white(HIDDEN[name](y))), DIAGNOSTICS[name](beside_white(y))
     assert found.gain > 3.0 * null95(name)
     assert found.gain > before.gain + 10.0
 
@@ -157,19 +157,19 @@ def test_same_data_same_finding_and_nothing_is_changed(name):
     kept = y.copy()
     one, other = beside_white(y), beside_white(kept)
     arrays = {field: getattr(one, field).copy() for field in ("whitened", "weight", "white", "fast")}
-    coefficients, samples = one.axis.coefficients.copy(), one.axis.y.copy()
-    found = LENSES[name](one)
-    assert LENSES[name](one) == found == LENSES[name](other)
+    coefficients, samples = one.axis.coefficients.copy(), one.axis.repaired.copy()
+    found = DIAGNOSTICS[name](one)
+    assert DIAGNOSTICS[name](one) == found == DIAGNOSTICS[name](other)
     for field, before in arrays.items():
         np.testing.assert_array_equal(getattr(one, field), before)
     np.testing.assert_array_equal(one.axis.coefficients, coefficients)
-    np.testing.assert_array_equal(one.axis.y, samples)
+    np.testing.assert_array_equal(one.axis.repaired, samples)
     np.testing.assert_array_equal(y, kept)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_place_is_inside_the_recording(name):
-    where = LENSES[name](beside_white(HIDDEN[name](white(n, np.random.default_rng(10))))).where
+    where = DIAGNOSTICS[name](beside_white(HIDDEN[name](white(n, np.random.default_rng(10))))).where
     limits = {
         "frequency": (-0.05, 0.5 * RATE_HZ + 0.05),
         "tau": (0.0, n / RATE_HZ),
@@ -185,7 +185,7 @@ def test_place_is_inside_the_recording(name):
 
 def test_the_place_is_that_of_what_is_hidden():
     def where(name):
-        return LENSES[name](beside_white(HIDDEN[name](white(n, np.random.default_rng(11))))).where
+        return DIAGNOSTICS[name](beside_white(HIDDEN[name](white(n, np.random.default_rng(11))))).where
 
     lo, hi = where("lines").frequency
     assert lo < 17.3 < hi

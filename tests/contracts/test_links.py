@@ -42,7 +42,7 @@ class Rig:
 
 
 def build(name: str, **keys: Any) -> Link:
-    module = discovery.load(links, name, "_link")
+    module = discovery.import_module(links, name, "_link")
     link: Link = module.build(msgspec.convert(keys, module.Settings))
     return link
 
@@ -153,9 +153,9 @@ def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
         yield made
 
 
-@pytest.fixture(params=discovery.names(links, "_link"))
+@pytest.fixture(params=discovery.list_modules(links, "_link"))
 def module(request: pytest.FixtureRequest) -> ModuleType:
-    return discovery.load(links, request.param, "_link")
+    return discovery.import_module(links, request.param, "_link")
 
 
 def receive(rig: Rig) -> list[Chunk]:
@@ -174,7 +174,7 @@ def read_on(link: Link) -> None:
 
 
 def test_every_link_has_a_rig() -> None:
-    assert {name.split("-")[0] for name in RIGS} == set(discovery.names(links, "_link"))
+    assert {name.split("-")[0] for name in RIGS} == set(discovery.list_modules(links, "_link"))
 
 
 def test_module_has_settings_build_and_default_decoder(module: ModuleType) -> None:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from drivers.credential_masking import has_secret, masked
+from drivers.credential_masking import has_secret, mask_secrets
 
 SECRET = "hunter2"
 
@@ -23,7 +23,7 @@ SECRET = "hunter2"
     ],
 )
 def test_it_is_gone(text: str) -> None:
-    assert SECRET not in masked(text)
+    assert SECRET not in mask_secrets(text)
     assert has_secret(text)
 
 
@@ -41,7 +41,7 @@ def test_it_is_gone(text: str) -> None:
     ],
 )
 def test_nothing_else_is(text: str) -> None:
-    assert masked(text) == text
+    assert mask_secrets(text) == text
     assert not has_secret(text)
 
 
@@ -49,4 +49,4 @@ def test_nothing_else_is(text: str) -> None:
 def test_a_megabyte_without_a_break_is_searched(piece: str) -> None:
     # the regular expressions took hours for a megabyte without a break; now they take seconds at most
     long = piece * (1_000_000 // len(piece))
-    assert SECRET not in masked(f"{long} password: {SECRET}")
+    assert SECRET not in mask_secrets(f"{long} password: {SECRET}")

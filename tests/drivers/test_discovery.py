@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from drivers import decoders, links
-from drivers.discovery import load, names, nearest
+from drivers.discovery import format_suggestion, import_module, list_modules
 from drivers.errors import ConfigError
 
 
@@ -26,48 +26,48 @@ def package(tmp_path, monkeypatch):
 
 
 def test_names_are_sorted_and_without_suffix(package):
-    assert names(package, "_link") == ("broken", "can", "serial")
+    assert list_modules(package, "_link") == ("broken", "can", "serial")
 
 
 def test_base_is_no_member(package):
-    assert "base" not in names(package)
-    assert "table" in names(package)
+    assert "base" not in list_modules(package)
+    assert "table" in list_modules(package)
 
 
 def test_listing_imports_nothing(package):
-    names(package, "_link")
+    list_modules(package, "_link")
     assert not any(name.startswith("some_plugins.") for name in sys.modules)
 
 
 def test_load_imports_the_one_asked_for(package):
-    assert load(package, "serial", "_link").NAME == "serial_link"
+    assert import_module(package, "serial", "_link").NAME == "serial_link"
     assert "some_plugins.can_link" not in sys.modules
 
 
 def test_an_error_inside_a_plugin_is_not_hidden(package):
     with pytest.raises(RuntimeError, match="imported"):
-        load(package, "broken", "_link")
+        import_module(package, "broken", "_link")
 
 
 def test_unknown_name_gets_all_names_the_nearest_first(package):
     with pytest.raises(ConfigError, match='unknown name "seriel"; possible are serial, broken, can'):
-        load(package, "seriel", "_link")
+        import_module(package, "seriel", "_link")
 
 
 @pytest.mark.parametrize("name", ["base", "serial_link", "", "../secret", "os.path"])
 def test_only_members_are_imported(package, name):
     with pytest.raises(ConfigError, match="unknown name"):
-        load(package, name, "_link")
+        import_module(package, name, "_link")
 
 
 def test_nearest_lists_all_when_none_is_near():
-    assert nearest("xyzzy", ("can", "serial")) == "; known are can, serial"
-    assert nearest("cam", ("can", "serial")) == '; did you mean "can"?'
+    assert format_suggestion("xyzzy", ("can", "serial")) == "; known are can, serial"
+    assert format_suggestion("cam", ("can", "serial")) == '; did you mean "can"?'
 
 
 def test_the_project_has_members_and_each_is_importable():
     for package, suffix in ((links, "_link"), (decoders, "")):
-        members = names(package, suffix)
+        members = list_modules(package, suffix)
         assert members
         for member in members:
-            assert load(package, member, suffix).__name__ == f"{package.__name__}.{member}{suffix}"
+            assert import_module(package, member, suffix).__name__ == f"{package.__name__}.{member}{suffix}"

@@ -14,12 +14,12 @@ import pytest
 from drivers import driver as driver_module
 from drivers.decoders import dbc, stim300, text, vectornav_binary
 from drivers.decoders import samples as samples_decoder
-from drivers.driver import UNDECODED_BYTES, AxisMap, Driver, axis_map
+from drivers.driver import MAX_UNDECODED_BYTES, AxisMap, Driver, parse_axis_map
 from drivers.errors import ConfigError
 from drivers.links.loopback_link import LoopbackLink
-from drivers.sample import NO_TICK, Chunk, block
+from drivers.sample import NO_TICK, Chunk, make_block
 from drivers.timing.sample_clock import SampleClock
-from drivers.zenoh.sample_message import pack
+from drivers.zenoh.sample_message import encode_samples
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
 RATE = 100.0
@@ -29,7 +29,7 @@ def samples(first, n, rate=RATE, tick_s=1e-9, modulus=1 << 62):
     index = np.arange(first, first + n)
     values = np.tile([0.1, -0.2, 0.3, 1.0, 2.0, 9.81], (n, 1)) + 1e-3 * index[:, None]
     ticks = np.rint(index / rate / tick_s).astype(np.int64) % modulus
-    return block(np.zeros(n, np.int64), values, None, ticks)
+    return make_block(np.zeros(n, np.int64), values, None, ticks)
 
 
 class Rig:
@@ -200,7 +200,7 @@ def test_bytes_without_a_sample_say_so():
         rig.send(5)
         rig.wait(lambda: rig.driver.state == "running")
         assert rig.driver.text == ""
-    assert UNDECODED_BYTES < 30 * 199
+    assert MAX_UNDECODED_BYTES < 30 * 199
 
 
 def test_fifty_lost_links_leave_nothing_behind():
@@ -278,7 +278,7 @@ def test_messages_that_never_came_are_lost_and_rejected_ones_are_bad():
     decoder = samples_decoder.build(samples_decoder.Settings())
     rig = Rig(decoder)
     t_ns = 1_700_000_000 * 10**9 + 10_000_000 * np.arange(100)
-    messages = [pack("a", n, block(t_ns[n - 10 : n], np.ones((10, 6)))) for n in range(10, 101, 10)]
+    messages = [encode_samples("a", n, make_block(t_ns[n - 10 : n], np.ones((10, 6)))) for n in range(10, 101, 10)]
     messages[3] = messages[3][:40]
     del messages[6:8]
     for message in messages:
@@ -298,7 +298,7 @@ def can_rig(late, n=500):
     decoder = dbc.build(msgspec.convert({"file": "j1939_imu", "signals": SIGNALS, "window": 0.005}, dbc.Settings))
     rig = Rig(decoder, 50.0)
     index = np.arange(n)
-    sent = decoder.encode(block(index * 20_000_000, np.tile([0.0, 0.0, 0.1, 0.0, 0.0, 9.81], (n, 1))))
+    sent = decoder.encode(make_block(index * 20_000_000, np.tile([0.0, 0.0, 0.1, 0.0, 0.0, 9.81], (n, 1))))
     rig.link.open()
     for i, chunk in enumerate(sent):
         delay_ns = i % 2 * (8_000_000 if i // 2 in late else 1_000_000)
@@ -317,7 +317,7 @@ def test_late_can_frames_are_late_samples_neither_bad_nor_sent_twice(late):
 
 def test_late_and_missing_can_frames_add_up_with_the_samples():
     rig = can_rig(range(0), 0)
-    sent = rig.decoder.encode(block(np.arange(100) * 20_000_000, np.ones((100, 6))))
+    sent = rig.decoder.encode(make_block(np.arange(100) * 20_000_000, np.ones((100, 6))))
     late, missing = {20, 21, 60}, {40, 41, 81}
     for i, chunk in enumerate(sent):
         if i // 2 in missing and i % 2 == 1:
@@ -360,7 +360,7 @@ def test_a_fault_of_the_program_does_not_look_like_a_running_device():
 
 
 def test_axes_are_mapped_with_their_signs():
-    axes = axis_map({"gy": "gz", "gz": "-gy", "ay": "+az", "az": "-ay"})
+    axes = parse_axis_map({"gy": "gz", "gz": "-gy", "ay": "+az", "az": "-ay"})
     with running(axes=axes) as rig:
         rig.send(1)
         rig.received(1)
@@ -368,19 +368,19 @@ def test_axes_are_mapped_with_their_signs():
 
 
 def test_axis_map_keeps_all_else():
-    first = block(np.arange(3), np.arange(18.0).reshape(3, 6), np.ones(3), np.arange(3), 4)
-    mapped = axis_map({"gx": "-gx"}).apply(first)
+    first = make_block(np.arange(3), np.arange(18.0).reshape(3, 6), np.ones(3), np.arange(3), 4)
+    mapped = parse_axis_map({"gx": "-gx"}).apply(first)
     assert (mapped.lost, mapped.ticks.tolist(), mapped.temperature_c.tolist()) == (4, [0, 1, 2], [1.0] * 3)
     assert mapped.values[:, 0].tolist() == [-0.0, -6.0, -12.0]
     assert np.array_equal(mapped.values[:, 1:], first.values[:, 1:])
     assert AxisMap().apply(first) is first
-    assert axis_map({}) == AxisMap()
+    assert parse_axis_map({}) == AxisMap()
 
 
 @pytest.mark.parametrize("table", [{"gq": "gx"}, {"gx": "mx"}, {"gx": "--gy"}, {"gx": ""}, {"gx": "-"}])
 def test_axes_that_are_none_are_refused(table):
     with pytest.raises(ConfigError, match="both are one of gx gy gz ax ay az and of one kind"):
-        axis_map(table)
+        parse_axis_map(table)
 
 
 def test_an_arrival_timed_device_counts_its_rejected_lines():
@@ -404,10 +404,10 @@ def test_many_holes_are_told_once_a_second(monkeypatch):
     rig = Rig()
     driver = rig.driver
     for lost in (3, 2, 2):
-        driver._count(block(np.zeros(1, np.int64), np.zeros((1, 6)), lost=lost), 0)
-        driver._tell_lost()
+        driver._count(make_block(np.zeros(1, np.int64), np.zeros((1, 6)), lost=lost), 0)
+        driver._report_lost()
     now_s[0] += 1.0
-    driver._tell_lost()
-    driver._tell_lost()
+    driver._report_lost()
+    driver._report_lost()
     assert [event.text for event in driver.take_events()] == ["3 samples missing", "4 samples missing in 2 places"]
     assert driver.counts.lost == 7

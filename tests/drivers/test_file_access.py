@@ -13,15 +13,15 @@ from monitor.settings import loading
 
 def test_all_of_a_file(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"1\r\n2")
-    assert file_access.read(tmp_path / "a") == b"1\r\n2"
+    assert file_access.read_small_file(tmp_path / "a") == b"1\r\n2"
 
 
 def test_what_is_too_large_is_one_line_for_every_reader(tmp_path: Path) -> None:
     path = tmp_path / "big"
     with path.open("wb") as file:
-        file.truncate(file_access.MOST_BYTES + 1)
+        file.truncate(file_access.MAX_BYTES + 1)
     with pytest.raises(OSError, match="more than 32 MB"):
-        file_access.read(path)
+        file_access.read_small_file(path)
     config, wrong = loading.read(path)
     assert config is None
     assert "more than 32 MB" in wrong[0]

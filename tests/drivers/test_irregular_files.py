@@ -13,13 +13,13 @@ import pytest
 from drivers import file_access
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.links import replay_link
-from drivers.recordings import load_samples, segment, writing
+from drivers.recordings import load_samples, open_recording_writer, segment
 from drivers.zenoh.session import configuration
 from monitor.commands import thermal
 from monitor.common import config_files
 from monitor.history import sqlite_store
 from monitor.noise.catalogue import read_model
-from monitor.publishing.zenoh.subscriber import listeners
+from monitor.publishing.zenoh.subscriber import client_configurations
 from monitor.settings import loading
 from tests.support.waiting import PATIENCE_S
 
@@ -69,7 +69,7 @@ def one_line(error: BaseException) -> str:
 def test_open_regular_says_what_it_is(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "name"
     make(kind, path)
-    for read in (file_access.read, file_access.open_regular, file_access.check_regular):
+    for read in (file_access.read_small_file, file_access.open_regular, file_access.check_regular):
         with pytest.raises(OSError, match=KINDS[kind]):
             read(path)
 
@@ -105,7 +105,9 @@ def test_a_recording_in_a_folder_is_left_out_with_a_note(kind: str, tmp_path: Pa
     assert KINDS[kind] in note
 
 
-@pytest.mark.parametrize("read", [segment.origin, segment.newest, lambda path: list(segment.read_samples(path))])
+@pytest.mark.parametrize(
+    "read", [segment.read_metadata, segment.read_last_piece, lambda path: list(segment.read_samples(path))]
+)
 def test_a_segment(kind: str, read: Callable[[Path], object], tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     path = tmp_path / segment.segment_name(1, 1.7e9)
@@ -116,13 +118,13 @@ def test_a_segment(kind: str, read: Callable[[Path], object], tmp_path: Path) ->
 
 def test_a_part_file_in_the_way_of_a_new_one(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.csv.part")
-    with writing.whole(tmp_path / "a.csv") as part:
+    with open_recording_writer.whole(tmp_path / "a.csv") as part:
         part.write_text("x")
     assert (tmp_path / "a.csv").read_text() == "x"
     pytest.importorskip("pyarrow")
     path = tmp_path / segment.segment_name(1, 1.7e9)
     os.mkfifo(path.with_name(path.name + ".part"))
-    segment.SegmentWriter(path, segment.Origin("a", "samples")).close()
+    segment.SegmentWriter(path, segment.SegmentMetadata("a", "samples")).close()
 
 
 @pytest.mark.parametrize(
@@ -131,7 +133,7 @@ def test_a_part_file_in_the_way_of_a_new_one(tmp_path: Path) -> None:
         ("configuration", loading.load),
         ("model", read_model),
         ("model name", lambda path: config_files.model_path(str(path), path.parent)),
-        ("zenoh file", lambda path: listeners((), path)),
+        ("zenoh file", lambda path: client_configurations((), path)),
     ],
 )
 def test_a_file_of_settings(kind: str, name: str, read: Callable[[Path], object], tmp_path: Path) -> None:
@@ -194,11 +196,11 @@ def test_a_can_database(kind: str, suffix: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["fifo", "socket", "device", "directory", "loop"])
 def test_a_history(kind: str, end: str, tmp_path: Path) -> None:
     if end:
-        sqlite_store.Store(tmp_path / sqlite_store.FILE).close()
-    path = tmp_path / f"{sqlite_store.FILE}{end}"
+        sqlite_store.HistoryStore(tmp_path / sqlite_store.FILE_NAME).close()
+    path = tmp_path / f"{sqlite_store.FILE_NAME}{end}"
     make(kind, path)
     for look in (
-        lambda: sqlite_store.Store(tmp_path / sqlite_store.FILE).close(),
+        lambda: sqlite_store.HistoryStore(tmp_path / sqlite_store.FILE_NAME).close(),
         lambda: list(read_history(tmp_path)),
     ):
         with pytest.raises((RecordingError, OSError), match=KINDS[kind]):
@@ -206,7 +208,7 @@ def test_a_history(kind: str, end: str, tmp_path: Path) -> None:
 
 
 def read_history(folder: Path) -> Iterator[str]:
-    with sqlite_store.reading(folder / sqlite_store.FILE) as reader:
+    with sqlite_store.open_history(folder / sqlite_store.FILE_NAME) as reader:
         yield from reader.devices()
 
 

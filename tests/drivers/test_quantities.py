@@ -8,7 +8,7 @@ import pytest
 
 from drivers import quantities
 from drivers.errors import ConfigError
-from drivers.quantities import RATE_HZ, SCALE, SEED, SILENCE_S, Quantity, check_settings, out_of_range
+from drivers.quantities import RATE_HZ, SCALE, SEED, SILENCE_S, Quantity, check_settings, find_out_of_range
 
 ALL = {name: one for name, one in vars(quantities).items() if isinstance(one, Quantity)}
 
@@ -54,7 +54,7 @@ def test_a_number_anywhere_in_settings_is_found(settings: Outer, text: str) -> N
 
 def test_what_is_no_number_passes() -> None:
     check_settings(Outer(rate="auto", signals={"gx": "Message.Signal"}, flag=False))
-    assert list(out_of_range(None, Annotated[float, RATE_HZ.meta] | None)) == []
+    assert list(find_out_of_range(None, Annotated[float, RATE_HZ.meta] | None)) == []
 
 
 def test_every_number_outside_its_range_is_found() -> None:

@@ -27,13 +27,13 @@ from drivers.recordings import (
     iter_blocks,
     load_samples,
     memory_check,
+    open_recording_writer,
     save_samples,
-    writing,
 )
 from drivers.recordings.arrow_messages import batch_sizes, buffer_count, check_buffers
 from drivers.recordings.csv_format import MAX_LINE_BYTES, READ_BYTES
-from drivers.recordings.writing import whole
-from drivers.sample import AXES, join
+from drivers.recordings.writing import atomic_write_path
+from drivers.sample import AXES, concatenate_blocks
 from tests.support.recordings import recordings
 
 SUFFIXES = tuple(FORMATS)
@@ -140,7 +140,7 @@ class TestRoundTrip:
 
 
 def appended(path, t, values, temperature, cuts):
-    with writing(path, AXES, temperature=True) as append:
+    with open_recording_writer(path, AXES, temperature=True) as append:
         for rows in map(slice, (0, *cuts), (*cuts, len(t))):
             append(t[rows], values[rows], temperature[rows])
 
@@ -158,14 +158,14 @@ class TestPieceByPiece:
 
     def test_columns_that_were_not_asked_for_are_absent(self, path):
         t, values, _ = samples()
-        with writing(path, ["gz"], temperature=False) as append:
+        with open_recording_writer(path, ["gz"], temperature=False) as append:
             append(t, values)
         assert load_samples(path).axes == ("gz",)
 
     @pytest.mark.parametrize("ended", [KeyboardInterrupt, OSError, SystemExit])
     def test_a_run_that_is_broken_off_leaves_nothing(self, path, ended):
         t, values, temperature = samples()
-        with pytest.raises(ended), writing(path, AXES, temperature=True) as append:  # noqa: PT012
+        with pytest.raises(ended), open_recording_writer(path, AXES, temperature=True) as append:  # noqa: PT012
             append(t, values, temperature)
             raise ended
         assert list(path.parent.iterdir()) == []
@@ -173,7 +173,7 @@ class TestPieceByPiece:
     def test_a_run_that_is_broken_off_leaves_what_was_there(self, path):
         save_samples(path, *samples())
         before = path.read_bytes()
-        with pytest.raises(KeyboardInterrupt), writing(path, AXES, temperature=True) as append:  # noqa: PT012
+        with pytest.raises(KeyboardInterrupt), open_recording_writer(path, AXES, temperature=True) as append:  # noqa: PT012
             append(*samples(9))
             raise KeyboardInterrupt
         assert list(path.parent.iterdir()) == [path]
@@ -185,7 +185,7 @@ class TestPieceByPiece:
 
         def peak(times):
             tracemalloc.start()
-            with writing(path, AXES, temperature=True) as append:
+            with open_recording_writer(path, AXES, temperature=True) as append:
                 for _ in range(times):
                     append(t, values, temperature)
             high = tracemalloc.get_traced_memory()[1]
@@ -219,7 +219,7 @@ class TestSaveRefuses:
 
     def test_a_full_disk_names_the_file_and_leaves_nothing(self, tmp_path):
         def fill():
-            with whole(tmp_path / "x.csv") as part:
+            with atomic_write_path(tmp_path / "x.csv") as part:
                 part.write_text("t,gz\n")
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -341,7 +341,7 @@ class TestBlocks:
         save_samples(tmp_path / "x.npz", t + 1.7637e9, values, temperature)
         blocks = list(iter_blocks(load_samples(tmp_path / "x.npz"), 300))
         assert [len(b) for b in blocks] == [300, 300, 300, 100]
-        whole = join(blocks)
+        whole = concatenate_blocks(blocks)
         assert np.array_equal(whole.values, values)
         assert np.array_equal(whole.temperature_c, temperature)
         # a float64 near 1.76e9 s is exact to 0.24 µs
@@ -351,7 +351,7 @@ class TestBlocks:
 
     def test_without_t_the_rate_makes_the_times(self, tmp_path):
         recording = load_samples(written(tmp_path / "x.csv", "gx\n" + "1\n" * 7), 3.0)
-        times = join(list(iter_blocks(recording, 3))).t_ns
+        times = concatenate_blocks(list(iter_blocks(recording, 3))).t_ns
         assert times.tolist() == [round(i * 1e9 / 3) for i in range(7)]
 
     def test_neither_times_nor_rate(self):
@@ -761,12 +761,12 @@ class TestRoom:
         t, values, temperature = samples(300)
         for i in range(3):
             save_samples(tmp_path / f"{i}.npz", 3.0 * i + t, values, temperature)
-        monkeypatch.setattr(memory_check, "free_bytes", lambda: 3 * 500 * 64)
+        monkeypatch.setattr(memory_check, "available_bytes", lambda: 3 * 500 * 64)
         with pytest.raises(ConfigError, match=r"GB of memory would be needed.*--last 1d") as error:
             load_samples(tmp_path)
         assert str(error.value).startswith(f"{tmp_path}: ")
         assert len(load_samples(tmp_path, last_s=1.0)) == 100
-        monkeypatch.setattr(memory_check, "free_bytes", lambda: None)
+        monkeypatch.setattr(memory_check, "available_bytes", lambda: None)
         assert len(load_samples(tmp_path)) == 900
 
     @pytest.mark.parametrize(("text", "free"), [
@@ -817,16 +817,16 @@ class TestRoom:
     def test_the_least_counts(self, monkeypatch):
         for name, free in (("system_bytes", 900), ("cgroup_bytes", None), ("process_bytes", 300)):
             monkeypatch.setattr(memory_check, name, lambda free=free: free)
-        assert memory_check.free_bytes() == 300
+        assert memory_check.available_bytes() == 300
         monkeypatch.setattr(memory_check, "process_bytes", lambda: -5)
-        assert memory_check.free_bytes() == 0
+        assert memory_check.available_bytes() == 0
 
     def test_a_file_that_does_not_fit_is_refused_before_it_is_read(self, path, monkeypatch):
         save_samples(path, *samples(3000))
-        monkeypatch.setattr(memory_check, "free_bytes", lambda: 3 * 64 * 2500)
+        monkeypatch.setattr(memory_check, "available_bytes", lambda: 3 * 64 * 2500)
         with pytest.raises(ConfigError, match="GB of memory would be needed"):
             load_samples(path)
-        monkeypatch.setattr(memory_check, "free_bytes", lambda: 3 * 64 * 3500)
+        monkeypatch.setattr(memory_check, "available_bytes", lambda: 3 * 64 * 3500)
         assert len(load_samples(path)) == 3000
 
     @pytest.mark.parametrize("suffix", [".csv.gz", ".npz", ".parquet", ".arrow", ".arrows"])

@@ -43,8 +43,8 @@ from monitor.commands.reconcile import Request, make
 from monitor.common import config_files
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
-from monitor.history.minute_aggregation import Minutes
-from monitor.history.sqlite_store import FILE, PastEvent, Store
+from monitor.history.minute_aggregation import MinuteAggregator
+from monitor.history.sqlite_store import FILE_NAME, HistoryStore, StoredEvent
 from monitor.noise.catalogue import read_model
 from monitor.noise.model import NoiseModel
 from monitor.publishing.plots.reconcile_chart import chart
@@ -52,11 +52,11 @@ from monitor.publishing.rerun import sinks
 from monitor.publishing.rerun.fleet import FleetView
 from monitor.publishing.rerun.view import RerunView
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
-from monitor.publishing.zenoh.subscriber import ZenohIn
+from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.reconcile.result import AxisResult
 from monitor.settings import loading
-from monitor.simulator import ROOM_C, WARM_UP_C, WARM_UP_S
-from monitor.simulator.demo import demo
+from monitor.simulator import AMBIENT_C, WARM_UP_C, WARM_UP_S
+from monitor.simulator.demo import demo_config
 from tests.monitor.publishing.made import estimate, true_coefficients
 
 SIZE = (1600, 1000)
@@ -187,7 +187,7 @@ def temperature(out: Path, folder: Path) -> Path:
     source = folder / "warm.npz"
     model = read_model(config_files.CONFIG_FOLDER / "models" / "stim300.toml") + NoiseModel.from_toml(WARM)
     n = round(WARM_S * WARM_HZ)
-    drawn = model.stream(WARM_HZ, 1).draw_all(n)
+    drawn = model.stream(WARM_HZ, 1).draw_with_temperature(n)
     save_samples(source, T0 + np.arange(n) / WARM_HZ, drawn.values, drawn.temperature_c)
     devices = REPLAY.format(recording=source, speed=WARM_SPEED).replace("rate = 100.0", f"rate = {WARM_HZ}")
     with window() as (port, shoot):
@@ -206,7 +206,10 @@ def drift(out: Path, folder: Path) -> Path:
     n = round(TURNED_S * 100.0)
     t_s = np.arange(n) / 100.0
     values = (
-        read_model(config_files.CONFIG_FOLDER / "models" / "adis16470.toml").stream(100.0, 1).draw_all(n).values.copy()
+        read_model(config_files.CONFIG_FOLDER / "models" / "adis16470.toml")
+        .stream(100.0, 1)
+        .draw_with_temperature(n)
+        .values.copy()
     )
     for axis, since_s in enumerate(TURNS_S):
         turning = (t_s >= since_s) & (t_s < since_s + 60.0)
@@ -227,7 +230,12 @@ def compensation(out: Path, folder: Path) -> Path:
     """What ``imu-monitor compensate --plot`` makes of three hours of a sensor at rest."""
     path, source = out / "compensate.png", folder / "still.npz"
     n = 1_080_000
-    values = read_model(config_files.CONFIG_FOLDER / "models" / "adis16470.toml").stream(100.0, 2).draw_all(n).values
+    values = (
+        read_model(config_files.CONFIG_FOLDER / "models" / "adis16470.toml")
+        .stream(100.0, 2)
+        .draw_with_temperature(n)
+        .values
+    )
     save_samples(source, np.arange(n) / 100.0, values)
     arguments = ["compensate", str(source), "--out", str(folder / "out.npz"), "--plot", str(path)]
     subprocess.run([sys.executable, "-m", "monitor.cli", *arguments], check=True)
@@ -252,7 +260,7 @@ def fleet(out: Path, folder: Path) -> Path:
     path = out / "viewer-fleet.png"
     with window() as (port, shoot), serving(folder, FLEET, port) as service:
         tail, wing = service.virtual["tail"], service.virtual["wing"]
-        until(lambda: all(station.latest is not None for station in service.stations), 120.0)
+        until(lambda: all(station.latest is not None for station in service.workers), 120.0)
         begun_s = time.monotonic()
         for at_s, act in (
             (PULLED_S, tail.unplug),
@@ -283,7 +291,7 @@ def view(out: Path, folder: Path) -> Path:
         viewer = RerunView(
             ViewerSettings("native", port), [DeviceInfo(key, "over zenoh") for key in detail], fleet=True
         )
-        arriving = ending.enter_context(contextlib.closing(ZenohIn("fleet/**", places, None, detail)))
+        arriving = ending.enter_context(contextlib.closing(ZenohSubscriber("fleet/**", places, None, detail)))
         ending.enter_context(contextlib.closing(viewer))
         stop = threading.Event()
         looking = threading.Thread(target=FleetView(arriving, viewer, detail).run, args=(stop, print))
@@ -291,7 +299,7 @@ def view(out: Path, folder: Path) -> Path:
         viewer.start()
         looking.start()
         try:
-            until(lambda: all(station.latest is not None for one in daemons for station in one.stations), 120.0)
+            until(lambda: all(station.latest is not None for one in daemons for station in one.workers), 120.0)
             time.sleep(PULLED_AGAIN_S)
             daemons[0].virtual[MEMBERS[3]].unplug()
             daemons[1].virtual[MEMBERS[4]].unplug()
@@ -307,9 +315,9 @@ def view(out: Path, folder: Path) -> Path:
 def yesterday(out: Path, folder: Path) -> Path:
     """A daemon that was started anew: its view opens on the last day, of which an hour is missing."""
     path = out / "viewer-history.png"
-    config = demo()
+    config = demo_config()
     (device,) = config.devices
-    remember(folder / "kept" / FILE, device.name, time.time())
+    remember(folder / "kept" / FILE_NAME, device.name, time.time())
     zenoh = msgspec.structs.replace(config.zenoh, mode="none")
     storage = loading.Storage(folder / "kept", record=False)
     with window() as (port, shoot):
@@ -323,13 +331,13 @@ def yesterday(out: Path, folder: Path) -> Path:
 
 def fitted(service: Service) -> bool:
     """Whether there are coefficients."""
-    latest = service.stations[0].latest
+    latest = service.workers[0].latest
     return latest is not None and bool(np.isfinite(latest.fitted).any())
 
 
 def remember(path: Path, device: str, now_s: float) -> None:
     """A day of rows that ends ten minutes ago, for a sensor like the demo's, that was knocked and got warm."""
-    rng, minutes = np.random.default_rng(1), Minutes()
+    rng, minutes = np.random.default_rng(1), MinuteAggregator()
     rows = []
     wander = np.cumsum(0.004 * rng.standard_normal((1440, 6)), axis=0)
     for i in range(1430):
@@ -337,12 +345,12 @@ def remember(path: Path, device: str, now_s: float) -> None:
             scale = (1.0 + wander[i]) * (1.5 if i == 500 else 1.0)
             rows.append(minutes.estimate(now_s - 86_400.0 + 60.0 * i, like(scale, rng)))
             rows.append(minutes.temperature(now_s - 86_400.0 + 60.0 * i, np.array([24.0 + 4.0 * np.sin(i / 229.0)])))
-    store = Store(path)
+    store = HistoryStore(path)
     times = [now_s - 86_400.0 + 60.0 * i for i in (500, 800, 860)]
     told = [("noise_changed", "gz angle random walk rose by 50 %"), ("link_lost", "/dev/ttyUSB0: gone"),
             ("link_back", "/dev/ttyUSB0: back after 1 h 00 min")]  # fmt: skip
-    events = [PastEvent(at, kind, text) for at, (kind, text) in zip(times, told, strict=True)]
-    store.add([(device, row) for row in (*rows, minutes.end()) if row is not None], [(device, one) for one in events])
+    events = [StoredEvent(at, kind, text) for at, (kind, text) in zip(times, told, strict=True)]
+    store.add([(device, row) for row in (*rows, minutes.flush()) if row is not None], [(device, one) for one in events])
     store.close()
 
 
@@ -358,7 +366,7 @@ def like(scale: Floats, rng: np.random.Generator) -> Estimate:
 def effect(out: Path, _: Path) -> Path:
     """The demo, whose sensor has begun to vibrate."""
     path = out / "demo-effect.png"
-    config = demo(effects=[VIBRATION])
+    config = demo_config(effects=[VIBRATION])
     zenoh = msgspec.structs.replace(config.zenoh, mode="none")
     with window() as (port, shoot):
         viewer = msgspec.structs.replace(config.viewer, mode="native", port=port)
@@ -366,7 +374,7 @@ def effect(out: Path, _: Path) -> Path:
             (sensor,) = [device.link for device in config.devices]
             assert isinstance(sensor, loading.VirtualTable)
             begun_s = time.monotonic()
-            until(lambda: service.stations[0].latest is not None, 60.0)
+            until(lambda: service.workers[0].latest is not None, 60.0)
             time.sleep(begun_s + sensor.effect_at + SHOWN_S - time.monotonic())
             shoot(path)
     return small(path)
@@ -497,7 +505,7 @@ def recording(folder: Path, seconds: float, changed: bool = False) -> Path:
         if changed:
             after = since_s >= CHANGED_S
             values[after, 2] += MORE_N * rate_hz**0.5 * np.random.default_rng(1).standard_normal(after.sum())
-        temperature_c = ROOM_C - WARM_UP_C * np.expm1(-since_s / WARM_UP_S)
+        temperature_c = AMBIENT_C - WARM_UP_C * np.expm1(-since_s / WARM_UP_S)
         kept = (since_s < GAP_S[0]) | (since_s >= GAP_S[1])
         save_samples(path, T0 + since_s[kept], values[kept], temperature_c[kept])
     return path
@@ -510,7 +518,7 @@ def replay(folder: Path, changed: bool = False) -> str:
 
 def replayed(service: Service, seconds: float) -> bool:
     """Whether so much of the recording is in the estimate."""
-    latest = service.stations[0].latest
+    latest = service.workers[0].latest
     return latest is not None and latest.t_ns >= (T0 + seconds) * 1e9
 
 
@@ -544,7 +552,7 @@ def window() -> Iterator[tuple[int, Callable[[Path], None]]]:
 
     port = free_port()
     size = f"{SIZE[0]}x{SIZE[1]}"
-    child = sinks.Child([
+    child = sinks.ViewerProcess([
         *("--bind", "127.0.0.1", "--port", str(port), "--headless", "--window-size", size, "--hide-welcome-screen")
     ])  # fmt: skip
     try:
@@ -558,7 +566,7 @@ def window() -> Iterator[tuple[int, Callable[[Path], None]]]:
 def page_server() -> Iterator[tuple[int, str]]:
     """What serves the page, as mode "web" starts it, but for it to stay when the service stops: its port, the page."""
     port, web_port = free_port(), free_port()
-    child = sinks.Child([
+    child = sinks.ViewerProcess([
         *("--serve-web", "--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(web_port))
     ])  # fmt: skip
     try:

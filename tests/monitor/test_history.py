@@ -17,9 +17,9 @@ from monitor.daemon.device_worker import Output
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
 from monitor.history import reading as past
-from monitor.history.reading import Past
-from monitor.history.sqlite_store import FILE, PastEvent, reading
-from monitor.history.time_ranges import Span, said
+from monitor.history.reading import HistoryTable
+from monitor.history.sqlite_store import FILE_NAME, StoredEvent, open_history
+from monitor.history.time_ranges import TimeRange, format_utc
 from monitor.noise.catalogue import read_model
 from monitor.publishing.messages import history
 from monitor.settings import loading
@@ -70,7 +70,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """With a hole of two seconds in it."""
     path = tmp_path_factory.mktemp("recording") / "r.npz"
     n = round(SECONDS * RATE_HZ)
-    drawn = read_model(MODEL).stream(RATE_HZ, 3).draw_all(n)
+    drawn = read_model(MODEL).stream(RATE_HZ, 3).draw_with_temperature(n)
     rows = np.delete(np.arange(n), slice(5000, 5100))
     save_samples(path, T0 + rows / RATE_HZ, drawn.values[rows], 20.0 + rows / 1000.0)
     return path
@@ -82,9 +82,9 @@ def config(folder: Path, recording: Path, zenoh: str = 'mode = "none"', speed: f
     return loading.load(path)
 
 
-def kept(folder: Path, step_s: int | None = 60) -> Past:
-    with reading(folder / "kept" / FILE) as reader:
-        return past.read(reader, "bench-1", Span(-math.inf, math.inf), step_s=step_s)
+def kept(folder: Path, step_s: int | None = 60) -> HistoryTable:
+    with open_history(folder / "kept" / FILE_NAME) as reader:
+        return past.read_history(reader, "bench-1", TimeRange(-math.inf, math.inf), step_s=step_s)
 
 
 def test_what_was_published_is_kept_and_a_second_run_adds_to_it(tmp_path: Path, recording: Path) -> None:
@@ -142,12 +142,12 @@ def test_a_query_over_zenoh_honours_its_time(asked: tuple[Service, Any]) -> None
         if reply.ok is None:
             return json.loads(bytes(reply.err.payload))["error"]
         assert (str(reply.ok.key_expr), str(reply.ok.encoding)) == ("imu/bench-1/history", "application/json")
-        return history.read(bytes(reply.ok.payload))
+        return history.decode_history(bytes(reply.ok.payload))
 
     whole = answer("step=1m")
     minutes = whole.start_s.tolist()
     assert len(minutes) >= 3
-    first, last = (said(one).replace(" ", "T") + "Z" for one in (minutes[1], minutes[2] + 60))
+    first, last = (format_utc(one).replace(" ", "T") + "Z" for one in (minutes[1], minutes[2] + 60))
     some = answer(f"_time=[{first}..{last}[;step=1m;axis=gz;what=coefficients")
     assert some.start_s.tolist() == minutes[1:3]
     assert some.axes() == ("gz",)
@@ -163,11 +163,11 @@ def test_a_damaged_history_is_said_in_the_status_and_to_who_asks(asked: tuple[Se
     service, client = asked
     assert service.history is not None
     path = service.history.path
-    path.with_name(FILE + "-wal").unlink(missing_ok=True)
+    path.with_name(FILE_NAME + "-wal").unlink(missing_ok=True)
     path.write_bytes(b"no more" * 1000)
     (reply,) = client.get("imu/bench-1/history", timeout=PATIENCE_S)
     assert "damaged" in json.loads(bytes(reply.err.payload))["error"]
-    service.history.tell("bench-1", PastEvent(T0, "moved", "once more"))
+    service.history.put_event("bench-1", StoredEvent(T0, "moved", "once more"))
     wait_for(lambda: "damaged" in service.states()["history"])
-    (aside,) = path.parent.glob(f"{FILE}.aside-*Z")
+    (aside,) = path.parent.glob(f"{FILE_NAME}.aside-*Z")
     assert aside.read_bytes() == b"no more" * 1000

@@ -19,5 +19,5 @@ def compile_kernels(say: Callable[[str], None]) -> None:
         Called with a line for each part that is being compiled.
     """
     for group in kernel_compilation.GROUPS:
-        for _ in kernel_compilation.prepare(group, lambda progress: say(str(progress))):
+        for _ in kernel_compilation.prepare_kernels(group, lambda progress: say(str(progress))):
             pass

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.sample import Floats, SampleBlock, block
+from drivers.sample import Floats, SampleBlock, make_block
 
 
 def recordings() -> Path:
@@ -27,4 +27,4 @@ def recorded_blocks(t_s: Floats, values: Floats | None = None, rows: int = 1000)
     t_ns = np.rint(np.asarray(t_s) * 1e9).astype(np.int64)
     values = white(len(t_ns)) if values is None else values
     edges = range(0, len(t_ns), rows)
-    return [block(t_ns[a : a + rows].copy(), values[a : a + rows].copy()) for a in edges]
+    return [make_block(t_ns[a : a + rows].copy(), values[a : a + rows].copy()) for a in edges]

@@ -10,7 +10,7 @@ from pathlib import Path
 import zenoh
 
 from drivers.recordings import iter_blocks, load_samples
-from drivers.zenoh.sample_message import pack
+from drivers.zenoh.sample_message import encode_samples
 from tests.support.waiting import wait_for
 from tests.support.zenoh_sessions import session
 
@@ -29,7 +29,7 @@ def main() -> None:
                     return
                 allowed += rows
             sent += len(samples)
-            publisher.put(pack("run1", sent, samples))
+            publisher.put(encode_samples("run1", sent, samples))
         sys.stdin.read()
 
 

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.sample import Event, SampleBlock, join
+from drivers.sample import Event, SampleBlock, concatenate_blocks
 from monitor.common.health import Health
-from monitor.daemon.device_worker import Output, Station
+from monitor.daemon.device_worker import DeviceWorker, Output
 from monitor.daemon.service import Service
-from monitor.drift.compensation.live_compensation import DriftLook
-from monitor.drift.thermal.live_thermal import ThermalLook
+from monitor.drift.compensation.live_compensation import DriftUpdate
+from monitor.drift.thermal.live_thermal import ThermalUpdate
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.detection.model_gap import ModelGap
@@ -32,9 +32,9 @@ class Caught(Output):
         self.estimates: dict[str, Estimate] = {}
         self.totals: dict[str, tuple[TotalCurve, HadamardCurve]] = {}
         self.gaps: dict[str, ModelGap] = {}
-        self.thermals: dict[str, list[ThermalLook]] = {}
+        self.thermals: dict[str, list[ThermalUpdate]] = {}
         self.rates: dict[str, list[SampleBlock]] = {}
-        self.drifts: dict[str, list[DriftLook]] = {}
+        self.drifts: dict[str, list[DriftUpdate]] = {}
         self.events: list[tuple[str, Event]] = []
         self.healths: dict[str, Health] = {}
 
@@ -44,16 +44,16 @@ class Caught(Output):
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         self.estimates[device] = estimate
 
-    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
+    def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
         self.gaps[device] = gap
 
-    def thermal(self, device: str, unix_s: float, received: int, look: ThermalLook) -> None:
+    def thermal(self, device: str, unix_s: float, received: int, look: ThermalUpdate) -> None:
         self.thermals.setdefault(device, []).append(look)
 
     def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         self.rates.setdefault(device, []).append(samples)
 
-    def drift(self, device: str, unix_s: float, look: DriftLook) -> None:
+    def drift(self, device: str, unix_s: float, look: DriftUpdate) -> None:
         self.drifts.setdefault(device, []).append(look)
 
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
@@ -66,7 +66,7 @@ class Caught(Output):
         self.healths[device] = health
 
     def values(self, device: str) -> np.ndarray:
-        return join(self.blocks[device]).values
+        return concatenate_blocks(self.blocks[device]).values
 
 
 class Running:
@@ -81,8 +81,8 @@ class Running:
         self._thread = threading.Thread(target=self.service.run)
         self._thread.start()
 
-    def station(self, name: str) -> Station:
-        return next(station for station in self.service.stations if station.name == name)
+    def station(self, name: str) -> DeviceWorker:
+        return next(station for station in self.service.workers if station.name == name)
 
     def stop(self) -> None:
         self.service.stop()

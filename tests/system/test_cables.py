@@ -9,7 +9,7 @@ import psutil
 import pytest
 
 from drivers import driver
-from drivers.sample import join
+from drivers.sample import concatenate_blocks
 from tests.support.waiting import wait_for
 from tests.system.rig import Running, running
 
@@ -59,14 +59,14 @@ def measured() -> tuple[int, int, int]:
 
 def received(run: Running) -> int:
     """Samples of both devices since the start."""
-    return sum(station.driver.counts.received for station in run.service.stations)
+    return sum(station.driver.counts.received for station in run.service.workers)
 
 
 def test_fifty_pulled_cables_leave_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver, "MIN_RETRY_PAUSE_S", 0.01)
     monkeypatch.setattr(driver, "MAX_RETRY_PAUSE_S", 0.05)
     with running(tmp_path, CONFIG) as run:
-        for station in run.service.stations:
+        for station in run.service.workers:
             counts = station.driver.counts
             wait_for(lambda counts=counts: counts.received >= 10, "the first samples")  # type: ignore[misc]
         for _ in range(WARM_UP):
@@ -85,10 +85,10 @@ def test_fifty_pulled_cables_leave_nothing_behind(tmp_path: Path, monkeypatch: p
     kinds = [event.kind for device, event in run.caught.events if device == "loose"]
     assert (kinds.count("link_lost"), kinds.count("link_back")) == (WARM_UP + CYCLES, WARM_UP + CYCLES)
     assert [device for device, event in run.caught.events if event.kind.startswith("link")].count("firm") == 0
-    for station in run.service.stations:
+    for station in run.service.workers:
         counts, blocks = station.driver.counts, run.caught.blocks[station.name]
         # TimeStartup tells which sample each one was
-        number = join(blocks).ticks // PERIOD_NS
+        number = concatenate_blocks(blocks).ticks // PERIOD_NS
         assert counts.received == number.size == sum(map(len, blocks))
         assert counts.received + counts.bad + counts.lost == number[-1] - number[0] + 1
         missing = np.concatenate([np.r_[one.lost, np.zeros(len(one) - 1, int)] for one in blocks])

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from drivers.sample import AXES
-from monitor.estimation.estimate import Course, Estimate
-from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.estimation.estimate import CoefficientHistory, Estimate
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
 from monitor.noise.model import NoiseModel
 from tests.support.waiting import wait_for
@@ -44,12 +44,12 @@ class Kept(Caught):
 
     def __init__(self) -> None:
         super().__init__()
-        self.course: list[Course] = []
+        self.course: list[CoefficientHistory] = []
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         super().estimate(device, unix_s, estimate)
-        if estimate.course is not None:
-            self.course.append(estimate.course)
+        if estimate.history is not None:
+            self.course.append(estimate.history)
 
 
 def sensor(k: dict[str, float]) -> NoiseModel:
@@ -117,7 +117,7 @@ def test_n_rises_at_once_and_q_stays(walked: Kept) -> None:
 def test_at_the_end_the_fit_is_that_of_the_new_sensor(walked: Kept) -> None:
     found = walked.estimates["gyro"].coefficients
     held = 0
-    for row, letter in enumerate(LETTERS):
+    for row, letter in enumerate(SYMBOLS):
         status, lo, hi = found.status[row], found.lo[row], found.hi[row]
         held += int(((status > Status.UNESTIMATED) & (lo <= AFTER[letter]) & (hi >= AFTER[letter])).sum())
         if letter in "QN":

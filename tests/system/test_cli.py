@@ -1189,19 +1189,19 @@ def test_watching_listens_nowhere() -> None:
 @pytest.fixture(scope="session")
 def histories(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what was kept of two devices for two hours."""
-    from monitor.history.bucket import Row
-    from monitor.history.sqlite_store import FILE, PastEvent, Store
+    from monitor.history.bucket import HistoryRow
+    from monitor.history.sqlite_store import FILE_NAME, HistoryStore, StoredEvent
 
     folder = tmp_path_factory.mktemp("kept")
-    store = Store(folder / FILE)
+    store = HistoryStore(folder / FILE_NAME)
     names, rng = ("gz.N", "gz.N.lo", "gz.N.hi", "gz.B", "temperature"), np.random.default_rng(1)
     for device in ("bench-1", "bench-2"):
         for i in range(120):
             last = np.array([1.5e-4, 1.4e-4, 1.6e-4, 4e-5, 25.0], np.float32) * np.float32(rng.uniform(0.9, 1.1))
             start_s, n = 1_763_683_200 + 60 * i, np.full(5, 600)
-            row = Row(start_s, 60, start_s + 59.0, names, n, last, last, last, (6000, 0, 0, 0), 1)
+            row = HistoryRow(start_s, 60, start_s + 59.0, names, n, last, last, last, (6000, 0, 0, 0), 1)
             store.add(
-                [(device, row)], [(device, PastEvent(start_s + 1.0, "moved", f"moved {i}"))] if i % 50 == 0 else []
+                [(device, row)], [(device, StoredEvent(start_s + 1.0, "moved", f"moved {i}"))] if i % 50 == 0 else []
             )
     store.close()
     return folder

@@ -6,8 +6,8 @@ import numpy as np
 import zenoh
 
 from drivers.recordings import load_samples, save_samples
-from drivers.sample import join
-from drivers.zenoh.sample_message import Batch, unpack
+from drivers.sample import concatenate_blocks
+from drivers.zenoh.sample_message import Batch, decode_samples
 from monitor.commands.compensate import Request, make
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
@@ -53,11 +53,11 @@ def test_rates_come_out_without_drift_live_as_offline(tmp_path: Path) -> None:
         batches: list[Batch] = []
 
         def last_batch() -> bool:
-            batches.extend(unpack(bytes(one.payload)) for one in iter(heard.try_recv, None))
+            batches.extend(decode_samples(bytes(one.payload)) for one in iter(heard.try_recv, None))
             return bool(batches) and batches[-1].samples == n
 
         wait_for(last_batch, "the last batch over zenoh")
-    rates = join(caught.rates["bench-1"])
+    rates = concatenate_blocks(caught.rates["bench-1"])
     make(Request(recording, tmp_path / "out.npz"))
     offline = load_samples(tmp_path / "out.npz")
     np.testing.assert_allclose(rates.values, offline.values, rtol=0.0, atol=1e-12)

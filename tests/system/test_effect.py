@@ -10,7 +10,7 @@ from drivers.decoders import samples
 from drivers.sample import Event
 from monitor.daemon.service import Service
 from monitor.settings.loading import VirtualTable
-from monitor.simulator.demo import demo
+from monitor.simulator.demo import demo_config
 from tests.support.paced_sensor import follow_reader
 from tests.support.waiting import PATIENCE_S
 from tests.system.rig import Caught
@@ -32,7 +32,7 @@ class Watching(Caught):
 
 
 def test_an_effect_that_comes_is_announced_on_its_axis() -> None:
-    config = demo(effects=[VIBRATION], effect_at_s=AT_S)
+    config = demo_config(effects=[VIBRATION], effect_at_s=AT_S)
     (device,) = config.devices
     assert isinstance(device.link, VirtualTable)
     # messages carry the sensor's own time, so that an event tells when it is by the sensor's clock
@@ -43,7 +43,7 @@ def test_an_effect_that_comes_is_announced_on_its_axis() -> None:
     caught = Watching()
     caught.service = service
     service.outputs.append(caught)
-    follow_reader(service.virtual["demo"], service.stations[0].driver)
+    follow_reader(service.virtual["demo"], service.workers[0].driver)
     with capture_logs() as lines:
         service.run(PATIENCE_S)
     added = [line for line in lines if line["event"] == "effect added"]
@@ -57,6 +57,6 @@ def test_an_effect_that_comes_is_announced_on_its_axis() -> None:
     assert AT_S <= (change.t_ns - first_ns) / 1e9 <= AT_S + 40.0
     assert change.since_ns is not None
     assert (change.since_ns - first_ns) / 1e9 == pytest.approx(AT_S, abs=2.0)
-    counts = service.stations[0].driver.counts
+    counts = service.workers[0].driver.counts
     assert (counts.lost, counts.bad) == (0, 0)
     assert "gz" in change.text

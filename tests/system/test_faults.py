@@ -20,7 +20,7 @@ import psutil
 import pytest
 import zenoh
 
-from drivers.sample import join
+from drivers.sample import concatenate_blocks
 from tests.support.ports import free_endpoint, free_port
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.zenoh_sessions import router, session
@@ -64,7 +64,9 @@ def healthy(folder: Path, text: str) -> Iterator[Running]:
         yield run
         if not run.service._stop.is_set():
             goes_on(run)
-    number = join(run.caught.blocks["healthy"]).ticks // PERIOD_NS  # TimeStartup: the place of each in what was sent
+    number = (
+        concatenate_blocks(run.caught.blocks["healthy"]).ticks // PERIOD_NS
+    )  # TimeStartup: the place of each in what was sent
     assert counts.received == number.size
     missing = number[-1] - number[0] + 1 - number.size
     # the simulated sensor drops what a reader does not fetch in time on a loaded machine; nothing else may be missing
@@ -110,8 +112,8 @@ def viewer(mode: str) -> str:
 
 
 def viewer_child(run: Running) -> psutil.Process:
-    assert run.service.view is not None
-    child = run.service.view._child
+    assert run.service.viewer is not None
+    child = run.service.viewer._child
     assert child is not None
     return psutil.Process(child.pid)
 
@@ -167,7 +169,7 @@ def test_a_window_waits_for_its_port_and_takes_a_viewer_that_comes(tmp_path: Pat
             output_says(run, "viewer", lambda text: "busy" in text)
             other.close()
             page = ("--web-viewer-port", str(free_port()))
-            child = sinks.Child(["--serve-web", "--bind", "127.0.0.1", "--port", str(port), *page])
+            child = sinks.ViewerProcess(["--serve-web", "--bind", "127.0.0.1", "--port", str(port), *page])
             try:
                 output_says(run, "viewer", lambda text: text == "ok")
             finally:
@@ -183,9 +185,9 @@ def test_a_page_whose_ports_are_busy_takes_others(tmp_path: Path) -> None:
         with healthy(tmp_path, text) as run:
             text = output_says(run, "viewer", lambda text: text.startswith("ok"))
             assert all(f"port {port} is busy" in text for port in ports)
-            assert run.service.view is not None
-            assert run.service.view.url.startswith("http://127.0.0.1:")
-            assert f":{ports[1]}/" not in run.service.view.url
+            assert run.service.viewer is not None
+            assert run.service.viewer.url.startswith("http://127.0.0.1:")
+            assert f":{ports[1]}/" not in run.service.viewer.url
 
 
 @needs_rerun

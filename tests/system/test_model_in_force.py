@@ -20,7 +20,7 @@ from monitor.daemon.operations.live_reconcile import Reconciler
 from monitor.daemon.service import Service
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.settings.loading import Config, VirtualTable, ZenohTable
-from monitor.simulator.demo import demo
+from monitor.simulator.demo import demo_config
 from tests.support.paced_sensor import follow_reader
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -38,7 +38,7 @@ VIBRATION = "gz.sinusoidal:amplitude=4e-3,frequency=17"
 
 def watched(zenoh_table: ZenohTable, effects: tuple[str, ...] = (), folder: Path | None = None) -> Config:
     """The demo, fifty times as fast, with its own model in force."""
-    config = demo(effects=effects, effect_at_s=AT_S)
+    config = demo_config(effects=effects, effect_at_s=AT_S)
     (device,) = config.devices
     assert isinstance(device.link, VirtualTable)
     fast = msgspec.structs.replace(device.link, speed=SPEED)
@@ -55,7 +55,7 @@ class Watching(Caught):
     told_s = 0.0  # of the sensor's time
     looked = 0  # samples that have been looked at
 
-    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
+    def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
         super().gap(device, unix_s, gap)
         self.looked = gap.samples
         if gap.samples / RATE_HZ < AT_S:
@@ -73,7 +73,7 @@ def test_the_moment_a_sensor_stops_agreeing_with_its_model_is_an_event() -> None
     caught = Watching()
     caught.service = service
     service.outputs.append(caught)
-    follow_reader(service.virtual["demo"], service.stations[0].driver, lambda: caught.looked + LOOK_SAMPLES)
+    follow_reader(service.virtual["demo"], service.workers[0].driver, lambda: caught.looked + LOOK_SAMPLES)
     service.run(PATIENCE_S)
     assert caught.before is not None
     assert caught.before.agrees == dict.fromkeys(AXES, True)
@@ -81,14 +81,14 @@ def test_the_moment_a_sensor_stops_agreeing_with_its_model_is_an_event() -> None
     assert [event.axis for event in told] == ["gz"]
     (event,) = told
     assert AT_S + 1.0 < caught.told_s < AT_S + 40.0
-    what = event.what["model"]
+    what = event.values["model"]
     assert what["agrees"] is False
     assert what["gap"] > 2.0 * what["threshold"]
     assert what["tau_lo"] <= 0.04 <= what["tau_hi"]  # a vibration of 17 Hz is largest at half its period
     assert what["ratio"] > 1.5
     assert "gz disagrees with its model at τ" in event.text
     assert caught.gaps["demo"].agrees["gz"] is False
-    counts = service.stations[0].driver.counts
+    counts = service.workers[0].driver.counts
     assert (counts.lost, counts.bad) == (0, 0)
 
 
@@ -111,7 +111,7 @@ def test_reconcile_is_asked_for_over_zenoh_and_holds_nothing_up(tmp_path: Path) 
     service = Service(watched(table), reconciler=Reconciler(stand_in(go, kept)))
     caught = Caught()
     service.outputs.append(caught)
-    follow_reader(service.virtual["demo"], service.stations[0].driver)
+    follow_reader(service.virtual["demo"], service.workers[0].driver)
     thread = threading.Thread(target=service.run)
     thread.start()
     try:
@@ -148,7 +148,7 @@ def test_reconcile_is_asked_for_over_zenoh_and_holds_nothing_up(tmp_path: Path) 
     assert recording.rate_hz == RATE_HZ
     n = len(recording)
     assert n >= 3000
-    counts = service.stations[0].driver.counts
+    counts = service.workers[0].driver.counts
     assert (counts.lost, counts.bad) == (0, 0)
     np.testing.assert_allclose(recording.values, sent[:n], rtol=0.0, atol=1e-9)  # from the first sample on
     assert np.isfinite(recording.temperature_c).all()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from monitor.reconcile.reconcile import Recording, reconcile
-from monitor.reconcile.result import Reconciliation, Step
+from monitor.reconcile.result import Reconciliation, ReconciliationStep
 from tests.support.recordings import recordings
 
 pytestmark = pytest.mark.data
@@ -20,13 +20,13 @@ def compared(file: str, axis: str, begin: int = 0, end: int | None = None) -> Re
         return reconcile(Recording({axis: values}, float(held["fs"])), None, seed=1)
 
 
-def added(result: Reconciliation) -> dict[str, Step]:
+def added(result: Reconciliation) -> dict[str, ReconciliationStep]:
     """By name, the last of a name."""
     (axis,) = result.axes.values()
     return {step.effect: step for step in axis.steps if step.kind == "added"}
 
 
-def size(step: Step, name: str) -> float:
+def size(step: ReconciliationStep, name: str) -> float:
     return float(step.parameters[name].value)
 
 

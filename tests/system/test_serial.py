@@ -10,7 +10,7 @@ import pytest
 
 from drivers.links.base import Link
 from drivers.sample import Chunk
-from monitor.estimation.allan.batch import overlapping
+from monitor.estimation.allan.batch import overlapping_avar
 from tests.support.recordings import recordings
 from tests.support.waiting import wait_for
 from tests.system.rig import Cable, paced, running
@@ -62,8 +62,8 @@ def test_every_sentence_of_a_real_sensor_is_accounted_for(tmp_path: Path) -> Non
         station = run.station("vn100")
         wait_for(lambda: station.driver.link._port is not None, "the port")
         stamp_by_sentence(station.driver.link)
-        turns = station.driver.turns
-        wait_for(lambda: station.driver.turns >= turns + 2, "a read that is stamped")
+        turns = station.driver.iterations
+        wait_for(lambda: station.driver.iterations >= turns + 2, "a read that is stamped")
         paced(cable.write, lines, RATE_HZ * SPEED)
         counts = station.driver.counts
         wait_for(lambda: counts.received + counts.bad + counts.lost >= len(lines), "the last sentence")
@@ -71,9 +71,9 @@ def test_every_sentence_of_a_real_sensor_is_accounted_for(tmp_path: Path) -> Non
     np.testing.assert_array_equal(run.caught.values("vn100"), parsed)
     curve = run.caught.estimates["vn100"].curve
     assert curve.n == len(lines)
-    avar, terms = overlapping(parsed, curve.factors)
+    avar, terms = overlapping_avar(parsed, curve.factors)
     np.testing.assert_array_equal(curve.terms, terms)
     np.testing.assert_allclose(np.sqrt(curve.avar), np.sqrt(avar), rtol=1e-9)
     with np.load(folder / "static-12min.npz") as npz:
         rounded = np.column_stack([npz[axis] for axis in ("gx", "gy", "gz", "ax", "ay", "az")])
-    np.testing.assert_allclose(np.sqrt(curve.avar), np.sqrt(overlapping(rounded, curve.factors)[0]), rtol=1e-5)
+    np.testing.assert_allclose(np.sqrt(curve.avar), np.sqrt(overlapping_avar(rounded, curve.factors)[0]), rtol=1e-5)

@@ -73,7 +73,7 @@ def test_bias_beside_what_its_temperature_lets_expect(tmp_path: Path) -> None:
     assert np.mean([one.one_step is not None and one.one_step.side(one.bias) == 0 for one in before]) > 0.75
     told = [event for _, event in caught.events if event.kind == "temperature_unexplained"]
     assert [event.axis for event in told] == ["gz"]
-    assert abs(told[0].what["bias"]["size"] / STEP - 1.0) < 0.2
+    assert abs(told[0].values["bias"]["size"] / STEP - 1.0) < 0.2
     assert told[0].since_ns is not None
     assert abs(told[0].since_ns / 1e9 - T0 - AT_H * 3600.0) <= 600.0
     last = sent[-1]

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from drivers.zenoh.sample_message import unpack
+from drivers.zenoh.sample_message import decode_samples
 from monitor.common import topics
 from tests.support.ports import free_endpoint
 from tests.support.recordings import recordings
@@ -179,7 +179,7 @@ mode = "none"
                 assert content["device"] == "bench-1"
                 assert content["t"] > 1.7e9
                 assert content["samples"] >= 0
-    batches = [unpack(payload) for _, payload in listener.heard["imu/bench-1/samples"]]
+    batches = [decode_samples(payload) for _, payload in listener.heard["imu/bench-1/samples"]]
     # those before the first were sent before zenoh had joined the three sessions
     assert sum(len(batch.block) for batch in batches[1:]) == batches[-1].samples - batches[0].samples
     assert batches[-1].samples == run.station("bench-1").driver.counts.received

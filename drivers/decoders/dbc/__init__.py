@@ -26,10 +26,10 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.decoders.base import QUIET_FRAMES, Decoder, Rows, Timing
+from drivers.decoders.base import HINT_FRAMES, BlockBuilder, Decoder, Timing
 from drivers.decoders.dbc.bits import Bytes
 from drivers.decoders.dbc.database import Database
-from drivers.decoders.dbc.join import COLUMNS, Join, Message, Sample
+from drivers.decoders.dbc.join import COLUMNS, Message, Sample, SampleAssembler
 from drivers.decoders.dbc.settings import Settings, SignalSettings
 from drivers.sample import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, Ints, SampleBlock
 
@@ -67,8 +67,8 @@ class DbcDecoder:
         self.hint = ""
         self._two_senders_hint = ""  # hint that two senders are on the bus
         self._samples_since_reject = 0  # number of good samples since the last rejected one
-        self._rows = Rows()
-        self._join = Join(self._messages, settings)
+        self._rows = BlockBuilder()
+        self._join = SampleAssembler(self._messages, settings)
         self._known = {m.address: i for i, m in self._numbered() if not m.j1939}
         self._groups = {_group(m.frame_id): i for i, m in self._numbered() if m.j1939}
         self._cache: dict[int, int | None] = {}
@@ -107,7 +107,7 @@ class DbcDecoder:
             self._join.put(which, chunk.data[:size] if len(chunk.data) >= size else b"", chunk.t_ns, done)
         blocks = self._decode(done)
         self._samples_since_reject = self._samples_since_reject + len(done) if self._rows.bad == self._left_out else 0
-        if self._samples_since_reject >= QUIET_FRAMES:
+        if self._samples_since_reject >= HINT_FRAMES:
             self.hint = self.late_hint = ""
         if delay_ns := self._join.take_delay_ns():
             self._samples_since_reject = 0

@@ -12,14 +12,14 @@ from typing import Any, Final
 
 import drivers
 from drivers import file_access, units
-from drivers.decoders.base import Arrival, Counter, Timing
+from drivers.decoders.base import ArrivalTiming, CounterTiming, Timing
 from drivers.decoders.dbc.bits import Bits
 from drivers.decoders.dbc.join import COLUMNS, Column, Message
 from drivers.decoders.dbc.settings import Settings, SignalSettings
-from drivers.discovery import nearest, possible
+from drivers.discovery import format_choices, format_suggestion
 from drivers.errors import ConfigError
 from drivers.extras import check_extra
-from drivers.quantities import range_problems
+from drivers.quantities import describe_range_errors
 from drivers.sample import AXES
 
 TEMPERATURE: Final = "temperature"
@@ -47,7 +47,7 @@ class Database:
         self._settings = settings
         self._errors = list(_problems(settings))
         self._used: dict[str, Message] = {}
-        self._timing: Timing = Arrival()
+        self._timing: Timing = ArrivalTiming()
         with self._collecting():
             self._path = _locate(settings.file)
             self._messages: dict[str, Any] = {m.name: m for m in _load(self._path).messages}
@@ -94,7 +94,7 @@ class Database:
                     f'counter: "{s.counter}"; a counter is a whole number of at most {MAX_COUNTER_BITS} bits'
                 )
             self._use(message, signal).counter = self._bits(message, signal)
-            self._timing = Counter(1 << int(signal.length), s.tick)
+            self._timing = CounterTiming(1 << int(signal.length), s.tick)
 
     def _counters(self) -> list[tuple[Any, Any]]:
         """Return message and signal of each counter."""
@@ -108,7 +108,7 @@ class Database:
     def _add_axis(self, axis: str, entry: SignalSettings) -> None:
         """Look up the signal of an axis."""
         if axis not in COLUMNS:
-            raise ConfigError(f"signals.{axis}: unknown axis{possible(axis, COLUMNS)}")
+            raise ConfigError(f"signals.{axis}: unknown axis{format_choices(axis, COLUMNS)}")
         message, signal = self._find(f"signals.{axis}", entry.signal)
         factor, offset = self._to_si(axis, entry, signal)
         column = Column(COLUMNS.index(axis), self._bits(message, signal), factor, offset)
@@ -139,12 +139,12 @@ class Database:
             raise ConfigError(f'{key}: "{name}"; it is "Message.Signal"{hint}')
         message = self._messages.get(message_name)
         if message is None:
-            known = nearest(message_name, tuple(self._messages))
+            known = format_suggestion(message_name, tuple(self._messages))
             raise ConfigError(f'{key}: {self._path.name} has no message "{message_name}"{known}')
         signals = {s.name: s for s in message.signals}
         signal = signals.get(signal_name)
         if signal is None:
-            known = nearest(signal_name, tuple(signals))
+            known = format_suggestion(signal_name, tuple(signals))
             raise ConfigError(f'{key}: message {message_name} has no signal "{signal_name}"{known}')
         if signal.multiplexer_ids:
             raise ConfigError(f"{key}: {name} is multiplexed; such signals are not supported")
@@ -217,7 +217,7 @@ def _problems(settings: Settings) -> Iterator[str]:
         yield f"signals: no axis but temperature; axes are {', '.join(AXES)}"
     if settings.join == "counter" and not settings.counter:
         yield 'counter: missing; join = "counter" needs counter = "Message.Signal"'
-    yield from range_problems(settings)
+    yield from describe_range_errors(settings)
 
 
 def _signal_settings(axis: str, entry: str | SignalSettings) -> SignalSettings:
@@ -231,14 +231,14 @@ def _signal_settings(axis: str, entry: str | SignalSettings) -> SignalSettings:
 
 def _locate(file: str) -> Path:
     """Return the path of a database, which may be a shipped one."""
-    path = file_access.path(file)
+    path = file_access.expand_user(file)
     name = file.removeprefix(SHIPPED_PREFIX)
     if name == file and (file_access.is_file(path) or len(path.parts) != 1):
         return path
     shipped: Mapping[str, Path] = {p.stem: p for p in sorted(SHIPPED.glob("*.dbc"))}
     stem = name.removesuffix(".dbc")
     if stem not in shipped:
-        raise ConfigError(f'file: "{file}": no such file, and none shipped{nearest(stem, tuple(shipped))}')
+        raise ConfigError(f'file: "{file}": no such file, and none shipped{format_suggestion(stem, tuple(shipped))}')
     return shipped[stem]
 
 
@@ -249,7 +249,7 @@ def _load(path: Path) -> Any:
 
     try:
         if path.suffix.lower() != ".dbc":
-            file_access.read(path)  # check that the file is readable, since cantools opens it again
+            file_access.read_small_file(path)  # check that the file is readable, since cantools opens it again
             return cantools.database.load_file(path, strict=False)
         return cantools.database.load_string(_text(path), "dbc", strict=False)
     except OSError as error:
@@ -260,7 +260,7 @@ def _load(path: Path) -> Any:
 
 def _text(path: Path) -> str:
     """Return the text of a DBC file. Editors write UTF-8 or a Windows code page, which differ in the degree sign."""
-    data = file_access.read(path)
+    data = file_access.read_small_file(path)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:

@@ -97,7 +97,7 @@ class Sample:
         return None not in self.frames
 
 
-class Join:
+class SampleAssembler:
     """Assembler of samples from frames in order of arrival.
 
     Parameters

@@ -32,13 +32,13 @@ from monitor.daemon.device_worker import Output
 from monitor.publishing.messages import encoding
 from monitor.settings.loading import Hook
 
-AT_ONCE: Final = 4
+THREADS: Final = 4
 """Number of threads, each of which runs one command at a time."""
-WAITING: Final = 100
+MAX_QUEUED: Final = 100
 """Capacity of the queue."""
 BURST: Final = 10
 """Runs that are possible in a row."""
-EVERY_S: Final = 6.0
+RUN_INTERVAL_S: Final = 6.0
 """Interval at which a further run becomes possible."""
 OUTPUT_BYTES: Final = 4096
 """Length of the end of a command's output that is kept."""
@@ -82,7 +82,7 @@ class Hooks(Output):
         self.hooks = tuple(hooks)
         self._put = put
         self._now = now
-        self._jobs: queue.Queue[_Job | None] = queue.Queue(WAITING)
+        self._jobs: queue.Queue[_Job | None] = queue.Queue(MAX_QUEUED)
         self._allowed: dict[tuple[Hook, str, str], tuple[float, float]] = {}  # runs left, and the time of that count
         self._threads: list[threading.Thread] = []
         self._closing = threading.Event()
@@ -103,7 +103,7 @@ class Hooks(Output):
         wanted = [one for one in self.hooks if _matches(one, device, event.kind)]
         if not wanted:
             return
-        payload = encoding.event(device, unix_s, received, event, encoding.since_s(unix_s, event))
+        payload = encoding.event(device, unix_s, received, event, encoding.event_start_s(unix_s, event))
         named = {"IMU_MONITOR_DEVICE": device, "IMU_MONITOR_KIND": event.kind, "IMU_MONITOR_AXIS": event.axis or ""}
         for hook in wanted:
             if not self._may_run(hook, event.kind, device):
@@ -135,7 +135,7 @@ class Hooks(Output):
         """Return True if the rate limit of a hook allows a run now, and count the run."""
         now_s = self._now()
         left, at_s = self._allowed.get((hook, kind, device), (float(BURST), now_s))
-        left = min(float(BURST), left + (now_s - at_s) / EVERY_S)
+        left = min(float(BURST), left + (now_s - at_s) / RUN_INTERVAL_S)
         may = left >= 1.0
         self._allowed[hook, kind, device] = (left - 1.0 if may else left, now_s)
         return may
@@ -143,7 +143,7 @@ class Hooks(Output):
     def _start(self, job: _Job) -> None:
         """Queue a command, and start the threads if they do not run yet."""
         try:
-            while len(self._threads) < AT_ONCE:
+            while len(self._threads) < THREADS:
                 thread = threading.Thread(target=self._run_queued, name=f"hooks {len(self._threads)}", daemon=True)
                 thread.start()
                 self._threads.append(thread)
@@ -157,7 +157,7 @@ class Hooks(Output):
     def _run_queued(self) -> None:
         """Run queued commands one after the other, in a thread."""
         while not self._closing.is_set() and (job := self._jobs.get()) is not None:
-            self._log_result(job.hook.command[0], run(job.hook, job.payload, job.named, self._closing.is_set))
+            self._log_result(job.hook.command[0], run_command(job.hook, job.payload, job.named, self._closing.is_set))
 
     def _log_result(self, what: str, wrong: str) -> None:
         """Log the result of a run and keep its error for the status."""
@@ -174,7 +174,7 @@ def _matches(hook: Hook, device: str, kind: str) -> bool:
     return ("*" in hook.on or kind in hook.on) and (not hook.devices or device in hook.devices)
 
 
-def run(hook: Hook, payload: bytes, named: Mapping[str, str], ending: Callable[[], bool]) -> str:
+def run_command(hook: Hook, payload: bytes, named: Mapping[str, str], ending: Callable[[], bool]) -> str:
     """Run the command of a hook to its end.
 
     Parameters

@@ -19,17 +19,17 @@ from typing import Final
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Event
-from monitor.common.units import COEFFICIENT_NAMES, kind_of, unit_of
+from monitor.common.units import COEFFICIENT_NAMES, sensor_kind, unit_of
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.noise.catalogue import read_model
 from monitor.noise.model import NoiseModel
 from monitor.publishing.exporters.noise import from_model
 from monitor.settings.loading import Device, Limit
 
-CROSSED: Final = "limit_crossed"
+LIMIT_CROSSED: Final = "limit_crossed"
 """Kind of the event for a crossed limit."""
-BACK: Final = "limit_back"
+LIMIT_BACK: Final = "limit_back"
 """Kind of the event for the return from a crossed limit."""
 Z95: Final = 1.959964
 """Two-sided 95 % quantile of the standard normal distribution."""
@@ -79,7 +79,7 @@ class _State:
     since: tuple[int, int] | None = None  # samples and t_ns of the first estimate that contradicts ``crossed``
 
 
-class Limits:
+class LimitMonitor:
     """State of all limits of one device.
 
     Parameters
@@ -96,14 +96,14 @@ class Limits:
     """
 
     def __init__(self, limits: Sequence[Limit], model: NoiseModel | None) -> None:
-        self.states = {bound: _State() for bound in bounds(limits, model)}
+        self.states = {bound: _State() for bound in make_bounds(limits, model)}
 
     @property
     def crossed(self) -> tuple[str, ...]:
         """Limits that are crossed now, for example ``gz N``."""
         return tuple(bound.place for bound, state in self.states.items() if state.crossed)
 
-    def take_over(self, other: "Limits") -> None:
+    def take_over(self, other: "LimitMonitor") -> None:
         """Copy the states of the limits that ``other`` has as well."""
         for bound in self.states:
             self.states[bound] = other.states.get(bound, self.states[bound])
@@ -128,7 +128,7 @@ class Limits:
         return _event(bound, seen, state.crossed, estimate.t_ns, since_ns)
 
 
-def model_of(device: Device) -> NoiseModel | None:
+def read_model_in_force(device: Device) -> NoiseModel | None:
     """Read the model in force of a device; return None if it has none.
 
     Raises
@@ -138,13 +138,13 @@ def model_of(device: Device) -> NoiseModel | None:
     """
     model = None if device.model is None else read_model(device.model)
     try:
-        bounds(device.limits, model)
+        make_bounds(device.limits, model)
     except ConfigError as error:
         raise ConfigError(*(f"device {device.name}: {line}" for line in error.lines)) from None
     return model
 
 
-def bounds(limits: Sequence[Limit], model: NoiseModel | None) -> list[Bound]:
+def make_bounds(limits: Sequence[Limit], model: NoiseModel | None) -> list[Bound]:
     """Return a bound for each axis of each limit.
 
     Parameters
@@ -184,7 +184,7 @@ def bounds(limits: Sequence[Limit], model: NoiseModel | None) -> list[Bound]:
 
 def _measured(bound: Bound, estimate: Estimate) -> _Measured:
     """Return the coefficient of a bound from an estimate."""
-    table, at = estimate.coefficients, (LETTERS.index(bound.letter), AXES.index(bound.axis))
+    table, at = estimate.coefficients, (SYMBOLS.index(bound.letter), AXES.index(bound.axis))
     if Status(int(table.status[at])) == Status.UNESTIMATED:
         return _Measured(float("nan"), float("nan"), float("nan"))
     return _Measured(float(table.value[at]), float(table.lo[at]), float(table.hi[at]))
@@ -193,7 +193,7 @@ def _measured(bound: Bound, estimate: Estimate) -> _Measured:
 def _event(bound: Bound, seen: _Measured, crossed: bool, t_ns: int, since_ns: int) -> Event:
     """Return the event for a limit that was crossed or is back."""
     what = {"value": seen.value, "lo": seen.lo, "hi": seen.hi, "limit": bound.limit}
-    kind = CROSSED if crossed else BACK
+    kind = LIMIT_CROSSED if crossed else LIMIT_BACK
     return Event(
         kind, t_ns, _text(bound, seen, crossed), bound.axis, {bound.letter: what}, since_ns, _sigma(bound, seen)
     )
@@ -209,7 +209,7 @@ def _sigma(bound: Bound, seen: _Measured) -> float | None:
 
 def _text(bound: Bound, seen: _Measured, crossed: bool) -> str:
     """Return the message of the event."""
-    unit, name = unit_of(bound.letter, bound.axis), COEFFICIENT_NAMES[kind_of(bound.axis)][bound.letter]
+    unit, name = unit_of(bound.letter, bound.axis), COEFFICIENT_NAMES[sensor_kind(bound.axis)][bound.letter]
     measured = unit.text(seen.value) if isfinite(seen.value) else f"at most {unit.text(seen.hi)}"
     limit = f"{unit.text(bound.limit)}, its {'upper' if bound.upper else 'lower'} limit"
     if bound.times_model is not None:

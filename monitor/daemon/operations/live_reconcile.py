@@ -30,7 +30,7 @@ import msgspec
 import numpy as np
 
 from drivers.sample import AXES, Floats
-from monitor.estimation.window_snapshot import Held
+from monitor.estimation.window_snapshot import WindowSnapshot
 from monitor.publishing.messages import encoding
 from monitor.publishing.zenoh.publisher import Command
 
@@ -41,7 +41,7 @@ A foreign module with the name ``monitor`` is therefore never run.
 """
 TIMEOUT_S: Final = 900.0
 """Time after which the child process is killed."""
-NICE: Final = 10
+NICENESS_INCREASE: Final = 10
 """Increase of the child's niceness over the daemon's. An unprivileged process cannot lower the niceness of its
 children.
 """
@@ -63,7 +63,7 @@ class Job:
     device: str
     unix_s: float  # time of the newest sample
     samples: int  # number of samples received up to the newest one
-    window: Held
+    window: WindowSnapshot
     temperature_c: Floats  # [n] of the samples in the window
     model: Path | None  # model under test
     folder: Path | None  # folder for reports; None if they are not kept
@@ -142,7 +142,7 @@ class Reconciler:
             self._finished.put(Finished(job.device, f"reconcile failed: {error}"))
             return
         command.answer(encoding.reconciled(job.device, job.unix_s, job.samples, result, status, folder))
-        self._finished.put(Finished(job.device, said(result, status)))
+        self._finished.put(Finished(job.device, format_result(result, status)))
 
     def _reconcile(self, job: Job) -> tuple[dict[str, Any], int, str | None]:
         """Return the JSON result, the exit status and the folder of the report, or None if the report is not kept.
@@ -158,7 +158,7 @@ class Reconciler:
                 stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(job.unix_s))
                 folder = job.folder / f"{job.device}-{stamp}"
                 folder.mkdir(parents=True, exist_ok=True)
-            write(path, job)
+            write_window(path, job)
             options = ["--out", str(folder), "--json", "-", "--seed", str(SEED)]
             if job.model is not None:
                 options += ["--model", str(job.model)]
@@ -179,7 +179,7 @@ class Reconciler:
         self._children[device] = child
         try:
             with contextlib.suppress(ProcessLookupError):
-                os.setpriority(os.PRIO_PROCESS, child.pid, min(os.nice(0) + NICE, LARGEST_NICENESS))
+                os.setpriority(os.PRIO_PROCESS, child.pid, min(os.nice(0) + NICENESS_INCREASE, LARGEST_NICENESS))
             if self._closing.is_set():  # the child was started while ``close`` killed the others
                 _kill(child)
             output, errors = child.communicate(timeout=self._limit_s)
@@ -194,7 +194,7 @@ class Reconciler:
         return child.returncode, output, errors
 
 
-def write(path: Path, job: Job) -> None:
+def write_window(path: Path, job: Job) -> None:
     """Write a window as a recording with its measured axes, its temperature and its rate.
 
     Parameters
@@ -211,7 +211,7 @@ def write(path: Path, job: Job) -> None:
     np.savez(path, fs=np.float64(job.window.rate_hz), **columns)  # type: ignore[arg-type]
 
 
-def said(result: dict[str, Any], status: int = DONE) -> str:
+def format_result(result: dict[str, Any], status: int = DONE) -> str:
     """Return the verdict and the changes of the model in one sentence.
 
     Parameters

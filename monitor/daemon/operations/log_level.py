@@ -9,7 +9,7 @@ LEVELS: Final = {"debug": 10, "info": 20, "warning": 30, "error": 40, "critical"
 """Names of the levels and their numbers."""
 
 
-class Level:
+class LevelFilter:
     """Processor of structlog that drops lines below the level.
 
     Parameters
@@ -28,5 +28,5 @@ class Level:
         return line
 
 
-LEVEL: Final = Level()
+LEVEL: Final = LevelFilter()
 """Log level of this process."""

@@ -22,7 +22,7 @@ from drivers.sample import AXES, Event
 from monitor.common.health import Health
 from monitor.daemon.device_worker import Output
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import LETTERS
+from monitor.estimation.fit.coefficients import SYMBOLS
 from monitor.settings.loading import Metrics
 
 if TYPE_CHECKING:
@@ -32,13 +32,13 @@ RETRY_S: Final = 5.0
 """Interval between two attempts to listen."""
 TIMEOUT_S: Final = 10.0
 """Time after which a scrape is ended."""
-AT_ONCE: Final = 8
+MAX_SCRAPES: Final = 8
 """Largest number of concurrent scrapes."""
 PAUSE_S: Final = 0.1
 """Pause after a connection that could not be accepted."""
 PATH: Final = "/metrics"
 """Path of the metrics in the URL."""
-MISSING: Final = 'prometheus-client is not installed: pip install "imu-monitor[metrics]"'
+MISSING_LIBRARY_TEXT: Final = 'prometheus-client is not installed: pip install "imu-monitor[metrics]"'
 """Status message if the library is not installed."""
 STATES: Final = ("running", "waiting", "lost", "ended")
 """States of a device."""
@@ -105,7 +105,7 @@ class MetricsOutput(Output):
         """Keep the newest health of a device."""
         self._healths[device] = health
 
-    def gone(self, device: str) -> None:
+    def device_removed(self, device: str) -> None:
         """Remove the values of a device."""
         self._healths.pop(device, None)
         self._estimates.pop(device, None)
@@ -143,7 +143,7 @@ class MetricsOutput(Output):
         try:
             from prometheus_client import CollectorRegistry
         except ImportError:
-            self.state = MISSING
+            self.state = MISSING_LIBRARY_TEXT
             return
         registry = CollectorRegistry(auto_describe=False)
         registry.register(self)
@@ -174,7 +174,7 @@ class _Server(socketserver.ThreadingTCPServer):
 
     def __init__(self, address: tuple[str, int], registry: Any) -> None:
         self.registry = registry
-        self.room = threading.Semaphore(AT_ONCE)
+        self.room = threading.Semaphore(MAX_SCRAPES)
         if ":" in address[0]:
             import socket
 
@@ -277,7 +277,7 @@ def _coefficient_metrics(estimates: Mapping[str, Estimate]) -> "Iterator[Metric]
             (device, axis, letter): float(getattr(one.coefficients, name)[row, column])
             for device, one in estimates.items()
             for column, axis in enumerate(AXES)
-            for row, letter in enumerate(LETTERS)
+            for row, letter in enumerate(SYMBOLS)
         }
         words = f"Coefficient of IEEE Std 952, {words}; SI: {UNITS}"
         yield _metric(

@@ -27,7 +27,7 @@ VARIABLES: Final = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
 """Environment variables of the protocol."""
 
 
-class Unit:
+class SystemdNotifier:
     """Connection of this process to systemd.
 
     Parameters
@@ -51,7 +51,7 @@ class Unit:
         self._turns: dict[str, tuple[int, float]] = {}  # read attempts of each reader, and the time of the last change
 
     @classmethod
-    def of(cls, environment: MutableMapping[str, str]) -> "Unit":
+    def from_environment(cls, environment: MutableMapping[str, str]) -> "SystemdNotifier":
         """Create a unit from the environment, and remove its variables, because they are not meant for child processes.
 
         Examples
@@ -71,7 +71,7 @@ class Unit:
         return self._watchdog_s is not None
 
     @property
-    def told_ready(self) -> bool:
+    def ready_sent(self) -> bool:
         """True if readiness has been sent."""
         return self._ready
 
@@ -95,7 +95,7 @@ class Unit:
         """Report that the service is stopping."""
         self._send("STOPPING=1")
 
-    def alive(self, turns: Mapping[str, int], now_s: float) -> list[str]:
+    def send_watchdog(self, turns: Mapping[str, int], now_s: float) -> list[str]:
         """Send a watchdog message if it is due and no reader is stuck.
 
         Parameters

@@ -31,25 +31,25 @@ from drivers.driver import AxisMap
 from drivers.errors import ConfigError, RecordingError
 from drivers.file_access import check_folder
 from drivers.recordings import segment
-from drivers.recordings.segment import Origin, Piece, SegmentWriter, State
-from drivers.recordings.table import PART
-from drivers.sample import AXES, NO_TICK, Chunk, Ints, SampleBlock, block
+from drivers.recordings.segment import DaemonState, SegmentMetadata, SegmentPiece, SegmentWriter
+from drivers.recordings.table import PARTIAL_SUFFIX
+from drivers.sample import AXES, NO_TICK, Chunk, Ints, SampleBlock, make_block
 from monitor.common.folder_lock import RECORDING_LOCK, FolderLock
 from monitor.daemon.storage import retention
 from monitor.settings.loading import Storage
 
-WRITE_S: Final = 0.5
+WRITE_INTERVAL_S: Final = 0.5
 """Interval between two batches of a device: the most that a crash loses. A power failure loses up to SYNC_INTERVAL_S.
 """
 SYNC_INTERVAL_S: Final = 1.0
 """Interval between two flushes of the files to disk."""
 RETRY_S: Final = 5.0
 """Interval between two attempts to record after an error."""
-TIDY_S: Final = 30.0
+DELETE_INTERVAL_S: Final = 30.0
 """Interval between two checks for segments to delete."""
 MAX_PACKING_S: Final = 0.1
 """Longest time for packing in one round, so that batches are written in between."""
-QUEUE_BYTES: Final = 16_000_000
+MAX_QUEUE_BYTES: Final = 16_000_000
 """Capacity of the queue of one device: three minutes of samples at 1 kHz."""
 TIME_RESOLUTION_NS: Final = 1000
 """Upper bound of the resolution of Unix times in a recording."""
@@ -65,12 +65,12 @@ RAW_FOLDER: Final = "raw"
 FOLDER_IN_USE_ADVICE: Final = "end it, or choose another folder in [storage]"
 """Second half of the message about a folder that another process uses."""
 
-Opening = Callable[[Path, Origin], SegmentWriter]
+Opening = Callable[[Path, SegmentMetadata], SegmentWriter]
 """Function that opens a new segment."""
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class RecorderEvent:
     """Event in the recording of a device."""
 
     device: str
@@ -79,14 +79,14 @@ class Told:
 
 
 @dataclass(frozen=True, slots=True)
-class Tail:
+class RecordingTail:
     """End of an existing recording, from which the daemon resumes after a restart."""
 
-    origin: Origin
+    segment_origin: SegmentMetadata
     paths: tuple[Path, ...]  # oldest first
-    newest: Piece
+    newest: SegmentPiece
 
-    def pieces(self, span_s: float) -> Iterator[Piece]:
+    def pieces(self, span_s: float) -> Iterator[SegmentPiece]:
         """Yield the last ``span_s`` seconds of the recording, oldest first, as far as the mounting is the same."""
         begin_ns = int(self.newest.samples.t_ns[-1]) - round(span_s * 1e9)
         for path in self._since(begin_ns):
@@ -99,7 +99,7 @@ class Tail:
         chosen: deque[Path] = deque()
         for path in reversed(self.paths):
             try:
-                if segment.origin(path).axes != self.origin.axes:
+                if segment.read_metadata(path).axes != self.segment_origin.axes:
                     break
                 first = next(segment.read_samples(path), None)
             except (RecordingError, OSError):
@@ -116,7 +116,7 @@ class Tail:
 class _Track:
     """Recording of one kind for one device: its folder, open segment and queue."""
 
-    origin: Origin
+    origin: SegmentMetadata
     folder: Path
     writer: SegmentWriter | None = None
     began_s: float = 0.0  # Unix time of the open segment's first row
@@ -155,16 +155,16 @@ class Recorder:
         Opens a segment. Tests pass functions that simulate slow and broken disks.
     """
 
-    def __init__(self, storage: Storage, origins: Sequence[Origin], opening: Opening = SegmentWriter) -> None:
+    def __init__(self, storage: Storage, origins: Sequence[SegmentMetadata], opening: Opening = SegmentWriter) -> None:
         self._storage = storage
         self._opening = opening
         self._tracks = {(one.device, one.kind): _Track(one, self.folder(one)) for one in origins}
-        self._states: dict[str, State] = {}
+        self._states: dict[str, DaemonState] = {}
         self._lock = threading.Lock()  # held only briefly, because reader threads wait for it
-        self._events: deque[Told] = deque(maxlen=1000)
+        self._events: deque[RecorderEvent] = deque(maxlen=1000)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
-        self._tidied_s = self._synced_s = -TIDY_S
+        self._tidied_s = self._synced_s = -DELETE_INTERVAL_S
         self._packing: Iterator[None] | None = None
         self._to_pack: deque[Path] = deque()
         self._full = ""  # message if the disk is too full
@@ -174,7 +174,7 @@ class Recorder:
         self._other_process = False  # True if another process holds the lock
         self._note = ""  # message about the last change of a file by another program
 
-    def add(self, origins: Sequence[Origin]) -> None:
+    def add(self, origins: Sequence[SegmentMetadata]) -> None:
         """Start to record a further device."""
         with self._lock:
             self._tracks = {
@@ -187,11 +187,11 @@ class Recorder:
         for track in self._tracks.values():
             track.leaving |= track.origin.device == device
 
-    def has(self, device: str) -> bool:
+    def is_recording(self, device: str) -> bool:
         """Return True while a device is recorded, or its queue is not written yet."""
         return any(name == device for name, _ in self._tracks)
 
-    def folder(self, origin: Origin) -> Path:
+    def folder(self, origin: SegmentMetadata) -> Path:
         """Return the folder for the segments of a recording."""
         own = self._storage.folder / origin.device
         return own if origin.kind == "samples" else own / RAW_FOLDER
@@ -216,7 +216,7 @@ class Recorder:
         """Number of samples and chunks that are missing in the recordings."""
         return sum(track.missed for track in self._tracks.values())
 
-    def take(self) -> list[Told]:
+    def take_events(self) -> list[RecorderEvent]:
         """Return the events since the last call."""
         return [self._events.popleft() for _ in range(len(self._events))]
 
@@ -249,7 +249,7 @@ class Recorder:
             return
         if not isinstance(offset_ns, int) or offset_ns:
             t_ns = samples.t_ns + offset_ns
-            samples = block(t_ns, samples.values, samples.temperature_c, samples.ticks, samples.lost)
+            samples = make_block(t_ns, samples.values, samples.temperature_c, samples.ticks, samples.lost)
         self._enqueue(track, [samples])
 
     def chunks(self, device: str, chunks: Sequence[Chunk], offset_ns: int) -> None:
@@ -273,7 +273,7 @@ class Recorder:
         with self._lock:
             track.waiting.extend(more)
             track.bytes += sum(_size(one) for one in more)
-            while track.bytes > QUEUE_BYTES and len(track.waiting) > 1:
+            while track.bytes > MAX_QUEUE_BYTES and len(track.waiting) > 1:
                 gone = track.waiting.popleft()
                 track.bytes -= _size(gone)
                 if self._other_process:  # another process records; missing rows are found after it has ended
@@ -282,7 +282,7 @@ class Recorder:
                 track.dropped += rows + (gone.lost if isinstance(gone, SampleBlock) else 0)
                 track.missed += rows
 
-    def know(self, device: str, state: State) -> None:
+    def set_state(self, device: str, state: DaemonState) -> None:
         """Set the state of the estimate that is recorded with the rows of a device from now on.
 
         Parameters
@@ -294,14 +294,14 @@ class Recorder:
         """
         self._states[device] = state
 
-    def full(self, device: str) -> bool:
+    def is_queue_filling(self, device: str) -> bool:
         """Return True if a replayed recording should wait, because the queue of its device is filling up."""
         track = self._tracks.get((device, "samples"))
-        return track is not None and not self._lock_failure and track.bytes > QUEUE_BYTES // 4
+        return track is not None and not self._lock_failure and track.bytes > MAX_QUEUE_BYTES // 4
 
     # --- after a restart
 
-    def tail(self, device: str) -> Tail | None:
+    def tail(self, device: str) -> RecordingTail | None:
         """Return the end of a device's recording from before this start, or None if there is nothing to resume from.
 
         This method must be called before anything is written. Files that are not valid segments are skipped and left in
@@ -312,17 +312,17 @@ class Recorder:
             return None
         if self._thread.ident is None:
             self._acquire_folder()  # with the lock, no other process adds to the segments that are found now
-        paths = segment.segments(track.folder)
+        paths = segment.list_segments(track.folder)
         while paths:
             path = paths[-1]
             try:
-                if segment.origin(path).axes != track.origin.axes:
+                if segment.read_metadata(path).axes != track.origin.axes:
                     return None
-                newest = segment.newest(path)
+                newest = segment.read_last_piece(path)
             except (RecordingError, ConfigError, OSError):
                 newest = None
             if newest is not None:
-                return Tail(track.origin, tuple(paths), newest)
+                return RecordingTail(track.origin, tuple(paths), newest)
             paths.pop()
         return None
 
@@ -333,7 +333,7 @@ class Recorder:
         closing = False
         while not closing:
             held = self._acquire_folder()
-            closing = self._closing.wait(WRITE_S)
+            closing = self._closing.wait(WRITE_INTERVAL_S)
             for track in self._tracks.values():
                 leaving = track.leaving  # read before the queue: nothing is added after it has been set
                 if held:
@@ -374,7 +374,7 @@ class Recorder:
             self._end(track, pack=False)
             track.number = None  # another process may create segments in the meantime
             if not self._lock_failure:
-                self._events.append(Told(track.origin.device, "recording_stopped", why))
+                self._events.append(RecorderEvent(track.origin.device, "recording_stopped", why))
         self._lock_failure, self._lock_failed_s = why, time.monotonic()
 
     def _resume(self) -> None:
@@ -383,7 +383,7 @@ class Recorder:
             if self._other_process:
                 self._drop_recorded_rows(track)
             text = f"recording goes on; {track.missed} rows are missing in it"
-            self._events.append(Told(track.origin.device, "recording_back", text))
+            self._events.append(RecorderEvent(track.origin.device, "recording_back", text))
         self._lock_failure, self._other_process = "", False
 
     def _drop_recorded_rows(self, track: _Track) -> None:
@@ -404,7 +404,7 @@ class Recorder:
 
     def _end_if_changed(self, track: _Track) -> None:
         """Close a file that another program has changed; the next row begins a new file."""
-        change = "" if track.writer is None else track.writer.change()
+        change = "" if track.writer is None else track.writer.external_change()
         if not change:
             return
         writer, track.writer = track.writer, None
@@ -413,11 +413,11 @@ class Recorder:
             writer.abandon()
         except OSError as error:
             change = f"{change} ({error.strerror or error})"
-        known = segment.segments(track.folder)  # files of another program may be among them, and are not packed
-        track.number = max(track.number or 0, segment.number_of(known[-1]) if known else 0)
+        known = segment.list_segments(track.folder)  # files of another program may be among them, and are not packed
+        track.number = max(track.number or 0, segment.segment_number(known[-1]) if known else 0)
         self._note = f"{writer.path} {change} while it was written, with {track.rows} rows in it; a new one is begun"
-        self._events.append(Told(track.origin.device, "recording_stopped", self._note))
-        self._events.append(Told(track.origin.device, "recording_back", "recording goes on in a new file"))
+        self._events.append(RecorderEvent(track.origin.device, "recording_stopped", self._note))
+        self._events.append(RecorderEvent(track.origin.device, "recording_back", "recording goes on in a new file"))
 
     def _remove_track(self, track: _Track) -> None:
         """Close the file of a removed device and delete its track."""
@@ -466,7 +466,7 @@ class Recorder:
         assert track.writer is not None
         if track.origin.kind == "samples":
             blocks = [one for one in track.held if isinstance(one, SampleBlock)]
-            track.writer.samples(blocks, self._states.get(track.origin.device, State()))
+            track.writer.samples(blocks, self._states.get(track.origin.device, DaemonState()))
             track.rows += sum(len(one) for one in blocks)
         else:
             track.writer.chunks([one for one in track.held if isinstance(one, Chunk)])
@@ -478,10 +478,10 @@ class Recorder:
         check_folder(track.folder)
         track.folder.mkdir(parents=True, exist_ok=True)
         if track.number is None:
-            known = segment.segments(track.folder)
-            track.number = segment.number_of(known[-1]) if known else 0
+            known = segment.list_segments(track.folder)
+            track.number = segment.segment_number(known[-1]) if known else 0
             self._to_pack.extend(known)
-            for part in track.folder.glob(f"*{PART}"):
+            for part in track.folder.glob(f"*{PARTIAL_SUFFIX}"):
                 part.unlink()
         path = track.folder / segment.segment_name(track.number + 1, began_s)
         track.writer = self._opening(path, track.origin)
@@ -502,7 +502,7 @@ class Recorder:
 
     def _sync(self) -> None:
         """Flush the open segments to disk once a second."""
-        if time.monotonic() - self._synced_s < SYNC_INTERVAL_S - WRITE_S / 2:
+        if time.monotonic() - self._synced_s < SYNC_INTERVAL_S - WRITE_INTERVAL_S / 2:
             return
         self._synced_s = time.monotonic()
         for track in self._tracks.values():
@@ -523,7 +523,7 @@ class Recorder:
         while time.monotonic() < until_s and (self._packing is not None or self._to_pack):
             try:
                 if self._packing is None:
-                    self._packing = segment.pack(self._to_pack.popleft())
+                    self._packing = segment.compress_segment(self._to_pack.popleft())
                 next(self._packing)
             except StopIteration:
                 self._packing = None
@@ -534,13 +534,13 @@ class Recorder:
 
     def _delete_old(self) -> None:
         """Delete segments that are too old, and the oldest segments while the disk is too full."""
-        if time.monotonic() - self._tidied_s < (RETRY_S if self._full else TIDY_S):
+        if time.monotonic() - self._tidied_s < (RETRY_S if self._full else DELETE_INTERVAL_S):
             return
         self._tidied_s = time.monotonic()
         folders = [track.folder for track in self._tracks.values()]
         try:
             retention.delete_old(folders, self._storage.keep_s, self._storage.segment_s)
-            self._full = retention.make_room(self._storage.folder, folders, self._storage.disk_share)
+            self._full = retention.delete_until_free(self._storage.folder, folders, self._storage.disk_share)
         except OSError as error:
             self._full = f"{self._storage.folder}: {error.strerror or error}; recording stopped, trying again"
 
@@ -549,7 +549,7 @@ class Recorder:
     def _report_failure(self, track: _Track, why: str) -> None:
         """Store the reason why the recording of a track has stopped, and queue an event if it had worked until now."""
         if not track.trouble:
-            self._events.append(Told(track.origin.device, "recording_stopped", why))
+            self._events.append(RecorderEvent(track.origin.device, "recording_stopped", why))
         track.trouble = why
         track.stopped_s = time.monotonic()
 
@@ -558,10 +558,12 @@ class Recorder:
         if track.trouble:
             track.trouble = ""
             text = f"recording goes on; {track.missed} rows are missing in it"
-            self._events.append(Told(track.origin.device, "recording_back", text))
+            self._events.append(RecorderEvent(track.origin.device, "recording_back", text))
 
 
-def origin(device: str, axes: AxisMap, kind: segment.Kind = "samples", carrier: str = "", decoder: str = "") -> Origin:
+def origin(
+    device: str, axes: AxisMap, kind: segment.Kind = "samples", carrier: str = "", decoder: str = ""
+) -> SegmentMetadata:
     """Return the description of a device's segments.
 
     Parameters
@@ -577,18 +579,18 @@ def origin(device: str, axes: AxisMap, kind: segment.Kind = "samples", carrier: 
     """
     measured = zip(axes.source, axes.sign, strict=True)
     mounting = " ".join(f"{'-' if sign < 0.0 else ''}{AXES[at]}" for at, sign in measured)
-    return Origin(device, kind, mounting, carrier, decoder)
+    return SegmentMetadata(device, kind, mounting, carrier, decoder)
 
 
 def _find_newest(track: _Track) -> _Newest | None:
     """Return the newest row in the folder of a track; None if there is none."""
-    for path in reversed(segment.segments(track.folder)):
+    for path in reversed(segment.list_segments(track.folder)):
         with contextlib.suppress(RecordingError, ConfigError, OSError):  # files that are no segments are skipped
             if track.origin.kind == "raw":
                 last = deque(segment.read_chunks(path), maxlen=1)
                 if last:
                     return _Newest(last[0].t_ns)
-            elif (piece := segment.newest(path)) is not None:
+            elif (piece := segment.read_last_piece(path)) is not None:
                 rows = piece.samples
                 span_s = int(rows.t_ns[-1] - rows.t_ns[0]) / 1e9
                 rate_hz = piece.state.rate or ((len(rows) - 1) / span_s if span_s > 0.0 else None)

@@ -30,15 +30,17 @@ def delete_old(folders: Sequence[Path], keep_s: float, segment_s: float) -> None
         Largest length of a segment in seconds.
     """
     for folder in folders:
-        known = segment.segments(folder)
+        known = segment.list_segments(folder)
         for at, (path, after) in enumerate(pairwise(known[: 1 - MIN_KEPT_SEGMENTS])):
-            by_name_s = segment.began_s(known[-1]) - segment.began_s(after)  # a segment ends where the next begins
+            by_name_s = segment.segment_start_s(known[-1]) - segment.segment_start_s(
+                after
+            )  # a segment ends where the next begins
             by_number_s = (len(known) - 1 - at) * segment_s
             if min(by_name_s, by_number_s) > keep_s:
                 _delete(path)
 
 
-def make_room(folder: Path, folders: Sequence[Path], share: float) -> str:
+def delete_until_free(folder: Path, folders: Sequence[Path], share: float) -> str:
     """Delete the oldest segments while more than ``share`` of the disk is in use.
 
     Parameters
@@ -58,10 +60,10 @@ def make_room(folder: Path, folders: Sequence[Path], share: float) -> str:
     if not folder.is_dir():
         return ""
     olds: deque[Path] | None = None
-    while (taken := taken_share(folder)) > share:
+    while (taken := used_disk_share(folder)) > share:
         if olds is None:
-            every = [path for one in folders for path in segment.segments(one)[:-MIN_KEPT_SEGMENTS]]
-            olds = deque(sorted(every, key=segment.began_s))
+            every = [path for one in folders for path in segment.list_segments(one)[:-MIN_KEPT_SEGMENTS]]
+            olds = deque(sorted(every, key=segment.segment_start_s))
         if not olds:
             return (
                 f"{folder}: the disk is {100 * taken:.4g} % full, disk_share allows {100 * share:.4g} %, and no older "
@@ -77,7 +79,7 @@ def _delete(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def taken_share(folder: Path) -> float:
+def used_disk_share(folder: Path) -> float:
     """Return the share of the disk of ``folder`` that is in use, 0 to 1, as seen by users other than root."""
     usage = shutil.disk_usage(folder)
     return 1.0 - usage.free / usage.total

@@ -56,7 +56,7 @@ START_VARIANCE_SHARES: Final = (1e-3, 0.03, 0.5)
 
 
 @dataclass(frozen=True, slots=True)
-class Arma:
+class ArmaModel:
     """Parameters of one identified ARMA process.
 
     >>> Arma((0.5, 0.3), -0.2, 1.0).green
@@ -67,12 +67,12 @@ class Arma:
     theta: float
     variance: float  # variance of a, (rad/s)²
     mean: float = 0.0  # μ, rad/s
-    white: float = 0.0  # variance of v, (rad/s)²
+    white_variance: float = 0.0  # variance of v, (rad/s)²
     order: Order = (2, 1)
     # limits of the 95 % intervals of φ1, φ2, θ1; NaN = not computed
     lo: tuple[float, float, float] = (np.nan, np.nan, np.nan)
     hi: tuple[float, float, float] = (np.nan, np.nan, np.nan)
-    likelihood: float = np.nan  # logarithm of the likelihood
+    log_likelihood: float = np.nan  # logarithm of the likelihood
     bic: float = np.nan
     count: int = 0  # number of values used for the identification
 
@@ -82,9 +82,9 @@ class Arma:
         return 1.0, self.phi[0] + self.theta
 
     @property
-    def spread(self) -> float:
+    def stationary_std(self) -> float:
         """Return the stationary standard deviation of x in rad/s; infinite for a random walk."""
-        return sqrt(self.variance * stationary(*self.phi, self.theta)[0])
+        return sqrt(self.variance * stationary_covariance(*self.phi, self.theta)[0])
 
     @property
     def name(self) -> str:
@@ -92,7 +92,7 @@ class Arma:
         return f"ARMA({self.order[0]}, {self.order[1]})" if self.order != (0, 0) else "constant"
 
 
-def identify(z: Floats, white: float = 0.0, orders: Sequence[Order] = ORDERS, intervals: bool = False) -> Arma:
+def fit_arma(z: Floats, white: float = 0.0, orders: Sequence[Order] = ORDERS, intervals: bool = False) -> ArmaModel:
     """Return the model of the order with the least BIC (Schwarz 1978).
 
     Parameters
@@ -138,7 +138,7 @@ def _propagate_covariance(p11, p12, p22, phi1, phi2, g1, variance):  # type: ign
 
 
 @compiled
-def stationary(phi1, phi2, theta):  # type: ignore[no-untyped-def]
+def stationary_covariance(phi1, phi2, theta):  # type: ignore[no-untyped-def]
     """Return the stationary covariance of the state for a of variance 1, as its elements p11, p12, p22.
 
     Parameters
@@ -155,7 +155,7 @@ def stationary(phi1, phi2, theta):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def innovations(z, phi1, phi2, theta, variance, white):  # type: ignore[no-untyped-def]
+def run_kalman_filter(z, phi1, phi2, theta, variance, white):  # type: ignore[no-untyped-def]
     """Run the exact Kalman filter and return the sums of the likelihood.
 
     Parameters
@@ -181,7 +181,7 @@ def innovations(z, phi1, phi2, theta, variance, white):  # type: ignore[no-untyp
         Generalised least-squares estimate of the mean.
     """
     g1 = phi1 + theta
-    p11, p12, p22 = stationary(phi1, phi2, theta)
+    p11, p12, p22 = stationary_covariance(phi1, phi2, theta)
     p11, p12, p22 = p11 * variance, p12 * variance, p22 * variance
     x1 = x2 = o1 = o2 = 0.0  # The filter runs on z and on a series of ones. Both together give the mean.
     count, logs, zz, zo, oo = 0, 0.0, 0.0, 0.0, 0.0
@@ -241,7 +241,7 @@ def _start_parameters(white: float, order: Order) -> list[Floats]:
 def _log_likelihood(z: Floats, white: float, order: Order, u: Floats) -> float:
     """Return the log likelihood, maximised over the mean and, if v is zero, over the variance."""
     phi1, phi2, theta, variance = _model_coefficients(order, u, white)
-    count, logs, square, _ = innovations(z, phi1, phi2, theta, variance, white)
+    count, logs, square, _ = run_kalman_filter(z, phi1, phi2, theta, variance, white)
     if white > 0.0 and order != (0, 0):
         return float(-0.5 * (count * log(2.0 * pi) + logs + square))
     size = max(square / count, 1e-300)
@@ -264,23 +264,23 @@ def _model_coefficients(order: Order, u: Floats, white: float) -> tuple[float, f
     return phi1, phi2, theta, exp(min(max(float(u[-1]), -60.0), 60.0)) if free else 1.0
 
 
-def _to_model(z: Floats, white: float, origin: float, scale: float, best: _OrderFit) -> Arma:
+def _to_model(z: Floats, white: float, origin: float, scale: float, best: _OrderFit) -> ArmaModel:
     """Return the fitted order as a model in the units of the measurement."""
     bic, order, u = best
     phi1, phi2, theta, variance = _model_coefficients(order, u, white)
     seen = white if order != (0, 0) else 0.0
-    count, _, square, mean = innovations(z, phi1, phi2, theta, variance, seen)
+    count, _, square, mean = run_kalman_filter(z, phi1, phi2, theta, variance, seen)
     if seen == 0.0:
         variance = square / count
     nothing = order == (0, 0) and white > 0.0
-    return Arma(
+    return ArmaModel(
         phi=(phi1, phi2),
         theta=theta,
         variance=0.0 if nothing else variance * scale**2,
         mean=origin + scale * mean,
-        white=(variance if nothing else white) * scale**2,
+        white_variance=(variance if nothing else white) * scale**2,
         order=order,
-        likelihood=_log_likelihood(z, white, order, u) - count * log(scale),
+        log_likelihood=_log_likelihood(z, white, order, u) - count * log(scale),
         bic=bic + 2.0 * count * log(scale),
         count=count,
     )

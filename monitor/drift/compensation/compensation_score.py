@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import Floats, Ints
-from monitor.estimation.allan.batch import cluster_sizes, overlapping_axis
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
 
 MINUTE_S: Final = 60.0
 """One minute in seconds."""
@@ -20,10 +20,10 @@ SPANS_S: Final = (60.0, 600.0, 3600.0)
 
 
 @dataclass(frozen=True, slots=True)
-class AtRest:
+class RestScore:
     """Quality of one axis at rest, in rad/s. Values that the record is too short for are NaN."""
 
-    deviation: float  # rms about zero
+    rms: float  # rms about zero
     worst_minute: float  # largest rms of a minute
     drift: tuple[float, ...]  # rms of the means over each of SPANS_S
     tau_s: Floats  # [k] averaging times
@@ -31,15 +31,15 @@ class AtRest:
 
 
 @dataclass(frozen=True, slots=True)
-class InMotion:
+class MotionScore:
     """Quality of one axis beside its known true rate."""
 
-    error: float  # rms, rad/s
+    rms_error: float  # rms, rad/s
     delay_s: float  # delay of the rate
-    angle: float  # rms of the integrated error, rad
+    angle_error_rad: float  # rms of the integrated error, rad
 
 
-def at_rest(rate: Floats, rate_hz: float) -> AtRest:
+def score_at_rest(rate: Floats, rate_hz: float) -> RestScore:
     """Return the quality of a rate whose true value is zero.
 
     Parameters
@@ -50,10 +50,10 @@ def at_rest(rate: Floats, rate_hz: float) -> AtRest:
         Sample rate in Hz.
     """
     sizes: Ints = cluster_sizes(rate.size, rate_hz)
-    allan, _ = overlapping_axis(rate, sizes)
+    allan, _ = overlapping_avar_axis(rate, sizes)
     minutes = _span_means(rate**2, round(MINUTE_S * rate_hz))
-    return AtRest(
-        deviation=_rms(rate),
+    return RestScore(
+        rms=_rms(rate),
         worst_minute=float(np.sqrt(minutes.max())) if minutes.size else np.nan,
         drift=tuple(_rms(_span_means(rate, round(span * rate_hz))) for span in SPANS_S),
         tau_s=sizes / rate_hz,
@@ -61,7 +61,7 @@ def at_rest(rate: Floats, rate_hz: float) -> AtRest:
     )
 
 
-def in_motion(rate: Floats, truth: Floats, rate_hz: float) -> InMotion:
+def score_in_motion(rate: Floats, truth: Floats, rate_hz: float) -> MotionScore:
     """Return the quality of a rate beside the true rate.
 
     Parameters
@@ -83,10 +83,10 @@ def in_motion(rate: Floats, truth: Floats, rate_hz: float) -> InMotion:
     difference = np.where(np.isfinite(rate), rate - truth, 0.0)
     slope = np.gradient(truth) * rate_hz
     moved = float(slope @ slope)
-    return InMotion(
-        error=_rms(rate - truth),
+    return MotionScore(
+        rms_error=_rms(rate - truth),
         delay_s=-float(difference @ slope) / moved if moved > 0.0 else np.nan,
-        angle=_rms(np.cumsum(difference) / rate_hz),
+        angle_error_rad=_rms(np.cumsum(difference) / rate_hz),
     )
 
 

@@ -22,8 +22,16 @@ from drivers.errors import NotReady
 from drivers.sample import AXES, Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.drift.compensation import sage_husa
-from monitor.drift.compensation.arma import ORDERS, Arma, Order, identify
-from monitor.drift.compensation.motion_filter_bank import LEAST, coast, follow, gains, learn, memories, shift
+from monitor.drift.compensation.arma import ORDERS, ArmaModel, Order, fit_arma
+from monitor.drift.compensation.motion_filter_bank import (
+    MIN_REST_INTERVALS,
+    filter_memories,
+    filter_sample,
+    gain_table,
+    predict_over_gap,
+    shift_bias,
+    update_rest_noise,
+)
 from monitor.estimation.detection import motion_kernel
 from monitor.estimation.detection.motion_detection import block_size
 
@@ -33,9 +41,9 @@ BLOCKS_PER_INTERVAL: Final = 4
 """Blocks of the motion detector in an interval. An interval lasts 1 s, and longer at rates below 32 Hz."""
 MIN_REST_BLOCKS: Final = 2
 """Blocks at rest that an interval needs to count as at rest."""
-SLOTS: Final = 4
+MAX_PENDING_BLOCKS: Final = 4
 """Blocks that can wait for a rest decision."""
-REMEMBERED: Final = 2048
+HISTORY_INTERVALS: Final = 2048
 """Intervals that are kept to identify a model."""
 MIN_IDENTIFICATION_INTERVALS: Final = 60
 """Intervals at rest before a first model is identified. The next identification follows after half as many more, and
@@ -62,10 +70,10 @@ standard error of the prediction. SCATTER is the variance of the mean, estimated
 """
 
 
-class State(NamedTuple):
+class CompensatorState(NamedTuple):
     """Complete state of the compensator, in arrays that compiled code can use."""
 
-    rest: motion_kernel.State
+    rest: motion_kernel.MotionState
     current: Ints  # [1] number of the current interval; -1 = none yet
     learned: Ints  # [3] intervals at rest from which the filters learned their noise
     row: Floats  # [3, ROW_SIZE] one row of ``sage_husa`` for each axis
@@ -85,14 +93,14 @@ class State(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Interval:
+class DriftInterval:
     """Result of one interval for three gyro axes, in rad/s."""
 
     end: int  # index of the first sample after the interval; missing samples count
     mean: Floats  # [3] measured at rest; NaN = in motion
     expected: Floats  # [3] predicted drift; NaN = not known yet
     error: Floats  # [3] predicted standard deviation of ``mean - expected``
-    became: Ints  # [3] NOT_SEEN, USED, LEFT_OUT or STEPPED of ``sage_husa``
+    outcome: Ints  # [3] NOT_SEEN, USED, LEFT_OUT or STEPPED of ``sage_husa``
     known: Floats  # [3] standard error of ``expected``
 
     @property
@@ -124,27 +132,27 @@ class Compensator:
 
     def __init__(self, rate_hz: float, adapts: bool = True, orders: Sequence[Order] = ORDERS) -> None:
         self.rate_hz = rate_hz
-        self.size = block_size(rate_hz)
-        self.models: list[Arma | None] = [None] * GYROS
+        self.block_samples = block_size(rate_hz)
+        self.models: list[ArmaModel | None] = [None] * GYROS
         self._orders = tuple(orders)
         self._state = _initial_state(rate_hz, adapts)
-        self.came = 0  # samples received, including missing ones
-        self._means = np.full((GYROS, REMEMBERED), np.nan)  # ring buffer of interval means
-        self._scatter = np.full((GYROS, REMEMBERED), np.nan)
+        self.sample_count = 0  # samples received, including missing ones
+        self._means = np.full((GYROS, HISTORY_INTERVALS), np.nan)  # ring buffer of interval means
+        self._scatter = np.full((GYROS, HISTORY_INTERVALS), np.nan)
         self._interval_count = 0
         self._at_rest = np.zeros(GYROS, np.int64)
         self._next_identification = np.full(GYROS, MIN_IDENTIFICATION_INTERVALS)
-        self._finished_intervals: list[Interval] = []
+        self._finished_intervals: list[DriftInterval] = []
 
     @property
-    def interval(self) -> int:
+    def interval_samples(self) -> int:
         """Return the number of samples in an interval."""
-        return BLOCKS_PER_INTERVAL * self.size
+        return BLOCKS_PER_INTERVAL * self.block_samples
 
     @property
     def interval_s(self) -> float:
         """Return the length of an interval in seconds."""
-        return self.interval / self.rate_hz
+        return self.interval_samples / self.rate_hz
 
     @property
     def bias(self) -> Floats:
@@ -154,10 +162,10 @@ class Compensator:
     @property
     def error(self) -> Floats:
         """Return the standard error [3] of the bias in rad/s; NaN means that the bias is not known yet."""
-        known = [sage_husa.drift(row)[1] ** 0.5 for row in self._state.row]
+        known = [sage_husa.expected_bias(row)[1] ** 0.5 for row in self._state.row]
         return np.where(np.isnan(self._state.bias), np.nan, known)
 
-    def update(self, values: Floats, lost: int = 0) -> Floats:
+    def compensate(self, values: Floats, lost: int = 0) -> Floats:
         """Return consecutive samples with the drift of the gyros removed.
 
         A gyro rate is not changed until the bias is known, or if the sample is missing.
@@ -176,21 +184,21 @@ class Compensator:
         """
         if lost:
             for axis in range(GYROS):
-                coast(self._state.bank[axis], self._state.ages[axis], lost)
-            self.came += lost
+                predict_over_gap(self._state.bank[axis], self._state.ages[axis], lost)
+            self.sample_count += lost
         out = np.array(values, dtype=np.float64, order="C")
         # Numba compiles one version per memory layout and access flag, so the array is always contiguous and read-only.
         values = np.ascontiguousarray(values, np.float64).view()
         values.flags.writeable = False
         # After a gap, all waiting blocks are decided at once, and each of them may end an interval.
-        outcomes = np.empty((len(values) // self.interval + 2 + SLOTS, 1 + 6 * GYROS))
-        filled = _advance(values, self.came, self.size, self._state, out, outcomes)
-        self.came += len(values)
+        outcomes = np.empty((len(values) // self.interval_samples + 2 + MAX_PENDING_BLOCKS, 1 + 6 * GYROS))
+        filled = _advance(values, self.sample_count, self.block_samples, self._state, out, outcomes)
+        self.sample_count += len(values)
         for k in range(filled):
             self._record_interval(outcomes[k])
         return out
 
-    def take(self) -> list[Interval]:
+    def take_intervals(self) -> list[DriftInterval]:
         """Return the results of the intervals that have ended since the last call."""
         outcomes, self._finished_intervals = self._finished_intervals, []
         return outcomes
@@ -198,19 +206,19 @@ class Compensator:
     # --- identification
 
     @property
-    def ahead(self) -> int:
+    def samples_to_interval_end(self) -> int:
         """Return the number of samples to the end of the interval.
 
         If models change only there, they change at the same sample however the stream is divided into blocks.
         """
-        return self.interval - self.came % self.interval
+        return self.interval_samples - self.sample_count % self.interval_samples
 
     @property
-    def due(self) -> tuple[int, ...]:
+    def axes_due(self) -> tuple[int, ...]:
         """Return the indices of the axes that have enough new intervals to identify a model."""
         return tuple(np.flatnonzero(self._at_rest >= self._next_identification).tolist())
 
-    def window(self, axis: int) -> tuple[Floats, float]:
+    def identification_data(self, axis: int) -> tuple[Floats, float]:
         """Return the interval means from which the model of an axis is to be identified.
 
         Parameters
@@ -229,7 +237,7 @@ class Compensator:
         white = float(np.nanmean(scatter)) if np.isfinite(scatter).any() else 0.0
         return z, white
 
-    def adopt(self, axis: int, model: Arma | None) -> None:
+    def set_model(self, axis: int, model: ArmaModel | None) -> None:
         """Use a new model for an axis, and filter all remembered intervals again with it.
 
         Parameters
@@ -240,38 +248,38 @@ class Compensator:
             The identified model. None means that no model was found, so the identification is repeated later.
         """
         self._next_identification[axis] = self._at_rest[axis] + min(
-            max(self._at_rest[axis], MIN_IDENTIFICATION_INTERVALS) // 2, REMEMBERED
+            max(self._at_rest[axis], MIN_IDENTIFICATION_INTERVALS) // 2, HISTORY_INTERVALS
         )
         if model is None:
             return
         self.models[axis] = model
         row = self._state.row[axis]
-        count = row[sage_husa.COUNT]
-        sage_husa.adopt(row, model)
-        sage_husa.again(row, *self._history(axis), _min_variance(self._state.rest.open, axis))
-        row[sage_husa.COUNT] = count  # The repeated intervals are not counted a second time.
+        count = row[sage_husa.REST_COUNT]
+        sage_husa.set_model(row, model)
+        sage_husa.refilter_history(row, *self._history(axis), _min_variance(self._state.rest.open, axis))
+        row[sage_husa.REST_COUNT] = count  # The repeated intervals are not counted a second time.
         _update_bias(axis, self._state.row, self._state.bias, self._state.bank)
 
     def identify(self) -> None:
         """Identify the models of all axes that are due."""
-        for axis in self.due:
+        for axis in self.axes_due:
             try:
-                self.adopt(axis, identify(*self.window(axis), self._orders))
+                self.set_model(axis, fit_arma(*self.identification_data(axis), self._orders))
             except NotReady:  # The means are all equal or too few. The identification is repeated later.
-                self.adopt(axis, None)
+                self.set_model(axis, None)
 
     # --- results of intervals
 
     def _history(self, axis: int) -> tuple[Floats, Floats]:
         """Return the remembered means and their scatter, oldest first."""
-        count = min(self._interval_count, REMEMBERED)
-        order = np.arange(self._interval_count - count, self._interval_count) % REMEMBERED
+        count = min(self._interval_count, HISTORY_INTERVALS)
+        order = np.arange(self._interval_count - count, self._interval_count) % HISTORY_INTERVALS
         return self._means[axis][order], self._scatter[axis][order]
 
     def _record_interval(self, outcomes: Floats) -> None:
         """Record the result of one interval in the history."""
         columns = outcomes[1:].reshape(GYROS, 6)
-        at = self._interval_count % REMEMBERED
+        at = self._interval_count % HISTORY_INTERVALS
         became = columns[:, OUTCOME]
         self._means[became == sage_husa.STEPPED] = np.nan  # The older means belong to the bias before the step.
         used = (became == sage_husa.USED) | (became == sage_husa.STEPPED)
@@ -280,8 +288,8 @@ class Compensator:
         self._interval_count += 1
         self._at_rest += used
         self._finished_intervals.append(
-            Interval(
-                int(outcomes[0] + 1) * self.interval,
+            DriftInterval(
+                int(outcomes[0] + 1) * self.interval_samples,
                 columns[:, MEAN].copy(),
                 columns[:, EXPECTED].copy(),
                 columns[:, INNOVATION_STD].copy(),
@@ -291,29 +299,29 @@ class Compensator:
         )
 
 
-def _initial_state(rate_hz: float, adapts: bool) -> State:
+def _initial_state(rate_hz: float, adapts: bool) -> CompensatorState:
     """Return the state before the first sample."""
-    each = memories(rate_hz)
-    table, first = gains(each)
+    each = filter_memories(rate_hz)
+    table, first = gain_table(each)
     filters = each.size
-    return State(
-        rest=motion_kernel.state(),
+    return CompensatorState(
+        rest=motion_kernel.make_state(),
         current=np.full(1, -1, np.int64),
         learned=np.zeros(GYROS, np.int64),
-        row=np.stack([sage_husa.unknown(adapts)] * GYROS),
+        row=np.stack([sage_husa.initial_row(adapts)] * GYROS),
         bias=np.full(GYROS, np.nan),
         bank=np.zeros((GYROS, filters + 1, 5)),
         ages=np.zeros((GYROS, filters, 2), np.int64),
         feedback=np.zeros((GYROS, 1)),
-        waiting=np.full((SLOTS, len(AXES), 5), -1.0),
-        sums=np.zeros((SLOTS, GYROS, filters + 1, 2)),
+        waiting=np.full((MAX_PENDING_BLOCKS, len(AXES), 5), -1.0),
+        sums=np.zeros((MAX_PENDING_BLOCKS, GYROS, filters + 1, 2)),
         means=np.full((GYROS, BLOCKS_PER_INTERVAL), np.nan),
         followed=np.zeros((GYROS, filters + 1, 2)),
         samples=np.zeros(GYROS),
         table=table,
         first=first,
-        decisions=np.zeros((2, SLOTS), np.int64),
-        episodes=np.zeros((SLOTS, 5)),
+        decisions=np.zeros((2, MAX_PENDING_BLOCKS), np.int64),
+        episodes=np.zeros((MAX_PENDING_BLOCKS, 5)),
     )
 
 
@@ -330,7 +338,7 @@ def _advance(values, index, size, s, out, outcomes):  # type: ignore[no-untyped-
         )
         for v in range(decisions[0]):
             filled += _apply_rest_decision(s.decisions[0, v], s.decisions[1, v] > 0, s, outcomes[filled])
-        slot = number % SLOTS
+        slot = number % MAX_PENDING_BLOCKS
         if s.waiting[slot, 0, BLOCK_NUMBER] != number:
             _begin_block(number, s.waiting[slot], s.sums[slot])
         for a in range(GYROS):
@@ -358,13 +366,13 @@ def _subtract_drift(z, axis, sums, s, keep, out):  # type: ignore[no-untyped-def
     """Remove the drift from samples of one gyro axis; NaN = missing."""
     bank, ages, feedback = s.bank[axis], s.ages[axis], s.feedback[axis]
     bias = s.bias[axis] if s.bias[axis] == s.bias[axis] else 0.0
-    trusted = s.learned[axis] >= LEAST
+    trusted = s.learned[axis] >= MIN_REST_INTERVALS
     for k in range(z.size):
         if z[k] != z[k]:
-            coast(bank, ages, 1)
+            predict_over_gap(bank, ages, 1)
             out[k] = z[k]
             continue
-        rate = follow(z[k] - bias, bank, ages, s.table, s.first, sums, feedback, keep)
+        rate = filter_sample(z[k] - bias, bank, ages, s.table, s.first, sums, feedback, keep)
         if not trusted:
             rate, feedback[0] = z[k] - bias, 0.0
         out[k] = rate
@@ -395,7 +403,7 @@ def _apply_rest_decision(number, moves, s, outcomes):  # type: ignore[no-untyped
             for a in range(GYROS):
                 _predict_next_interval(a, s)
     s.current[0] = interval
-    slot = number % SLOTS
+    slot = number % MAX_PENDING_BLOCKS
     if moves or s.waiting[slot, 0, BLOCK_NUMBER] != number or _exceeds_rest_limits(s.waiting[slot]):
         return over
     for a in range(GYROS):
@@ -433,12 +441,12 @@ def _finish_interval(s, outcomes):  # type: ignore[no-untyped-def]
         known = s.bias[a] == s.bias[a]
         for column in range(6):
             outcome[column] = np.nan
-        outcome[EXPECTED], outcome[OUTCOME] = s.bias[a], sage_husa.NOT_SEEN
+        outcome[EXPECTED], outcome[OUTCOME] = s.bias[a], sage_husa.NOT_AT_REST
         if known:
-            outcome[EXPECTED_ERROR] = np.sqrt(sage_husa.drift(s.row[a])[1])
+            outcome[EXPECTED_ERROR] = np.sqrt(sage_husa.expected_bias(s.row[a])[1])
         count, mean, scatter = _interval_mean(s.means[a])
         if count >= MIN_REST_BLOCKS:
-            variance, became = sage_husa.measure(s.row[a], mean, scatter, _min_variance(s.rest.open, a))
+            variance, became = sage_husa.update_with_interval(s.row[a], mean, scatter, _min_variance(s.rest.open, a))
             outcome[MEAN], outcome[INNOVATION_STD], outcome[OUTCOME], outcome[SCATTER] = (
                 mean,
                 np.sqrt(variance),
@@ -447,9 +455,9 @@ def _finish_interval(s, outcomes):  # type: ignore[no-untyped-def]
             )
             if known and became == sage_husa.USED:
                 s.learned[a] += 1
-                learn(s.bank[a], s.followed[a], s.samples[a], s.learned[a])
+                update_rest_noise(s.bank[a], s.followed[a], s.samples[a], s.learned[a])
         else:
-            sage_husa.not_seen(s.row[a])
+            sage_husa.skip_interval(s.row[a])
         _predict_next_interval(a, s)
         for b in range(BLOCKS_PER_INTERVAL):
             s.means[a, b] = np.nan
@@ -476,21 +484,21 @@ def _interval_mean(means):  # type: ignore[no-untyped-def]
 @compiled
 def _min_variance(blocks, axis):  # type: ignore[no-untyped-def]
     """Return the variance of an interval mean that rounding may hide; ``blocks`` is ``motion_kernel.State.open``."""
-    return blocks[axis, motion_kernel.STEP] ** 2 / 12.0 / BLOCKS_PER_INTERVAL + motion_kernel.NOTHING
+    return blocks[axis, motion_kernel.STEP] ** 2 / 12.0 / BLOCKS_PER_INTERVAL + motion_kernel.MIN_VARIANCE
 
 
 @compiled
 def _predict_next_interval(axis, s):  # type: ignore[no-untyped-def]
     """Predict the drift of the next interval, if a level is confirmed."""
-    if s.row[axis, sage_husa.COUNT] >= sage_husa.CONFIRMED:
-        sage_husa.forward(s.row[axis])
+    if s.row[axis, sage_husa.REST_COUNT] >= sage_husa.MIN_CONFIRMED_INTERVALS:
+        sage_husa.predict(s.row[axis])
         _update_bias(axis, s.row, s.bias, s.bank)
 
 
 @compiled
 def _update_bias(axis, rows, biases, banks):  # type: ignore[no-untyped-def]
     """Subtract the predicted drift from now on, and shift the filters by its change."""
-    now = sage_husa.drift(rows[axis])[0]
+    now = sage_husa.expected_bias(rows[axis])[0]
     before = biases[axis] if biases[axis] == biases[axis] else 0.0
-    shift(banks[axis], now - before)
+    shift_bias(banks[axis], now - before)
     biases[axis] = now

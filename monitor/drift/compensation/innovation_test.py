@@ -10,7 +10,7 @@ from typing import Final
 
 INTERVALS: Final = 64
 """Intervals over which the squared innovations are averaged."""
-CHANCE: Final = 1e-8
+FALSE_ALARM_PROBABILITY: Final = 1e-8
 """Probability that noise alone exceeds the limit in one evaluation. Successive evaluations overlap."""
 LIMIT: Final = 2.327393746165351
 """Quantile of χ² with INTERVALS degrees of freedom that is exceeded with probability CHANCE, divided by INTERVALS."""
@@ -18,7 +18,7 @@ RESET_LIMIT: Final = 1.3
 """Mean square below which the model fits again."""
 
 
-class Innovations:
+class InnovationTest:
     """Innovation test of one axis."""
 
     def __init__(self) -> None:
@@ -41,7 +41,7 @@ class Innovations:
         self._exceeded = True
         return True
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Discard all innovations, after a change of the model or of the level."""
         self._squares.clear()
         self._exceeded = False

@@ -10,20 +10,20 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import AXES, Event, Floats, SampleBlock, block
-from monitor.common.rates import amount
-from monitor.drift.compensation.arma import Arma
-from monitor.drift.compensation.compensator import GYROS, Compensator, Interval
-from monitor.drift.compensation.innovation_test import INTERVALS, Innovations
+from drivers.sample import AXES, Event, Floats, SampleBlock, make_block
+from monitor.common.rates import format_rate
+from monitor.drift.compensation.arma import ArmaModel
+from monitor.drift.compensation.compensator import GYROS, Compensator, DriftInterval
+from monitor.drift.compensation.innovation_test import INTERVALS, InnovationTest
 from monitor.drift.compensation.sage_husa import STEPPED, USED
-from monitor.estimation.detection.signal_monitor import OTHER_RATE
+from monitor.estimation.detection.signal_monitor import MAX_RATE_CHANGE
 
-KIND: Final = "drift_unexplained"
+EVENT_KIND: Final = "drift_unexplained"
 """Kind of the events of this module."""
 
 
 @dataclass(frozen=True, slots=True)
-class DriftLook:
+class DriftUpdate:
     """Result of one interval for three gyro axes, in rad/s."""
 
     t_ns: int  # time of the last sample
@@ -32,7 +32,7 @@ class DriftLook:
     expected: Floats  # [3] drift that was subtracted; NaN = not known yet
     error: Floats  # [3] standard error of ``expected``
     innovation: Floats  # [3] normalised innovation ε/√S; NaN = not used
-    models: tuple[Arma | None, ...]  # one model per axis; None = not identified yet
+    models: tuple[ArmaModel | None, ...]  # one model per axis; None = not identified yet
 
 
 class LiveCompensation:
@@ -47,19 +47,19 @@ class LiveCompensation:
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
         self._events: list[Event] = []
-        self._looks: list[DriftLook] = []
+        self._looks: list[DriftUpdate] = []
         self._reset()
 
     def update(self, samples: SampleBlock) -> SampleBlock:
         """Return the block with the drift of its gyros removed; times, temperature and accelerations stay the same."""
-        values = self.compensator.update(samples.values, samples.lost)
+        values = self.compensator.compensate(samples.values, samples.lost)
         newest_ns = int(samples.t_ns[-1])
-        for interval in self.compensator.take():
-            t_ns = newest_ns - round((self.compensator.came - interval.end) / self._rate_hz * 1e9)
+        for interval in self.compensator.take_intervals():
+            t_ns = newest_ns - round((self.compensator.sample_count - interval.end) / self._rate_hz * 1e9)
             self._publish(interval, t_ns)
-        return block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
+        return make_block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
 
-    def take(self) -> list[DriftLook]:
+    def take(self) -> list[DriftUpdate]:
         """Return the results of the intervals that have ended since the last call."""
         looks, self._looks = self._looks, []
         return looks
@@ -69,7 +69,7 @@ class LiveCompensation:
         events, self._events = self._events, []
         return events
 
-    def adopt(self, axis: int, model: Arma | None) -> None:
+    def set_model(self, axis: int, model: ArmaModel | None) -> None:
         """Use a newly identified model for an axis.
 
         Parameters
@@ -79,30 +79,30 @@ class LiveCompensation:
         model : Arma or None
             The identified model. None means that no model was found.
         """
-        self.compensator.adopt(axis, model)
+        self.compensator.set_model(axis, model)
         if model is not None:
-            self._innovations[axis].forget()
+            self._innovations[axis].reset()
 
-    def relabel(self, rate_hz: float) -> None:
+    def set_rate(self, rate_hz: float) -> None:
         """Set a better estimate of the sample rate in Hz.
 
         If the rate differs by more than OTHER_RATE, the compensation starts anew, because its intervals had another
         length.
         """
-        if abs(rate_hz / self._rate_hz - 1.0) > OTHER_RATE:
+        if abs(rate_hz / self._rate_hz - 1.0) > MAX_RATE_CHANGE:
             self._rate_hz = rate_hz
             self._reset()
 
     def _reset(self) -> None:
         """Start the compensation anew at the current sample rate."""
         self.compensator = Compensator(self._rate_hz)
-        self._innovations = [Innovations() for _ in range(GYROS)]
+        self._innovations = [InnovationTest() for _ in range(GYROS)]
 
-    def _publish(self, interval: Interval, t_ns: int) -> None:
+    def _publish(self, interval: DriftInterval, t_ns: int) -> None:
         """Append the result of an interval and its events."""
-        used = interval.became == USED
+        used = interval.outcome == USED
         self._looks.append(
-            DriftLook(
+            DriftUpdate(
                 t_ns,
                 self.compensator.interval_s,
                 np.where(used, interval.mean, np.nan),
@@ -113,8 +113,8 @@ class LiveCompensation:
             )
         )
         for at in range(GYROS):
-            if interval.became[at] == STEPPED:
-                self._innovations[at].forget()
+            if interval.outcome[at] == STEPPED:
+                self._innovations[at].reset()
                 self._events.append(_step_event(AXES[at], float(interval.mean[at] - interval.expected[at]), t_ns))
                 continue
             known = used[at] and np.isfinite(interval.expected[at])
@@ -125,8 +125,10 @@ class LiveCompensation:
 
 def _step_event(axis: str, size: float, t_ns: int) -> Event:
     """Return the event of a step of the bias by ``size`` rad/s."""
-    text = f"{axis}: the bias has stepped by {amount(axis, size, sign=True)} and stayed; it is taken out from now on"
-    return Event(KIND, t_ns, text, axis, {"bias": {"size": size}})
+    text = (
+        f"{axis}: the bias has stepped by {format_rate(axis, size, sign=True)} and stayed; it is taken out from now on"
+    )
+    return Event(EVENT_KIND, t_ns, text, axis, {"bias": {"size": size}})
 
 
 def _misfit_event(axis: str, mean_square: float, t_ns: int, since_ns: int) -> Event:
@@ -135,4 +137,4 @@ def _misfit_event(axis: str, mean_square: float, t_ns: int, since_ns: int) -> Ev
         f"{axis}: the drift does not go as its model lets expect: squared innovations are {mean_square:.1f} times as "
         f"large as they should be"
     )
-    return Event(KIND, t_ns, text, axis, {"innovation": {"mean_square": mean_square}}, since_ns, mean_square**0.5)
+    return Event(EVENT_KIND, t_ns, text, axis, {"innovation": {"mean_square": mean_square}}, since_ns, mean_square**0.5)

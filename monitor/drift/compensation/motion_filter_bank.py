@@ -36,7 +36,7 @@ MAX_GATE_EXCEEDANCES: Final = 3
 SETTLING_SAMPLES: Final = (6, 48)
 """Age at which a filter has reached its steady gains after a reset: a multiple of its memory, and a
 minimum in samples."""
-LEAST: Final = 5
+MIN_REST_INTERVALS: Final = 5
 """Intervals at rest before the output of the filters is used."""
 NOISE_MEMORY_INTERVALS: Final = 60
 """Time constant of the exponential average of the noise, in intervals at rest."""
@@ -50,7 +50,7 @@ AGE, EXCEEDANCES = range(2)
 """Columns of ``ages``: samples since the reset of a filter, and successive samples beyond the gate."""
 
 
-def memories(rate_hz: float) -> Ints:
+def filter_memories(rate_hz: float) -> Ints:
     """Return the filter memories in samples: 2, 4, 8, … up to about MAX_MEMORY_S.
 
     >>> memories(4.0).tolist()
@@ -59,7 +59,7 @@ def memories(rate_hz: float) -> Ints:
     return np.asarray(2 ** np.arange(1, max(round(log2(MAX_MEMORY_S * rate_hz)), 1) + 1), dtype=np.int64)
 
 
-def intensity(memory: int) -> float:
+def process_noise_intensity(memory: int) -> float:
     """Return the noise intensity 2ασ_a² of a filter that reduces the noise variance by the factor ``memory``.
 
     The result is in units of one sample and of the measured variance. The gain of the steady filter is about √2 q^¼,
@@ -68,14 +68,15 @@ def intensity(memory: int) -> float:
     return (4.0 / (3.0 * memory) / sqrt(2.0)) ** 4
 
 
-def gains(each: Ints) -> tuple[Floats, Ints]:
+def gain_table(each: Ints) -> tuple[Floats, Ints]:
     """Return the gains [rows, 2] of ω and ω̇ by age, and the first row of each filter [filters + 1].
 
     The filters follow one another in the table. The last row of a filter holds its steady gains. ``each`` holds the
     memories in samples.
     """
     tables = [
-        _gains(intensity(int(memory)), max(SETTLING_SAMPLES[0] * int(memory), SETTLING_SAMPLES[1])) for memory in each
+        _gains(process_noise_intensity(int(memory)), max(SETTLING_SAMPLES[0] * int(memory), SETTLING_SAMPLES[1]))
+        for memory in each
     ]
     return np.concatenate(tables), np.cumsum([0, *(len(one) for one in tables)])
 
@@ -95,7 +96,7 @@ def _gains(q, rows):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def follow(z, bank, ages, table, first, sums, feedback, keep):  # type: ignore[no-untyped-def]
+def filter_sample(z, bank, ages, table, first, sums, feedback, keep):  # type: ignore[no-untyped-def]
     """Process one sample of one axis, and return the filtered rate.
 
     Parameters
@@ -154,7 +155,7 @@ def follow(z, bank, ages, table, first, sums, feedback, keep):  # type: ignore[n
 
 
 @compiled
-def coast(bank, ages, samples):  # type: ignore[no-untyped-def]
+def predict_over_gap(bank, ages, samples):  # type: ignore[no-untyped-def]
     """Advance the filters over missing samples.
 
     Filters predict along their slopes. Filters with a memory shorter than the gap are reset.
@@ -177,7 +178,7 @@ def coast(bank, ages, samples):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def shift(bank, by):  # type: ignore[no-untyped-def]
+def shift_bias(bank, by):  # type: ignore[no-untyped-def]
     """Correct the filters after the estimate of the bias has changed.
 
     Parameters
@@ -192,7 +193,7 @@ def shift(bank, by):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def learn(bank, sums, count, intervals):  # type: ignore[no-untyped-def]
+def update_rest_noise(bank, sums, count, intervals):  # type: ignore[no-untyped-def]
     """Update the noise at rest with an interval that was at rest.
 
     Parameters

@@ -33,12 +33,12 @@ SIGMA_OF_MAD: Final = 0.6745
 MISSING_PACKAGES: Final = 'EMD-signal and PyWavelets are not installed: pip install "imu-monitor[denoise]"'
 """Message for a missing optional package."""
 
-Variant = Callable[[Floats, Floats], Floats]
+ReferenceMethod = Callable[[Floats, Floats], Floats]
 """Function of a rate [n] and of samples at rest [m], both minus the mean at rest; it returns the rate [n] without
 noise."""
 
 
-def compensated(x: Floats, learned: Floats, variant: Variant) -> Floats:
+def apply_reference_method(x: Floats, learned: Floats, variant: ReferenceMethod) -> Floats:
     """Return the rate of one axis without drift and noise.
 
     Parameters
@@ -70,7 +70,7 @@ def compensated(x: Floats, learned: Floats, variant: Variant) -> Floats:
     return np.where(there, out, np.nan)
 
 
-def ar(x: Floats, learned: Floats) -> Floats:
+def autoregressive_filter(x: Floats, learned: Floats) -> Floats:
     """Filter with an autoregressive model: Yule–Walker equations, order by BIC, Kalman filter.
 
     Parameters
@@ -83,7 +83,7 @@ def ar(x: Floats, learned: Floats) -> Floats:
     return _kalman_filtered(x, *_autoregression(learned), float(learned.var()))
 
 
-def emd(x: Floats, learned: Floats) -> Floats:
+def filter_emd_modes(x: Floats, learned: Floats) -> Floats:
     """Filter the noise modes of an empirical mode decomposition (Huang et al. 1998).
 
     The modes whose autocorrelation falls within MAX_NOISE_LAG samples are filtered as in ``ar``.
@@ -103,7 +103,7 @@ def emd(x: Floats, learned: Floats) -> Floats:
     return _process_pieces(x, _filter_noise_modes)
 
 
-def wavelet(x: Floats, learned: Floats) -> Floats:
+def shrink_wavelets(x: Floats, learned: Floats) -> Floats:
     """Shrink wavelet coefficients softly by the universal threshold (Donoho & Johnstone 1994).
 
     Parameters
@@ -239,5 +239,9 @@ def _process_pieces(x: Floats, work: Callable[[Floats], Floats]) -> Floats:
     return out
 
 
-VARIANTS: Final[dict[str, Variant]] = {"ar": ar, "emd": emd, "wavelet": wavelet}
+REFERENCE_METHODS: Final[dict[str, ReferenceMethod]] = {
+    "ar": autoregressive_filter,
+    "emd": filter_emd_modes,
+    "wavelet": shrink_wavelets,
+}
 """Methods by name."""

@@ -24,11 +24,11 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.drift.compensation.arma import Arma, stationary
+from monitor.drift.compensation.arma import ArmaModel, stationary_covariance
 
 FORGETTING_FACTOR: Final = 0.995
 """Forgetting factor b of the noise estimate. It corresponds to 200 intervals."""
-FLOOR: Final = 0.05
+MIN_VARIANCE_SHARE: Final = 0.05
 """Lower limit of s, as a share of the identified variance of a."""
 OUTLIER_SIGMAS: Final = 6.0
 """Largest innovation of an accepted interval, in predicted standard deviations."""
@@ -41,7 +41,7 @@ AGREEMENT_SIGMAS: Final = 4.0
 """Largest difference of two intervals at rest that agree, in standard deviations of the difference."""
 STEP_INTERVALS: Final = (10.0, 300.0)
 """Smallest and largest number of intervals after which a persistent change counts as a step."""
-CONFIRMED: Final = 5
+MIN_CONFIRMED_INTERVALS: Final = 5
 """Successive intervals at rest that confirm the first level. The carrier may rotate at the start."""
 SCATTER_WEIGHT: Final = 0.02
 """Weight of one interval in the average of the scatter within intervals."""
@@ -53,7 +53,7 @@ X, P = 0, 3
 """First columns of the state and of its covariance."""
 PHI1, PHI2, G1, VARIANCE, LEVEL = range(12, 17)
 """Columns of the model: φ1, φ2, G1, variance of a, and variance of the steps of the level."""
-S, R, SCATTER, SCATTER_COUNT, COUNT, OUTLIER_RUN, LAST_OUTLIER, GUARD_LEFT, ADAPTIVE, IDENTIFIED = range(17, 27)
+S, R, SCATTER, SCATTER_COUNT, REST_COUNT, OUTLIER_RUN, LAST_OUTLIER, GUARD_LEFT, ADAPTIVE, IDENTIFIED = range(17, 27)
 """Columns of the noise estimate, in the order of ROW_SIZE."""
 ROW_SIZE: Final = 27
 """Number of columns of a row.
@@ -63,11 +63,11 @@ holds s, R̂, the scatter within intervals, the number of intervals with a scatt
 It also holds the number of successive outliers, the last outlier, the remaining guard intervals, and two flags.
 ADAPTIVE is 1 if the noise is estimated, and IDENTIFIED is 1 if a model has been identified.
 """
-NOT_SEEN, USED, LEFT_OUT, STEPPED = range(4)
+NOT_AT_REST, USED, REJECTED, STEPPED = range(4)
 """Outcomes of an interval: not at rest, used, rejected, or used as a step of the bias."""
 
 
-def unknown(adapts: bool) -> Floats:
+def initial_row(adapts: bool) -> Floats:
     """Return a row before the first identification, which models a level only.
 
     ``adapts`` is True if the noise is to be estimated continuously.
@@ -77,7 +77,7 @@ def unknown(adapts: bool) -> Floats:
     return row
 
 
-def adopt(row: Floats, arma: Arma) -> None:
+def set_model(row: Floats, arma: ArmaModel) -> None:
     """Set a new model, with an unknown state and the identified noise.
 
     Parameters
@@ -88,13 +88,15 @@ def adopt(row: Floats, arma: Arma) -> None:
         Identified model, in rad/s.
     """
     phi1, phi2 = arma.phi
-    p11, p12, p22 = stationary(phi1, phi2, arma.theta)
+    p11, p12, p22 = stationary_covariance(phi1, phi2, arma.theta)
     row[X : X + 3] = 0.0, 0.0, arma.mean
     row[P : P + 9] = arma.variance * np.array([p11, p12, 0.0, p12, p22, 0.0, 0.0, 0.0, 0.0])
     row[PHI1], row[PHI2], row[G1] = phi1, phi2, phi1 + arma.theta
     row[VARIANCE] = row[S] = arma.variance
-    row[R] = arma.white
-    slow = arma.white + arma.variance * ((1.0 + arma.theta) / (1.0 - phi1 - phi2)) ** 2  # spectral density at f = 0
+    row[R] = arma.white_variance
+    slow = (
+        arma.white_variance + arma.variance * ((1.0 + arma.theta) / (1.0 - phi1 - phi2)) ** 2
+    )  # spectral density at f = 0
     row[LEVEL] = slow / min(max(arma.count / 3.0, MIN_LEVEL_MEMORY), MAX_LEVEL_MEMORY) ** 2
     row[P + 8] = slow / arma.count
     row[OUTLIER_RUN] = row[GUARD_LEFT] = 0.0
@@ -102,7 +104,7 @@ def adopt(row: Floats, arma: Arma) -> None:
 
 
 @compiled
-def forward(row):  # type: ignore[no-untyped-def]
+def predict(row):  # type: ignore[no-untyped-def]
     """Predict the state of the next interval."""
     phi1, phi2, g1, s = row[PHI1], row[PHI2], row[G1], row[S]
     row[X], row[X + 1] = row[X + 1], phi2 * row[X] + phi1 * row[X + 1]
@@ -116,20 +118,20 @@ def forward(row):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def not_seen(row):  # type: ignore[no-untyped-def]
+def skip_interval(row):  # type: ignore[no-untyped-def]
     """Process an interval that was not at rest."""
-    if row[COUNT] < CONFIRMED:
-        row[COUNT] = 0.0
+    if row[REST_COUNT] < MIN_CONFIRMED_INTERVALS:
+        row[REST_COUNT] = 0.0
 
 
 @compiled
-def drift(row):  # type: ignore[no-untyped-def]
+def expected_bias(row):  # type: ignore[no-untyped-def]
     """Return the expected bias of the interval in rad/s and its variance in (rad/s)²."""
     return row[X] + row[X + 2], row[P] + 2.0 * row[P + 2] + row[P + 8]
 
 
 @compiled
-def measure(row, z, scatter, least):  # type: ignore[no-untyped-def]
+def update_with_interval(row, z, scatter, least):  # type: ignore[no-untyped-def]
     """Process the mean of an interval at rest.
 
     Parameters
@@ -157,22 +159,22 @@ def measure(row, z, scatter, least):  # type: ignore[no-untyped-def]
     if row[IDENTIFIED] == 0.0:  # The row models a level only, so all other variation is scatter.
         row[R] = max(row[SCATTER], least)
         row[LEVEL] = row[R] / MIN_LEVEL_MEMORY**2
-        if row[COUNT] == 0.0:
+        if row[REST_COUNT] == 0.0:
             row[X + 2], row[P + 8] = z, row[R]
     row[R] = max(row[R], least)
-    expected, known = drift(row)
+    expected, known = expected_bias(row)
     e, total = z - expected, known + row[R]
     became = USED
     if loud or e * e > OUTLIER_SIGMAS * OUTLIER_SIGMAS * total:
-        if row[COUNT] < CONFIRMED:
-            row[X + 2], row[P + 8], row[COUNT] = z, row[R], 1.0
-            return total, LEFT_OUT
+        if row[REST_COUNT] < MIN_CONFIRMED_INTERVALS:
+            row[X + 2], row[P + 8], row[REST_COUNT] = z, row[R], 1.0
+            return total, REJECTED
         alike = (z - row[LAST_OUTLIER]) ** 2 < 2.0 * OUTLIER_SIGMAS * OUTLIER_SIGMAS * row[R]
         row[OUTLIER_RUN] = row[OUTLIER_RUN] + 1.0 if alike else 1.0
         row[LAST_OUTLIER] = z
-        if row[OUTLIER_RUN] < min(max(row[COUNT], STEP_INTERVALS[0]), STEP_INTERVALS[1]):
+        if row[OUTLIER_RUN] < min(max(row[REST_COUNT], STEP_INTERVALS[0]), STEP_INTERVALS[1]):
             row[GUARD_LEFT] = GUARD_INTERVALS
-            return total, LEFT_OUT
+            return total, REJECTED
         became, row[GUARD_LEFT] = STEPPED, 0.0
         row[P + 8] += e * e
         row[SCATTER_COUNT] = 0.0  # The noise may have changed with the level.
@@ -181,15 +183,15 @@ def measure(row, z, scatter, least):  # type: ignore[no-untyped-def]
         agrees = (z - row[LAST_OUTLIER]) ** 2 < 2.0 * AGREEMENT_SIGMAS * AGREEMENT_SIGMAS * row[R]
         row[GUARD_LEFT] = row[GUARD_LEFT] - 1.0 if agrees else GUARD_INTERVALS
         row[LAST_OUTLIER] = z
-        return total, LEFT_OUT
-    row[COUNT] += 1.0
+        return total, REJECTED
+    row[REST_COUNT] += 1.0
     _correct(row, e)
     if row[ADAPTIVE] > 0.0 and row[IDENTIFIED] > 0.0 and became == USED:
-        d = (1.0 - FORGETTING_FACTOR) / (1.0 - FORGETTING_FACTOR ** (row[COUNT] + 1.0))
+        d = (1.0 - FORGETTING_FACTOR) / (1.0 - FORGETTING_FACTOR ** (row[REST_COUNT] + 1.0))
         left = row[R] / total  # 1 − H K
-        row[R] = max((1.0 - d) * row[R] + d * (left * left * e * e + drift(row)[1]), 0.5 * row[SCATTER], least)
+        row[R] = max((1.0 - d) * row[R] + d * (left * left * e * e + expected_bias(row)[1]), 0.5 * row[SCATTER], least)
         s = row[S]
-        row[S] = max(s + d * s * s * (e * e - total) / (total * total), FLOOR * row[VARIANCE])
+        row[S] = max(s + d * s * s * (e * e - total) / (total * total), MIN_VARIANCE_SHARE * row[VARIANCE])
     return total, became
 
 
@@ -206,7 +208,7 @@ def _correct(row, e):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def again(row, z, scatter, least):  # type: ignore[no-untyped-def]
+def refilter_history(row, z, scatter, least):  # type: ignore[no-untyped-def]
     """Filter all remembered intervals again after ``adopt``.
 
     Parameters
@@ -222,5 +224,5 @@ def again(row, z, scatter, least):  # type: ignore[no-untyped-def]
     """
     for k in range(z.size):
         if z[k] == z[k]:
-            measure(row, z[k], scatter[k], least)
-        forward(row)
+            update_with_interval(row, z[k], scatter[k], least)
+        predict(row)

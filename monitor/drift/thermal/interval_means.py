@@ -7,14 +7,14 @@ import numpy as np
 
 from drivers.sample import Floats
 
-PARTS: Final = 8
+PARTS_PER_INTERVAL: Final = 8
 """Parts of an interval. Their scatter gives the standard error of the mean."""
-MOSTLY: Final = 0.5
+MIN_KNOWN_SHARE: Final = 0.5
 """Smallest share of known samples in an interval."""
 
 
 @dataclass(frozen=True, slots=True)
-class Means:
+class IntervalMeans:
     """Means of the bias of one axis and of temperature over successive intervals without gaps in time."""
 
     interval_s: float
@@ -27,12 +27,12 @@ class Means:
         """True [n] where bias and temperature are both known."""
         return np.isfinite(self.bias) & np.isfinite(self.temperature_c)
 
-    def upto(self, n: int) -> "Means":
+    def first(self, n: int) -> "IntervalMeans":
         """Return the first n intervals."""
-        return Means(self.interval_s, self.bias[:n], self.error[:n], self.temperature_c[:n])
+        return IntervalMeans(self.interval_s, self.bias[:n], self.error[:n], self.temperature_c[:n])
 
 
-def interval_means(values: Floats, temperature_c: Floats, rate_hz: float, interval_s: float) -> Means:
+def compute_interval_means(values: Floats, temperature_c: Floats, rate_hz: float, interval_s: float) -> IntervalMeans:
     """Return the means over whole intervals; a shorter remainder at the end is dropped.
 
     The standard error is √(mean square of half differences of neighbouring parts / parts). For white noise it equals
@@ -59,27 +59,31 @@ def interval_means(values: Floats, temperature_c: Floats, rate_hz: float, interv
     n = values.size // length
     bias, error = _row_means(values[: n * length].reshape(n, length))
     mean_temperature_c, _ = _row_means(temperature_c[: n * length].reshape(n, length))
-    return Means(length / rate_hz, bias, error, mean_temperature_c)
+    return IntervalMeans(length / rate_hz, bias, error, mean_temperature_c)
 
 
 def _row_means(rows: Floats) -> tuple[Floats, Floats]:
     """Return the mean [n] and the standard error [n] of each row [n, length]; NaN if fewer than MOSTLY are known."""
     known_samples = np.isfinite(rows)
     count = known_samples.sum(axis=1)
-    too_few = count < max(MOSTLY * rows.shape[1], 1.0)
+    too_few = count < max(MIN_KNOWN_SHARE * rows.shape[1], 1.0)
     # The origin is subtracted to preserve the digits of a mean of 9.81 with noise of 1e-4.
     origin = np.nanmedian(rows) if known_samples.any() else 0.0
     mean = origin + np.where(known_samples, rows - origin, 0.0).sum(axis=1) / np.maximum(count, 1)
-    size = rows.shape[1] // PARTS
+    size = rows.shape[1] // PARTS_PER_INTERVAL
     error = np.full(count.size, np.nan)
     if size:
-        shape = (count.size, PARTS, size)
-        inside = known_samples[:, : PARTS * size].reshape(shape).sum(axis=2)
-        part = np.where(known_samples, rows - mean[:, None], 0.0)[:, : PARTS * size].reshape(shape).sum(axis=2)
+        shape = (count.size, PARTS_PER_INTERVAL, size)
+        inside = known_samples[:, : PARTS_PER_INTERVAL * size].reshape(shape).sum(axis=2)
+        part = (
+            np.where(known_samples, rows - mean[:, None], 0.0)[:, : PARTS_PER_INTERVAL * size]
+            .reshape(shape)
+            .sum(axis=2)
+        )
         with np.errstate(invalid="ignore", divide="ignore"):
             differences = np.diff(part / inside, axis=1)
             both = np.isfinite(differences)
             square = np.where(both, differences, 0.0) ** 2
-            error = np.sqrt(0.5 * square.sum(axis=1) / both.sum(axis=1) / PARTS)
+            error = np.sqrt(0.5 * square.sum(axis=1) / both.sum(axis=1) / PARTS_PER_INTERVAL)
     mean[too_few], error[too_few] = np.nan, np.nan
     return mean, error

@@ -14,25 +14,25 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import AXES, Event, SampleBlock
-from monitor.common.rates import amount
-from monitor.drift.thermal.interval_means import PARTS
-from monitor.drift.thermal.online_thermal_model import KEPT, AxisThermal, Following
-from monitor.drift.thermal.residual_alarm import Unexplained
-from monitor.drift.thermal.running_interval_means import Interval, RunningMeans
-from monitor.estimation.detection.signal_monitor import OTHER_RATE
+from monitor.common.rates import format_rate
+from monitor.drift.thermal.interval_means import PARTS_PER_INTERVAL
+from monitor.drift.thermal.online_thermal_model import MAX_INTERVALS, AxisThermalUpdate, OnlineThermalModel
+from monitor.drift.thermal.residual_alarm import UnexplainedChange
+from monitor.drift.thermal.running_interval_means import IntervalMean, RunningIntervalMeans
+from monitor.estimation.detection.signal_monitor import MAX_RATE_CHANGE
 
 KIND: Final = "temperature_unexplained"
 """Kind of the events of this module."""
 
 
 @dataclass(frozen=True, slots=True)
-class ThermalLook:
+class ThermalUpdate:
     """Interval means and predictions of all axes that have been measured."""
 
     t_ns: int  # end of the interval
     interval_s: float
     temperature_c: float  # mean of the interval, °C
-    axes: Mapping[str, AxisThermal]  # axis -> result, in the order of AXES
+    axes: Mapping[str, AxisThermalUpdate]  # axis -> result, in the order of AXES
 
 
 class LiveThermal:
@@ -54,7 +54,7 @@ class LiveThermal:
         self._sample_count = 0  # samples since the first temperature, including missing ones
         self._reset()
 
-    def update(self, samples: SampleBlock) -> list[ThermalLook]:
+    def update(self, samples: SampleBlock) -> list[ThermalUpdate]:
         """Return the intervals with a temperature that have ended with these samples."""
         # Samples that are missing before the first temperature belong to no interval.
         lost = samples.lost if self._has_temperature else 0
@@ -84,47 +84,47 @@ class LiveThermal:
         events, self._events = self._events, []
         return events
 
-    def offset_is_new(self) -> None:
+    def learn_new_offset(self) -> None:
         """Learn new offsets after the sensor was moved or restarted, and discard the current interval."""
         self._means.forget()
         for one in self._axes.values():
             one.offset_is_new()
 
-    def relabel(self, rate_hz: float) -> None:
+    def set_rate(self, rate_hz: float) -> None:
         """Set a better estimate of the sample rate in Hz.
 
         If the rate differs by more than OTHER_RATE, the models start anew, because the intervals had another length.
         """
-        if abs(rate_hz / self._rate_hz - 1.0) > OTHER_RATE:
+        if abs(rate_hz / self._rate_hz - 1.0) > MAX_RATE_CHANGE:
             self._rate_hz = rate_hz
             self._reset()
 
     def _reset(self) -> None:
         """Start anew at the current sample rate."""
-        length = max(round(self._requested_interval_s * self._rate_hz), PARTS)
+        length = max(round(self._requested_interval_s * self._rate_hz), PARTS_PER_INTERVAL)
         self._interval_s = length / self._rate_hz
-        self._means = RunningMeans(length, KEPT)
-        self._axes: dict[str, Following] = {}
+        self._means = RunningIntervalMeans(length, MAX_INTERVALS)
+        self._axes: dict[str, OnlineThermalModel] = {}
         self._has_temperature, self._sample_count = False, 0
         self._t_ns = 0  # end of the last interval
 
-    def _process_interval(self, interval: Interval, newest_ns: int) -> ThermalLook:
+    def _process_interval(self, interval: IntervalMean, newest_ns: int) -> ThermalUpdate:
         """Update the models of all axes with an interval; ``newest_ns`` is the time of the newest sample."""
         t_ns = newest_ns - round((self._sample_count - interval.end) / self._rate_hz * 1e9)
-        axes: dict[str, AxisThermal] = {}
+        axes: dict[str, AxisThermalUpdate] = {}
         for at, axis in enumerate(AXES):
             bias, error = float(interval.bias[at]), float(interval.error[at])
             if axis not in self._axes:
                 if not np.isfinite(bias):
                     continue  # The axis has not been measured yet.
-                self._axes[axis] = Following(self._interval_s)
+                self._axes[axis] = OnlineThermalModel(self._interval_s)
             axes[axis] = self._axes[axis].update(bias, error, interval.temperature_c)
         self._t_ns = t_ns
-        return ThermalLook(t_ns, self._interval_s, interval.temperature_c, axes)
+        return ThermalUpdate(t_ns, self._interval_s, interval.temperature_c, axes)
 
-    def _event(self, axis: str, found: Unexplained) -> Event:
+    def _event(self, axis: str, found: UnexplainedChange) -> Event:
         """Return the event of an unexplained change."""
-        size = amount(axis, found.size, sign=True)
+        size = format_rate(axis, found.size, sign=True)
         text = (
             f"{axis} is {size} off what its temperature lets expect: {found.outside} of the last {found.of} means "
             f"were outside of their interval"

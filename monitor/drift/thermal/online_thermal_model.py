@@ -24,19 +24,19 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import NotReady
-from monitor.drift.thermal.interval_means import Means
-from monitor.drift.thermal.recursive_least_squares import Band, Recursion
-from monitor.drift.thermal.residual_alarm import Suspicion, Unexplained
-from monitor.drift.thermal.thermal_fit import Pieces, fitting
+from monitor.drift.thermal.interval_means import IntervalMeans
+from monitor.drift.thermal.recursive_least_squares import PredictionInterval, RecursiveThermalFit
+from monitor.drift.thermal.residual_alarm import ResidualAlarm, UnexplainedChange
+from monitor.drift.thermal.thermal_fit import StepwiseWork, fit_in_steps
 from monitor.drift.thermal.thermal_model import ThermalModel
 
-KEPT: Final = 1000
+MAX_INTERVALS: Final = 1000
 """Largest number of intervals that are kept: a week of ten minutes each."""
-GROWN: Final = 1.25
+REFIT_GROWTH: Final = 1.25
 """Growth of the number of known intervals after which the model is chosen again."""
-LEARNED: Final = 3
+OFFSET_INTERVALS: Final = 3
 """Intervals that determine a new offset."""
-SURE: Final = 10.0
+STEP_AICC_MARGIN: Final = 10.0
 """Gain in AICc above which a step is accepted. The margin is needed because the intervals themselves determined the
 position of the step."""
 NEW_OFFSET: Final = "it was handled, or started anew: its new offset is being learned"
@@ -44,13 +44,13 @@ NEW_OFFSET: Final = "it was handled, or started anew: its new offset is being le
 
 
 @dataclass(frozen=True, slots=True)
-class AxisThermal:
+class AxisThermalUpdate:
     """One interval of one axis, with its prediction."""
 
     bias: float  # rad/s or m/s²; NaN if too few samples are known
     error: float  # standard error of ``bias``
-    multi_step: Band | None  # prediction from temperature only; None if there is no model yet
-    one_step: Band | None  # prediction from temperature and from the bias before
+    multi_step: PredictionInterval | None  # prediction from temperature only; None if there is no model yet
+    one_step: PredictionInterval | None  # prediction from temperature and from the bias before
     model: str  # name of the form of the model
     slope: float  # bias per °C after all lags have settled; NaN without a model
     text: str  # reason why there is no prediction
@@ -70,7 +70,7 @@ class _Row:
         return bool(np.isfinite(self.bias) and np.isfinite(self.temperature_c))
 
 
-class Following:
+class OnlineThermalModel:
     """Online model of one axis and the intervals from which it is fitted.
 
     Parameters
@@ -81,19 +81,19 @@ class Following:
 
     def __init__(self, interval_s: float) -> None:
         self._interval_s = interval_s
-        self._rows: deque[_Row] = deque(maxlen=KEPT)
-        self._recursion: Recursion | None = None
-        self._suspicion = Suspicion()
-        self._work: Pieces[None] | None = None
+        self._rows: deque[_Row] = deque(maxlen=MAX_INTERVALS)
+        self._recursion: RecursiveThermalFit | None = None
+        self._suspicion = ResidualAlarm()
+        self._work: StepwiseWork[None] | None = None
         self._interval_count = 0  # intervals since the start
         self._known_count = 0  # intervals with a known bias and temperature
         self._next_choice = 0  # number of known intervals at the next choice
         self._offset_differences: list[float] | None = None  # residuals since the offset changed; None if it did not
         self._new_offset_at = 0  # number of intervals at the change of the offset
-        self._settled: list[Unexplained] = []
+        self._settled: list[UnexplainedChange] = []
         self._missing_reason = ""  # reason why there is no model
 
-    def update(self, bias: float, error: float, temperature_c: float) -> AxisThermal:
+    def update(self, bias: float, error: float, temperature_c: float) -> AxisThermalUpdate:
         """Add an interval, and return it with its prediction.
 
         Parameters
@@ -112,21 +112,21 @@ class Following:
         if self._recursion is None:
             if self._work is None:
                 self._begin(self._choose())
-            return AxisThermal(bias, error, None, None, "", np.nan, self._missing_reason)
-        multi_step, one_step = self._recursion.expect(temperature_c)
+            return AxisThermalUpdate(bias, error, None, None, "", np.nan, self._missing_reason)
+        multi_step, one_step = self._recursion.predict(temperature_c)
         model = self._recursion.model
         if self._offset_differences is not None:
             self._recursion.update(temperature_c, np.nan)
             if row.known:
                 self._add_offset_difference(self._offset_differences, bias - multi_step.bias)
-            return AxisThermal(bias, error, None, None, model.shape.name, model.slope, NEW_OFFSET)
+            return AxisThermalUpdate(bias, error, None, None, model.shape.name, model.slope, NEW_OFFSET)
         found = self._suspicion.update(bias if row.known else np.nan, multi_step, one_step)
         self._recursion.update(temperature_c, np.nan if row.known and self._suspicion.far else bias)
         if found is not None:
             self._begin(self._test_for_step(found))
         elif self._known_count >= self._next_choice and self._work is None and self._suspicion.clear:
             self._begin(self._choose())
-        return AxisThermal(bias, error, multi_step, one_step, model.shape.name, model.slope, "")
+        return AxisThermalUpdate(bias, error, multi_step, one_step, model.shape.name, model.slope, "")
 
     @property
     def choosing(self) -> bool:
@@ -143,7 +143,7 @@ class Following:
             self._work = None
         return True
 
-    def take(self) -> list[Unexplained]:
+    def take(self) -> list[UnexplainedChange]:
         """Return the changes that temperature does not explain, confirmed since the last call."""
         told, self._settled = self._settled, []
         return told
@@ -157,35 +157,35 @@ class Following:
         else:
             self._offset_differences, self._new_offset_at = [], self._interval_count
 
-    def _begin(self, work: Pieces[None]) -> None:
+    def _begin(self, work: StepwiseWork[None]) -> None:
         """Start new work. Unfinished earlier work is discarded, because it used fewer intervals."""
         self._work = work
         self.step()
 
-    def _choose(self) -> Pieces[None]:
+    def _choose(self) -> StepwiseWork[None]:
         """Choose the model again, and keep the present one if the intervals do not suffice."""
-        self._next_choice = ceil(GROWN * self._known_count)
+        self._next_choice = ceil(REFIT_GROWTH * self._known_count)
         self._missing_reason = "the model is being chosen"
         try:
-            chosen = yield from fitting(self._means())
+            chosen = yield from fit_in_steps(self._means())
         except NotReady as error:
             self._missing_reason = str(error)
         else:
-            self._recursion = Recursion(chosen.model, self._means())
+            self._recursion = RecursiveThermalFit(chosen.model, self._means())
 
-    def _test_for_step(self, doubt: Unexplained) -> Pieces[None]:
+    def _test_for_step(self, doubt: UnexplainedChange) -> StepwiseWork[None]:
         """Decide whether another model of temperature or a step of the offset explains a suspected change."""
         means, came, since = self._means(), self._interval_count, len(self._rows) - doubt.since
-        self._next_choice = ceil(GROWN * self._known_count)
+        self._next_choice = ceil(REFIT_GROWTH * self._known_count)
         size, model = doubt.size, None
         try:
-            without = yield from fitting(means, lags=True)
-            stepped = yield from fitting(means, since, lags=True)
+            without = yield from fit_in_steps(means, lags=True)
+            stepped = yield from fit_in_steps(means, since, lags=True)
         except NotReady:
             pass  # The intervals do not suffice for a choice. The present model is kept.
         else:
-            if without.aicc - stepped.aicc < SURE:
-                self._recursion = Recursion(without.model, self._means())
+            if without.aicc - stepped.aicc < STEP_AICC_MARGIN:
+                self._recursion = RecursiveThermalFit(without.model, self._means())
                 return
             size, model = stepped.step, stepped.model
         since = doubt.since + self._interval_count - came
@@ -195,14 +195,16 @@ class Following:
     def _add_offset_difference(self, apart: list[float], by: float) -> None:
         """Add a residual, and determine the new offset when there are enough."""
         apart.append(by)
-        if len(apart) == LEARNED:
+        if len(apart) == OFFSET_INTERVALS:
             self._begin(self._settle_offset(float(np.mean(apart))))
 
-    def _settle_offset(self, size: float) -> Pieces[None]:
+    def _settle_offset(self, size: float) -> StepwiseWork[None]:
         """Determine the new offset, by a fit to all intervals if possible, else by the mean residual."""
         model = None
         try:
-            stepped = yield from fitting(self._means(), len(self._rows) - (self._interval_count - self._new_offset_at))
+            stepped = yield from fit_in_steps(
+                self._means(), len(self._rows) - (self._interval_count - self._new_offset_at)
+            )
         except NotReady:
             pass  # The mean residual is used.
         else:
@@ -214,11 +216,11 @@ class Following:
         """Shift the bias of all but the last intervals by the step of the offset, and fit the model again."""
         before = max(len(self._rows) - last, 0)
         moved = [_Row(row.bias + by, row.error, row.temperature_c) for row in islice(self._rows, before)]
-        self._rows = deque([*moved, *islice(self._rows, before, None)], maxlen=KEPT)
+        self._rows = deque([*moved, *islice(self._rows, before, None)], maxlen=MAX_INTERVALS)
         if self._recursion is not None:
-            self._recursion = Recursion(model or self._recursion.model, self._means())
+            self._recursion = RecursiveThermalFit(model or self._recursion.model, self._means())
 
-    def _means(self) -> Means:
+    def _means(self) -> IntervalMeans:
         """Return the kept intervals as arrays."""
         bias, error, temperature_c = np.array([(r.bias, r.error, r.temperature_c) for r in self._rows]).T
-        return Means(self._interval_s, bias, error, temperature_c)
+        return IntervalMeans(self._interval_s, bias, error, temperature_c)

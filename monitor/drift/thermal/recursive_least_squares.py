@@ -16,22 +16,22 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.distributions import student_quantile
-from monitor.drift.thermal.interval_means import Means
-from monitor.drift.thermal.thermal_fit import whitened
+from monitor.drift.thermal.interval_means import IntervalMeans
+from monitor.drift.thermal.thermal_fit import whiten
 from monitor.drift.thermal.thermal_model import (
     LOG_TIME_CONSTANT_STEP,
     ThermalModel,
-    bent,
-    covariance,
-    derivatives,
-    expected,
-    whole,
+    coefficient_covariance,
+    combine_derivatives,
+    interpolate_gaps,
+    predict_with_variance,
+    regressor_derivatives,
 )
-from monitor.drift.thermal.thermal_response import Shape, responses
+from monitor.drift.thermal.thermal_response import ThermalModelForm, regressors
 
 
 @dataclass(frozen=True, slots=True)
-class Band:
+class PredictionInterval:
     """Predicted mean of one interval and its 95 % prediction interval, rad/s or m/s²."""
 
     bias: float
@@ -43,7 +43,7 @@ class Band:
         return int(bias > self.hi) - int(bias < self.lo)
 
 
-class Recursion:
+class RecursiveThermalFit:
     """Thermal model with coefficients that are updated recursively.
 
     Parameters
@@ -54,25 +54,27 @@ class Recursion:
         The intervals so far, from the first one that the model is to use.
     """
 
-    def __init__(self, model: ThermalModel, means: Means) -> None:
+    def __init__(self, model: ThermalModel, means: IntervalMeans) -> None:
         self._model = model
         shape = model.shape
         k = self._k = shape.memory
         self._terms = 1 + shape.powers + k
-        excess = whole(means.temperature_c) - model.reference_c
-        columns = responses(shape, excess, model.interval_s, began=True)
-        rows = np.hstack([columns, derivatives(shape, excess, model.interval_s)])
+        excess = interpolate_gaps(means.temperature_c) - model.reference_c
+        columns = regressors(shape, excess, model.interval_s, began=True)
+        rows = np.hstack([columns, regressor_derivatives(shape, excess, model.interval_s)])
         near = np.multiply.outer(
             np.exp([-LOG_TIME_CONSTANT_STEP, 0.0, LOG_TIME_CONSTANT_STEP]), np.asarray(shape.constants_s)
         )
         # [3, k] for slightly shorter, exact and slightly longer time constants
         self._decays = np.exp(-model.interval_s / near)
-        moved = [responses(Shape(0, tuple(one)), excess, model.interval_s, began=True)[-1, 1:] for one in near]
+        moved = [
+            regressors(ThermalModelForm(0, tuple(one)), excess, model.interval_s, began=True)[-1, 1:] for one in near
+        ]
         # each [3, k], after the last interval
         self._lags, self._initial_responses = np.hsplit(np.array(moved).reshape(3, 2 * k), 2)
         self._excess = float(excess[-1])
         self._row, self._bias = rows[-1], float(means.bias[-1]) if means.known[-1] else np.nan
-        white, z, _ = whitened(rows, np.where(means.known, means.bias, 0.0), means.known, model.phi)
+        white, z, _ = whiten(rows, np.where(means.known, means.bias, 0.0), means.known, model.phi)
         self._triangle = _upper_triangle(np.hstack([white, z[:, None]]))
         self._count = int(means.known.sum())
         self.model = self._with_current_coefficients(
@@ -80,12 +82,12 @@ class Recursion:
         )
 
     @property
-    def free(self) -> int:
+    def degrees_of_freedom(self) -> int:
         """Return the degrees of freedom of the residuals."""
         taken = self._terms + 2 * self._k + (self._model.phi > 0.0)
         return max(self._count - taken, 1)
 
-    def expect(self, temperature_c: float) -> tuple[Band, Band]:
+    def predict(self, temperature_c: float) -> tuple[PredictionInterval, PredictionInterval]:
         """Return the multi-step and the one-step prediction of the next interval from its temperature in °C.
 
         The prediction intervals use Student's t distribution, because few intervals determine the scatter at first.
@@ -93,17 +95,17 @@ class Recursion:
         model = self.model
         excess = np.array([self._excess, temperature_c - model.reference_c if np.isfinite(temperature_c) else np.nan])
         excess[1] = excess[0] if np.isnan(excess[1]) else excess[1]
-        row, _, _ = self._next_row(float(excess[1]), model.ends)
+        row, _, _ = self._next_row(float(excess[1]), model.temperature_range_c)
         rows = np.stack([self._row, row])
-        sizes = np.concatenate([model.sizes, model.start])
+        sizes = np.concatenate([model.coefficients, model.initial_state])
         own = sizes.size
-        bends = bent(model.shape, rows[:, own:], sizes)
-        wide = student_quantile(self.free, 0.975)
+        bends = combine_derivatives(model.shape, rows[:, own:], sizes)
+        wide = student_quantile(self.degrees_of_freedom, 0.975)
         both = []
         for measured in (None, np.array([self._bias, np.nan])):
-            bias, variance = expected(model, excess, rows[:, :own], sizes, bends, measured)
+            bias, variance = predict_with_variance(model, excess, rows[:, :own], sizes, bends, measured)
             at, half = float(bias[1]), wide * float(variance[1]) ** 0.5
-            both.append(Band(at, at - half, at + half))
+            both.append(PredictionInterval(at, at - half, at + half))
         return both[0], both[1]
 
     def update(self, temperature_c: float, bias: float) -> None:
@@ -138,7 +140,7 @@ class Recursion:
         lags = self._decays * self._lags + (1.0 - self._decays) * excess
         left = self._initial_responses * self._decays
         shape = replace(self._model.shape, constants_s=())
-        first = responses(shape, np.array([excess]), self._model.interval_s, ends=ends)[0]
+        first = regressors(shape, np.array([excess]), self._model.interval_s, ends=ends)[0]
         by = [(one[2] - one[0]) / (2.0 * LOG_TIME_CONSTANT_STEP) for one in (lags, left)]
         return np.concatenate([first, lags[1], left[1], *by]), lags, left
 
@@ -149,14 +151,14 @@ class Recursion:
         scale = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
         sizes = np.linalg.lstsq(x / scale, z, rcond=1e-10)[0] / scale
         square = max(float(((z - x @ sizes) ** 2).sum()), 1e-300)
-        sigma = (square / self.free) ** 0.5
-        bends = bent(self._model.shape, self._triangle[:, own:-1], sizes)
+        sigma = (square / self.degrees_of_freedom) ** 0.5
+        bends = combine_derivatives(self._model.shape, self._triangle[:, own:-1], sizes)
         return replace(
             self._model,
-            sizes=sizes[: self._terms],
-            start=sizes[self._terms :],
+            coefficients=sizes[: self._terms],
+            initial_state=sizes[self._terms :],
             sigma=sigma,
-            covariance=covariance(np.hstack([x, bends]), sigma),
+            covariance=coefficient_covariance(np.hstack([x, bends]), sigma),
             lowest_c=lowest_c,
             highest_c=highest_c,
         )

@@ -13,20 +13,20 @@ from typing import Final
 
 import numpy as np
 
-from monitor.drift.thermal.recursive_least_squares import Band
+from monitor.drift.thermal.recursive_least_squares import PredictionInterval
 from monitor.drift.thermal.thermal_model import Z95
 
-OUTSIDE: Final = 4
+MIN_OUTSIDE: Final = 4
 """Intervals outside their prediction on one side that raise a suspicion, and the number of intervals that are
 considered."""
-OF: Final = 6
+WINDOW_INTERVALS: Final = 6
 FAR_HALF_WIDTHS: Final = 2.0
 """Distance from the prediction, in half widths of its interval, above which an interval is not used for the fit until
 others confirm it."""
 
 
 @dataclass(frozen=True, slots=True)
-class Unexplained:
+class UnexplainedChange:
     """Change of a bias that temperature does not explain."""
 
     size: float  # mean of measured minus predicted since the change began; rad/s or m/s²
@@ -46,11 +46,11 @@ class _Residual:
     z: float  # normalised residual of the one-step prediction
 
 
-class Suspicion:
+class ResidualAlarm:
     """Detector of unexplained changes of one axis, from its last intervals."""
 
     def __init__(self) -> None:
-        self._recent: deque[_Residual] = deque(maxlen=OF)  # only intervals with a known bias
+        self._recent: deque[_Residual] = deque(maxlen=WINDOW_INTERVALS)  # only intervals with a known bias
         self._interval_count = 0
 
     @property
@@ -66,7 +66,9 @@ class Suspicion:
         """True if the last interval was so far outside that it must not be used for the fit yet."""
         return bool(self._recent) and abs(self._recent[-1].z) > FAR_HALF_WIDTHS * Z95
 
-    def update(self, bias: float, multi_step: Band, one_step: Band) -> Unexplained | None:
+    def update(
+        self, bias: float, multi_step: PredictionInterval, one_step: PredictionInterval
+    ) -> UnexplainedChange | None:
         """Add an interval with its predictions, and return the change if one is now suspected.
 
         Parameters
@@ -83,13 +85,13 @@ class Suspicion:
         z = Z95 * (bias - one_step.bias) / half
         self._recent.append(_Residual(self._interval_count, one_step.side(bias), bias - multi_step.bias, z))
         side = self._recent[-1].side
-        if not side or self._count_outside(side) < OUTSIDE:
+        if not side or self._count_outside(side) < MIN_OUTSIDE:
             return None
         part = list(dropwhile(lambda one: one.side != side, self._recent))
         size = float(np.mean([one.apart for one in part]))
         together = float(abs(sum(one.z for one in part))) / len(part) ** 0.5
         outside, of, since = self._count_outside(side), len(self._recent), self._interval_count - part[0].at + 1
-        found = Unexplained(size, outside, of, since, together)
+        found = UnexplainedChange(size, outside, of, since, together)
         self._recent.clear()
         return found
 

@@ -12,16 +12,16 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import AXES, Floats
-from monitor.drift.thermal.interval_means import MOSTLY, PARTS
+from monitor.drift.thermal.interval_means import MIN_KNOWN_SHARE, PARTS_PER_INTERVAL
 
-GATHERED: Final = 1024
+BUFFER_ROWS: Final = 1024
 """Largest number of rows in the buffer."""
 TEMPERATURE_COLUMN: Final = len(AXES)
 """Column of the temperature, after the columns of the axes."""
 
 
 @dataclass(frozen=True, slots=True)
-class Interval:
+class IntervalMean:
     """Means of one interval."""
 
     bias: Floats  # [6] rad/s and m/s²; NaN if too few samples are known
@@ -30,7 +30,7 @@ class Interval:
     end: int  # index of the first sample after the interval; missing samples count
 
 
-class RunningMeans:
+class RunningIntervalMeans:
     """Means of successive intervals.
 
     Parameters
@@ -49,19 +49,19 @@ class RunningMeans:
     """
 
     def __init__(self, length: int, longest: int = 1000) -> None:
-        size = length // PARTS
+        size = length // PARTS_PER_INTERVAL
         self._length = length
         self._max_empty = longest
         # The last edge ends the remainder of the interval, which belongs to no part.
-        self._edges = [*(size * k for k in range(1, PARTS)), size * PARTS, length]
-        self._rows = np.empty((GATHERED, TEMPERATURE_COLUMN + 1))
+        self._edges = [*(size * k for k in range(1, PARTS_PER_INTERVAL)), size * PARTS_PER_INTERVAL, length]
+        self._rows = np.empty((BUFFER_ROWS, TEMPERATURE_COLUMN + 1))
         self._buffered = 0
         # The origin is subtracted to preserve the digits of a mean of 9.81 with noise of 1e-4.
         self._origin = np.full(TEMPERATURE_COLUMN + 1, np.nan)
         self._end = 0  # end of the last finished interval, in samples
         self._begin()
 
-    def update(self, values: Floats, temperature_c: Floats, lost: int) -> list[Interval]:
+    def update(self, values: Floats, temperature_c: Floats, lost: int) -> list[IntervalMean]:
         """Add samples and return the intervals that have ended.
 
         Parameters
@@ -76,7 +76,7 @@ class RunningMeans:
         finished = self._skip_missing(lost) if lost else []
         at = 0
         while at < len(values):
-            count = min(len(values) - at, GATHERED - self._buffered, self._edges[self._part] - self._position)
+            count = min(len(values) - at, BUFFER_ROWS - self._buffered, self._edges[self._part] - self._position)
             rows = slice(self._buffered, self._buffered + count)
             self._rows[rows, :TEMPERATURE_COLUMN] = values[at : at + count]
             self._rows[rows, TEMPERATURE_COLUMN] = temperature_c[at : at + count]
@@ -93,16 +93,16 @@ class RunningMeans:
     def _begin(self) -> None:
         """Clear the sums for a new interval."""
         self._position = self._part = 0
-        self._sum = np.zeros((PARTS + 1, TEMPERATURE_COLUMN + 1))
-        self._count = np.zeros((PARTS + 1, TEMPERATURE_COLUMN + 1), np.int64)
+        self._sum = np.zeros((PARTS_PER_INTERVAL + 1, TEMPERATURE_COLUMN + 1))
+        self._count = np.zeros((PARTS_PER_INTERVAL + 1, TEMPERATURE_COLUMN + 1), np.int64)
 
-    def _advance(self, count: int) -> list[Interval]:
+    def _advance(self, count: int) -> list[IntervalMean]:
         """Advance by ``count`` samples; sum the buffer at the end of a part, and return the
         interval if it has ended."""
         self._position += count
-        if self._buffered == GATHERED or self._position == self._edges[self._part]:
+        if self._buffered == BUFFER_ROWS or self._position == self._edges[self._part]:
             self._sum_buffer()
-        while self._part < PARTS and self._position == self._edges[self._part]:
+        while self._part < PARTS_PER_INTERVAL and self._position == self._edges[self._part]:
             self._part += 1
         if self._position < self._length:
             return []
@@ -121,9 +121,9 @@ class RunningMeans:
         self._sum[self._part] += np.where(there, rows - self._origin, 0.0).sum(axis=0)
         self._count[self._part] += there.sum(axis=0)
 
-    def _skip_missing(self, lost: int) -> list[Interval]:
+    def _skip_missing(self, lost: int) -> list[IntervalMean]:
         """Advance over missing samples, and return the intervals that have ended."""
-        finished: list[Interval] = []
+        finished: list[IntervalMean] = []
         while lost and self._position:
             count = min(lost, self._edges[self._part] - self._position)
             lost -= count
@@ -135,23 +135,25 @@ class RunningMeans:
         whole, self._position = divmod(lost, self._length)
         nothing = np.full(TEMPERATURE_COLUMN, np.nan)
         for left in range(min(whole, self._max_empty) - 1, -1, -1):
-            finished.append(Interval(nothing, nothing, np.nan, self._end + (whole - left) * self._length))
+            finished.append(IntervalMean(nothing, nothing, np.nan, self._end + (whole - left) * self._length))
         self._end += whole * self._length
-        while self._part < PARTS and self._position >= self._edges[self._part]:
+        while self._part < PARTS_PER_INTERVAL and self._position >= self._edges[self._part]:
             self._part += 1
         return finished
 
-    def _interval(self) -> Interval:
+    def _interval(self) -> IntervalMean:
         """Return the means and standard errors of the interval that has just ended."""
         count = self._count.sum(axis=0)
-        too_few = count < max(MOSTLY * self._length, 1.0)
+        too_few = count < max(MIN_KNOWN_SHARE * self._length, 1.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = self._origin + self._sum.sum(axis=0) / count
             differences = np.diff(
-                self._sum[:PARTS, :TEMPERATURE_COLUMN] / self._count[:PARTS, :TEMPERATURE_COLUMN], axis=0
+                self._sum[:PARTS_PER_INTERVAL, :TEMPERATURE_COLUMN]
+                / self._count[:PARTS_PER_INTERVAL, :TEMPERATURE_COLUMN],
+                axis=0,
             )
             both = np.isfinite(differences)
             square = np.where(both, differences, 0.0) ** 2
-            error = np.sqrt(0.5 * square.sum(axis=0) / both.sum(axis=0) / PARTS)
+            error = np.sqrt(0.5 * square.sum(axis=0) / both.sum(axis=0) / PARTS_PER_INTERVAL)
         mean[too_few], error[too_few[:TEMPERATURE_COLUMN]] = np.nan, np.nan
-        return Interval(mean[:TEMPERATURE_COLUMN], error, float(mean[TEMPERATURE_COLUMN]), self._end)
+        return IntervalMean(mean[:TEMPERATURE_COLUMN], error, float(mean[TEMPERATURE_COLUMN]), self._end)

@@ -28,9 +28,9 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.distributions import incomplete_beta
-from monitor.drift.thermal.interval_means import Means
-from monitor.drift.thermal.thermal_model import whole
-from monitor.drift.thermal.thermal_response import lagged
+from monitor.drift.thermal.interval_means import IntervalMeans
+from monitor.drift.thermal.thermal_model import interpolate_gaps
+from monitor.drift.thermal.thermal_response import first_order_lag
 
 SIGNIFICANCE: Final = 0.01
 """Largest p-value of a dependence or a hysteresis that is reported, after Bonferroni's correction."""
@@ -143,7 +143,7 @@ def heating_direction(temperature_c: Floats) -> Floats:
     return direction
 
 
-def find_dependence(means: Means) -> TemperatureDependence | None:
+def find_dependence(means: IntervalMeans) -> TemperatureDependence | None:
     """Test whether the bias depends on temperature.
 
     Parameters
@@ -183,7 +183,7 @@ def find_dependence(means: Means) -> TemperatureDependence | None:
     return found
 
 
-def find_hysteresis(means: Means) -> Hysteresis | None:
+def find_hysteresis(means: IntervalMeans) -> Hysteresis | None:
     """Test whether the bias differs between heating and cooling at the same temperature.
 
     Parameters
@@ -215,7 +215,7 @@ def find_hysteresis(means: Means) -> Hysteresis | None:
     return Hysteresis(size, min(len(p_values) * min(p_values), 1.0))
 
 
-def _pooled(means: Means) -> Means:
+def _pooled(means: IntervalMeans) -> IntervalMeans:
     """Return the means, averaged in groups if there are more than MAX_MEANS."""
     group = -(-means.bias.size // MAX_MEANS)
     if group == 1:
@@ -226,8 +226,8 @@ def _pooled(means: Means) -> Means:
     bias, error = (part.sum(axis=1) for part in rows)
     there = np.maximum(known.sum(axis=1), 1)
     enough = 2 * known.sum(axis=1) >= group
-    temperature_c = whole(means.temperature_c)[: count * group].reshape(count, group).mean(axis=1)
-    return Means(
+    temperature_c = interpolate_gaps(means.temperature_c)[: count * group].reshape(count, group).mean(axis=1)
+    return IntervalMeans(
         group * means.interval_s,
         np.where(enough, bias / there, np.nan),
         error / there**1.5,
@@ -235,9 +235,9 @@ def _pooled(means: Means) -> Means:
     )
 
 
-def _scaled(means: Means) -> tuple[Floats, Floats]:
+def _scaled(means: IntervalMeans) -> tuple[Floats, Floats]:
     """Return temperature scaled to -1 … 1, and the direction of its change."""
-    temperature_c = whole(means.temperature_c)
+    temperature_c = interpolate_gaps(means.temperature_c)
     lowest, swing = float(temperature_c.min()), float(np.ptp(temperature_c))
     return 2.0 * (temperature_c - lowest) / swing - 1.0, heating_direction(temperature_c)
 
@@ -261,7 +261,7 @@ def _hysteresis_regressors(x: Floats, direction: Floats) -> Mapping[str, Floats]
     """Return the regressors [n, k] of each description of hysteresis."""
     return {
         "direction": np.stack([direction * (1.0 - x**2) * x**power for power in range(LOOP_POWERS)], axis=1),
-        "lag": np.stack([lagged(x, float(np.exp(-1.0 / constant))) - x for constant in LAG_INTERVALS], axis=1),
+        "lag": np.stack([first_order_lag(x, float(np.exp(-1.0 / constant))) - x for constant in LAG_INTERVALS], axis=1),
         "play": np.stack([_play(x, 2.0 * width) - x for width in PLAY_WIDTHS], axis=1),
     }
 

@@ -19,21 +19,21 @@ import numpy as np
 
 from drivers.errors import NotReady
 from drivers.sample import AXES, Floats
-from monitor.drift.thermal.interval_means import interval_means
+from monitor.drift.thermal.interval_means import compute_interval_means
 from monitor.drift.thermal.temperature_dependence import TemperatureDependence, find_dependence
-from monitor.drift.thermal.thermal_fit import MIN_SWING_C, check, fitted
-from monitor.drift.thermal.thermal_model import predicted
-from monitor.drift.thermal.thermal_study import nice_interval
+from monitor.drift.thermal.thermal_fit import MIN_SWING_C, check_means, fit_thermal_model
+from monitor.drift.thermal.thermal_model import predict
+from monitor.drift.thermal.thermal_study import round_interval_s
 from monitor.estimation.allan.batch import EachAxis
-from monitor.estimation.analysis import Analysis, refitted
-from monitor.estimation.fit.coefficients import LETTERS, Coefficients, Status
+from monitor.estimation.analysis import Analysis, refit
+from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
 
-SLOW: Final = ("K", "R")
+SLOW_LETTERS: Final = ("K", "R")
 """Letters of the coefficients of slow variation."""
 
 
 @dataclass(frozen=True, slots=True)
-class WithoutTemperature:
+class TemperatureShare:
     """Dependence of each axis on temperature, and the coefficients after its removal from the bias."""
 
     models: Mapping[str, str]  # axis -> form of its model, for the axes with a fitted model
@@ -47,7 +47,7 @@ class WithoutTemperature:
         """Return the axes of which temperature explains most of the slow variance."""
         return tuple(axis for axis, one in self.dependences.items() if one.explains_most)
 
-    def share(self, letter: str, axis: str) -> float | None:
+    def variance_share(self, letter: str, axis: str) -> float | None:
         """Return the share of a coefficient's variance that temperature explains: 1 − after²/before².
 
         If only an upper bound is known after the removal, the result is a lower bound of the share.
@@ -64,14 +64,14 @@ class WithoutTemperature:
         float or None
             The share, at least 0. None if the coefficient was not estimated before, or not determined after.
         """
-        at = LETTERS.index(letter), AXES.index(axis)
+        at = SYMBOLS.index(letter), AXES.index(axis)
         if self.before.status[at] != Status.ESTIMATED or self.coefficients.status[at] == Status.UNESTIMATED:
             return None
         bounded = self.coefficients.status[at] == Status.UPPER_BOUND
         after = float((self.coefficients.hi if bounded else self.coefficients.value)[at])
         return max(1.0 - (after / float(self.before.value[at])) ** 2, 0.0)
 
-    def matters(self, letter: str, axis: str) -> bool:
+    def is_significant(self, letter: str, axis: str) -> bool:
         """Return True if the coefficient has changed significantly: its new upper limit lies below its old interval.
 
         Parameters
@@ -81,11 +81,11 @@ class WithoutTemperature:
         axis : str
             Name of the axis.
         """
-        at = LETTERS.index(letter), AXES.index(axis)
-        return self.share(letter, axis) is not None and bool(self.coefficients.hi[at] < self.before.lo[at])
+        at = SYMBOLS.index(letter), AXES.index(axis)
+        return self.variance_share(letter, axis) is not None and bool(self.coefficients.hi[at] < self.before.lo[at])
 
 
-def moved(temperatures_c: Floats) -> bool:
+def temperature_varied(temperatures_c: Floats) -> bool:
     """Return True if temperature [n] in °C is known and varied by more than MIN_SWING_C."""
     return (
         bool(np.isfinite(temperatures_c).any())
@@ -93,7 +93,7 @@ def moved(temperatures_c: Floats) -> bool:
     )
 
 
-def without_temperature(result: Analysis, temperature_c: Floats, each: EachAxis = map) -> WithoutTemperature | None:
+def remove_temperature(result: Analysis, temperature_c: Floats, each: EachAxis = map) -> TemperatureShare | None:
     """Return the coefficients of an analysis without the temperature part of the bias.
 
     Parameters
@@ -111,35 +111,35 @@ def without_temperature(result: Analysis, temperature_c: Floats, each: EachAxis 
         None if no axis depends on temperature.
     """
     rate_hz = result.estimate.rate_hz
-    interval_s = nice_interval(len(result.values) / rate_hz, rate_hz)
+    interval_s = round_interval_s(len(result.values) / rate_hz, rate_hz)
     values, models, dependences = result.values, dict[str, str](), dict[str, TemperatureDependence]()
     for at, axis in enumerate(AXES):
-        means = interval_means(result.values[:, at], temperature_c, rate_hz, interval_s)
+        means = compute_interval_means(result.values[:, at], temperature_c, rate_hz, interval_s)
         try:
-            check(means)
+            check_means(means)
         except NotReady:
             continue
         dependence = find_dependence(means)
         if dependence is None:
             continue
         dependences[axis] = dependence
-        model = fitted(means).model
+        model = fit_thermal_model(means).model
         if model.shape.memory or model.shape.powers:
             values = values.copy() if values is result.values else values
-            course = predicted(model, means.temperature_c, began=True).bias
-            values[:, at] -= drawn(course, round(means.interval_s * rate_hz), len(values))
+            course = predict(model, means.temperature_c, began=True).bias
+            values[:, at] -= interpolate_smoothly(course, round(means.interval_s * rate_hz), len(values))
             models[axis] = model.shape.name
     if not dependences:
         return None
     before, k_or_r = result.estimate.coefficients, result.estimate.k_or_r
     after = before
     if models:
-        fit = refitted(result, values, each)
+        fit = refit(result, values, each)
         after, k_or_r = fit.coefficients, fit.k_or_r
-    return WithoutTemperature(models, before, after, tuple(bool(one) for one in k_or_r), dependences)
+    return TemperatureShare(models, before, after, tuple(bool(one) for one in k_or_r), dependences)
 
 
-def drawn(course: Floats, length: int, n: int) -> Floats:
+def interpolate_smoothly(course: Floats, length: int, n: int) -> Floats:
     """Interpolate interval values by a smooth curve of n samples with zero mean.
 
     The curve is a natural cubic spline through the middles of the intervals, and linear beyond them.

@@ -25,10 +25,15 @@ import numpy as np
 
 from drivers.errors import NotReady
 from drivers.sample import Floats
-from monitor.drift.thermal.interval_means import Means
+from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.temperature_dependence import find_hysteresis
-from monitor.drift.thermal.thermal_model import ThermalModel, covariance, slopes, whole
-from monitor.drift.thermal.thermal_response import Shape, responses, solved
+from monitor.drift.thermal.thermal_model import (
+    ThermalModel,
+    coefficient_covariance,
+    interpolate_gaps,
+    time_constant_derivatives,
+)
+from monitor.drift.thermal.thermal_response import ThermalModelForm, least_squares, regressors
 
 MIN_INTERVALS: Final = 12
 """Smallest number of intervals for a fit."""
@@ -75,7 +80,7 @@ GOLDEN_RATIO: Final = 0.6180339887498949
 class Candidate:
     """One form of the model that was fitted."""
 
-    shape: Shape
+    shape: ThermalModelForm
     aicc: float  # difference to the chosen form; negative if a margin was not reached
     rms: float  # rms of the multi-step residuals, rad/s or m/s²
     validated: float  # cross-validated rms, rad/s or m/s²
@@ -97,11 +102,11 @@ class ThermalFit:
 
 
 T = TypeVar("T")
-Pieces = Generator[None, None, T]
+StepwiseWork = Generator[None, None, T]
 """Generator that does one piece of the work at each ``next``, and returns the result at its end."""
 
 
-def fitted(means: Means) -> ThermalFit:
+def fit_thermal_model(means: IntervalMeans) -> ThermalFit:
     """Choose and fit a model, and test whether heating and cooling differ.
 
     Raises
@@ -109,14 +114,14 @@ def fitted(means: Means) -> ThermalFit:
     NotReady
         If there are too few intervals, or if temperature hardly moved.
     """
-    found = finished(fitting(means))
+    found = run_all_steps(fit_in_steps(means))
     loop = find_hysteresis(means) if found.both_ways else None
     if loop is None:
         return found
     return replace(found, hysteresis=loop.size if loop.significant else 0.0, hysteresis_p=loop.p_value)
 
 
-def finished(pieces: Pieces[T]) -> T:
+def run_all_steps(pieces: StepwiseWork[T]) -> T:
     """Run all pieces and return the result."""
     try:
         while True:
@@ -126,7 +131,7 @@ def finished(pieces: Pieces[T]) -> T:
         return made
 
 
-def fitting(means: Means, since: int | None = None, lags: bool = False) -> Pieces[ThermalFit]:
+def fit_in_steps(means: IntervalMeans, since: int | None = None, lags: bool = False) -> StepwiseWork[ThermalFit]:
     """Choose and fit a model, with one least-squares fit in each piece.
 
     Parameters
@@ -143,7 +148,7 @@ def fitting(means: Means, since: int | None = None, lags: bool = False) -> Piece
     NotReady
         If there are too few intervals, or if temperature hardly moved. The first piece raises it.
     """
-    check(means)
+    check_means(means)
     excess, reference_c = _temperature_difference(means)
     both_ways = _both_ways(means.temperature_c)
     tried = []
@@ -154,7 +159,7 @@ def fitting(means: Means, since: int | None = None, lags: bool = False) -> Piece
     for one in tried:
         yield
         errors.append(_cross_validated_error(_without_step(means, since, one.step), excess, one))
-    alone = next(error for one, error in zip(tried, errors, strict=True) if one.shape == Shape(0, ()))
+    alone = next(error for one, error in zip(tried, errors, strict=True) if one.shape == ThermalModelForm(0, ()))
     at = next(i for i, error in enumerate(errors) if error <= MAX_ERROR_RATIO * alone)
     best = tried.pop(at)
     kept = [(best, errors.pop(at)), *zip(tried, errors, strict=True)]
@@ -172,7 +177,7 @@ def fitting(means: Means, since: int | None = None, lags: bool = False) -> Piece
 class _ShapeFit:
     """Least-squares fit of one form of the model."""
 
-    shape: Shape
+    shape: ThermalModelForm
     columns: Floats  # [n, terms + k] regressors
     sizes: Floats  # [terms + k] coefficients
     phi: float
@@ -182,7 +187,7 @@ class _ShapeFit:
     step: float
 
 
-def check(means: Means) -> None:
+def check_means(means: IntervalMeans) -> None:
     """Check that the means suffice for a fit.
 
     Raises
@@ -213,41 +218,43 @@ def check(means: Means) -> None:
         raise NotReady("the bias is the same in all intervals")
 
 
-def _aicc_margin(shape: Shape) -> float:
+def _aicc_margin(shape: ThermalModelForm) -> float:
     """Return the margin in AICc that a form must gain."""
     if shape.memory:
         return LAG_AICC_MARGIN
     return CURVE_AICC_MARGIN if shape.powers > CUBIC else 0.0
 
 
-def _temperature_difference(means: Means) -> tuple[Floats, float]:
+def _temperature_difference(means: IntervalMeans) -> tuple[Floats, float]:
     """Return temperature minus the reference [n] and the reference, in °C."""
-    known = whole(means.temperature_c)
+    known = interpolate_gaps(means.temperature_c)
     reference_c = round(float(known.mean()), 2)
     return known - reference_c, reference_c
 
 
 def _both_ways(temperature_c: Floats) -> bool:
     """Return True if temperature, smoothed over three intervals, moved both ways by more than MIN_REVERSE_SHARE."""
-    smooth = np.convolve(np.pad(whole(temperature_c), 1, mode="edge"), np.full(3, 1.0 / 3.0), mode="valid")
+    smooth = np.convolve(np.pad(interpolate_gaps(temperature_c), 1, mode="edge"), np.full(3, 1.0 / 3.0), mode="valid")
     moved = np.diff(smooth)
     up, down = float(moved[moved > 0.0].sum()), float(-moved[moved < 0.0].sum())
     return min(up, down) > MIN_REVERSE_SHARE * (up + down)
 
 
-def _shapes(means: Means, lags: bool) -> Iterator[Shape]:
+def _shapes(means: IntervalMeans, lags: bool) -> Iterator[ThermalModelForm]:
     """Yield the forms that the number of intervals allows."""
     count = int(means.known.sum())
     for powers in range(MAX_POWER + 1):
         if powers + 3 < count / 2:
-            yield Shape(powers, ())
+            yield ThermalModelForm(powers, ())
     for k in range(1, MAX_LAGS + 1):
         for powers in (0, 1):
             if lags and INTERVALS_PER_SQUARED_LAGS * k**2 < count:
-                yield Shape(powers, tuple(means.interval_s * 2.0**i for i in range(k)))
+                yield ThermalModelForm(powers, tuple(means.interval_s * 2.0**i for i in range(k)))
 
 
-def _fit_shape(means: Means, excess: Floats, shape: Shape, since: int | None) -> Pieces[_ShapeFit]:
+def _fit_shape(
+    means: IntervalMeans, excess: Floats, shape: ThermalModelForm, since: int | None
+) -> StepwiseWork[_ShapeFit]:
     """Fit a form with its best time constants and the best φ."""
     best = yield from _fit_time_constants(means, excess, shape, PHI_VALUES[0], since)
     for phi in PHI_VALUES[1:]:
@@ -256,7 +263,9 @@ def _fit_shape(means: Means, excess: Floats, shape: Shape, since: int | None) ->
     return best
 
 
-def _fit_time_constants(means: Means, excess: Floats, shape: Shape, phi: float, since: int | None) -> Pieces[_ShapeFit]:
+def _fit_time_constants(
+    means: IntervalMeans, excess: Floats, shape: ThermalModelForm, phi: float, since: int | None
+) -> StepwiseWork[_ShapeFit]:
     """Fit a form with a given φ and its best time constants.
 
     The time constants are chosen one after the other from a grid, then refined by golden-section search.
@@ -270,7 +279,7 @@ def _fit_time_constants(means: Means, excess: Floats, shape: Shape, phi: float, 
     ratio = float(grid[1] / grid[0])
     constants: tuple[float, ...] = ()
 
-    def evaluate(each: tuple[float, ...]) -> Pieces[_ShapeFit]:
+    def evaluate(each: tuple[float, ...]) -> StepwiseWork[_ShapeFit]:
         yield
         return _fit_sizes(means, excess, replace(shape, constants_s=tuple(sorted(each))), phi, since)
 
@@ -301,16 +310,18 @@ def _fit_time_constants(means: Means, excess: Floats, shape: Shape, phi: float, 
     return (yield from evaluate(constants))
 
 
-def _fit_sizes(means: Means, excess: Floats, shape: Shape, phi: float, since: int | None = None) -> _ShapeFit:
+def _fit_sizes(
+    means: IntervalMeans, excess: Floats, shape: ThermalModelForm, phi: float, since: int | None = None
+) -> _ShapeFit:
     """Fit the coefficients by least squares on the whitened rows."""
     known = means.known
-    columns = responses(shape, excess, means.interval_s, began=True)
+    columns = regressors(shape, excess, means.interval_s, began=True)
     own = columns.shape[1]
     if since is not None:
         columns = np.hstack([columns, (np.arange(excess.size) >= since)[:, None]])
     y = np.where(known, means.bias, 0.0)
-    x, z, fresh = whitened(columns, y, known, phi)
-    sizes = solved(x, z)
+    x, z, fresh = whiten(columns, y, known, phi)
+    sizes = least_squares(x, z)
     count = x.shape[0]
     square = max(float(((z - x @ sizes) ** 2).sum()), 1e-300)
     free = sizes.size + shape.memory + (phi > 0.0) + 1
@@ -322,14 +333,14 @@ def _fit_sizes(means: Means, excess: Floats, shape: Shape, phi: float, since: in
     return _ShapeFit(shape, columns[:, :own], sizes[:own], phi, sigma, rms, aicc, step)
 
 
-def _without_step(means: Means, since: int | None, step: float) -> Means:
+def _without_step(means: IntervalMeans, since: int | None, step: float) -> IntervalMeans:
     """Return the means with the step of the offset removed."""
     if since is None:
         return means
     return replace(means, bias=means.bias - step * (np.arange(means.bias.size) >= since))
 
 
-def whitened(columns: Floats, y: Floats, known: np.ndarray, phi: float) -> tuple[Floats, Floats, int]:
+def whiten(columns: Floats, y: Floats, known: np.ndarray, phi: float) -> tuple[Floats, Floats, int]:
     """Return rows and values with the correlation φ of the residuals removed.
 
     Each row is reduced by φ times the row before, if that row is known. The first row after a gap is scaled to the same
@@ -365,7 +376,7 @@ def whitened(columns: Floats, y: Floats, known: np.ndarray, phi: float) -> tuple
     return (x * weight[:, None])[known], (z * weight)[known], int(first.sum())
 
 
-def _cross_validated_error(means: Means, excess: Floats, one: _ShapeFit) -> float:
+def _cross_validated_error(means: IntervalMeans, excess: Floats, one: _ShapeFit) -> float:
     """Return the rms error over parts of the record, each predicted from the others with the same form and time
     constants.
 
@@ -376,14 +387,14 @@ def _cross_validated_error(means: Means, excess: Floats, one: _ShapeFit) -> floa
     for lo, hi in pairwise(edges.tolist()):
         used = means.known.copy()
         used[lo:hi] = False
-        columns = one.columns if lo else responses(one.shape, excess, means.interval_s)
-        x, z, _ = whitened(columns, np.where(used, means.bias, 0.0), used, one.phi)
-        differences = (means.bias - columns @ solved(x, z))[lo:hi]
+        columns = one.columns if lo else regressors(one.shape, excess, means.interval_s)
+        x, z, _ = whiten(columns, np.where(used, means.bias, 0.0), used, one.phi)
+        differences = (means.bias - columns @ least_squares(x, z))[lo:hi]
         square += float((differences[means.known[lo:hi]] ** 2).sum())
     return float((square / means.known.sum()) ** 0.5)
 
 
-def _to_model(means: Means, excess: Floats, reference_c: float, one: _ShapeFit) -> ThermalModel:
+def _to_model(means: IntervalMeans, excess: Floats, reference_c: float, one: _ShapeFit) -> ThermalModel:
     """Return the model of a fitted form, with the covariance of its coefficients."""
     k = one.shape.memory
     terms = one.sizes.size - k
@@ -391,14 +402,14 @@ def _to_model(means: Means, excess: Floats, reference_c: float, one: _ShapeFit) 
         shape=one.shape,
         interval_s=means.interval_s,
         reference_c=reference_c,
-        sizes=one.sizes[:terms],
-        start=one.sizes[terms:],
+        coefficients=one.sizes[:terms],
+        initial_state=one.sizes[terms:],
         phi=one.phi,
         sigma=one.sigma,
         covariance=np.zeros((0, 0)),
         lowest_c=float(np.nanmin(means.temperature_c)),
         highest_c=float(np.nanmax(means.temperature_c)),
     )
-    rows = np.hstack([one.columns, slopes(model, excess, one.sizes)])
-    x, _, _ = whitened(rows, np.zeros(excess.size), means.known, one.phi)
-    return replace(model, covariance=covariance(x, one.sigma))
+    rows = np.hstack([one.columns, time_constant_derivatives(model, excess, one.sizes)])
+    x, _, _ = whiten(rows, np.zeros(excess.size), means.known, one.phi)
+    return replace(model, covariance=coefficient_covariance(x, one.sigma))

@@ -12,7 +12,12 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.drift.thermal.thermal_response import Shape, equation, outside, responses
+from monitor.drift.thermal.thermal_response import (
+    ThermalModelForm,
+    difference_equation,
+    excess_beyond_range,
+    regressors,
+)
 
 LOG_TIME_CONSTANT_STEP: Final = 1e-3
 """Step of the logarithm of a time constant for its numerical derivative."""
@@ -24,11 +29,11 @@ Z95: Final = 1.959964
 class ThermalModel:
     """Bias of one axis as a function of temperature and its history."""
 
-    shape: Shape
+    shape: ThermalModelForm
     interval_s: float
     reference_c: float  # °C, reference temperature, at which the constant applies
-    sizes: Floats  # [terms] coefficients of constant, powers and lags: rad/s (m/s²) per power of °C
-    start: Floats  # [k] initial state of each lag at the start of the fit, rad/s (m/s²)
+    coefficients: Floats  # [terms] coefficients of constant, powers and lags: rad/s (m/s²) per power of °C
+    initial_state: Floats  # [k] initial state of each lag at the start of the fit, rad/s (m/s²)
     phi: float  # correlation of the residuals of successive intervals
     sigma: float  # rad/s (m/s²), standard deviation of the one-step residuals
     covariance: Floats  # covariance of sizes, start and logarithms of the time constants
@@ -36,7 +41,7 @@ class ThermalModel:
     highest_c: float  # °C, highest temperature of the fit
 
     @property
-    def spread(self) -> float:
+    def residual_std(self) -> float:
         """Return the standard deviation of the multi-step residuals, rad/s or m/s²."""
         return float(self.sigma / (1.0 - self.phi**2) ** 0.5)
 
@@ -44,9 +49,11 @@ class ThermalModel:
     def slope(self) -> float:
         """Return the mean slope of the bias in rad/s or m/s² per °C over the temperatures of the fit, with settled
         lags."""
-        (lo, hi), powers = self.ends, np.arange(1, self.shape.powers + 1)
+        (lo, hi), powers = self.temperature_range_c, np.arange(1, self.shape.powers + 1)
         chords = (hi**powers - lo**powers) / (hi - lo)
-        return float(self.sizes[1 : 1 + self.shape.powers] @ chords + self.sizes[1 + self.shape.powers :].sum())
+        return float(
+            self.coefficients[1 : 1 + self.shape.powers] @ chords + self.coefficients[1 + self.shape.powers :].sum()
+        )
 
     @property
     def equation(self) -> dict[str, list[float] | float] | None:
@@ -54,11 +61,11 @@ class ThermalModel:
         order 2 or more."""
         if self.shape.powers > 1:
             return None
-        a, b, c = equation(self.shape, self.sizes, self.interval_s)
+        a, b, c = difference_equation(self.shape, self.coefficients, self.interval_s)
         return {"a": a.tolist(), "b": b.tolist(), "c": c}
 
     @property
-    def ends(self) -> tuple[float, float]:
+    def temperature_range_c(self) -> tuple[float, float]:
         """Return the lowest and the highest temperature of the fit minus the reference, °C."""
         return self.lowest_c - self.reference_c, self.highest_c - self.reference_c
 
@@ -72,7 +79,7 @@ class Prediction:
     hi: Floats  # [n]
 
 
-def predicted(
+def predict(
     model: ThermalModel, temperature_c: Floats, measured: Floats | None = None, began: bool = False
 ) -> Prediction:
     """Predict the interval means, multi-step or one-step.
@@ -93,23 +100,25 @@ def predicted(
         True if the first interval is the first one of the fit, whose initial state is known. If False, temperature is
         assumed to have been constant before, and the prediction intervals include the uncertainty of this assumption.
     """
-    excess = whole(temperature_c) - model.reference_c
-    columns = responses(model.shape, excess, model.interval_s, began=True, ends=model.ends)
+    excess = interpolate_gaps(temperature_c) - model.reference_c
+    columns = regressors(model.shape, excess, model.interval_s, began=True, ends=model.temperature_range_c)
     k = model.shape.memory
     if not began:
         columns[:, columns.shape[1] - k :] = 0.0
-    sizes = np.concatenate([model.sizes, model.start if began else np.zeros(k)])
-    bias, variance = expected(model, excess, columns, sizes, slopes(model, excess, sizes), measured)
+    sizes = np.concatenate([model.coefficients, model.initial_state if began else np.zeros(k)])
+    bias, variance = predict_with_variance(
+        model, excess, columns, sizes, time_constant_derivatives(model, excess, sizes), measured
+    )
     if not began and k:
         swing = (model.highest_c - model.lowest_c) / 12.0**0.5
-        lags = model.sizes[1 + model.shape.powers :]
+        lags = model.coefficients[1 + model.shape.powers :]
         p = np.exp(-model.interval_s / np.asarray(model.shape.constants_s))
         variance += ((lags * swing) ** 2 * p ** (2.0 * np.arange(excess.size)[:, None])).sum(axis=1)
     half = Z95 * np.sqrt(variance)
     return Prediction(bias, bias - half, bias + half)
 
 
-def expected(
+def predict_with_variance(
     model: ThermalModel, excess: Floats, columns: Floats, sizes: Floats, bends: Floats, measured: Floats | None
 ) -> tuple[Floats, Floats]:
     """Return the expected bias of successive intervals, and the variance of a measured mean about it.
@@ -138,7 +147,7 @@ def expected(
     """
     bias = columns @ sizes
     rows = np.hstack([columns, bends])
-    sigma = np.full(excess.size, model.spread)
+    sigma = np.full(excess.size, model.residual_std)
     if measured is not None:
         known = np.isfinite(measured[:-1])
         last = np.where(known, measured[:-1] - bias[:-1], 0.0)
@@ -146,17 +155,17 @@ def expected(
         bias[1:] += model.phi * last
         sigma[1:][known] = model.sigma
     variance = np.einsum("ij,jk,ik->i", rows, model.covariance, rows) + sigma**2
-    variance += (model.slope * outside(excess, model.ends)) ** 2
+    variance += (model.slope * excess_beyond_range(excess, model.temperature_range_c)) ** 2
     return bias, variance
 
 
-def whole(temperature_c: Floats) -> Floats:
+def interpolate_gaps(temperature_c: Floats) -> Floats:
     """Return the temperature [n] with gaps interpolated, because the lags depend on the temperature within the gaps."""
     there = np.flatnonzero(np.isfinite(temperature_c))
     return np.interp(np.arange(temperature_c.size), there, temperature_c[there])
 
 
-def covariance(rows: Floats, sigma: float) -> Floats:
+def coefficient_covariance(rows: Floats, sigma: float) -> Floats:
     """Return the covariance [m, m] of least-squares coefficients.
 
     Parameters
@@ -171,7 +180,7 @@ def covariance(rows: Floats, sigma: float) -> Floats:
     return np.asarray(sigma**2 * np.linalg.pinv(scaled.T @ scaled, rcond=1e-10) / np.outer(scale, scale))
 
 
-def slopes(model: ThermalModel, excess: Floats, sizes: Floats) -> Floats:
+def time_constant_derivatives(model: ThermalModel, excess: Floats, sizes: Floats) -> Floats:
     """Return the derivatives [n, k] of the bias with respect to the logarithm of each time constant.
 
     Parameters
@@ -183,10 +192,10 @@ def slopes(model: ThermalModel, excess: Floats, sizes: Floats) -> Floats:
     sizes : ndarray, shape (terms + k,)
         Coefficients of the columns.
     """
-    return bent(model.shape, derivatives(model.shape, excess, model.interval_s), sizes)
+    return combine_derivatives(model.shape, regressor_derivatives(model.shape, excess, model.interval_s), sizes)
 
 
-def derivatives(shape: Shape, excess: Floats, interval_s: float) -> Floats:
+def regressor_derivatives(shape: ThermalModelForm, excess: Floats, interval_s: float) -> Floats:
     """Return the derivatives [n, 2 k] of the lags and of their initial-state responses by the logarithm of their time
     constants.
 
@@ -200,13 +209,15 @@ def derivatives(shape: Shape, excess: Floats, interval_s: float) -> Floats:
         Length of an interval, s.
     """
     less, more = (
-        responses(Shape(0, tuple(one * np.exp(by) for one in shape.constants_s)), excess, interval_s, began=True)
+        regressors(
+            ThermalModelForm(0, tuple(one * np.exp(by) for one in shape.constants_s)), excess, interval_s, began=True
+        )
         for by in (-LOG_TIME_CONSTANT_STEP, LOG_TIME_CONSTANT_STEP)
     )
     return np.asarray((more - less)[:, 1:] / (2.0 * LOG_TIME_CONSTANT_STEP))
 
 
-def bent(shape: Shape, of_each: Floats, sizes: Floats) -> Floats:
+def combine_derivatives(shape: ThermalModelForm, of_each: Floats, sizes: Floats) -> Floats:
     """Return the derivatives [n, k] of the bias by the logarithms of the time constants, from those of the columns.
 
     Parameters

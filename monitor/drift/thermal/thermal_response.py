@@ -22,7 +22,7 @@ from monitor.common.compiled import compiled
 
 
 @dataclass(frozen=True, slots=True)
-class Shape:
+class ThermalModelForm:
     """Form of the model: its nonlinear parameters."""
 
     powers: int  # order of the polynomial in T − reference, which acts without delay
@@ -45,7 +45,7 @@ class Shape:
         return f"polynomial {self.powers}" if self.powers else "constant"
 
 
-def roots(shape: Shape, interval_s: float) -> Floats:
+def lag_roots(shape: ThermalModelForm, interval_s: float) -> Floats:
     """Return the root p of each lag.
 
     Parameters
@@ -58,8 +58,12 @@ def roots(shape: Shape, interval_s: float) -> Floats:
     return np.exp(-interval_s / np.asarray(shape.constants_s, dtype=np.float64))
 
 
-def responses(
-    shape: Shape, excess_c: Floats, interval_s: float, began: bool = False, ends: tuple[float, float] | None = None
+def regressors(
+    shape: ThermalModelForm,
+    excess_c: Floats,
+    interval_s: float,
+    began: bool = False,
+    ends: tuple[float, float] | None = None,
 ) -> Floats:
     """Return the regressors [n, terms]: one, powers of T − reference, lags, and initial-state responses.
 
@@ -85,14 +89,14 @@ def responses(
     n = excess_c.size
     columns = [np.ones(n)]
     columns += [_power(excess_c, power, ends) for power in range(1, shape.powers + 1)]
-    p = roots(shape, interval_s)
-    columns += [lagged(excess_c, one) for one in p]
+    p = lag_roots(shape, interval_s)
+    columns += [first_order_lag(excess_c, one) for one in p]
     if began:
         columns += [one ** np.arange(n, dtype=np.float64) for one in p]
     return np.stack(columns, axis=1)
 
 
-def outside(excess_c: Floats, ends: tuple[float, float]) -> Floats:
+def excess_beyond_range(excess_c: Floats, ends: tuple[float, float]) -> Floats:
     """Return how far each temperature lies beyond the ends, °C.
 
     Parameters
@@ -110,11 +114,11 @@ def _power(x: Floats, power: int, ends: tuple[float, float] | None) -> Floats:
     if ends is None or ends[1] <= ends[0]:
         return np.asarray(x**power)
     chord = (ends[1] ** power - ends[0] ** power) / (ends[1] - ends[0])
-    return np.asarray(np.clip(x, *ends) ** power + chord * outside(x, ends))
+    return np.asarray(np.clip(x, *ends) ** power + chord * excess_beyond_range(x, ends))
 
 
 @compiled
-def lagged(x, p):  # type: ignore[no-untyped-def]
+def first_order_lag(x, p):  # type: ignore[no-untyped-def]
     """Return a first-order lag of x, L_n = p L_{n−1} + (1 − p) x_n, settled at the first value.
 
     Parameters
@@ -132,7 +136,7 @@ def lagged(x, p):  # type: ignore[no-untyped-def]
     return out
 
 
-def solved(columns: Floats, y: Floats) -> Floats:
+def least_squares(columns: Floats, y: Floats) -> Floats:
     """Return the least-squares coefficients [terms].
 
     The columns are scaled, so that their units have no effect.
@@ -149,7 +153,7 @@ def solved(columns: Floats, y: Floats) -> Floats:
     return np.asarray(found / scale)
 
 
-def equation(shape: Shape, sizes: Floats, interval_s: float) -> tuple[Floats, Floats, float]:
+def difference_equation(shape: ThermalModelForm, sizes: Floats, interval_s: float) -> tuple[Floats, Floats, float]:
     """Return the coefficients a [k], b [m + 1] and c of the difference equation in T − reference.
 
     Parameters
@@ -167,7 +171,7 @@ def equation(shape: Shape, sizes: Floats, interval_s: float) -> tuple[Floats, Fl
     >>> a.round(12).tolist(), b.round(12).tolist(), round(c, 12)
     ([-0.5], [5.0], 1.5)
     """
-    p = roots(shape, interval_s)
+    p = lag_roots(shape, interval_s)
     whole = np.poly(p) if p.size else np.ones(1)  # [k + 1] 1, followed by a
     b = np.zeros(whole.size)
     if shape.powers:

@@ -7,9 +7,9 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.drift.thermal.interval_means import Means
+from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.thermal_fit import ThermalFit
-from monitor.drift.thermal.thermal_model import Prediction, ThermalModel, predicted
+from monitor.drift.thermal.thermal_model import Prediction, ThermalModel, predict
 
 DEFAULT_INTERVALS: Final = 72
 """Number of intervals in a recording, if no interval is given. The paper uses 72 h in intervals of 1 h."""
@@ -39,44 +39,44 @@ ROUND_INTERVALS_S: Final = (
 
 
 @dataclass(frozen=True, slots=True)
-class Study:
+class ThermalFitReport:
     """Thermal models fitted in one recording."""
 
     recording: str
     interval_s: float
-    means: Mapping[str, Means]
+    means: Mapping[str, IntervalMeans]
     fits: Mapping[str, ThermalFit]
     refused: Mapping[str, str]  # axis -> reason why no model was fitted
     notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class ModelComparison:
     """Comparison of a model with the means of a recording."""
 
     multi_step: Prediction
     one_step: Prediction
     offset: float  # mean of measured minus multi-step; a bias changes from one start to the next
     rms: float  # rms of measured minus multi-step, rad/s or m/s²
-    rms_moved: float  # rms of measured minus multi-step minus offset
+    rms_without_offset: float  # rms of measured minus multi-step minus offset
     rms_one_step: float  # rms of measured minus one-step
-    rms_alone: float  # rms of measured about its mean
-    within: float  # share of means inside the multi-step prediction interval
+    rms_about_mean: float  # rms of measured about its mean
+    coverage: float  # share of means inside the multi-step prediction interval
 
 
 @dataclass(frozen=True, slots=True)
-class Outlook:
+class ThermalPredictionReport:
     """Predictions of models for a recording."""
 
     recording: str
     interval_s: float
-    means: Mapping[str, Means]
-    judged: Mapping[str, Judged]
+    means: Mapping[str, IntervalMeans]
+    judged: Mapping[str, ModelComparison]
     refused: Mapping[str, str]
     notes: tuple[str, ...] = ()
 
 
-def judge(model: ThermalModel, means: Means) -> Judged:
+def compare_with_means(model: ThermalModel, means: IntervalMeans) -> ModelComparison:
     """Compare a model with means that were not used for its fit.
 
     Parameters
@@ -86,12 +86,12 @@ def judge(model: ThermalModel, means: Means) -> Judged:
     means : Means
         Interval means of bias (rad/s or m/s²) and temperature (°C).
     """
-    multi, known = predicted(model, means.temperature_c), means.known
+    multi, known = predict(model, means.temperature_c), means.known
     residual = means.bias - multi.bias
     offset = float(residual[known].mean())
-    one = predicted(model, means.temperature_c, means.bias - offset)
+    one = predict(model, means.temperature_c, means.bias - offset)
     inside = (means.bias >= multi.lo) & (means.bias <= multi.hi)
-    return Judged(
+    return ModelComparison(
         multi,
         Prediction(one.bias + offset, one.lo + offset, one.hi + offset),
         offset,
@@ -103,7 +103,7 @@ def judge(model: ThermalModel, means: Means) -> Judged:
     )
 
 
-def nice_interval(seconds: float, rate_hz: float) -> float:
+def round_interval_s(seconds: float, rate_hz: float) -> float:
     """Return a round interval length in seconds that divides a recording into about DEFAULT_INTERVALS intervals.
 
     Parameters

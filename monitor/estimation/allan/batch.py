@@ -52,7 +52,7 @@ A row of this length is worth the set-up of a vector loop and fits the first-lev
 """
 
 
-def overlapping(values: Floats, factors: Ints, each: EachAxis = map) -> tuple[Floats, Ints]:
+def overlapping_avar(values: Floats, factors: Ints, each: EachAxis = map) -> tuple[Floats, Ints]:
     """Return the overlapping Allan variance of rates and the number of its terms.
 
     NIST SP 1065 eq. 11 on rates: σ²(m) = Σ (x_{k+2m} - 2x_{k+m} + x_k)² / (2 m² C), with phase x in samples of the
@@ -77,11 +77,11 @@ def overlapping(values: Floats, factors: Ints, each: EachAxis = map) -> tuple[Fl
     >>> overlapping(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().tolist()
     [0.5, 0.0]
     """
-    columns = list(each(lambda column: overlapping_axis(column, factors), values.T))
+    columns = list(each(lambda column: overlapping_avar_axis(column, factors), values.T))
     return np.stack([avar for avar, _ in columns], axis=1), np.stack([terms for _, terms in columns], axis=1)
 
 
-def overlapping_axis(rate: Floats, factors: Ints) -> Column:
+def overlapping_avar_axis(rate: Floats, factors: Ints) -> Column:
     """Return the overlapping Allan variance of one axis and the number of its terms, see ``overlapping``.
 
     Parameters
@@ -108,7 +108,7 @@ def overlapping_axis(rate: Floats, factors: Ints) -> Column:
         return lanes.sum(axis=1) / (2.0 * m * m * terms), terms
 
 
-def slope(values: Floats) -> Floats:
+def slope_of_recording(values: Floats) -> Floats:
     """Return the slope of the rate [k] over a recording [n, k] in units per sample, from its first and last third.
 
     The slope is NaN if more than a fiftieth of the samples is missing.
@@ -128,7 +128,7 @@ def slope(values: Floats) -> Floats:
     return np.where(whole, (parts[2][1] - parts[0][1]) / (2.0 * third), np.nan)
 
 
-def slopes(values: Floats, factors: Ints) -> Floats:
+def slope_per_tau(values: Floats, factors: Ints) -> Floats:
     """Return the slope of the rate as seen by each τ: the mean second difference of phase divided by m².
 
     The sum of all second differences telescopes to four blocks of phase at the ends, so one pass serves all τ. Missing

@@ -58,7 +58,7 @@ def per_sample(theta: Floats, rate_hz: float) -> Floats:
     return np.asarray(np.maximum(theta, 0.0) * (rate_hz ** (-2.0 * TO_SI))[:, None])
 
 
-def spread(
+def correct_bias(
     moments: Iterable[Moments], theta: Floats, variance: Floats, terms: Ints
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Correct measured variances for bias, and compute their degrees of freedom and intervals.

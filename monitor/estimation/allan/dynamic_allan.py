@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 from drivers.errors import ConfigError, NotReady
 from drivers.sample import Floats
 from monitor.estimation.allan.batch import TauGrid, cluster_sizes
-from monitor.estimation.allan.uncertainty import intervals, table
+from monitor.estimation.allan.uncertainty import covariance_table, intervals
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow
 from monitor.estimation.fit.coefficient_fit import design, fit
 
 STEPS_PER_WINDOW: Final = 20
 """Default number of steps per window length."""
-MOST_STEPS: Final = 500
+MAX_STEPS: Final = 500
 """Maximum number of steps."""
 
 Progress = Callable[[float], None]
@@ -36,7 +36,7 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Dynamic:
+class DynamicAllan:
     """Dynamic Allan variance at T times. Columns are gx … az, rows of the coefficients are Q N B K R, all in SI."""
 
     t_s: Floats  # [T] END of each window in seconds since the first sample
@@ -52,14 +52,14 @@ class Dynamic:
     status: NDArray[np.int8]  # [T, 5, 6] values of ``Status``
 
 
-def dynamic(
+def compute_dynamic_allan(
     values: Floats,
     rate_hz: float,
     window_s: float,
     tau: TauGrid = "octave",
     step_s: float | None = None,
     progress: Progress | None = None,
-) -> Dynamic:
+) -> DynamicAllan:
     """Compute the dynamic Allan variance and the coefficients of a recording on a regular grid.
 
     Parameters
@@ -95,7 +95,7 @@ def dynamic(
     ends = _ends(len(values), length, rate_hz, step_s)
     factors = cluster_sizes(length, rate_hz, tau)
     window = AllanWindow(length, factors)
-    columns, covariances = design(factors, rate_hz), table(length, factors)
+    columns, covariances = design(factors, rate_hz), covariance_table(length, factors)
     steps, taus, axes = ends.size, factors.size, values.shape[1]
     deviation, lo, hi = np.full((3, steps, taus, axes), np.nan)
     value, value_lo, value_hi = np.full((3, steps, 5, axes), np.nan)
@@ -115,7 +115,7 @@ def dynamic(
         value[row], value_lo[row], value_hi[row], status[row] = known.value, known.lo, known.hi, known.status
         if progress is not None:
             progress((row + 1) / steps)
-    return Dynamic(
+    return DynamicAllan(
         ends / rate_hz, length / rate_hz, rate_hz, factors / rate_hz,
         deviation, lo, hi, value, value_lo, value_hi, status,
     )  # fmt: skip
@@ -139,5 +139,5 @@ def _ends(n: int, length: int, rate_hz: float, step_s: float | None) -> NDArray[
     if n < length:
         raise NotReady(f"{n / rate_hz:g} s are recorded, less than the window of {length / rate_hz:g} s")
     step = max(round(length / STEPS_PER_WINDOW if step_s is None else step_s * rate_hz), 1)
-    fewest = -(-(n - length) // (MOST_STEPS - 1))
+    fewest = -(-(n - length) // (MAX_STEPS - 1))
     return np.arange(length, n + 1, max(step, fewest), dtype=np.int64)

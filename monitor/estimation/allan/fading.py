@@ -24,7 +24,7 @@ from drivers.errors import ConfigError
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.estimation.allan.window import MIN_LENGTH, phase_scale
-from monitor.estimation.allan.window_kernel import AXES, STAGE
+from monitor.estimation.allan.window_kernel import AXES, STAGE_SAMPLES
 
 Noise = Literal["white", "flicker", "walk"]
 
@@ -82,7 +82,7 @@ class FadingWindow:
         self._now = np.zeros((2, AXES), np.int64)  # phase, and how many samples have been missing
         self._total = np.zeros(1, np.int64)
         self._sums = np.zeros((self.factors.size, sum(map(len, CASCADES[poles])), AXES))
-        self._stage = np.zeros((STAGE, AXES))
+        self._stage = np.zeros((STAGE_SAMPLES, AXES))
         self.reset()
 
     @property
@@ -101,8 +101,8 @@ class FadingWindow:
         rows = np.asarray(values)
         if rows.ndim != 2 or rows.shape[1] != AXES:
             raise ValueError(f"samples of shape {rows.shape}; expected is [n, {AXES}]")
-        for start in range(0, len(rows), STAGE):
-            part = rows[start : start + STAGE]
+        for start in range(0, len(rows), STAGE_SAMPLES):
+            part = rows[start : start + STAGE_SAMPLES]
             self._stage[: len(part)] = part
             _advance(
                 len(part), self._stage, self._scaling, self._total, self._now, self._rings,

@@ -22,9 +22,9 @@ from monitor.estimation.allan.difference_moments import (
     NUM_COEFFICIENTS,
     Moments,
     autocovariance,
+    correct_bias,
     per_sample,
     quadrature_nodes,
-    spread,
 )
 from monitor.estimation.allan.total import integrate_to_phase, octaves
 
@@ -48,7 +48,7 @@ class HadamardCurve:
     hi: Floats  # [m, k] upper end of the same interval
 
 
-def hadamard(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
+def hadamard_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     """Return the overlapping Hadamard variance of rates and the number of its terms.
 
     Parameters
@@ -93,11 +93,11 @@ def hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints 
     """
     n = len(values)
     factors = octaves(n // 3) if factors is None else factors
-    raw, terms = hadamard(values, factors)
-    return curve_of([moments(n, int(m)) for m in factors], rate_hz, theta, raw, terms)
+    raw, terms = hadamard_variance(values, factors)
+    return make_curve([moments(n, int(m)) for m in factors], rate_hz, theta, raw, terms)
 
 
-def curve_of(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Floats, terms: Ints) -> HadamardCurve:
+def make_curve(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Floats, terms: Ints) -> HadamardCurve:
     """Return Hadamard variances as a curve with degrees of freedom and intervals.
 
     Parameters
@@ -114,7 +114,7 @@ def curve_of(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Float
         Number of terms.
     """
     each = list(known)
-    _, edf, lo, hi = spread(each, per_sample(theta, rate_hz), raw, terms)
+    _, edf, lo, hi = correct_bias(each, per_sample(theta, rate_hz), raw, terms)
     factors = np.array([one.factor for one in each])
     return HadamardCurve(factors / rate_hz, factors, raw, terms, edf, lo, hi)
 

@@ -34,7 +34,7 @@ from monitor.estimation.allan.window_kernel import AXES
 
 TOTAL, HADAMARD = 0, 1
 """Indices of the two statistics."""
-FEWEST: Final = 8
+MIN_SAMPLES: Final = 8
 """Minimum number of samples for a round."""
 MOMENTS_RENEWAL_RATIO: Final = 1.02
 """Ratio of window lengths at which bias and degrees of freedom are recomputed while the window grows."""
@@ -55,7 +55,7 @@ class _Result:
     moments: Moments
 
 
-class SlowStatistics:
+class LiveTotalHadamard:
     """Total and Hadamard variance of a window, computed in rounds.
 
     Parameters
@@ -75,7 +75,7 @@ class SlowStatistics:
 
     def __init__(self, window: AllanWindow, totals: Ints | None = None, hadamards: Ints | None = None) -> None:
         self._window = window
-        unit = window.ring()[3]
+        unit = window.view_ring()[3]
         longest = int((2.0**63 * unit / (0.5 * np.array(FULL_SCALE[:AXES]))).min())
         limits = (min(window.length - 1, longest), min(window.length // 3, longest // 2))
         given = [total.octaves(limits[0]) if totals is None else totals]
@@ -117,7 +117,7 @@ class SlowStatistics:
         totals, hadamards = self._last
         return (
             total.curve_of([one.moments for one in totals], rate_hz, theta, *_stack(totals)),
-            hadamard.curve_of([one.moments for one in hadamards], rate_hz, theta, *_stack(hadamards)),
+            hadamard.make_curve([one.moments for one in hadamards], rate_hz, theta, *_stack(hadamards)),
         )
 
     def _steps(self) -> Iterator[None]:
@@ -126,7 +126,7 @@ class SlowStatistics:
             n = self._window.n
             totals = [m for m in self._factors[TOTAL] if m < n]
             hadamards = [m for m in self._factors[HADAMARD] if 3 * m <= n]
-            if n < FEWEST or not totals or not hadamards:
+            if n < MIN_SAMPLES or not totals or not hadamards:
                 yield
                 continue
             sums: tuple[list[_Result], list[_Result]] = [], []
@@ -142,7 +142,7 @@ class SlowStatistics:
 
     def _total(self, m: int) -> _Result:
         """Compute the total variance at one cluster size."""
-        phase, missing, first, unit = self._window.ring()
+        phase, missing, first, unit = self._window.view_ring()
         n = self._window.n
         sums, terms = np.zeros(AXES), np.zeros(AXES, np.int64)
         inner = np.flatnonzero((self._window.factors == m) & (self._window.spans == self._window.length))
@@ -160,7 +160,7 @@ class SlowStatistics:
 
     def _hadamard(self, m: int) -> _Result:
         """Compute the Hadamard variance at one cluster size."""
-        phase, missing, first, unit = self._window.ring()
+        phase, missing, first, unit = self._window.view_ring()
         n = self._window.n
         sums, terms = np.zeros(AXES), np.zeros(AXES, np.int64)
         hadamard.add_hadamard(phase, missing, first, n, m, sums, terms)

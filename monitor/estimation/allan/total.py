@@ -35,9 +35,9 @@ from monitor.estimation.allan.difference_moments import (
     NUM_COEFFICIENTS,
     Moments,
     autocovariance,
+    correct_bias,
     per_sample,
     quadrature_nodes,
-    spread,
 )
 
 MIN_SHARE: Final = 0.5
@@ -67,7 +67,7 @@ class TotalCurve:
     hi: Floats  # [m, k] upper end of the same interval
 
 
-def total(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
+def total_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     """Return the uncorrected total variance of rates and the number of its terms.
 
     Parameters
@@ -113,7 +113,7 @@ def total_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | N
     """
     n = len(values)
     factors = octaves(n - 1) if factors is None else factors
-    raw, terms = total(values, factors)
+    raw, terms = total_variance(values, factors)
     return curve_of([moments(n, int(m)) for m in factors], rate_hz, theta, raw, terms)
 
 
@@ -135,7 +135,7 @@ def curve_of(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Float
     """
     each = list(known)
     enough = terms >= MIN_SHARE * np.array([one.terms for one in each])[:, None]
-    tvar, edf, lo, hi = spread(each, per_sample(theta, rate_hz), np.where(enough, raw, np.nan), terms)
+    tvar, edf, lo, hi = correct_bias(each, per_sample(theta, rate_hz), np.where(enough, raw, np.nan), terms)
     factors = np.array([one.factor for one in each])
     unsure = 2 * factors > np.array([one.n for one in each])
     lo[unsure] = hi[unsure] = np.nan

@@ -51,7 +51,7 @@ TABLE_STEP: Final = 1.1
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class CovarianceTable:
     """Covariance coefficients C for one window length. The arrays are read-only."""
 
     n: int  # samples in the window
@@ -62,7 +62,7 @@ class Table:
     bend: Floats  # [m, 4] covariance of this slope with the slope seen by each τ (``window_kernel.mean_bend``)
 
 
-class Tables:
+class CovarianceTables:
     """Cache of the covariance table for a growing window.
 
     Parameters
@@ -76,16 +76,16 @@ class Tables:
     def __init__(self, factors: Ints, capacity: int) -> None:
         self._factors = factors
         self._capacity = capacity
-        self._table: Table | None = None
+        self._table: CovarianceTable | None = None
 
-    def at(self, n: int) -> Table:
+    def at(self, n: int) -> CovarianceTable:
         """Return a table for n samples. While the window grows, the table may be for up to a tenth fewer samples."""
         known = self._table
         if known is None or not (known.n == n or known.n < n < min(self._capacity, TABLE_STEP * known.n)):
-            known = self._table = table(n, self._factors)
+            known = self._table = covariance_table(n, self._factors)
         return known
 
-    def lasts(self, n: int) -> int:
+    def valid_for(self, n: int) -> int:
         """Return for how many samples ``at(n)`` stays valid, including sample n.
 
         The number is ``UNLIMITED_SAMPLES`` for a full window.
@@ -96,7 +96,7 @@ class Tables:
         return min(self._capacity, math.ceil(TABLE_STEP * known.n)) - n
 
 
-class AxisTables:
+class AxisCovarianceTables:
     """Covariance tables of six axes. Axes that fill the window share one, and each restarted axis has its own.
 
     Parameters
@@ -108,10 +108,10 @@ class AxisTables:
     """
 
     def __init__(self, factors: Ints, capacity: int) -> None:
-        self._shared = Tables(factors, capacity)
-        self._own = [Tables(factors, capacity) for _ in AXES]
+        self._shared = CovarianceTables(factors, capacity)
+        self._own = [CovarianceTables(factors, capacity) for _ in AXES]
 
-    def of(self, axis: int, n: int, filled: int) -> Tables:
+    def of(self, axis: int, n: int, filled: int) -> CovarianceTables:
         """Return the tables of an axis.
 
         Parameters
@@ -126,7 +126,7 @@ class AxisTables:
         return self._shared if n == filled else self._own[axis]
 
 
-def table(n: int, factors: Ints) -> Table:
+def covariance_table(n: int, factors: Ints) -> CovarianceTable:
     """Return the covariances of overlapping Allan variances of n samples.
 
     In the example, white noise at m = 1 has edf = 2/3 of the terms, because neighbouring terms share one sample.
@@ -153,7 +153,7 @@ def table(n: int, factors: Ints) -> Table:
     slope, bend = _slope_variance(n), np.array([_bend_covariance(n, m) for m in factors.tolist()])
     for array in (terms, covariance, slope, bend):
         array.flags.writeable = False
-    return Table(n, factors, terms, covariance, slope, bend)
+    return CovarianceTable(n, factors, terms, covariance, slope, bend)
 
 
 @cache
@@ -210,7 +210,7 @@ class SpanDegreesOfFreedom:
     """
 
     def __init__(self, factors: Ints, spans: Ints, columns: Floats) -> None:
-        tables = [table(int(span), np.array([m])) for m, span in zip(factors, spans, strict=True)]
+        tables = [covariance_table(int(span), np.array([m])) for m, span in zip(factors, spans, strict=True)]
         self._covariance = np.array([one.covariance[0, 0] for one in tables])  # [m, 10]
         self._columns = columns[:, :NOISES]
         self._terms = np.array([one.terms[0] for one in tables])

@@ -34,18 +34,18 @@ from drivers.sample import Floats, Ints
 from monitor.estimation.allan.window_kernel import (
     AXES,
     LANES,
+    LAST_MISSING,
     LINE,
     NEWEST,
-    RUN,
-    STAGE,
-    STRUCK,
+    RUN_SAMPLES,
+    STAGE_SAMPLES,
     TOTAL,
     WIDTH,
     Parts,
     advance,
-    bends,
     forget,
-    thirds,
+    mean_second_differences,
+    slope_of_thirds,
     view_floats,
     view_ints,
 )
@@ -70,7 +70,7 @@ QUICK_CLUSTERS: Final = 16
 """Minimum number of clusters of length τ in a span. It gives 15 independent differences and a deviation to ±20 %."""
 
 
-def quick_spans(factors: Ints, rate_hz: float, length: int) -> Ints:
+def display_spans(factors: Ints, rate_hz: float, length: int) -> Ints:
     """Return the number of samples that each displayed deviation uses: max(10 s, 16 τ), at most the whole window.
 
     A change of N then shows within a minute at τ up to 3 s, while a window of an hour needs the hour. Long τ keep the
@@ -147,16 +147,16 @@ class AllanWindow:
         self._taus = int(factors.size)
         self._scale = phase_scale(int(factors.max()))
         # only a few arrays, because passing one to the kernel takes 50 ns; see view_ints and view_floats
-        taus, places = self._taus, length + 1 + RUN
+        taus, places = self._taus, length + 1 + RUN_SAMPLES
         self._ints = _aligned(LANES + -(-2 * taus // LINE) * LINE + taus * LANES + places * LANES, np.int64)
-        self._floats = _aligned((2 + 2 * RUN + 2 * taus + STAGE) * LANES, np.float64)
+        self._floats = _aligned((2 + 2 * RUN_SAMPLES + 2 * taus + STAGE_SAMPLES) * LANES, np.float64)
         self._missing = np.zeros(places * LANES, np.int32)
         self._state, rows_m, rows_span, terms, self._phase = view_ints(self._ints, taus)
         rows_m[:], rows_span[:] = self.factors, self.spans
         self._scaling, _, sums, rest, stage = view_floats(self._floats, taus)
         self._terms = terms.reshape(taus, LANES)
         self._sums, self._rest = sums.reshape(taus, LANES), rest.reshape(taus, LANES)
-        self._stage = stage[: STAGE * AXES].reshape(STAGE, AXES)
+        self._stage = stage[: STAGE_SAMPLES * AXES].reshape(STAGE_SAMPLES, AXES)
         self.resets = -1  # number of times the window has been emptied; the call below makes it 0
         self.reset()
 
@@ -179,7 +179,7 @@ class AllanWindow:
         self._terms[:] = 0
         self._floats[:] = 0
         self._scaling[:LANES] = self._scale
-        self._state[[TOTAL, STRUCK, WIDTH]] = (0, -(1 << 62), LANES)
+        self._state[[TOTAL, LAST_MISSING, WIDTH]] = (0, -(1 << 62), LANES)
 
     def update(self, values: Floats) -> None:
         """Advance the window by samples.
@@ -199,9 +199,9 @@ class AllanWindow:
         if len(shape) != 2 or shape[1] != AXES:
             raise ValueError(f"samples of shape {shape}; expected is [n, {AXES}]")
         n = shape[0]
-        if n > STAGE:
-            for start in range(0, n, STAGE):
-                self.update(rows[start : start + STAGE])
+        if n > STAGE_SAMPLES:
+            for start in range(0, n, STAGE_SAMPLES):
+                self.update(rows[start : start + STAGE_SAMPLES])
             return
         self._stage[:n] = rows  # the same as ``stage``; calling it would slow down a single sample by 3 %
         advance(self._ints, self._floats, self._missing, self._taus, 0, n)
@@ -211,7 +211,7 @@ class AllanWindow:
         # copied, because each new memory layout or access flag of an array triggers a compilation of seconds
         self._stage[: len(values)] = values
 
-    def parts(self) -> Parts:
+    def kernel_arrays(self) -> Parts:
         """Return the arrays with which compiled code advances the window."""
         return Parts(self._ints, self._floats, self._missing, self._taus, self.length)
 
@@ -225,7 +225,7 @@ class AllanWindow:
         for start in range(0, n, SKIP_BLOCK_ROWS):
             self.update(hole[: n - start])
 
-    def forget(self, axis: int, n: int) -> None:
+    def discard(self, axis: int, n: int) -> None:
         """Discard all but the newest samples of one axis, and count the older ones as missing.
 
         The cost is one pass over the window plus the cost of n samples.
@@ -268,7 +268,9 @@ class AllanWindow:
         """
         newest = int(self._state[NEWEST])
         lengths = np.full(AXES, self.n) if lengths is None else lengths
-        result = np.array([thirds(self._phase, self._missing, newest, n, axis) for axis, n in enumerate(lengths)])
+        result = np.array(
+            [slope_of_thirds(self._phase, self._missing, newest, n, axis) for axis, n in enumerate(lengths)]
+        )
         return result / self._scale[:AXES]
 
     def slopes(self, lengths: Ints | None = None) -> Floats:
@@ -286,7 +288,7 @@ class AllanWindow:
         """
         result = np.empty((self._taus, AXES))
         lengths = np.full(AXES, self.n) if lengths is None else lengths
-        bends(self._phase, self._missing, int(self._state[NEWEST]), lengths, self.factors, result)
+        mean_second_differences(self._phase, self._missing, int(self._state[NEWEST]), lengths, self.factors, result)
         return result / self._scale[:AXES]
 
     def terms(self) -> Ints:
@@ -308,7 +310,7 @@ class AllanWindow:
         phase, missing = self._phase[at * LANES + axis], self._missing[at * LANES + axis]
         return np.where(np.diff(missing) > 0, np.nan, np.diff(phase) / self._scale[axis])
 
-    def ring(self) -> tuple[Ints, NDArray[np.int32], int, Floats]:
+    def view_ring(self) -> tuple[Ints, NDArray[np.int32], int, Floats]:
         """Return a view of the ring of phase without a copy. It is valid until the next update.
 
         Returns

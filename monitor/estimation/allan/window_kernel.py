@@ -15,20 +15,20 @@ from monitor.common.compiled import compiled, inlined
 AXES: Final = 6
 LANES: Final = 8
 """Number of columns per sample: six axes, padded to a vector register."""
-TOTAL, NEWEST, STRUCK, WIDTH = 0, 1, 2, 3
+TOTAL, NEWEST, LAST_MISSING, WIDTH = 0, 1, 2, 3
 """Indices of the state array.
 
 They are: samples since the last reset, row of the newest phase point, newest sample that was missing on any axis, and
 ``LANES``. ``LANES`` is stored there so that the compiler does not know it. Otherwise it would turn a vector loop into
 eight scalar statements.
 """
-RUN: Final = 64
+RUN_SAMPLES: Final = 64
 """Maximum number of samples whose phase is written before the sums are updated."""
-STAGE: Final = 512
+STAGE_SAMPLES: Final = 512
 """Maximum number of samples passed to the kernel at a time."""
 LINE: Final = 8
 """Number of 8-byte numbers in a cache line. A row of phase fills one line and must not cross into a second."""
-PRESENT: Final = 0.98
+MIN_PRESENT_SHARE: Final = 0.98
 """Minimum share of samples that must be present for a slope.
 
 Gaps shift the centre of the remaining samples by less than this share.
@@ -82,7 +82,7 @@ def view_floats(floats: Floats, taus: int) -> tuple[Floats, Floats, Floats, Floa
         Scale and rounding not yet in phase [2 · LANES], two scratch arrays of a run, sums [m · LANES], the rounding
         errors of the sums [m · LANES], and the input buffer [at least STAGE · AXES].
     """
-    scratch, sums = 2 * LANES, (2 + 2 * RUN) * LANES
+    scratch, sums = 2 * LANES, (2 + 2 * RUN_SAMPLES) * LANES
     rest, stage = sums + taus * LANES, sums + 2 * taus * LANES
     return floats[:scratch], floats[scratch:sums], floats[sums:rest], floats[rest:stage], floats[stage:]
 
@@ -113,19 +113,19 @@ def advance(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, s
     state, factors, spans, terms, phase = cut_ints(ints, taus)
     scaling, scratch, sums, rest, stage = cut_floats(floats, taus)
     places = phase.size // LANES
-    length = places - 1 - RUN
+    length = places - 1 - RUN_SAMPLES
     done, end = start, start + n
     while done < end:
-        run = min(RUN, end - done)
+        run = min(RUN_SAMPLES, end - done)
         first = state[NEWEST] + 1 if state[NEWEST] + 1 < places else 0
         for row in range(done, done + run):
             _append(stage[row * AXES : (row + 1) * AXES], scaling, phase, missing, state)
         done += run
         count = state[TOTAL] - run  # number of samples before this run
-        whole = count - state[STRUCK] > length
+        whole = count - state[LAST_MISSING] > length
         if run == 1 and whole and count >= length:
-            for row in range(0, taus, RUN):
-                some, lanes = slice(row, row + RUN), slice(row * LANES, (row + RUN) * LANES)
+            for row in range(0, taus, RUN_SAMPLES):
+                some, lanes = slice(row, row + RUN_SAMPLES), slice(row * LANES, (row + RUN_SAMPLES) * LANES)
                 _swap(first, factors[some], spans[some], phase, scratch, sums[lanes], rest[lanes])
         else:
             _take(first, run, count, whole, factors, spans, phase, missing, scratch, terms, sums, rest, state[WIDTH])
@@ -183,7 +183,7 @@ def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.in
         else:
             phase[now + lane] = phase[before + lane]
             count = missing[before + lane] + 1
-            state[STRUCK] = state[TOTAL]
+            state[LAST_MISSING] = state[TOTAL]
         if missing[now + lane] != count:  # not written while it is 0, so that the system does not allocate the memory
             missing[now + lane] = count
 
@@ -214,7 +214,7 @@ def _slide(
     old0, old1, old2 = place(old + 2 * m, places), place(old + m, places), place(old, places)
     run = min(rows, places - max(now, new1, new2, old0, old1, old2))
     n = run * LANES
-    added, evicted = scratch[: RUN * LANES], scratch[RUN * LANES :]
+    added, evicted = scratch[: RUN_SAMPLES * LANES], scratch[RUN_SAMPLES * LANES :]
     _square(phase, now, new1, new2, n, added)
     if leaving:
         _square(phase, old0, old1, old2, n, evicted)
@@ -290,7 +290,7 @@ def _swap(now: int, factors: Ints, spans: Ints, phase: Ints, scratch: Floats, su
     one by one, and a single loop updates all sums.
     """
     places = phase.size // LANES
-    added, evicted = scratch[: RUN * LANES], scratch[RUN * LANES :]
+    added, evicted = scratch[: RUN_SAMPLES * LANES], scratch[RUN_SAMPLES * LANES :]
     at0 = np.uintp(now * LANES)
     for i in range(factors.size):
         m, old = factors[i], now - spans[i] - 1
@@ -327,9 +327,9 @@ def forget(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, ax
     places = phase.size // LANES
     # the count differs from point to point, so no term can begin and end with the same count
     oldest = place(state[NEWEST] - n, places) * LANES + axis
-    for back in range(1, min(state[TOTAL], places - 1 - RUN) - n + 1):
+    for back in range(1, min(state[TOTAL], places - 1 - RUN_SAMPLES) - n + 1):
         missing[place(state[NEWEST] - n - back, places) * LANES + axis] = missing[oldest] - back
-    state[STRUCK] = max(state[STRUCK], state[TOTAL] - n)
+    state[LAST_MISSING] = max(state[LAST_MISSING], state[TOTAL] - n)
     for i in range(taus):
         m, own = factors[i], i * LANES + axis
         total, left, count = 0.0, 0.0, 0
@@ -348,7 +348,7 @@ def forget(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, ax
 
 
 @inlined
-def level(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> int:
+def reference_level(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> int:
     """Return the mean of the newest samples of an axis in integer units, as a reference level.
 
     The level is close enough to the mean of the axis for differences to fit 64 bits.
@@ -378,7 +378,7 @@ def level(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: in
 
 
 @inlined
-def thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> float:
+def slope_of_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> float:
     """Return the slope of the last n samples from the means of the first and the last third.
 
     Parameters
@@ -400,13 +400,16 @@ def thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: i
         Slope in integer units per sample; NaN if too many samples are missing.
     """
     third, places = n // 3, phase.size // LANES
-    middle = level(phase, missing, newest, n, axis)
+    middle = reference_level(phase, missing, newest, n, axis)
     if third == 0 or middle == NEVER:
         return np.nan
     at0, at1 = newest * LANES + axis, place(newest - third, places) * LANES + axis
     at2, at3 = place(newest - 2 * third, places) * LANES + axis, place(newest - 3 * third, places) * LANES + axis
     late, early = third - (missing[at0] - missing[at1]), third - (missing[at2] - missing[at3])
-    if min(late, early) < PRESENT * third or 3 * third - (missing[at0] - missing[at3]) < PRESENT * 3 * third:
+    if (
+        min(late, early) < MIN_PRESENT_SHARE * third
+        or 3 * third - (missing[at0] - missing[at3]) < MIN_PRESENT_SHARE * 3 * third
+    ):
         return np.nan
     # phase and level · count both wrap modulo 2⁶⁴; their difference is small and is taken before the conversion
     rise = float(phase[at0] - phase[at1] - middle * late) / late
@@ -415,7 +418,9 @@ def thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: i
 
 
 @compiled
-def bends(phase: Ints, missing: NDArray[np.int32], newest: int, lengths: Ints, factors: Ints, out: Floats) -> None:
+def mean_second_differences(
+    phase: Ints, missing: NDArray[np.int32], newest: int, lengths: Ints, factors: Ints, out: Floats
+) -> None:
     """Compute ``mean_bend`` of all τ and axes.
 
     Parameters
@@ -435,11 +440,11 @@ def bends(phase: Ints, missing: NDArray[np.int32], newest: int, lengths: Ints, f
     """
     for i in range(factors.size):
         for axis in range(AXES):
-            out[i, axis] = mean_bend(phase, missing, newest, lengths[axis], factors[i], axis)
+            out[i, axis] = mean_second_difference(phase, missing, newest, lengths[axis], factors[i], axis)
 
 
 @compiled
-def mean_bend(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, m: int, axis: int) -> float:
+def mean_second_difference(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, m: int, axis: int) -> float:
     """Return the mean second difference of phase over clusters of m samples, divided by m².
 
     The sum of all second differences telescopes to four blocks of m points at the ends. Only ``BEND_POINTS`` points of
@@ -468,8 +473,8 @@ def mean_bend(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, m: i
     """
     places = phase.size // LANES
     last, first = newest * LANES + axis, place(newest - n, places) * LANES + axis
-    middle = level(phase, missing, newest, n, axis)
-    if n < 2 * m or middle == NEVER or n - (missing[last] - missing[first]) < PRESENT * n:
+    middle = reference_level(phase, missing, newest, n, axis)
+    if n < 2 * m or middle == NEVER or n - (missing[last] - missing[first]) < MIN_PRESENT_SHARE * n:
         return np.nan
     stride = max(1, m // BEND_POINTS)
     total = 0.0

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Floats
-from monitor.common.rates import amount
+from monitor.common.rates import format_rate
 from monitor.estimation.detection.change_kernel import (
     AFTER,
     BEFORE,
@@ -44,8 +44,8 @@ from monitor.estimation.detection.change_kernel import (
     EVIDENCE,
     FOUND,
     KIND,
-    LEARN,
     LIMIT,
+    MIN_REFERENCE_TERMS,
     NEVER,
     NEXT_DUE,
     SEED,
@@ -53,7 +53,7 @@ from monitor.estimation.detection.change_kernel import (
     SINCE,
     START,
     STEP,
-    TICK,
+    TICK_SAMPLES,
     TOTAL,
     UNIT_EXTREME,
     UNIT_INSIDE,
@@ -67,7 +67,7 @@ from monitor.estimation.detection.change_kernel import (
     make_state,
     set_due,
 )
-from monitor.estimation.detection.change_size import Octaves, named
+from monitor.estimation.detection.change_size import Octaves, identify_noise_change
 
 MAX_CLUSTER_S: Final = 300.0
 """Longest cluster in seconds. Longer ones would learn for days and show temperature rather than noise."""
@@ -161,7 +161,7 @@ class ChangeDetector:
         once = -NormalDist().inv_cdf(min(0.5 * OTHER_SHARE * alarms_per_day / looks, 0.01))
         self._state.levels[:] = (
             max(log(looks * RATE_AT_ZERO / (NOISE_SHARE * alarms_per_day)), 1.0),
-            max(log(looks / TICK / (OTHER_SHARE * alarms_per_day)), 1.0),
+            max(log(looks / TICK_SAMPLES / (OTHER_SHARE * alarms_per_day)), 1.0),
             once, MIN_DWELL_SAMPLES, max(MAX_DWELL_S * rate_hz, MIN_DWELL_SAMPLES), LEARN_S * rate_hz,
         )  # fmt: skip
         self._found: list[Change] = []
@@ -175,7 +175,7 @@ class ChangeDetector:
     def watched(self) -> NDArray[np.bool_]:
         """True for octaves [J, 6] (clusters of 2^j samples) whose reference is long enough for an alarm."""
         band = self._state.band
-        known = (band[:, :, N] >= LEARN * band[:, :, F] ** 2) & (band[:, :, S] > 0.0)
+        known = (band[:, :, N] >= MIN_REFERENCE_TERMS * band[:, :, F] ** 2) & (band[:, :, S] > 0.0)
         return np.asarray((known & self._is_old_enough[:, None]).T)
 
     @property
@@ -281,7 +281,7 @@ class ChangeDetector:
                 v1 = after[:, UNIT_RAW] / after[:, UNIT_N]
             v1 = np.where(after[:, UNIT_N] > 0, v1, 0.0)
         octaves = Octaves(v0, np.maximum(before_n, 0.0) / spread, v1, after[:, UNIT_N] / spread)
-        what = named(octaves, self.rate_hz)
+        what = identify_noise_change(octaves, self.rate_hz)
         sigma = sqrt(2.0 * max(octaves.evidence(), alarm[EVIDENCE]))
         text = f"{AXES[axis]} {_noise_text(AXES[axis], what)}"
         self._found.append(Change("noise_changed", axis, int(alarm[START]), int(alarm[FOUND]), sigma, what, text))
@@ -304,7 +304,7 @@ class ChangeDetector:
         # an outlier of size a in one sample gives one z² = a²/2
         scale = sqrt(2.0 * max(after[0, UNIT_RAW] - after[0, UNIT_S], 0.0) / max(count, 1.0))
         what = {"count": (0.0, float(count)), "scale": (sqrt(variance), scale)}
-        text = f"{AXES[axis]} {count:.0f} outliers of about {amount(AXES[axis], scale)} within " + (
+        text = f"{AXES[axis]} {count:.0f} outliers of about {format_rate(AXES[axis], scale)} within " + (
             f"{(now - alarm[START]) / self.rate_hz:.1f} s"
         )
         sigma = sqrt(2.0 * alarm[EVIDENCE])
@@ -319,7 +319,7 @@ class ChangeDetector:
     def _report_step(self, axis: int, alarm: Floats) -> None:
         """Report a step of the bias."""
         before, after = (float(x) for x in self._state.step[axis, [BEFORE, AFTER]])
-        text = f"{AXES[axis]} bias stepped by {amount(AXES[axis], after - before, sign=True)}"
+        text = f"{AXES[axis]} bias stepped by {format_rate(AXES[axis], after - before, sign=True)}"
         sigma = sqrt(2.0 * alarm[EVIDENCE])
         what = {"bias": (before, after)}
         self._found.append(Change("bias_stepped", axis, int(alarm[START]), int(alarm[FOUND]), sigma, what, text))

@@ -38,7 +38,7 @@ GAIN: Final = 1.0 - 1.0 / RATIOS
 """The factor 1 − 1/r of each ratio r."""
 HALF_LOG: Final = 0.5 * np.log(RATIOS)
 """The term ½ ln r of each ratio r."""
-TICK: Final = 32
+TICK_SAMPLES: Final = 32
 """Number of samples processed at a time. z² of the shortest octaves are summed over it, because logarithms are slow."""
 SHORT: Final = 5
 """Number of octaves within a tick."""
@@ -56,19 +56,19 @@ SEED: Final = 31
 """Number of first z² of a band. Their median sets the clip level, so that an outlier at the start has no effect."""
 SETTLED: Final = 256
 """Number of z² after which the clip level is final."""
-LEARN: Final = 64
+MIN_REFERENCE_TERMS: Final = 64
 """Minimum number of terms of a reference for an alarm, multiplied by F².
 
 One factor F makes the terms as informative as this many independent ones. The other ensures that F is known for sums
 much longer than the correlation of the terms.
 """
-FEW: Final = 16
+MIN_BAND_TERMS: Final = 16
 """Minimum number of terms of a band for a bound on the variation of the mean by slow noise."""
-PAIRS: Final = 8
+MIN_SPREAD_PAIRS: Final = 8
 """Minimum number of pairs for a valid spread F."""
-FLANK: Final = 12.0
+MAX_FLANK: Final = 12.0
 """Value of u beyond which a pair of blocks beside a step is not at rest."""
-CONFIRM: Final = 2
+CONFIRM_PAIRS: Final = 2
 """Number of pairs after a step that must stay at its height."""
 SLOTS: Final = 4
 """Number of snapshots per level in ``State.snap``."""
@@ -91,11 +91,11 @@ BEFORE, AFTER, PLACE, SIGMA, LEFT = range(1, 6)
 """Columns of ``State.step``; column 0 is the octave."""
 TOTAL, NEXT_DUE = 0, 1
 """Elements of ``State.clock``."""
-H_NOISE, H_BURST, STEP_SIGMA, DWELL, LONGEST_DWELL, LEARN_SAMPLES = range(6)
+H_NOISE, H_BURST, STEP_SIGMA, DWELL, LONGEST_DWELL, LEARN_TIME = range(6)
 """Elements of ``State.levels``."""
 
 
-class State(NamedTuple):
+class ChangeState(NamedTuple):
     """State of the detector of constant size. A = 6 axes, J octaves, L = 12 levels."""
 
     levels: Floats  # [6] thresholds, and times in samples; see H_NOISE
@@ -118,12 +118,12 @@ class State(NamedTuple):
     snap_at: Ints  # [levels, SLOTS] sample numbers of the snapshots
 
 
-def make_state(octaves: int) -> State:
+def make_state(octaves: int) -> ChangeState:
     """Return the initial state. The caller must set ``levels``."""
     a, j = AXES, octaves
-    state = State(
+    state = ChangeState(
         np.zeros(6), np.array([0, NEVER], np.int64), np.zeros(a, np.int64),
-        np.zeros((a, TICK)), np.zeros((a, j, 2)), np.zeros((a, j), np.int64), np.zeros((a, j, 2, 2)),
+        np.zeros((a, TICK_SAMPLES)), np.zeros((a, j, 2)), np.zeros((a, j), np.int64), np.zeros((a, j, 2, 2)),
         np.zeros((a, j, SEED)),
         np.zeros((a, j, 5)), np.zeros((a, j, 5)), np.zeros((a, j, 5)), np.zeros((a, j, RATIOS.size, 4)),
         np.zeros((a, j, 12, 5)), np.zeros((a, 2)), np.zeros((a, 6)), np.zeros((a, 6)),
@@ -135,7 +135,7 @@ def make_state(octaves: int) -> State:
 
 
 @compiled
-def advance(s: State, rows: Floats, first: int) -> int:
+def advance(s: ChangeState, rows: Floats, first: int) -> int:
     """Process rows until a decision is due, and return the row after the last one processed.
 
     Parameters
@@ -148,26 +148,26 @@ def advance(s: State, rows: Floats, first: int) -> int:
         First row to process.
     """
     for row in range(first, len(rows)):
-        place = s.clock[TOTAL] % TICK
+        place = s.clock[TOTAL] % TICK_SAMPLES
         for axis in range(AXES):
             s.stage[axis, place] = rows[row, axis]
         s.clock[TOTAL] += 1
-        if place == TICK - 1:
+        if place == TICK_SAMPLES - 1:
             now = s.clock[TOTAL]
             for axis in range(AXES):
                 _tick(s, axis, now)
-            _remember(s, now // TICK)
+            _remember(s, now // TICK_SAMPLES)
             if now >= s.clock[NEXT_DUE]:
                 return row + 1
     return len(rows)
 
 
 @compiled
-def _tick(s: State, axis: int, now: int) -> None:
+def _tick(s: ChangeState, axis: int, now: int) -> None:
     """Process a tick of one axis: first the octaves within the tick, then the carry through the longer octaves."""
     sums = s.stage[axis]
     total, count = 0.0, 0.0
-    for i in range(TICK):
+    for i in range(TICK_SAMPLES):
         if np.abs(sums[i]) < HUGE:
             total += sums[i]
             count += 1.0
@@ -181,7 +181,7 @@ def _tick(s: State, axis: int, now: int) -> None:
         best = _look(s.unit, s.cum, s.band, s.spread, s.cusum, axis, j, now, h)
         if best >= 0:
             _suspect(s, axis, j, best, now)
-    place = now // TICK - 1
+    place = now // TICK_SAMPLES - 1
     for j in range(SHORT, s.half.shape[1]):
         if place & 1 == 0:
             s.half[axis, j, 0], s.half[axis, j, 1] = total, count
@@ -209,7 +209,7 @@ def _differences(sums: Floats, band: Floats, unit: Floats, seeds: Floats, axis: 
     inner, outer = limit * (MEDIAN / CLIP), limit * (EXTREME / CLIP)
     seeded = band[axis, j, SEEDED] == SEED
     n, clipped, raw, inside, extreme = 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(TICK >> (j + 1)):
+    for i in range(TICK_SAMPLES >> (j + 1)):
         d = sums[2 * i + 1] - sums[2 * i]
         sums[i] = sums[2 * i] + sums[2 * i + 1]
         z2 = d * d * scale
@@ -230,7 +230,7 @@ def _differences(sums: Floats, band: Floats, unit: Floats, seeds: Floats, axis: 
 
 
 @compiled
-def _pair(s: State, axis: int, j: int, sum1: float, count1: float, sum2: float, count2: float, now: int) -> None:
+def _pair(s: ChangeState, axis: int, j: int, sum1: float, count1: float, sum2: float, count2: float, now: int) -> None:
     """Process two blocks of 2^j samples. A block is not used if more than a sixteenth of it is missing."""
     m = 1 << j
     least = m - m // 16
@@ -312,7 +312,7 @@ def _look(
     band[axis, j, S] += q
     if unsettled and band[axis, j, N] >= SETTLED:
         band[axis, j, LIMIT] = CLIP * band[axis, j, S] / band[axis, j, N]
-    if k == max(1, TICK >> (j + 1)):
+    if k == max(1, TICK_SAMPLES >> (j + 1)):
         _feed_spread(spread, band, axis, j, q, k)
     return _raise_cusums(cusum, band, axis, j, k, q, now, h)
 
@@ -335,7 +335,7 @@ def _feed_spread(spread: Floats, band: Floats, axis: int, j: int, q: float, k: f
         spread[axis, j, level, COUNT] += 1.0
         count = spread[axis, j, level, COUNT]
         q += held
-        if count >= PAIRS and v > 0.0:
+        if count >= MIN_SPREAD_PAIRS and v > 0.0:
             expected = 4.0 * k * (1 << level) * v * v * count
             found, error = spread[axis, j, level, SQUARES] / expected, np.sqrt(3.0 / count)
             if found < 1.0 + 2.0 * error:  # a significantly larger value is used without a correction
@@ -373,18 +373,18 @@ def _raise_cusums(
 
 
 @compiled
-def _suspect(s: State, axis: int, j: int, i: int, now: int) -> None:
+def _suspect(s: ChangeState, axis: int, j: int, i: int, now: int) -> None:
     """Raise an alarm for a ratio above its threshold, if the reference is long enough."""
     since = s.cusum[axis, j, i, SINCE]
-    enough = s.band[axis, j, N] - s.cusum[axis, j, i, N1] >= LEARN * s.band[axis, j, F] ** 2
-    if enough and since - s.born[axis] >= s.levels[LEARN_SAMPLES]:
+    enough = s.band[axis, j, N] - s.cusum[axis, j, i, N1] >= MIN_REFERENCE_TERMS * s.band[axis, j, F] ** 2
+    if enough and since - s.born[axis] >= s.levels[LEARN_TIME]:
         _alarm(s, axis, NOISE, j, since, s.cusum[axis, j, i, G], now)
     elif s.alarm[axis, KIND] == 0.0:
         _relearn(s, axis, j)
 
 
 @compiled
-def _relearn(s: State, axis: int, j: int) -> None:
+def _relearn(s: ChangeState, axis: int, j: int) -> None:
     """Restart the reference of a band that changed while it was being learned."""
     s.band[axis, j] = 0.0
     s.band[axis, j, F] = 1.0
@@ -403,7 +403,7 @@ def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis
     if band[axis, 0, SEEDED] != SEED or outer == 0.0:
         return 0.0
     k, extremes = 0.0, 0.0
-    for i in range(TICK // 2):
+    for i in range(TICK_SAMPLES // 2):
         d = sums[2 * i + 1] - sums[2 * i]
         if d == d:
             k += 1.0
@@ -419,14 +419,14 @@ def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis
 
 
 @compiled
-def _suspect_burst(s: State, axis: int, now: int) -> None:
+def _suspect_burst(s: ChangeState, axis: int, now: int) -> None:
     """Raise an alarm for too many extremes, if the reference is long enough."""
-    if s.burst[axis, 1] - s.born[axis] >= s.levels[LEARN_SAMPLES]:
+    if s.burst[axis, 1] - s.born[axis] >= s.levels[LEARN_TIME]:
         _alarm(s, axis, BURST, 0, s.burst[axis, 1], s.burst[axis, 0], now)
 
 
 @compiled
-def _alarm(s: State, axis: int, kind: float, j: int, since: float, evidence: float, now: int) -> None:
+def _alarm(s: ChangeState, axis: int, kind: float, j: int, since: float, evidence: float, now: int) -> None:
     """Record the first alarm of an axis.
 
     The decision waits for as long again as the alarm took to be raised, within limits.
@@ -434,7 +434,7 @@ def _alarm(s: State, axis: int, kind: float, j: int, since: float, evidence: flo
     alarm = s.alarm[axis]
     if alarm[KIND] != 0.0 and not (alarm[FOUND] == now and evidence > alarm[EVIDENCE]):
         return
-    wait = np.ceil(min(max(now - since, s.levels[DWELL]), s.levels[LONGEST_DWELL]) / TICK) * TICK
+    wait = np.ceil(min(max(now - since, s.levels[DWELL]), s.levels[LONGEST_DWELL]) / TICK_SAMPLES) * TICK_SAMPLES
     alarm[KIND], alarm[WHERE], alarm[START], alarm[FOUND] = kind, j, since, now
     alarm[EVIDENCE], alarm[DUE] = evidence, now + wait
     s.step[axis, 0] = -1.0
@@ -442,7 +442,7 @@ def _alarm(s: State, axis: int, kind: float, j: int, since: float, evidence: flo
 
 
 @compiled
-def set_due(s: State) -> None:
+def set_due(s: ChangeState) -> None:
     """Set the sample at which the kernel stops for the next decision."""
     s.clock[NEXT_DUE] = NEVER
     for axis in range(AXES):
@@ -451,7 +451,7 @@ def set_due(s: State) -> None:
 
 
 @compiled
-def _seek_step(s: State, axis: int, j: int, mean: float, d: float, now: int) -> None:
+def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, now: int) -> None:
     """Test whether the newest pair of blocks shows a step from the one before the last.
 
     Both pairs must be at rest, and no slope may explain the difference.
@@ -465,13 +465,13 @@ def _seek_step(s: State, axis: int, j: int, mean: float, d: float, now: int) -> 
     square = height * height
     if square <= s.levels[STEP_SIGMA] ** 2 * v * band[F]:
         return
-    quiet = 2.0 * FLANK * v * band[F]
+    quiet = 2.0 * MAX_FLANK * v * band[F]
     if d * d > quiet or ring[0, 1] ** 2 > quiet:
         return
-    if now - s.born[axis] < s.levels[LEARN_SAMPLES]:
+    if now - s.born[axis] < s.levels[LEARN_TIME]:
         return
     for above in range(j + 1, j + 4):
-        if s.band[axis, above, N] < FEW:
+        if s.band[axis, above, N] < MIN_BAND_TERMS:
             return
         # variation of means four blocks apart by random walk and flicker: 10/3 of 5.33, and less
         v = max(v, 2.0 * s.band[axis, above, S] / s.band[axis, above, N])
@@ -483,11 +483,11 @@ def _seek_step(s: State, axis: int, j: int, mean: float, d: float, now: int) -> 
     step, m = s.step[axis], 1 << j
     step[0], step[BEFORE], step[AFTER] = j, ring[0, 0], mean
     step[PLACE] = now - 2.0 * m * (1.0 + min(max(share, 0.0), 1.0))
-    step[SIGMA], step[LEFT] = sigma, CONFIRM
+    step[SIGMA], step[LEFT] = sigma, CONFIRM_PAIRS
 
 
 @compiled
-def _confirm(s: State, axis: int, mean: float, now: int) -> None:
+def _confirm(s: ChangeState, axis: int, mean: float, now: int) -> None:
     """Confirm a step that stays at its height for ``CONFIRM`` pairs, and discard it otherwise."""
     step = s.step[axis]
     if np.abs(mean - step[AFTER]) > 0.5 * np.abs(step[AFTER] - step[BEFORE]):
@@ -502,7 +502,7 @@ def _confirm(s: State, axis: int, mean: float, now: int) -> None:
 
 
 @compiled
-def _remember(s: State, tick: int) -> None:
+def _remember(s: ChangeState, tick: int) -> None:
     """Store a snapshot of ``cum``.
 
     Odd multiples of 2^k ticks go to the slots of level k, so that the spacing of the snapshots grows with their age.

@@ -28,7 +28,7 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.estimation.fit.coefficient_fit import UNIT_SOURCES
 
-LETTERS: Final = "QNBK"
+CHANGE_SYMBOLS: Final = "QNBK"
 """Symbols of the coefficients that can change."""
 CHI2_PER_LETTER: Final = 9.0
 """Minimum decrease of χ² for each coefficient."""
@@ -65,7 +65,7 @@ class Octaves:
         return float(max(gained.sum() - 0.5 * ok.sum(), 0.0))
 
 
-def named(octaves: Octaves, rate_hz: float) -> dict[str, tuple[float, float]]:
+def identify_noise_change(octaves: Octaves, rate_hz: float) -> dict[str, tuple[float, float]]:
     """Return the coefficients that changed, or the frequency band if no coefficient explains the change.
 
     Parameters
@@ -87,10 +87,12 @@ def named(octaves: Octaves, rate_hz: float) -> dict[str, tuple[float, float]]:
         return {}
     tau0 = 1.0 / rate_hz
     tau = np.asarray(tau0 * 2.0 ** np.flatnonzero(ok), np.float64)
-    columns = np.stack([source.avar(tau, tau0) for source in UNIT_SOURCES[: len(LETTERS)]], axis=1)
+    columns = np.stack([source.avar(tau, tau0) for source in UNIT_SOURCES[: len(CHANGE_SYMBOLS)]], axis=1)
     v0, v1, n0, n1 = octaves.before[ok], octaves.after[ok], octaves.n_before[ok], octaves.n_after[ok]
-    floor, _, _ = _select_letters(columns, v0, 2.0 * v0**2 / n0 + (SHAPE_TOLERANCE * v0) ** 2, np.zeros(len(LETTERS)))
-    change, misfit, var = np.zeros(len(LETTERS)), np.inf, 2.0 * (v1**2 / n1 + v0**2 / n0)
+    floor, _, _ = _select_letters(
+        columns, v0, 2.0 * v0**2 / n0 + (SHAPE_TOLERANCE * v0) ** 2, np.zeros(len(CHANGE_SYMBOLS))
+    )
+    change, misfit, var = np.zeros(len(CHANGE_SYMBOLS)), np.inf, 2.0 * (v1**2 / n1 + v0**2 / n0)
     for _ in range(3):  # weights from the model, so that a variance that is small by chance gets no large weight
         change, chosen, misfit = _select_letters(columns, v1 - v0, var + (SHAPE_TOLERANCE * v1) ** 2, floor)
         model = np.maximum(v0 + columns @ change, 0.2 * v1)
@@ -98,7 +100,7 @@ def named(octaves: Octaves, rate_hz: float) -> dict[str, tuple[float, float]]:
     free = v0.size - len(chosen)
     if chosen and misfit <= free + MAX_MISFIT_SIGMA * np.sqrt(2.0 * max(free, 1)):
         after = np.sqrt(np.maximum(floor + change, 0.0))
-        return {LETTERS[i]: (float(np.sqrt(floor[i])), float(after[i])) for i in chosen}
+        return {CHANGE_SYMBOLS[i]: (float(np.sqrt(floor[i])), float(after[i])) for i in chosen}
     return _find_band(tau, v0, v1, np.sqrt(var), rate_hz)
 
 
@@ -107,10 +109,10 @@ def _select_letters(
 ) -> tuple[Floats, tuple[int, ...], float]:
     """Return the coefficients, the indices and the χ² of the subset with the smallest penalized χ²."""
     weight = 1.0 / np.sqrt(var)
-    best, which = np.zeros(len(LETTERS)), tuple[int, ...]()
+    best, which = np.zeros(len(CHANGE_SYMBOLS)), tuple[int, ...]()
     least = price = float(((values * weight) ** 2).sum())
-    for size in range(1, min(len(LETTERS), values.size) + 1):
-        for chosen in combinations(range(len(LETTERS)), size):
+    for size in range(1, min(len(CHANGE_SYMBOLS), values.size) + 1):
+        for chosen in combinations(range(len(CHANGE_SYMBOLS)), size):
             a = columns[:, chosen] * weight[:, None]
             scale = np.linalg.norm(a, axis=0)
             scaled, *_ = np.linalg.lstsq(a / scale, values * weight, rcond=1e-9)
@@ -123,7 +125,7 @@ def _select_letters(
             chi2 = float(((values * weight - a @ x) ** 2).sum())
             if chi2 + CHI2_PER_LETTER * size < price:
                 price, least, which = chi2 + CHI2_PER_LETTER * size, chi2, chosen
-                best = np.zeros(len(LETTERS))
+                best = np.zeros(len(CHANGE_SYMBOLS))
                 best[list(chosen)] = x
     return best, which, least
 

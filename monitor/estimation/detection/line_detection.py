@@ -33,9 +33,9 @@ Mask = NDArray[np.bool_]
 
 ROWS: Final = 4096
 """Maximum number of samples in a stretch."""
-FEWEST_ROWS: Final = 256
+MIN_ROWS: Final = 256
 """Minimum number of samples in a stretch."""
-LEAST: Final = 8
+MIN_STRETCHES: Final = 8
 """Minimum number of stretches for a spectrum."""
 MAX_STRETCHES: Final = 128
 """Maximum number of stretches for a spectrum."""
@@ -44,7 +44,7 @@ MAX_OUTLIER_STRETCHES: Final = 32
 
 They hold 131 072 samples, of which a share of a thousandth is measured to a tenth.
 """
-LACKING: Final = 0.05
+MAX_MISSING_SHARE: Final = 0.05
 """Maximum share of missing samples in a stretch."""
 MIN_PEAK_SIGMA: Final = 6.5
 """Minimum height of a peak in σ.
@@ -66,9 +66,9 @@ SIDE_BINS: Final = 16
 """Number of bins in a side; a quarter of it for the wider bins."""
 FOOT_SIGMA: Final = 2.0
 """Distance in σ by which ``NEAR_BINS`` bins together are below the previous ones while a peak falls to its foot."""
-MATTERS: Final = 0.002
+MIN_LINE_SHARE: Final = 0.002
 """Minimum share of the Allan variance for a reported line."""
-LINES: Final = 3
+MAX_LINES: Final = 3
 """Maximum number of lines per axis, the strongest first."""
 OUTLIER_SIGMA: Final = 5.0
 """Minimum deviation of an outlier in σ."""
@@ -103,7 +103,7 @@ class _Peak:
     wide: bool  # True if it is wider than the resolution of the spectrum
 
 
-def lines(values: Floats, moving: Mask, rate_hz: float, curve: AllanCurve) -> list[Line]:
+def detect_lines(values: Floats, moving: Mask, rate_hz: float, curve: AllanCurve) -> list[Line]:
     """Return the spectral peaks of all axes, the strongest of each axis first.
 
     Parameters
@@ -117,23 +117,23 @@ def lines(values: Floats, moving: Mask, rate_hz: float, curve: AllanCurve) -> li
     curve : AllanCurve
         Allan curve of the recording, which determines the relevant peaks.
     """
-    rows = min(ROWS, 1 << (len(values) // LEAST).bit_length() >> 1)
-    if rows < FEWEST_ROWS:
+    rows = min(ROWS, 1 << (len(values) // MIN_STRETCHES).bit_length() >> 1)
+    if rows < MIN_ROWS:
         return []
     found = []
     for axis in range(len(AXES)):
         parts = [_filled(part) for part in _stretches(values[:, axis], moving, rows, MAX_STRETCHES)]
-        if len(parts) < LEAST:
+        if len(parts) < MIN_STRETCHES:
             continue
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # constant axes and extreme values
             peaks = _peaks(_spectrum(np.stack(parts)), len(parts))
             of_axis = [_make_line(axis, peak, rate_hz / rows, rate_hz, curve) for peak in peaks]
-        strong = sorted((one for one in of_axis if one.share >= MATTERS), key=lambda one: -one.share)
-        found += strong[:LINES]
+        strong = sorted((one for one in of_axis if one.share >= MIN_LINE_SHARE), key=lambda one: -one.share)
+        found += strong[:MAX_LINES]
     return found
 
 
-def outliers(values: Floats, moving: Mask) -> Floats:
+def outlier_share(values: Floats, moving: Mask) -> Floats:
     """Return the share of outliers of each axis.
 
     Parameters
@@ -165,7 +165,7 @@ def outliers(values: Floats, moving: Mask) -> Floats:
     return shares
 
 
-def added(line: Line, curve: AllanCurve) -> Floats:
+def line_share(line: Line, curve: AllanCurve) -> Floats:
     """Return the share [m] of the Allan variance of its axis that a line contributes at each τ.
 
     Parameters
@@ -184,7 +184,7 @@ def _stretches(column: Floats, moving: Mask, rows: int, most: int) -> Iterator[F
     begins = np.linspace(0, len(column) - rows, min(most, max(2 * len(column) // rows - 1, 1))).astype(np.int64)
     for begin in begins:
         part = np.where(moving[begin : begin + rows], np.nan, column[begin : begin + rows])
-        if np.isfinite(part).mean() >= 1.0 - LACKING:
+        if np.isfinite(part).mean() >= 1.0 - MAX_MISSING_SHARE:
             yield part
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from drivers.sample import AXES, Event
-from monitor.estimation.detection.model_gap import FEWEST, AxisGap, ModelGap
+from monitor.estimation.detection.model_gap import MIN_SAMPLES, AxisGap, ModelGap
 
 KIND: Final = "model_disagrees"
 """Kind of the events."""
@@ -34,7 +34,7 @@ class _Axis:
     since: tuple[int, int] | None = None  # samples and t_ns of the first comparison that contradicts the decision
 
 
-class Agreement:
+class ModelAgreement:
     """Decision for each axis of one device whether it agrees with its model."""
 
     def __init__(self) -> None:
@@ -62,7 +62,7 @@ class Agreement:
             axis.since = look.samples, look.t_ns
         samples, since_ns = axis.since
         clear = axis.agrees is not False and gap.gap > CLEAR_FACTOR * gap.threshold
-        if look.samples - samples < max(FEWEST, 0 if clear else round(RENEWED * gap.samples)):
+        if look.samples - samples < max(MIN_SAMPLES, 0 if clear else round(RENEWED * gap.samples)):
             return None
         axis.agrees, axis.since = axis.agrees is False, None
         return _event(gap, axis.agrees, look.t_ns, since_ns)
@@ -83,13 +83,14 @@ def _event(gap: AxisGap, agrees: bool, t_ns: int, since_ns: int) -> Event:
         text = f"{gap.axis} agrees with its model again: {gap.gap:.1f} σ apart at most"
     else:
         text = (
-            f"{gap.axis} disagrees with its model at τ {place(gap)}: deviation {gap.ratio:.3g} times the model's, "
+            f"{gap.axis} disagrees with its model at τ {format_tau_range(gap)}: "
+            f"deviation {gap.ratio:.3g} times the model's, "
             f"{gap.gap:.3g} σ apart where chance stays below {gap.threshold:.1f}"
         )
     return Event(KIND, t_ns, text, gap.axis, {"model": what}, since_ns, gap.gap)
 
 
-def place(gap: AxisGap) -> str:
+def format_tau_range(gap: AxisGap) -> str:
     """Format the range of τ with the largest gap.
 
     >>> import numpy as np

@@ -31,18 +31,18 @@ import numpy as np
 from drivers.sample import AXES, Floats, Ints
 from monitor.common.distributions import normal_quantile
 from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.allan.uncertainty import NOISES, PAIRS, AxisTables, K, Table
+from monitor.estimation.allan.uncertainty import NOISES, PAIRS, AxisCovarianceTables, CovarianceTable, K
 from monitor.estimation.estimate import Estimate
 from monitor.noise.effects.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.bias_instability import BiasInstability
 from monitor.noise.effects.quantization_noise import QuantizationNoise
 from monitor.noise.effects.rate_random_walk import RateRandomWalk
 from monitor.noise.model import NoiseModel
-from monitor.noise.spectrum import BELOW, Spectrum, frequencies
+from monitor.noise.spectrum import MIN_FREQUENCY_CYCLES, Spectrum, frequency_grid
 
-FEWEST_EDF: Final = 2.0
+MIN_EDF: Final = 2.0
 """Minimum degrees of freedom of a compared τ."""
-FEWEST: Final = 1000
+MIN_SAMPLES: Final = 1000
 """Minimum number of samples of an axis. It determines N to 3 %."""
 FALSE_ALARM: Final = 0.01
 """Share of independent windows of a true model that exceed the threshold on any axis."""
@@ -60,7 +60,7 @@ class AxisGap:
     z: Floats  # [m] standard deviations above the model; NaN if not compared
     gap: float  # largest |z|
     tau_s: tuple[float, float]  # range of τ around the largest |z| that exceed the threshold on the same side
-    at: int  # row of the largest |z|
+    row: int  # row of the largest |z|
     null95: float  # 95 of 100 windows of a true model are below, for this axis alone
     threshold: float  # 99 of 100 windows are below on all axes
     alarm: float  # 999 of 1000 windows are below on all axes, for repeated comparisons
@@ -74,7 +74,7 @@ class AxisGap:
     @property
     def ratio(self) -> float:
         """Ratio of the measured deviation to that of the model at the largest gap."""
-        return float(self.measured[self.at] / self.model[self.at])
+        return float(self.measured[self.row] / self.model[self.row])
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class ModelGap:
     agrees: Mapping[str, bool] = field(default_factory=dict)  # current decisions, see ``model_agreement``
 
 
-class ModelInForce:
+class ModelComparison:
     """Noise model prepared for comparison with the curves of one window.
 
     Parameters
@@ -106,10 +106,10 @@ class ModelInForce:
         self._model = model
         self._length = length
         self._expected: dict[str, _Expected] = {}
-        self._tables = AxisTables(np.empty(0, np.int64), length)
+        self._tables = AxisCovarianceTables(np.empty(0, np.int64), length)
         self._of: tuple[float, tuple[int, ...]] = (0.0, ())  # rate and cluster sizes of the prepared values
 
-    def look(self, estimate: Estimate) -> ModelGap:
+    def compare(self, estimate: Estimate) -> ModelGap:
         """Compare all axes that are measured, part of the model, and long enough."""
         curve = estimate.curve
         tables = self._prepare(curve.factors, estimate.rate_hz)
@@ -118,7 +118,7 @@ class ModelInForce:
             i = AXES.index(axis)
             terms = curve.terms[:, i]
             n = samples_of(curve, i)
-            if n < FEWEST:
+            if n < MIN_SAMPLES:
                 continue
             edf = expected.edf(tables.of(i, n, curve.n).at(n), terms)
             one = _axis_gap(axis, curve.tau_s, curve.avar[:, i], expected.avar, edf, n, len(self._expected))
@@ -128,11 +128,11 @@ class ModelInForce:
             estimate.t_ns, estimate.rate_hz, estimate.window_s, estimate.samples, curve.n, curve.tau_s, found
         )
 
-    def _prepare(self, factors: Ints, rate_hz: float) -> AxisTables:
+    def _prepare(self, factors: Ints, rate_hz: float) -> AxisCovarianceTables:
         """Compute the expected curves once per rate and list of cluster sizes, and return the covariance tables."""
         of = (rate_hz, tuple(factors.tolist()))
         if self._of[1] != of[1]:
-            self._tables = AxisTables(factors, self._length)
+            self._tables = AxisCovarianceTables(factors, self._length)
         if self._of != of:
             named = (axis for axis in AXES if self._model.effects.get(axis))
             known = {axis: _Expected.of(self._model, axis, factors, rate_hz) for axis in named}
@@ -173,9 +173,9 @@ class _Expected:
         # a ramp has no variance of its own, but its product with the noise has; the effect is at most that of a
         # random walk of the same size
         shape[K] += 1.5 * spectrum.slope**2 * float(tau_s.max()) / rate_hz
-        return cls(spectrum.allan(tau_s), shape, more)
+        return cls(spectrum.avar(tau_s), shape, more)
 
-    def edf(self, table: Table, terms: Ints) -> Floats:
+    def edf(self, table: CovarianceTable, terms: Ints) -> Floats:
         """Return the degrees of freedom [m] for these numbers of terms; NaN without terms."""
         pairs = np.array([self.shape[a] * self.shape[b] * (1.0 if a == b else 2.0) for a, b in PAIRS])
         exact = np.einsum("iik,k->i", table.covariance, pairs)
@@ -204,7 +204,7 @@ def _excess_variance(spectrum: Spectrum, classic: NoiseModel, factors: Ints, rat
     r(c)², by Parseval 2/M ∫ (S G)² dν. A line of mean square P adds 4/M P S G² at its frequency.
     """
     (axis,) = classic.effects
-    f_hz = frequencies(BELOW * rate_hz / float(factors.max()), 1.0 / rate_hz, spectrum.peaks)
+    f_hz = frequency_grid(MIN_FREQUENCY_CYCLES * rate_hz / float(factors.max()), 1.0 / rate_hz, spectrum.peaks)
     own, known = (s.density(f_hz) * rate_hz for s in (spectrum, classic.spectrum(axis, 1.0 / rate_hz)))
     difference = own**2 - known**2
     if not difference.any() and not spectrum.lines:
@@ -236,7 +236,7 @@ def _axis_gap(
     if not judged.any():
         return None
     count = int(judged.sum())
-    threshold, alarm = (limit(share, axes * count) for share in (FALSE_ALARM, FALSE_ALARM_WATCHED))
+    threshold, alarm = (max_z_limit(share, axes * count) for share in (FALSE_ALARM, FALSE_ALARM_WATCHED))
     size = np.where(judged, np.abs(z), -1.0)
     at = int(size.argmax())
     alike = (size > threshold) & (np.sign(z) == np.sign(z[at]))
@@ -246,7 +246,7 @@ def _axis_gap(
     while last + 1 < alike.size and alike[last + 1]:
         last += 1
     where = float(tau_s[first]), float(tau_s[last])
-    null95 = limit(0.05, count)
+    null95 = max_z_limit(0.05, count)
     return AxisGap(
         axis, np.sqrt(avar), np.sqrt(expected), z, float(size[at]), where, at, null95, threshold, alarm, samples
     )
@@ -267,11 +267,11 @@ def normal_score(ratio: Floats, edf: Floats) -> Floats:
     >>> round(float(normal_score(np.array([1.29561]), np.array([100.0]))[0]), 2)
     1.96
     """
-    spread = 2.0 / (9.0 * np.where(edf >= FEWEST_EDF, edf, np.nan))
+    spread = 2.0 / (9.0 * np.where(edf >= MIN_EDF, edf, np.nan))
     return np.asarray((np.cbrt(ratio) - 1.0 + spread) / np.sqrt(spread))
 
 
-def limit(share: float, numbers: int) -> float:
+def max_z_limit(share: float, numbers: int) -> float:
     """Return the limit that the largest of several |z| exceeds with a given probability.
 
     The probability is exact for independent z, and an upper bound otherwise.

@@ -20,9 +20,19 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import AXES, Floats, Ints, SampleBlock, block
-from monitor.common.rates import amount
-from monitor.estimation.detection.motion_kernel import AFTER, AXIS, BEGAN, CHANGED, FIRST, LAST, PEAK, advance, state
+from drivers.sample import AXES, Floats, Ints, SampleBlock, make_block
+from monitor.common.rates import format_rate
+from monitor.estimation.detection.motion_kernel import (
+    AXIS,
+    BEGAN,
+    CHANGED,
+    FIRST,
+    LAST,
+    PEAK,
+    REMOVED_AFTER,
+    advance,
+    make_state,
+)
 
 BLOCK_S: Final = 0.25
 """Length of a block in seconds."""
@@ -48,7 +58,7 @@ class Motion:
     text: str  # description for users
 
 
-class Rest:
+class MotionDetector:
     """Motion detector that removes the samples in motion from a stream.
 
     Parameters
@@ -71,7 +81,7 @@ class Rest:
         self.episodes = 0
         self._rate_hz = rate_hz
         self._size = block_size(rate_hz)
-        self._state = state()
+        self._state = make_state()
         self._held: deque[tuple[int, SampleBlock]] = deque()  # blocks with the index of their first row
         self._index = 0  # index of the next sample
         self._motions: list[Motion] = []
@@ -127,7 +137,7 @@ class Rest:
         return out
 
 
-def find(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], list[Motion]]:
+def detect_motion(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], list[Motion]]:
     """Find motion in a whole recording on a regular grid.
 
     Parameters
@@ -145,7 +155,7 @@ def find(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], list[Motion
         Episodes of motion.
     """
     size = block_size(rate_hz)
-    kernel_state = state()
+    kernel_state = make_state()
     blocks, moving, episodes = _allocate_output(len(values), size)
     verdicts, stretches = advance(_read_only(values), 0, size, True, kernel_state, blocks, moving, episodes)
     mask = np.repeat(moving[:verdicts].astype(bool), size)[: len(values)]
@@ -178,7 +188,7 @@ def _remove_moving(samples: SampleBlock, struck: NDArray[np.bool_]) -> SampleBlo
     if not struck.any():
         return samples
     values = np.where(struck[:, None], np.nan, samples.values)
-    return block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
+    return make_block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
 
 
 def _make_motion(episode: Floats, size: int, rate_hz: float) -> Motion:
@@ -188,9 +198,9 @@ def _make_motion(episode: Floats, size: int, rate_hz: float) -> Motion:
     moving = last - first + 1
     seconds = moving * size / rate_hz
     kind: Kind = "handling/orientation" if episode[CHANGED] else "knock" if moving <= MAX_KNOCK_BLOCKS else "motion"
-    size_text = f"{axis} up to {amount(axis, peak)}"
+    size_text = f"{axis} up to {format_rate(axis, peak)}"
     verb = {"knock": "knocked", "motion": "moved", "handling/orientation": "handled, and left in another orientation,"}
     text = f"{verb[kind]} for {seconds:.1f} s: {size_text}"
     if kind == "knock":
         text = f"knocked: {size_text}"
-    return Motion(kind, max(first - 1, 0) * size, (last + 1 + AFTER) * size, seconds, axis, peak, text)
+    return Motion(kind, max(first - 1, 0) * size, (last + 1 + REMOVED_AFTER) * size, seconds, axis, peak, text)

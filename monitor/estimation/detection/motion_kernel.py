@@ -24,9 +24,9 @@ from monitor.common.compiled import compiled
 
 AXES: Final = 6
 GYROS: Final = 3
-LEARNED: Final = 240
+REFERENCE_BLOCKS: Final = 240
 """Number of blocks at rest in the reference, and of steady moving blocks that make a new one: 60 s of 0.25 s."""
-LEAST: Final = 8
+MIN_REFERENCE_BLOCKS: Final = 8
 """Minimum number of blocks at rest for a first reference. Its bands are twice as wide as later."""
 BAND: Final = 8.0
 """Deviation of the mean or the log variance of a block that is still rest, in standard deviations (from quartiles)."""
@@ -45,7 +45,7 @@ QUIETER: Final = log(9.0)
 
 If most axes are this quiet for ``LEAST`` blocks, the reference was learned in motion.
 """
-SURE: Final = (0.1,) * 3 + (1.0,) * 3
+NEVER_AT_REST: Final = (0.1,) * 3 + (1.0,) * 3
 """Limits in rad/s and m/s² that no MEMS sensor exceeds at rest.
 
 They apply to the rms within a block and to the change between blocks, and only until there is a reference.
@@ -62,9 +62,9 @@ SPUN: Final = 40
 
 The reference was then learned in rotation.
 """
-AFTER: Final = 2
+REMOVED_AFTER: Final = 2
 """Number of blocks removed after a moving block. One block before it is removed as well."""
-APART: Final = 4
+EPISODE_GAP_BLOCKS: Final = 4
 """Number of blocks at rest that end an episode."""
 LOOK_EVERY: Final = 20
 """Number of blocks between two tests whether an episode has become steady."""
@@ -72,9 +72,9 @@ WANDER: Final = 4.0
 """Largest ratio of the scatter of means to what the scatter within blocks explains. Above it, the means move."""
 SIGMA_OF_QUARTER: Final = 0.6745
 """Upper quartile of the standard normal distribution."""
-NOTHING: Final = 1e-30
+MIN_VARIANCE: Final = 1e-30
 """Variance assigned to a constant."""
-FEWEST: Final = 4
+MIN_BLOCK_SAMPLES: Final = 4
 """Minimum number of samples in a block for a decision. At least half of the block must be present as well."""
 
 OPEN, HELD, HELD_MOVES, QUIET_RUN, BEGAN, LATEST, STILL, QUIET, RECENT, TURNED = range(10)
@@ -105,7 +105,7 @@ COUNT, SHIFT, SUM, SQUARES, LOW, HIGH, BEFORE, STEP = range(8)
 """
 
 
-class State(NamedTuple):
+class MotionState(NamedTuple):
     """State of the motion detector."""
 
     place: Ints  # [10] counters and flags, see OPEN
@@ -118,22 +118,22 @@ class State(NamedTuple):
     peaks: Floats  # [2, 6] largest excursion of the open episode, in SI and relative to the noise
 
 
-def state() -> State:
+def make_state() -> MotionState:
     """Return the initial state."""
     place = np.zeros(10, np.int64)
     place[[HELD, BEGAN]] = -1
-    place[QUIET_RUN] = APART
+    place[QUIET_RUN] = EPISODE_GAP_BLOCKS
     fresh = np.zeros((AXES, 8))
     fresh[:, BEFORE] = np.nan
-    rings = [np.full((2, AXES, LEARNED), np.nan) for _ in range(3)]
-    return State(
+    rings = [np.full((2, AXES, REFERENCE_BLOCKS), np.nan) for _ in range(3)]
+    return MotionState(
         place, fresh, np.zeros(AXES, np.int64), np.zeros(AXES), rings[0], rings[1], rings[2], np.zeros((2, AXES))
     )
 
 
 @compiled
 def advance(
-    values: Floats, first: int, size: int, ends: bool, s: State, blocks: Ints, moving: Ints, episodes: Floats
+    values: Floats, first: int, size: int, ends: bool, s: MotionState, blocks: Ints, moving: Ints, episodes: Floats
 ) -> Ints:
     """Process consecutive rows, and return the decisions and episodes that have become final.
 
@@ -193,14 +193,14 @@ def advance(
 
 
 @compiled
-def _close(size: int, s: State, blocks: Ints, moving: Ints, episodes: Floats, filled: Ints) -> None:
+def _close(size: int, s: MotionState, blocks: Ints, moving: Ints, episodes: Floats, filled: Ints) -> None:
     """Complete the open block: measure, decide, learn, and release the previous block."""
     number = s.place[OPEN]
     follows = s.place[HELD] == number - 1
     now = np.empty((2, AXES))
     for a in range(AXES):
         now[LOG_VARIANCE, a] = now[MEAN, a] = nan
-        if 2.0 * s.open[a, COUNT] >= size and s.open[a, COUNT] >= FEWEST:
+        if 2.0 * s.open[a, COUNT] >= size and s.open[a, COUNT] >= MIN_BLOCK_SAMPLES:
             _measure(a, s, now)
     moves = _judge(now, follows, size, s)
     if moves:
@@ -208,16 +208,16 @@ def _close(size: int, s: State, blocks: Ints, moving: Ints, episodes: Floats, fi
         s.place[HELD_MOVES] |= follows
     _learn(now, moves, number, size, s)
     _emit(s, blocks, moving, filled)
-    s.place[QUIET_RUN] = 0 if moves else min(s.place[QUIET_RUN] + 1, APART)
-    s.place[HELD], s.place[HELD_MOVES] = number, s.place[QUIET_RUN] <= AFTER
-    if s.place[BEGAN] >= 0 and s.place[QUIET_RUN] == APART:
+    s.place[QUIET_RUN] = 0 if moves else min(s.place[QUIET_RUN] + 1, EPISODE_GAP_BLOCKS)
+    s.place[HELD], s.place[HELD_MOVES] = number, s.place[QUIET_RUN] <= REMOVED_AFTER
+    if s.place[BEGAN] >= 0 and s.place[QUIET_RUN] == EPISODE_GAP_BLOCKS:
         _end(s, episodes, filled)
     for a in range(AXES):
         s.open[a, COUNT] = 0.0
 
 
 @compiled
-def _measure(a: int, s: State, now: Floats) -> None:
+def _measure(a: int, s: MotionState, now: Floats) -> None:
     """Compute log variance and mean of one axis of the block without the sample furthest from the mean."""
     n = s.open[a, COUNT]
     mean = s.open[a, SUM] / n
@@ -228,12 +228,12 @@ def _measure(a: int, s: State, now: Floats) -> None:
     square = max(square - furthest * furthest * n / (n - 1.0), 0.0)
     mean -= furthest / (n - 1.0)
     floor = s.open[a, STEP] ** 2 / 12.0  # variance that rounding may hide
-    now[LOG_VARIANCE, a] = log(square / (n - 2.0) + floor + NOTHING)
+    now[LOG_VARIANCE, a] = log(square / (n - 2.0) + floor + MIN_VARIANCE)
     now[MEAN, a] = mean
-    floor = log(floor + NOTHING)
+    floor = log(floor + MIN_VARIANCE)
     if s.ordered[LOG_VARIANCE, a, 0] < floor:  # the step was not known when these values were learned
         for ring in (s.ordered, s.ring, s.recent):
-            for k in range(LEARNED):
+            for k in range(REFERENCE_BLOCKS):
                 if ring[LOG_VARIANCE, a, k] < floor:
                     ring[LOG_VARIANCE, a, k] = floor
 
@@ -242,27 +242,27 @@ def _measure(a: int, s: State, now: Floats) -> None:
 
 
 @compiled
-def _judge(now: Floats, follows: bool, size: int, s: State) -> bool:
+def _judge(now: Floats, follows: bool, size: int, s: MotionState) -> bool:
     """Return True if the block moves. A new orientation shifts the reference."""
     loud, off, rotates = False, False, False
     still = follows
-    before = (s.place[RECENT] - 1) % LEARNED
+    before = (s.place[RECENT] - 1) % REFERENCE_BLOCKS
     judged, rises, excess = 0, 0.0, 0.0
     for a in range(AXES):
         if now[MEAN, a] != now[MEAN, a]:
             continue
         change = abs(now[MEAN, a] - s.recent[MEAN, a, before]) if follows else 0.0
-        n = min(s.seen[a], LEARNED)
-        if n < LEAST:
-            loud |= now[LOG_VARIANCE, a] > 2.0 * log(SURE[a]) or change > SURE[a]
+        n = min(s.seen[a], REFERENCE_BLOCKS)
+        if n < MIN_REFERENCE_BLOCKS:
+            loud |= now[LOG_VARIANCE, a] > 2.0 * log(NEVER_AT_REST[a]) or change > NEVER_AT_REST[a]
             continue
-        young = 1.0 + LEAST / n
+        young = 1.0 + MIN_REFERENCE_BLOCKS / n
         step = s.open[a, STEP]
         middle = _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)
         # approximately the standard deviation of the logarithm of χ² over its degrees of freedom
         sigma = min(max(_scatter(s.ordered[LOG_VARIANCE, a], n), sqrt(2.0 / (size - 2.0))), LOUDEST / BAND)
         loud |= exp(now[LOG_VARIANCE, a]) > exp(middle + young * max(LOUDER, BAND * sigma)) + step * step
-        rise = log(max(exp(now[LOG_VARIANCE, a]) - TOGGLE * step * step, NOTHING)) - middle
+        rise = log(max(exp(now[LOG_VARIANCE, a]) - TOGGLE * step * step, MIN_VARIANCE)) - middle
         rise = min(max(rise, -LOUDEST), LOUDEST)
         judged, rises, excess = judged + 1, rises + rise / young, excess + rise / sigma / young
         band = young * _band(a, n, size, s) + step
@@ -282,20 +282,20 @@ def _judge(now: Floats, follows: bool, size: int, s: State) -> bool:
 
 
 @compiled
-def _band(a: int, n: int, size: int, s: State) -> float:
+def _band(a: int, n: int, size: int, s: MotionState) -> float:
     """Return the distance of the mean of a block from the median of the means that is still rest."""
     explained = exp(0.5 * _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)) / sqrt(size)
     return BAND * min(max(_scatter(s.ordered[MEAN, a], n), explained), DRIFT / BAND * explained)
 
 
 @compiled
-def _take_over(now: Floats, s: State) -> None:
+def _take_over(now: Floats, s: MotionState) -> None:
     """Shift the reference to the current means of all axes; their scatter is kept."""
     for a in range(AXES):
-        n = min(s.seen[a], LEARNED)
+        n = min(s.seen[a], REFERENCE_BLOCKS)
         if now[MEAN, a] == now[MEAN, a] and n > 0:
             shift = now[MEAN, a] - _quantile(s.ordered[MEAN, a], n, 0.5)
-            for k in range(LEARNED):
+            for k in range(REFERENCE_BLOCKS):
                 s.ordered[MEAN, a, k] += shift
                 s.ring[MEAN, a, k] += shift
             s.shifted[a] += shift
@@ -306,40 +306,43 @@ def _take_over(now: Floats, s: State) -> None:
 
 
 @compiled
-def _learn(now: Floats, moves: bool, number: int, size: int, s: State) -> None:
+def _learn(now: Floats, moves: bool, number: int, size: int, s: MotionState) -> None:
     """Add a block at rest to the reference, or replace a reference that has proved wrong."""
-    newest = s.place[RECENT] % LEARNED
+    newest = s.place[RECENT] % REFERENCE_BLOCKS
     s.place[RECENT] += 1
     quieter = measured = 0
     for a in range(AXES):
         s.recent[LOG_VARIANCE, a, newest], s.recent[MEAN, a, newest] = now[LOG_VARIANCE, a], now[MEAN, a]
-        n = min(s.seen[a], LEARNED)
+        n = min(s.seen[a], REFERENCE_BLOCKS)
         if now[MEAN, a] != now[MEAN, a]:
             continue
         measured += 1
-        quieter += n >= LEAST and now[LOG_VARIANCE, a] < _quantile(s.ordered[LOG_VARIANCE, a], n, 0.25) - QUIETER
+        quieter += (
+            n >= MIN_REFERENCE_BLOCKS
+            and now[LOG_VARIANCE, a] < _quantile(s.ordered[LOG_VARIANCE, a], n, 0.25) - QUIETER
+        )
         if not moves:
             _insert(a, now[LOG_VARIANCE, a], now[MEAN, a], s)
     s.place[QUIET] = s.place[QUIET] + 1 if measured and 2 * quieter >= measured else 0
     blocks = 0
-    if s.place[QUIET] == LEAST:
-        blocks = LEAST
+    if s.place[QUIET] == MIN_REFERENCE_BLOCKS:
+        blocks = MIN_REFERENCE_BLOCKS
         s.place[QUIET] = 0
     lasted = number - s.place[BEGAN] + 1
-    if moves and lasted >= LEARNED and lasted % LOOK_EVERY == 0 and _steady(size, s):
-        blocks = LEARNED
+    if moves and lasted >= REFERENCE_BLOCKS and lasted % LOOK_EVERY == 0 and _steady(size, s):
+        blocks = REFERENCE_BLOCKS
     if blocks > 0:
         _begin_anew(blocks, s)
 
 
 @compiled
-def _insert(a: int, log_variance: float, mean: float, s: State) -> None:
+def _insert(a: int, log_variance: float, mean: float, s: MotionState) -> None:
     """Add one value to both rings of an axis, and remove the oldest."""
-    at, n = s.seen[a] % LEARNED, min(s.seen[a], LEARNED)
+    at, n = s.seen[a] % REFERENCE_BLOCKS, min(s.seen[a], REFERENCE_BLOCKS)
     for kind in range(2):
         value, ordered = log_variance if kind == LOG_VARIANCE else mean, s.ordered[kind, a]
         place = n
-        if n == LEARNED:
+        if n == REFERENCE_BLOCKS:
             place = _rank(ordered, n, s.ring[kind, a, at])
         while place > 0 and ordered[place - 1] > value:
             ordered[place] = ordered[place - 1]
@@ -350,7 +353,7 @@ def _insert(a: int, log_variance: float, mean: float, s: State) -> None:
         ordered[place] = value
         s.ring[kind, a, at] = value
     s.seen[a] += 1
-    if at == LEARNED - 1:
+    if at == REFERENCE_BLOCKS - 1:
         s.shifted[a] = 0.0
 
 
@@ -368,58 +371,58 @@ def _rank(ordered: Floats, n: int, value: float) -> int:
 
 
 @compiled
-def _begin_anew(blocks: int, s: State) -> None:
+def _begin_anew(blocks: int, s: MotionState) -> None:
     """Replace the reference by the most recent blocks."""
     for a in range(AXES):
         s.seen[a], s.shifted[a] = 0, 0.0
         for kind in range(2):
-            for k in range(LEARNED):
+            for k in range(REFERENCE_BLOCKS):
                 s.ring[kind, a, k] = s.ordered[kind, a, k] = nan
     for back in range(blocks, 0, -1):
-        k = (s.place[RECENT] - back) % LEARNED
+        k = (s.place[RECENT] - back) % REFERENCE_BLOCKS
         for a in range(AXES):
             if s.recent[MEAN, a, k] == s.recent[MEAN, a, k]:
                 _insert(a, s.recent[LOG_VARIANCE, a, k], s.recent[MEAN, a, k], s)
 
 
 @compiled
-def _steady(size: int, s: State) -> bool:
+def _steady(size: int, s: MotionState) -> bool:
     """Return True if the last ``LEARNED`` blocks are one steady state.
 
     Both halves must agree, without bursts and without a mean that wanders.
     """
-    half, ordered = LEARNED // 2, np.empty(LEARNED)
+    half, ordered = REFERENCE_BLOCKS // 2, np.empty(REFERENCE_BLOCKS)
     for a in range(AXES):
-        n = _sort_recent(s, MEAN, a, 0, LEARNED, ordered)
+        n = _sort_recent(s, MEAN, a, 0, REFERENCE_BLOCKS, ordered)
         if n == 0:
             continue
-        if LEARNED - n > LEARNED // 10:
+        if REFERENCE_BLOCKS - n > REFERENCE_BLOCKS // 10:
             return False
         scatter = 0.5 * (_interpolate(ordered, n, 0.75) - _interpolate(ordered, n, 0.25)) / SIGMA_OF_QUARTER
-        n = _sort_recent(s, LOG_VARIANCE, a, 0, LEARNED, ordered)
+        n = _sort_recent(s, LOG_VARIANCE, a, 0, REFERENCE_BLOCKS, ordered)
         middle = _median(ordered, n)
         louder = 0
         for k in range(n):
             louder += ordered[k] > middle + 2.0 * LOUDER
-        if louder > LEARNED // 50:
+        if louder > REFERENCE_BLOCKS // 50:
             return False
         explained = exp(0.5 * middle) / sqrt(size) + s.open[a, STEP]
         if scatter > WANDER * explained:
             return False
         for kind in range(2):
             early = _median(ordered, _sort_recent(s, kind, a, 0, half, ordered))
-            late = _median(ordered, _sort_recent(s, kind, a, half, LEARNED, ordered))
+            late = _median(ordered, _sort_recent(s, kind, a, half, REFERENCE_BLOCKS, ordered))
             if abs(early - late) > (0.5 * LOUDER if kind == LOG_VARIANCE else WANDER * explained):
                 return False
     return True
 
 
 @compiled
-def _sort_recent(s: State, kind: int, a: int, begin: int, end: int, ordered: Floats) -> int:
+def _sort_recent(s: MotionState, kind: int, a: int, begin: int, end: int, ordered: Floats) -> int:
     """Sort the values that are not NaN of the recent blocks begin ≤ k < end, oldest first; return their number."""
     n = 0
     for k in range(begin, end):
-        value = s.recent[kind, a, (s.place[RECENT] + k) % LEARNED]
+        value = s.recent[kind, a, (s.place[RECENT] + k) % REFERENCE_BLOCKS]
         if value == value:
             place = n
             while place > 0 and ordered[place - 1] > value:
@@ -462,7 +465,7 @@ def _scatter(ordered: Floats, n: int) -> float:
 
 
 @compiled
-def _remember(now: Floats, number: int, s: State) -> None:
+def _remember(now: Floats, number: int, s: MotionState) -> None:
     """Start or continue an episode with a moving block, and update its peaks."""
     if s.place[BEGAN] < 0:
         s.place[BEGAN], s.place[TURNED] = number, 0
@@ -470,12 +473,12 @@ def _remember(now: Floats, number: int, s: State) -> None:
             s.peaks[0, a] = s.peaks[1, a] = 0.0
     s.place[LATEST] = number
     for a in range(AXES):
-        n = min(s.seen[a], LEARNED)
+        n = min(s.seen[a], REFERENCE_BLOCKS)
         if s.open[a, COUNT] == 0.0:
             continue
-        learned = n >= LEAST
+        learned = n >= MIN_REFERENCE_BLOCKS
         middle = _quantile(s.ordered[MEAN, a], n, 0.5) if learned else now[MEAN, a]
-        noise = exp(0.5 * _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)) if learned else SURE[a]
+        noise = exp(0.5 * _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)) if learned else NEVER_AT_REST[a]
         peak = max(s.open[a, HIGH] - middle, middle - s.open[a, LOW])
         if peak > s.peaks[0, a]:
             s.peaks[0, a] = peak
@@ -483,7 +486,7 @@ def _remember(now: Floats, number: int, s: State) -> None:
 
 
 @compiled
-def _emit(s: State, blocks: Ints, moving: Ints, filled: Ints) -> None:
+def _emit(s: MotionState, blocks: Ints, moving: Ints, filled: Ints) -> None:
     """Write the pending decision to the output."""
     if s.place[HELD] >= 0:
         blocks[filled[0]], moving[filled[0]] = s.place[HELD], s.place[HELD_MOVES]
@@ -491,7 +494,7 @@ def _emit(s: State, blocks: Ints, moving: Ints, filled: Ints) -> None:
 
 
 @compiled
-def _end(s: State, episodes: Floats, filled: Ints) -> None:
+def _end(s: MotionState, episodes: Floats, filled: Ints) -> None:
     """Write the open episode to the output and close it."""
     axis = 0
     for a in range(1, AXES):

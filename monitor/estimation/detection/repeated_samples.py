@@ -22,7 +22,7 @@ BISECTIONS: Final = 40
 """Number of bisection steps."""
 
 
-def stale_share(values: Floats) -> float:
+def repeated_share(values: Floats) -> float:
     """Return the share of rows [n, 6] that repeat the previous one because the sensor had no new measurement.
 
     Let s be the share of repeated rows. Axis a repeats in p_a = s + (1 - s) q_a of the rows, where q_a is due to its

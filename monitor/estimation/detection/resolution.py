@@ -13,18 +13,18 @@ import numpy as np
 
 from drivers.sample import AXES, Floats
 
-COARSE: Final = 0.5
+MIN_STEP_TO_NOISE: Final = 0.5
 """Minimum step as a share of the noise. Smaller steps add at most two percent to the variance of the noise."""
 ROWS: Final = 4096
 """Maximum number of samples in a stretch."""
 MAX_STRETCHES: Final = 16
 """Maximum number of stretches."""
-ON_GRID: Final = 0.1
+GRID_TOLERANCE: Final = 0.1
 """Deviation from a whole number of steps, as a share of the step, within which a value is on the grid.
 
 Values rounded to float32 are on the grid.
 """
-GAUSSIAN: Final = 0.8862269254527580
+SIGMA_PER_MEAN_DISTANCE: Final = 0.8862269254527580
 """√π/2, the ratio of σ to the mean distance of two samples of Gaussian noise."""
 
 
@@ -37,7 +37,7 @@ class QuantizationStep:
     noise: float  # σ from sample to sample, including quantization, rad/s or m/s²
 
 
-def coarse(values: Floats) -> list[QuantizationStep]:
+def find_coarse_axes(values: Floats) -> list[QuantizationStep]:
     """Return the axes whose values [n, 6] have steps of at least ``COARSE`` of their noise.
 
     >>> noise = np.random.default_rng(0).standard_normal((20_000, 6))
@@ -53,9 +53,9 @@ def coarse(values: Floats) -> list[QuantizationStep]:
         parts = [values[begin : begin + rows, axis] for begin in begins]
         away = np.abs(np.concatenate([np.diff(part) for part in parts]))
         away = away[np.isfinite(away)]
-        noise = GAUSSIAN * float(away.mean()) if away.size else 0.0
+        noise = SIGMA_PER_MEAN_DISTANCE * float(away.mean()) if away.size else 0.0
         levels = np.unique(np.concatenate(parts))
-        step = _step(levels[np.isfinite(levels)], COARSE * noise)
+        step = _step(levels[np.isfinite(levels)], MIN_STEP_TO_NOISE * noise)
         if step is not None and noise > 0.0:
             found.append(QuantizationStep(axis, step, noise))
     return found
@@ -71,4 +71,4 @@ def _step(levels: Floats, least: float) -> float | None:
     if not np.isfinite(counts).all():
         return None
     step = float((levels[-1] - levels[0]) / counts[-1])
-    return step if (np.abs((levels[1:] - levels[0]) / step - counts) < ON_GRID).all() else None
+    return step if (np.abs((levels[1:] - levels[0]) / step - counts) < GRID_TOLERANCE).all() else None

@@ -10,9 +10,9 @@ from typing import Final
 
 from drivers.sample import AXES, Event, SampleBlock
 from monitor.estimation.detection.change_detection import Change, ChangeDetector
-from monitor.estimation.detection.motion_detection import Motion, Rest
+from monitor.estimation.detection.motion_detection import Motion, MotionDetector
 
-OTHER_RATE: Final = 0.02
+MAX_RATE_CHANGE: Final = 0.02
 """Relative change of the sample rate below which the detectors continue. Blocks of a quarter of a second stay valid."""
 MAX_SKIPPED_SAMPLES: Final = 10_000_000
 """Largest gap that the change detector processes as missing samples, which takes 1.6 s.
@@ -29,7 +29,7 @@ class Restart:
     samples: int  # number of newest samples that belong to the new noise, including missing ones
 
 
-class Watch:
+class SignalMonitor:
     """Motion and change detection for one device.
 
     Parameters
@@ -72,9 +72,9 @@ class Watch:
         """Number of samples in motion so far."""
         return self._moved_before + self._rest.moved_samples
 
-    def relabel(self, rate_hz: float) -> None:
+    def set_rate(self, rate_hz: float) -> None:
         """Set a more accurate sample rate. If it differs by more than ``OTHER_RATE``, the detectors start again."""
-        if abs(rate_hz / self._rate_hz - 1.0) > OTHER_RATE:
+        if abs(rate_hz / self._rate_hz - 1.0) > MAX_RATE_CHANGE:
             self._pending = self.flush()
             self._moved_before += self._rest.moved_samples
             self._rate_hz = rate_hz
@@ -104,7 +104,7 @@ class Watch:
         restarts, self._restarts = self._restarts, []
         return restarts
 
-    def take_still(self) -> list[SampleBlock]:
+    def take_samples_at_rest(self) -> list[SampleBlock]:
         """Return the decided samples since the last call, with those in motion removed; they are 0.5 s late."""
         still, self._still = self._still, []
         return still
@@ -112,7 +112,7 @@ class Watch:
     def _begin(self) -> None:
         """Start new detectors at the current rate."""
         self._began = self._received
-        self._rest = Rest(self._rate_hz)
+        self._rest = MotionDetector(self._rate_hz)
         self._first = 0  # index since then of the first sample that the change detector received
         self._changes = self._detector() if self._alarms_per_day > 0.0 else None
 

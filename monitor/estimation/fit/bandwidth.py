@@ -21,10 +21,10 @@ import numpy as np
 from drivers.sample import Floats, Ints
 from monitor.common.minimization import golden_section
 from monitor.estimation.allan.batch import MIN_PRESENT_SHARE
-from monitor.estimation.allan.uncertainty import Table
+from monitor.estimation.allan.uncertainty import CovarianceTable
 from monitor.estimation.fit.coefficient_fit import Design, Fit, MeasuredCurve, fit_columns, replace_axis
 from monitor.estimation.fit.coefficients import Status
-from monitor.estimation.fit.confidence_bounds import BOUND, highest
+from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, upper_limit
 from monitor.estimation.fit.least_squares import N, Q
 
 Kind = Literal["digital", "sampled"]
@@ -117,7 +117,7 @@ def _autocovariance_sums(kind: Kind, order: int, cutoff: float) -> tuple[Floats,
     return level / level[-1], first / level[-1]
 
 
-def power(rates: Floats) -> Floats:
+def power_spectrum(rates: Floats) -> Floats:
     """Return the spectrum [POWER_BINS + 1] of one axis [n] in arbitrary units, or an empty array without enough data.
 
     The spectrum is the mean over stretches that are spread over the samples and have few missing ones.
@@ -135,7 +135,7 @@ def power(rates: Floats) -> Floats:
     return np.asarray((turned.real**2 + turned.imag**2).mean(axis=0))
 
 
-def seen(low_pass: LowPass, power: Floats) -> bool:
+def is_in_spectrum(low_pass: LowPass, power: Floats) -> bool:
     """Return True if a spectrum falls beyond the cutoff as expected behind the filter.
 
     Medians are compared, so that spectral lines do not matter.
@@ -160,7 +160,7 @@ def seen(low_pass: LowPass, power: Floats) -> bool:
 
 
 def with_bandwidth(
-    design: Design, table: Table, measured: MeasuredCurve, found: Fit, filters: Sequence[LowPass | None]
+    design: Design, table: CovarianceTable, measured: MeasuredCurve, found: Fit, filters: Sequence[LowPass | None]
 ) -> tuple[Fit, list[LowPass | None]]:
     """Replace the fit of each contradicted axis by a fit with its low-pass, if the low-pass explains the curve.
 
@@ -198,7 +198,7 @@ def with_bandwidth(
 def _bound_q(design: Design, found: Fit, measured: MeasuredCurve) -> None:
     """Bound Q of a single-axis fit by the whole first point, because a fit with a filter cannot determine it."""
     c, first = found.coefficients, int(np.argmax(measured.avar[:, 0] > 0.0))
-    most = highest(measured.avar[first, 0], found.edf[first, 0], BOUND) / design.columns[first, Q]
+    most = upper_limit(measured.avar[first, 0], found.edf[first, 0], UPPER_BOUND_Z) / design.columns[first, Q]
     if np.isfinite(most):
         c.status[Q], c.lo[Q], c.hi[Q] = Status.UPPER_BOUND, 0.0, most**0.5 / design.rate_hz
 
@@ -216,7 +216,7 @@ def is_contradicted(found: Fit, axis: int) -> bool:
     return bool(found.left_out[axis] > 0 or found.theta[0, axis] < 0.0 or found.misfit[axis] > 1.0)
 
 
-def find_low_pass(design: Design, table: Table, measured: MeasuredCurve, power: Floats) -> LowPass | None:
+def find_low_pass(design: Design, table: CovarianceTable, measured: MeasuredCurve, power: Floats) -> LowPass | None:
     """Return the low-pass with the smallest misfit for a single axis, or None if none explains its curve.
 
     Parameters
@@ -240,7 +240,7 @@ def find_low_pass(design: Design, table: Table, measured: MeasuredCurve, power: 
 
 
 def search_low_pass(
-    design: Design, table: Table, measured: MeasuredCurve, power: Floats
+    design: Design, table: CovarianceTable, measured: MeasuredCurve, power: Floats
 ) -> Generator[None, None, LowPass | None]:
     """Search as ``find_low_pass`` in steps of a few milliseconds, for callers that must not block.
 
@@ -282,7 +282,7 @@ def search_low_pass(
         found.append((least, LowPass(kind, order, float(np.exp(log_cutoff)))))
         yield
     least, low_pass = min(found, key=lambda one: one[0])
-    return low_pass if least < MAX_SCATTER and seen(low_pass, power) else None
+    return low_pass if least < MAX_SCATTER and is_in_spectrum(low_pass, power) else None
 
 
 def yield_in_pieces(search: Generator[None, None, tuple[float, float]]) -> Generator[None, None, tuple[float, float]]:
@@ -306,7 +306,7 @@ def _with_noise_column(design: Design, column: Floats) -> Design:
     return replace(design, columns=columns)
 
 
-def _fit_low_pass(design: Design, table: Table, measured: MeasuredCurve, low_pass: LowPass) -> Fit:
+def _fit_low_pass(design: Design, table: CovarianceTable, measured: MeasuredCurve, low_pass: LowPass) -> Fit:
     """Return the fit with this filter, with the direction of a change of its cutoff projected out."""
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
     up, down = (

@@ -31,11 +31,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
-from monitor.estimation.allan.uncertainty import NOISES, Table
+from monitor.estimation.allan.uncertainty import NOISES, CovarianceTable
 from monitor.estimation.fit.coefficients import Coefficients, Status
 from monitor.estimation.fit.fit_kernel import WHITE, fit_axes
 from monitor.estimation.fit.least_squares import N, R
-from monitor.estimation.fit.term_selection import SharedInputs, answer, gains
+from monitor.estimation.fit.term_selection import SharedInputs, empty_fit_output, empty_gains
 from monitor.noise.effect import Source
 from monitor.noise.effects.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.bias_instability import BiasInstability
@@ -105,7 +105,9 @@ def design(factors: Ints, rate_hz: float) -> Design:
     return Design(factors, rate_hz, columns)
 
 
-def shared_inputs(design: Design, table: Table, blind: Floats | None = None, ask: bool = True) -> SharedInputs:
+def shared_inputs(
+    design: Design, table: CovarianceTable, blind: Floats | None = None, ask: bool = True
+) -> SharedInputs:
     """Return the inputs that are the same for every fit at one window length.
 
     Parameters
@@ -147,7 +149,7 @@ class MeasuredCurve:
 
 def fit(
     design: Design,
-    table: Table,
+    table: CovarianceTable,
     avar: Floats,
     terms: Ints,
     before: NDArray[np.bool_] | None = None,
@@ -189,7 +191,7 @@ def fit(
 
 
 def fit_columns(
-    design: Design, table: Table, measured: MeasuredCurve, full: bool = False, blind: Floats | None = None
+    design: Design, table: CovarianceTable, measured: MeasuredCurve, full: bool = False, blind: Floats | None = None
 ) -> Fit:
     """Fit with the columns exactly as given, without leaving out any τ.
 
@@ -211,13 +213,20 @@ def fit_columns(
 
 
 def _fit(
-    design: Design, table: Table, measured: MeasuredCurve, shared: SharedInputs, full: bool, start: Floats | None = None
+    design: Design,
+    table: CovarianceTable,
+    measured: MeasuredCurve,
+    shared: SharedInputs,
+    full: bool,
+    start: Floats | None = None,
 ) -> Fit:
     """Run the compiled fit and convert its results to SI."""
     avar, terms, before = measured.avar, measured.terms, measured.before
     m, axes = avar.shape
-    found = answer(axes, m, np.zeros((axes, 5), np.bool_) if before is None else np.array(before.T, order="C"))
-    frozen = gains(axes, m)
+    found = empty_fit_output(
+        axes, m, np.zeros((axes, 5), np.bool_) if before is None else np.array(before.T, order="C")
+    )
+    frozen = empty_gains(axes, m)
     if start is not None:
         found.theta[:] = start.T / design.rate_hz ** (2.0 * TO_SI)
     curves, counts = np.ascontiguousarray(avar.T), np.ascontiguousarray(terms.T, np.float64)
@@ -281,7 +290,7 @@ def concatenate_fits(fits: Sequence[Fit], axes: Ints) -> Fit:
     return Fit(coefficients, **{name: side_by_side(name) for name in PER_AXIS_FIELDS})
 
 
-def nothing_fitted(avar: Floats) -> Fit:
+def empty_fit(avar: Floats) -> Fit:
     """Return the result for a curve [m, 6] that has not been fitted: every coefficient is unestimated."""
     nothing = np.full((5, avar.shape[1]), np.nan)
     status = np.full((5, avar.shape[1]), Status.UNESTIMATED, np.int8)
@@ -324,7 +333,7 @@ def slope_of_thirds(phase: Floats, seconds: float) -> Floats:
     return np.asarray((phase[3] - phase[2] - phase[1] + phase[0]) / (2.0 / 9.0 * seconds**2))
 
 
-def _white_edf(design: Design, table: Table, terms: Ints) -> Floats:
+def _white_edf(design: Design, table: CovarianceTable, terms: Ints) -> Floats:
     """Return the degrees of freedom for white noise, used until there is a fit.
 
     A sensor shows white noise in its first seconds.

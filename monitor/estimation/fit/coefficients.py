@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from drivers.sample import Floats
 
-LETTERS: Final = ("Q", "N", "B", "K", "R")
+SYMBOLS: Final = ("Q", "N", "B", "K", "R")
 """Symbols of the coefficients in the order of their rows.
 
 They denote quantization noise, angle random walk, bias instability, rate random walk and rate ramp.

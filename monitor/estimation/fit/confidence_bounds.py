@@ -9,20 +9,20 @@ from monitor.estimation.fit.least_squares import N, Q
 
 TWO_SIDED_95: Final = 1.959963984540054
 """Quantile of the normal distribution for a two-sided probability of 95 %."""
-BOUND: Final = TWO_SIDED_95
+UPPER_BOUND_Z: Final = TWO_SIDED_95
 """Quantile of an upper bound.
 
 It gives 97.5 % for a single fit. It still gives 95 % of the reported bounds when large terms are estimated instead and
 their intervals miss as well.
 """
 
-SURELY: Final = 3.3
+EXCLUSION_SIGMA: Final = 3.3
 """Distance in σ by which a curve lies below a term that it does not contain.
 
 With 20 τ, none is that far off by chance in 99 of 100 cases.
 """
 
-LEAST_SHRUNK: Final = 0.05
+MIN_CUBE_ROOT_FACTOR: Final = 0.05
 """Minimum factor of the cube root of χ². Below it (under two degrees of freedom) a measured variance gives no bound."""
 
 
@@ -72,7 +72,7 @@ def interval_end(estimate, c0, c1, c2, skewness, z):  # type: ignore[no-untyped-
 
 
 @compiled
-def cap(  # type: ignore[no-untyped-def]
+def limit_by_curve(  # type: ignore[no-untyped-def]
     curve, edf, rows, columns, memory, entered, theta, lo, hi, status
 ):
     """Limit the coefficients of a curve that the five terms do not describe: none may exceed the whole curve at any τ.
@@ -96,7 +96,7 @@ def cap(  # type: ignore[no-untyped-def]
         most = np.inf
         for i in rows:
             if columns[i, a] > 0.0 and (a != N or columns[i, N] * memory < 1.0):
-                most = min(most, highest(curve[i], edf[i], SURELY) / columns[i, a])
+                most = min(most, upper_limit(curve[i], edf[i], EXCLUSION_SIGMA) / columns[i, a])
         most = np.sqrt(most)
         if status[a] == 0 or hi[a] <= most:
             continue
@@ -106,7 +106,7 @@ def cap(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def highest(avar, edf, z):  # type: ignore[no-untyped-def]
+def upper_limit(avar, edf, z):  # type: ignore[no-untyped-def]
     """Return the upper limit of the true variance at z σ (Wilson & Hilferty); infinite with too few degrees of freedom.
 
     Parameters
@@ -120,7 +120,7 @@ def highest(avar, edf, z):  # type: ignore[no-untyped-def]
     """
     spread = 2.0 / (9.0 * max(edf, 1.0))
     shrunk = 1.0 - spread - z * np.sqrt(spread)
-    return avar / shrunk**3 if shrunk > LEAST_SHRUNK else np.inf
+    return avar / shrunk**3 if shrunk > MIN_CUBE_ROOT_FACTOR else np.inf
 
 
 @compiled
@@ -139,4 +139,4 @@ def bound_by_first_point(avar, edf, column, entered, lo, hi, status):  # type: i
     entered[Q] = False
     status[Q] = 1
     lo[Q] = 0.0
-    hi[Q] = np.sqrt(highest(avar, edf, BOUND) / column)
+    hi[Q] = np.sqrt(upper_limit(avar, edf, UPPER_BOUND_Z) / column)

@@ -28,25 +28,32 @@ from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.estimation.allan.uncertainty import NOISES, UNLIMITED_SAMPLES, AxisTables, Table
+from monitor.estimation.allan.uncertainty import NOISES, UNLIMITED_SAMPLES, AxisCovarianceTables, CovarianceTable
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.allan.window_kernel import (
     AXES,
     LANES,
     NEWEST,
-    STAGE,
+    STAGE_SAMPLES,
     TOTAL,
     advance,
     cut_floats,
     cut_ints,
-    mean_bend,
-    thirds,
+    mean_second_difference,
+    slope_of_thirds,
 )
 from monitor.estimation.fit.coefficient_fit import THRESHOLDS_WATCHED, TO_SI, Design, shared_inputs
 from monitor.estimation.fit.coefficients import Status
 from monitor.estimation.fit.fit_kernel import fit_axes
-from monitor.estimation.fit.least_squares import Q, R, invert, present, solve_nonnegative
-from monitor.estimation.fit.term_selection import NUMBERS, Answer, Gains, SharedInputs, answer, gains
+from monitor.estimation.fit.least_squares import Q, R, invert, nonzero_terms, solve_nonnegative
+from monitor.estimation.fit.term_selection import (
+    LIMIT_COUNT,
+    FitOutput,
+    Gains,
+    SharedInputs,
+    empty_fit_output,
+    empty_gains,
+)
 
 REFRESH: Final = 2
 """Minimum number of times that the gains are recomputed within one window length."""
@@ -60,7 +67,7 @@ The gains cannot detect that a band limit, a spectral line or a transient has di
 U0, U1, U2, U3 = (np.uintp(a) for a in range(NOISES))
 
 
-class Refit:
+class ContinuousRefit:
     """Coefficients of a window, updated with every sample.
 
     Parameters
@@ -73,7 +80,7 @@ class Refit:
         Covariances of these rows, for the length of each axis.
     """
 
-    def __init__(self, window: AllanWindow, rows: int, tables: AxisTables) -> None:
+    def __init__(self, window: AllanWindow, rows: int, tables: AxisCovarianceTables) -> None:
         self._window, self._rows, self._tables = window, rows, tables
         self._curve, self._terms, self._slopes = np.zeros((3, AXES, rows))
         self._slope = np.zeros(AXES)
@@ -82,9 +89,9 @@ class Refit:
 
     def reset(self) -> None:
         """Restart the fit of all axes, without any term."""
-        self._answer: Answer = answer(AXES, self._rows, np.zeros((AXES, 5), np.bool_))
-        self._gains: Gains = gains(AXES, self._rows)
-        self._used: list[Table | None] = [None] * AXES  # tables from which ``_known`` was computed
+        self._answer: FitOutput = empty_fit_output(AXES, self._rows, np.zeros((AXES, 5), np.bool_))
+        self._gains: Gains = empty_gains(AXES, self._rows)
+        self._used: list[CovarianceTable | None] = [None] * AXES  # tables from which ``_known`` was computed
         self._known: list[SharedInputs] = []
 
     def restart(self, axis: int) -> None:
@@ -116,8 +123,8 @@ class Refit:
             Coefficients in SI; NaN where not estimated.
         """
         course = np.empty((len(values), 5, AXES))
-        for start in range(0, len(values), STAGE):
-            self._advance(design, values[start : start + STAGE], lengths, course[start : start + STAGE])
+        for start in range(0, len(values), STAGE_SAMPLES):
+            self._advance(design, values[start : start + STAGE_SAMPLES], lengths, course[start : start + STAGE_SAMPLES])
         return course
 
     def _advance(self, design: Design, values: Floats, lengths: Ints, course: Floats) -> None:
@@ -129,7 +136,7 @@ class Refit:
             until = done + min(len(values) - done, self._find_tables(design, lengths))
             while done < until:
                 done, due = _follow(
-                    self._window.parts(), done, until, lengths, to_si, self._answer, self._gains, self._ages,
+                    self._window.kernel_arrays(), done, until, lengths, to_si, self._answer, self._gains, self._ages,
                     self._curve, self._terms, self._slope, self._slopes, course,
                 )  # fmt: skip
                 if due:
@@ -157,7 +164,7 @@ class Refit:
                 self._used[axis] = table
                 self._request_fit(axis)
                 self._known[axis : axis + 1] = [shared_inputs(design, table)]
-            lasts = min(lasts, tables.lasts(n))
+            lasts = min(lasts, tables.valid_for(n))
         return lasts
 
     def _request_fit(self, axis: int) -> None:
@@ -191,7 +198,7 @@ def _follow(  # type: ignore[no-untyped-def]
         filled = min(state[TOTAL], window)
         for axis in range(AXES):
             lengths[axis] = min(lengths[axis] + 1, filled)
-            slope[axis] = thirds(phase, missing, state[NEWEST], lengths[axis], axis) / scaling[axis]
+            slope[axis] = slope_of_thirds(phase, missing, state[NEWEST], lengths[axis], axis) / scaling[axis]
         _project(
             units, inverse, terms, counts, sums, rest, slope, gains.rows, gains.ramp, gains.twist, gains.used, right
         )
@@ -210,7 +217,7 @@ def _follow(  # type: ignore[no-untyped-def]
                     inverse[axis, i] = 1.0 / (units[axis, i] * counts[at])
                     # as in AllanWindow.avar, a constant axis has no noise
                     curve[axis, i] = total * inverse[axis, i] if total > counts[at] else 0.0
-                    bend = mean_bend(phase, missing, state[NEWEST], lengths[axis], factors[i], axis)
+                    bend = mean_second_difference(phase, missing, state[NEWEST], lengths[axis], factors[i], axis)
                     slopes[axis, i] = bend / scaling[axis]
                 due |= 1 << axis
                 ages[axis] = 0
@@ -259,7 +266,9 @@ def _settle(  # type: ignore[no-untyped-def]
             continue
         s = slope[axis]
         measured = s == s
-        holds = measured == straight[axis] and (not measured or low[axis, NUMBERS] <= abs(s) <= high[axis, NUMBERS])
+        holds = measured == straight[axis] and (
+            not measured or low[axis, LIMIT_COUNT] <= abs(s) <= high[axis, LIMIT_COUNT]
+        )
         same = True
         for a in range(np.uintp(NOISES)):
             x, u = 0.0, 0.0
@@ -282,7 +291,7 @@ def _settle(  # type: ignore[no-untyped-def]
                 same = same and pull <= 1e-9 * abs(right[axis, a])
         if holds and not same:
             solve_nonnegative(normal[axis], right[axis], free[axis], theta[axis])
-            invert(normal[axis], present(theta[axis]), inverse[axis])
+            invert(normal[axis], nonzero_terms(theta[axis]), inverse[axis])
         for a in range(np.uintp(NOISES)):
             holds = holds and low[axis, a] <= theta[axis, a] <= high[axis, a]
         theta[axis, R] = s * s if entered[axis, R] else 0.0

@@ -14,26 +14,35 @@ import numpy as np
 
 from monitor.common.compiled import compiled
 from monitor.estimation.allan.uncertainty import NOISES, PAIRS
-from monitor.estimation.fit.confidence_bounds import bound_by_first_point, cap
-from monitor.estimation.fit.least_squares import K, N, Q, R, normal_equations, solve_nonnegative, variances, weigh
-from monitor.estimation.fit.term_selection import freeze, judge, judge_ramp, sharpen
+from monitor.estimation.fit.confidence_bounds import bound_by_first_point, limit_by_curve
+from monitor.estimation.fit.least_squares import (
+    K,
+    N,
+    Q,
+    R,
+    normal_equations,
+    solve_nonnegative,
+    variances,
+    weight_columns,
+)
+from monitor.estimation.fit.term_selection import select_ramp, select_terms, store_linear_map, tighten_bounds
 
 MIN_ROWS: Final = NOISES + 1
 """Minimum number of τ. With fewer τ, a fit has no degree of freedom left to be contradicted."""
 
-PASSES: Final = 3
+COLD_PASSES: Final = 3
 """Number of re-weightings from scratch. More passes move no coefficient by a tenth of its standard deviation."""
 
 WARM_PASSES: Final = 1
 """Number of re-weightings from the coefficients of a recent fit."""
 
-MISFIT: Final = 4.0
+MISFIT_SIGMA: Final = 4.0
 """Distance in σ from which a short τ contradicts the fit."""
 
-MISFIT_AGAIN: Final = 2.5
+REPEATED_MISFIT_SIGMA: Final = 2.5
 """Same threshold after a contradiction, so that the remaining effect of a band limit does not bias N."""
 
-MISFIT_OF_ALL: Final = 6.0
+TOTAL_MISFIT_SIGMA: Final = 6.0
 """Standard deviations of χ² per τ beyond which the five terms do not describe the curve."""
 
 SHORT_ROWS: Final = 4
@@ -110,17 +119,17 @@ def fit_axis(  # type: ignore[no-untyped-def]
     for a in range(5):
         lo[a], hi[a], status[a] = np.nan, np.nan, 0
     misfit = scatter if scatter > limit else 1.0
-    found, c0, enters = judge(
+    found, c0, enters = select_terms(
         level, rows[first:], stretch, shared.covariance, weighted, normal, thresholds, straight, misfit,
         entered, theta, lo, hi, status,
     )  # fmt: skip
-    sharpen(level, rows[first:], stretch, flat, shared.covariance, misfit, found, c0, theta, hi, status)
+    tighten_bounds(level, rows[first:], stretch, flat, shared.covariance, misfit, found, c0, theta, hi, status)
     for a in range(5):
         if status[a] == 1 and not hi[a] < np.inf:  # the curve is too short for a bound
             status[a], lo[a], hi[a] = 0, np.nan, np.nan
     noise, most = 0.0, np.nan
     if straight:
-        noise, most = judge_ramp(slope, shared.slope_variance, thresholds, entered, theta, lo, hi, status)
+        noise, most = select_ramp(slope, shared.slope_variance, thresholds, entered, theta, lo, hi, status)
     # K is only bounded and the other terms do not explain the slope, or K is estimated without a measured slope
     others = noise - max(theta[K], 0.0) * shared.slope_variance[K]
     gains.either[axis] = (
@@ -132,12 +141,14 @@ def fit_axis(  # type: ignore[no-untyped-def]
     _draw(rows, first, theta, shared.columns, noise, variance, answer.fitted[axis], answer.edf[axis])
     answer.left_out[axis] = first
     answer.misfit[axis], answer.scatter[axis] = misfit, scatter
-    freeze(
+    store_linear_map(
         axis, rows[first:], weighted, normal, free, thresholds, found, c0, enters, most,
         shared.columns, slope, slopes, answer, gains,
     )  # fmt: skip
     if misfit > 1.0:
-        cap(curve, answer.edf[axis], rows[first:], shared.columns, FILTER_MEMORY, entered, theta, lo, hi, status)
+        limit_by_curve(
+            curve, answer.edf[axis], rows[first:], shared.columns, FILTER_MEMORY, entered, theta, lo, hi, status
+        )
     if free:
         i = rows[0]
         bound_by_first_point(curve[i], answer.edf[axis, i], shared.columns[i, Q], entered, lo, hi, status)
@@ -186,17 +197,17 @@ def _fit_terms(  # type: ignore[no-untyped-def]
     while True:
         used = rows[first:]
         if warm:
-            weigh(used, theta, covariance, stretch, columns, shared.blind, full, variance, weighted)
+            weight_columns(used, theta, covariance, stretch, columns, shared.blind, full, variance, weighted)
         else:
             for i in used:  # start with white noise of the level of the curve
                 variance[i] = avar[i] * avar[i] * covariance[i, i, WHITE] / columns[i, N] ** 2
                 for a in range(5):
                     weighted[i, a] = columns[i, a] / variance[i]
-        for _ in range(WARM_PASSES if warm else PASSES):
+        for _ in range(WARM_PASSES if warm else COLD_PASSES):
             normal_equations(level, used, columns, weighted, normal, right)
             solve_nonnegative(normal, right, free, theta)
-            weigh(used, theta, covariance, stretch, columns, shared.blind, full, variance, weighted)
-        limit = MISFIT_AGAIN if free else MISFIT
+            weight_columns(used, theta, covariance, stretch, columns, shared.blind, full, variance, weighted)
+        limit = REPEATED_MISFIT_SIGMA if free else MISFIT_SIGMA
         if not asking or not _contradicted(level, used[:SHORT_ROWS], theta, columns, variance, limit):
             break
         if not free:
@@ -228,7 +239,7 @@ def _misfit(level, rows, theta, columns, variance):  # type: ignore[no-untyped-d
             spread = variance[i] / (9.0 * model * model)
             total += ((max(level[i], 0.0) / model) ** (1.0 / 3.0) - 1.0 + spread) ** 2 / spread
     freedom = max(freedom, 1)
-    return total / freedom, 1.0 + MISFIT_OF_ALL * np.sqrt(2.0 / freedom)
+    return total / freedom, 1.0 + TOTAL_MISFIT_SIGMA * np.sqrt(2.0 / freedom)
 
 
 @compiled

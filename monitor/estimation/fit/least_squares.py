@@ -107,7 +107,7 @@ def whiten(rows, theta, covariance, stretch, columns, blind, variance, weighted)
 
 
 @compiled
-def weigh(rows, theta, covariance, stretch, columns, blind, full, variance, weighted):  # type: ignore[no-untyped-def]
+def weight_columns(rows, theta, covariance, stretch, columns, blind, full, variance, weighted):  # type: ignore[no-untyped-def]
     """Compute ``weighted`` = V⁻¹ columns with the covariance V of the τ under the model, or with its diagonal.
 
     Parameters
@@ -266,7 +266,7 @@ def solve(normal, right, subset, solution):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def present(theta):  # type: ignore[no-untyped-def]
+def nonzero_terms(theta):  # type: ignore[no-untyped-def]
     """Return the bit set of the terms that are not zero."""
     subset = 0
     for a in range(NOISES):

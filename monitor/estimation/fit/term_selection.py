@@ -13,19 +13,19 @@ from numpy.typing import NDArray
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.estimation.allan.uncertainty import NOISES
-from monitor.estimation.fit.confidence_bounds import BOUND, TWO_SIDED_95, interval_end, quantile
-from monitor.estimation.fit.least_squares import K, Q, R, invert, normal_equations, present, solve, weigh
+from monitor.estimation.fit.confidence_bounds import TWO_SIDED_95, UPPER_BOUND_Z, interval_end, quantile
+from monitor.estimation.fit.least_squares import K, Q, R, invert, nonzero_terms, normal_equations, solve, weight_columns
 
-MOVED: Final = 0.4
+MAX_THETA_CHANGE: Final = 0.4
 """Gains are recomputed when a θ has moved by this share (a coefficient by a fifth) and by more than its own scatter."""
 
-SCATTER: Final = 1.0
+MAX_THETA_SIGMA: Final = 1.0
 """Distance in σ that a θ may move before its gains are recomputed, if this is more than the share ``MOVED``."""
 
-JUST_SEEN: Final = 3.0
+DETECTABLE_SIGMA: Final = 3.0
 """Size in σ at which an absent term would be detected."""
 
-NUMBERS: Final = 2 * NOISES
+LIMIT_COUNT: Final = 2 * NOISES
 """Number of quantities with limits in ``Gains``: θ of Q N B K, then the unconstrained û of Q N B K."""
 
 
@@ -41,7 +41,7 @@ class SharedInputs(NamedTuple):
     ask: bool  # True to leave out short τ that contradict the fit
 
 
-class Answer(NamedTuple):
+class FitOutput(NamedTuple):
     """Results of a fit, one row per axis."""
 
     entered: NDArray[np.bool_]  # [axes, 5] terms in the fit; on input, the terms of the previous fit
@@ -76,7 +76,7 @@ class Gains(NamedTuple):
     either: NDArray[np.bool_]  # [axes] True if noise without K does not explain the slope: K or R
 
 
-def answer(axes: int, m: int, entered: NDArray[np.bool_]) -> Answer:
+def empty_fit_output(axes: int, m: int, entered: NDArray[np.bool_]) -> FitOutput:
     """Allocate the results of a fit.
 
     Parameters
@@ -91,10 +91,10 @@ def answer(axes: int, m: int, entered: NDArray[np.bool_]) -> Answer:
     theta, lo, hi = np.full((3, axes, 5), np.nan)
     edf, fitted = np.full((2, axes, m), np.nan)
     status, left_out = np.zeros((axes, 5), np.int8), np.zeros(axes, np.int64)
-    return Answer(entered, theta, lo, hi, status, edf, fitted, left_out, np.ones(axes), np.full(axes, np.inf))
+    return FitOutput(entered, theta, lo, hi, status, edf, fitted, left_out, np.ones(axes), np.full(axes, np.inf))
 
 
-def gains(axes: int, m: int) -> Gains:
+def empty_gains(axes: int, m: int) -> Gains:
     """Allocate gains that are not valid yet.
 
     Parameters
@@ -111,8 +111,8 @@ def gains(axes: int, m: int) -> Gains:
         np.zeros((axes, 5, 5)),
         np.zeros((axes, NOISES, NOISES)),
         np.zeros((axes, NOISES, NOISES)),
-        np.full((axes, NUMBERS + 1), np.inf),
-        np.full((axes, NUMBERS + 1), -np.inf),
+        np.full((axes, LIMIT_COUNT + 1), np.inf),
+        np.full((axes, LIMIT_COUNT + 1), -np.inf),
         np.zeros((axes, 2), np.int64),
         np.zeros(axes, np.bool_),
         np.zeros(axes, np.bool_),
@@ -121,7 +121,7 @@ def gains(axes: int, m: int) -> Gains:
 
 
 @compiled
-def judge(  # type: ignore[no-untyped-def]
+def select_terms(  # type: ignore[no-untyped-def]
     level, rows, stretch, covariance, weighted, normal, thresholds, straight, misfit,
     entered, theta, lo, hi, status,
 ):  # fmt: skip
@@ -186,12 +186,12 @@ def judge(  # type: ignore[no-untyped-def]
             # a bound tighter than the one from an estimate of zero would claim more than the curve supports
             status[a] = 1
             lo[a] = 0.0
-            hi[a] = interval_end(max(estimate[a], 0.0), c0, c1, c2, skewness, -BOUND)
+            hi[a] = interval_end(max(estimate[a], 0.0), c0, c1, c2, skewness, -UPPER_BOUND_Z)
     return estimate, absent, enters
 
 
 @compiled
-def sharpen(  # type: ignore[no-untyped-def]
+def tighten_bounds(  # type: ignore[no-untyped-def]
     level, rows, stretch, columns, covariance, misfit, found, c0, theta, hi, status
 ):
     """Recompute the bounds of absent terms with weights that suit a term just large enough to be detected.
@@ -221,14 +221,14 @@ def sharpen(  # type: ignore[no-untyped-def]
             continue
         for b in range(5):
             supposed[b] = theta[b]
-        supposed[a] = max(found[a], 0.0) + JUST_SEEN * np.sqrt(c0[a])
-        weigh(rows, supposed, covariance, stretch, columns, scratch, False, scratch, weights)
+        supposed[a] = max(found[a], 0.0) + DETECTABLE_SIGMA * np.sqrt(c0[a])
+        weight_columns(rows, supposed, covariance, stretch, columns, scratch, False, scratch, weights)
         normal_equations(level, rows, columns, weights, normal, right)
         if _row_of(a, rows, weights, normal, stretch, gain[0]):
             c = _variance_forms(a, a + 1, gain, rows, theta, covariance)[0]
             estimate = max(_estimate(gain[0], level, rows, stretch), 0.0)
             skewness = 2.0 * np.sqrt(c[2])
-            hi[a] = interval_end(estimate, misfit * c[0], misfit * c[1], c[2], skewness, -BOUND)
+            hi[a] = interval_end(estimate, misfit * c[0], misfit * c[1], c[2], skewness, -UPPER_BOUND_Z)
 
 
 @compiled
@@ -295,7 +295,7 @@ def _variance_forms(first, end, gain, rows, theta, covariance):  # type: ignore[
 
 
 @compiled
-def judge_ramp(slope, slope_variance, thresholds, entered, theta, lo, hi, status):  # type: ignore[no-untyped-def]
+def select_ramp(slope, slope_variance, thresholds, entered, theta, lo, hi, status):  # type: ignore[no-untyped-def]
     """Include R if the slope is larger than noise explains with K at the upper end of its interval.
 
     Parameters
@@ -326,12 +326,12 @@ def judge_ramp(slope, slope_variance, thresholds, entered, theta, lo, hi, status
     theta[R] = slope * slope if entered[R] else max(slope * slope - noise, 0.0)
     status[R] = 2 if entered[R] else 1
     lo[R] = max(abs(slope) - TWO_SIDED_95 * np.sqrt(most), 0.0) if entered[R] else 0.0
-    hi[R] = abs(slope) + (TWO_SIDED_95 if entered[R] else BOUND) * np.sqrt(most)
+    hi[R] = abs(slope) + (TWO_SIDED_95 if entered[R] else UPPER_BOUND_Z) * np.sqrt(most)
     return noise, most
 
 
 @compiled
-def freeze(  # type: ignore[no-untyped-def]
+def store_linear_map(  # type: ignore[no-untyped-def]
     axis, rows, weighted, normal, free, thresholds, found, c0, enters, most, columns, slope, slopes, answer, gains
 ):
     """Store the solution as a linear map with the limits of its validity.
@@ -370,7 +370,9 @@ def freeze(  # type: ignore[no-untyped-def]
     for a in range(5):
         for b in range(5):
             gains.normal[axis, a, b] = normal[a, b]
-    if not invert(normal, 2**NOISES - 1, gains.whole[axis]) or not invert(normal, present(theta), gains.inverse[axis]):
+    if not invert(normal, 2**NOISES - 1, gains.whole[axis]) or not invert(
+        normal, nonzero_terms(theta), gains.inverse[axis]
+    ):
         return
     for a in range(NOISES):
         gains.ramp[axis, a] = gains.twist[axis, a] = 0.0
@@ -379,18 +381,18 @@ def freeze(  # type: ignore[no-untyped-def]
             if gains.straight[axis]:
                 gains.ramp[axis, a] += weighted[i, a] * columns[i, R]
                 gains.twist[axis, a] += weighted[i, a] * columns[i, R] * 2.0 * (slopes[axis, i] - slope)
-        reach = max(MOVED * abs(theta[a]), SCATTER * np.sqrt(c0[a]))
+        reach = max(MAX_THETA_CHANGE * abs(theta[a]), MAX_THETA_SIGMA * np.sqrt(c0[a]))
         low[a], high[a] = theta[a] - reach, theta[a] + reach
         # limits of û, at which the term would be added or dropped
         low[NOISES + a], high[NOISES + a] = -np.inf, np.inf
         if entered[a]:
             low[NOISES + a] = thresholds[1] * np.sqrt(c0[a])
         else:
-            high[NOISES + a] = max(enters[a], found[a] + SCATTER * np.sqrt(c0[a]))
-    low[NUMBERS], high[NUMBERS] = 0.0, np.inf
+            high[NOISES + a] = max(enters[a], found[a] + MAX_THETA_SIGMA * np.sqrt(c0[a]))
+    low[LIMIT_COUNT], high[LIMIT_COUNT] = 0.0, np.inf
     if entered[R]:
-        low[NUMBERS] = thresholds[1] * np.sqrt(most)
+        low[LIMIT_COUNT] = thresholds[1] * np.sqrt(most)
     elif status[K] > 0 and most == most:
-        high[NUMBERS] = thresholds[0] * np.sqrt(most)
+        high[LIMIT_COUNT] = thresholds[0] * np.sqrt(most)
     gains.free[axis] = free
     gains.used[axis, 0], gains.used[axis, 1] = rows[0], rows[-1] + 1

@@ -32,7 +32,7 @@ from monitor.noise.effects.temperature_bias import TemperatureBias
 from monitor.noise.effects.temperature_lag import TemperatureLag
 from monitor.noise.effects.turn_on_transient import TurnOnTransient
 
-ORDER: Final[tuple[type[Transform], ...]] = (
+TRANSFORM_ORDER: Final[tuple[type[Transform], ...]] = (
     ScaleFactor,
     BandwidthLimit,
     SampleRateError,
@@ -63,14 +63,14 @@ _ALL: Final[tuple[type[Effect], ...]] = (
     NoiseStep,
     GSensitivity,
     CrossAxis,
-    *ORDER,
+    *TRANSFORM_ORDER,
 )
 EFFECTS: Final[dict[str, type[Effect]]] = {effect.name: effect for effect in _ALL}
 """Name of an effect in model files -> its class."""
 
 __all__ = [
     "EFFECTS",
-    "ORDER",
+    "TRANSFORM_ORDER",
     "AngleRandomWalk",
     "BandwidthLimit",
     "Bias",

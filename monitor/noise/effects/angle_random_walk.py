@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Block, Series, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +20,7 @@ class AngleRandomWalk(Source):
     N: float = parameter("rad/√s", "m/s/√s")
 
     name: ClassVar[str] = "angle_random_walk"
-    means: ClassVar[str] = "White noise of the rate: averaging four times as long halves it."
+    description: ClassVar[str] = "White noise of the rate: averaging four times as long halves it."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """Return the Allan variance N²/τ."""
@@ -35,14 +35,14 @@ class AngleRandomWalk(Source):
         return _White(self.N * rate_hz**0.5, rng)
 
 
-class _White(Series):
+class _White(NoiseSeries):
     """Series of independent Gaussian samples."""
 
     def __init__(self, deviation: float, rng: np.random.Generator) -> None:
         self._deviation = deviation
         self._rng = rng
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         white = self._rng.standard_normal(out=block.scratch)
         white *= self._deviation
         values += white

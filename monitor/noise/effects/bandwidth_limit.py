@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Running, Transform, below_nyquist, parameter
+from monitor.noise.effect import RunningTransform, Transform, check_below_nyquist, parameter
 from monitor.noise.spectrum import Spectrum
 
 
@@ -27,13 +27,13 @@ class BandwidthLimit(Transform):
     order: int = parameter("1", "1", positive=True, whole=True, most=8)
 
     name: ClassVar[str] = "bandwidth_limit"
-    means: ClassVar[str] = "The sensor's own filter lets slow motion through and damps what is fast, noise too."
+    description: ClassVar[str] = "The sensor's own filter lets slow motion through and damps what is fast, noise too."
 
     def check_rate(self, rate_hz: float) -> None:
         """Raise ConfigError if the cutoff is not below half the sample rate."""
-        below_nyquist(self, "cutoff", rate_hz)
+        check_below_nyquist(self, "cutoff", rate_hz)
 
-    def reshape(self, spectrum: Spectrum) -> Spectrum:
+    def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum times |H|²."""
         tau0_s = spectrum.tau0_s
         corner = np.tan(np.pi * self.cutoff * tau0_s)
@@ -45,8 +45,8 @@ class BandwidthLimit(Transform):
 
         return spectrum.filtered(gain)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> Running:
+    def start(self, rate_hz: float, rng: np.random.Generator) -> RunningTransform:
         """Return the filter, which settles at the first sample."""
-        from monitor.noise.low_pass import LowPass, butterworth  # imports Numba, which only simulation needs
+        from monitor.noise.low_pass import LowPass, butterworth_sections  # imports Numba, which only simulation needs
 
-        return LowPass(butterworth(int(self.order), self.cutoff, rate_hz))
+        return LowPass(butterworth_sections(int(self.order), self.cutoff, rate_hz))

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Block, Series, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
 from monitor.noise.spectrum import Spectrum
 
 
@@ -21,7 +21,7 @@ class Bias(Source):
     value: float = parameter("rad/s", "m/s²", signed=True)
 
     name: ClassVar[str] = "bias"
-    means: ClassVar[str] = "What the sensor reads when it should read zero."
+    description: ClassVar[str] = "What the sensor reads when it should read zero."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """Return zero for every τ."""
@@ -40,11 +40,11 @@ class Bias(Source):
         return _Constant(self.value)
 
 
-class _Constant(Series):
+class _Constant(NoiseSeries):
     """Series of one value."""
 
     def __init__(self, value: float) -> None:
         self._value = value
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         values += self._value

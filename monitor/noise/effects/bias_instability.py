@@ -15,7 +15,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import Block, Series, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
 
 # fmt: off
 ONE_MINUS_POLE: Final = np.array([
@@ -53,7 +53,7 @@ class BiasInstability(Source):
     B: float = parameter("rad/s", "m/s²")
 
     name: ClassVar[str] = "bias_instability"
-    means: ClassVar[str] = "Slow flicker of the bias: the floor that no averaging gets below."
+    description: ClassVar[str] = "Slow flicker of the bias: the floor that no averaging gets below."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """Return the Allan variance (2 ln 2/π) B².
@@ -83,7 +83,7 @@ def _sampled_allan_variance(m: Floats) -> Floats:
     return integral
 
 
-class _Flicker(Series):
+class _Flicker(NoiseSeries):
     """Series of the filter in partial fractions: y = direct·w + Σ residue·s, s ← pole·s + w."""
 
     def __init__(self, B: float, rng: np.random.Generator) -> None:
@@ -96,7 +96,7 @@ class _Flicker(Series):
         overlap = ONE_MINUS_POLE[:, None] + ONE_MINUS_POLE - ONE_MINUS_POLE[:, None] * ONE_MINUS_POLE
         self._states = np.linalg.cholesky(1.0 / overlap) @ rng.standard_normal(ONE_MINUS_POLE.size)
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         white = self._rng.standard_normal(out=block.scratch)
         _add_flicker_noise(values, white, self._states, self._poles, self._residues, self._direct)
 

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Block, Series, Source, first_sample, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, first_sample, parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class BiasStep(Source):
     height: float = parameter("rad/s", "m/s²", signed=True)
 
     name: ClassVar[str] = "bias_step"
-    means: ClassVar[str] = "The bias jumps once and stays there, as after a knock."
+    description: ClassVar[str] = "The bias jumps once and stays there, as after a knock."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """Return NaN, because the Allan variance depends on the length of the recording."""
@@ -38,11 +38,11 @@ class BiasStep(Source):
         return _Step(first_sample(self.time, rate_hz), self.height)
 
 
-class _Step(Series):
+class _Step(NoiseSeries):
     """Series with one step at a sample index."""
 
     def __init__(self, index: int, height: float) -> None:
         self._index, self._height = index, height
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         values[max(0, self._index - block.first) :] += self._height

@@ -21,7 +21,7 @@ class CrossAxis(Leak):
     coefficient: float = parameter("1", "1", signed=True)
 
     name: ClassVar[str] = "cross_axis"
-    means: ClassVar[str] = "The axis is not square to its neighbour and reads a little of it."
+    description: ClassVar[str] = "The axis is not square to its neighbour and reads a little of it."
 
     def check_axis(self, axis: str) -> None:
         """Raise ConfigError if the source is the same axis or an axis of the other kind."""

@@ -8,7 +8,7 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
 from monitor.noise import gauss_markov
-from monitor.noise.effect import Block, Series, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class ExponentiallyCorrelated(Source):
     correlation_time: float = parameter("s", "s", positive=True)
 
     name: ClassVar[str] = "exponentially_correlated"
-    means: ClassVar[str] = "The bias wanders and comes back, and forgets where it was after a correlation time."
+    description: ClassVar[str] = "The bias wanders and comes back, and forgets where it was after a correlation time."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """Return the Allan variance by the closed form of the class docstring."""
@@ -44,7 +44,7 @@ class ExponentiallyCorrelated(Source):
         return _GaussMarkov(self.sigma, 1.0 / (self.correlation_time * rate_hz), rng)
 
 
-class _GaussMarkov(Series):
+class _GaussMarkov(NoiseSeries):
     """Series of the recursion x ← φx + σ√(1 − φ²) w."""
 
     def __init__(self, sigma: float, step: float, rng: np.random.Generator) -> None:
@@ -53,7 +53,7 @@ class _GaussMarkov(Series):
         self._drive = sigma * float(np.sqrt(-np.expm1(-2.0 * step)))
         self._state = sigma * float(rng.standard_normal())
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         white = self._rng.standard_normal(out=block.scratch)
         self._state = _add_gauss_markov(values, white, self._phi, self._drive, self._state)
 

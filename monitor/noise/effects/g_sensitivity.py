@@ -22,7 +22,7 @@ class GSensitivity(Leak):
     coefficient: float = parameter("rad/s per m/s²", "1", signed=True)
 
     name: ClassVar[str] = "g_sensitivity"
-    means: ClassVar[str] = "The gyroscope feels acceleration: gravity and vibration shift its reading."
+    description: ClassVar[str] = "The gyroscope feels acceleration: gravity and vibration shift its reading."
 
     def check_axis(self, axis: str) -> None:
         """Raise ConfigError if the axis is not a gyroscope, or the source not an accelerometer."""

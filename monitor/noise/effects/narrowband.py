@@ -9,7 +9,7 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
 from monitor.noise import gauss_markov
-from monitor.noise.effect import Block, Series, Source, below_nyquist, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, check_below_nyquist, parameter
 from monitor.noise.spectrum import Spectrum
 
 
@@ -32,11 +32,11 @@ class Narrowband(Source):
     bandwidth: float = parameter("Hz", "Hz", positive=True)
 
     name: ClassVar[str] = "narrowband"
-    means: ClassVar[str] = "Something near rings at its own frequency, with an amplitude that comes and goes."
+    description: ClassVar[str] = "Something near rings at its own frequency, with an amplitude that comes and goes."
 
     def check_rate(self, rate_hz: float) -> None:
         """Raise ConfigError if the frequency is not below half the sample rate."""
-        below_nyquist(self, "frequency", rate_hz)
+        check_below_nyquist(self, "frequency", rate_hz)
 
     @property
     def _decay(self) -> complex:
@@ -60,7 +60,7 @@ class Narrowband(Source):
         return _Ringing(self.sigma, self._decay / rate_hz, rng)
 
 
-class _Ringing(Series):
+class _Ringing(NoiseSeries):
     """Series of the real part of complex first-order noise."""
 
     def __init__(self, sigma: float, step: complex, rng: np.random.Generator) -> None:
@@ -70,7 +70,7 @@ class _Ringing(Series):
         self._drive = sigma * float(np.sqrt(-np.expm1(-2.0 * step.real)))
         self._x, self._y = sigma * rng.standard_normal(2)
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         white = self._rng.standard_normal((values.size, 2))
         self._x, self._y = _add_resonance(values, white, self._cos, self._sin, self._drive, self._x, self._y)
 

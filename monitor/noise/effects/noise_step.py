@@ -21,4 +21,4 @@ class NoiseStep(Effect):
     ratio: float = parameter("1", "1")
 
     name: ClassVar[str] = "noise_step"
-    means: ClassVar[str] = "From one moment on the white noise is stronger, or weaker, by a factor."
+    description: ClassVar[str] = "From one moment on the white noise is stronger, or weaker, by a factor."

@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Block, Series, Source, parameter
-from monitor.noise.random_events import Events
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.random_events import RandomEvents
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class Outliers(Source):
     scale: float = parameter("rad/s", "m/s²")
 
     name: ClassVar[str] = "outliers"
-    means: ClassVar[str] = "Single samples are far off, the next ones are right again."
+    description: ClassVar[str] = "Single samples are far off, the next ones are right again."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """Return the Allan variance ps²τ0/τ."""
@@ -40,7 +40,7 @@ class Outliers(Source):
         return _Isolated(self.fraction, self.scale, rate_hz, rng)
 
 
-class _Isolated(Series):
+class _Isolated(NoiseSeries):
     """Series of isolated errors."""
 
     def __init__(self, fraction: float, scale: float, rate_hz: float, rng: np.random.Generator) -> None:
@@ -49,9 +49,9 @@ class _Isolated(Series):
                 return np.full(n, np.inf)
             return rng.geometric(fraction, n).astype(np.float64)
 
-        self._events = Events(gaps, lambda n: scale * rng.standard_normal(n), rate_hz, before=-1.0)
+        self._events = RandomEvents(gaps, lambda n: scale * rng.standard_normal(n), rate_hz, before=-1.0)
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         when, errors = self._events.take(block.first, values.size)
         values[when] += errors
 

@@ -7,9 +7,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Block, Series, Source, check_event_rate, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, check_event_rate, parameter
 from monitor.noise.effects.rate_random_walk import RateRandomWalk
-from monitor.noise.random_events import Events
+from monitor.noise.random_events import RandomEvents
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class PoissonSteps(Source):
     height: float = parameter("rad/s", "m/s²")
 
     name: ClassVar[str] = "poisson_steps"
-    means: ClassVar[str] = "Now and then the bias jumps to a new place and stays there."
+    description: ClassVar[str] = "Now and then the bias jumps to a new place and stays there."
 
     @property
     def _equivalent_random_walk(self) -> RateRandomWalk:
@@ -51,15 +51,17 @@ class PoissonSteps(Source):
         return _Jumps(self.rate / rate_hz, self.height, rate_hz, rng)
 
 
-class _Jumps(Series):
+class _Jumps(NoiseSeries):
     """Series of random steps."""
 
     def __init__(self, rate: float, height: float, rate_hz: float, rng: np.random.Generator) -> None:
         gap = 1.0 / rate if rate > 0.0 else np.inf
-        self._events = Events(lambda n: rng.exponential(gap, n), lambda n: height * rng.standard_normal(n), rate_hz)
+        self._events = RandomEvents(
+            lambda n: rng.exponential(gap, n), lambda n: height * rng.standard_normal(n), rate_hz
+        )
         self._level = 0.0
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         when, heights = self._events.take(block.first, values.size)
         edges = [0, *when.tolist(), values.size]
         for jump, (begin, end) in zip([0.0, *heights.tolist()], pairwise(edges), strict=True):

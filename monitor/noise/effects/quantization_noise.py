@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Block, Series, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +20,7 @@ class QuantizationNoise(Source):
     Q: float = parameter("rad", "m/s")
 
     name: ClassVar[str] = "quantization_noise"
-    means: ClassVar[str] = (
+    description: ClassVar[str] = (
         "The angle is rounded anew at every reading: strong between neighbouring samples, gone over seconds."
     )
 
@@ -37,7 +37,7 @@ class QuantizationNoise(Source):
         return _Differences(self.Q, rate_hz, rng)
 
 
-class _Differences(Series):
+class _Differences(NoiseSeries):
     """Series of differences of white noise."""
 
     def __init__(self, Q: float, rate_hz: float, rng: np.random.Generator) -> None:
@@ -45,7 +45,7 @@ class _Differences(Series):
         self._scale = Q * rate_hz
         self._angle = self._scale * float(rng.standard_normal())  # last angle error divided by the sample interval
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         angles = self._rng.standard_normal(out=block.scratch)
         angles *= self._scale
         values += angles

@@ -8,8 +8,8 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.noise import gauss_markov
-from monitor.noise.effect import Block, Series, Source, check_event_rate, parameter
-from monitor.noise.random_events import Events
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, check_event_rate, parameter
+from monitor.noise.random_events import RandomEvents
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,7 @@ class RandomTelegraph(Source):
     dwell_time: float = parameter("s", "s", positive=True)
 
     name: ClassVar[str] = "random_telegraph"
-    means: ClassVar[str] = "The bias jumps between two levels at random times, like popcorn."
+    description: ClassVar[str] = "The bias jumps between two levels at random times, like popcorn."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """Return the Allan variance of exponentially correlated noise with σ = a/2, T_c = T/2."""
@@ -50,15 +50,15 @@ class RandomTelegraph(Source):
         return _TwoLevels(0.5 * self.amplitude, self.dwell_time * rate_hz, rate_hz, rng)
 
 
-class _TwoLevels(Series):
+class _TwoLevels(NoiseSeries):
     """Series that switches between two levels."""
 
     def __init__(self, level: float, dwell: float, rate_hz: float, rng: np.random.Generator) -> None:
         self._level = level if rng.random() < 0.5 else -level
         self._first_level = self._level
-        self._flips = Events(lambda n: rng.exponential(dwell, n), np.zeros, rate_hz)
+        self._flips = RandomEvents(lambda n: rng.exponential(dwell, n), np.zeros, rate_hz)
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         when, _ = self._flips.take(block.first, values.size)
         edges = [0, *when.tolist(), values.size]
         for begin, end in pairwise(edges):

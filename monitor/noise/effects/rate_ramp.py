@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Block, Series, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
 from monitor.noise.spectrum import Spectrum
 
 
@@ -21,7 +21,7 @@ class RateRamp(Source):
     R: float = parameter("rad/s²", "m/s³")
 
     name: ClassVar[str] = "rate_ramp"
-    means: ClassVar[str] = "The bias moves steadily in one direction, as while a sensor warms up."
+    description: ClassVar[str] = "The bias moves steadily in one direction, as while a sensor warms up."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """Return the Allan variance R²τ²/2."""
@@ -40,13 +40,13 @@ class RateRamp(Source):
         return _Slope(self.R / rate_hz)
 
 
-class _Slope(Series):
+class _Slope(NoiseSeries):
     """Series with a constant slope."""
 
     def __init__(self, step: float) -> None:
         self._step = step
         self._count = 0
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         values += self._step * np.arange(self._count, self._count + values.size, dtype=np.float64)
         self._count += values.size

@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import Block, Series, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +24,7 @@ class RateRandomWalk(Source):
     K: float = parameter("rad/s/√s", "m/s²/√s")
 
     name: ClassVar[str] = "rate_random_walk"
-    means: ClassVar[str] = "The bias itself takes random steps and never returns: worse the longer one averages."
+    description: ClassVar[str] = "The bias itself takes random steps and never returns: worse the longer one averages."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """Return the Allan variance K²τ/3 (1 + τ0²/(2τ²))."""
@@ -39,7 +39,7 @@ class RateRandomWalk(Source):
         return _RandomWalk(self.K / rate_hz**0.5, rng)
 
 
-class _RandomWalk(Series):
+class _RandomWalk(NoiseSeries):
     """Series of a random walk."""
 
     def __init__(self, step: float, rng: np.random.Generator) -> None:
@@ -47,7 +47,7 @@ class _RandomWalk(Series):
         self._rng = rng
         self._level = 0.0
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         steps = self._rng.standard_normal(out=block.scratch)
         self._level = _add_random_walk(values, steps, self._step, self._level)
 

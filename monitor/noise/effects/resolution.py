@@ -6,8 +6,8 @@ from typing import ClassVar, Final
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Running, Transform, parameter
-from monitor.noise.spectrum import Spectrum, unknown, white
+from monitor.noise.effect import RunningTransform, Transform, parameter
+from monitor.noise.spectrum import Spectrum, undefined_spectrum, white_noise_spectrum
 
 MIN_DEVIATION_STEPS: Final = 0.6
 """Smallest Allan deviation at τ0, in steps, for which the rounding error is white. The harmonics of the error are then
@@ -31,16 +31,16 @@ class Resolution(Transform):
     step: float = parameter("rad/s", "m/s²", positive=True)
 
     name: ClassVar[str] = "resolution"
-    means: ClassVar[str] = "The output moves in steps of one least significant bit."
+    description: ClassVar[str] = "The output moves in steps of one least significant bit."
 
-    def reshape(self, spectrum: Spectrum) -> Spectrum:
+    def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum plus white noise of variance step²/12, or NaN if the Allan deviation is too small."""
         tau0_s = spectrum.tau0_s
-        deviation = float(spectrum.allan(np.array([tau0_s]))[0]) ** 0.5
+        deviation = float(spectrum.avar(np.array([tau0_s]))[0]) ** 0.5
         return (
-            spectrum + white(self.step**2 / 12.0, tau0_s)
+            spectrum + white_noise_spectrum(self.step**2 / 12.0, tau0_s)
             if deviation >= MIN_DEVIATION_STEPS * self.step
-            else unknown(tau0_s)
+            else undefined_spectrum(tau0_s)
         )
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Rounding":
@@ -48,7 +48,7 @@ class Resolution(Transform):
         return _Rounding(self.step)
 
 
-class _Rounding(Running):
+class _Rounding(RunningTransform):
     """Running rounding to whole steps."""
 
     def __init__(self, step: float) -> None:

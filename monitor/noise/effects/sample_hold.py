@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import Running, Transform, parameter
+from monitor.noise.effect import RunningTransform, Transform, parameter
 from monitor.noise.spectrum import Spectrum
 
 
@@ -29,9 +29,9 @@ class SampleHold(Transform):
     fraction: float = parameter("1", "1", most=0.999)
 
     name: ClassVar[str] = "sample_hold"
-    means: ClassVar[str] = "Some samples are not new: the value before is sent once more."
+    description: ClassVar[str] = "Some samples are not new: the value before is sent once more."
 
-    def reshape(self, spectrum: Spectrum) -> Spectrum:
+    def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum by the formula of the class docstring."""
         h, tau0_s = self.fraction, spectrum.tau0_s
 
@@ -55,7 +55,7 @@ class SampleHold(Transform):
         return _Holding(self.fraction, rng)
 
 
-class _Holding(Running):
+class _Holding(RunningTransform):
     """Running transform that repeats samples at random."""
 
     def __init__(self, fraction: float, rng: np.random.Generator) -> None:

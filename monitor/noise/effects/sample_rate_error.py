@@ -8,7 +8,7 @@ import numpy as np
 from drivers.errors import ConfigError
 from drivers.quantities import RATE_RATIO
 from drivers.sample import Floats
-from monitor.noise.effect import Running, Transform, parameter
+from monitor.noise.effect import RunningTransform, Transform, parameter
 from monitor.noise.spectrum import Spectrum
 
 
@@ -30,20 +30,20 @@ class SampleRateError(Transform):
     ratio: float = parameter("1", "1", positive=True)
 
     name: ClassVar[str] = "sample_rate_error"
-    means: ClassVar[str] = "The clock is off: what happens at one frequency is seen at another."
+    description: ClassVar[str] = "The clock is off: what happens at one frequency is seen at another."
 
     def check_rate(self, rate_hz: float) -> None:
         """Raise ConfigError if the ratio is outside the supported range."""
         if not RATE_RATIO.supports(self.ratio):
             raise ConfigError(f"{self.name}: ratio must be {RATE_RATIO.range_text()}, is {self.ratio!r}")
 
-    def reshape(self, spectrum: Spectrum) -> Spectrum:
+    def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum unchanged; ``restated`` converts its time scale after all transforms."""
         return spectrum
 
     def restated(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum of samples at the true rate, converted to the time scale that the recording states."""
-        r, closed = self.ratio, spectrum.closed
+        r, closed = self.ratio, spectrum.closed_form_avar
         return Spectrum(
             lambda f: r * spectrum.density(r * f),
             None if closed is None else lambda tau: closed(tau / r),
@@ -59,7 +59,7 @@ class SampleRateError(Transform):
         return _Unchanged()
 
 
-class _Unchanged(Running):
+class _Unchanged(RunningTransform):
     """Transform that returns its input."""
 
     def apply(self, values: Floats) -> None:

@@ -6,8 +6,8 @@ from typing import ClassVar, Final
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Running, Transform, parameter
-from monitor.noise.spectrum import Spectrum, unknown
+from monitor.noise.effect import RunningTransform, Transform, parameter
+from monitor.noise.spectrum import Spectrum, undefined_spectrum
 
 OBSERVATION_S: Final = 3600.0
 """Time in seconds over which noise and slope must stay within the range."""
@@ -30,21 +30,21 @@ class Saturation(Transform):
     limit: float = parameter("rad/s", "m/s²", positive=True)
 
     name: ClassVar[str] = "saturation"
-    means: ClassVar[str] = "Beyond its range the sensor reads the end of the range."
+    description: ClassVar[str] = "Beyond its range the sensor reads the end of the range."
 
-    def reshape(self, spectrum: Spectrum) -> Spectrum:
+    def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum unchanged if the series stays within the range for an hour, else NaN."""
         steady = abs(spectrum.level) + sum((2.0 * size) ** 0.5 for _, size in spectrum.lines)
         steady += spectrum.slope * OBSERVATION_S
         noise = spectrum.without_lines().mean_square(1.0 / max(OBSERVATION_S, 4.0 * spectrum.tau0_s)) ** 0.5
-        return spectrum if steady + NOISE_SIGMAS * noise < self.limit else unknown(spectrum.tau0_s)
+        return spectrum if steady + NOISE_SIGMAS * noise < self.limit else undefined_spectrum(spectrum.tau0_s)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Clipping":
         """Return a clipping transform."""
         return _Clipping(self.limit)
 
 
-class _Clipping(Running):
+class _Clipping(RunningTransform):
     """Running clipping at ± limit."""
 
     def __init__(self, limit: float) -> None:

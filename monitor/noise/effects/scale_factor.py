@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Running, Transform, parameter
+from monitor.noise.effect import RunningTransform, Transform, parameter
 from monitor.noise.spectrum import Spectrum
 
 
@@ -22,11 +22,11 @@ class ScaleFactor(Transform):
     factor: float = parameter("1", "1")
 
     name: ClassVar[str] = "scale_factor"
-    means: ClassVar[str] = (
+    description: ClassVar[str] = (
         "Everything the axis reads is too large or too small by one factor, as after a slip of units."
     )
 
-    def reshape(self, spectrum: Spectrum) -> Spectrum:
+    def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum times f²."""
         return spectrum.scaled(self.factor)
 
@@ -35,7 +35,7 @@ class ScaleFactor(Transform):
         return _Scaling(self.factor)
 
 
-class _Scaling(Running):
+class _Scaling(RunningTransform):
     """Running multiplication by a factor."""
 
     def __init__(self, factor: float) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import Block, Series, Source, below_nyquist, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, check_below_nyquist, parameter
 from monitor.noise.spectrum import Spectrum, allan_of_line
 
 RENEWAL_SAMPLES: Final = 64
@@ -34,11 +34,13 @@ class Sinusoidal(Source):
     phase: float | None = parameter("rad", "rad", signed=True, optional=True)
 
     name: ClassVar[str] = "sinusoidal"
-    means: ClassVar[str] = "A steady oscillation at one frequency: a line in the spectrum, waves in the Allan curve."
+    description: ClassVar[str] = (
+        "A steady oscillation at one frequency: a line in the spectrum, waves in the Allan curve."
+    )
 
     def check_rate(self, rate_hz: float) -> None:
         """Raise ConfigError if the frequency is not below half the sample rate."""
-        below_nyquist(self, "frequency", rate_hz)
+        check_below_nyquist(self, "frequency", rate_hz)
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """Return the Allan variance A² sin⁴(πfτ)/(m² sin²(πfτ0))."""
@@ -59,13 +61,13 @@ class Sinusoidal(Source):
         return _Line(self.amplitude, self.frequency / rate_hz, phase, drawn)
 
 
-class _Line(Series):
+class _Line(NoiseSeries):
     """Series of a sinusoid."""
 
     def __init__(self, amplitude: float, step: float, phase: float, drawn: bool) -> None:
         self._amplitude, self._step, self._phase, self._drawn = amplitude, step, phase, drawn
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         _add_sinusoid(values, block.first, self._amplitude, self._step, self._phase)
 
     def truth(self) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Block, Series, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +24,7 @@ class TemperatureBias(Source):
     quadratic: float | None = parameter("rad/s/°C²", "m/s²/°C²", signed=True, optional=True)
 
     name: ClassVar[str] = "temperature_bias"
-    means: ClassVar[str] = "The bias moves with the temperature of the sensor, without delay."
+    description: ClassVar[str] = "The bias moves with the temperature of the sensor, without delay."
     uses_temperature: ClassVar[bool] = True
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
@@ -40,12 +40,12 @@ class TemperatureBias(Source):
         return _TemperaturePolynomial(self.coefficient, self.quadratic or 0.0, self.reference)
 
 
-class _TemperaturePolynomial(Series):
+class _TemperaturePolynomial(NoiseSeries):
     """Series of a polynomial in temperature."""
 
     def __init__(self, linear: float, quadratic: float, reference_c: float) -> None:
         self._linear, self._quadratic, self._reference_c = linear, quadratic, reference_c
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         warmer = block.temperature_c - self._reference_c
         values += (self._linear + self._quadratic * warmer) * warmer

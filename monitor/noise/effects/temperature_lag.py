@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import Block, Series, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class TemperatureLag(Source):
     time_constant: float = parameter("s", "s", positive=True)
 
     name: ClassVar[str] = "temperature_lag"
-    means: ClassVar[str] = "The bias follows the temperature of the sensor, but later: heat takes its time."
+    description: ClassVar[str] = "The bias follows the temperature of the sensor, but later: heat takes its time."
     uses_temperature: ClassVar[bool] = True
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
@@ -45,14 +45,14 @@ class TemperatureLag(Source):
         return _Lagging(self.coefficient, self.reference, -expm1(-1.0 / (self.time_constant * rate_hz)))
 
 
-class _Lagging(Series):
+class _Lagging(NoiseSeries):
     """Series of a first-order lag of the temperature."""
 
     def __init__(self, coefficient: float, reference_c: float, share: float) -> None:
         self._coefficient, self._reference_c, self._share = coefficient, reference_c, share
         self._lagged_c: float | None = None
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         inside = float(block.temperature_c[0]) if self._lagged_c is None else self._lagged_c
         self._lagged_c = _add_lagged_bias(
             values, block.temperature_c, inside, self._coefficient, self._reference_c, self._share

@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import Block, Series, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class TurnOnTransient(Source):
     time_constant: float = parameter("s", "s", positive=True)
 
     name: ClassVar[str] = "turn_on_transient"
-    means: ClassVar[str] = "After switching on the bias runs in, quickly at first, then ever more slowly."
+    description: ClassVar[str] = "After switching on the bias runs in, quickly at first, then ever more slowly."
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
         """Return NaN, because the Allan variance depends on the length of the recording."""
@@ -41,14 +41,14 @@ class TurnOnTransient(Source):
         return _Decay(self.amplitude, 1.0 / (self.time_constant * rate_hz))
 
 
-class _Decay(Series):
+class _Decay(NoiseSeries):
     """Series of an exponential decay."""
 
     def __init__(self, amplitude: float, step: float) -> None:
         self._amplitude, self._step = amplitude, step
         self._count = 0
 
-    def add(self, values: Floats, block: Block) -> None:
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
         _add_decay(values, self._count, self._amplitude, self._step)
         self._count += values.size
 

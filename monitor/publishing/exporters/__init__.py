@@ -19,15 +19,21 @@ from drivers.quantities import COEFFICIENT, INFLATION
 from monitor.publishing.exporters.gyroparams import gyroparams
 from monitor.publishing.exporters.kalibr import kalibr
 from monitor.publishing.exporters.kalman import kalman
-from monitor.publishing.exporters.noise import Noise, Term, from_analysis, from_model, lacking
+from monitor.publishing.exporters.noise import (
+    NoiseCoefficients,
+    Term,
+    from_analysis,
+    from_model,
+    missing_coefficient_error,
+)
 
-__all__ = ["FORMATS", "Noise", "Term", "export", "from_analysis", "from_model"]
+__all__ = ["FORMATS", "NoiseCoefficients", "Term", "export", "from_analysis", "from_model"]
 
 FORMATS: Final[dict[str, Callable[..., str]]] = {"kalibr": kalibr, "gyroparams": gyroparams, "kalman": kalman}
 """Export function of each format."""
 
 
-def export(noise: Noise, form: str, inflation: float = 1.0, **options: Any) -> str:
+def export(noise: NoiseCoefficients, form: str, inflation: float = 1.0, **options: Any) -> str:
     """Return the text of a parameter file.
 
     Parameters
@@ -55,7 +61,7 @@ def export(noise: Noise, form: str, inflation: float = 1.0, **options: Any) -> s
     except ConfigError as error:
         raise ConfigError(f"inflation: {error}") from None
     if not noise.axes:
-        raise lacking(noise, "nothing to export: no axis has any of Q, N, B, K, R")
+        raise missing_coefficient_error(noise, "nothing to export: no axis has any of Q, N, B, K, R")
     for axis, terms in noise.axes.items():
         for letter, term in terms.items():
             if term.value and not COEFFICIENT.supports(term.value):

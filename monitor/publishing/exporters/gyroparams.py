@@ -11,13 +11,20 @@ The script is meant for simulation. A coefficient with only an upper bound is th
 
 from typing import Final
 
-from monitor.publishing.exporters.noise import AXES_OF, Noise, head, number, tail, text
+from monitor.publishing.exporters.noise import (
+    AXES_OF,
+    NoiseCoefficients,
+    header_comments,
+    join_lines,
+    number,
+    omitted_comment,
+)
 
 N_POLES: Final = 500
 """Number of poles of the 1/f filter, as in the Allan variance example of MathWorks."""
 
 
-def gyroparams(noise: Noise, inflation: float = 1.0) -> str:
+def gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
     """Return the script; for its properties see the module.
 
     Parameters
@@ -29,7 +36,7 @@ def gyroparams(noise: Noise, inflation: float = 1.0) -> str:
     """
     lines = [
         "% Noise of an IMU for imuSensor (Navigation Toolbox, or Sensor Fusion and Tracking Toolbox), R2023b or newer",
-        *head(noise, inflation, "%"),
+        *header_comments(noise, inflation, "%"),
         "% single-sided: white noise of sigma = NoiseDensity*sqrt(rate) a sample, N of IEEE Std 952",
         f"% fractalcoef({N_POLES}): 1/f noise down to about rate/{N_POLES}; more poles reach lower and take longer",
     ]
@@ -52,12 +59,12 @@ def gyroparams(noise: Noise, inflation: float = 1.0) -> str:
         ]
     rate = "" if noise.sample_rate_hz is None else f", 'SampleRate', {noise.sample_rate_hz!r}"
     lines += ["", f"imu = imuSensor('accel-gyro'{rate}{''.join(made)});"]
-    return text([*lines, *tail(noise, "NBK", "%")])
+    return join_lines([*lines, *omitted_comment(noise, "NBK", "%")])
 
 
-def _property(noise: Noise, kind: str, letter: str, name: str, unit: str, inflation: float) -> str:
+def _property(noise: NoiseCoefficients, kind: str, letter: str, name: str, unit: str, inflation: float) -> str:
     """Return one property of three axes; unknown values are 0 and named in a comment."""
-    known, values, said = noise.of(kind, letter), [], ""
+    known, values, said = noise.coefficients(kind, letter), [], ""
     for axis in AXES_OF[kind]:
         term = known.get(axis)
         values.append("0" if term is None or term.bound else number(term.value * inflation))

@@ -7,7 +7,16 @@ upper bounds, the largest bound is used and the comment says so.
 """
 
 from drivers.errors import ConfigError
-from monitor.publishing.exporters.noise import EFFECT_OF, Noise, Term, head, lacking, number, tail, text
+from monitor.publishing.exporters.noise import (
+    EFFECT_OF,
+    NoiseCoefficients,
+    Term,
+    header_comments,
+    join_lines,
+    missing_coefficient_error,
+    number,
+    omitted_comment,
+)
 
 INFLATION_COMMENT = (
     "# Kalibr's wiki, IMU Noise Model: a sensor at rest at one temperature shows too little; for the",
@@ -17,7 +26,7 @@ INFLATION_COMMENT = (
 """Comment on the inflation of the values."""
 
 
-def kalibr(noise: Noise, inflation: float = 1.0, rostopic: str = "/imu0") -> str:
+def kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: str = "/imu0") -> str:
     """Return the text of the file.
 
     Parameters
@@ -40,7 +49,7 @@ def kalibr(noise: Noise, inflation: float = 1.0, rostopic: str = "/imu0") -> str
         raise ConfigError("kalibr needs an update_rate, and the model has no sample_rate")
     lines = [
         "# imu.yaml for Kalibr: continuous-time noise; one value for all axes of a kind, that of the worst axis",
-        *head(noise, inflation, "#"),
+        *header_comments(noise, inflation, "#"),
         *INFLATION_COMMENT,
         f"rostopic: {rostopic}",
         f"update_rate: {noise.sample_rate_hz!r}  # Hz",
@@ -52,14 +61,16 @@ def kalibr(noise: Noise, inflation: float = 1.0, rostopic: str = "/imu0") -> str
         for letter, key, unit in (("N", "noise_density", white), ("K", "random_walk", walk)):
             worst, said = _largest_term(noise, kind, letter)
             lines += [f"# {letter}: {said}", f"{word}_{key}: {number(worst.value * inflation)}  # {unit}"]
-    return text([*lines, *tail(noise, "NK", "#")])
+    return join_lines([*lines, *omitted_comment(noise, "NK", "#")])
 
 
-def _largest_term(noise: Noise, kind: str, letter: str) -> tuple[Term, str]:
+def _largest_term(noise: NoiseCoefficients, kind: str, letter: str) -> tuple[Term, str]:
     """Return the largest estimate of a kind, or the largest bound if there is no estimate, and a comment on it."""
-    known = noise.of(kind, letter)
+    known = noise.coefficients(kind, letter)
     if not known:
-        raise lacking(noise, f"kalibr needs {letter} ({EFFECT_OF[letter]}) above 0 on the {kind} axes, and none has it")
+        raise missing_coefficient_error(
+            noise, f"kalibr needs {letter} ({EFFECT_OF[letter]}) above 0 on the {kind} axes, and none has it"
+        )
     rank = {axis: (not term.bound, term.value) for axis, term in known.items()}
     axis = max(rank, key=lambda one: rank[one])
     listed = ", ".join(f"{one} {'<= ' if term.bound else ''}{term.value:.3g}" for one, term in known.items())

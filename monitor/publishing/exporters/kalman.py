@@ -22,11 +22,19 @@ import numpy as np
 from drivers.errors import ConfigError
 from drivers.quantities import DURATION_S
 from drivers.sample import Floats
-from monitor.publishing.exporters.noise import AXES_OF, Noise, Term, head, number, tail, text
+from monitor.publishing.exporters.noise import (
+    AXES_OF,
+    NoiseCoefficients,
+    Term,
+    header_comments,
+    join_lines,
+    number,
+    omitted_comment,
+)
 
 FLICKER_FLOOR_RATIO: Final = math.sqrt(2.0 * math.log(2.0) / math.pi)
 """Ratio of the Allan deviation of flicker noise to B (IEEE Std 952)."""
-MARKOV_PEAK: Final = 0.437 * math.sqrt(2.0)
+MARKOV_PEAK_RATIO: Final = 0.437 * math.sqrt(2.0)
 """Ratio of the peak Allan deviation of the Gauss-Markov process to σ: 0.437 q √T with q² = 2σ²/T (IEEE Std 952)."""
 MARKOV_PEAK_AT: Final = 1.89
 """Averaging time of this peak in units of the correlation time T."""
@@ -44,7 +52,7 @@ HEADER_COMMENT: Final = (
 
 
 def kalman(
-    noise: Noise, inflation: float = 1.0, dt_s: float | None = None, correlation_time_s: float | None = None
+    noise: NoiseCoefficients, inflation: float = 1.0, dt_s: float | None = None, correlation_time_s: float | None = None
 ) -> str:
     """Return the text of the file.
 
@@ -76,14 +84,14 @@ def kalman(
             raise ConfigError(f"correlation time: {error}") from None
     lines = [
         *HEADER_COMMENT,
-        *head(noise, inflation, "#"),
+        *header_comments(noise, inflation, "#"),
         'schema = "imu-monitor/kalman/1"',
         f"dt = {step_s!r}  # s",
         f"inflation = {float(inflation)!r}",
     ]
     for axis, terms in noise.axes.items():
         lines += ["", f"[{axis}]", *_axis(axis, terms, inflation, step_s, correlation_time_s)]
-    return text([*lines, *tail(noise, "NBK", "#")])
+    return join_lines([*lines, *omitted_comment(noise, "NBK", "#")])
 
 
 def markov_sigma(B: float) -> float:
@@ -97,7 +105,7 @@ def markov_sigma(B: float) -> float:
     B
         Bias instability, in the unit of the result.
     """
-    return FLICKER_FLOOR_RATIO * B / MARKOV_PEAK
+    return FLICKER_FLOOR_RATIO * B / MARKOV_PEAK_RATIO
 
 
 def markov_time_s(N: float, K: float) -> float:

@@ -38,7 +38,7 @@ class Term:
 
 
 @dataclass(frozen=True, slots=True)
-class Noise:
+class NoiseCoefficients:
     """Noise coefficients by axis and letter; unknown axes and letters are absent."""
 
     axes: Mapping[str, Mapping[str, Term]]
@@ -48,7 +48,7 @@ class Noise:
     measured: bool = False  # True if the coefficients come from a recording
     warnings: tuple[str, ...] = ()  # ASCII sentences for the header of the file
 
-    def of(self, kind: str, letter: str) -> dict[str, Term]:
+    def coefficients(self, kind: str, letter: str) -> dict[str, Term]:
         """Return one coefficient of the axes that have it.
 
         Parameters
@@ -61,7 +61,7 @@ class Noise:
         return {axis: self.axes[axis][letter] for axis in AXES_OF[kind] if letter in self.axes.get(axis, {})}
 
 
-def from_model(model: NoiseModel, source: str = "noise model") -> Noise:
+def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficients:
     """Return the coefficients of a noise model; the variances of equal effects on one axis are added.
 
     >>> model = NoiseModel.from_toml('sample_rate = 100.0\\n["g*".angle_random_walk]\\nN = 1.5e-4')
@@ -88,7 +88,7 @@ def from_model(model: NoiseModel, source: str = "noise model") -> Noise:
                 sizes[letter] = math.hypot(sizes.get(letter, 0.0), getattr(one, letter))
         axes[axis] = {letter: Term(size) for letter, size in sizes.items() if size > 0.0}
     known = {axis: axes[axis] for axis in AXES if axes.get(axis)}
-    return Noise(known, model.sample_rate_hz, source, tuple(left_out))
+    return NoiseCoefficients(known, model.sample_rate_hz, source, tuple(left_out))
 
 
 class _Coefficient(msgspec.Struct):
@@ -120,7 +120,7 @@ class _Analysis(msgspec.Struct):
     rate: float | None = None
 
 
-def from_analysis(text: bytes | str, source: str = "analysis of a recording") -> Noise:
+def from_analysis(text: bytes | str, source: str = "analysis of a recording") -> NoiseCoefficients:
     """Return the coefficients in the output of ``imu-monitor analyze --json``.
 
     Parameters
@@ -159,10 +159,10 @@ def from_analysis(text: bytes | str, source: str = "analysis of a recording") ->
         for axis in axes
         if (mark := found.axes[axis].temperature) is not None
     )
-    return Noise(axes, found.rate, source, measured=True, warnings=warnings)
+    return NoiseCoefficients(axes, found.rate, source, measured=True, warnings=warnings)
 
 
-def lacking(noise: Noise, text: str) -> ImuError:
+def missing_coefficient_error(noise: NoiseCoefficients, text: str) -> ImuError:
     """Return the exception for a source that lacks a coefficient: NotReady for a recording, else ConfigError.
 
     Parameters
@@ -175,7 +175,7 @@ def lacking(noise: Noise, text: str) -> ImuError:
     return NotReady(f"{text}: a longer recording is needed") if noise.measured else ConfigError(text)
 
 
-def head(noise: Noise, inflation: float, mark: str) -> list[str]:
+def header_comments(noise: NoiseCoefficients, inflation: float, mark: str) -> list[str]:
     """Return comments on the origin of the numbers, the inflation factor and the warnings.
 
     Parameters
@@ -196,7 +196,7 @@ def head(noise: Noise, inflation: float, mark: str) -> list[str]:
     ]
 
 
-def tail(noise: Noise, used: Collection[str], mark: str) -> list[str]:
+def omitted_comment(noise: NoiseCoefficients, used: Collection[str], mark: str) -> list[str]:
     """Return a comment that lists the terms of the source that the format cannot represent.
 
     Parameters
@@ -222,6 +222,6 @@ def number(value: float) -> str:
     return f"{value:.6e}"
 
 
-def text(lines: Iterable[str]) -> str:
+def join_lines(lines: Iterable[str]) -> str:
     """Join lines to the text of a file."""
     return "\n".join(lines) + "\n"

@@ -14,14 +14,14 @@ from drivers.sample import AXES, Event, Floats
 from monitor.common.health import Health
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import LETTERS, Coefficients
+from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients
 from monitor.publishing.messages import remote_device
 
 MAX_AVERAGING_TIMES: Final = 1000
 """Largest accepted number of averaging times."""
 
 
-def estimate(allan: remote_device.AllanMessage, noise: remote_device.Noise) -> Estimate:
+def to_estimate(allan: remote_device.AllanMessage, noise: remote_device.Noise) -> Estimate:
     """Build an estimate from the messages of a device.
 
     Parameters
@@ -66,13 +66,13 @@ def estimate(allan: remote_device.AllanMessage, noise: remote_device.Noise) -> E
             hi=hi,
             n=round(allan.filled * allan.rate),
         ),
-        fitted=fitted(tau_s, noise.coefficients),
+        fitted=fitted_variance(tau_s, noise.coefficients),
         coefficients=noise.coefficients,
         k_or_r=np.array([axis in noise.either for axis in AXES]),
     )
 
 
-def fitted(tau_s: Floats, coefficients: Coefficients) -> Floats:
+def fitted_variance(tau_s: Floats, coefficients: Coefficients) -> Floats:
     """Return the Allan variance of the estimated terms, shape [m, 6]; NaN on axes without estimated terms.
 
     σ²(τ) = 3Q²/τ² + N²/τ + (2 ln 2/π)B² + K²τ/3 + R²τ²/2, IEEE Std 952-1997, Annex C.
@@ -91,10 +91,10 @@ def fitted(tau_s: Floats, coefficients: Coefficients) -> Floats:
     return total
 
 
-def health(status: remote_device.StatusMessage) -> Health:
+def to_health(status: remote_device.StatusMessage) -> Health:
     """Build a health report from a status message."""
     return Health(
-        state=remote_device.clean(status.state),
+        state=remote_device.strip_control_characters(status.state),
         rate_hz=status.rate,
         received=status.received,
         lost=status.lost,
@@ -103,22 +103,29 @@ def health(status: remote_device.StatusMessage) -> Health:
         latency_p50_s=status.latency.p50,
         latency_p99_s=status.latency.p99,
         memory_bytes=status.memory,
-        outputs={remote_device.clean(name): remote_device.clean(said) for name, said in status.outputs.items()},
-        text=remote_device.clean(status.text),
+        outputs={
+            remote_device.strip_control_characters(name): remote_device.strip_control_characters(said)
+            for name, said in status.outputs.items()
+        },
+        text=remote_device.strip_control_characters(status.text),
         uptime_s=status.uptime,
     )
 
 
-def event(message: remote_device.EventMessage) -> Event:
+def to_event(message: remote_device.EventMessage) -> Event:
     """Build an event from a message; it includes the changed coefficients, so that they can be marked in plots."""
     axis = message.axis if message.axis in AXES else None
     what = {
         letter: {side: value for side, value in sizes.items() if isinstance(value, float | int)}
         for letter, sizes in message.what.items()
-        if letter in LETTERS
+        if letter in SYMBOLS
     }
     return Event(
-        remote_device.clean(message.kind), round(message.t * 1e9), remote_device.clean(message.text), axis, what
+        remote_device.strip_control_characters(message.kind),
+        round(message.t * 1e9),
+        remote_device.strip_control_characters(message.text),
+        axis,
+        what,
     )
 
 

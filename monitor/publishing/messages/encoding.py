@@ -11,15 +11,15 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
-from drivers.credential_masking import masked
+from drivers.credential_masking import mask_secrets
 from drivers.sample import AXES, Event, Floats
 from monitor.common import topics
 from monitor.common.health import Health
-from monitor.drift.thermal.live_thermal import ThermalLook
-from monitor.drift.thermal.recursive_least_squares import Band
-from monitor.drift.thermal.temperature_share import SLOW, WithoutTemperature
+from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.drift.thermal.recursive_least_squares import PredictionInterval
+from monitor.drift.thermal.temperature_share import SLOW_LETTERS, TemperatureShare
 from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.allan.dynamic_allan import Dynamic
+from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.analysis import Analysis
@@ -27,13 +27,13 @@ from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.detection.motion_detection import Motion
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import LETTERS, Coefficients, Status
+from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
 
 ANALYZE_SCHEMA: Final = "imu-monitor/analyze/1"
 _ENCODER: Final = msgspec.json.Encoder()
 
 
-def allan(device: str, unix_s: float, estimate: Estimate) -> bytes:
+def encode_allan(device: str, unix_s: float, estimate: Estimate) -> bytes:
     """Encode ``imu/<device>/allan``: the Allan deviation of each measured axis and its 95 % interval at each τ.
 
     ``recent`` holds the same over a shorter time span, max(10 s, 16 τ) for each τ.
@@ -49,9 +49,9 @@ def allan(device: str, unix_s: float, estimate: Estimate) -> bytes:
     """
     tau = _list(estimate.curve.tau_s)
     axes: dict[str, dict[str, Any]] = {axis: _curve(estimate.curve, i) for i, axis in measured_axes(estimate)}
-    if estimate.recent is not None:
+    if estimate.display_curve is not None:
         for i, axis in measured_axes(estimate):
-            axes[axis]["recent"] = _curve(estimate.recent, i)
+            axes[axis]["recent"] = _curve(estimate.display_curve, i)
     return _encode(topics.ALLAN, device, unix_s, estimate.samples, _window_payload(estimate, tau=tau, axes=axes))
 
 
@@ -116,7 +116,7 @@ def gap(device: str, unix_s: float, look: ModelGap) -> bytes:
     return _encode(topics.GAP, device, unix_s, look.samples, payload)
 
 
-def thermal(device: str, unix_s: float, samples: int, look: ThermalLook) -> bytes:
+def thermal(device: str, unix_s: float, samples: int, look: ThermalUpdate) -> bytes:
     """Encode ``imu/<device>/thermal``: the mean bias of an interval and its prediction; ``t`` is the interval's end.
 
     ``multi_step`` is predicted from the temperature alone, ``one_step`` also from the preceding bias. Both are null if
@@ -204,7 +204,7 @@ def coefficient_table(all_axes: Coefficients, axis: int, k_or_r: bool = False) -
             "status": Status(int(all_axes.status[row, axis])).name.lower(),
             **({"or": other[letter]} if letter in other else {}),
         }
-        for row, letter in enumerate(LETTERS)
+        for row, letter in enumerate(SYMBOLS)
     }
 
 
@@ -227,15 +227,15 @@ def event(device: str, unix_s: float, samples: int, what: Event, since_s: float 
     payload = {
         "kind": what.kind,
         "axis": what.axis,
-        "what": what.what,
+        "what": what.values,
         "since": since_s,
         "sigma": what.sigma,
-        "text": masked(what.text),
+        "text": mask_secrets(what.text),
     }
     return _encode(topics.EVENT, device, unix_s, samples, payload)
 
 
-def since_s(unix_s: float, what: Event) -> float | None:
+def event_start_s(unix_s: float, what: Event) -> float | None:
     """Return the Unix time [s] at which the condition reported by an event began; None if unknown.
 
     Parameters
@@ -269,14 +269,14 @@ def status(device: str, unix_s: float | None, health: Health) -> bytes:
         "overflowed": health.overflowed,
         "latency": {"p50": health.latency_p50_s, "p99": health.latency_p99_s},
         "memory": health.memory_bytes,
-        "outputs": {name: masked(said) for name, said in health.outputs.items()},
+        "outputs": {name: mask_secrets(said) for name, said in health.outputs.items()},
         "uptime": health.uptime_s,
         "repeated": health.repeated,
         "late": health.late,
         "moving": health.moving,
         "moved": health.moved,
         "crossed": health.crossed,
-        "text": masked(health.text),
+        "text": mask_secrets(health.text),
     }
     return _encode(topics.STATUS, device, unix_s, health.received, payload)
 
@@ -326,8 +326,8 @@ def analysis(
     result: Analysis,
     total: TotalCurve | None = None,
     hadamard: HadamardCurve | None = None,
-    dynamic: Dynamic | None = None,
-    warmth: WithoutTemperature | None = None,
+    dynamic: DynamicAllan | None = None,
+    warmth: TemperatureShare | None = None,
 ) -> bytes:
     """Encode the output of ``analyze --json``, with the optional curves that were computed.
 
@@ -381,7 +381,7 @@ def analysis(
     return _ENCODER.encode(payload)
 
 
-def no_analysis(why: str, samples: int) -> bytes:
+def encode_failed_analysis(why: str, samples: int) -> bytes:
     """Encode the output of ``analyze --json`` if the data do not support an estimate.
 
     Parameters
@@ -423,7 +423,7 @@ def _deviation_of_axis(tau_s: Floats, variance: Floats, lo: Floats, hi: Floats, 
     return {"tau": _list(tau_s), **{name: _list(column[:, axis]) for name, column in columns.items()}}
 
 
-def _temperature_dependence(warmth: WithoutTemperature, axis: str) -> dict[str, Any]:
+def _temperature_dependence(warmth: TemperatureShare, axis: str) -> dict[str, Any]:
     """Return the measures of how strongly the bias of an axis depends on temperature."""
     one = warmth.dependences[axis]
     return {
@@ -435,14 +435,14 @@ def _temperature_dependence(warmth: WithoutTemperature, axis: str) -> dict[str, 
     }
 
 
-def _without_temperature(warmth: WithoutTemperature, axis: str) -> dict[str, Any]:
+def _without_temperature(warmth: TemperatureShare, axis: str) -> dict[str, Any]:
     """Return K and R of an axis after its temperature-correlated bias has been removed."""
     i = AXES.index(axis)
     table = coefficient_table(warmth.coefficients, i, warmth.k_or_r[i])
     return {
         "model": warmth.models[axis],
-        "coefficients": {letter: table[letter] for letter in SLOW},
-        "share": {letter: warmth.share(letter, axis) for letter in SLOW},
+        "coefficients": {letter: table[letter] for letter in SLOW_LETTERS},
+        "share": {letter: warmth.variance_share(letter, axis) for letter in SLOW_LETTERS},
     }
 
 
@@ -470,7 +470,7 @@ def _change(change: Change, rate_hz: float) -> dict[str, Any]:
     }
 
 
-def _dynamic(dynamic: Dynamic, axes: Sequence[tuple[int, str]]) -> dict[str, Any]:
+def _dynamic(dynamic: DynamicAllan, axes: Sequence[tuple[int, str]]) -> dict[str, Any]:
     """Return the dynamic Allan deviation as lists by time step; deviations hold one list by τ in each."""
     return {
         "window": dynamic.window_s,
@@ -488,7 +488,7 @@ def _dynamic(dynamic: Dynamic, axes: Sequence[tuple[int, str]]) -> dict[str, Any
                         "hi": _list(dynamic.value_hi[:, row, i]),
                         "status": [Status(one).name.lower() for one in dynamic.status[:, row, i].tolist()],
                     }
-                    for row, letter in enumerate(LETTERS)
+                    for row, letter in enumerate(SYMBOLS)
                 },
             }
             for i, axis in axes
@@ -496,7 +496,7 @@ def _dynamic(dynamic: Dynamic, axes: Sequence[tuple[int, str]]) -> dict[str, Any
     }
 
 
-def _band(band: Band | None) -> dict[str, float] | None:
+def _band(band: PredictionInterval | None) -> dict[str, float] | None:
     """Return a predicted bias with its interval; None if there is no model."""
     return None if band is None else {"bias": band.bias, "lo": band.lo, "hi": band.hi}
 

@@ -14,14 +14,14 @@ import numpy as np
 
 from drivers.sample import AXES, Floats
 from monitor.common import topics
-from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.history.bucket import COUNTS, STATES, Singles
-from monitor.history.columns import HEALTH, TEMPERATURE
-from monitor.history.query import COEFFICIENTS, DEVIATIONS, EVENTS, STATUS, Question
-from monitor.history.reading import EVENTS as EVENTS_AT_MOST
-from monitor.history.reading import Course, Past
-from monitor.history.sqlite_store import PastEvent
-from monitor.history.time_ranges import Span
+from monitor.history.columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS
+from monitor.history.query import COEFFICIENTS, DEVIATIONS, EVENTS, STATUS, HistoryQuery
+from monitor.history.reading import MAX_EVENTS as EVENTS_AT_MOST
+from monitor.history.reading import ColumnStatistics, HistoryTable
+from monitor.history.sqlite_store import StoredEvent
+from monitor.history.time_ranges import TimeRange
 
 MAX_BUCKETS: Final = 1_000_000
 """Largest number of buckets accepted in a message."""
@@ -39,7 +39,7 @@ class Number(msgspec.Struct, frozen=True, kw_only=True):
     high: Numbers
 
 
-class Letter(Number, frozen=True, kw_only=True):
+class CoefficientHistory(Number, frozen=True, kw_only=True):
     """Coefficient of one axis over time, with interval, count and status."""
 
     lo: Numbers
@@ -63,7 +63,7 @@ class Deviations(msgspec.Struct, frozen=True, kw_only=True):
     axes: dict[str, Deviation]
 
 
-class StatusCourse(msgspec.Struct, frozen=True, kw_only=True):
+class StatusHistory(msgspec.Struct, frozen=True, kw_only=True):
     """State and counters of the device over time."""
 
     state: list[State]
@@ -77,7 +77,7 @@ class StatusCourse(msgspec.Struct, frozen=True, kw_only=True):
     temperature: Number | None = None
 
 
-class EventOfPast(msgspec.Struct, frozen=True, kw_only=True):
+class EventMessage(msgspec.Struct, frozen=True, kw_only=True):
     """Event of the device."""
 
     t: float
@@ -102,14 +102,14 @@ class HistoryMessage(msgspec.Struct, frozen=True, kw_only=True):
     step: int
     start: list[int]
     width: list[int]
-    axes: dict[str, dict[str, Letter]] | None = None
+    axes: dict[str, dict[str, CoefficientHistory]] | None = None
     deviations: Deviations | None = None
-    status: StatusCourse | None = None
-    events: list[EventOfPast] | None = None
+    status: StatusHistory | None = None
+    events: list[EventMessage] | None = None
     events_in_all: int = 0
 
 
-def history(past: Past, asked: Question, unix_s: float, samples: int) -> bytes:
+def encode_history(past: HistoryTable, asked: HistoryQuery, unix_s: float, samples: int) -> bytes:
     """Encode the reply to a history query.
 
     Parameters
@@ -143,7 +143,11 @@ def history(past: Past, asked: Question, unix_s: float, samples: int) -> bytes:
         payload["status"] = {
             "state": [STATES[one] for one in past.state.tolist()],
             **{name: past.counts[:, i].tolist() for i, name in enumerate(COUNTS)},
-            **{name: _number(past.column(name)) for name in (*HEALTH, *TEMPERATURE) if name in past.names},
+            **{
+                name: _number(past.column(name))
+                for name in (*HEALTH_COLUMNS, *TEMPERATURE_COLUMNS)
+                if name in past.names
+            },
         }
     if EVENTS in asked.what:
         payload["events"] = [_event(one) for one in past.events]
@@ -151,7 +155,7 @@ def history(past: Past, asked: Question, unix_s: float, samples: int) -> bytes:
     return _ENCODER.encode(payload)
 
 
-def read(payload: bytes) -> Past:
+def decode_history(payload: bytes) -> HistoryTable:
     """Decode a history message.
 
     Raises
@@ -163,10 +167,10 @@ def read(payload: bytes) -> Past:
     p = len(said.start)
     if said.schema != topics.HISTORY.schema() or len(said.width) != p or p > MAX_BUCKETS:
         raise ValueError("not an answer of a history")
-    columns: dict[str, Course] = {}
+    columns: dict[str, ColumnStatistics] = {}
     for axis, letters in (said.axes or {}).items():
         for letter, one in letters.items():
-            if axis in AXES and letter in LETTERS:
+            if axis in AXES and letter in SYMBOLS:
                 columns |= _letter_columns(f"{axis}.{letter}", one, p)
     if said.deviations is not None:
         columns |= _deviation_columns(said.deviations, p)
@@ -175,7 +179,7 @@ def read(payload: bytes) -> Past:
     if said.status is not None:
         counts = np.column_stack([_integers(getattr(said.status, name), p) for name in COUNTS]).reshape(p, len(COUNTS))
         state = _integers([STATES.index(one) for one in said.status.state], p)
-        for name in (*HEALTH, *TEMPERATURE):
+        for name in (*HEALTH_COLUMNS, *TEMPERATURE_COLUMNS):
             number = getattr(said.status, name)
             if number is not None:
                 columns[name] = _course(number, p)
@@ -183,9 +187,9 @@ def read(payload: bytes) -> Past:
     low, high, last = (
         _singles([getattr(one, part) for one in columns.values()], p) for part in ("low", "high", "last")
     )
-    return Past(
+    return HistoryTable(
         clean(said.device),
-        Span(said.from_, said.to),
+        TimeRange(said.from_, said.to),
         said.step,
         _integers(said.start, p),
         _integers(said.width, p),
@@ -201,7 +205,7 @@ def read(payload: bytes) -> Past:
     )
 
 
-def _letter(past: Past, axis: str, letter: str) -> dict[str, Any]:
+def _letter(past: HistoryTable, axis: str, letter: str) -> dict[str, Any]:
     """Encode one coefficient of one axis."""
     value, bound = past.column(f"{axis}.{letter}"), past.column(f"{axis}.{letter}.bound")
     lo, hi = (past.column(f"{axis}.{letter}.{end}") for end in ("lo", "hi"))
@@ -217,7 +221,7 @@ def _letter(past: Past, axis: str, letter: str) -> dict[str, Any]:
     }
 
 
-def _letter_columns(name: str, one: Letter, p: int) -> dict[str, Course]:
+def _letter_columns(name: str, one: CoefficientHistory, p: int) -> dict[str, ColumnStatistics]:
     """Return the stored columns of one decoded coefficient."""
     n = _integers(one.n, p)
     value, lo, hi = _course(one, p), _floats(one.lo, p), _floats(one.hi, p)
@@ -226,14 +230,14 @@ def _letter_columns(name: str, one: Letter, p: int) -> dict[str, Course]:
     only = np.array([status == _STATUSES[Status.UPPER_BOUND] for status in one.status], np.bool_)
     missing = np.full(p, np.nan)
     return {
-        name: Course(n, value.low, value.high, value.last),
+        name: ColumnStatistics(n, value.low, value.high, value.last),
         f"{name}.lo": _column_without_extremes(np.where(only, missing, lo)),
         f"{name}.hi": _column_without_extremes(np.where(only, missing, hi)),
         f"{name}.bound": _column_without_extremes(np.where(only, hi, missing)),
     }
 
 
-def _deviations(past: Past, axes: Sequence[str]) -> dict[str, Any]:
+def _deviations(past: HistoryTable, axes: Sequence[str]) -> dict[str, Any]:
     """Encode the deviations of the given axes."""
     taus = past.taus()
     found: dict[str, Any] = {}
@@ -247,7 +251,7 @@ def _deviations(past: Past, axes: Sequence[str]) -> dict[str, Any]:
     return {"tau": [float(tau) for tau in taus], "axes": found}
 
 
-def _deviation_columns(said: Deviations, p: int) -> dict[str, Course]:
+def _deviation_columns(said: Deviations, p: int) -> dict[str, ColumnStatistics]:
     """Return the stored columns of the decoded deviations."""
     columns = {}
     for axis, one in said.axes.items():
@@ -255,27 +259,29 @@ def _deviation_columns(said: Deviations, p: int) -> dict[str, Course]:
             continue
         value, low, high = (_two_dimensional(part, p, len(said.tau)) for part in (one.value, one.low, one.high))
         for i, tau in enumerate(said.tau):
-            columns[f"{axis}.sigma.{tau:g}"] = Course(np.isfinite(value[:, i]) * 1, low[:, i], high[:, i], value[:, i])
+            columns[f"{axis}.sigma.{tau:g}"] = ColumnStatistics(
+                np.isfinite(value[:, i]) * 1, low[:, i], high[:, i], value[:, i]
+            )
     return columns
 
 
-def _number(course: Course) -> dict[str, Numbers]:
+def _number(course: ColumnStatistics) -> dict[str, Numbers]:
     """Encode a number over time."""
     return {"value": _list(course.last), "low": _list(course.low), "high": _list(course.high)}
 
 
-def _course(number: Number, p: int) -> Course:
+def _course(number: Number, p: int) -> ColumnStatistics:
     """Return the stored column of a decoded number."""
     low, high, last = (_floats(one, p) for one in (number.low, number.high, number.value))
-    return Course((~np.isnan(last)).astype(np.int64), low, high, last)
+    return ColumnStatistics((~np.isnan(last)).astype(np.int64), low, high, last)
 
 
-def _column_without_extremes(last: Floats) -> Course:
+def _column_without_extremes(last: Floats) -> ColumnStatistics:
     """Return a column whose extremes equal its last values."""
-    return Course((~np.isnan(last)).astype(np.int64), last, last, last)
+    return ColumnStatistics((~np.isnan(last)).astype(np.int64), last, last, last)
 
 
-def _event(event: PastEvent) -> dict[str, Any]:
+def _event(event: StoredEvent) -> dict[str, Any]:
     """Encode an event."""
     return {
         "t": event.t_s,
@@ -285,17 +291,17 @@ def _event(event: PastEvent) -> dict[str, Any]:
         "since": event.since_s,
         "sigma": event.sigma,
         "text": event.text,
-        "stands_for": event.stands_for,
+        "stands_for": event.represented_events,
     }
 
 
-def _read_event(said: EventOfPast) -> PastEvent:
+def _read_event(said: EventMessage) -> StoredEvent:
     """Return the stored form of a decoded event."""
     what = {
         name: {key: np.nan if one is None else one for key, one in sides.items()} for name, sides in said.what.items()
     }
     axis = said.axis if said.axis in AXES else None
-    return PastEvent(said.t, clean(said.kind), clean(said.text), axis, what, said.since, said.sigma, said.stands_for)
+    return StoredEvent(said.t, clean(said.kind), clean(said.text), axis, what, said.since, said.sigma, said.stands_for)
 
 
 def _list(column: Floats) -> Numbers:

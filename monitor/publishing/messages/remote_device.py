@@ -13,17 +13,17 @@ import numpy as np
 
 from drivers.sample import AXES
 from monitor.common import topics
-from monitor.estimation.fit.coefficients import LETTERS, Coefficients, Status
+from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
 
 STATUSES: Final = {status.name.lower(): status for status in Status}
 NORMAL_OUTPUT_STATES: Final = ("ok", "off")
 """States of an output that are not shown."""
-GONE_S: Final = 1.5
+GONE_TIMEOUT_S: Final = 1.5
 """Age of the newest message [s] after which a device without liveliness token is gone. The status comes at 1 Hz, so a
 daemon that is killed is reported within two seconds."""
 MAX_NAMED_LIMITS: Final = 6
 """Largest number of exceeded limits that are listed by name."""
-SILENT_S: Final = 5.0
+SILENCE_TIMEOUT_S: Final = 5.0
 """Age of the newest message [s] after which a device is silent, if its token exists or was never seen."""
 MAX_TEXT_LENGTH: Final = 400
 MAX_OUTPUTS: Final = 16
@@ -150,25 +150,25 @@ class Noise:
 
 
 @dataclass(slots=True)
-class Heard:
+class RemoteDevice:
     """State of a remote device; times are those of the receiver's monotonic clock."""
 
     key: str  # key of the device, without the topic
-    heard_s: float  # time of the newest message of any topic
+    last_message_s: float  # time of the newest message of any topic
     status: StatusMessage | None = None
     noise: Noise | None = None
     gap: GapMessage | None = None
-    there: bool | None = None  # True if its liveliness token exists; None if unknown
+    token_exists: bool | None = None  # True if its liveliness token exists; None if unknown
 
     def state(self, now_s: float) -> str:
         """Return the state that the daemon reports, or gone, silent or present (no status received yet)."""
-        age_s = now_s - self.heard_s
+        age_s = now_s - self.last_message_s
         ended = self.status is not None and self.status.state == "ended"
-        if age_s > GONE_S and self.there is False and not ended:
+        if age_s > GONE_TIMEOUT_S and self.token_exists is False and not ended:
             return "gone"
-        if age_s > SILENT_S and not ended:
+        if age_s > SILENCE_TIMEOUT_S and not ended:
             return "silent"
-        return "present" if self.status is None else clean(self.status.state)
+        return "present" if self.status is None else strip_control_characters(self.status.state)
 
     def rank(self, now_s: float) -> int:
         """Return the sort key, worst first: 0 no data, 1 a problem or not ready, 2 running, 3 ended."""
@@ -183,31 +183,40 @@ class Heard:
         well &= not status.text and not status.overflowed and not status.crossed
         return 2 if well and not self.disagreements() else 1
 
-    def trouble(self) -> str:
+    def problems(self) -> str:
         """Return a description of all problems; empty if there are none."""
         if self.status is None:
             return ""
-        said = [clean(self.status.text)] if self.status.text else []
+        said = [strip_control_characters(self.status.text)] if self.status.text else []
         outputs = self.status.outputs.items()
-        said += [f"{clean(name)}: {clean(state)}" for name, state in outputs if state not in NORMAL_OUTPUT_STATES]
+        said += [
+            f"{strip_control_characters(name)}: {strip_control_characters(state)}"
+            for name, state in outputs
+            if state not in NORMAL_OUTPUT_STATES
+        ]
         if self.status.overflowed:
             said.append(f"{self.status.overflowed:,} samples overwritten before they were used: too slow here")
         if crossed := self.status.crossed:
             more = f" and {len(crossed) - MAX_NAMED_LIMITS} more" if len(crossed) > MAX_NAMED_LIMITS else ""
-            said.append(f"beyond its limit: {', '.join(clean(one) for one in crossed[:MAX_NAMED_LIMITS])}{more}")
+            said.append(
+                "beyond its limit: "
+                + ", ".join(strip_control_characters(one) for one in crossed[:MAX_NAMED_LIMITS])
+                + more
+            )
         return "; ".join([*said, *self.disagreements()])
 
     def disagreements(self) -> list[str]:
         """Return one line for each axis that disagrees with its model."""
         found = [] if self.gap is None else [item for item in self.gap.axes.items() if item[1].agrees is False]
         return [
-            f"{clean(axis)} disagrees with its model: {one.gap:.3g} σ at τ {one.where.tau[0]:.3g} to "
+            f"{strip_control_characters(axis)} disagrees with its model: "
+            f"{one.gap:.3g} σ at τ {one.where.tau[0]:.3g} to "
             f"{one.where.tau[1]:.3g} s"
             for axis, one in found
         ]
 
 
-def split(key: str) -> tuple[str, topics.Topic] | None:
+def split_key(key: str) -> tuple[str, topics.Topic] | None:
     """Split a key into the device's part and the topic; None if the topic is not in ``monitor.common.topics``.
 
     >>> split("imu/bench-1/status")
@@ -263,7 +272,7 @@ def status(payload: bytes) -> StatusMessage:
 def event(payload: bytes) -> EventMessage:
     """Decode an event message; text is truncated as in a status message."""
     found = read(EventMessage, topics.EVENT, payload)
-    what = {letter: found.what[letter] for letter in LETTERS if letter in found.what}
+    what = {letter: found.what[letter] for letter in SYMBOLS if letter in found.what}
     return msgspec.structs.replace(
         found, kind=found.kind[:MAX_TEXT_LENGTH], text=found.text[:MAX_TEXT_LENGTH], what=what
     )
@@ -277,21 +286,21 @@ def gap(payload: bytes) -> GapMessage:
 
 def noise(message: CoefficientsMessage) -> Noise:
     """Convert coefficients into arrays of shape [5, 6] in SI; an unknown status raises ValueError."""
-    value, lo, hi = (np.full((len(LETTERS), len(AXES)), np.nan) for _ in range(3))
+    value, lo, hi = (np.full((len(SYMBOLS), len(AXES)), np.nan) for _ in range(3))
     status = np.full(value.shape, Status.UNESTIMATED, np.int8)
     axes = tuple(axis for axis in AXES if axis in message.axes)
     for axis in axes:
         for letter, one in message.axes[axis].items():
-            if letter not in LETTERS:
+            if letter not in SYMBOLS:
                 continue
-            at = LETTERS.index(letter), AXES.index(axis)
+            at = SYMBOLS.index(letter), AXES.index(axis)
             value[at], lo[at], hi[at] = (np.nan if x is None else x for x in (one.value, one.lo, one.hi))
             status[at] = _status(one.status)
     either = frozenset(axis for axis in axes if any(one.either for one in message.axes[axis].values()))
     return Noise(Coefficients(value, lo, hi, status), axes, message.filled, either)
 
 
-def clean(text: Any) -> str:
+def strip_control_characters(text: Any) -> str:
     """Replace control characters by spaces, because a terminal would interpret them.
 
     >>> clean("link\\x1b[2J lost\\nnow")

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.sample import AXES, Floats
+from monitor.common.units import DEVIATION_UNITS, KIND_NAMES, Kind, axes_of
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import LETTERS, Status
-from monitor.publishing.coefficient_cells import DEVIATION_UNITS, KIND_NAMES, Kind, axes_of
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,7 +35,7 @@ DARK: Final = "#222222"
 READING_TAU_S: Final = {"Q": 3.0**0.5, "N": 1.0, "K": 3.0, "R": 2.0**0.5}  # τ at which the term's deviation equals it
 SLOPES: Final = {"Q": -1.0, "N": -0.5, "B": 0.0, "K": 0.5, "R": 1.0}  # log-log slope of the deviation
 FLICKER_FLOOR_RATIO: Final = (2.0 * np.log(2.0) / np.pi) ** 0.5  # ratio of the deviation of flicker noise to B
-READING: Final = (
+LEGEND_TEXT: Final = (
     "○ a coefficient, read on its own line: Q at √3 s, N at 1 s, K at 3 s, R at √2 s; 0.664 B where the curve is lowest"
 )
 OTHER_LINE_STYLES: Final = ("-", ":", "-.")  # line styles of other deviations
@@ -47,7 +47,7 @@ MIN_LETTER_DISTANCE: Final = 0.045  # rings closer than this share of the plot's
 
 
 @dataclass(frozen=True, slots=True)
-class Beside:
+class OtherDeviation:
     """Another deviation of the same recording, drawn next to the overlapping Allan deviation."""
 
     name: str  # "total" or "Hadamard"
@@ -71,7 +71,7 @@ class Beside:
         return np.asarray(there & (self.tau_s > longest_s) if self.only_beyond else there)
 
 
-def besides(total: TotalCurve | None = None, hadamard: HadamardCurve | None = None) -> list[Beside]:
+def other_deviations(total: TotalCurve | None = None, hadamard: HadamardCurve | None = None) -> list[OtherDeviation]:
     """Return the other deviations to draw: total deviation beyond the Allan deviation, Hadamard deviation everywhere.
 
     Parameters
@@ -83,9 +83,9 @@ def besides(total: TotalCurve | None = None, hadamard: HadamardCurve | None = No
     """
     found = []
     if total is not None:
-        found.append(Beside("total", total.tau_s, np.sqrt(total.tvar), total.lo, total.hi, only_beyond=True))
+        found.append(OtherDeviation("total", total.tau_s, np.sqrt(total.tvar), total.lo, total.hi, only_beyond=True))
     if hadamard is not None:
-        found.append(Beside("Hadamard", hadamard.tau_s, np.sqrt(hadamard.hvar), hadamard.lo, hadamard.hi))
+        found.append(OtherDeviation("Hadamard", hadamard.tau_s, np.sqrt(hadamard.hvar), hadamard.lo, hadamard.hi))
     return found
 
 
@@ -104,7 +104,7 @@ class _Ring:
         return COLOURS[self.number]
 
 
-def allan_panel(axes: "Axes", estimate: Estimate, kind: Kind, others: Sequence[Beside] = ()) -> None:
+def allan_panel(axes: "Axes", estimate: Estimate, kind: Kind, others: Sequence[OtherDeviation] = ()) -> None:
     """Draw one log-log panel with title and legend.
 
     Parameters
@@ -159,7 +159,7 @@ def allan_panel(axes: "Axes", estimate: Estimate, kind: Kind, others: Sequence[B
 
 
 def _draw_others(
-    axes: "Axes", others: Sequence[Beside], i: int, colour: str, marker: str, factor: float, longest_s: float
+    axes: "Axes", others: Sequence[OtherDeviation], i: int, colour: str, marker: str, factor: float, longest_s: float
 ) -> list[Floats]:
     """Draw other deviations of one axis as thin lines with open markers; return the values the plot must contain."""
     shown = []
@@ -203,7 +203,7 @@ def _rings(estimate: Estimate, i: int, factor: float, lowest_s: float, floor: fl
             float(value) * (FLICKER_FLOOR_RATIO if letter == "B" else 1.0) * factor,
             i % 3,
         )
-        for letter, value, status in zip(LETTERS, known.value[:, i], known.status[:, i], strict=True)
+        for letter, value, status in zip(SYMBOLS, known.value[:, i], known.status[:, i], strict=True)
         if status == Status.ESTIMATED
     ]
     return [ring for ring in rings if ring.sigma > floor / MAX_DEPTH_RATIO]
@@ -261,7 +261,7 @@ def _group_rings(axes: "Axes", rings: Sequence[_Ring]) -> list[list[_Ring]]:
     return heaps
 
 
-def _draw_labels(axes: "Axes", kind: Kind, others: Sequence[Beside], drawn: Collection[str]) -> None:
+def _draw_labels(axes: "Axes", kind: Kind, others: Sequence[OtherDeviation], drawn: Collection[str]) -> None:
     """Draw labels, grid and legend; the legend names only those other deviations that are drawn."""
     axes.plot([], [], "--", color=GREY, linewidth=1.3, label="fit")
     axes.fill_between([], [], [], color=GREY, alpha=0.25, label="95 %")
@@ -281,8 +281,8 @@ def _draw_labels(axes: "Axes", kind: Kind, others: Sequence[Beside], drawn: Coll
         )
     axes.set(xlabel="averaging time τ, s", ylabel=f"Allan deviation σ(τ), {DEVIATION_UNITS[kind].name}")
     axes.set_title(KIND_NAMES[kind], loc="left", fontsize=12)
-    plain_ticks(axes)
-    quiet(axes)
+    set_log_ticks(axes)
+    style_grid(axes)
     # The legend is above the box, because curves and intervals may fill every corner of it.
     axes.legend(
         loc="lower right",
@@ -296,7 +296,7 @@ def _draw_labels(axes: "Axes", kind: Kind, others: Sequence[Beside], drawn: Coll
     )
 
 
-def quiet(axes: "Axes") -> None:
+def style_grid(axes: "Axes") -> None:
     """Draw grid and frame in pale colours behind the data."""
     axes.grid(which="major", color="#d0d0d0", linewidth=0.8)
     axes.grid(which="minor", color="#ececec", linewidth=0.5)
@@ -304,7 +304,7 @@ def quiet(axes: "Axes") -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def plain_ticks(axes: "Axes") -> None:
+def set_log_ticks(axes: "Axes") -> None:
     """Label a logarithmic y axis: powers of ten for several decades, else also plain numbers between them."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 

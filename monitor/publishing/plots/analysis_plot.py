@@ -12,24 +12,20 @@ import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES
-from monitor.estimation.allan.dynamic_allan import Dynamic
+from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KINDS, Kind, axes_of
+from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.publishing.coefficient_cells import (
-    COEFFICIENT_NAMES,
-    COEFFICIENT_UNITS,
-    KINDS,
     TEMPERATURE_MARK,
     TEMPERATURE_MEANS,
-    Kind,
-    axes_of,
-    marked,
+    format_coefficient,
+    mark_temperature_axis,
     measured_axes,
-    reading,
 )
-from monitor.publishing.plots.allan_figure import COLOURS, GREY, READING, Beside, allan_panel
-from monitor.publishing.plots.dynamic_figure import Mark, dynamic_panels, height_inches
-from monitor.publishing.rerun.panels import duration
+from monitor.publishing.plots.allan_figure import COLOURS, GREY, LEGEND_TEXT, OtherDeviation, allan_panel
+from monitor.publishing.plots.dynamic_figure import ChangeMark, dynamic_panels, height_inches
+from monitor.publishing.rerun.panels import format_duration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,9 +43,9 @@ def allan_plot(
     estimate: Estimate,
     path: Path,
     title: str = "",
-    others: Sequence[Beside] = (),
-    dynamic: Dynamic | None = None,
-    marks: Sequence[Mark] = (),
+    others: Sequence[OtherDeviation] = (),
+    dynamic: DynamicAllan | None = None,
+    marks: Sequence[ChangeMark] = (),
     axes_of_temperature: Collection[str] = (),
 ) -> None:
     """Write the plot; the suffix of ``path`` selects the format.
@@ -108,7 +104,7 @@ def summary(estimate: Estimate) -> str:
     """Return one line with the number of samples, rate, duration and number of missing samples."""
     missing = estimate.curve.n - estimate.samples
     gaps = f", {missing:,} missing" if missing > 0 else ""
-    seconds = duration(estimate.curve.n / estimate.rate_hz)
+    seconds = format_duration(estimate.curve.n / estimate.rate_hz)
     return f"{estimate.samples:,} samples at {estimate.rate_hz:.6g} Hz, {seconds}{gaps}"
 
 
@@ -128,7 +124,7 @@ def k_or_r(estimate: Estimate, letter: str, axis: str) -> bool:
     return (
         drifts
         and bool(estimate.k_or_r[i])
-        and estimate.coefficients.status[LETTERS.index(letter), i] == Status.UPPER_BOUND
+        and estimate.coefficients.status[SYMBOLS.index(letter), i] == Status.UPPER_BOUND
     )
 
 
@@ -136,7 +132,7 @@ def _draw_allan_and_table(
     part: "SubFigure",
     estimate: Estimate,
     kind: Kind,
-    others: Sequence[Beside],
+    others: Sequence[OtherDeviation],
     axes_of_temperature: Collection[str],
 ) -> None:
     """Draw the Allan plot and the table of one kind of sensor."""
@@ -149,18 +145,20 @@ def _table(axes: "Axes", estimate: Estimate, kind: Kind, axes_of_temperature: Co
     """Draw the table of coefficients: the value, and its interval in small print."""
     axes.axis("off")
     columns = (0.0, 0.46, 0.65, 0.84)
-    rows = np.linspace(0.97, 0.19, len(LETTERS) + 1)
+    rows = np.linspace(0.97, 0.19, len(SYMBOLS) + 1)
     for axis, x, colour in zip(axes_of(kind), columns[1:], COLOURS, strict=True):
-        axes.text(x, rows[0], marked(axis, axes_of_temperature), color=colour, fontweight="bold", va="center")
-    for letter, y in zip(LETTERS, rows[1:], strict=True):
+        axes.text(
+            x, rows[0], mark_temperature_axis(axis, axes_of_temperature), color=colour, fontweight="bold", va="center"
+        )
+    for letter, y in zip(SYMBOLS, rows[1:], strict=True):
         unit = COEFFICIENT_UNITS[kind][letter].name
         axes.text(columns[0], y, f"{letter}  {COEFFICIENT_NAMES[kind][letter]}, {unit}", va="center", fontsize=9.5)
         for axis, x in zip(axes_of(kind), columns[1:], strict=True):
-            cell = reading(estimate.coefficients, letter, axis)
+            cell = format_coefficient(estimate.coefficients, letter, axis)
             axes.text(x, y + 0.02, cell.value, va="center", fontsize=9.5)
             small = "K or R" if k_or_r(estimate, letter, axis) else cell.interval
             axes.text(x, y - 0.05, small, va="center", fontsize=6.5, color=GREY)
     temperature = f";  {TEMPERATURE_MARK} {TEMPERATURE_MEANS}" if axes_of_temperature else ""
     axes.text(columns[0], 0.03, EXPLAINED + temperature, va="center", fontsize=7.5, color=GREY)
-    axes.text(columns[0], -0.04, READING, va="center", fontsize=7.5, color=GREY)
+    axes.text(columns[0], -0.04, LEGEND_TEXT, va="center", fontsize=7.5, color=GREY)
     axes.set(xlim=(0, 1), ylim=(-0.06, 1))

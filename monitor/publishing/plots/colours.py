@@ -25,7 +25,7 @@ TEXT: Final[Colour] = (236, 239, 242)  # legible on the label boxes of the dark 
 TEMPERATURE: Final[Colour] = (236, 180, 72)
 
 
-def mixed(colour: Colour, share: float, ground: Colour = BACKGROUND) -> Colour:
+def blend(colour: Colour, share: float, ground: Colour = BACKGROUND) -> Colour:
     """Return the mix of a colour and a background, as a translucent fill would appear.
 
     Parameters

@@ -10,12 +10,12 @@ import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES
-from monitor.drift.compensation.compensation_result import Axis, Result
+from monitor.common.units import DEVIATION_UNITS
+from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
 from monitor.drift.compensation.sage_husa import USED
-from monitor.publishing.coefficient_cells import DEVIATION_UNITS
 from monitor.publishing.plots.allan_figure import COLOURS, GREY
 from monitor.publishing.plots.analysis_plot import DPI, MISSING
-from monitor.publishing.rerun.panels import duration
+from monitor.publishing.rerun.panels import format_duration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,7 +25,7 @@ UNIT: Final = DEVIATION_UNITS["gyro"]
 Z95: Final = 1.959964
 
 
-def compensate_plot(result: Result, path: Path) -> None:
+def compensate_plot(result: CompensationResult, path: Path) -> None:
     """Write the plot.
 
     Parameters
@@ -60,18 +60,18 @@ def compensate_plot(result: Result, path: Path) -> None:
         raise ConfigError(f"cannot write the plot {path}: {error}") from error
 
 
-def _drift(panel: "Axes", axis: str, result: Result) -> None:
+def _drift(panel: "Axes", axis: str, result: CompensationResult) -> None:
     """Draw the means at rest and the predicted drift of one axis."""
     at = AXES.index(axis)
     minutes = np.array([one.end for one in result.intervals]) / result.rate_hz / 60.0
     mean = np.array([one.mean[at] for one in result.intervals])
-    used = np.array([one.became[at] for one in result.intervals]) == USED
+    used = np.array([one.outcome[at] for one in result.intervals]) == USED
     expected = np.array([one.expected[at] for one in result.intervals])
     error = Z95 * np.array([one.known[at] for one in result.intervals])
     middle = float(np.nanmedian(np.where(used, mean, np.nan)))
     mean, expected, error = UNIT.factor * (mean - middle), UNIT.factor * (expected - middle), UNIT.factor * error
     panel.plot(
-        minutes[used], mean[used], ".", ms=2, color=GREY, label=f"means of {duration(result.interval_s)} at rest"
+        minutes[used], mean[used], ".", ms=2, color=GREY, label=f"means of {format_duration(result.interval_s)} at rest"
     )
     panel.fill_between(minutes, expected - error, expected + error, color=COLOURS[at], alpha=0.25, lw=0)
     panel.plot(minutes, expected, color=COLOURS[at], lw=1.3, label="drift expected before each, 95 %")
@@ -81,11 +81,11 @@ def _drift(panel: "Axes", axis: str, result: Result) -> None:
     panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize=7.5, frameon=False, borderaxespad=0.1)
 
 
-def _allan(panel: "Axes", axis: str, one: Axis) -> None:
+def _allan(panel: "Axes", axis: str, one: AxisCompensation) -> None:
     """Draw the Allan deviation of one axis before and after compensation."""
     colour = COLOURS[AXES.index(axis)]
-    panel.loglog(one.before.tau_s, UNIT.factor * one.before.allan, color=GREY, lw=1.2, label="before")
-    panel.loglog(one.after.tau_s, UNIT.factor * one.after.allan, color=colour, lw=1.5, label="after")
+    panel.loglog(one.uncompensated.tau_s, UNIT.factor * one.uncompensated.allan, color=GREY, lw=1.2, label="before")
+    panel.loglog(one.compensated.tau_s, UNIT.factor * one.compensated.allan, color=colour, lw=1.5, label="after")
     panel.grid(which="major", lw=0.3, alpha=0.6)
     panel.set_ylabel(f"Allan deviation, {UNIT.name}")
     panel.legend(loc="best", fontsize=7.5, frameon=False)

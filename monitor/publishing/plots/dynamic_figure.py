@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.sample import AXES, Floats
-from monitor.estimation.allan.dynamic_allan import Dynamic
-from monitor.estimation.fit.coefficients import LETTERS, Status
-from monitor.publishing.coefficient_cells import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, Kind, axes_of
-from monitor.publishing.plots.allan_figure import COLOURS, DARK, GREY, plain_ticks, quiet
+from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, Kind, axes_of
+from monitor.estimation.allan.dynamic_allan import DynamicAllan
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.publishing.plots.allan_figure import COLOURS, DARK, GREY, set_log_ticks, style_grid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,7 +32,7 @@ SPARE_INCHES: Final = 1.2  # height of title, colour bar and time axis
 MIN_ESTIMATED_SHARE: Final = 0.05  # smallest share of time steps with an estimate for a coefficient to have a panel
 PALE_ALPHA: Final = 0.3
 DASHED_LINE: Final = (0, (4, 2))
-APART: Final = 0.13  # smallest distance between two labels, as a share of the width
+MIN_LABEL_DISTANCE: Final = 0.13  # smallest distance between two labels, as a share of the width
 COLOUR_SCALE_RATIOS: Final = (
     1.25,
     1.5,
@@ -47,7 +47,7 @@ UNITS_S: Final = (("s", 1.0, 600.0), ("min", 60.0, 10_800.0), ("h", 3600.0, 259_
 
 
 @dataclass(frozen=True, slots=True)
-class Mark:
+class ChangeMark:
     """Change of one axis to mark in the plot."""
 
     t_s: float  # time since the first sample
@@ -55,14 +55,14 @@ class Mark:
 
 
 @dataclass(frozen=True, slots=True)
-class Clock:
+class TimeUnit:
     """Unit of a time axis."""
 
     name: str
     seconds: float
 
     @classmethod
-    def of(cls, span_s: float) -> "Clock":
+    def of(cls, span_s: float) -> "TimeUnit":
         """Return the unit that suits a time span given in seconds.
 
         >>> Clock.of(7200.0).name, Clock.of(5e5).name
@@ -71,7 +71,7 @@ class Clock:
         return next(cls(name, seconds) for name, seconds, below in UNITS_S if span_s < below)
 
 
-def letters(dynamic: Dynamic, kind: Kind) -> tuple[str, ...]:
+def panel_letters(dynamic: DynamicAllan, kind: Kind) -> tuple[str, ...]:
     """Return the coefficients that are estimated often enough to have a panel.
 
     Parameters
@@ -83,10 +83,10 @@ def letters(dynamic: Dynamic, kind: Kind) -> tuple[str, ...]:
     """
     columns = [AXES.index(axis) for axis in axes_of(kind)]
     share = (dynamic.status[:, :, columns] == Status.ESTIMATED).mean(axis=0).max(axis=1)
-    return tuple(letter for letter, one in zip(LETTERS, share, strict=True) if one >= MIN_ESTIMATED_SHARE)
+    return tuple(letter for letter, one in zip(SYMBOLS, share, strict=True) if one >= MIN_ESTIMATED_SHARE)
 
 
-def axes_shown(dynamic: Dynamic, kind: Kind) -> tuple[str, ...]:
+def axes_shown(dynamic: DynamicAllan, kind: Kind) -> tuple[str, ...]:
     """Return the measured axes of a kind of sensor.
 
     Parameters
@@ -99,7 +99,7 @@ def axes_shown(dynamic: Dynamic, kind: Kind) -> tuple[str, ...]:
     return tuple(a for a in axes_of(kind) if bool(np.isfinite(dynamic.deviation[:, :, AXES.index(a)]).any()))
 
 
-def height_inches(dynamic: Dynamic, kind: Kind) -> float:
+def height_inches(dynamic: DynamicAllan, kind: Kind) -> float:
     """Return the height of the figure [inches].
 
     Parameters
@@ -109,11 +109,11 @@ def height_inches(dynamic: Dynamic, kind: Kind) -> float:
     kind
         Kind of sensor.
     """
-    surfaces, lines = len(axes_shown(dynamic, kind)), len(letters(dynamic, kind))
+    surfaces, lines = len(axes_shown(dynamic, kind)), len(panel_letters(dynamic, kind))
     return SPARE_INCHES + SURFACE_INCHES * surfaces + LINE_INCHES * lines
 
 
-def relative(dynamic: Dynamic) -> Floats:
+def relative(dynamic: DynamicAllan) -> Floats:
     """Return the deviation divided by its median over time, shape [T, m, 6]; NaN if missing or if the median is 0.
 
     >>> from monitor.estimation.allan.dynamic_allan import dynamic as of
@@ -125,7 +125,9 @@ def relative(dynamic: Dynamic) -> Floats:
         return dynamic.deviation / _median(dynamic)
 
 
-def dynamic_panels(figure: "Figure | SubFigure", dynamic: Dynamic, kind: Kind, marks: Sequence[Mark] = ()) -> None:
+def dynamic_panels(
+    figure: "Figure | SubFigure", dynamic: DynamicAllan, kind: Kind, marks: Sequence[ChangeMark] = ()
+) -> None:
     """Draw the panels of one kind of sensor.
 
     Parameters
@@ -139,10 +141,10 @@ def dynamic_panels(figure: "Figure | SubFigure", dynamic: Dynamic, kind: Kind, m
     marks
         Changes of all axes; those of this kind are drawn.
     """
-    axes, shown = axes_shown(dynamic, kind), letters(dynamic, kind)
+    axes, shown = axes_shown(dynamic, kind), panel_letters(dynamic, kind)
     ratios = [SURFACE_INCHES] * len(axes) + [LINE_INCHES] * len(shown)
     panels = figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
-    clock = Clock.of(float(dynamic.t_s[-1]))
+    clock = TimeUnit.of(float(dynamic.t_s[-1]))
     edges = _edges(dynamic.t_s) / clock.seconds
     ratio, mesh = _colour_scale_end(relative(dynamic)[..., [AXES.index(axis) for axis in axes]]), None
     for panel, axis in zip(panels, axes, strict=False):
@@ -160,10 +162,10 @@ def dynamic_panels(figure: "Figure | SubFigure", dynamic: Dynamic, kind: Kind, m
         _draw_colour_bar(figure, mesh, list(panels[: len(axes)]), ratio)
 
 
-def _draw_changes(panels: "Sequence[Axes]", axes: Sequence[str], marks: Sequence[Mark], clock: Clock) -> None:
+def _draw_changes(panels: "Sequence[Axes]", axes: Sequence[str], marks: Sequence[ChangeMark], clock: TimeUnit) -> None:
     """Draw changes as vertical lines, with labels in the heat map of their axis."""
     left, right = panels[0].get_xlim()
-    apart = APART * (right - left)
+    apart = MIN_LABEL_DISTANCE * (right - left)
     for panel, axis in zip(panels, axes, strict=False):
         times = [mark.t_s / clock.seconds for mark in marks if mark.axis == axis]
         for at in times:
@@ -197,7 +199,7 @@ def _group_times(times: Sequence[float], apart: float) -> list[list[float]]:
     return heaps
 
 
-def _draw_heat_map(panel: "Axes", dynamic: Dynamic, axis: str, edges: Floats, ratio: float) -> "QuadMesh":
+def _draw_heat_map(panel: "Axes", dynamic: DynamicAllan, axis: str, edges: Floats, ratio: float) -> "QuadMesh":
     """Draw the heat map of one axis, time by τ."""
     from matplotlib.ticker import NullLocator
 
@@ -233,9 +235,9 @@ def _draw_colour_bar(figure: "Figure | SubFigure", mesh: "QuadMesh", panels: "li
     bar.outline.set_visible(False)
 
 
-def _draw_coefficient(panel: "Axes", dynamic: Dynamic, kind: Kind, letter: str, t: Floats) -> None:
+def _draw_coefficient(panel: "Axes", dynamic: DynamicAllan, kind: Kind, letter: str, t: Floats) -> None:
     """Draw one coefficient of three axes over time."""
-    row, unit = LETTERS.index(letter), COEFFICIENT_UNITS[kind][letter]
+    row, unit = SYMBOLS.index(letter), COEFFICIENT_UNITS[kind][letter]
     held, ends = [], []
     for axis, colour in zip(axes_of(kind), COLOURS, strict=True):
         i = AXES.index(axis)
@@ -255,14 +257,14 @@ def _draw_coefficient(panel: "Axes", dynamic: Dynamic, kind: Kind, letter: str, 
     if low > 0 and high > LOG_SCALE_RATIO * low:
         panel.set_yscale("log")
         panel.set_ylim(low / 1.5, high * 1.5)
-        plain_ticks(panel)
+        set_log_ticks(panel)
     else:
         room = 0.25 * (high - low) + 0.02 * high
         lowest, highest = np.nanquantile(ends, [1.0 - BANDS, BANDS]).tolist()
         panel.set_ylim(max(min(low - room, lowest), 0.0), max(high + room, highest))
     panel.set_ylabel(f"{letter}, {unit.name}")
     panel.set_title(COEFFICIENT_NAMES[kind][letter], loc="left", fontsize=9, color=GREY, pad=3)
-    quiet(panel)
+    style_grid(panel)
     panel.legend(
         loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, frameon=False,
         ncols=3, fontsize=8, handlelength=1.2, columnspacing=1.0,
@@ -275,7 +277,7 @@ def _isolated(there: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(there & ~padded[:-2] & ~padded[2:])
 
 
-def _median(dynamic: Dynamic) -> Floats:
+def _median(dynamic: DynamicAllan) -> Floats:
     """Return the median of the deviation over time, shape [1, m, 6]; NaN if there is none."""
     import warnings
 

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from drivers.errors import ConfigError, NotReady
 from drivers.sample import AXES, Floats
-from monitor.estimation.fit.coefficients import LETTERS
+from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, KINDS, Kind, axes_of
+from monitor.estimation.fit.coefficients import SYMBOLS
 from monitor.history.bucket import COUNTS, STATES
-from monitor.history.reading import Past
-from monitor.history.sqlite_store import PastEvent
-from monitor.publishing.coefficient_cells import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, KINDS, Kind, axes_of
-from monitor.publishing.plots.allan_figure import COLOURS, DARK, GREY, plain_ticks, quiet
+from monitor.history.reading import HistoryTable
+from monitor.history.sqlite_store import StoredEvent
+from monitor.publishing.plots.allan_figure import COLOURS, DARK, GREY, set_log_ticks, style_grid
 from monitor.publishing.plots.analysis_plot import DPI, MISSING
-from monitor.publishing.terminal.history_text import head
+from monitor.publishing.terminal.history_text import summary_line
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,7 +49,7 @@ MIN_LABEL_DISTANCE: Final = 0.055  # smallest distance between two labels, as a 
 PRIORITY_KINDS: Final = ("noise_changed", "bias_stepped", "limit_crossed", "model_disagrees")
 
 
-def history_plot(past: Past, path: Path, axes: Sequence[str] = AXES) -> None:
+def history_plot(past: HistoryTable, path: Path, axes: Sequence[str] = AXES) -> None:
     """Write the plot; the suffix of ``path`` selects the format.
 
     Parameters
@@ -75,10 +75,10 @@ def history_plot(past: Past, path: Path, axes: Sequence[str] = AXES) -> None:
         raise ConfigError(MISSING) from error
     if not len(past):
         raise NotReady(f"{past.device}: events alone are not drawn; there are no rows in that time")
-    there = [axis for axis in axes if any(_was_estimated(past, axis, letter) for letter in LETTERS)]
+    there = [axis for axis in axes if any(_was_estimated(past, axis, letter) for letter in SYMBOLS)]
     shown = {kind: [axis for axis in axes_of(kind) if axis in there] for kind in KINDS}
     kinds = [kind for kind in KINDS if shown[kind]] or [KINDS[0]]
-    letters = [one for one in LETTERS if any(_was_estimated(past, axis, one) for kind in kinds for axis in shown[kind])]
+    letters = [one for one in SYMBOLS if any(_was_estimated(past, axis, one) for kind in kinds for axis in shown[kind])]
     rows = len(letters) + (1 if len(kinds) > 1 else 2)
     figure = Figure(
         figsize=(PANEL_INCHES[0] * len(kinds), SPARE_INCHES + PANEL_INCHES[1] * rows), dpi=DPI, layout="constrained"
@@ -96,19 +96,19 @@ def history_plot(past: Past, path: Path, axes: Sequence[str] = AXES) -> None:
     for column, kind in enumerate(kinds):
         own = [one for one in _select_events(past) if one.axis is None or one.axis in shown[kind]]
         _draw_events(list(panels[:, column]), own)
-    figure.suptitle(head(past), fontsize=11)
+    figure.suptitle(summary_line(past), fontsize=11)
     try:
         figure.savefig(path)
     except (OSError, ValueError) as error:
         raise ConfigError(f"cannot write the plot {path}: {error}") from error
 
 
-def _was_estimated(past: Past, axis: str, letter: str) -> bool:
+def _was_estimated(past: HistoryTable, axis: str, letter: str) -> bool:
     """Return True if a coefficient was estimated in at least one bucket."""
     return bool(np.isfinite(past.column(f"{axis}.{letter}").last).any())
 
 
-def _draw_coefficient(panel: "Axes", past: Past, kind: Kind, letter: str, axes: Sequence[str]) -> None:
+def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str, axes: Sequence[str]) -> None:
     """Draw one coefficient of up to three axes."""
     unit = COEFFICIENT_UNITS[kind][letter]
     lows, highs = [], []
@@ -131,18 +131,18 @@ def _draw_coefficient(panel: "Axes", past: Past, kind: Kind, letter: str, axes: 
     elif min(lows) > 0 and max(highs) > LOG_SCALE_RATIO * min(lows):
         panel.set_yscale("log")
         panel.set_ylim(min(lows) / 1.2, max(highs) * 1.2)
-        plain_ticks(panel)
+        set_log_ticks(panel)
     else:
         room = 0.15 * (max(highs) - min(lows)) + 0.02 * max(highs)
         panel.set_ylim(max(min(lows) - room, 0.0), max(highs) + room)
     panel.set_ylabel(f"{letter}, {unit.name}")
     _draw_title(panel, COEFFICIENT_NAMES[kind][letter])
-    quiet(panel)
+    style_grid(panel)
     if lows:
         panel.legend(loc="upper left", frameon=False, ncols=3, fontsize=8, handlelength=1.2, columnspacing=1.0)
 
 
-def _temperature(panel: "Axes", past: Past) -> None:
+def _temperature(panel: "Axes", past: HistoryTable) -> None:
     """Draw the temperature with its extremes."""
     course = past.column("temperature")
     t, low, high, last = _with_gaps(past, course.low, course.high, course.last)
@@ -153,10 +153,10 @@ def _temperature(panel: "Axes", past: Past) -> None:
         panel.text(0.5, 0.5, "no temperature measured", transform=panel.transAxes, ha="center", color=GREY)
     panel.set_ylabel("°C")
     _draw_title(panel, "temperature")
-    quiet(panel)
+    style_grid(panel)
 
 
-def _losses(panel: "Axes", past: Past) -> None:
+def _losses(panel: "Axes", past: HistoryTable) -> None:
     """Draw the number of missing samples by bucket, and the time in which the device was not running."""
     t, width = _days(past.start_s), past.width_s / 86_400.0
     missing = past.counts[:, [COUNTS.index(name) for name in ("lost", "bad", "overflowed")]].sum(axis=1)
@@ -167,7 +167,7 @@ def _losses(panel: "Axes", past: Past) -> None:
     panel.set_ylim(0, max(float(missing.max()) * 1.15, 1.0))
     panel.set_ylabel("samples")
     _draw_title(panel, "lost, bad or overflowed; red: not running at some time")
-    quiet(panel)
+    style_grid(panel)
 
 
 def _draw_title(panel: "Axes", text: str) -> None:
@@ -176,14 +176,14 @@ def _draw_title(panel: "Axes", text: str) -> None:
     panel.text(0.995, 0.95, text, transform=panel.transAxes, ha="right", va="top", fontsize=9, color=GREY, bbox=place)
 
 
-def _select_events(past: Past) -> list[PastEvent]:
+def _select_events(past: HistoryTable) -> list[StoredEvent]:
     """Return the events to draw, in order of time."""
     kinds = [one for one in past.events if one.kind in EVENT_LABELS]
     kinds.sort(key=lambda one: (one.kind not in PRIORITY_KINDS, -(one.sigma or 0.0)))
     return sorted(kinds[:MAX_EVENTS], key=lambda one: one.t_s)
 
 
-def _draw_events(panels: "Sequence[Axes]", events: Sequence[PastEvent]) -> None:
+def _draw_events(panels: "Sequence[Axes]", events: Sequence[StoredEvent]) -> None:
     """Draw event lines through the panels and labels above the first one; labels that would overlap are omitted."""
     left, right = panels[0].get_xlim()
     said_to = -np.inf
@@ -203,7 +203,7 @@ def _draw_events(panels: "Sequence[Axes]", events: Sequence[PastEvent]) -> None:
         above.set_in_layout(False)  # the title reserves the space
 
 
-def _dates(panels: Any, past: Past) -> None:
+def _dates(panels: Any, past: HistoryTable) -> None:
     """Set the limits and labels of the time axes."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
@@ -217,7 +217,7 @@ def _dates(panels: Any, past: Past) -> None:
         panel.set_xlabel("UTC")
 
 
-def _with_gaps(past: Past, *columns: Floats) -> tuple[Floats, ...]:
+def _with_gaps(past: HistoryTable, *columns: Floats) -> tuple[Floats, ...]:
     """Return times in days and the columns, with a NaN wherever buckets are missing."""
     ends, starts = past.end_s[:-1], past.start_s[1:]
     holes: NDArray[np.int64] = np.flatnonzero(starts > ends) + 1

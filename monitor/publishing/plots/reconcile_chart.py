@@ -15,12 +15,12 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import AXES, Floats
-from monitor.publishing.coefficient_cells import DEVIATION_UNITS, kind_of
+from monitor.common.units import DEVIATION_UNITS, sensor_kind
 from monitor.publishing.plots.allan_figure import COLOURS, DARK, GREY
-from monitor.publishing.plots.dynamic_figure import Clock
+from monitor.publishing.plots.dynamic_figure import TimeUnit
 from monitor.publishing.plots.ruler import Ruler, thinned
-from monitor.publishing.reports.reconcile_sentences import field_unit, place, plain
-from monitor.reconcile.result import View, Where
+from monitor.publishing.reports.reconcile_sentences import field_unit, format_range, words_of
+from monitor.reconcile.result import Location, PlotData
 
 LEFT, RIGHT, ABOVE, BELOW = 54.0, 16.0, 28.0, 40.0  # px round a panel, for labels
 BAND: Final = "#cfd5dd"
@@ -57,7 +57,9 @@ class Plot:
     mark_label: str
 
 
-def chart(views: Sequence[tuple[str, View]], axis: str, width: float, height: float, where: Where | None = None) -> str:
+def chart(
+    views: Sequence[tuple[str, PlotData]], axis: str, width: float, height: float, where: Location | None = None
+) -> str:
     """An SVG element with a panel a view, all of one lens.
 
     Args:
@@ -78,13 +80,13 @@ def chart(views: Sequence[tuple[str, View]], axis: str, width: float, height: fl
     )
 
 
-def view_at(views: Sequence[View], lens: str, where: Where) -> View | None:
+def view_at(views: Sequence[PlotData], lens: str, where: Location) -> PlotData | None:
     """The picture of a lens; of a lens without one, the first that looks along the place that it found."""
     own = [view for view in views if view.lens == lens]
     return next(iter(own or [view for view in views if along(view, where) is not None]), None)
 
 
-def along(view: View, where: Where) -> tuple[float, float] | None:
+def along(view: PlotData, where: Location) -> tuple[float, float] | None:
     """The place as far as it lies along x of a view, in the view's unit."""
     match view.x_name, view.x_unit:
         case _, "Hz":
@@ -100,7 +102,7 @@ def along(view: View, where: Where) -> tuple[float, float] | None:
     return None
 
 
-def near(view: View, where: Where) -> View | None:
+def near(view: PlotData, where: Location) -> PlotData | None:
     """The part of a view round a place that is too narrow to be seen in the whole; None where it is not."""
     at = along(view, where)
     if at is None or view.x.size < 2:
@@ -116,17 +118,17 @@ def near(view: View, where: Where) -> View | None:
     if rows.sum() < POINTS:
         return None
     lines = (line[rows] for line in (view.x, view.measured, view.expected, view.lo, view.hi))
-    return View(view.lens, view.x_name, view.x_unit, view.y_name, view.y_unit, view.log, *lines)
+    return PlotData(view.lens, view.x_name, view.x_unit, view.y_name, view.y_unit, view.log, *lines)
 
 
-def plotted(title: str, view: View, axis: str, where: Where | None) -> Plot:
+def plotted(title: str, view: PlotData, axis: str, where: Location | None) -> Plot:
     """A view of an axis in the units that people read, with the place to mark if it lies along x."""
     x_unit, y_unit = field_unit(view.x_unit, _largest(view.x)), field_unit(view.y_unit, _largest(view.measured))
     if view.x_name == "averaging time":  # a deviation stands in the unit of all Allan plots
-        y_unit = DEVIATION_UNITS[kind_of(axis)] if view.y_unit in ("rad/s", "m/s²") else y_unit
+        y_unit = DEVIATION_UNITS[sensor_kind(axis)] if view.y_unit in ("rad/s", "m/s²") else y_unit
     factor, x_name = x_unit.factor, x_unit.name
     if view.x_name == "time" and not view.log:
-        clock = Clock.of(float(np.ptp(view.x)))
+        clock = TimeUnit.of(float(np.ptp(view.x)))
         factor, x_name = 1.0 / clock.seconds, clock.name
     mark = None if where is None else along(view, where)
     measured, expected, lo, hi = (line * y_unit.factor for line in (view.measured, view.expected, view.lo, view.hi))
@@ -141,12 +143,12 @@ def plotted(title: str, view: View, axis: str, where: Where | None) -> Plot:
         lo=lo,
         hi=hi,
         mark=None if mark is None else (mark[0] * factor, mark[1] * factor),
-        mark_label="" if where is None else place(where, axis),
+        mark_label="" if where is None else format_range(where, axis),
     )
 
 
 def _label(name: str, unit: str) -> str:
-    return f"{plain(name)}, {unit}" if unit else plain(name)
+    return f"{words_of(name)}, {unit}" if unit else words_of(name)
 
 
 def _largest(values: Floats) -> float:

@@ -10,13 +10,13 @@ import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Floats
-from monitor.drift.thermal.interval_means import Means
-from monitor.drift.thermal.thermal_model import Prediction, predicted
-from monitor.drift.thermal.thermal_study import Outlook, Study
-from monitor.publishing.coefficient_cells import DEVIATION_UNITS, kind_of
+from monitor.common.units import DEVIATION_UNITS, sensor_kind
+from monitor.drift.thermal.interval_means import IntervalMeans
+from monitor.drift.thermal.thermal_model import Prediction, predict
+from monitor.drift.thermal.thermal_study import ThermalFitReport, ThermalPredictionReport
 from monitor.publishing.plots.allan_figure import COLOURS, GREY
 from monitor.publishing.plots.analysis_plot import DPI, MISSING
-from monitor.publishing.rerun.panels import duration
+from monitor.publishing.rerun.panels import format_duration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 ROW_INCHES: Final = (11.0, 2.6)
 
 
-def study_plot(study: Study, path: Path) -> None:
+def study_plot(study: ThermalFitReport, path: Path) -> None:
     """Write a plot of interval means and the fitted thermal models.
 
     Parameters
@@ -43,15 +43,15 @@ def study_plot(study: Study, path: Path) -> None:
         (
             axis,
             study.means[axis],
-            predicted(one.model, study.means[axis].temperature_c, began=True),
+            predict(one.model, study.means[axis].temperature_c, began=True),
             one.model.shape.name,
         )
         for axis, one in study.fits.items()
     ]
-    _draw(rows, f"{study.recording}: bias and temperature, means of {duration(study.interval_s)}", path)
+    _draw(rows, f"{study.recording}: bias and temperature, means of {format_duration(study.interval_s)}", path)
 
 
-def outlook_plot(outlook: Outlook, path: Path) -> None:
+def outlook_plot(outlook: ThermalPredictionReport, path: Path) -> None:
     """Write a plot of interval means and the predictions of models of another recording, with the offset removed.
 
     Parameters
@@ -70,10 +70,10 @@ def outlook_plot(outlook: Outlook, path: Path) -> None:
     for axis, one in outlook.judged.items():
         band = Prediction(*(each + one.offset for each in (one.multi_step.bias, one.multi_step.lo, one.multi_step.hi)))
         rows.append((axis, outlook.means[axis], band, "multi-step, offset out"))
-    _draw(rows, f"{outlook.recording}: expected from temperature, means of {duration(outlook.interval_s)}", path)
+    _draw(rows, f"{outlook.recording}: expected from temperature, means of {format_duration(outlook.interval_s)}", path)
 
 
-def _draw(rows: list[tuple[str, Means, Prediction, str]], title: str, path: Path) -> None:
+def _draw(rows: list[tuple[str, IntervalMeans, Prediction, str]], title: str, path: Path) -> None:
     """Write the plot; raise ConfigError if matplotlib is missing or the file cannot be written."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -84,7 +84,7 @@ def _draw(rows: list[tuple[str, Means, Prediction, str]], title: str, path: Path
     FigureCanvasAgg(figure)
     panels: Any = figure.subplots(len(rows), 2, squeeze=False, width_ratios=[2.4, 1.0])
     for (over_time, against), (axis, means, model, name) in zip(panels, rows, strict=True):
-        unit, colour = DEVIATION_UNITS[kind_of(axis)], COLOURS[AXES.index(axis) % 3]
+        unit, colour = DEVIATION_UNITS[sensor_kind(axis)], COLOURS[AXES.index(axis) % 3]
         hours = (np.arange(means.bias.size) + 0.5) * means.interval_s / 3600.0
         middle = float(np.nanmean(means.bias))
         bias, expected, lo, hi, bars = (

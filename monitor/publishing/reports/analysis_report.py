@@ -15,26 +15,21 @@ from typing import TYPE_CHECKING, Final
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES
-from monitor.estimation.allan.dynamic_allan import Dynamic
+from monitor.common.units import COEFFICIENT_NAMES, KIND_NAMES, Kind, axes_of, format_number, unit_of
+from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.analysis import Analysis
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.publishing.coefficient_cells import (
-    COEFFICIENT_NAMES,
-    KIND_NAMES,
     TEMPERATURE_MARK,
     TEMPERATURE_MEANS,
-    Kind,
-    axes_of,
-    marked,
-    number,
-    reading,
-    unit_of,
+    format_coefficient,
+    mark_temperature_axis,
 )
 from monitor.publishing.plots import analysis_plot
-from monitor.publishing.plots.allan_figure import COLOURS, READING, Beside, allan_panel
-from monitor.publishing.plots.dynamic_figure import Mark, dynamic_panels, height_inches
-from monitor.publishing.rerun.panels import duration
+from monitor.publishing.plots.allan_figure import COLOURS, LEGEND_TEXT, OtherDeviation, allan_panel
+from monitor.publishing.plots.dynamic_figure import ChangeMark, dynamic_panels, height_inches
+from monitor.publishing.rerun.panels import format_duration
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -86,9 +81,9 @@ def html_report(
     analysis: Analysis,
     path: Path,
     title: str = "",
-    others: Sequence[Beside] = (),
-    dynamic: Dynamic | None = None,
-    marks: Sequence[Mark] = (),
+    others: Sequence[OtherDeviation] = (),
+    dynamic: DynamicAllan | None = None,
+    marks: Sequence[ChangeMark] = (),
 ) -> None:
     """Write the page.
 
@@ -122,9 +117,9 @@ def html_report(
 def html(
     analysis: Analysis,
     title: str = "",
-    others: Sequence[Beside] = (),
-    dynamic: Dynamic | None = None,
-    marks: Sequence[Mark] = (),
+    others: Sequence[OtherDeviation] = (),
+    dynamic: DynamicAllan | None = None,
+    marks: Sequence[ChangeMark] = (),
 ) -> str:
     """Return the page as text.
 
@@ -168,8 +163,8 @@ def html(
             for kind in analysis_plot.kinds_of(estimate)
         ],
         temperature=f"{TEMPERATURE_MARK} {TEMPERATURE_MEANS}." if analysis.axes_of_temperature else "",
-        reading=READING,
-        window="" if dynamic is None else duration(dynamic.window_s),
+        reading=LEGEND_TEXT,
+        window="" if dynamic is None else format_duration(dynamic.window_s),
     )
 
 
@@ -177,13 +172,13 @@ def facts(analysis: Analysis) -> tuple[tuple[str, str], ...]:
     """Return names and values that describe the recording."""
     estimate = analysis.estimate
     missing = max(estimate.curve.n - estimate.samples, 0)
-    share = f" ({number(100.0 * missing / estimate.curve.n, 2)} %)" if missing else ""
+    share = f" ({format_number(100.0 * missing / estimate.curve.n, 2)} %)" if missing else ""
     return (
         ("rate", f"{estimate.rate_hz:.6g} Hz"),
         ("samples", f"{estimate.samples:,}"),
-        ("duration", duration(analysis.seconds)),
+        ("duration", format_duration(analysis.seconds)),
         ("missing samples", f"{missing:,}{share}" if missing else "none"),
-        ("averaging times", f"{number(estimate.curve.tau_s[0])} … {number(estimate.curve.tau_s[-1])} s"),
+        ("averaging times", f"{format_number(estimate.curve.tau_s[0])} … {format_number(estimate.curve.tau_s[-1])} s"),
     )
 
 
@@ -199,15 +194,15 @@ def table(estimate: Estimate, kind: Kind) -> tuple[Row, ...]:
     """
     return tuple(
         Row(letter, COEFFICIENT_NAMES[kind][letter], tuple(_cell(estimate, letter, axis) for axis in axes_of(kind)))
-        for letter in LETTERS
+        for letter in SYMBOLS
     )
 
 
 def _cell(estimate: Estimate, letter: str, axis: str) -> Cell:
     """Return the text of one coefficient of one axis."""
     known = estimate.coefficients
-    status = Status(int(known.status[LETTERS.index(letter), AXES.index(axis)]))
-    one = reading(known, letter, axis)
+    status = Status(int(known.status[SYMBOLS.index(letter), AXES.index(axis)]))
+    one = format_coefficient(known, letter, axis)
     value = one.value if status == Status.UNESTIMATED else f"{one.value} {unit_of(letter, axis).name}"
     word = K_OR_R if analysis_plot.k_or_r(estimate, letter, axis) else STATUS_TEXTS[status]
     return Cell(value, one.interval, word)
@@ -216,9 +211,9 @@ def _cell(estimate: Estimate, letter: str, axis: str) -> Cell:
 def _part(
     estimate: Estimate,
     kind: Kind,
-    others: Sequence[Beside],
-    dynamic: Dynamic | None,
-    marks: Sequence[Mark],
+    others: Sequence[OtherDeviation],
+    dynamic: DynamicAllan | None,
+    marks: Sequence[ChangeMark],
     axes_of_temperature: Collection[str],
 ) -> Part:
     """Return the section of one kind of sensor, drawn with simplified lines."""
@@ -232,9 +227,9 @@ def _part(
 def _draw_part(
     estimate: Estimate,
     kind: Kind,
-    others: Sequence[Beside],
-    dynamic: Dynamic | None,
-    marks: Sequence[Mark],
+    others: Sequence[OtherDeviation],
+    dynamic: DynamicAllan | None,
+    marks: Sequence[ChangeMark],
     axes_of_temperature: Collection[str],
 ) -> Part:
     """Draw the figures of one kind of sensor and return its section."""
@@ -247,7 +242,7 @@ def _draw_part(
         figure = Figure(figsize=(DYNAMIC_WIDTH_INCHES, height_inches(dynamic, kind)), layout="constrained")
         dynamic_panels(figure, dynamic, kind, marks)
         surface = _svg(figure, f"{kind}-dynamic")
-    names = (marked(axis, axes_of_temperature) for axis in axes_of(kind))
+    names = (mark_temperature_axis(axis, axes_of_temperature) for axis in axes_of(kind))
     tints = tuple(zip(names, COLOURS, strict=True))
     return Part(KIND_NAMES[kind], tints, table(estimate, kind), _svg(curves, f"{kind}-allan"), surface)
 

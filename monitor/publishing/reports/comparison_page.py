@@ -21,9 +21,9 @@ from monitor.publishing.plots.ruler import Ruler
 from monitor.publishing.reports import comparison_sentences as runs_words
 from monitor.publishing.reports import reconcile_sentences as words
 from monitor.publishing.reports.reconcile_page import MISSING
-from monitor.publishing.rerun.panels import duration
-from monitor.reconcile.result import Bounds, Step
-from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, Seen
+from monitor.publishing.rerun.panels import format_duration
+from monitor.reconcile.result import ParameterInterval, ReconciliationStep
+from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, MatchedEffect
 
 TEMPLATE: Final = "reconcile_runs.html.j2"
 STRIP_PX: Final = (260.0, 22.0)
@@ -112,13 +112,13 @@ def page(c: Comparison) -> str:
     return environment.get_template(TEMPLATE).render(
         title=f"{len(c.runs)} recordings of one sensor",
         verdict=c.verdict,
-        word=words.VERDICTS[c.verdict],
+        word=words.RESULT_TEXTS[c.verdict],
         summary=runs_words.summary(c),
         recorded=_recorded(c),
         rows=[_row(c, one) for one in c.axes.values()],
         common=[_common(c, axis, seen) for axis, one in c.axes.items() for seen in one.common],
         single=[_single(c, axis, seen) for axis, one in c.axes.items() for seen in one.single],
-        silent=c.silent,
+        silent=c.without_result,
         model=str(c.model),
     )
 
@@ -129,8 +129,8 @@ def _recorded(c: Comparison) -> list[Recorded]:
         Recorded(
             run.name,
             run.result.verdict,
-            words.VERDICTS[run.result.verdict],
-            duration(run.result.seconds),
+            words.RESULT_TEXTS[run.result.verdict],
+            format_duration(run.result.duration_s),
             f"{run.result.samples:,}",
             f"{run.result.rate_hz:.6g} Hz",
         )
@@ -144,11 +144,11 @@ def _row(c: Comparison, one: AxisRuns) -> AxisRow:
     for run in c.runs:
         result = one.results.get(run.name)
         verdict = "" if result is None else result.verdict
-        cells.append((verdict, words.VERDICTS.get(verdict, ""), runs_words.cell(result)))
+        cells.append((verdict, words.RESULT_TEXTS.get(verdict, ""), runs_words.axis_summary(result)))
     return AxisRow(one.axis, _colour(one.axis), tuple(cells))
 
 
-def _common(c: Comparison, axis: str, seen: Seen) -> CommonPart:
+def _common(c: Comparison, axis: str, seen: MatchedEffect) -> CommonPart:
     """Return the section of one common effect."""
     names = tuple(seen.parameters)
     drawn = next((name for name, one in seen.parameters.items() if one.freedom), "")
@@ -167,30 +167,30 @@ def _common(c: Comparison, axis: str, seen: Seen) -> CommonPart:
     return CommonPart(
         axis,
         _colour(axis),
-        f"{seen.kind} {words.plain(seen.effect)}",
-        EFFECTS[seen.effect].means,
-        runs_words.agreement(seen),
+        f"{seen.kind} {words.words_of(seen.effect)}",
+        EFFECTS[seen.effect].description,
+        runs_words.size_agreement(seen),
         seen.consistent is False,
-        tuple(words.plain(name) for name in names),
-        words.plain(drawn) if ruler else "",
+        tuple(words.words_of(name) for name in names),
+        words.words_of(drawn) if ruler else "",
         rows,
     )
 
 
-def _cells(c: Comparison, axis: str, step: Step, names: Sequence[str]) -> tuple[str, ...]:
+def _cells(c: Comparison, axis: str, step: ReconciliationStep, names: Sequence[str]) -> tuple[str, ...]:
     """Return the text of each parameter."""
     known = {one.name: one.short for one in words.parameters(step, axis, c.baseline)}
     return tuple(known.get(name, "—") for name in names)
 
 
-def _single(c: Comparison, axis: str, seen: Seen) -> SingleRow:
+def _single(c: Comparison, axis: str, seen: MatchedEffect) -> SingleRow:
     """Return the row of one effect that only some recordings have."""
-    effect, _, parameters = runs_words.line(seen, axis, c.baseline).partition(": ")
+    effect, _, parameters = runs_words.effect_line(seen, axis, c.baseline).partition(": ")
     elsewhere = tuple((a.run, a.meaning, runs_words.MEANINGS[a.meaning], a.because) for a in seen.absent)
     return SingleRow(axis, _colour(axis), seen.kind, effect, parameters, ", ".join(seen.steps), elsewhere)
 
 
-def _ruler(intervals: Sequence[Bounds]) -> Ruler | None:
+def _ruler(intervals: Sequence[ParameterInterval]) -> Ruler | None:
     """Return a linear scale that contains all intervals; None if they have no extent."""
     ends = [end for one in intervals for end in (one.lo, one.hi) if end is not None and np.isfinite(end)]
     if not ends or not max(ends) > min(ends):
@@ -200,7 +200,7 @@ def _ruler(intervals: Sequence[Bounds]) -> Ruler | None:
     return Ruler(low - more, high + more, False, 0.0, STRIP_PX[0])
 
 
-def _strip(one: Bounds | None, ruler: Ruler, colour: str, whole: bool) -> str:
+def _strip(one: ParameterInterval | None, ruler: Ruler, colour: str, whole: bool) -> str:
     """Return the SVG of an interval and its value; the pooled one is dark and marked with a diamond."""
     wide, middle = STRIP_PX[0], 0.5 * STRIP_PX[1]
     parts = [f'<line x1="0" x2="{wide:g}" y1="{middle:g}" y2="{middle:g}" stroke="#eee"/>']

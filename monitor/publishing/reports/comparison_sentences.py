@@ -6,11 +6,11 @@ digits of ``reconcile_sentences``.
 
 from typing import Final
 
+from monitor.common.units import format_number
 from monitor.noise.model import NoiseModel
-from monitor.publishing.coefficient_cells import number
 from monitor.publishing.reports import reconcile_sentences as words
 from monitor.reconcile.result import AxisResult
-from monitor.reconcile.several_recordings.comparison import Comparison, Seen
+from monitor.reconcile.several_recordings.comparison import Comparison, MatchedEffect
 
 MEANINGS: Final = {
     "contradiction": "contradicts it",
@@ -40,7 +40,7 @@ def summary(c: Comparison) -> str:
     return " ".join(said)
 
 
-def line(seen: Seen, axis: str, baseline: NoiseModel) -> str:
+def effect_line(seen: MatchedEffect, axis: str, baseline: NoiseModel) -> str:
     """Return one line with an effect and its pooled parameters.
 
     Parameters
@@ -55,7 +55,7 @@ def line(seen: Seen, axis: str, baseline: NoiseModel) -> str:
     return words.step_line(seen.step(), axis, baseline)
 
 
-def agreement(seen: Seen) -> str:
+def size_agreement(seen: MatchedEffect) -> str:
     """Return whether the sizes of an effect agree between the recordings, with the p-value."""
     if seen.p is None:
         return "nothing to compare"
@@ -68,10 +68,10 @@ def probability(p: float) -> str:
     >>> probability(0.413), probability(2e-5)
     ('p = 0.41', 'p < 0.001')
     """
-    return "p < 0.001" if p < 0.001 else f"p = {number(p, 2)}"
+    return "p < 0.001" if p < 0.001 else f"p = {format_number(p, 2)}"
 
 
-def cell(result: AxisResult | None) -> str:
+def axis_summary(result: AxisResult | None) -> str:
     """Return a short description of one axis in one recording, shown next to its result."""
     if result is None:
         return "not recorded"
@@ -80,6 +80,6 @@ def cell(result: AxisResult | None) -> str:
     return ", ".join(one for one in (named, left) if one)
 
 
-def _effect_name(seen: Seen) -> str:
+def _effect_name(seen: MatchedEffect) -> str:
     """Return the name of an effect, with a remark if it is a changed term of the model."""
-    return words.plain(seen.effect) + (" of another size" if seen.kind == "retuned" else "")
+    return words.words_of(seen.effect) + (" of another size" if seen.kind == "retuned" else "")

@@ -9,12 +9,12 @@ from typing import Final
 
 import numpy as np
 
-from drivers.recordings.formats import format_of
-from drivers.recordings.writing import whole
+from drivers.recordings.formats import format_for_path
+from drivers.recordings.writing import atomic_write_path
 from drivers.sample import Floats
+from monitor.common.units import sensor_kind
 from monitor.history.bucket import COUNTS, STATES
-from monitor.history.reading import Past
-from monitor.publishing.coefficient_cells import kind_of
+from monitor.history.reading import HistoryTable
 
 COEFFICIENT_SI_UNITS: Final = {
     "gyro": {"Q": "rad", "N": "rad/sqrt(s)", "B": "rad/s", "K": "rad/s/sqrt(s)", "R": "rad/s^2", "sigma": "rad/s"},
@@ -26,7 +26,7 @@ STATE_COLUMN_NAME: Final = (
 )
 
 
-def save(past: Past, path: Path) -> None:
+def save(past: HistoryTable, path: Path) -> None:
     """Write a history in the format of the path's suffix.
 
     Parameters
@@ -42,12 +42,12 @@ def save(past: Past, path: Path) -> None:
         The suffix is unknown or the file cannot be written.
     """
     columns = table(past)
-    begin = format_of(path).writer
-    with whole(path) as part, begin(part, list(columns)) as append:
+    begin = format_for_path(path).writer
+    with atomic_write_path(path) as part, begin(part, list(columns)) as append:
         append(columns)
 
 
-def table(past: Past) -> dict[str, Floats]:
+def table(past: HistoryTable) -> dict[str, Floats]:
     """Return the columns by name, shape [p] each; interval ends and bounds have only their last value per bucket."""
     columns: dict[str, Floats] = {
         "t (Unix s)": past.start_s.astype(np.float64),
@@ -74,4 +74,4 @@ def unit_of(name: str) -> str:
     ('rad/sqrt(s)', 'm/s^2', 'Hz')
     """
     axis, _, rest = name.partition(".")
-    return COEFFICIENT_SI_UNITS[kind_of(axis)][rest.split(".")[0]] if rest else STATUS_UNITS[name]
+    return COEFFICIENT_SI_UNITS[sensor_kind(axis)][rest.split(".")[0]] if rest else STATUS_UNITS[name]

@@ -21,8 +21,8 @@ from monitor.publishing.plots.reconcile_chart import BAND, PLACE, chart, near, v
 from monitor.publishing.plots.ruler import Ruler
 from monitor.publishing.reports import reconcile_sentences as words
 from monitor.publishing.reports.reconcile_sentences import Parameter
-from monitor.publishing.rerun.panels import duration
-from monitor.reconcile.result import AxisResult, Look, Reconciliation, Score, Step
+from monitor.publishing.rerun.panels import format_duration
+from monitor.reconcile.result import AxisResult, DiagnosticSnapshot, Reconciliation, ReconciliationStep, Score
 
 TEMPLATE: Final = "reconcile.html.j2"
 MISSING: Final = 'Jinja2 is needed: pip install "imu-monitor[plot]"'
@@ -45,12 +45,12 @@ class Row:
     colour: str
     verdict: str  # as in the JSON
     word: str
-    did: tuple[tuple[str, str, str], ...]  # kind, effect with parameters, confidence
+    steps: tuple[tuple[str, str, str], ...]  # kind, effect with parameters, confidence
     left_over: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class LensRow:
+class DiagnosticRow:
     """Row of one diagnostic in a step, with its gaps as text."""
 
     name: str
@@ -77,7 +77,7 @@ class StepPart:
     confidence: str
     why_not: str
     held_out: str
-    lenses: tuple[LensRow, ...]
+    lenses: tuple[DiagnosticRow, ...]
     pairs: tuple[str, ...]  # SVG of each diagnostic, before and after
 
 
@@ -92,7 +92,7 @@ class AxisPart:
     line: str
     steps: tuple[StepPart, ...]
     left_over: tuple[tuple[str, tuple[str, ...]], ...]  # description and SVG of the range
-    lenses: tuple[LensRow, ...]  # only of an axis without steps
+    lenses: tuple[DiagnosticRow, ...]  # only of an axis without steps
     views: tuple[str, ...]
 
 
@@ -135,7 +135,7 @@ def page(r: Reconciliation, title: str = "") -> str:
     return environment.get_template(TEMPLATE).render(
         title=title or "Recording",
         verdict=r.verdict,
-        word=words.VERDICTS[r.verdict],
+        word=words.RESULT_TEXTS[r.verdict],
         summary=words.summary(r),
         facts=facts(r),
         rows=[_row(r, result) for result in results],
@@ -158,7 +158,7 @@ def facts(r: Reconciliation) -> tuple[tuple[str, str], ...]:
     return (
         ("rate", f"{r.rate_hz:.6g} Hz"),
         ("samples", f"{r.samples:,}"),
-        ("duration", duration(r.seconds)),
+        ("duration", format_duration(r.duration_s)),
         ("model under test", "five classic terms, fitted first" if r.fitted_first else "as given"),
         ("seed", str(r.seed)),
     )
@@ -170,8 +170,8 @@ def _row(r: Reconciliation, result: AxisResult) -> Row:
         (step.kind, words.step_line(step, result.axis, r.baseline), words.percent(step.confidence))
         for step in result.steps
     )
-    left = tuple(words.score(one, result.axis) for one in result.left_over)
-    return Row(result.axis, _colour(result.axis), result.verdict, words.VERDICTS[result.verdict], did, left)
+    left = tuple(words.score_line(one, result.axis) for one in result.left_over)
+    return Row(result.axis, _colour(result.axis), result.verdict, words.RESULT_TEXTS[result.verdict], did, left)
 
 
 def _axis(r: Reconciliation, result: AxisResult) -> AxisPart:
@@ -182,14 +182,14 @@ def _axis(r: Reconciliation, result: AxisResult) -> AxisPart:
         for i, (step, before) in enumerate(zip(result.steps, looks, strict=False), start=1)
     )
     left = tuple(
-        (words.score(one, result.axis), _plots_of_range(result.end, one, result.axis)) for one in result.left_over
+        (words.score_line(one, result.axis), _plots_of_range(result.end, one, result.axis)) for one in result.left_over
     )
     alone = not result.steps
     return AxisPart(
         result.axis,
         _colour(result.axis),
         result.verdict,
-        words.VERDICTS[result.verdict],
+        words.RESULT_TEXTS[result.verdict],
         words.verdict_line(result),
         steps,
         left,
@@ -204,7 +204,7 @@ def _agreeing(results: Sequence[AxisResult]) -> Agreeing:
     gaps = [{score.lens: _of_threshold(score) for score in result.start.scores} for result in results]
     return Agreeing(
         tuple((result.axis, _colour(result.axis)) for result in results),
-        tuple((words.lens_name(lens), tuple(known.get(lens, "—") for known in gaps)) for lens in lenses),
+        tuple((words.diagnostic_name(lens), tuple(known.get(lens, "—") for known in gaps)) for lens in lenses),
         tuple(_first_model_plots(result) for result in results),
     )
 
@@ -216,10 +216,10 @@ def _first_model_plots(result: AxisResult) -> tuple[str, ...]:
 
 def _of_threshold(score: Score) -> str:
     """Format a gap and its threshold."""
-    return f"{words.gap(score.gap)} of {words.gap(score.threshold)}"
+    return f"{words.format_gap(score.gap)} of {words.format_gap(score.threshold)}"
 
 
-def _step(r: Reconciliation, axis: str, count: int, step: Step, before: Look) -> StepPart:
+def _step(r: Reconciliation, axis: str, count: int, step: ReconciliationStep, before: DiagnosticSnapshot) -> StepPart:
     """Return the section of one step."""
     after = {view.lens: view for view in step.look.views}
     pairs = tuple(
@@ -228,29 +228,31 @@ def _step(r: Reconciliation, axis: str, count: int, step: Step, before: Look) ->
         if view.lens in after
     )
     return StepPart(
-        title=f"Step {count}: {step.kind} {words.plain(step.effect)}",
-        means=EFFECTS[step.effect].means,
+        title=f"Step {count}: {step.kind} {words.words_of(step.effect)}",
+        means=EFFECTS[step.effect].description,
         because=step.because,
-        found=words.score(step.found, axis),
+        found=words.score_line(step.found, axis),
         where=_plots_of_range(before, step.found, axis),
         parameters=words.parameters(step, axis, r.baseline),
         confidence=words.percent(step.confidence),
-        why_not=words.why_not(step),
+        why_not=words.alternatives_sentence(step),
         held_out=_held_out(step),
         lenses=_lenses(before, step.look, axis),
         pairs=pairs,
     )
 
 
-def _held_out(step: Step) -> str:
+def _held_out(step: ReconciliationStep) -> str:
     """Return how the gap changed on the held-out data, which were not used to choose the effect."""
     before, after = step.held_out_before, step.held_out_after
     if before is None or after is None:
         return f"None: {step.held_out_reason}."
-    return f"{words.gap(before.gap)} → {words.gap(after.gap)}, threshold {words.gap(after.threshold)}"
+    return (
+        f"{words.format_gap(before.gap)} → {words.format_gap(after.gap)}, threshold {words.format_gap(after.threshold)}"
+    )
 
 
-def _plots_of_range(look: Look, found: Score, axis: str) -> tuple[str, ...]:
+def _plots_of_range(look: DiagnosticSnapshot, found: Score, axis: str) -> tuple[str, ...]:
     """Return the plot that shows a range best, and a detail plot if the range is narrow."""
     view = view_at(look.views, found.lens, found.where)
     if view is None:
@@ -262,25 +264,25 @@ def _plots_of_range(look: Look, found: Score, axis: str) -> tuple[str, ...]:
     return whole, chart([("", part)], axis, *DETAIL_PLOT_PX, where=found.where)
 
 
-def _lenses(before: Look, after: Look | None, axis: str) -> tuple[LensRow, ...]:
+def _lenses(before: DiagnosticSnapshot, after: DiagnosticSnapshot | None, axis: str) -> tuple[DiagnosticRow, ...]:
     """Return the rows of all diagnostics, before and after a step; without ``after``, only ``before`` is filled."""
     later = {} if after is None else {score.lens: score for score in after.scores}
     pairs = [(score, later.get(score.lens)) for score in before.scores]
-    largest = max((words.over_threshold(one) for pair in pairs for one in pair if one is not None), default=1.0)
+    largest = max((words.gap_ratio(one) for pair in pairs for one in pair if one is not None), default=1.0)
     ruler = Ruler(BAR_LIMITS[0], max(BAR_LIMITS[1], 1.3 * largest), True, 8.0, BAR_PX[0] - 8.0)
     return tuple(_lens(score, other, axis, ruler) for score, other in pairs)
 
 
-def _lens(score: Score, later: Score | None, axis: str, ruler: Ruler) -> LensRow:
+def _lens(score: Score, later: Score | None, axis: str, ruler: Ruler) -> DiagnosticRow:
     """Return the row of one diagnostic."""
     deciding = later or score
-    return LensRow(
-        words.lens_name(score.lens),
-        words.place(score.where, axis),
-        words.gap(score.gap),
-        "" if later is None else words.gap(later.gap),
-        words.gap(deciding.threshold),
-        words.gap(deciding.null95),
+    return DiagnosticRow(
+        words.diagnostic_name(score.lens),
+        words.format_range(score.where, axis),
+        words.format_gap(score.gap),
+        "" if later is None else words.format_gap(later.gap),
+        words.format_gap(deciding.threshold),
+        words.format_gap(deciding.null95),
         score.passes,
         later is not None and later.passes,
         _bar(score, later, ruler),
@@ -309,7 +311,7 @@ def _bar(score: Score, later: Score | None, ruler: Ruler) -> str:
 
 def _on_strip(score: Score | None, ruler: Ruler) -> float:
     """Return the position of a gap, or of the threshold, on a bar [px]; a gap of zero is drawn at the left end."""
-    share = 1.0 if score is None else max(words.over_threshold(score), ruler.low)
+    share = 1.0 if score is None else max(words.gap_ratio(score), ruler.low)
     return float(ruler.at(np.array([share]))[0])
 
 

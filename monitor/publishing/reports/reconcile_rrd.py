@@ -22,14 +22,24 @@ from drivers.sample import AXES, Floats
 from monitor.publishing.plots import colours
 from monitor.publishing.plots.reconcile_chart import DOTS, Plot, height_of, plotted
 from monitor.publishing.reports import reconcile_sentences as words
-from monitor.publishing.rerun.allan_chart import FILL_STEPS, HEIGHT, WIDTH, Scale, band, clip, decades, grid, runs
-from monitor.publishing.rerun.panels import duration
-from monitor.reconcile.result import AxisResult, Look, Reconciliation
+from monitor.publishing.rerun.allan_chart import (
+    FILL_STEPS,
+    HEIGHT,
+    WIDTH,
+    Scale,
+    band,
+    clip,
+    decades,
+    finite_sections,
+    grid,
+)
+from monitor.publishing.rerun.panels import format_duration
+from monitor.reconcile.result import AxisResult, DiagnosticSnapshot, Reconciliation
 
 APPLICATION: Final = "imu-monitor"
 TIMELINE: Final = "step"
 MAX_PLOTTED_DIAGNOSTICS: Final = 2  # number of diagnostics drawn per axis; the first ones are used
-BAND_COLOUR: Final = colours.mixed(colours.FRAME, 0.55)
+BAND_COLOUR: Final = colours.blend(colours.FRAME, 0.55)
 LEGEND_X: Final = (8.6, 12.2, 15.4)  # positions of the names of the curves, above the box
 RANGE_COLOUR: Final = colours.TEMPERATURE  # orange, as on the HTML page
 GAP_LINE_COLOURS: Final = (  # colours of the gap lines; more lines would not fit into the legend
@@ -93,13 +103,13 @@ def overview(r: Reconciliation) -> str:
     for axis in _axes(r):
         result = r.axes[axis]
         did = "; ".join(f"{step.kind} {words.step_line(step, axis, r.baseline)}" for step in result.steps)
-        left = "; ".join(words.score(one, axis) for one in result.left_over)
-        rows.append(f"| **{axis}** | {words.VERDICTS[result.verdict]} | {did or '—'} | {left or '—'} |")
+        left = "; ".join(words.score_line(one, axis) for one in result.left_over)
+        rows.append(f"| **{axis}** | {words.RESULT_TEXTS[result.verdict]} | {did or '—'} | {left or '—'} |")
     head = "| axis | verdict | added or retuned | left over |\n|:--|:--|:--|:--|"
-    recorded = f"{r.samples:,} samples at {r.rate_hz:.6g} Hz, {duration(r.seconds)}"
+    recorded = f"{r.samples:,} samples at {r.rate_hz:.6g} Hz, {format_duration(r.duration_s)}"
     notes = [f"note: {note}" for note in r.notes]
     return "\n\n".join(
-        [f"## {words.VERDICTS[r.verdict]}", words.summary(r), recorded, "\n".join([head, *rows]), *notes]
+        [f"## {words.RESULT_TEXTS[r.verdict]}", words.summary(r), recorded, "\n".join([head, *rows]), *notes]
     )
 
 
@@ -113,21 +123,21 @@ def steps_text(r: Reconciliation, result: AxisResult) -> str:
     result
         Result of the axis.
     """
-    parts = [f"## {result.axis}: {words.VERDICTS[result.verdict]}", words.verdict_line(result)]
+    parts = [f"## {result.axis}: {words.RESULT_TEXTS[result.verdict]}", words.verdict_line(result)]
     for count, step in enumerate(result.steps, start=1):
         known = words.parameters(step, result.axis, r.baseline)
         parts += [
             "---",
-            f"**Step {count}: {step.kind} {words.plain(step.effect)}** ({words.percent(step.confidence)})",
-            "\n".join(f"- {words.plain(one.name)} **{one.short}**" for one in known),
-            f"{words.lens_name(step.found.lens)}, {words.place(step.found.where, result.axis)}: gap "
-            f"**{words.gap(step.before.gap)} → {words.gap(step.after.gap)}**, "
-            f"threshold {words.gap(step.after.threshold)}",
+            f"**Step {count}: {step.kind} {words.words_of(step.effect)}** ({words.percent(step.confidence)})",
+            "\n".join(f"- {words.words_of(one.name)} **{one.short}**" for one in known),
+            f"{words.diagnostic_name(step.found.lens)}, {words.format_range(step.found.where, result.axis)}: gap "
+            f"**{words.format_gap(step.before.gap)} → {words.format_gap(step.after.gap)}**, "
+            f"threshold {words.format_gap(step.after.threshold)}",
             step.because,
-            words.why_not(step),
+            words.alternatives_sentence(step),
         ]
     if result.left_over:
-        parts += ["---", "**Left over**", *(f"- {words.score(one, result.axis)}" for one in result.left_over)]
+        parts += ["---", "**Left over**", *(f"- {words.score_line(one, result.axis)}" for one in result.left_over)]
     return "\n\n".join(parts)
 
 
@@ -136,7 +146,7 @@ def _axes(r: Reconciliation) -> list[str]:
     return [axis for axis in AXES if axis in r.axes]
 
 
-def _looks_by_step(result: AxisResult) -> list[Look]:
+def _looks_by_step(result: AxisResult) -> list[DiagnosticSnapshot]:
     """Return the diagnostics with the first model and after each step; the last one excludes withdrawn effects."""
     return [result.start, *(step.look for step in result.steps[:-1]), *([result.end] if result.steps else [])]
 
@@ -163,13 +173,13 @@ def _tab(result: AxisResult) -> rrb.Container:
         )
         for lens in _lenses(result)
     ]
-    name = f"{axis}: {words.VERDICTS[result.verdict]}"
+    name = f"{axis}: {words.RESULT_TEXTS[result.verdict]}"
     return rrb.Horizontal(left, rrb.Vertical(*rows), column_shares=[3, 7], name=name)
 
 
 def _diagnostic_view(result: AxisResult, lens: str, when: str) -> rrb.View:
     """Return the view of one diagnostic, before or after the steps."""
-    what = words.lens_name(lens)
+    what = words.diagnostic_name(lens)
     what = what[0].upper() + what[1:]
     names = {"before": f"{what}: beside the first model", "after": f"{what}: after the steps"}
     return rrb.Spatial2DView(
@@ -191,11 +201,11 @@ def _axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult) -> 
 
 def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
     """Log the gap of each diagnostic relative to its threshold, for the largest gaps, and the threshold, which is 1."""
-    looks = [{score.lens: words.over_threshold(score) for score in look.scores} for look in _looks_by_step(result)]
+    looks = [{score.lens: words.gap_ratio(score) for score in look.scores} for look in _looks_by_step(result)]
     path = f"{result.axis}/gap"
     largest = sorted(looks[0], key=lambda lens: -max(look.get(lens, 0.0) for look in looks))
     for lens, tint in zip(largest, GAP_LINE_COLOURS, strict=False):
-        line = rr.SeriesLines(colors=[tint], widths=[2.0], names=[words.lens_name(lens)])
+        line = rr.SeriesLines(colors=[tint], widths=[2.0], names=[words.diagnostic_name(lens)])
         stream.log(f"{path}/{lens}", line, static=True)
         _log_by_step(stream, f"{path}/{lens}", [look.get(lens, np.nan) for look in looks])
     line = rr.SeriesLines(colors=[colours.TEXT], widths=[1.0], names=["threshold"])
@@ -229,20 +239,22 @@ def _lens(stream: rr.RecordingStream, result: AxisResult, lens: str) -> None:
 def _log_curves(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot, axis: str, static: bool) -> None:
     """Log the band, the measured curve and the expected curve."""
     # A lower end of zero has no logarithm; it is drawn below the box.
-    low, high = (scale.place(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
+    low, high = (scale.to_chart(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
     fill = rr.LineStrips2D(
         list(band(low, high)), colors=[BAND_COLOUR], radii=[WIDTH / FILL_STEPS / 2], draw_order=-20.0
     )
     stream.log(f"{path}/band", fill, static=static)
-    colour, at = colours.AXIS_COLOURS[axis], _inside(scale.place(plot.x, plot.measured))
+    colour, at = colours.AXIS_COLOURS[axis], _inside(scale.to_chart(plot.x, plot.measured))
     thin = rr.Radius.ui_points(0.8)
     stream.log(
-        f"{path}/measured", rr.LineStrips2D(runs(at), colors=[colour], radii=thin, draw_order=5.0), static=static
+        f"{path}/measured",
+        rr.LineStrips2D(finite_sections(at), colors=[colour], radii=thin, draw_order=5.0),
+        static=static,
     )
     if len(at) <= DOTS:
         dots = rr.Points2D(at, colors=[colour], radii=rr.Radius.ui_points(3.0), draw_order=20.0)
         stream.log(f"{path}/points", dots, static=static)
-    expected = runs(_inside(scale.place(plot.x, plot.expected)))
+    expected = finite_sections(_inside(scale.to_chart(plot.x, plot.expected)))
     line = rr.LineStrips2D(expected, colors=[colours.TEXT], radii=rr.Radius.ui_points(1.0), draw_order=10.0)
     stream.log(f"{path}/expected", line, static=static)
 
@@ -256,7 +268,7 @@ def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, resul
     if not bounds:
         return
     one = 10.0 ** np.array([scale.y[0], scale.y[0]], float)
-    ends = [np.clip(scale.place(np.array(bound), one)[:, 0], 0.0, WIDTH) for bound in bounds]
+    ends = [np.clip(scale.to_chart(np.array(bound), one)[:, 0], 0.0, WIDTH) for bound in bounds]
     frames = [np.array([[a, 0], [b, 0], [b, HEIGHT], [a, HEIGHT], [a, 0]]) for a, b in ends]
     strips = rr.LineStrips2D(frames, colors=[RANGE_COLOUR], radii=rr.Radius.ui_points(0.75), draw_order=-5.0)
     stream.log(f"{path}/place", strips, static=True)

@@ -12,9 +12,7 @@ from math import floor, isfinite, log10
 from typing import Any, Final
 
 from drivers.sample import AXES
-from monitor.noise.effects import EFFECTS
-from monitor.noise.model import NoiseModel
-from monitor.publishing.coefficient_cells import (
+from monitor.common.units import (
     COEFFICIENT_UNITS,
     DEGREE,
     DEVIATION_UNITS,
@@ -22,12 +20,14 @@ from monitor.publishing.coefficient_cells import (
     MICRO_G,
     SAMPLE_UNITS,
     Unit,
-    kind_of,
-    number,
+    format_number,
+    sensor_kind,
 )
-from monitor.reconcile.result import AxisResult, Bounds, Reconciliation, Score, Step, Where
+from monitor.noise.effects import EFFECTS
+from monitor.noise.model import NoiseModel
+from monitor.reconcile.result import AxisResult, Location, ParameterInterval, Reconciliation, ReconciliationStep, Score
 
-VERDICTS: Final = {
+RESULT_TEXTS: Final = {
     "agrees": "agrees",
     "explained": "explained",
     "partly_explained": "partly explained",
@@ -112,14 +112,14 @@ def field_unit(si: str, size: float) -> Unit:
     return FIELD_UNITS.get(si, Unit(1.0, si))
 
 
-def plain(name: str) -> str:
+def words_of(name: str) -> str:
     """Return the name of an effect or a parameter with spaces instead of underscores."""
     return name.replace("_", " ")
 
 
-def lens_name(lens: str) -> str:
+def diagnostic_name(lens: str) -> str:
     """Return the name of a diagnostic for the user."""
-    return DIAGNOSTIC_NAMES.get(lens, plain(lens))
+    return DIAGNOSTIC_NAMES.get(lens, words_of(lens))
 
 
 def percent(share: float) -> str:
@@ -153,7 +153,7 @@ def span(low: float, high: float, unit: str) -> str:
     return f"{_short(low)} … {_short(high)} {unit}".rstrip()
 
 
-def place(where: Where, axis: str) -> str:
+def format_range(where: Location, axis: str) -> str:
     """Format the range in which a diagnostic found a gap; "everywhere" if no range is given.
 
     >>> place(Where(tau=(1.0, 4.0), source="ax"), "gz")
@@ -171,7 +171,7 @@ def place(where: Where, axis: str) -> str:
         if isinstance(at, str):
             found.append(f"from {at}")
         elif name == "value":
-            unit = field_unit("rad/s" if kind_of(axis) == "gyro" else "m/s²", max(map(abs, at)))
+            unit = field_unit("rad/s" if sensor_kind(axis) == "gyro" else "m/s²", max(map(abs, at)))
             found.append(span(at[0] * unit.factor, at[1] * unit.factor, unit.name))
         else:
             sign, unit_name = RANGE_FORMATS[name]
@@ -179,7 +179,7 @@ def place(where: Where, axis: str) -> str:
     return ", ".join(found) or "everywhere"
 
 
-def score(one: Score, axis: str) -> str:
+def score_line(one: Score, axis: str) -> str:
     """Return one line with the diagnostic, its range, its gap and its threshold.
 
     Parameters
@@ -189,27 +189,28 @@ def score(one: Score, axis: str) -> str:
     axis
         Name of the axis, which selects the units.
     """
-    return f"{lens_name(one.lens)}, {place(one.where, axis)}: gap {gap(one.gap)}, threshold {gap(one.threshold)}"
+    gap = f"gap {format_gap(one.gap)}, threshold {format_gap(one.threshold)}"
+    return f"{diagnostic_name(one.lens)}, {format_range(one.where, axis)}: {gap}"
 
 
-def gap(size: float) -> str:
+def format_gap(size: float) -> str:
     """Format the size of a gap.
 
     >>> gap(0.6), gap(41.23), gap(12345.0)
     ('0.60', '41.2', '12300')
     """
     if not isfinite(size) or size >= 1000.0:
-        return number(size)
+        return format_number(size)
     return f"{size:.2f}" if size < 10.0 else f"{size:.1f}"
 
 
-def over_threshold(one: Score) -> float:
+def gap_ratio(one: Score) -> float:
     """Return gap divided by threshold; 0 if the ratio is not finite."""
     share = one.gap / one.threshold if one.threshold > 0.0 else 0.0
     return share if isfinite(share) else 0.0
 
 
-def parameters(step: Step, axis: str, baseline: NoiseModel) -> tuple[Parameter, ...]:
+def parameters(step: ReconciliationStep, axis: str, baseline: NoiseModel) -> tuple[Parameter, ...]:
     """Return the text of all parameters of a step; for a changed term, also its value in the model under test.
 
     Parameters
@@ -229,7 +230,7 @@ def parameters(step: Step, axis: str, baseline: NoiseModel) -> tuple[Parameter, 
     )
 
 
-def step_line(step: Step, axis: str, baseline: NoiseModel) -> str:
+def step_line(step: ReconciliationStep, axis: str, baseline: NoiseModel) -> str:
     """Return one line with an effect and its parameters.
 
     Example: "sinusoidal: amplitude 30.94 ± 0.55 °/h, frequency 17.30000 ± 0.00010 Hz".
@@ -243,8 +244,8 @@ def step_line(step: Step, axis: str, baseline: NoiseModel) -> str:
     baseline
         Model under test.
     """
-    said = [f"{plain(one.name)} {one.short}" for one in parameters(step, axis, baseline)]
-    return f"{plain(step.effect)}: {', '.join(said)}" if said else plain(step.effect)
+    said = [f"{words_of(one.name)} {one.short}" for one in parameters(step, axis, baseline)]
+    return f"{words_of(step.effect)}: {', '.join(said)}" if said else words_of(step.effect)
 
 
 def summary(r: Reconciliation) -> str:
@@ -278,27 +279,27 @@ def verdict_line(result: AxisResult) -> str:
             return "Model and measurement differ, and no known effect closes the gap: no name is given."
 
 
-def why_not(step: Step) -> str:
+def alternatives_sentence(step: ReconciliationStep) -> str:
     """Return a sentence on the effects that were also tried, with their probabilities."""
     if not step.runners_up:
         return "No other effect came near."
-    tried = [f"{plain(one.effect)} ({percent(one.confidence)})" for one in step.runners_up]
+    tried = [f"{words_of(one.effect)} ({percent(one.confidence)})" for one in step.runners_up]
     return f"Tried for the same gap and less likely: {_listed(tried)}."
 
 
-def _parameter(effect: str, name: str, bounds: Bounds, axis: str, given: Any) -> Parameter:
+def _parameter(effect: str, name: str, bounds: ParameterInterval, axis: str, given: Any) -> Parameter:
     """Return the text of one parameter."""
     if isinstance(bounds.value, str):
         return Parameter(name, bounds.value, "", bounds.value, "", "" if given is None else str(given))
     known = {f.name: f.metadata for f in fields(EFFECTS[effect])}[name]  # type: ignore[arg-type]
-    unit = UNITS_BY_NAME.get(name) or field_unit(known["units"][0 if kind_of(axis) == "gyro" else 1], bounds.value)
-    was = "" if given is None else f"{number(given * unit.factor)} {unit.name}".rstrip()
+    unit = UNITS_BY_NAME.get(name) or field_unit(known["units"][0 if sensor_kind(axis) == "gyro" else 1], bounds.value)
+    was = "" if given is None else f"{format_number(given * unit.factor)} {unit.name}".rstrip()
     value, lo, hi = (None if one is None else one * unit.factor for one in (bounds.value, bounds.lo, bounds.hi))
     assert value is not None
     if known["whole"]:
         return Parameter(name, f"{value:.0f}", "", f"{value:.0f} {unit.name}".rstrip(), unit.name, was)
     if lo is None or hi is None or not (isfinite(lo) and isfinite(hi)) or hi <= lo:
-        return Parameter(name, number(value), "", f"{number(value)} {unit.name}".rstrip(), unit.name, was)
+        return Parameter(name, format_number(value), "", f"{format_number(value)} {unit.name}".rstrip(), unit.name, was)
     texts = _with_interval(value, lo, hi)
     short, interval = _plus_minus(value, lo, hi, texts), f"{texts[1]} … {texts[2]}"
     return Parameter(name, texts[0], interval, f"{short} {unit.name}".rstrip(), unit.name, was)
@@ -319,24 +320,24 @@ def _with_interval(value: float, lo: float, hi: float) -> tuple[str, ...]:
     if 0 <= decimals <= 9 and max(map(abs, (value, lo, hi))) < 1e6:
         return tuple(f"{one:.{decimals}f}".replace("-", "−") for one in (value, lo, hi, half))
     digits = max(3, 2 + floor(log10(max(abs(value), half) / half)))
-    ends = (number(one, digits).replace("-", "−") for one in (value, lo, hi))
-    return (*ends, number(half, 2))
+    ends = (format_number(one, digits).replace("-", "−") for one in (value, lo, hi))
+    return (*ends, format_number(half, 2))
 
 
 def _short(value: float) -> str:
     """Format a number with at most four digits and without trailing zeros."""
-    text = f"{value:.4g}" if 1e-4 <= abs(value) < 1e5 or value == 0.0 else number(value)
+    text = f"{value:.4g}" if 1e-4 <= abs(value) < 1e5 or value == 0.0 else format_number(value)
     return text.replace("-", "−", 1) if value < 0.0 else text
 
 
-def _counted(steps: Sequence[Step]) -> list[str]:
+def _counted(steps: Sequence[ReconciliationStep]) -> list[str]:
     """Return the numbers of added effects and of changed terms, with their names."""
     said = []
     for kind, one, many in (
         ("added", "effect added", "effects added"),
         ("retuned", "known term retuned", "known terms retuned"),
     ):
-        names = [plain(step.effect) for step in steps if step.kind == kind]
+        names = [words_of(step.effect) for step in steps if step.kind == kind]
         if names:
             said.append(f"{len(names)} {one if len(names) == 1 else many} ({_listed(list(dict.fromkeys(names)))})")
     return said

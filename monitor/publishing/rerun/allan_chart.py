@@ -27,7 +27,7 @@ class Scale:
     x: tuple[int, int]
     y: tuple[int, int]
 
-    def place(self, tau: Floats, sigma: Floats) -> Floats:
+    def to_chart(self, tau: Floats, sigma: Floats) -> Floats:
         """Return chart positions, shape [n, 2]; NaN if σ is not positive.
 
         Parameters
@@ -72,14 +72,14 @@ def clip(y: Floats) -> Floats:
     return np.clip(y, 0.0, HEIGHT)
 
 
-def runs(positions: Floats) -> list[Floats]:
+def finite_sections(positions: Floats) -> list[Floats]:
     """Return the finite sections of a line with at least two points; NaN separates sections."""
     good = np.isfinite(positions).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
     return [positions[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
 
 
-def dashes(line: Floats, length: float = 0.22) -> list[Floats]:
+def dash_line(line: Floats, length: float = 0.22) -> list[Floats]:
     """Divide a line of shape [n, 2] into dashes with gaps of the same length.
 
     >>> [stroke.tolist() for stroke in dashes(np.array([[0.0, 0.0], [4.0, 0.0]]), 1.0)]
@@ -116,7 +116,7 @@ def band(low: Floats, high: Floats) -> Floats:
     return np.stack([np.column_stack([x, bottom]), np.column_stack([x, top])], axis=1)
 
 
-def whiskers(low: Floats, high: Floats) -> Floats:
+def interval_strokes(low: Floats, high: Floats) -> Floats:
     """Return one vertical stroke per point from the lower to the upper end of its interval, shape [n, 2, 2].
 
     Parameters

@@ -16,7 +16,7 @@ INITIAL_COLUMN_S = 2.0
 """Initial time span of a column [s], in sample time."""
 
 
-class Surface:
+class AllanHistory:
     """Allan deviations of one device over time. An estimate with other τ or an earlier time starts a new history."""
 
     def __init__(self, column_s: float = INITIAL_COLUMN_S) -> None:
@@ -51,7 +51,7 @@ class Surface:
         if wall_s < self._newest_s or not np.array_equal(self.tau_s, estimate.curve.tau_s):
             self._reset(estimate.curve.tau_s, wall_s)
         # The recent curve uses a separate time span for each τ, so a change appears at once and at the correct time.
-        avar = (estimate.recent or estimate.curve).avar
+        avar = (estimate.display_curve or estimate.curve).avar
         there = np.isfinite(avar) & (avar > 0.0)
         self._sums[there] += 0.5 * np.log(avar[there])
         self._counts += there

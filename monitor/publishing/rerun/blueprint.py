@@ -12,7 +12,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TimelineColumn
 
-from monitor.publishing.coefficient_cells import (
+from monitor.common.units import (
     COEFFICIENT_UNITS,
     DEVIATION_UNITS,
     KIND_NAMES,
@@ -20,7 +20,7 @@ from monitor.publishing.coefficient_cells import (
     SAMPLE_UNITS,
     Kind,
     axes_of,
-    kind_of,
+    sensor_kind,
 )
 from monitor.publishing.plots import colours
 from monitor.publishing.rerun import dynamic_surface
@@ -139,7 +139,7 @@ def _bias(device: str, axis: str) -> rrb.View:
     """Return the view of the bias of one axis and its prediction."""
     return rrb.TimeSeriesView(
         origin=f"/{device}/thermal/{axis}",
-        name=f"{axis}: bias, and what its temperature lets expect, {DEVIATION_UNITS[kind_of(axis)].name}",
+        name=f"{axis}: bias, and what its temperature lets expect, {DEVIATION_UNITS[sensor_kind(axis)].name}",
         plot_legend=rrb.PlotLegend(visible=False),
         axis_x=_until_cursor(),
     )

@@ -7,7 +7,7 @@ from typing import Generic, TypeVar
 T = TypeVar("T")
 
 
-class Backlog(Generic[T]):
+class BoundedQueue(Generic[T]):
     """Queue whose items have a total weight of at most ``limit`` (bytes); thread-safe.
 
     >>> backlog = Backlog[str](limit=2)

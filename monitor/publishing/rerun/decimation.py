@@ -16,7 +16,7 @@ BUCKETS_PER_S: Final = 95.0  # two rows per bucket; the remainder allows for the
 ROWS_PER_FLUSH: Final = 4000  # limits the rows of a replay at full speed, which delivers hours at once
 
 
-def extremes(wall_s: Floats, values: Floats) -> tuple[Floats, Floats]:
+def decimate_extremes(wall_s: Floats, values: Floats) -> tuple[Floats, Floats]:
     """Return the times and values of one axis to draw: finite samples, reduced to bucket extremes if there are many.
 
     Parameters
@@ -38,7 +38,7 @@ def extremes(wall_s: Floats, values: Floats) -> tuple[Floats, Floats]:
     return wall_s[keep], values[keep]
 
 
-def means(wall_s: Floats, values: Floats, per_s: float) -> tuple[Floats, Floats]:
+def average_buckets(wall_s: Floats, values: Floats, per_s: float) -> tuple[Floats, Floats]:
     """Return the mean time and mean value of each time bucket, for a slow quantity such as temperature.
 
     Parameters

@@ -16,12 +16,12 @@ from PIL import Image  # installed with rerun-sdk
 
 from drivers.sample import AXES, Floats
 from monitor.publishing.plots import colours
-from monitor.publishing.rerun.allan_history import COLUMNS, Surface
+from monitor.publishing.rerun.allan_history import COLUMNS, AllanHistory
 
 HEIGHT: Final = 60  # approximate height of an image [pixels]; with COLUMNS the shape of a third of a tab
 COLOUR_SCALE_RATIO: Final = 2.0  # ends of the colour scale: half and twice the median
 SHADES: Final = 127  # shades on either side of the median
-NOTHING: Final = 2 * SHADES + 1  # palette index of a missing deviation
+NO_VALUE_INDEX: Final = 2 * SHADES + 1  # palette index of a missing deviation
 MIN_COLUMNS: Final = 4  # number of columns required for a meaningful median
 BAR_X: Final = COLUMNS + 9.0
 BAR_STEPS: Final = 24
@@ -34,7 +34,7 @@ def bounds(taus: int) -> tuple[tuple[float, float], tuple[float, float]]:
     return (-left, COLUMNS + right), (-above, _rows(taus) * taus + below)
 
 
-def draw(stream: rr.RecordingStream, device: str, surface: Surface) -> None:
+def draw(stream: rr.RecordingStream, device: str, surface: AllanHistory) -> None:
     """Log the images and labels of all measured axes at the current time of the stream.
 
     Parameters
@@ -62,7 +62,7 @@ def draw(stream: rr.RecordingStream, device: str, surface: Surface) -> None:
 def picture(relative: Floats) -> bytes:
     """Return a PNG of ln(deviation / median), shape [columns, m]: COLUMNS pixels wide, the longest τ at the top."""
     share = np.clip(np.nan_to_num(relative) / np.log(COLOUR_SCALE_RATIO), -1.0, 1.0)
-    shade = np.where(np.isfinite(relative), np.rint(SHADES * (1.0 + share)), NOTHING).astype(np.uint8)
+    shade = np.where(np.isfinite(relative), np.rint(SHADES * (1.0 + share)), NO_VALUE_INDEX).astype(np.uint8)
     wide = shade[np.arange(COLUMNS) * len(relative) // COLUMNS]
     image = Image.fromarray(np.repeat(wide.T[::-1], _rows(relative.shape[1]), axis=0), "P")
     image.putpalette([part for colour in PALETTE for part in colour])
@@ -73,8 +73,8 @@ def picture(relative: Floats) -> bytes:
 
 def _palette() -> tuple[colours.Colour, ...]:
     """Return the palette: blue below the median, dark at it, vermilion above, and the colour of missing values."""
-    below = [colours.mixed(colours.AXIS_COLOURS["gz"], (SHADES - i) / SHADES, colours.MINOR) for i in range(SHADES)]
-    above = [colours.mixed(colours.AXIS_COLOURS["gx"], i / SHADES, colours.MINOR) for i in range(SHADES + 1)]
+    below = [colours.blend(colours.AXIS_COLOURS["gz"], (SHADES - i) / SHADES, colours.MINOR) for i in range(SHADES)]
+    above = [colours.blend(colours.AXIS_COLOURS["gx"], i / SHADES, colours.MINOR) for i in range(SHADES + 1)]
     return (*below, *above, colours.BACKGROUND)
 
 
@@ -95,7 +95,7 @@ def _tau_labels(tau_s: Floats, height: int) -> list[tuple[float, float, str]]:
     return [*labels, (-11.0, -4.0, "τ, s")]
 
 
-def _time_labels(surface: Surface, height: int) -> list[tuple[float, float, str]]:
+def _time_labels(surface: AllanHistory, height: int) -> list[tuple[float, float, str]]:
     """Return labels with the time of day in UTC of the oldest and newest column."""
     at = ((12.0, surface.ends_s[0]), (COLUMNS - 1.0, surface.ends_s[-1]))
     return [(x, height + 6.0, _clock_time(t)) for x, t in at]

@@ -13,13 +13,13 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from drivers.errors import DecodeError
-from drivers.zenoh.sample_message import unpack
+from drivers.zenoh.sample_message import decode_samples
 from monitor.common import topics
 from monitor.publishing.messages import decoding, remote_device
 from monitor.publishing.rerun.panels import fleet_text
 from monitor.publishing.rerun.view import RerunView
-from monitor.publishing.terminal.live_table import Board, note
-from monitor.publishing.zenoh.subscriber import Message, ZenohIn
+from monitor.publishing.terminal.live_table import DeviceStates, connection_note
+from monitor.publishing.zenoh.subscriber import Message, ZenohSubscriber
 
 RECEIVE_TIMEOUT_S: Final = 0.1
 TABLE_PERIOD_S: Final = 1.0
@@ -62,12 +62,12 @@ class FleetView:
         Keys of the devices shown in detail.
     """
 
-    def __init__(self, arriving: ZenohIn, viewer: RerunView, detail: Sequence[str]) -> None:
+    def __init__(self, arriving: ZenohSubscriber, viewer: RerunView, detail: Sequence[str]) -> None:
         self._arriving = arriving
         self._viewer = viewer
         self._detail = frozenset(detail)
         self._noise: dict[str, remote_device.Noise] = {}  # newest coefficients of devices shown in detail
-        self.board = Board()
+        self.board = DeviceStates()
         self.malformed = 0  # number of messages of devices in detail that could not be decoded
 
     def run(self, stop: threading.Event, tell: Callable[[str], None], seconds: float | None = None) -> None:
@@ -101,17 +101,17 @@ class FleetView:
     def take(self, message: Message) -> None:
         """Process a message: update the table, and the viewer if the device is shown in detail."""
         if message.payload is None:
-            self.board.alive(message.key, message.there)
+            self.board.set_token(message.key, message.there)
             return
-        self.board.take(message.key, message.payload)
-        found = remote_device.split(message.key)
+        self.board.process_message(message.key, message.payload)
+        found = remote_device.split_key(message.key)
         if found is None:
             return
         device, topic = found
         try:
             if topic is topics.EVENT:
                 happened = remote_device.event(message.payload)
-                self._viewer.event(device, happened.t, decoding.event(happened))
+                self._viewer.event(device, happened.t, decoding.to_event(happened))
             elif device in self._detail:
                 self._show(device, topic, message.payload)
         except (ValueError, DecodeError):
@@ -128,12 +128,12 @@ class FleetView:
             Current time on the clock of the messages [s].
         """
         devices = self.board.devices(now_s)
-        self._viewer.overview(wall_s, fleet_text(devices, now_s, MAX_ROWS, note(self.board, self._arriving)))
+        self._viewer.overview(wall_s, fleet_text(devices, now_s, MAX_ROWS, connection_note(self.board, self._arriving)))
 
     def _show(self, device: str, topic: topics.Topic, payload: bytes) -> None:
         """Pass a message of a device shown in detail to the viewer."""
         if topic is topics.SAMPLES:
-            rows = unpack(payload).block
+            rows = decode_samples(payload).block
             self._viewer.samples(device, rows.t_ns / 1e9, rows.values, rows.temperature_c)
         elif topic is topics.COEFFICIENTS:
             self._noise[device] = remote_device.noise(
@@ -141,11 +141,11 @@ class FleetView:
             )
         elif topic is topics.ALLAN and device in self._noise:
             allan = remote_device.read(remote_device.AllanMessage, topic, payload)
-            self._viewer.estimate(device, allan.t, decoding.estimate(allan, self._noise[device]))
+            self._viewer.estimate(device, allan.t, decoding.to_estimate(allan, self._noise[device]))
         elif topic is topics.STATUS:
             status = remote_device.status(payload)
             if status.t is not None:
-                self._viewer.health(device, status.t, decoding.health(status))
+                self._viewer.health(device, status.t, decoding.to_health(status))
 
     def _trouble(self) -> str:
         """Return the problems of the viewer and of the subscriber."""

@@ -11,23 +11,14 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from monitor.common.health import Health
-from monitor.drift.compensation.arma import Arma
-from monitor.drift.compensation.live_compensation import DriftLook
+from monitor.common.units import COEFFICIENT_UNITS, DEVIATION_UNITS, KIND_NAMES, KINDS, Kind, axes_of, format_number
+from monitor.drift.compensation.arma import ArmaModel
+from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import LETTERS
-from monitor.publishing.coefficient_cells import (
-    COEFFICIENT_UNITS,
-    DEVIATION_UNITS,
-    KIND_NAMES,
-    KINDS,
-    Kind,
-    axes_of,
-    measured_axes,
-    number,
-    reading,
-)
+from monitor.estimation.fit.coefficients import SYMBOLS
+from monitor.publishing.coefficient_cells import format_coefficient, measured_axes
 from monitor.publishing.messages import remote_device
-from monitor.publishing.messages.remote_device import Heard
+from monitor.publishing.messages.remote_device import RemoteDevice
 
 FLEET_AXES: Final = ("gx", "gy", "gz")
 """Axes whose white noise is shown in the table of all devices [°/√h]."""
@@ -63,7 +54,7 @@ def health_text(device: str, health: Health, about: str = "") -> str:
         f"overflowed **{health.overflowed:,}**"
     )
     outputs = "".join(f", {name} **{state}**" for name, state in health.outputs.items())
-    lines.append(f"up **{duration(health.uptime_s)}**{outputs}")
+    lines.append(f"up **{format_duration(health.uptime_s)}**{outputs}")
     lines.append(
         f"latency **{_milliseconds(health.latency_p50_s)}** median, "
         f"**{_milliseconds(health.latency_p99_s)}** at 99 %, memory **{health.memory_bytes / 1e6:.0f} MB**"
@@ -81,7 +72,7 @@ def overview_text(healths: Mapping[str, Health]) -> str:
     return "\n".join([head, *rows])
 
 
-def fleet_text(devices: Sequence[Heard], now_s: float, rows: int, note: str = "") -> str:
+def fleet_text(devices: Sequence[RemoteDevice], now_s: float, rows: int, note: str = "") -> str:
     """Return a table of many devices, those with problems first, with the number of devices in each state above it.
 
     Parameters
@@ -99,7 +90,7 @@ def fleet_text(devices: Sequence[Heard], now_s: float, rows: int, note: str = ""
     states = ", ".join(f"**{count:,}** {_escape_cell(state)}" for state, count in counts.most_common())
     head = [f"**{len(devices):,}** device{'' if len(devices) == 1 else 's'}{': ' if states else ''}{states}"]
     head[0] += f"; N in {COEFFICIENT_UNITS['gyro']['N'].name}" if devices else ""
-    head += [f"**{remote_device.clean(note)}**"] if note else []
+    head += [f"**{remote_device.strip_control_characters(note)}**"] if note else []
     table = [_fleet_row(one, now_s) for one in devices[:rows]]
     if table:
         columns = [*("device", "state", "rate", "received", "lost", "bad"), *(f"N {axis}" for axis in FLEET_AXES), ""]
@@ -108,20 +99,20 @@ def fleet_text(devices: Sequence[Heard], now_s: float, rows: int, note: str = ""
     return "\n\n".join([*head, *(["\n".join(table)] if table else []), *left])
 
 
-def _fleet_row(one: Heard, now_s: float) -> str:
+def _fleet_row(one: RemoteDevice, now_s: float) -> str:
     """Return the row of one device."""
     state, status = one.state(now_s), one.status
     name = _escape_cell(one.key)
     word = f"**{state.upper()}**" if one.rank(now_s) == 0 else _escape_cell(state)
     noise = [
-        "" if one.noise is None else reading(one.noise.coefficients, "N", axis).value.replace("| ", "")
+        "" if one.noise is None else format_coefficient(one.noise.coefficients, "N", axis).value.replace("| ", "")
         for axis in FLEET_AXES
     ]
     if status is None:
         return f"| **{name}** | {word} | | | | | {' | '.join(noise)} | nothing known yet |"
     rate = "—" if status.rate is None else f"{status.rate:.2f} Hz"
-    trouble = _escape_cell(one.trouble()) or (
-        f"no data for {now_s - one.heard_s:.1f} s" if state in ("gone", "silent") else ""
+    trouble = _escape_cell(one.problems()) or (
+        f"no data for {now_s - one.last_message_s:.1f} s" if state in ("gone", "silent") else ""
     )
     counts = f"{status.received:,} | {status.lost:,} | {status.bad:,}"
     return f"| **{name}** | {word} | {rate} | {counts} | {' | '.join(noise)} | {trouble} |"
@@ -129,7 +120,7 @@ def _fleet_row(one: Heard, now_s: float) -> str:
 
 def _escape_cell(text: str) -> str:
     """Escape text of another process for a table cell, so that it cannot end the cell or form a link or an image."""
-    return re.sub(r"([\\`*_\[\]<>!|#])", r"\\\1", remote_device.clean(text))
+    return re.sub(r"([\\`*_\[\]<>!|#])", r"\\\1", remote_device.strip_control_characters(text))
 
 
 def noise_text(estimate: Estimate) -> str:
@@ -139,11 +130,11 @@ def noise_text(estimate: Estimate) -> str:
     if not tables:
         return "Too few samples yet."
     seen_s = estimate.curve.n / estimate.rate_hz
-    head = f"Last **{duration(min(seen_s, estimate.window_s))}**, 95 % intervals; ≤ bound; — too few data"
+    head = f"Last **{format_duration(min(seen_s, estimate.window_s))}**, 95 % intervals; ≤ bound; — too few data"
     return "\n\n".join([head, *tables])
 
 
-def drift_text(look: DriftLook) -> str:
+def drift_text(look: DriftUpdate) -> str:
     """Return a table of the drift models of the gyroscopes and the drift that is currently removed."""
     unit = DEVIATION_UNITS["gyro"]
     rows = ["| axis | drift now | model | φ₁ | φ₂ | θ₁ |", "|---|---|---|---|---|---|"]
@@ -152,7 +143,8 @@ def drift_text(look: DriftLook) -> str:
         if not math.isfinite(expected):
             rows.append(f"| {axis} | not known yet | | | | |")
             continue
-        now = f"{number(unit.factor * expected)} ± {number(1.96 * unit.factor * float(look.error[at]), 2)} {unit.name}"
+        error = format_number(1.96 * unit.factor * float(look.error[at]), 2)
+        now = f"{format_number(unit.factor * expected)} ± {error} {unit.name}"
         if model is None:
             rows.append(f"| {axis} | {now} | learning | | | |")
             continue
@@ -161,25 +153,24 @@ def drift_text(look: DriftLook) -> str:
             for x, there in zip((*model.phi, model.theta), _coefficients_in_model(model), strict=True)
         ]
         rows.append(f"| {axis} | {now} | {model.name} | {' | '.join(parts)} |")
-    head = (
-        f"Learned at rest, from means of {duration(look.interval_s)}; what each of them brought anew is the innovation."
-    )
+    interval = format_duration(look.interval_s)
+    head = f"Learned at rest, from means of {interval}; what each of them brought anew is the innovation."
     return "\n".join([head, "", *rows])
 
 
-def _coefficients_in_model(model: Arma) -> tuple[bool, bool, bool]:
+def _coefficients_in_model(model: ArmaModel) -> tuple[bool, bool, bool]:
     """Return which of φ₁, φ₂ and θ₁ are part of the model."""
     return model.order[0] > 0, model.order[0] > 1, model.order[1] > 0
 
 
-def duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Format a duration given in seconds with two units.
 
     >>> duration(3725.0), duration(0.5), duration(90.0)
     ('1 h 02 min', '0.500 s', '1 min 30 s')
     """
     if seconds < 60:
-        return f"{number(seconds)} s" if seconds < 10 else f"{seconds:.0f} s"
+        return f"{format_number(seconds)} s" if seconds < 10 else f"{seconds:.0f} s"
     whole = round(seconds)
     days, hours, minutes = whole // 86400, whole // 3600 % 24, whole // 60 % 60
     if days:
@@ -196,16 +187,16 @@ def _rate(health: Health) -> str:
 
 def _milliseconds(seconds: float | None) -> str:
     """Format a duration in milliseconds."""
-    return "—" if seconds is None else f"{number(seconds * 1e3)} ms"
+    return "—" if seconds is None else f"{format_number(seconds * 1e3)} ms"
 
 
 def _noise_table(estimate: Estimate, kind: Kind) -> str:
     """Return the table of coefficients of one kind of sensor."""
     axes = axes_of(kind)
     lines = [f"| {KIND_NAMES[kind]} | {' | '.join(axes)} |", "|:--|" + "--:|" * len(axes)]
-    for letter in LETTERS:
+    for letter in SYMBOLS:
         unit = COEFFICIENT_UNITS[kind][letter].name
-        cells = [reading(estimate.coefficients, letter, axis) for axis in axes]
+        cells = [format_coefficient(estimate.coefficients, letter, axis) for axis in axes]
         values = " | ".join(f"**{c.value}**" if c.value != "—" else "—" for c in cells)
         lines.append(f"| **{letter}** {unit} | {values} |")
         if any(c.interval for c in cells):

@@ -10,13 +10,13 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.history.reading import Course, Past
+from monitor.history.reading import ColumnStatistics, HistoryTable
 
 MAX_INTERVAL_RATIO: Final = 1.5
 """Intervals whose ends differ from the value by more than this factor are not drawn: they would determine the scale."""
 
 
-def points(past: Past, course: Course, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
+def history_points(past: HistoryTable, course: ColumnStatistics, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
     """Return Unix times [m] and value, lo and hi [m, 3]; a NaN row separates gaps and follows the last bucket.
 
     Parameters

@@ -17,23 +17,15 @@ import rerun as rr
 
 from drivers.sample import AXES, Event, Floats
 from monitor.common.health import Health
-from monitor.drift.compensation.live_compensation import DriftLook
-from monitor.drift.thermal.live_thermal import ThermalLook
-from monitor.drift.thermal.online_thermal_model import AxisThermal
+from monitor.common.units import COEFFICIENT_UNITS, DEVIATION_UNITS, KINDS, SAMPLE_UNITS, Kind, axes_of, sensor_kind
+from monitor.drift.compensation.live_compensation import DriftUpdate
+from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.drift.thermal.online_thermal_model import AxisThermalUpdate
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import LETTERS, Status
-from monitor.history.reading import Past
-from monitor.history.time_ranges import said
-from monitor.publishing.coefficient_cells import (
-    COEFFICIENT_UNITS,
-    DEVIATION_UNITS,
-    KINDS,
-    SAMPLE_UNITS,
-    Kind,
-    axes_of,
-    kind_of,
-)
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.history.reading import HistoryTable
+from monitor.history.time_ranges import format_utc
 from monitor.publishing.plots import colours
 from monitor.publishing.rerun import dynamic_surface, past_points
 from monitor.publishing.rerun.allan_chart import (
@@ -42,14 +34,14 @@ from monitor.publishing.rerun.allan_chart import (
     WIDTH,
     Scale,
     band,
-    dashes,
+    dash_line,
     decades,
+    finite_sections,
     grid,
-    runs,
-    whiskers,
+    interval_strokes,
 )
-from monitor.publishing.rerun.allan_history import Surface
-from monitor.publishing.rerun.decimation import extremes, means
+from monitor.publishing.rerun.allan_history import AllanHistory
+from monitor.publishing.rerun.decimation import average_buckets, decimate_extremes
 from monitor.publishing.rerun.panels import drift_text, health_text, noise_text, overview_text
 
 TIMELINE: Final = "sample_time"
@@ -81,7 +73,7 @@ class _Device:
     about: str
     scales: dict[Kind, Scale] = field(default_factory=dict)
     gap: ModelGap | None = None  # newest comparison with the model
-    surface: Surface = field(default_factory=Surface)
+    surface: AllanHistory = field(default_factory=AllanHistory)
 
 
 class Scene:
@@ -130,7 +122,7 @@ class Scene:
                 self._style_axis(device, axis)
             line = rr.SeriesLines(colors=[colours.TEMPERATURE], widths=[1.5], names=["temperature, °C"])
             self._stream.log(f"{device}/temperature", line, static=True)
-            line = rr.SeriesLines(colors=[colours.mixed(colours.TEXT, 0.6)], widths=[1.0], names=["threshold"])
+            line = rr.SeriesLines(colors=[colours.blend(colours.TEXT, 0.6)], widths=[1.0], names=["threshold"])
             self._stream.log(f"{device}/gap/threshold", line, static=True)
 
     def samples(self, device: str, wall_s: Floats, values: Floats, temperature_c: Floats) -> None:
@@ -148,9 +140,9 @@ class Scene:
             Temperatures [°C], shape [n].
         """
         for i, axis in enumerate(AXES):
-            t, y = extremes(wall_s, values[:, i])
-            self._scalars(f"{device}/samples/{axis}", t, y * SAMPLE_UNITS[kind_of(axis)].factor)
-        self._scalars(f"{device}/temperature", *means(wall_s, temperature_c, TEMPERATURES_PER_S))
+            t, y = decimate_extremes(wall_s, values[:, i])
+            self._scalars(f"{device}/samples/{axis}", t, y * SAMPLE_UNITS[sensor_kind(axis)].factor)
+        self._scalars(f"{device}/temperature", *average_buckets(wall_s, temperature_c, TEMPERATURES_PER_S))
 
     def estimate(self, device: str, wall_s: float, estimate: Estimate) -> None:
         """Log the Allan plots and the table of an estimate, and the surface over time if it has a new column.
@@ -172,7 +164,7 @@ class Scene:
         if surface.add(wall_s, estimate):
             dynamic_surface.draw(self._stream, device, surface)
 
-    def courses(self, device: str, wall_s: Floats, estimates: Sequence[Estimate]) -> None:
+    def coefficients(self, device: str, wall_s: Floats, estimates: Sequence[Estimate]) -> None:
         """Log coefficients over time: one point with interval per estimate, and the values between the estimates.
 
         Parameters
@@ -189,7 +181,7 @@ class Scene:
             for at_s, estimate in zip(np.asarray(wall_s), estimates, strict=True)
         ]
         at = np.concatenate([times for times, _ in looks])
-        for row, letter in enumerate(LETTERS):
+        for row, letter in enumerate(SYMBOLS):
             for column, axis in enumerate(AXES):
                 parts = []
                 for estimate, (_, value) in zip(estimates, looks, strict=True):
@@ -199,10 +191,10 @@ class Scene:
                     parts.append(between)
                 values = np.concatenate(parts)
                 if np.isfinite(values).any():
-                    factor = COEFFICIENT_UNITS[kind_of(axis)][letter].factor
+                    factor = COEFFICIENT_UNITS[sensor_kind(axis)][letter].factor
                     self._scalars(f"{device}/coefficients/{letter}/{axis}", at, values * factor)
 
-    def past(self, device: str, past: Past) -> None:
+    def past(self, device: str, past: HistoryTable) -> None:
         """Log the stored history: coefficients and temperature with their extremes, and events.
 
         Lines have a gap where buckets are missing and after the last bucket, so that live data form a separate line.
@@ -214,19 +206,19 @@ class Scene:
         past
             The history.
         """
-        for letter in LETTERS:
+        for letter in SYMBOLS:
             for axis in past.axes():
                 course, lo, hi = (past.column(f"{axis}.{letter}{end}") for end in ("", ".lo", ".hi"))
                 if np.isfinite(course.last).any():
-                    at, values = past_points.points(past, course, lo.last, hi.last)
-                    factor = COEFFICIENT_UNITS[kind_of(axis)][letter].factor
+                    at, values = past_points.history_points(past, course, lo.last, hi.last)
+                    factor = COEFFICIENT_UNITS[sensor_kind(axis)][letter].factor
                     self._scalars(f"{device}/coefficients/{letter}/{axis}", at, values * factor)
         temperature = past.column("temperature")
         if np.isfinite(temperature.last).any():
-            at, values = past_points.points(past, temperature, temperature.last, temperature.last)
+            at, values = past_points.history_points(past, temperature, temperature.last, temperature.last)
             self._scalars(f"{device}/temperature", at, values[:, 0])
         for event in past.events[-MAX_PAST_EVENTS:]:
-            text = f"{said(event.t_s)[:10]}: {event.text}"  # the log line shows only the time of day
+            text = f"{format_utc(event.t_s)[:10]}: {event.text}"  # the log line shows only the time of day
             self.event(device, event.t_s, Event(event.kind, round(event.t_s * 1e9), text, event.axis, event.what))
 
     def gaps(self, device: str, wall_s: Floats, looks: Sequence[ModelGap]) -> None:
@@ -251,7 +243,7 @@ class Scene:
             if np.isfinite(gap).any():
                 self._scalars(f"{device}/gap/{axis}", wall_s, gap)
 
-    def thermal(self, device: str, wall_s: Floats, looks: Sequence[ThermalLook]) -> None:
+    def thermal(self, device: str, wall_s: Floats, looks: Sequence[ThermalUpdate]) -> None:
         """Log the mean bias of each axis and its prediction with interval.
 
         Parameters
@@ -266,7 +258,7 @@ class Scene:
         for axis in AXES:
             rows = np.array([_thermal(look.axes.get(axis)) for look in looks])
             if np.isfinite(rows).any():
-                self._scalars(f"{device}/thermal/{axis}", wall_s, rows * DEVIATION_UNITS[kind_of(axis)].factor)
+                self._scalars(f"{device}/thermal/{axis}", wall_s, rows * DEVIATION_UNITS[sensor_kind(axis)].factor)
 
     def compensated(self, device: str, wall_s: Floats, values: Floats) -> None:
         """Log drift-compensated rates, thinned like the samples.
@@ -281,10 +273,10 @@ class Scene:
             Rates [rad/s], shape [n, 3].
         """
         for i, axis in enumerate(axes_of("gyro")):
-            t, y = extremes(wall_s, values[:, i])
+            t, y = decimate_extremes(wall_s, values[:, i])
             self._scalars(f"{device}/compensated/{axis}", t, y * SAMPLE_UNITS["gyro"].factor)
 
-    def drift(self, device: str, wall_s: Floats, looks: Sequence[DriftLook]) -> None:
+    def drift(self, device: str, wall_s: Floats, looks: Sequence[DriftUpdate]) -> None:
         """Log means at rest, predicted drift, innovations, and the table of the models.
 
         Parameters
@@ -362,20 +354,20 @@ class Scene:
     def _style_axis(self, device: str, axis: str) -> None:
         """Log the line styles of one axis."""
         colour = colours.AXIS_COLOURS[axis]
-        unit = SAMPLE_UNITS[kind_of(axis)].name
+        unit = SAMPLE_UNITS[sensor_kind(axis)].name
         line = rr.SeriesLines(colors=[colour], widths=[1.0], names=[f"{axis}, {unit}"])
         self._stream.log(f"{device}/samples/{axis}", line, static=True)
         line = rr.SeriesLines(colors=[colour], widths=[1.5], names=[f"{axis}, σ from its model"])
         self._stream.log(f"{device}/gap/{axis}", line, static=True)
-        dim = colours.mixed(colour, 0.45)
-        unit = DEVIATION_UNITS[kind_of(axis)].name
+        dim = colours.blend(colour, 0.45)
+        unit = DEVIATION_UNITS[sensor_kind(axis)].name
         names = [f"{axis} bias, {unit}", f"{axis} expected", f"{axis} 95 % low", f"{axis} 95 % high"]
         line = rr.SeriesLines(colors=[colour, colours.TEXT, dim, dim], widths=[2.0, 1.0, 0.75, 0.75], names=names)
         self._stream.log(f"{device}/thermal/{axis}", line, static=True)
-        if kind_of(axis) == "gyro":
+        if sensor_kind(axis) == "gyro":
             self._style_drift(device, axis)
-        for letter in LETTERS:
-            unit = COEFFICIENT_UNITS[kind_of(axis)][letter].name
+        for letter in SYMBOLS:
+            unit = COEFFICIENT_UNITS[sensor_kind(axis)][letter].name
             names = [f"{axis}, {unit}", f"{axis} 95 % low", f"{axis} 95 % high"]
             line = rr.SeriesLines(colors=[colour, dim, dim], widths=[2.0, 0.75, 0.75], names=names)
             self._stream.log(f"{device}/coefficients/{letter}/{axis}", line, static=True)
@@ -385,7 +377,7 @@ class Scene:
     def _style_drift(self, device: str, axis: str) -> None:
         """Log the line styles of the drift compensation of one gyroscope axis."""
         colour = colours.AXIS_COLOURS[axis]
-        dim = colours.mixed(colour, 0.45)
+        dim = colours.blend(colour, 0.45)
         unit = DEVIATION_UNITS["gyro"].name
         names = [f"{axis} at rest, {unit}", f"{axis} expected", f"{axis} 95 % low", f"{axis} 95 % high"]
         line = rr.SeriesLines(colors=[dim, colours.TEXT, colour, colour], widths=[0.75, 1.5, 1.0, 1.0], names=names)
@@ -399,9 +391,9 @@ class Scene:
         """Mark changed coefficients with a diamond at their new value."""
         if event.axis is None:
             return
-        for letter, sizes in event.what.items():
-            if letter in LETTERS and "after" in sizes:
-                unit = COEFFICIENT_UNITS[kind_of(event.axis)][letter]
+        for letter, sizes in event.values.items():
+            if letter in SYMBOLS and "after" in sizes:
+                unit = COEFFICIENT_UNITS[sensor_kind(event.axis)][letter]
                 path = f"{device}/coefficients/{letter}/{event.axis}/changed"
                 self._scalars(path, np.array([wall_s]), np.array([sizes["after"]]) * unit.factor)
 
@@ -467,26 +459,28 @@ class Scene:
     def _curve(self, path: str, scale: Scale, curve: "_Curve") -> None:
         """Log band, fitted line, intervals and measured points of one axis, and the model in use as a dashed line."""
         colour = colours.AXIS_COLOURS[curve.axis]
-        low, high = scale.place(curve.tau, curve.lo), scale.place(curve.tau, curve.hi)
+        low, high = scale.to_chart(curve.tau, curve.lo), scale.to_chart(curve.tau, curve.hi)
         fill = rr.LineStrips2D(
             list(band(low, high)),
-            colors=[colours.mixed(colour, 0.22)],
+            colors=[colours.blend(colour, 0.22)],
             radii=[WIDTH / FILL_STEPS / 2],
             draw_order=-20.0,
         )
         self._stream.log(f"{path}/band", fill)
         thin = rr.Radius.ui_points(0.75)
-        dim = colours.mixed(colour, 0.6)
-        strokes = rr.LineStrips2D(list(whiskers(low, high)), colors=[dim], radii=thin, draw_order=5.0)
+        dim = colours.blend(colour, 0.6)
+        strokes = rr.LineStrips2D(list(interval_strokes(low, high)), colors=[dim], radii=thin, draw_order=5.0)
         self._stream.log(f"{path}/interval", strokes)
-        fitted = runs(scale.place(curve.tau, curve.fitted))
+        fitted = finite_sections(scale.to_chart(curve.tau, curve.fitted))
         fit = rr.LineStrips2D(fitted, colors=[colour], radii=rr.Radius.ui_points(1.25), draw_order=10.0)
         self._stream.log(f"{path}/fit", fit)
-        dashed = [stroke for run in runs(scale.place(curve.tau, curve.model)) for stroke in dashes(run)]
+        dashed = [
+            stroke for run in finite_sections(scale.to_chart(curve.tau, curve.model)) for stroke in dash_line(run)
+        ]
         model = rr.LineStrips2D(dashed, colors=[colours.TEXT], radii=rr.Radius.ui_points(0.75), draw_order=15.0)
         self._stream.log(f"{path}/model", model)
         points = rr.Points2D(
-            scale.place(curve.tau, curve.deviation),
+            scale.to_chart(curve.tau, curve.deviation),
             colors=[colour],
             radii=rr.Radius.ui_points(3.0),
             draw_order=20.0,
@@ -524,7 +518,7 @@ class _Curve:
         model = np.full(fitted.shape, np.nan)
         if gap is not None and axis in gap.axes and gap.axes[axis].model.shape == rows.shape:
             model = gap.axes[axis].model[rows]
-        f = DEVIATION_UNITS[kind_of(axis)].factor
+        f = DEVIATION_UNITS[sensor_kind(axis)].factor
         return cls(axis, si["tau"], deviation * f, si["lo"] * f, si["hi"] * f, fitted * f, model * f, si)
 
 
@@ -534,12 +528,12 @@ def _values_between_estimates(wall_s: float, estimate: Estimate) -> tuple[Floats
     The entries are thinned to POINTS_BETWEEN_ESTIMATES points. More could not be distinguished and would overload the
     viewer.
     """
-    if estimate.course is None:
+    if estimate.history is None:
         return np.array([wall_s]), np.full((1, 5, 6), np.nan)
-    step = -(-estimate.course.t_ns.size // POINTS_BETWEEN_ESTIMATES)
-    rows = slice((estimate.course.t_ns.size - 1) % step, None, step)
-    before_s = (estimate.course.t_ns[-1] - estimate.course.t_ns[rows]) / 1e9
-    return wall_s - before_s, estimate.course.value[rows].copy()
+    step = -(-estimate.history.t_ns.size // POINTS_BETWEEN_ESTIMATES)
+    rows = slice((estimate.history.t_ns.size - 1) % step, None, step)
+    before_s = (estimate.history.t_ns[-1] - estimate.history.t_ns[rows]) / 1e9
+    return wall_s - before_s, estimate.history.value[rows].copy()
 
 
 def _value_with_interval(estimate: Estimate, row: int, column: int) -> tuple[float, float, float]:
@@ -558,7 +552,7 @@ def _value_with_interval(estimate: Estimate, row: int, column: int) -> tuple[flo
     )
 
 
-def _thermal(one: AxisThermal | None) -> tuple[float, float, float, float]:
+def _thermal(one: AxisThermalUpdate | None) -> tuple[float, float, float, float]:
     """Return measured bias, one-step prediction, and the ends of its interval, which events are based on."""
     if one is None:
         return np.nan, np.nan, np.nan, np.nan
@@ -566,7 +560,7 @@ def _thermal(one: AxisThermal | None) -> tuple[float, float, float, float]:
     return (one.bias, np.nan, np.nan, np.nan) if band is None else (one.bias, band.bias, band.lo, band.hi)
 
 
-def _drift(look: DriftLook, axis: int) -> tuple[float, float, float, float]:
+def _drift(look: DriftUpdate, axis: int) -> tuple[float, float, float, float]:
     """Return mean at rest, predicted drift, and the ends of its 95 % interval."""
     expected, wide = float(look.expected[axis]), Z95 * float(look.error[axis])
     return float(look.mean[axis]), expected, expected - wide, expected + wide

@@ -33,8 +33,8 @@ import rerun as rr
 import rerun_cli  # type: ignore[import-untyped]
 
 from drivers.file_access import check_regular
-from monitor.common.folder_lock import NO_LOCKS
-from monitor.publishing.rerun.viewer_settings import ViewerClosed, ViewerSettings, ViewerTrouble
+from monitor.common.folder_lock import LOCKS_UNSUPPORTED_ERRNOS
+from monitor.publishing.rerun.viewer_settings import ViewerClosed, ViewerError, ViewerSettings
 
 LOOPBACK: Final = "127.0.0.1"
 APPLICATION: Final = "imu-monitor"
@@ -51,7 +51,7 @@ def has_desktop() -> bool:
     return sys.platform in ("darwin", "win32") or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
 
 
-class Child:
+class ViewerProcess:
     """Viewer process and the last line of its log."""
 
     def __init__(self, arguments: list[str]) -> None:
@@ -70,12 +70,12 @@ class Child:
         """Process id."""
         return self._process.pid
 
-    def trouble(self) -> str | None:
+    def exit_reason(self) -> str | None:
         """Return why the process has ended; None if it is running."""
         status = self._process.poll()
         return None if status is None else f"viewer ended ({status}): {self._last_log_line()}"
 
-    def left(self) -> bool:
+    def exited_normally(self) -> bool:
         """Return True if the process ended normally, as after its window was closed."""
         return self._process.poll() == 0
 
@@ -112,7 +112,7 @@ class Output:
     stream: rr.RecordingStream
     flush_every_s: float
     url: str = ""  # address of the page or of the Rerun server
-    child: Child | None = None
+    child: ViewerProcess | None = None
     port: int | None = None  # port of the Rerun server; None for a file
     note: str = ""  # which ports were in use, and which are used instead
     lock: IO[bytes] | None = None  # open while a file is written, so that no other process writes it
@@ -127,13 +127,13 @@ class Output:
         ViewerTrouble
             The viewer ended for another reason.
         """
-        if self.child is not None and self.child.left():
+        if self.child is not None and self.child.exited_normally():
             raise ViewerClosed(CLOSED)
-        trouble = self.child.trouble() if self.child is not None else None
+        trouble = self.child.exit_reason() if self.child is not None else None
         if trouble is None and self.port is not None and not listens(self.port):
             trouble = f"the viewer on port {self.port} was closed"
         if trouble is not None:
-            raise ViewerTrouble(trouble)
+            raise ViewerError(trouble)
 
     def confirm(self, patience_s: float) -> bool:
         """Return True if all logged data were sent within ``patience_s`` seconds and the viewer answers.
@@ -144,7 +144,7 @@ class Output:
             self.stream.flush(timeout_sec=patience_s)
         except RuntimeError:  # Rerun raises it for "timed out" and for "connection lost"
             return False
-        return self.port is None or ask(self.port, "/imu.monitor/Ping", patience_s) is not None
+        return self.port is None or grpc_call(self.port, "/imu.monitor/Ping", patience_s) is not None
 
     def close(self) -> None:
         """End the viewer if it was started here; a file is complete afterwards."""
@@ -164,7 +164,7 @@ def viewer_program() -> Path:
     names = ("Rerun.app/Contents/MacOS/Rerun", "rerun.exe", "rerun")
     found = next((room / name for name in names if (room / name).is_file()), None)
     if found is None:
-        raise ViewerTrouble(f"rerun-sdk came without its viewer: no program in {room}")
+        raise ViewerError(f"rerun-sdk came without its viewer: no program in {room}")
     return found
 
 
@@ -189,11 +189,11 @@ def is_rerun(port: int) -> bool:
 
     Other gRPC servers answer "unimplemented" (status 12), and other servers do not answer with gRPC.
     """
-    reply = ask(port, PROBE_METHOD, 1.0)
+    reply = grpc_call(port, PROBE_METHOD, 1.0)
     return reply is not None and "grpc" in reply.get("content-type", "") and reply.get("grpc-status") != "12"
 
 
-def ask(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
+def grpc_call(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
     """Return the headers of the reply to an empty gRPC call; None if there is no reply in time.
 
     Parameters
@@ -234,7 +234,7 @@ def free_port(wanted: int, taken: int | None = None) -> int:
     for port in range(wanted, min(wanted + PORTS_TRIED, 65536)):
         if port != taken and _bindable(port):
             return port
-    raise ViewerTrouble(f"cannot listen on {wanted} to {wanted + PORTS_TRIED - 1}: all busy")
+    raise ViewerError(f"cannot listen on {wanted} to {wanted + PORTS_TRIED - 1}: all busy")
 
 
 def _bindable(port: int) -> bool:
@@ -282,16 +282,16 @@ def _open_file(path: Path, recording_id: str) -> Output:
             check_regular(path)  # opening a FIFO would wait for a reader
         lock = path.open("ab")
     except OSError as error:
-        raise ViewerTrouble(f"cannot write {path}: {error.strerror}") from error
+        raise ViewerError(f"cannot write {path}: {error.strerror}") from error
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released by the system when this process ends
     except BlockingIOError:
         lock.close()
-        raise ViewerTrouble(f"{path}: another process writes this file; name another one") from None
+        raise ViewerError(f"{path}: another process writes this file; name another one") from None
     except OSError as error:  # a file system without locks
-        if error.errno not in NO_LOCKS:
+        if error.errno not in LOCKS_UNSUPPORTED_ERRNOS:
             lock.close()
-            raise ViewerTrouble(f"cannot lock {path}: {error.strerror}") from error
+            raise ViewerError(f"cannot lock {path}: {error.strerror}") from error
     try:
         stream = _stream(recording_id)
         # A footer would keep an entry for every chunk in memory while the daemon runs.
@@ -307,15 +307,15 @@ def _open_native(settings: ViewerSettings, recording_id: str, given_up: Callable
     port = settings.port
     if listens(port):
         if not is_rerun(port):
-            raise ViewerTrouble(f"cannot listen on {port}: busy")
+            raise ViewerError(f"cannot listen on {port}: busy")
         return _connected(port, recording_id)
     if settings.mode == "join":
         raise ViewerClosed(CLOSED)
     if not has_desktop():
-        raise ViewerTrouble('no desktop here (DISPLAY and WAYLAND_DISPLAY are not set): use viewer mode "web"')
-    child = Child([
+        raise ViewerError('no desktop here (DISPLAY and WAYLAND_DISPLAY are not set): use viewer mode "web"')
+    child = ViewerProcess([
         *("--bind", LOOPBACK, "--port", str(port)),
-        *("--memory-limit", with_program(settings.memory), "--server-memory-limit", "64MiB"),
+        *("--memory-limit", total_memory_limit(settings.memory), "--server-memory-limit", "64MiB"),
         *("--hide-welcome-screen", "--expect-data-soon"),
     ])  # fmt: skip
     _wait_for(port, child, given_up)
@@ -326,7 +326,7 @@ def _open_web(settings: ViewerSettings, recording_id: str, given_up: Callable[[]
     """Start a Rerun server with a web page, and open the page if there is a desktop."""
     port = free_port(settings.port)
     web_port = free_port(settings.web_port, taken=port)
-    child = Child([
+    child = ViewerProcess([
         *("--serve-web", "--bind", LOOPBACK, "--port", str(port), "--web-viewer-port", str(web_port)),
         *("--server-memory-limit", settings.memory),
     ])  # fmt: skip
@@ -340,7 +340,7 @@ def _open_web(settings: ViewerSettings, recording_id: str, given_up: Callable[[]
     return output
 
 
-def with_program(memory: str) -> str:
+def total_memory_limit(memory: str) -> str:
     """Return the memory limit of a window, increased by the memory of the program; a percentage is not changed.
 
     >>> with_program("256MiB"), with_program("1GiB"), with_program("25%")
@@ -358,7 +358,9 @@ def server_url(port: int) -> str:
     return f"rerun+http://{LOOPBACK}:{port}/proxy"
 
 
-def _connected(port: int, recording_id: str, child: Child | None = None, joined_port: int | None = None) -> Output:
+def _connected(
+    port: int, recording_id: str, child: ViewerProcess | None = None, joined_port: int | None = None
+) -> Output:
     """Return an output that is connected to a Rerun server."""
     stream = _stream(recording_id)
     stream.set_sinks(rr.GrpcSink(server_url(port)))
@@ -379,16 +381,16 @@ def _stream(recording_id: str) -> rr.RecordingStream:
     return stream
 
 
-def _wait_for(port: int, child: Child, given_up: Callable[[], bool]) -> None:
+def _wait_for(port: int, child: ViewerProcess, given_up: Callable[[], bool]) -> None:
     """Wait until the viewer listens; end it and raise ViewerTrouble if it does not."""
     end = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < end and not given_up():
-        trouble = child.trouble()
+        trouble = child.exit_reason()
         if trouble is not None:
             child.end()
-            raise ViewerTrouble(trouble)
+            raise ViewerError(trouble)
         if listens(port):
             return
         time.sleep(0.05)
     child.end()
-    raise ViewerTrouble(f"the viewer did not listen on {port} within {START_TIMEOUT_S:.0f} s")
+    raise ViewerError(f"the viewer did not listen on {port} within {START_TIMEOUT_S:.0f} s")

@@ -24,17 +24,17 @@ import numpy as np
 
 from drivers.sample import Event, Floats
 from monitor.common.health import Health
-from monitor.drift.compensation.live_compensation import DriftLook
-from monitor.drift.thermal.live_thermal import ThermalLook
+from monitor.drift.compensation.live_compensation import DriftUpdate
+from monitor.drift.thermal.live_thermal import ThermalUpdate
 from monitor.estimation.detection.model_gap import ModelGap
-from monitor.estimation.estimate import Estimate, joined
-from monitor.history.reading import Past
-from monitor.publishing.rerun.bounded_queue import Backlog
-from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerClosed, ViewerSettings, ViewerTrouble
+from monitor.estimation.estimate import Estimate, concatenate_histories
+from monitor.history.reading import HistoryTable
+from monitor.publishing.rerun.bounded_queue import BoundedQueue
+from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerClosed, ViewerError, ViewerSettings
 
 if TYPE_CHECKING:
     from monitor.publishing.rerun.scene import Scene
-    from monitor.publishing.rerun.sinks import Child, Output
+    from monitor.publishing.rerun.sinks import Output, ViewerProcess
 
 BACKLOG_BYTES: Final = 16_000_000  # about 25 s of 16 devices at 1 kHz with six axes
 CONFIRM_PERIOD_S: Final = 1.0  # interval between checks that drawn data have reached the viewer
@@ -47,7 +47,7 @@ POINT_INTERVAL_S: Final = 1.0  # interval between two coefficient points, in sam
 MIN_WINDOW_LIFETIME_S: Final = 10.0  # a window that closes sooner is taken as not working
 MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
 
-Recall = Callable[[str], Past | None]
+Recall = Callable[[str], HistoryTable | None]
 """Function that returns the stored history of a device, or None."""
 Message = tuple[str, "_Samples | _Estimate | _Gap | _Thermal | _Rates | _Drift | _Event | _Health | _Overview"]
 
@@ -90,7 +90,7 @@ class _Drift:
     """State of the drift compensation, with its time."""
 
     wall_s: float
-    look: DriftLook
+    look: DriftUpdate
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ class _Thermal:
     """Result of the thermal model, with its time."""
 
     wall_s: float
-    look: ThermalLook
+    look: ThermalUpdate
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,13 +152,13 @@ class RerunView:
         self._recall = recall or _no_history
         self._fleet = fleet
         self._devices = tuple(devices)
-        self._backlog: Backlog[Message] = Backlog(BACKLOG_BYTES)
+        self._backlog: BoundedQueue[Message] = BoundedQueue(BACKLOG_BYTES)
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._phase = "off"
         self._stalled = False
         self._inside_since: float | None = None  # monotonic time at which the current Rerun call began [s]
-        self._child: Child | None = None
+        self._child: ViewerProcess | None = None
         self._url = ""
         self._recording_id = str(uuid.uuid4())
 
@@ -183,7 +183,7 @@ class RerunView:
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
         self._thread.start()
 
-    def show(self, devices: Sequence[DeviceInfo]) -> None:
+    def set_devices(self, devices: Sequence[DeviceInfo]) -> None:
         """Set the devices to show; this must be called before data of a new device are passed.
 
         Parameters
@@ -252,7 +252,7 @@ class RerunView:
         """
         self._put(device, _Rates(wall_s, values), wall_s.nbytes + values.nbytes)
 
-    def drift(self, device: str, wall_s: float, look: DriftLook) -> None:
+    def drift(self, device: str, wall_s: float, look: DriftUpdate) -> None:
         """Draw the state of the drift compensation after an interval.
 
         Parameters
@@ -266,7 +266,7 @@ class RerunView:
         """
         self._put(device, _Drift(wall_s, look), 1000)
 
-    def thermal(self, device: str, wall_s: float, look: ThermalLook) -> None:
+    def thermal(self, device: str, wall_s: float, look: ThermalUpdate) -> None:
         """Draw the mean bias of an interval and its prediction from the temperature.
 
         Parameters
@@ -357,7 +357,7 @@ class RerunView:
             except ViewerClosed as closed:
                 settings = replace(settings, mode="join")
                 self._phase = str(closed)
-            except ViewerTrouble as trouble:
+            except ViewerError as trouble:
                 self._phase = str(trouble)
             except ImportError as missing:
                 self._phase = MISSING if missing.name in ("rerun", "rerun_cli", "rerun_bindings") else str(missing)
@@ -454,7 +454,7 @@ class RerunView:
         self._stalled = False
 
 
-def _no_history(_device: str) -> Past | None:
+def _no_history(_device: str) -> HistoryTable | None:
     """Return None: no history is stored."""
     return None
 
@@ -541,15 +541,17 @@ class _Pending:
         for device in list(self.course):
             if everything or self._due("course", device, POINTS_PERIOD_S):
                 points = self.course.pop(device)
-                scene.courses(device, np.array([p.wall_s for p in points]), [p.estimate for p in points])
+                scene.coefficients(device, np.array([p.wall_s for p in points]), [p.estimate for p in points])
 
     def _add_to_course(self, device: str, message: _Estimate) -> None:
         """Add a coefficient point; replace the previous one if it is younger than POINT_INTERVAL_S."""
         points = self.course.setdefault(device, [])
         if len(points) > 1 and message.wall_s - points[-2].wall_s < POINT_INTERVAL_S:
             # The per-sample values between the points are kept.
-            course = joined([part for part in (points.pop().estimate.course, message.estimate.course) if part])
-            message = _Estimate(message.wall_s, replace(message.estimate, course=course))
+            course = concatenate_histories(
+                [part for part in (points.pop().estimate.history, message.estimate.history) if part]
+            )
+            message = _Estimate(message.wall_s, replace(message.estimate, history=course))
         points.append(message)
 
     def _add_gap(self, device: str, message: _Gap) -> None:

@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 
-class ViewerTrouble(Exception):
+class ViewerError(Exception):
     """Error: the viewer cannot be opened or has ended; the message is one line for the user."""
 
 
-class ViewerClosed(ViewerTrouble):
+class ViewerClosed(ViewerError):
     """Error: a user closed the window, so it must not be opened again without request."""
 
 

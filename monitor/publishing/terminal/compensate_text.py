@@ -8,11 +8,11 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
 
-from monitor.drift.compensation.arma import Arma
-from monitor.drift.compensation.compensation_result import Axis, Result
-from monitor.drift.compensation.compensation_score import SPANS_S, AtRest
-from monitor.publishing.coefficient_cells import DEVIATION_UNITS, number
-from monitor.publishing.rerun.panels import duration
+from monitor.common.units import DEVIATION_UNITS, format_number
+from monitor.drift.compensation.arma import ArmaModel
+from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
+from monitor.drift.compensation.compensation_score import SPANS_S, RestScore
+from monitor.publishing.rerun.panels import format_duration
 
 SCHEMA: Final = "imu-monitor/compensate/1"
 UNIT: Final = DEVIATION_UNITS["gyro"]
@@ -20,7 +20,7 @@ ARMA_COEFFICIENT_NAMES: Final = ("phi1", "phi2", "theta1")
 """JSON keys of the ARMA coefficients."""
 
 
-def tell(result: Result, console: Console) -> None:
+def tell(result: CompensationResult, console: Console) -> None:
     """Print the results of the compensation.
 
     Parameters
@@ -32,15 +32,18 @@ def tell(result: Result, console: Console) -> None:
     """
     console.print(
         f"{result.recording}: {result.samples} samples at {result.rate_hz:g} Hz, {result.method}; judged on "
-        f"{duration(result.judged_s)} at rest, after {duration(result.learned_s)}",
+        f"{format_duration(result.evaluated_rest_s)} at rest, after {format_duration(result.learning_rest_s)}",
         highlight=False,
     )
     rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
     for head in ("axis", "drift", "rms, °/h", "worst minute", *(f"{span / 60.0:.0f} min" for span in SPANS_S)):
         rows.add_column(head, no_wrap=head == "axis")
     for axis, one in result.axes.items():
-        pairs = [(one.before.deviation, one.after.deviation), (one.before.worst_minute, one.after.worst_minute)]
-        pairs += list(zip(one.before.drift, one.after.drift, strict=True))
+        pairs = [
+            (one.uncompensated.rms, one.compensated.rms),
+            (one.uncompensated.worst_minute, one.compensated.worst_minute),
+        ]
+        pairs += list(zip(one.uncompensated.drift, one.compensated.drift, strict=True))
         rows.add_row(axis, "—" if one.model is None else one.model.name, *(_format_pair(*pair) for pair in pairs))
     console.print(Padding(rows, (1, 0)))
     console.print(
@@ -48,14 +51,14 @@ def tell(result: Result, console: Console) -> None:
         style="dim",
     )
     for axis, one in result.axes.items():
-        if one.steps or one.left_out:
+        if one.steps or one.rejected_intervals:
             console.print(f"{axis}: {_describe_exceptions(one, result.interval_s)}", highlight=False, soft_wrap=True)
     for note in result.notes:
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
     console.print(f"{result.out} written", highlight=False, soft_wrap=True)
 
 
-def to_json(result: Result) -> bytes:
+def to_json(result: CompensationResult) -> bytes:
     """Encode the results as JSON, in SI units."""
     whole = {
         "schema": SCHEMA,
@@ -65,22 +68,22 @@ def to_json(result: Result) -> bytes:
         "rate": result.rate_hz,
         "samples": result.samples,
         "interval": result.interval_s,
-        "learned": result.learned_s,
-        "judged": result.judged_s,
+        "learned": result.learning_rest_s,
+        "judged": result.evaluated_rest_s,
         "axes": {axis: _axis(at, one, result) for at, (axis, one) in enumerate(result.axes.items())},
         "notes": list(result.notes),
     }
     return msgspec.json.encode(whole, enc_hook=_encode_array)
 
 
-def _axis(at: int, one: Axis, result: Result) -> dict[str, Any]:
+def _axis(at: int, one: AxisCompensation, result: CompensationResult) -> dict[str, Any]:
     """Return the results of one axis, which is column ``at`` of the intervals."""
     each = result.intervals
     return {
         "model": None if one.model is None else _model(one.model),
-        "before": _rest(one.before),
-        "after": _rest(one.after),
-        "left_out": one.left_out,
+        "before": _rest(one.uncompensated),
+        "after": _rest(one.compensated),
+        "left_out": one.rejected_intervals,
         "steps": one.steps,
         "intervals": {
             "end": [i.end / result.rate_hz for i in each],
@@ -92,7 +95,7 @@ def _axis(at: int, one: Axis, result: Result) -> dict[str, Any]:
     }
 
 
-def _model(model: Arma) -> dict[str, Any]:
+def _model(model: ArmaModel) -> dict[str, Any]:
     """Return the ARMA model with the intervals of its coefficients."""
     values = (*model.phi, model.theta)
     return {
@@ -103,15 +106,15 @@ def _model(model: Arma) -> dict[str, Any]:
             if np.isfinite(lo)
         },
         "variance": model.variance,
-        "white": model.white,
+        "white": model.white_variance,
         "mean": model.mean,
     }
 
 
-def _rest(one: AtRest) -> dict[str, Any]:
+def _rest(one: RestScore) -> dict[str, Any]:
     """Return the statistics at rest."""
     return {
-        "deviation": one.deviation,
+        "deviation": one.rms,
         "worst_minute": _number(one.worst_minute),
         "drift": {f"{span:g}": _number(x) for span, x in zip(SPANS_S, one.drift, strict=True)},
         "allan": {"tau": one.tau_s, "deviation": one.allan},
@@ -122,14 +125,14 @@ def _format_pair(before: float, after: float) -> str:
     """Format a value before and after compensation."""
     if not (np.isfinite(before) and np.isfinite(after)):
         return "—"
-    return f"{number(UNIT.factor * before, 2)} → {number(UNIT.factor * after, 2)}"
+    return f"{format_number(UNIT.factor * before, 2)} → {format_number(UNIT.factor * after, 2)}"
 
 
-def _describe_exceptions(one: Axis, interval_s: float) -> str:
+def _describe_exceptions(one: AxisCompensation, interval_s: float) -> str:
     """Describe the intervals that were left out and the steps of the bias."""
     parts = []
-    if one.left_out:
-        parts.append(f"{one.left_out} intervals of {interval_s:g} s left out, as no drift explains them")
+    if one.rejected_intervals:
+        parts.append(f"{one.rejected_intervals} intervals of {interval_s:g} s left out, as no drift explains them")
     if one.steps:
         parts.append(f"{one.steps} step{'s' if one.steps > 1 else ''} of the bias")
     return "; ".join(parts)

@@ -14,10 +14,10 @@ from rich.table import Table
 from rich.text import Text
 
 from drivers.sample import Floats
+from monitor.common.units import KIND_NAMES, KINDS, Kind, axes_of, format_number, unit_of
 from monitor.history.bucket import COUNTS, STATES
-from monitor.history.reading import Course, Past
-from monitor.history.time_ranges import said
-from monitor.publishing.coefficient_cells import KIND_NAMES, KINDS, Kind, axes_of, number, unit_of
+from monitor.history.reading import ColumnStatistics, HistoryTable
+from monitor.history.time_ranges import format_utc
 
 LETTERS: Final = ("N", "B", "K")
 """Coefficients shown for all axes; for a single axis all five are shown."""
@@ -32,7 +32,7 @@ WIDTH_UNITS: Final = ((86_400, "d"), (3600, "h"), (60, "min"), (1, "s"))
 """Units of bucket widths, the largest first."""
 
 
-def tell(past: Past, axes: tuple[str, ...], letters: tuple[str, ...], console: Console) -> None:
+def tell(past: HistoryTable, axes: tuple[str, ...], letters: tuple[str, ...], console: Console) -> None:
     """Print the summary of a history: one line per axis and letter, then status and events.
 
     Parameters
@@ -46,7 +46,7 @@ def tell(past: Past, axes: tuple[str, ...], letters: tuple[str, ...], console: C
     console
         Destination.
     """
-    console.print(head(past), highlight=False, soft_wrap=True)
+    console.print(summary_line(past), highlight=False, soft_wrap=True)
     for kind in KINDS:
         shown = [axis for axis in axes_of(kind) if axis in axes and axis in past.axes()]
         if shown:
@@ -56,7 +56,7 @@ def tell(past: Past, axes: tuple[str, ...], letters: tuple[str, ...], console: C
     tell_events(past, console)
 
 
-def tell_course(past: Past, axis: str, letters: tuple[str, ...], console: Console) -> None:
+def tell_course(past: HistoryTable, axis: str, letters: tuple[str, ...], console: Console) -> None:
     """Print one axis over time: one line per bucket, with the extremes of each coefficient.
 
     Parameters
@@ -81,13 +81,16 @@ def tell_course(past: Past, axis: str, letters: tuple[str, ...], console: Consol
         cells = [_cell(past, axis, letter, p) for letter in letters]
         lost = int(past.counts[p, COUNTS.index("lost")])
         table.add_row(
-            said(float(past.start_s[p]))[:16], *cells, number(float(temperature.last[p])), f"{lost:,}" if lost else "",
+            format_utc(float(past.start_s[p]))[:16],
+            *cells,
+            format_number(float(temperature.last[p])),
+            f"{lost:,}" if lost else "",
             STATES[int(past.state[p])],
-        )  # fmt: skip
+        )
     console.print(Padding(table, (1, 0, 0, 0)))
 
 
-def tell_events(past: Past, console: Console) -> None:
+def tell_events(past: HistoryTable, console: Console) -> None:
     """Print the newest MAX_EVENTS events.
 
     Parameters
@@ -105,30 +108,30 @@ def tell_events(past: Past, console: Console) -> None:
     if more > 0:
         console.print(f"… {more:,} earlier events", style="dim")
     for event in shown:
-        times = f" (and {event.stands_for - 1:,} more before it)" if event.stands_for > 1 else ""
-        console.print(f"{said(event.t_s)}  {event.text}{times}", markup=False, highlight=False, soft_wrap=True)
+        times = f" (and {event.represented_events - 1:,} more before it)" if event.represented_events > 1 else ""
+        console.print(f"{format_utc(event.t_s)}  {event.text}{times}", markup=False, highlight=False, soft_wrap=True)
 
 
-def head(past: Past) -> str:
+def summary_line(past: HistoryTable) -> str:
     """Return one line with device, time range, number of rows and number of samples."""
     samples = int(past.counts[:, COUNTS.index("received")].sum())
     if not len(past):
-        return f"{past.device}: no rows between {said(past.span.start_s)} and {said(past.span.end_s)} UTC"
+        return f"{past.device}: no rows between {format_utc(past.span.start_s)} and {format_utc(past.span.end_s)} UTC"
     widths = sorted({int(one) for one in past.width_s})
     rows = (" and " if len(widths) < 3 else " to ").join(_format_width(one) for one in (*widths[:1], *widths[1:][-1:]))
     return (
-        f"{past.device}: {said(float(past.start_s[0]))[:16]} to {said(float(past.end_s[-1]))[:16]} UTC, "
+        f"{past.device}: {format_utc(float(past.start_s[0]))[:16]} to {format_utc(float(past.end_s[-1]))[:16]} UTC, "
         f"{len(past):,} rows of {rows}, {samples:,} samples"
     )
 
 
-def status_lines(past: Past) -> list[str]:
+def status_lines(past: HistoryTable) -> list[str]:
     """Return lines with temperature range, lost samples, and the time during which the device was not running."""
     lines = []
     temperature = past.column("temperature")
     if temperature.n.any():
         low, high = np.nanmin(temperature.low), np.nanmax(temperature.high)
-        lines.append(f"temperature {number(float(low))} … {number(float(high))} °C")
+        lines.append(f"temperature {format_number(float(low))} … {format_number(float(high))} °C")
     counts = past.counts.sum(axis=0)
     wrong = [f"{int(counts[i]):,} {name}" for i, name in enumerate(COUNTS) if i and counts[i]]
     if wrong:
@@ -170,7 +173,7 @@ def sparkline(last: Floats, t_s: Floats, span: tuple[float, float], width: int =
     return "".join(next(marks) if some else GAP for some in count)
 
 
-def _summary(past: Past, kind: Kind, axes: list[str], letters: tuple[str, ...]) -> Table:
+def _summary(past: HistoryTable, kind: Kind, axes: list[str], letters: tuple[str, ...]) -> Table:
     """Return a table with first, last, lowest and highest value and a sparkline for each axis and coefficient."""
     table = _table()
     table.add_column(KIND_NAMES[kind], no_wrap=True)
@@ -188,28 +191,28 @@ def _summary(past: Past, kind: Kind, axes: list[str], letters: tuple[str, ...]) 
                 table.add_row(label, NO_VALUE, *_bound(past, axis, letter), "")
                 continue
             numbers = [float(one) * unit.factor for one in (there[0], there[-1], *_extremes(course))]
-            table.add_row(label, *(number(one) for one in numbers), sparkline(course.last, middle_s, span))
+            table.add_row(label, *(format_number(one) for one in numbers), sparkline(course.last, middle_s, span))
     return table
 
 
-def _bound(past: Past, axis: str, letter: str) -> tuple[str, str, str]:
+def _bound(past: HistoryTable, axis: str, letter: str) -> tuple[str, str, str]:
     """Return the cells of a coefficient that was never estimated: its last upper bound and two dashes."""
     bound, unit = past.column(f"{axis}.{letter}.bound"), unit_of(letter, axis)
     there = bound.last[np.isfinite(bound.last)]
     if not there.size:
         return NO_VALUE, NO_VALUE, NO_VALUE
-    return f"≤ {number(float(there[-1]) * unit.factor)}", NO_VALUE, NO_VALUE
+    return f"≤ {format_number(float(there[-1]) * unit.factor)}", NO_VALUE, NO_VALUE
 
 
-def _cell(past: Past, axis: str, letter: str, p: int) -> str:
+def _cell(past: HistoryTable, axis: str, letter: str, p: int) -> str:
     """Format a coefficient in one bucket: its last value, and its extremes if they differ, or its upper bound."""
     course, unit = past.column(f"{axis}.{letter}"), unit_of(letter, axis)
     low, high, last = (float(part[p]) * unit.factor for part in (course.low, course.high, course.last))
     if math.isfinite(last):
-        alike = number(low) == number(high)
-        return number(last) if alike else f"{number(last)} [{number(low)} … {number(high)}]"
+        alike = format_number(low) == format_number(high)
+        return format_number(last) if alike else f"{format_number(last)} [{format_number(low)} … {format_number(high)}]"
     bound = float(past.column(f"{axis}.{letter}.bound").last[p]) * unit.factor
-    return f"≤ {number(bound)}" if math.isfinite(bound) else NO_VALUE
+    return f"≤ {format_number(bound)}" if math.isfinite(bound) else NO_VALUE
 
 
 def _format_width(seconds: int) -> str:
@@ -222,7 +225,7 @@ def _format_width(seconds: int) -> str:
     return f"{seconds // unit_s} {unit}"
 
 
-def _extremes(course: Course) -> tuple[float, float]:
+def _extremes(course: ColumnStatistics) -> tuple[float, float]:
     """Return the minimum and maximum over all buckets."""
     return float(np.nanmin(course.low)), float(np.nanmax(course.high))
 

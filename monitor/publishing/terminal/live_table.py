@@ -4,7 +4,7 @@ The input are messages of ``monitor.common.topics``, received over zenoh (``watc
 ``demo``). The output are rich renderables for any width. The most detailed layout that fits is used. At 160 columns a
 device has one line with three digits, at 100 columns one line with two digits, and below that three lines, one per
 axis. Each state has a word and a symbol in addition to its colour. Numbers have the units of
-``monitor.publishing.coefficient_cells``.
+``monitor.common.units``.
 """
 
 import contextlib
@@ -24,21 +24,26 @@ from rich.table import Table
 from rich.text import Text
 
 from monitor.common import topics
+from monitor.common.units import COEFFICIENT_UNITS, KIND_NAMES, KINDS, Kind, axes_of, format_number
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import LETTERS
-from monitor.publishing import coefficient_cells
-from monitor.publishing.coefficient_cells import Kind
+from monitor.estimation.fit.coefficients import SYMBOLS
+from monitor.publishing.coefficient_cells import (
+    TEMPERATURE_MARK,
+    TEMPERATURE_MEANS,
+    format_coefficient,
+    mark_temperature_axis,
+)
 from monitor.publishing.messages import remote_device
 from monitor.publishing.messages.encoding import measured_axes
-from monitor.publishing.messages.remote_device import Heard
-from monitor.publishing.rerun.panels import duration
+from monitor.publishing.messages.remote_device import RemoteDevice
+from monitor.publishing.rerun.panels import format_duration
 from monitor.publishing.terminal.queued_writer import QueuedWriter
-from monitor.publishing.zenoh.subscriber import KEYEXPR, ZenohIn
+from monitor.publishing.zenoh.subscriber import KEYEXPR, ZenohSubscriber
 
 REFRESH_PERIOD_S: Final = 0.5
-DEVICES: Final = 20_000
+MAX_DEVICES: Final = 20_000
 """Largest number of devices. A further device replaces one that has been silent for FORGET_S, or is ignored."""
-FORGET_S: Final = 600.0
+FORGET_AFTER_S: Final = 600.0
 MAX_KEY_LENGTH: Final = 200
 SILENCE_NOTE_S: Final = 5.0
 """Time without any message after which the note says so, because access control refuses silently."""
@@ -79,7 +84,7 @@ LAYOUTS: Final = (Layout(3, True, False, 2), Layout(3, False, False, 1), Layout(
 NARROW_LAYOUT: Final = Layout(3, False, True, 1)
 
 
-class Board:
+class DeviceStates:
     """State of all devices, updated from the messages of ``monitor.common.topics``; thread-safe.
 
     Parameters
@@ -93,11 +98,13 @@ class Board:
         self.malformed = 0  # number of messages that could not be decoded
         self.passed_over = 0  # number of messages of devices beyond DEVICES
         self._clock = clock
-        self._devices: OrderedDict[str, Heard] = OrderedDict()  # ordered by the time of the last message, oldest first
+        self._devices: OrderedDict[str, RemoteDevice] = (
+            OrderedDict()
+        )  # ordered by the time of the last message, oldest first
         self._events: deque[tuple[str, remote_device.EventMessage]] = deque(maxlen=EVENTS)
         self._lock = threading.Lock()
 
-    def take(self, key: str, payload: bytes) -> None:
+    def process_message(self, key: str, payload: bytes) -> None:
         """Process a message; other topics are ignored and malformed payloads are counted.
 
         Parameters
@@ -107,7 +114,7 @@ class Board:
         payload
             Encoded message.
         """
-        found = remote_device.split(key)
+        found = remote_device.split_key(key)
         if found is None:
             return
         device, topic = found
@@ -117,7 +124,7 @@ class Board:
             except ValueError:
                 self.malformed += 1
 
-    def alive(self, key: str, there: bool) -> None:
+    def set_token(self, key: str, there: bool) -> None:
         """Process the change of a liveliness token.
 
         Parameters
@@ -127,16 +134,16 @@ class Board:
         there
             True if the token exists.
         """
-        found = remote_device.split(key)
+        found = remote_device.split_key(key)
         if found is None or found[1] is not topics.ALIVE:
             return
         with self._lock:
             if known := self._device(found[0]):
-                known.there = there
+                known.token_exists = there
 
-    def forget(self, key: str) -> None:
+    def remove(self, key: str) -> None:
         """Remove the row and the events of the device that ``key`` belongs to."""
-        found = remote_device.split(key)
+        found = remote_device.split_key(key)
         if found is None:
             return
         with self._lock:
@@ -152,7 +159,7 @@ class Board:
             ]  # copied, because messages arrive while it is drawn
             parts: list[RenderableType] = [self._summary(devices, now_s)]
             if devices:
-                parts.append(Fleet(devices, now_s))
+                parts.append(FittedFleetTable(devices, now_s))
             parts += _with_blank_line(_troubles(devices, now_s))
             if len(devices) == 1 and devices[0].noise is not None:
                 parts += _with_blank_line(_coefficient_tables(devices[0].noise))
@@ -160,12 +167,12 @@ class Board:
             parts += _with_blank_line([_event(names[device], event) for device, event in self._events])
         return Group(*parts)
 
-    def devices(self, now_s: float) -> list[Heard]:
+    def devices(self, now_s: float) -> list[RemoteDevice]:
         """Return all known devices, those with problems first."""
         with self._lock:
             return self._sorted(now_s)
 
-    def _sorted(self, now_s: float) -> list[Heard]:
+    def _sorted(self, now_s: float) -> list[RemoteDevice]:
         """Return the devices sorted by severity and then by key."""
         return sorted(self._devices.values(), key=lambda one: (one.rank(now_s), one.key))
 
@@ -188,29 +195,31 @@ class Board:
             if self._update_heard(device):
                 self._events.append((device, event))
 
-    def _update_heard(self, device: str) -> Heard | None:
+    def _update_heard(self, device: str) -> RemoteDevice | None:
         """Return the state of a device and set the time of its newest message; None if the table is full."""
         known = self._device(device)
         if known is not None:
-            known.heard_s = self._clock()
+            known.last_message_s = self._clock()
             self._devices.move_to_end(device)
         return known
 
-    def _device(self, device: str) -> Heard | None:
+    def _device(self, device: str) -> RemoteDevice | None:
         """Return the state of a device, which is added if it is new; None if the table is full."""
         known = self._devices.get(device)
         if known is not None:
             return known
         now_s = self._clock()
-        full = len(self._devices) >= DEVICES
-        if len(device) > MAX_KEY_LENGTH or (full and now_s - next(iter(self._devices.values())).heard_s < FORGET_S):
+        full = len(self._devices) >= MAX_DEVICES
+        if len(device) > MAX_KEY_LENGTH or (
+            full and now_s - next(iter(self._devices.values())).last_message_s < FORGET_AFTER_S
+        ):
             self.passed_over += 1
             return None
         if full:
             self._devices.popitem(last=False)
-        return self._devices.setdefault(device, Heard(device, now_s))
+        return self._devices.setdefault(device, RemoteDevice(device, now_s))
 
-    def _summary(self, devices: list[Heard], now_s: float) -> Text:
+    def _summary(self, devices: list[RemoteDevice], now_s: float) -> Text:
         """Return the line above the table: number of devices by state, and the note."""
         line = Text("imu-monitor", style="bold")
         counts = Counter(one.state(now_s) for one in devices)
@@ -223,16 +232,16 @@ class Board:
                 f"  {self.malformed:,} malformed message{'' if self.malformed == 1 else 's'}", style="not bold yellow"
             )
         if self.passed_over:
-            line.append(f"  {self.passed_over:,} of devices beyond {DEVICES:,}", style="not bold yellow")
+            line.append(f"  {self.passed_over:,} of devices beyond {MAX_DEVICES:,}", style="not bold yellow")
         if self.note:
             line.append(f"\n{self.note}", style="not bold yellow")
         return line
 
 
-class Fleet:
+class FittedFleetTable:
     """Renderable of the table in the most detailed layout that fits, limited to the height of the terminal."""
 
-    def __init__(self, devices: list[Heard], now_s: float) -> None:
+    def __init__(self, devices: list[RemoteDevice], now_s: float) -> None:
         self._devices = devices
         self._now_s = now_s
 
@@ -256,7 +265,7 @@ class Fleet:
         return console.measure(table, options=options.update(max_width=10_000)).maximum <= options.max_width
 
 
-def fleet_table(devices: Sequence[Heard], now_s: float, layout: Layout) -> Table:
+def fleet_table(devices: Sequence[RemoteDevice], now_s: float, layout: Layout) -> Table:
     """Return the table of devices, one row per device.
 
     Parameters
@@ -285,7 +294,7 @@ def fleet_table(devices: Sequence[Heard], now_s: float, layout: Layout) -> Table
     for i, one in enumerate(devices):
         cells = [Text(names[one.key], style="bold"), _state(one.state(now_s)), *_counts(one, layout)]
         cells += [column[i] for _, column in noise]
-        table.add_row(*cells, _latency(one), Text(_age(now_s - one.heard_s)))
+        table.add_row(*cells, _latency(one), Text(_age(now_s - one.last_message_s)))
     return table
 
 
@@ -303,7 +312,7 @@ class LiveTable:
         Content. While it is None, only lines are written.
     """
 
-    def __init__(self, console: Console, board: Board | None = None) -> None:
+    def __init__(self, console: Console, board: DeviceStates | None = None) -> None:
         self.board = board
         self._console = console
         self._live: Live | None = None
@@ -378,8 +387,11 @@ def watch(
         Standard output cannot be written.
     """
     stop, console = stop or threading.Event(), console or Console()
-    board = Board()
-    with contextlib.closing(ZenohIn(keyexpr, connect, file)) as arriving, contextlib.suppress(KeyboardInterrupt):
+    board = DeviceStates()
+    with (
+        contextlib.closing(ZenohSubscriber(keyexpr, connect, file)) as arriving,
+        contextlib.suppress(KeyboardInterrupt),
+    ):
         arriving.start()
         if once_s is not None:
             stop.wait(once_s)
@@ -402,17 +414,17 @@ def watch(
                     out.put(captured.get())
 
 
-def _take(board: Board, arriving: ZenohIn) -> None:
+def _take(board: DeviceStates, arriving: ZenohSubscriber) -> None:
     """Pass all received messages to the board."""
     for message in arriving.take(0.0):
         if message.payload is None:
-            board.alive(message.key, message.there)
+            board.set_token(message.key, message.there)
         else:
-            board.take(message.key, message.payload)
-    board.note = note(board, arriving)
+            board.process_message(message.key, message.payload)
+    board.note = connection_note(board, arriving)
 
 
-def note(board: Board, arriving: ZenohIn) -> str:
+def connection_note(board: DeviceStates, arriving: ZenohSubscriber) -> str:
     """Return what is wrong with the connection to the daemons; empty if nothing is.
 
     Parameters
@@ -437,7 +449,7 @@ def _names(keys: Sequence[str]) -> dict[str, str]:
     """Return the display name of each key: its last part if all keys share one prefix, else the whole key."""
     prefixes = {key.rpartition("/")[0] for key in keys}
     short = len(prefixes) == 1
-    return {key: remote_device.clean(key.rpartition("/")[2] if short else key) for key in keys}
+    return {key: remote_device.strip_control_characters(key.rpartition("/")[2] if short else key) for key in keys}
 
 
 def _state(state: str) -> Text:
@@ -446,20 +458,20 @@ def _state(state: str) -> Text:
     return Text(f"{sign} {state}", style=colour)
 
 
-def _counts(one: Heard, layout: Layout) -> list[Text]:
+def _counts(one: RemoteDevice, layout: Layout) -> list[Text]:
     """Return the cells of the rate and of the sample counters."""
     if one.status is None:
         return [Text(NO_VALUE, style="dim")] * 4
-    rate = NO_VALUE if one.status.rate is None else coefficient_cells.number(one.status.rate, 4)
+    rate = NO_VALUE if one.status.rate is None else format_number(one.status.rate, 4)
     write = _format_full_count if layout.full_counts else _format_short_count
     lost, bad = (Text(write(count), style="yellow" if count else "dim") for count in (one.status.lost, one.status.bad))
     return [Text(rate), Text(write(one.status.received)), lost, bad]
 
 
-def _latency(one: Heard) -> Text:
+def _latency(one: RemoteDevice) -> Text:
     """Return the cell of the 99th percentile of the latency [ms]."""
     p99_s = None if one.status is None else one.status.latency.p99
-    return Text(NO_VALUE, style="dim") if p99_s is None else Text(coefficient_cells.number(p99_s * 1e3, 2))
+    return Text(NO_VALUE, style="dim") if p99_s is None else Text(format_number(p99_s * 1e3, 2))
 
 
 def _format_full_count(count: int) -> str:
@@ -493,16 +505,16 @@ def _age(age_s: float) -> str:
     return f"{age_s / 60:.0f} min" if age_s < 7200 else f"{age_s / 3600:.0f} h"
 
 
-def _has_axis_of(one: Heard, kind: Kind) -> bool:
+def _has_axis_of(one: RemoteDevice, kind: Kind) -> bool:
     """Return True if the device measures an axis of this kind."""
-    return one.noise is not None and bool(set(coefficient_cells.axes_of(kind)) & set(one.noise.axes))
+    return one.noise is not None and bool(set(axes_of(kind)) & set(one.noise.axes))
 
 
-def _noise_column(devices: Sequence[Heard], kind: Kind, letter: str, layout: Layout) -> tuple[Text, list[Text]]:
+def _noise_column(devices: Sequence[RemoteDevice], kind: Kind, letter: str, layout: Layout) -> tuple[Text, list[Text]]:
     """Return the header and cells of one coefficient on three axes; values are aligned between rows."""
-    axes = coefficient_cells.axes_of(kind)
+    axes = axes_of(kind)
     rows = [[_value(one, letter, axis, layout.digits) for axis in axes] for one in devices]
-    unit = coefficient_cells.COEFFICIENT_UNITS[kind][letter].name
+    unit = COEFFICIENT_UNITS[kind][letter].name
     if layout.stacked:
         return Text(f"{letter} {unit}"), [Text("\n".join(row) if any(row) else "") for row in rows]
     widths = [max(map(len, column)) for column in zip(axes, *rows, strict=True)]
@@ -512,11 +524,11 @@ def _noise_column(devices: Sequence[Heard], kind: Kind, letter: str, layout: Lay
     return Text(f"{letter} {unit}\n{lines[0]}"), [Text(line) for line in lines[1:]]
 
 
-def _value(one: Heard, letter: str, axis: str, digits: int) -> str:
+def _value(one: RemoteDevice, letter: str, axis: str, digits: int) -> str:
     """Format a coefficient: value, upper bound, a dash if there are too few data, or blank if it is not measured."""
     if one.noise is None or axis not in one.noise.axes:
         return ""
-    return coefficient_cells.reading(one.noise.coefficients, letter, axis, digits).value.replace("≤ ", "≤")
+    return format_coefficient(one.noise.coefficients, letter, axis, digits).value.replace("≤ ", "≤")
 
 
 # --- below the table
@@ -527,12 +539,12 @@ def _with_blank_line(lines: Sequence[RenderableType]) -> list[RenderableType]:
     return [Text(), *lines] if lines else []
 
 
-def _troubles(devices: Sequence[Heard], now_s: float) -> list[Text]:
+def _troubles(devices: Sequence[RemoteDevice], now_s: float) -> list[Text]:
     """Return one line per device with problems."""
     names = _names([one.key for one in devices])
     lines = []
     for one in devices:
-        if trouble := one.trouble():
+        if trouble := one.problems():
             sign, colour = STATES.get(one.state(now_s), UNKNOWN_STATE_STYLE)
             sign = "!" if sign == "●" else sign
             lines.append(Text.assemble((f"{sign} {names[one.key]}  ", colour), trouble))
@@ -546,7 +558,9 @@ def _troubles(devices: Sequence[Heard], now_s: float) -> list[Text]:
 
 def _event(name: str, event: remote_device.EventMessage) -> Text:
     """Return the line of an event."""
-    return Text.assemble((f"{_clock_time(event.t)}  ", "dim"), (f"{name}  ", "bold"), remote_device.clean(event.text))
+    return Text.assemble(
+        (f"{_clock_time(event.t)}  ", "dim"), (f"{name}  ", "bold"), remote_device.strip_control_characters(event.text)
+    )
 
 
 def _clock_time(unix_s: float) -> str:
@@ -578,18 +592,16 @@ def _coefficient_tables(
     noise: remote_device.Noise, either: Sequence[str] = (), axes_of_temperature: Collection[str] = ()
 ) -> list[RenderableType]:
     """Return a table per kind of sensor: axes by coefficients with intervals; ``either`` lists the axes with K or R."""
-    seen = "" if noise.seen_s is None else f"last {duration(noise.seen_s)}; "
+    seen = "" if noise.seen_s is None else f"last {format_duration(noise.seen_s)}; "
     known = f"; {K_OR_R}: one of them" if either else ""
-    known += (
-        f"; {coefficient_cells.TEMPERATURE_MARK} {coefficient_cells.TEMPERATURE_MEANS}" if axes_of_temperature else ""
-    )
+    known += f"; {TEMPERATURE_MARK} {TEMPERATURE_MEANS}" if axes_of_temperature else ""
     parts: list[RenderableType] = [
         Text(f"{seen}[95 % interval]; ≤ bound; {NO_VALUE} too few data yet{known}", style="dim")
     ]
-    for kind in coefficient_cells.KINDS:
-        if set(coefficient_cells.axes_of(kind)) & set(noise.axes):
+    for kind in KINDS:
+        if set(axes_of(kind)) & set(noise.axes):
             wide, narrow = (detail_table(noise, kind, each, either, axes_of_temperature) for each in (False, True))
-            parts.append(Fitting(wide, narrow))
+            parts.append(WidthDependentTable(wide, narrow))
     return parts
 
 
@@ -616,29 +628,27 @@ def detail_table(
         Axes to mark because temperature explains most of their slow variance.
     """
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
-    table.add_column(coefficient_cells.KIND_NAMES[kind] if not stacked else kind, no_wrap=True)
-    for letter in LETTERS:
-        table.add_column(
-            f"{letter} {coefficient_cells.COEFFICIENT_UNITS[kind][letter].name}", justify="right", no_wrap=True
-        )
-    for axis in coefficient_cells.axes_of(kind):
+    table.add_column(KIND_NAMES[kind] if not stacked else kind, no_wrap=True)
+    for letter in SYMBOLS:
+        table.add_column(f"{letter} {COEFFICIENT_UNITS[kind][letter].name}", justify="right", no_wrap=True)
+    for axis in axes_of(kind):
         if axis in noise.axes:
             between = "\n" if stacked else " "
-            cells = [_interval(noise, letter, axis, between, axis in either) for letter in LETTERS]
-            table.add_row(Text(coefficient_cells.marked(axis, axes_of_temperature), style="bold"), *cells)
+            cells = [_interval(noise, letter, axis, between, axis in either) for letter in SYMBOLS]
+            table.add_row(Text(mark_temperature_axis(axis, axes_of_temperature), style="bold"), *cells)
     return table
 
 
 def _interval(noise: remote_device.Noise, letter: str, axis: str, between: str, either: bool) -> Text:
     """Return the cell of one coefficient: value, interval and the mark ``K or R``."""
-    one = coefficient_cells.reading(noise.coefficients, letter, axis)
+    one = format_coefficient(noise.coefficients, letter, axis)
     small = [f"[{one.interval}]"] if one.interval else []
     if either and letter in ("K", "R"):
         small.append(K_OR_R)
     return Text.assemble(one.value, *((between + part, "dim") for part in small))
 
 
-class Fitting:
+class WidthDependentTable:
     """Renderable that shows the wide table if it fits, and the narrow one otherwise."""
 
     def __init__(self, wide: Table, narrow: Table) -> None:

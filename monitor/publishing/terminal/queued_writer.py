@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Final, TextIO
 
-from monitor.publishing.rerun.bounded_queue import Backlog
+from monitor.publishing.rerun.bounded_queue import BoundedQueue
 
 MAX_QUEUED_CHARACTERS: Final = 256 * 1024
 """Length of the queued text at most; some 2000 log lines."""
@@ -72,7 +72,7 @@ class QueuedWriter:
         self._render = render or (lambda lines, _last: "".join(lines))
         self._period_s = period_s
         self._tell = tell
-        self._queue: Backlog[str] = Backlog(limit)
+        self._queue: BoundedQueue[str] = BoundedQueue(limit)
         self._lost_lines = 0  # taken from the queue but not written
         self._told_lines = 0  # dropped lines that were reported through tell
         self._lost_frames = 0

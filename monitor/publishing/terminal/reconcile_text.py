@@ -16,9 +16,9 @@ from rich.text import Text
 from drivers.sample import AXES
 from monitor.publishing.reports import comparison_sentences as runs_words
 from monitor.publishing.reports import reconcile_sentences as words
-from monitor.publishing.rerun.panels import duration
-from monitor.reconcile.result import AxisResult, Reconciliation, Step
-from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, Seen
+from monitor.publishing.rerun.panels import format_duration
+from monitor.reconcile.result import AxisResult, Reconciliation, ReconciliationStep
+from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, MatchedEffect
 
 RESULT_STYLES: Final = {
     "agrees": ("●", "green"),
@@ -39,7 +39,7 @@ def tell(r: Reconciliation, console: Console) -> None:
     console
         Destination.
     """
-    console.print(f"{r.samples} samples at {r.rate_hz:g} Hz, {duration(r.seconds)}", highlight=False)
+    console.print(f"{r.samples} samples at {r.rate_hz:g} Hz, {format_duration(r.duration_s)}", highlight=False)
     console.print(_verdict(r.verdict), Text(words.summary(r)))
     console.print(table(r))
     for note in r.notes:
@@ -60,27 +60,29 @@ def table(r: Reconciliation) -> RenderableType:
 def _add(rows: Table, r: Reconciliation, result: AxisResult) -> None:
     """Add an axis to the table: its first line with the name of the axis, then its other lines."""
     lines = [_step(r, result.axis, step) for step in result.steps]
-    lines += [("", "", Text(f"left over: {words.score(one, result.axis)}", style="yellow")) for one in result.left_over]
+    lines += [
+        ("", "", Text(f"left over: {words.score_line(one, result.axis)}", style="yellow")) for one in result.left_over
+    ]
     head = (Text(result.axis, style="bold"), _verdict(result.verdict))
     if not lines and result.start.scores:
-        most = max(result.start.scores, key=words.over_threshold)
-        lines.append(("", "", Text(f"largest: {words.score(most, result.axis)}", style="dim")))
+        most = max(result.start.scores, key=words.gap_ratio)
+        lines.append(("", "", Text(f"largest: {words.score_line(most, result.axis)}", style="dim")))
     for i, line in enumerate(lines or [("", "", Text())]):
         rows.add_row(*(head if i == 0 else ("", "")), *line)
 
 
-def _step(r: Reconciliation, axis: str, step: Step) -> tuple[str, str, Text]:
+def _step(r: Reconciliation, axis: str, step: ReconciliationStep) -> tuple[str, str, Text]:
     """Return the gap, confidence and description of one step."""
     what = Text.assemble(f"{step.kind} ", words.step_line(step, axis, r.baseline))
-    what.highlight_words([words.plain(step.effect)], "bold")
-    gap = f"{words.gap(step.before.gap)} → {words.gap(step.after.gap)}"
+    what.highlight_words([words.words_of(step.effect)], "bold")
+    gap = f"{words.format_gap(step.before.gap)} → {words.format_gap(step.after.gap)}"
     return gap, words.percent(step.confidence), what
 
 
 def _verdict(verdict: str) -> Text:
     """Return the symbol and word of a result in its colour."""
     sign, style = RESULT_STYLES[verdict]
-    return Text(f"{sign} {words.VERDICTS[verdict]}", style=style)
+    return Text(f"{sign} {words.RESULT_TEXTS[verdict]}", style=style)
 
 
 def tell_runs(c: Comparison, console: Console) -> None:
@@ -99,7 +101,7 @@ def tell_runs(c: Comparison, console: Console) -> None:
         if found:
             console.print(Text(title, style="bold"))
             console.print(Padding(_lines(found), (0, 0, 1, 2)))
-    for name, why in c.silent.items():
+    for name, why in c.without_result.items():
         console.print(f"note: {name} is left out: {why}", markup=False, highlight=False, soft_wrap=True)
 
 
@@ -116,7 +118,7 @@ def _axes_by_runs(c: Comparison) -> Table:
 
 def _cell(result: AxisResult | None) -> Text:
     """Return the cell of one axis in one recording."""
-    said = Text(runs_words.cell(result), style="dim")
+    said = Text(runs_words.axis_summary(result), style="dim")
     return (
         said
         if result is None
@@ -142,7 +144,7 @@ def _common(c: Comparison) -> list[tuple[str, Text]]:
     for axis, one in c.axes.items():
         for seen in one.common:
             said = _effect(c, axis, seen)
-            said.append(f"; {runs_words.agreement(seen)}", style="yellow" if seen.consistent is False else "")
+            said.append(f"; {runs_words.size_agreement(seen)}", style="yellow" if seen.consistent is False else "")
             found.append((axis, said))
     return found
 
@@ -166,8 +168,8 @@ def _single_on(c: Comparison, axis: str, one: AxisRuns) -> list[tuple[str, Text]
     return found
 
 
-def _effect(c: Comparison, axis: str, seen: Seen) -> Text:
+def _effect(c: Comparison, axis: str, seen: MatchedEffect) -> Text:
     """Return the description of an effect, with its name in bold."""
-    said = Text(f"{seen.kind} {runs_words.line(seen, axis, c.baseline)}")
-    said.highlight_words([words.plain(seen.effect)], "bold")
+    said = Text(f"{seen.kind} {runs_words.effect_line(seen, axis, c.baseline)}")
+    said.highlight_words([words.words_of(seen.effect)], "bold")
     return said

@@ -9,15 +9,16 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
 
-from monitor.common.rates import amount
-from monitor.drift.thermal.interval_means import Means
-from monitor.drift.thermal.temperature_share import SLOW, WithoutTemperature
+from monitor.common.rates import format_rate
+from monitor.common.units import DEVIATION_UNITS, sensor_kind
+from monitor.drift.thermal.interval_means import IntervalMeans
+from monitor.drift.thermal.temperature_share import SLOW_LETTERS, TemperatureShare
 from monitor.drift.thermal.thermal_fit import ThermalFit
 from monitor.drift.thermal.thermal_model import Prediction
-from monitor.drift.thermal.thermal_response import Shape
-from monitor.drift.thermal.thermal_study import Judged, Outlook, Study
-from monitor.publishing.coefficient_cells import DEVIATION_UNITS, kind_of, reading
-from monitor.publishing.rerun.panels import duration
+from monitor.drift.thermal.thermal_response import ThermalModelForm
+from monitor.drift.thermal.thermal_study import ModelComparison, ThermalFitReport, ThermalPredictionReport
+from monitor.publishing.coefficient_cells import format_coefficient
+from monitor.publishing.rerun.panels import format_duration
 
 FIT_SCHEMA: Final = "imu-monitor/thermal-fit/1"
 PREDICT_SCHEMA: Final = "imu-monitor/thermal-predict/1"
@@ -27,7 +28,7 @@ ONE_WAY: Final = (
 DRIFT_WITH_TIME: Final = "temperature only rose or only fell, so a drift with time by itself can look the same"
 
 
-def tell(study: Study, console: Console) -> None:
+def tell(study: ThermalFitReport, console: Console) -> None:
     """Print the results of a thermal model fit.
 
     Parameters
@@ -54,7 +55,7 @@ def tell(study: Study, console: Console) -> None:
     _print_notes(study.refused, notes, console)
 
 
-def tell_outlook(outlook: Outlook, console: Console) -> None:
+def tell_outlook(outlook: ThermalPredictionReport, console: Console) -> None:
     """Print the predictions of thermal models for a recording, and their errors.
 
     Parameters
@@ -68,28 +69,30 @@ def tell_outlook(outlook: Outlook, console: Console) -> None:
     if outlook.judged:
         rows = _table("axis", "rms alone", "multi-step", "offset out", "one-step", "offset", "within 95 %")
         for axis, one in outlook.judged.items():
-            each = (one.rms_alone, one.rms, one.rms_moved, one.rms_one_step, one.offset)
-            rows.add_row(axis, *(_format_deviation(axis, x) for x in each), f"{100.0 * one.within:.0f} %")
+            each = (one.rms_about_mean, one.rms, one.rms_without_offset, one.rms_one_step, one.offset)
+            rows.add_row(axis, *(_format_deviation(axis, x) for x in each), f"{100.0 * one.coverage:.0f} %")
         console.print(Padding(rows, (1, 0)))
     _print_notes(outlook.refused, outlook.notes, console)
 
 
-def notes_without(found: WithoutTemperature) -> list[str]:
+def temperature_notes(found: TemperatureShare) -> list[str]:
     """Return a sentence for each axis whose slow variance, or whose K or R, is largely due to temperature."""
     notes = []
     for axis, one in found.dependences.items():
         fallen = [
             f"{letter} falls from {before.value} to {after.value} {after.unit} ({100.0 * share:.0f} % of its variance)"
-            for letter in SLOW
-            if found.matters(letter, axis) and (share := found.share(letter, axis)) is not None
-            for before, after in [(reading(found.before, letter, axis), reading(found.coefficients, letter, axis))]
+            for letter in SLOW_LETTERS
+            if found.is_significant(letter, axis) and (share := found.variance_share(letter, axis)) is not None
+            for before, after in [
+                (format_coefficient(found.before, letter, axis), format_coefficient(found.coefficients, letter, axis))
+            ]
         ]
         without = f"without temperature ({found.models.get(axis, '')}), {' and '.join(fallen)}" if fallen else ""
         if one.explains_most:
             share_text = f"{math.floor(100.0 * one.share):d} %"
             notes.append(
                 f"{axis} follows its temperature: a {one.form} explains {share_text} of the variance of means of "
-                f"{duration(one.interval_s)}, so Q N B K R describe temperature as well as noise"
+                f"{format_duration(one.interval_s)}, so Q N B K R describe temperature as well as noise"
                 f"{'; ' + without if without else ''}; imu-monitor thermal fit models it"
                 f"{'' if not one.one_way else f' ({DRIFT_WITH_TIME})'}"
             )
@@ -98,17 +101,17 @@ def notes_without(found: WithoutTemperature) -> list[str]:
     return notes
 
 
-def notes_on_hysteresis(study: Study) -> list[str]:
+def notes_on_hysteresis(study: ThermalFitReport) -> list[str]:
     """Return a sentence for each axis on which heating and cooling differ by more than noise explains."""
     return [
         f"{axis}: at one temperature the bias differs between heating and cooling by up to "
-        f"{amount(axis, one.hysteresis)} (hysteresis or a lag, p = {one.hysteresis_p:.1g})"
+        f"{format_rate(axis, one.hysteresis)} (hysteresis or a lag, p = {one.hysteresis_p:.1g})"
         for axis, one in study.fits.items()
         if one.hysteresis and one.hysteresis_p is not None
     ]
 
 
-def study_json(study: Study) -> bytes:
+def study_json(study: ThermalFitReport) -> bytes:
     """Encode the results of a thermal model fit as JSON, in SI units."""
     axes: dict[str, Any] = {}
     for axis, one in study.fits.items():
@@ -116,7 +119,7 @@ def study_json(study: Study) -> bytes:
         axes[axis] = {
             "model": model.shape.name,
             "reference": model.reference_c,
-            "sizes": model.sizes.tolist(),
+            "sizes": model.coefficients.tolist(),
             "time_constants": list(model.shape.constants_s),
             "equation": model.equation,
             "slope": model.slope,
@@ -136,21 +139,21 @@ def study_json(study: Study) -> bytes:
     return _json(FIT_SCHEMA, study.recording, study.interval_s, axes, study.refused, study.notes)
 
 
-def outlook_json(outlook: Outlook) -> bytes:
+def outlook_json(outlook: ThermalPredictionReport) -> bytes:
     """Encode predictions and measured means as JSON, in SI units."""
     axes = {axis: _prediction_of_axis(outlook.means[axis], one) for axis, one in outlook.judged.items()}
     return _json(PREDICT_SCHEMA, outlook.recording, outlook.interval_s, axes, outlook.refused, outlook.notes)
 
 
-def _prediction_of_axis(means: Means, one: Judged) -> dict[str, Any]:
+def _prediction_of_axis(means: IntervalMeans, one: ModelComparison) -> dict[str, Any]:
     """Return the prediction errors and the predicted and measured bias of one axis."""
     return {
         "rms": one.rms,
-        "rms_offset_out": one.rms_moved,
+        "rms_offset_out": one.rms_without_offset,
         "rms_one_step": one.rms_one_step,
-        "rms_alone": one.rms_alone,
+        "rms_alone": one.rms_about_mean,
         "offset": one.offset,
-        "within": one.within,
+        "within": one.coverage,
         "temperature": means.temperature_c,
         "bias": means.bias,
         "multi_step": _band(one.multi_step),
@@ -187,21 +190,21 @@ def _encode_array(value: Any) -> Any:
 
 def _summary_line(recording: str, interval_s: float, means: Any) -> str:
     """Return one line with recording, number and width of intervals, and temperature range."""
-    first: Means = next(iter(means.values()))
+    first: IntervalMeans = next(iter(means.values()))
     count = first.bias.size
     warmth = first.temperature_c
     span = f"{np.nanmin(warmth):.1f} … {np.nanmax(warmth):.1f} °C" if np.isfinite(warmth).any() else "no temperature"
-    return f"{recording}: {count} intervals of {duration(interval_s)}, {span}"
+    return f"{recording}: {count} intervals of {format_duration(interval_s)}, {span}"
 
 
 def _fit_row(axis: str, one: ThermalFit) -> tuple[str, ...]:
     """Return the cells of one fitted axis."""
     model, best = one.model, one.candidates[0]
-    cubic = next((each.validated for each in one.candidates if each.shape == Shape(3, ())), None)
+    cubic = next((each.validated for each in one.candidates if each.shape == ThermalModelForm(3, ())), None)
     return (
         model.shape.name,
-        _format_deviation(axis, model.slope) if model.shape != Shape(0, ()) else "—",
-        ", ".join(duration(each) for each in model.shape.constants_s) or "—",
+        _format_deviation(axis, model.slope) if model.shape != ThermalModelForm(0, ()) else "—",
+        ", ".join(format_duration(each) for each in model.shape.constants_s) or "—",
         "—" if not one.hysteresis else _format_deviation(axis, one.hysteresis),
         _format_deviation(axis, best.rms),
         f"{100.0 * one.explained:.0f} %",
@@ -211,7 +214,7 @@ def _fit_row(axis: str, one: ThermalFit) -> tuple[str, ...]:
 
 def _format_deviation(axis: str, si: float) -> str:
     """Format a rate or an acceleration in the unit of the axis."""
-    return DEVIATION_UNITS[kind_of(axis)].text(si)
+    return DEVIATION_UNITS[sensor_kind(axis)].text(si)
 
 
 def _table(*heads: str) -> Table:

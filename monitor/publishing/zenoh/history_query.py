@@ -8,14 +8,14 @@ import json
 from pathlib import Path
 from typing import Any, Final
 
-from drivers.credential_masking import masked
+from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError, LinkUnavailable, NotReady
-from drivers.zenoh.connection_errors import refused
-from drivers.zenoh.session import plain
+from drivers.zenoh.connection_errors import explain_refusals
+from drivers.zenoh.session import format_error
 from monitor.common import topics
-from monitor.history.reading import Past
+from monitor.history.reading import HistoryTable
 from monitor.publishing.messages import history
-from monitor.publishing.zenoh.subscriber import listeners
+from monitor.publishing.zenoh.subscriber import client_configurations
 
 PATIENCE_S: Final = 20.0
 """Timeout of the query."""
@@ -23,9 +23,9 @@ ERRORS: Final = {2: ConfigError, 3: NotReady}
 """Exception by the exit status in an error reply."""
 
 
-def ask(
+def query_histories(
     endpoint: str | None, device: str, parameters: str, prefix: str = "imu", file: Path | None = None
-) -> list[Past]:
+) -> list[HistoryTable]:
     """Return the histories of all devices that reply, sorted by device.
 
     Parameters
@@ -52,19 +52,21 @@ def ask(
     """
     import zenoh
 
-    endpoint, config = next(iter(listeners([endpoint] if endpoint else [], file).items()))
+    endpoint, config = next(iter(client_configurations([endpoint] if endpoint else [], file).items()))
     selector = f"{topics.HISTORY.key(prefix, device)}?{parameters}"
     try:
         with zenoh.open(config) as session:
             replies = list(session.get(selector, timeout=PATIENCE_S))
     except zenoh.ZError as error:
-        raise LinkUnavailable(refused([endpoint], config) or f"{masked(endpoint)}: {plain(error)}") from error
-    endpoint = masked(endpoint)
+        raise LinkUnavailable(
+            explain_refusals([endpoint], config) or f"{mask_secrets(endpoint)}: {format_error(error)}"
+        ) from error
+    endpoint = mask_secrets(endpoint)
     found, wrong = [], [_error_of_reply(reply.err) for reply in replies if reply.ok is None]
     for reply in replies:
         if reply.ok is not None:
             try:
-                found.append(history.read(bytes(reply.ok.payload)))
+                found.append(history.decode_history(bytes(reply.ok.payload)))
             except ValueError as error:
                 wrong.append(LinkUnavailable(f"{reply.ok.key_expr}: not an answer of a history: {error}"))
     if not found:

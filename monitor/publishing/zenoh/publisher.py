@@ -23,10 +23,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from drivers.credential_masking import masked
+from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError, ImuError, NotReady
-from drivers.zenoh.connection_errors import refused
-from drivers.zenoh.session import CLOSED, alone, configuration, endpoints, plain
+from drivers.zenoh.connection_errors import explain_refusals
+from drivers.zenoh.session import DEFAULT_CONFIGURATION, configuration, endpoints, format_error, is_unconnected
 from monitor.common import topics
 from monitor.settings.loading import ZenohTable
 
@@ -53,12 +53,12 @@ class Command:
     refuse: Callable[[str], None]
 
 
-Recall = Callable[[str, str], bytes]
+HistoryFunction = Callable[[str, str], bytes]
 """Function that returns the history of a device as a payload, given its name and the parameters of a selector; it
 raises ImuError if there is none."""
 
 
-class ZenohOut:
+class ZenohPublisher:
     """Publisher: the zenoh session of the daemon and all its declarations for each device.
 
     Parameters
@@ -71,7 +71,7 @@ class ZenohOut:
         Function that answers queries of ``history``; None if no history is stored.
     """
 
-    def __init__(self, settings: ZenohTable, devices: Sequence[str], recall: Recall | None = None) -> None:
+    def __init__(self, settings: ZenohTable, devices: Sequence[str], recall: HistoryFunction | None = None) -> None:
         self.settings = settings
         self._recall = recall
         self._session_state = "off" if settings.mode == "none" else "not open yet"
@@ -98,8 +98,8 @@ class ZenohOut:
         session = self._session
         if self._unsent or session is None:
             return self._unsent or self._session_state
-        if self._connect and alone(session):
-            return f"{self._refusal or 'nobody at ' + masked(', '.join(self._connect))}; trying again"
+        if self._connect and is_unconnected(session):
+            return f"{self._refusal or 'nobody at ' + mask_secrets(', '.join(self._connect))}; trying again"
         twins = self._duplicates.found(time.monotonic())
         if not twins:
             return self._session_state
@@ -133,11 +133,11 @@ class ZenohOut:
         try:
             publisher.put(payload)
         except zenoh.ZError as error:
-            self._unsent = f"cannot send: {plain(error)}"
+            self._unsent = f"cannot send: {format_error(error)}"
         else:
             self._unsent = ""
 
-    def put_on(self, key: str, payload: bytes) -> str:
+    def put_key(self, key: str, payload: bytes) -> str:
         """Publish JSON under a key that the user has chosen; return "" or the reason why it was not sent.
 
         Parameters
@@ -155,10 +155,10 @@ class ZenohOut:
         try:
             session.put(key, payload, encoding=zenoh.Encoding(topics.JSON), express=True)
         except zenoh.ZError as error:
-            return f"not sent: zenoh: {plain(error)}"
+            return f"not sent: zenoh: {format_error(error)}"
         return ""
 
-    def alive(self, device: str, flowing: bool) -> None:
+    def set_alive(self, device: str, flowing: bool) -> None:
         """Declare or remove the liveliness token of a device.
 
         Parameters
@@ -183,7 +183,7 @@ class ZenohOut:
 
     def remove(self, device: str) -> None:
         """Remove a device and undeclare its keys."""
-        self.alive(device, False)
+        self.set_alive(device, False)
         with self._declaring, contextlib.suppress(*_zenoh_errors()):  # the session may be closing
             self._devices = tuple(one for one in self._devices if one != device)
             del self._alive[device]
@@ -210,21 +210,21 @@ class ZenohOut:
             try:
                 self._open()
             except errors as error:
-                self._session_state = f"{self._find_refusal() or plain(error)}; trying again"
+                self._session_state = f"{self._find_refusal() or format_error(error)}; trying again"
                 self._close_session()
                 self._closing.wait(RETRY_S)
             else:
                 break
         while self._connect and not self._closing.wait(REFUSAL_CHECK_S):
             session = self._session
-            self._refusal = self._find_refusal() if session is not None and alone(session) else ""
+            self._refusal = self._find_refusal() if session is not None and is_unconnected(session) else ""
         if self._closing.is_set():  # close() may have stopped waiting before the session was open
             self._close_session()
 
     def _find_refusal(self) -> str:
         """Return why the endpoints refuse the connection; "" if no program listens there."""
         with contextlib.suppress(*_zenoh_errors()):  # zenoh has reported an invalid file already
-            return refused(self._connect, self._configuration(None))
+            return explain_refusals(self._connect, self._configuration(None))
         return ""
 
     def _close_session(self) -> None:
@@ -285,7 +285,7 @@ class ZenohOut:
             "listen/endpoints": [] if own.mode == "client" else listen,  # a client does not listen
             "connect/endpoints": own.connect or None,
         }
-        unsaid = {**CLOSED, "listen/endpoints": [topics.ENDPOINT], "timestamping/enabled": True}
+        unsaid = {**DEFAULT_CONFIGURATION, "listen/endpoints": [topics.ENDPOINT], "timestamping/enabled": True}
         return configuration(keys, own.config, unsaid)
 
     def _publisher(
@@ -336,7 +336,7 @@ class ZenohOut:
         taker.start()
         self._add_queryable(device, queryable, taker)
 
-    def _declare_history(self, session: "zenoh.Session", device: str, recall: Recall) -> None:
+    def _declare_history(self, session: "zenoh.Session", device: str, recall: HistoryFunction) -> None:
         """Declare the queryable of a device's history and start its thread."""
         import zenoh
 
@@ -353,7 +353,7 @@ class ZenohOut:
         self._queryables.setdefault(device, []).append(queryable)
         self._takers = [*(one for one in self._takers if one.is_alive()), taker]
 
-    def _answer_history(self, device: str, key: str, queryable: Any, recall: Recall) -> None:
+    def _answer_history(self, device: str, key: str, queryable: Any, recall: HistoryFunction) -> None:
         """Answer history queries until the session is closed (runs in a thread)."""
         handler = queryable.handler
         while not self._closing.is_set():

@@ -21,12 +21,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from drivers.credential_masking import masked
+from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
-from drivers.zenoh.connection_errors import why
-from drivers.zenoh.session import CLOSED, alone, configuration, endpoints, plain
+from drivers.zenoh.connection_errors import explain_refusal
+from drivers.zenoh.session import DEFAULT_CONFIGURATION, configuration, endpoints, format_error, is_unconnected
 from monitor.common import topics
-from monitor.publishing.rerun.bounded_queue import Backlog
+from monitor.publishing.rerun.bounded_queue import BoundedQueue
 from monitor.settings import file_permissions
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class Message:
     there: bool = True
 
 
-class ZenohIn:
+class ZenohSubscriber:
     """Subscriber to the results of any number of daemons.
 
     Parameters
@@ -89,11 +89,11 @@ class ZenohIn:
         file: Path | None = None,
         detail: Sequence[str] = (),
     ) -> None:
-        keys = {topic: narrowed(keyexpr, topic) for topic in (*TOPICS, topics.ALIVE)}
+        keys = {topic: topic_keys(keyexpr, topic) for topic in (*TOPICS, topics.ALIVE)}
         _check_keys(keyexpr, [key for part in keys.values() for key in part])
         keys |= {topic: tuple(f"{device}/{topic.name}" for device in detail) for topic in DETAIL_TOPICS}
-        self._backlog: Backlog[Message] = Backlog(BACKLOG_BYTES)
-        found = listeners(connect, file)
+        self._backlog: BoundedQueue[Message] = BoundedQueue(BACKLOG_BYTES)
+        found = client_configurations(connect, file)
         self._duplicate_filter = _DuplicateFilter() if len(found) > 1 else None
         self._sessions = [_EndpointSession(endpoint, config, keys, self._push) for endpoint, config in found.items()]
 
@@ -173,7 +173,7 @@ class _EndpointSession:
         keys: Mapping[topics.Topic, Sequence[str]],
         push: Callable[[Message, str], None],
     ) -> None:
-        self.endpoint = masked(endpoint)
+        self.endpoint = mask_secrets(endpoint)
         self.why = ""  # reason found by the newest check why the connection is refused; "" if no program listens there
         self.closing = threading.Event()
         self._endpoint, self._config, self._keys, self._push = endpoint, config, keys, push
@@ -187,7 +187,7 @@ class _EndpointSession:
     def open(self) -> bool:
         """True if the session is open and connected."""
         session = self._session
-        return session is not None and not alone(session)
+        return session is not None and not is_unconnected(session)
 
     @property
     def open_s(self) -> float:
@@ -216,7 +216,7 @@ class _EndpointSession:
                 self._subscribe(session)
             except zenoh.ZError:
                 self._close_session()
-                self.why = why(self._endpoint, self._config)
+                self.why = explain_refusal(self._endpoint, self._config)
                 self.closing.wait(RETRY_S)
             else:
                 break
@@ -233,7 +233,7 @@ class _EndpointSession:
             while self._tokens:
                 self._push(Message(self._tokens.pop(), None, there=False), "")
             if time.monotonic() - asked_s >= REFUSAL_CHECK_S:
-                self.why = why(self._endpoint, self._config)
+                self.why = explain_refusal(self._endpoint, self._config)
                 asked_s = time.monotonic()
 
     def _close_session(self) -> None:
@@ -276,7 +276,7 @@ class _EndpointSession:
             self._push(Message(key, None if liveliness else bytes(sample.payload), there), stamp)
 
 
-def narrowed(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
+def topic_keys(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
     """Return the key expressions for the messages of ``topic`` that a key expression selects; a device selects all.
 
     >>> narrowed("imu/**", topics.STATUS), narrowed("imu/bench-1", topics.STATUS)
@@ -300,7 +300,7 @@ def narrowed(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
     return ("/".join([*parts[:-1], topic.name]), below) if parts[-1] == "*" else (below,)
 
 
-def listeners(connect: Sequence[str], file: Path | None) -> dict[str, "zenoh.Config"]:
+def client_configurations(connect: Sequence[str], file: Path | None) -> dict[str, "zenoh.Config"]:
     """Return the zenoh configuration of a client session for each endpoint (see ``ZenohIn``).
 
     Parameters
@@ -322,16 +322,18 @@ def listeners(connect: Sequence[str], file: Path | None) -> dict[str, "zenoh.Con
     try:
         theirs = endpoints(configuration({}, file))
     except zenoh.ZError as error:
-        text = plain(error)
+        text = format_error(error)
         raise ConfigError(text if text.startswith(str(file)) else f"{file}: {text}") from error
-    unsaid = {**CLOSED, "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES}
+    unsaid = {**DEFAULT_CONFIGURATION, "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES}
     found = {}
     for endpoint in dict.fromkeys(connect or theirs or (topics.ENDPOINT,)):
         own = {"mode": "client", "connect/endpoints": [endpoint], "listen/endpoints": []}
         try:
             found[endpoint] = configuration(own, file, unsaid)
         except (zenoh.ZError, UnicodeEncodeError) as error:
-            raise ConfigError(f'connect "{masked(endpoint)}": no endpoint; write e.g. {topics.ENDPOINT}') from error
+            raise ConfigError(
+                f'connect "{mask_secrets(endpoint)}": no endpoint; write e.g. {topics.ENDPOINT}'
+            ) from error
     return found
 
 
@@ -359,7 +361,7 @@ def _check_keys(keyexpr: str, keys: list[str]) -> None:
     except UnicodeEncodeError as error:
         raise ConfigError(f'key expression "{keyexpr!a}": no UTF-8') from error
     except zenoh.ZError as error:
-        raise ConfigError(f'key expression "{keyexpr}": {plain(error)}') from error
+        raise ConfigError(f'key expression "{keyexpr}": {format_error(error)}') from error
     if not keys:
         shown = ", ".join(topic.name for topic in (*TOPICS, topics.ALIVE))
         raise ConfigError(f'key expression "{keyexpr}": nothing to show of it; shown are {shown}')

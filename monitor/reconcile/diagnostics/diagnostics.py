@@ -32,14 +32,19 @@ from monitor.noise.effects import (
     TemperatureLag,
     TurnOnTransient,
 )
-from monitor.reconcile.likelihood.outlier_statistics import Outliers, outliers
-from monitor.reconcile.likelihood.variance_history import Course, Tiles, tiles, variance_course
+from monitor.reconcile.likelihood.outlier_statistics import OutlierFit, fit_outliers
+from monitor.reconcile.likelihood.variance_history import (
+    SpectrogramExtremes,
+    VarianceHistory,
+    find_least_constant_tiles,
+    fit_variance_history,
+)
 from monitor.reconcile.preparation.axis import Axis, Effects, Likely
-from monitor.reconcile.preparation.cosine_bins import bins as even_bins
-from monitor.reconcile.preparation.cosine_bins import series
-from monitor.reconcile.result import Where
+from monitor.reconcile.preparation.cosine_bins import frequency_bins as even_bins
+from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
+from monitor.reconcile.result import Location
 
-LAGS: Final = 64
+MAX_LAG_SAMPLES: Final = 64
 """Number of lags of the autocorrelation, in samples."""
 TRANSIENT_TIME_FRACTIONS: Final = 0.3 / 3.0 ** np.arange(6)
 """Time constants of transients, as fractions of the recording."""
@@ -55,7 +60,7 @@ MIN_COEFFICIENTS_PER_BIN: Final = 64
 """
 SMOOTHING_BINS: Final = 9
 """Number of bins that are averaged if one bin has too few coefficients."""
-MARGIN: Final = 0.001
+STEP_MARGIN_FRACTION: Final = 0.001
 """Fraction of the recording at each end in which no step is sought, because the ends of a recording affect the
 spectrum.
 """
@@ -64,7 +69,7 @@ MIN_DENSITY_RATIO: Final = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class WhitenedAxis:
     """Axis whitened by a model."""
 
     axis: Axis
@@ -75,14 +80,14 @@ class Sight:
     fast: Floats  # [n] the same without low frequencies and with each bin at unit power, for tails and variance
 
     @property
-    def course(self) -> Course:
+    def course(self) -> VarianceHistory:
         """Variance of the whitened series as a function of time."""
-        return variance_course(self.fast, 1.0 / self.axis.rate_hz)
+        return fit_variance_history(self.fast, 1.0 / self.axis.rate_hz)
 
     @property
-    def outliers(self) -> Outliers | None:
+    def outliers(self) -> OutlierFit | None:
         """Outlier statistics of the whitened series, or None if a Gaussian fits no worse."""
-        return outliers(self.fast)
+        return fit_outliers(self.fast)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,14 +95,14 @@ class Finding:
     """Strongest departure that a diagnostic detects."""
 
     gain: float  # log-likelihood gain, nats
-    where: Where
+    where: Location
 
 
-Diagnostic = Callable[[Sight], Finding]
+Diagnostic = Callable[[WhitenedAxis], Finding]
 """Function that measures one kind of departure."""
 
 
-def sight(axis: Axis, likely: Likely) -> Sight:
+def whiten_axis(axis: Axis, likely: Likely) -> WhitenedAxis:
     """Whiten an axis by a fitted model.
 
     Parameters
@@ -107,12 +112,14 @@ def sight(axis: Axis, likely: Likely) -> Sight:
     likely : Likely
         Fitted effects of the axis.
     """
-    weight = axis.bins.spread(axis.heard / np.sqrt(likely.fitted.variance))
+    weight = axis.bins.spread(axis.used_bins / np.sqrt(likely.fitted.variance))
     whitened = axis.residual(likely) * weight
     silent = np.flatnonzero(weight == 0.0)
     # a gap in the spectrum would itself be detected
     whitened[silent] = np.random.default_rng(silent.size).standard_normal(silent.size)
-    return Sight(axis, likely, whitened, weight, series(whitened), _flattened_series(axis, likely, whitened))
+    return WhitenedAxis(
+        axis, likely, whitened, weight, inverse_cosine_transform(whitened), _flattened_series(axis, likely, whitened)
+    )
 
 
 def _flattened_series(axis: Axis, likely: Likely, whitened: Floats) -> Floats:
@@ -130,10 +137,10 @@ def _flattened_series(axis: Axis, likely: Likely, whitened: Floats) -> Floats:
     flat[silent] = np.random.default_rng(silent.size).standard_normal(silent.size)
     slow = int(SLOW_BAND_FRACTION * axis.n)
     flat[:slow] = np.random.default_rng(slow).standard_normal(slow)  # replaced for the same reason
-    return series(flat) / noise_course(likely.effects, axis.n, axis.rate_hz)
+    return inverse_cosine_transform(flat) / noise_deviation_over_time(likely.effects, axis.n, axis.rate_hz)
 
 
-def noise_course(effects: Effects, n: int, rate_hz: float) -> Floats:
+def noise_deviation_over_time(effects: Effects, n: int, rate_hz: float) -> Floats:
     """Return the standard deviation of the white noise as a function of time, according to the noise steps of the axis.
 
     Parameters
@@ -157,7 +164,7 @@ def noise_course(effects: Effects, n: int, rate_hz: float) -> Floats:
     return np.asarray(course / np.sqrt(np.mean(course**2)))
 
 
-def psd(seen: Sight) -> Finding:
+def psd(seen: WhitenedAxis) -> Finding:
     """Find the range of frequency bins, of any width, whose power differs most from its expectation."""
     bins = even_bins(seen.axis.n, seen.axis.rate_hz)  # the same bins for recordings with and without peaks
     power = np.concatenate([[0.0], np.cumsum(bins.sums(seen.whitened**2))])
@@ -174,7 +181,7 @@ def psd(seen: Sight) -> Finding:
             best, place = float(gains[at]), (int(first[at]), int(first[at]) + width)
         width *= 2
     lo, hi = bins.f_hz[place[0]], bins.f_hz[place[1] - 1]
-    return Finding(best, Where(frequency=(float(lo), float(hi))))
+    return Finding(best, Location(frequency=(float(lo), float(hi))))
 
 
 def power_gain(ratio: Floats, count: Floats) -> Floats:
@@ -196,15 +203,15 @@ def power_gain(ratio: Floats, count: Floats) -> Floats:
     return np.asarray(0.5 * count * (safe - 1.0 - np.log(safe)))
 
 
-def lines(seen: Sight) -> Finding:
+def lines(seen: WhitenedAxis) -> Finding:
     """Find a steady oscillation: the largest value of the periodogram at twice the usual resolution."""
-    found = line_peaks(seen.white, seen.axis.rate_hz, 1)
+    found = find_line_peaks(seen.white, seen.axis.rate_hz, 1)
     gain, f_hz = found[0]
     half = seen.axis.rate_hz / seen.axis.n
-    return Finding(gain, Where(frequency=(f_hz - half, f_hz + half)))
+    return Finding(gain, Location(frequency=(f_hz - half, f_hz + half)))
 
 
-def line_peaks(white: Floats, rate_hz: float, most: int) -> list[tuple[float, float]]:
+def find_line_peaks(white: Floats, rate_hz: float, most: int) -> list[tuple[float, float]]:
     """Return the largest peaks of the periodogram, strongest first and separated from each other.
 
     Parameters
@@ -248,29 +255,29 @@ def periodogram(white: Floats) -> Floats:
     return np.asarray(power)
 
 
-def level(seen: Sight) -> Finding:
+def level(seen: WhitenedAxis) -> Finding:
     """Find a change of the level: a step at any time, a slope, or a transient after the start.
 
     If the model itself contains jumps, a change of the level is no evidence, because whitening does not remove jumps.
     """
     if any(isinstance(effect, (PoissonSteps, RandomTelegraph)) for effect in seen.likely.effects):
-        return Finding(0.0, Where())
+        return Finding(0.0, Location())
     gains, times_s = step_gains(seen)
     at = int(np.argmax(gains))
-    best = Finding(float(gains[at]), Where(time=(float(times_s[at]), float(times_s[at]))))
+    best = Finding(float(gains[at]), Location(time=(float(times_s[at]), float(times_s[at]))))
     axis = seen.axis
     length_s = axis.n / axis.rate_hz
     for share in TRANSIENT_TIME_FRACTIONS:
         effect = TurnOnTransient(amplitude=1.0, time_constant=float(share * length_s))
-        gain = course_gain(seen, axis.columns(effect))
+        gain = regressor_gain(seen, axis.columns(effect))
         if gain > best.gain:
-            best = Finding(gain, Where(time=(0.0, effect.time_constant)))
+            best = Finding(gain, Location(time=(0.0, effect.time_constant)))
     ramp = axis.columns(RateRamp(R=1.0))
-    gain = max(course_gain(seen, ramp), course_gain(seen, [*ramp, axis.courses.curve]) - 1.0)
-    return max(best, Finding(gain, Where(time=(0.0, length_s))), key=lambda one: one.gain)
+    gain = max(regressor_gain(seen, ramp), regressor_gain(seen, [*ramp, axis.courses.curve]) - 1.0)
+    return max(best, Finding(gain, Location(time=(0.0, length_s))), key=lambda one: one.gain)
 
 
-def step_gains(seen: Sight) -> tuple[Floats, Floats]:
+def step_gains(seen: WhitenedAxis) -> tuple[Floats, Floats]:
     """Return the gain of a step at each time, by two Fourier transforms.
 
     The coefficients of a step at sample s are −√(2/n) sin(πks/n)/(2 sin(πk/2n)). Its squared length under the weights W
@@ -291,19 +298,19 @@ def step_gains(seen: Sight) -> tuple[Floats, Floats]:
     """
     axis = seen.axis
     n = axis.n
-    weighted = series(seen.whitened * seen.weight)
+    weighted = inverse_cosine_transform(seen.whitened * seen.weight)
     product = np.cumsum(weighted[::-1])[::-1]  # [n] product of the data with a step at each sample
     u = np.zeros(n)
     u[1:] = seen.weight**2 * axis.courses.steps
     cosines = rfft(u).real  # for s up to n/2; the values beyond are the mirror image
     length = u.sum() - np.concatenate([cosines, cosines[1 : n - cosines.size + 1][::-1]])
-    margin = ceil(MARGIN * n)
+    margin = ceil(STEP_MARGIN_FRACTION * n)
     inside = slice(margin, n - margin)
     gains = 0.5 * product[inside] ** 2 / np.maximum(length[inside], 1e-300)
     return gains, np.arange(n)[inside] / axis.rate_hz
 
 
-def course_gain(seen: Sight, columns: list[Floats]) -> float:
+def regressor_gain(seen: WhitenedAxis, columns: list[Floats]) -> float:
     """Return the log-likelihood gain in nats of regressors with free sizes.
 
     Parameters
@@ -320,83 +327,89 @@ def course_gain(seen: Sight, columns: list[Floats]) -> float:
     return float(0.5 * solved @ (right / scale))
 
 
-def autocorrelation(seen: Sight) -> Finding:
+def autocorrelation(seen: WhitenedAxis) -> Finding:
     """Find the lag at which the whitened series is most strongly correlated with itself."""
     n = seen.white.size
-    turned = rfft(seen.white, next_fast_len(n + LAGS, real=True))
-    products = irfft(turned.real**2 + turned.imag**2, next_fast_len(n + LAGS, real=True))[1 : LAGS + 1]
+    turned = rfft(seen.white, next_fast_len(n + MAX_LAG_SAMPLES, real=True))
+    products = irfft(turned.real**2 + turned.imag**2, next_fast_len(n + MAX_LAG_SAMPLES, real=True))[
+        1 : MAX_LAG_SAMPLES + 1
+    ]
     gains = 0.5 * (products / n) ** 2 * n
     at = int(np.argmax(gains))
     lag_s = (at + 1) / seen.axis.rate_hz
-    return Finding(float(gains[at]), Where(tau=(lag_s, lag_s)))
+    return Finding(float(gains[at]), Location(tau=(lag_s, lag_s)))
 
 
-def temperature(seen: Sight) -> Finding:
+def temperature(seen: WhitenedAxis) -> Finding:
     """Find a dependence of the level on the temperature, with and without delay."""
     warmth = seen.axis.temperature_c
     if warmth is None:
-        return Finding(0.0, Where())
+        return Finding(0.0, Location())
     reference = float(warmth.mean())
-    place = Where(temperature=(float(warmth.min()), float(warmth.max())))
-    best = course_gain(seen, seen.axis.columns(TemperatureBias(coefficient=1.0, reference=reference, quadratic=1.0)))
-    best = max(best - 1.0, course_gain(seen, seen.axis.columns(TemperatureBias(coefficient=1.0, reference=reference))))
+    place = Location(temperature=(float(warmth.min()), float(warmth.max())))
+    best = regressor_gain(seen, seen.axis.columns(TemperatureBias(coefficient=1.0, reference=reference, quadratic=1.0)))
+    best = max(
+        best - 1.0, regressor_gain(seen, seen.axis.columns(TemperatureBias(coefficient=1.0, reference=reference)))
+    )
     for delay_s in TEMPERATURE_DELAYS_S:
         lag = TemperatureLag(coefficient=1.0, reference=reference, time_constant=delay_s)
-        best = max(best, course_gain(seen, seen.axis.columns(lag)))
+        best = max(best, regressor_gain(seen, seen.axis.columns(lag)))
     return Finding(best, place)
 
 
-def other_axes(seen: Sight) -> Finding:
+def other_axes(seen: WhitenedAxis) -> Finding:
     """Find the axis that leaks most strongly into this axis."""
-    best = Finding(0.0, Where())
+    best = Finding(0.0, Location())
     for name, coefficients in seen.axis.others.items():
-        gain = course_gain(seen, [coefficients])
+        gain = regressor_gain(seen, [coefficients])
         if gain > best.gain:
-            best = Finding(gain, Where(source=name))
+            best = Finding(gain, Location(source=name))
     return best
 
 
-def variance(seen: Sight) -> Finding:
+def variance(seen: WhitenedAxis) -> Finding:
     """Find a variation of the noise variance in time: a step, a trend, a period or a slow random variation."""
     found = seen.course
     gain = max(found.step.gain, found.trend, found.periodic.gain, found.wander)
-    return Finding(gain, Where(time=(found.step.time.lo, found.step.time.hi)))
+    return Finding(gain, Location(time=(found.step.time.lo, found.step.time.hi)))
 
 
-def spectrogram(seen: Sight) -> Finding:
+def spectrogram(seen: WhitenedAxis) -> Finding:
     """Find the place in time and frequency whose power is least constant: a rectangle or a whole row."""
-    found = unsteady(seen)
+    found = least_constant_tiles(seen)
     if found.gain >= found.row_gain:
-        return Finding(found.gain, Where(time=found.time, frequency=found.frequency))
-    return Finding(found.row_gain, Where(frequency=found.row))
+        return Finding(found.gain, Location(time=found.time, frequency=found.frequency))
+    return Finding(found.row_gain, Location(frequency=found.row))
 
 
-def unsteady(seen: Sight) -> Tiles:
+def least_constant_tiles(seen: WhitenedAxis) -> SpectrogramExtremes:
     """Return the least constant rectangle and row of the spectrogram, corrected for the noise steps of the axis."""
     axis = seen.axis
-    return tiles(seen.white / noise_course(seen.likely.effects, axis.n, axis.rate_hz), 1.0 / axis.rate_hz)
+    return find_least_constant_tiles(
+        seen.white / noise_deviation_over_time(seen.likely.effects, axis.n, axis.rate_hz), 1.0 / axis.rate_hz
+    )
 
 
-def tails(seen: Sight) -> Finding:
+def tails(seen: WhitenedAxis) -> Finding:
     """Find outliers in the distribution of the samples."""
     found = seen.outliers
-    return Finding(found.gain if found else 0.0, Where())
+    return Finding(found.gain if found else 0.0, Location())
 
 
-def values(seen: Sight) -> Finding:
+def values(seen: WhitenedAxis) -> Finding:
     """Find quantization, clipping or repeats in the measured values that the model does not contain."""
     have = {type(effect) for effect in seen.likely.effects}
     shown = seen.axis.shown
-    best = Finding(0.0, Where())
+    best = Finding(0.0, Location())
     for kind, found in ((Resolution, shown.levels), (Saturation, shown.clipped), (SampleHold, shown.repeats)):
         if found is not None and kind not in have and found.gain > best.gain:
-            best = Finding(found.gain, Where())
+            best = Finding(found.gain, Location())
     if best.gain and shown.clipped is not None and best.gain == shown.clipped.gain:
-        return Finding(best.gain, Where(value=(shown.clipped.limit.lo, shown.clipped.limit.hi)))
+        return Finding(best.gain, Location(value=(shown.clipped.limit.lo, shown.clipped.limit.hi)))
     return best
 
 
-LENSES: Final[dict[str, Diagnostic]] = {
+DIAGNOSTICS: Final[dict[str, Diagnostic]] = {
     "values": values,
     "psd": psd,
     "lines": lines,

@@ -12,11 +12,11 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import chdtri, erfc
 
 from drivers.sample import Floats, Ints
-from monitor.estimation.allan.batch import cluster_sizes, overlapping_axis
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
 from monitor.noise.spectrum import allan_of_density
-from monitor.reconcile.diagnostics.diagnostics import LAGS, Sight, noise_course
-from monitor.reconcile.preparation.cosine_bins import series
-from monitor.reconcile.result import View
+from monitor.reconcile.diagnostics.diagnostics import MAX_LAG_SAMPLES, WhitenedAxis, noise_deviation_over_time
+from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
+from monitor.reconcile.result import PlotData
 
 SPECTRUM_POINTS: Final = 240
 """Approximate number of points of a spectrum."""
@@ -32,7 +32,7 @@ DENSITY_UNITS: Final = {"g": "(rad/s)²/Hz", "a": "(m/s²)²/Hz"}
 """Unit of the spectral density by the first letter of the axis."""
 
 
-def views(seen: Sight) -> tuple[View, ...]:
+def plot_data(seen: WhitenedAxis) -> tuple[PlotData, ...]:
     """Return the plot data of every diagnostic that has a plot."""
     made = [
         _psd_view(seen),
@@ -47,11 +47,11 @@ def views(seen: Sight) -> tuple[View, ...]:
     return tuple(made)
 
 
-def _psd_view(seen: Sight) -> View:
+def _psd_view(seen: WhitenedAxis) -> PlotData:
     """Return the plot of the spectral density."""
     bins, tau0_s = seen.axis.bins, 1.0 / seen.axis.rate_hz
     variance, power = seen.likely.fitted.variance, seen.likely.fitted.residual
-    used = np.flatnonzero(seen.axis.heard)
+    used = np.flatnonzero(seen.axis.used_bins)
     # average neighbouring bins to about SPECTRUM_POINTS points that are evenly spaced in the logarithm of frequency
     f = np.log(bins.f_hz[used])
     cell = np.floor((f - f[0]) / max(f[-1] - f[0], 1e-9) * SPECTRUM_POINTS)
@@ -62,7 +62,7 @@ def _psd_view(seen: Sight) -> View:
     middle = np.exp(np.add.reduceat((bins.count * np.log(bins.f_hz))[used], first) / count)
     lo, hi = _chi2_band(count)
     unit = DENSITY_UNITS[seen.axis.name[0]]
-    return View(
+    return PlotData(
         "psd",
         "frequency",
         "Hz",
@@ -77,13 +77,13 @@ def _psd_view(seen: Sight) -> View:
     )
 
 
-def _allan_view(seen: Sight) -> View:
+def _allan_view(seen: WhitenedAxis) -> PlotData:
     """Return the plot of the Allan deviation."""
     axis, tau0_s = seen.axis, 1.0 / seen.axis.rate_hz
     m = cluster_sizes(axis.n, axis.rate_hz)
-    measured, _ = overlapping_axis(axis.y, m)
-    courses = axis.y - axis.y.mean() - series(axis.residual(seen.likely))
-    of_courses, _ = overlapping_axis(courses, m)
+    measured, _ = overlapping_avar_axis(axis.repaired, m)
+    courses = axis.repaired - axis.repaired.mean() - inverse_cosine_transform(axis.residual(seen.likely))
+    of_courses, _ = overlapping_avar_axis(courses, m)
     tau_s = np.asarray(m * tau0_s, np.float64)
     density = _density_function(seen)
     noise = allan_of_density(density, tau_s, tau0_s, ())
@@ -91,7 +91,7 @@ def _allan_view(seen: Sight) -> View:
     expected = noise + of_courses
     bounds = (np.sqrt(lo * noise + of_courses), np.sqrt(hi * noise + of_courses))
     unit = LEVEL_UNITS[axis.name[0]]
-    return View(
+    return PlotData(
         "allan",
         "averaging time",
         "s",
@@ -105,14 +105,14 @@ def _allan_view(seen: Sight) -> View:
     )
 
 
-def _density_function(seen: Sight) -> Callable[[Floats], Floats]:
+def _density_function(seen: WhitenedAxis) -> Callable[[Floats], Floats]:
     """Return the spectral density of the fitted noise as an interpolating function of the frequency in Hz."""
     bins = seen.axis.bins
     x, y = np.log(bins.f_hz), np.log(seen.likely.fitted.variance / seen.axis.rate_hz)
     return lambda f: np.asarray(np.exp(np.interp(np.log(f), x, y)))
 
 
-def _allan_degrees_of_freedom(seen: Sight, m: Ints) -> Floats:
+def _allan_degrees_of_freedom(seen: WhitenedAxis, m: Ints) -> Floats:
     """Return the degrees of freedom of overlapping Allan variances: for Σ a_k Y_k², 2 E²/Var = (Σ a v)²/Σ (a v)².
 
     The weights are a_k ∝ sin⁴(πfτ)/sin²(πfτ0). If a bin contains more than a period of sin⁴, the mean 3/8 and the mean
@@ -132,34 +132,36 @@ def _allan_degrees_of_freedom(seen: Sight, m: Ints) -> Floats:
     return np.maximum(found, 1.0)
 
 
-def _level_view(seen: Sight) -> View:
+def _level_view(seen: WhitenedAxis) -> PlotData:
     """Return the plot of the level over time."""
     axis = seen.axis
     size = max(1, axis.n // TIME_BLOCKS)
-    courses = axis.y - axis.y.mean() - series(axis.residual(seen.likely))
-    measured, expected = _block_means(axis.y, size), _block_means(courses, size) + axis.y.mean()
+    courses = axis.repaired - axis.repaired.mean() - inverse_cosine_transform(axis.residual(seen.likely))
+    measured, expected = _block_means(axis.repaired, size), _block_means(courses, size) + axis.repaired.mean()
     t = np.asarray((np.arange(measured.size) + 0.5) * size / axis.rate_hz, np.float64)
     bins = axis.bins
     block = np.sinc(bins.f_hz * size / axis.rate_hz) ** 2
     spread = Z95 * float(np.sqrt((bins.count * seen.likely.fitted.variance * block).sum() / axis.n))
     unit = LEVEL_UNITS[axis.name[0]]
-    return View("level", "time", "s", "level", unit, False, t, measured, expected, expected - spread, expected + spread)
+    return PlotData(
+        "level", "time", "s", "level", unit, False, t, measured, expected, expected - spread, expected + spread
+    )
 
 
-def _variance_view(seen: Sight) -> View:
+def _variance_view(seen: WhitenedAxis) -> PlotData:
     """Return the plot of the noise standard deviation over time."""
     axis = seen.axis
     size = max(1, axis.n // TIME_BLOCKS)
-    course = noise_course(seen.likely.effects, axis.n, axis.rate_hz)
+    course = noise_deviation_over_time(seen.likely.effects, axis.n, axis.rate_hz)
     measured, expected = np.sqrt(_block_means((seen.fast * course) ** 2, size)), np.sqrt(_block_means(course**2, size))
     t = np.asarray((np.arange(measured.size) + 0.5) * size / axis.rate_hz, np.float64)
     lo, hi = np.sqrt(_chi2_band(np.array([float(size)])))
-    return View(
+    return PlotData(
         "variance", "time", "s", "noise over its mean", "1", False, t, measured, expected, lo * expected, hi * expected
     )
 
 
-def _tails_view(seen: Sight) -> View:
+def _tails_view(seen: WhitenedAxis) -> PlotData:
     """Return the plot of the share of samples beyond a distance."""
     sizes = np.sort(np.abs(seen.fast))
     n = sizes.size
@@ -168,7 +170,7 @@ def _tails_view(seen: Sight) -> View:
     expected = erfc(x / 2.0**0.5)
     spread = Z95 * np.sqrt(np.maximum(expected * (1.0 - expected), 0.0) / n)
     least = 0.3 / n
-    return View(
+    return PlotData(
         "tails",
         "distance",
         "σ",
@@ -183,29 +185,32 @@ def _tails_view(seen: Sight) -> View:
     )
 
 
-def _autocorrelation_view(seen: Sight) -> View:
+def _autocorrelation_view(seen: WhitenedAxis) -> PlotData:
     """Return the plot of the autocorrelation of the whitened series."""
     n = seen.white.size
-    size = next_fast_len(n + LAGS, real=True)
+    size = next_fast_len(n + MAX_LAG_SAMPLES, real=True)
     turned = rfft(seen.white, size)
-    measured = irfft(turned.real**2 + turned.imag**2, size)[1 : LAGS + 1] / n
-    lag_s = np.arange(1, LAGS + 1) / seen.axis.rate_hz
-    zero, band = np.zeros(LAGS), np.full(LAGS, Z95 / n**0.5)
-    return View("autocorrelation", "lag", "s", "autocorrelation", "1", False, lag_s, measured, zero, -band, band)
+    measured = irfft(turned.real**2 + turned.imag**2, size)[1 : MAX_LAG_SAMPLES + 1] / n
+    lag_s = np.arange(1, MAX_LAG_SAMPLES + 1) / seen.axis.rate_hz
+    zero, band = np.zeros(MAX_LAG_SAMPLES), np.full(MAX_LAG_SAMPLES, Z95 / n**0.5)
+    return PlotData("autocorrelation", "lag", "s", "autocorrelation", "1", False, lag_s, measured, zero, -band, band)
 
 
-def _temperature_view(seen: Sight) -> View:
+def _temperature_view(seen: WhitenedAxis) -> PlotData:
     """Return the plot of the level over temperature."""
     axis = seen.axis
     warmth = axis.temperature_c
     assert warmth is not None
-    courses = axis.y - axis.y.mean() - series(axis.residual(seen.likely))
+    courses = axis.repaired - axis.repaired.mean() - inverse_cosine_transform(axis.residual(seen.likely))
     edges = np.linspace(float(warmth.min()), float(warmth.max()), TEMPERATURE_BINS + 1)
     of = np.clip(np.searchsorted(edges, warmth, "right") - 1, 0, TEMPERATURE_BINS - 1)
     count = np.bincount(of, minlength=TEMPERATURE_BINS)
     there = count > 0
-    mean = [np.bincount(of, weights=one, minlength=TEMPERATURE_BINS)[there] / count[there] for one in (axis.y, courses)]
-    expected = mean[1] + axis.y.mean()
+    mean = [
+        np.bincount(of, weights=one, minlength=TEMPERATURE_BINS)[there] / count[there]
+        for one in (axis.repaired, courses)
+    ]
+    expected = mean[1] + axis.repaired.mean()
     longest_s = count[there] / axis.rate_hz
     bins = axis.bins
     spread = np.array(
@@ -217,7 +222,7 @@ def _temperature_view(seen: Sight) -> View:
     )
     x = 0.5 * (edges[1:] + edges[:-1])[there]
     unit = LEVEL_UNITS[axis.name[0]]
-    return View(
+    return PlotData(
         "temperature",
         "temperature",
         "°C",

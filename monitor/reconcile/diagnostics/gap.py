@@ -17,10 +17,10 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.reconcile.diagnostics.diagnostics import LENSES, Finding, Sight
+from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS, Finding, WhitenedAxis
 from monitor.reconcile.result import Score
 
-ACCUSED: Final = 0.01
+FALSE_ALARM_PROBABILITY: Final = 0.01
 """Fraction of the recordings of a true model that pass a threshold in any diagnostic on any axis."""
 UPPER_QUANTILE: Final = 0.25
 """Fraction of the gains above which their distribution is modelled as exponential."""
@@ -34,19 +34,21 @@ Findings = Mapping[str, Finding]
 
 
 @dataclass(frozen=True, slots=True)
-class Null:
+class NullDistribution:
     """Null distribution of one diagnostic under a true model."""
 
     null95: float  # 95 % quantile of the gain, nats
     threshold: float  # gain above which a departure is significant, nats
 
 
-def look(seen: Sight) -> Findings:
+def run_diagnostics(seen: WhitenedAxis) -> Findings:
     """Run all diagnostics on a whitened axis."""
-    return {name: lens(seen) for name, lens in LENSES.items()}
+    return {name: lens(seen) for name, lens in DIAGNOSTICS.items()}
 
 
-def nulls(simulated: Mapping[str, Sequence[Findings]], looks: int) -> dict[str, dict[str, Null]]:
+def null_distributions(
+    simulated: Mapping[str, Sequence[Findings]], looks: int
+) -> dict[str, dict[str, NullDistribution]]:
     """Return the null distribution of each axis and diagnostic.
 
     Parameters
@@ -56,28 +58,28 @@ def nulls(simulated: Mapping[str, Sequence[Findings]], looks: int) -> dict[str, 
     looks : int
         Number of axes that are tested together.
     """
-    found: dict[str, dict[str, Null]] = {axis: {} for axis in simulated}
-    for lens in LENSES:
+    found: dict[str, dict[str, NullDistribution]] = {axis: {} for axis in simulated}
+    for lens in DIAGNOSTICS:
         gains = {axis: np.array([one[lens].gain for one in seen]) for axis, seen in simulated.items()}
         pooled = _tail_quantiles(np.concatenate(list(gains.values())), looks)
         for axis, own in gains.items():
             beyond = float(own.max(initial=0.0)) + AXIS_MARGIN_NATS
             found[axis][lens] = (
-                pooled if beyond <= pooled.threshold else Null(max(pooled.null95, float(own.max())), beyond)
+                pooled if beyond <= pooled.threshold else NullDistribution(max(pooled.null95, float(own.max())), beyond)
             )
     return found
 
 
-def _tail_quantiles(gains: Floats, looks: int) -> Null:
+def _tail_quantiles(gains: Floats, looks: int) -> NullDistribution:
     """Return the quantiles of the null distribution from pooled gains."""
     quartile = float(np.quantile(gains, 1.0 - UPPER_QUANTILE)) if gains.size else 0.0
     beyond = gains[gains > quartile] - quartile
     scale = float(np.clip(beyond.mean() if beyond.size else EXCESS_RANGE_NATS[0], *EXCESS_RANGE_NATS))
-    p = ACCUSED / (len(LENSES) * looks)
-    return Null(quartile + scale * log(UPPER_QUANTILE / 0.05), quartile + scale * log(UPPER_QUANTILE / p))
+    p = FALSE_ALARM_PROBABILITY / (len(DIAGNOSTICS) * looks)
+    return NullDistribution(quartile + scale * log(UPPER_QUANTILE / 0.05), quartile + scale * log(UPPER_QUANTILE / p))
 
 
-def scores(seen: Findings, null: Mapping[str, Null]) -> tuple[Score, ...]:
+def score_findings(seen: Findings, null: Mapping[str, NullDistribution]) -> tuple[Score, ...]:
     """Return the scores of an axis, in the order of the diagnostics.
 
     Parameters

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Block, Effect, Leak, Source
+from monitor.noise.effect import Effect, Leak, SampleBlockContext, Source
 from monitor.noise.effects import (
     AngleRandomWalk,
     BiasInstability,
@@ -34,7 +34,7 @@ from monitor.noise.effects import (
     TurnOnTransient,
 )
 
-NOISE: Final[dict[type[Effect], str]] = {
+NOISE_SIZE_PARAMETERS: Final[dict[type[Effect], str]] = {
     QuantizationNoise: "Q",
     AngleRandomWalk: "N",
     BiasInstability: "B",
@@ -46,7 +46,7 @@ NOISE: Final[dict[type[Effect], str]] = {
 }
 """For each noise effect, the parameter that is its size."""
 
-COURSE: Final[dict[type[Effect], str]] = {
+DETERMINISTIC_SIZE_PARAMETERS: Final[dict[type[Effect], str]] = {
     RateRamp: "R",
     Sinusoidal: "amplitude",
     TemperatureBias: "coefficient",
@@ -58,11 +58,11 @@ COURSE: Final[dict[type[Effect], str]] = {
 }
 """For each deterministic effect, the parameter that is its size."""
 
-ONCE: Final = frozenset({"bias_step", "noise_step", "turn_on_transient"})
+ONE_TIME_EFFECTS: Final = frozenset({"bias_step", "noise_step", "turn_on_transient"})
 """Names of the effects that happen once. One part of a recording contains no information about another part."""
 
 
-NATURAL: Final[dict[str, str]] = {
+NATURAL_DIAGNOSTIC: Final[dict[str, str]] = {
     "quantization_noise": "psd",
     "angle_random_walk": "psd",
     "bias_instability": "psd",
@@ -90,10 +90,10 @@ NATURAL: Final[dict[str, str]] = {
 
 def size(effect: Effect) -> float:
     """Return the size of a noise effect or of a deterministic effect."""
-    return float(getattr(effect, (NOISE | COURSE)[type(effect)]))
+    return float(getattr(effect, (NOISE_SIZE_PARAMETERS | DETERMINISTIC_SIZE_PARAMETERS)[type(effect)]))
 
 
-def resized(effect: Effect, value: float) -> Effect:
+def with_size(effect: Effect, value: float) -> Effect:
     """Return the effect with another size.
 
     The size of a noise, of a ramp and of a sinusoid has no sign.
@@ -105,12 +105,12 @@ def resized(effect: Effect, value: float) -> Effect:
     value : float
         New size, in the unit of the size parameter.
     """
-    name = (NOISE | COURSE)[type(effect)]
-    unsigned = isinstance(effect, (RateRamp, Sinusoidal)) or type(effect) in NOISE
+    name = (NOISE_SIZE_PARAMETERS | DETERMINISTIC_SIZE_PARAMETERS)[type(effect)]
+    unsigned = isinstance(effect, (RateRamp, Sinusoidal)) or type(effect) in NOISE_SIZE_PARAMETERS
     return replace(effect, **{name: abs(value) if unsigned else value})  # type: ignore[type-var]
 
 
-def basis(effect: Effect, f_hz: Floats, tau0_s: float) -> Floats:
+def unit_spectrum(effect: Effect, f_hz: Floats, tau0_s: float) -> Floats:
     """Return the two-sided spectral density of a noise effect with size one, before transforms.
 
     Parameters
@@ -128,10 +128,10 @@ def basis(effect: Effect, f_hz: Floats, tau0_s: float) -> Floats:
         Spectral density in unit²/Hz.
     """
     assert isinstance(effect, Source)
-    return np.asarray(resized(effect, 1.0).psd(f_hz, tau0_s))  # type: ignore[attr-defined]
+    return np.asarray(with_size(effect, 1.0).psd(f_hz, tau0_s))  # type: ignore[attr-defined]
 
 
-def columns(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | None) -> list[Floats]:
+def regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | None) -> list[Floats]:
     """Return the regressors whose linear combinations give a deterministic effect of any size.
 
     Effects with a phase or a quadratic term have two regressors.
@@ -168,11 +168,11 @@ def columns(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | None
             replace(effect, coefficient=0.0, quadratic=1.0),
         ]
     else:
-        variants = [resized(effect, 1.0)]
+        variants = [with_size(effect, 1.0)]
     return [_series_of(one, n, rate_hz, temperature_c) for one in variants]
 
 
-def sized(effect: Effect, factors: Floats) -> Effect:
+def with_factors(effect: Effect, factors: Floats) -> Effect:
     """Return the effect whose regressors have the given factors.
 
     Parameters
@@ -186,7 +186,7 @@ def sized(effect: Effect, factors: Floats) -> Effect:
         return replace(effect, amplitude=hypot(*factors), phase=atan2(factors[1], factors[0]) % (2.0 * pi))
     if isinstance(effect, TemperatureBias) and effect.quadratic is not None:
         return replace(effect, coefficient=float(factors[0]), quadratic=float(factors[1]))
-    return resized(effect, float(factors[0]))
+    return with_size(effect, float(factors[0]))
 
 
 def _series_of(effect: Source, n: int, rate_hz: float, temperature_c: Floats | None) -> Floats:
@@ -194,5 +194,5 @@ def _series_of(effect: Source, n: int, rate_hz: float, temperature_c: Floats | N
     values = np.zeros(n)
     warmth = np.full(n, np.nan) if temperature_c is None else temperature_c
     # a deterministic effect draws no random numbers, but the interface requires a generator
-    effect.start(rate_hz, np.random.default_rng(0)).add(values, Block(0, warmth, np.empty(n)))
+    effect.start(rate_hz, np.random.default_rng(0)).add(values, SampleBlockContext(0, warmth, np.empty(n)))
     return values

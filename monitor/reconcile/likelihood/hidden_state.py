@@ -20,7 +20,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.reconcile.result import Bounds
+from monitor.reconcile.result import ParameterInterval
 
 MAX_BLOCKS: Final = 1 << 15
 """Largest number of blocks. Only the first blocks of a longer recording are used."""
@@ -45,7 +45,7 @@ CURVATURE_STEP: Final = 0.1
 """Step in the logarithm of a parameter for the numerical curvature at the maximum."""
 ODDS_STEP: Final = 1e-3
 """Relative change of the odds for the numerical derivative that counts the events."""
-FACTOR: Final = log(30.0)
+MAX_LOG_PARAMETER_RANGE: Final = log(30.0)
 """Largest distance of the logarithm of a parameter from its starting value."""
 
 
@@ -54,13 +54,13 @@ class ModelComparison:
     """Comparison of two effects that have the same spectrum on one axis."""
 
     gain: float  # log-likelihood of the first minus that of the second
-    first: Mapping[str, Bounds]  # parameters at the maximum, SI, 95 %
-    second: Mapping[str, Bounds]
+    first: Mapping[str, ParameterInterval]  # parameters at the maximum, SI, 95 %
+    second: Mapping[str, ParameterInterval]
     events: int  # switches or jumps expected, given the data and the first explanation
 
 
 @dataclass(frozen=True, slots=True)
-class Rest:
+class BackgroundNoise:
     """Additional noise of an axis, as two-sided spectra."""
 
     white: float  # N²: S(f) = N², unit² s
@@ -80,28 +80,32 @@ class StateSpaceNoise(NamedTuple):
     white: float  # variance of the white noise and of all v
 
 
-class Peak(NamedTuple):
+class LikelihoodMaximum(NamedTuple):
     """Maximum of a log-likelihood over the logarithms of its parameters."""
 
     height: float  # log-likelihood at the maximum
     at: Floats  # [k] parameters
     deviation: Floats  # [k] standard deviations of their logarithms; NaN if there is no maximum
 
-    def bounds(self, k: int) -> Bounds:
+    def bounds(self, k: int) -> ParameterInterval:
         """Return parameter ``k`` with its 95 % interval, or without an interval if it is wider than the search."""
         value, wide = float(self.at[k]), INTERVAL_SIGMAS * float(self.deviation[k])
-        return Bounds(value, value * exp(-wide), value * exp(wide)) if wide < FACTOR else Bounds(value)
+        return (
+            ParameterInterval(value, value * exp(-wide), value * exp(wide))
+            if wide < MAX_LOG_PARAMETER_RANGE
+            else ParameterInterval(value)
+        )
 
 
 class EventProcessFit(NamedTuple):
     """Fit of a process of random events at the maximum of its likelihood."""
 
-    peak: Peak
+    peak: LikelihoodMaximum
     names: tuple[str, str]
     events: float  # expected number of events, given the data
 
     @property
-    def parameters(self) -> dict[str, Bounds]:
+    def parameters(self) -> dict[str, ParameterInterval]:
         """Parameters with their intervals, by name."""
         return {name: self.peak.bounds(k) for k, name in enumerate(self.names)}
 
@@ -143,7 +147,7 @@ def block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Floats, float
     return means - means.mean(), size * tau0_s
 
 
-def parts(rest: Rest, block_s: float, span_s: float) -> StateSpaceNoise:
+def state_space_noise(rest: BackgroundNoise, block_s: float, span_s: float) -> StateSpaceNoise:
     """Return the noise as it appears in block means.
 
     Parameters
@@ -164,14 +168,14 @@ def parts(rest: Rest, block_s: float, span_s: float) -> StateSpaceNoise:
         raise ValueError(f"white noise of {rest.white:g}; it must be above zero")
     walk = rest.walk * block_s
     rows, white = [(1.0, 1.0, walk, 0.5 * walk)], rest.white / block_s + walk / 3.0
-    for sigma, time_s in (*rest.correlated, *flicker(rest, block_s, span_s)):
-        row, own = markov(sigma, time_s, block_s)
+    for sigma, time_s in (*rest.correlated, *flicker_processes(rest, block_s, span_s)):
+        row, own = block_markov_noise(sigma, time_s, block_s)
         rows.append(row)
         white += own
     return StateSpaceNoise(np.array(rows), white)
 
 
-def markov(sigma: float, time_s: float, block_s: float) -> tuple[tuple[float, float, float, float], float]:
+def block_markov_noise(sigma: float, time_s: float, block_s: float) -> tuple[tuple[float, float, float, float], float]:
     """Return exponentially correlated noise as it appears in block means.
 
     With x = Δ/T_c the mean of a block has the variance σ² 2(x − 1 + e^−x)/x². Its covariance with the value at either
@@ -200,7 +204,7 @@ def markov(sigma: float, time_s: float, block_s: float) -> tuple[tuple[float, fl
     return (decay, seen, -(sigma**2) * float(np.expm1(-2.0 * x)), sigma**2 * seen * (1.0 - decay)), sigma**2 * own
 
 
-def flicker(rest: Rest, block_s: float, span_s: float) -> list[tuple[float, float]]:
+def flicker_processes(rest: BackgroundNoise, block_s: float, span_s: float) -> list[tuple[float, float]]:
     """Return exponentially correlated noises whose sum is flicker noise.
 
     The sum is B²/(2πf) from 1/span to the frequency at which white noise dominates. Processes with equal variance s and
@@ -231,7 +235,7 @@ def flicker(rest: Rest, block_s: float, span_s: float) -> list[tuple[float, floa
     return [(sigma, slowest * exp(-k * spacing)) for k in range(count)]
 
 
-def maximise(log_likelihood: Callable[..., float], start: Sequence[float]) -> Peak:
+def maximise(log_likelihood: Callable[..., float], start: Sequence[float]) -> LikelihoodMaximum:
     """Maximise a log-likelihood over positive parameters, by the Nelder-Mead method in their logarithms.
 
     Parameters
@@ -248,14 +252,14 @@ def maximise(log_likelihood: Callable[..., float], start: Sequence[float]) -> Pe
         lambda at: -log_likelihood(*np.exp(at)),
         origin,
         method="Nelder-Mead",
-        bounds=[(x - FACTOR, x + FACTOR) for x in origin],
+        bounds=[(x - MAX_LOG_PARAMETER_RANGE, x + MAX_LOG_PARAMETER_RANGE) for x in origin],
         options={"initial_simplex": _simplex(origin), "xatol": 0.02, "fatol": 0.02, "maxiter": 80},
     )
     curvature = _curvature(lambda at: log_likelihood(*np.exp(at)), found.x, -float(found.fun))
     deviation = np.full(origin.size, np.nan)
     if (np.linalg.eigvalsh(curvature) < 0.0).all():
         deviation = np.sqrt(np.diag(np.linalg.inv(-curvature)))
-    return Peak(-float(found.fun), np.exp(found.x), deviation)
+    return LikelihoodMaximum(-float(found.fun), np.exp(found.x), deviation)
 
 
 def fit_process(likelihood: Callable[[float, float, float], float], start: Mapping[str, float]) -> EventProcessFit:
@@ -296,7 +300,7 @@ def _curvature(function: Callable[[Floats], float], at: Floats, height: float) -
     return curvature / CURVATURE_STEP**2
 
 
-def anywhere(means: Floats) -> float:
+def prior_level_variance(means: Floats) -> float:
     """Return the prior variance of the first level."""
     return INITIAL_VARIANCE_RATIO * float(means.var())
 
@@ -329,7 +333,7 @@ def predict_block(table, covariance, reach):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def kalman(means, table, white, start):  # type: ignore[no-untyped-def]
+def kalman_log_likelihood(means, table, white, start):  # type: ignore[no-untyped-def]
     """Return the log-likelihood of Gaussian noise in block means.
 
     The Kalman filter follows Anderson & Moore, "Optimal Filtering", 1979, sections 5.5 and 10.4.

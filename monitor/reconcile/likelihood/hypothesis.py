@@ -14,9 +14,9 @@ from typing import Any, Final
 import numpy as np
 
 from monitor.noise.effect import Effect
-from monitor.reconcile.likelihood.effect_terms import COURSE, NOISE, size
+from monitor.reconcile.likelihood.effect_terms import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS, size
 from monitor.reconcile.preparation.axis import Axis, Effects, Likely
-from monitor.reconcile.result import Bounds
+from monitor.reconcile.result import ParameterInterval
 
 RESIZE_PENALTY_NATS: Final = 5.0
 """Log-likelihood gain in nats that justifies another size of a noise effect of the model."""
@@ -61,7 +61,7 @@ class Hypothesis:
         return self.likely.log_likelihood - RESIZE_PENALTY_NATS * self.freed
 
 
-def believed(axis: Axis, model: Effects) -> Hypothesis:
+def fit_with_given_sizes(axis: Axis, model: Effects) -> Hypothesis:
     """Fit the deterministic effects of a model and keep the sizes of its noise effects.
 
     The sizes of deterministic effects differ from recording to recording.
@@ -73,10 +73,12 @@ def believed(axis: Axis, model: Effects) -> Hypothesis:
     model : tuple of Effect
         Effects of the axis in the model under test.
     """
-    return Hypothesis(model, axis.fit(model, frozenset(at for at, e in enumerate(model) if type(e) in NOISE)))
+    return Hypothesis(
+        model, axis.fit(model, frozenset(at for at, e in enumerate(model) if type(e) in NOISE_SIZE_PARAMETERS))
+    )
 
 
-def settled(axis: Axis, found: Sequence[Effect], model: Effects) -> Hypothesis:
+def fit_with_fewest_changes(axis: Axis, found: Sequence[Effect], model: Effects) -> Hypothesis:
     """Fit new effects together with a model and change as few sizes of the model as the data require.
 
     Parameters
@@ -89,7 +91,7 @@ def settled(axis: Axis, found: Sequence[Effect], model: Effects) -> Hypothesis:
         Effects of the axis in the model under test.
     """
     effects = (*model, *found)
-    held = frozenset(at for at, effect in enumerate(model) if type(effect) in NOISE)
+    held = frozenset(at for at, effect in enumerate(model) if type(effect) in NOISE_SIZE_PARAMETERS)
     best = Hypothesis(model, axis.fit(effects, held))
     if not held:
         return best
@@ -109,7 +111,7 @@ def settled(axis: Axis, found: Sequence[Effect], model: Effects) -> Hypothesis:
     return best
 
 
-def refined(axis: Axis, effects: Effects, index: int, names: Sequence[str], reach: float = 1.5) -> Effects:
+def refine_shape(axis: Axis, effects: Effects, index: int, names: Sequence[str], reach: float = 1.5) -> Effects:
     """Maximise the likelihood over shape parameters of one effect with all sizes free.
 
     The parameters are varied in turn, by golden-section search in their logarithm.
@@ -180,7 +182,7 @@ def _golden_section(axis: Axis, effects: Effects, index: int, name: str, lo: flo
     return 0.5 * (lo + hi)
 
 
-def size_bounds(likely: Likely, index: int) -> Bounds:
+def size_bounds(likely: Likely, index: int) -> ParameterInterval:
     """Return the size of an effect with its 95 % interval.
 
     The logarithm of a standard deviation, and the value of a signed size, is taken as Gaussian.
@@ -193,14 +195,14 @@ def size_bounds(likely: Likely, index: int) -> Bounds:
         Index of the effect.
     """
     value, error = size(likely.effects[index]), likely.error(index)
-    if type(likely.effects[index]) in COURSE:
-        return Bounds(value, value - Z95 * error, value + Z95 * error)
+    if type(likely.effects[index]) in DETERMINISTIC_SIZE_PARAMETERS:
+        return ParameterInterval(value, value - Z95 * error, value + Z95 * error)
     if not value > 0.0 or not np.isfinite(error):
-        return Bounds(value)
-    return Bounds(value, value * exp(-Z95 * error / value), value * exp(Z95 * error / value))
+        return ParameterInterval(value)
+    return ParameterInterval(value, value * exp(-Z95 * error / value), value * exp(Z95 * error / value))
 
 
-def shape_bounds(axis: Axis, hypothesis: Hypothesis, index: int, name: str) -> Bounds:
+def shape_bounds(axis: Axis, hypothesis: Hypothesis, index: int, name: str) -> ParameterInterval:
     """Return a shape parameter with its 95 % interval from the profile likelihood.
 
     Each end of the interval is the value at which the log-likelihood has fallen by ``CHI2_HALF_NATS``.
@@ -233,4 +235,4 @@ def shape_bounds(axis: Axis, hypothesis: Hypothesis, index: int, name: str) -> B
             middle = 0.5 * (lo + hi)
             lo, hi = (middle, hi) if fall(exp(sign * middle)) < CHI2_HALF_NATS else (lo, middle)
         ends.append(value * exp(sign * hi))
-    return Bounds(value, ends[0], ends[1])
+    return ParameterInterval(value, ends[0], ends[1])

@@ -19,7 +19,7 @@ from scipy.special import bdtrc, chdtrc, gammaln, ndtr, ndtri, pdtrc
 
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.reconcile.preparation.value_statistics import Mask, Size
+from monitor.reconcile.preparation.value_statistics import Interval, Mask
 
 LINEAR_BINS: Final = 240
 """Number of bins with equal width."""
@@ -53,11 +53,11 @@ Z95: Final = 1.959964
 
 
 @dataclass(frozen=True, slots=True)
-class Outliers:
+class OutlierFit:
     """Fit of a mixture of two Gaussians, with its alternatives."""
 
-    fraction: Size
-    scale: Size  # standard deviation of the error that is added to a sample
+    fraction: Interval
+    scale: Interval  # standard deviation of the error that is added to a sample
     noise: float  # standard deviation of the other samples
     mask: Mask  # [n] True for samples that are more likely outliers than not
     count: int  # number of samples in the mask
@@ -69,7 +69,7 @@ class Outliers:
     misfit_z: float  # z of the misfit between the magnitudes and the mixture
 
 
-def outliers(w: Floats) -> Outliers | None:
+def fit_outliers(w: Floats) -> OutlierFit | None:
     """Fit a mixture of two Gaussians to white residuals.
 
     Parameters
@@ -109,9 +109,9 @@ def outliers(w: Floats) -> Outliers | None:
     far = _outlier_threshold(narrow, wide, share)
     mask = np.asarray(np.abs(w) > far * unit) & good if np.isfinite(far) else np.zeros(w.size, dtype=np.bool_)
     fraction, scale = _parameter_intervals(counts, squares, narrow, wide, share)
-    return Outliers(
+    return OutlierFit(
         fraction=fraction,
-        scale=Size(unit * scale.value, unit * scale.lo, unit * scale.hi),
+        scale=Interval(unit * scale.value, unit * scale.lo, unit * scale.hi),
         noise=unit * float(narrow**0.5),
         mask=mask,
         count=int(mask.sum()),
@@ -241,7 +241,7 @@ def _outlier_threshold(narrow: float, wide: float, share: float) -> float:
 
 def _parameter_intervals(
     counts: Floats, squares: Floats, narrow: float, wide: float, share: float
-) -> tuple[Size, Size]:
+) -> tuple[Interval, Interval]:
     """Return fraction and scale with 95 % intervals, from the curvature of the likelihood in ln s, ln scale and logit
     f.
     """
@@ -264,7 +264,7 @@ def _parameter_intervals(
     with np.errstate(over="ignore"):
         f = 1.0 / (1.0 + np.exp(-(at[2] + half[2] * np.array([0.0, -1.0, 1.0]))))
         scale = np.exp(at[1] + half[1] * np.array([0.0, -1.0, 1.0]))
-    return Size(*map(float, f)), Size(*map(float, scale))
+    return Interval(*map(float, f)), Interval(*map(float, scale))
 
 
 def _vuong_statistic(counts: Floats, log_density_difference: Floats) -> float:

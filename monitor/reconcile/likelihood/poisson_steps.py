@@ -18,18 +18,18 @@ from drivers.sample import Floats
 from monitor.common.compiled import compiled
 from monitor.reconcile.likelihood.hidden_state import (
     TARGET_BLOCKS,
+    BackgroundNoise,
     EventProcessFit,
     ModelComparison,
-    Rest,
     StateSpaceNoise,
-    anywhere,
     block_means,
     fit_process,
     initial_covariance,
-    kalman,
+    kalman_log_likelihood,
     maximise,
-    parts,
     predict_block,
+    prior_level_variance,
+    state_space_noise,
 )
 
 BLOCKS_PER_CROSSING_TIME: Final = 3.0
@@ -48,7 +48,7 @@ START_RATES: Final = 6
 """Number of starting rates."""
 
 
-def steps_or_walk(y: Floats, tau0_s: float, rest: Rest, K: float) -> ModelComparison:
+def compare_steps_with_random_walk(y: Floats, tau0_s: float, rest: BackgroundNoise, K: float) -> ModelComparison:
     """Compare Poisson steps with a random walk.
 
     Parameters
@@ -74,11 +74,11 @@ def steps_or_walk(y: Floats, tau0_s: float, rest: Rest, K: float) -> ModelCompar
         If there are too few samples or no white noise.
     """
     means, block_s = block_means(y, tau0_s, block_for(y.size * tau0_s, rest, K))
-    start, span_s = anywhere(means), means.size * block_s
+    start, span_s = prior_level_variance(means), means.size * block_s
 
     def walk(K: float) -> float:
-        noise = parts(replace(rest, walk=rest.walk + K * K), block_s, span_s)
-        return float(kalman(means, noise.table, noise.white, start))
+        noise = state_space_noise(replace(rest, walk=rest.walk + K * K), block_s, span_s)
+        return float(kalman_log_likelihood(means, noise.table, noise.white, start))
 
     first = fit_jumps(means, block_s, rest, K)
     second = maximise(walk, (K,))
@@ -90,7 +90,7 @@ def steps_or_walk(y: Floats, tau0_s: float, rest: Rest, K: float) -> ModelCompar
     )
 
 
-def block_for(span_s: float, rest: Rest, K: float) -> float:
+def block_for(span_s: float, rest: BackgroundNoise, K: float) -> float:
     """Return the length of a block in seconds.
 
     Parameters
@@ -106,7 +106,7 @@ def block_for(span_s: float, rest: Rest, K: float) -> float:
     return min(crossing_s / BLOCKS_PER_CROSSING_TIME, span_s / TARGET_BLOCKS)
 
 
-def fit_jumps(means: Floats, block_s: float, rest: Rest, K: float) -> EventProcessFit:
+def fit_jumps(means: Floats, block_s: float, rest: BackgroundNoise, K: float) -> EventProcessFit:
     """Maximise the likelihood over the rate and the height of the jumps.
 
     The search starts from the likeliest of several rates, with the second moments of a random walk ``K``.
@@ -122,8 +122,8 @@ def fit_jumps(means: Floats, block_s: float, rest: Rest, K: float) -> EventProce
     K : float
         Random walk coefficient in unit/√s.
     """
-    span_s, start = means.size * block_s, anywhere(means)
-    noise = parts(rest, block_s, span_s)
+    span_s, start = means.size * block_s, prior_level_variance(means)
+    noise = state_space_noise(rest, block_s, span_s)
 
     def poisson(rate: float, height: float, odds: float = 1.0) -> float:
         return log_likelihood(means, noise, start, rate * block_s, height, odds)

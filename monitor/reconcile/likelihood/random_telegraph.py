@@ -17,19 +17,19 @@ from drivers.sample import Floats
 from monitor.common.compiled import compiled
 from monitor.reconcile.likelihood.hidden_state import (
     TARGET_BLOCKS,
+    BackgroundNoise,
     EventProcessFit,
     ModelComparison,
-    Rest,
     StateSpaceNoise,
-    anywhere,
+    block_markov_noise,
     block_means,
     fit_process,
     initial_covariance,
-    kalman,
-    markov,
+    kalman_log_likelihood,
     maximise,
-    parts,
     predict_block,
+    prior_level_variance,
+    state_space_noise,
 )
 
 BLOCKS_PER_CORRELATION_TIME: Final = 8.0
@@ -52,8 +52,8 @@ MIN_WEIGHT: Final = 1e-300
 """Lower limit of the weight of a case relative to the likeliest one. It avoids a division by zero."""
 
 
-def telegraph_or_correlated(
-    y: Floats, tau0_s: float, rest: Rest, sigma: float, correlation_time: float
+def compare_telegraph_with_correlated(
+    y: Floats, tau0_s: float, rest: BackgroundNoise, sigma: float, correlation_time: float
 ) -> ModelComparison:
     """Compare a random telegraph with exponentially correlated noise.
 
@@ -81,12 +81,14 @@ def telegraph_or_correlated(
     ValueError
         If there are too few samples or no white noise.
     """
-    means, block_s = block_means(y, tau0_s, block_for(y.size * tau0_s, tau0_s, correlation_time, rest.white / sigma**2))
-    noise, start = parts(rest, block_s, means.size * block_s), anywhere(means)
+    means, block_s = block_means(
+        y, tau0_s, block_length_s(y.size * tau0_s, tau0_s, correlation_time, rest.white / sigma**2)
+    )
+    noise, start = state_space_noise(rest, block_s, means.size * block_s), prior_level_variance(means)
 
     def correlated(sigma: float, time_s: float) -> float:
-        row, own = markov(sigma, time_s, block_s)
-        return float(kalman(means, np.vstack([noise.table, row]), noise.white + own, start))
+        row, own = block_markov_noise(sigma, time_s, block_s)
+        return float(kalman_log_likelihood(means, np.vstack([noise.table, row]), noise.white + own, start))
 
     first = fit_telegraph(means, block_s, noise, sigma, correlation_time)
     second = maximise(correlated, (sigma, correlation_time))
@@ -98,7 +100,7 @@ def telegraph_or_correlated(
     )
 
 
-def block_for(span_s: float, tau0_s: float, correlation_time: float, even_s: float) -> float:
+def block_length_s(span_s: float, tau0_s: float, correlation_time: float, even_s: float) -> float:
     """Return the length of a block in seconds. Shorter blocks resolve the time of a switch better.
 
     Parameters
@@ -138,7 +140,7 @@ def fit_telegraph(
     correlation_time : float
         Correlation time in seconds that determines the starting dwell times.
     """
-    start = anywhere(means)
+    start = prior_level_variance(means)
 
     def two_levels(amplitude: float, dwell_s: float, odds: float) -> float:
         return log_likelihood(means, noise, start, amplitude, block_s / dwell_s, odds)

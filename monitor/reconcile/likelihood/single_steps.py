@@ -22,17 +22,17 @@ from monitor.common.compiled import compiled
 from monitor.reconcile.likelihood import poisson_steps
 from monitor.reconcile.likelihood.hidden_state import (
     INTERVAL_SIGMAS,
+    BackgroundNoise,
     ModelComparison,
-    Rest,
     StateSpaceNoise,
-    anywhere,
     block_means,
     initial_covariance,
-    kalman,
-    parts,
+    kalman_log_likelihood,
     predict_block,
+    prior_level_variance,
+    state_space_noise,
 )
-from monitor.reconcile.result import Bounds
+from monitor.reconcile.result import ParameterInterval
 
 TIMES_PER_BLOCK: Final = 8
 """Number of times that are tried within a block."""
@@ -48,18 +48,20 @@ class SingleStepsFit(NamedTuple):
     heights: Floats  # [k] unit of the axis
     deviations: Floats  # [k] standard deviations of the heights
 
-    def parameters(self, block_s: float) -> dict[str, Bounds]:
+    def parameters(self, block_s: float) -> dict[str, ParameterInterval]:
         """Return ``time_1``, ``height_1``, ``time_2``, … with 95 % intervals, in the order of time."""
-        found: dict[str, Bounds] = {}
+        found: dict[str, ParameterInterval] = {}
         for k in range(self.times.size):
             time, early, late = (float(t[k]) * block_s for t in (self.times, self.earliest, self.latest))
             height, wide = float(self.heights[k]), INTERVAL_SIGMAS * float(self.deviations[k])
-            found[f"time_{k + 1}"] = Bounds(time, early, late)
-            found[f"height_{k + 1}"] = Bounds(height, height - wide, height + wide)
+            found[f"time_{k + 1}"] = ParameterInterval(time, early, late)
+            found[f"height_{k + 1}"] = ParameterInterval(height, height - wide, height + wide)
         return found
 
 
-def steps_or_once(y: Floats, tau0_s: float, rest: Rest, K: float, most: int = 5) -> ModelComparison:
+def compare_steps_with_single_steps(
+    y: Floats, tau0_s: float, rest: BackgroundNoise, K: float, most: int = 5
+) -> ModelComparison:
     """Compare Poisson steps with a few single steps.
 
     Parameters
@@ -88,13 +90,13 @@ def steps_or_once(y: Floats, tau0_s: float, rest: Rest, K: float, most: int = 5)
     """
     means, block_s = block_means(y, tau0_s, poisson_steps.block_for(y.size * tau0_s, rest, K))
     first = poisson_steps.fit_jumps(means, block_s, rest, K)
-    second = fit_once(means, parts(rest, block_s, means.size * block_s), most)
+    second = fit_single_steps(means, state_space_noise(rest, block_s, means.size * block_s), most)
     return ModelComparison(
         first.peak.height - second.height, first.parameters, second.parameters(block_s), round(first.events)
     )
 
 
-def fit_once(means: Floats, noise: StateSpaceNoise, most: int) -> SingleStepsFit:
+def fit_single_steps(means: Floats, noise: StateSpaceNoise, most: int) -> SingleStepsFit:
     """Fit the number of single steps that explains the block means at the smallest cost.
 
     Parameters
@@ -107,7 +109,9 @@ def fit_once(means: Floats, noise: StateSpaceNoise, most: int) -> SingleStepsFit
         Largest number of steps.
     """
     blocks: list[int] = []
-    best = SingleStepsFit(kalman(means, noise.table, noise.white, anywhere(means)), *np.empty((5, 0)))
+    best = SingleStepsFit(
+        kalman_log_likelihood(means, noise.table, noise.white, prior_level_variance(means)), *np.empty((5, 0))
+    )
     for _ in range(most):
         blocks.append(int(np.argmax(_shock_gains(means, noise, blocks))))
         for k in range(len(blocks)):
@@ -124,8 +128,8 @@ def _shock_gains(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> Fl
     The shocks in ``blocks`` are already present.
     """
     free = np.zeros(means.size)
-    free[blocks] = anywhere(means)
-    scores = np.asarray(shocks(means, noise.table, noise.white, anywhere(means), free))
+    free[blocks] = prior_level_variance(means)
+    scores = np.asarray(shock_statistics(means, noise.table, noise.white, prior_level_variance(means), free))
     scores[blocks] = 0.0
     return scores
 
@@ -154,7 +158,7 @@ def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[
     # fraction of each block that lies after the step
     columns = np.clip(np.arange(1.0, means.size + 1.0)[:, None] - times, 0.0, 1.0)
     columns = np.column_stack([means, columns])
-    logarithms = whiten(columns, noise.table, noise.white, anywhere(means))
+    logarithms = whiten(columns, noise.table, noise.white, prior_level_variance(means))
     data, design = columns[:, 0], columns[:, 1:]
     normal = np.linalg.inv(design.T @ design)
     heights = normal @ (design.T @ data)
@@ -185,7 +189,7 @@ def whiten(columns, table, white, start):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def shocks(means, table, white, start, free):  # type: ignore[no-untyped-def]
+def shock_statistics(means, table, white, start, free):  # type: ignore[no-untyped-def]
     """Return twice the log-likelihood ratio, shape (m,), of a shock of the level at the start of each block.
 
     The ratio is r²/N of the fixed-interval smoother (de Jong & Penzer 1998, section 2). The backward recursions are r ←

@@ -26,7 +26,7 @@ from scipy.special import gammaincc, gammaln, polygamma, psi
 
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.reconcile.preparation.value_statistics import Size
+from monitor.reconcile.preparation.value_statistics import Interval
 
 MIN_SEGMENT_SAMPLES: Final = 16
 """Smallest number of samples on each side of a step."""
@@ -61,8 +61,8 @@ class VarianceStep:
     """Step of the variance."""
 
     gain: float  # log-likelihood gain over a constant variance, nats
-    time: Size  # s from the first sample
-    ratio: Size  # standard deviation after the step over the one before it
+    time: Interval  # s from the first sample
+    ratio: Interval  # standard deviation after the step over the one before it
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ class PeriodicVariance:
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class VarianceHistory:
     """Variance history: a step and its alternatives."""
 
     step: VarianceStep
@@ -88,7 +88,7 @@ class Course:
 
 
 @dataclass(frozen=True, slots=True)
-class Tiles:
+class SpectrogramExtremes:
     """Rectangle and row of a spectrogram that are least constant in time."""
 
     gain: float  # gain of the best rectangle over the rest of its row, nats
@@ -100,7 +100,7 @@ class Tiles:
     seconds: tuple[float, float]  # length of the pieces of the rectangle and of the row, s
 
 
-def variance_course(w: Floats, tau0_s: float) -> Course:
+def fit_variance_history(w: Floats, tau0_s: float) -> VarianceHistory:
     """Fit steps and other variations of the variance of white residuals.
 
     Parameters
@@ -133,7 +133,7 @@ def variance_course(w: Floats, tau0_s: float) -> Course:
     scores = energy / energy.mean() - 1.0
     step = _best_step(squares, tau0_s)
     time = np.linspace(-1.0, 1.0, count)
-    return Course(
+    return VarianceHistory(
         step=step,
         trend=_log_linear_gain(energy, length, np.stack([time, time**2 - 1.0 / 3.0])),
         periodic=_fit_periodic(energy, scores, length, length * tau0_s),
@@ -144,7 +144,7 @@ def variance_course(w: Floats, tau0_s: float) -> Course:
     )
 
 
-def tiles(w: Floats, tau0_s: float) -> Tiles:
+def find_least_constant_tiles(w: Floats, tau0_s: float) -> SpectrogramExtremes:
     """Find the rectangle of time and frequency, and the row, in which the power of white residuals is least constant.
 
     Parameters
@@ -175,7 +175,7 @@ def tiles(w: Floats, tau0_s: float) -> Tiles:
         one, other = _best_tiles(_piece_spectra(w, piece), piece)
         best, row = max(best, one), max(row, other)
     _, piece, a, i, b, j, ratio = best
-    return Tiles(
+    return SpectrogramExtremes(
         gain=best[0],
         ratio=ratio,
         time=(i * a * piece * tau0_s, (i + 1) * a * piece * tau0_s),
@@ -212,7 +212,9 @@ def _best_step(squares: Floats, tau0_s: float, first: int = 0) -> VarianceStep:
     half = float(np.exp(Z95 * (0.5 / at + 0.5 / after) ** 0.5))
     ends = (at, min(int(k[lo]), at) - stride + 1, max(int(k[hi]), at) + stride - 1)
     return VarianceStep(
-        float(gains[best]), Size(*((first + one) * tau0_s for one in ends)), Size(ratio, ratio / half, ratio * half)
+        float(gains[best]),
+        Interval(*((first + one) * tau0_s for one in ends)),
+        Interval(ratio, ratio / half, ratio * half),
     )
 
 

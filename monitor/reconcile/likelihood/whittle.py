@@ -33,7 +33,7 @@ MIN_VARIANCE_RATIO: Final = 1e-20
 
 
 @dataclass(frozen=True, slots=True)
-class Sums:
+class BinSums:
     """Sums over bins that the likelihood needs."""
 
     power: Floats  # [m] Σ Y²
@@ -42,7 +42,7 @@ class Sums:
 
 
 @dataclass(frozen=True, slots=True)
-class Fitted:
+class WhittleFit:
     """Maximum of the likelihood."""
 
     theta: Floats  # [p] variances
@@ -54,7 +54,7 @@ class Fitted:
     beta_covariance: Floats  # [q, q] covariance of β
 
 
-def sums(bins: Bins, y: Floats, regressors: Floats) -> Sums:
+def bin_sums(bins: Bins, y: Floats, regressors: Floats) -> BinSums:
     """Return the sums over bins of an axis and its regressors.
 
     Parameters
@@ -72,10 +72,10 @@ def sums(bins: Bins, y: Floats, regressors: Floats) -> Sums:
         cross[i] = bins.sums(regressors[i] * y)
         for j in range(i + 1):
             gram[i, j] = gram[j, i] = bins.sums(regressors[i] * regressors[j])
-    return Sums(bins.sums(y * y), cross, gram)
+    return BinSums(bins.sums(y * y), cross, gram)
 
 
-def maximise(count: Floats, found: Sums, bases: Floats, constant: Floats, start: Floats) -> Fitted:
+def maximise_whittle(count: Floats, found: BinSums, bases: Floats, constant: Floats, start: Floats) -> WhittleFit:
     """Return the θ and β with the largest likelihood.
 
     Parameters
@@ -96,7 +96,7 @@ def maximise(count: Floats, found: Sums, bases: Floats, constant: Floats, start:
         count, found.power, found.cross, found.gram, bases, constant + least, np.maximum(start, 0.0)
     )
     covariance = np.linalg.pinv(normal) if beta.size else np.zeros((0, 0))
-    return Fitted(theta, beta, variance, residual, float(likelihood), information, covariance)
+    return WhittleFit(theta, beta, variance, residual, float(likelihood), information, covariance)
 
 
 @compiled

@@ -16,7 +16,7 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.noise.effect import Effect, Leak, Transform
 from monitor.noise.effects import (
-    ORDER,
+    TRANSFORM_ORDER,
     AngleRandomWalk,
     BandwidthLimit,
     Bias,
@@ -25,11 +25,19 @@ from monitor.noise.effects import (
     SampleHold,
     Saturation,
 )
-from monitor.noise.spectrum import Spectrum, white
-from monitor.reconcile.likelihood.effect_terms import COURSE, NOISE, basis, columns, resized, size, sized
-from monitor.reconcile.likelihood.whittle import Fitted, Sums, maximise
-from monitor.reconcile.preparation.cosine_bins import Bins, transform
-from monitor.reconcile.preparation.value_statistics import Clipped, Levels, Repeats
+from monitor.noise.spectrum import Spectrum, white_noise_spectrum
+from monitor.reconcile.likelihood.effect_terms import (
+    DETERMINISTIC_SIZE_PARAMETERS,
+    NOISE_SIZE_PARAMETERS,
+    regressors,
+    size,
+    unit_spectrum,
+    with_factors,
+    with_size,
+)
+from monitor.reconcile.likelihood.whittle import BinSums, WhittleFit, maximise_whittle
+from monitor.reconcile.preparation.cosine_bins import Bins, cosine_transform
+from monitor.reconcile.preparation.value_statistics import Clipping, QuantizationGrid, RepeatedSamples
 
 MIN_BIN_POWER_RATIO: Final = 1e-4
 """Smallest power of a bin relative to the median bin. In the stop band of a filter, weaker bins contain only the effect
@@ -58,7 +66,7 @@ class Likely:
     effects: Effects  # with fitted sizes
     held: frozenset[int]  # indices of effects whose size was not fitted
     log_likelihood: float
-    fitted: Fitted
+    fitted: WhittleFit
     noises: tuple[int, ...]  # index in ``effects`` of each fitted θ
     courses: tuple[tuple[int, slice], ...]  # index in ``effects`` and slice of β of each deterministic effect
     behind: float = 0.0  # variance of a coefficient due to the white noise floor after a low-pass filter
@@ -77,15 +85,15 @@ class Likely:
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class ValueStatistics:
     """Statistics of the measured values of an axis: quantization levels, clipping and repeated samples."""
 
-    levels: Levels | None
-    clipped: Clipped | None
-    repeats: Repeats | None
+    levels: QuantizationGrid | None
+    clipped: Clipping | None
+    repeats: RepeatedSamples | None
 
 
-class Courses:
+class RegressorCache:
     """Cached transforms of the regressors that depend on time and temperature.
 
     Every trial uses the same regressors again.
@@ -102,9 +110,9 @@ class Courses:
 
     def __init__(self, n: int, rate_hz: float, temperature_c: Floats | None) -> None:
         def make(effect: Effect) -> list[Floats]:
-            return [transform(one) for one in columns(effect, n, rate_hz, temperature_c)]
+            return [cosine_transform(one) for one in regressors(effect, n, rate_hz, temperature_c)]
 
-        self.curve = transform(np.linspace(-1.0, 1.0, n) ** 2)
+        self.curve = cosine_transform(np.linspace(-1.0, 1.0, n) ** 2)
         """[n − 1] transform of t², a drift that corresponds to no named effect."""
         self.steps = 0.25 / n / np.sin(0.5 * np.pi * np.arange(1, n) / n) ** 2
         """[n − 1] mean squares of the coefficients of a unit step, averaged over all step times."""
@@ -112,7 +120,7 @@ class Courses:
 
     def columns(self, effect: Effect) -> list[Floats]:
         """Return the transforms of the regressors of a deterministic effect with size one, each of shape (n − 1,)."""
-        return self._make(sized(effect, np.ones(2)))
+        return self._make(with_factors(effect, np.ones(2)))
 
 
 @dataclass(slots=True)
@@ -121,25 +129,25 @@ class Axis:
 
     name: str
     raw: Floats  # [n] rad/s or m/s² as measured; NaN = missing
-    y: Floats  # [n] rad/s or m/s², repaired
+    repaired: Floats  # [n] rad/s or m/s², repaired
     coefficients: Floats  # [n − 1] cosine transform of ``y``
     bins: Bins
     others: Mapping[str, Floats]  # [n − 1] transforms of the axes that may leak into it
     temperature_c: Floats | None  # [n] °C
-    shown: Shown
-    courses: "Courses"  # shared by all axes of a recording and of its simulations
-    heard: Floats = field(init=False)  # [m] 1 for bins that are used, 0 for bins deep in a stop band
+    shown: ValueStatistics
+    courses: "RegressorCache"  # shared by all axes of a recording and of its simulations
+    used_bins: Floats = field(init=False)  # [m] 1 for bins that are used, 0 for bins deep in a stop band
     _products: dict[tuple[object, ...], Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         power = self.bins.sums(self.coefficients**2) / self.bins.count
         slow = self.bins.f_hz < MIN_STOP_BAND_FRACTION * self.bins.rate_hz
-        self.heard = ((power > MIN_BIN_POWER_RATIO * np.median(power)) | slow).astype(np.float64)
+        self.used_bins = ((power > MIN_BIN_POWER_RATIO * np.median(power)) | slow).astype(np.float64)
 
     @property
     def n(self) -> int:
         """Number of samples."""
-        return self.y.size
+        return self.repaired.size
 
     @property
     def rate_hz(self) -> float:
@@ -151,7 +159,7 @@ class Axis:
         return Axis(
             self.name,
             self.raw,
-            self.y,
+            self.repaired,
             self.coefficients,
             bins,
             self.others,
@@ -195,11 +203,13 @@ class Axis:
             Effects with fitted sizes and their log-likelihood.
         """
         f_hz, tau0_s = self.bins.f_hz, 1.0 / self.rate_hz
-        transforms = sorted((e for e in effects if self._changes_spectrum(e)), key=lambda e: ORDER.index(type(e)))
+        transforms = sorted(
+            (e for e in effects if self._changes_spectrum(e)), key=lambda e: TRANSFORM_ORDER.index(type(e))
+        )
         constant = apply_transforms(transforms, Spectrum(np.zeros_like, np.zeros_like, tau0_s), f_hz) / tau0_s
         noises, bases, start = [], [], []
         for at, effect in enumerate(effects):
-            if type(effect) not in NOISE:
+            if type(effect) not in NOISE_SIZE_PARAMETERS:
                 continue
             made = self._variance_basis(effect, effects, transforms)
             if at in held:
@@ -218,7 +228,7 @@ class Axis:
         courses: list[tuple[int, slice]] = []
         regressors: list[tuple[Effect, int]] = []
         for at, effect in enumerate(effects):
-            if type(effect) in COURSE:
+            if type(effect) in DETERMINISTIC_SIZE_PARAMETERS:
                 made_columns = self.columns(effect)
                 courses.append((at, slice(len(regressors), len(regressors) + len(made_columns))))
                 regressors += [(effect, i) for i in range(len(made_columns))]
@@ -226,7 +236,9 @@ class Axis:
             regressors.append((CURVATURE_REGRESSOR, 0))
         found = self._binned_sums(regressors)
         stacked = np.asarray(bases).reshape(len(bases), f_hz.size)
-        fitted = maximise(self.bins.count * self.heard, found, stacked, constant, np.asarray(start, np.float64))
+        fitted = maximise_whittle(
+            self.bins.count * self.used_bins, found, stacked, constant, np.asarray(start, np.float64)
+        )
         return Likely(
             self._with_fitted_sizes(effects, noises, courses, fitted),
             held,
@@ -237,7 +249,7 @@ class Axis:
             float(fitted.theta[len(noises)]) if floor else 0.0,
         )
 
-    def at(self, likely: Likely, beta: Floats) -> Likely:
+    def with_beta(self, likely: Likely, beta: Floats) -> Likely:
         """Return the fit with given sizes of the deterministic effects and unchanged noise.
 
         Parameters
@@ -251,7 +263,7 @@ class Axis:
         regressors = [(likely.effects[at], i) for at, place in likely.courses for i in range(place.stop - place.start)]
         found = self._binned_sums(regressors)
         residual = found.power - 2.0 * beta @ found.cross + np.einsum("i,j,ijb->b", beta, beta, found.gram)
-        count = self.bins.count * self.heard
+        count = self.bins.count * self.used_bins
         value = -0.5 * float((count * np.log(fitted.variance) + residual / fitted.variance).sum())
         changed = replace(fitted, beta=beta, residual=np.maximum(residual, 0.0), log_likelihood=value)
         return replace(likely, fitted=changed, log_likelihood=value)
@@ -280,16 +292,18 @@ class Axis:
                 if isinstance(other, NoiseStep):
                     later = 1.0 - min(other.time * self.rate_hz / self.n, 1.0)
                     share *= 1.0 + later * (other.ratio**2 - 1.0)  # mean variance over the recording
-        raw = Spectrum(lambda f: share * basis(effect, f, tau0_s), None, tau0_s)
+        raw = Spectrum(lambda f: share * unit_spectrum(effect, f, tau0_s), None, tau0_s)
         empty = Spectrum(np.zeros_like, np.zeros_like, tau0_s)
         with_it = apply_transforms(transforms, raw, self.bins.f_hz)
         return np.asarray((with_it - apply_transforms(transforms, empty, self.bins.f_hz)) / tau0_s)
 
     def _full_power_theta(self, basis: Floats) -> float:
         """Return the θ for which a basis would have the total power of the axis."""
-        return float(self._binned_product(None, None).sum() / max((self.bins.count * self.heard * basis).sum(), 1e-300))
+        return float(
+            self._binned_product(None, None).sum() / max((self.bins.count * self.used_bins * basis).sum(), 1e-300)
+        )
 
-    def _binned_sums(self, regressors: Sequence[tuple[Effect, int]]) -> Sums:
+    def _binned_sums(self, regressors: Sequence[tuple[Effect, int]]) -> BinSums:
         """Return the sums over bins of the products of the axis and its regressors."""
         q, m = len(regressors), self.bins.count.size
         cross, gram = np.empty((q, m)), np.empty((q, q, m))
@@ -297,7 +311,7 @@ class Axis:
             cross[i] = self._binned_product(one, None)
             for j in range(i + 1):
                 gram[i, j] = gram[j, i] = self._binned_product(one, regressors[j])
-        return Sums(self._binned_product(None, None), cross, gram)
+        return BinSums(self._binned_product(None, None), cross, gram)
 
     def _binned_product(self, one: tuple[Effect, int] | None, other: tuple[Effect, int] | None) -> Floats:
         """Return the sums over bins of the product of two columns. None means the axis itself."""
@@ -306,7 +320,7 @@ class Axis:
             a, b = (self._regressor(x) for x in (one, other))
             if len(self._products) > MAX_CACHED_PRODUCTS:
                 self._products.clear()
-            self._products[key] = self.bins.sums(a * b) * self.heard
+            self._products[key] = self.bins.sums(a * b) * self.used_bins
         return self._products[key]
 
     def _regressor(self, one: tuple[Effect, int] | None) -> Floats:
@@ -317,14 +331,14 @@ class Axis:
 
     @staticmethod
     def _with_fitted_sizes(
-        effects: Sequence[Effect], noises: Sequence[int], courses: Sequence[tuple[int, slice]], fitted: Fitted
+        effects: Sequence[Effect], noises: Sequence[int], courses: Sequence[tuple[int, slice]], fitted: WhittleFit
     ) -> Effects:
         """Return the effects with their fitted sizes."""
         found = list(effects)
         for theta, at in zip(fitted.theta, noises, strict=False):  # bases without an effect come last
-            found[at] = resized(found[at], float(theta) ** 0.5)
+            found[at] = with_size(found[at], float(theta) ** 0.5)
         for at, place in courses:
-            found[at] = sized(found[at], fitted.beta[place])
+            found[at] = with_factors(found[at], fitted.beta[place])
         return tuple(found)
 
 
@@ -351,9 +365,9 @@ def apply_transforms(transforms: Sequence[Transform], spectrum: Spectrum, f_hz: 
         if isinstance(one, Saturation):
             continue  # clipped samples have been restored before
         if isinstance(one, Resolution):
-            spectrum = spectrum + white(one.step**2 / 12.0, spectrum.tau0_s)
+            spectrum = spectrum + white_noise_spectrum(one.step**2 / 12.0, spectrum.tau0_s)
         else:
-            spectrum = one.reshape(spectrum)
+            spectrum = one.transform_spectrum(spectrum)
     return spectrum.density(f_hz)
 
 
@@ -364,4 +378,4 @@ def _regressor_key(one: tuple[Effect, int] | None) -> tuple[object, int] | None:
     effect, at = one
     if effect is CURVATURE_REGRESSOR:
         return effect, at
-    return (resized(effect, 1.0) if isinstance(effect, Leak) else sized(effect, np.ones(2)), at)
+    return (with_size(effect, 1.0) if isinstance(effect, Leak) else with_factors(effect, np.ones(2)), at)

@@ -54,7 +54,7 @@ class Bins:
         return np.repeat(of_bins, self.count.astype(np.int64))
 
 
-def bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] = ()) -> Bins:
+def frequency_bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] = ()) -> Bins:
     """Return the frequency bins of a series.
 
     Parameters
@@ -98,7 +98,7 @@ def bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] = ()) -> B
     return Bins(first - 1, (last - first).astype(np.float64), np.sqrt(first * (last - 1.0)) * step_hz, n, rate_hz)
 
 
-def transform(y: Floats) -> Floats:
+def cosine_transform(y: Floats) -> Floats:
     """Return the cosine transform of a series without its mean.
 
     Parameters
@@ -114,7 +114,7 @@ def transform(y: Floats) -> Floats:
     return np.asarray(dct(y - y.mean(), norm="ortho")[1:])
 
 
-def series(coefficients: Floats) -> Floats:
+def inverse_cosine_transform(coefficients: Floats) -> Floats:
     """Return the zero-mean series, shape (n,), that has the given coefficients, shape (n − 1,).
 
     Examples

@@ -14,15 +14,15 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Outliers, SampleHold, Saturation
-from monitor.reconcile.diagnostics.diagnostics import sight
-from monitor.reconcile.likelihood.hypothesis import believed
-from monitor.reconcile.likelihood.outlier_statistics import outliers
-from monitor.reconcile.preparation.axis import Axis, Courses, Effects, Shown
-from monitor.reconcile.preparation.cosine_bins import Bins, bins, transform
-from monitor.reconcile.preparation.sample_repair import filled, unclipped
-from monitor.reconcile.preparation.value_statistics import clipped, levels, repeats
+from monitor.reconcile.diagnostics.diagnostics import whiten_axis
+from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes
+from monitor.reconcile.likelihood.outlier_statistics import fit_outliers
+from monitor.reconcile.preparation.axis import Axis, Effects, RegressorCache, ValueStatistics
+from monitor.reconcile.preparation.cosine_bins import Bins, cosine_transform, frequency_bins
+from monitor.reconcile.preparation.sample_repair import fill_missing, restore_clipped
+from monitor.reconcile.preparation.value_statistics import detect_clipping, detect_quantization, detect_repeats
 
-FEWEST: Final = 4096
+MIN_SAMPLES: Final = 4096
 """Smallest number of samples. With fewer samples, neither a spectrum nor a spectrogram is meaningful."""
 CLIP_RELATIVE_TOLERANCE: Final = 1e-9
 """Relative distance to the limit below which a sample counts as clipped."""
@@ -33,12 +33,12 @@ SIGMA_RELATIVE_TOLERANCE: Final = 5e-4
 E = TypeVar("E", bound=Effect)
 
 
-def prepared(
+def prepare_axes(
     raw: Mapping[str, Floats],
     rate_hz: float,
     effects: Mapping[str, Effects],
     temperature_c: Floats | None,
-    courses: Courses,
+    courses: RegressorCache,
     rng: np.random.Generator,
 ) -> dict[str, Axis]:
     """Return the prepared axes of one recording.
@@ -58,10 +58,10 @@ def prepared(
     rng : numpy.random.Generator
         Generator for the replacement samples.
     """
-    even = bins(len(next(iter(raw.values()))), rate_hz)
-    shown = {name: look_at_values(y) for name, y in raw.items()}
-    mended = {name: mend(y, shown[name], effects[name], rng) for name, y in raw.items()}
-    coefficients = {name: transform(y) for name, y in mended.items()}
+    even = frequency_bins(len(next(iter(raw.values()))), rate_hz)
+    shown = {name: measure_value_statistics(y) for name, y in raw.items()}
+    mended = {name: repair_samples(y, shown[name], effects[name], rng) for name, y in raw.items()}
+    coefficients = {name: cosine_transform(y) for name, y in mended.items()}
     axes = {}
     for name, y in raw.items():
         others = {other: one for other, one in coefficients.items() if may_leak(other, name)}
@@ -70,7 +70,7 @@ def prepared(
     return axes
 
 
-def again(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:
+def repair_again(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:
     """Return the same axis, repaired for other effects.
 
     Parameters
@@ -82,7 +82,7 @@ def again(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:
     rng : numpy.random.Generator
         Generator for the replacement samples.
     """
-    y = mend(axis.raw, axis.shown, effects, rng)
+    y = repair_samples(axis.raw, axis.shown, effects, rng)
     return replace_outliers(_replace_samples(axis, y, axis.bins), effects, rng)
 
 
@@ -98,7 +98,15 @@ def without_sources(axis: Axis, sources: frozenset[str]) -> Axis:
     """
     others = {name: one for name, one in axis.others.items() if name not in sources}
     return Axis(
-        axis.name, axis.raw, axis.y, axis.coefficients, axis.bins, others, axis.temperature_c, axis.shown, axis.courses
+        axis.name,
+        axis.raw,
+        axis.repaired,
+        axis.coefficients,
+        axis.bins,
+        others,
+        axis.temperature_c,
+        axis.shown,
+        axis.courses,
     )
 
 
@@ -117,15 +125,15 @@ def may_leak(source: str, axis: str) -> bool:
     return source != axis and (axis.startswith("g") or source.startswith("a"))
 
 
-def look_at_values(y: Floats) -> Shown:
+def measure_value_statistics(y: Floats) -> ValueStatistics:
     """Return the quantization, clipping and repeats of measured samples ``y``, shape (n,), in rad/s or m/s²."""
-    grid = levels(y)
+    grid = detect_quantization(y)
     step = grid.step.value if grid else 0.0
-    ends = clipped(y, step)
-    return Shown(grid, ends, repeats(y, step, ends.limit.value if ends and ends.symmetric else np.inf))
+    ends = detect_clipping(y, step)
+    return ValueStatistics(grid, ends, detect_repeats(y, step, ends.limit.value if ends and ends.symmetric else np.inf))
 
 
-def mend(y: Floats, shown: Shown, effects: Effects, rng: np.random.Generator) -> Floats:
+def repair_samples(y: Floats, shown: ValueStatistics, effects: Effects, rng: np.random.Generator) -> Floats:
     """Return the samples with missing, repeated and clipped samples replaced.
 
     Parameters
@@ -147,7 +155,7 @@ def mend(y: Floats, shown: Shown, effects: Effects, rng: np.random.Generator) ->
     missing = ~np.isfinite(y)
     if _first_of_type(effects, SampleHold) and shown.repeats:
         missing = missing | shown.repeats.mask
-    mended = filled(y, missing, rng)
+    mended = fill_missing(y, missing, rng)
     limit = _first_of_type(effects, Saturation)
     if limit is not None and shown.clipped is not None and shown.clipped.symmetric:
         at = shown.clipped.limit.value
@@ -164,7 +172,7 @@ def _restore_clipped(y: Floats, limit: float, sigma: float, rng: np.random.Gener
     """
     whole = y
     for _ in range(MAX_SIGMA_ITERATIONS):
-        whole = unclipped(y, limit, sigma, rng)
+        whole = restore_clipped(y, limit, sigma, rng)
         before, sigma = sigma, float(np.std(np.diff(whole))) / 2.0**0.5
         if abs(sigma - before) < SIGMA_RELATIVE_TOLERANCE * sigma:
             break
@@ -185,13 +193,15 @@ def replace_outliers(axis: Axis, effects: Effects, rng: np.random.Generator) -> 
     """
     if _first_of_type(effects, Outliers) is None:
         return axis
-    found = outliers(sight(axis, believed(axis, effects).likely).fast)
-    return axis if found is None else _replace_samples(axis, filled(axis.y, found.mask, rng), axis.bins)
+    found = fit_outliers(whiten_axis(axis, fit_with_given_sizes(axis, effects).likely).fast)
+    return axis if found is None else _replace_samples(axis, fill_missing(axis.repaired, found.mask, rng), axis.bins)
 
 
 def _replace_samples(axis: Axis, y: Floats, binned: Bins) -> Axis:
     """Return a copy of an axis with other samples and bins."""
-    return Axis(axis.name, axis.raw, y, transform(y), binned, axis.others, axis.temperature_c, axis.shown, axis.courses)
+    return Axis(
+        axis.name, axis.raw, y, cosine_transform(y), binned, axis.others, axis.temperature_c, axis.shown, axis.courses
+    )
 
 
 def _first_of_type(effects: Effects, kind: type[E]) -> E | None:

@@ -14,11 +14,11 @@ import numpy as np
 
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Narrowband, Sinusoidal
-from monitor.reconcile.diagnostics.diagnostics import periodogram, sight
-from monitor.reconcile.likelihood.hypothesis import CHI2_HALF_NATS, GOLDEN, believed
+from monitor.reconcile.diagnostics.diagnostics import periodogram, whiten_axis
+from monitor.reconcile.likelihood.hypothesis import CHI2_HALF_NATS, GOLDEN, fit_with_given_sizes
 from monitor.reconcile.preparation.axis import Axis, Effects
-from monitor.reconcile.result import Bounds
-from monitor.reconcile.search.candidates import peaks
+from monitor.reconcile.result import ParameterInterval
+from monitor.reconcile.search.candidates import find_spectral_peaks
 
 MAX_LOG_RATIO: Final = 0.15
 """Largest absolute logarithm of the ratio. A larger error means that the recording is from another sensor."""
@@ -31,7 +31,7 @@ SAME_FEATURE_RATIO: Final = 1.01
 """Largest ratio of two frequencies, on any axes, that belong to the same feature."""
 MAX_TRIAL_RATIOS: Final = 12
 """Number of ratios at which all axes are fitted."""
-PRICE: Final = 12.0
+SAMPLE_RATE_PENALTY_NATS: Final = 12.0
 """Penalty in nats for the ratio and for the choice of features."""
 RATIO_EXPONENTS: Final[Mapping[str, float]] = {
     "Q": 1.0,
@@ -53,16 +53,16 @@ and τ becomes τ/r.
 
 
 @dataclass(frozen=True, slots=True)
-class Clock:
+class SampleRateErrorEstimate:
     """Detected error of the sample rate."""
 
-    ratio: Bounds  # true rate over stated rate
+    ratio: ParameterInterval  # true rate over stated rate
     gain: float  # log-likelihood gain summed over all axes, nats
     axis: str  # axis with the largest gain
     frequency: tuple[float, float]  # frequency of the feature in the model and in the recording, Hz
 
 
-def restated(effect: Effect, ratio: float) -> Effect:
+def in_stated_time(effect: Effect, ratio: float) -> Effect:
     """Return the effect as it appears in a recording whose stated sample rate is 1/ratio of the true rate.
 
     Parameters
@@ -85,7 +85,9 @@ def restated(effect: Effect, ratio: float) -> Effect:
     return replace(effect, **changed) if changed else effect  # type: ignore[type-var]
 
 
-def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clock | None:
+def detect_sample_rate_error(
+    axes: Mapping[str, Axis], effects: Mapping[str, Effects]
+) -> SampleRateErrorEstimate | None:
     """Detect a sample rate error that is common to all axes.
 
     Parameters
@@ -103,11 +105,13 @@ def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clo
     trials = _candidate_ratios(axes, effects)
     if not trials:
         return None
-    before = {name: believed(axes[name], effects[name]).likely.log_likelihood for name in axes}
+    before = {name: fit_with_given_sizes(axes[name], effects[name]).likely.log_likelihood for name in axes}
 
     def gains(x: float) -> dict[str, float]:
-        changed = {name: tuple(restated(effect, exp(x)) for effect in effects[name]) for name in axes}
-        return {name: believed(axes[name], changed[name]).likely.log_likelihood - before[name] for name in axes}
+        changed = {name: tuple(in_stated_time(effect, exp(x)) for effect in effects[name]) for name in axes}
+        return {
+            name: fit_with_given_sizes(axes[name], changed[name]).likely.log_likelihood - before[name] for name in axes
+        }
 
     def gain(x: float) -> float:
         return sum(gains(x).values())
@@ -115,7 +119,7 @@ def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clo
     ratio, width = max(trials, key=lambda one: gain(log(one[0])))
     x = _maximise_gain(gain, log(ratio), width)
     top = gain(x)
-    if top < PRICE:
+    if top < SAMPLE_RATE_PENALTY_NATS:
         return None
     alone = _gain_per_feature(axes, effects, before, exp(x))
     if top - max(alone) < MIN_OTHER_GAIN_NATS or min(alone) < -MIN_OTHER_GAIN_NATS:
@@ -125,7 +129,9 @@ def wrong_clock(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> Clo
     strongest = max(of_axes, key=lambda one: of_axes[one])
     features = [e for e in effects[strongest] if isinstance(e, (Sinusoidal, Narrowband))]
     stated = features[0].frequency if features else 0.0
-    return Clock(Bounds(exp(x), exp(ends[0]), exp(ends[1])), top, strongest, (stated, stated / exp(x)))
+    return SampleRateErrorEstimate(
+        ParameterInterval(exp(x), exp(ends[0]), exp(ends[1])), top, strongest, (stated, stated / exp(x))
+    )
 
 
 def _gain_per_feature(
@@ -143,9 +149,9 @@ def _gain_per_feature(
     for group in groups:
         gain = 0.0
         for name, of in effects.items():
-            moved = tuple(restated(e, ratio) if getattr(e, "frequency", None) in group else e for e in of)
+            moved = tuple(in_stated_time(e, ratio) if getattr(e, "frequency", None) in group else e for e in of)
             if moved != of:
-                gain += believed(axes[name], moved).likely.log_likelihood - before[name]
+                gain += fit_with_given_sizes(axes[name], moved).likely.log_likelihood - before[name]
         gains.append(gain)
     return gains
 
@@ -167,7 +173,7 @@ def _candidate_ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) 
         lines = [one for one in features[name] if isinstance(one, Sinusoidal)]
         if not features[name]:
             continue
-        view = sight(axis, believed(axis, effects[name]).likely)
+        view = whiten_axis(axis, fit_with_given_sizes(axis, effects[name]).likely)
         turned = periodogram(view.white)
         spacing = axis.rate_hz / (2 * (turned.size - 1))
         for line in lines:
@@ -176,7 +182,7 @@ def _candidate_ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) 
             ]
         for one in features[name]:
             if isinstance(one, Narrowband):
-                places = [middle for middle, _ in peaks(view, 4)]
+                places = [middle for middle, _ in find_spectral_peaks(view, 4)]
                 near = [place for place in places if abs(log(one.frequency / place)) < MAX_LOG_RATIO]
                 found += [(one.frequency / place, 2.0 * one.bandwidth / one.frequency) for place in near]
     for at in np.argsort(power)[-MAX_TRIAL_RATIOS:]:

@@ -44,7 +44,7 @@ CLIP_TOLERANCE_SIGMA: Final = 1e-2
 """Largest change of a sample, in standard deviations, that ends the iterations."""
 
 
-def filled(y: Floats, mask: Mask, rng: np.random.Generator) -> Floats:
+def fill_missing(y: Floats, mask: Mask, rng: np.random.Generator) -> Floats:
     """Return a copy of the series with masked and non-finite samples replaced.
 
     Parameters
@@ -97,7 +97,7 @@ def filled(y: Floats, mask: Mask, rng: np.random.Generator) -> Floats:
     return new
 
 
-def unclipped(y: Floats, limit: float, sigma: float, rng: np.random.Generator) -> Floats:
+def restore_clipped(y: Floats, limit: float, sigma: float, rng: np.random.Generator) -> Floats:
     """Return a copy of the series with clipped samples replaced by draws from beyond the limit.
 
     Parameters

@@ -24,7 +24,7 @@ from scipy.special import log_ndtr, ndtr, xlogy
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.estimation.detection.resolution import GAUSSIAN, ON_GRID
+from monitor.estimation.detection.resolution import GRID_TOLERANCE, SIGMA_PER_MEAN_DISTANCE
 
 Mask = NDArray[np.bool_]
 """Boolean array."""
@@ -62,7 +62,7 @@ Z95: Final = 1.959964
 
 
 @dataclass(frozen=True, slots=True)
-class Size:
+class Interval:
     """Value with its 95 % interval."""
 
     value: float
@@ -71,10 +71,10 @@ class Size:
 
 
 @dataclass(frozen=True, slots=True)
-class Levels:
+class QuantizationGrid:
     """Grid that all values lie on."""
 
-    step: Size
+    step: Interval
     offset: float  # offset of the grid from zero, in [−step/2, step/2]
     levels: int  # number of grid levels from the smallest to the largest value
     noise: float  # standard deviation from sample to sample, including the steps
@@ -87,10 +87,10 @@ class Levels:
 
 
 @dataclass(frozen=True, slots=True)
-class Clipped:
+class Clipping:
     """Values that accumulate at an end of the range."""
 
-    limit: Size
+    limit: Interval
     count: int  # number of clipped samples
     upper: bool  # True if values are clipped at the largest value
     lower: bool  # True if values are clipped at the smallest value
@@ -99,16 +99,16 @@ class Clipped:
 
 
 @dataclass(frozen=True, slots=True)
-class Repeats:
+class RepeatedSamples:
     """Samples that repeat the sample before them."""
 
-    fraction: Size
+    fraction: Interval
     count: float  # number of repeats in excess of chance
     mask: Mask  # [n] True for each repeat of a continuous value; all False for stepped values
     gain: float  # log-likelihood gain over chance, nats
 
 
-def levels(y: Floats) -> Levels | None:
+def detect_quantization(y: Floats) -> QuantizationGrid | None:
     """Detect the grid that all values lie on.
 
     A grid that the number format explains is not reported.
@@ -146,7 +146,7 @@ def levels(y: Floats) -> Levels | None:
     return None
 
 
-def clipped(y: Floats, step: float = 0.0) -> Clipped | None:
+def detect_clipping(y: Floats, step: float = 0.0) -> Clipping | None:
     """Detect values that accumulate at the largest or the smallest value.
 
     Parameters
@@ -183,8 +183,8 @@ def clipped(y: Floats, step: float = 0.0) -> Clipped | None:
     near = max(0.5 * step, 2.0 * _float_spacing(values))
     piled = (gains > 0.0) & (np.abs(ends - limit) <= near)
     at = [int(np.count_nonzero(sign * values >= end - near)) for sign, end in zip((1, -1), ends, strict=True)]
-    return Clipped(
-        limit=Size(abs(limit), abs(limit) - near, abs(limit) + near),
+    return Clipping(
+        limit=Interval(abs(limit), abs(limit) - near, abs(limit) + near),
         count=int(np.dot(at, piled)),
         upper=bool(piled[0]),
         lower=bool(piled[1]),
@@ -193,7 +193,7 @@ def clipped(y: Floats, step: float = 0.0) -> Clipped | None:
     )
 
 
-def repeats(y: Floats, step: float = 0.0, limit: float = np.inf) -> Repeats | None:
+def detect_repeats(y: Floats, step: float = 0.0, limit: float = np.inf) -> RepeatedSamples | None:
     """Detect samples that repeat the sample before them more often than chance explains.
 
     Parameters
@@ -222,14 +222,14 @@ def repeats(y: Floats, step: float = 0.0, limit: float = np.inf) -> Repeats | No
     good = np.isfinite(y) & (np.abs(y) < limit - max(0.5 * step, 1e-9 * abs(limit)) if np.isfinite(limit) else True)
     pairs = good[1:] & good[:-1]
     apart = np.diff(y)[pairs]
-    noise = GAUSSIAN * float(np.abs(apart).mean()) if apart.size >= MIN_SAMPLES else 0.0
+    noise = SIGMA_PER_MEAN_DISTANCE * float(np.abs(apart).mean()) if apart.size >= MIN_SAMPLES else 0.0
     if not noise > 0.0:
         return None
     if step < 1e-6 * noise:
         return _repeats_of_continuous(y, pairs, apart, noise)
     twice = (y[2:] - y[:-2])[good[2:] & good[1:-1] & good[:-2]]
     # differences over two samples are less affected by repeats
-    quiet = GAUSSIAN * float(np.abs(twice).mean()) < MIN_NOISE_TO_STEP_REPEATS * step
+    quiet = SIGMA_PER_MEAN_DISTANCE * float(np.abs(twice).mean()) < MIN_NOISE_TO_STEP_REPEATS * step
     return None if quiet else _repeats_of_stepped(np.abs(apart) / step, np.abs(twice) / step, y.size)
 
 
@@ -240,7 +240,7 @@ def _finite_values(y: Floats) -> Floats:
 
 def _sample_noise(values: Floats) -> float:
     """Return the standard deviation from sample to sample, from the mean absolute difference of neighbours."""
-    return GAUSSIAN * float(_total_variation(values)) / (values.size - 1)
+    return SIGMA_PER_MEAN_DISTANCE * float(_total_variation(values)) / (values.size - 1)
 
 
 @compiled
@@ -312,7 +312,7 @@ def _common_divisor(gaps: Floats, blur: float) -> float | None:
     return None
 
 
-def _fit_grid(values: Floats, step: float, blur: float, noise: float) -> Levels | None:
+def _fit_grid(values: Floats, step: float, blur: float, noise: float) -> QuantizationGrid | None:
     """Return the grid with a given step if every value lies on it."""
     middle = float(values[values.size // 2])
     for _ in range(2):  # the second pass uses the step derived from the two extreme values
@@ -323,14 +323,14 @@ def _fit_grid(values: Floats, step: float, blur: float, noise: float) -> Levels 
     left = values - middle
     left -= counts * step
     most = max(float(np.ptp(left)) / 2.0, blur)
-    if not (between and most < ON_GRID * step):
+    if not (between and most < GRID_TOLERANCE * step):
         return None
     offset = middle + 0.5 * float(left.max() + left.min())
     told = np.count_nonzero(np.diff(values)) - 1  # a repeated sample is no evidence
     gain = told * np.log(step / (2.0 * most)) - 2.0 * np.log(between + 1.0)
     error = 2.0 * most / between
-    return Levels(
-        step=Size(step, step - error, step + error),
+    return QuantizationGrid(
+        step=Interval(step, step - error, step + error),
         offset=offset - step * float(np.rint(offset / step)),
         levels=int(between) + 1,
         noise=noise,
@@ -407,7 +407,7 @@ def _predict_from_neighbours(values: Floats) -> tuple[Floats, float]:
     return expected + values.mean(), float((z - expected).std())
 
 
-def _repeats_of_continuous(y: Floats, pairs: Mask, differences: Floats, noise: float) -> Repeats | None:
+def _repeats_of_continuous(y: Floats, pairs: Mask, differences: Floats, noise: float) -> RepeatedSamples | None:
     """Return the repeats of values without a known step.
 
     If values also recur after a different value in between, they lie on an unknown grid. Neighbours are then equal by
@@ -428,17 +428,17 @@ def _repeats_of_continuous(y: Floats, pairs: Mask, differences: Floats, noise: f
             _share_difference_gain(np.array([count, n * chance]), np.full(2, n)), _excess_gain(count, n * chance, 0.0)
         )
         error = Z95 * (count + n * again) ** 0.5 / n
-        size = Size(share, max(share - error, 0.0), share + error)
-        return Repeats(size, n * share, np.zeros_like(mask), gain) if gain > 0.0 else None
+        size = Interval(share, max(share - error, 0.0), share + error)
+        return RepeatedSamples(size, n * share, np.zeros_like(mask), gain) if gain > 0.0 else None
     # probability density of a difference at zero, times the spacing of the numbers
     chance = max(
         MIN_EXPECTED_COINCIDENCES, differences.size * _float_spacing(_finite_values(y)) / (noise * 2.0 * np.pi**0.5)
     )
     gain = _poisson_gain(count, chance)
-    return Repeats(_wilson_interval(count, differences.size), float(count), mask, gain) if gain > 0.0 else None
+    return RepeatedSamples(_wilson_interval(count, differences.size), float(count), mask, gain) if gain > 0.0 else None
 
 
-def _repeats_of_stepped(differences: Floats, differences_over_two: Floats, n: int) -> Repeats | None:
+def _repeats_of_stepped(differences: Floats, differences_over_two: Floats, n: int) -> RepeatedSamples | None:
     """Return the repeats of stepped values.
 
     The arguments are the absolute differences, in steps, of successive samples and of every second sample. The
@@ -447,7 +447,7 @@ def _repeats_of_stepped(differences: Floats, differences_over_two: Floats, n: in
     differences over two samples as well, whereas repeats with a share h add only h² there. The smaller gain therefore
     counts.
     """
-    most = int(np.clip(np.ceil(GAUSSIAN * 2.0**0.5 * differences.mean()), 2, 64))
+    most = int(np.clip(np.ceil(SIGMA_PER_MEAN_DISTANCE * 2.0**0.5 * differences.mean()), 2, 64))
     counts, chance, gain = _zero_difference_excess(differences, most)
     _, chance_of_two, _ = _zero_difference_excess(differences_over_two, most)
     of_two = float(np.count_nonzero(differences_over_two < 0.5)) - chance_of_two
@@ -459,8 +459,8 @@ def _repeats_of_stepped(differences: Floats, differences_over_two: Floats, n: in
         return None
     error = (counts[0] + 3.0 * chance**2 / max(counts[1:].sum(), 1.0)) ** 0.5
     lo, hi = ((excess + sign * Z95 * error) / differences.size for sign in (-1.0, 1.0))
-    fraction = Size(excess / differences.size, max(float(lo), 0.0), float(hi))
-    return Repeats(fraction, excess, np.zeros(n, dtype=np.bool_), gain)
+    fraction = Interval(excess / differences.size, max(float(lo), 0.0), float(hi))
+    return RepeatedSamples(fraction, excess, np.zeros(n, dtype=np.bool_), gain)
 
 
 def _zero_difference_excess(differences: Floats, most: int) -> tuple[Floats, float, float]:
@@ -540,9 +540,9 @@ def _poisson_gain(count: float, expected: float) -> float:
     return float(count * np.log(count / expected) - count + expected) if count > expected else 0.0
 
 
-def _wilson_interval(count: int, trials: int) -> Size:
+def _wilson_interval(count: int, trials: int) -> Interval:
     """Return a share with its 95 % interval (Wilson 1927)."""
     share, extra = count / trials, Z95**2 / trials
     middle = (share + 0.5 * extra) / (1.0 + extra)
     half = Z95 / (1.0 + extra) * (share * (1.0 - share) / trials + 0.25 * extra / trials) ** 0.5
-    return Size(share, max(middle - half, 0.0), middle + half)
+    return Interval(share, max(middle - half, 0.0), middle + half)

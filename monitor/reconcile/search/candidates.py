@@ -31,11 +31,11 @@ from monitor.noise.effects import (
     TemperatureLag,
     TurnOnTransient,
 )
-from monitor.reconcile.diagnostics.diagnostics import Sight, line_peaks, power_gain, step_gains
-from monitor.reconcile.likelihood.hypothesis import Hypothesis, refined
+from monitor.reconcile.diagnostics.diagnostics import WhitenedAxis, find_line_peaks, power_gain, step_gains
+from monitor.reconcile.likelihood.hypothesis import Hypothesis, refine_shape
 from monitor.reconcile.preparation.axis import Axis, Effects
 
-PRICE: Final[dict[str, float]] = {
+PENALTY_NATS: Final[dict[str, float]] = {
     "quantization_noise": 8.5,
     "angle_random_walk": 8.5,
     "bias_instability": 8.5,
@@ -79,11 +79,11 @@ MAX_PEAKS: Final = 2
 FILTER_ORDERS: Final = (1, 2, 3, 4)
 """Orders of the low-pass filters that are tried."""
 
-CandidateFunction = Callable[[Axis, Hypothesis, Sight], list[Effect]]
+CandidateFunction = Callable[[Axis, Hypothesis, WhitenedAxis], list[Effect]]
 """Function that proposes effects of one family."""
 
 
-def noises(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
+def propose_classic_terms(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Effect]:
     """Return the classic terms Q, N, B and K that the axis does not have yet.
 
     Parameters
@@ -101,7 +101,7 @@ def noises(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
     return [effect for effect in every if type(effect) not in have]
 
 
-def correlated(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
+def propose_correlated_noise(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Effect]:
     """Return a list with the best exponentially correlated noise, or an empty list if its correlation time is out of
     range.
 
@@ -122,12 +122,12 @@ def correlated(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
         ExponentiallyCorrelated(sigma=_start_size(axis), correlation_time=float(t)) for t in times_s
     ]
     best = _most_likely(axis, state.effects, trials)
-    found = refined(axis, (*state.effects, best), len(state.effects), ["correlation_time"], 2.0)[-1]
+    found = refine_shape(axis, (*state.effects, best), len(state.effects), ["correlation_time"], 2.0)[-1]
     assert isinstance(found, ExponentiallyCorrelated)
     return [found] if shortest <= found.correlation_time <= longest else []
 
 
-def ringing(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
+def propose_resonances(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Effect]:
     """Return resonances at the peaks of the whitened spectrum.
 
     Parameters
@@ -140,16 +140,16 @@ def ringing(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
         Axis whitened by ``state``.
     """
     found: list[Effect] = []
-    for middle, width in peaks(seen):
+    for middle, width in find_spectral_peaks(seen):
         trials: list[Effect] = [
             Narrowband(sigma=_start_size(axis), frequency=middle, bandwidth=float(width * factor))
             for factor in (0.3, 0.6, 1.0, 1.8)
         ]
         best = _most_likely(axis, state.effects, trials)
         at = len(state.effects)
-        effects = refined(axis, (*state.effects, best), at, ["bandwidth"], 2.5)
+        effects = refine_shape(axis, (*state.effects, best), at, ["bandwidth"], 2.5)
         effects = refined_frequency(axis, effects, at)
-        effects = refined(axis, effects, at, ["bandwidth"], 1.5)
+        effects = refine_shape(axis, effects, at, ["bandwidth"], 1.5)
         found.append(effects[at])
     return found
 
@@ -168,10 +168,10 @@ def refined_frequency(axis: Axis, effects: Effects, index: int) -> Effects:
     """
     peak = effects[index]
     assert isinstance(peak, Narrowband)
-    return refined(axis, effects, index, ["frequency"], 1.0 + 0.7 * peak.bandwidth / peak.frequency)
+    return refine_shape(axis, effects, index, ["frequency"], 1.0 + 0.7 * peak.bandwidth / peak.frequency)
 
 
-def peaks(seen: Sight, most: int = MAX_PEAKS) -> list[tuple[float, float]]:
+def find_spectral_peaks(seen: WhitenedAxis, most: int = MAX_PEAKS) -> list[tuple[float, float]]:
     """Return the peaks of the whitened spectrum that are wider than a line, strongest first.
 
     Parameters
@@ -204,14 +204,14 @@ def peaks(seen: Sight, most: int = MAX_PEAKS) -> list[tuple[float, float]]:
         width *= 2
     chosen: list[tuple[float, float]] = []
     for gain, middle, wide in sorted(found, reverse=True):
-        if gain < PRICE["narrowband"] / 2.0 or len(chosen) == most:
+        if gain < PENALTY_NATS["narrowband"] / 2.0 or len(chosen) == most:
             break
         if all(abs(middle - other) > 2.0 * (wide + width_of) for other, width_of in chosen):
             chosen.append((middle, wide))
     return chosen
 
 
-def oscillations(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
+def propose_sinusoids(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Effect]:
     """Return sinusoids at the lines of the spectrum.
 
     Parameters
@@ -224,14 +224,14 @@ def oscillations(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
         Axis whitened by ``state``.
     """
     found: list[Effect] = []
-    for gain, f_hz in line_peaks(seen.white, axis.rate_hz, MAX_PEAKS):
-        if gain > PRICE["sinusoidal"] / 2.0:
+    for gain, f_hz in find_line_peaks(seen.white, axis.rate_hz, MAX_PEAKS):
+        if gain > PENALTY_NATS["sinusoidal"] / 2.0:
             best = line_frequency(seen, f_hz)
             found.append(Sinusoidal(amplitude=_start_size(axis), frequency=best, phase=0.0))
     return found
 
 
-def line_frequency(seen: Sight, f_hz: float) -> float:
+def line_frequency(seen: WhitenedAxis, f_hz: float) -> float:
     """Return the frequency of the maximum of the periodogram near a given frequency, by golden-section search.
 
     Parameters
@@ -254,7 +254,7 @@ def line_frequency(seen: Sight, f_hz: float) -> float:
     return 0.5 * (lo + hi)
 
 
-def low_pass(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
+def propose_low_pass(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Effect]:
     """Return a list with the best low-pass filter, or an empty list if the effects already contain one or no filter
     fits.
 
@@ -275,13 +275,13 @@ def low_pass(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
     for order in FILTER_ORDERS:
         best = _most_likely(axis, state.effects, [BandwidthLimit(cutoff=float(f), order=order) for f in cutoffs])
         at = len(state.effects)
-        effects = refined(axis, (*state.effects, best), at, ["cutoff"], 1.4)
+        effects = refine_shape(axis, (*state.effects, best), at, ["cutoff"], 1.4)
         if effects[at].cutoff < 0.99 * nyquist:  # type: ignore[attr-defined]
             found.append(effects[at])
     return [_most_likely(axis, state.effects, found)] if found else []
 
 
-def drifts(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
+def propose_drifts(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Effect]:
     """Return effects that follow time: a ramp, a transient after the start, and a step.
 
     Parameters
@@ -303,7 +303,7 @@ def drifts(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
         trials: list[Effect] = [TurnOnTransient(amplitude=1.0, time_constant=float(t)) for t in times_s]
         best = _most_likely(axis, state.effects, trials)
         at = len(state.effects)
-        effects = refined(axis, (*state.effects, best), at, ["time_constant"], 1.6)
+        effects = refine_shape(axis, (*state.effects, best), at, ["time_constant"], 1.6)
         if effects[at].time_constant <= MAX_TIME_CONSTANT_FRACTION * length_s:  # type: ignore[attr-defined]
             found.append(effects[at])
     if not have & {PoissonSteps, RandomTelegraph}:
@@ -312,7 +312,7 @@ def drifts(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
     return found
 
 
-def warmth(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
+def propose_temperature_effects(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Effect]:
     """Return effects that follow the temperature: linearly, quadratically or with a delay.
 
     Parameters
@@ -340,13 +340,13 @@ def warmth(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
         ]
         best = _most_likely(axis, state.effects, trials)
         at = len(state.effects)
-        effects = refined(axis, (*state.effects, best), at, ["time_constant"], 2.2)
+        effects = refine_shape(axis, (*state.effects, best), at, ["time_constant"], 2.2)
         if MIN_DELAY_FRACTION * length_s < effects[at].time_constant <= MAX_TIME_CONSTANT_FRACTION * length_s:  # type: ignore[attr-defined]
             found.append(effects[at])
     return found
 
 
-def leaks(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
+def propose_leaks(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Effect]:
     """Return leaks from the other axes.
 
     Parameters
@@ -368,9 +368,19 @@ def leaks(axis: Axis, state: Hypothesis, seen: Sight) -> list[Effect]:
     return found
 
 
-NOISE_CANDIDATES: Final[tuple[CandidateFunction, ...]] = (noises, correlated, ringing, oscillations, low_pass)
+NOISE_CANDIDATES: Final[tuple[CandidateFunction, ...]] = (
+    propose_classic_terms,
+    propose_correlated_noise,
+    propose_resonances,
+    propose_sinusoids,
+    propose_low_pass,
+)
 """Functions that propose noise effects and filters."""
-DETERMINISTIC_CANDIDATES: Final[tuple[CandidateFunction, ...]] = (drifts, warmth, leaks)
+DETERMINISTIC_CANDIDATES: Final[tuple[CandidateFunction, ...]] = (
+    propose_drifts,
+    propose_temperature_effects,
+    propose_leaks,
+)
 """Functions that propose effects that follow time, temperature or another axis."""
 
 

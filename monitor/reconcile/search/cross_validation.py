@@ -17,13 +17,18 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Outliers, Resolution, SampleHold, Saturation, Sinusoidal
-from monitor.reconcile.diagnostics.diagnostics import LENSES, sight
-from monitor.reconcile.diagnostics.gap import Null
-from monitor.reconcile.likelihood.effect_terms import COURSE, NOISE, ONCE, size
+from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS, whiten_axis
+from monitor.reconcile.diagnostics.gap import NullDistribution
+from monitor.reconcile.likelihood.effect_terms import (
+    DETERMINISTIC_SIZE_PARAMETERS,
+    NOISE_SIZE_PARAMETERS,
+    ONE_TIME_EFFECTS,
+    size,
+)
 from monitor.reconcile.likelihood.hypothesis import Hypothesis
-from monitor.reconcile.preparation.axis import Axis, Courses, Effects, Likely
-from monitor.reconcile.preparation.cosine_bins import bins, series, transform
-from monitor.reconcile.preparation.prepare import again, look_at_values
+from monitor.reconcile.preparation.axis import Axis, Effects, Likely, RegressorCache
+from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequency_bins, inverse_cosine_transform
+from monitor.reconcile.preparation.prepare import measure_value_statistics, repair_again
 
 MIN_HALF_GAIN_NATS: Final = 5.0
 """Smallest gain in nats that one half must be able to provide."""
@@ -41,13 +46,13 @@ class CrossValidation:
     reason: str  # why no validation was possible; the gaps are then NaN and the step is kept
 
 
-def proof(
+def cross_validate(
     axis: Axis,
     before: Hypothesis,
     after: Hypothesis,
     added: Effect | None,
     lens: str,
-    null: Null,
+    null: NullDistribution,
     rng: np.random.Generator,
 ) -> CrossValidation:
     """Cross-validate a step on the two halves of an axis.
@@ -67,7 +72,7 @@ def proof(
     rng : numpy.random.Generator
         Generator for the replacement samples.
     """
-    if added is not None and added.name in ONCE:
+    if added is not None and added.name in ONE_TIME_EFFECTS:
         return _not_applicable("it happens once")
     parts = [slice(0, axis.n // 2), slice(axis.n - axis.n // 2, axis.n)]
     sources = {getattr(effect, "source", "") for effect in (*before.effects, *after.effects)}
@@ -76,7 +81,7 @@ def proof(
         halves = [_half_axis(axis, part, before.effects, sources, rng) for part in parts]
         return _validate_sample_effect(halves, repaired, before, after, lens)
     if (
-        type(added) in COURSE
+        type(added) in DETERMINISTIC_SIZE_PARAMETERS
         and min(_expected_gain(half, after, len(after.effects) - 1) for half in repaired) < MIN_HALF_GAIN_NATS
     ):
         return _not_applicable("one half of the recording alone shows too little of it")
@@ -89,7 +94,7 @@ def proof(
         for at, state in enumerate((before, after)):
             learned = repaired[learn].fit(state.effects, state.likely.held)
             seen = _predict_half(repaired[test], learned)
-            gaps[at] += LENSES[lens](sight(repaired[test], seen)).gain
+            gaps[at] += DIAGNOSTICS[lens](whiten_axis(repaired[test], seen)).gain
             better += seen.log_likelihood * (2 * at - 1)
     gap_before, gap_after = (sqrt(gain) for gain in gaps)
     below = gap_after < max(gap_before, sqrt(2.0 * null.threshold))
@@ -106,25 +111,27 @@ def _half_axis(axis: Axis, part: slice, effects: Effects, sources: Collection[st
     raw = axis.raw[part]
     n = raw.size
     warmth = None if axis.temperature_c is None else axis.temperature_c[part]
-    others = {name: transform(_part_of_series(one, part)) for name, one in axis.others.items() if name in sources}
-    y = axis.y[part]
+    others = {
+        name: cosine_transform(_part_of_series(one, part)) for name, one in axis.others.items() if name in sources
+    }
+    y = axis.repaired[part]
     half = Axis(
         axis.name,
         raw,
         y,
-        transform(y),
-        bins(n, axis.rate_hz),
+        cosine_transform(y),
+        frequency_bins(n, axis.rate_hz),
         others,
         warmth,
-        look_at_values(raw),
-        Courses(n, axis.rate_hz, warmth),
+        measure_value_statistics(raw),
+        RegressorCache(n, axis.rate_hz, warmth),
     )
-    return again(half, effects, rng)
+    return repair_again(half, effects, rng)
 
 
 def _part_of_series(coefficients: Floats, part: slice) -> Floats:
     """Return a part of the series that has the given coefficients."""
-    return series(coefficients)[part]
+    return inverse_cosine_transform(coefficients)[part]
 
 
 def _expected_gain(half: Axis, state: Hypothesis, index: int) -> float:
@@ -132,7 +139,7 @@ def _expected_gain(half: Axis, state: Hypothesis, index: int) -> float:
     learned = half.fit(state.effects, state.likely.held)
     effect = state.effects[index]
     columns = half.columns(effect)
-    weight = half.bins.spread(half.heard / learned.fitted.variance)
+    weight = half.bins.spread(half.used_bins / learned.fitted.variance)
     if isinstance(effect, Sinusoidal):
         return 0.5 * effect.amplitude**2 * float((columns[0] ** 2 * weight).sum())
     quadratic = getattr(effect, "quadratic", None)
@@ -149,14 +156,14 @@ def _predict_half(half: Axis, learned: Likely) -> Likely:
     the weighted mean of both. The phase of a line is fitted anew.
     """
     effects = learned.effects
-    held = frozenset(at for at, effect in enumerate(effects) if type(effect) in NOISE)
+    held = frozenset(at for at, effect in enumerate(effects) if type(effect) in NOISE_SIZE_PARAMETERS)
     free = half.fit(effects, held)
     beta = free.fitted.beta.copy()
     for at, place in free.courses:
         line = effects[at]
         if isinstance(line, Sinusoidal):  # the phase is fitted anew, the amplitude is kept
             beta[place] *= line.amplitude / max(float(np.hypot(*beta[place])), 1e-300)
-    free = half.at(free, beta)
+    free = half.with_beta(free, beta)
     known = [
         k
         for at, place in free.courses
@@ -172,7 +179,7 @@ def _predict_half(half: Axis, learned: Likely) -> Likely:
     price = 0.5 * float(apart @ np.linalg.pinv(both) @ apart)
     price += 0.5 * float(np.linalg.slogdet(both)[1] - np.linalg.slogdet(here)[1])
     beta[known] -= here @ np.linalg.pinv(both) @ apart
-    fixed = half.at(free, beta)
+    fixed = half.with_beta(free, beta)
     return replace(fixed, log_likelihood=free.log_likelihood - price)
 
 
@@ -188,6 +195,6 @@ def _validate_sample_effect(
     gaps = np.zeros(2)
     for half, put_right in zip(halves, repaired, strict=True):
         for at, (axis, state) in enumerate(((half, before), (put_right, after))):
-            gaps[at] += LENSES[lens](sight(axis, axis.fit(state.effects, state.likely.held))).gain
+            gaps[at] += DIAGNOSTICS[lens](whiten_axis(axis, axis.fit(state.effects, state.likely.held))).gain
     one, other = (sqrt(gain) for gain in gaps)
     return CrossValidation(one, other, other < one, "")

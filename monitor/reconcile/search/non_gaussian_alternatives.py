@@ -19,14 +19,14 @@ from monitor.noise.effects import (
     RateRandomWalk,
 )
 from monitor.reconcile.likelihood.effect_terms import size
-from monitor.reconcile.likelihood.hidden_state import Rest
+from monitor.reconcile.likelihood.hidden_state import BackgroundNoise
 from monitor.reconcile.likelihood.hypothesis import Hypothesis
-from monitor.reconcile.likelihood.poisson_steps import steps_or_walk
-from monitor.reconcile.likelihood.random_telegraph import telegraph_or_correlated
-from monitor.reconcile.likelihood.single_steps import steps_or_once
+from monitor.reconcile.likelihood.poisson_steps import compare_steps_with_random_walk
+from monitor.reconcile.likelihood.random_telegraph import compare_telegraph_with_correlated
+from monitor.reconcile.likelihood.single_steps import compare_steps_with_single_steps
 from monitor.reconcile.preparation.axis import Axis, Effects
-from monitor.reconcile.preparation.cosine_bins import series
-from monitor.reconcile.result import Bounds
+from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
+from monitor.reconcile.result import ParameterInterval
 
 MIN_ALTERNATIVE_GAIN_NATS: Final = 3.0
 """Gain in nats that an alternative must reach. In 2 of 4000 simulated recordings, telegraph and correlated noise were
@@ -48,13 +48,13 @@ class NonGaussianAlternative:
 
     found: Effects  # effects beyond the model; the alternative comes last and replaces the original effect
     gain: float  # log-likelihood gain over the original effect, nats
-    bounds: Mapping[str, Bounds]  # parameters of the alternative
+    bounds: Mapping[str, ParameterInterval]  # parameters of the alternative
     events: int  # number of switches or jumps
     whole: float = 0.0  # log-likelihood with Poisson steps: that of a random walk plus their gain over it
     rival: "NonGaussianAlternative | None" = None  # the alternative that this one was preferred to
 
 
-def telegraph(axis: Axis, state: Hypothesis, at: int) -> NonGaussianAlternative | None:
+def fit_telegraph_alternative(axis: Axis, state: Hypothesis, at: int) -> NonGaussianAlternative | None:
     """Return a random telegraph as alternative to correlated noise.
 
     Parameters
@@ -73,11 +73,15 @@ def telegraph(axis: Axis, state: Hypothesis, at: int) -> NonGaussianAlternative 
     """
     noise = state.effects[at]
     assert isinstance(noise, ExponentiallyCorrelated)
-    rest = _rest(state.effects, without=at)
+    rest = _background_noise(state.effects, without=at)
     if not rest.white > 0.0:
         return None
-    contest = telegraph_or_correlated(
-        series(axis.residual(state.likely)), 1.0 / axis.rate_hz, rest, noise.sigma, noise.correlation_time
+    contest = compare_telegraph_with_correlated(
+        inverse_cosine_transform(axis.residual(state.likely)),
+        1.0 / axis.rate_hz,
+        rest,
+        noise.sigma,
+        noise.correlation_time,
     )
     amplitude, dwell = (float(contest.first[name].value) for name in ("amplitude", "dwell_time"))
     effect = RandomTelegraph(amplitude=amplitude, dwell_time=dwell)
@@ -85,7 +89,7 @@ def telegraph(axis: Axis, state: Hypothesis, at: int) -> NonGaussianAlternative 
     return NonGaussianAlternative(found, contest.gain, contest.first, contest.events)
 
 
-def poisson(axis: Axis, state: Hypothesis) -> NonGaussianAlternative | None:
+def fit_poisson_alternative(axis: Axis, state: Hypothesis) -> NonGaussianAlternative | None:
     """Return Poisson steps as alternative to single steps or to an increased random walk.
 
     Parameters
@@ -115,14 +119,14 @@ def poisson(axis: Axis, state: Hypothesis) -> NonGaussianAlternative | None:
     known = max((size(sizes[at]) for at in walks if at < state.given), default=0.0)
     walk = axis.fit((*sizes, *bare, RateRandomWalk(K=max(known, 1e-12))), held)
     excess = size(walk.effects[-1])
-    rest = _rest(without.effects)
+    rest = _background_noise(without.effects)
     if not (excess > 0.0 and rest.white > 0.0):
         return None
-    left, tau0_s = series(axis.residual(without)), 1.0 / axis.rate_hz
-    contest = steps_or_walk(left, tau0_s, rest, excess)
+    left, tau0_s = inverse_cosine_transform(axis.residual(without)), 1.0 / axis.rate_hz
+    contest = compare_steps_with_random_walk(left, tau0_s, rest, excess)
     gain, whole = contest.gain, walk.log_likelihood + contest.gain
     if steps:
-        contest = steps_or_once(left, tau0_s, rest, excess, most=max(len(steps), MIN_FITTED_STEPS))
+        contest = compare_steps_with_single_steps(left, tau0_s, rest, excess, most=max(len(steps), MIN_FITTED_STEPS))
         single = sum(name.startswith("time") for name in contest.second)
         gain = contest.gain + STEP_PENALTY_NATS * max(single - MAX_FREE_STEPS, 0)
     rate, height = (float(contest.first[name].value) for name in ("rate", "height"))
@@ -130,7 +134,7 @@ def poisson(axis: Axis, state: Hypothesis) -> NonGaussianAlternative | None:
     return NonGaussianAlternative(found, gain - POISSON_PENALTY_NATS, contest.first, contest.events, whole=whole)
 
 
-def _rest(effects: Effects, without: int | None = None) -> Rest:
+def _background_noise(effects: Effects, without: int | None = None) -> BackgroundNoise:
     """Return the noise of an axis, without one effect, in the form that the likelihood ratios use."""
     white = walk = flicker = 0.0
     correlated: list[tuple[float, float]] = []
@@ -150,4 +154,4 @@ def _rest(effects: Effects, without: int | None = None) -> Rest:
                 correlated.append((effect.sigma, effect.correlation_time))
             case RandomTelegraph():
                 correlated.append((0.5 * effect.amplitude, 0.5 * effect.dwell_time))
-    return Rest(white, walk, flicker, tuple(correlated))
+    return BackgroundNoise(white, walk, flicker, tuple(correlated))

@@ -15,25 +15,31 @@ import numpy as np
 
 from monitor.noise.effect import Effect, Leak
 from monitor.noise.effects import BiasStep, ExponentiallyCorrelated, Outliers, RateRandomWalk, SampleHold, Saturation
-from monitor.reconcile.diagnostics.diagnostics import LENSES, Sight, sight
-from monitor.reconcile.diagnostics.figures import views
-from monitor.reconcile.diagnostics.gap import Findings, Null, look
-from monitor.reconcile.likelihood.effect_terms import COURSE, NATURAL, NOISE, ONCE, size
-from monitor.reconcile.likelihood.hypothesis import Hypothesis, believed, settled
+from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS, WhitenedAxis, whiten_axis
+from monitor.reconcile.diagnostics.figures import plot_data
+from monitor.reconcile.diagnostics.gap import Findings, NullDistribution, run_diagnostics
+from monitor.reconcile.likelihood.effect_terms import (
+    DETERMINISTIC_SIZE_PARAMETERS,
+    NATURAL_DIAGNOSTIC,
+    NOISE_SIZE_PARAMETERS,
+    ONE_TIME_EFFECTS,
+    size,
+)
+from monitor.reconcile.likelihood.hypothesis import Hypothesis, fit_with_fewest_changes, fit_with_given_sizes
 from monitor.reconcile.preparation.axis import Axis, Effects
-from monitor.reconcile.preparation.cosine_bins import bins
-from monitor.reconcile.preparation.prepare import again
-from monitor.reconcile.result import View
-from monitor.reconcile.search.candidates import PRICE, correlated, peaks
-from monitor.reconcile.search.cross_validation import CrossValidation, proof
+from monitor.reconcile.preparation.cosine_bins import frequency_bins
+from monitor.reconcile.preparation.prepare import repair_again
+from monitor.reconcile.result import PlotData
+from monitor.reconcile.search.candidates import PENALTY_NATS, find_spectral_peaks, propose_correlated_noise
+from monitor.reconcile.search.cross_validation import CrossValidation, cross_validate
 from monitor.reconcile.search.non_gaussian_alternatives import (
     MIN_ALTERNATIVE_GAIN_NATS,
     NonGaussianAlternative,
-    poisson,
-    telegraph,
+    fit_poisson_alternative,
+    fit_telegraph_alternative,
 )
-from monitor.reconcile.search.trials import UNNAMED, Trial, replacements_for_resizing, tried
-from monitor.reconcile.search.withdrawal import SMOOTH_SPECTRA, upheld
+from monitor.reconcile.search.trials import UNNAMED, Trial, replacements_for_resizing, trial_groups
+from monitor.reconcile.search.withdrawal import SMOOTH_SPECTRA, supported_effects
 
 MAX_ROUNDS: Final = 8
 """Largest number of rounds."""
@@ -59,7 +65,7 @@ SHARED_SPECTRUM: Final = CrossValidation(
 class Round:
     """Result of one round of the search."""
 
-    views: tuple[View, ...]  # before the round
+    views: tuple[PlotData, ...]  # before the round
     seen: Findings  # before the round
     trials: tuple[Trial, ...]  # the first was selected; the others follow, best first
     state: Hypothesis  # after the round
@@ -74,13 +80,13 @@ class Search:
     rounds: tuple[Round, ...]
     axis: Axis  # repaired, with bins as fine as its peaks require
     state: Hypothesis
-    views: tuple[View, ...]  # at the end
+    views: tuple[PlotData, ...]  # at the end
     seen: Findings  # at the end
-    before: tuple[tuple[View, ...], Findings] | None  # state before effects were withdrawn; None if none were
+    before: tuple[tuple[PlotData, ...], Findings] | None  # state before effects were withdrawn; None if none were
     rivals: tuple[Trial, ...]  # trials of a last round that selected nothing
 
 
-def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.Generator) -> Search:
+def search_axis(axis: Axis, model: Effects, null: Mapping[str, NullDistribution], rng: np.random.Generator) -> Search:
     """Search for the effects that explain one axis.
 
     Parameters
@@ -94,12 +100,12 @@ def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.
     rng : numpy.random.Generator
         Generator for the replacement of samples that are found to be wrong.
     """
-    state = start = believed(axis, model)
+    state = start = fit_with_given_sizes(axis, model)
     rounds: list[Round] = []
     rivals: tuple[Trial, ...] = ()
     while True:
-        view = sight(axis, state.likely)
-        seen = look(view)
+        view = whiten_axis(axis, state.likely)
+        seen = run_diagnostics(view)
         closed = not any(one.gain > null[lens].threshold for lens, one in seen.items())
         if len(rounds) == MAX_ROUNDS:
             break
@@ -112,18 +118,18 @@ def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.
             )
             if jumps is None or jumps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
                 break
-            state = settled(axis, jumps.found, model)
-            rounds.append(Round(views(view), seen, _trials_of_alternative(jumps, 0.0), state, SHARED_SPECTRUM))
+            state = fit_with_fewest_changes(axis, jumps.found, model)
+            rounds.append(Round(plot_data(view), seen, _trials_of_alternative(jumps, 0.0), state, SHARED_SPECTRUM))
             continue
-        finer = bins(axis.n, axis.rate_hz, peaks(view))
+        finer = frequency_bins(axis.n, axis.rate_hz, find_spectral_peaks(view))
         if finer.count.size > axis.bins.count.size + 8:
             axis = axis.rebinned(finer)
             state = Hypothesis(model, axis.fit(state.effects, state.likely.held))
             start = start if rounds else state
-            view = sight(axis, state.likely)
+            view = whiten_axis(axis, state.likely)
         asked: list[Trial] = []
         taken = None
-        for trials in [better] if better else tried(axis, state, view):
+        for trials in [better] if better else trial_groups(axis, state, view):
             asked += trials
             taken = _select_trial(axis, state, trials, view, seen, null, rng)
             if taken is not None or (trials and trials[0].name == UNNAMED):
@@ -134,24 +140,26 @@ def search(axis: Axis, model: Effects, null: Mapping[str, Null], rng: np.random.
         axis, done = taken
         state = done.state
         rounds.append(done)
-    kept = tuple(effect for effect in upheld(state, _gains_by_type(rounds), seen, null) if not _has_zero_size(effect))
+    kept = tuple(
+        effect for effect in supported_effects(state, _gains_by_type(rounds), seen, null) if not _has_zero_size(effect)
+    )
     before = None
     while kept != state.found:
-        before = before or (views(view), seen)
-        state = settled(axis, kept, model)
-        view = sight(axis, state.likely)
-        seen = look(view)
+        before = before or (plot_data(view), seen)
+        state = fit_with_fewest_changes(axis, kept, model)
+        view = whiten_axis(axis, state.likely)
+        seen = run_diagnostics(view)
         kept = tuple(effect for effect in state.found if not _has_zero_size(effect))
-    return Search(start, tuple(rounds), axis, state, views(view), seen, before, rivals)
+    return Search(start, tuple(rounds), axis, state, plot_data(view), seen, before, rivals)
 
 
 def _select_trial(
     axis: Axis,
     state: Hypothesis,
     trials: list[Trial],
-    view: Sight,
+    view: WhitenedAxis,
     seen: Findings,
-    null: Mapping[str, Null],
+    null: Mapping[str, NullDistribution],
     rng: np.random.Generator,
 ) -> tuple[Axis, Round] | None:
     """Return the best trial of one kind that passes cross-validation, or None."""
@@ -159,27 +167,30 @@ def _select_trial(
     for at, trial in enumerate(trials[:MAX_VALIDATION_ATTEMPTS]):
         if trial.value <= 0.0 or trial.name == UNNAMED:
             return None
-        lens = NATURAL.get(trial.name, strongest)
+        lens = NATURAL_DIAGNOSTIC.get(trial.name, strongest)
         found = state.found if trial.effect is None else (*state.found, trial.effect)
-        mended = again(axis, (*state.model, *found), rng) if type(trial.effect) in REPAIRED_EFFECTS else axis
-        after = pruned(mended, settled(mended, found, state.model))
+        mended = repair_again(axis, (*state.model, *found), rng) if type(trial.effect) in REPAIRED_EFFECTS else axis
+        after = drop_unneeded_effects(mended, fit_with_fewest_changes(mended, found, state.model))
         if trial.effect is not None and _has_zero_size(after.found[-1]):
             continue
-        if trial.name in ONCE and LENSES[lens](sight(mended, after.likely)).gain >= seen[lens].gain:
+        if (
+            trial.name in ONE_TIME_EFFECTS
+            and DIAGNOSTICS[lens](whiten_axis(mended, after.likely)).gain >= seen[lens].gain
+        ):
             continue
         added = None if trial.effect is None else after.found[-1]
         told = trials[at:]
-        beside = sight(mended, after.likely)
+        beside = whiten_axis(mended, after.likely)
         if _is_gaussian_and_stationary(beside, null):
             after, told = resolve_distribution(mended, after, told, beside)
-        proven = proof(mended, state, after, added, lens, null[lens], rng)
+        proven = cross_validate(mended, state, after, added, lens, null[lens], rng)
         if proven.kept:
-            return mended, Round(views(view), seen, tuple(told), after, proven)
+            return mended, Round(plot_data(view), seen, tuple(told), after, proven)
     return None
 
 
 def resolve_distribution(
-    axis: Axis, state: Hypothesis, trials: list[Trial], view: Sight
+    axis: Axis, state: Hypothesis, trials: list[Trial], view: WhitenedAxis
 ) -> tuple[Hypothesis, list[Trial]]:
     """Replace a new effect by one with the same spectrum if its distribution fits better.
 
@@ -205,7 +216,7 @@ def resolve_distribution(
     if isinstance(trials[0].effect, ExponentiallyCorrelated) and isinstance(
         state.effects[last], ExponentiallyCorrelated
     ):
-        alternative = telegraph(axis, state, last)
+        alternative = fit_telegraph_alternative(axis, state, last)
     elif isinstance(trials[0].effect, BiasStep):
         alternative = compare_jump_processes(axis, state, view)
     if alternative is None:
@@ -213,10 +224,10 @@ def resolve_distribution(
     named = _trials_of_alternative(alternative, trials[0].value)
     if alternative.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return state, [trials[0], *named, *trials[1:]]
-    return settled(axis, alternative.found, state.model), [*named, *trials]
+    return fit_with_fewest_changes(axis, alternative.found, state.model), [*named, *trials]
 
 
-def compare_jump_processes(axis: Axis, state: Hypothesis, view: Sight) -> NonGaussianAlternative | None:
+def compare_jump_processes(axis: Axis, state: Hypothesis, view: WhitenedAxis) -> NonGaussianAlternative | None:
     """Return Poisson steps as alternative to a random walk or single steps, or a slow telegraph if it fits better.
 
     Parameters
@@ -233,7 +244,7 @@ def compare_jump_processes(axis: Axis, state: Hypothesis, view: Sight) -> NonGau
     NonGaussianAlternative or None
         The alternative, or None if the axis has no random walk and no steps that it could replace.
     """
-    steps = poisson(axis, state)
+    steps = fit_poisson_alternative(axis, state)
     if steps is None or steps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return steps
     # Use the original random walk of the model. An increased random walk would leave nothing for a telegraph.
@@ -241,29 +252,29 @@ def compare_jump_processes(axis: Axis, state: Hypothesis, view: Sight) -> NonGau
     held = state.likely.held | walks
     known = [state.model[at] if at in walks else state.effects[at] for at in range(state.given)]
     bare = (*known, *(one for one in state.found if type(one) not in WALK_EFFECTS))
-    for noise in correlated(axis, Hypothesis(state.model, axis.fit(bare, held)), view):
+    for noise in propose_correlated_noise(axis, Hypothesis(state.model, axis.fit(bare, held)), view):
         other = Hypothesis(state.model, axis.fit((*bare, noise), held))
         if _has_zero_size(other.found[-1]):
             continue
-        switching = telegraph(axis, other, len(other.effects) - 1)
+        switching = fit_telegraph_alternative(axis, other, len(other.effects) - 1)
         if switching is None or switching.events < MIN_SWITCHES:
             continue
         over = other.likely.log_likelihood + switching.gain - steps.whole
-        over -= PRICE["random_telegraph"] - PRICE["poisson_steps"]
+        over -= PENALTY_NATS["random_telegraph"] - PENALTY_NATS["poisson_steps"]
         if over > 0.0:
             return replace(switching, gain=steps.gain + over, rival=steps)
     return steps
 
 
-def _is_gaussian_and_stationary(view: Sight, null: Mapping[str, Null]) -> bool:
+def _is_gaussian_and_stationary(view: WhitenedAxis, null: Mapping[str, NullDistribution]) -> bool:
     """Return True if the samples are Gaussian and stationary.
 
     Otherwise, effects that differ only in their distribution cannot be distinguished.
     """
-    return all(LENSES[lens](view).gain <= null[lens].threshold for lens in DISTRIBUTION_DIAGNOSTICS)
+    return all(DIAGNOSTICS[lens](view).gain <= null[lens].threshold for lens in DISTRIBUTION_DIAGNOSTICS)
 
 
-def pruned(axis: Axis, state: Hypothesis) -> Hypothesis:
+def drop_unneeded_effects(axis: Axis, state: Hypothesis) -> Hypothesis:
     """Return the hypothesis without effects from earlier rounds that no longer contribute.
 
     Parameters
@@ -275,8 +286,11 @@ def pruned(axis: Axis, state: Hypothesis) -> Hypothesis:
     """
     for at in range(len(state.found) - 2, -1, -1):
         effect = state.found[at]
-        less = settled(axis, state.found[:at] + state.found[at + 1 :], state.model)
-        if state.score - less.score < 0.5 * PRICE.get(effect.name, 0.0) and type(effect) in NOISE | COURSE:
+        less = fit_with_fewest_changes(axis, state.found[:at] + state.found[at + 1 :], state.model)
+        if (
+            state.score - less.score < 0.5 * PENALTY_NATS.get(effect.name, 0.0)
+            and type(effect) in NOISE_SIZE_PARAMETERS | DETERMINISTIC_SIZE_PARAMETERS
+        ):
             state = less
     return state
 
@@ -291,14 +305,14 @@ def _gains_by_type(rounds: list[Round]) -> dict[type[Effect], float]:
         if one.state.found:
             kind = type(one.state.found[-1])
             own = issubclass(kind, (Leak, BiasStep, *SMOOTH_SPECTRA))
-            lenses = (NATURAL[kind.name],) if own else tuple(one.seen)
+            lenses = (NATURAL_DIAGNOSTIC[kind.name],) if own else tuple(one.seen)
             found[kind] = max(found.get(kind, 0.0), *(one.seen[lens].gain for lens in lenses))
     return found
 
 
 def _has_zero_size(effect: Effect) -> bool:
     """Return True if the fit gave a noise effect the size zero."""
-    return type(effect) in NOISE and size(effect) == 0.0
+    return type(effect) in NOISE_SIZE_PARAMETERS and size(effect) == 0.0
 
 
 def _trials_of_alternative(alternative: NonGaussianAlternative, value: float) -> tuple[Trial, ...]:

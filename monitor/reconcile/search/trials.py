@@ -32,13 +32,18 @@ from monitor.noise.effects import (
     Saturation,
     ScaleFactor,
 )
-from monitor.reconcile.diagnostics.diagnostics import MARGIN, Sight, unsteady
-from monitor.reconcile.likelihood.effect_terms import NOISE
-from monitor.reconcile.likelihood.hypothesis import GOLDEN, RESIZE_PENALTY_NATS, Hypothesis, settled
+from monitor.reconcile.diagnostics.diagnostics import STEP_MARGIN_FRACTION, WhitenedAxis, least_constant_tiles
+from monitor.reconcile.likelihood.effect_terms import NOISE_SIZE_PARAMETERS
+from monitor.reconcile.likelihood.hypothesis import GOLDEN, RESIZE_PENALTY_NATS, Hypothesis, fit_with_fewest_changes
 from monitor.reconcile.preparation.axis import Axis, Effects
-from monitor.reconcile.preparation.value_statistics import Size
-from monitor.reconcile.result import Bounds
-from monitor.reconcile.search.candidates import DETERMINISTIC_CANDIDATES, NOISE_CANDIDATES, PRICE, correlated
+from monitor.reconcile.preparation.value_statistics import Interval
+from monitor.reconcile.result import ParameterInterval
+from monitor.reconcile.search.candidates import (
+    DETERMINISTIC_CANDIDATES,
+    NOISE_CANDIDATES,
+    PENALTY_NATS,
+    propose_correlated_noise,
+)
 
 UNNAMED: Final = "power_law"
 """Name of a trial that corresponds to no known effect."""
@@ -80,11 +85,13 @@ class Trial:
     effect: Effect | None  # None: no known effect, or no new effect
     value: float  # gain less penalty, nats; for a deterministic effect, together with the best slow noise
     alone: float = 0.0  # gain less penalty of a deterministic effect without such noise, nats
-    bounds: Mapping[str, Bounds] = field(default_factory=dict)  # parameters that the spectrum does not determine
+    bounds: Mapping[str, ParameterInterval] = field(
+        default_factory=dict
+    )  # parameters that the spectrum does not determine
     events: int = 0  # number of events that were detected
 
 
-def tried(axis: Axis, state: Hypothesis, seen: Sight) -> Iterator[list[Trial]]:
+def trial_groups(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> Iterator[list[Trial]]:
     """Yield the trials of one kind after the other, each kind with the best trial first.
 
     Parameters
@@ -109,7 +116,7 @@ def tried(axis: Axis, state: Hypothesis, seen: Sight) -> Iterator[list[Trial]]:
         yield courses
 
 
-def replacements_for_resizing(axis: Axis, state: Hypothesis, view: Sight) -> list[Trial]:
+def replacements_for_resizing(axis: Axis, state: Hypothesis, view: WhitenedAxis) -> list[Trial]:
     """Return effects that explain the data better than changed sizes of known noise effects.
 
     Parameters
@@ -122,14 +129,18 @@ def replacements_for_resizing(axis: Axis, state: Hypothesis, view: Sight) -> lis
         Axis whitened by ``state``.
     """
     found = [one for one in _deterministic_trials(axis, state, view) if one.alone > 0.0 and one.value > 0.0]
-    for effect in correlated(axis, state, view):
-        value = settled(axis, (*state.found, effect), state.model).score - state.score - PRICE[effect.name]
+    for effect in propose_correlated_noise(axis, state, view):
+        value = (
+            fit_with_fewest_changes(axis, (*state.found, effect), state.model).score
+            - state.score
+            - PENALTY_NATS[effect.name]
+        )
         if value > 0.0:
             found.append(Trial(effect.name, effect, value))
     return sorted(found, key=lambda one: -one.value)
 
 
-def _value_trials(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
+def _value_trials(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Trial]:
     """Return the trials of quantization, clipping and repeats."""
     have, shown = {type(effect) for effect in state.effects}, axis.shown
     found: list[Trial] = []
@@ -156,7 +167,7 @@ def _value_trials(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
     return sorted(found, key=lambda one: -one.value)
 
 
-def _sample_trials(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
+def _sample_trials(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Trial]:
     """Return the trials of outliers and of a step of the noise."""
     found: list[Trial] = []
     far, course = seen.outliers, seen.course
@@ -174,7 +185,7 @@ def _sample_trials(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
         found.append(_penalised_trial(effect, far.gain, bounds, far.count))
     rival = max(course.trend, course.periodic.gain, course.wander)
     length_s = axis.n / axis.rate_hz
-    inside = MARGIN * length_s < course.step.time.value < (1.0 - MARGIN) * length_s
+    inside = STEP_MARGIN_FRACTION * length_s < course.step.time.value < (1.0 - STEP_MARGIN_FRACTION) * length_s
     if (
         inside
         and course.step.gain > rival - RIVAL_MARGIN_NATS
@@ -187,12 +198,12 @@ def _sample_trials(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
     return sorted(found, key=lambda one: -one.value)
 
 
-def _band_burst_gain(seen: Sight) -> float:
+def _band_burst_gain(seen: WhitenedAxis) -> float:
     """Return the gain in nats of the least constant place of the spectrogram if it is a band, otherwise 0.
 
     A change within a band is no step of the white noise.
     """
-    found = unsteady(seen)
+    found = least_constant_tiles(seen)
     return found.gain if np.ptp(found.frequency) < MAX_BAND_FRACTION * seen.axis.rate_hz else 0.0
 
 
@@ -205,27 +216,31 @@ def _whitened_unit(axis: Axis, state: Hypothesis) -> float:
     return float(np.sqrt(variance.sum() / count.sum()))
 
 
-def _penalised_trial(effect: Effect, gain: float, bounds: Mapping[str, Bounds], events: int = 0) -> Trial:
+def _penalised_trial(effect: Effect, gain: float, bounds: Mapping[str, ParameterInterval], events: int = 0) -> Trial:
     """Return a trial whose value is the gain less the penalty of the effect."""
-    return Trial(effect.name, effect, gain - PRICE[effect.name], bounds=bounds, events=events)
+    return Trial(effect.name, effect, gain - PENALTY_NATS[effect.name], bounds=bounds, events=events)
 
 
-def _scaled_bounds(found: Size, unit: float = 1.0) -> Bounds:
+def _scaled_bounds(found: Interval, unit: float = 1.0) -> ParameterInterval:
     """Return an interval in another unit."""
-    return Bounds(unit * found.value, unit * found.lo, unit * found.hi)
+    return ParameterInterval(unit * found.value, unit * found.lo, unit * found.hi)
 
 
-def _noise_trials(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
+def _noise_trials(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Trial]:
     """Return the trials of noise effects by their score, including an unnamed one."""
-    resized = settled(axis, state.found, state.model)
+    resized = fit_with_fewest_changes(axis, state.found, state.model)
     found = [Trial(RETUNE, None, resized.score - state.score - MIN_RESIZE_GAIN_NATS)]
     for family in NOISE_CANDIDATES:
         for effect in family(axis, state, seen):
-            value = settled(axis, (*state.found, effect), state.model).score - state.score - PRICE[effect.name]
+            value = (
+                fit_with_fewest_changes(axis, (*state.found, effect), state.model).score
+                - state.score
+                - PENALTY_NATS[effect.name]
+            )
             found.append(Trial(effect.name, effect, value))
     found.append(_scale_factor_trial(axis, state, resized))
     found.sort(key=lambda one: -one.value)
-    value = max(_power_law_score(axis, state, exponent) for exponent in EXPONENTS) - state.score - PRICE[UNNAMED]
+    value = max(_power_law_score(axis, state, exponent) for exponent in EXPONENTS) - state.score - PENALTY_NATS[UNNAMED]
     if value > max(found[0].value, 0.0) + UNNAMED_MARGIN_NATS and found[0].name in POWER_LAW_RIVALS:
         return [Trial(UNNAMED, None, value), *found]
     return found
@@ -244,27 +259,29 @@ POWER_LAW_RIVALS: Final = frozenset(
 """Effects that compete with a power law."""
 
 
-def _deterministic_trials(axis: Axis, state: Hypothesis, seen: Sight) -> list[Trial]:
+def _deterministic_trials(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Trial]:
     """Return the trials of effects that follow time, temperature or another axis."""
     free = axis.fit(state.effects).log_likelihood
     kept: list[Effect] = []
     for family in DETERMINISTIC_CANDIDATES:
         for effect in family(axis, state, seen):
             gain = axis.fit((*state.effects, effect)).log_likelihood - free
-            if gain > 0.3 * PRICE[effect.name] and (
+            if gain > 0.3 * PENALTY_NATS[effect.name] and (
                 not isinstance(effect, Leak) or _has_flat_coefficient(seen, effect)
             ):
                 kept.append(effect)
     if not kept:
         return []
     beside = _slow_noise_scores(axis, state)
-    without = max(settled(axis, state.found, state.model).score, *(one(state.effects) for one in beside))
+    without = max(
+        fit_with_fewest_changes(axis, state.found, state.model).score, *(one(state.effects) for one in beside)
+    )
     trials = []
     for effect in kept:
         with_it = (*state.effects, effect)
-        alone = settled(axis, (*state.found, effect), state.model).score
+        alone = fit_with_fewest_changes(axis, (*state.found, effect), state.model).score
         gain = max(alone, *(one(with_it) for one in beside)) - without
-        price = PRICE[effect.name] + _quadratic_penalty(effect)
+        price = PENALTY_NATS[effect.name] + _quadratic_penalty(effect)
         trials.append(Trial(effect.name, effect, gain - price, alone - state.score - price))
     trials.sort(key=lambda one: -one.value)
     curved = _curved_drift_score(axis, state) - without
@@ -273,7 +290,7 @@ def _deterministic_trials(axis: Axis, state: Hypothesis, seen: Sight) -> list[Tr
     return trials
 
 
-def _has_flat_coefficient(seen: Sight, leak: Leak) -> bool:
+def _has_flat_coefficient(seen: WhitenedAxis, leak: Leak) -> bool:
     """Return True if one coefficient describes a leak at all frequencies.
 
     If something shakes both axes, the coefficient depends on the frequency. The coefficients in ``FREQUENCY_BANDS``
@@ -291,7 +308,7 @@ def _curved_drift_score(axis: Axis, state: Hypothesis) -> float:
     """Return the score of a curved drift without a name, less its penalty."""
     ramp = RateRamp(R=1e-3 * float(np.sqrt(np.mean(axis.coefficients**2))))
     bent = axis.fit((*state.effects, ramp), state.likely.held, curved=True)
-    return bent.log_likelihood - RESIZE_PENALTY_NATS * state.freed - PRICE["rate_ramp"] - QUADRATIC_PENALTY_NATS
+    return bent.log_likelihood - RESIZE_PENALTY_NATS * state.freed - PENALTY_NATS["rate_ramp"] - QUADRATIC_PENALTY_NATS
 
 
 def _quadratic_penalty(effect: Effect) -> float:
@@ -308,11 +325,11 @@ def _slow_noise_scores(axis: Axis, state: Hypothesis) -> list[Callable[[Effects]
     held, cost, length_s = state.likely.held, RESIZE_PENALTY_NATS * state.freed, axis.n / axis.rate_hz
 
     def beside(one: Effect) -> Callable[[Effects], float]:
-        return lambda effects: axis.fit((*effects, one), held).log_likelihood - cost - PRICE[one.name]
+        return lambda effects: axis.fit((*effects, one), held).log_likelihood - cost - PENALTY_NATS[one.name]
 
     def beside_law(exponent: float) -> Callable[[Effects], float]:
         row = _power_law(axis, exponent)
-        return lambda effects: axis.fit(effects, held, row).log_likelihood - cost - PRICE[UNNAMED]
+        return lambda effects: axis.fit(effects, held, row).log_likelihood - cost - PENALTY_NATS[UNNAMED]
 
     times_s = np.geomspace(10.0 / axis.rate_hz, 0.1 * length_s, 8)
     stand_ins: list[Effect] = [ExponentiallyCorrelated(sigma=small, correlation_time=float(t)) for t in times_s]
@@ -341,7 +358,7 @@ def _scale_factor_trial(axis: Axis, state: Hypothesis, resized: Hypothesis) -> T
     wrong and one factor explains them as well, the factor is preferred.
     """
     effects = (*state.model, *state.found)
-    held = frozenset(at for at, effect in enumerate(state.model) if type(effect) in NOISE)
+    held = frozenset(at for at, effect in enumerate(state.model) if type(effect) in NOISE_SIZE_PARAMETERS)
 
     def value(x: float) -> float:
         return axis.fit((*effects, ScaleFactor(factor=float(np.exp(x)))), held).log_likelihood
@@ -352,7 +369,7 @@ def _scale_factor_trial(axis: Axis, state: Hypothesis, resized: Hypothesis) -> T
         a, b = hi - GOLDEN * (hi - lo), lo + GOLDEN * (hi - lo)
         lo, hi = (lo, b) if value(a) > value(b) else (a, hi)
     x = 0.5 * (lo + hi)
-    worth = value(x) - state.score - PRICE["scale_factor"]
+    worth = value(x) - state.score - PENALTY_NATS["scale_factor"]
     if resized.freed > 1 and value(x) > resized.likely.log_likelihood - SCALE_FACTOR_MARGIN_NATS:
         worth = max(worth, resized.score - state.score)
     return Trial("scale_factor", ScaleFactor(factor=float(np.exp(x))), worth)

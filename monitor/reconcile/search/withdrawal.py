@@ -24,7 +24,7 @@ import numpy as np
 
 from monitor.noise.effect import Effect, Leak
 from monitor.noise.effects import BandwidthLimit, BiasStep, ExponentiallyCorrelated, Narrowband, Sinusoidal
-from monitor.reconcile.diagnostics.gap import Findings, Null
+from monitor.reconcile.diagnostics.gap import Findings, NullDistribution
 from monitor.reconcile.likelihood.hypothesis import Hypothesis
 from monitor.reconcile.preparation.axis import Effects
 
@@ -58,8 +58,8 @@ FREQUENCY_DIAGNOSTICS: Final = ("psd", "lines", "spectrogram")
 """Diagnostics that locate a departure in frequency."""
 
 
-def upheld(
-    state: Hypothesis, closing: Mapping[type[Effect], float], seen: Findings, null: Mapping[str, Null]
+def supported_effects(
+    state: Hypothesis, closing: Mapping[type[Effect], float], seen: Findings, null: Mapping[str, NullDistribution]
 ) -> Effects:
     """Return the effects that were found on an axis and pass all checks.
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from math import hypot, sqrt
 from typing import Final, Literal
 
-from monitor.reconcile.likelihood.effect_terms import ONCE
-from monitor.reconcile.result import AxisResult, Reconciliation, Score, Step
+from monitor.reconcile.likelihood.effect_terms import ONE_TIME_EFFECTS
+from monitor.reconcile.result import AxisResult, Reconciliation, ReconciliationStep, Score
 
 Meaning = Literal["contradiction", "too_faint", "other_name", "unnamed", "may_differ"]
 """Meaning of an absence.
@@ -42,16 +42,16 @@ class Absence:
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class StrongestObservation:
     """Effect in the recording that shows it most clearly."""
 
-    step: Step
+    step: ReconciliationStep
     of: AxisResult  # result of the axis in that recording
     gap: float  # gap that the effect itself causes, standard deviations
     seconds: float  # length of that recording, s
 
 
-def absence(shown: Shown, run: str, other: Reconciliation) -> Absence:
+def explain_absence(shown: StrongestObservation, run: str, other: Reconciliation) -> Absence:
     """Return why a recording does not show an effect.
 
     Parameters
@@ -66,13 +66,13 @@ def absence(shown: Shown, run: str, other: Reconciliation) -> Absence:
     return Absence(run, *_explain_absence(shown, other))
 
 
-def _explain_absence(shown: Shown, other: Reconciliation) -> tuple[Meaning, str]:
+def _explain_absence(shown: StrongestObservation, other: Reconciliation) -> tuple[Meaning, str]:
     """Return the meaning of the absence and the sentence that explains it."""
     step, of = shown.step, shown.of
     there = other.axes.get(of.axis)
     if there is None:
         return "may_differ", f"{of.axis} is not in it"
-    if step.effect in ONCE:
+    if step.effect in ONE_TIME_EFFECTS:
         return "may_differ", "what happens once need not happen in another recording"
     if rival := _confused_effect(step, of, there):
         return "other_name", f"what is seen there was named {rival}, and the two are hard to tell apart"
@@ -86,10 +86,10 @@ def _explain_absence(shown: Shown, other: Reconciliation) -> tuple[Meaning, str]
         return "may_differ", f"how much of it is seen depends on how {source} moves"
     if seen is None or not shown.gap > 0.0:
         return "may_differ", f"the lens that found it ({step.found.lens}) tells nothing of its size there"
-    growth = _gap_ratio(step, shown.seconds, other.seconds, seen)
+    growth = _gap_ratio(step, shown.seconds, other.duration_s, seen)
     if growth is None:
         return "too_faint", "no changing temperature was recorded"
-    return _compare_expected_gap(growth * shown.gap, growth, seen, other.seconds)
+    return _compare_expected_gap(growth * shown.gap, growth, seen, other.duration_s)
 
 
 def _compare_expected_gap(expected: float, growth: float, seen: Score, seconds: float) -> tuple[Meaning, str]:
@@ -103,7 +103,7 @@ def _compare_expected_gap(expected: float, growth: float, seen: Score, seconds: 
     return ("contradiction" if expected > enough else "too_faint"), said
 
 
-def _gap_ratio(step: Step, seconds: float, other_s: float, seen: Score) -> float | None:
+def _gap_ratio(step: ReconciliationStep, seconds: float, other_s: float, seen: Score) -> float | None:
     """Return the expected gap of the other recording relative to the first one, for an effect of the same size.
 
     The result is None if the effect cannot be visible there.
@@ -121,7 +121,7 @@ def _gap_ratio(step: Step, seconds: float, other_s: float, seen: Score) -> float
     return sqrt(longer) * swing
 
 
-def _confused_effect(step: Step, axis_result: AxisResult, other_axis_result: AxisResult) -> str:
+def _confused_effect(step: ReconciliationStep, axis_result: AxisResult, other_axis_result: AxisResult) -> str:
     """Return an effect that only the other recording has if one of the two effects was the runner-up of the other."""
     mine = {one.effect for one in axis_result.steps}
     for one in other_axis_result.steps:
@@ -131,6 +131,6 @@ def _confused_effect(step: Step, axis_result: AxisResult, other_axis_result: Axi
     return ""
 
 
-def _runner_up_names(step: Step) -> set[str]:
+def _runner_up_names(step: ReconciliationStep) -> set[str]:
     """Return the names of the alternatives of a step."""
     return {one.effect for one in step.runners_up}

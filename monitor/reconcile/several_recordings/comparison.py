@@ -20,26 +20,39 @@ from drivers.sample import AXES
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Sinusoidal
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.reconcile import overall
-from monitor.reconcile.result import AxisResult, Bounds, Kind, Reconciliation, Step, Verdict
-from monitor.reconcile.several_recordings.absence import Absence, Shown, absence
+from monitor.reconcile.reconcile import combine_decisions
+from monitor.reconcile.result import (
+    AxisResult,
+    Decision,
+    ParameterInterval,
+    Reconciliation,
+    ReconciliationStep,
+    StepKind,
+)
+from monitor.reconcile.several_recordings.absence import Absence, StrongestObservation, explain_absence
 from monitor.reconcile.several_recordings.effect_matching import (
     SAMPLE_RATE_EFFECT,
+    closest_effect,
     distance,
     effect_of,
     fields_of,
-    nearest,
-    place,
-    place_name,
+    identifying_parameter,
+    identifying_parameter_name,
 )
-from monitor.reconcile.several_recordings.pooled_parameters import DISAGREE, Pooled, agreement, deviations, pooled
+from monitor.reconcile.several_recordings.pooled_parameters import (
+    MIN_AGREEMENT_PROBABILITY,
+    PooledParameter,
+    agreement,
+    distance_in_sigma,
+    pool_parameter,
+)
 
 NON_SIZE_PARAMETERS: Final = ("phase", "reference", "order")
 """Parameters that are not a size: they are chosen, or have no meaning in another recording."""
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class NamedResult:
     """Result of one recording, with its name."""
 
     name: str
@@ -47,22 +60,22 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class MatchedEffect:
     """Effect on one axis, in one or more recordings."""
 
     effect: str
-    kind: Kind
-    steps: Mapping[str, Step]  # recording -> its step
-    parameters: Mapping[str, Pooled]
+    kind: StepKind
+    steps: Mapping[str, ReconciliationStep]  # recording -> its step
+    parameters: Mapping[str, PooledParameter]
     p: float | None  # probability that sizes as different as these come from one size; None: nothing to compare
     absent: tuple[Absence, ...] = ()
 
     @property
     def consistent(self) -> bool | None:
         """True if the sizes in all recordings agree, or None if there is nothing to compare."""
-        return None if self.p is None else self.p >= DISAGREE
+        return None if self.p is None else self.p >= MIN_AGREEMENT_PROBABILITY
 
-    def step(self) -> Step:
+    def step(self) -> ReconciliationStep:
         """Return the step of the first recording with the pooled parameters."""
         first = next(iter(self.steps.values()))
         return replace(first, parameters={name: one.bounds for name, one in self.parameters.items()})
@@ -74,17 +87,17 @@ class AxisRuns:
 
     axis: str
     results: Mapping[str, AxisResult]  # recording -> result of the axis
-    common: tuple[Seen, ...]
-    single: tuple[Seen, ...]
+    common: tuple[MatchedEffect, ...]
+    single: tuple[MatchedEffect, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
     """Joint result of several recordings."""
 
-    verdict: Verdict
-    runs: tuple[Run, ...]
-    silent: Mapping[str, str]  # recording without a result -> reason
+    verdict: Decision
+    runs: tuple[NamedResult, ...]
+    without_result: Mapping[str, str]  # recording without a result -> reason
     axes: Mapping[str, AxisRuns]  # in AXES order
     baseline: NoiseModel  # the model under test
     model: NoiseModel  # with the common effects
@@ -92,7 +105,9 @@ class Comparison:
     seed: int
 
 
-def compare(runs: Sequence[Run], fitted_to: str | None = None, silent: Mapping[str, str] | None = None) -> Comparison:
+def compare(
+    runs: Sequence[NamedResult], fitted_to: str | None = None, silent: Mapping[str, str] | None = None
+) -> Comparison:
     """Compare the results of several recordings that were reconciled with one model.
 
     Parameters
@@ -107,7 +122,7 @@ def compare(runs: Sequence[Run], fitted_to: str | None = None, silent: Mapping[s
     baseline = runs[0].result.baseline
     axes = {axis: _compare_axis(axis, runs) for axis in AXES if any(axis in run.result.axes for run in runs)}
     return Comparison(
-        overall([run.result.verdict for run in runs]),
+        combine_decisions([run.result.verdict for run in runs]),
         tuple(runs),
         dict(silent or {}),
         axes,
@@ -141,22 +156,22 @@ def add_common_effects(
             if seen.kind == "added":
                 effects[axis] = (*known, made)
             else:
-                old = nearest(known, seen.effect, fields_of(made))
+                old = closest_effect(known, seen.effect, fields_of(made))
                 effects[axis] = tuple(made if effect is old else effect for effect in known)
     return NoiseModel(effects, baseline.sample_rate_hz, baseline.temperature)
 
 
-def _with_pooled_parameters(effect: Effect, seen: Seen) -> Effect:
+def _with_pooled_parameters(effect: Effect, seen: MatchedEffect) -> Effect:
     """Return the effect with the pooled value of each parameter that has an interval. The phase of a line is random."""
     known = {name: one.bounds.value for name, one in seen.parameters.items() if one.bounds.lo is not None}
     made: Effect = replace(effect, **known)  # type: ignore[type-var]
     return replace(made, phase=None) if isinstance(made, Sinusoidal) else made
 
 
-def _compare_axis(axis: str, runs: Sequence[Run]) -> AxisRuns:
+def _compare_axis(axis: str, runs: Sequence[NamedResult]) -> AxisRuns:
     """Return the common and the single effects of one axis."""
     results = {run.name: run.result.axes[axis] for run in runs if axis in run.result.axes}
-    groups: list[dict[str, Step]] = []
+    groups: list[dict[str, ReconciliationStep]] = []
     for run in runs:
         for step in _steps_of_axis(run, axis, runs):
             _add_to_group(groups, run.name, step, axis, runs)
@@ -165,7 +180,7 @@ def _compare_axis(axis: str, runs: Sequence[Run]) -> AxisRuns:
     return AxisRuns(axis, results, common, tuple(one for one in every if one not in common))
 
 
-def _steps_of_axis(run: Run, axis: str, runs: Sequence[Run]) -> list[Step]:
+def _steps_of_axis(run: NamedResult, axis: str, runs: Sequence[NamedResult]) -> list[ReconciliationStep]:
     """Return the steps of one axis.
 
     A sample rate error belongs to the first axis on which any recording shows it.
@@ -175,12 +190,12 @@ def _steps_of_axis(run: Run, axis: str, runs: Sequence[Run]) -> list[Step]:
     return _sample_rate_steps(run) + steps if axis == _sample_rate_axis(runs) else steps
 
 
-def _sample_rate_steps(run: Run) -> list[Step]:
+def _sample_rate_steps(run: NamedResult) -> list[ReconciliationStep]:
     """Return the steps that correct the sample rate."""
     return [step for one in run.result.axes.values() for step in one.steps if step.effect == SAMPLE_RATE_EFFECT]
 
 
-def _sample_rate_axis(runs: Sequence[Run]) -> str:
+def _sample_rate_axis(runs: Sequence[NamedResult]) -> str:
     """Return the first axis on which any recording shows a sample rate error, or ""."""
     shown = {
         axis
@@ -191,16 +206,22 @@ def _sample_rate_axis(runs: Sequence[Run]) -> str:
     return next((axis for axis in AXES if axis in shown), "")
 
 
-def _add_to_group(groups: list[dict[str, Step]], run: str, step: Step, axis: str, runs: Sequence[Run]) -> None:
+def _add_to_group(
+    groups: list[dict[str, ReconciliationStep]],
+    run: str,
+    step: ReconciliationStep,
+    axis: str,
+    runs: Sequence[NamedResult],
+) -> None:
     """Add a step to the closest group of the same effect in other recordings, or start a new group."""
     models = {one.name: one.result.model for one in runs}
-    here = place(step, axis, models[run])
-    best: tuple[float, dict[str, Step]] | None = None
+    here = identifying_parameter(step, axis, models[run])
+    best: tuple[float, dict[str, ReconciliationStep]] | None = None
     for group in groups:
         other, first = next(iter(group.items()))
         if run in group or (first.effect, first.kind) != (step.effect, step.kind):
             continue
-        apart = distance(step.effect, here, place(first, axis, models[other]))
+        apart = distance(step.effect, here, identifying_parameter(first, axis, models[other]))
         if apart is not None and (best is None or apart < best[0]):
             best = apart, group
     if best is None:
@@ -209,33 +230,37 @@ def _add_to_group(groups: list[dict[str, Step]], run: str, step: Step, axis: str
         best[1][run] = step
 
 
-def _summarise_group(group: Mapping[str, Step], axis: str, runs: Sequence[Run]) -> Seen:
+def _summarise_group(group: Mapping[str, ReconciliationStep], axis: str, runs: Sequence[NamedResult]) -> MatchedEffect:
     """Return the effect that a group of steps describes."""
     first = next(iter(group.values()))
     parameters = _pool_parameters(group)
-    sizes = [one for name, one in parameters.items() if name not in (*NON_SIZE_PARAMETERS, place_name(first.effect))]
+    sizes = [
+        one
+        for name, one in parameters.items()
+        if name not in (*NON_SIZE_PARAMETERS, identifying_parameter_name(first.effect))
+    ]
     having = [run for run in runs if axis in run.result.axes or first.effect == SAMPLE_RATE_EFFECT]
     strongest = max((run for run in runs if run.name in group), key=lambda run: group[run.name].before.gap)
     step = group[strongest.name]
     # the sample rate error may be on another axis in that recording
     of = next(one for one in strongest.result.axes.values() if any(own is step for own in one.steps))
-    shown = Shown(step, of, _gap_of_effect(step, axis, strongest.result), strongest.result.seconds)
-    absent = tuple(absence(shown, run.name, run.result) for run in having if run.name not in group)
-    return Seen(first.effect, first.kind, dict(group), parameters, _size_agreement(sizes, parameters), absent)
+    shown = StrongestObservation(step, of, _gap_of_effect(step, axis, strongest.result), strongest.result.duration_s)
+    absent = tuple(explain_absence(shown, run.name, run.result) for run in having if run.name not in group)
+    return MatchedEffect(first.effect, first.kind, dict(group), parameters, _size_agreement(sizes, parameters), absent)
 
 
-def _gap_of_effect(step: Step, axis: str, result: Reconciliation) -> float:
+def _gap_of_effect(step: ReconciliationStep, axis: str, result: Reconciliation) -> float:
     """Return the gap that an effect itself causes.
 
     For a changed size, return the distance of the size in the model from its interval, in standard deviations.
     """
     if step.kind == "added":
         return sqrt(max(step.before.gap**2 - step.after.gap**2, 0.0))
-    given = nearest(result.baseline.effects[axis], step.effect, fields_of(effect_of(result.model, axis, step)))
-    return max(deviations(one, getattr(given, name)) for name, one in step.parameters.items())
+    given = closest_effect(result.baseline.effects[axis], step.effect, fields_of(effect_of(result.model, axis, step)))
+    return max(distance_in_sigma(one, getattr(given, name)) for name, one in step.parameters.items())
 
 
-def _size_agreement(sizes: Sequence[Pooled], parameters: Mapping[str, Pooled]) -> float | None:
+def _size_agreement(sizes: Sequence[PooledParameter], parameters: Mapping[str, PooledParameter]) -> float | None:
     """Return the probability that the sizes agree.
 
     For an effect without a size, such as a bandwidth limit, all parameters are compared.
@@ -243,14 +268,16 @@ def _size_agreement(sizes: Sequence[Pooled], parameters: Mapping[str, Pooled]) -
     return agreement(sizes or parameters.values())
 
 
-def _pool_parameters(group: Mapping[str, Step]) -> dict[str, Pooled]:
+def _pool_parameters(group: Mapping[str, ReconciliationStep]) -> dict[str, PooledParameter]:
     """Return the pooled parameters of a group of steps."""
     steps = [_at_common_reference(step, next(iter(group.values()))) for step in group.values()]
     names = dict.fromkeys(name for step in steps for name in step.parameters if name != "phase")
-    return {name: pooled([step.parameters[name] for step in steps if name in step.parameters]) for name in names}
+    return {
+        name: pool_parameter([step.parameters[name] for step in steps if name in step.parameters]) for name in names
+    }
 
 
-def _at_common_reference(step: Step, first: Step) -> Step:
+def _at_common_reference(step: ReconciliationStep, first: ReconciliationStep) -> ReconciliationStep:
     """Return a step whose quadratic temperature dependence refers to the temperature of the first recording.
 
     The coefficient becomes c + 2 q (T₁ − T₀).
@@ -261,16 +288,19 @@ def _at_common_reference(step: Step, first: Step) -> Step:
     twice = 2.0 * (_numerical_value(first.parameters["reference"]) - _numerical_value(own["reference"]))
     value = _numerical_value(own["coefficient"]) + twice * _numerical_value(own["quadratic"])
     half = hypot(_half_width(own["coefficient"]), twice * _half_width(own["quadratic"]))
-    moved = {"coefficient": Bounds(value, value - half, value + half), "reference": first.parameters["reference"]}
+    moved = {
+        "coefficient": ParameterInterval(value, value - half, value + half),
+        "reference": first.parameters["reference"],
+    }
     return replace(step, parameters={**own, **moved})
 
 
-def _numerical_value(bounds: Bounds) -> float:
+def _numerical_value(bounds: ParameterInterval) -> float:
     """Return the numerical value of a parameter."""
     assert not isinstance(bounds.value, str)
     return bounds.value
 
 
-def _half_width(bounds: Bounds) -> float:
+def _half_width(bounds: ParameterInterval) -> float:
     """Return half the width of the interval, or NaN if there is none."""
     return nan if bounds.lo is None or bounds.hi is None else 0.5 * (bounds.hi - bounds.lo)

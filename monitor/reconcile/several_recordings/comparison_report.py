@@ -12,14 +12,14 @@ from typing import Any, Final
 
 import msgspec
 
-from monitor.reconcile.result import Bounds, Step
-from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, Run, Seen
+from monitor.reconcile.result import ParameterInterval, ReconciliationStep
+from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, MatchedEffect, NamedResult
 
 SCHEMA: Final = "imu-monitor/reconcile-runs/1"
 """Name and version of the JSON schema."""
 
 
-def to_json(c: Comparison) -> bytes:
+def encode_comparison(c: Comparison) -> bytes:
     """Encode a comparison as JSON."""
     return msgspec.json.encode({
         "schema": SCHEMA,
@@ -28,13 +28,13 @@ def to_json(c: Comparison) -> bytes:
         "fitted_to": c.fitted_to,
         "recordings": [
             *(_run_entry(run) for run in c.runs),
-            *({"name": name, "folder": name, "verdict": None, "why": why} for name, why in c.silent.items()),
+            *({"name": name, "folder": name, "verdict": None, "why": why} for name, why in c.without_result.items()),
         ],
         "axes": {axis: _axis_entry(one) for axis, one in c.axes.items()},
     })  # fmt: skip
 
 
-def _run_entry(run: Run) -> dict[str, Any]:
+def _run_entry(run: NamedResult) -> dict[str, Any]:
     """Return the report entry of one recording."""
     return {
         "name": run.name,
@@ -42,7 +42,7 @@ def _run_entry(run: Run) -> dict[str, Any]:
         "verdict": run.result.verdict,
         "rate": _finite_or_none(run.result.rate_hz),
         "samples": int(run.result.samples),
-        "seconds": _finite_or_none(run.result.seconds),
+        "seconds": _finite_or_none(run.result.duration_s),
     }
 
 
@@ -61,7 +61,7 @@ def _axis_entry(one: AxisRuns) -> dict[str, Any]:
     }
 
 
-def _effect_entry(seen: Seen) -> dict[str, Any]:
+def _effect_entry(seen: MatchedEffect) -> dict[str, Any]:
     """Return the report entry of one effect."""
     return {
         "effect": seen.effect,
@@ -77,7 +77,7 @@ def _effect_entry(seen: Seen) -> dict[str, Any]:
     }
 
 
-def _step_entry(step: Step) -> dict[str, Any]:
+def _step_entry(step: ReconciliationStep) -> dict[str, Any]:
     """Return the report entry of one effect in one recording."""
     return {
         "parameters": {name: _bounds_entry(one) for name, one in step.parameters.items()},
@@ -86,7 +86,7 @@ def _step_entry(step: Step) -> dict[str, Any]:
     }
 
 
-def _bounds_entry(one: Bounds) -> dict[str, Any]:
+def _bounds_entry(one: ParameterInterval) -> dict[str, Any]:
     """Return the report entry of a parameter."""
     if isinstance(one.value, str):
         return {"value": one.value}

@@ -11,9 +11,9 @@ from typing import Any, Final
 
 from monitor.noise.effect import Effect
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.result import Bounds, Step
+from monitor.reconcile.result import ParameterInterval, ReconciliationStep
 
-PLACES: Final[Mapping[str, tuple[str, float]]] = {
+IDENTIFYING_PARAMETERS: Final[Mapping[str, tuple[str, float]]] = {
     "sinusoidal": ("frequency", 0.005),
     "narrowband": ("frequency", 0.05),
     "exponentially_correlated": ("correlation_time", 1 / 3),
@@ -36,12 +36,12 @@ SAMPLE_RATE_EFFECT: Final = "sample_rate_error"
 """Name of the effect that is common to all axes of a recording."""
 
 
-def place_name(effect: str) -> str:
+def identifying_parameter_name(effect: str) -> str:
     """Return the name of the parameter that identifies an effect, or "" if there is none."""
-    return PLACES.get(effect, ("", 0.0))[0]
+    return IDENTIFYING_PARAMETERS.get(effect, ("", 0.0))[0]
 
 
-def place(step: Step, axis: str, model: NoiseModel) -> Bounds | None:
+def identifying_parameter(step: ReconciliationStep, axis: str, model: NoiseModel) -> ParameterInterval | None:
     """Return the parameter that identifies an effect among effects of the same name.
 
     A step that changes a known effect contains only its size. The model of the recording then provides the parameter.
@@ -55,11 +55,13 @@ def place(step: Step, axis: str, model: NoiseModel) -> Bounds | None:
     model : NoiseModel
         Model of the same recording, with all effects that were found.
     """
-    name = place_name(step.effect)
-    return (step.parameters.get(name) or Bounds(getattr(effect_of(model, axis, step), name))) if name else None
+    name = identifying_parameter_name(step.effect)
+    return (
+        (step.parameters.get(name) or ParameterInterval(getattr(effect_of(model, axis, step), name))) if name else None
+    )
 
 
-def distance(effect: str, a: Bounds | None, b: Bounds | None) -> float | None:
+def distance(effect: str, a: ParameterInterval | None, b: ParameterInterval | None) -> float | None:
     """Return the relative distance of two identifying parameters, or None if they do not match.
 
     The distance is 0 if one of the parameters is None.
@@ -80,12 +82,12 @@ def distance(effect: str, a: Bounds | None, b: Bounds | None) -> float | None:
         return 0.0
     if isinstance(a.value, str) or isinstance(b.value, str):
         return 0.0 if a.value == b.value else None
-    share = PLACES[effect][1]
+    share = IDENTIFYING_PARAMETERS[effect][1]
     (lo, hi), (other_lo, other_hi) = _widened_interval(a, share), _widened_interval(b, share)
     return _relative_difference(a.value, b.value) if lo <= other_hi and other_lo <= hi else None
 
 
-def effect_of(model: NoiseModel, axis: str, step: Step) -> Effect:
+def effect_of(model: NoiseModel, axis: str, step: ReconciliationStep) -> Effect:
     """Return the effect that a step added or changed, from the model of its recording.
 
     Parameters
@@ -103,10 +105,10 @@ def effect_of(model: NoiseModel, axis: str, step: Step) -> Effect:
         else []
     )
     parameters = {name: one.value for name, one in step.parameters.items()}
-    return nearest(clock or model.effects[axis], step.effect, parameters)
+    return closest_effect(clock or model.effects[axis], step.effect, parameters)
 
 
-def nearest(effects: Sequence[Effect], name: str, parameters: Mapping[str, Any]) -> Effect:
+def closest_effect(effects: Sequence[Effect], name: str, parameters: Mapping[str, Any]) -> Effect:
     """Return the effect of a given name whose parameters are closest to the given ones.
 
     Parameters
@@ -137,7 +139,7 @@ def _relative_difference(a: Any, b: Any) -> float:
     return min(abs(a - b) / (abs(a) + abs(b)), 1.0) if a != b else 0.0
 
 
-def _widened_interval(bounds: Bounds, share: float) -> tuple[float, float]:
+def _widened_interval(bounds: ParameterInterval, share: float) -> tuple[float, float]:
     """Return the stretched and widened interval of a parameter."""
     assert not isinstance(bounds.value, str)
     below = 0.0 if bounds.lo is None else bounds.value - bounds.lo

@@ -17,19 +17,19 @@ from scipy.special import chdtrc
 
 from drivers.sample import Floats
 from monitor.reconcile.likelihood.hypothesis import Z95
-from monitor.reconcile.result import Bounds
+from monitor.reconcile.result import ParameterInterval
 
-DISAGREE: Final = 0.01
+MIN_AGREEMENT_PROBABILITY: Final = 0.01
 """Probability below which recordings disagree. It is small because a report contains many parameters."""
 MIN_RELATIVE_ERROR: Final = 1e-6
 """Smallest standard deviation relative to the value, because sample times and numbers in files are rounded."""
 
 
 @dataclass(frozen=True, slots=True)
-class Pooled:
+class PooledParameter:
     """Parameter, averaged over all recordings that contain it."""
 
-    bounds: Bounds
+    bounds: ParameterInterval
     chi2: float = 0.0  # χ² of the recordings about their mean
     freedom: int = 0  # degrees of freedom: number of recordings with an interval, less one
 
@@ -41,7 +41,7 @@ class Pooled:
         return agreement([self])
 
 
-def agreement(parameters: Iterable[Pooled]) -> float | None:
+def agreement(parameters: Iterable[PooledParameter]) -> float | None:
     """Return the probability of a larger total χ² of all parameters, treated as independent, or None without degrees of
     freedom.
     """
@@ -50,7 +50,7 @@ def agreement(parameters: Iterable[Pooled]) -> float | None:
     return float(chdtrc(freedom, sum(one.chi2 for one in every))) if freedom else None
 
 
-def pooled(found: Sequence[Bounds]) -> Pooled:
+def pool_parameter(found: Sequence[ParameterInterval]) -> PooledParameter:
     """Return the mean of one parameter over one or more recordings.
 
     Examples
@@ -61,21 +61,21 @@ def pooled(found: Sequence[Bounds]) -> Pooled:
     """
     known = [one for one in found if _finite_interval(one) is not None]
     if len(known) < 2:
-        return Pooled(known[0] if known else found[0])
+        return PooledParameter(known[0] if known else found[0])
     ends, factors = _symmetric_scale(np.array([_finite_interval(one) for one in known]))
     x, deviation = ends[:, 1], 0.5 * (ends[:, 2] - ends[:, 0]) / Z95
     weight = np.maximum(deviation, MIN_RELATIVE_ERROR * (1.0 if factors else np.abs(x))) ** -2
     mean = float(np.average(x, weights=weight))
     chi2, freedom = float(weight @ (x - mean) ** 2), x.size - 1
     half = Z95 / float(np.sqrt(weight.sum()))
-    if chdtrc(freedom, chi2) < DISAGREE:
+    if chdtrc(freedom, chi2) < MIN_AGREEMENT_PROBABILITY:
         half *= (chi2 / freedom) ** 0.5
     middle_and_ends = np.array([mean, mean - half, mean + half])
     values = np.exp(middle_and_ends) if factors else middle_and_ends
-    return Pooled(Bounds(*(float(value) for value in values)), chi2, freedom)
+    return PooledParameter(ParameterInterval(*(float(value) for value in values)), chi2, freedom)
 
 
-def deviations(bounds: Bounds, value: float) -> float:
+def distance_in_sigma(bounds: ParameterInterval, value: float) -> float:
     """Return the distance of a value from a parameter, in standard deviations of the parameter.
 
     The distance is 0 if the parameter has no interval.
@@ -100,7 +100,7 @@ def deviations(bounds: Bounds, value: float) -> float:
     return float(abs(at - other) * 2.0 * Z95 / (hi - lo))
 
 
-def _finite_interval(bounds: Bounds) -> tuple[float, float, float] | None:
+def _finite_interval(bounds: ParameterInterval) -> tuple[float, float, float] | None:
     """Return the lower end, the value and the upper end, or None if there is no finite interval."""
     if isinstance(bounds.value, str) or bounds.lo is None or bounds.hi is None or not bounds.lo < bounds.hi:
         return None

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.decoders import base
-from drivers.decoders.base import NEED_MORE, QUIET_FRAMES, REJECT, FrameBuffer, Frames, Rows
+from drivers.decoders.base import HINT_FRAMES, NEED_MORE, REJECT, BlockBuilder, FrameBuffer, Frames
 from drivers.sample import Chunk
 
 
@@ -110,13 +110,13 @@ def test_memory_stays_bounded_on_garbage() -> None:
 def test_hints() -> None:
     buffer = FrameBuffer(b"\xaa", match, 5)
     assert buffer.hint == ""
-    buffer.feed([Chunk(b"\x11" * base.MUTE_BYTES, 0)])
+    buffer.feed([Chunk(b"\x11" * base.MAX_BYTES_WITHOUT_FRAME, 0)])
     assert "baud rate" in buffer.hint
     buffer.feed([Chunk(FRAMES[0], 0)])
     assert buffer.hint == ""
     buffer.feed([Chunk(FRAMES[0][:-1] + b"\x99" + FRAMES[1], 0)])
     assert "fail their check" in buffer.hint
-    buffer.feed([Chunk(FRAMES[0] * QUIET_FRAMES, 0)])
+    buffer.feed([Chunk(FRAMES[0] * HINT_FRAMES, 0)])
     assert buffer.hint == ""
 
 
@@ -138,13 +138,13 @@ def rows(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 
 def test_rows_without_loss_make_one_block() -> None:
-    out = Rows().blocks(*rows(5), np.zeros(5, np.int64))
+    out = BlockBuilder().blocks(*rows(5), np.zeros(5, np.int64))
     assert [len(b) for b in out] == [5]
     assert out[0].lost == 0
 
 
 def test_rows_are_cut_where_frames_were_bad() -> None:
-    collected = Rows()
+    collected = BlockBuilder()
     out = collected.blocks(*rows(5), np.array([1, 0, 2, 0, 0]), bad_after=4)
     assert [(len(b), b.lost) for b in out] == [(2, 1), (3, 2)]
     assert collected.bad == 7
@@ -156,7 +156,7 @@ def test_rows_are_cut_where_frames_were_bad() -> None:
 def test_implausible_rows_leave_an_empty_place() -> None:
     t_ns, values, temperature, ticks = rows(6)
     values[0, 0], values[2, 4], values[3], values[5, 5] = 1001.0, -np.inf, np.nan, 10_001.0
-    collected = Rows()
+    collected = BlockBuilder()
     out = collected.blocks(t_ns, values, temperature, ticks, np.array([0, 0, 0, 0, 3, 0]))
     assert [(b.ticks.tolist(), b.lost) for b in out] == [([1], 1), ([4], 5)]
     assert collected.bad == 7
@@ -165,7 +165,7 @@ def test_implausible_rows_leave_an_empty_place() -> None:
 
 def test_rows_all_bad_and_rows_none_carry_over() -> None:
     t_ns, _, temperature, ticks = rows(2)
-    collected = Rows()
+    collected = BlockBuilder()
     assert collected.blocks(t_ns, np.full((2, 6), np.inf), temperature, ticks, np.array([1, 0])) == []
     empty = np.empty(0, np.int64)
     assert collected.blocks(empty, np.empty((0, 6)), np.empty(0), empty, empty, 2) == []
@@ -180,7 +180,7 @@ def test_some_axes_not_measured_pass_and_an_impossible_temperature_does_not() ->
     t_ns, values, temperature, ticks = rows(3)
     values[:, :3] = np.nan
     temperature[1] = 4000.0
-    out = Rows().blocks(t_ns, values, temperature, ticks, np.zeros(3, np.int64))
+    out = BlockBuilder().blocks(t_ns, values, temperature, ticks, np.zeros(3, np.int64))
     assert [len(b) for b in out] == [3]
     assert np.isnan(out[0].temperature_c).tolist() == [False, True, False]
 
@@ -195,7 +195,7 @@ def test_xor_agrees_with_one_byte_after_the_other(data: bytes) -> None:
     expected = 0
     for byte in data:
         expected ^= byte
-    assert base.xor(data) == expected
+    assert base.xor_checksum(data) == expected
 
 
 def test_the_examples_run() -> None:

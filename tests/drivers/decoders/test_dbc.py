@@ -12,12 +12,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.decoders import dbc
-from drivers.decoders.base import Arrival, Counter
+from drivers.decoders.base import ArrivalTiming, CounterTiming
 from drivers.decoders.dbc.bits import Bits
 from drivers.decoders.dbc.database import SHIPPED
 from drivers.errors import ConfigError, LinkEnded
 from drivers.links import replay_link
-from drivers.sample import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, SampleBlock, block, join
+from drivers.sample import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, SampleBlock, concatenate_blocks, make_block
 from drivers.units import DEGREE, G0
 from tests.support.recordings import recordings
 
@@ -77,7 +77,7 @@ def test_axis_order_of_sae_and_of_xyz_devices() -> None:
 def test_not_available_is_not_measured() -> None:
     decoder = build("j1939_imu", {a: SAE[a] for a in ("gx", "gy", "gz")})
     largest = 0xFDFF / 128 - 250
-    got = join(decoder.feed([chunk(ARI, "FFFF007D00FE0005"), chunk(ARI, "FFFDFFFD00000005")]))
+    got = concatenate_blocks(decoder.feed([chunk(ARI, "FFFF007D00FE0005"), chunk(ARI, "FFFDFFFD00000005")]))
     assert got.values[0, :3] / DEGREE == pytest.approx([0.0, np.nan, np.nan], nan_ok=True)
     assert got.values[1, :3] / DEGREE == pytest.approx([largest, largest, -250.0])
     assert decoder.feed([chunk(ARI, "FFFFFFFFFFFFFFFF")]) == []
@@ -96,7 +96,7 @@ def test_slope_of_the_shipped_database() -> None:
 def test_xsens_frames() -> None:
     signals = {**XSENS, "temperature": "Temperature.SensorTemperature"}
     decoder = build("xsens_mti", signals, counter="SampleTime.SampleTimeFine", tick=1e-4)
-    assert decoder.timing == Counter(1 << 32, 1e-4)
+    assert decoder.timing == CounterTiming(1 << 32, 1e-4)
     got = decoder.feed(
         [
             chunk(0x51, "1980"),
@@ -176,7 +176,7 @@ def test_floats_on_the_wire(tmp_path: Path, length: int, kind: int, code: str, b
     decoder = build(path, {"ax": "M.S"})
     wire = struct.pack((">" if big else "<") + code, 12.75).ljust(8, b"\0")
     assert decoder.feed([chunk(100, wire)])[0].values[0, 3] == 9.75
-    [sent] = decoder.encode(block(np.zeros(1, np.int64), np.full((1, 6), 9.75)))
+    [sent] = decoder.encode(make_block(np.zeros(1, np.int64), np.full((1, 6), 9.75)))
     assert sent.data == wire
     nan = struct.pack((">" if big else "<") + code, np.nan).ljust(8, b"\0")
     assert decoder.feed([chunk(100, nan)]) == []
@@ -208,7 +208,7 @@ def some(n: int, seed: int = 0) -> SampleBlock:
     rng = np.random.default_rng(seed)
     values = rng.uniform(-1, 1, (n, 6)) * [2, 2, 2, 30, 30, 30]
     ticks = np.arange(100, 100 + n)
-    return block(np.arange(n) * 10_000_000, values, rng.uniform(0, 50, n), ticks)
+    return make_block(np.arange(n) * 10_000_000, values, rng.uniform(0, 50, n), ticks)
 
 
 @pytest.mark.parametrize(("file", "signals", "keys", "lsb"), CASES)
@@ -218,22 +218,22 @@ def test_encoded_samples_come_back_to_half_a_bit(
     decoder = build(file, signals, **keys)
     sent = some(300)
     chunks = decoder.encode(sent)
-    got = join(decoder.feed(chunks))
+    got = concatenate_blocks(decoder.feed(chunks))
     assert (np.abs(got.values - sent.values) <= 0.5001 * np.array(lsb)).all()
     np.testing.assert_array_equal(got.t_ns, sent.t_ns)
     np.testing.assert_array_equal(got.ticks, sent.ticks if "counter" in keys else np.full(300, NO_TICK))
     assert (decoder.bad, got.lost, decoder.hint) == (0, 0, "")
     # frame by frame is the same
     single = build(file, signals, **keys)
-    one_by_one = join([b for c in chunks for b in single.feed([c])])
+    one_by_one = concatenate_blocks([b for c in chunks for b in single.feed([c])])
     np.testing.assert_array_equal(one_by_one.values, got.values)
 
 
 def test_temperature_may_be_slower_than_the_samples() -> None:
     decoder = build("xsens_mti", {**XSENS, "temperature": "Temperature.SensorTemperature"})
     temperature = np.array([np.nan, 20.0, np.nan, np.nan, 30.0])
-    sent = block(np.arange(5), some(5).values.copy(), temperature)
-    got = join(decoder.feed(decoder.encode(sent)))
+    sent = make_block(np.arange(5), some(5).values.copy(), temperature)
+    got = concatenate_blocks(decoder.feed(decoder.encode(sent)))
     np.testing.assert_array_equal(got.temperature_c, [np.nan, 20.0, 20.0, 20.0, 30.0])
     assert 0x51 in decoder.addresses
 
@@ -275,7 +275,7 @@ def counts(blocks: list[SampleBlock]) -> list[tuple[int, int]]:
     """What ``pairs`` counted, as (rate, acceleration) of each sample."""
     if not blocks:
         return []
-    values = join(blocks).values
+    values = concatenate_blocks(blocks).values
     rates = np.rint(values[:, 0] / DEGREE * 128).astype(int)
     return list(zip(rates.tolist(), np.rint(values[:, 5] * 100).astype(int).tolist(), strict=True))
 
@@ -364,7 +364,7 @@ def test_a_late_frame_that_is_too_short_makes_its_sample_bad() -> None:
 
 def test_a_partial_sample_is_kept_without_its_late_frame() -> None:
     decoder = build("j1939_imu", SAE, window=0.005, partial=True)
-    got = join(decoder.feed(delayed(6, [3], 10)))
+    got = concatenate_blocks(decoder.feed(delayed(6, [3], 10)))
     assert np.isnan(got.values).all(axis=1).tolist() == [False] * 6
     assert np.isnan(got.values[:, 3:]).all(axis=1).tolist() == [i == 3 for i in range(6)]
     assert (decoder.late, decoder.bad, decoder.hint) == (0, 0, HINT)
@@ -389,7 +389,7 @@ def test_partial_samples_keep_what_came() -> None:
     decoder = build("j1939_imu", SAE, partial=True)
     frames = pairs(4)
     del frames[3]
-    got = join(decoder.feed(frames))
+    got = concatenate_blocks(decoder.feed(frames))
     assert len(got) == 4
     assert np.isnan(got.values[1]).tolist() == [False] * 3 + [True] * 3
     assert decoder.bad == 0
@@ -431,13 +431,13 @@ def test_frames_with_equal_counts_belong_together(tmp_path: Path) -> None:
     path.write_text(COUNTED)
     signals = {"gz": "Gyro.Z", "az": "Accel.Z"}
     decoder = build(path, signals, counter="Count", join="counter")
-    assert decoder.timing == Counter(16, None)
+    assert decoder.timing == CounterTiming(16, None)
     frames = [chunk(1 + which, struct.pack("<h5xB", i, i % 16), i) for i in range(40) for which in (0, 1)]
     del frames[21]  # Accel 10
     del frames[9]  # Accel 4 … and the order of the two does not matter
     frames[30], frames[31] = frames[31], frames[30]
     blocks = decoder.feed(frames)
-    got = join(blocks)
+    got = concatenate_blocks(blocks)
     ids = np.rint(got.values[:, 2] / DEGREE * 1e3).astype(int)
     assert ids.tolist() == [i for i in range(40) if i not in (4, 10)]
     assert np.rint(got.values[:, 5] * 1e3).astype(int).tolist() == ids.tolist()
@@ -451,7 +451,7 @@ def test_a_frame_behind_the_start_of_the_next_sample_does_not_end_that_sample(tm
     decoder = build(path, {"gz": "Gyro.Z", "az": "Accel.Z"}, counter="Count", join="counter")
     frames = [chunk(1 + which, struct.pack("<h5xB", i, i % 16), i) for i in range(10) for which in (0, 1)]
     frames[9], frames[10] = frames[10], frames[9]  # Accel 4 behind Gyro 5
-    got = join(decoder.feed(frames))
+    got = concatenate_blocks(decoder.feed(frames))
     assert got.ticks.tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 9]
     assert (decoder.bad, got.lost) == (1, 1)
 
@@ -465,7 +465,7 @@ def test_a_frame_with_the_count_of_its_sample_is_late_after_the_window(tmp_path:
         for i in range(10)
         for which in (0, 1)
     ]
-    got = join(decoder.feed(frames))
+    got = concatenate_blocks(decoder.feed(frames))
     assert got.ticks.tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 9]
     assert (decoder.late, decoder.bad, got.lost, decoder.hint) == (1, 0, 1, HINT)
 
@@ -477,7 +477,7 @@ def test_a_counter_message_starts_the_sample() -> None:
     chunks = decoder.encode(sent)
     assert [c.address for c in chunks[:3]] == [5, 0x32, 0x34]
     # joined behind the first time, and a time frame lost later
-    got = join(decoder.feed(chunks[1:9] + chunks[10:]))
+    got = concatenate_blocks(decoder.feed(chunks[1:9] + chunks[10:]))
     assert got.ticks.tolist() == [101, 102, 104, 105]
     assert (np.abs(got.values - sent.values[[1, 2, 4, 5]]) < 2**-8).all()
     assert decoder.bad == 1
@@ -487,7 +487,7 @@ def test_one_sender_at_a_time() -> None:
     decoder = build("j1939_imu", {"gz": SAE["gz"]})
     frame = "007D007D00820005"
     other = 0x0CF02A81 | EXTENDED_ID
-    assert len(join(decoder.feed([chunk(ARI, frame), chunk(other, frame), chunk(ARI, frame)]))) == 2
+    assert len(concatenate_blocks(decoder.feed([chunk(ARI, frame), chunk(other, frame), chunk(ARI, frame)]))) == 2
     assert "0x81" in decoder.hint
     chosen = build("j1939_imu", {"gz": SAE["gz"]}, source=0x81)
     assert len(chosen.feed([chunk(ARI, frame), chunk(other, frame)])) == 1
@@ -501,7 +501,7 @@ def test_addresses() -> None:
     exact = build("j1939_imu", SAE, j1939=False)
     assert exact.addresses == (0x0CF02AFE | EXTENDED_ID, 0x0CF02DFE | EXTENDED_ID)
     assert exact.feed([chunk(ARI, "007D007D007D0005")]) == []
-    assert isinstance(exact.timing, Arrival)
+    assert isinstance(exact.timing, ArrivalTiming)
 
 
 def test_reset_forgets_a_half_sample() -> None:
@@ -611,7 +611,7 @@ def test_recorded_frames_give_the_recorded_samples(name: str) -> None:
             blocks += decoder.feed(chunks)
             all_blocks += lenient.feed(chunks)
     link.close()
-    every = join(all_blocks)
+    every = concatenate_blocks(all_blocks)
     half_a_bit = np.repeat([0.125 * DEGREE, 0.0625], 3)
     assert every.values.shape == expected.shape
     assert (np.abs(every.values - expected) < half_a_bit).all()

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.decoders import ros2_imu
-from drivers.decoders.base import QUIET_FRAMES, Decoder
-from drivers.sample import NO_TICK, Chunk, Given, block, join
+from drivers.decoders.base import HINT_FRAMES, Decoder
+from drivers.sample import NO_TICK, Chunk, SenderTiming, concatenate_blocks, make_block
 
 GOLDEN_HEAD = bytes.fromhex("0001000000F1536515CD5B0709000000696D755F6C696E6B00000000")
 GYRO, ACCEL = (0.01, -0.02, 0.03), (0.1, 0.2, 9.81)
@@ -58,7 +58,7 @@ def test_golden_message(decoder: Decoder) -> None:
     assert got.values[0].tolist() == [*GYRO, *ACCEL]
     assert got.ticks.tolist() == [9]
     assert np.isnan(got.temperature_c).all()
-    assert decoder.timing == Given()
+    assert decoder.timing == SenderTiming()
     assert payload().replace(b"\xcc", b"\0") == GOLDEN
 
 
@@ -67,14 +67,14 @@ def test_golden_message(decoder: Decoder) -> None:
 def test_byte_orders_and_frame_names(decoder: Decoder, end: str, frame_id: str) -> None:
     data = payload(frame_id, end)
     assert len(data) == (316 if len(frame_id) <= 3 else len(data))
-    got = join(decoder.feed([Chunk(data, 0), Chunk(GOLDEN, 0), Chunk(data + bytes(3), 0)]))
+    got = concatenate_blocks(decoder.feed([Chunk(data, 0), Chunk(GOLDEN, 0), Chunk(data + bytes(3), 0)]))
     assert got.values.tolist() == [[*GYRO, *ACCEL]] * 3
     assert got.t_ns.tolist() == [1_700_000_000_123_456_789] * 3
 
 
 def test_quantities_that_are_not_provided(decoder: Decoder) -> None:
     no_gyro, no_accel = payload(gyro_covariance=-1.0), payload(accel_covariance=-1.0)
-    got = join(decoder.feed([Chunk(no_gyro, 0), Chunk(no_accel, 0)]))
+    got = concatenate_blocks(decoder.feed([Chunk(no_gyro, 0), Chunk(no_accel, 0)]))
     assert np.isnan(got.values).tolist() == [[True] * 3 + [False] * 3, [False] * 3 + [True] * 3]
     assert decoder.feed([Chunk(payload(gyro_covariance=-1.0, accel_covariance=-1.0), 0)]) == []
     assert decoder.bad == 1
@@ -98,14 +98,14 @@ def test_a_rejected_message_is_missing_once(decoder: Decoder) -> None:
     assert [(len(b), b.lost) for b in blocks] == [(2, 0), (2, 1)]
     assert decoder.bad == 1
     assert "XCDR1" in decoder.hint
-    decoder.feed([Chunk(GOLDEN, 0)] * QUIET_FRAMES)
+    decoder.feed([Chunk(GOLDEN, 0)] * HINT_FRAMES)
     assert decoder.hint == ""
 
 
 def test_another_publisher_or_another_count_is_no_loss(decoder: Decoder) -> None:
     numbers = [(5, b"a"), (900, b"b"), (901, b"b"), (1, b"b"), (2**62, b"b"), (-(2**63), b"b")]
     chunks = [Chunk(GOLDEN, 0, attachment=bare(i, gid * 16)) for i, gid in numbers]
-    assert join(decoder.feed(chunks)).lost == 0
+    assert concatenate_blocks(decoder.feed(chunks)).lost == 0
 
 
 def test_without_attachment_there_are_no_ticks(decoder: Decoder) -> None:
@@ -133,8 +133,8 @@ def test_what_is_no_imu_message_is_bad(decoder: Decoder, data: bytes) -> None:
 def test_encode_feeds_back(decoder: Decoder) -> None:
     values = np.random.default_rng(0).normal(size=(40, 6))
     values[7, :3] = np.nan
-    sent = block(1_700_000_000_000_000_001 + np.arange(40) * 7, values, ticks=np.arange(3, 43))
-    got = join(decoder.feed(decoder.encode(sent)))
+    sent = make_block(1_700_000_000_000_000_001 + np.arange(40) * 7, values, ticks=np.arange(3, 43))
+    got = concatenate_blocks(decoder.feed(decoder.encode(sent)))
     np.testing.assert_array_equal(got.values, values)
     np.testing.assert_array_equal(got.t_ns, sent.t_ns)
     np.testing.assert_array_equal(got.ticks, sent.ticks)

@@ -5,20 +5,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.decoders import samples
-from drivers.decoders.base import QUIET_FRAMES
-from drivers.sample import Chunk, Given, block, join
-from drivers.zenoh.sample_message import pack
+from drivers.decoders.base import HINT_FRAMES
+from drivers.sample import Chunk, SenderTiming, concatenate_blocks, make_block
+from drivers.zenoh.sample_message import encode_samples
 
 
 def message(count: int, n: int = 10, lost: int = 0, bad_rows: tuple[int, ...] = ()) -> Chunk:
     values = np.arange(6 * n, dtype=np.float64).reshape(n, 6) / 100
     values[list(bad_rows)] = np.inf
-    return Chunk(pack("d", count, block(np.arange(n) * 10_000_000, values, lost=lost)), 0)
+    return Chunk(encode_samples("d", count, make_block(np.arange(n) * 10_000_000, values, lost=lost)), 0)
 
 
 def test_times_are_given() -> None:
     decoder = samples.build(samples.Settings())
-    assert decoder.timing == Given()
+    assert decoder.timing == SenderTiming()
     assert decoder.carrier == "messages"
 
 
@@ -55,16 +55,16 @@ def test_a_rejected_message_is_counted_and_explained() -> None:
     assert [b.lost for b in blocks] == [0, 10]
     assert decoder.bad == 1
     assert "samples message" in decoder.hint
-    for i in range(QUIET_FRAMES):
+    for i in range(HINT_FRAMES):
         decoder.feed([message(40 + 10 * i)])
     assert decoder.hint == ""
 
 
 def test_encode_feeds_back() -> None:
     decoder = samples.build(samples.Settings())
-    sent = block(np.arange(50) ** 2 * 1_000_000, np.random.default_rng(0).normal(size=(50, 6)))
+    sent = make_block(np.arange(50) ** 2 * 1_000_000, np.random.default_rng(0).normal(size=(50, 6)))
     chunks = [c for i in range(0, 50, 7) for c in decoder.encode(sent[i : i + 7])]
-    got = join(decoder.feed(chunks))
+    got = concatenate_blocks(decoder.feed(chunks))
     np.testing.assert_array_equal(got.values, sent.values)
     assert np.abs(got.t_ns - sent.t_ns).max() <= 500
     assert got.lost == 0

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from drivers.decoders.base import MUTE_BYTES
-from drivers.decoders.stim300 import IDENTIFIERS, SIZES, Settings, build, crc, crc_holds
+from drivers.decoders.base import MAX_BYTES_WITHOUT_FRAME
+from drivers.decoders.stim300 import IDENTIFIERS, SIZES, Settings, build, datagram_crc, has_valid_crc
 from drivers.errors import ConfigError
-from drivers.sample import Chunk, Counter, SampleBlock, block, join
+from drivers.sample import Chunk, CounterTiming, SampleBlock, concatenate_blocks, make_block
 
 PUBLISHED = bytes.fromhex(
     "AF 00 01 24 FF FA D6 00 03 5B 00 FF E7 A6 FF DD 36 08 1C 52 00 FF 7E 70 FE BA 0C 3F FA 1D 00"
@@ -21,12 +21,12 @@ GYRO_STATUS, ACCEL_STATUS, INCL_STATUS, TEMPERATURE_STATUS = 10, 20, 30, 37
 def changed(at: int, byte: int) -> bytes:
     """The published frame with one byte set and the CRC made anew."""
     body = PUBLISHED[:at] + bytes([byte]) + PUBLISHED[at + 1 : -4]
-    return body + crc(body)
+    return body + datagram_crc(body)
 
 
 def decoded(data: bytes, **settings: object) -> SampleBlock | None:
     blocks = build(Settings(**settings)).feed([Chunk(data, 77)])
-    return join(blocks) if blocks else None
+    return concatenate_blocks(blocks) if blocks else None
 
 
 def test_the_published_frame() -> None:
@@ -37,7 +37,7 @@ def test_the_published_frame() -> None:
     np.testing.assert_allclose(got.values[0], [*gyro, *accel], rtol=1e-14)
     assert got.temperature_c[0] == pytest.approx((35.625 + 35.75 + 35.625) / 3, abs=1e-12)
     assert got.ticks.tolist() == [225]
-    assert build(Settings()).timing == Counter(256, 1 / 2000)
+    assert build(Settings()).timing == CounterTiming(256, 1 / 2000)
 
 
 def test_the_crc_against_one_bit_after_the_other() -> None:
@@ -47,9 +47,9 @@ def test_the_crc_against_one_bit_after_the_other() -> None:
         for _ in range(8):
             register = (register << 1 ^ (0x04C11DB7 if register >> 31 else 0)) & 0xFFFFFFFF
     assert register == 0xC64942C6 == 3326689990
-    assert crc(PUBLISHED[:-4]) == PUBLISHED[-4:]
-    assert crc_holds(PUBLISHED)
-    assert not crc_holds(PUBLISHED[:-1] + b"\0")
+    assert datagram_crc(PUBLISHED[:-4]) == PUBLISHED[-4:]
+    assert has_valid_crc(PUBLISHED)
+    assert not has_valid_crc(PUBLISHED[:-1] + b"\0")
 
 
 @pytest.mark.parametrize(
@@ -74,9 +74,9 @@ def test_the_manuals_table_of_padding_is_the_rule_of_four(identifier: int, paddi
 def test_every_datagram_comes_back(identifier: int) -> None:
     rng = np.random.default_rng(identifier)
     n = 5
-    samples = block(np.arange(n), rng.normal(0, 1, (n, 6)), np.full(n, 20.0), np.arange(253, 253 + n) % 256)
+    samples = make_block(np.arange(n), rng.normal(0, 1, (n, 6)), np.full(n, 20.0), np.arange(253, 253 + n) % 256)
     decoder = build(Settings())
-    got = join(decoder.feed(build(Settings(identifier=identifier)).encode(samples)))
+    got = concatenate_blocks(decoder.feed(build(Settings(identifier=identifier)).encode(samples)))
     parts = IDENTIFIERS[identifier]
     np.testing.assert_allclose(got.values[:, :3], samples.values[:, :3], atol=DEGREE / 2**15)
     if parts & 1:
@@ -133,14 +133,14 @@ def test_cr_lf_is_passed_over() -> None:
 
 
 def test_auto_follows_a_device_that_is_set_anew() -> None:
-    short = [c.data for c in build(Settings(identifier=0x91)).encode(block(np.arange(200), np.zeros((200, 6))))]
+    short = [c.data for c in build(Settings(identifier=0x91)).encode(make_block(np.arange(200), np.zeros((200, 6))))]
     decoder = build(Settings())
     assert len(decoder.feed([Chunk(PUBLISHED * 3, 0)])) == 1
     size = len(short[0])
-    assert decoder.feed([Chunk(b"".join(short)[:MUTE_BYTES], 0)]) == []
+    assert decoder.feed([Chunk(b"".join(short)[:MAX_BYTES_WITHOUT_FRAME], 0)]) == []
     assert "baud rate" in decoder.hint
-    got = sum(len(b) for b in decoder.feed([Chunk(b"".join(short)[MUTE_BYTES:], 0)]))
-    assert got == 200 - MUTE_BYTES // size - 1
+    got = sum(len(b) for b in decoder.feed([Chunk(b"".join(short)[MAX_BYTES_WITHOUT_FRAME:], 0)]))
+    assert got == 200 - MAX_BYTES_WITHOUT_FRAME // size - 1
     once = build(Settings())
     assert sum(len(b) for b in once.feed([Chunk(PUBLISHED * 3 + b"".join(short), 0)])) == 3 + got
     decoder = build(Settings(identifier=0xAF))
@@ -151,7 +151,7 @@ def test_an_unmeasured_axis_is_sent_as_a_channel_error() -> None:
     values = np.zeros((3, 6))
     values[1, 2] = np.nan
     decoder = build(Settings())
-    blocks = decoder.feed(decoder.encode(block(np.arange(3), values)))
+    blocks = decoder.feed(decoder.encode(make_block(np.arange(3), values)))
     assert [(len(b), b.lost) for b in blocks] == [(1, 0), (1, 1)]
 
 

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from drivers.decoders.base import xor
-from drivers.decoders.text import LONGEST, Settings, build
+from drivers.decoders.base import xor_checksum
+from drivers.decoders.text import MAX_LINE_BYTES, Settings, build
 from drivers.errors import ConfigError
-from drivers.sample import Arrival, Chunk, Counter, SampleBlock, join
+from drivers.sample import ArrivalTiming, Chunk, CounterTiming, SampleBlock, concatenate_blocks
 
 SIX = ("gx", "gy", "gz", "ax", "ay", "az")
 LINE = b"1,2,3,4,5,6\n"
@@ -21,7 +21,7 @@ def blocks_of(data: bytes, **settings: object) -> list[tuple[int, int]]:
 
 def decoded(data: bytes, **settings: object) -> SampleBlock:
     decoder = build(Settings(**{"columns": SIX, "first_line": "keep", **settings}))
-    return join(decoder.feed([Chunk(data, 77)]))
+    return concatenate_blocks(decoder.feed([Chunk(data, 77)]))
 
 
 @pytest.mark.parametrize(
@@ -124,15 +124,15 @@ def test_header_and_comments_are_passed_over() -> None:
 
 def test_an_overlong_line_is_one_bad_line() -> None:
     decoder = build(Settings(columns=SIX, first_line="keep"))
-    feeds = [LINE, *[b"7" * 1000] * (3 * LONGEST // 1000), b"\n", LINE]
+    feeds = [LINE, *[b"7" * 1000] * (3 * MAX_LINE_BYTES // 1000), b"\n", LINE]
     blocks = [b for data in feeds for b in decoder.feed([Chunk(data, 0)])]
     assert [(len(b), b.lost) for b in blocks] == [(1, 0), (1, 1)]
     assert "line end" in decoder.hint
-    assert blocks_of(LINE + b"7" * (LONGEST + 1) + b"\n" + LINE) == [(1, 0), (1, 1)]
+    assert blocks_of(LINE + b"7" * (MAX_LINE_BYTES + 1) + b"\n" + LINE) == [(1, 0), (1, 1)]
 
 
 def sentence(body: bytes) -> bytes:
-    return b"$%b*%02X\r\n" % (body, xor(body))
+    return b"$%b*%02X\r\n" % (body, xor_checksum(body))
 
 
 def test_nmea_checksum() -> None:
@@ -156,15 +156,15 @@ def test_nmea_checksum() -> None:
 def test_the_devices_own_time(unit: str, text: bytes, ticks: int, modulus: int) -> None:
     settings = {"columns": ("t", *SIX), "time_unit": unit}
     assert decoded(text + b"," + LINE, **settings).ticks.tolist() == [ticks]
-    assert build(Settings(**settings)).timing == Counter(modulus, 1e-9)
+    assert build(Settings(**settings)).timing == CounterTiming(modulus, 1e-9)
 
 
 def test_a_counter() -> None:
     settings = {"columns": (*SIX, "counter"), "counter_modulus": 100}
     got = decoded(b"1,2,3,4,5,6,99\n1,2,3,4,5,6,0\n", **settings)
     assert got.ticks.tolist() == [99, 0]
-    assert build(Settings(**settings)).timing == Counter(100)
-    assert build(Settings(columns=SIX)).timing == Arrival()
+    assert build(Settings(**settings)).timing == CounterTiming(100)
+    assert build(Settings(columns=SIX)).timing == ArrivalTiming()
     assert blocks_of(b"1,2,3,4,5,6,1\n1,2,3,4,5,6,nan\n1,2,3,4,5,6,3\n", **settings) == [(1, 0), (1, 1)]
 
 

@@ -6,9 +6,9 @@ import gzip
 import numpy as np
 import pytest
 
-from drivers.decoders.base import xor
+from drivers.decoders.base import xor_checksum
 from drivers.decoders.vectornav_ascii import Settings, build
-from drivers.sample import Chunk, SampleBlock, join
+from drivers.sample import Chunk, SampleBlock, concatenate_blocks
 from tests.support.recordings import recordings
 
 IMU = (
@@ -27,11 +27,11 @@ REGISTER = b"$VNRRG,08,-114.314,+000.058,-001.773*5F\r\n"
 
 def decoded(data: bytes, **settings: object) -> SampleBlock | None:
     blocks = build(Settings(**settings)).feed([Chunk(data, 77)])
-    return join(blocks) if blocks else None
+    return concatenate_blocks(blocks) if blocks else None
 
 
 def sentence(body: bytes) -> bytes:
-    return b"$%b*%02X\r\n" % (body, xor(body))
+    return b"$%b*%02X\r\n" % (body, xor_checksum(body))
 
 
 def test_imu() -> None:
@@ -127,7 +127,9 @@ def test_a_recorded_stream_gives_what_it_was_read_as() -> None:
     folder = recordings()
     wire = gzip.decompress((folder / "vn100-serial" / "vnymr-sentences.txt.gz").read_bytes())
     decoder = build(Settings())
-    got = join([b for i in range(0, len(wire), 4096) for b in decoder.feed([Chunk(wire[i : i + 4096], i)])])
+    got = concatenate_blocks(
+        [b for i in range(0, len(wire), 4096) for b in decoder.feed([Chunk(wire[i : i + 4096], i)])]
+    )
     with np.load(folder / "vn100-serial" / "static-12min.npz") as known:
         expected = np.column_stack([known[axis] for axis in ("gx", "gy", "gz", "ax", "ay", "az")])
     assert len(got) == 30_178

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drivers.decoders.vectornav_binary import FIELD_SIZES, TICKS, Settings, build, layout
-from drivers.sample import NO_TICK, Arrival, Chunk, Counter, SampleBlock, block, join
+from drivers.sample import NO_TICK, ArrivalTiming, Chunk, CounterTiming, SampleBlock, concatenate_blocks, make_block
 
 EXAMPLE_1 = bytes.fromhex("FA 01 08 00 93 50 2E 42 83 3E F1 3F 48 B5 04 BB 92 88")
 EXAMPLE_2_WRONG = bytes.fromhex("FA 05 08 00 01 00" + "00" * 20 + "A8 3A")
@@ -23,7 +23,7 @@ def message(masks: dict[int, int], payload: bytes) -> bytes:
 def decoded(data: bytes, **settings: object) -> SampleBlock | None:
     decoder = build(Settings(**settings))
     blocks = decoder.feed([Chunk(data, 77)])
-    return join(blocks) if blocks else None
+    return concatenate_blocks(blocks) if blocks else None
 
 
 def vector(*numbers: float) -> bytes:
@@ -58,7 +58,7 @@ def test_the_recommended_message() -> None:
     assert got.values.tolist() == [[0.125, -0.5, 1.0, 0.5, -0.25, -9.75]]
     assert got.ticks.tolist() == [123_456_789]
     assert np.isnan(got.temperature_c).all()
-    assert build(Settings()).timing == Counter(TICKS, 1e-9)
+    assert build(Settings()).timing == CounterTiming(TICKS, 1e-9)
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_without_a_time_the_hint_says_what_to_do() -> None:
     decoder = build(Settings(clock="arrival"))
     decoder.feed([Chunk(data, 0)])
     assert decoder.hint == ""
-    assert decoder.timing == Arrival()
+    assert decoder.timing == ArrivalTiming()
 
 
 def test_time_beyond_62_bits_wraps() -> None:
@@ -141,7 +141,7 @@ def test_time_beyond_62_bits_wraps() -> None:
 
 
 def test_encode_writes_the_recommended_message() -> None:
-    samples = block(np.array([9]), np.zeros((1, 6)), ticks=np.array([7]))
+    samples = make_block(np.array([9]), np.zeros((1, 6)), ticks=np.array([7]))
     (chunk,) = build(Settings()).encode(samples)
     assert chunk.data[:4] == bytes.fromhex("FA 01 01 02")
     assert len(chunk.data) == 38

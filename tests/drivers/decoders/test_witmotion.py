@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from drivers.decoders.witmotion import Settings, build, packet
+from drivers.decoders.witmotion import Settings, build, encode_packet
 from drivers.errors import ConfigError
-from drivers.sample import Arrival, Chunk, SampleBlock, block, join
+from drivers.sample import ArrivalTiming, Chunk, SampleBlock, concatenate_blocks, make_block
 
 DEGREE, G = math.pi / 180.0, 9.80665
 ACCEL = bytes.fromhex("55 51 0A 00 EC FF 00 08 D0 09 7C")
 RATE = bytes.fromhex("55 52 10 00 E0 FF 05 00 00 00 9B")
-ANGLES = packet(0x53, bytes(8))
+ANGLES = encode_packet(0x53, bytes(8))
 REGISTER = bytes.fromhex("55 71 3A 00 68 01 69 00 7A 00 00 00 00 00 00 00 00 00 00 00")
 
 
@@ -21,7 +21,7 @@ def blocks_of(data: bytes, **settings: object) -> list[tuple[int, int]]:
 
 
 def decoded(data: bytes, **settings: object) -> SampleBlock:
-    return join(build(Settings(**settings)).feed([Chunk(data, 77)]))
+    return concatenate_blocks(build(Settings(**settings)).feed([Chunk(data, 77)]))
 
 
 def test_a_sample_is_both_packets() -> None:
@@ -30,7 +30,7 @@ def test_a_sample_is_both_packets() -> None:
     accel = np.array([0.0048828125, -0.009765625, 1.0]) * G
     np.testing.assert_allclose(got.values[0], [*gyro, *accel], rtol=1e-14)
     assert got.temperature_c[0] == pytest.approx(25.12)
-    assert build(Settings()).timing == Arrival()
+    assert build(Settings()).timing == ArrivalTiming()
 
 
 def test_the_other_familys_temperature() -> None:
@@ -97,13 +97,13 @@ def test_packets_without_pairs_are_told() -> None:
 
 
 def test_a_type_out_of_the_range_is_no_packet() -> None:
-    assert blocks_of(packet(0x60, bytes(8)) + packet(0x4F, bytes(8))) == []
+    assert blocks_of(encode_packet(0x60, bytes(8)) + encode_packet(0x4F, bytes(8))) == []
 
 
 def bluetooth(n: int) -> bytes:
     rng = np.random.default_rng(2)
     values = rng.normal(0.0, 1.0, (n, 6))
-    return b"".join(c.data for c in build(Settings(packet="bluetooth")).encode(block(np.arange(n), values)))
+    return b"".join(c.data for c in build(Settings(packet="bluetooth")).encode(make_block(np.arange(n), values)))
 
 
 def test_bluetooth_comes_one_packet_late() -> None:

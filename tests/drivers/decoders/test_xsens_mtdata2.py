@@ -5,8 +5,8 @@ import struct
 import numpy as np
 import pytest
 
-from drivers.decoders.xsens_mtdata2 import MAX_PAYLOAD, Settings, build, match, message
-from drivers.sample import NO_TICK, Chunk, Counter, SampleBlock, join
+from drivers.decoders.xsens_mtdata2 import MAX_PAYLOAD, Settings, build, encode_message, match
+from drivers.sample import NO_TICK, Chunk, CounterTiming, SampleBlock, concatenate_blocks
 
 DOCUMENTED = bytes.fromhex(
     "FA FF 36 31 10 20 02 DF C5 10 60 04 00 45 9D A0 40 20 0C BE DC 9A FA 3F 54 9F 37 41 1C BB 70"
@@ -31,7 +31,7 @@ def floats(did: int, *numbers: float) -> bytes:
 
 def decoded(data: bytes, **settings: object) -> SampleBlock | None:
     blocks = build(Settings(**settings)).feed([Chunk(data, 77)])
-    return join(blocks) if blocks else None
+    return concatenate_blocks(blocks) if blocks else None
 
 
 def test_the_documented_frame() -> None:
@@ -47,8 +47,8 @@ def test_the_other_clock() -> None:
     got = decoded(DOCUMENTED, clock="packet_counter")
     assert got is not None
     assert got.ticks.tolist() == [57285]
-    assert build(Settings()).timing == Counter(2**32, 1e-4)
-    assert build(Settings(clock="packet_counter")).timing == Counter(65536)
+    assert build(Settings()).timing == CounterTiming(2**32, 1e-4)
+    assert build(Settings(clock="packet_counter")).timing == CounterTiming(65536)
     free = decoded(DOCUMENTED, clock="arrival")
     assert free is not None
     assert free.ticks.tolist() == [NO_TICK]
@@ -78,12 +78,12 @@ def test_commands_and_answers_are_passed_over() -> None:
 
 
 def test_free_acceleration_is_never_used() -> None:
-    assert decoded(message(floats(0x4030, 0.1, 0.2, 0.3))) is None
+    assert decoded(encode_message(floats(0x4030, 0.1, 0.2, 0.3))) is None
 
 
 @pytest.mark.parametrize("frame", [0x0, 0x4, 0x8])
 def test_the_frame_bits_of_the_identifier_are_masked(frame: int) -> None:
-    got = decoded(message(floats(0x4020 | frame, 1, 2, 3) + floats(0x8020 | frame, 4, 5, 6)))
+    got = decoded(encode_message(floats(0x4020 | frame, 1, 2, 3) + floats(0x8020 | frame, 4, 5, 6)))
     assert got is not None
     assert got.values.tolist() == [[4, 5, 6, 1, 2, 3]]
 
@@ -97,17 +97,26 @@ def test_the_frame_bits_of_the_identifier_are_masked(frame: int) -> None:
     ],
 )
 def test_number_formats(kind: int, data: bytes) -> None:
-    got = decoded(message(item(0x4020 | kind, data)))
+    got = decoded(encode_message(item(0x4020 | kind, data)))
     assert got is not None
     assert got.values[0, 3:].tolist() == [-2.5, 0.25, 9.0]
 
 
 def test_a_slow_temperature_is_held() -> None:
     def sample(tick: int) -> bytes:
-        return message(item(0x1060, struct.pack(">I", tick)) + floats(0x4020, 0, 0, 9.8) + floats(0x8020, 0, 0, 0))
+        return encode_message(
+            item(0x1060, struct.pack(">I", tick)) + floats(0x4020, 0, 0, 9.8) + floats(0x8020, 0, 0, 0)
+        )
 
     decoder = build(Settings())
-    data = sample(0) + message(floats(0x0810, 25.5)) + sample(1) + sample(2) + message(floats(0x0810, 26.0)) + sample(3)
+    data = (
+        sample(0)
+        + encode_message(floats(0x0810, 25.5))
+        + sample(1)
+        + sample(2)
+        + encode_message(floats(0x0810, 26.0))
+        + sample(3)
+    )
     blocks = decoder.feed([Chunk(data, 0)])
     assert [(len(b), b.lost) for b in blocks] == [(4, 0)]
     np.testing.assert_array_equal(blocks[0].temperature_c, [np.nan, 25.5, 25.5, 26.0])
@@ -118,9 +127,9 @@ def test_a_slow_temperature_is_held() -> None:
 
 
 def test_layouts_mixed_in_one_feed_stay_in_order() -> None:
-    a = [message(item(0x1060, struct.pack(">I", i)) + floats(0x4020, i, 0, 0)) for i in range(6)]
-    b = [message(item(0x1060, struct.pack(">I", i)) + floats(0x8020, i, 0, 0)) for i in range(6)]
-    c = [message(floats(0x8020, i, 0, 0) + item(0x1060, struct.pack(">I", i))) for i in range(6)]
+    a = [encode_message(item(0x1060, struct.pack(">I", i)) + floats(0x4020, i, 0, 0)) for i in range(6)]
+    b = [encode_message(item(0x1060, struct.pack(">I", i)) + floats(0x8020, i, 0, 0)) for i in range(6)]
+    c = [encode_message(floats(0x8020, i, 0, 0) + item(0x1060, struct.pack(">I", i))) for i in range(6)]
     got = decoded(b"".join(x for trio in zip(a, b, c, strict=True) for x in trio))
     assert got is not None
     assert got.ticks.tolist() == [i for i in range(6) for _ in range(3)]
@@ -130,7 +139,7 @@ def test_layouts_mixed_in_one_feed_stay_in_order() -> None:
 
 def test_items_that_do_not_fill_the_packet_are_bad() -> None:
     decoder = build(Settings())
-    wrong = message(floats(0x4020, 1, 2, 3) + b"\x40\x20")
+    wrong = encode_message(floats(0x4020, 1, 2, 3) + b"\x40\x20")
     blocks = decoder.feed([Chunk(DOCUMENTED + wrong + DOCUMENTED, 0)])
     assert [(len(b), b.lost) for b in blocks] == [(1, 0), (1, 1)]
 
@@ -138,19 +147,19 @@ def test_items_that_do_not_fill_the_packet_are_bad() -> None:
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])
 def test_what_is_no_number_is_bad(wrong: float) -> None:
     decoder = build(Settings())
-    assert decoder.feed([Chunk(message(floats(0x4020, 1, wrong, 3)), 0)]) == []
+    assert decoder.feed([Chunk(encode_message(floats(0x4020, 1, wrong, 3)), 0)]) == []
     assert decoder.bad == 1
 
 
 def test_a_missing_clock_is_told() -> None:
     decoder = build(Settings())
-    decoder.feed([Chunk(message(floats(0x4020, 1, 2, 3)), 0)])
+    decoder.feed([Chunk(encode_message(floats(0x4020, 1, 2, 3)), 0)])
     assert "sample_time_fine" in decoder.hint
 
 
 def test_extended_length() -> None:
     payload = floats(0x4020, 1, 2, 3) + item(0x2010, bytes(250)) + item(0xC020, bytes(12))
-    data = message(payload)
+    data = encode_message(payload)
     assert data[3] == 0xFF
     got = decoded(data)
     assert got is not None

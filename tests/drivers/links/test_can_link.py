@@ -24,7 +24,7 @@ from drivers.decoders import dbc
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links import can_link
 from drivers.links.can_link import CanLink
-from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk, join
+from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk, concatenate_blocks
 
 UNIQUE = itertools.count()
 
@@ -72,14 +72,14 @@ def test_identifiers_and_data(peer: can.BusABC, channel: str) -> None:
 def test_a_read_is_never_without_end(peer: can.BusABC, channel: str) -> None:
     link = build(interface="virtual", channel=channel)
     link.open()
-    for _ in range(can_link.BATCH + 5):
+    for _ in range(can_link.MAX_FRAMES + 5):
         peer.send(message(1))
     sizes = []
-    while sum(sizes) < can_link.BATCH + 5:
+    while sum(sizes) < can_link.MAX_FRAMES + 5:
         sizes.append(len(link.read(0.1) or ()))
     link.close()
-    assert max(sizes) <= can_link.BATCH
-    assert sum(sizes) == can_link.BATCH + 5
+    assert max(sizes) <= can_link.MAX_FRAMES
+    assert sum(sizes) == can_link.MAX_FRAMES + 5
 
 
 def test_a_late_reader_still_gives_the_time_of_arrival(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -319,7 +319,7 @@ def test_from_the_bus_to_samples(peer: can.BusABC, channel: str) -> None:
     chunks = collect(link)
     link.close()
     assert len(chunks) == 20
-    got = join(decoder.feed(chunks))
+    got = concatenate_blocks(decoder.feed(chunks))
     assert np.rad2deg(got.values[:, :3]) == pytest.approx(np.repeat(np.arange(20.0)[:, None], 3, axis=1))
     assert (np.diff(got.t_ns) >= 0).all()
 

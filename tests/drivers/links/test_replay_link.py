@@ -14,7 +14,7 @@ from drivers.errors import ConfigError, LinkEnded, LinkUnavailable
 from drivers.links import replay_link
 from drivers.links.base import Link
 from drivers.recordings import load_samples
-from drivers.sample import EXTENDED_ID, Chunk, join
+from drivers.sample import EXTENDED_ID, Chunk, concatenate_blocks
 
 FRAMES = [(0x9, False, bytes(range(8))), (0x0CF02AE2, True, b"\x00\x7d\x00\x7d\x00\x7d\x00\x05")] * 20
 
@@ -71,7 +71,7 @@ def test_a_recording_arrives_as_it_is(tmp_path: Path) -> None:
     link = build(path)
     assert (link.carrier, link.epoch) == ("messages", "unix")
     chunks, _ = read_all(link)
-    got = join(samples.build(samples.Settings()).feed(chunks))
+    got = concatenate_blocks(samples.build(samples.Settings()).feed(chunks))
     kept = load_samples(path)
     np.testing.assert_array_equal(got.values, kept.values)
     np.testing.assert_array_equal(got.temperature_c, kept.temperature_c)
@@ -96,7 +96,7 @@ def test_uneven_times_of_a_recording_are_kept(tmp_path: Path) -> None:
     rows = ["t,gz,ax", "1700000000.0,1,2", "1700000000.013,3,", "1700000000.011,5,6", "1700000007.5,7,8"]
     path.write_text("\n".join(rows) + "\n")
     chunks, _ = read_all(build(path))
-    got = join(samples.build(samples.Settings()).feed(chunks))
+    got = concatenate_blocks(samples.build(samples.Settings()).feed(chunks))
     assert got.t_ns - 1_700_000_000_000_000_000 == pytest.approx([0, 13e6, 11e6, 7.5e9], abs=500)
     np.testing.assert_array_equal(got.values[:, 2], [1, 3, 5, 7])
     np.testing.assert_array_equal(got.values[:, 3], [2, np.nan, 6, 8])
@@ -108,7 +108,7 @@ def test_rate_of_a_recording_without_times(tmp_path: Path) -> None:
     with pytest.raises(LinkUnavailable, match="rate"):
         build(path).open()
     chunks, _ = read_all(build(path, rate=50.0))
-    got = join(samples.build(samples.Settings()).feed(chunks))
+    got = concatenate_blocks(samples.build(samples.Settings()).feed(chunks))
     assert got.t_ns.tolist() == [0, 20_000_000, 40_000_000]
 
 

@@ -73,13 +73,13 @@ def test_a_flow_faster_than_the_buffer_is_not_held_up(pty: tuple[int, str], monk
     waits: list[float] = []
     wait = link._closing.wait
     monkeypatch.setattr(link._closing, "wait", lambda timeout_s: waits.append(timeout_s) or wait(timeout_s))
-    sent = os.urandom(20 * serial_link.READ_SIZE)
+    sent = os.urandom(20 * serial_link.READ_BYTES)
     parts = [sent[at : at + 500] for at in range(0, len(sent), 500)]
     writer = threading.Thread(target=lambda: [os.write(master, part) for part in parts], daemon=True)
     writer.start()
     got = b""
     for _ in range(5):
-        wait_for(lambda: link._port is not None and link._port.in_waiting > serial_link.READ_SIZE // 2 + 1)
+        wait_for(lambda: link._port is not None and link._port.in_waiting > serial_link.READ_BYTES // 2 + 1)
         got += b"".join(chunk.data for chunk in link.read(1.0) or ())
     assert len(waits) == 1
     got += read_all(link, len(sent) - len(got))

@@ -109,7 +109,7 @@ def test_long_messages_that_nobody_reads_give_way(router: Any, endpoint: str) ->
         time.sleep(0.05)
     wait_for(lambda: link._waiting[-1].data[:1] == b"\x0b", "the last message")
     held = sum(len(chunk.data) for chunk in link._waiting)
-    assert held <= zenoh_link.WAITING_BYTES
+    assert held <= zenoh_link.MAX_QUEUED_BYTES
     assert link.read(0.1)
     link.close()
 

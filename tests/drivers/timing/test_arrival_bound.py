@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.sample import Counter, SampleBlock, block
+from drivers.sample import CounterTiming, SampleBlock, make_block
 from drivers.timing.arrival_bound import SETTLED_S, WINDOW_S, ArrivalBound
-from drivers.timing.sample_clock import Before, SampleClock
+from drivers.timing.sample_clock import LastSample, SampleClock
 
 NS = 1e9
 BEGUN_S = 5_000.0
@@ -22,8 +22,8 @@ BEGUN_S = 5_000.0
 POLL_S = 0.01
 BURST_S = 2e-4
 """Time between two reads while the buffer is not empty."""
-WITH_TIME = Counter(1 << 40, 1e-6)
-SAMPLES = Counter(1 << 32)
+WITH_TIME = CounterTiming(1 << 40, 1e-6)
+SAMPLES = CounterTiming(1 << 32)
 COUNTERS = st.sampled_from([(WITH_TIME, True), (WITH_TIME, False), (SAMPLES, True), (SAMPLES, False)])
 """What is counted, and whether the rate is configured."""
 
@@ -77,7 +77,7 @@ class Reader:
         return reads
 
 
-def ticks_of(index: "np.ndarray", counter: Counter, rate_hz: float) -> "np.ndarray":
+def ticks_of(index: "np.ndarray", counter: CounterTiming, rate_hz: float) -> "np.ndarray":
     counted = index if counter.tick_s is None else np.rint(index / (rate_hz * counter.tick_s))
     return (counted.astype(np.int64) + counter.modulus - 1000) % counter.modulus  # wraps early
 
@@ -85,7 +85,7 @@ def ticks_of(index: "np.ndarray", counter: Counter, rate_hz: float) -> "np.ndarr
 def stamp(clock: SampleClock, arrived_s: float, samples: list[int], ticks: "np.ndarray") -> list[SampleBlock]:
     values = np.tile(np.array(samples, float)[:, None], 6)
     t_ns = np.full(len(samples), round((BEGUN_S + arrived_s) * NS))
-    return clock.stamp(block(t_ns, values, None, ticks))
+    return clock.assign_times(make_block(t_ns, values, None, ticks))
 
 
 def counts(out: list[SampleBlock]) -> tuple[int, int]:
@@ -96,7 +96,7 @@ def told(clock: SampleClock) -> list[str]:
     return [event.text for event in clock.take_events(ended=True) if event.kind == "clock_jumped"]
 
 
-def new_clock(counter: Counter, rate_hz: float, configured: bool) -> SampleClock:
+def new_clock(counter: CounterTiming, rate_hz: float, configured: bool) -> SampleClock:
     clock = SampleClock(counter, rate_hz if configured else None)
     clock.link_idle(round(BEGUN_S * NS))
     return clock
@@ -116,7 +116,9 @@ readers = st.builds(
 
 @settings(max_examples=40)
 @given(reader=readers, kind=COUNTERS)
-def test_every_sample_is_received_or_lost_however_late_it_is_read(reader: Reader, kind: tuple[Counter, bool]) -> None:
+def test_every_sample_is_received_or_lost_however_late_it_is_read(
+    reader: Reader, kind: tuple[CounterTiming, bool]
+) -> None:
     counter, configured = kind
     reads = reader.read(35.0 + sum(pause.for_s for pause in reader.pauses))
     clock = new_clock(counter, reader.rate_hz, configured)
@@ -137,7 +139,7 @@ STARVED = [Pause(12.0, 0.4), Pause(15.0, 8.0), Pause(30.0, 1.5)]
 @pytest.mark.parametrize("ahead_s", [-3600.0, -45.0, 30.0, 3600.0, 86400.0])
 @pytest.mark.parametrize("starved", [False, True])
 def test_a_jump_is_told_and_counted_as_no_loss(
-    counter: Counter, configured: bool, ahead_s: float, starved: bool
+    counter: CounterTiming, configured: bool, ahead_s: float, starved: bool
 ) -> None:
     """The counter goes on or back, or begins anew, at 40 s."""
     rate_hz = 100.0
@@ -161,7 +163,7 @@ def test_a_jump_is_told_and_counted_as_no_loss(
     kind=COUNTERS,
 )
 def test_a_jump_longer_than_the_reader_was_late_is_told(
-    at_s: float, for_s: float, ahead_s: float, kind: tuple[Counter, bool]
+    at_s: float, for_s: float, ahead_s: float, kind: tuple[CounterTiming, bool]
 ) -> None:
     """The counter jumps while the reader is late: a longer step than that cannot be a hole."""
     counter, configured = kind
@@ -187,12 +189,14 @@ def test_a_device_that_begins_late_has_jumps_told_from_its_first_samples_on() ->
 
 @pytest.mark.parametrize("counter", [WITH_TIME, SAMPLES])
 @pytest.mark.parametrize(("away", "jumps"), [(800, 0), (10_000, 1)])
-def test_the_last_sample_before_a_restart_may_have_been_read_late(counter: Counter, away: int, jumps: int) -> None:
+def test_the_last_sample_before_a_restart_may_have_been_read_late(
+    counter: CounterTiming, away: int, jumps: int
+) -> None:
     """It was taken at 2.5 s and read at 6 s; after the restart the first sample comes at 10.5 s."""
     last = np.array([250])
     step = 1.0 if counter.tick_s is None else 1e4
     clock = SampleClock(counter, 100.0)
-    clock.resume(Before(round((BEGUN_S + 6.0) * NS), int(ticks_of(last, counter, 100.0)[0]), 100.0, step))
+    clock.resume(LastSample(round((BEGUN_S + 6.0) * NS), int(ticks_of(last, counter, 100.0)[0]), 100.0, step))
     out = stamp(clock, 10.5, [1], ticks_of(last + away, counter, 100.0))
     assert len(told(clock)) == jumps
     if not jumps:

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from drivers.timing.duplicate_rows import EVENT_S, FRESH, Repeats, Telling, steady_order
+from drivers.timing.duplicate_rows import (
+    MIN_EVENT_INTERVAL_S,
+    MIN_NEW_KEYS,
+    DuplicateDetector,
+    EventRateLimiter,
+    steady_order,
+)
 
 MS = 10**6
 
@@ -14,15 +20,15 @@ def found(repeats, keys, first=0.0):
 
 
 def test_nothing_is_called_a_repeat_before_enough_is_seen():
-    repeats = Repeats(ordered=True)
+    repeats = DuplicateDetector(ordered=True)
     assert repeats.find(np.zeros(5, np.int64), np.zeros((5, 6))) == (None, 0)
-    assert found(repeats, range(1, FRESH + 1)) == (None, 0)
+    assert found(repeats, range(1, MIN_NEW_KEYS + 1)) == (None, 0)
     mask, others = repeats.find(np.array([99, 99]), np.ones((2, 6)))
     assert (mask.tolist(), others) == ([False, True], 0)
 
 
 def test_absent_axes_are_equal():
-    repeats = Repeats(ordered=True)
+    repeats = DuplicateDetector(ordered=True)
     found(repeats, range(100))
     values = np.full((2, 6), np.nan)
     values[:, 0] = 1.0
@@ -30,14 +36,14 @@ def test_absent_axes_are_equal():
 
 
 def test_a_counter_that_wraps_repeats_only_the_row_before():
-    repeats = Repeats(ordered=False)
+    repeats = DuplicateDetector(ordered=False)
     for _ in range(3):
         assert repeats.find(np.arange(50), np.zeros((50, 6)))[0] is None
     assert repeats.find(np.array([50, 50, 7]), np.zeros((3, 6)))[0].tolist() == [False, True, False]
 
 
 def test_a_clock_set_back_by_hours_does_not_slow_what_follows():
-    repeats = Repeats(ordered=True)
+    repeats = DuplicateDetector(ordered=True)
     found(repeats, np.arange(100) * MS + 10**13)
     found(repeats, np.arange(100) * MS)
     assert repeats._last == 99 * MS
@@ -60,7 +66,7 @@ def test_only_a_steady_sequence_is_put_in_order(t, order):
 
 
 def test_events_keep_their_distance_and_nothing_is_forgotten():
-    telling = Telling()
+    telling = EventRateLimiter()
     for i in range(100):
         telling.tell("a", i * 100 * MS, "{n} rows", 2)
     telling.tell("b", 9900 * MS, "once")
@@ -68,14 +74,14 @@ def test_events_keep_their_distance_and_nothing_is_forgotten():
     assert [event.text for event in told if event.kind == "b"] == ["once"]
     of_a = [event for event in told if event.kind == "a"]
     assert len(of_a) == 10
-    assert np.diff([event.t_ns for event in of_a]).min() >= EVENT_S * 1e9
+    assert np.diff([event.t_ns for event in of_a]).min() >= MIN_EVENT_INTERVAL_S * 1e9
     last = telling.take(ended=True)
     assert sum(int(event.text.split()[0]) for event in of_a + last) == 200
     assert telling.take(ended=True) == []
 
 
 def test_other_texts_of_a_kind_are_counted_while_they_are_held_back():
-    telling = Telling()
+    telling = EventRateLimiter()
     for text in ("first", "second", "third", "fourth"):
         telling.tell("a", 5 * MS, text)
     assert [event.text for event in telling.take()] == ["first"]

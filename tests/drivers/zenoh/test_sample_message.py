@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import DecodeError
-from drivers.sample import AXES, SampleBlock, block
+from drivers.sample import AXES, SampleBlock, make_block
 from drivers.zenoh import sample_message
-from drivers.zenoh.sample_message import pack, unpack
+from drivers.zenoh.sample_message import decode_samples, encode_samples
 from tests.support.ports import free_endpoint
 from tests.support.zenoh_sessions import router
 
@@ -27,7 +27,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "samples-format.md"
 def rows(n: int, jitter_ns: int = 0) -> SampleBlock:
     rng = np.random.default_rng(3)
     t_ns = START_NS + np.arange(n) * 10_000_000 + rng.integers(0, jitter_ns + 1, n)
-    return block(t_ns, rng.normal(size=(n, 6)), rng.normal(25, 1, n), lost=4)
+    return make_block(t_ns, rng.normal(size=(n, 6)), rng.normal(25, 1, n), lost=4)
 
 
 def loose(payload: bytes) -> dict[str, Any]:
@@ -40,7 +40,7 @@ def loose(payload: bytes) -> dict[str, Any]:
 @pytest.mark.parametrize("jitter_ns", [0, 3_000_000])
 def test_there_and_back(n: int, jitter_ns: int) -> None:
     sent = rows(n, jitter_ns)
-    batch = unpack(pack("bench-1", 1000, sent))
+    batch = decode_samples(encode_samples("bench-1", 1000, sent))
     assert (batch.device, batch.samples, batch.block.lost) == ("bench-1", 1000, 4)
     np.testing.assert_array_equal(batch.block.values, sent.values)
     np.testing.assert_array_equal(batch.block.temperature_c, sent.temperature_c)
@@ -49,7 +49,7 @@ def test_there_and_back(n: int, jitter_ns: int) -> None:
 
 
 def test_even_batches_are_told_by_start_and_rate() -> None:
-    even, uneven = loose(pack("d", 10, rows(10))), loose(pack("d", 10, rows(10, 3_000_000)))
+    even, uneven = loose(encode_samples("d", 10, rows(10))), loose(encode_samples("d", 10, rows(10, 3_000_000)))
     assert even["rate"] == pytest.approx(100.0)
     assert even["t0"] == pytest.approx(START_NS * 1e-9)
     assert even["t"] == pytest.approx(START_NS * 1e-9 + 0.09)
@@ -61,18 +61,20 @@ def test_even_batches_are_told_by_start_and_rate() -> None:
 def test_only_measured_columns_travel() -> None:
     values = np.full((3, 6), np.nan)
     values[:, 2] = [1.0, np.nan, 3.0]
-    sent = block(np.arange(3) * 1000, values)
-    payload = loose(pack("d", 3, sent))
+    sent = make_block(np.arange(3) * 1000, values)
+    payload = loose(encode_samples("d", 3, sent))
     assert payload["axes"] == ["gz"]
     assert len(payload["data"]) == 24
-    got = unpack(pack("d", 3, sent)).block
+    got = decode_samples(encode_samples("d", 3, sent)).block
     np.testing.assert_array_equal(got.values, values)
     assert np.isnan(got.temperature_c).all()
 
 
 def test_offset_makes_unix_time() -> None:
-    sent = block(np.array([5_000_000_000]), np.ones((1, 6)))
-    assert unpack(pack("d", 1, sent, offset_ns=START_NS)).block.t_ns[0] == pytest.approx(START_NS + 5e9, abs=250)
+    sent = make_block(np.array([5_000_000_000]), np.ones((1, 6)))
+    assert decode_samples(encode_samples("d", 1, sent, offset_ns=START_NS)).block.t_ns[0] == pytest.approx(
+        START_NS + 5e9, abs=250
+    )
 
 
 def good() -> dict[str, Any]:
@@ -89,7 +91,7 @@ def good() -> dict[str, Any]:
 
 
 def test_layout_of_the_page() -> None:
-    batch = unpack(msgspec.msgpack.encode(good()))
+    batch = decode_samples(msgspec.msgpack.encode(good()))
     assert batch.block.t_ns.tolist() == [12_000_000_000, 12_500_000_000]
     assert batch.block.values[:, AXES.index("gz")].tolist() == [1.0, 3.0]
     assert batch.block.values[:, AXES.index("az")].tolist() == [2.0, 4.0]
@@ -97,7 +99,7 @@ def test_layout_of_the_page() -> None:
 
 def test_unknown_keys_and_columns_are_left_aside() -> None:
     later = good() | {"axes": ["gz", "mx"], "quality": {"a": [1, 2]}}
-    values = unpack(msgspec.msgpack.encode(later)).block.values
+    values = decode_samples(msgspec.msgpack.encode(later)).block.values
     assert values[:, 2].tolist() == [1.0, 3.0]
     assert np.isnan(values[:, [0, 1, 3, 4, 5]]).all()
 
@@ -127,19 +129,19 @@ def test_unknown_keys_and_columns_are_left_aside() -> None:
 )
 def test_refused(change: dict[str, Any], says: str) -> None:
     with pytest.raises(DecodeError, match=says):
-        unpack(msgspec.msgpack.encode(good() | change))
+        decode_samples(msgspec.msgpack.encode(good() | change))
 
 
 def test_too_many_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sample_message, "MAX_ROWS", 1)
     with pytest.raises(DecodeError, match="rows"):
-        unpack(msgspec.msgpack.encode(good()))
+        decode_samples(msgspec.msgpack.encode(good()))
 
 
 @given(st.binary(max_size=200))
 def test_noise_is_no_message(data: bytes) -> None:
     with pytest.raises(DecodeError):
-        unpack(data)
+        decode_samples(data)
 
 
 @given(st.integers(0, 200), st.integers(0, 255))
@@ -147,7 +149,7 @@ def test_a_damaged_message_is_refused_or_read(at: int, value: int) -> None:
     payload = bytearray(msgspec.msgpack.encode(good()))
     payload[at % len(payload)] = value
     with contextlib.suppress(DecodeError):
-        assert len(unpack(bytes(payload)).block) >= 1
+        assert len(decode_samples(bytes(payload)).block) >= 1
 
 
 def test_the_example_of_the_page_reads_what_is_published() -> None:
@@ -171,7 +173,7 @@ def test_the_example_of_the_page_reads_what_is_published() -> None:
 
         def publish() -> None:
             while not stop.wait(0.05):
-                opened.put("imu/bench-1/samples", pack("bench-1", 20, sent))
+                opened.put("imu/bench-1/samples", encode_samples("bench-1", 20, sent))
 
         publisher = threading.Thread(target=publish)
         publisher.start()

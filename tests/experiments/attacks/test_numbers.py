@@ -31,7 +31,7 @@ from monitor.commands.analyze import Request, make
 from monitor.common import config_files
 from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
-from monitor.noise.temperature import UNITS as TEMPERATURE_KEYS
+from monitor.noise.temperature import TEMPERATURE_UNITS as TEMPERATURE_KEYS
 from monitor.settings import loading, schema
 
 pytestmark = pytest.mark.timeout(900)
@@ -218,13 +218,17 @@ def key_cases() -> Iterator[tuple[str, type[msgspec.Struct], str]]:
     ):
         yield (
             DEVICE.format(keys="", driver=driver),
-            discovery.load(drivers.links, name, "_link").Settings,
+            discovery.import_module(drivers.links, name, "_link").Settings,
             f"link {name}",
         )
-    for name in discovery.names(drivers.decoders):
+    for name in discovery.list_modules(drivers.decoders):
         wanted = {"text": 'columns = ["gz"]\n', "dbc": 'file = "canmod_gps"\nsignals = { gz = "ImuData.GyroZ" }\n'}
         driver = f'link = "virtual"\ndecoder = "{name}"\n[device.driver.decoder_options]\n{wanted.get(name, "")}{{}}'
-        yield DEVICE.format(keys="", driver=driver), discovery.load(drivers.decoders, name).Settings, f"decoder {name}"
+        yield (
+            DEVICE.format(keys="", driver=driver),
+            discovery.import_module(drivers.decoders, name).Settings,
+            f"decoder {name}",
+        )
 
 
 def numeric_keys(kind: type[msgspec.Struct]) -> list[str]:
@@ -397,14 +401,14 @@ def columns(n: int = 400) -> dict[str, Any]:
 def test_stated_rate_of_a_recording(fs: Any, tmp_path: Path) -> None:
     path = tmp_path / "r.npz"
     np.savez(path, fs=fs, **columns())
-    answer_or_refuse(Request(path, others=True))
+    answer_or_refuse(Request(path, total_and_hadamard=True))
 
 
 @pytest.mark.parametrize("step_s", [1e-300, 1e-12, 1e-9, 1e-7, 1e-6, 1e-5, 15.0, 900.0, 1e4, 1e7])
 def test_time_stamps_of_a_recording(step_s: float, tmp_path: Path) -> None:
     path = tmp_path / "r.npz"
     np.savez(path, t=np.arange(400) * step_s, **columns())
-    answered = answer_or_refuse(Request(path, others=True))
+    answered = answer_or_refuse(Request(path, total_and_hadamard=True))
     assert answered == (1e-6 <= step_s <= 900.0), step_s
 
 
@@ -447,7 +451,7 @@ def test_absurd_samples(value: float, tmp_path: Path) -> None:
     data["gx"][100:110] = value
     data["gz"] = data["gz"] * value
     np.savez(path, fs=100.0, **data)
-    answer_or_refuse(Request(path, others=True))
+    answer_or_refuse(Request(path, total_and_hadamard=True))
 
 
 @pytest.mark.parametrize("last_s", [1e-6, 1e-3, 1e9])
@@ -462,7 +466,7 @@ def test_every_supported_rate_is_answered(rate_hz: float, tmp_path: Path) -> Non
     """Both ends of the range, and a sensor of vibration; slow sensors are above, by their time stamps."""
     path = tmp_path / "r.npz"
     np.savez(path, t=np.arange(2000) / rate_hz, **columns(2000))
-    found = make(Request(path, others=True, window_s=500.0 / rate_hz))
+    found = make(Request(path, total_and_hadamard=True, window_s=500.0 / rate_hz))
     assert found.analysis.estimate.rate_hz == pytest.approx(rate_hz, rel=1e-3)
 
 

@@ -20,12 +20,12 @@ import zenoh
 from drivers.errors import LinkUnavailable
 from drivers.links import serial_link
 from drivers.recordings import load_samples, segment
-from drivers.sample import block
-from drivers.zenoh.sample_message import pack
+from drivers.sample import make_block
+from drivers.zenoh.sample_message import encode_samples
 from drivers.zenoh.session import configuration
 from monitor.common import topics
 from monitor.daemon.operations.metrics import MetricsOutput
-from monitor.publishing.zenoh.publisher import ZenohOut
+from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.settings.loading import Metrics, ZenohTable
 from tests.experiments.benchmarks import faults
 
@@ -77,7 +77,9 @@ class Publisher:
             values = np.zeros((len(index), 6))
             values[:, 0] = index * 1e-6
             self.sent = due
-            self._publisher.put(pack("imu", due, block(begun_ns + index * (1_000_000_000 // RATE), values)))
+            self._publisher.put(
+                encode_samples("imu", due, make_block(begun_ns + index * (1_000_000_000 // RATE), values))
+            )
 
 
 class Daemon:
@@ -133,14 +135,14 @@ format = "json"
 
 def numbers(folder: Path) -> list[int]:
     """Numbers of all samples in the recording, in its order."""
-    pieces = [piece for path in segment.segments(folder) for piece in segment.read_samples(path)]
+    pieces = [piece for path in segment.list_segments(folder) for piece in segment.read_samples(path)]
     return [round(value * 1e6) for piece in pieces for value in piece.samples.values[:, 0]]
 
 
 def missing(folder: Path) -> int:
     """Samples that are not in the recording; AssertionError for one kept twice, or missing without being counted."""
     due, total = None, 0
-    for path in segment.segments(folder):
+    for path in segment.list_segments(folder):
         for piece in segment.read_samples(path):
             found = [round(value * 1e6) for value in piece.samples.values[:, 0]]
             if due is not None:
@@ -160,7 +162,7 @@ def test_two_daemons_on_one_folder_record_each_sample_once(tmp_path: Path) -> No
         with daemons() as running:
             first = Daemon(tmp_path, "first", text)
             running.append(first)
-            eventually(lambda: segment.segments(folder / "imu"), "the first records")
+            eventually(lambda: segment.list_segments(folder / "imu"), "the first records")
             second = Daemon(tmp_path, "second", text)
             running.append(second)
             held = f"{folder}: in use by process {first.pid}; "
@@ -197,8 +199,8 @@ def test_two_daemons_on_one_folder_record_each_sample_once(tmp_path: Path) -> No
 # --- one endpoint, one key
 
 
-def opened(settings: ZenohTable) -> ZenohOut:
-    one = ZenohOut(settings, ["bench"])
+def opened(settings: ZenohTable) -> ZenohPublisher:
+    one = ZenohPublisher(settings, ["bench"])
     one.start()
     eventually(lambda: one.state.startswith("ok"), "the session")
     return one

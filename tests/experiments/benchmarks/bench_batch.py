@@ -18,7 +18,7 @@ import numpy as np
 
 from drivers.recordings import Recording, iter_blocks
 from drivers.sample import AXES, Floats, Ints
-from monitor.estimation.allan.batch import cluster_sizes, overlapping, overlapping_axis, slope
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, overlapping_avar_axis, slope_of_recording
 from monitor.estimation.analysis import analyze
 from tests.experiments.benchmarks.machine import Load, about, alternate, console, table
 
@@ -44,7 +44,7 @@ def peer(column: Floats, factors: Ints) -> Floats:
 def agreement(values: Floats, factors: Ints) -> float:
     """Largest relative difference of the two in deviation."""
     theirs = peer(values[:, 5].copy(), factors)
-    ours = np.sqrt(overlapping_axis(values[:, 5], factors)[0][: theirs.size])
+    ours = np.sqrt(overlapping_avar_axis(values[:, 5], factors)[0][: theirs.size])
     return float(np.abs(ours / theirs - 1.0).max())
 
 
@@ -69,13 +69,13 @@ def one_thread(values: Floats, rounds: int) -> None:
     column = values[:, 5].copy()
     works = {
         "allantools": lambda: peer(column, octave),
-        "one axis": lambda: overlapping_axis(column, octave),
-        "of six": lambda: overlapping_axis(values[:, 5], octave),
-        "six": lambda: overlapping(values, octave),
-        "slope": lambda: slope(values),
+        "one axis": lambda: overlapping_avar_axis(column, octave),
+        "of six": lambda: overlapping_avar_axis(values[:, 5], octave),
+        "six": lambda: overlapping_avar(values, octave),
+        "slope": lambda: slope_of_recording(values),
         "analyze": lambda: analyze(blocks, RATE_HZ),
         "allantools, decade10": lambda: peer(column, decade),
-        "decade10": lambda: overlapping_axis(column, decade),
+        "decade10": lambda: overlapping_avar_axis(column, decade),
     }
     took = alternate(works, rounds)  # type: ignore[arg-type]
     shown = table(
@@ -110,8 +110,8 @@ def threads(values: Floats, rounds: int) -> None:
     shown = table(f"overlapping, six axes of {len(values):,} samples", "", "on the wall", "processor")
     with ThreadPoolExecutor(THREADS) as pool:
         works = {
-            "one thread": lambda: overlapping(values, factors),
-            f"{THREADS} threads": lambda: overlapping(values, factors, each=pool.map),
+            "one thread": lambda: overlapping_avar(values, factors),
+            f"{THREADS} threads": lambda: overlapping_avar(values, factors, each=pool.map),
         }
         for name, work in works.items():
             wall, processor = on_the_wall(work, rounds)

@@ -16,7 +16,7 @@ from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).parents[3]))
 
-from drivers.sample import Chunk, SampleBlock, block
+from drivers.sample import Chunk, SampleBlock, make_block
 from tests.contracts.decoder_examples import EXAMPLES, Example
 
 SAMPLES = 20_000
@@ -29,7 +29,7 @@ def made(n: int) -> SampleBlock:
     rng = np.random.default_rng(1)
     values = rng.normal(0.0, 0.01, (n, 6)) + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.8])
     at = np.arange(n)
-    return block(at * 1_000_000, values, np.full(n, 25.0), at * 10)
+    return make_block(at * 1_000_000, values, np.full(n, 25.0), at * 10)
 
 
 def fed_at(chunks: Sequence[Chunk], carrier: str) -> list[Chunk]:

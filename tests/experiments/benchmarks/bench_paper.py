@@ -21,9 +21,9 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from drivers.sample import Floats, Ints, block
+from drivers.sample import Floats, Ints, make_block
 from monitor.estimation.allan.batch import cluster_sizes
-from monitor.estimation.allan.uncertainty import table as covariances
+from monitor.estimation.allan.uncertainty import covariance_table as covariances
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.estimator import Estimator
 from monitor.estimation.fit.coefficient_fit import design, fit
@@ -96,7 +96,7 @@ class Fitted:
         for start in range(0, n, ROWS):
             values = NOISE * others.standard_normal((min(ROWS, n - start), AXES))
             values[:, 0] = first[start : start + ROWS]
-            samples = block(start + np.arange(len(values)), values)
+            samples = make_block(start + np.arange(len(values)), values)
             begun = time.thread_time()
             estimator.update(samples)
             took += time.thread_time() - begun
@@ -213,11 +213,11 @@ def each_sample(length: int, taus: int, rounds: int) -> tuple[str, ...]:
     window = AllanWindow(length, sizes)
     plain, fitting = Estimator(1.0, float(length), grid), Estimator(1.0, float(length), grid, every_sample=True)
     for _ in range(-(-length // n) + 1):
-        samples = block(np.arange(n), noise(n))
+        samples = make_block(np.arange(n), noise(n))
         window.update(samples.values)
         plain.update(samples)
         fitting.update(samples)
-    parts = [block(np.arange(100), noise(100)) for _ in range(n // 100)]
+    parts = [make_block(np.arange(100), noise(100)) for _ in range(n // 100)]
     model, table_ = design(sizes, 1.0), covariances(length, sizes)
     avar, terms, slope = window.avar(), window.terms(), window.slope()
     took = alternate(

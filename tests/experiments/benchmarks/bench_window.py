@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 from allantools.realtime import oadev_realtime
 
-from drivers.sample import Floats, Ints, block
+from drivers.sample import Floats, Ints, make_block
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.estimator import Estimator
 from tests.experiments.benchmarks.machine import Load, about, alternate, console, table
@@ -157,7 +157,7 @@ def full_estimator(seconds: float, rate_hz: float) -> Estimator:
     estimator = Estimator(rate_hz, seconds)
     for start in range(0, round(seconds * rate_hz), 100_000):
         n = min(100_000, round(seconds * rate_hz) - start)
-        estimator.update(block(np.arange(n), made(n), np.full(n, np.nan), np.arange(n)))
+        estimator.update(make_block(np.arange(n), made(n), np.full(n, np.nan), np.arange(n)))
     return estimator
 
 
@@ -167,7 +167,7 @@ def growing_refits() -> list[float]:
     values = made(60_000)
     for start in range(0, len(values), CHUNK):
         part = values[start : start + CHUNK]
-        estimator.update(block(np.arange(CHUNK), part, np.full(CHUNK, np.nan), np.arange(CHUNK)))
+        estimator.update(make_block(np.arange(CHUNK), part, np.full(CHUNK, np.nan), np.arange(CHUNK)))
         begun = time.perf_counter()
         estimator.get()
         took.append(time.perf_counter() - begun)

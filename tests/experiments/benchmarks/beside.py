@@ -22,10 +22,7 @@ from scipy.signal import welch
 
 from drivers.sample import AXES, Floats
 from monitor.commands import analyze, simulate
-from monitor.estimation.analysis import Analysis
-from monitor.estimation.detection.line_detection import lines
-from monitor.noise.catalogue import load
-from monitor.publishing.coefficient_cells import (
+from monitor.common.units import (
     COEFFICIENT_UNITS,
     DEGREE,
     DEVIATION_UNITS,
@@ -33,10 +30,13 @@ from monitor.publishing.coefficient_cells import (
     KINDS,
     Kind,
     axes_of,
-    kind_of,
-    reading,
+    sensor_kind,
 )
-from monitor.publishing.plots.allan_figure import COLOURS, DARK, DASHES, GREY, MARKERS, SIZES, plain_ticks, quiet
+from monitor.estimation.analysis import Analysis
+from monitor.estimation.detection.line_detection import detect_lines
+from monitor.noise.catalogue import load_model
+from monitor.publishing.coefficient_cells import format_coefficient
+from monitor.publishing.plots.allan_figure import COLOURS, DARK, DASHES, GREY, MARKERS, SIZES, set_log_ticks, style_grid
 from tests.experiments.benchmarks.machine import console, table
 from tests.experiments.pictures import small
 
@@ -79,7 +79,7 @@ def sides(recording: Path, model: str, seed: int) -> tuple[Side, Side]:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "simulated.npz"
         seconds = estimate.curve.n / estimate.rate_hz
-        simulate.make(simulate.Request(load(model, Path.cwd()), out, seconds, seed, estimate.rate_hz, name=model))
+        simulate.make(simulate.Request(load_model(model, Path.cwd()), out, seconds, seed, estimate.rate_hz, name=model))
         simulated = analyze.make(analyze.Request(out)).analysis
     return Side("recorded", recorded), Side("simulated", simulated)
 
@@ -118,14 +118,14 @@ def panel(axes: "Axes", recorded: Side, simulated: Side, kind: Kind) -> None:
     axes.set(xlabel="averaging time τ, s", ylabel=f"Allan deviation σ(τ), {DEVIATION_UNITS[kind].name}")
     axes.set_title(KIND_NAMES[kind], loc="left", fontsize=12)
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, frameon=False, ncols=5)
-    plain_ticks(axes)
-    quiet(axes)
+    set_log_ticks(axes)
+    style_grid(axes)
 
 
 def curve(side: Side, axis: str) -> tuple[Floats, Floats, Floats, Floats]:
     """τ in s; deviation and the ends of its interval in the field's unit."""
     known, i = side.result.estimate.curve, AXES.index(axis)
-    factor = DEVIATION_UNITS[kind_of(axis)].factor
+    factor = DEVIATION_UNITS[sensor_kind(axis)].factor
     rows = np.isfinite(known.avar[:, i]) & (known.avar[:, i] > 0)
     deviation, lo, hi = (factor * a[rows, i] for a in (np.sqrt(known.avar), known.lo, known.hi))
     return known.tau_s[rows], deviation, np.clip(lo, deviation / BEYOND, None), np.clip(hi, None, deviation * BEYOND)
@@ -134,7 +134,7 @@ def curve(side: Side, axis: str) -> tuple[Floats, Floats, Floats, Floats]:
 def name_lines(axes: "Axes", side: Side, kind: Kind) -> None:
     """A mark where each line of the recording stands out most, one for those of several axes."""
     result = side.result
-    found = lines(result.values, np.zeros(len(result.values), bool), side.rate_hz, result.estimate.curve)
+    found = detect_lines(result.values, np.zeros(len(result.values), bool), side.rate_hz, result.estimate.curve)
     named: list[float] = []
     for line in sorted((one for one in found if AXES[one.axis] in axes_of(kind)), key=lambda one: -one.share):
         if all(abs(line.frequency_hz / other - 1.0) > 0.1 for other in named):
@@ -180,13 +180,13 @@ def neighbours(side: Side) -> Floats:
 
 def figures(recorded: Side, simulated: Side) -> None:
     """Print what differs, six axes beside each other."""
-    as_n = np.array([COEFFICIENT_UNITS[kind_of(axis)]["N"].factor for axis in AXES])
-    as_rms = np.array([DEGREE if kind_of(axis) == "gyro" else 1e3 / 9.80665 for axis in AXES])
+    as_n = np.array([COEFFICIENT_UNITS[sensor_kind(axis)]["N"].factor for axis in AXES])
+    as_rms = np.array([DEGREE if sensor_kind(axis) == "gyro" else 1e3 / 9.80665 for axis in AXES])
     shown = table("what differs", "", "", *AXES)
     for letter in "NBK":
         units = "; ".join(COEFFICIENT_UNITS[kind][letter].name for kind in KINDS)
         for side in (recorded, simulated):
-            cells = (reading(side.result.estimate.coefficients, letter, axis).value for axis in AXES)
+            cells = (format_coefficient(side.result.estimate.coefficients, letter, axis).value for axis in AXES)
             shown.add_row(f"{letter}, {units}", side.name, *cells)
     for low_hz, high_hz in BANDS_HZ:
         for side in (recorded, simulated):

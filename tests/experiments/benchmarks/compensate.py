@@ -19,18 +19,18 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from drivers.recordings import load_samples
-from drivers.sample import AXES, Floats, block
+from drivers.sample import AXES, Floats, make_block
 from monitor.commands.compensate import METHODS, Request, make
-from monitor.daemon.arma_worker import Identifier
+from monitor.daemon.arma_worker import ArmaWorker
 from monitor.drift.compensation import sage_husa
-from monitor.drift.compensation.arma import identify
-from monitor.drift.compensation.compensation_result import Axis
-from monitor.drift.compensation.compensation_score import InMotion, in_motion
+from monitor.drift.compensation.arma import fit_arma
+from monitor.drift.compensation.compensation_result import AxisCompensation
+from monitor.drift.compensation.compensation_score import MotionScore, score_in_motion
 from monitor.drift.compensation.compensator import Compensator
 from monitor.drift.compensation.live_compensation import LiveCompensation
-from monitor.drift.compensation.reference_methods import VARIANTS, compensated
-from monitor.drift.thermal.interval_means import interval_means
-from monitor.noise.catalogue import load
+from monitor.drift.compensation.reference_methods import REFERENCE_METHODS, apply_reference_method
+from monitor.drift.thermal.interval_means import compute_interval_means
+from monitor.noise.catalogue import load_model
 from tests.experiments.benchmarks.joint import compiled_joint, joint
 from tests.experiments.benchmarks.machine import console, table
 
@@ -50,8 +50,8 @@ RECORDINGS = (
 
 def noise(sensor: str, seed: int, seconds: float) -> Floats:
     """[n, 6] at rest."""
-    model = load(sensor, Path.cwd())
-    return model.stream(RATE_HZ, seed, None).draw_all(round(seconds * RATE_HZ)).values.copy()
+    model = load_model(sensor, Path.cwd())
+    return model.stream(RATE_HZ, seed, None).draw_with_temperature(round(seconds * RATE_HZ)).values.copy()
 
 
 def profiles(t: Floats) -> Iterator[tuple[str, Floats]]:
@@ -66,17 +66,17 @@ def profiles(t: Floats) -> Iterator[tuple[str, Floats]]:
 def live(values: Floats, rate_hz: float, adapts: bool = True) -> tuple[Floats, Compensator]:
     """As the daemon does."""
     one, out = Compensator(rate_hz, adapts), np.empty_like(values)
-    size = one.interval
+    size = one.interval_samples
     for start in range(0, len(values), size):
-        out[start : start + size] = one.update(values[start : start + size])
+        out[start : start + size] = one.compensate(values[start : start + size])
         one.identify()
     return out, one
 
 
 def by(method: str, values: Floats, rest: int, axis: int) -> Floats:
     """One axis by a method that has learned from the first ``rest`` samples."""
-    if method in VARIANTS:
-        return compensated(values[:, axis], values[:rest, axis], VARIANTS[method])
+    if method in REFERENCE_METHODS:
+        return apply_reference_method(values[:, axis], values[:rest, axis], REFERENCE_METHODS[method])
     return live(values, RATE_HZ, method != "fixed")[0][:, axis]
 
 
@@ -142,7 +142,7 @@ def allan(_seeds: int) -> None:
         curves = [
             [
                 [np.interp(np.log(tau), np.log(one.tau_s), one.allan) for tau in taus]
-                for one in (axis.before, axis.after)
+                for one in (axis.uncompensated, axis.compensated)
             ]
             for axis in _axes(Path(folder) / name, "adaptive")
         ]
@@ -153,11 +153,13 @@ def allan(_seeds: int) -> None:
 def _judged(recording: Path, method: str) -> Floats:
     """[2, 5] before and after: root mean squares over the axes of rms, worst minute and drift over each span, rad/s."""
     axes = _axes(recording, method)
-    rows = [[[one.deviation, one.worst_minute, *one.drift] for one in (axis.before, axis.after)] for axis in axes]
+    rows = [
+        [[one.rms, one.worst_minute, *one.drift] for one in (axis.uncompensated, axis.compensated)] for axis in axes
+    ]
     return np.asarray(np.sqrt(np.mean(np.square(rows), axis=0)))
 
 
-def _axes(recording: Path, method: str) -> list[Axis]:
+def _axes(recording: Path, method: str) -> list[AxisCompensation]:
     """What compensation made of each axis; the recording that comes out is not kept."""
     with tempfile.TemporaryDirectory() as folder:
         return list(make(Request(recording, Path(folder) / "out.npz", method)).axes.values())
@@ -185,13 +187,13 @@ def motion(seeds: int) -> None:
             for method in METHODS:
                 pairs = [_in_motion(sensor, seed, truth, method) for seed in range(1 if method == "emd" else seeds)]
                 ratio = float(
-                    np.sqrt(np.mean([a.error**2 for _, a in pairs]) / np.mean([b.error**2 for b, _ in pairs]))
+                    np.sqrt(np.mean([a.rms_error**2 for _, a in pairs]) / np.mean([b.rms_error**2 for b, _ in pairs]))
                 )
                 worst[method] = max(worst[method], ratio)
                 cells.append(f"{ratio:.3f}")
                 first = first or pairs
             assert first is not None
-            angle = [np.sqrt(np.mean([one[k].angle ** 2 for one in first])) / DEGREE for k in (0, 1)]
+            angle = [np.sqrt(np.mean([one[k].angle_error_rad ** 2 for one in first])) / DEGREE for k in (0, 1)]
             delay = np.mean([after.delay_s for _, after in first])
             made.add_row(name, *cells, f"{1e3 * delay:.1f} ms", f"{angle[0]:.2g} → {angle[1]:.2g}")
         made.add_row("worst", *(f"{worst[method]:.3f}" for method in METHODS))
@@ -207,29 +209,29 @@ def one_filter(_seeds: int) -> None:
     for sensor in SENSORS:
         still = round(REST_S * RATE_HZ)
         measured = noise(sensor, 0, REST_S + MOTION_S)[:, 2]
-        means = interval_means(measured[:still], np.zeros(still), RATE_HZ, 1.0)
-        model = identify(means.bias, float(np.mean(means.error**2)), [(1, 0)])
+        means = compute_interval_means(measured[:still], np.zeros(still), RATE_HZ, 1.0)
+        model = fit_arma(means.bias, float(np.mean(means.error**2)), [(1, 0)])
         phi, white = max(model.phi[0], 0.5) ** (1.0 / RATE_HZ), float(measured[:still].var())
-        variance = model.spread**2 * (1.0 - phi**2)
+        variance = model.stationary_std**2 * (1.0 - phi**2)
         for intensity in (1e-8, 1e-6, 1e-4, 1e-2, 1.0):
             cells = []
             for truth in truths.values():
                 z = measured - measured[:still].mean()
                 z[still:] += truth
                 out = compiled_joint(z, 1.0 / RATE_HZ, phi, 0.0, 0.0, variance, white, intensity)
-                before, after = in_motion(z[still:], truth, RATE_HZ), in_motion(out[still:], truth, RATE_HZ)
-                cells.append(f"{after.error / before.error:.3g}")
+                before, after = score_in_motion(z[still:], truth, RATE_HZ), score_in_motion(out[still:], truth, RATE_HZ)
+                cells.append(f"{after.rms_error / before.rms_error:.3g}")
             made.add_row(f"{sensor}, {intensity / DEGREE**2:.1e}", *cells)
     console.print(made)
 
 
-def _in_motion(sensor: str, seed: int, truth: Floats, method: str) -> tuple[InMotion, InMotion]:
+def _in_motion(sensor: str, seed: int, truth: Floats, method: str) -> tuple[MotionScore, MotionScore]:
     still = round(REST_S * RATE_HZ)
     values = noise(sensor, seed, REST_S + MOTION_S)
     before = values[still:, 2] - values[:still, 2].mean() + truth
     values[still:, 2] += truth
     after = by(method, values, still, 2)[still:]
-    return in_motion(before, truth, RATE_HZ), in_motion(after, truth, RATE_HZ)
+    return score_in_motion(before, truth, RATE_HZ), score_in_motion(after, truth, RATE_HZ)
 
 
 def slow(seeds: int) -> None:
@@ -270,7 +272,7 @@ def doubling(seeds: int) -> None:
             white = np.where(np.arange(n) < n // 2, 3.0, 3.0 * factor)
             z = drift + white * rng.standard_normal(n)
             scatter = white**2 * rng.chisquare(3, n) / 3.0
-            model = identify(z[:2048], float(scatter[:2048].mean()))
+            model = fit_arma(z[:2048], float(scatter[:2048].mean()))
             rows.append([_followed(model, z, scatter, drift, adapts) for adapts in (True, False)])
         (before, adaptive, first), (_, fixed, second) = np.sqrt(np.mean(np.square(rows), axis=0))
         made.add_row(
@@ -286,15 +288,15 @@ def doubling(seeds: int) -> None:
 
 def _followed(model, z: Floats, scatter: Floats, drift: Floats, adapts: bool) -> list[float]:  # type: ignore[no-untyped-def]
     """rms error before and after the change, and of ε/√S after it."""
-    row = sage_husa.unknown(adapts)
-    sage_husa.adopt(row, model)
+    row = sage_husa.initial_row(adapts)
+    sage_husa.set_model(row, model)
     off, new = np.empty(z.size), np.empty(z.size)
     for k in range(z.size):
-        expected = sage_husa.drift(row)[0]
+        expected = sage_husa.expected_bias(row)[0]
         off[k] = expected - drift[k]
-        total, _ = sage_husa.measure(row, z[k], scatter[k], 1e-12)
+        total, _ = sage_husa.update_with_interval(row, z[k], scatter[k], 1e-12)
         new[k] = (z[k] - expected) / total**0.5
-        sage_husa.forward(row)
+        sage_husa.predict(row)
     half = z.size // 2
     return [float(np.sqrt(np.mean(part**2))) for part in (off[2048:half], off[half + 200 :], new[half + 200 :])]
 
@@ -327,13 +329,13 @@ def _coast_cells(rows: Floats) -> list[str]:
 def _coasted(values: Floats, rate_hz: float, spans: tuple[float, ...]) -> Floats:
     """[3, spans] rms over axes and places: of the last minute's mean, of the filter's, and what the filter said."""
     one = Compensator(rate_hz)
-    size, kept = one.interval, []
+    size, kept = one.interval_samples, []
     taught: list[Floats] = []
     for start in range(0, len(values) - size, size):
-        one.update(values[start : start + size])
+        one.compensate(values[start : start + size])
         one.identify()
         kept.append((one._state.row.copy(), len(taught)))
-        taught += [interval.mean for interval in one.take()]
+        taught += [interval.mean for interval in one.take_intervals()]
     means, per_min = np.array(taught), round(60.0 / one.interval_s)
     squares = np.zeros((3, len(spans)))
     for at, span in enumerate(spans):
@@ -346,8 +348,8 @@ def _coasted(values: Floats, rate_hz: float, spans: tuple[float, ...]) -> Floats
             rows = rows.copy()
             for row in rows:
                 for _ in range(ahead + per_min // 2):
-                    sage_husa.forward(row)
-            now = np.array([sage_husa.drift(row) for row in rows])
+                    sage_husa.predict(row)
+            now = np.array([sage_husa.expected_bias(row) for row in rows])
             spread = now[:, 1] + np.array([row[sage_husa.R] for row in rows]) / per_min
             squares[:, at] += np.mean([(truth - minute) ** 2, (truth - now[:, 0]) ** 2, spread], axis=1)
             count += 1
@@ -368,11 +370,11 @@ def alarms(seeds: int) -> None:
     for name, records, rate_hz in sources:
         told: list[str] = []
         for values in records:
-            one, by_hand = LiveCompensation(rate_hz), Identifier("", at_once=True)
+            one, by_hand = LiveCompensation(rate_hz), ArmaWorker("", at_once=True)
             t_ns = np.round(np.arange(len(values)) / rate_hz * 1e9).astype(np.int64)
             for start in range(0, len(values), 100):
-                one.update(block(t_ns[start : start + 100].copy(), values[start : start + 100].copy()))
-                by_hand.renew(one)
+                one.update(make_block(t_ns[start : start + 100].copy(), values[start : start + 100].copy()))
+                by_hand.update(one)
             told += [event.text for event in one.take_events()]
         hours = sum(len(values) for values in records) / rate_hz / 3600.0
         made.add_row(name, f"{hours:.1f}", str(len(told)), str(sum("stepped" in text for text in told)))
@@ -464,7 +466,7 @@ def arma(seeds: int) -> None:
             for seed in range(count):
                 a = np.random.default_rng(seed).standard_normal(n + 500)
                 z = lfilter([1.0, theta], [1.0, -phi[0], -phi[1]], a)[500:]
-                found = identify(z, orders=[(2, 1)], intervals=True)
+                found = fit_arma(z, orders=[(2, 1)], intervals=True)
                 inside += (np.array(found.lo) <= [*phi, theta]) & (np.array(found.hi) >= [*phi, theta])
             made.add_row(f"{phi[0]:g}, {phi[1]:g}, {theta:g}", str(n), *(f"{100 * x / count:.0f}" for x in inside))
     console.print(made)
@@ -492,9 +494,9 @@ def robust(_seeds: int) -> None:
             values[:, :3] += np.sin(np.arange(size) / rng.uniform(5.0, 5e4))[:, None]
         elif kind == 5:
             values[size // 2 :] += 0.05
-        out = one.update(values, lost=int(rng.integers(2)) * int(rng.integers(10**6)))
+        out = one.compensate(values, lost=int(rng.integers(2)) * int(rng.integers(10**6)))
         one.identify()
-        one.take()
+        one.take_intervals()
         assert np.array_equal(np.isfinite(out), np.isfinite(values))
         for row in one._state.row:
             covariance = row[3:12].reshape(3, 3)
@@ -510,14 +512,14 @@ def robust(_seeds: int) -> None:
 def speed(_seeds: int) -> None:
     """Processor time a sample and axis, beside a plain NumPy Kalman filter of a drift and a rate."""
     values = 1e-3 * np.random.default_rng(0).standard_normal((400_000, 6))
-    Compensator(RATE_HZ).update(values[:1000])
+    Compensator(RATE_HZ).compensate(values[:1000])
 
     def cost(rows: int, count: int) -> float:
         best = np.inf
         for _ in range(3):
             one, began = Compensator(RATE_HZ), time.process_time()
             for start in range(0, count, rows):
-                one.update(values[start : start + rows])
+                one.compensate(values[start : start + rows])
             best = min(best, (time.process_time() - began) / count / 3.0)
         return 1e9 * best
 

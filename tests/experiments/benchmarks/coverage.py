@@ -25,9 +25,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import Ints, block
+from drivers.sample import Ints, make_block
 from monitor.estimation.analysis import analyze
-from monitor.estimation.fit.coefficients import LETTERS, Coefficients, Status
+from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
 from tests.experiments.benchmarks.records import (
     HOURS_3,
     MIN_45,
@@ -73,9 +73,9 @@ def count(cell: str, seconds: int, seed: int, chunk: int) -> Chunk:
     n = round(seconds * RATE_HZ)
     t_ns = np.arange(n) * round(1e9 / RATE_HZ)
     by_tau: list[BoolMatrix] = []
-    letters = np.zeros((len(LETTERS), len(COUNTED)), np.int64)
+    letters = np.zeros((len(SYMBOLS), len(COUNTED)), np.int64)
     for values in sixes(noise, cell, seconds, seed, chunk):
-        found = analyze([block(t_ns, values)], RATE_HZ).estimate
+        found = analyze([make_block(t_ns, values)], RATE_HZ).estimate
         truth = np.sqrt(true_avar(noise, found.curve.factors))[:, None]
         by_tau.append((found.curve.lo <= truth) & (truth <= found.curve.hi))
         letters += _counted(found.coefficients, noise)
@@ -85,13 +85,13 @@ def count(cell: str, seconds: int, seed: int, chunk: int) -> Chunk:
         "m": m.tolist(),
         "deviations": inside.sum(axis=1).tolist(),
         "shares": [shares.sum(), (shares**2).sum()],
-        "letters": {c: dict(zip(COUNTED, row, strict=True)) for c, row in zip(LETTERS, letters.tolist(), strict=True)},
+        "letters": {c: dict(zip(COUNTED, row, strict=True)) for c, row in zip(SYMBOLS, letters.tolist(), strict=True)},
     }
 
 
 def _counted(given: Coefficients, noise: Noise) -> Ints:
     """[5, 4] of COUNTED in six axes."""
-    truth = np.array([getattr(noise, letter) for letter in LETTERS])[:, None]
+    truth = np.array([getattr(noise, letter) for letter in SYMBOLS])[:, None]
     held = (given.lo <= truth) & (truth <= given.hi)
     estimated, bounded = given.status == Status.ESTIMATED, given.status == Status.UPPER_BOUND
     return np.stack([flags.sum(axis=1) for flags in (estimated, estimated & held, bounded, bounded & held)], axis=1)
@@ -111,7 +111,7 @@ def tables(chunks: list[Chunk]) -> str:
             [row for group in groups.items() for row in _present(*group)],
         ),
         "Terms that are absent, and enter all the same, %:",
-        markdown(("record", "noise", *LETTERS), [_absent(*group) for group in groups.items()]),
+        markdown(("record", "noise", *SYMBOLS), [_absent(*group) for group in groups.items()]),
         f"Bold: all of the figure's interval lies outside {_percent(*TWO_SIDED)} % (intervals), "
         f"{_percent(*ONE_SIDED)} % (bounds), {_percent(*SAID)} % (what is said), {_percent(*FALSE)} % (absent terms).",
     ]
@@ -158,7 +158,7 @@ def _absent(key: tuple[int, str], group: list[Chunk]) -> tuple[str, ...]:
     there = CELLS[cell].present()
     entered = [
         "–" if c in there else _share(sum(chunk["letters"][c]["estimated"] for chunk in group), records, FALSE)
-        for c in LETTERS
+        for c in SYMBOLS
     ]
     return length(seconds), cell, *entered
 

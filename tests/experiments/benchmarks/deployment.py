@@ -22,7 +22,7 @@ import numpy as np
 import psutil
 
 from drivers.decoders import vectornav_binary
-from drivers.sample import block
+from drivers.sample import make_block
 from monitor.common import config_files
 from monitor.noise.catalogue import read_model
 
@@ -56,10 +56,10 @@ class Sensors:
         self._masters = [self._plug(port) for port in self.ports]
         n = round(rate_hz * seconds)
         model = read_model(config_files.CONFIG_FOLDER / "models" / "consumer-mems.toml")
-        values = model.stream(float(rate_hz), 1).draw_all(n).values
+        values = model.stream(float(rate_hz), 1).draw_with_temperature(n).values
         ticks = np.arange(n, dtype=np.int64) * (1_000_000_000 // rate_hz)
         encoder = vectornav_binary.build(vectornav_binary.Settings())
-        self._frames = [one.data for one in encoder.encode(block(ticks, values, np.full(n, 25.0), ticks))]
+        self._frames = [one.data for one in encoder.encode(make_block(ticks, values, np.full(n, 25.0), ticks))]
         self._rate_hz = rate_hz
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)

@@ -29,10 +29,10 @@ import numpy as np
 from scipy.optimize import least_squares, nnls
 
 from drivers.sample import Floats, Ints
-from monitor.estimation.allan.batch import cluster_sizes, overlapping, slope, slopes
-from monitor.estimation.allan.uncertainty import Table, table
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, slope_of_recording, slope_per_tau
+from monitor.estimation.allan.uncertainty import CovarianceTable, covariance_table
 from monitor.estimation.fit.coefficient_fit import Design, design, fit
-from monitor.estimation.fit.coefficients import LETTERS
+from monitor.estimation.fit.coefficients import SYMBOLS
 from tests.experiments.benchmarks.records import (
     HOURS_3,
     MIN_45,
@@ -68,9 +68,9 @@ Estimator = Callable[[Floats, float], Floats]
 
 
 @cache
-def _octaves(n: int, rate_hz: float) -> tuple[Ints, Design, Table]:
+def _octaves(n: int, rate_hz: float) -> tuple[Ints, Design, CovarianceTable]:
     factors = cluster_sizes(n, rate_hz)
-    return factors, design(factors, rate_hz), table(n, factors)
+    return factors, design(factors, rate_hz), covariance_table(n, factors)
 
 
 def weighed_by_variances(values: Floats, rate_hz: float) -> Floats:
@@ -85,8 +85,8 @@ def weighed_by_covariances(values: Floats, rate_hz: float) -> Floats:
 
 def _fitted(values: Floats, rate_hz: float, full: bool) -> Floats:
     factors, columns, covariances = _octaves(len(values), rate_hz)
-    avar, terms = overlapping(values, factors)
-    straight, each = slope(values) * rate_hz, slopes(values, factors) * rate_hz
+    avar, terms = overlapping_avar(values, factors)
+    straight, each = slope_of_recording(values) * rate_hz, slope_per_tau(values, factors) * rate_hz
     found = fit(columns, covariances, avar, terms, slope=straight, slopes=each, full=full)
     return np.asarray(np.sqrt(np.maximum(found.theta, 0.0)))
 
@@ -96,7 +96,7 @@ def unweighted(values: Floats, rate_hz: float) -> Floats:
     factors = cluster_sizes(len(values), rate_hz)
     shapes = _shapes(factors / rate_hz)
     scale: Floats = np.linalg.norm(shapes, axis=0)
-    avar, _ = overlapping(values, factors)
+    avar, _ = overlapping_avar(values, factors)
     squares = np.stack([nnls(shapes / scale, column)[0] / scale for column in avar.T], axis=1)
     return np.asarray(np.sqrt(squares))
 
@@ -105,7 +105,7 @@ def imu_utils(values: Floats, rate_hz: float) -> Floats:
     """Five terms, equal relative weights: squares of log σ² of the model over that of the record."""
     longest = 2.0 ** np.floor(np.log2(len(values) // 2))
     factors = np.unique(np.ceil(np.geomspace(1.0, longest, IMU_UTILS_CLUSTERS) - 1e-9)).astype(np.int64)
-    avar, _ = overlapping(values, factors)
+    avar, _ = overlapping_avar(values, factors)
     tau = factors / rate_hz
     found = [_log_squares(tau, column) for column in avar.T]
     # from the bare powers of τ to the coefficients of IEEE Std 952
@@ -133,10 +133,10 @@ def allan_variance_ros(values: Floats, rate_hz: float) -> Floats:
     tau, factors = tau[short], factors[short]
     phase = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values - values.mean(axis=0), axis=0)])
     deviation = np.stack([_apart(phase[::m]) / (m * np.sqrt(2.0)) for m in factors])
-    found = np.full((len(LETTERS), values.shape[1]), np.nan)
-    found[LETTERS.index("N")] = _line(tau[tau < 9.95], deviation[tau < 9.95], -0.5, at=1.0)
-    found[LETTERS.index("B")] = deviation.min(axis=0) / FLOOR
-    found[LETTERS.index("K")] = _line(tau, deviation, 0.5, at=3.0)
+    found = np.full((len(SYMBOLS), values.shape[1]), np.nan)
+    found[SYMBOLS.index("N")] = _line(tau[tau < 9.95], deviation[tau < 9.95], -0.5, at=1.0)
+    found[SYMBOLS.index("B")] = deviation.min(axis=0) / FLOOR
+    found[SYMBOLS.index("K")] = _line(tau, deviation, 0.5, at=3.0)
     return found
 
 

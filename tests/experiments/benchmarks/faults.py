@@ -28,7 +28,7 @@ import numpy as np
 
 from drivers.recordings import segment
 from monitor.common.health import Health
-from monitor.daemon.device_worker import Output, Station
+from monitor.daemon.device_worker import DeviceWorker, Output
 from monitor.daemon.service import Service
 from monitor.settings import loading
 from tests.support.ports import free_endpoint, free_port
@@ -194,8 +194,8 @@ class Rig:
     said: Said
 
     @property
-    def station(self) -> Station:
-        return self.service.stations[0]
+    def station(self) -> DeviceWorker:
+        return self.service.workers[0]
 
     def flows(self, more: int = 50) -> None:
         """Samples come now."""
@@ -323,7 +323,7 @@ def two_daemons(folder: Path, times: int) -> Outcome:
         finally:
             second.stop()
             thread.join(PATIENCE_S)
-        assert second.stations[0].driver.counts.received == 0
+        assert second.workers[0].driver.counts.received == 0
         return rig.outcome("two daemons on one port", f"the second: {held}; {busy}")
 
 
@@ -356,7 +356,7 @@ def can_bus(folder: Path, times: int) -> Outcome:
     path, said = folder / "faults.toml", Said()
     path.write_text(CAN.format(rate=RATE, channel=channel) + NO_ZENOH + NO_VIEWER)
     service = Service(loading.load(path), [said])
-    station = service.stations[0]
+    station = service.workers[0]
     # python-can would sort a peer's error frames out by their identifier, as the kernel does not
     station.driver.link.accept([])  # type: ignore[attr-defined]
     thread = threading.Thread(target=service.run)
@@ -449,7 +449,7 @@ def _storage(folder: Path) -> str:
 
 def _check_recording(store: Path, outcome: Outcome) -> None:
     """All that was received is recorded, and what is missing in it is where it says."""
-    ticks = [piece.samples for path in segment.segments(store / "board") for piece in segment.read_samples(path)]
+    ticks = [piece.samples for path in segment.list_segments(store / "board") for piece in segment.read_samples(path)]
     rows = sum(len(one) for one in ticks)
     assert rows == outcome.received, f"{rows} rows of {outcome.received} received"
 
@@ -469,7 +469,7 @@ def clock_back(folder: Path, times: int) -> Outcome:
     times_s = np.concatenate(
         [
             piece.samples.t_ns / 1e9
-            for path in segment.segments(folder / "store" / "board")
+            for path in segment.list_segments(folder / "store" / "board")
             for piece in segment.read_samples(path)
         ]
     )
@@ -526,9 +526,9 @@ def viewer(folder: Path, times: int) -> Outcome:
     """The viewer is frozen (SIGSTOP) for some seconds."""
     more = NO_ZENOH + f'[viewer]\nmode = "web"\nport = {free_port()}\nweb_port = {free_port()}\n'
     with running(folder, more) as rig:
-        assert rig.service.view is not None
+        assert rig.service.viewer is not None
         wait_for(lambda: rig.service.states()["viewer"] == "ok", "the viewer")
-        child = rig.service.view._child
+        child = rig.service.viewer._child
         assert child is not None
         os.kill(child.pid, signal.SIGSTOP)
         said = rig.said.wait("stalled")

@@ -10,20 +10,20 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import AXES, Floats, block
-from monitor.estimation.analysis import CHUNK, Analysis, analyze
-from monitor.estimation.analysis_notes import FAR_SHARE, SAME
+from drivers.sample import AXES, Floats, make_block
+from monitor.estimation.analysis import DETECTOR_CHUNK_ROWS, Analysis, analyze
+from monitor.estimation.analysis_notes import LINE_FREQUENCY_TOLERANCE, MIN_OUTLIER_SHARE
 from monitor.estimation.detection.change_detection import Change, ChangeDetector
-from monitor.estimation.detection.line_detection import Line, lines, outliers
-from monitor.estimation.detection.motion_detection import find
-from monitor.estimation.detection.resolution import coarse
-from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.estimation.detection.line_detection import Line, detect_lines, outlier_share
+from monitor.estimation.detection.motion_detection import detect_motion
+from monitor.estimation.detection.resolution import find_coarse_axes
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.noise.effects import Narrowband, Sinusoidal
 from monitor.noise.model import NoiseModel
 
 EFFECTS: Final = dict(
     zip(
-        LETTERS,
+        SYMBOLS,
         ("quantization_noise", "angle_random_walk", "bias_instability", "rate_random_walk", "rate_ramp"),
         strict=True,
     )
@@ -54,7 +54,7 @@ def names(columns: Mapping[str, Floats], rate_hz: float, model: NoiseModel) -> s
     n = next(iter(columns.values())).size
     values = np.stack([columns.get(axis, np.full(n, np.nan)) for axis in AXES], axis=1)
     t_ns = np.rint(np.arange(n) * (1e9 / rate_hz)).astype(np.int64)
-    result = analyze([block(t_ns, values)], rate_hz)
+    result = analyze([make_block(t_ns, values)], rate_hz)
     said = (*_of_fit(result, model), *_of_events(result, model))
     return {(axis, name) for axis, name in said if axis in columns}
 
@@ -64,26 +64,26 @@ def _of_fit(result: Analysis, model: NoiseModel) -> Iterator[tuple[str, str]]:
     status = result.estimate.coefficients.status
     for i, axis in enumerate(AXES):
         for letter, effect in EFFECTS.items():
-            if status[LETTERS.index(letter), i] == Status.ESTIMATED and effect not in has[axis]:
+            if status[SYMBOLS.index(letter), i] == Status.ESTIMATED and effect not in has[axis]:
                 yield axis, effect
         if np.isfinite(result.bandwidth_hz[i]) and "bandwidth_limit" not in has[axis]:
             yield axis, "bandwidth_limit"
-    for one in coarse(result.values):
+    for one in find_coarse_axes(result.values):
         yield AXES[one.axis], "resolution"
 
 
 def _of_events(result: Analysis, model: NoiseModel) -> Iterator[tuple[str, str]]:
     """Of what ``events_of`` looks for, where it stands as numbers: each thing is sought once, as there."""
     values, rate_hz = result.values, result.estimate.rate_hz
-    moving, _ = find(values, rate_hz)
-    for line in lines(values, moving, rate_hz, result.estimate.curve):
+    moving, _ = detect_motion(values, rate_hz)
+    for line in detect_lines(values, moving, rate_hz, result.estimate.curve):
         if not _expected(line, model):
             yield AXES[line.axis], "narrowband" if line.wide else "sinusoidal"
-    for i in np.flatnonzero(outliers(values, moving) > FAR_SHARE).tolist():
+    for i in np.flatnonzero(outlier_share(values, moving) > MIN_OUTLIER_SHARE).tolist():
         yield AXES[i], "outliers"
     detector = ChangeDetector(rate_hz)
-    for begin in range(0, len(values), CHUNK):
-        rows = slice(begin, begin + CHUNK)
+    for begin in range(0, len(values), DETECTOR_CHUNK_ROWS):
+        rows = slice(begin, begin + DETECTOR_CHUNK_ROWS)
         detector.update(np.where(moving[rows, None], np.nan, values[rows]))
     for change in detector.take():
         name = _of_change(change)
@@ -101,7 +101,10 @@ def _of_change(change: Change) -> str | None:
 def _expected(line: Line, model: NoiseModel) -> bool:
     """Whether the model has a line or a resonance there."""
     for effect in model.effects.get(AXES[line.axis], ()):
-        if isinstance(effect, Sinusoidal) and abs(line.frequency_hz / effect.frequency - 1.0) < SAME:
+        if (
+            isinstance(effect, Sinusoidal)
+            and abs(line.frequency_hz / effect.frequency - 1.0) < LINE_FREQUENCY_TOLERANCE
+        ):
             return True
         if isinstance(effect, Narrowband) and abs(line.frequency_hz - effect.frequency) < 2.0 * effect.bandwidth:
             return True

@@ -27,8 +27,8 @@ import psutil
 import zenoh
 
 from drivers.zenoh.session import configuration
-from monitor.publishing.terminal.live_table import Board
-from monitor.publishing.zenoh.subscriber import ZenohIn
+from monitor.publishing.terminal.live_table import DeviceStates
+from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from tests.support.ports import free_port
 
 PATIENCE_S: Final = 600.0
@@ -132,8 +132,8 @@ class Watcher:
     """What ``watch`` has, and when each token went."""
 
     def __init__(self, endpoint: str) -> None:
-        self.arriving = ZenohIn("imu/**", [endpoint])
-        self.board = Board()
+        self.arriving = ZenohSubscriber("imu/**", [endpoint])
+        self.board = DeviceStates()
         self.gone_s: dict[str, float] = {}
         self.messages: Counter[str] = Counter()
         self.bytes: Counter[str] = Counter()
@@ -146,11 +146,11 @@ class Watcher:
             self.messages[topic] += 1
             self.bytes[topic] += len(message.payload or b"")
             if message.payload is None:
-                self.board.alive(message.key, message.there)
+                self.board.set_token(message.key, message.there)
                 if not message.there:
                     self.gone_s[message.key] = time.monotonic()
             else:
-                self.board.take(message.key, message.payload)
+                self.board.process_message(message.key, message.payload)
 
     def until(self, true: Callable[[], bool], what: str) -> float:
         """s until it is true."""

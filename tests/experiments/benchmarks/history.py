@@ -19,13 +19,13 @@ import numpy as np
 
 from monitor.estimation.estimate import Estimate
 from monitor.history import reading as past
-from monitor.history.bucket import Row, pack
-from monitor.history.columns import HEALTH, TEMPERATURE, Numbers
-from monitor.history.minute_aggregation import Minutes
-from monitor.history.query import WHAT, Question
-from monitor.history.reading import Past
-from monitor.history.sqlite_store import PastEvent, Store, reading
-from monitor.history.time_ranges import Span
+from monitor.history.bucket import HistoryRow, pack_statistics
+from monitor.history.columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS, ColumnConverter
+from monitor.history.minute_aggregation import MinuteAggregator
+from monitor.history.query import PARTS, HistoryQuery
+from monitor.history.reading import HistoryTable
+from monitor.history.sqlite_store import HistoryStore, StoredEvent, open_history
+from monitor.history.time_ranges import TimeRange
 from monitor.publishing.messages import history
 from tests.experiments.benchmarks.machine import Load
 from tests.monitor.history.kills import kill
@@ -36,12 +36,12 @@ DAY_S, MINUTES, YEAR_D = 86_400, 1440, 365.25
 LOOKS = 600  # estimates a minute at 10 Hz
 DEVICE = "bench-1"
 QUESTIONS = (
-    ("last hour", 3600.0, Question()),
-    ("last day", 86_400.0, Question()),
-    ("last month", 30 * 86_400.0, Question()),
-    ("all, N of gz", math.inf, Question(what=("coefficients",), axes=("gz",), letters=("N",))),
-    ("all, coefficients and status", math.inf, Question()),
-    ("all, everything", math.inf, Question(what=WHAT)),
+    ("last hour", 3600.0, HistoryQuery()),
+    ("last day", 86_400.0, HistoryQuery()),
+    ("last month", 30 * 86_400.0, HistoryQuery()),
+    ("all, N of gz", math.inf, HistoryQuery(what=("coefficients",), axes=("gz",), letters=("N",))),
+    ("all, coefficients and status", math.inf, HistoryQuery()),
+    ("all, everything", math.inf, HistoryQuery(what=PARTS)),
 )
 
 
@@ -67,28 +67,28 @@ def main() -> None:
 def cost() -> None:
     """Of an estimate in the loop, and of a row in the writer's thread."""
     looks = [estimate(seed=seed) for seed in range(50)]
-    minutes, rows = Minutes(), []
+    minutes, rows = MinuteAggregator(), []
     begun = time.perf_counter()
     for i in range(20_000):
         rows.append(minutes.estimate(T0 + 0.1 * i, looks[i % 50]))
     each = (time.perf_counter() - begun) / 20_000
     full = [row for row in rows if row is not None]
     print(f"an estimate: {each * 1e6:.1f} µs in the loop; {len(full[0].names)} numbers")
-    packed = _timed(lambda: [pack(row) for row in full]) / len(full)
-    print(f"a row: {packed * 1e6:.0f} µs to pack, {np.mean([len(pack(row)) for row in full]):.0f} bytes")
+    packed = _timed(lambda: [pack_statistics(row) for row in full]) / len(full)
+    print(f"a row: {packed * 1e6:.0f} µs to pack, {np.mean([len(pack_statistics(row)) for row in full]):.0f} bytes")
 
 
 def years(path: Path, count: float) -> None:
     """Write so many years, and say what they take."""
     rng, course = np.random.default_rng(1), _Course(estimate())
-    store, begun, written = Store(path), time.perf_counter(), 0
+    store, begun, written = HistoryStore(path), time.perf_counter(), 0
     days = round(count * YEAR_D)
     largest = 0
     for day in range(days):
         rows = course.day(day, rng)
         store.add([(DEVICE, row) for row in rows], [(DEVICE, one) for one in _events(day, rng)])
         written += len(rows)
-        while store.thin(math.inf, 1000):
+        while store.merge_old_rows(math.inf, 1000):
             pass
         if day % 30 == 0 or day == days - 1:
             largest = max(largest, _size(path))
@@ -98,23 +98,23 @@ def years(path: Path, count: float) -> None:
     took = time.perf_counter() - begun
     print(f"{count:g} years of one device: {_size(path) / 1e6:.1f} MB (with its log at most {largest / 1e6:.1f} MB)")
     print(f"  {written:,} rows written and thinned, {took / written * 1e6:.0f} µs each")
-    with reading(path) as reader:
-        widths = [row.width_s for row in reader.rows(DEVICE, Span(-math.inf, math.inf))]
+    with open_history(path) as reader:
+        widths = [row.width_s for row in reader.rows(DEVICE, TimeRange(-math.inf, math.inf))]
         print("  rows: " + ", ".join(f"{widths.count(one):,} of {one} s" for one in sorted(set(widths))))
-        print(f"  events: {reader.events(DEVICE, Span(-math.inf, math.inf), 10**9)[1]:,}")
+        print(f"  events: {reader.events(DEVICE, TimeRange(-math.inf, math.inf), 10**9)[1]:,}")
 
 
 def queries(path: Path) -> None:
     """How long an answer takes, from the file to the message."""
-    with reading(path) as reader:
-        held = reader.held(DEVICE)
+    with open_history(path) as reader:
+        held = reader.stored_range(DEVICE)
     assert held is not None
     for name, seconds, asked in QUESTIONS:
-        span = Span(held[1] - seconds, held[1])
+        span = TimeRange(held[1] - seconds, held[1])
         read_s = _timed(lambda span=span, asked=asked: _read(path, span, asked))  # type: ignore[misc]
         found = _read(path, span, asked)
-        said_s = _timed(lambda found=found, asked=asked: history.history(found, asked, 0.0, 0))  # type: ignore[misc]
-        size = len(history.history(found, asked, 0.0, 0))
+        said_s = _timed(lambda found=found, asked=asked: history.encode_history(found, asked, 0.0, 0))  # type: ignore[misc]
+        size = len(history.encode_history(found, asked, 0.0, 0))
         print(
             f"{name}: {len(found)} buckets of {found.step_s} s; {read_s * 1e3:.0f} ms to read, "
             f"{said_s * 1e3:.0f} ms to write as {size / 1e3:.0f} kB"
@@ -135,14 +135,14 @@ class _Course:
     """Rows of days: each number wanders around what a sensor has."""
 
     def __init__(self, first: Estimate) -> None:
-        numbers = Numbers(first)
-        self.names = (*numbers.names, *HEALTH, *TEMPERATURE)
-        values = np.concatenate([numbers.of(first), [100.0, 0.02, 1.8e8, 25.0]])
+        numbers = ColumnConverter(first)
+        self.names = (*numbers.names, *HEALTH_COLUMNS, *TEMPERATURE_COLUMNS)
+        values = np.concatenate([numbers.convert(first), [100.0, 0.02, 1.8e8, 25.0]])
         self._centre = values
         # wide for what a short window knows badly, narrow for rate and memory
         self._spread = np.array([_spread(name) for name in self.names])
 
-    def day(self, day: int, rng: np.random.Generator) -> list[Row]:
+    def day(self, day: int, rng: np.random.Generator) -> list[HistoryRow]:
         """A day of minutes; now and then the device is away for some of them."""
         t = (day * MINUTES + np.arange(MINUTES)) / MINUTES  # d
         k = len(self.names)
@@ -165,19 +165,19 @@ class _Course:
         for i in np.flatnonzero(there).tolist():
             start_s, lost = day_s + 60 * i, int(rng.poisson(0.02))
             counts = (6000 - lost, lost, 0, 0)
-            rows.append(Row(start_s, 60, start_s + 59.9, self.names, n, low[i], high[i], singles[i], counts, 1))
+            rows.append(HistoryRow(start_s, 60, start_s + 59.9, self.names, n, low[i], high[i], singles[i], counts, 1))
         return rows
 
 
 def _spread(name: str) -> float:
-    if name in HEALTH:
+    if name in HEALTH_COLUMNS:
         return 0.01
-    if name in TEMPERATURE:
+    if name in TEMPERATURE_COLUMNS:
         return 1.5
     return 2.0 if ".K" in name or ".R" in name else 1.0
 
 
-def _events(day: int, rng: np.random.Generator) -> list[PastEvent]:
+def _events(day: int, rng: np.random.Generator) -> list[StoredEvent]:
     kinds = ("moved", "samples_lost", "bias_stepped", "noise_changed")
     found = []
     for at in np.sort(rng.uniform(0.0, DAY_S, 8)).tolist():
@@ -185,13 +185,13 @@ def _events(day: int, rng: np.random.Generator) -> list[PastEvent]:
         axis = "gz" if kind in ("bias_stepped", "noise_changed") else None
         what = {"N": {"before": 1.5e-4, "after": 2.2e-4}} if kind == "noise_changed" else {}
         text = f"{axis or 'device'}: {kind.replace('_', ' ')} by 47 %"
-        found.append(PastEvent(t_s, kind, text, axis, what, t_s - 5.0, float(rng.uniform(3.0, 12.0))))
+        found.append(StoredEvent(t_s, kind, text, axis, what, t_s - 5.0, float(rng.uniform(3.0, 12.0))))
     return found
 
 
-def _read(path: Path, span: Span, asked: Question) -> Past:
-    with reading(path) as reader:
-        return past.read(reader, DEVICE, span, asked.wants, asked.step_s)
+def _read(path: Path, span: TimeRange, asked: HistoryQuery) -> HistoryTable:
+    with open_history(path) as reader:
+        return past.read_history(reader, DEVICE, span, asked.selects, asked.step_s)
 
 
 def _timed(work: Callable[[], object]) -> float:

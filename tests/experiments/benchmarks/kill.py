@@ -24,8 +24,8 @@ import numpy as np
 
 from drivers.recordings import load_samples, segment
 from drivers.sample import Floats, Ints
-from monitor.history.sqlite_store import reading
-from monitor.history.time_ranges import Span
+from monitor.history.sqlite_store import open_history
+from monitor.history.time_ranges import TimeRange
 from tests.support.terminal import LineTerminal
 from tests.support.waiting import PATIENCE_S, wait_for
 
@@ -181,7 +181,7 @@ class Bench:
     def ticks(self) -> Ints:
         """The counts in all segments; AssertionError where a file cannot be read or a count does not follow."""
         ticks, lost = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-        for path in segment.segments(self.folder / "bench"):
+        for path in segment.list_segments(self.folder / "bench"):
             for piece in segment.read_samples(path):
                 ticks.append(piece.samples.ticks)
                 lost.append(np.zeros(len(piece.samples), np.int64))
@@ -193,17 +193,17 @@ class Bench:
 
     def _batches_s(self) -> tuple[float, ...]:
         """Seconds of samples in each batch of the newest segment, which stands as it was written."""
-        newest = segment.segments(self.folder / "bench")[-1]
+        newest = segment.list_segments(self.folder / "bench")[-1]
         return tuple(len(piece.samples) / RATE for piece in segment.read_samples(newest))
 
     def check_files(self) -> None:
         """Every file with the commands' own reader, and the raw ones."""
-        if segment.segments(self.folder / "bench"):
+        if segment.list_segments(self.folder / "bench"):
             recording = load_samples(self.folder / "bench")
             left_out = [note for note in recording.notes if "left out" in note]
             assert not left_out, left_out
             assert len(recording) == len(self.ticks())
-        for path in segment.segments(self.folder / "bench" / "raw"):
+        for path in segment.list_segments(self.folder / "bench" / "raw"):
             assert sum(1 for _ in segment.read_chunks(path)), path
         self._check_history()
 
@@ -214,8 +214,8 @@ class Bench:
             return
         with contextlib.closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as store:
             assert store.execute("PRAGMA integrity_check").fetchone() == ("ok",)
-        with reading(path) as reader:
-            starts = [row.start_s for row in reader.rows("bench", Span(-np.inf, np.inf))]
+        with open_history(path) as reader:
+            starts = [row.start_s for row in reader.rows("bench", TimeRange(-np.inf, np.inf))]
         assert starts == sorted(set(starts))
 
     def _start(self) -> subprocess.Popen[bytes]:

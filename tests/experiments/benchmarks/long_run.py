@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.estimation.allan.batch import cluster_sizes, overlapping
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar
 from monitor.estimation.allan.window import AllanWindow
 from tests.experiments.benchmarks.machine import about, console
 
@@ -36,7 +36,7 @@ def block_of(index: int) -> Floats:
 
 def difference(window: AllanWindow, newest: Floats) -> float:
     """Largest relative difference to the batch computation."""
-    avar, terms = overlapping(newest[-LENGTH:], window.factors)
+    avar, terms = overlapping_avar(newest[-LENGTH:], window.factors)
     if not np.array_equal(terms, window.terms()):
         raise SystemExit("the window counts other terms than the batch computation")
     return float(np.nanmax(np.abs(window.avar() / avar - 1.0)))

@@ -30,7 +30,7 @@ from scipy.fft import dct, fft, next_fast_len
 from scipy.special import ndtri, sici
 
 from drivers.sample import Floats, Ints
-from monitor.estimation.fit.coefficients import LETTERS
+from monitor.estimation.fit.coefficients import SYMBOLS
 
 RATE_HZ: Final = 100.0
 AXES: Final = 6
@@ -63,7 +63,7 @@ class Noise:
 
     def present(self) -> tuple[str, ...]:
         """Letters of the terms that are there."""
-        return tuple(letter for letter in LETTERS if getattr(self, letter) > 0.0)
+        return tuple(letter for letter in SYMBOLS if getattr(self, letter) > 0.0)
 
 
 MIX: Final = Noise(Q=2e-6, N=1.5e-4, B=4e-5, K=1.5e-6)
@@ -169,7 +169,7 @@ def cramer_rao(noise: Noise, n: int) -> dict[str, float]:
     k = np.arange(1, n)
     sine = np.sin(np.pi * k / (2.0 * n))
     shapes = {"Q": 4.0 * sine**2, "N": np.ones(n - 1), "B": n / (np.pi * k), "K": 0.25 / sine**2}
-    theta = dict(zip(LETTERS, noise.at_unit_step(), strict=True))
+    theta = dict(zip(SYMBOLS, noise.at_unit_step(), strict=True))
     spectra = np.stack([theta[letter] * shapes[letter] for letter in letters])
     shares = spectra / spectra.sum(0)
     limits = 0.5 * np.sqrt(np.diag(np.linalg.inv(0.5 * shares @ shares.T)))

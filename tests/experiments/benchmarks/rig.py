@@ -24,7 +24,7 @@ import psutil
 import zenoh
 
 from drivers.decoders import vectornav_binary
-from drivers.sample import Ints, block
+from drivers.sample import Ints, make_block
 from tests.support.ports import free_port
 from tests.support.waiting import wait_for
 
@@ -145,7 +145,7 @@ def frames_of(rate_hz: int, seconds: float) -> list[bytes]:
     values = 1e-3 * np.random.default_rng(1).standard_normal((n, 6)) + [0.0, 0.0, 0.0, 0.0, 0.0, 9.81]
     at = np.arange(n, dtype=np.int64) * (1_000_000_000 // rate_hz)
     decoder = vectornav_binary.VectornavBinaryDecoder(vectornav_binary.Settings())
-    return [chunk.data for chunk in decoder.encode(block(at, values, np.full(n, np.nan), at + 1_000_000))]
+    return [chunk.data for chunk in decoder.encode(make_block(at, values, np.full(n, np.nan), at + 1_000_000))]
 
 
 def cables(folder: Path, devices: int) -> list[int]:

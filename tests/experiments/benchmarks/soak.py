@@ -25,11 +25,11 @@ from drivers.driver import Counts
 from drivers.errors import LinkEnded, LinkLost
 from drivers.links.base import Carrier
 from drivers.recordings import segment
-from drivers.sample import Chunk, block
+from drivers.sample import Chunk, make_block
 from monitor.common import config_files
 from monitor.daemon.service import Service
-from monitor.history.sqlite_store import reading
-from monitor.history.time_ranges import Span
+from monitor.history.sqlite_store import open_history
+from monitor.history.time_ranges import TimeRange
 from monitor.noise.catalogue import read_model
 from monitor.settings import loading
 
@@ -95,10 +95,12 @@ class Wire:
         if n == 0:
             raise LinkEnded("the end of the month")
         index = np.arange(truth.sent, truth.sent + n)
-        drawn = self._stream.draw_all(n)
+        drawn = self._stream.draw_with_temperature(n)
         t_ns = START_NS + np.rint(index * (1e9 / self._rate_hz)).astype(np.int64)
         ticks = np.rint(index * (1e9 / self._rate_hz)).astype(np.int64)
-        samples = block(t_ns, drawn.values, 24.0 + 6.0 * np.sin(index * (2 * np.pi / 86400 / self._rate_hz)), ticks)
+        samples = make_block(
+            t_ns, drawn.values, 24.0 + 6.0 * np.sin(index * (2 * np.pi / 86400 / self._rate_hz)), ticks
+        )
         frames = [chunk.data for chunk in self._encoder.encode(samples)]
         return [Chunk(self._hurt(frames, n), int(t_ns[-1]))]
 
@@ -159,7 +161,7 @@ def main() -> None:
 def _watch(service: Service, rate_hz: float, store: Path, course: Course, done: threading.Event) -> None:
     process = psutil.Process()
     while not done.wait(1.0):
-        course.days.append(service.stations[0].driver.counts.received / rate_hz / 86400)
+        course.days.append(service.workers[0].driver.counts.received / rate_hz / 86400)
         course.rows.append(
             (process.memory_info().rss / 1e6, process.num_fds(), process.num_threads(), _size(store) / 1e6)
         )
@@ -176,20 +178,20 @@ def _size(folder: Path) -> int:
 
 
 def _tell(service: Service, wire: Wire, course: Course, took_s: float, store: Path) -> None:
-    counts, truth = service.stations[0].driver.counts, wire.truth
+    counts, truth = service.workers[0].driver.counts, wire.truth
     print(f"{truth.sent} samples in {took_s:.0f} s, {truth.sent / took_s:.0f} a second")
     print(f"received {counts.received}, lost {counts.lost}, bad {counts.bad}; lost on the way {truth.lost},", end=" ")
     print(f"flipped {truth.flipped}, rubbish {truth.rubbish}: {_sum(counts, truth)} of {truth.sent} sent")
     assert _sum(counts, truth) == truth.sent
     recorded = missing = 0
-    for path in segment.segments(store / "soak"):
+    for path in segment.list_segments(store / "soak"):
         for piece in segment.read_samples(path):
             recorded += len(piece.samples)
             missing += piece.samples.lost
     print(f"recorded {recorded}, missing in the recording {missing}: sum {recorded + missing}")
-    with reading(store / "history.sqlite") as reader:
-        kept = list(reader.rows("soak", Span(-np.inf, np.inf)))
-        _, events = reader.events("soak", Span(-np.inf, np.inf), 1)
+    with open_history(store / "history.sqlite") as reader:
+        kept = list(reader.rows("soak", TimeRange(-np.inf, np.inf)))
+        _, events = reader.events("soak", TimeRange(-np.inf, np.inf), 1)
     print(f"history: {len(kept)} rows of {', '.join(sorted({f'{row.width_s} s' for row in kept}))}, {events} events")
     sums = [sum(row.counts[at] for row in kept) for at in range(3)]
     print(f"received, lost and bad of all its rows: {sums}")
@@ -199,7 +201,7 @@ def _tell(service: Service, wire: Wire, course: Course, took_s: float, store: Pa
     names = ("memory MB", "descriptors", "threads", "store MB")
     for at, name in enumerate(names):
         print(f"{name}: most before the half {early[at]:.1f}, after it {late[at]:.1f}")
-    estimator = service.stations[0].chain.estimator
+    estimator = service.workers[0].chain.estimator
     print(f"the window holds {estimator.filled if estimator is not None else 0} samples")
 
 

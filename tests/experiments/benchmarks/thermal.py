@@ -12,8 +12,8 @@ from collections import Counter
 
 import numpy as np
 
-from monitor.drift.thermal.thermal_fit import fitted
-from monitor.drift.thermal.thermal_model import predicted
+from monitor.drift.thermal.thermal_fit import fit_thermal_model
+from monitor.drift.thermal.thermal_model import predict
 from tests.experiments.benchmarks.machine import console, table
 from tests.monitor.drift.made import hourly
 
@@ -27,9 +27,9 @@ def cell(lag_h: float, noise: float, seeds: int) -> tuple[str, ...]:
     ratios, inside, names = [], [], Counter[str]()
     for seed in range(seeds):
         means = hourly(seed, lag_h, noise)
-        model = fitted(means.upto(DAY)).model
-        multi = predicted(model, means.temperature_c, began=True)
-        one = predicted(model, means.temperature_c, means.bias, began=True)
+        model = fit_thermal_model(means.first(DAY)).model
+        multi = predict(model, means.temperature_c, began=True)
+        one = predict(model, means.temperature_c, means.bias, began=True)
         cubic = np.polynomial.Polynomial.fit(means.temperature_c[:DAY], means.bias[:DAY], 3)(means.temperature_c)
         of_cubic = np.sqrt(np.mean((means.bias - cubic)[DAY:] ** 2))
         ratios.append([np.sqrt(np.mean((means.bias - each.bias)[DAY:] ** 2)) / of_cubic for each in (multi, one)])

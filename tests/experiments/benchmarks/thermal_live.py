@@ -13,8 +13,8 @@ from itertools import islice
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.drift.thermal.online_thermal_model import AxisThermal, Following
-from monitor.drift.thermal.residual_alarm import Unexplained
+from monitor.drift.thermal.online_thermal_model import AxisThermalUpdate, OnlineThermalModel
+from monitor.drift.thermal.residual_alarm import UnexplainedChange
 from tests.experiments.benchmarks.machine import console, table
 from tests.monitor.drift.made import COEFFICIENT, late, weather
 
@@ -53,10 +53,12 @@ def wandering(draws: Floats) -> Floats:
     return out
 
 
-def followed(kind: str, seed: int, step: float = 0.0) -> tuple[list[AxisThermal], list[tuple[int, Unexplained]], float]:
+def followed(
+    kind: str, seed: int, step: float = 0.0
+) -> tuple[list[AxisThermalUpdate], list[tuple[int, UnexplainedChange]], float]:
     """The intervals, what was told when, and the deviation of a mean."""
     biases, warmth, size = record(kind, seed, step)
-    axis, looks, told = Following(60.0 * MINUTES), [], []
+    axis, looks, told = OnlineThermalModel(60.0 * MINUTES), [], []
     for k, (bias, temperature_c) in enumerate(zip(biases.tolist(), warmth.tolist(), strict=True)):
         looks.append(axis.update(bias, size, temperature_c))
         while axis.step():

@@ -15,13 +15,13 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.estimation.allan.batch import cluster_sizes, overlapping, slope
-from monitor.estimation.allan.difference_moments import per_sample, spread
-from monitor.estimation.allan.hadamard import hadamard
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, slope_of_recording
+from monitor.estimation.allan.difference_moments import correct_bias, per_sample
+from monitor.estimation.allan.hadamard import hadamard_variance
 from monitor.estimation.allan.hadamard import moments as hadamard_moments
 from monitor.estimation.allan.total import moments as total_moments
-from monitor.estimation.allan.total import total
-from monitor.estimation.allan.uncertainty import table
+from monitor.estimation.allan.total import total_variance
+from monitor.estimation.allan.uncertainty import covariance_table
 from monitor.estimation.fit.coefficient_fit import design, fit
 from monitor.noise.effect import Source
 from monitor.noise.effects.angle_random_walk import AngleRandomWalk
@@ -54,8 +54,10 @@ def records(coefficients: tuple[float, ...], n: int, count: int, rng: np.random.
 def fitted(values: Floats) -> Floats:
     """θ [5, k] of the records themselves."""
     factors = cluster_sizes(len(values), 1.0)
-    avar, terms = overlapping(values, factors)
-    return fit(design(factors, 1.0), table(len(values), factors), avar, terms, slope=slope(values)).theta
+    avar, terms = overlapping_avar(values, factors)
+    return fit(
+        design(factors, 1.0), covariance_table(len(values), factors), avar, terms, slope=slope_of_recording(values)
+    ).theta
 
 
 Spread = tuple[Floats, Floats, Floats, Floats]
@@ -98,11 +100,11 @@ def main() -> None:
         values = records(coefficients, n, arguments.records, rng)
         theta = np.append(np.square(coefficients), 0.0)
         known, found = np.repeat(theta[:, None], arguments.records, axis=1), per_sample(fitted(values), 1.0)
-        tvar, terms = total(values, factors)
-        totals = spread(own, known, tvar, terms), spread(own, found, tvar, terms)
+        tvar, terms = total_variance(values, factors)
+        totals = correct_bias(own, known, tvar, terms), correct_bias(own, found, tvar, terms)
         line(name, totals, np.stack([one.allan for one in own]) @ theta)
-        hvar, terms = hadamard(values, thirds)
-        hadamards = spread(other, known, hvar, terms), spread(other, found, hvar, terms)
+        hvar, terms = hadamard_variance(values, thirds)
+        hadamards = correct_bias(other, known, hvar, terms), correct_bias(other, found, hvar, terms)
         rows.append((name, hadamards, np.stack([one.mean for one in other]) @ theta))
     print("\n| Hadamard variance | " + " | ".join(f"{m / n:.3f} T" for m in thirds) + " |")
     print("| --- " * (1 + len(thirds)) + "|")

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from drivers.sample import AXES, Floats, Ints
 from monitor.estimation.allan.batch import cluster_sizes
 from monitor.estimation.allan.fading import FadingWindow
-from monitor.estimation.allan.uncertainty import table as covariances
-from monitor.estimation.allan.window import AllanWindow, quick_spans
+from monitor.estimation.allan.uncertainty import covariance_table as covariances
+from monitor.estimation.allan.window import AllanWindow, display_spans
 from monitor.estimation.fit.coefficient_fit import Fit, design, fit
 from monitor.estimation.fit.coefficients import Status
 from monitor.noise.effect import Source
@@ -52,7 +52,7 @@ def windows(factors: Ints, length: int, rate_hz: float) -> dict[str, Window]:
         "rectangle": AllanWindow(length, factors),
         "one pole": FadingWindow(factors, length, 1),
         "two poles": FadingWindow(factors, length, 2),
-        "a window per τ": AllanWindow(length, factors, quick_spans(factors, rate_hz, length)),
+        "a window per τ": AllanWindow(length, factors, display_spans(factors, rate_hz, length)),
     }
 
 
@@ -242,7 +242,7 @@ def fit_table(records: int, seed: int) -> None:
 def fitted(name: str, factors: Ints, avar: Floats, length: int = LENGTH) -> Fit:
     """The fit as if the curve were a rectangle's, each row of its own number of terms."""
     whole = covariances(length, factors)
-    spans = quick_spans(factors, RATE_HZ, length) if name == "a window per τ" else np.full(factors.size, length)
+    spans = display_spans(factors, RATE_HZ, length) if name == "a window per τ" else np.full(factors.size, length)
     terms = np.repeat(np.maximum(spans + 1 - 2 * factors, 0)[:, None], 6, axis=1)
     return fit(design(factors, RATE_HZ), whole, avar, terms)
 

@@ -37,8 +37,8 @@ def without_null() -> Iterator[None]:
     from monitor.reconcile import reconcile
     from monitor.reconcile.diagnostics import gap
 
-    def table(simulated: Mapping[str, Sequence[Any]], _looks: int) -> dict[str, dict[str, gap.Null]]:
-        return {axis: {lens: gap.Null(1.92, 3.32) for lens in gap.LENSES} for axis in simulated}
+    def table(simulated: Mapping[str, Sequence[Any]], _looks: int) -> dict[str, dict[str, gap.NullDistribution]]:
+        return {axis: {lens: gap.NullDistribution(1.92, 3.32) for lens in gap.DIAGNOSTICS} for axis in simulated}
 
     with patch.object(reconcile, "nulls", table):
         yield
@@ -63,7 +63,7 @@ def without_refit() -> Iterator[None]:
     from monitor.reconcile.search import search, trials
 
     def stiff(axis: Any, found: Sequence[Any], model: tuple[Any, ...]) -> Any:
-        held = frozenset(at for at, effect in enumerate(model) if type(effect) in hypothesis.NOISE)
+        held = frozenset(at for at, effect in enumerate(model) if type(effect) in hypothesis.NOISE_SIZE_PARAMETERS)
         return hypothesis.Hypothesis(model, axis.fit((*model, *found), held))
 
     with patch.object(search, "settled", stiff), patch.object(trials, "settled", stiff):

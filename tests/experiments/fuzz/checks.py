@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from drivers.decoders.base import ACCEL_LIMIT, GYRO_LIMIT, TEMPERATURE_LIMITS_C, Decoder
-from drivers.sample import NO_TICK, Chunk, Counter, Given, SampleBlock
+from drivers.decoders.base import MAX_ACCEL_M_S2, MAX_GYRO_RAD_S, TEMPERATURE_LIMITS_C, Decoder
+from drivers.sample import NO_TICK, Chunk, CounterTiming, SampleBlock, SenderTiming
 
-LIMITS = (GYRO_LIMIT,) * 3 + (ACCEL_LIMIT,) * 3
+LIMITS = (MAX_GYRO_RAD_S,) * 3 + (MAX_ACCEL_M_S2,) * 3
 LARGEST_LOSS = 10**10
 """Samples: ten days at 10 kHz; more at one place is no loss that a decoder can know of."""
 
@@ -38,10 +38,10 @@ def fed(decoder: Decoder, calls: list[list[Chunk]]) -> list[SampleBlock]:
         bad = decoder.bad
         for block in decoder.feed(chunks):
             sound(block)
-            if isinstance(decoder.timing, Counter):
+            if isinstance(decoder.timing, CounterTiming):
                 known = block.ticks[block.ticks != NO_TICK]
                 assert ((known >= 0) & (known < decoder.timing.modulus)).all(), "a count outside its turn"
-            if not isinstance(decoder.timing, Given):
+            if not isinstance(decoder.timing, SenderTiming):
                 assert set(block.t_ns.tolist()) <= arrivals, "a time at which nothing arrived"
             out.append(block)
         assert decoder.bad >= bad

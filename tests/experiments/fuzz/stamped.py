@@ -1,6 +1,6 @@
 """A ``SampleClock`` under watch: what must hold of the times it gives and of what it calls missing."""
 
-from drivers.sample import Given, SampleBlock, Timing
+from drivers.sample import SampleBlock, SenderTiming, Timing
 from drivers.timing.sample_clock import JUMP_S, SampleClock
 from tests.experiments.fuzz.checks import LARGEST_LOSS
 
@@ -13,7 +13,7 @@ class Stamped:
 
     def __init__(self, timing: Timing, rate_hz: float | None) -> None:
         self.clock = SampleClock(timing, rate_hz)
-        self._given = isinstance(timing, Given)
+        self._given = isinstance(timing, SenderTiming)
         self._rows = self._passed = 0
         self._told = self._missing = 0  # by the decoder; by the clock
         self._first_ns: int | None = None
@@ -22,7 +22,7 @@ class Stamped:
 
     def put(self, block: SampleBlock) -> list[SampleBlock]:
         """The stamped samples."""
-        out = self.clock.stamp(block)
+        out = self.clock.assign_times(block)
         self._rows += len(block)
         self._told += block.lost
         first, newest = int(block.t_ns.min()), int(block.t_ns.max())
@@ -33,7 +33,7 @@ class Stamped:
             self._passed += len(one)
             self._missing += one.lost
             self._times(block, one)
-        kept_out = self.clock.repeated + self.clock.late
+        kept_out = self.clock.repeated_rows + self.clock.late_rows
         assert self._passed + kept_out == self._rows, "a row is gone, or came twice"
         self._missing_is_possible()
         rate = self.clock.rate_hz

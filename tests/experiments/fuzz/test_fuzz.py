@@ -30,7 +30,7 @@ def _within_limits() -> Iterator[None]:
 
 
 def test_every_reader_has_a_target() -> None:
-    decoders = {f"{kind}-{name}" for kind in ("decoder", "wire") for name in discovery.names(drivers.decoders)}
+    decoders = {f"{kind}-{name}" for kind in ("decoder", "wire") for name in discovery.list_modules(drivers.decoders)}
     formats = {f"recording-{suffix[1:].replace('.', '-')}" for suffix in FORMATS}
     assert decoders | formats <= TARGETS.keys()
 
@@ -99,7 +99,7 @@ def test_memory_that_is_only_claimed_and_memory_that_is_used() -> None:
 def test_a_sample_of_a_frame_whose_check_fails_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     from drivers.decoders import stim300, xsens_mtdata2
 
-    monkeypatch.setattr(stim300, "crc_holds", lambda frame: True)
+    monkeypatch.setattr(stim300, "has_valid_crc", lambda frame: True)
     monkeypatch.setattr(xsens_mtdata2, "sum", lambda data: 0, raising=False)
     for name in ("wire-stim300", "wire-xsens_mtdata2"):
         found = [tried(TARGETS[name], data) for data in inputs(TARGETS[name], 300, seed=1)]

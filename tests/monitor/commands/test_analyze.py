@@ -9,9 +9,9 @@ import pytest
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import save_samples
 from monitor.commands import analyze, thermal
-from monitor.commands.analyze import Request, TooShort, make
+from monitor.commands.analyze import Request, TooFewSamples, make
 from monitor.common.rates import MILLI_G
-from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.publishing import exporters
 from monitor.publishing.messages import encoding
 from monitor.publishing.terminal.thermal_text import notes_on_hysteresis
@@ -32,7 +32,7 @@ def recording(tmp_path: Path) -> Path:
 
 def test_only_what_is_wanted_is_made(recording: Path) -> None:
     results = make(Request(recording))
-    assert results.total is results.hadamard is results.dynamic is results.warmth is None
+    assert results.total is results.hadamard is results.dynamic is results.without_temperature is None
     assert results.lacking == ""
     [change] = results.analysis.changes  # told in the notes, so always looked for
     assert (change.axis, change.since) == (0, pytest.approx(15_000, abs=50))
@@ -40,7 +40,9 @@ def test_only_what_is_wanted_is_made(recording: Path) -> None:
 
 def test_all_of_it(recording: Path) -> None:
     told: list[tuple[str, float | None]] = []
-    results = make(Request(recording, window_s=30.0, others=True), lambda what, share: told.append((what, share)))
+    results = make(
+        Request(recording, window_s=30.0, total_and_hadamard=True), lambda what, share: told.append((what, share))
+    )
     assert results.total is not None
     assert results.hadamard is not None
     assert results.dynamic is not None
@@ -66,7 +68,7 @@ def test_drift_that_was_temperature_is_told(tmp_path: Path) -> None:
     results = make(Request(tmp_path / "warm.npz"))
     (note,) = (one for one in results.analysis.notes if "follows its temperature" in one)
     assert note.startswith("gz follows its temperature")
-    written = json.loads(encoding.analysis(results.analysis, warmth=results.warmth))
+    written = json.loads(encoding.analysis(results.analysis, warmth=results.without_temperature))
     gz = written["axes"]["gz"]["without_temperature"]
     assert set(gz) == {"model", "coefficients", "share"}
     assert written["axes"]["gz"]["temperature"]["share"] > 0.9
@@ -100,8 +102,8 @@ def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k
     named = [one.split()[0] for one in results.analysis.notes if "follows its temperature" in one]
     assert named == ["gy", "gz", "az"]
     if shape == "ramp":  # the case in which nothing was said of gy
-        assert results.analysis.estimate.coefficients.status[LETTERS.index("K"), 1] != Status.ESTIMATED
-    written = encoding.analysis(results.analysis, warmth=results.warmth)
+        assert results.analysis.estimate.coefficients.status[SYMBOLS.index("K"), 1] != Status.ESTIMATED
+    written = encoding.analysis(results.analysis, warmth=results.without_temperature)
     marks = {axis: one.get("temperature") for axis, one in json.loads(written)["axes"].items()}
     assert [axis for axis, one in marks.items() if one] == ["gy", "gz", "az"]
     assert set(marks["gy"]) == {"share", "p_value", "form", "one_way", "interval"}
@@ -130,12 +132,12 @@ def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k
 
 def test_listed_tau_are_those_of_every_curve_as_far_as_they_are_possible(recording: Path) -> None:
     listed = (0.1, 0.2, 0.5, 1.0, 2.0, 100.0)
-    results = make(Request(recording, tau=listed, others=True))
+    results = make(Request(recording, tau=listed, total_and_hadamard=True))
     assert results.total is not None
     assert results.hadamard is not None
     assert results.total.tau_s.tolist() == list(listed)
     assert results.hadamard.tau_s.tolist() == list(listed[:-1])
-    assert make(Request(recording, tau=(100.0,), others=True)).hadamard is None
+    assert make(Request(recording, tau=(100.0,), total_and_hadamard=True)).hadamard is None
 
 
 def test_a_window_longer_than_the_recording_leaves_the_rest(recording: Path) -> None:
@@ -147,7 +149,7 @@ def test_a_window_longer_than_the_recording_leaves_the_rest(recording: Path) -> 
 
 def test_too_short_says_how_short(tmp_path: Path) -> None:
     save_samples(tmp_path / "x.npz", np.arange(20) / RATE_HZ, np.zeros((20, 6)))
-    with pytest.raises(TooShort, match="20 samples; at least 50") as raised:
+    with pytest.raises(TooFewSamples, match="20 samples; at least 50") as raised:
         make(Request(tmp_path / "x.npz"))
     assert raised.value.samples == 20
 
@@ -163,7 +165,7 @@ def test_what_is_wrong_is_said(tmp_path: Path, recording: Path) -> None:
 def test_a_drawing_has_the_changes_marked(recording: Path, name: str, start: bytes) -> None:
     pytest.importorskip("matplotlib")
     pytest.importorskip("jinja2")
-    results = make(Request(recording, window_s=30.0, others=True))
+    results = make(Request(recording, window_s=30.0, total_and_hadamard=True))
     path = recording.with_name(name)
     analyze.draw(results, path, "bench")
     assert path.read_bytes().startswith(start)

@@ -16,10 +16,10 @@ import pytest
 
 from drivers.driver import AxisMap
 from drivers.recordings import segment
-from drivers.recordings.segment import SegmentWriter, State
-from drivers.sample import block
+from drivers.recordings.segment import DaemonState, SegmentWriter
+from drivers.sample import make_block
 from monitor.commands import doctor
-from monitor.commands.doctor import SAMPLE_BYTES, Finding, bytes_a_day, examine, room, satisfies, worst
+from monitor.commands.doctor import SAMPLE_BYTES, Finding, bytes_a_day, disk_space, examine, satisfies, worst
 from monitor.common.compiled import cache_folder
 from monitor.common.config_files import CONFIG_FOLDER
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, FolderLock
@@ -209,7 +209,7 @@ def test_ports_that_are_taken_and_routers_that_do_not_answer_are_told(tmp_path: 
 
 @pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:99999", f"tcp/{'a' * 70}.example:1", "tcp/192.0.2.1:7447"])
 def test_an_address_that_cannot_be_listened_on_is_wrong(endpoint: str) -> None:
-    (found,) = doctor.free("zenoh", endpoint)
+    (found,) = doctor.port_is_free("zenoh", endpoint)
     assert found.mark == "wrong"
     assert found.text.startswith(f"{endpoint}: cannot be listened on: ")
 
@@ -244,7 +244,9 @@ def test_a_rate_that_is_not_configured_leaves_the_disk_unjudged(tmp_path: Path) 
 
 def test_room_is_judged_by_days(tmp_path: Path) -> None:
     own = Storage(tmp_path, keep_s=30 * 86400.0, disk_share=0.9)
-    marks = [room(own, 1e9, 100_000_000_000, free)[0] for free in (90_000_000_000, 25_000_000_000, 10_500_000_000)]
+    marks = [
+        disk_space(own, 1e9, 100_000_000_000, free)[0] for free in (90_000_000_000, 25_000_000_000, 10_500_000_000)
+    ]
     assert [one.mark for one in marks] == ["well", "doubt", "wrong"]
     assert "the oldest will be deleted after about 15 days" in marks[1].text
 
@@ -261,9 +263,11 @@ def test_what_a_sample_is_said_to_take_is_what_it_takes(tmp_path: Path) -> None:
     for at in range(0, 60_000, 50):
         rows = slice(at, at + 50)
         ticks = np.arange(at, at + 50) * 10
-        writer.samples([block(t_ns[rows].copy(), values[rows].copy(), temperature[rows].copy(), ticks)], State())
+        writer.samples(
+            [make_block(t_ns[rows].copy(), values[rows].copy(), temperature[rows].copy(), ticks)], DaemonState()
+        )
     writer.close()
-    list(segment.pack(writer.path))
+    list(segment.compress_segment(writer.path))
     (packed,) = tmp_path.iterdir()
     assert 0.8 * SAMPLE_BYTES < packed.stat().st_size / 60_000 < SAMPLE_BYTES
 

@@ -13,7 +13,7 @@ import pytest
 from drivers.errors import ConfigError, NotReady, RecordingError
 from monitor.cli import main
 from monitor.commands import reconcile, simulate
-from monitor.commands.reconcile import RunsRequest, make_runs, names
+from monitor.commands.reconcile import ComparisonRequest, compare_recordings, unique_names
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, BiasStep, Sinusoidal
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import Reconciliation
@@ -109,7 +109,7 @@ def test_the_terminal_tells_the_same(compared: tuple[Path, str]) -> None:
 def test_without_a_model_that_of_the_first_is_for_all(tmp_path: Path) -> None:
     paths = tuple(recorded(tmp_path / f"{name}.csv", KNOWN + LINE, seed, 200.0) for name, seed in (("a", 1), ("b", 2)))
     told = []
-    found = make_runs(RunsRequest(paths, None, tmp_path / "out"), lambda what, _share: told.append(what))
+    found = compare_recordings(ComparisonRequest(paths, None, tmp_path / "out"), lambda what, _share: told.append(what))
     assert found.fitted_to == "a"
     first, second = (run.result for run in found.runs)
     assert first.fitted_first
@@ -127,9 +127,9 @@ def test_a_recording_without_an_answer_is_left_out_and_named(tmp_path: Path, mon
         recorded(tmp_path / f"{name}.csv", KNOWN, k, s)
         for k, (name, s) in enumerate((("a", 60), ("b", 60), ("short", 2)))
     ]
-    found = make_runs(RunsRequest(tuple(paths), KNOWN, tmp_path / "out"))
+    found = compare_recordings(ComparisonRequest(tuple(paths), KNOWN, tmp_path / "out"))
     assert [run.name for run in found.runs] == ["a", "b"]
-    assert "200 samples" in found.silent["short"]
+    assert "200 samples" in found.without_result["short"]
     last = report(tmp_path / "out")["recordings"][-1]
     assert (last["name"], last["verdict"]) == ("short", None)
     assert "200 samples" in last["why"]
@@ -153,8 +153,8 @@ def test_two_answers_at_least_are_needed(tmp_path: Path) -> None:
 
 def test_names_are_those_of_the_files_and_differ(tmp_path: Path) -> None:
     paths = [Path("a/run.csv"), Path("b/run.csv.gz"), Path("c/RUN.NPZ"), Path("d/run-2.csv"), tmp_path / "segments"]
-    assert list(names(paths)) == ["run", "run-2", "RUN", "run-2-2", "segments"]
-    assert list(names([Path(".csv"), Path("x.parquet")])) == [".csv", "x"]
+    assert list(unique_names(paths)) == ["run", "run-2", "RUN", "run-2-2", "segments"]
+    assert list(unique_names([Path(".csv"), Path("x.parquet")])) == [".csv", "x"]
 
 
 def test_what_cannot_be_compared_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,11 +166,11 @@ def test_what_cannot_be_compared_is_refused_before_the_work(tmp_path: Path, monk
     (tmp_path / "b").mkdir()
     a, b = tmp_path / "a.csv", tmp_path / "b"
     with pytest.raises(ConfigError, match=r"a\.csv: is given twice"):
-        make_runs(RunsRequest((a, tmp_path / "b" / ".." / "a.csv"), KNOWN, tmp_path / "out"))
+        compare_recordings(ComparisonRequest((a, tmp_path / "b" / ".." / "a.csv"), KNOWN, tmp_path / "out"))
     with pytest.raises(RecordingError, match=r"c\.csv: cannot be read"):
-        make_runs(RunsRequest((a, tmp_path / "c.csv"), KNOWN, tmp_path / "out"))
+        compare_recordings(ComparisonRequest((a, tmp_path / "c.csv"), KNOWN, tmp_path / "out"))
     with pytest.raises(ConfigError, match=r"--out: .*b is a recording"):
-        make_runs(RunsRequest((a, b), KNOWN, tmp_path))
+        compare_recordings(ComparisonRequest((a, b), KNOWN, tmp_path))
     assert not (tmp_path / "out").exists()
 
 
@@ -187,6 +187,6 @@ def test_one_recording_is_reported_as_before(tmp_path: Path) -> None:
 def test_the_first_without_an_answer_ends_it_where_the_model_was_to_be_its(tmp_path: Path) -> None:
     paths = (recorded(tmp_path / "s.csv", KNOWN, 1, 2.0), recorded(tmp_path / "t.csv", KNOWN, 1, 2.0))
     with pytest.raises(NotReady, match=r"0 can be: s: 200 samples"):
-        make_runs(RunsRequest(paths, None, tmp_path / "out"))
+        compare_recordings(ComparisonRequest(paths, None, tmp_path / "out"))
     with pytest.raises(NotReady, match=r"0 can be: s: 200 samples.*; t: 200 samples"):
-        make_runs(RunsRequest(paths, KNOWN, tmp_path / "out"))
+        compare_recordings(ComparisonRequest(paths, KNOWN, tmp_path / "out"))

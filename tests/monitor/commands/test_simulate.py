@@ -13,7 +13,7 @@ from drivers.recordings import FORMATS, load_samples, save_samples
 from drivers.sample import AXES
 from monitor.commands import analyze
 from monitor.commands.simulate import ROWS, Request, make
-from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.noise.model import NoiseModel
 
 FIVE = {"Q": 2e-5, "N": 1.5e-4, "B": 3e-4, "K": 2e-4, "R": 3e-5}
@@ -61,7 +61,7 @@ def test_the_five_terms_come_back_from_every_format(path: Path) -> None:
     found = analyze.make(analyze.Request(path)).analysis.estimate.coefficients
     assert found.value.shape == (5, 6)
     assert found.status[1, 2] == Status.ESTIMATED
-    for row, letter in enumerate(LETTERS):
+    for row, letter in enumerate(SYMBOLS):
         assert found.lo[row, 2] <= FIVE[letter] <= found.hi[row, 2], letter
 
 
@@ -69,7 +69,7 @@ def test_it_is_the_models_own_series_to_the_last_bit(path: Path) -> None:
     n = ROWS + 1000  # more than one block
     make(Request(WARM, path, n / 50.0, seed=4))
     recording = load_samples(path)
-    drawn = WARM.stream(50.0, 4).draw_all(n)
+    drawn = WARM.stream(50.0, 4).draw_with_temperature(n)
     assert recording.axes == ("gy", "ax", "az")  # what the model does not name is absent, not zero
     for axis in recording.axes:
         assert np.array_equal(recording.values[:, AXES.index(axis)], drawn.values[:, AXES.index(axis)])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import monitor.common.compiled
-from monitor.common.compiled import IMPORTS, Kernel, compiled, stamp
+from monitor.common.compiled import IMPORT_STATEMENT, Kernel, compiled, source_hash
 from monitor.estimation.fit import fit_kernel
 from tests.support.waiting import PATIENCE_S
 
@@ -44,8 +44,8 @@ def test_cached_code_is_stale_when_what_it_calls_has_changed(tmp_path):
     files["d"].write_text("x = 1\n")
 
     def now():
-        stamp.cache_clear()
-        return stamp(files["a"], tmp_path)
+        source_hash.cache_clear()
+        return source_hash(files["a"], tmp_path)
 
     before = now()
     files["d"].write_text("x = 2\n")
@@ -57,9 +57,9 @@ def test_cached_code_is_stale_when_what_it_calls_has_changed(tmp_path):
 
 
 def test_the_stamp_of_a_kernel_covers_the_files_it_calls():
-    imported = [package for package, *_ in IMPORTS.findall(Path(inspect.getfile(fit_kernel)).read_text())]
+    imported = [package for package, *_ in IMPORT_STATEMENT.findall(Path(inspect.getfile(fit_kernel)).read_text())]
     assert imported.count("monitor.estimation.fit.term_selection") == 1
-    assert fit_kernel.fit_axes._cache._cache_file._source_stamp[1] == stamp(Path(inspect.getfile(fit_kernel)))
+    assert fit_kernel.fit_axes._cache._cache_file._source_stamp[1] == source_hash(Path(inspect.getfile(fit_kernel)))
 
 
 def test_machine_code_is_generated_only_for_the_kernel_that_python_calls():

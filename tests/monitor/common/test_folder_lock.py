@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from monitor.common.folder_lock import RECORDING_LOCK, FolderLock, holder
+from monitor.common.folder_lock import RECORDING_LOCK, FolderLock, lock_holder
 
 HOLDER = """
 import subprocess, sys
@@ -56,23 +56,23 @@ def test_a_holder_that_is_killed_gives_it_back_although_a_child_lives_on(tmp_pat
     lock = FolderLock(tmp_path, "a.lock")
     try:
         assert f"process {process.pid}" in lock.hold()
-        assert holder(tmp_path, "a.lock") == f"process {process.pid}"
+        assert lock_holder(tmp_path, "a.lock") == f"process {process.pid}"
         process.kill()
         process.wait()
         os.kill(child, 0)  # it lives
         assert lock.hold() == ""
-        assert holder(tmp_path, "a.lock") == f"process {os.getpid()}"
+        assert lock_holder(tmp_path, "a.lock") == f"process {os.getpid()}"
     finally:
         process.kill()
         process.communicate()
         os.kill(child, 9)
         lock.release()
-    assert holder(tmp_path, "a.lock") == ""
+    assert lock_holder(tmp_path, "a.lock") == ""
 
 
 def test_looking_for_a_holder_makes_nothing(tmp_path: Path) -> None:
-    assert holder(tmp_path / "store", "a.lock") == ""
-    assert holder(tmp_path, "a.lock") == ""
+    assert lock_holder(tmp_path / "store", "a.lock") == ""
+    assert lock_holder(tmp_path, "a.lock") == ""
     assert not list(tmp_path.iterdir())
 
 
@@ -134,7 +134,7 @@ def test_a_file_system_without_locks_is_used_with_a_warning(
     assert lock.hold() == ""
     assert lock.held
     assert lock.warning.startswith(f"{tmp_path}: this file system has no locks ({os.strerror(number)})")
-    assert holder(tmp_path, "a.lock") == ""
+    assert lock_holder(tmp_path, "a.lock") == ""
     lock.release()
 
 
@@ -143,7 +143,7 @@ def test_a_holder_on_another_host_is_named_with_it(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(socket, "gethostname", lambda: "bench-pc")
     assert lock.hold() == ""
     monkeypatch.undo()
-    assert holder(tmp_path, RECORDING_LOCK) == f"process {os.getpid()} on bench-pc"
+    assert lock_holder(tmp_path, RECORDING_LOCK) == f"process {os.getpid()} on bench-pc"
     lock.path.write_text("rubbish")
-    assert holder(tmp_path, RECORDING_LOCK) == "another process"
+    assert lock_holder(tmp_path, RECORDING_LOCK) == "another process"
     lock.release()

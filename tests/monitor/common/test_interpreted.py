@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from drivers.sample import Floats, block
+from drivers.sample import Floats, make_block
 from monitor.common.compiled import Kernel
 from monitor.drift.compensation.live_compensation import LiveCompensation
-from monitor.drift.thermal.thermal_response import lagged
-from monitor.estimation.detection.signal_monitor import Watch
-from monitor.estimation.estimator import FEWEST, Estimator
+from monitor.drift.thermal.thermal_response import first_order_lag
+from monitor.estimation.detection.signal_monitor import SignalMonitor
+from monitor.estimation.estimator import MIN_SAMPLES, Estimator
 from tests.support.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[3]
@@ -71,24 +71,29 @@ def results(seed: int) -> list[Any]:
     n = int(rng.integers(200, 700))
     values = signal(rng, n)
     estimator = Estimator(RATE_HZ, float(rng.choice([2.0, 10.0, 60.0])), every_sample=seed % 4 == 0)
-    watch, compensation = Watch(RATE_HZ, bool(seed % 2), 10.0, keep_still=True), LiveCompensation(RATE_HZ)
+    watch, compensation = SignalMonitor(RATE_HZ, bool(seed % 2), 10.0, keep_still=True), LiveCompensation(RATE_HZ)
     found: list[Any] = []
     at = 0
     while at < n:
         size = int(rng.choice([1, 7, 50, 200]))
         lost = int(rng.integers(1, 30)) if rng.random() < 0.1 else 0
         piece = values[at : at + size]
-        samples = block(np.arange(at, at + len(piece)) * 10_000_000, piece, lost=lost)
+        samples = make_block(np.arange(at, at + len(piece)) * 10_000_000, piece, lost=lost)
         at += size
         for part in watch.update(samples):
             estimator.update(part)
         for restart in watch.take_restarts():
             estimator.restart(restart.axis, restart.samples)
         found += [compensation.update(samples).values, compensation.take()]
-        if rng.random() < 0.2 and estimator.filled >= FEWEST:
+        if rng.random() < 0.2 and estimator.filled >= MIN_SAMPLES:
             found.append(estimator.get())
-    found += [estimator.step() for _ in range(3)]
-    found += [watch.take_events(), watch.take_still(), compensation.take_events(), lagged(values[:, 0], 0.5)]
+    found += [estimator.step_slow_statistics() for _ in range(3)]
+    found += [
+        watch.take_events(),
+        watch.take_samples_at_rest(),
+        compensation.take_events(),
+        first_order_lag(values[:, 0], 0.5),
+    ]
     return [plain(one) for one in found]
 
 

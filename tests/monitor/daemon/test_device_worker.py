@@ -13,10 +13,10 @@ from drivers.driver import AxisMap
 from drivers.errors import ConfigError
 from drivers.links import replay_link
 from drivers.links.loopback_link import LoopbackLink
-from drivers.sample import block, join
+from drivers.sample import concatenate_blocks, make_block
 from monitor.daemon import device_worker
-from monitor.daemon.device_worker import Station
-from monitor.daemon.pipeline import Ready
+from monitor.daemon.device_worker import DeviceWorker
+from monitor.daemon.pipeline import KernelReadiness
 from monitor.estimation.fit.coefficients import Status
 from monitor.settings import loading as settings
 from monitor.settings.loading import Device
@@ -98,12 +98,12 @@ class Rig:
             compensate=compensate,
         )
         self.wake = threading.Event()
-        self.ready = ready or Ready()
+        self.ready = ready or KernelReadiness()
         if ready is None:
             self.ready.window.set()
             self.ready.fit.set()
             self.ready.all.set()
-        self.station = Station(device, self.link, decoder, self.wake, self.ready)
+        self.station = DeviceWorker(device, self.link, decoder, self.wake, self.ready)
         self.caught = Caught()
         self.sent = self.stamped = 0
         self.link.open()
@@ -114,7 +114,7 @@ class Rig:
         index = np.arange(self.sent, self.sent + n)
         self.sent += n
         values = 1e-3 * scale * np.random.default_rng(self.sent).standard_normal((n, 6))
-        samples = block(index * 10_000_000, values, 20.0 + 1e-3 * index, index, lost)
+        samples = make_block(index * 10_000_000, values, 20.0 + 1e-3 * index, index, lost)
         self.station.driver.counts.received += n
         self.station._push(samples)
 
@@ -147,7 +147,7 @@ def test_a_running_device_whose_can_frames_are_late_says_so():
     settings = {"file": "j1939_imu", "signals": signals, "window": 0.005}
     decoder = dbc.build(msgspec.convert(settings, dbc.Settings))
     rig = Rig(rate=50.0, decoder=decoder)
-    sent = decoder.encode(block(np.arange(50) * 20_000_000, np.ones((50, 6))))
+    sent = decoder.encode(make_block(np.arange(50) * 20_000_000, np.ones((50, 6))))
     for i, chunk in enumerate(sent):
         delay_ns = i % 2 * (8_000_000 if i // 2 == 30 else 1_000_000)
         rig.link.write(replace(chunk, t_ns=chunk.t_ns + delay_ns))
@@ -195,7 +195,7 @@ def test_no_sample_is_missing_from_the_courses_that_are_published():
 
 
 def test_a_fit_at_every_sample_waits_for_its_kernels():
-    ready = Ready(interpretable_hz=0.0)
+    ready = KernelReadiness(interpretable_hz=0.0)
     ready.window.set()
     rig = Rig(refit_s=0.0, publish_s=0.0, ready=ready)
     rig.bring(300)
@@ -236,7 +236,7 @@ def test_samples_wait_for_a_rate_and_none_is_left_out():
     assert rig.caught.blocks == []
     for i in range(400):  # the clock learns from what the reader stamps
         t_ns = np.array([10**12 + i * 10_000_000])
-        rig.station.clock.stamp(block(t_ns, np.zeros((1, 6))))
+        rig.station.clock.assign_times(make_block(t_ns, np.zeros((1, 6))))
     rig.bring(100)
     rig.work(1001.0)
     assert sum(map(len, rig.caught.blocks)) == 400
@@ -250,14 +250,14 @@ def test_a_rate_known_better_is_the_new_label():
     t_ns = 10**12
     for _ in range(300):
         t_ns += 10_300_000
-        rig.station.clock.stamp(block(np.array([t_ns]), np.zeros((1, 6))))
+        rig.station.clock.assign_times(make_block(np.array([t_ns]), np.zeros((1, 6))))
     rig.bring(500)
     rig.work(1000.0, drain=True)
     before = rig.caught.estimates[-1][1]
     for _ in range(60_000):
         t_ns += 10_000_000
-        rig.station.clock.stamp(block(np.array([t_ns]), np.zeros((1, 6))))
-    rig.station.report([rig.caught], {}, 0)
+        rig.station.clock.assign_times(make_block(np.array([t_ns]), np.zeros((1, 6))))
+    rig.station.publish_status([rig.caught], {}, 0)
     rig.bring(1)
     rig.work(1001.0, drain=True)
     after = rig.caught.estimates[-1][1]
@@ -330,7 +330,7 @@ def test_through_the_reader_s_thread_to_the_end_of_a_replay():
     rig, begun_s = Rig(), time.time()
     encoder = vectornav_binary.build(vectornav_binary.Settings())
     index = np.arange(400)
-    made = block(index, np.random.default_rng(0).standard_normal((400, 6)), None, index * 10_000_000)
+    made = make_block(index, np.random.default_rng(0).standard_normal((400, 6)), None, index * 10_000_000)
     for chunk in encoder.encode(made):
         rig.link.write(chunk.data)
     rig.link.end()
@@ -341,7 +341,7 @@ def test_through_the_reader_s_thread_to_the_end_of_a_replay():
     rig.work(time.monotonic(), drain=True)
     assert sum(map(len, rig.caught.blocks)) == 400
     assert rig.caught.estimates[-1][1].samples == 400
-    assert rig.station.report([rig.caught], {"zenoh": "ok"}, 7).received == 400
+    assert rig.station.publish_status([rig.caught], {"zenoh": "ok"}, 7).received == 400
     assert (rig.caught.healths[-1].state, rig.caught.healths[-1].memory_bytes) == ("ended", 7)
     assert rig.wake.is_set()
     # Unix time of samples stamped by the monotonic clock
@@ -351,7 +351,7 @@ def test_through_the_reader_s_thread_to_the_end_of_a_replay():
 def test_a_rate_off_the_configured_one_is_said():
     rig = Rig(rate=100.0)
     for i in range(400):
-        rig.station.clock.stamp(block(np.array([10**12 + i * 20_000_000]), np.zeros((1, 6))))
+        rig.station.clock.assign_times(make_block(np.array([10**12 + i * 20_000_000]), np.zeros((1, 6))))
     rig.station.driver.state, rig.station.driver.text = "running", ""
     said = (
         "measured rate 50 Hz differs from the configured 100 Hz; coefficients are withheld: correct `rate` or remove it"
@@ -366,7 +366,7 @@ def stamp(rig, n, rate_hz, rng):
     at, rig.stamped = rig.stamped, rig.stamped + n
     arrived_s = (at + np.arange(n)) / rate_hz + rng.uniform(0.0, 0.02, n)
     for t_ns in np.maximum.accumulate(10**12 + np.rint(arrived_s * 1e9).astype(np.int64)):
-        rig.station.clock.stamp(block(np.array([t_ns]), np.zeros((1, 6))))
+        rig.station.clock.stamp(make_block(np.array([t_ns]), np.zeros((1, 6))))
 
 
 def statuses(estimate):
@@ -380,7 +380,7 @@ def test_nothing_is_estimated_by_a_rate_that_the_device_contradicts(tmp_path):
         stamp(rig, 50, 100.0, rng)
         rig.bring(50)
         rig.work(1000.0 + i)
-    rig.station.report([rig.caught], {}, 0)
+    rig.station.publish_status([rig.caught], {}, 0)
     rig.work(1100.0, drain=True)
     estimates = [estimate for _, estimate in rig.caught.estimates]
     assert len(estimates) > 10
@@ -417,7 +417,7 @@ def test_a_rate_within_an_oscillator_s_tolerance_gives_way_to_the_measured_one()
         stamp(rig, 50, 98.8, rng)
         rig.bring(50)
         rig.work(1000.0 + i)
-        rig.station.report([rig.caught], {}, 0)
+        rig.station.publish_status([rig.caught], {}, 0)
     _, last = rig.caught.estimates[-1]
     assert Status.ESTIMATED in statuses(last)
     assert last.rate_hz == pytest.approx(98.8, rel=2e-3)
@@ -440,10 +440,10 @@ def test_captured_bytes_and_fast_simulations_have_no_times_of_arrival(tmp_path):
     capture.write_bytes(b"")
     link = replay_link.build(replay_link.Settings(path=str(capture)))
     lines = text.build(text.Settings(columns=("gx", "gy", "gz", "ax", "ay", "az")))
-    rig = Rig(rate=100.0, decoder=lines, link=link, ready=Ready())
+    rig = Rig(rate=100.0, decoder=lines, link=link, ready=KernelReadiness())
     link.close()
     stamp(rig, 600, 5000.0, np.random.default_rng(1))
-    assert not rig.station.clock.unchecked
+    assert not rig.station.clock.rate_check_pending
     assert rig.station.clock.contradicted_hz is None
     config = tmp_path / "config.toml"
     config.write_text(
@@ -451,15 +451,15 @@ def test_captured_bytes_and_fast_simulations_have_no_times_of_arrival(tmp_path):
         '[device.driver.decoder_options]\ncolumns = ["gx", "gy", "gz"]\n'
     )
     (device,) = settings.load(config).devices
-    station = Station(device, LoopbackLink(), lines, threading.Event(), Ready())
+    station = DeviceWorker(device, LoopbackLink(), lines, threading.Event(), KernelReadiness())
     for i in range(9000):
-        station.clock.stamp(block(np.array([10**12 + i * 333_333]), np.zeros((1, 6))))
-    assert not station.clock.unchecked
+        station.clock.assign_times(make_block(np.array([10**12 + i * 333_333]), np.zeros((1, 6))))
+    assert not station.clock.rate_check_pending
     assert station.clock.contradicted_hz is None
 
 
 def test_a_replay_has_ended_when_its_samples_are_fitted():
-    rig = Rig(ready=Ready(interpretable_hz=0.0))
+    rig = Rig(ready=KernelReadiness(interpretable_hz=0.0))
     rig.bring(300)
     rig.work(1000.0)
     rig.station.driver.state = "ended"
@@ -471,7 +471,7 @@ def test_a_replay_has_ended_when_its_samples_are_fitted():
     rig.ready.fit.set()
     rig.work(1002.0)
     assert rig.caught.estimates[-1][1].coefficients.status.max() > 0
-    assert rig.station.chain.watch is None
+    assert rig.station.chain.signal_monitor is None
     rig.ready.all.set()
     assert rig.station.ended
     rig.bring(10)
@@ -480,18 +480,18 @@ def test_a_replay_has_ended_when_its_samples_are_fitted():
 
 
 def test_at_a_low_rate_everything_is_there_before_the_kernels_are_compiled():
-    rig = Rig(rate=100.0, ready=Ready())
+    rig = Rig(rate=100.0, ready=KernelReadiness())
     rig.bring(300)
     rig.work(1000.0)
     assert rig.caught.estimates[-1][1].coefficients.status.max() > 0
-    assert rig.station.chain.watch is not None
+    assert rig.station.chain.signal_monitor is not None
     rig.station.driver.state = "running"
     rig.ready.progress = "compiling 2 of 8: fit"
     assert rig.station.health({}, 0).text == "compiling 2 of 8: fit; no sample is lost"
 
 
 def test_interpreted_fits_come_once_a_second_and_compiled_ones_as_configured():
-    ready = Ready()
+    ready = KernelReadiness()
     rig = Rig(rate=100.0, ready=ready)
     for i in range(40):
         rig.bring(10)
@@ -506,14 +506,14 @@ def test_interpreted_fits_come_once_a_second_and_compiled_ones_as_configured():
 
 @pytest.mark.parametrize("setting", [{"rate": 1000.0}, {"refit_s": 0.0}])
 def test_a_high_rate_or_a_fit_at_every_sample_waits_for_compiled_kernels(setting):
-    rig = Rig(ready=Ready(), **setting)
+    rig = Rig(ready=KernelReadiness(), **setting)
     rig.bring(300)
     rig.work(1000.0)
     assert rig.caught.blocks == []
 
 
 def test_devices_are_interpreted_until_their_rates_add_up_to_the_limit():
-    ready = Ready(interpretable_hz=250.0)
+    ready = KernelReadiness(interpretable_hz=250.0)
     rigs = [Rig(rate=100.0, ready=ready) for _ in range(3)]
     for rig in rigs:
         rig.bring(300)
@@ -578,7 +578,7 @@ def follow_temperature(rig, seconds, begin_s=0.0):
         rig.sent += 10
         warmth = 25.0 + np.sin(2.0 * np.pi * index / 5000.0)
         values = 1e-3 * np.random.default_rng(rig.sent).standard_normal((10, 6)) + 2e-3 * (warmth - 25.0)[:, None]
-        rig.station._push(block(index * 10_000_000, values, warmth, index))
+        rig.station._push(make_block(index * 10_000_000, values, warmth, index))
         rig.work(begin_s + 0.1 * i)
 
 
@@ -612,7 +612,7 @@ def test_a_recording_waits_for_its_model(monkeypatch):
     index = np.arange(4000)
     warmth = 25.0 + np.sin(2.0 * np.pi * index / 5000.0)
     values = 1e-3 * np.random.default_rng(1).standard_normal((4000, 6)) + 2e-3 * (warmth - 25.0)[:, None]
-    rig.station._push(block(index * 10_000_000, values, warmth, index))  # as fast as can be
+    rig.station._push(make_block(index * 10_000_000, values, warmth, index))  # as fast as can be
     with monkeypatch.context() as slow:
         slow.setattr(device_worker, "MODEL_SELECTION_REPLAY_S", 0.0)  # a step each time, however fast the machine is
         rig.work(1000.0)
@@ -639,7 +639,7 @@ def test_where_it_is_off_nothing_is_held_against_temperature():
     rig = Rig(thermal_s=None)
     follow_temperature(rig, 5.0)
     assert (rig.station.chain.thermal, rig.caught.thermals) == (None, [])
-    assert rig.station.chain.watch.take_still() == []
+    assert rig.station.chain.signal_monitor.take_samples_at_rest() == []
 
 
 def test_without_a_model_there_is_no_gap():
@@ -658,11 +658,11 @@ def test_a_model_that_is_none_is_said_at_once(tmp_path):
 
 def test_the_samples_of_the_window_and_their_temperature():
     rig = Rig(window_s=5.0)
-    assert rig.station.held() is None
+    assert rig.station.window_snapshot() is None
     for i in range(14):
         rig.bring(50, lost=3 if i == 12 else 0)
         rig.work(1000.0 + 0.1 * i)
-    held, temperature_c = rig.station.held()
+    held, temperature_c = rig.station.window_snapshot()
     values = held.values()
     sent = np.concatenate([samples.values for samples in rig.caught.blocks] + [np.empty((0, 6))])
     assert (len(held), temperature_c.shape) == (500, (500,))
@@ -685,7 +685,7 @@ def test_every_sample_comes_out_without_drift_too_and_models_are_identified_besi
         thread.join(PATIENCE_S)
     rig.bring(100)
     rig.work(1100.0, drain=True)
-    measured, rates = join(rig.caught.blocks), join(rig.caught.rates)
+    measured, rates = concatenate_blocks(rig.caught.blocks), concatenate_blocks(rig.caught.rates)
     np.testing.assert_array_equal(rates.t_ns, measured.t_ns)
     np.testing.assert_array_equal(rates.values[:, 3:], measured.values[:, 3:])
     assert rates.values[2000:, :3].std() < 0.3 * measured.values[2000:, :3].std()
@@ -711,7 +711,7 @@ def test_nothing_is_compensated_where_it_is_not_wanted_or_no_gyro_is_measured():
     blind = Rig()
     values = np.full((500, 6), np.nan)
     values[:, 3:] = 1.0
-    blind.station._push(block(np.arange(500) * 10_000_000, values))
+    blind.station._push(make_block(np.arange(500) * 10_000_000, values))
     blind.work(1000.0, drain=True)
     for rig in (off, blind):
         assert rig.caught.blocks
@@ -727,7 +727,7 @@ def test_a_step_of_the_bias_is_an_event_of_its_time():
             at = np.arange(rig.sent - 1000, rig.sent)
             values = 1e-3 * np.random.default_rng(i).standard_normal((1000, 6))
             values[:, 1] += 0.02
-            rig.station._push(block(at * 10_000_000, values, np.full(1000, 20.0), at))
+            rig.station._push(make_block(at * 10_000_000, values, np.full(1000, 20.0), at))
         rig.work(1000.0 + i, drain=i == 59)
         rig.finish_models()
     told = [event for _, event in rig.caught.events if event.kind == "drift_unexplained" and "stepped" in event.text]
@@ -744,15 +744,15 @@ def test_a_host_clock_that_is_set_is_told_once_and_stands_in_the_status(monkeypa
     rig = Rig()
     rig.station.driver.state, rig.station.driver.text = "running", ""
     host = time.time_ns
-    assert rig.station.report([rig.caught], {}, 0).text == ""
+    assert rig.station.publish_status([rig.caught], {}, 0).text == ""
     monkeypatch.setattr(time, "time_ns", lambda: host() + step_s * 1_000_000_000)
-    texts = [rig.station.report([rig.caught], {}, 0).text for _ in range(3)]
+    texts = [rig.station.publish_status([rig.caught], {}, 0).text for _ in range(3)]
     assert all(status in one for one in texts), texts
     (event,) = [event for _, event in rig.caught.events]
     assert event.kind == "clock_jumped"
     assert event.text.startswith(text)
     monkeypatch.undo()
-    assert rig.station.report([rig.caught], {}, 0).text == ""
+    assert rig.station.publish_status([rig.caught], {}, 0).text == ""
 
 
 def test_a_recording_has_its_own_times_whatever_the_host_does(monkeypatch, tmp_path):
@@ -762,7 +762,7 @@ def test_a_recording_has_its_own_times_whatever_the_host_does(monkeypatch, tmp_p
     rig.station.driver.state, rig.station.driver.text = "running", ""
     host = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: host() + 10**13)
-    assert rig.station.report([rig.caught], {}, 0).text == ""
+    assert rig.station.publish_status([rig.caught], {}, 0).text == ""
     assert rig.caught.events == []
 
 
@@ -791,7 +791,7 @@ def test_before_its_first_sample_a_recording_has_no_time(tmp_path):
 
 
 def test_while_samples_wait_in_the_ring_the_first_has_the_time(tmp_path):
-    rig = replayed(tmp_path, ready=Ready())
+    rig = replayed(tmp_path, ready=KernelReadiness())
     rig.station.driver.first_t_ns = 10_000_000  # as the reader sees it
     rig.bring(10)
     rig.station.driver.state = "running"
@@ -816,8 +816,8 @@ def test_the_time_of_a_device_with_its_own_clock_goes_on_while_it_is_lost(monkey
 
 def test_before_its_first_sample_a_sensor_has_the_host_s_time():
     rig, begun_s = Rig(), time.time()
-    rig.station.report([rig.caught], {}, 0)
-    rig.station.announce([rig.caught], "recording_stopped", "no room")
+    rig.station.publish_status([rig.caught], {}, 0)
+    rig.station.publish_event([rig.caught], "recording_stopped", "no room")
     (health_s,), ((event_s, _),) = rig.caught.health_times, rig.caught.events
     assert begun_s - 1.0 <= health_s <= event_s <= time.time() + 1.0
 
@@ -826,7 +826,7 @@ def test_slow_statistics_of_a_rebuilt_window_have_its_time(tmp_path):
     rig = replayed(tmp_path)
     index = np.arange(400)
     values = 1e-3 * np.random.default_rng(1).standard_normal((400, 6))
-    rig.station.chain.relive(block(10**9 + index * 10_000_000, values), RATE)
+    rig.station.chain.relive(make_block(10**9 + index * 10_000_000, values), RATE)
     for i in range(10_000):
         rig.work(1000.0 + 100.0 * i)
         if rig.caught.totals:

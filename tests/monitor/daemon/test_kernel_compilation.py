@@ -11,7 +11,7 @@ from drivers.errors import ConfigError
 from monitor.cli.warm_up import warm_up
 from monitor.common import compiled
 from monitor.daemon import kernel_compilation
-from monitor.daemon.kernel_compilation import Group, Part, Progress
+from monitor.daemon.kernel_compilation import KernelGroup, KernelPart, Progress
 from tests.support.waiting import PATIENCE_S
 
 ANSWERS_ALL = "import sys\nfor line in sys.stdin: print(line, end='', flush=True)"
@@ -36,8 +36,8 @@ def _empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernel_compilation, "cache_folder", lambda: tmp_path)
 
 
-def group_of(calls: list[str], names: str) -> Group:
-    return Group("test", tuple(Part(name, lambda name=name: calls.append(name)) for name in names))
+def group_of(calls: list[str], names: str) -> KernelGroup:
+    return KernelGroup("test", tuple(KernelPart(name, lambda name=name: calls.append(name)) for name in names))
 
 
 @pytest.mark.usefixtures("_empty_cache")
@@ -51,13 +51,13 @@ def test_every_part_is_ready_in_its_order_whatever_becomes_of_the_children(
     told: list[Progress] = []
     group = group_of(calls, "abcd")
     assert not kernel_compilation.is_warm(group)
-    assert list(kernel_compilation.prepare(group, told.append, processes)) == list("abcd")
+    assert list(kernel_compilation.prepare_kernels(group, told.append, processes)) == list("abcd")
     assert calls == list("abcd")
     assert {name for progress in told for name in progress.running} == set("abcd")
     assert all(progress.of == 4 and 0 <= progress.done < 4 for progress in told)
     assert kernel_compilation.is_warm(group)
     told.clear()
-    assert list(kernel_compilation.prepare(group, told.append, processes)) == list("abcd")
+    assert list(kernel_compilation.prepare_kernels(group, told.append, processes)) == list("abcd")
     assert told == []
 
 
@@ -73,7 +73,7 @@ def test_progress_that_cannot_be_written_ends_the_compilation_with_its_error(
 
     calls: list[str] = []
     with pytest.raises(BrokenPipeError):
-        list(kernel_compilation.prepare(group_of(calls, "abcd"), tell, processes))
+        list(kernel_compilation.prepare_kernels(group_of(calls, "abcd"), tell, processes))
     assert calls == []
 
 
@@ -82,7 +82,7 @@ def test_processors_are_counted_where_the_system_has_no_affinity(monkeypatch: py
     monkeypatch.delattr(os, "sched_getaffinity")  # as on macOS
     monkeypatch.setattr(kernel_compilation, "PROGRAM", (sys.executable, "-c", ANSWERS_ALL))
     calls: list[str] = []
-    assert list(kernel_compilation.prepare(group_of(calls, "ab"), lambda _: None)) == ["a", "b"]
+    assert list(kernel_compilation.prepare_kernels(group_of(calls, "ab"), lambda _: None)) == ["a", "b"]
 
 
 @pytest.mark.usefixtures("_empty_cache")
@@ -91,7 +91,7 @@ def test_a_program_that_cannot_be_started_leaves_the_compilation_to_this_process
 ) -> None:
     monkeypatch.setattr(kernel_compilation, "PROGRAM", (str(tmp_path / "missing"),))
     calls: list[str] = []
-    assert list(kernel_compilation.prepare(group_of(calls, "ab"), lambda _: None, 2)) == ["a", "b"]
+    assert list(kernel_compilation.prepare_kernels(group_of(calls, "ab"), lambda _: None, 2)) == ["a", "b"]
     assert calls == ["a", "b"]
 
 
@@ -104,7 +104,7 @@ def test_without_a_folder_for_them_kernels_are_compiled_by_this_process_at_every
     told: list[Progress] = []
     group = group_of(calls, "ab")
     for _ in range(2):
-        assert list(kernel_compilation.prepare(group, told.append)) == ["a", "b"]
+        assert list(kernel_compilation.prepare_kernels(group, told.append)) == ["a", "b"]
     assert calls == ["a", "b"] * 2
     assert [str(progress) for progress in told] == ["compiling 1 of 2: a", "compiling 2 of 2: b"] * 2
 

@@ -22,7 +22,7 @@ from monitor.daemon.device_worker import Output
 from monitor.daemon.outputs import TableOutput
 from monitor.daemon.service import Service
 from monitor.noise.catalogue import read_model
-from monitor.publishing.terminal.live_table import Board
+from monitor.publishing.terminal.live_table import DeviceStates
 from monitor.settings import loading
 from tests.monitor.daemon.operations.test_systemd import Listening
 from tests.monitor.publishing import made
@@ -39,13 +39,13 @@ def device(name: str, extra: str = "", driver: str = "") -> str:
     )
 
 
-def changed(folder: Path, before: str, after: str) -> reload.Change:
+def changed(folder: Path, before: str, after: str) -> reload.ConfigChange:
     path = folder / "c.toml"
     path.write_text(before)
     config = loading.load(path)
     models = {one.name: None if one.model is None else read_model(one.model) for one in config.devices}
     path.write_text(after)
-    return reload.change(config, models)
+    return reload.compare_with_file(config, models)
 
 
 def test_devices_are_compared_as_they_stand_in_the_file(tmp_path: Path) -> None:
@@ -68,7 +68,7 @@ def test_a_model_that_reads_otherwise_begins_its_device_anew(tmp_path: Path) -> 
     path = tmp_path / "c.toml"
     config, models = loading.load(path), {"a": read_model(model)}
     model.write_text("sample_rate = 100.0\n[gz.angle_random_walk]\nN = 2e-4\n")
-    assert reload.change(config, models).text() == "begun anew: a"
+    assert reload.compare_with_file(config, models).text() == "begun anew: a"
 
 
 def test_what_only_a_restart_makes_hold_is_said_again_and_again(tmp_path: Path) -> None:
@@ -77,9 +77,9 @@ def test_what_only_a_restart_makes_hold_is_said_again_and_again(tmp_path: Path) 
     assert change.restart == ("zenoh", "log.format")
     assert change.config.zenoh.mode == "none"
     assert change.config.log.level == "debug"
-    assert reload.change(change.config, {"a": None}).restart == ("zenoh", "log.format")
+    assert reload.compare_with_file(change.config, {"a": None}).restart == ("zenoh", "log.format")
     (tmp_path / "c.toml").write_text(device("a") + QUIET)
-    assert reload.change(change.config, {"a": None}).restart == ()
+    assert reload.compare_with_file(change.config, {"a": None}).restart == ()
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ class Gone(Output):
     def event(self, device: str, unix_s: float, received: int, event: Any) -> None:
         self.events.append((device, event.kind))
 
-    def gone(self, device: str) -> None:
+    def device_removed(self, device: str) -> None:
         self.names.append(device)
 
 
@@ -144,9 +144,9 @@ def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None
     rest = f'[zenoh]\nlisten = ["{endpoint}"]\n[viewer]\nmode = "view.rrd"\n[storage]\nfolder = "kept"\n'
     path.write_text(device("stays") + device("goes") + device("changes") + rest)
     with running(path, gone) as service:
-        stations = {station.name: station for station in service.stations}
-        wait_for(lambda: all(station.published > 300 for station in service.stations))
-        wait_for(lambda: service.zenoh.state == "ok" and service.view is not None and service.view.state == "ok")
+        stations = {station.name: station for station in service.workers}
+        wait_for(lambda: all(station.published > 300 for station in service.workers))
+        wait_for(lambda: service.zenoh.state == "ok" and service.viewer is not None and service.viewer.state == "ok")
         ring, estimator = stations["stays"].ring, stations["stays"].chain.estimator
         path.write_text(device("stays") + device("comes") + device("changes", 'publish = "5 Hz"') + rest)
         with session(connect=[endpoint]) as listener:
@@ -156,7 +156,7 @@ def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None
                 lambda sample: heard.setdefault(str(sample.key_expr).split("/")[1], []).append(bytes(sample.payload)),
             )
             service.reload()
-            wait_for(lambda: [station.name for station in service.stations] == ["stays", "comes", "changes"])
+            wait_for(lambda: [station.name for station in service.workers] == ["stays", "comes", "changes"])
             wait_for(lambda: gone.names == ["goes", "changes"])
             heard.clear()
             wait_for(lambda: {"stays", "comes", "changes"} <= heard.keys())
@@ -164,7 +164,7 @@ def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None
             alive = {f"imu/{name}/alive" for name in ("stays", "comes", "changes")}
             wait_for(lambda: tokens(listener) == alive, lambda: f"{alive}, there are {tokens(listener)}")
             assert not [one for one in listener.get("imu/goes/command/reset", timeout=PATIENCE_S) if one.ok is not None]
-        new = {station.name: station for station in service.stations}
+        new = {station.name: station for station in service.workers}
         assert new["stays"] is stations["stays"]
         assert (new["stays"].ring, new["stays"].chain.estimator) == (ring, estimator)
         # a simulated sensor on a busy machine drops what it has no time to send; nothing else may be missing
@@ -172,8 +172,8 @@ def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None
         assert new["changes"] is not stations["changes"]
         # what was recorded of it is in its window again
         wait_for(lambda: ("changes", "window_rebuilt") in gone.events)
-        assert service.view is not None
-        assert service.view.state == "ok"
+        assert service.viewer is not None
+        assert service.viewer.state == "ok"
         assert set(service.virtual) == {"stays", "comes", "changes"}
     assert not [thread.name for thread in threading.enumerate() if thread.name.startswith(("reader of", "virtual imu"))]
 
@@ -182,7 +182,7 @@ def test_new_limits_and_hooks_hold_at_once_and_a_wrong_file_changes_nothing(tmp_
     path = tmp_path / "c.toml"
     path.write_text(device("a") + QUIET)
     with capture_logs() as lines, running(path) as service:
-        (station,) = service.stations
+        (station,) = service.workers
         wait_for(lambda: station.latest is not None and station.published > 500)
         path.write_text("[[device")
         service.reload()
@@ -192,7 +192,7 @@ def test_new_limits_and_hooks_hold_at_once_and_a_wrong_file_changes_nothing(tmp_
         service.reload()
         wait_for(lambda: station.health({}, 0).crossed == ("ax N", "ay N", "az N"))
         assert service.states()["hook"] == "ok"
-        assert service.stations == [station]
+        assert service.workers == [station]
         path.write_text(device("a") + QUIET)
         service.reload()
         wait_for(lambda: station.health({}, 0).crossed == ())
@@ -238,13 +238,13 @@ def test_reloads_leave_nothing_behind(tmp_path: Path) -> None:
     path, rest = tmp_path / "c.toml", f'[zenoh]\nlisten = ["{free_endpoint()}"]\n[viewer]\nmode = "none"\n'
     path.write_text(device("stays") + device("a") + rest)
     with running(path) as service:
-        wait_for(lambda: service.zenoh.state == "ok" and all(one.published > 50 for one in service.stations))
+        wait_for(lambda: service.zenoh.state == "ok" and all(one.published > 50 for one in service.workers))
         most = (0, 0)
         for i in range(8):
             name = "ba"[i % 2]
             path.write_text(device("stays") + device(name) + rest)
             service.reload()
-            wait_for(lambda name=name: service.stations[-1].name == name and service.stations[-1].published > 50)
+            wait_for(lambda name=name: service.workers[-1].name == name and service.workers[-1].published > 50)
             if i == 1:
                 most = in_use()
             elif i > 1:
@@ -257,12 +257,12 @@ def in_use() -> tuple[int, int]:
 
 
 def test_a_device_that_is_gone_has_no_row() -> None:
-    board = Board()
+    board = DeviceStates()
     table = TableOutput(board)
     for name in ("first", "second"):
         table.health(name, 0.0, made.health())
         table.event(name, 0.0, 1, Event("moved", 0, f"{name} was moved"))
-    table.gone("first")
+    table.device_removed("first")
     with (console := Console(width=200)).capture() as captured:
         console.print(board.table(0.0))
     assert "second was moved" in captured.get()
@@ -279,4 +279,4 @@ def test_a_fifo_in_place_of_the_file_is_not_waited_for_and_another_folder_needs_
     path.unlink()
     os.mkfifo(path)
     with pytest.raises(ConfigError, match=r"c.toml: cannot be read: is a FIFO, not a regular file"):
-        reload.change(change.config, {"a": None})
+        reload.compare_with_file(change.config, {"a": None})

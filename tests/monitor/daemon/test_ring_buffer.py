@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.sample import block
+from drivers.sample import make_block
 from monitor.daemon.ring_buffer import RingBuffer
 
 
 def made(first, n, lost=0):
     """Samples numbered from ``first`` on, the number in every column."""
     t_ns = np.arange(first, first + n, dtype=np.int64)
-    return block(t_ns, np.repeat(t_ns[:, None].astype(float), 6, axis=1), t_ns + 0.5, t_ns % 256, lost)
+    return make_block(t_ns, np.repeat(t_ns[:, None].astype(float), 6, axis=1), t_ns + 0.5, t_ns % 256, lost)
 
 
 def numbers(blocks):

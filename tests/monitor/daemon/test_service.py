@@ -22,9 +22,9 @@ from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import Status
 from monitor.history import reading as past
-from monitor.history.sqlite_store import FILE, reading
-from monitor.history.time_ranges import Span
-from monitor.publishing.terminal.live_table import Board
+from monitor.history.sqlite_store import FILE_NAME, open_history
+from monitor.history.time_ranges import TimeRange
+from monitor.publishing.terminal.live_table import DeviceStates
 from monitor.settings import loading
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
@@ -59,16 +59,16 @@ def test_the_page_is_told_once_in_the_log_and_stands_above_the_table(
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     viewer = f'mode = "auto"\nport = {free_port()}\nweb_port = {free_port()}\n'
-    board = Board()
+    board = DeviceStates()
     rounds = Rounds()
     service = Service(config(tmp_path, 'link = "virtual"', viewer), [TableOutput(board), rounds])
-    assert service.view is not None
+    assert service.viewer is not None
     thread = threading.Thread(target=service.run)
     with capture_logs() as logs:
         thread.start()
         try:
             wait_for(lambda: board.note != "")
-            url, note = service.view.url, board.note
+            url, note = service.viewer.url, board.note
             before = rounds.healths
             wait_for(lambda: rounds.healths >= before + 2, "two more rounds of the status")
             with (console := Console(width=200)).capture() as captured:
@@ -89,7 +89,7 @@ def test_a_recording_of_long_ago_leaves_nothing_at_todays_date(tmp_path: Path) -
     (tmp_path / "long-ago.csv").write_text("\n".join(["t,gz", *rows]))
     service = Service(config(tmp_path, 'link = "replay", path = "long-ago.csv"', f'mode = "{path}"\n'))
     service.run(PATIENCE_S)
-    assert service.stations[0].driver.state == "ended"
+    assert service.workers[0].driver.state == "ended"
     cells = read(path)
     assert "ENDED" in str(cells["/d/status"])
     times_s = [t / 1e9 for entity in cells.values() for t in entity.get("sample_time", []) if isinstance(t, int)]
@@ -118,15 +118,15 @@ class Times(Output):
 def test_a_recording_that_waits_for_kernels_leaves_nothing_outside_of_its_own_times(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    n, compiled, prepare = 2000, threading.Event(), kernel_compilation.prepare
+    n, compiled, prepare = 2000, threading.Event(), kernel_compilation.prepare_kernels
 
     def held_back(
-        group: kernel_compilation.Group, tell: Callable[[kernel_compilation.Progress], None]
+        group: kernel_compilation.KernelGroup, tell: Callable[[kernel_compilation.Progress], None]
     ) -> Iterator[str]:
         compiled.wait(PATIENCE_S)
         yield from prepare(group, tell)
 
-    monkeypatch.setattr(kernel_compilation, "prepare", held_back)
+    monkeypatch.setattr(kernel_compilation, "prepare_kernels", held_back)
     t_s = np.arange(n) / 100.0
     values = np.random.default_rng(1).standard_normal((n, 6)) * 1e-3
     name = {"csv": "r.csv", "npz": "r.npz", "folder": "r"}[kind]
@@ -162,12 +162,12 @@ record = false
         assert wait_for(lambda: told.count(received=False) >= 2)  # there is no recording yet
         away.rename(recording)
         assert wait_for(lambda: told.count(received=True) >= 2)  # its samples wait in the ring
-        assert service.stations[0].published == 0
+        assert service.workers[0].published == 0
     finally:
         compiled.set()
         thread.join(PATIENCE_S)
     assert not thread.is_alive()
-    assert service.stations[0].published == n
+    assert service.workers[0].published == n
     first_s, last_s = 0.0, (n - 1) / 100.0
     assert {unix_s for unix_s, health in told.healths if not health.received} == {None}
     stamps = [unix_s for unix_s, health in told.healths if health.received]
@@ -178,8 +178,8 @@ record = false
     assert "ENDED" in str(cells["/night-run/status"])
     times_s = [t / 1e9 for entity in cells.values() for t in entity.get("sample_time", []) if isinstance(t, int)]
     assert first_s <= min(times_s) <= max(times_s) <= last_s
-    with reading(tmp_path / "kept" / FILE) as reader:
-        kept = past.read(reader, "night-run", Span(-math.inf, math.inf), step_s=60)
+    with open_history(tmp_path / "kept" / FILE_NAME) as reader:
+        kept = past.read_history(reader, "night-run", TimeRange(-math.inf, math.inf), step_s=60)
     assert kept.start_s.tolist() == [0]
     assert kept.counts[:, 0].tolist() == [n]
     assert all(first_s <= event.t_s <= last_s for event in kept.events)
@@ -197,7 +197,7 @@ class Estimates(Output):
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         self.all.append(estimate)
 
-    def gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
+    def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
         self.gaps.append(gap)
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
@@ -234,10 +234,10 @@ folder = "kept"
 record = false
 """
     )
-    told, board = Estimates(), Board()
+    told, board = Estimates(), DeviceStates()
     Service(loading.load(path), [told, TableOutput(board)]).run(60.0)
-    with reading(tmp_path / "kept" / FILE) as reader:
-        kept = past.read(reader, "d", Span(-math.inf, math.inf), step_s=60)
+    with open_history(tmp_path / "kept" / FILE_NAME) as reader:
+        kept = past.read_history(reader, "d", TimeRange(-math.inf, math.inf), step_s=60)
     (known,) = board.devices(time.monotonic())
     assert known.noise is not None
     published = {Status(one) for estimate in told.all for one in estimate.coefficients.status.ravel().tolist()}
@@ -271,24 +271,24 @@ def test_a_recording_that_shows_no_rate_says_so(tmp_path: Path) -> None:
     )
     service = Service(loading.load(path), [told])
     service.run(60.0)
-    assert service.stations[0].published == 50
+    assert service.workers[0].published == 50
     assert told.all == []
     assert told.health_text.endswith("; no estimate: the times of the samples do not show a rate; set `rate`")
 
 
 def test_kernels_that_cannot_be_kept_hold_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full_disk(
-        _group: kernel_compilation.Group, _tell: Callable[[kernel_compilation.Progress], None]
+        _group: kernel_compilation.KernelGroup, _tell: Callable[[kernel_compilation.Progress], None]
     ) -> Iterator[str]:
         yield kernel_compilation.WINDOW
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(kernel_compilation, "prepare", full_disk)
+    monkeypatch.setattr(kernel_compilation, "prepare_kernels", full_disk)
     save_samples(tmp_path / "short.npz", np.arange(500) / 100.0, np.random.default_rng(1).standard_normal((500, 6)))
     service = Service(config(tmp_path, 'link = "replay", path = "short.npz", speed = "max"', 'mode = "none"'))
     with capture_logs() as logs:
         service.run(PATIENCE_S)
-    latest = service.stations[0].latest
+    latest = service.workers[0].latest
     assert latest is not None
     assert latest.samples == 500
     assert np.isfinite(latest.fitted[:, 2]).any()
@@ -299,7 +299,7 @@ def test_a_replay_that_is_stopped_loses_nothing_it_has_counted(tmp_path: Path) -
     n = 1_000_000  # many times what the ring holds
     save_samples(tmp_path / "long.npz", np.arange(n) / 100.0, np.random.default_rng(1).standard_normal((n, 6)))
     service = Service(config(tmp_path, 'link = "replay", path = "long.npz", speed = "max"', 'mode = "none"'))
-    (station,) = service.stations
+    (station,) = service.workers
     thread = threading.Thread(target=service.run)
     thread.start()
     wait_for(lambda: station.published > 0)

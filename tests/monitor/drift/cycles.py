@@ -6,7 +6,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from drivers.sample import Floats
-from monitor.drift.thermal.interval_means import Means
+from monitor.drift.thermal.interval_means import IntervalMeans
 
 COLDEST_C: Final = -18.0
 HOTTEST_C: Final = 74.0
@@ -55,7 +55,7 @@ def drift(kind: str, n: int, rng: np.random.Generator) -> Floats:
     return np.asarray(white * rng.standard_normal(n) + slow.reshape(n, PARTS).mean(axis=1))
 
 
-def chamber_means(shape: str, noise: Floats, law: str = "none", size: float = 0.0) -> Means:
+def chamber_means(shape: str, noise: Floats, law: str = "none", size: float = 0.0) -> IntervalMeans:
     """Return means of 120 s of noise [n] and of a bias that follows temperature.
 
     ``law``: "none"; "linear" or "cubic", of deviation ``size``; "loop", "lag" or "play", whose heating and cooling
@@ -73,7 +73,7 @@ def chamber_means(shape: str, noise: Floats, law: str = "none", size: float = 0.
         bias = size * bias / opening(bias, x)
     interval = (n, PARTS)
     warmth = temperature_c.reshape(interval).mean(axis=1)
-    return Means(120.0, noise + bias.reshape(interval).mean(axis=1), np.ones(n), warmth)
+    return IntervalMeans(120.0, noise + bias.reshape(interval).mean(axis=1), np.ones(n), warmth)
 
 
 def loop(law: str, x: Floats) -> Floats:

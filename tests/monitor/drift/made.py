@@ -3,7 +3,7 @@
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.drift.thermal.interval_means import Means
+from monitor.drift.thermal.interval_means import IntervalMeans
 
 HOUR_S = 3600.0
 COEFFICIENT = 2e-5  # rad/s per °C
@@ -33,13 +33,13 @@ def late(temperature_c: Floats, lag_h: float) -> Floats:
     return out
 
 
-def hourly(seed: int, lag_h: float, noise: float, hours: int = 72) -> Means:
+def hourly(seed: int, lag_h: float, noise: float, hours: int = 72) -> IntervalMeans:
     """Means of the hour; ``noise`` of them over the swing of the bias."""
     rng = np.random.default_rng(seed)
     warmth = weather(hours, rng)
     bias = COEFFICIENT * late(warmth, lag_h)[-60 * hours :].reshape(hours, 60).mean(axis=1)
     error = noise * np.ptp(bias)
-    return Means(
+    return IntervalMeans(
         HOUR_S,
         bias + error * rng.standard_normal(hours),
         np.full(hours, error),

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConfigError, NotReady
-from monitor.estimation.allan.batch import overlapping
-from monitor.estimation.analysis import FEWEST, analyze, events_of
+from monitor.estimation.allan.batch import overlapping_avar
+from monitor.estimation.analysis import MIN_SAMPLES, analyze, detect_events
 from monitor.estimation.fit.coefficients import Status
-from monitor.estimation.regular_grid import LONGEST_HOLE, on_grid
+from monitor.estimation.regular_grid import MAX_GAP_SAMPLES, resample_to_grid
 from tests.support.recordings import recorded_blocks, recordings, white
 
 
@@ -23,7 +23,7 @@ def test_a_steady_recording(rate, rows):
     assert found.seconds == 60.0
     estimate = found.estimate
     assert (estimate.rate_hz, estimate.samples, estimate.window_s) == (100.0, 6000, 60.0)
-    assert estimate.curve.avar == pytest.approx(overlapping(values, estimate.curve.factors)[0])
+    assert estimate.curve.avar == pytest.approx(overlapping_avar(values, estimate.curve.factors)[0])
     assert (estimate.coefficients.status[1] == Status.ESTIMATED).all()
     assert estimate.coefficients.value[1] == pytest.approx(1e-4, rel=0.1)
 
@@ -34,7 +34,7 @@ def test_holes_stay_in_their_places(rate, rows):
     index = np.arange(8000)
     kept = ~((index >= 3000) & (index < 3123) | (index == 5000))
     values = white(8000)
-    grid, found, notes = on_grid(recorded_blocks(index[kept] / 100, values[kept], rows), rate)
+    grid, found, notes = resample_to_grid(recorded_blocks(index[kept] / 100, values[kept], rows), rate)
     assert found == 100.0
     assert notes == ["124 samples are missing in 2 places; terms that touch them are left out"]
     expected = np.where(kept[:, None], values, np.nan)
@@ -42,14 +42,14 @@ def test_holes_stay_in_their_places(rate, rows):
 
 
 def test_a_very_long_pause_is_not_counted_among_the_short_holes():
-    index = np.concatenate([np.arange(3000), 3000 + 2 * LONGEST_HOLE + np.arange(3000)])
+    index = np.concatenate([np.arange(3000), 3000 + 2 * MAX_GAP_SAMPLES + np.arange(3000)])
     index = np.delete(index, [1000, 1001, 1002])
-    _, _, notes = on_grid(recorded_blocks(index / 100, white(5997)), 100.0)
+    _, _, notes = resample_to_grid(recorded_blocks(index / 100, white(5997)), 100.0)
     assert "3 samples are missing in 1 place; terms that touch them are left out" in notes
 
 
 def test_a_very_long_pause_costs_no_memory_and_no_term_reaches_across():
-    t = np.concatenate([np.arange(3000) / 100, 30.0 + 2 * LONGEST_HOLE / 100 + np.arange(3000) / 100])
+    t = np.concatenate([np.arange(3000) / 100, 30.0 + 2 * MAX_GAP_SAMPLES / 100 + np.arange(3000) / 100])
     values = white(6000)
     values[3000:] += 1.0  # a step that would show in every term across
     found = analyze(recorded_blocks(t, values), 100.0)
@@ -72,7 +72,7 @@ def test_times_that_jitter_are_no_holes():
     assert (found.estimate.rate_hz, found.estimate.curve.n) == (100.0, 8000)
 
 
-@pytest.mark.parametrize("n", [1, 2, FEWEST - 1])
+@pytest.mark.parametrize("n", [1, 2, MIN_SAMPLES - 1])
 def test_too_short_is_an_answer(n):
     with pytest.raises(NotReady):
         analyze(recorded_blocks(np.arange(n) / 100), None)
@@ -152,12 +152,12 @@ def test_motion_is_told_and_left_in_unless_it_is_to_be_struck_out():
     left = analyze(blocks, 100.0)
     assert left.motions == ()
     assert not any("moved" in note for note in left.notes)  # asked only by events_of
-    told = events_of(left)
+    told = detect_events(left)
     [motion] = told.motions
     assert 5900 <= motion.since < 6000
     assert "the sensor moved once, 3 s in all: left in; --rest strikes it out" in told.notes
     assert any(note.startswith(f"at {motion.since / 100:.1f} s: moved for 3.0 s: gx") for note in told.notes)
-    struck = events_of(analyze(blocks, 100.0, rest=True))
+    struck = detect_events(analyze(blocks, 100.0, rest=True))
     assert struck.motions == told.motions
     assert sum("struck out" in note for note in struck.notes) == 1
     assert np.isnan(struck.values[motion.since : motion.until]).all()
@@ -169,13 +169,13 @@ def test_motion_is_told_and_left_in_unless_it_is_to_be_struck_out():
 
 def test_motion_is_no_change_of_noise():
     values = moved(30_000)
-    assert events_of(analyze(recorded_blocks(np.arange(30_000) / 100, values), 100.0)).changes == ()
+    assert detect_events(analyze(recorded_blocks(np.arange(30_000) / 100, values), 100.0)).changes == ()
 
 
 def test_changes_are_told_with_time_and_size():
     values = white(60_000)
     values[40_000:, 2] += 1.5e-3 * np.random.default_rng(9).standard_normal(20_000)
-    found = events_of(analyze(recorded_blocks(np.arange(60_000) / 100, values), 100.0, notes=["of the file"]))
+    found = detect_events(analyze(recorded_blocks(np.arange(60_000) / 100, values), 100.0, notes=["of the file"]))
     [change] = found.changes
     assert (change.kind, change.axis) == ("noise_changed", 2)
     assert change.since == pytest.approx(40_000, abs=50)

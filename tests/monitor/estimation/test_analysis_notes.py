@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drivers.sample import AXES, block
+from drivers.sample import AXES, make_block
 from monitor.estimation import analysis_notes
 from monitor.estimation.analysis import analyze
 from monitor.estimation.detection.change_detection import Change
-from monitor.estimation.detection.line_detection import Line, lines
+from monitor.estimation.detection.line_detection import Line, detect_lines
 from monitor.estimation.detection.motion_detection import Motion
 from monitor.estimation.fit.bandwidth import LowPass
 from monitor.estimation.fit.coefficients import Status
@@ -20,7 +20,7 @@ RATE_HZ = 100.0
 
 def analyzed(values):
     t_ns = np.arange(len(values)) * 10_000_000
-    return analyze([block(t_ns, values)], RATE_HZ)
+    return analyze([make_block(t_ns, values)], RATE_HZ)
 
 
 def white(n, seed=1):
@@ -48,8 +48,8 @@ def test_a_line_is_told_with_the_averaging_times_that_it_spoils():
     assert where == "0.64"  # a line's deviation peaks at 0.37 of its period, 2 s: sin⁴(πfτ)/(πfτ)²
     assert found.fit.misfit[0] == 1.0
     curve = found.estimate.curve
-    told = lines(values, np.zeros(len(values), bool), RATE_HZ, curve)
-    known = analysis_notes.explained(["first", *found.notes], curve, found.fit, told)
+    told = detect_lines(values, np.zeros(len(values), bool), RATE_HZ, curve)
+    known = analysis_notes.replace_guessed_causes(["first", *found.notes], curve, found.fit, told)
     assert known[0] == "first"
     [known] = [one for one in known if "departs" in one]
     assert known == note.replace("vibration, motion or temperature may be why", "the line at 0.4999 Hz shows there")
@@ -89,12 +89,14 @@ def test_axes_that_depart_alike_share_a_note():
 
 def test_motion_left_in_is_one_note_that_points_to_rest():
     curve, fit = departing((4.0, 4.0, 4.0, 9.0, 9.0, 9.0), at=(0, 1, 3, 5, 6, 7))
-    notes = analysis_notes.explained(analysis_notes.of_misfit(curve, fit), curve, fit, [line(0, 9.0)], moved=True)
+    notes = analysis_notes.replace_guessed_causes(
+        analysis_notes.of_misfit(curve, fit), curve, fit, [line(0, 9.0)], moved=True
+    )
     assert notes == [
         "gx, gy, gz, ax, ay, az: the curve departs from every sum of the five terms (scatter 2 to 3 times wider): the "
         "sensor moved, which may be why; --rest strikes it out; intervals are widened accordingly"
     ]
-    assert analysis_notes.explained(["other"], *departing(), [], moved=True) == ["other"]
+    assert analysis_notes.replace_guessed_causes(["other"], *departing(), [], moved=True) == ["other"]
 
 
 def test_a_line_is_blamed_only_where_it_shows():
@@ -122,7 +124,7 @@ def test_quantization_noise_that_may_be_a_line(amplitude, hz, told):
     curve, fit = departing(q=(0, 2, 4))
     found = [line(axis, hz, amplitude) for axis in (0, 1, 2)]
     expected = [f"gx, gz: quantization noise may be the line at {hz:g} Hz"] if told else []
-    assert analysis_notes.explained([], curve, fit, found) == expected
+    assert analysis_notes.replace_guessed_causes([], curve, fit, found) == expected
 
 
 def test_a_drift_in_a_short_record_is_k_or_r():
@@ -187,7 +189,7 @@ def test_a_filter_that_is_not_known_is_told_too():
     # a moving average of two: no Butterworth
     white = 1e-3 * np.random.default_rng(8).standard_normal((200_001, 6))
     values = 0.85 * white[1:] + 0.15 * white[:-1]
-    found = analyze([block(np.arange(len(values)) * 10_000_000, values)], RATE_HZ)
+    found = analyze([make_block(np.arange(len(values)) * 10_000_000, values)], RATE_HZ)
     assert (found.fit.theta[0] < 0.0).any()
     assert np.isnan(found.bandwidth_hz[found.fit.theta[0] < 0.0]).all()
     assert any("lie below white noise" in note for note in found.notes)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConfigError, NotReady
-from drivers.sample import AXES, block
-from monitor.estimation.allan.batch import overlapping
-from monitor.estimation.estimator import COURSE_SAMPLES, FEWEST, Estimator
+from drivers.sample import AXES, make_block
+from monitor.estimation.allan.batch import overlapping_avar
+from monitor.estimation.estimator import COURSE_SAMPLES, MIN_SAMPLES, Estimator
 from monitor.estimation.fit.coefficients import Status
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from monitor.noise.model import NoiseModel
@@ -16,7 +16,7 @@ RATE = 100.0
 
 def made(first, n, lost=0, seed=0):
     values = 1e-3 * np.random.default_rng([seed, first]).standard_normal((n, 6)) + 9.81
-    return block(np.arange(first, first + n) * 10_000_000, values, lost=lost)
+    return make_block(np.arange(first, first + n) * 10_000_000, values, lost=lost)
 
 
 def test_the_last_estimate_covers_all_samples():
@@ -28,7 +28,7 @@ def test_the_last_estimate_covers_all_samples():
     assert (found.samples, found.t_ns, found.window_s, found.rate_hz) == (3000, 29_990_000_000, 20.0, RATE)
     values = np.concatenate([one.values for one in blocks])[-2000:]
     assert found.curve.n == 2000
-    assert found.curve.avar == pytest.approx(overlapping(values, found.curve.factors)[0], rel=1e-8)
+    assert found.curve.avar == pytest.approx(overlapping_avar(values, found.curve.factors)[0], rel=1e-8)
     assert np.array_equal(found.curve.tau_s, found.curve.factors / RATE)
     assert (found.curve.lo < np.sqrt(found.curve.avar)).all()
     assert (found.curve.hi > np.sqrt(found.curve.avar)).all()
@@ -43,7 +43,7 @@ def test_missing_samples_keep_their_place():
     estimator.update(made(537, 400, lost=37))
     values = np.concatenate([made(0, 500).values, np.full((37, 6), np.nan), made(537, 400).values])
     found = estimator.get().curve
-    expected, terms = overlapping(values, found.factors)
+    expected, terms = overlapping_avar(values, found.factors)
     assert np.array_equal(found.terms, terms)
     assert found.avar[terms > 0] == pytest.approx(expected[terms > 0], rel=1e-8)
     assert found.n == 937
@@ -55,7 +55,7 @@ def test_more_missing_than_the_window_holds(lost):
     estimator.update(made(0, 3000))
     estimator.update(made(5000, 300, lost=lost))
     found = estimator.get()
-    expected, terms = overlapping(made(5000, 300).values, found.curve.factors)
+    expected, terms = overlapping_avar(made(5000, 300).values, found.curve.factors)
     assert np.array_equal(found.curve.terms, terms)
     assert found.curve.avar[terms > 0] == pytest.approx(expected[terms > 0], rel=1e-8)
     assert found.samples == 3300
@@ -77,10 +77,10 @@ def test_too_few_samples_are_no_answer():
     estimator = Estimator(RATE, 20.0)
     with pytest.raises(NotReady, match="0 of at least 8"):
         estimator.get()
-    estimator.update(made(0, FEWEST - 1))
+    estimator.update(made(0, MIN_SAMPLES - 1))
     with pytest.raises(NotReady):
         estimator.get()
-    estimator.update(made(FEWEST - 1, 1))
+    estimator.update(made(MIN_SAMPLES - 1, 1))
     found = estimator.get()
     assert (found.coefficients.status != Status.ESTIMATED).all() or np.isfinite(found.coefficients.value).any()
 
@@ -102,7 +102,7 @@ def test_another_rate_is_another_label():
     one, other = Estimator(RATE, 20.0), Estimator(2 * RATE, 10.0)
     for estimator in (one, other):
         estimator.update(made(0, 2500))
-    one.relabel(2 * RATE)
+    one.set_rate(2 * RATE)
     a, b = one.get(), other.get()
     assert (a.rate_hz, a.window_s) == (b.rate_hz, b.window_s) == (200.0, 10.0)
     assert np.array_equal(a.curve.tau_s, b.curve.tau_s)
@@ -114,7 +114,7 @@ def test_an_axis_that_is_not_measured_is_unestimated():
     samples = made(0, 3000)
     values = samples.values.copy()
     values[:, 2] = np.nan
-    estimator.update(block(samples.t_ns.copy(), values))
+    estimator.update(make_block(samples.t_ns.copy(), values))
     found = estimator.get()
     assert (found.coefficients.status[:, 2] == Status.UNESTIMATED).all()
     assert np.isnan(found.coefficients.value[:, 2]).all()
@@ -123,7 +123,7 @@ def test_an_axis_that_is_not_measured_is_unestimated():
 
 def test_a_constant_axis_is_unestimated():
     estimator = Estimator(RATE, 20.0)
-    estimator.update(block(np.arange(2500) * 10**7, np.full((2500, 6), 9.81)))
+    estimator.update(make_block(np.arange(2500) * 10**7, np.full((2500, 6), 9.81)))
     assert (estimator.get().coefficients.status == Status.UNESTIMATED).all()
 
 
@@ -163,7 +163,7 @@ def test_a_restarted_axis_is_at_its_new_noise_at_once(every_sample):
     for at in range(0, 40_000, 500):
         one = made(at, 500)
         loud = np.where(np.arange(6) == 1, 3.0, 1.0) if at >= 30_000 else 1.0
-        estimator.update(block(one.t_ns, (one.values - 9.81) * loud + 9.81))
+        estimator.update(make_block(one.t_ns, (one.values - 9.81) * loud + 9.81))
         if at + 500 == 32_000:
             estimator.restart(1, 2_000)
     n = estimator.get().coefficients.value[1]
@@ -195,7 +195,7 @@ def test_the_course_of_a_restarted_axis_is_that_of_a_young_window():
         def feed(estimators, first, last, values=values):
             for at in range(first, last, 2000):
                 for estimator in estimators:
-                    estimator.update(block(np.arange(at, at + 2000) * 10_000_000, values[at : at + 2000].copy()))
+                    estimator.update(make_block(np.arange(at, at + 2000) * 10_000_000, values[at : at + 2000].copy()))
 
         feed([old], 0, 32_000)
         old.get()
@@ -204,7 +204,7 @@ def test_the_course_of_a_restarted_axis_is_that_of_a_young_window():
         feed([young], 30_000, 32_000)
         young.get()
         feed([old, young], 32_000, 60_000)
-        one, other = old.get().course, young.get().course
+        one, other = old.get().history, young.get().history
         assert np.isfinite(one.value[:, 1]).all()  # from the first sample on
         differences.append((one.value[:, 1] / other.value[:, 1] - 1.0).ravel())
         ramps += np.isfinite(one.value[:, 4]).sum()
@@ -215,7 +215,7 @@ def test_the_course_of_a_restarted_axis_is_that_of_a_young_window():
 def test_an_outage_longer_than_the_window_forgets_what_was_seen_before():
     estimator = Estimator(RATE, 20.0, every_sample=True)
     estimator.update(made(0, 3000))
-    assert np.isfinite(estimator.get().course.value[-1, 1]).all()
+    assert np.isfinite(estimator.get().history.value[-1, 1]).all()
     estimator.update(made(10_000, 5, lost=7000))
     assert not estimator._refit.entered.any()
 
@@ -224,7 +224,7 @@ def test_the_course_is_bounded_until_someone_looks():
     estimator = Estimator(RATE, 5.0, every_sample=True)
     for at in range(0, 70_000, 700):
         estimator.update(made(at, 700))
-    t_ns = estimator.get().course.t_ns
+    t_ns = estimator.get().history.t_ns
     assert COURSE_SAMPLES <= t_ns.size < COURSE_SAMPLES + 700
     assert t_ns[-1] == 69_999 * 10_000_000
     assert (np.diff(t_ns) == 10_000_000).all()
@@ -235,20 +235,20 @@ def test_the_course_has_a_row_a_sample():
     estimator.update(made(0, 700))
     estimator.update(made(707, 300, lost=7))
     found = estimator.get()
-    assert found.course is not None
-    assert found.course.t_ns.tolist() == [*made(0, 700).t_ns.tolist(), *made(707, 300).t_ns.tolist()]
-    assert found.course.value[-1, 1] == pytest.approx(found.coefficients.value[1], rel=0.06)
-    assert estimator.get().course is None
+    assert found.history is not None
+    assert found.history.t_ns.tolist() == [*made(0, 700).t_ns.tolist(), *made(707, 300).t_ns.tolist()]
+    assert found.history.value[-1, 1] == pytest.approx(found.coefficients.value[1], rel=0.06)
+    assert estimator.get().history is None
 
 
 def test_recent_deviations_follow_a_change_at_once():
     estimator = Estimator(RATE, 600.0)
     for at in range(0, 60_000, 500):
         one = made(at, 500)
-        estimator.update(block(one.t_ns, (one.values - 9.81) * (2.0 if at >= 58_000 else 1.0)))
+        estimator.update(make_block(one.t_ns, (one.values - 9.81) * (2.0 if at >= 58_000 else 1.0)))
     found = estimator.get()
-    assert found.recent is not None
-    assert np.sqrt(found.recent.avar[0]) == pytest.approx(2e-3, rel=0.1)
+    assert found.display_curve is not None
+    assert np.sqrt(found.display_curve.avar[0]) == pytest.approx(2e-3, rel=0.1)
     assert np.sqrt(found.curve.avar[0]) == pytest.approx(np.sqrt(1 + 3 * 2000 / 60_000) * 1e-3, rel=0.05)
-    truth = 2e-3 / np.sqrt(found.recent.factors[:8, None])
-    assert ((found.recent.lo[:8] < truth) & (truth < found.recent.hi[:8])).mean() > 0.85
+    truth = 2e-3 / np.sqrt(found.display_curve.factors[:8, None])
+    assert ((found.display_curve.lo[:8] < truth) & (truth < found.display_curve.hi[:8])).mean() > 0.85

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from drivers.sample import block
+from drivers.sample import make_block
 from monitor.estimation.estimator import Estimator
-from monitor.estimation.window_snapshot import Temperatures
+from monitor.estimation.window_snapshot import TemperatureRing
 
 STEP = 1.2e-4
 
@@ -14,7 +14,7 @@ def window(values: np.ndarray, length: int, pieces: int = 1) -> Estimator:
     estimator = Estimator(100.0, length / 100.0)
     t_ns = np.arange(len(values)) * 10_000_000
     for part in np.array_split(np.arange(len(values)), pieces):
-        estimator.update(block(t_ns[part], values[part]))
+        estimator.update(make_block(t_ns[part], values[part]))
     return estimator
 
 
@@ -23,7 +23,7 @@ def test_the_newest_samples_come_back_in_order(n: int) -> None:
     values = np.random.default_rng(n).standard_normal((n, 6)) * 1e-2 + [0.0, 1e-3, 0.1, 0.0, -3.0, 9.81]
     values[n - 600 : n - 590, 3] = np.nan
     values[n - 1] = np.nan
-    held = window(values, 3000, pieces=7).held()
+    held = window(values, 3000, pieces=7).copy_window()
     found = held.values()
     assert (len(held), held.rate_hz) == (min(n, 3000), 100.0)
     np.testing.assert_allclose(found, values[-3000:], rtol=0.0, atol=1e-10)
@@ -32,10 +32,10 @@ def test_the_newest_samples_come_back_in_order(n: int) -> None:
 def test_missing_samples_keep_their_places() -> None:
     values = np.random.default_rng(1).standard_normal((500, 6))
     estimator = Estimator(100.0, 20.0)
-    estimator.update(block(np.arange(300) * 10_000_000, values[:300].copy()))
-    estimator.update(block(np.arange(350, 550) * 10_000_000, values[300:].copy(), lost=50))
+    estimator.update(make_block(np.arange(300) * 10_000_000, values[:300].copy()))
+    estimator.update(make_block(np.arange(350, 550) * 10_000_000, values[300:].copy(), lost=50))
     estimator.restart(2, 100)
-    found = estimator.held().values()
+    found = estimator.copy_window().values()
     assert found.shape == (550, 6)
     assert np.isnan(found[300:350]).all()
     assert np.isnan(found[:450, 2]).all()
@@ -46,7 +46,7 @@ def test_missing_samples_keep_their_places() -> None:
 def test_steps_of_the_sensor_are_steps_again() -> None:
     """Phase rounds on from sample to sample: equal samples may come back a unit apart, and are made equal."""
     counts = np.round(np.random.default_rng(3).standard_normal((20_000, 6)) * 20.0)
-    found = window(counts * STEP, 20_000).held().values()
+    found = window(counts * STEP, 20_000).copy_window().values()
     for axis in range(6):
         levels = np.unique(found[:, axis])
         assert levels.size == np.unique(counts[:, axis]).size
@@ -60,7 +60,7 @@ def test_single_precision_comes_back_to_the_last_bit() -> None:
     values = np.random.default_rng(4).standard_normal((20_000, 6)) * 1e-3 + [0.0, 0.0, 1e-2, 0.0, 0.0, 9.81]
     values = values.astype(np.float32).astype(np.float64)
     values[7] = np.nan
-    held = window(values, 20_000).held()
+    held = window(values, 20_000).copy_window()
     found = held.values()
     assert np.array_equal(found, found.astype(np.float32).astype(np.float64), equal_nan=True)
     coarse = np.spacing(np.abs(values).astype(np.float32)) > 4.0 * held.unit  # the smallest are finer than phase
@@ -72,7 +72,7 @@ def test_single_precision_comes_back_to_the_last_bit() -> None:
 def test_values_on_an_uneven_scale_stay_on_it() -> None:
     scale = np.array([-3e-3, -1e-3, 0.0, 0.4e-3, 1.7e-3])
     values = scale[np.random.default_rng(2).integers(0, 5, (3000, 6))]
-    found = window(values, 3000).held().values()
+    found = window(values, 3000).copy_window().values()
     assert all(np.unique(found[:, axis]).size == 5 for axis in range(6))
     np.testing.assert_allclose(found, values, rtol=0.0, atol=1e-11)
 
@@ -80,13 +80,13 @@ def test_values_on_an_uneven_scale_stay_on_it() -> None:
 def test_a_copy_stays_what_it_was() -> None:
     values = np.random.default_rng(1).standard_normal((2000, 6))
     estimator = window(values[:1000], 1000)
-    held = estimator.held()
-    estimator.update(block(np.arange(1000) * 10_000_000, values[1000:]))
+    held = estimator.copy_window()
+    estimator.update(make_block(np.arange(1000) * 10_000_000, values[1000:]))
     np.testing.assert_allclose(held.values(), values[:1000], rtol=0.0, atol=1e-10)
 
 
 def test_temperatures_stand_beside_their_samples() -> None:
-    beside = Temperatures(100)
+    beside = TemperatureRing(100)
     said = []
     rng = np.random.default_rng(1)
     for n in (1, 30, 7, 250, 3, 99, 100):
@@ -103,7 +103,7 @@ def test_temperatures_stand_beside_their_samples() -> None:
 def test_values_without_steps_get_none() -> None:
     """No two of them were equal, and they lay on no grid: neither do they now, nor is anything but rounding added."""
     values = np.random.default_rng(1).standard_normal((100_000, 6)) * 1e-3
-    held = window(values, 100_000).held()
+    held = window(values, 100_000).copy_window()
     found = held.values()
     assert all(np.unique(found[:, axis]).size == 100_000 for axis in range(6))
     assert np.array_equal(found, held.values())

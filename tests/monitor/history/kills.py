@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from monitor.history.bucket import Row
-from monitor.history.sqlite_store import reading
-from monitor.history.time_ranges import Span
+from monitor.history.bucket import HistoryRow
+from monitor.history.sqlite_store import open_history
+from monitor.history.time_ranges import TimeRange
 from tests.monitor.history.killed import T0, row_of
 
-ALL = Span(float("-inf"), float("inf"))
+ALL = TimeRange(float("-inf"), float("inf"))
 ROOT = Path(__file__).parents[3]
 
 
@@ -42,7 +42,7 @@ def kill_once(path: Path, first: int, rng: random.Random, within_s: float) -> Le
 
 def check(path: Path, acknowledged: int) -> Left:
     """Every minute in one row, none missing, sums and extremes exact."""
-    with reading(path) as reader:
+    with open_history(path) as reader:
         rows = sorted(reader.rows("bench-1", ALL), key=lambda row: row.start_s)
         events, in_all = reader.events("bench-1", ALL, 10_000_000)
     found = (rows[-1].end_s - T0) // 60 if rows[-1].width_s == 60 else _minutes(rows)
@@ -62,7 +62,7 @@ def check(path: Path, acknowledged: int) -> Left:
     return Left(acknowledged, found, tuple(sorted({row.width_s for row in rows})))
 
 
-def _minutes(rows: list[Row]) -> int:
+def _minutes(rows: list[HistoryRow]) -> int:
     return sum(int(row.counts[1]) for row in rows)  # each minute lost one sample
 
 

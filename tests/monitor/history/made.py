@@ -5,14 +5,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from monitor.history.bucket import Row
+from monitor.history.bucket import HistoryRow
 
 NAMES = ("gz.N", "gz.sigma.1", "rate")
 
 
 def row(
     start_s: int, rng: np.random.Generator, width_s: int = 60, names: tuple[str, ...] = NAMES, missing: float = 0.2
-) -> Row:
+) -> HistoryRow:
     """Numbers that are there, and some that are not."""
     k = len(names)
     there = rng.random(k) >= missing
@@ -20,10 +20,12 @@ def row(
     low, last, high = (np.where(there, part, np.float32(np.nan)) for part in draws)
     n = np.where(there, rng.integers(1, 600, k), 0)
     counts = tuple(int(one) for one in rng.integers(0, 6000, 4))
-    return Row(start_s, width_s, start_s + width_s - 0.5, names, n, low, high, last, counts, int(rng.integers(0, 4)))
+    return HistoryRow(
+        start_s, width_s, start_s + width_s - 0.5, names, n, low, high, last, counts, int(rng.integers(0, 4))
+    )
 
 
-def together(rows: Sequence[Row], name: str) -> tuple[int, float, float, float]:
+def together(rows: Sequence[HistoryRow], name: str) -> tuple[int, float, float, float]:
     """n, low, high and last of a number over rows by time."""
     n, low, high, last = 0, math.inf, -math.inf, math.nan
     for one in rows:
@@ -40,7 +42,7 @@ def same(found: tuple[float, ...], expected: tuple[float, ...]) -> bool:
     return all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in zip(found, expected, strict=True))
 
 
-def numbers_of(one: Row, name: str) -> tuple[int, float, float, float]:
+def numbers_of(one: HistoryRow, name: str) -> tuple[int, float, float, float]:
     """n, low, high and last; of a number that it has not, that it was never there."""
     if name not in one.names:
         return 0, math.nan, math.nan, math.nan

@@ -6,7 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import RecordingError
-from monitor.history.bucket import Extremes, Row, chosen, merged, pack, unpack
+from monitor.history.bucket import (
+    HistoryRow,
+    RunningExtremes,
+    merge_rows,
+    pack_statistics,
+    select_columns,
+    unpack_statistics,
+)
 from tests.monitor.history.made import NAMES, numbers_of, row, same, together
 
 OTHER = ("gz.N", "gx.N", "rate")
@@ -17,8 +24,8 @@ def test_merging_in_any_groups_is_merging_at_once(seed: int, cuts: list[int], co
     rng = np.random.default_rng(seed)
     rows = [row(60 * i, rng, names=OTHER if rng.random() < 0.3 else NAMES) for i in range(count)]
     edges = sorted({0, count, *(cut for cut in cuts if cut < count)})
-    pieces = [merged(rows[a:b], 60 * a, 60 * (b - a)) for a, b in pairwise(edges)]
-    whole = merged(pieces, 0, 60 * count)
+    pieces = [merge_rows(rows[a:b], 60 * a, 60 * (b - a)) for a, b in pairwise(edges)]
+    whole = merge_rows(pieces, 0, 60 * count)
     for name in {*NAMES, *OTHER}:
         assert same(numbers_of(whole, name), together(rows, name)), name
     assert whole.counts == tuple(sum(one.counts[i] for one in rows) for i in range(4))
@@ -30,7 +37,7 @@ def test_merging_in_any_groups_is_merging_at_once(seed: int, cuts: list[int], co
 def test_what_is_unpacked_is_what_was_packed(seed: int, count: int) -> None:
     names = tuple(f"a{i}" for i in range(count))
     one = row(0, np.random.default_rng(seed), names=names)
-    found = unpack(pack(one), count)
+    found = unpack_statistics(pack_statistics(one), count)
     for part, expected in zip(found, (one.n, one.low, one.high, one.last), strict=True):
         np.testing.assert_array_equal(part, expected)
 
@@ -38,35 +45,35 @@ def test_what_is_unpacked_is_what_was_packed(seed: int, count: int) -> None:
 @given(data=st.binary(max_size=200), count=st.integers(0, 300))
 def test_bytes_that_were_never_packed_are_said(data: bytes, count: int) -> None:
     with pytest.raises(RecordingError):
-        unpack(data + b"\xff", max(count, 1))
+        unpack_statistics(data + b"\xff", max(count, 1))
 
 
 def test_a_small_piece_that_unpacks_to_a_flood_is_refused() -> None:
     flood = row(0, np.random.default_rng(1), names=tuple(f"a{i}" for i in range(4000)), missing=1.0)
     with pytest.raises(RecordingError, match="not 48"):
-        unpack(pack(flood), 3)
+        unpack_statistics(pack_statistics(flood), 3)
 
 
 @given(st.lists(st.tuples(*[st.floats(width=32, allow_infinity=False)] * 3), min_size=1, max_size=30))
 def test_extremes_are_those_of_the_numbers(looks: list[tuple[float, float, float]]) -> None:
-    seen = Extremes(NAMES)
+    seen = RunningExtremes(NAMES)
     for look in looks:
         seen.add(np.array(look))
     for i in range(3):
         there = [look[i] for look in looks if look[i] == look[i]]
         expected = (len(there), min(there), max(there), there[-1]) if there else (0, *[float("nan")] * 3)
-        assert same((int(seen.n[i]), float(seen.low[i]), float(seen.high[i]), float(seen.last[i])), expected)
+        assert same((int(seen.count[i]), float(seen.minimum[i]), float(seen.maximum[i]), float(seen.last[i])), expected)
 
 
 def test_a_late_row_does_not_have_the_last_word() -> None:
     rng = np.random.default_rng(3)
     first, second = row(0, rng, missing=0.0), row(60, rng, missing=0.0)
-    np.testing.assert_array_equal(merged([second, first], 0, 120).last, second.last)
+    np.testing.assert_array_equal(merge_rows([second, first], 0, 120).last, second.last)
 
 
 def test_chosen_numbers_keep_their_names() -> None:
     one = row(0, np.random.default_rng(4), missing=0.0)
-    few = chosen(one, ("rate", "not there"))
+    few = select_columns(one, ("rate", "not there"))
     assert numbers_of(few, "rate") == numbers_of(one, "rate")
     assert same(numbers_of(few, "not there"), together([], "not there"))
-    assert isinstance(few, Row)
+    assert isinstance(few, HistoryRow)

@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 
 from drivers.sample import AXES
-from monitor.estimation.fit.coefficients import LETTERS, Status
-from monitor.history.columns import TAU_S, Numbers
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.history.columns import TAU_S, ColumnConverter
 from tests.monitor.publishing.made import estimate, terms, true_coefficients
 
 
 def kept(found):
-    numbers = Numbers(found)
-    return dict(zip(numbers.names, numbers.of(found), strict=True))
+    numbers = ColumnConverter(found)
+    return dict(zip(numbers.names, numbers.convert(found), strict=True))
 
 
 def test_each_letter_has_its_numbers_by_its_status() -> None:
     found = estimate(seconds=900.0)  # some estimated, K a bound, R not yet
     c, by_name = found.coefficients, kept(found)
     seen = set()
-    for row, letter in enumerate(LETTERS):
+    for row, letter in enumerate(SYMBOLS):
         for column, axis in enumerate(AXES):
             parts = [by_name[f"{axis}.{letter}{part}"] for part in ("", ".lo", ".hi", ".bound")]
             status = Status(int(c.status[row, column]))
@@ -72,17 +72,17 @@ def test_axes_that_are_not_measured_are_not_kept_and_new_ones_do_not_fit() -> No
     avar = found.curve.avar.copy()
     avar[:, 3:] = np.nan
     fewer = replace(found, curve=replace(found.curve, avar=avar))
-    numbers = Numbers(fewer)
+    numbers = ColumnConverter(fewer)
     assert {name.split(".")[0] for name in numbers.names} == {"gx", "gy", "gz"}
-    assert numbers.fit(fewer)
-    assert not numbers.fit(found)
-    assert not numbers.fit(replace(fewer, curve=replace(fewer.curve, tau_s=fewer.curve.tau_s * 1.1)))
+    assert numbers.is_compatible(fewer)
+    assert not numbers.is_compatible(found)
+    assert not numbers.is_compatible(replace(fewer, curve=replace(fewer.curve, tau_s=fewer.curve.tau_s * 1.1)))
 
 
 def test_between_averaging_times_far_apart_nothing_is_made_up() -> None:
     found = estimate()
     few = [0, 8, 12]
     curve = replace(found.curve, tau_s=found.curve.tau_s[few], avar=found.curve.avar[few])
-    assert [name for name in Numbers(replace(found, curve=curve)).names if name.startswith("gz.sigma")] == [
+    assert [name for name in ColumnConverter(replace(found, curve=curve)).names if name.startswith("gz.sigma")] == [
         "gz.sigma.0.01"
     ]

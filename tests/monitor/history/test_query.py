@@ -3,21 +3,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import ConfigError
-from monitor.history.query import UNASKED, Question, question
-from monitor.history.time_ranges import Span
+from monitor.history.query import DEFAULT_PARTS, HistoryQuery, parse_query
+from monitor.history.time_ranges import TimeRange
 
 NOW = 1_763_700_000.0
 
 
 def test_nothing_asked_is_the_last_day_without_deviations() -> None:
-    assert question("", NOW) == Question(None, None, UNASKED)
+    assert parse_query("", NOW) == HistoryQuery(None, None, DEFAULT_PARTS)
 
 
 def test_all_at_once_in_any_order_and_a_range_keeps_its_semicolon() -> None:
-    asked = question("letter=B,N;step=15min;_time=[now(-1h);30m];axis=gz;what=deviations,coefficients;_anyke", NOW)
-    expected = Question(Span(NOW - 3600.0, NOW - 1800.0), 900, ("coefficients", "deviations"), ("gz",), ("N", "B"))
+    asked = parse_query("letter=B,N;step=15min;_time=[now(-1h);30m];axis=gz;what=deviations,coefficients;_anyke", NOW)
+    expected = HistoryQuery(
+        TimeRange(NOW - 3600.0, NOW - 1800.0), 900, ("coefficients", "deviations"), ("gz",), ("N", "B")
+    )
     assert asked == expected
-    wanted = [name for name in ("gz.N", "gz.B.bound", "gz.K", "gx.N", "gz.sigma.1", "rate") if asked.wants(name)]
+    wanted = [name for name in ("gz.N", "gz.B.bound", "gz.K", "gx.N", "gz.sigma.1", "rate") if asked.selects(name)]
     assert wanted == ["gz.N", "gz.B.bound", "gz.sigma.1"]
 
 
@@ -37,7 +39,7 @@ def test_all_at_once_in_any_order_and_a_range_keeps_its_semicolon() -> None:
 )
 def test_what_is_wrong_is_said_in_a_line(parameters: str, says: str) -> None:
     with pytest.raises(ConfigError, match=says) as error:
-        question(parameters, NOW)
+        parse_query(parameters, NOW)
     assert "\n" not in str(error.value)
 
 
@@ -45,7 +47,7 @@ def test_what_is_wrong_is_said_in_a_line(parameters: str, says: str) -> None:
 def test_any_text_is_a_question_or_a_line(text: str) -> None:
     said = ""
     try:
-        question(text, NOW)
+        parse_query(text, NOW)
     except ConfigError as error:
         said = str(error)
     assert len(said) < 1000

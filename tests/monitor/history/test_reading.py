@@ -11,31 +11,31 @@ from hypothesis import strategies as st
 
 from drivers.errors import NotReady
 from monitor.history import reading as past
-from monitor.history.bucket import Row
-from monitor.history.reading import Past
-from monitor.history.sqlite_store import PastEvent, Store, reading
-from monitor.history.time_ranges import Span
+from monitor.history.bucket import HistoryRow
+from monitor.history.reading import HistoryTable
+from monitor.history.sqlite_store import HistoryStore, StoredEvent, open_history
+from monitor.history.time_ranges import TimeRange
 from tests.monitor.history.made import NAMES, row, same, together
 
 T0 = 1_760_400_000
 DAY_S = 86_400
 
 
-def kept(path: Path, rows: list[Row], events: tuple[PastEvent, ...] = ()) -> None:
-    store = Store(path)
+def kept(path: Path, rows: list[HistoryRow], events: tuple[StoredEvent, ...] = ()) -> None:
+    store = HistoryStore(path)
     store.add([("a", one) for one in rows], [("a", one) for one in events])
-    while store.thin(math.inf):
+    while store.merge_old_rows(math.inf):
         pass
     store.close()
 
 
-def read(path: Path, *arguments: object, **more: object) -> Past:
-    with reading(path) as reader:
-        return past.read(reader, "a", *arguments, **more)  # type: ignore[arg-type]
+def read(path: Path, *arguments: object, **more: object) -> HistoryTable:
+    with open_history(path) as reader:
+        return past.read_history(reader, "a", *arguments, **more)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
-def long(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Row]]:
+def long(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[HistoryRow]]:
     """Two hundred days with gaps: all three widths, thinned."""
     path = tmp_path_factory.mktemp("past") / "h.sqlite"
     rng = np.random.default_rng(1)
@@ -53,14 +53,14 @@ def long(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Row]]:
     points=st.sampled_from([3, 50, 1000]),
 )
 def test_every_bucket_has_the_sums_and_extremes_of_its_rows(
-    long: tuple[Path, list[Row]], start_d: float, days: float, step_s: int | None, points: int
+    long: tuple[Path, list[HistoryRow]], start_d: float, days: float, step_s: int | None, points: int
 ) -> None:
     path, rows = long
-    span = Span(T0 + start_d * DAY_S, T0 + (start_d + days) * DAY_S)
+    span = TimeRange(T0 + start_d * DAY_S, T0 + (start_d + days) * DAY_S)
     try:
         found = read(path, span, step_s=step_s, points=points)
     except NotReady:
-        assert not [one for one in rows if span.touches(one.start_s, one.end_s)]
+        assert not [one for one in rows if span.overlaps(one.start_s, one.end_s)]
         return
     assert len(found) <= 2 * points + 4
     assert (found.width_s >= found.step_s).all()
@@ -73,11 +73,11 @@ def test_every_bucket_has_the_sums_and_extremes_of_its_rows(
             numbers = (int(course.n[p]), *(float(part[p]) for part in (course.low, course.high, course.last)))
             assert same(numbers, together(inside, name))
         assert found.counts[p].tolist() == [sum(one.counts[i] for one in inside) for i in range(4)]
-    every = [one for one in rows if span.touches(one.start_s, one.end_s)]
+    every = [one for one in rows if span.overlaps(one.start_s, one.end_s)]
     assert int(found.counts[:, 0].sum()) >= sum(one.counts[0] for one in every)
 
 
-def test_nothing_asked_is_the_last_day(long: tuple[Path, list[Row]]) -> None:
+def test_nothing_asked_is_the_last_day(long: tuple[Path, list[HistoryRow]]) -> None:
     path, rows = long
     found = read(path, None)
     assert found.end_s[-1] >= rows[-1].end_s
@@ -85,31 +85,31 @@ def test_nothing_asked_is_the_last_day(long: tuple[Path, list[Row]]) -> None:
     assert found.step_s == 300
 
 
-def test_numbers_that_are_not_wanted_are_not_there(long: tuple[Path, list[Row]]) -> None:
+def test_numbers_that_are_not_wanted_are_not_there(long: tuple[Path, list[HistoryRow]]) -> None:
     found = read(long[0], None, wanted=lambda name: name == "rate")
     assert found.names == ("rate",)
     assert np.isnan(found.column("gz.N").last).all()
     assert found.column("gz.N").n.sum() == 0
 
 
-def test_where_there_is_nothing_it_is_said_with_what_there_is(long: tuple[Path, list[Row]]) -> None:
+def test_where_there_is_nothing_it_is_said_with_what_there_is(long: tuple[Path, list[HistoryRow]]) -> None:
     with pytest.raises(NotReady, match=r"nothing in that time; kept are 2025-10-15 00:\d\d"):
-        read(long[0], Span(T0 - 30 * DAY_S, T0 - 29 * DAY_S))
-    with reading(long[0]) as reader, pytest.raises(NotReady, match="nobody: no history yet"):
-        past.read(reader, "nobody", None)
+        read(long[0], TimeRange(T0 - 30 * DAY_S, T0 - 29 * DAY_S))
+    with open_history(long[0]) as reader, pytest.raises(NotReady, match="nobody: no history yet"):
+        past.read_history(reader, "nobody", None)
 
 
-def test_all_of_time_is_asked_without_harm(long: tuple[Path, list[Row]]) -> None:
-    found = read(long[0], Span(-math.inf, math.inf))
+def test_all_of_time_is_asked_without_harm(long: tuple[Path, list[HistoryRow]]) -> None:
+    found = read(long[0], TimeRange(-math.inf, math.inf))
     assert int(found.counts[:, 1].sum()) == sum(one.counts[1] for one in long[1])
     assert len(found) <= 1000
 
 
 def test_an_event_is_found_where_no_row_is(tmp_path: Path) -> None:
     path = tmp_path / "h.sqlite"
-    event = PastEvent(T0 + 5 * 3600.0, "link_lost", "gone")
+    event = StoredEvent(T0 + 5 * 3600.0, "link_lost", "gone")
     kept(path, [row(T0, np.random.default_rng(1))], (event,))
-    found = read(path, Span(T0 + 4 * 3600.0, T0 + 6 * 3600.0))
+    found = read(path, TimeRange(T0 + 4 * 3600.0, T0 + 6 * 3600.0))
     assert (len(found), found.events, found.events_in_all) == (0, (event,), 1)
 
 
@@ -119,10 +119,10 @@ def test_a_table_is_read_while_rows_are_written(tmp_path: Path) -> None:
     done = threading.Event()
 
     def write() -> None:
-        store = Store(path)
+        store = HistoryStore(path)
         for i in range(1, 200):
             store.add([("a", row(T0 + 60 * i, rng))])
-            store.thin(math.inf)
+            store.merge_old_rows(math.inf)
         store.close()
         done.set()
 

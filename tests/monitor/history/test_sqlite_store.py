@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 from drivers.errors import RecordingError
 from monitor.history import sqlite_store as stores
-from monitor.history.bucket import Row
-from monitor.history.sqlite_store import LEVELS, PastEvent, Store, reading
-from monitor.history.time_ranges import Span
+from monitor.history.bucket import HistoryRow
+from monitor.history.sqlite_store import LEVELS, HistoryStore, StoredEvent, open_history
+from monitor.history.time_ranges import TimeRange
 from tests.monitor.history.kills import ALL, kill
 from tests.monitor.history.made import NAMES, numbers_of, row, same, together
 
@@ -26,22 +26,22 @@ T0 = 1_760_400_000  # a multiple of all widths
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[Store]:
-    store = Store(path)
+def writing(path: Path) -> Iterator[HistoryStore]:
+    store = HistoryStore(path)
     try:
         yield store
     finally:
         store.close()
 
 
-def rows_in(path: Path, device: str = "a", span: Span = ALL) -> list[Row]:
-    with reading(path) as reader:
+def rows_in(path: Path, device: str = "a", span: TimeRange = ALL) -> list[HistoryRow]:
+    with open_history(path) as reader:
         return sorted(reader.rows(device, span), key=lambda one: one.start_s)
 
 
-def thinned(store: Store, now_s: float) -> int:
+def thinned(store: HistoryStore, now_s: float) -> int:
     done = 0
-    while some := store.thin(now_s, 7):
+    while some := store.merge_old_rows(now_s, 7):
         done += some
     return done
 
@@ -114,23 +114,23 @@ def test_devices_do_not_mix_and_spans_are_kept_to(tmp_path: Path) -> None:
     with writing(path) as store:
         store.add([(device, row(T0 + 60 * i, rng)) for i in range(5) for device in ("a", "b")])
         store.add([("c", row(T0, rng))])
-    with reading(path) as reader:
+    with open_history(path) as reader:
         assert reader.devices() == ("a", "b", "c")
-        assert reader.held("a") == (T0, T0 + 300)
-        assert reader.held("nobody") is None
+        assert reader.stored_range("a") == (T0, T0 + 300)
+        assert reader.stored_range("nobody") is None
         assert list(reader.rows("nobody", ALL)) == []
-    some = rows_in(path, "b", Span(T0 + 61.0, T0 + 180.0, end_in=False))
+    some = rows_in(path, "b", TimeRange(T0 + 61.0, T0 + 180.0, end_included=False))
     assert [one.start_s - T0 for one in some] == [60, 120]
 
 
 def test_a_transaction_is_whole_or_has_not_happened(tmp_path: Path) -> None:
     path, rng = tmp_path / "h.sqlite", np.random.default_rng(5)
-    broken = PastEvent(T0, "moved", "x", sigma=object())  # type: ignore[arg-type]
+    broken = StoredEvent(T0, "moved", "x", sigma=object())  # type: ignore[arg-type]
     with writing(path) as store:
         with pytest.raises((RecordingError, sqlite3.Error)):
             store.add([("new", row(T0, rng, names=("other",)))], [("new", broken)])
         store.add([("a", row(T0, rng))])
-    with reading(path) as reader:
+    with open_history(path) as reader:
         assert reader.devices() == ("a",)
 
 
@@ -138,11 +138,11 @@ def test_a_reader_sees_one_moment_while_a_writer_goes_on(tmp_path: Path) -> None
     path, rng = tmp_path / "h.sqlite", np.random.default_rng(6)
     with writing(path) as store:
         store.add([("a", row(T0 + 60 * i, rng)) for i in range(15)])
-        with reading(path) as reader:
-            before = reader.held("a")
+        with open_history(path) as reader:
+            before = reader.stored_range("a")
             store.add([("a", row(T0 + 30 * DAY_S, rng))])
             assert thinned(store, math.inf) == 1
-            assert reader.held("a") == before
+            assert reader.stored_range("a") == before
             assert [one.width_s for one in reader.rows("a", ALL)] == [60] * 15
     assert [one.width_s for one in rows_in(path)] == [900, 60]
 
@@ -175,32 +175,32 @@ def test_two_writers_share_a_file(tmp_path: Path) -> None:
 # --- events
 
 
-def event(t_s: float, kind: str = "moved", sigma: float | None = None, axis: str | None = None) -> PastEvent:
-    return PastEvent(t_s, kind, f"{kind} at {t_s}", axis, {"N": {"before": 1.0, "after": 2.0}}, t_s - 5.0, sigma)
+def event(t_s: float, kind: str = "moved", sigma: float | None = None, axis: str | None = None) -> StoredEvent:
+    return StoredEvent(t_s, kind, f"{kind} at {t_s}", axis, {"N": {"before": 1.0, "after": 2.0}}, t_s - 5.0, sigma)
 
 
-def events_in(path: Path, span: Span = ALL, at_most: int = 10_000_000) -> tuple[list[PastEvent], int]:
-    with reading(path) as reader:
+def events_in(path: Path, span: TimeRange = ALL, at_most: int = 10_000_000) -> tuple[list[StoredEvent], int]:
+    with open_history(path) as reader:
         return reader.events("a", span, at_most)
 
 
 def test_events_come_back_as_they_were(tmp_path: Path) -> None:
     path = tmp_path / "h.sqlite"
     told = [event(T0 + i, sigma=float(i), axis="gz") for i in range(10)]
-    odd = PastEvent(T0 + 20.0, "limit_crossed", "∞ \n", None, {"N": {"limit": math.nan}}, None, None)
+    odd = StoredEvent(T0 + 20.0, "limit_crossed", "∞ \n", None, {"N": {"limit": math.nan}}, None, None)
     with writing(path) as store:
         store.add([], [("a", one) for one in (*told[::-1], odd)])
         store.add([], [("b", told[0])])
     found, count = events_in(path)
     assert (found[:10], count) == (told, 11)
     assert math.isnan(found[10].what["N"]["limit"])
-    assert events_in(path, Span(T0, T0 + 5.0, end_in=False), 2) == (told[3:5], 6)
+    assert events_in(path, TimeRange(T0, T0 + 5.0, end_included=False), 2) == (told[3:5], 6)
 
 
 def test_too_many_events_leave_the_first_the_last_and_the_surest_and_are_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stores, "EVENTS_AT_MOST", 200)
+    monkeypatch.setattr(stores, "MAX_EVENTS", 200)
     path, rng = tmp_path / "h.sqlite", np.random.default_rng(7)
     told = [
         event(T0 + DAY_S * day + second, kind, float(rng.random()))
@@ -212,7 +212,7 @@ def test_too_many_events_leave_the_first_the_last_and_the_surest_and_are_counted
         store.add([], [("a", one) for one in told])
         thinned(store, math.inf)
     found, _ = events_in(path)
-    assert sum(one.stands_for for one in found) == len(told)
+    assert sum(one.represented_events for one in found) == len(told)
     for day in range(5):
         for kind in ("moved", "bias_stepped"):
             of = [one for one in told if one.kind == kind and (one.t_s - T0) // DAY_S == day]
@@ -221,15 +221,15 @@ def test_too_many_events_leave_the_first_the_last_and_the_surest_and_are_counted
 
 
 def test_a_flood_of_events_for_years_stays_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stores, "EVENTS_AT_MOST", 300)
+    monkeypatch.setattr(stores, "MAX_EVENTS", 300)
     path = tmp_path / "h.sqlite"
     with writing(path) as store:
         for month in range(60):
             store.add([], [("a", event(T0 + 30 * DAY_S * month + 3600 * i)) for i in range(100)])
-            store.thin(math.inf)
+            store.merge_old_rows(math.inf)
     found, _ = events_in(path)
     assert len(found) <= 300
-    assert sum(one.stands_for for one in found) == 6000
+    assert sum(one.represented_events for one in found) == 6000
 
 
 # --- what goes wrong
@@ -253,7 +253,7 @@ def test_what_is_not_a_history_is_said_and_left_alone(tmp_path: Path) -> None:
     empty.touch()
     for path, says in ((text, "damaged"), (other, "not a history"), (newer, "newer imu-monitor")):
         before = path.read_bytes()
-        for attempt in (lambda path=path: Store(path), lambda path=path: rows_in(path)):
+        for attempt in (lambda path=path: HistoryStore(path), lambda path=path: rows_in(path)):
             with pytest.raises(RecordingError, match=says) as error:
                 attempt()
             assert str(path) in str(error.value)
@@ -274,12 +274,12 @@ def test_damage_anywhere_is_a_line_or_does_not_matter(tmp_path: Path, seed: int)
     for at in rng.integers(0, len(data), 400).tolist():
         data[at] = int(rng.integers(0, 256))
     path.write_bytes(data[: int(rng.integers(len(data) // 2, len(data) + 1))])
-    with contextlib.suppress(RecordingError), reading(path) as reader:
+    with contextlib.suppress(RecordingError), open_history(path) as reader:
         list(reader.rows("a", ALL))
         reader.events("a", ALL, 1000)
     with contextlib.suppress(RecordingError, sqlite3.OperationalError), writing(path) as store:
         store.add([("a", row(T0 + 60 * i, rng)) for i in range(200)], [("a", event(T0))])
-        store.thin(math.inf)
+        store.merge_old_rows(math.inf)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="to root every folder can be written")

@@ -5,7 +5,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from drivers.errors import ConfigError
-from monitor.history.time_ranges import UNITS_S, Span, length, moment, said, zenoh_span
+from monitor.history.time_ranges import UNITS_S, TimeRange, format_utc, parse_duration_s, parse_time, parse_zenoh_range
 
 NOW = 1_763_700_000.0
 TIMES = st.datetimes(datetime(1971, 1, 1), datetime(2200, 1, 1), timezones=st.just(UTC))
@@ -19,43 +19,43 @@ def rfc3339(at: datetime) -> str:
 @given(a=TIMES, b=TIMES, left=st.sampled_from("[]"), right=st.sampled_from("[]"))
 def test_a_range_of_instants_has_its_ends_and_its_brackets(a: datetime, b: datetime, left: str, right: str) -> None:
     a, b = sorted((a, b))
-    span = zenoh_span(f"{left}{rfc3339(a)}..{rfc3339(b)}{right}", NOW)
+    span = parse_zenoh_range(f"{left}{rfc3339(a)}..{rfc3339(b)}{right}", NOW)
     assert (span.start_s, span.end_s) == (a.timestamp(), b.timestamp())
-    assert (span.start_in, span.end_in) == (left == "[", right == "]")
+    assert (span.start_included, span.end_included) == (left == "[", right == "]")
     assume(a < b)
-    assert span.holds(a.timestamp()) is span.start_in
-    assert span.holds(b.timestamp()) is span.end_in
+    assert span.contains(a.timestamp()) is span.start_included
+    assert span.contains(b.timestamp()) is span.end_included
 
 
 @given(a=TIMES, duration=DURATIONS)
 def test_a_start_and_a_duration(a: datetime, duration: tuple[int, str]) -> None:
     number, unit = duration
-    span = zenoh_span(f"[{rfc3339(a)};{number}{unit}]", NOW)
-    assert span == Span(a.timestamp(), a.timestamp() + number * UNITS_S[unit])
+    span = parse_zenoh_range(f"[{rfc3339(a)};{number}{unit}]", NOW)
+    assert span == TimeRange(a.timestamp(), a.timestamp() + number * UNITS_S[unit])
 
 
 @given(before=DURATIONS)
 def test_now_goes_both_ways_and_an_open_end_is_open(before: tuple[int, str]) -> None:
     number, unit = before
     seconds = number * UNITS_S[unit]
-    assert zenoh_span(f"[now(-{number}{unit})..]", NOW) == Span(NOW - seconds, float("inf"))
-    assert zenoh_span(f"[..now({number}{unit})]", NOW) == Span(float("-inf"), NOW + seconds)
-    assert moment(f"-{number}{unit}", NOW) == NOW - seconds
+    assert parse_zenoh_range(f"[now(-{number}{unit})..]", NOW) == TimeRange(NOW - seconds, float("inf"))
+    assert parse_zenoh_range(f"[..now({number}{unit})]", NOW) == TimeRange(float("-inf"), NOW + seconds)
+    assert parse_time(f"-{number}{unit}", NOW) == NOW - seconds
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("[..]", Span(float("-inf"), float("inf"))),
-        ("[now()..now()]", Span(NOW, NOW)),
-        ("[now(-1h);30m]", Span(NOW - 3600.0, NOW - 1800.0)),
-        ("[ now( -1.5h ) .. now() ]", Span(NOW - 5400.0, NOW)),
-        ("[2025-11-21T04:40:00.5Z..]", Span(NOW + 0.5, float("inf"))),
-        ("[2025-11-21T05:40:00+01:00..]", Span(NOW, float("inf"))),
+        ("[..]", TimeRange(float("-inf"), float("inf"))),
+        ("[now()..now()]", TimeRange(NOW, NOW)),
+        ("[now(-1h);30m]", TimeRange(NOW - 3600.0, NOW - 1800.0)),
+        ("[ now( -1.5h ) .. now() ]", TimeRange(NOW - 5400.0, NOW)),
+        ("[2025-11-21T04:40:00.5Z..]", TimeRange(NOW + 0.5, float("inf"))),
+        ("[2025-11-21T05:40:00+01:00..]", TimeRange(NOW, float("inf"))),
     ],
 )
-def test_spans_as_zenoh_writes_them(text: str, expected: Span) -> None:
-    assert zenoh_span(text, NOW) == expected
+def test_spans_as_zenoh_writes_them(text: str, expected: TimeRange) -> None:
+    assert parse_zenoh_range(text, NOW) == expected
 
 
 @pytest.mark.parametrize(
@@ -66,13 +66,13 @@ def test_spans_as_zenoh_writes_them(text: str, expected: Span) -> None:
 )  # fmt: skip
 def test_what_is_no_span_is_said_in_a_line(text: str) -> None:
     with pytest.raises(ConfigError) as error:
-        zenoh_span(text, NOW)
+        parse_zenoh_range(text, NOW)
     assert "\n" not in str(error.value)
 
 
 @given(st.text(max_size=80))
 def test_any_text_is_a_time_or_a_line(text: str) -> None:
-    for read in (lambda: zenoh_span(text, NOW), lambda: moment(text, NOW), lambda: length(text)):
+    for read in (lambda: parse_zenoh_range(text, NOW), lambda: parse_time(text, NOW), lambda: parse_duration_s(text)):
         said = ""
         try:
             read()
@@ -82,11 +82,11 @@ def test_any_text_is_a_time_or_a_line(text: str) -> None:
 
 
 def test_a_row_that_only_borders_on_a_span_does_not_touch_it() -> None:
-    span = zenoh_span("[1970-01-01T00:01:00Z..1970-01-01T00:02:00Z[", NOW)
-    touching = [start for start in range(0, 240, 60) if span.touches(start, start + 60)]
+    span = parse_zenoh_range("[1970-01-01T00:01:00Z..1970-01-01T00:02:00Z[", NOW)
+    touching = [start for start in range(0, 240, 60) if span.overlaps(start, start + 60)]
     assert touching == [60]
 
 
 @given(TIMES)
 def test_a_moment_as_it_is_said_is_that_moment(at: datetime) -> None:
-    assert moment(said(at.timestamp()), NOW) == int(at.timestamp())
+    assert parse_time(format_utc(at.timestamp()), NOW) == int(at.timestamp())

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from monitor.history import writer as writers
-from monitor.history.sqlite_store import APPLICATION, BESIDE, VERSION, PastEvent, Store, reading
-from monitor.history.writer import Writer
+from monitor.history.sqlite_store import APPLICATION, SQLITE_SUFFIXES, VERSION, HistoryStore, StoredEvent, open_history
+from monitor.history.writer import HistoryWriter
 from tests.monitor.history.kills import ALL
 from tests.monitor.history.made import row
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -26,8 +26,8 @@ RNG = np.random.default_rng(1)
 
 
 @contextlib.contextmanager
-def started(path: Path) -> Iterator[Writer]:
-    writer = Writer(path, lambda: T0 + 1e6)
+def started(path: Path) -> Iterator[HistoryWriter]:
+    writer = HistoryWriter(path, lambda: T0 + 1e6)
     writer.start()
     try:
         yield writer
@@ -36,21 +36,21 @@ def started(path: Path) -> Iterator[Writer]:
 
 
 def count(path: Path) -> tuple[int, int]:
-    with reading(path) as reader:
+    with open_history(path) as reader:
         return len(list(reader.rows("a", ALL))), reader.events("a", ALL, 1000)[1]
 
 
-def fill(writer: Writer, n: int, first: int = 0) -> None:
+def fill(writer: HistoryWriter, n: int, first: int = 0) -> None:
     for i in range(first, first + n):
-        writer.put("a", row(T0 + 60 * i, RNG))
-        writer.tell("a", PastEvent(T0 + 60.0 * i, "moved", "x"))
+        writer.put_row("a", row(T0 + 60 * i, RNG))
+        writer.put_event("a", StoredEvent(T0 + 60.0 * i, "moved", "x"))
 
 
 def test_what_is_handed_over_is_in_the_file_at_the_end(tmp_path: Path) -> None:
     path = tmp_path / "h.sqlite"
     with started(path) as writer:
         fill(writer, 100)
-        writer.put("a", None)
+        writer.put_row("a", None)
     assert (writer.state, writer.written) == ("ok", 200)
     assert not path.with_name("h.sqlite-wal").exists()
     assert count(path) == (100, 100)
@@ -62,7 +62,11 @@ def _checked_briskly(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def aside(path: Path) -> list[Path]:
-    return sorted(one for one in path.parent.glob(f"{path.name}{writers.ASIDE}*") if not one.name.endswith(BESIDE))
+    return sorted(
+        one
+        for one in path.parent.glob(f"{path.name}{writers.RENAMED_SUFFIX}*")
+        if not one.name.endswith(SQLITE_SUFFIXES)
+    )
 
 
 def test_a_damaged_file_is_moved_aside_unchanged_and_a_new_one_is_begun(
@@ -85,7 +89,7 @@ def test_a_damaged_file_is_moved_aside_unchanged_and_a_new_one_is_begun(
 
 def test_no_more_than_some_files_are_moved_aside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _checked_briskly(monkeypatch)
-    monkeypatch.setattr(writers, "ASIDE_AT_MOST", 2)
+    monkeypatch.setattr(writers, "MAX_RENAMED_FILES", 2)
     path = tmp_path / "h.sqlite"
     with started(path) as writer:
         for i in range(3):
@@ -104,7 +108,7 @@ def test_no_more_than_some_files_are_moved_aside(tmp_path: Path, monkeypatch: py
 def test_a_history_of_a_newer_version_is_left_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _checked_briskly(monkeypatch)
     path = tmp_path / "h.sqlite"
-    Store(path).close()
+    HistoryStore(path).close()
     with contextlib.closing(sqlite3.connect(path)) as db:
         db.execute("PRAGMA user_version = 99")
     data = path.read_bytes()
@@ -254,7 +258,7 @@ def test_a_second_writer_of_a_folder_keeps_nothing_until_the_first_has_ended(
 
 
 def test_a_queue_that_is_full_drops_and_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(writers, "WAITING_AT_MOST", 50)
+    monkeypatch.setattr(writers, "QUEUE_CAPACITY", 50)
     folder = tmp_path / "here"
     folder.write_bytes(b"")  # a file where the folder would be
     monkeypatch.setattr(writers, "RETRY_S", 0.05)
@@ -271,7 +275,7 @@ def test_a_file_that_is_held_by_another_is_waited_for(tmp_path: Path, monkeypatc
     monkeypatch.setattr(writers, "RETRY_S", 0.05)
     monkeypatch.setattr("monitor.history.sqlite_store.BUSY_S", 0.05)
     path = tmp_path / "h.sqlite"
-    Store(path).close()
+    HistoryStore(path).close()
     with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as other, started(path) as writer:
         other.execute("BEGIN IMMEDIATE")
         fill(writer, 5)

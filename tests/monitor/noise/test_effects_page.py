@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from monitor.noise.effect import Transform
-from monitor.noise.effects import EFFECTS, ORDER
-from monitor.noise.temperature import UNITS
+from monitor.noise.effects import EFFECTS, TRANSFORM_ORDER
+from monitor.noise.temperature import TEMPERATURE_UNITS
 from tests.contracts.effect_examples import AXIS, model
 
 PAGE = Path(__file__).parents[3] / "docs" / "effects.md"
@@ -21,14 +21,14 @@ SECTIONS = dict(
 def test_every_effect_is_there_and_transforms_are_marked_in_their_order():
     assert list(SECTIONS) == [*EFFECTS, "temperature"]
     marked = re.findall(r"^## `(\w+)` →$", PAGE.read_text("utf-8"), flags=re.MULTILINE)
-    assert marked == [kind.name for kind in ORDER]
+    assert marked == [kind.name for kind in TRANSFORM_ORDER]
     assert {name for name, kind in EFFECTS.items() if issubclass(kind, Transform)} == set(marked)
 
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_section_is_that_of_the_code(name):
     section = SECTIONS[name]
-    assert section.strip().startswith(EFFECTS[name].means)
+    assert section.strip().startswith(EFFECTS[name].description)
     rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", section, flags=re.MULTILINE))
     assert list(rows) == [f.name for f in fields(EFFECTS[name])]
     for f in fields(EFFECTS[name]):
@@ -44,4 +44,6 @@ def test_page_says_nan_where_the_code_does(name):
 
 
 def test_temperature_is_there():
-    assert dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", SECTIONS["temperature"], flags=re.MULTILINE)) == UNITS
+    assert (
+        dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", SECTIONS["temperature"], flags=re.MULTILINE)) == TEMPERATURE_UNITS
+    )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfilt, sosfilt_zi, sosfreqz
 
-from monitor.noise.low_pass import LowPass, butterworth
+from monitor.noise.low_pass import LowPass, butterworth_sections
 
 
 @pytest.mark.parametrize("order", range(1, 9))
@@ -13,7 +13,7 @@ def test_samples_are_filtered_as_by_scipy(order: int, cutoff_hz: float) -> None:
     sections = butter(order, cutoff_hz, fs=100.0, output="sos")
     values = 9.81 + np.random.default_rng(order).standard_normal(3000)
     expected, _ = sosfilt(sections, values, zi=sosfilt_zi(sections) * values[0])
-    low_pass = LowPass(butterworth(order, cutoff_hz, 100.0))
+    low_pass = LowPass(butterworth_sections(order, cutoff_hz, 100.0))
     for piece in np.split(values, [1, 8, 1000, 1000]):  # views of values
         if piece.size:
             low_pass.apply(piece)
@@ -23,7 +23,7 @@ def test_samples_are_filtered_as_by_scipy(order: int, cutoff_hz: float) -> None:
 
 @pytest.mark.parametrize("order", range(1, 9))
 def test_the_gain_is_that_of_butterworth(order: int) -> None:
-    b0, b1, b2, a1, a2 = butterworth(order, 20.0, 100.0).T
+    b0, b1, b2, a1, a2 = butterworth_sections(order, 20.0, 100.0).T
     sections = np.stack([b0, b1, b2, np.ones(b0.size), a1, a2], axis=1)
     f_hz, gain = sosfreqz(sections, 64, fs=100.0)
     expected = 1.0 / (1.0 + (np.tan(np.pi * f_hz / 100.0) / np.tan(np.pi * 0.2)) ** (2 * order))
@@ -32,5 +32,5 @@ def test_the_gain_is_that_of_butterworth(order: int) -> None:
 
 def test_columns_of_a_table_are_filtered_in_place() -> None:
     table = np.full((10, 6), 9.81)
-    LowPass(butterworth(2, 10.0, 100.0)).apply(table[:, 2])
+    LowPass(butterworth_sections(2, 10.0, 100.0)).apply(table[:, 2])
     assert table == pytest.approx(np.full((10, 6), 9.81), rel=1e-14)

@@ -10,7 +10,7 @@ from scipy.stats import kstest
 from drivers.errors import ConfigError
 from drivers.sample import AXES
 from monitor.noise.effects import (
-    ORDER,
+    TRANSFORM_ORDER,
     AngleRandomWalk,
     BandwidthLimit,
     Bias,
@@ -44,7 +44,7 @@ RATE_HZ = 100.0
 
 
 def test_transforms_act_in_their_order_wherever_they_stand():
-    assert [kind.name for kind in ORDER] == [
+    assert [kind.name for kind in TRANSFORM_ORDER] == [
         "scale_factor", "bandwidth_limit", "sample_rate_error", "saturation", "resolution", "sample_hold",
     ]  # fmt: skip
     axis = (Resolution(step=0.4), Saturation(limit=1.0), Bias(value=0.7), ScaleFactor(factor=2.0))
@@ -208,20 +208,20 @@ def test_starts_stationary(source):
 
 def test_generated_temperature_is_what_the_table_says():
     warm = Temperature(mean=25.0, swing=3.0, period=40.0)
-    drawn = NoiseModel({}, RATE_HZ, warm).stream(RATE_HZ, 1).draw_all(5000)
+    drawn = NoiseModel({}, RATE_HZ, warm).stream(RATE_HZ, 1).draw_with_temperature(5000)
     np.testing.assert_allclose(
         drawn.temperature_c, 25.0 + 3.0 * np.sin(2.0 * np.pi * np.arange(5000) / RATE_HZ / 40.0), atol=1e-9
     )
     wander = Temperature(mean=0.0, wander=2.0, wander_time=0.05)
-    c = NoiseModel({}, RATE_HZ, wander).stream(RATE_HZ, 1).draw_all(200_000).temperature_c
+    c = NoiseModel({}, RATE_HZ, wander).stream(RATE_HZ, 1).draw_with_temperature(200_000).temperature_c
     assert c.var() == pytest.approx(4.0, rel=0.05)
     assert np.mean(c[5:] * c[:-5]) == pytest.approx(4.0 * np.exp(-1.0), rel=0.08)
-    assert np.isnan(NoiseModel().stream(RATE_HZ, 1).draw_all(3).temperature_c).all()
+    assert np.isnan(NoiseModel().stream(RATE_HZ, 1).draw_with_temperature(3).temperature_c).all()
 
 
 def test_recorded_temperature_stands_instead_and_is_held():
     model = NoiseModel({"gx": (TemperatureBias(coefficient=1.0, reference=0.0),)}, None, Temperature(mean=99.0))
-    drawn = model.stream(RATE_HZ, 1, np.array([np.nan, 20.0, np.nan, 22.0, np.nan])).draw_all(7)
+    drawn = model.stream(RATE_HZ, 1, np.array([np.nan, 20.0, np.nan, 22.0, np.nan])).draw_with_temperature(7)
     assert drawn.temperature_c.tolist() == [20.0, 20.0, 20.0, 22.0, 22.0, 22.0, 22.0]
     assert drawn.values[:, 0].tolist() == drawn.temperature_c.tolist()
     with pytest.raises(ConfigError, match="no temperature"):

@@ -6,16 +6,16 @@ import numpy as np
 
 from drivers.sample import AXES
 from monitor.common.health import Health
-from monitor.drift.thermal.live_thermal import ThermalLook
-from monitor.drift.thermal.online_thermal_model import AxisThermal
-from monitor.drift.thermal.recursive_least_squares import Band
+from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.drift.thermal.online_thermal_model import AxisThermalUpdate
+from monitor.drift.thermal.recursive_least_squares import PredictionInterval
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve, hadamard_curve
 from monitor.estimation.allan.total import TotalCurve, total_curve
 from monitor.estimation.analysis import Analysis
-from monitor.estimation.detection.model_gap import ModelGap, ModelInForce
+from monitor.estimation.detection.model_gap import ModelComparison, ModelGap
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_fit import nothing_fitted
+from monitor.estimation.fit.coefficient_fit import empty_fit
 from monitor.estimation.fit.coefficients import Coefficients, Status
 from monitor.noise.model import NoiseModel
 
@@ -96,15 +96,23 @@ def look(found: Estimate | None = None, scale: float = 1.0, **agrees: bool) -> M
         f"[{axis}]\n" + "\n".join(f"{name} = {float(letters[row, i])}" for row, name in enumerate(names))
         for i, axis in enumerate(AXES)
     )
-    in_force = ModelInForce(NoiseModel.from_toml(text), 360_000)
-    return replace(in_force.look(found), agrees=agrees)
+    in_force = ModelComparison(NoiseModel.from_toml(text), 360_000)
+    return replace(in_force.compare(found), agrees=agrees)
 
 
-def thermal_look(t_ns: int = 0, bias: float = 3e-4) -> ThermalLook:
+def thermal_look(t_ns: int = 0, bias: float = 3e-4) -> ThermalUpdate:
     """Ten minutes of a device that measures gz and az; az has no model yet."""
-    gz = AxisThermal(bias, 1e-6, Band(2e-4, 1e-4, 3e-4), Band(2.2e-4, 1.8e-4, 2.6e-4), "polynomial 1", 2e-5, "")
-    az = AxisThermal(9.81, np.nan, None, None, "", np.nan, "temperature hardly moved")
-    return ThermalLook(t_ns, 600.0, 25.5, {"gz": gz, "az": az})
+    gz = AxisThermalUpdate(
+        bias,
+        1e-6,
+        PredictionInterval(2e-4, 1e-4, 3e-4),
+        PredictionInterval(2.2e-4, 1.8e-4, 2.6e-4),
+        "polynomial 1",
+        2e-5,
+        "",
+    )
+    az = AxisThermalUpdate(9.81, np.nan, None, None, "", np.nan, "temperature hardly moved")
+    return ThermalUpdate(t_ns, 600.0, 25.5, {"gz": gz, "az": az})
 
 
 def slow_curves() -> tuple[TotalCurve, HadamardCurve]:
@@ -118,7 +126,7 @@ def slow_curves() -> tuple[TotalCurve, HadamardCurve]:
 def analysis(found: Estimate | None = None, seconds: float = 3600.0, notes: tuple[str, ...] = ()) -> Analysis:
     """An analysis of that estimate: of its samples only the first is kept."""
     found = found or estimate(seconds=seconds)
-    return Analysis(found, seconds, notes, np.zeros((1, 6)), nothing_fitted(found.curve.avar), np.full(6, np.nan))
+    return Analysis(found, seconds, notes, np.zeros((1, 6)), empty_fit(found.curve.avar), np.full(6, np.nan))
 
 
 def health(**changed: object) -> Health:

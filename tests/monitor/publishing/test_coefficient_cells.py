@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from drivers.sample import AXES
-from monitor.estimation.fit.coefficients import LETTERS, Coefficients, Status
-from monitor.publishing.coefficient_cells import COEFFICIENT_UNITS, DEVIATION_UNITS, axes_of, number, reading, unit_of
+from monitor.common.units import COEFFICIENT_UNITS, DEVIATION_UNITS, axes_of, format_number, unit_of
+from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
+from monitor.publishing.coefficient_cells import format_coefficient
 
 
 @pytest.mark.parametrize(
@@ -57,7 +58,7 @@ def test_deviation_has_the_unit_of_bias_instability():
     ],
 )
 def test_a_number_keeps_three_digits(value, text):
-    assert number(value) == text
+    assert format_number(value) == text
 
 
 def test_a_reading_says_what_its_status_allows():
@@ -65,11 +66,11 @@ def test_a_reading_says_what_its_status_allows():
     coefficients = Coefficients(
         np.full(shape, 1.5e-4), np.full(shape, 1.4e-4), np.full(shape, 1.6e-4), np.zeros(shape, np.int8)
     )
-    at = LETTERS.index("N"), AXES.index("gz")
+    at = SYMBOLS.index("N"), AXES.index("gz")
     seen = []
     for status in (Status.UNESTIMATED, Status.UPPER_BOUND, Status.ESTIMATED):
         coefficients.status[at] = status
-        cell = reading(coefficients, "N", "gz")
+        cell = format_coefficient(coefficients, "N", "gz")
         assert cell.unit == "°/√h"
         seen.append((cell.value, cell.interval))
     assert seen == [("—", ""), ("≤ 0.550", ""), ("0.516", "0.481 … 0.550")]

@@ -11,12 +11,12 @@ from rich.console import Console
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings.formats import FORMATS
 from drivers.sample import AXES
-from monitor.estimation.fit.coefficients import LETTERS
-from monitor.history.bucket import STATES, Row
-from monitor.history.reading import Past, table
-from monitor.history.sqlite_store import PastEvent
-from monitor.history.time_ranges import Span
-from monitor.publishing.coefficient_cells import unit_of
+from monitor.common.units import unit_of
+from monitor.estimation.fit.coefficients import SYMBOLS
+from monitor.history.bucket import STATES, HistoryRow
+from monitor.history.reading import HistoryTable, build_table
+from monitor.history.sqlite_store import StoredEvent
+from monitor.history.time_ranges import TimeRange
 from monitor.publishing.plots.history_plot import history_plot
 from monitor.publishing.reports import history_file
 from monitor.publishing.terminal import history_text
@@ -25,12 +25,12 @@ T0 = 1_763_683_200  # a midnight
 RNG = np.random.default_rng(1)
 WHAT = {"N": {"before": 1e-4, "after": 2e-4}}
 EVENTS = (
-    PastEvent(T0 + 3600.0, "noise_changed", "gz noisier [not markup]", "gz", WHAT, T0, 9.0),
-    PastEvent(T0 + 7200.0, "link_lost", "gone", stands_for=4),
+    StoredEvent(T0 + 3600.0, "noise_changed", "gz noisier [not markup]", "gz", WHAT, T0, 9.0),
+    StoredEvent(T0 + 7200.0, "link_lost", "gone", represented_events=4),
 )  # fmt: skip
 
 
-def made(buckets: int = 48, hole: slice = slice(20, 24), axes: tuple[str, ...] = ("gx", "gz", "az")) -> Past:
+def made(buckets: int = 48, hole: slice = slice(20, 24), axes: tuple[str, ...] = ("gx", "gz", "az")) -> HistoryTable:
     """Half hours: N of each axis with one high value, R bounded, a hole, lost samples."""
     names = (*(f"{axis}.{letter}" for axis in axes for letter in ("N", "B")), *(f"{axis}.R.bound" for axis in axes))
     names = (*names, *(f"{axis}.N.{end}" for axis in axes for end in ("lo", "hi")), "temperature", "gz.sigma.1")
@@ -43,8 +43,8 @@ def made(buckets: int = 48, hole: slice = slice(20, 24), axes: tuple[str, ...] =
         counts = (180_000, 12 if i == 9 else 0, 0, 0)
         state = STATES.index("lost" if i == 9 else "running")
         low = last * np.float32(0.99)
-        rows.append(Row(T0 + 1800 * i, 1800, T0 + 1800.0 * i + 1799, names, n, low, high, last, counts, state))
-    return table("bench-1", Span(T0, T0 + 1800 * buckets), 1800, rows, EVENTS, 7)
+        rows.append(HistoryRow(T0 + 1800 * i, 1800, T0 + 1800.0 * i + 1799, names, n, low, high, last, counts, state))
+    return build_table("bench-1", TimeRange(T0, T0 + 1800 * buckets), 1800, rows, EVENTS, 7)
 
 
 def printed(tell, *arguments: object, width: int = 110) -> str:
@@ -75,7 +75,7 @@ def test_the_summary_has_first_last_extremes_and_what_happened() -> None:
 
 
 def test_one_axis_over_time_has_a_line_a_bucket() -> None:
-    text = printed(history_text.tell_course, made(), "gz", LETTERS)
+    text = printed(history_text.tell_course, made(), "gz", SYMBOLS)
     lines = [line for line in text.splitlines() if line.startswith("2025-11-21")]
     assert len(lines) == 44
     assert lines[7].split()[3].startswith(f"{1e-4 * unit_of('N', 'gz').factor:.1f}")
@@ -84,8 +84,8 @@ def test_one_axis_over_time_has_a_line_a_bucket() -> None:
 
 
 def test_a_span_of_events_alone_is_printed() -> None:
-    past = table("bench-1", Span(T0, T0 + 60.0), 60, [], EVENTS, 2)
-    text = printed(history_text.tell, past, AXES, LETTERS)
+    past = build_table("bench-1", TimeRange(T0, T0 + 60.0), 60, [], EVENTS, 2)
+    text = printed(history_text.tell, past, AXES, SYMBOLS)
     assert "no rows between 2025-11-21 00:00:00" in text
     assert "gz noisier" in text
 
@@ -148,7 +148,7 @@ def test_a_picture_of_one_row_and_of_nothing(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     history_plot(made(1, slice(0, 0)), tmp_path / "one.png")
     with pytest.raises(NotReady):
-        history_plot(table("a", Span(T0, T0 + 60.0), 60, [], EVENTS, 2), tmp_path / "none.png")
+        history_plot(build_table("a", TimeRange(T0, T0 + 60.0), 60, [], EVENTS, 2), tmp_path / "none.png")
     with pytest.raises(ConfigError, match="cannot write"):
         history_plot(made(), tmp_path / "nowhere" / "h.png")
 

@@ -22,9 +22,9 @@ from drivers.zenoh.session import configuration
 from monitor.common import topics
 from monitor.common.config_files import CONFIG_FOLDER
 from monitor.publishing.messages import encoding
-from monitor.publishing.zenoh.history_query import ask
-from monitor.publishing.zenoh.publisher import ZenohOut
-from monitor.publishing.zenoh.subscriber import ZenohIn
+from monitor.publishing.zenoh.history_query import query_histories
+from monitor.publishing.zenoh.publisher import ZenohPublisher
+from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.settings import loading
 from monitor.settings.loading import ZenohTable
 from tests.monitor.publishing import made
@@ -102,10 +102,10 @@ def nothing_kept(device: str, _parameters: str) -> bytes:
 
 
 @contextlib.contextmanager
-def daemon(file: Path) -> Iterator[ZenohOut]:
+def daemon(file: Path) -> Iterator[ZenohPublisher]:
     """A daemon's session that sends status ten times a second and answers ``reset``."""
     table = ZenohTable(mode=None, listen=None, config=file)
-    out, ending = ZenohOut(table, ["nose"], recall=nothing_kept), threading.Event()
+    out, ending = ZenohPublisher(table, ["nose"], recall=nothing_kept), threading.Event()
 
     def work() -> None:
         while not ending.wait(0.1):
@@ -115,7 +115,7 @@ def daemon(file: Path) -> Iterator[ZenohOut]:
 
     worker = threading.Thread(target=work)
     out.start()
-    out.alive("nose", True)
+    out.set_alive("nose", True)
     worker.start()
     try:
         yield out
@@ -130,14 +130,14 @@ def replies(file: Path, key: str) -> list[bytes]:
         return [bytes(reply.ok.payload) for reply in session.get(key, timeout=PATIENCE_S) if reply.ok]
 
 
-def heard(arriving: ZenohIn, so_far: set[str]) -> set[str]:
+def heard(arriving: ZenohSubscriber, so_far: set[str]) -> set[str]:
     so_far |= {one.key for one in arriving.take(0.1)}
     return so_far
 
 
 def refusal(file: Path) -> str:
     """What a watcher says who does not get in; nothing reaches it."""
-    with contextlib.closing(ZenohIn("imu/**", file=file)) as arriving:
+    with contextlib.closing(ZenohSubscriber("imu/**", file=file)) as arriving:
         arriving.start()
         said = wait_for(lambda: ": " in arriving.state and arriving.state)
         assert arriving.take(0.0) == []
@@ -152,7 +152,7 @@ def test_who_has_the_right_certificate_watches_and_commands(by_certificate: Worl
     with daemon(by_certificate.file("daemon.json5")) as out:
         wait_for(lambda: out.state == "ok")
         for who in ("reader", "operator"):
-            with contextlib.closing(ZenohIn("imu/**", file=by_certificate.certified(who))) as arriving:
+            with contextlib.closing(ZenohSubscriber("imu/**", file=by_certificate.certified(who))) as arriving:
                 arriving.start()
                 so_far: set[str] = set()
                 wait_for(lambda a=arriving, s=so_far: heard(a, s) >= {"imu/nose/status", "imu/nose/alive"})
@@ -173,7 +173,7 @@ def test_a_reader_is_refused_commands(by_certificate: World, key: str) -> None:
 
 def test_a_reader_cannot_publish(by_certificate: World) -> None:
     with (
-        contextlib.closing(ZenohIn("imu/**", file=by_certificate.certified("operator"))) as arriving,
+        contextlib.closing(ZenohSubscriber("imu/**", file=by_certificate.certified("operator"))) as arriving,
         zenoh.open(configuration({"mode": "client"}, by_certificate.certified("reader"))) as reader,
         zenoh.open(configuration({"mode": "client"}, by_certificate.certified("nose"))) as nose,
     ):
@@ -217,7 +217,7 @@ def test_who_knows_the_password_watches_and_commands_by_its_right(by_password: W
     with daemon(by_password.user("nose", USERS["nose"])) as out:
         wait_for(lambda: out.state == "ok")
         reader, operator = (by_password.user(who, USERS[who]) for who in ("reader", "operator"))
-        with contextlib.closing(ZenohIn("imu/**", file=reader)) as arriving:
+        with contextlib.closing(ZenohSubscriber("imu/**", file=reader)) as arriving:
             arriving.start()
             so_far: set[str] = set()
             wait_for(lambda: "imu/nose/status" in heard(arriving, so_far))
@@ -238,9 +238,9 @@ def test_the_past_is_told_to_those_who_get_in_alone(by_certificate: World) -> No
         operator = by_certificate.certified("operator")
         wait_for(lambda: replies(operator, "imu/nose/command/reset"))
         with pytest.raises(NotReady, match="nothing is kept of nose"):  # the daemon's own word
-            ask(None, "nose", "", file=by_certificate.certified("reader"))
+            query_histories(None, "nose", "", file=by_certificate.certified("reader"))
         with pytest.raises(LinkUnavailable, match="not signed by its authority"):
-            ask(None, "nose", "", file=by_certificate.certified("impostor"))
+            query_histories(None, "nose", "", file=by_certificate.certified("impostor"))
 
 
 # --- the link and the files

@@ -10,11 +10,11 @@ from drivers.sample import AXES, Floats
 from monitor.noise.effect import Effect
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, BiasInstability, RateRandomWalk
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.diagnostics.diagnostics import LENSES, Sight, sight
-from monitor.reconcile.diagnostics.gap import Null
-from monitor.reconcile.likelihood.hypothesis import believed
-from monitor.reconcile.preparation.axis import Axis, Courses
-from monitor.reconcile.preparation.prepare import prepared
+from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS, WhitenedAxis, whiten_axis
+from monitor.reconcile.diagnostics.gap import NullDistribution
+from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes
+from monitor.reconcile.preparation.axis import Axis, RegressorCache
+from monitor.reconcile.preparation.prepare import prepare_axes
 from monitor.reconcile.reconcile import Recording
 
 RATE_HZ = 100.0
@@ -23,7 +23,7 @@ TERMS = (AngleRandomWalk(N=N), BiasInstability(B=B), RateRandomWalk(K=K))
 WHITE, WALK = TERMS[0], TERMS[2]
 GYRO_AXES = ("gx", "gy", "gz")
 MODEL = NoiseModel(dict.fromkeys(GYRO_AXES, TERMS), RATE_HZ)
-STRICT = dict.fromkeys(LENSES, Null(7.0, 15.0))
+STRICT = dict.fromkeys(DIAGNOSTICS, NullDistribution(7.0, 15.0))
 """Null and threshold in nats, near those of a true model; what is hidden in these tests gains far more."""
 
 
@@ -70,8 +70,8 @@ def axes(
     """As a search gets them."""
     n = next(iter(values.values())).size
     each = effects if isinstance(effects, Mapping) else dict.fromkeys(values, effects)
-    courses = Courses(n, RATE_HZ, temperature_c)
-    return prepared(values, RATE_HZ, each, temperature_c, courses, np.random.default_rng(seed))
+    courses = RegressorCache(n, RATE_HZ, temperature_c)
+    return prepare_axes(values, RATE_HZ, each, temperature_c, courses, np.random.default_rng(seed))
 
 
 def axis(y: Floats, effects: tuple[Effect, ...] = (), temperature_c: Floats | None = None) -> Axis:
@@ -79,9 +79,9 @@ def axis(y: Floats, effects: tuple[Effect, ...] = (), temperature_c: Floats | No
     return axes({"gz": y}, effects, temperature_c)["gz"]
 
 
-def seen(one: Axis, effects: tuple[Effect, ...]) -> Sight:
+def seen(one: Axis, effects: tuple[Effect, ...]) -> WhitenedAxis:
     """Beside a model as it stands."""
-    return sight(one, believed(one, effects).likely)
+    return whiten_axis(one, fit_with_given_sizes(one, effects).likely)
 
 
 def recording(
@@ -114,7 +114,7 @@ def check_report(report: dict[str, Any]) -> None:
         assert one["verdict"] == expected[bool(one["steps"]), bool(one["left_over"])]
         for score in one["left_over"]:
             assert set(score) == SCORE
-            assert score["lens"] in LENSES
+            assert score["lens"] in DIAGNOSTICS
             assert score["gap"] > score["threshold"]
         for step in one["steps"]:
             _check_step(step)

@@ -6,31 +6,42 @@ from dataclasses import replace
 from monitor.noise.effect import Effect
 from monitor.noise.effects import EFFECTS, Sinusoidal
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.result import AxisResult, Bounds, Look, RunnerUp, Score, Step, Verdict, Where
-from monitor.reconcile.several_recordings.comparison import Run
+from monitor.reconcile.result import (
+    AxisResult,
+    Decision,
+    DiagnosticSnapshot,
+    Location,
+    ParameterInterval,
+    ReconciliationStep,
+    RunnerUp,
+    Score,
+)
+from monitor.reconcile.several_recordings.comparison import NamedResult
 from tests.monitor.reconcile import samples
 
-LENS = Score("lines", Where(frequency=(17.0, 18.0)), 1.2, 2.0, 4.0)
+LENS = Score("lines", Location(frequency=(17.0, 18.0)), 1.2, 2.0, 4.0)
 """What a lens shows of an axis of which nothing is to be said."""
 
 
 def step(
-    effect: str, gap: float = 30.0, rivals: Sequence[str] = (), kind: str = "added", **given: Bounds | float
-) -> Step:
+    effect: str, gap: float = 30.0, rivals: Sequence[str] = (), kind: str = "added", **given: ParameterInterval | float
+) -> ReconciliationStep:
     """Found through ``LENS`` with that gap; a bare number has an interval of one in a hundred."""
     before = replace(LENS, gap=gap)
-    parameters = {name: one if isinstance(one, Bounds) else around(one, 0.01 * abs(one)) for name, one in given.items()}
-    return Step(
+    parameters = {
+        name: one if isinstance(one, ParameterInterval) else around(one, 0.01 * abs(one)) for name, one in given.items()
+    }
+    return ReconciliationStep(
         before, kind, effect, parameters, 0.99, tuple(RunnerUp(one, 0.01) for one in rivals),  # type: ignore[arg-type]
-        before, LENS, None, None, "made by hand", "it was made by hand", Look((LENS,), ()),
+        before, LENS, None, None, "made by hand", "it was made by hand", DiagnosticSnapshot((LENS,), ()),
     )  # fmt: skip
 
 
-def around(value: float, half: float) -> Bounds:
-    return Bounds(value, value - half, value + half)
+def around(value: float, half: float) -> ParameterInterval:
+    return ParameterInterval(value, value - half, value + half)
 
 
-def line(amplitude: float = 1.5e-4, frequency: float = 17.3, half: float = 3e-6) -> Step:
+def line(amplitude: float = 1.5e-4, frequency: float = 17.3, half: float = 3e-6) -> ReconciliationStep:
     return step(
         "sinusoidal",
         amplitude=around(amplitude, half),
@@ -39,32 +50,36 @@ def line(amplitude: float = 1.5e-4, frequency: float = 17.3, half: float = 3e-6)
     )
 
 
-def run(name: str, *steps: Step, axis: str = "gz", seconds: float = 600.0, left: Sequence[Score] = ()) -> Run:
+def run(
+    name: str, *steps: ReconciliationStep, axis: str = "gz", seconds: float = 600.0, left: Sequence[Score] = ()
+) -> NamedResult:
     """A recording of one axis with these steps; its model has their effects."""
-    verdict: Verdict = ("partly_explained" if steps else "unexplained") if left else "explained" if steps else "agrees"
-    result = AxisResult(axis, verdict, Look((LENS,), ()), steps, tuple(left), Look((LENS,), ()))
+    verdict: Decision = ("partly_explained" if steps else "unexplained") if left else "explained" if steps else "agrees"
+    result = AxisResult(
+        axis, verdict, DiagnosticSnapshot((LENS,), ()), steps, tuple(left), DiagnosticSnapshot((LENS,), ())
+    )
     whole = samples.agrees()
     given = whole.baseline.effects[axis]
     baseline = NoiseModel({axis: given}, samples.RATE_HZ)
     added = [made(one) for one in steps if one.kind == "added"]
     retuned = {one.effect: made(one) for one in steps if one.kind == "retuned"}
     effects = (*(retuned.get(effect.name, effect) for effect in given), *added)
-    return Run(
+    return NamedResult(
         name,
         replace(
-            whole, verdict=verdict, axes={axis: result}, baseline=baseline, seconds=seconds,
+            whole, verdict=verdict, axes={axis: result}, baseline=baseline, duration_s=seconds,
             model=NoiseModel({axis: effects}, samples.RATE_HZ),
         ),
     )  # fmt: skip
 
 
-def made(one: Step) -> Effect:
+def made(one: ReconciliationStep) -> Effect:
     extra = {"reference": 25.0} if one.effect == "temperature_lag" else {}
     values = {name: bounds.value for name, bounds in one.parameters.items()}
     return EFFECTS[one.effect](**extra, **values)
 
 
-def with_axes(first: Run, *others: Run) -> Run:
+def with_axes(first: NamedResult, *others: NamedResult) -> NamedResult:
     """One recording with the axes of all."""
     axes = {axis: one for run in (first, *others) for axis, one in run.result.axes.items()}
     models = [
@@ -77,7 +92,7 @@ def with_axes(first: Run, *others: Run) -> Run:
     return replace(first, result=replace(first.result, axes=axes, baseline=models[0], model=models[1]))
 
 
-def known_lines(models: Sequence[Sinusoidal], one: Run) -> Run:
+def known_lines(models: Sequence[Sinusoidal], one: NamedResult) -> NamedResult:
     """The same beside a model that has these lines as well."""
     effects = {axis: (*given, *models) for axis, given in one.result.baseline.effects.items()}
     return replace(one, result=replace(one.result, baseline=NoiseModel(effects, samples.RATE_HZ)))

@@ -11,7 +11,17 @@ import numpy as np
 from drivers.sample import AXES, Floats
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk, Sinusoidal
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.result import AxisResult, Bounds, Look, Reconciliation, RunnerUp, Score, Step, View, Where
+from monitor.reconcile.result import (
+    AxisResult,
+    DiagnosticSnapshot,
+    Location,
+    ParameterInterval,
+    PlotData,
+    Reconciliation,
+    ReconciliationStep,
+    RunnerUp,
+    Score,
+)
 
 RATE_HZ, SECONDS = 100.0, 3600.0
 N, B, K = 1.5e-4, 4.0e-5, 1.5e-6  # rad/√s, rad/s, rad/s/√s
@@ -43,7 +53,7 @@ def look(
     line: bool = False,
     known_line: bool = False,
     hump: bool = False,
-) -> Look:
+) -> DiagnosticSnapshot:
     """One axis beside a model through four lenses; ``line`` is measured, ``known_line`` is in the model too."""
     rng = np.random.default_rng(AXES.index(axis))  # the same measurement beside every model
     size = 1.0 if axis.startswith("g") else ACCELEROMETER
@@ -54,16 +64,16 @@ def look(
         _distribution(rng, n_true / n_model),
     )
     off = abs(n_true / n_model - 1) * 40
-    peak = Where(frequency=(17.1, 17.5)) if line and not known_line else Where(frequency=(6.0, 11.0))
+    peak = Location(frequency=(17.1, 17.5)) if line and not known_line else Location(frequency=(6.0, 11.0))
     psd = 41.2 if line and not known_line else 7.9 if hump else 0.6 + off / 2
     scores = (
         Score("psd", peak, psd, 1.9, 2.6),
-        Score("allan", Where(tau=(0.01, 0.64)), 0.7 + off, 1.6, 2.4),
-        Score("level", Where(time=(1200.0, 1320.0)), 1.1, 1.7, 2.5),
-        Score("distribution", Where(), 0.4 + off / 9, 1.8, 2.7),
-        Score("other_axes", Where(source="ax" if axis != "ax" else "gx"), 0.2, 1.5, 2.5),
+        Score("allan", Location(tau=(0.01, 0.64)), 0.7 + off, 1.6, 2.4),
+        Score("level", Location(time=(1200.0, 1320.0)), 1.1, 1.7, 2.5),
+        Score("distribution", Location(), 0.4 + off / 9, 1.8, 2.7),
+        Score("other_axes", Location(source="ax" if axis != "ax" else "gx"), 0.2, 1.5, 2.5),
     )
-    return Look(scores, views)
+    return DiagnosticSnapshot(scores, views)
 
 
 def agrees(fitted_first: bool = False) -> Reconciliation:
@@ -78,30 +88,30 @@ def explained() -> Reconciliation:
     start = look("gz", n_true=MORE_N, line=True)
     with_line = look("gz", n_true=MORE_N, line=True, known_line=True)
     with_all = look("gz", n_model=MORE_N, n_true=MORE_N, line=True, known_line=True)
-    line = Step(
+    line = ReconciliationStep(
         found=start.scores[0],
         kind="added",
         effect="sinusoidal",
         parameters={
-            "amplitude": Bounds(1.5e-4, 1.474e-4, 1.526e-4),
-            "frequency": Bounds(17.300012, 17.299912, 17.300112),
+            "amplitude": ParameterInterval(1.5e-4, 1.474e-4, 1.526e-4),
+            "frequency": ParameterInterval(17.300012, 17.299912, 17.300112),
         },
         confidence=0.9983,
         runners_up=(RunnerUp("narrowband", 0.0016), RunnerUp("sample_rate_error", 0.0001)),
         before=start.scores[0],
         after=with_line.scores[0],
-        held_out_before=Score("psd", Where(frequency=(17.1, 17.5)), 39.7, 1.9, 2.6),
-        held_out_after=Score("psd", Where(frequency=(17.1, 17.5)), 1.0, 1.9, 2.6),
+        held_out_before=Score("psd", Location(frequency=(17.1, 17.5)), 39.7, 1.9, 2.6),
+        held_out_after=Score("psd", Location(frequency=(17.1, 17.5)), 1.0, 1.9, 2.6),
         held_out_reason="",
         because="One bin of 0.28 mHz at 17.3 Hz holds 41 times what the model expects there, and its phase holds "
         "from the first minute to the last; a resonance would be at least 1 mHz wide.",
         look=with_line,
     )
-    white = Step(
+    white = ReconciliationStep(
         found=with_line.scores[1],
         kind="retuned",
         effect="angle_random_walk",
-        parameters={"N": Bounds(MORE_N, 1.7958e-4, 1.8042e-4)},
+        parameters={"N": ParameterInterval(MORE_N, 1.7958e-4, 1.8042e-4)},
         confidence=0.99996,
         runners_up=(),
         before=with_line.scores[1],
@@ -154,7 +164,7 @@ def _psd(
     line: bool,
     known_line: bool,
     hump: bool,
-) -> View:
+) -> PlotData:
     """Bins of a log-binned DCT: the first 48 single, then 16 an octave, at most 0.1 Hz wide."""
     single = np.arange(1, 49) / (2 * SECONDS)
     edges = [float(single[-1])]
@@ -167,7 +177,7 @@ def _psd(
     truth = truth * (1 + 0.5 * hump * np.exp(-0.5 * (np.log(f / 8.0) / 0.15) ** 2))
     expected = spectrum(f, n_model) + known_line * density
     spread = 1.96 * np.sqrt(2 / count)
-    return View(
+    return PlotData(
         "psd", "frequency", "Hz", "spectral density", "(rad/s)²/Hz" if axis.startswith("g") else "(m/s²)²/Hz", True, f,
         size**2 * truth * rng.chisquare(count) / count,
         size**2 * expected, size**2 * expected * np.exp(-spread), size**2 * expected * np.exp(0.7 * spread),
@@ -176,37 +186,37 @@ def _psd(
 
 def _allan(
     axis: str, rng: np.random.Generator, size: float, n_model: float, n_true: float, line: bool, known_line: bool
-) -> View:
+) -> PlotData:
     tau = 2.0 ** np.arange(17) / RATE_HZ
     edf = 1.5 * SECONDS / tau
     expected = size * np.sqrt(avar(tau, n_model) + known_line * line_avar(tau))
     measured = size * np.sqrt((avar(tau, n_true) + line * line_avar(tau)) * rng.chisquare(edf) / edf)
     spread = np.exp(0.98 * np.sqrt(2 / edf))
     unit = "rad/s" if axis.startswith("g") else "m/s²"
-    return View(
+    return PlotData(
         "allan", "averaging time", "s", "Allan deviation", unit, True, tau, measured,
         expected, expected / spread, expected * spread,
     )  # fmt: skip
 
 
-def _level(axis: str, rng: np.random.Generator, size: float) -> View:
+def _level(axis: str, rng: np.random.Generator, size: float) -> PlotData:
     """Means of 10 s."""
     t = np.arange(5.0, SECONDS, 10.0)
     sigma = size * np.sqrt(avar(np.array([10.0]), N)[0] + K**2 * 300)
     measured = sigma * rng.standard_normal(t.size)
     unit = "rad/s" if axis.startswith("g") else "m/s²"
     half = 1.96 * sigma * np.ones_like(t)
-    return View("level", "time", "s", "mean of 10 s", unit, False, t, measured, 0 * t, -half, half)
+    return PlotData("level", "time", "s", "mean of 10 s", unit, False, t, measured, 0 * t, -half, half)
 
 
-def _distribution(rng: np.random.Generator, ratio: float) -> View:
+def _distribution(rng: np.random.Generator, ratio: float) -> PlotData:
     """Density of the whitened samples."""
     x = np.linspace(-4.5, 4.5, 73)
     expected = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
     truth = np.exp(-0.5 * (x / ratio) ** 2) / np.sqrt(2 * np.pi) / ratio
     sigma = np.sqrt(expected / 360_000 / (x[1] - x[0]))
     measured = np.maximum(truth + sigma * rng.standard_normal(x.size), 0.0)
-    return View(
+    return PlotData(
         "distribution", "value over its deviation", "1", "density", "1", False, x, measured,
         expected, np.maximum(expected - 1.96 * sigma, 0.0), expected + 1.96 * sigma,
     )  # fmt: skip

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.description import described
-from monitor.reconcile.diagnostics.diagnostics import LENSES
-from monitor.reconcile.diagnostics.gap import Null
-from monitor.reconcile.report import to_json
+from monitor.reconcile.description import describe_axis
+from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
+from monitor.reconcile.diagnostics.gap import NullDistribution
+from monitor.reconcile.report import encode_report
 from monitor.reconcile.result import Reconciliation
-from monitor.reconcile.search.search import search
+from monitor.reconcile.search.search import search_axis
 from tests.monitor.reconcile.axes import (
     RATE_HZ,
     STRICT,
@@ -32,8 +32,8 @@ n = 40_000
 MODEL = (WHITE, WALK)
 T = time_s(n)
 LINE = 2e-4 * np.sin(2 * np.pi * 17.3 * T + 0.7)
-UNREACHED = dict.fromkeys(LENSES, Null(1e6, 1e9))
-ALWAYS = dict.fromkeys(LENSES, Null(0.0, 0.0))
+UNREACHED = dict.fromkeys(DIAGNOSTICS, NullDistribution(1e6, 1e9))
+ALWAYS = dict.fromkeys(DIAGNOSTICS, NullDistribution(0.0, 0.0))
 
 
 def noise(seed=0):
@@ -58,12 +58,12 @@ NAMES = ("nothing", "line", "louder", "outliers", "correlated", "filtered and co
 
 @cache
 def found(name):
-    return search(axis(hidden(name), MODEL), MODEL, STRICT, np.random.default_rng(0))
+    return search_axis(axis(hidden(name), MODEL), MODEL, STRICT, np.random.default_rng(0))
 
 
 @cache
 def told(name):
-    return described(found(name), STRICT, STRICT)
+    return describe_axis(found(name), STRICT, STRICT)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -71,10 +71,10 @@ def test_the_report_is_as_its_contract_says(name):
     result = told(name)
     model = NoiseModel({"gz": MODEL}, RATE_HZ)
     whole = Reconciliation(result.verdict, {"gz": result}, model, model, False, RATE_HZ, n, n / RATE_HZ, 1)
-    report = json.loads(to_json(whole))
+    report = json.loads(encode_report(whole))
     check_report(report)
     assert report["verdict"] == ("agrees" if name == "nothing" else "explained")
-    assert [score["lens"] for score in report["axes"]["gz"]["scores"]] == list(LENSES)
+    assert [score["lens"] for score in report["axes"]["gz"]["scores"]] == list(DIAGNOSTICS)
 
 
 def test_a_line_is_described_with_all_that_it_has():
@@ -126,18 +126,18 @@ def test_runners_up_are_other_names_and_never_certain():
 
 
 def test_verdicts_follow_from_steps_and_what_is_left():
-    assert described(found("nothing"), STRICT, STRICT).verdict == "agrees"
-    assert described(found("nothing"), STRICT, ALWAYS).verdict == "unexplained"
-    assert described(found("line"), STRICT, STRICT).verdict == "explained"
-    left = described(found("line"), STRICT, ALWAYS)
+    assert describe_axis(found("nothing"), STRICT, STRICT).verdict == "agrees"
+    assert describe_axis(found("nothing"), STRICT, ALWAYS).verdict == "unexplained"
+    assert describe_axis(found("line"), STRICT, STRICT).verdict == "explained"
+    left = describe_axis(found("line"), STRICT, ALWAYS)
     assert left.verdict == "partly_explained"
     assert {score.lens for score in left.left_over} == {lens for lens, one in found("line").seen.items() if one.gain}
-    assert described(found("line"), STRICT, UNREACHED).left_over == ()
+    assert describe_axis(found("line"), STRICT, UNREACHED).left_over == ()
 
 
 def test_gaps_before_are_beside_the_model_that_decided_and_after_beside_the_new_one():
-    other = dict.fromkeys(LENSES, Null(8.0, 18.0))
-    (step,) = described(found("line"), STRICT, other).steps
+    other = dict.fromkeys(DIAGNOSTICS, NullDistribution(8.0, 18.0))
+    (step,) = describe_axis(found("line"), STRICT, other).steps
     assert step.before.threshold == pytest.approx(30.0**0.5)
     assert step.after.threshold == pytest.approx(36.0**0.5)
     assert step.after.null95 == pytest.approx(4.0)
@@ -147,4 +147,4 @@ def test_what_did_not_shrink_is_still_told():
     """A search whose last look sees as much as its first has a step and is partly explained."""
     one = found("line")
     again = replace(one, seen=one.rounds[0].seen)
-    assert described(again, STRICT, STRICT).verdict == "partly_explained"
+    assert describe_axis(again, STRICT, STRICT).verdict == "partly_explained"

@@ -22,10 +22,18 @@ from monitor.noise.effects import (
     TemperatureBias,
 )
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.preparation.axis import Courses
-from monitor.reconcile.preparation.prepare import FEWEST
-from monitor.reconcile.reconcile import Recording, effects_of, five_terms, overall, reconcile, smooth, usable
-from monitor.reconcile.report import to_json
+from monitor.reconcile.preparation.axis import RegressorCache
+from monitor.reconcile.preparation.prepare import MIN_SAMPLES
+from monitor.reconcile.reconcile import (
+    Recording,
+    combine_decisions,
+    effects_by_axis,
+    fit_five_terms,
+    reconcile,
+    select_usable_axes,
+    smooth_temperature,
+)
+from monitor.reconcile.report import encode_report
 from tests.monitor.reconcile.axes import (
     GYRO_AXES,
     MODEL,
@@ -73,13 +81,13 @@ def test_a_true_model_agrees(seed):
     assert found.model.effects == MODEL.effects
     assert list(found.axes) == list(GYRO_AXES)
     assert (found.samples, found.seconds, found.rate_hz, found.fitted_first) == (n, n / RATE_HZ, RATE_HZ, False)
-    check_report(json.loads(to_json(found)))
+    check_report(json.loads(encode_report(found)))
 
 
 @pytest.mark.parametrize("name", HIDDEN)
 def test_what_was_hidden_is_found_on_its_axis(name):
     found, (where, effect) = result(name), HIDDEN[name]
-    check_report(json.loads(to_json(found)))
+    check_report(json.loads(encode_report(found)))
     assert found.verdict == "explained"
     assert {axis for axis, one in found.axes.items() if one.steps} == {where}
     added = [step for step in found.axes[where].steps if step.kind == "added"]
@@ -106,9 +114,9 @@ def test_the_model_that_was_found_agrees_with_another_run():
 def test_same_seed_same_bytes_also_in_threads():
     small = recording(MODEL + NoiseModel({"gy": (HIDDEN["outliers"][1],)}), 12_000, 5)
     first = reconcile(small, MODEL, 4)
-    one = to_json(first)
+    one = encode_report(first)
     with ThreadPoolExecutor(3) as pool:
-        assert to_json(reconcile(small, MODEL, 4, pool.map)) == one
+        assert encode_report(reconcile(small, MODEL, 4, pool.map)) == one
     other = reconcile(small, MODEL, 5)
     assert other.seed == 5
     # other simulated recordings stand behind its thresholds
@@ -124,7 +132,7 @@ def test_a_wrong_clock_is_one_step_for_all_axes():
     unknown = Sinusoidal(amplitude=3e-4, frequency=31.0)
     drawn = recording(plain + NoiseModel({"gy": (SampleRateError(ratio=1.004),), "gz": (unknown,)}), 24_000, 6)
     found = reconcile(drawn, plain, 1)
-    check_report(json.loads(to_json(found)))
+    check_report(json.loads(encode_report(found)))
     assert found.verdict == "explained"
     (step,) = (step for one in found.axes.values() for step in one.steps if step.effect == "sample_rate_error")
     assert step.parameters["ratio"].value == pytest.approx(1.004, abs=1e-4)
@@ -168,8 +176,8 @@ def test_only_terms_that_the_data_support_are_fitted():
         "gz": white(n, rng) + 1e-5 * time_s(n),
         "ax": NoiseModel({"ax": (WHITE, QuantizationNoise(Q=5e-6))}).simulate(n, RATE_HZ, 1)[:, 3].copy(),
     }
-    courses = Courses(n, RATE_HZ, None)
-    found = five_terms(Recording(values, RATE_HZ), courses, 1)
+    courses = RegressorCache(n, RATE_HZ, None)
+    found = fit_five_terms(Recording(values, RATE_HZ), courses, 1)
     kinds = {axis: {type(effect) for effect in effects} for axis, effects in found.effects.items()}
     assert kinds["gx"] == {AngleRandomWalk}
     assert kinds["gy"] >= {AngleRandomWalk, RateRandomWalk}
@@ -184,32 +192,32 @@ def test_only_terms_that_the_data_support_are_fitted():
 
 
 def drawn(**changed):
-    small = recording(MODEL, FEWEST, 1)
+    small = recording(MODEL, MIN_SAMPLES, 1)
     return Recording({**small.values, **changed}, RATE_HZ)
 
 
 def test_too_few_samples_say_how_many_are_needed():
-    with pytest.raises(NotReady, match=rf"{FEWEST - 1} samples; {FEWEST} are .*100 Hz"):
-        usable(recording(MODEL, FEWEST - 1, 1), MODEL)
-    assert usable(drawn(), MODEL)[1] == ()
+    with pytest.raises(NotReady, match=rf"{MIN_SAMPLES - 1} samples; {MIN_SAMPLES} are .*100 Hz"):
+        select_usable_axes(recording(MODEL, MIN_SAMPLES - 1, 1), MODEL)
+    assert select_usable_axes(drawn(), MODEL)[1] == ()
 
 
 def test_axes_that_cannot_be_compared_are_left_out_and_told():
     values = drawn().values
     holed = values["gx"].copy()
     holed[10:] = np.nan
-    kept, notes = usable(drawn(gx=holed, gy=np.full(FEWEST, 0.3), ax=values["gz"]), MODEL)
+    kept, notes = select_usable_axes(drawn(gx=holed, gy=np.full(MIN_SAMPLES, 0.3), ax=values["gz"]), MODEL)
     assert list(kept.values) == ["gz"]
     assert [note.split(":")[0] for note in notes] == ["gx", "gy", "ax"]
     assert all(note.endswith("left out") for note in notes)
     with pytest.raises(NotReady, match=r"no axis to compare: gx: .*; gy: "):
-        usable(Recording({"gx": holed, "gy": holed}, RATE_HZ), MODEL)
+        select_usable_axes(Recording({"gx": holed, "gy": holed}, RATE_HZ), MODEL)
 
 
 def test_a_constant_bias_is_no_part_of_the_comparison():
     model = MODEL + NoiseModel({"gz": (Bias(value=0.3),)})
-    assert effects_of(model, drawn())["gz"] == TERMS
-    assert effects_of(NoiseModel({}), drawn()) == dict.fromkeys(GYRO_AXES, ())
+    assert effects_by_axis(model, drawn())["gz"] == TERMS
+    assert effects_by_axis(NoiseModel({}), drawn()) == dict.fromkeys(GYRO_AXES, ())
 
 
 def test_temperature_is_made_smooth_and_whole():
@@ -217,12 +225,12 @@ def test_temperature_is_made_smooth_and_whole():
     true = changing(n)
     noisy = true + 0.3 * rng.standard_normal(n)
     noisy[rng.random(n) < 0.5] = np.nan
-    found = smooth(noisy)
+    found = smooth_temperature(noisy)
     assert np.isfinite(found).all()
     inside = slice(100, -100)
     assert np.std((found - true)[inside]) < 0.1
-    np.testing.assert_allclose(smooth(np.full(n, 25.0)), 25.0)
-    assert smooth(np.array([1.0, np.nan, 3.0])).tolist() == [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(smooth_temperature(np.full(n, 25.0)), 25.0)
+    assert smooth_temperature(np.array([1.0, np.nan, 3.0])).tolist() == [1.0, 2.0, 3.0]
 
 
 @pytest.mark.parametrize(
@@ -236,7 +244,7 @@ def test_temperature_is_made_smooth_and_whole():
     ],
 )
 def test_verdict_of_the_whole(axes, whole):
-    assert overall(axes) == whole
+    assert combine_decisions(axes) == whole
 
 
 def test_sizes_are_told_in_the_order_of_the_axes():

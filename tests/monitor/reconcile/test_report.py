@@ -6,13 +6,21 @@ from typing import Any
 
 import numpy as np
 
-from monitor.reconcile.report import to_json
-from monitor.reconcile.result import AxisResult, Bounds, Look, Reconciliation, Score, Step, Where
+from monitor.reconcile.report import encode_report
+from monitor.reconcile.result import (
+    AxisResult,
+    DiagnosticSnapshot,
+    Location,
+    ParameterInterval,
+    Reconciliation,
+    ReconciliationStep,
+    Score,
+)
 from tests.monitor.reconcile import samples
 
 
 def written(r: Reconciliation) -> dict[str, Any]:
-    return dict(json.loads(to_json(r)))
+    return dict(json.loads(encode_report(r)))
 
 
 def with_step(r: Reconciliation, **changed: object) -> Reconciliation:
@@ -68,7 +76,7 @@ def test_what_happens_once_has_a_reason_instead_of_a_held_out_gap() -> None:
 
 
 def test_the_threshold_beside_a_gap_is_the_one_after_the_step() -> None:
-    after = Score("psd", Where(), 1.0, 1.7, 2.2)
+    after = Score("psd", Location(), 1.0, 1.7, 2.2)
     step = written(with_step(samples.explained(), after=after))["axes"]["gz"]["steps"][0]
     assert step["gap"] == {"before": 41.2, "after": 1.0, "null95": 1.7, "threshold": 2.2}
     assert step["found"]["threshold"] == 2.6
@@ -76,11 +84,11 @@ def test_the_threshold_beside_a_gap_is_the_one_after_the_step() -> None:
 
 def test_what_is_no_number_is_null_and_an_axis_has_no_interval() -> None:
     parameters = {
-        "source": Bounds("ax"),
-        "coefficient": Bounds(np.float64(2e-4), np.nan, np.inf),
-        "order": Bounds(2),
+        "source": ParameterInterval("ax"),
+        "coefficient": ParameterInterval(np.float64(2e-4), np.nan, np.inf),
+        "order": ParameterInterval(2),
     }
-    found = Score("other_axes", Where(source="ax", value=(-np.inf, 0.1)), np.inf, np.nan, 2.5)
+    found = Score("other_axes", Location(source="ax", value=(-np.inf, 0.1)), np.inf, np.nan, 2.5)
     changed = with_step(samples.explained(), parameters=parameters, found=found, confidence=np.nan)
     step = written(changed)["axes"]["gz"]["steps"][0]
     assert step["parameters"] == {
@@ -107,14 +115,16 @@ def test_what_is_left_over_has_its_place_and_no_name() -> None:
 def test_the_same_reconciliation_gives_the_same_bytes_in_the_order_of_the_axes() -> None:
     r = samples.explained()
     backwards = replace(r, axes=dict(reversed(r.axes.items())))
-    assert to_json(samples.explained()) == to_json(r) == to_json(backwards)
+    assert encode_report(samples.explained()) == encode_report(r) == encode_report(backwards)
     assert list(written(backwards)["axes"]) == ["gx", "gy", "gz", "ax", "ay", "az"]
 
 
 def test_numbers_of_numpy_are_numbers() -> None:
-    score = Score("psd", Where(frequency=(np.float64(1), np.float64(2))), np.float64(3), np.float64(1), np.float64(2))
-    look = Look((score,), ())
-    step = Step(
+    score = Score(
+        "psd", Location(frequency=(np.float64(1), np.float64(2))), np.float64(3), np.float64(1), np.float64(2)
+    )
+    look = DiagnosticSnapshot((score,), ())
+    step = ReconciliationStep(
         score, "added", "bias_step", {}, np.float64(0.5), (), score, score, None, None, "once", "it jumps", look
     )
     axes = {"gx": AxisResult("gx", "explained", look, (step,), (), look)}

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import ConfigError
-from monitor.publishing.zenoh.subscriber import listeners
+from monitor.publishing.zenoh.subscriber import client_configurations
 from monitor.settings import file_permissions, loading
 from tests.system.test_cli import VIRTUAL
 
@@ -93,7 +93,7 @@ def test_a_zenoh_file_that_anyone_may_change_or_that_zenoh_refuses_is_wrong(fold
     path = made(folder / "a.toml", VIRTUAL + '[zenoh]\nconfig = "z.json5"\n', 0o644)
     assert "zenoh.config: anyone on this machine may change it" in loading.read(path)[1][0]
     with pytest.raises(ConfigError, match="anyone on this machine may change it"):
-        listeners((), zenoh)
+        client_configurations((), zenoh)
     made(zenoh, SECRET.replace('"hunter2"', '"hunter2" x'), 0o600)
     (line,) = loading.read(path)[1]
     assert line == f"{path}: zenoh.config: {zenoh}: line 1, column 54: expected boolean or null"

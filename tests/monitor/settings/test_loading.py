@@ -612,11 +612,11 @@ TABLES = {
     "metrics": (MetricsTable, ()),
     "log": (LogTable, ()),
 }
-LINKS = sorted({*discovery.names(drivers.links, "_link"), "virtual"} - {"loopback"})
+LINKS = sorted({*discovery.list_modules(drivers.links, "_link"), "virtual"} - {"loopback"})
 WITH_KEYS = [
     name
-    for name in discovery.names(drivers.decoders)
-    if msgspec.structs.fields(discovery.load(drivers.decoders, name).Settings)
+    for name in discovery.list_modules(drivers.decoders)
+    if msgspec.structs.fields(discovery.import_module(drivers.decoders, name).Settings)
 ]
 
 
@@ -629,7 +629,7 @@ def test_the_printed_defaults_have_every_key_of_a_table(name):
 
 @pytest.mark.parametrize("link", LINKS)
 def test_the_printed_defaults_have_every_key_of_every_link(link):
-    kind = VirtualTable if link == "virtual" else discovery.load(drivers.links, link, "_link").Settings
+    kind = VirtualTable if link == "virtual" else discovery.import_module(drivers.links, link, "_link").Settings
     table = driver_of(link)
     keys = dict(table.keys)
     if link == "virtual":
@@ -645,7 +645,7 @@ def test_the_printed_defaults_have_every_key_of_every_decoder(decoder):
     first, *others = options_of(decoder)
     first.keys |= {one.name.split(".")[3]: one.keys for one in others}
     first.lines += [f"{one.name.split('.')[3]} = # {one.about.removeprefix('# ')}" for one in others]
-    stands_whole(first, discovery.load(drivers.decoders, decoder).Settings)
+    stands_whole(first, discovery.import_module(drivers.decoders, decoder).Settings)
 
 
 def test_the_printed_defaults_have_every_table():
@@ -653,7 +653,7 @@ def test_the_printed_defaults_have_every_table():
     assert names == {field.encode_name for field in msgspec.structs.fields(FileTable)}
     assert set(TABLES) - {one.name for one in printed()} == set()
     says_so = "ros2_imu and samples (messages) have no keys" in (CONFIG_FOLDER / "defaults.toml").read_text("utf-8")
-    assert set(discovery.names(drivers.decoders)) - set(WITH_KEYS) == {"ros2_imu", "samples"}
+    assert set(discovery.list_modules(drivers.decoders)) - set(WITH_KEYS) == {"ros2_imu", "samples"}
     assert says_so
 
 
@@ -704,10 +704,10 @@ def test_the_printed_defaults_pass_the_check():
 
 
 def test_every_link_can_be_named():
-    known = {*discovery.names(drivers.links, "_link")} - {"loopback"}
+    known = {*discovery.list_modules(drivers.links, "_link")} - {"loopback"}
     for name in known:
-        module = discovery.load(drivers.links, name, "_link")
-        assert module.DEFAULT_DECODER in ("", *discovery.names(drivers.decoders))
+        module = discovery.import_module(drivers.links, name, "_link")
+        assert module.DEFAULT_DECODER in ("", *discovery.list_modules(drivers.decoders))
 
 
 # --- words

@@ -85,10 +85,10 @@ def kinds() -> Iterator[type[msgspec.Struct]]:
     """The struct of every table, link and decoder."""
     yield from (one for one in vars(schema).values() if isinstance(one, type) and issubclass(one, msgspec.Struct))
     yield SignalSettings
-    for name in discovery.names(drivers.links, "_link"):
-        yield discovery.load(drivers.links, name, "_link").Settings
-    for name in discovery.names(drivers.decoders):
-        yield discovery.load(drivers.decoders, name).Settings
+    for name in discovery.list_modules(drivers.links, "_link"):
+        yield discovery.import_module(drivers.links, name, "_link").Settings
+    for name in discovery.list_modules(drivers.decoders):
+        yield discovery.import_module(drivers.decoders, name).Settings
 
 
 @pytest.mark.parametrize("kind", list(kinds()), ids=lambda kind: f"{kind.__module__}.{kind.__name__}")

@@ -5,7 +5,7 @@ import pytest
 
 from drivers.sample import Chunk
 from monitor.settings.loading import FaultsTable
-from monitor.simulator.faults import Faults, Kind, Truth
+from monitor.simulator.faults import FaultCounts, FaultKind, Faults
 
 SHARES = FaultsTable(lost=0.01, repeated=0.02, flipped=0.03, cut=0.04, unplugged=0.05)
 DATA = bytes(range(40))
@@ -17,18 +17,18 @@ def test_each_comes_as_often_as_asked_for() -> None:
     share = np.bincount(draws.kind, minlength=5) / n
     assert share == pytest.approx([0.01, 0.02, 0.03, 0.04, 0.9], abs=4 * np.sqrt(0.04 / n))
     assert draws.pulled.mean() == pytest.approx(0.05, abs=4 * np.sqrt(0.05 / n))
-    apart = draws.pulled[draws.kind == Kind.CUT].mean()
+    apart = draws.pulled[draws.kind == FaultKind.CUT].mean()
     assert apart == pytest.approx(0.05, abs=4 * np.sqrt(0.05 / (0.04 * n)))
 
 
 def test_none_are_asked_for_and_none_come() -> None:
     draws = Faults(FaultsTable(), 1, "bytes").draw(10_000)
-    assert (draws.kind == Kind.WHOLE).all()
+    assert (draws.kind == FaultKind.WHOLE).all()
     assert not draws.pulled.any()
 
 
 def test_all_samples_may_be_lost() -> None:
-    assert (Faults(FaultsTable(lost=1.0), 1, "bytes").draw(10_000).kind == Kind.LOST).all()
+    assert (Faults(FaultsTable(lost=1.0), 1, "bytes").draw(10_000).kind == FaultKind.LOST).all()
 
 
 @pytest.mark.parametrize("cuts", [(1,), (7, 8, 500), (999,)])
@@ -43,10 +43,10 @@ def test_the_same_however_samples_are_cut_into_bursts(cuts: tuple[int, ...]) -> 
 
 def test_holding_back_bursts_changes_no_sample_fault() -> None:
     faults = Faults(FaultsTable(lost=0.5, jitter=0.1), 5, "bytes")
-    held = [faults.hold_s() for _ in range(100)]
+    held = [faults.draw_delay_s() for _ in range(100)]
     assert 0.0 <= min(held) < 0.02 < 0.08 < max(held) <= 0.1
     calm = Faults(FaultsTable(lost=0.5), 5, "bytes")
-    assert calm.hold_s() == 0.0
+    assert calm.draw_delay_s() == 0.0
     assert np.array_equal(faults.draw(100).kind, calm.draw(100).kind)
 
 
@@ -54,15 +54,15 @@ def test_holding_back_bursts_changes_no_sample_fault() -> None:
 def test_what_they_do_to_bytes(where: float) -> None:
     faults = Faults(SHARES, 1, "bytes")
     chunks = [Chunk(b"first", 7), Chunk(DATA, 7, address=3)]
-    assert faults.hurt(Kind.WHOLE, where, chunks) == chunks
-    assert faults.hurt(Kind.LOST, where, chunks) == []
-    assert faults.hurt(Kind.REPEATED, where, chunks) == [*chunks, *chunks]
-    first, flipped = faults.hurt(Kind.FLIPPED, where, chunks)
+    assert faults.apply_fault(FaultKind.WHOLE, where, chunks) == chunks
+    assert faults.apply_fault(FaultKind.LOST, where, chunks) == []
+    assert faults.apply_fault(FaultKind.REPEATED, where, chunks) == [*chunks, *chunks]
+    first, flipped = faults.apply_fault(FaultKind.FLIPPED, where, chunks)
     assert first == chunks[0]
     assert (flipped.address, flipped.t_ns) == (3, 7)
     apart = int.from_bytes(flipped.data, "big") ^ int.from_bytes(DATA, "big")
     assert apart.bit_count() == 1
-    first, cut = faults.hurt(Kind.CUT, where, chunks)
+    first, cut = faults.apply_fault(FaultKind.CUT, where, chunks)
     assert first == chunks[0]
     assert DATA.startswith(cut.data)
     assert 1 <= len(cut.data) < len(DATA)
@@ -70,14 +70,14 @@ def test_what_they_do_to_bytes(where: float) -> None:
 
 def test_a_flipped_can_frame_does_not_arrive() -> None:
     chunks = [Chunk(b"a" * 8, 1, address=1), Chunk(b"b" * 8, 1, address=2)]
-    assert Faults(SHARES, 1, "frames").hurt(Kind.FLIPPED, 0.5, chunks) == chunks[:1]
+    assert Faults(SHARES, 1, "frames").apply_fault(FaultKind.FLIPPED, 0.5, chunks) == chunks[:1]
 
 
 def test_the_truth_adds_up() -> None:
-    truth = Truth()
-    for kind in Kind:
+    truth = FaultCounts()
+    for kind in FaultKind:
         truth.count(kind, out=True)
         truth.count(kind, out=False)
     assert (truth.sent, truth.repeated, truth.lost, truth.flipped, truth.cut) == (2, 1, 1, 1, 1)
-    assert truth.dropped == len(Kind)
-    assert truth.made == 2 * len(Kind)
+    assert truth.dropped == len(FaultKind)
+    assert truth.made == 2 * len(FaultKind)

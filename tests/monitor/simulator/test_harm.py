@@ -15,7 +15,7 @@ from monitor.common.config_files import CONFIG_FOLDER
 from monitor.settings.loading import FaultsTable, VirtualTable
 from monitor.simulator import VirtualImu
 from monitor.simulator.can_port import CanPort
-from monitor.simulator.faults import Faults, Kind
+from monitor.simulator.faults import FaultKind, Faults
 from monitor.simulator.pty_port import PtyPort
 from monitor.simulator.zenoh_port import ZenohPort
 from tests.contracts.decoder_examples import EXAMPLES, Example
@@ -48,7 +48,7 @@ class Rig:
         speed: float = 10.0,
         seed: int = 3,
         samples: int | None = 150,
-        of: Kind = Kind.WHOLE,
+        of: FaultKind = FaultKind.WHOLE,
         **faults: float,
     ) -> None:
         decoder = example.build(folder)
@@ -108,16 +108,16 @@ class Rig:
     @property
     def received(self) -> int:
         """Samples that have come, the repeated ones that were left out among them."""
-        return self.counts.received + self.driver.clock.repeated
+        return self.counts.received + self.driver.clock.repeated_rows
 
 
-def whole_at_end(kinds: np.ndarray, samples: int, of: Kind) -> int:
+def whole_at_end(kinds: np.ndarray, samples: int, of: FaultKind) -> int:
     """How many samples it takes: so many at least, ENOUGH of one kind, and the last of them whole.
 
     A decoder knows of a damaged frame by the frames after it.
     """
     enough = np.cumsum(kinds == of) >= ENOUGH
-    whole = np.convolve(kinds == Kind.WHOLE, np.ones(WHOLE_AT_END, int))[: kinds.size] == WHOLE_AT_END
+    whole = np.convolve(kinds == FaultKind.WHOLE, np.ones(WHOLE_AT_END, int))[: kinds.size] == WHOLE_AT_END
     return samples + int(np.flatnonzero((enough & whole)[samples - 1 :])[0])
 
 
@@ -139,7 +139,7 @@ def test_without_faults_every_sample_comes(any_link: Example, tmp_path: Path) ->
 
 @pytest.mark.parametrize("name", COUNTED)
 def test_lost_samples_are_counted_exactly_where_the_protocol_counts(name: str, tmp_path: Path) -> None:
-    with Rig(BY_NAME[name], tmp_path, of=Kind.LOST, lost=0.1) as rig:
+    with Rig(BY_NAME[name], tmp_path, of=FaultKind.LOST, lost=0.1) as rig:
         rig.read_all()
     assert rig.counts.bad == 0
 
@@ -147,16 +147,16 @@ def test_lost_samples_are_counted_exactly_where_the_protocol_counts(name: str, t
 @pytest.mark.parametrize("name", ["vectornav_binary", "stim300", "ros2_imu", "samples"])
 def test_repeated_samples_are_left_out(name: str, tmp_path: Path) -> None:
     """The first of them come before the clock has seen enough to call anything a repeat."""
-    with Rig(BY_NAME[name], tmp_path, of=Kind.REPEATED, repeated=0.1) as rig:
+    with Rig(BY_NAME[name], tmp_path, of=FaultKind.REPEATED, repeated=0.1) as rig:
         rig.read_all()
         assert rig.truth.repeated >= ENOUGH
-        assert 0 <= rig.truth.repeated - rig.driver.clock.repeated <= 5
+        assert 0 <= rig.truth.repeated - rig.driver.clock.repeated_rows <= 5
         rig.wait(lambda: "samples_repeated" in rig.kinds)
 
 
 @pytest.mark.parametrize("name", CHECKED)
 def test_a_flipped_bit_costs_its_sample_and_no_wrong_one_comes(name: str, tmp_path: Path) -> None:
-    with Rig(BY_NAME[name], tmp_path, of=Kind.FLIPPED, flipped=0.1) as rig:
+    with Rig(BY_NAME[name], tmp_path, of=FaultKind.FLIPPED, flipped=0.1) as rig:
         rig.read_all()
     assert rig.counts.bad > 0.8 * rig.truth.flipped
 
@@ -164,13 +164,13 @@ def test_a_flipped_bit_costs_its_sample_and_no_wrong_one_comes(name: str, tmp_pa
 @pytest.mark.parametrize("name", ["vectornav_binary", "xsens_mtdata2", "dbc", "ros2_imu"])
 def test_a_cut_frame_costs_its_sample(name: str, tmp_path: Path) -> None:
     example = next(example for example in EXAMPLES if str(example) == name or example.name == name)
-    with Rig(example, tmp_path, of=Kind.CUT, cut=0.1) as rig:
+    with Rig(example, tmp_path, of=FaultKind.CUT, cut=0.1) as rig:
         rig.read_all()
 
 
 def test_a_flipped_can_frame_is_kept_off_by_the_bus(tmp_path: Path) -> None:
     example = next(example for example in EXAMPLES if example.name == "dbc")
-    with Rig(example, tmp_path, of=Kind.FLIPPED, flipped=0.1) as rig:
+    with Rig(example, tmp_path, of=FaultKind.FLIPPED, flipped=0.1) as rig:
         rig.read_all()
     assert rig.counts.bad == rig.truth.flipped
 

@@ -5,18 +5,18 @@ import pytest
 from drivers.errors import ConfigError
 from drivers.sample import AXES
 from monitor.noise.effects import EFFECTS
-from monitor.simulator import effects_of
+from monitor.simulator import parse_effects
 
 
 def test_one_axis_or_all_of_a_kind() -> None:
     sinusoidal = EFFECTS["sinusoidal"](amplitude=1e-3, frequency=17.0)
-    assert effects_of("gz.sinusoidal:amplitude=1e-3,frequency=17") == [("gz", sinusoidal)]
-    assert effects_of(" gz.sinusoidal : frequency = 17 , amplitude = 1e-3 ") == [("gz", sinusoidal)]
-    assert effects_of("a*.sinusoidal:amplitude=1e-3,frequency=17") == [(axis, sinusoidal) for axis in AXES[3:]]
+    assert parse_effects("gz.sinusoidal:amplitude=1e-3,frequency=17") == [("gz", sinusoidal)]
+    assert parse_effects(" gz.sinusoidal : frequency = 17 , amplitude = 1e-3 ") == [("gz", sinusoidal)]
+    assert parse_effects("a*.sinusoidal:amplitude=1e-3,frequency=17") == [(axis, sinusoidal) for axis in AXES[3:]]
 
 
 def test_an_axis_as_a_parameter() -> None:
-    ((axis, effect),) = effects_of("gz.g_sensitivity:source=ax,coefficient=1e-4")
+    ((axis, effect),) = parse_effects("gz.g_sensitivity:source=ax,coefficient=1e-4")
     assert (axis, effect) == ("gz", EFFECTS["g_sensitivity"](source="ax", coefficient=1e-4))
 
 
@@ -44,7 +44,7 @@ def test_an_axis_as_a_parameter() -> None:
 )
 def test_what_is_wrong_is_one_line(text: str, words: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        effects_of(text)
+        parse_effects(text)
     line = str(caught.value)
     assert words in line
     assert "\n" not in line

@@ -4,21 +4,21 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import NO_TICK, Arrival, Counter, Given, SampleBlock, Timing, block
+from drivers.sample import NO_TICK, ArrivalTiming, CounterTiming, SampleBlock, SenderTiming, Timing, make_block
 from tests.experiments.fuzz.stamped import Stamped
 from tests.experiments.fuzz.tape import Tape
 from tests.experiments.fuzz.target import target
 
 TIMINGS: Final[tuple[Timing, ...]] = (
-    Arrival(),
-    Given(),
-    Counter(256, 1.0 / 2000.0),
-    Counter(1 << 16),
-    Counter(1 << 32, 1e-4),
-    Counter(1 << 62, 1e-9),
-    Counter((1 << 32) * 1_000_000, 1e-9),
-    Counter(1 << 32),
-    Counter(2),
+    ArrivalTiming(),
+    SenderTiming(),
+    CounterTiming(256, 1.0 / 2000.0),
+    CounterTiming(1 << 16),
+    CounterTiming(1 << 32, 1e-4),
+    CounterTiming(1 << 62, 1e-9),
+    CounterTiming((1 << 32) * 1_000_000, 1e-9),
+    CounterTiming(1 << 32),
+    CounterTiming(2),
 )
 RATES_HZ: Final = (None, 100.0, 1.0, 8000.0, 1e-3)
 STEPS: Final = (0, 1, 1_000, 1_000_000, 10_000_000, 10_000_000, 1_000_000_000, 3_600_000_000_000, -1, -1_000_000_000)
@@ -56,11 +56,11 @@ def clock(data: bytes) -> None:
             stamped.clock.pause()
             continue
         n = 1 + kind % 8
-        given = isinstance(timing, Given)
+        given = isinstance(timing, SenderTiming)
         times = _walk(tape, n if given else 1, t_ns, 0)
         t_ns = times[-1]
         ticks = [NO_TICK] * n
-        if isinstance(timing, Counter) and kind & 64 == 0:
+        if isinstance(timing, CounterTiming) and kind & 64 == 0:
             ticks = _walk(tape, n, tick, timing.modulus)
             tick = ticks[-1]
         stamped.put(_rows(times if given else times * n, ticks, i if kind & 128 == 0 else 0, kind // 16 % 4))
@@ -69,4 +69,4 @@ def clock(data: bytes) -> None:
 def _rows(times: list[int], ticks: list[int], number: int, lost: int) -> SampleBlock:
     values = np.zeros((len(times), 6))
     values[:, 0] = number + np.arange(len(times)) * (number > 0)
-    return block(np.array(times, np.int64), values, None, np.array(ticks, np.int64), lost)
+    return make_block(np.array(times, np.int64), values, None, np.array(ticks, np.int64), lost)

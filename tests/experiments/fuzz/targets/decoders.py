@@ -22,7 +22,7 @@ from drivers.decoders.base import Decoder
 from drivers.decoders.dbc import DbcDecoder
 from drivers.decoders.dbc import Settings as DbcSettings
 from drivers.decoders.dbc.database import Database
-from drivers.sample import AXES, EXTENDED_ID, NO_TICK, Chunk, Counter, SampleBlock, block
+from drivers.sample import AXES, EXTENDED_ID, NO_TICK, Chunk, CounterTiming, SampleBlock, make_block
 from drivers.zenoh.sample_message import COLUMNS, SCHEMA, SCHEMAS
 from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, EXAMPLES, NAMES, Example
 from tests.experiments.fuzz.checks import fed, seen
@@ -51,9 +51,9 @@ def samples_of(data: bytes, decoder: Decoder) -> SampleBlock:
     n = 1 + min(len(data) // 8, 7)
     table = np.frombuffer(data.ljust(8 * n, b"\0")[: 8 * n], np.int8).reshape(n, 8) / 16.0
     ticks = np.full(n, NO_TICK, np.int64)
-    if isinstance(decoder.timing, Counter):
+    if isinstance(decoder.timing, CounterTiming):
         ticks = (np.arange(n, dtype=np.int64) * 4 + (data[0] if data else 0)) % decoder.timing.modulus
-    return block(START_NS + np.arange(n, dtype=np.int64) * 10**7, table[:, :6].copy(), 20.0 + table[:, 6], ticks)
+    return make_block(START_NS + np.arange(n, dtype=np.int64) * 10**7, table[:, :6].copy(), 20.0 + table[:, 6], ticks)
 
 
 # --- streams

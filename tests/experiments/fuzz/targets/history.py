@@ -3,8 +3,8 @@
 import math
 
 from drivers.errors import ConfigError
-from monitor.history.query import question
-from monitor.history.time_ranges import length, moment, said, zenoh_span
+from monitor.history.query import parse_query
+from monitor.history.time_ranges import format_utc, parse_duration_s, parse_time, parse_zenoh_range
 from tests.experiments.fuzz.checks import one_line
 from tests.experiments.fuzz.target import target
 
@@ -36,14 +36,14 @@ WORDS = (
 def history_question(data: bytes) -> None:
     """A selector's parameters: a question, or a line; a question's own words ask the same."""
     try:
-        asked = question(data.decode("utf-8", "surrogateescape"), NOW_S)
+        asked = parse_query(data.decode("utf-8", "surrogateescape"), NOW_S)
     except ConfigError as error:
         one_line(error)
         return
     if asked.span is not None:
         assert not math.isnan(asked.span.start_s)
         assert asked.span.start_s <= asked.span.end_s
-    again = question(asked.parameters(), NOW_S)
+    again = parse_query(asked.parameters(), NOW_S)
     assert (again.step_s, again.what, again.axes, again.letters) == (
         asked.step_s,
         asked.what,
@@ -56,7 +56,7 @@ def history_question(data: bytes) -> None:
 def history_times(data: bytes) -> None:
     """A moment, a duration and a span: numbers, or a line."""
     text = data.decode("utf-8", "surrogateescape")
-    for read in (lambda word: moment(word, NOW_S), length, lambda word: zenoh_span(word, NOW_S)):
+    for read in (lambda word: parse_time(word, NOW_S), parse_duration_s, lambda word: parse_zenoh_range(word, NOW_S)):
         try:
             found = read(text)
         except ConfigError as error:
@@ -64,4 +64,4 @@ def history_times(data: bytes) -> None:
             continue
         if isinstance(found, float):
             assert abs(found) < math.inf
-            assert said(found)
+            assert format_utc(found)

@@ -11,15 +11,15 @@ import numpy as np
 from rich.console import Console
 
 from drivers.errors import ConfigError, DecodeError, ImuError
-from drivers.zenoh.sample_message import pack, unpack
+from drivers.zenoh.sample_message import decode_samples, encode_samples
 from monitor.cli import options
 from monitor.commands import thermal
 from monitor.common import topics
 from monitor.publishing.exporters import FORMATS, export, from_analysis
-from monitor.publishing.terminal.live_table import Board
-from monitor.publishing.zenoh.subscriber import ZenohIn
+from monitor.publishing.terminal.live_table import DeviceStates
+from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.settings import loading
-from monitor.simulator.scheduled_effects import effects_of
+from monitor.simulator.scheduled_effects import parse_effects
 from tests.experiments.fuzz.checks import one_line
 from tests.experiments.fuzz.tape import Tape
 from tests.experiments.fuzz.target import target
@@ -61,10 +61,10 @@ def _messages() -> Iterator[bytes]:
         yield bytes([i]) + payload[:-1] + b',"x":' + b"[" * 1200
 
 
-def _taken(data: bytes) -> Board:
-    board = Board(lambda: 1.0)
+def _taken(data: bytes) -> DeviceStates:
+    board = DeviceStates(lambda: 1.0)
     name = NAMES[data[0] % len(NAMES)] if data else "status"
-    board.take(f"imu/a/{name}", data[1:])
+    board.process_message(f"imu/a/{name}", data[1:])
     return board
 
 
@@ -95,20 +95,22 @@ class _Nowhere:
         """Nothing is kept."""
 
 
-@target("samples-message", lambda: [pack("a", 3, samples_of(bytes(range(24)), _Plain())), bytes(range(80))], 600)
+@target(
+    "samples-message", lambda: [encode_samples("a", 3, samples_of(bytes(range(24)), _Plain())), bytes(range(80))], 600
+)
 def samples_message(data: bytes) -> None:
     """A map of samples: what is read is packed and read again as the same."""
     if data[:1] < b"\x40":
         data = message_of(Tape(data))
     try:
-        batch = unpack(data)
+        batch = decode_samples(data)
     except DecodeError as error:
         one_line(error)
         return
     rows = batch.block
     assert (np.abs(rows.t_ns) < 1 << 62).all()
     if (np.diff(rows.t_ns) > 0).all():
-        again = unpack(pack(batch.device, batch.samples, rows)).block
+        again = decode_samples(encode_samples(batch.device, batch.samples, rows)).block
         assert np.array_equal(again.values, rows.values, equal_nan=True)
         assert np.abs(again.t_ns - rows.t_ns).max() <= 1100, "times that came back as others"
 
@@ -165,10 +167,10 @@ def thermal_model(data: bytes) -> None:
         one_line(error)
         return
     for model in models.values():
-        n = model.sizes.size
+        n = model.coefficients.size
         assert model.interval_s > 0.0
-        assert model.covariance.shape == (n + 2 * model.start.size,) * 2
-        assert np.isfinite(model.sizes).all()
+        assert model.covariance.shape == (n + 2 * model.initial_state.size,) * 2
+        assert np.isfinite(model.coefficients).all()
         assert np.isfinite(model.covariance).all()
 
 
@@ -188,7 +190,7 @@ def _text(data: bytes) -> str:
 def effects(data: bytes) -> None:
     """Effects as people write them."""
     try:
-        found = effects_of(_text(data))
+        found = parse_effects(_text(data))
     except ConfigError as error:
         one_line(error)
         return
@@ -242,6 +244,6 @@ def listening(data: bytes) -> None:
     """Key expression and endpoint of ``watch``; nothing is opened."""
     keyexpr, _, endpoint = _text(data).partition("\0")
     try:
-        ZenohIn(keyexpr, (endpoint,))
+        ZenohSubscriber(keyexpr, (endpoint,))
     except ConfigError as error:
         one_line(error)

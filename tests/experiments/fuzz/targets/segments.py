@@ -6,8 +6,17 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import RecordingError
-from drivers.recordings.segment import Origin, SegmentWriter, State, newest, origin, pack, read_chunks, read_samples
-from drivers.sample import AXES, Chunk, block
+from drivers.recordings.segment import (
+    DaemonState,
+    SegmentMetadata,
+    SegmentWriter,
+    compress_segment,
+    read_chunks,
+    read_last_piece,
+    read_metadata,
+    read_samples,
+)
+from drivers.sample import AXES, Chunk, make_block
 from tests.experiments.fuzz.checks import LARGEST_LOSS, one_line
 from tests.experiments.fuzz.target import target
 from tests.experiments.fuzz.targets.files import LARGEST_NS, folder, replayed
@@ -15,19 +24,19 @@ from tests.experiments.fuzz.targets.files import LARGEST_NS, folder, replayed
 NAME: Final = "00000001_2026-11-22T03-00-00Z.arrows"
 
 
-def _written(of: Origin, packed: bool) -> bytes:
+def _written(of: SegmentMetadata, packed: bool) -> bytes:
     path = folder() / f"seed-{NAME}"
     writer = SegmentWriter(path, of)
     for i in range(3):
         rng = np.random.default_rng(i)
-        rows = block(10**18 + np.arange(4) * 10**7, rng.normal(size=(4, 6)), np.full(4, 20.0), np.arange(4), i)
+        rows = make_block(10**18 + np.arange(4) * 10**7, rng.normal(size=(4, 6)), np.full(4, 20.0), np.arange(4), i)
         if of.kind == "samples":
-            writer.samples([rows], State(100.0, (1.7e9,) * 6, 5.0, (1e-4,) * 30, (True,) * 30))
+            writer.samples([rows], DaemonState(100.0, (1.7e9,) * 6, 5.0, (1e-4,) * 30, (True,) * 30))
         else:
             writer.chunks([Chunk(rng.bytes(9), 10**18 + i, i, b"beside"[:i])])
     writer.close()
     if packed:
-        list(pack(path))
+        list(compress_segment(path))
     data = path.read_bytes()
     path.unlink()
     return data
@@ -35,13 +44,13 @@ def _written(of: Origin, packed: bool) -> bytes:
 
 def _samples() -> Iterator[bytes]:
     for packed in (False, True):
-        data = _written(Origin("a", "samples", "gx,gy", "bytes", "stim300"), packed)
+        data = _written(SegmentMetadata("a", "samples", "gx,gy", "bytes", "stim300"), packed)
         yield from (data, data[: len(data) * 2 // 3])
 
 
 def _raw() -> Iterator[bytes]:
-    yield _written(Origin("a", "raw", "", "bytes", "stim300"), False)
-    yield _written(Origin("a", "raw", "", "messages", "samples"), True)
+    yield _written(SegmentMetadata("a", "raw", "", "bytes", "stim300"), False)
+    yield _written(SegmentMetadata("a", "raw", "", "messages", "samples"), True)
 
 
 WORDS: Final = (
@@ -65,11 +74,11 @@ def segment(data: bytes) -> None:
     path = folder() / NAME
     path.write_bytes(data)
     try:
-        origin(path)
+        read_metadata(path)
         pieces = [*read_samples(path)]
-        last = newest(path)
+        last = read_last_piece(path)
         assert last is None or pieces
-        for _ in pack(path):
+        for _ in compress_segment(path):
             pass
     except RecordingError as error:
         one_line(error)

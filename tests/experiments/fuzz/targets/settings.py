@@ -293,8 +293,10 @@ def model(data: bytes) -> None:
         one_line(error)
         return
     possible([value for _, effect in found for value in (getattr(effect, f.name) for f in fields(effect))])
-    model_file.table(found)
-    assert model_file.write(NoiseModel.from_toml(model_file.write(found))) == model_file.write(found)
+    model_file.format_table(found)
+    assert model_file.format_model(NoiseModel.from_toml(model_file.format_model(found))) == model_file.format_model(
+        found
+    )
 
 
 # --- CAN databases

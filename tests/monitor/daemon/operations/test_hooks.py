@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from drivers.sample import Event
-from monitor.daemon.operations.hooks import AT_ONCE, BURST, EVERY_S, WAITING, Hooks
+from monitor.daemon.operations.hooks import BURST, MAX_QUEUED, RUN_INTERVAL_S, THREADS, Hooks
 from monitor.settings.loading import Hook
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
@@ -146,7 +146,7 @@ def test_a_flood_is_held_back_and_does_not_drown_what_is_rare() -> None:
         assert len(running.sent) == BURST + 1
         assert json.loads(running.sent[-1][1])["kind"] == "limit_crossed"
         assert running.hooks.state == f"ok, but {1000 - BURST} held back, too many at once"
-        running.now_s = 2.5 * EVERY_S
+        running.now_s = 2.5 * RUN_INTERVAL_S
         for _ in range(10):
             running.happen(Event("samples_lost", 0, "1 sample missing"))
         assert len(running.sent) == BURST + 1 + 2
@@ -157,7 +157,7 @@ def test_no_more_run_or_wait_than_there_is_room_for(tmp_path: Path) -> None:
     marks.mkdir()
     text = f"open(os.path.join({str(marks)!r}, str(os.getpid())), 'w')\ntime.sleep({FOREVER_S})"
     with Running(hook(program(tmp_path, text), timeout_s=FOREVER_S)) as running:
-        for i in range(WAITING + AT_ONCE + 50):
+        for i in range(MAX_QUEUED + THREADS + 50):
             running.happen(device=f"d{i}")  # returns at once, although no command ends
-        wait_for(lambda: len(os.listdir(marks)) == AT_ONCE)
+        wait_for(lambda: len(os.listdir(marks)) == THREADS)
         assert "held back" in running.hooks.state

@@ -9,9 +9,9 @@ import pytest
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Event
-from monitor.daemon.operations.limits import Limits, bounds
+from monitor.daemon.operations.limits import LimitMonitor, make_bounds
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import LETTERS, Coefficients, Status
+from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
 from monitor.noise.model import NoiseModel
 from monitor.publishing.messages import encoding
 from monitor.settings.loading import Limit
@@ -26,7 +26,7 @@ def look(
     at_s: float, value: float, error: float = 1e-6, status: Status = Status.ESTIMATED, letter: str = "N"
 ) -> Estimate:
     """What the window says of one letter of gz at a time; ``error`` is half the interval."""
-    row, column = LETTERS.index(letter), AXES.index("gz")
+    row, column = SYMBOLS.index(letter), AXES.index("gz")
     table = Coefficients(*(np.full((5, 6), np.nan) for _ in range(3)), np.zeros((5, 6), np.int8))
     table.status[row, column] = status
     if status != Status.UNESTIMATED:
@@ -37,39 +37,39 @@ def look(
     return replace(made(), t_ns=round(at_s * 1e9), rate_hz=RATE_HZ, samples=samples, coefficients=table)
 
 
-def told(limits: Limits, course: list[tuple[float, float]], **more: object) -> list[tuple[float, Event]]:
+def told(limits: LimitMonitor, course: list[tuple[float, float]], **more: object) -> list[tuple[float, Event]]:
     """Events and when they came, of (time, value)."""
     return [(at_s, e) for at_s, value in course for e in limits.update(look(at_s, value, **more))]  # type: ignore[arg-type]
 
 
 def test_a_limit_is_crossed_once_and_back_once() -> None:
-    limits = Limits([N_ABOVE], None)
+    limits = LimitMonitor([N_ABOVE], None)
     course = [(t, 1.5e-4 if t < 100 or t > 300 else 2.5e-4) for t in np.arange(0.0, 500.0, 0.5).tolist()]
     (up_s, up), (down_s, down) = told(limits, course)
     assert (up.kind, up_s, up.since_ns) == ("limit_crossed", 160.0, 100_000_000_000)
     assert (down.kind, down_s, down.since_ns) == ("limit_back", 360.5, 300_500_000_000)
     assert up.axis == "gz"
-    assert up.what["N"]["limit"] == 2e-4
-    assert up.what["N"]["value"] == 2.5e-4
+    assert up.values["N"]["limit"] == 2e-4
+    assert up.values["N"]["value"] == 2.5e-4
     assert up.sigma == pytest.approx(0.5e-4 / (1e-6 / 1.96), rel=1e-3)
     assert up.text == "gz angle random walk 0.859 °/√h is above 0.688 °/√h, its upper limit"
     assert down.text == "gz angle random walk 0.516 °/√h is no longer above 0.688 °/√h, its upper limit"
 
 
 def test_a_value_whose_interval_reaches_under_the_limit_has_not_crossed_it() -> None:
-    limits = Limits([N_ABOVE], None)
+    limits = LimitMonitor([N_ABOVE], None)
     assert told(limits, [(float(t), 2.5e-4) for t in range(600)], error=0.6e-4) == []
     assert limits.crossed == ()
 
 
 def test_one_look_under_the_limit_begins_the_time_anew() -> None:
-    limits = Limits([N_ABOVE], None)
+    limits = LimitMonitor([N_ABOVE], None)
     course = [(float(t), 1.9e-4 if t == 50 else 2.5e-4) for t in range(200)]
     assert [at_s for at_s, _ in told(limits, course)] == [111.0]
 
 
 def test_a_look_without_an_answer_shows_nothing_either_way() -> None:
-    limits = Limits([N_ABOVE], None)
+    limits = LimitMonitor([N_ABOVE], None)
     assert told(limits, [(float(t), 2.5e-4) for t in range(59)]) == []
     assert limits.update(look(59.0, 0.0, status=Status.UNESTIMATED)) == []
     assert [at_s for at_s, _ in told(limits, [(60.0 + t, 2.5e-4) for t in range(100)])] == [120.0]
@@ -80,7 +80,7 @@ def test_a_look_without_an_answer_shows_nothing_either_way() -> None:
 
 def test_what_is_missing_proves_nothing() -> None:
     """An hour without samples is no hour of noise: time is counted in samples."""
-    limits = Limits([N_ABOVE], None)
+    limits = LimitMonitor([N_ABOVE], None)
     assert limits.update(look(0.0, 2.5e-4)) == []
     later = replace(look(0.5, 2.5e-4), t_ns=3_600_000_000_000)
     assert limits.update(later) == []
@@ -88,20 +88,20 @@ def test_what_is_missing_proves_nothing() -> None:
 
 
 def test_an_upper_bound_counts_under_a_lower_limit_and_never_above_an_upper_one() -> None:
-    both = Limits([N_ABOVE, N_BELOW], None)
+    both = LimitMonitor([N_ABOVE, N_BELOW], None)
     bound = [event for t in range(100) for event in both.update(look(float(t), 0.4e-4, 0.1e-4, Status.UPPER_BOUND))]
     assert [(event.kind, event.sigma) for event in bound] == [("limit_crossed", None)]
-    assert bound[0].what["N"]["limit"] == 1e-4
+    assert bound[0].values["N"]["limit"] == 1e-4
     assert bound[0].text == "gz angle random walk at most 0.172 °/√h is below 0.344 °/√h, its lower limit"
     assert json.loads(encoding.event("d", 0.0, 1, bound[0], None))["what"]["N"]["value"] is None
     back = told(both, [(100.0 + t, 1.5e-4) for t in range(100)])
     assert [event.kind for _, event in back] == ["limit_back"]
-    high = Limits([N_ABOVE], None)
+    high = LimitMonitor([N_ABOVE], None)
     assert [e for t in range(100) for e in high.update(look(float(t), 9e-4, 1e-4, Status.UPPER_BOUND))] == []
 
 
 def test_an_upper_bound_is_back_only_when_it_is_under_the_limit_itself() -> None:
-    limits = Limits([N_ABOVE], None)
+    limits = LimitMonitor([N_ABOVE], None)
     told(limits, [(float(t), 2.5e-4) for t in range(61)])
     assert limits.crossed == ("gz N",)
     loose = [e for t in range(61, 200) for e in limits.update(look(float(t), 2.5e-4, 1e-5, Status.UPPER_BOUND))]
@@ -113,22 +113,22 @@ def test_an_upper_bound_is_back_only_when_it_is_under_the_limit_itself() -> None
 def test_a_limit_relative_to_the_model_is_that_many_times_its_size() -> None:
     model = NoiseModel.from_toml('sample_rate = 100.0\n["g*".angle_random_walk]\nN = 1.0e-4')
     relative = Limit(("gx", "gz"), "N", None, None, 1.5, 1.0)
-    assert [(b.axis, b.limit, b.upper) for b in bounds([relative], model)] == [
+    assert [(b.axis, b.limit, b.upper) for b in make_bounds([relative], model)] == [
         ("gx", pytest.approx(1.5e-4), True),
         ("gz", pytest.approx(1.5e-4), True),
     ]
-    ((_, event),) = told(Limits([relative], model), [(float(t), 1.6e-4) for t in range(2)])
+    ((_, event),) = told(LimitMonitor([relative], model), [(float(t), 1.6e-4) for t in range(2)])
     assert event.text.endswith("its upper limit (1.5 times its model)")
     with pytest.raises(ConfigError, match=r"limit of K: times_model = 2, but the model in force has no K on gz"):
-        Limits([Limit(("gz",), "K", None, None, 2.0, 1.0)], model)
+        LimitMonitor([Limit(("gz",), "K", None, None, 2.0, 1.0)], model)
     with pytest.raises(ConfigError, match="no N on ax"):
-        Limits([Limit(AXES, "N", None, None, 2.0, 1.0)], model)
+        LimitMonitor([Limit(AXES, "N", None, None, 2.0, 1.0)], model)
 
 
 def test_new_limits_go_on_where_the_old_ones_were() -> None:
-    old = Limits([N_ABOVE], None)
+    old = LimitMonitor([N_ABOVE], None)
     told(old, [(float(t), 2.5e-4) for t in range(61)])
-    same, other = Limits([N_ABOVE, N_BELOW], None), Limits([N_BELOW], None)
+    same, other = LimitMonitor([N_ABOVE, N_BELOW], None), LimitMonitor([N_BELOW], None)
     same.take_over(old)
     other.take_over(old)
     assert (same.crossed, other.crossed) == (("gz N",), ())

@@ -13,8 +13,8 @@ import pytest
 
 import imu_monitor
 from drivers.recordings import load_samples
-from drivers.sample import block
-from monitor.daemon.operations.live_reconcile import NICE, PROGRAM, Job, Reconciler, said
+from drivers.sample import make_block
+from monitor.daemon.operations.live_reconcile import NICENESS_INCREASE, PROGRAM, Job, Reconciler, format_result
 from monitor.estimation.estimator import Estimator
 from monitor.publishing.zenoh.publisher import Command
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
@@ -57,9 +57,9 @@ class Asked:
 
 def job(device: str = "bench-1", model: Path | None = None, folder: Path | None = None, warm: bool = True) -> Job:
     estimator = Estimator(100.0, N / 100.0)
-    estimator.update(block(np.arange(N) * 10_000_000, VALUES.copy()))
+    estimator.update(make_block(np.arange(N) * 10_000_000, VALUES.copy()))
     temperature_c = WARM if warm else np.full(N, np.nan)
-    return Job(device, 1_763_700_000.0, 360_000, estimator.held(), temperature_c, model, folder)
+    return Job(device, 1_763_700_000.0, 360_000, estimator.copy_window(), temperature_c, model, folder)
 
 
 def program(text: str) -> tuple[str, ...]:
@@ -105,7 +105,7 @@ def test_the_program_is_given_the_window_as_a_recording(tmp_path: Path) -> None:
     asked, told = run(text, job(model=model))
     (answer,) = asked.answers
     assert answer["given"] | {"--out": ""} == {"--out": "", "--json": "-", "--seed": "1", "--model": str(model)}
-    assert answer["nice"] == min(os.nice(0) + NICE, LARGEST_NICENESS)
+    assert answer["nice"] == min(os.nice(0) + NICENESS_INCREASE, LARGEST_NICENESS)
     assert told == ["reconcile: agrees"]
     recording = load_samples(kept)
     assert recording.rate_hz == 100.0
@@ -233,7 +233,7 @@ def test_the_program_is_this_one() -> None:
 
 def test_a_verdict_without_steps_and_a_step_without_confidence() -> None:
     step = {"kind": "retuned", "effect": "angle_random_walk", "confidence": None}
-    assert said({"verdict": "explained", "axes": {"gz": {"steps": [step]}}}) == (
+    assert format_result({"verdict": "explained", "axes": {"gz": {"steps": [step]}}}) == (
         "reconcile: explained: gz angle_random_walk retuned"
     )
-    assert said({"verdict": "unexplained", "axes": {"gz": {"steps": []}}}) == "reconcile: unexplained"
+    assert format_result({"verdict": "unexplained", "axes": {"gz": {"steps": []}}}) == "reconcile: unexplained"

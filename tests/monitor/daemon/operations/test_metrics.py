@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from drivers.sample import AXES, Event
-from monitor.daemon.operations.metrics import AT_ONCE, MISSING, MetricsOutput
-from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.daemon.operations.metrics import MAX_SCRAPES, MISSING_LIBRARY_TEXT, MetricsOutput
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.settings.loading import Metrics
 from tests.monitor.publishing import made
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -75,7 +75,7 @@ def test_every_number_is_the_newest_one_in_si() -> None:
     assert at(numbers, "events_total", device="a", kind="link_lost") == 3.0
     table = estimate.coefficients
     statuses = set()
-    for row, letter in enumerate(LETTERS):
+    for row, letter in enumerate(SYMBOLS):
         for column, axis in enumerate(AXES):
             labels = {"device": "a", "axis": axis, "letter": letter}
             key = tuple(sorted(labels.items()))
@@ -94,7 +94,7 @@ def test_a_device_that_is_gone_has_no_numbers() -> None:
             output.health(name, 0.0, made.health())
             output.estimate(name, 0.0, made.estimate())
             output.event(name, 0.0, 1, Event("moved", 0, ""))
-        output.gone("a")
+        output.device_removed("a")
         devices = {dict(labels).get("device") for _, labels in scrape(output.port)}
     assert devices == {"b", None}
 
@@ -130,7 +130,7 @@ def test_those_who_connect_and_say_nothing_keep_nobody_out_for_long(monkeypatch:
     monkeypatch.setattr("monitor.daemon.operations.metrics._Scrape.timeout", 1.0)
     with serving() as output:
         wait_for(lambda: output.state == "ok")
-        mute = [socket.create_connection(("127.0.0.1", output.port)) for _ in range(3 * AT_ONCE)]
+        mute = [socket.create_connection(("127.0.0.1", output.port)) for _ in range(3 * MAX_SCRAPES)]
         try:
             wait_for(lambda: answers(output.port))
         finally:
@@ -158,4 +158,4 @@ def test_it_listens_on_the_address_that_was_said() -> None:
 def test_without_the_library_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "prometheus_client", None)
     with serving() as output:
-        wait_for(lambda: output.state == MISSING)
+        wait_for(lambda: output.state == MISSING_LIBRARY_TEXT)

@@ -14,7 +14,7 @@ from drivers.errors import LinkLost
 from drivers.links.base import Carrier
 from drivers.sample import Chunk
 from monitor.common.config_files import CONFIG_FOLDER
-from monitor.daemon.operations.systemd import Unit
+from monitor.daemon.operations.systemd import SystemdNotifier
 from monitor.daemon.service import Service
 from monitor.settings import loading
 from tests.support.ports import free_endpoint
@@ -58,7 +58,7 @@ def address(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 def test_what_is_said_arrives_by_a_path_and_by_an_abstract_name(address: str) -> None:
     with Listening(address) as systemd:
-        unit = Unit(address, 9.0)
+        unit = SystemdNotifier(address, 9.0)
         begun_s = time.monotonic() - 1e-6  # the stamp is cut to microseconds
         unit.status("1 device;\nall well")
         unit.status("1 device; all well")
@@ -78,29 +78,31 @@ def test_what_is_said_arrives_by_a_path_and_by_an_abstract_name(address: str) ->
 
 def test_signs_of_life_come_three_in_the_time_allowed_and_end_with_a_stuck_reader(tmp_path: Path) -> None:
     with Listening(str(tmp_path / "notify")) as systemd:
-        unit = Unit(str(tmp_path / "notify"), 60.0)
+        unit = SystemdNotifier(str(tmp_path / "notify"), 60.0)
         for second in range(100):
-            assert unit.alive({"a": second, "b": second // 10}, float(second)) == []
+            assert unit.send_watchdog({"a": second, "b": second // 10}, float(second)) == []
         assert systemd.count("WATCHDOG=1") == 5
-        stuck_at = [second for second in range(100, 200) if unit.alive({"a": second, "b": 9}, float(second))]
+        stuck_at = [second for second in range(100, 200) if unit.send_watchdog({"a": second, "b": 9}, float(second))]
         assert systemd.count("WATCHDOG=1") == 7  # the last at 120 s: b has stood still since 90 s
         assert stuck_at == list(range(121, 200))
-        assert unit.alive({"a": 200}, 200.0) == []  # b was taken out
+        assert unit.send_watchdog({"a": 200}, 200.0) == []  # b was taken out
         assert systemd.count("WATCHDOG=1") == 8
 
 
 def test_nobody_to_tell_is_no_trouble(tmp_path: Path) -> None:
     for address in ("", str(tmp_path / "none"), "vsock:2:9999"):
-        unit = Unit.of({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "1000000"})
+        unit = SystemdNotifier.from_environment({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "1000000"})
         unit.ready()
-        assert unit.alive({"a": 1}, 1.0) == []
-    assert not Unit.of({"WATCHDOG_USEC": "1000000"}).watched
-    assert not Unit.of({"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "1"}).watched
+        assert unit.send_watchdog({"a": 1}, 1.0) == []
+    assert not SystemdNotifier.from_environment({"WATCHDOG_USEC": "1000000"}).watched
+    assert not SystemdNotifier.from_environment(
+        {"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "1"}
+    ).watched
 
 
 def test_a_socket_that_nobody_reads_holds_nothing_up(tmp_path: Path) -> None:
     with Listening(str(tmp_path / "notify")):
-        unit = Unit(str(tmp_path / "notify"))
+        unit = SystemdNotifier(str(tmp_path / "notify"))
         for i in range(10_000):
             unit.status(str(i))
 
@@ -140,10 +142,11 @@ def test_a_frozen_reader_ends_the_signs_of_life_and_nothing_else(tmp_path: Path)
     )
     with Listening(str(tmp_path / "notify")) as systemd:
         service = Service(
-            loading.load(tmp_path / "c.toml"), unit=Unit(str(tmp_path / "notify"), watchdog_s=1.5, stuck_s=3.0)
+            loading.load(tmp_path / "c.toml"),
+            unit=SystemdNotifier(str(tmp_path / "notify"), watchdog_s=1.5, stuck_s=3.0),
         )
         link = Freezing()
-        service.stations[1].driver.link = link
+        service.workers[1].driver.link = link
         thread = threading.Thread(target=service.run)
         thread.start()
         try:
@@ -153,8 +156,8 @@ def test_a_frozen_reader_ends_the_signs_of_life_and_nothing_else(tmp_path: Path)
             link.frozen.set()
             wait_for(lambda: any("frozen: its reader is stuck" in line for line in systemd.lines()))
             signs = systemd.count("WATCHDOG=1")
-            received = service.stations[0].driver.counts.received
-            wait_for(lambda: service.stations[0].driver.counts.received > received + 200)
+            received = service.workers[0].driver.counts.received
+            wait_for(lambda: service.workers[0].driver.counts.received > received + 200)
             assert systemd.count("WATCHDOG=1") == signs
         finally:
             service.stop()

@@ -17,10 +17,10 @@ from drivers.decoders import text
 from drivers.driver import AxisMap
 from drivers.links.loopback_link import LoopbackLink
 from drivers.recordings import load_samples, segment
-from drivers.recordings.segment import Origin, SegmentWriter, State
-from drivers.sample import Chunk, SampleBlock, block, join
-from monitor.daemon.device_worker import Station
-from monitor.daemon.pipeline import Ready
+from drivers.recordings.segment import DaemonState, SegmentMetadata, SegmentWriter
+from drivers.sample import Chunk, SampleBlock, concatenate_blocks, make_block
+from monitor.daemon.device_worker import DeviceWorker
+from monitor.daemon.pipeline import KernelReadiness
 from monitor.daemon.storage import recorder as room
 from monitor.daemon.storage.recorder import Recorder, origin
 from monitor.settings.loading import Device, Storage
@@ -30,17 +30,17 @@ pytest.importorskip("pyarrow", reason="recording needs the extra arrow")
 
 START_NS = 1_700_000_000_000_000_000
 RATE = 100.0
-SAMPLES = Origin("bench", "samples")
+SAMPLES = SegmentMetadata("bench", "samples")
 
 
 def rows(first: int, n: int, lost: int = 0, start_ns: int = START_NS) -> SampleBlock:
     index = np.arange(first, first + n)
     values = np.random.default_rng(first).standard_normal((n, 6)) * 1e-3
-    return block(start_ns + index * 10_000_000, values, 20.0 + index * 1e-4, index.astype(np.int64), lost)
+    return make_block(start_ns + index * 10_000_000, values, 20.0 + index * 1e-4, index.astype(np.int64), lost)
 
 
-def written(folder: Path) -> list[segment.Piece]:
-    return [piece for path in segment.segments(folder) for piece in segment.read_samples(path)]
+def written(folder: Path) -> list[segment.SegmentPiece]:
+    return [piece for path in segment.list_segments(folder) for piece in segment.read_samples(path)]
 
 
 def all_written(keeper: Recorder) -> None:
@@ -50,14 +50,14 @@ def all_written(keeper: Recorder) -> None:
 
 @pytest.fixture(autouse=True)
 def _brisk(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room, "WRITE_S", 0.02)
+    monkeypatch.setattr(room, "WRITE_INTERVAL_S", 0.02)
     monkeypatch.setattr(room, "RETRY_S", 0.1)
-    monkeypatch.setattr(room, "TIDY_S", 0.05)
+    monkeypatch.setattr(room, "DELETE_INTERVAL_S", 0.05)
 
 
 def test_every_value_counter_and_hole_comes_back(tmp_path: Path) -> None:
     keeper = Recorder(Storage(tmp_path, segment_s=3.0), [SAMPLES])
-    keeper.know("bench", State(RATE, (None, None, 5.0, None, None, None), 1.0))
+    keeper.set_state("bench", DaemonState(RATE, (None, None, 5.0, None, None, None), 1.0))
     keeper.start()
     given = [rows(0, 150), rows(160, 150, lost=10), rows(310, 1), rows(311, 700)]
     for one in given:
@@ -65,14 +65,14 @@ def test_every_value_counter_and_hole_comes_back(tmp_path: Path) -> None:
         all_written(keeper)  # as a batch of its own
     keeper.close(PATIENCE_S)
     back = written(tmp_path / "bench")
-    got, expected = join([piece.samples for piece in back]), join(given)
+    got, expected = concatenate_blocks([piece.samples for piece in back]), concatenate_blocks(given)
     np.testing.assert_array_equal(got.values, expected.values)
     np.testing.assert_array_equal(got.ticks, expected.ticks)
     np.testing.assert_array_equal(got.temperature_c, expected.temperature_c)
     assert np.abs(got.t_ns - expected.t_ns).max() <= 240
     assert [piece.samples.lost for piece in back if piece.samples.lost] == [10]
-    assert back[-1].state == State(RATE, (None, None, 5.0, None, None, None), 1.0)
-    assert len(segment.segments(tmp_path / "bench")) > 1
+    assert back[-1].state == DaemonState(RATE, (None, None, 5.0, None, None, None), 1.0)
+    assert len(segment.list_segments(tmp_path / "bench")) > 1
     whole = load_samples(tmp_path / "bench")
     np.testing.assert_array_equal(whole.values, expected.values)
     assert not any("left aside" in note for note in whole.notes)
@@ -85,28 +85,29 @@ def test_segments_that_have_ended_are_packed_and_say_the_same(tmp_path: Path) ->
     for one in given:
         keeper.samples("bench", one, 0)
         all_written(keeper)
-    packed = lambda: [segment.origin(path).packed for path in segment.segments(tmp_path / "bench")]  # noqa: E731
+    packed = lambda: [segment.read_metadata(path).packed for path in segment.list_segments(tmp_path / "bench")]  # noqa: E731
     wait_for(lambda: len(packed()) >= 3 and all(packed()[:-1]))
     keeper.close(PATIENCE_S)
     np.testing.assert_array_equal(
-        join([piece.samples for piece in written(tmp_path / "bench")]).values, join(given).values
+        concatenate_blocks([piece.samples for piece in written(tmp_path / "bench")]).values,
+        concatenate_blocks(given).values,
     )
     assert not list(tmp_path.rglob("*.part"))
 
 
 def test_raw_bytes_come_back_as_chunks(tmp_path: Path) -> None:
-    of = Origin("bench", "raw", carrier="bytes", decoder="text")
+    of = SegmentMetadata("bench", "raw", carrier="bytes", decoder="text")
     keeper = Recorder(Storage(tmp_path), [of])
     keeper.start()
     given = [Chunk(bytes([i] * (i + 1)), 1000 + i, address=i, attachment=b"a" * (i % 3)) for i in range(50)]
     keeper.chunks("bench", given, offset_ns=START_NS)
     keeper.close(PATIENCE_S)
-    (path,) = segment.segments(tmp_path / "bench" / "raw")
+    (path,) = segment.list_segments(tmp_path / "bench" / "raw")
     back = list(segment.read_chunks(path))
     assert [(one.data, one.t_ns - START_NS, one.address, one.attachment) for one in back] == [
         (one.data, one.t_ns, one.address, one.attachment) for one in given
     ]
-    assert segment.origin(path).carrier == "bytes"
+    assert segment.read_metadata(path).carrier == "bytes"
 
 
 @pytest.mark.parametrize("cut", [1, 7, 200, 1999, 2600])
@@ -114,42 +115,44 @@ def test_a_segment_that_was_cut_is_read_up_to_the_cut(tmp_path: Path, cut: int) 
     path = tmp_path / segment.segment_name(1, 1.7e9)
     writer = SegmentWriter(path, SAMPLES)
     for first in range(0, 100, 10):
-        writer.samples([rows(first, 10)], State())
+        writer.samples([rows(first, 10)], DaemonState())
     writer.close()
     data = path.read_bytes()
     path.write_bytes(data[:-cut])
-    back = join([piece.samples for piece in segment.read_samples(path)])
+    back = concatenate_blocks([piece.samples for piece in segment.read_samples(path)])
     assert len(back) % 10 == 0
     assert len(back) >= 60
     np.testing.assert_array_equal(back.values, rows_of(len(back)))
-    newest = segment.newest(path)
+    newest = segment.read_last_piece(path)
     assert newest is not None
     assert newest.samples.ticks[-1] == len(back) - 1
-    list(segment.pack(path))
-    np.testing.assert_array_equal(join([piece.samples for piece in segment.read_samples(path)]).values, back.values)
+    list(segment.compress_segment(path))
+    np.testing.assert_array_equal(
+        concatenate_blocks([piece.samples for piece in segment.read_samples(path)]).values, back.values
+    )
 
 
-@pytest.mark.parametrize("read", [segment.read_samples, segment.newest])
+@pytest.mark.parametrize("read", [segment.read_samples, segment.read_last_piece])
 def test_a_segment_that_is_packed_while_it_is_opened_is_read_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[Path], object]
 ) -> None:
     path = tmp_path / segment.segment_name(1, 1.7e9)
     writer = SegmentWriter(path, SAMPLES)
     for first in range(0, 100, 10):
-        writer.samples([rows(first, 10)], State())
+        writer.samples([rows(first, 10)], DaemonState())
     writer.close()
     opened = segment.open_regular
 
     def open_then_pack(name: Path) -> IO[bytes]:
         file = opened(name)
         monkeypatch.setattr(segment, "open_regular", opened)
-        list(segment.pack(path))
+        list(segment.compress_segment(path))
         return file
 
     monkeypatch.setattr(segment, "open_regular", open_then_pack)
     found = read(path)
-    pieces = [found] if isinstance(found, segment.Piece) else list(found)  # type: ignore[call-overload]
-    assert segment.origin(path).packed
+    pieces = [found] if isinstance(found, segment.SegmentPiece) else list(found)  # type: ignore[call-overload]
+    assert segment.read_metadata(path).packed
     assert pieces[-1].samples.ticks[-1] == 99
 
 
@@ -200,14 +203,16 @@ def test_a_disk_that_fails_stops_the_recording_with_an_event_until_it_can_go_on(
     disk.why = None
     wait_for(lambda: keeper.state == "ok")
     keeper.close(PATIENCE_S)
-    told = keeper.take()
+    told = keeper.take_events()
     assert [one.kind for one in told] == ["recording_stopped", "recording_back"]
     # what came meanwhile had room in memory
-    np.testing.assert_array_equal(join([piece.samples for piece in written(tmp_path / "bench")]).ticks, np.arange(300))
+    np.testing.assert_array_equal(
+        concatenate_blocks([piece.samples for piece in written(tmp_path / "bench")]).ticks, np.arange(300)
+    )
 
 
 def test_what_a_slow_disk_cannot_take_is_a_hole_that_is_counted(tmp_path, disk, monkeypatch) -> None:
-    monkeypatch.setattr(room, "QUEUE_BYTES", 500 * room.SAMPLE_BYTES)
+    monkeypatch.setattr(room, "MAX_QUEUE_BYTES", 500 * room.SAMPLE_BYTES)
     keeper = Recorder(Storage(tmp_path), [SAMPLES], Broken)
     keeper.start()
     for first in range(0, 20_000, 2000):
@@ -218,7 +223,7 @@ def test_what_a_slow_disk_cannot_take_is_a_hole_that_is_counted(tmp_path, disk, 
         all_written(keeper)
     keeper.close(PATIENCE_S)
     back = written(tmp_path / "bench")
-    got = join([piece.samples for piece in back])
+    got = concatenate_blocks([piece.samples for piece in back])
     assert keeper.missed > 0
     assert keeper.missed == 20_000 - len(got)
     assert str(keeper.missed) in keeper.state
@@ -238,7 +243,7 @@ def test_old_segments_go_when_both_their_names_and_their_number_say_so(tmp_path:
         (folder / name).write_bytes(b"x")
     (folder / "notes.txt").write_text("mine")
     room.retention.delete_old([folder], keep_s=350.0, segment_s=100.0)
-    assert [path.name for path in segment.segments(folder)] == names[5:]
+    assert [path.name for path in segment.list_segments(folder)] == names[5:]
     assert (folder / "notes.txt").exists()
 
 
@@ -250,7 +255,7 @@ def test_neither_a_clock_set_wrong_nor_many_restarts_delete_what_is_new(tmp_path
     for i, unix_s in enumerate(began):
         (folder / segment.segment_name(i, unix_s)).write_bytes(b"x")
     room.retention.delete_old([folder], keep_s=2000.0 if step_s > 1.0 else 350.0, segment_s=100.0)
-    assert len(segment.segments(folder)) == 10
+    assert len(segment.list_segments(folder)) == 10
 
 
 def test_the_oldest_of_all_devices_go_while_the_disk_is_too_full(tmp_path: Path, monkeypatch) -> None:
@@ -259,38 +264,38 @@ def test_the_oldest_of_all_devices_go_while_the_disk_is_too_full(tmp_path: Path,
         folder.mkdir()
         for i in range(5):
             (folder / segment.segment_name(i, 1.7e9 + 100.0 * i + at)).write_bytes(b"x")
-    left = lambda: [len(segment.segments(folder)) for folder in folders]  # noqa: E731
-    monkeypatch.setattr(room.retention, "taken_share", lambda _: 0.1 * sum(left()))
-    assert room.retention.make_room(tmp_path, folders, share=0.75) == ""
+    left = lambda: [len(segment.list_segments(folder)) for folder in folders]  # noqa: E731
+    monkeypatch.setattr(room.retention, "used_disk_share", lambda _: 0.1 * sum(left()))
+    assert room.retention.delete_until_free(tmp_path, folders, share=0.75) == ""
     assert left() == [3, 4]
-    assert "no older segment is left" in room.retention.make_room(tmp_path, folders, share=0.2)
+    assert "no older segment is left" in room.retention.delete_until_free(tmp_path, folders, share=0.2)
     assert left() == [2, 2]
 
 
 def test_a_disk_that_others_have_filled_stops_the_recording(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(room.retention, "taken_share", lambda _: 0.95)
+    monkeypatch.setattr(room.retention, "used_disk_share", lambda _: 0.95)
     keeper = Recorder(Storage(tmp_path), [SAMPLES])
     keeper.start()
     keeper.samples("bench", rows(0, 10), 0)
     wait_for(lambda: "95 % full" in keeper.state)
     keeper.samples("bench", rows(10, 10), 0)  # waits until there is room
-    monkeypatch.setattr(room.retention, "taken_share", lambda _: 0.5)
+    monkeypatch.setattr(room.retention, "used_disk_share", lambda _: 0.5)
     wait_for(lambda: keeper.state == "ok")
     keeper.close(PATIENCE_S)
-    assert len(join([piece.samples for piece in written(tmp_path / "bench")])) == 20
+    assert len(concatenate_blocks([piece.samples for piece in written(tmp_path / "bench")])) == 20
 
 
 # --- going on after a restart
 
 
-def station(folder: Path, keeper: Recorder, window_s: float = 30.0, axes: AxisMap | None = None) -> Station:
+def station(folder: Path, keeper: Recorder, window_s: float = 30.0, axes: AxisMap | None = None) -> DeviceWorker:
     decoder = text.build(text.Settings(columns=("counter", "gx", "gy", "gz", "ax", "ay", "az")))
-    ready = Ready()
+    ready = KernelReadiness()
     for kernels in (ready.window, ready.fit, ready.all):
         kernels.set()
     link = LoopbackLink()
     device = Device("bench", RATE, window_s, "octave", 0.1, 0.1, link, decoder, axes or AxisMap(), 0.0)
-    return Station(device, link, decoder, threading.Event(), ready, keeper)
+    return DeviceWorker(device, link, decoder, threading.Event(), ready, keeper)
 
 
 def now_rows(first: int, n: int, wall_ns: int) -> SampleBlock:
@@ -298,7 +303,7 @@ def now_rows(first: int, n: int, wall_ns: int) -> SampleBlock:
     return rows(first, n, start_ns=wall_ns - (first + n) * 10_000_000)
 
 
-def lived(tmp_path: Path, tick_step: float | None = 1.0) -> Station:
+def lived(tmp_path: Path, tick_step: float | None = 1.0) -> DeviceWorker:
     """A station that has taken 60 s, recorded them, and died without a word."""
     keeper = Recorder(Storage(tmp_path), [origin("bench", AxisMap())])
     keeper.start()
@@ -308,7 +313,7 @@ def lived(tmp_path: Path, tick_step: float | None = 1.0) -> Station:
         before._push(rows(first, 50, start_ns=mono_ns - 6000 * 10_000_000))
         before.work([], first / 100.0)
     before.work([], 100.0, drain=True)
-    keeper.know("bench", msgspec.structs.replace(before._restart_state(), tick_step=tick_step))
+    keeper.set_state("bench", msgspec.structs.replace(before._restart_state(), tick_step=tick_step))
     wait_for(lambda: sum(len(piece.samples) for piece in written(tmp_path / "bench")) == 6000)
     before._push(rows(6000, 1, start_ns=mono_ns - 6000 * 10_000_000))  # with what is known at last
     before.work([], 101.0, drain=True)
@@ -334,7 +339,7 @@ def test_the_window_after_a_restart_is_the_one_before(tmp_path: Path) -> None:
     # bounds are sought to seven digits
     np.testing.assert_allclose(new.coefficients.hi, old.coefficients.hi, rtol=1e-6)
     np.testing.assert_array_equal(new.coefficients.status, old.coefficients.status)
-    assert after.chain.watch is not None
+    assert after.chain.signal_monitor is not None
     (event,) = after._pending_events
     assert event.kind == "window_rebuilt"
     assert event.text == "30 s of the window were rebuilt from the recording"
@@ -351,7 +356,7 @@ def test_an_axis_that_began_anew_counts_from_there_after_a_restart_too(tmp_path:
         if first == 5000:
             before.chain.estimator.restart(2, 1000)
             before.chain.since_ns[2] = before._newest_ns - 9_995_000_000
-            before.report([], {}, 0)
+            before.publish_status([], {}, 0)
             all_written(keeper)
     wait_for(lambda: sum(len(piece.samples) for piece in written(tmp_path / "bench")) == 6000)
     keeper.close(PATIENCE_S)
@@ -430,18 +435,20 @@ def test_files_that_are_no_segments_are_passed_over(tmp_path: Path) -> None:
 def rows_of_all(folder: Path) -> tuple[np.ndarray, int]:
     """Counts of all rows, and the samples that are said to be lost between them; the first loss does not count."""
     pieces = written(folder)
-    return join([piece.samples for piece in pieces]).ticks, sum(piece.samples.lost for piece in pieces[1:])
+    return concatenate_blocks([piece.samples for piece in pieces]).ticks, sum(
+        piece.samples.lost for piece in pieces[1:]
+    )
 
 
 def test_two_recorders_on_one_folder_lose_nothing_and_keep_nothing_twice(tmp_path: Path) -> None:
     """Both receive the same samples; the times of the second are 3 ms late."""
     first, second = (Recorder(Storage(tmp_path, segment_s=10.0), [SAMPLES]) for _ in range(2))
     for one in (first, second):
-        one.know("bench", State(RATE))
+        one.set_state("bench", DaemonState(RATE))
     first.start()
     wait_for((tmp_path / "recording.lock").exists)
     first.samples("bench", rows(0, 20), 0)
-    wait_for(lambda: bool(segment.segments(tmp_path / "bench")))
+    wait_for(lambda: bool(segment.list_segments(tmp_path / "bench")))
     second.start()
     wait_for(lambda: "in use" in second.state)
     assert second.state == (
@@ -463,20 +470,20 @@ def test_two_recorders_on_one_folder_lose_nothing_and_keep_nothing_twice(tmp_pat
     ticks, lost = rows_of_all(tmp_path / "bench")
     assert ticks.tolist() == list(range(given + 2000))
     assert lost == 0
-    assert [one.kind for one in second.take()] == ["recording_stopped", "recording_back"]
+    assert [one.kind for one in second.take_events()] == ["recording_stopped", "recording_back"]
     assert first.state == second.state == "ok"
 
 
 def test_a_second_recorder_without_counts_goes_on_by_time_and_says_what_is_missing(tmp_path: Path) -> None:
     def uncounted(first: int, n: int) -> SampleBlock:
         one = rows(first, n)
-        return block(one.t_ns.copy(), one.values.copy(), one.temperature_c.copy())
+        return make_block(one.t_ns.copy(), one.values.copy(), one.temperature_c.copy())
 
     first, second = (Recorder(Storage(tmp_path), [SAMPLES]) for _ in range(2))
-    first.know("bench", State(RATE))
+    first.set_state("bench", DaemonState(RATE))
     first.start()
     first.samples("bench", uncounted(0, 100), 0)
-    wait_for(lambda: bool(segment.segments(tmp_path / "bench")))
+    wait_for(lambda: bool(segment.list_segments(tmp_path / "bench")))
     second.start()
     wait_for(lambda: "in use" in second.state)
     second.samples("bench", uncounted(50, 50), 0)  # these are in the recording
@@ -485,21 +492,21 @@ def test_a_second_recorder_without_counts_goes_on_by_time_and_says_what_is_missi
     wait_for(lambda: second.state == "ok")
     second.close()
     pieces = written(tmp_path / "bench")
-    times = (join([piece.samples for piece in pieces]).t_ns - START_NS + 1000) // 10_000_000
+    times = (concatenate_blocks([piece.samples for piece in pieces]).t_ns - START_NS + 1000) // 10_000_000
     assert times.tolist() == [*range(100), *range(105, 155)]
     assert sum(piece.samples.lost for piece in pieces) == 5
 
 
 def test_a_second_recorder_deletes_nothing(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(room.retention, "taken_share", lambda _: 0.1)
+    monkeypatch.setattr(room.retention, "used_disk_share", lambda _: 0.1)
     first = Recorder(Storage(tmp_path), [SAMPLES])
     first.start()
     first.samples("bench", rows(0, 100), 0)
-    wait_for(lambda: bool(segment.segments(tmp_path / "bench")))
+    wait_for(lambda: bool(segment.list_segments(tmp_path / "bench")))
     for i in range(2, 8):
         (tmp_path / "bench" / segment.segment_name(i, 1.0e9)).write_bytes(b"old")
     (tmp_path / "bench" / "00000099_x.arrows.part").write_bytes(b"of the first")
-    monkeypatch.setattr(room.retention, "taken_share", lambda _: 0.99)
+    monkeypatch.setattr(room.retention, "used_disk_share", lambda _: 0.99)
     monkeypatch.setattr(first, "_delete_old", lambda: None)
     before = sorted(path.name for path in tmp_path.rglob("*"))
     second = Recorder(Storage(tmp_path, keep_s=10.0, segment_s=10.0), [SAMPLES])
@@ -514,19 +521,19 @@ def test_a_second_recorder_deletes_nothing(tmp_path: Path, monkeypatch) -> None:
 
 
 def test_raw_bytes_of_two_recorders_are_kept_once(tmp_path: Path) -> None:
-    of = Origin("bench", "raw", carrier="frames", decoder="dbc")
+    of = SegmentMetadata("bench", "raw", carrier="frames", decoder="dbc")
     given = [Chunk(bytes([i]), START_NS + i, address=i) for i in range(100)]
     first, second = (Recorder(Storage(tmp_path), [of]) for _ in range(2))
     first.start()
     first.chunks("bench", given[:60], 0)
-    wait_for(lambda: bool(segment.segments(tmp_path / "bench" / "raw")))
+    wait_for(lambda: bool(segment.list_segments(tmp_path / "bench" / "raw")))
     second.start()
     wait_for(lambda: "in use" in second.state)
     second.chunks("bench", given[30:], 0)
     first.close()
     wait_for(lambda: second.state == "ok")
     second.close()
-    back = [one for path in segment.segments(tmp_path / "bench" / "raw") for one in segment.read_chunks(path)]
+    back = [one for path in segment.list_segments(tmp_path / "bench" / "raw") for one in segment.read_chunks(path)]
     assert [one.address for one in back] == list(range(100))
 
 
@@ -567,19 +574,19 @@ def test_a_file_that_is_changed_while_it_is_written_is_noticed_and_another_begun
     keeper = Recorder(Storage(tmp_path / "store"), [SAMPLES])
     keeper.start()
     keeper.samples("bench", rows(0, 100), 0)
-    wait_for(lambda: bool(segment.segments(folder)))
-    (path,) = segment.segments(folder)
+    wait_for(lambda: bool(segment.list_segments(folder)))
+    (path,) = segment.list_segments(folder)
     tamper(path)
     wait_for(lambda: "ok, but" in keeper.state)
     assert f"{path} was " in keeper.state
     assert "with 100 rows in it; a new one is begun" in keeper.state
-    assert [one.kind for one in keeper.take()] == ["recording_stopped", "recording_back"]
+    assert [one.kind for one in keeper.take_events()] == ["recording_stopped", "recording_back"]
     keeper.samples("bench", rows(100, 100), 0)
-    wait_for(lambda: any(one != path and one.stat().st_size > 9000 for one in segment.segments(folder)))
+    wait_for(lambda: any(one != path and one.stat().st_size > 9000 for one in segment.list_segments(folder)))
     keeper.close()
-    newest = segment.segments(folder)[-1]
+    newest = segment.list_segments(folder)[-1]
     np.testing.assert_array_equal(
-        join([piece.samples for piece in segment.read_samples(newest)]).ticks, np.arange(100, 200)
+        concatenate_blocks([piece.samples for piece in segment.read_samples(newest)]).ticks, np.arange(100, 200)
     )
     match tamper.__name__:
         case "put_another":
@@ -595,7 +602,7 @@ def test_a_file_that_is_changed_while_it_is_written_is_noticed_and_another_begun
 
 
 def test_the_folder_of_one_device_can_go_while_another_is_recorded(tmp_path: Path) -> None:
-    keeper = Recorder(Storage(tmp_path), [SAMPLES, Origin("other", "samples")])
+    keeper = Recorder(Storage(tmp_path), [SAMPLES, SegmentMetadata("other", "samples")])
     keeper.start()
     for at in range(0, 300, 100):
         keeper.samples("bench", rows(at, 100), 0)
@@ -614,7 +621,7 @@ def test_what_is_no_file_in_place_of_segments_is_passed_over(tmp_path: Path, kin
     keeper = Recorder(Storage(tmp_path), [SAMPLES])
     keeper.start()
     keeper.samples("bench", rows(0, 100), 0)
-    wait_for(lambda: bool(segment.segments(tmp_path / "bench")))
+    wait_for(lambda: bool(segment.list_segments(tmp_path / "bench")))
     keeper.close()
     for name in (segment.segment_name(1, 1.0e9), segment.segment_name(7, 1.7e9)):
         path = tmp_path / "bench" / name
@@ -632,7 +639,7 @@ def test_what_is_no_file_in_place_of_segments_is_passed_over(tmp_path: Path, kin
     assert len(list(tail.pieces(10.0))) == 1
     again.start()
     again.samples("bench", rows(100, 100), 0)
-    wait_for(lambda: segment.number_of(segment.segments(tmp_path / "bench")[-1]) == 8)
+    wait_for(lambda: segment.segment_number(segment.list_segments(tmp_path / "bench")[-1]) == 8)
     again.close()
     assert again.state == "ok"
 
@@ -651,7 +658,7 @@ def test_something_else_in_place_of_the_folder_is_said_until_it_is_gone(tmp_path
 
 
 def test_a_folder_that_cannot_be_used_costs_only_what_has_no_room_in_memory(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(room, "QUEUE_BYTES", 500 * room.SAMPLE_BYTES)
+    monkeypatch.setattr(room, "MAX_QUEUE_BYTES", 500 * room.SAMPLE_BYTES)
     (tmp_path / "store").write_text("in the way")
     keeper = Recorder(Storage(tmp_path / "store"), [SAMPLES])
     keeper.start()

@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 
 from drivers.errors import NotReady
 from monitor.drift.compensation import arma
-from monitor.drift.compensation.arma import Arma, identify, innovations
+from monitor.drift.compensation.arma import ArmaModel, fit_arma, run_kalman_filter
 
 TRUE = ((1.2, -0.5), -0.4)
 
@@ -36,7 +36,7 @@ def test_the_likelihood_is_that_of_the_dense_covariance_also_with_holes(white):
     one = np.ones(there.sum())
     mean = one @ inverse @ z[there] / (one @ inverse @ one)
     left = z[there] - mean
-    count, logs, square, found = innovations(z, *TRUE[0], TRUE[1], variance, white)
+    count, logs, square, found = run_kalman_filter(z, *TRUE[0], TRUE[1], variance, white)
     assert count == there.sum()
     assert logs == pytest.approx(np.linalg.slogdet(c)[1], rel=1e-9)
     assert square == pytest.approx(left @ inverse @ left, rel=1e-9)
@@ -45,7 +45,7 @@ def test_the_likelihood_is_that_of_the_dense_covariance_also_with_holes(white):
 
 def test_units_move_nothing_but_the_units():
     z = drawn(400, 2)
-    one, other = identify(z, 0.2), identify(5.0 + 1e-4 * z, 0.2e-8)
+    one, other = fit_arma(z, 0.2), fit_arma(5.0 + 1e-4 * z, 0.2e-8)
     assert one.order == other.order
     assert other.phi == pytest.approx(one.phi, abs=1e-6)
     assert other.mean == pytest.approx(5.0 + 1e-4 * one.mean, rel=1e-9)
@@ -58,18 +58,18 @@ def test_units_move_nothing_but_the_units():
     [((0.0, 0.0), 0.0, (0, 0)), ((0.95, 0.0), 0.0, (1, 0)), ((0.95, 0.0), -0.6, (1, 1)), ((1.6, -0.7), -0.5, (2, 1))],
 )
 def test_the_criterion_finds_the_order(phi, theta, order):
-    found = [identify(drawn(2000, seed, phi, theta)).order for seed in range(5)]
+    found = [fit_arma(drawn(2000, seed, phi, theta)).order for seed in range(5)]
     assert found.count(order) >= 4
 
 
 def test_white_noise_that_is_known_is_told_from_the_drift():
     rng = np.random.default_rng(3)
     drift = lfilter([1.0], [1.0, -0.98], 0.2 * rng.standard_normal(4000))[2000:]
-    found = identify(drift + 2.0 * rng.standard_normal(2000), 4.0, [(1, 0)])
+    found = fit_arma(drift + 2.0 * rng.standard_normal(2000), 4.0, [(1, 0)])
     assert found.phi[0] == pytest.approx(0.98, abs=0.02)
     assert found.variance == pytest.approx(0.04, rel=0.6)
-    assert found.white == pytest.approx(4.0)
-    assert found.spread == pytest.approx(1.0, rel=0.4)
+    assert found.white_variance == pytest.approx(4.0)
+    assert found.stationary_std == pytest.approx(1.0, rel=0.4)
 
 
 @pytest.mark.long
@@ -77,7 +77,7 @@ def test_intervals_hold_the_truth():
     """60 drifts, 3 coefficients: fewer than 51 inside would come by chance once in 2000 at 95 %."""
     inside = np.zeros(3)
     for seed in range(60):
-        found = identify(drawn(400, seed), orders=[(2, 1)], intervals=True)
+        found = fit_arma(drawn(400, seed), orders=[(2, 1)], intervals=True)
         true = np.array([*TRUE[0], TRUE[1]])
         inside += (np.array(found.lo) <= true) & (true <= np.array(found.hi))
         assert np.all(np.array(found.lo) <= [*found.phi, found.theta])
@@ -85,7 +85,7 @@ def test_intervals_hold_the_truth():
 
 
 def test_a_constant_has_no_coefficients():
-    found = identify(np.random.default_rng(4).standard_normal(500), 1.0, intervals=True)
+    found = fit_arma(np.random.default_rng(4).standard_normal(500), 1.0, intervals=True)
     assert found.name == "constant"
     assert np.isnan(found.lo).all()
     assert found.variance == 0.0
@@ -93,26 +93,26 @@ def test_a_constant_has_no_coefficients():
 
 def test_too_few_and_all_the_same_are_refused():
     with pytest.raises(NotReady, match="30 are needed"):
-        identify(np.arange(10.0))
+        fit_arma(np.arange(10.0))
     with pytest.raises(NotReady, match="the same"):
-        identify(np.ones(100))
+        fit_arma(np.ones(100))
 
 
 def test_green():
-    assert Arma((0.5, 0.3), -0.2, 1.0).green == (1.0, pytest.approx(0.3))
+    assert ArmaModel((0.5, 0.3), -0.2, 1.0).green == (1.0, pytest.approx(0.3))
 
 
 @pytest.mark.parametrize("white", [0.0, 0.5])
 def test_parameters_and_intervals_are_those_that_scipy_finds(monkeypatch, white):
     z = drawn(600, 4) + white**0.5 * np.random.default_rng(5).standard_normal(600)
-    found = identify(z, white, intervals=True)
+    found = fit_arma(z, white, intervals=True)
 
     def by_scipy(function, start, gradient_tolerance):
         result = minimize(function, start, method="BFGS", options={"gtol": gradient_tolerance})
         return float(result.fun), result.x
 
     monkeypatch.setattr(arma, "minimize_bfgs", by_scipy)
-    expected = identify(z, white, intervals=True)
+    expected = fit_arma(z, white, intervals=True)
     assert found.order == expected.order
     assert found.bic == pytest.approx(expected.bic, abs=1e-5)
     assert (*found.phi, found.theta) == pytest.approx((*expected.phi, expected.theta), abs=1e-4)

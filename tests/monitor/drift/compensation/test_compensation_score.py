@@ -3,39 +3,39 @@
 import numpy as np
 import pytest
 
-from monitor.drift.compensation.compensation_score import at_rest, in_motion
+from monitor.drift.compensation.compensation_score import score_at_rest, score_in_motion
 
 
 def test_at_rest_white_noise_and_a_drift():
     rng = np.random.default_rng(0)
     rate = 1e-3 * rng.standard_normal(600_000)
-    one = at_rest(rate, 100.0)
-    assert one.deviation == pytest.approx(1e-3, rel=0.01)
+    one = score_at_rest(rate, 100.0)
+    assert one.rms == pytest.approx(1e-3, rel=0.01)
     assert 1e-3 < one.worst_minute < 1.05e-3
     assert one.drift[0] == pytest.approx(1e-3 / np.sqrt(6000.0), rel=0.15)
     assert one.drift[1] == pytest.approx(1e-3 / np.sqrt(60_000.0), rel=0.5)
     np.testing.assert_allclose(one.allan[:8] * np.sqrt(one.tau_s[:8] * 100.0), 1e-3, rtol=0.05)
-    moved = at_rest(rate + 5e-4, 100.0)
+    moved = score_at_rest(rate + 5e-4, 100.0)
     assert moved.drift[2] == pytest.approx(5e-4, rel=0.01)
 
 
 def test_holes_and_short_records():
     rate = np.full(9000, 2.0)
     rate[3000:5999] = np.nan
-    one = at_rest(rate, 100.0)
-    assert one.deviation == 2.0
+    one = score_at_rest(rate, 100.0)
+    assert one.rms == 2.0
     assert one.drift[0] == 2.0
     assert np.isnan(one.drift[2])
     rate[:] = np.nan
-    assert np.isnan(at_rest(rate, 100.0).deviation)
+    assert np.isnan(score_at_rest(rate, 100.0).rms)
 
 
 def test_delay_error_and_angle_of_a_rate_that_comes_late():
     t = np.arange(10_000) / 100.0
     truth = np.sin(2.0 * np.pi * 0.5 * t)
     late = np.sin(2.0 * np.pi * 0.5 * (t - 0.03)) + 0.01
-    one = in_motion(late, truth, 100.0)
+    one = score_in_motion(late, truth, 100.0)
     assert one.delay_s == pytest.approx(0.03, rel=0.01)
-    assert one.error == pytest.approx(np.sqrt(np.mean((late - truth) ** 2)))
-    assert one.angle == pytest.approx(0.01 * 100.0 / np.sqrt(3.0), rel=0.05)
-    assert np.isnan(in_motion(late, np.zeros_like(t), 100.0).delay_s)
+    assert one.rms_error == pytest.approx(np.sqrt(np.mean((late - truth) ** 2)))
+    assert one.angle_error_rad == pytest.approx(0.01 * 100.0 / np.sqrt(3.0), rel=0.05)
+    assert np.isnan(score_in_motion(late, np.zeros_like(t), 100.0).delay_s)

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monitor.drift.compensation.arma import Arma
-from monitor.drift.compensation.compensator import REMEMBERED, SLOTS, Compensator
-from monitor.drift.compensation.sage_husa import LEFT_OUT, NOT_SEEN, STEPPED, USED
+from monitor.drift.compensation.arma import ArmaModel
+from monitor.drift.compensation.compensator import HISTORY_INTERVALS, MAX_PENDING_BLOCKS, Compensator
+from monitor.drift.compensation.sage_husa import NOT_AT_REST, REJECTED, STEPPED, USED
 
 RATE_HZ = 100.0
 SIGMA = 1e-3
@@ -21,7 +21,7 @@ def still(seconds: float, seed: int = 0, bias: float = 0.02) -> np.ndarray:
 def fed(one: Compensator, values: np.ndarray, rows: int = 100) -> np.ndarray:
     out = []
     for start in range(0, len(values), rows):
-        out.append(one.update(values[start : start + rows]))
+        out.append(one.compensate(values[start : start + rows]))
         one.identify()
     return np.concatenate(out)
 
@@ -33,14 +33,14 @@ def test_any_cut_gives_the_same(cuts, seed):
     values[1500:1700, 2] += 0.5
     values[[100, 2222], 1] = np.nan
     whole = Compensator(RATE_HZ)
-    expected = whole.update(values)
+    expected = whole.compensate(values)
     one, parts, at = Compensator(RATE_HZ), [], 0
     for cut in [*cuts, len(values)]:
         if at < len(values):
-            parts.append(one.update(values[at : at + cut]))
+            parts.append(one.compensate(values[at : at + cut]))
             at += cut
     np.testing.assert_array_equal(np.concatenate(parts), expected)
-    np.testing.assert_array_equal([i.mean for i in one.take()], [i.mean for i in whole.take()])
+    np.testing.assert_array_equal([i.mean for i in one.take_intervals()], [i.mean for i in whole.take_intervals()])
 
 
 def test_rest_is_stilled_and_the_rest_left_alone():
@@ -60,7 +60,7 @@ def test_a_known_rate_is_passed_on_and_not_learned():
     out = fed(one, values)
     assert np.sqrt(np.mean((out[24_000:, 2] - truth) ** 2)) < 1.02 * SIGMA
     np.testing.assert_allclose(one.bias, 0.02, atol=2e-4)
-    assert [i.became[2] for i in one.take()[245:297]] == [NOT_SEEN] * 52
+    assert [i.outcome[2] for i in one.take_intervals()[245:297]] == [NOT_AT_REST] * 52
 
 
 @pytest.mark.parametrize("rate", [0.3, 1.0, 5.0])
@@ -71,7 +71,7 @@ def test_a_slow_turn_is_no_drift(rate):
     out = fed(one, values)
     assert out[20_100:26_000, 2].mean() == pytest.approx(rate * DEGREE, rel=0.01)
     assert abs(out[26_100:, 2].mean()) < 1e-4
-    assert {int(i.became[2]) for i in one.take()[203:258]} <= {LEFT_OUT, NOT_SEEN}
+    assert {int(i.outcome[2]) for i in one.take_intervals()[203:258]} <= {REJECTED, NOT_AT_REST}
 
 
 def test_a_step_of_the_bias_is_taken_in_the_end_and_forgets_what_was_before():
@@ -81,9 +81,9 @@ def test_a_step_of_the_bias_is_taken_in_the_end_and_forgets_what_was_before():
     out = fed(one, values)
     assert out[39_000:40_000, 0].mean() == pytest.approx(1.0 * DEGREE, rel=0.02)
     np.testing.assert_allclose(one.bias, [0.02 + DEGREE, 0.02, 0.02], atol=2e-4)
-    became = [int(i.became[0]) for i in one.take()]
+    became = [int(i.outcome[0]) for i in one.take_intervals()]
     assert became.count(STEPPED) == 1
-    assert np.isfinite(one.window(0)[0]).sum() < 400 < np.isfinite(one.window(1)[0]).sum()
+    assert np.isfinite(one.identification_data(0)[0]).sum() < 400 < np.isfinite(one.identification_data(1)[0]).sum()
 
 
 def test_what_turns_from_the_start_is_never_a_bias():
@@ -115,7 +115,7 @@ def test_gaps_outliers_and_missing_values():
         values = still(3.0, k)
         values[rng.integers(300, size=5)] *= 1e4
         values[rng.integers(300, size=20), rng.integers(6, size=20)] = np.nan
-        out = one.update(values, lost=int(rng.choice([0, 0, 1, 30, 5000, 10**8])))
+        out = one.compensate(values, lost=int(rng.choice([0, 0, 1, 30, 5000, 10**8])))
         one.identify()
         np.testing.assert_array_equal(np.isfinite(out), np.isfinite(values))
     np.testing.assert_allclose(one.bias, 0.02, atol=1e-3)
@@ -129,22 +129,22 @@ def test_all_intervals_that_a_hole_ends_at_once_find_room():
         one = Compensator(rate_hz)
         for lost in rng.integers(0, 20_000, 200):
             n = int(rng.integers(1, 600))
-            one.update(1e-3 * rng.standard_normal((n, 6)), int(lost))
-            most = max(most, len(one.take()) - n // one.interval)
-    assert 2 < most <= 2 + SLOTS
+            one.compensate(1e-3 * rng.standard_normal((n, 6)), int(lost))
+            most = max(most, len(one.take_intervals()) - n // one.interval_samples)
+    assert 2 < most <= 2 + MAX_PENDING_BLOCKS
 
 
 def test_models_are_identified_as_rest_goes_on_and_memory_stays():
     one = Compensator(RATE_HZ)
     asked = []
     for k in range(30):
-        one.update(still(10.0, k))
-        asked.append(bool(one.due))
+        one.compensate(still(10.0, k))
+        asked.append(bool(one.axes_due))
         one.identify()
-        assert not one.due
+        assert not one.axes_due
     assert asked.count(True) == 4  # 60, 90, 135, 203 intervals, as far as they end
-    assert all(isinstance(model, Arma) for model in one.models)
-    assert one.window(0)[0].size <= REMEMBERED
+    assert all(isinstance(model, ArmaModel) for model in one.models)
+    assert one.identification_data(0)[0].size <= HISTORY_INTERVALS
     assert one.error == pytest.approx(SIGMA / np.sqrt(100.0 * 60.0), rel=0.9)
 
 
@@ -155,17 +155,17 @@ def test_the_drift_that_it_expects_is_as_near_as_it_says():
     drift = np.cumsum(rng.standard_normal((len(values), 3)), axis=0) * 2e-6
     values[:, :3] += drift
     fed(one, values)
-    taught = one.take()
+    taught = one.take_intervals()
     innovations = np.array([i.innovation for i in taught])[120:]
     assert np.nanmean(innovations**2) == pytest.approx(1.0, abs=0.15)
     off = np.array([(i.expected - 0.02 - drift[i.end - 50]) / i.known for i in taught[540:]])
     assert np.mean(np.abs(off) < 1.96) > 0.85
-    assert {int(x) for i in taught[10:] for x in i.became} <= {USED, LEFT_OUT}
+    assert {int(x) for i in taught[10:] for x in i.outcome} <= {USED, REJECTED}
 
 
 def test_slow_and_fast_sensors():
     for rate_hz in (4.0, 25.0, 1000.0):
         values = SIGMA * np.random.default_rng(4).standard_normal((round(60.0 * max(rate_hz, 25.0)), 6)) + 0.02
         one = Compensator(rate_hz)
-        out = one.update(values)
+        out = one.compensate(values)
         assert np.sqrt(np.mean(out[-len(out) // 4 :, :3] ** 2)) < 0.6 * SIGMA

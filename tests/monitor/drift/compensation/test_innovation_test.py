@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from monitor.drift.compensation.innovation_test import CHANCE, INTERVALS, LIMIT, Innovations
+from monitor.drift.compensation.innovation_test import FALSE_ALARM_PROBABILITY, INTERVALS, LIMIT, InnovationTest
 
 
 def test_chance_passes_next_to_never():
     """150 000 looks, 1.7 days of an axis."""
-    one = Innovations()
+    one = InnovationTest()
     assert not any(one.update(x) for x in np.random.default_rng(0).standard_normal(150_000).tolist())
 
 
 def test_twice_the_noise_is_told_once_and_again_when_it_comes_back():
-    one = Innovations()
+    one = InnovationTest()
     rng = np.random.default_rng(1)
 
     def alarms(scale: float, n: int) -> int:
@@ -26,9 +26,9 @@ def test_twice_the_noise_is_told_once_and_again_when_it_comes_back():
     assert one.mean_square > LIMIT
     assert alarms(1.0, 400) == 0
     assert alarms(2.0, 400) == 1
-    one.forget()
+    one.reset()
     assert alarms(1.0, INTERVALS - 1) == 0
 
 
 def test_the_limit_is_a_quantile_of_chi2():
-    assert pytest.approx(chi2.isf(CHANCE, INTERVALS) / INTERVALS, rel=1e-12) == LIMIT
+    assert pytest.approx(chi2.isf(FALSE_ALARM_PROBABILITY, INTERVALS) / INTERVALS, rel=1e-12) == LIMIT

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from drivers.sample import block
-from monitor.drift.compensation.arma import Arma
-from monitor.drift.compensation.live_compensation import KIND, LiveCompensation
+from drivers.sample import make_block
+from monitor.drift.compensation.arma import ArmaModel
+from monitor.drift.compensation.live_compensation import EVENT_KIND, LiveCompensation
 
 RATE_HZ = 100.0
 SIGMA = 1e-3
@@ -15,7 +15,7 @@ def fed(live: LiveCompensation, seconds: float, start_s: float = 0.0, scale: flo
     n = round(seconds * RATE_HZ)
     t_ns = np.round((start_s + np.arange(n) / RATE_HZ) * 1e9).astype(np.int64)
     values = 0.01 + scale * SIGMA * np.random.default_rng(seed).standard_normal((n, 6))
-    return live.update(block(t_ns, values, np.full(n, 21.0), np.arange(n), lost))
+    return live.update(make_block(t_ns, values, np.full(n, 21.0), np.arange(n), lost))
 
 
 def test_blocks_keep_what_is_not_a_rate():
@@ -35,26 +35,28 @@ def test_noise_that_grows_is_an_event_with_its_times():
     live = LiveCompensation(RATE_HZ)
     fed(live, 100.0)
     for axis in range(3):
-        live.adopt(axis, Arma((0.0, 0.0), 0.0, 0.0, mean=0.01, white=SIGMA**2 / 100.0, order=(0, 0), count=100))
+        live.set_model(
+            axis, ArmaModel((0.0, 0.0), 0.0, 0.0, mean=0.01, white_variance=SIGMA**2 / 100.0, order=(0, 0), count=100)
+        )
     fed(live, 100.0, 100.0)
     assert not live.take_events()
     fed(live, 300.0, 200.0, scale=1.9)
     events = live.take_events()
-    assert {event.kind for event in events} == {KIND}
+    assert {event.kind for event in events} == {EVENT_KIND}
     assert {event.axis for event in events} == {"gx", "gy", "gz"}
     one = events[0]
     assert 200.0 < one.t_ns / 1e9 < 350.0
     assert one.since_ns is not None
     assert "times as large as they should be" in one.text
-    assert one.what["innovation"]["mean_square"] == pytest.approx(one.sigma**2)
+    assert one.values["innovation"]["mean_square"] == pytest.approx(one.sigma**2)
 
 
 def test_another_rate_begins_anew_and_nearly_the_same_does_not():
     live = LiveCompensation(RATE_HZ)
     fed(live, 20.0)
     kept = live.compensator
-    live.relabel(101.0)
+    live.set_rate(101.0)
     assert live.compensator is kept
-    live.relabel(200.0)
+    live.set_rate(200.0)
     assert live.compensator is not kept
     assert live.compensator.rate_hz == 200.0

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from monitor.drift.compensation.motion_filter_bank import coast, follow, gains, intensity, learn, memories, shift
+from monitor.drift.compensation.motion_filter_bank import (
+    filter_memories,
+    filter_sample,
+    gain_table,
+    predict_over_gap,
+    process_noise_intensity,
+    shift_bias,
+    update_rest_noise,
+)
 
 SIGMA = 1e-3
 
@@ -13,8 +21,8 @@ class Bank:
     """One axis."""
 
     def __init__(self, rate_hz: float = 100.0) -> None:
-        each = memories(rate_hz)
-        self.table, self.first = gains(each)
+        each = filter_memories(rate_hz)
+        self.table, self.first = gain_table(each)
         self.bank, self.ages = np.zeros((each.size + 1, 5)), np.zeros((each.size, 2), np.int64)
         self.feedback, self.sums = np.zeros(1), np.zeros((each.size + 1, 2))
         self.intervals = 0
@@ -22,10 +30,10 @@ class Bank:
     def run(self, z: np.ndarray, rest: bool) -> np.ndarray:
         out = np.empty_like(z)
         for k, one in enumerate(z):
-            out[k] = follow(one, self.bank, self.ages, self.table, self.first, self.sums, self.feedback, 5e-4)
+            out[k] = filter_sample(one, self.bank, self.ages, self.table, self.first, self.sums, self.feedback, 5e-4)
             if rest and k % 100 == 99:
                 self.intervals += 1
-                learn(self.bank, self.sums, 100.0, self.intervals)
+                update_rest_noise(self.bank, self.sums, 100.0, self.intervals)
             if k % 100 == 99:
                 self.sums[:] = 0.0
         return out
@@ -39,17 +47,17 @@ def learned() -> Bank:
 
 
 def test_the_steady_gains_solve_the_riccati_equation():
-    each = memories(100.0)
-    table, first = gains(each)
+    each = filter_memories(100.0)
+    table, first = gain_table(each)
     step, look = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0], [0.0]])
     for j, memory in enumerate(each):
-        q = intensity(int(memory))
+        q = process_noise_intensity(int(memory))
         before = solve_discrete_are(step.T, look, q * np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]]), np.eye(1))
         np.testing.assert_allclose(table[first[j + 1] - 1], before[:, 0] / (before[0, 0] + 1.0), rtol=1e-2)
 
 
 def test_the_first_gains_are_those_of_a_straight_line():
-    table, first = gains(memories(100.0))
+    table, first = gain_table(filter_memories(100.0))
     k = np.arange(2, 20)
     np.testing.assert_allclose(table[first[-2] + k - 1, 0], 2 * (2 * k - 1) / (k * (k + 1)), rtol=1e-3)
 
@@ -57,7 +65,7 @@ def test_the_first_gains_are_those_of_a_straight_line():
 def test_noise_at_rest_falls_by_the_memory(learned):
     noise = learned.bank[:, 3] / SIGMA**2
     assert noise[0] == pytest.approx(1.0, rel=0.1)
-    np.testing.assert_allclose(noise[1:7] * memories(100.0)[:6], 1.0, rtol=0.35)
+    np.testing.assert_allclose(noise[1:7] * filter_memories(100.0)[:6], 1.0, rtol=0.35)
 
 
 def test_at_rest_the_slowest_is_taken(learned):
@@ -93,9 +101,9 @@ def test_no_angle_is_lost(learned):
 def test_a_hole_makes_short_memories_begin_anew_and_a_shift_moves_all():
     bank = Bank()
     bank.run(np.full(500, 0.1), rest=False)
-    shift(bank.bank, 0.1)
+    shift_bias(bank.bank, 0.1)
     np.testing.assert_allclose(bank.bank[1:, 0], 0.0, atol=1e-9)
-    coast(bank.bank, bank.ages, 16)
+    predict_over_gap(bank.bank, bank.ages, 16)
     assert bank.ages[:4, 0].tolist() == [0, 0, 0, 0]
     assert (bank.ages[4:, 0] == 500).all()
 

@@ -6,7 +6,7 @@ from scipy.linalg import solve_discrete_are
 
 from drivers.errors import NotReady
 from monitor.drift.compensation import reference_methods
-from monitor.drift.compensation.reference_methods import PIECE, VARIANTS, compensated
+from monitor.drift.compensation.reference_methods import PIECE, REFERENCE_METHODS, apply_reference_method
 
 N = 40_000
 
@@ -17,11 +17,11 @@ def noisy(truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize("name", REFERENCE_METHODS)
 def test_noise_at_rest_falls_and_holes_stay(name):
     z, learned = noisy(np.zeros(N))
     z[[3, 30_000]] = np.nan
-    out = compensated(z, learned, VARIANTS[name])
+    out = apply_reference_method(z, learned, REFERENCE_METHODS[name])
     assert np.isnan(out).sum() == 2
     left = out[np.isfinite(out)]
     assert abs(left.mean()) < 0.05
@@ -33,14 +33,17 @@ def test_motion_is_halved_by_an_autoregression_and_kept_by_modes():
     t = np.arange(N) / 100.0
     truth = np.where(t > 200.0, 30.0 * np.sin(np.pi * t), 0.0)
     z, learned = noisy(truth)
-    off = {name: np.std((compensated(z, learned, VARIANTS[name]) - truth)[N // 2 :]) for name in ("ar", "emd")}
+    off = {
+        name: np.std((apply_reference_method(z, learned, REFERENCE_METHODS[name]) - truth)[N // 2 :])
+        for name in ("ar", "emd")
+    }
     assert off["ar"] > 5.0
     assert off["emd"] < 1.0
 
 
 def test_pieces_fade_into_each_other():
     z, learned = noisy(np.linspace(0.0, 200.0, N))
-    out = compensated(z, learned, VARIANTS["emd"])
+    out = apply_reference_method(z, learned, REFERENCE_METHODS["emd"])
     assert N > 2 * PIECE
     slope = np.polyfit(np.arange(N), out, 1)
     assert np.abs(out - np.polyval(slope, np.arange(N))).max() < 5.0
@@ -48,7 +51,7 @@ def test_pieces_fade_into_each_other():
 
 def test_too_little_rest_is_refused():
     with pytest.raises(NotReady, match="100 are needed"):
-        compensated(np.zeros(1000), np.zeros(50), VARIANTS["ar"])
+        apply_reference_method(np.zeros(1000), np.zeros(50), REFERENCE_METHODS["ar"])
 
 
 @pytest.mark.parametrize("order", range(1, 9))

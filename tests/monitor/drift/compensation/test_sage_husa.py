@@ -6,14 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from monitor.drift.compensation import sage_husa
-from monitor.drift.compensation.arma import Arma
+from monitor.drift.compensation.arma import ArmaModel
 
-MODEL = Arma((1.5, -0.53), -0.7, 0.2, mean=3.0, white=1.0, count=900)
+MODEL = ArmaModel((1.5, -0.53), -0.7, 0.2, mean=3.0, white_variance=1.0, count=900)
 
 
-def adopted(adapts: bool, model: Arma = MODEL) -> np.ndarray:
-    row = sage_husa.unknown(adapts)
-    sage_husa.adopt(row, model)
+def adopted(adapts: bool, model: ArmaModel = MODEL) -> np.ndarray:
+    row = sage_husa.initial_row(adapts)
+    sage_husa.set_model(row, model)
     return row
 
 
@@ -24,12 +24,12 @@ def test_without_adaptation_it_is_the_textbook_filter():
     b, h = np.array([1.0, phi1 + MODEL.theta, 0.0]), np.array([1.0, 0.0, 1.0])
     x, p = row[:3].copy(), row[3:12].reshape(3, 3).copy()
     for z in 3.0 + np.random.default_rng(0).standard_normal(50):
-        s = h @ p @ h + MODEL.white
+        s = h @ p @ h + MODEL.white_variance
         gain = p @ h / s
         x, p = x + gain * (z - h @ x), p - np.outer(gain, h @ p)
         x, p = a @ x, a @ p @ a.T + MODEL.variance * np.outer(b, b) + np.diag([0.0, 0.0, row[sage_husa.LEVEL]])
-        total, became = sage_husa.measure(row, z, np.nan, 1e-12)
-        sage_husa.forward(row)
+        total, became = sage_husa.update_with_interval(row, z, np.nan, 1e-12)
+        sage_husa.predict(row)
         assert became == sage_husa.USED
         assert total == pytest.approx(s)
     np.testing.assert_allclose(row[:3], x, rtol=1e-9)
@@ -42,46 +42,46 @@ def test_noise_that_doubles_is_noticed_and_only_by_the_one_that_adapts():
     for _ in range(3000):
         z = 3.0 + 2.0 * rng.standard_normal()
         for row in (one, other):
-            sage_husa.measure(row, z, 4.0 * rng.chisquare(3) / 3.0, 1e-12)
-            sage_husa.forward(row)
+            sage_husa.update_with_interval(row, z, 4.0 * rng.chisquare(3) / 3.0, 1e-12)
+            sage_husa.predict(row)
     assert one[sage_husa.R] == pytest.approx(4.0, rel=0.25)
     assert other[sage_husa.R] == 1.0
 
 
 def test_an_outlier_is_left_out_and_a_step_taken_after_it_has_stayed():
     row = adopted(True)
-    row[sage_husa.COUNT] = 40.0
+    row[sage_husa.REST_COUNT] = 40.0
     for k in range(60):
-        became = sage_husa.measure(row, 3.0 + (100.0 if k == 5 else 0.0), 1.0, 1e-12)[1]
-        sage_husa.forward(row)
-        assert became == (sage_husa.LEFT_OUT if 5 <= k <= 11 else sage_husa.USED), k
+        became = sage_husa.update_with_interval(row, 3.0 + (100.0 if k == 5 else 0.0), 1.0, 1e-12)[1]
+        sage_husa.predict(row)
+        assert became == (sage_husa.REJECTED if 5 <= k <= 11 else sage_husa.USED), k
     told = []
     for _ in range(120):
-        told.append(sage_husa.measure(row, 103.0, 1.0, 1e-12)[1])
-        sage_husa.forward(row)
+        told.append(sage_husa.update_with_interval(row, 103.0, 1.0, 1e-12)[1])
+        sage_husa.predict(row)
     assert told.index(sage_husa.STEPPED) == 92  # as long as the level before had been confirmed: 40 + 60 − 7 intervals
     assert told[93:] == [sage_husa.USED] * 27
-    assert sage_husa.drift(row)[0] == pytest.approx(103.0, abs=1.0)
+    assert sage_husa.expected_bias(row)[0] == pytest.approx(103.0, abs=1.0)
 
 
 def test_what_wanders_far_off_is_no_step():
     row = adopted(True)
     for k in range(400):
-        _, became = sage_husa.measure(row, 3.0 + 100.0 + 20.0 * k, 1.0, 1e-12)
-        sage_husa.forward(row)
-        assert became == sage_husa.LEFT_OUT
+        _, became = sage_husa.update_with_interval(row, 3.0 + 100.0 + 20.0 * k, 1.0, 1e-12)
+        sage_husa.predict(row)
+        assert became == sage_husa.REJECTED
 
 
 def test_a_first_level_has_to_be_confirmed():
-    row = sage_husa.unknown(True)
-    for k in range(sage_husa.CONFIRMED - 1):
-        sage_husa.measure(row, 50.0, 1.0, 1e-12)
-        assert row[sage_husa.COUNT] == k + 1
-    sage_husa.not_seen(row)
-    assert row[sage_husa.COUNT] == 0.0
-    for _ in range(sage_husa.CONFIRMED):
-        sage_husa.measure(row, 2.0, 1.0, 1e-12)
-    assert sage_husa.drift(row)[0] == pytest.approx(2.0)
+    row = sage_husa.initial_row(True)
+    for k in range(sage_husa.MIN_CONFIRMED_INTERVALS - 1):
+        sage_husa.update_with_interval(row, 50.0, 1.0, 1e-12)
+        assert row[sage_husa.REST_COUNT] == k + 1
+    sage_husa.skip_interval(row)
+    assert row[sage_husa.REST_COUNT] == 0.0
+    for _ in range(sage_husa.MIN_CONFIRMED_INTERVALS):
+        sage_husa.update_with_interval(row, 2.0, 1.0, 1e-12)
+    assert sage_husa.expected_bias(row)[0] == pytest.approx(2.0)
 
 
 @given(
@@ -90,7 +90,11 @@ def test_a_first_level_has_to_be_confirmed():
         max_size=200,
     ),
     st.sampled_from(
-        [MODEL, Arma((0.99999, 0.0), 0.0, 1e-9, white=1e-12, count=30), Arma((0.0, 0.0), 0.0, 0.0, white=1.0, count=60)]
+        [
+            MODEL,
+            ArmaModel((0.99999, 0.0), 0.0, 1e-9, white_variance=1e-12, count=30),
+            ArmaModel((0.0, 0.0), 0.0, 0.0, white_variance=1.0, count=60),
+        ]
     ),
 )
 def test_covariances_stay_positive_whatever_comes(course, model):
@@ -98,12 +102,12 @@ def test_covariances_stay_positive_whatever_comes(course, model):
     for kind, z, scatter in course:
         if kind != "missing":
             value = {"used": z, "outlier": 1e6 * z, "same": model.mean}[kind]
-            total, _ = sage_husa.measure(row, value, scatter, 1e-30)
+            total, _ = sage_husa.update_with_interval(row, value, scatter, 1e-30)
             assert total > 0.0
-        sage_husa.forward(row)
+        sage_husa.predict(row)
         p = row[3:12].reshape(3, 3)
         assert np.isfinite(row).all()
         np.testing.assert_allclose(p, p.T, atol=1e-9 * np.trace(p))
         assert np.linalg.eigvalsh(p)[0] >= -1e-9 * np.trace(p)
         assert row[sage_husa.R] > 0.0
-        assert row[sage_husa.S] >= sage_husa.FLOOR * model.variance
+        assert row[sage_husa.S] >= sage_husa.MIN_VARIANCE_SHARE * model.variance

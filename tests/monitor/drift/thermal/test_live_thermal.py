@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from drivers.sample import block
+from drivers.sample import make_block
 from monitor.drift.thermal.live_thermal import KIND, LiveThermal
 from tests.monitor.drift.made import COEFFICIENT, late, weather
 
@@ -37,7 +37,7 @@ def fed(live, values, warmth, edges=None, lost=0, choose=True):
     for lo, hi in pairwise(edges):
         missing = lost if hi == edges[-1] else 0
         t_ns = PERIOD_NS * (np.arange(lo, hi) + missing)
-        looks += live.update(block(t_ns, values[lo:hi], warmth[lo:hi], None, missing))
+        looks += live.update(make_block(t_ns, values[lo:hi], warmth[lo:hi], None, missing))
         while choose and live.step():
             pass
     return looks
@@ -110,9 +110,9 @@ def test_intervals_keep_their_places_across_a_hole():
 def test_another_rate_begins_anew():
     live = LiveThermal(RATE_HZ, INTERVAL_S)
     assert len(fed(live, *day(3, 7))) == 18
-    live.relabel(RATE_HZ * 1.001)
+    live.set_rate(RATE_HZ * 1.001)
     assert fed(live, *day(1, 8))[-1].axes["gz"].one_step is not None
-    live.relabel(RATE_HZ * 2.0)
+    live.set_rate(RATE_HZ * 2.0)
     looks = fed(live, *day(1, 8))
     assert len(looks) == 3
     assert looks[-1].axes["gz"].text.startswith("3 intervals")
@@ -122,7 +122,7 @@ def test_a_new_offset_leaves_nothing_of_the_interval_in_which_it_came():
     values, warmth = day(12, 9)
     live = LiveThermal(RATE_HZ, INTERVAL_S)
     fed(live, values[:4000], warmth[:4000])  # 40 samples into an interval
-    live.offset_is_new()
+    live.learn_new_offset()
     looks = fed(live, values[4000:] + 1e-3, warmth[4000:])
     assert np.isnan(looks[0].axes["gz"].bias)
     assert looks[1].axes["gz"].bias == pytest.approx(np.mean(values[4020:4080, 2]) + 1e-3, rel=1e-9)

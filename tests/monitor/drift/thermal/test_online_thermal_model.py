@@ -5,8 +5,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from monitor.drift.thermal.online_thermal_model import GROWN, KEPT, LEARNED, NEW_OFFSET, Following
-from monitor.drift.thermal.residual_alarm import OUTSIDE
+from monitor.drift.thermal.online_thermal_model import (
+    MAX_INTERVALS,
+    NEW_OFFSET,
+    OFFSET_INTERVALS,
+    REFIT_GROWTH,
+    OnlineThermalModel,
+)
+from monitor.drift.thermal.residual_alarm import MIN_OUTSIDE
 from tests.monitor.drift.made import COEFFICIENT, HOUR_S, hourly
 
 
@@ -14,7 +20,7 @@ class Run:
     """An axis that is given intervals, its choices made at once."""
 
     def __init__(self, slow: bool = False) -> None:
-        self.following = Following(HOUR_S)
+        self.following = OnlineThermalModel(HOUR_S)
         self.slow = slow
         self.looks, self.found = [], []
 
@@ -62,7 +68,7 @@ def test_a_step_that_temperature_does_not_explain_is_told_once_and_then_expected
     biases = means.bias + size * (np.arange(72) >= 50)
     run = Run().give(biases, means.temperature_c)
     (at,) = (k for k, one in enumerate(run.found) if one)
-    assert 50 + OUTSIDE - 1 <= at <= 50 + 2 * OUTSIDE
+    assert 50 + MIN_OUTSIDE - 1 <= at <= 50 + 2 * MIN_OUTSIDE
     found = run.found[at]
     assert at - found.since + 1 == 50
     assert found.size == pytest.approx(size, rel=0.25)
@@ -83,9 +89,9 @@ def test_a_new_offset_is_learned_and_nothing_is_told():
     run = Run().give(means.bias[:50], means.temperature_c[:50])
     run.following.offset_is_new()
     run.give(means.bias[50:] + 1e-3, means.temperature_c[50:])
-    assert [one.text for one in run.looks[50 : 50 + LEARNED]] == [NEW_OFFSET] * LEARNED
-    after = run.looks[50 + LEARNED :]
-    assert shares(after, means.bias[50 + LEARNED :] + 1e-3) > 0.85
+    assert [one.text for one in run.looks[50 : 50 + OFFSET_INTERVALS]] == [NEW_OFFSET] * OFFSET_INTERVALS
+    after = run.looks[50 + OFFSET_INTERVALS :]
+    assert shares(after, means.bias[50 + OFFSET_INTERVALS :] + 1e-3) > 0.85
     assert after[0].slope == pytest.approx(run.looks[49].slope, rel=0.3)
     assert not any(run.found)
 
@@ -121,7 +127,7 @@ def test_choices_follow_at_growing_spacings():
         while run.following.step():
             pass
     assert at[0] == 12
-    assert all(later >= GROWN * one for one, later in pairwise(at))
+    assert all(later >= REFIT_GROWTH * one for one, later in pairwise(at))
     assert len(at) >= 6
 
 
@@ -144,7 +150,7 @@ def test_temperature_that_hardly_moves_says_so():
 
 
 def test_memory_is_bounded():
-    following = Following(HOUR_S)
-    for _ in range(KEPT + 100):
+    following = OnlineThermalModel(HOUR_S)
+    for _ in range(MAX_INTERVALS + 100):
         following.update(0.0, 1e-7, 25.0)
-    assert len(following._rows) == KEPT
+    assert len(following._rows) == MAX_INTERVALS

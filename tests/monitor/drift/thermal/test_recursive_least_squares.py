@@ -6,21 +6,25 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from monitor.drift.thermal.interval_means import Means
-from monitor.drift.thermal.recursive_least_squares import Recursion
-from monitor.drift.thermal.thermal_fit import fitted
-from monitor.drift.thermal.thermal_model import Z95, ThermalModel, predicted
-from monitor.drift.thermal.thermal_response import Shape
+from monitor.drift.thermal.interval_means import IntervalMeans
+from monitor.drift.thermal.recursive_least_squares import RecursiveThermalFit
+from monitor.drift.thermal.thermal_fit import fit_thermal_model
+from monitor.drift.thermal.thermal_model import Z95, ThermalModel, predict
+from monitor.drift.thermal.thermal_response import ThermalModelForm
 from tests.monitor.drift.made import hourly
 
 
-def of(means: Means, shape: Shape, phi: float) -> ThermalModel:
+def of(means: IntervalMeans, shape: ThermalModelForm, phi: float) -> ThermalModel:
     """A model whose sizes nobody has fitted yet."""
-    model = fitted(means).model
-    return replace(model, shape=shape, phi=phi, sizes=np.zeros(0), start=np.zeros(0))
+    model = fit_thermal_model(means).model
+    return replace(model, shape=shape, phi=phi, coefficients=np.zeros(0), initial_state=np.zeros(0))
 
 
-@pytest.mark.parametrize("shape", [Shape(3, ()), Shape(0, (7e3,)), Shape(1, (3e3, 4e4))], ids=lambda shape: shape.name)
+@pytest.mark.parametrize(
+    "shape",
+    [ThermalModelForm(3, ()), ThermalModelForm(0, (7e3,)), ThermalModelForm(1, (3e3, 4e4))],
+    ids=lambda shape: shape.name,
+)
 @pytest.mark.parametrize("phi", [0.0, 0.6])
 def test_interval_by_interval_is_the_whole_at_once(shape, phi):
     means = hourly(2, 2, 0.05)
@@ -28,23 +32,23 @@ def test_interval_by_interval_is_the_whole_at_once(shape, phi):
     bias[[30, 31, 45]] = np.nan
     means = replace(means, bias=bias)
     model = of(means, shape, phi)
-    one, whole = Recursion(model, means.upto(20)), Recursion(model, means)
+    one, whole = RecursiveThermalFit(model, means.first(20)), RecursiveThermalFit(model, means)
     for k in range(20, 72):
         one.update(float(means.temperature_c[k]), float(means.bias[k]))
     for name in ("sizes", "start", "sigma", "lowest_c", "highest_c"):
         np.testing.assert_allclose(getattr(one.model, name), getattr(whole.model, name), rtol=1e-7, err_msg=name)
     np.testing.assert_allclose(one.model.covariance, whole.model.covariance, rtol=1e-4, atol=1e-25)
-    for mine, theirs in zip(one.expect(27.0), whole.expect(27.0), strict=True):
+    for mine, theirs in zip(one.predict(27.0), whole.predict(27.0), strict=True):
         np.testing.assert_allclose(astuple(mine), astuple(theirs), rtol=1e-7)
 
 
 @pytest.mark.parametrize("seed", [3, 5])
 def test_it_begins_with_what_was_fitted(seed):
     means = hourly(seed, 2, 0.05)
-    model = fitted(means).model
-    found = Recursion(model, means).model
-    np.testing.assert_allclose(found.sizes, model.sizes, rtol=1e-6)
-    np.testing.assert_allclose(found.start, model.start, rtol=1e-6)
+    model = fit_thermal_model(means).model
+    found = RecursiveThermalFit(model, means).model
+    np.testing.assert_allclose(found.coefficients, model.coefficients, rtol=1e-6)
+    np.testing.assert_allclose(found.initial_state, model.initial_state, rtol=1e-6)
     np.testing.assert_allclose(found.covariance, model.covariance, rtol=1e-4, atol=1e-25)
     assert found.sigma == pytest.approx(model.sigma, rel=1e-9)
 
@@ -53,12 +57,12 @@ def test_it_begins_with_what_was_fitted(seed):
 def test_what_it_expects_is_what_the_model_predicts(to_c):
     """With Student's factor, as the scatter is known from 71 intervals less what was fitted."""
     means = hourly(4, 1, 0.05)
-    recursion = Recursion(replace(fitted(means).model, phi=0.3), means.upto(71))
+    recursion = RecursiveThermalFit(replace(fit_thermal_model(means).model, phi=0.3), means.first(71))
     warmth = np.append(means.temperature_c[:71], to_c)
     measured = np.append(means.bias[:71], np.nan)
-    wide = student.ppf(0.975, recursion.free) / Z95
-    for found, known in zip(recursion.expect(to_c), (None, measured), strict=True):
-        want = predicted(recursion.model, warmth, known, began=True)
+    wide = student.ppf(0.975, recursion.degrees_of_freedom) / Z95
+    for found, known in zip(recursion.predict(to_c), (None, measured), strict=True):
+        want = predict(recursion.model, warmth, known, began=True)
         assert found.bias == pytest.approx(want.bias[-1], rel=1e-9)
         assert found.hi - found.bias == pytest.approx(wide * (want.hi[-1] - want.bias[-1]), rel=1e-6)
         assert found.bias - found.lo == pytest.approx(wide * (want.bias[-1] - want.lo[-1]), rel=1e-6)
@@ -66,10 +70,10 @@ def test_what_it_expects_is_what_the_model_predicts(to_c):
 
 def test_without_temperature_it_goes_on_as_if_that_had_stayed():
     means = hourly(6, 2, 0.05)
-    model = fitted(means).model
-    held, told = Recursion(model, means), Recursion(model, means)
+    model = fit_thermal_model(means).model
+    held, told = RecursiveThermalFit(model, means), RecursiveThermalFit(model, means)
     last = float(means.temperature_c[-1])
     held.update(np.nan, 1.0)
     told.update(last, np.nan)
-    assert held.expect(np.nan)[0].bias == pytest.approx(told.expect(last)[0].bias)
-    assert held.free == Recursion(model, means).free
+    assert held.predict(np.nan)[0].bias == pytest.approx(told.predict(last)[0].bias)
+    assert held.degrees_of_freedom == RecursiveThermalFit(model, means).degrees_of_freedom

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from monitor.drift.thermal.recursive_least_squares import Band
-from monitor.drift.thermal.residual_alarm import OF, OUTSIDE, Suspicion
+from monitor.drift.thermal.recursive_least_squares import PredictionInterval
+from monitor.drift.thermal.residual_alarm import MIN_OUTSIDE, WINDOW_INTERVALS, ResidualAlarm
 
-MULTI, ONE = Band(0.0, -3.0, 3.0), Band(1.0, -1.0, 3.0)
+MULTI, ONE = PredictionInterval(0.0, -3.0, 3.0), PredictionInterval(1.0, -1.0, 3.0)
 
 
 def told(biases):
-    suspicion = Suspicion()
+    suspicion = ResidualAlarm()
     return [suspicion.update(bias, MULTI, ONE) for bias in biases]
 
 
@@ -18,7 +18,7 @@ def test_enough_on_one_side_are_told_once():
     found = told([0.0, 5.0, 0.0, 5.0, 7.0, 7.0, 7.0, 7.0, 7.0])
     assert [at for at, one in enumerate(found) if one] == [5]
     one = found[5]
-    assert (one.outside, one.of, one.since) == (OUTSIDE, OF, 5)
+    assert (one.outside, one.of, one.since) == (MIN_OUTSIDE, WINDOW_INTERVALS, 5)
     assert one.size == pytest.approx((5.0 + 0.0 + 5.0 + 7.0 + 7.0) / 5)  # off the multi-step estimate
     assert one.sigma == pytest.approx(1.959964 / 2.0 * (4 - 1 + 4 + 6 + 6) / 5**0.5)  # off the one-step estimate
 
@@ -37,7 +37,7 @@ def test_what_was_not_measured_is_no_witness_and_keeps_its_place():
 
 
 def test_outside_now_or_twice_before_is_not_clear():
-    suspicion = Suspicion()
+    suspicion = ResidualAlarm()
     for bias, clear in [(5.0, False), (0.0, True), (-5.0, False), (0.0, True), (5.0, False), (0.0, False)]:
         suspicion.update(bias, MULTI, ONE)
         assert suspicion.clear is clear
@@ -46,7 +46,7 @@ def test_outside_now_or_twice_before_is_not_clear():
 
 
 def test_far_outside_is_no_chance():
-    suspicion = Suspicion()
+    suspicion = ResidualAlarm()
     assert not suspicion.far
     for bias, far in [(4.9, False), (5.1, True), (-3.1, True), (1.0, False)]:
         suspicion.update(bias, MULTI, ONE)  # half a width of 2 about 1

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monitor.drift.thermal.interval_means import interval_means
-from monitor.drift.thermal.running_interval_means import GATHERED, RunningMeans
+from monitor.drift.thermal.interval_means import compute_interval_means
+from monitor.drift.thermal.running_interval_means import BUFFER_ROWS, RunningIntervalMeans
 
 
 def recording(seed: int, n: int, holes: float) -> tuple[np.ndarray, np.ndarray]:
@@ -32,7 +32,7 @@ def test_equal_to_those_of_the_whole(length, seed, holes, cuts, hole):
     values, warmth = recording(seed, 1500, holes)
     first, lost = hole[0], min(hole[1], 1500 - hole[0])
     values[first : first + lost], warmth[first : first + lost] = np.nan, np.nan
-    means, found = RunningMeans(length), []
+    means, found = RunningIntervalMeans(length), []
     edges = sorted({0, 1500, first, first + lost, *cuts} - set(range(first + 1, first + lost)))
     behind = 0
     for lo, hi in pairwise(edges):
@@ -45,16 +45,16 @@ def test_equal_to_those_of_the_whole(length, seed, holes, cuts, hole):
         found += means.update(values[:0], warmth[:0], behind)
     assert [one.end for one in found] == [length * (k + 1) for k in range(1500 // length)]
     for axis in range(6):
-        want = interval_means(values[:, axis], warmth, 1.0, float(length))
+        want = compute_interval_means(values[:, axis], warmth, 1.0, float(length))
         np.testing.assert_allclose([one.bias[axis] for one in found], want.bias, rtol=1e-12)
         np.testing.assert_allclose([one.error[axis] for one in found], want.error, rtol=1e-6)
         np.testing.assert_allclose([one.temperature_c for one in found], want.temperature_c, rtol=1e-12)
 
 
 def test_cuts_make_no_difference_at_all():
-    values, warmth = recording(1, 5 * GATHERED, 0.2)
-    whole = RunningMeans(3 * GATHERED).update(values, warmth, 0)
-    means = RunningMeans(3 * GATHERED)
+    values, warmth = recording(1, 5 * BUFFER_ROWS, 0.2)
+    whole = RunningIntervalMeans(3 * BUFFER_ROWS).update(values, warmth, 0)
+    means = RunningIntervalMeans(3 * BUFFER_ROWS)
     single = [one for k in range(len(values)) for one in means.update(values[k : k + 1], warmth[k : k + 1], 0)]
     assert len(whole) == len(single) == 1
     assert whole[0].bias.tolist() == single[0].bias.tolist()
@@ -62,7 +62,7 @@ def test_cuts_make_no_difference_at_all():
 
 
 def test_a_hole_of_years_is_passed_over_at_once():
-    means = RunningMeans(100, longest=5)
+    means = RunningIntervalMeans(100, longest=5)
     found = means.update(np.ones((30, 6)), np.full(30, 20.0), 10**12)
     assert len(found) == 5
     assert found[-1].end == 10**12

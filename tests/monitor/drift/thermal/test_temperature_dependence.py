@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from monitor.drift.thermal.interval_means import Means
+from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.temperature_dependence import find_dependence, find_hysteresis, heating_direction
 from tests.monitor.drift.cycles import NOISES, SHAPES, chamber_means, drift
 
@@ -82,7 +82,7 @@ def test_many_means_are_averaged_and_few_are_no_answer() -> None:
     found = find_hysteresis(chamber_means("ramp", noise, "loop", 20.0))
     assert found is not None
     assert found.size == pytest.approx(20.0, rel=0.15)
-    short = Means(1.0, np.arange(8.0), np.ones(8), np.array([0.0, 1.0, 2.0, 3.0, 3.0, 2.0, 1.0, 0.0]))
+    short = IntervalMeans(1.0, np.arange(8.0), np.ones(8), np.array([0.0, 1.0, 2.0, 3.0, 3.0, 2.0, 1.0, 0.0]))
     assert find_hysteresis(short) is None
     assert find_dependence(short) is None
 

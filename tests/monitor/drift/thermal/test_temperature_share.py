@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from drivers.sample import block
-from monitor.drift.thermal.temperature_share import drawn, moved, without_temperature
+from drivers.sample import make_block
+from monitor.drift.thermal.temperature_share import interpolate_smoothly, remove_temperature, temperature_varied
 from monitor.estimation.analysis import analyze
-from monitor.estimation.fit.coefficients import LETTERS, Status
-from monitor.publishing.terminal.thermal_text import notes_without
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.publishing.terminal.thermal_text import temperature_notes
 
 RATE_HZ = 2.0
 N = 1e-4
@@ -28,24 +28,24 @@ def warm():
     values[:, :2] = N * RATE_HZ**0.5 * rng.standard_normal((n, 2))
     values[:, 0] += 3e-5 * (warmth - 25.0)
     values[:, 1] += 3e-6 / RATE_HZ**0.5 * rng.standard_normal(n).cumsum()
-    samples = block(np.rint(1e9 * t).astype(np.int64), values, warmth)
+    samples = make_block(np.rint(1e9 * t).astype(np.int64), values, warmth)
     return analyze([samples], RATE_HZ), warmth
 
 
 def test_what_was_temperature_is_gone_and_the_rest_stays(warm):
     result, warmth = warm
-    found = without_temperature(result, warmth)
+    found = remove_temperature(result, warmth)
     assert found.models["gx"] == "polynomial 1"
-    k = LETTERS.index("K")
+    k = SYMBOLS.index("K")
     assert found.before.status[k, 0] == found.before.status[k, 1] == Status.ESTIMATED
-    assert found.share("K", "gx") > 0.9
-    assert found.matters("K", "gx")
+    assert found.variance_share("K", "gx") > 0.9
+    assert found.is_significant("K", "gx")
     assert found.coefficients.value[k, 1] == pytest.approx(3e-6, rel=0.4)
-    assert not found.matters("K", "gy")
+    assert not found.is_significant("K", "gy")
     assert found.coefficients.value[1, 0] == pytest.approx(N, rel=0.03)  # N is as it was
     assert "gy" not in found.dependences
     assert found.axes_of_temperature == ("gx",)
-    (note,) = notes_without(found)
+    (note,) = temperature_notes(found)
     assert note.startswith("gx follows its temperature: a cubic explains ")
     assert "without temperature (polynomial 1), K falls from " in note
 
@@ -55,18 +55,18 @@ def test_temperature_that_explains_nothing_takes_nothing(warm):
     still = result.values.copy()
     still[:, 0] = np.random.default_rng(4).standard_normal(len(still))
     still[:, 1] = np.nan
-    assert without_temperature(replace(result, values=still), warmth) is None
+    assert remove_temperature(replace(result, values=still), warmth) is None
 
 
 def test_temperature_that_stayed_is_no_question():
-    assert not moved(np.full(100, np.nan))
-    assert not moved(25.0 + 0.04 * np.sin(np.arange(100.0)))
-    assert moved(np.array([np.nan, 25.0, 26.0]))
+    assert not temperature_varied(np.full(100, np.nan))
+    assert not temperature_varied(25.0 + 0.04 * np.sin(np.arange(100.0)))
+    assert temperature_varied(np.array([np.nan, 25.0, 26.0]))
 
 
 def test_the_course_has_neither_steps_nor_corners():
     means = np.sin(2.0 * np.pi * (np.arange(20) + 0.5) / 20.0)
-    course = drawn(means, 50, 1020)
+    course = interpolate_smoothly(means, 50, 1020)
     want = np.sin(2.0 * np.pi * (np.arange(1000) + 0.5) / 1000.0)
     np.testing.assert_allclose(course[:1000] - course[:1000].mean(), want, atol=0.03)
     assert np.abs(np.diff(course, 2)).max() < 3.0 * np.abs(np.diff(want, 2)).max()
@@ -81,4 +81,4 @@ def test_the_course_is_a_natural_spline(count: int, length: int, n: int) -> None
     at = np.arange(n, dtype=np.float64)
     inside = np.clip(at, middle[0], middle[-1])
     expected = spline(inside) + np.where(at < middle[0], spline(middle[0], 1), spline(middle[-1], 1)) * (at - inside)
-    assert drawn(course, length, n) == pytest.approx(expected - expected.mean(), abs=1e-12)
+    assert interpolate_smoothly(course, length, n) == pytest.approx(expected - expected.mean(), abs=1e-12)

@@ -3,23 +3,23 @@
 import numpy as np
 import pytest
 
-from monitor.drift.thermal.thermal_model import ThermalModel, covariance, slopes
-from monitor.drift.thermal.thermal_response import Shape, responses
+from monitor.drift.thermal.thermal_model import ThermalModel, coefficient_covariance, time_constant_derivatives
+from monitor.drift.thermal.thermal_response import ThermalModelForm, regressors
 
 X = np.random.default_rng(5).standard_normal(40).cumsum()
 
 
-def model(shape: Shape, sizes: list[float], start: list[float]) -> ThermalModel:
+def model(shape: ThermalModelForm, sizes: list[float], start: list[float]) -> ThermalModel:
     n = len(sizes) + 2 * len(start)
     return ThermalModel(shape, 60.0, 25.0, np.array(sizes), np.array(start), 0.0, 1.0, np.zeros((n, n)), 20.0, 30.0)
 
 
 def test_the_equation_is_that_of_the_lags():
     """One lag, half of it left after an interval: Y_n − ½ Y_{n−1} = ½ · 10 T_n + ½ · 3."""
-    one = model(Shape(0, (60.0 / np.log(2.0),)), [3.0, 10.0], [0.0])
+    one = model(ThermalModelForm(0, (60.0 / np.log(2.0),)), [3.0, 10.0], [0.0])
     assert one.equation == {"a": pytest.approx([-0.5]), "b": pytest.approx([5.0]), "c": pytest.approx(1.5)}
-    assert model(Shape(1, ()), [3.0, 2.0], []).equation == {"a": [], "b": [2.0], "c": 3.0}
-    assert model(Shape(2, ()), [3.0, 2.0, 1.0], []).equation is None
+    assert model(ThermalModelForm(1, ()), [3.0, 2.0], []).equation == {"a": [], "b": [2.0], "c": 3.0}
+    assert model(ThermalModelForm(2, ()), [3.0, 2.0, 1.0], []).equation is None
 
 
 def test_the_bias_bends_with_its_time_constants_as_differences_say():
@@ -27,13 +27,13 @@ def test_the_bias_bends_with_its_time_constants_as_differences_say():
 
     def bias(at: int, by: float) -> np.ndarray:
         moved = tuple(one * np.exp(by if i == at else 0.0) for i, one in enumerate(constants))
-        return responses(Shape(1, moved), X, 60.0, began=True) @ np.array(sizes + start)
+        return regressors(ThermalModelForm(1, moved), X, 60.0, began=True) @ np.array(sizes + start)
 
-    found = slopes(model(Shape(1, constants), sizes, start), X, np.array(sizes + start))
+    found = time_constant_derivatives(model(ThermalModelForm(1, constants), sizes, start), X, np.array(sizes + start))
     want = np.stack([(bias(at, 1e-5) - bias(at, -1e-5)) / 2e-5 for at in (0, 1)], axis=1)
     np.testing.assert_allclose(found, want, rtol=1e-4, atol=1e-5)
 
 
 def test_the_covariance_is_that_of_least_squares():
     rows = np.random.default_rng(6).standard_normal((50, 3)) * [1.0, 1e-4, 1e5]
-    np.testing.assert_allclose(covariance(rows, 2.0), 4.0 * np.linalg.inv(rows.T @ rows), rtol=1e-6)
+    np.testing.assert_allclose(coefficient_covariance(rows, 2.0), 4.0 * np.linalg.inv(rows.T @ rows), rtol=1e-6)

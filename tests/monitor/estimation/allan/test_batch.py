@@ -9,12 +9,19 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConfigError
-from monitor.estimation.allan.batch import BLOCK, LANES, cluster_sizes, overlapping, overlapping_axis, slope
+from monitor.estimation.allan.batch import (
+    BLOCK,
+    LANES,
+    cluster_sizes,
+    overlapping_avar,
+    overlapping_avar_axis,
+    slope_of_recording,
+)
 from tests.support.allan_references import columns, nist_1000
 
 
 def deviations(y, factors):
-    avar, terms = overlapping(np.asarray(y, float)[:, None], np.asarray(factors, np.int64))
+    avar, terms = overlapping_avar(np.asarray(y, float)[:, None], np.asarray(factors, np.int64))
     return np.sqrt(avar[:, 0]), terms[:, 0]
 
 
@@ -49,7 +56,7 @@ def test_missing_samples_strike_out_the_terms_that_touch_them():
             span = y[k : k + 2 * m, 0]
             if not np.isnan(span).any():
                 squares.append((span[m:].mean() - span[:m].mean()) ** 2)
-        avar, terms = overlapping(y, np.array([m]))
+        avar, terms = overlapping_avar(y, np.array([m]))
         assert terms.tolist() == [[len(squares), 0]]
         assert avar[0, 0] == pytest.approx(0.5 * np.mean(squares), rel=1e-12)
         assert np.isnan(avar[0, 1])
@@ -93,7 +100,7 @@ def test_equals_a_sum_without_rounding(added, within):
     n = 12_000
     y = wandering(np.random.default_rng(3), n) + added(n)
     factors = np.array([1, 2, 3, 7, 64, 1000, 3000, 6000])
-    avar, terms = overlapping_axis(y, factors)
+    avar, terms = overlapping_avar_axis(y, factors)
     assert avar == pytest.approx(exact(y, factors), rel=within)
     assert terms.tolist() == (n + 1 - 2 * factors).tolist()
 
@@ -105,7 +112,7 @@ def test_gaps_in_a_long_record_leave_the_sum_exact():
     y[rng.integers(0, n, 5)] = np.nan
     y[[0, n - 1, BLOCK - 1, BLOCK, BLOCK + 1]] = [np.inf, -np.inf, np.nan, np.nan, np.nan]
     factors = np.array([1, 5, 100, 700])
-    avar, terms = overlapping_axis(y, factors)
+    avar, terms = overlapping_avar_axis(y, factors)
     assert avar == pytest.approx(exact(y, factors), rel=1e-14)
     assert (terms > 0).all()
 
@@ -115,7 +122,7 @@ def test_blocks_and_rows_join_without_seam(n):
     y = np.random.default_rng(n).standard_normal(n)
     factors = np.array([1, LANES - 1, LANES, BLOCK // 4, BLOCK // 2 - 1, BLOCK // 2, n // 2])
     expected = allantools.oadev(y, rate=1.0, data_type="freq", taus=factors)[1]
-    found, terms = overlapping_axis(y, factors)
+    found, terms = overlapping_avar_axis(y, factors)
     assert np.sqrt(found)[: len(expected)] == pytest.approx(expected, rel=1e-12)
     assert terms.tolist() == (n + 1 - 2 * factors).tolist()
 
@@ -123,32 +130,34 @@ def test_blocks_and_rows_join_without_seam(n):
 def test_single_precision_is_summed_in_double():
     y = (9.81 + 1e-3 * np.random.default_rng(5).standard_normal((30_000, 2))).astype(np.float32)
     factors = 2 ** np.arange(12)
-    assert overlapping(y, factors)[0] == pytest.approx(overlapping(y.astype(np.float64), factors)[0], rel=1e-15)
-    assert slope(y) == pytest.approx(slope(y.astype(np.float64)), rel=1e-12)
+    assert overlapping_avar(y, factors)[0] == pytest.approx(
+        overlapping_avar(y.astype(np.float64), factors)[0], rel=1e-15
+    )
+    assert slope_of_recording(y) == pytest.approx(slope_of_recording(y.astype(np.float64)), rel=1e-12)
 
 
 def test_axes_in_threads_are_the_same_axes():
     y = np.random.default_rng(6).standard_normal((5000, 6))
     y[77, 2] = np.nan
     with ThreadPoolExecutor(3) as pool:
-        avar, terms = overlapping(y, np.array([1, 10, 100]), each=pool.map)
-    assert avar.tolist() == overlapping(y, np.array([1, 10, 100]))[0].tolist()
+        avar, terms = overlapping_avar(y, np.array([1, 10, 100]), each=pool.map)
+    assert avar.tolist() == overlapping_avar(y, np.array([1, 10, 100]))[0].tolist()
     assert terms[0].tolist() == [4999, 4999, 4997, 4999, 4999, 4999]
 
 
 def test_slope_is_that_of_what_is_there_in_the_thirds_and_absent_where_too_little_is():
     y = np.random.default_rng(7).standard_normal((1001, 3)) + 0.01 * np.arange(1001.0)[:, None]
     y[500, 1], y[600, 2], y[601, 2] = np.nan, np.inf, -np.inf
-    found = slope(y)
+    found = slope_of_recording(y)
     assert found[0] == pytest.approx((y[668:, 0].mean() - y[2:335, 0].mean()) / 666.0, rel=1e-12)
     assert found[1:] == pytest.approx((y[668:, 1:].mean(axis=0) - y[2:335, 1:].mean(axis=0)) / 666.0, rel=1e-12)
     y[700:720, 1] = np.nan
-    assert np.isnan(slope(y)).tolist() == [False, True, False]
-    assert np.isnan(slope(y[:2])).all()
+    assert np.isnan(slope_of_recording(y)).tolist() == [False, True, False]
+    assert np.isnan(slope_of_recording(y[:2])).all()
 
 
 def test_too_long_clusters_have_no_answer():
-    avar, terms = overlapping(np.ones((10, 1)), np.array([5, 6]))
+    avar, terms = overlapping_avar(np.ones((10, 1)), np.array([5, 6]))
     assert avar[0, 0] == 0.0
     assert np.isnan(avar[1, 0])
     assert terms.ravel().tolist() == [1, 0]
@@ -157,7 +166,7 @@ def test_too_long_clusters_have_no_answer():
 def test_input_is_left_alone():
     y = np.random.default_rng(0).standard_normal((50, 6)) + 3.0
     before = y.copy()
-    overlapping(y, np.array([1, 2]))
+    overlapping_avar(y, np.array([1, 2]))
     assert np.array_equal(y, before)
 
 

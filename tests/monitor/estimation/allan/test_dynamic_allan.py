@@ -5,10 +5,10 @@ import pytest
 
 from drivers.errors import ConfigError, NotReady
 from monitor.estimation.allan import batch
-from monitor.estimation.allan.dynamic_allan import MOST_STEPS, dynamic
-from monitor.estimation.allan.uncertainty import intervals, table
+from monitor.estimation.allan.dynamic_allan import MAX_STEPS, compute_dynamic_allan
+from monitor.estimation.allan.uncertainty import covariance_table, intervals
 from monitor.estimation.fit.coefficient_fit import design, fit
-from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.noise.effects import (
     AngleRandomWalk,
     BiasInstability,
@@ -49,18 +49,18 @@ def test_every_step_is_a_batch_over_its_window() -> None:
     values = jumping(1)[20_000:32_000]
     values[:, 5] += 9.81
     values[[500, 4321]] = np.nan
-    found = dynamic(values, RATE_HZ, 40.0, "octave", 7.0)
+    found = compute_dynamic_allan(values, RATE_HZ, 40.0, "octave", 7.0)
     length, step = 4000, 700
     factors = batch.cluster_sizes(length, RATE_HZ)
-    columns, covariances = design(factors, RATE_HZ), table(length, factors)
+    columns, covariances = design(factors, RATE_HZ), covariance_table(length, factors)
     entered = np.zeros((5, 6), np.bool_)
     assert found.t_s.tolist() == [(length + i * step) / RATE_HZ for i in range(found.t_s.size)]
     assert found.t_s.size == 12
     assert found.window_s == 40.0
     for row, end in enumerate(range(length, 12_001, step)):
         window = values[end - length : end]
-        avar, terms = batch.overlapping(window, factors)
-        slope, slopes = batch.slope(window) * RATE_HZ, batch.slopes(window, factors) * RATE_HZ
+        avar, terms = batch.overlapping_avar(window, factors)
+        slope, slopes = batch.slope_of_recording(window) * RATE_HZ, batch.slope_per_tau(window, factors) * RATE_HZ
         expected = fit(columns, covariances, avar, terms, entered, slope, slopes)
         entered = expected.entered
         lo, hi = intervals(avar, expected.edf)
@@ -80,12 +80,12 @@ def test_every_step_is_a_batch_over_its_window() -> None:
 
 @pytest.fixture(scope="module")
 def experiment() -> list:
-    return [dynamic(jumping(seed), RATE_HZ, WINDOW_S) for seed in range(4)]
+    return [compute_dynamic_allan(jumping(seed), RATE_HZ, WINDOW_S) for seed in range(4)]
 
 
 def test_of_a_jump_in_n_b_k_r_the_window_shows_it_and_q_stays(experiment: list) -> None:
     """ "Dynamic extraction of random drift error coefficients of MEMS gyroscopes", its experiment, 24 axes."""
-    q, n = LETTERS.index("Q"), LETTERS.index("N")
+    q, n = SYMBOLS.index("Q"), SYMBOLS.index("N")
     t_s = experiment[0].t_s
     before, after = t_s <= JUMP_S, t_s >= JUMP_S + WINDOW_S
     values = np.concatenate([one.value for one in experiment], axis=2)  # [T, 5, 24]
@@ -116,7 +116,7 @@ def test_the_longest_deviations_rise_by_flicker_and_walk(experiment: list) -> No
 def test_the_whole_recording_hides_what_the_window_shows(experiment: list) -> None:
     """The mean of both variances, in which no time stands."""
     values = jumping(0)
-    avar, _ = batch.overlapping(values, np.array([16]))
+    avar, _ = batch.overlapping_avar(values, np.array([16]))
     whole = np.sqrt(avar[0].mean())
     at = int(np.argmin(abs(experiment[0].tau_s - 0.16)))
     mine = experiment[0].deviation[:, at].mean(axis=1)
@@ -126,8 +126,8 @@ def test_the_whole_recording_hides_what_the_window_shows(experiment: list) -> No
 def test_a_long_recording_is_shown_in_a_bounded_number_of_steps() -> None:
     values = np.random.default_rng(3).standard_normal((200_000, 6))
     shares: list[float] = []
-    found = dynamic(values, 10.0, 20.0, (0.1, 0.4, 1.6), step_s=1.0, progress=shares.append)
-    assert 0.9 * MOST_STEPS < found.t_s.size <= MOST_STEPS
+    found = compute_dynamic_allan(values, 10.0, 20.0, (0.1, 0.4, 1.6), step_s=1.0, progress=shares.append)
+    assert 0.9 * MAX_STEPS < found.t_s.size <= MAX_STEPS
     assert np.diff(found.t_s) == pytest.approx(np.full(found.t_s.size - 1, found.t_s[1] - found.t_s[0]))
     assert found.t_s[-1] > 20_000.0 - (found.t_s[1] - found.t_s[0])
     assert shares == pytest.approx(np.arange(1, found.t_s.size + 1) / found.t_s.size)
@@ -136,15 +136,15 @@ def test_a_long_recording_is_shown_in_a_bounded_number_of_steps() -> None:
 def test_an_axis_that_is_not_measured_says_nothing() -> None:
     values = np.random.default_rng(4).standard_normal((2000, 6))
     values[:, 3:] = np.nan
-    found = dynamic(values, 10.0, 100.0)
+    found = compute_dynamic_allan(values, 10.0, 100.0)
     assert np.isnan(found.deviation[..., 3:]).all()
     assert (found.status[..., 3:] == Status.UNESTIMATED).all()
-    assert (found.status[:, LETTERS.index("N"), :3] == Status.ESTIMATED).all()
+    assert (found.status[:, SYMBOLS.index("N"), :3] == Status.ESTIMATED).all()
 
 
 def test_a_recording_shorter_than_the_window_gives_no_answer() -> None:
     with pytest.raises(NotReady, match=r"50 s are recorded, less than the window of 60 s"):
-        dynamic(np.zeros((500, 6)), 10.0, 60.0)
+        compute_dynamic_allan(np.zeros((500, 6)), 10.0, 60.0)
 
 
 @pytest.mark.parametrize(
@@ -153,4 +153,4 @@ def test_a_recording_shorter_than_the_window_gives_no_answer() -> None:
 )
 def test_what_is_impossible_is_a_wrong_request(window_s: float, step_s: float | None, says: str) -> None:
     with pytest.raises(ConfigError, match=says):
-        dynamic(np.zeros((500, 6)), 10.0, window_s, step_s=step_s)
+        compute_dynamic_allan(np.zeros((500, 6)), 10.0, window_s, step_s=step_s)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from drivers.errors import ConfigError
 from monitor.estimation.allan import fading as fading_module
-from monitor.estimation.allan.batch import overlapping
+from monitor.estimation.allan.batch import overlapping_avar
 from monitor.estimation.allan.fading import FadingWindow
 from monitor.estimation.allan.window import FULL_SCALE
 from monitor.noise.effects.bias_instability import BiasInstability
@@ -289,7 +289,7 @@ def test_white_noise_of_a_long_memory_is_the_batch_s():
     factors = 2 ** np.arange(9)
     window = FadingWindow(factors, 1e9)
     window.update(values)
-    np.testing.assert_allclose(window.avar(), overlapping(values, factors)[0], rtol=0.03)
+    np.testing.assert_allclose(window.avar(), overlapping_avar(values, factors)[0], rtol=0.03)
 
 
 # --- life
@@ -345,4 +345,4 @@ def test_a_month_at_a_kilohertz_takes_kilobytes():
     held = sum(array.nbytes for array in vars(window).values() if isinstance(array, np.ndarray))
     assert held < 150_000
     window.update(made(2000))
-    np.testing.assert_allclose(window.avar()[0], overlapping(made(2000), np.array([1]))[0][0], rtol=1e-3)
+    np.testing.assert_allclose(window.avar()[0], overlapping_avar(made(2000), np.array([1]))[0][0], rtol=1e-3)

@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from monitor.estimation.allan.difference_moments import autocovariance
-from monitor.estimation.allan.hadamard import hadamard, hadamard_curve, moments
+from monitor.estimation.allan.hadamard import hadamard_curve, hadamard_variance, moments
 from monitor.estimation.allan.total import moments as total_moments
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
 from tests.support.allan_references import columns, nist_1000
 
 
 def test_thousand_points_of_nist_sp_1065():
-    found, terms = hadamard(nist_1000()[:, None], np.array([1, 10, 100]))
+    found, terms = hadamard_variance(nist_1000()[:, None], np.array([1, 10, 100]))
     assert np.sqrt(found[:, 0]) == pytest.approx([2.943883e-01, 9.581083e-02, 3.237638e-02], abs=5e-8)
     assert terms.ravel().tolist() == [998, 971, 701]
 
@@ -27,7 +27,7 @@ def test_equals_allantools(kind, rate_hz):
     y = 1e2 * rng.standard_normal(900) + np.cumsum(rng.standard_normal(900))
     y = np.rint(y).astype(np.int64) if kind == "int" else y
     factors = np.array([1, 2, 3, 7, 50, 200, 299])
-    found, _ = hadamard(y[:, None], factors)
+    found, _ = hadamard_variance(y[:, None], factors)
     _, expected, _, _ = allantools.ohdev(y, rate=rate_hz, data_type="freq", taus=factors / rate_hz)
     assert np.sqrt(found[:, 0]) == pytest.approx(expected, rel=1e-10)
 
@@ -45,7 +45,7 @@ def test_equals_allantools(kind, rate_hz):
 def test_is_the_mean_over_three_clusters_whatever_is_missing_or_drifts(n, m, holes, offset, drift, scale, seed):
     rate = np.random.default_rng(seed).standard_normal(n)
     rate[[h for h in holes if h < n]] = np.nan
-    found, terms = hadamard((offset + scale * (rate + drift * np.arange(n)))[:, None], np.array([m]))
+    found, terms = hadamard_variance((offset + scale * (rate + drift * np.arange(n)))[:, None], np.array([m]))
     clusters = [rate[k : k + 3 * m].reshape(3, m).mean(axis=1) for k in range(n + 1 - 3 * m)]
     squares = np.array([(a - 2.0 * b + c) ** 2 for a, b, c in clusters])
     whole = ~np.isnan(squares)
@@ -62,7 +62,9 @@ def test_a_linear_drift_of_a_thousand_times_the_noise_is_not_seen():
     noise = rng.standard_normal((600, 1))
     factors = np.array([1, 8, 64, 200])
     np.testing.assert_allclose(
-        hadamard(noise + 0.5 * np.arange(600)[:, None], factors)[0], hadamard(noise, factors)[0], rtol=1e-8
+        hadamard_variance(noise + 0.5 * np.arange(600)[:, None], factors)[0],
+        hadamard_variance(noise, factors)[0],
+        rtol=1e-8,
     )
     assert moments(2000, 64).mean[4] == 0.0
 
@@ -137,6 +139,6 @@ def test_stable32(reference, data, table):
     else:
         y, within = columns(reference / "ocxo-frequency.csv.gz", "y")[0] / 1e7 - 1.0, 1.5e-3
     m, dev, n = columns(reference / f"{data}-stable32-{table}.csv", "m", "dev", "n")
-    found, terms = hadamard(y[:, None], m.astype(np.int64))
+    found, terms = hadamard_variance(y[:, None], m.astype(np.int64))
     assert np.sqrt(found[:, 0]) == pytest.approx(dev, rel=within)
     assert terms.ravel().tolist() == n.astype(int).tolist()

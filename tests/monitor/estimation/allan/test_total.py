@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from monitor.estimation.allan import difference_moments as moments_module
-from monitor.estimation.allan.batch import overlapping
-from monitor.estimation.allan.total import MIN_SHARE, moments, octaves, total, total_curve
+from monitor.estimation.allan.batch import overlapping_avar
+from monitor.estimation.allan.total import MIN_SHARE, moments, octaves, total_curve, total_variance
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from tests.support.allan_references import nist_1000
 
@@ -38,7 +38,7 @@ def differences(n, m):
 
 
 def test_thousand_points_of_nist_sp_1065():
-    found, terms = total(nist_1000()[:, None], np.array([1, 10, 100]))
+    found, terms = total_variance(nist_1000()[:, None], np.array([1, 10, 100]))
     assert np.sqrt(found[:, 0]) == pytest.approx([2.922319e-01, 9.134743e-02, 3.406530e-02], abs=5e-8)
     assert terms.ravel().tolist() == [999, 999, 999]
 
@@ -50,7 +50,7 @@ def test_equals_allantools_up_to_the_longest_cluster(kind, rate_hz):
     y = 1e2 * rng.standard_normal(700) + np.cumsum(rng.standard_normal(700))
     y = {"float": y, "int": np.rint(y).astype(np.int64), "float32": y.astype(np.float32)}[kind]
     factors = np.array([1, 2, 3, 7, 100, 349, 350, 351, 352, 500, 698, 699])
-    found, _ = total(y[:, None], factors)
+    found, _ = total_variance(y[:, None], factors)
     _, expected, _, _ = allantools.totdev(
         y.astype(float) if kind == "float32" else y, rate=rate_hz, data_type="freq", taus=factors / rate_hz
     )
@@ -69,7 +69,7 @@ def test_equals_allantools_up_to_the_longest_cluster(kind, rate_hz):
 def test_is_the_mean_over_the_reflected_rate_whatever_is_missing(n, m, holes, offset, scale, seed):
     rate = np.random.default_rng(seed).standard_normal(n)
     rate[[h for h in holes if h < n]] = np.nan
-    found, terms = total((offset + scale * rate)[:, None], np.array([m]))
+    found, terms = total_variance((offset + scale * rate)[:, None], np.array([m]))
     squares = reflected(rate, m) ** 2 if m < n else np.array([])
     whole = ~np.isnan(squares)
     assert terms[0, 0] == whole.sum()
@@ -83,12 +83,12 @@ def test_columns_do_not_mix_and_the_input_is_left_alone():
     values = np.random.default_rng(0).standard_normal((80, 3))
     values[:, 1], values[10, 2], values[11, 2] = np.nan, np.inf, -np.inf
     before = values.copy()
-    found, terms = total(values, np.array([1, 5, 79]))
+    found, terms = total_variance(values, np.array([1, 5, 79]))
     assert np.array_equal(values, before, equal_nan=True)
     assert np.isnan(found[:, 1]).all()
     assert terms[:, 0].tolist() == [79, 79, 79]
     for k in range(3):
-        alone, _ = total(values[:, [k]], np.array([1, 5, 79]))
+        alone, _ = total_variance(values[:, [k]], np.array([1, 5, 79]))
         np.testing.assert_allclose(found[:, [k]], alone, rtol=1e-12)
 
 
@@ -170,7 +170,7 @@ def test_the_shortest_cluster_is_allan_s_and_the_grid_ends_below_the_record():
     curve = total_curve(values, 50.0, np.tile([[0.0], [0.02], [0.0], [0.0], [0.0]], 6))
     assert curve.factors.tolist() == [1, 2, 4, 8, 16, 32, 64, 128, 256]
     np.testing.assert_allclose(curve.tau_s, curve.factors / 50.0)
-    np.testing.assert_allclose(curve.tvar[0], overlapping(values, np.array([1]))[0][0], rtol=1e-12)
+    np.testing.assert_allclose(curve.tvar[0], overlapping_avar(values, np.array([1]))[0][0], rtol=1e-12)
     assert octaves(256)[-1] == 256
     assert octaves(255)[-1] == 128
 
@@ -198,5 +198,5 @@ def test_phase_dat_of_stable32(reference):
     with (reference / "phase-dat-stable32-totdev.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     factors = np.array([int(float(row["m"])) for row in rows])
-    found, _ = total(np.diff(x)[:, None], factors)
+    found, _ = total_variance(np.diff(x)[:, None], factors)
     assert np.sqrt(found[:, 0]) == pytest.approx([float(row["dev"]) for row in rows], rel=5e-5)

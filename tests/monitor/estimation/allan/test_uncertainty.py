@@ -6,8 +6,8 @@ import pytest
 from allantools.ci import edf_greenhall
 from scipy.stats import chi2
 
-from monitor.estimation.allan.batch import overlapping
-from monitor.estimation.allan.uncertainty import PAIRS, TABLE_STEP, Tables, intervals, table
+from monitor.estimation.allan.batch import overlapping_avar
+from monitor.estimation.allan.uncertainty import PAIRS, TABLE_STEP, CovarianceTables, covariance_table, intervals
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 
 
@@ -32,7 +32,7 @@ def plain_sum(n: int, first: int, second: int) -> np.ndarray:
 def test_table_is_the_plain_sum(n):
     factors = np.array([1, 2, 3, 4, 7, 8, 30, 32, 100, 128, 250, 400])
     factors = factors[2 * factors < n + 1]
-    covariance = table(n, factors).covariance
+    covariance = covariance_table(n, factors).covariance
     for i, first in enumerate(factors):
         for j, second in enumerate(factors):
             expected = plain_sum(n, first, second)
@@ -50,7 +50,7 @@ def test_table_is_the_plain_sum(n):
 )
 def test_degrees_of_freedom_agree_with_greenhall_and_riley_where_that_is_good(source, alpha):
     factors = 2 ** np.arange(5, 12)
-    t = table(20_000, factors)
+    t = covariance_table(20_000, factors)
     a = 1 - alpha
     own = t.covariance[:, :, PAIRS.index((a, a))].diagonal()
     edf = 2.0 * source.avar(factors * 1.0, 1.0) ** 2 / own
@@ -69,10 +69,10 @@ def test_degrees_of_freedom_agree_with_greenhall_and_riley_where_that_is_good(so
 )
 def test_covariance_is_that_of_simulated_curves(source, pair):
     n, factors, runs = 512, np.array([1, 4, 16, 64, 128]), 3000
-    t = table(n, factors)
+    t = covariance_table(n, factors)
     rng = np.random.default_rng(11)
     records = np.stack([source.start(1.0, rng).draw(n) for _ in range(runs)], axis=1)
-    measured = np.cov(overlapping(records, factors)[0])
+    measured = np.cov(overlapping_avar(records, factors)[0])
     stated = t.covariance[:, :, PAIRS.index(pair)]
     # a sample covariance of 3000 curves scatters by 3–5 % of the two deviations
     deviation = np.sqrt(stated.diagonal())
@@ -97,14 +97,14 @@ def test_a_fraction_of_a_degree_of_freedom_bounds_nothing_from_above_not_even_ze
 
 
 def test_too_short_a_window_is_nan_not_a_number():
-    t = table(100, np.array([1, 50, 51]))
+    t = covariance_table(100, np.array([1, 50, 51]))
     assert t.terms.tolist() == [99, 1, -1]
     assert np.isfinite(t.covariance[:2, :2]).all()
     assert np.isnan(t.covariance[2]).all()
 
 
 def test_tables_are_renewed_as_the_window_grows_and_kept_when_it_is_full():
-    tables = Tables(np.array([1, 2, 4]), capacity=10_000)
+    tables = CovarianceTables(np.array([1, 2, 4]), capacity=10_000)
     made = [tables.at(n) for n in range(8, 10_001)]
     lengths = sorted({t.n for t in made})
     assert len(lengths) < np.log(10_000 / 8) / np.log(TABLE_STEP) + 12

@@ -10,9 +10,9 @@ from hypothesis.extra import numpy as hnp
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
 from drivers.errors import ConfigError
-from monitor.estimation.allan.batch import cluster_sizes, overlapping, slope, slopes
-from monitor.estimation.allan.window import FULL_SCALE, MAX_LENGTH, MIN_LENGTH, AllanWindow, quick_spans
-from monitor.estimation.allan.window_kernel import STAGE, advance
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, slope_of_recording, slope_per_tau
+from monitor.estimation.allan.window import FULL_SCALE, MAX_LENGTH, MIN_LENGTH, AllanWindow, display_spans
+from monitor.estimation.allan.window_kernel import STAGE_SAMPLES, advance
 from tests.experiments.benchmarks import long_run
 
 FACTORS = np.array([1, 2, 3, 7, 16, 25, 50])
@@ -25,7 +25,7 @@ def made(n, seed=0, noise=1e-4):
 
 
 def expected(values, length=LENGTH, factors=FACTORS):
-    return overlapping(values[-length:], factors)
+    return overlapping_avar(values[-length:], factors)
 
 
 def expected_of_spans(window, values):
@@ -289,7 +289,7 @@ def test_impossible_spans_are_refused(factors, spans):
 @pytest.mark.parametrize(("length", "rate_hz"), [(100, 1.0), (100, 100.0), (360_000, 100.0), (3_600_000, 1000.0)])
 def test_quick_spans_fit_any_window(length, rate_hz):
     factors = np.unique([*cluster_sizes(length, rate_hz), length // 2])
-    window = AllanWindow(length, factors, quick_spans(factors, rate_hz, length))
+    window = AllanWindow(length, factors, display_spans(factors, rate_hz, length))
     assert ((window.spans >= 16 * factors) | (window.spans == length)).all()
     assert (window.spans >= min(10 * rate_hz, length)).all()
 
@@ -298,12 +298,12 @@ def test_quick_spans_fit_any_window(length, rate_hz):
 
 
 def test_staged_samples_can_be_taken_one_at_a_time():
-    values = broken(STAGE)
+    values = broken(STAGE_SAMPLES)
     window, plain = AllanWindow(LENGTH, FACTORS), AllanWindow(LENGTH, FACTORS)
     for row in values:
         plain.update(row[None])
     window._stage[:] = values
-    for row in range(STAGE):
+    for row in range(STAGE_SAMPLES):
         advance(window._ints, window._floats, window._missing, window._taus, row, 1)
     assert_same(window, plain)
     window._stage[:] = values[::-1]
@@ -492,7 +492,7 @@ class Calls(RuleBasedStateMachine):
 
     @rule(axis=st.integers(0, 5), n=st.integers(0, LENGTH + 33))
     def forget(self, axis, n):
-        self.window.forget(axis, n)
+        self.window.discard(axis, n)
         self.held[: max(len(self.held) - n, 0), axis] = np.nan
 
     @rule()
@@ -505,8 +505,8 @@ class Calls(RuleBasedStateMachine):
         assert self.window.n == len(self.held)
         check(self.window, self.held)
         if len(self.held) >= 3:
-            np.testing.assert_allclose(self.window.slope(), slope(self.held), rtol=1e-6, atol=1e-12)
-            seen, true = self.window.slopes(), slopes(self.held, self.window.factors)
+            np.testing.assert_allclose(self.window.slope(), slope_of_recording(self.held), rtol=1e-6, atol=1e-12)
+            seen, true = self.window.slopes(), slope_per_tau(self.held, self.window.factors)
             assert np.array_equal(np.isnan(seen), np.isnan(true))
             whole = np.isfinite(self.held).all(axis=0)  # with a gap, each puts another mean in its place
             np.testing.assert_allclose(seen[:, whole], true[:, whole], rtol=1e-5, atol=1e-12)
@@ -525,12 +525,12 @@ def test_forgetting_one_axis_makes_its_older_samples_missing(kept):
     values[LENGTH : LENGTH + 7, 2] = np.nan
     window, expected = AllanWindow(LENGTH, FACTORS), values[: 2 * LENGTH].copy()
     window.update(expected)
-    window.forget(1, kept)
+    window.discard(1, kept)
     expected[: len(expected) - kept, 1] = np.nan
     for n in (0, 3, 40, LENGTH):
         window.update(values[len(expected) : len(expected) + n])
         expected = np.concatenate([expected, values[len(expected) : len(expected) + n]])
-        avar, terms = overlapping(expected[-LENGTH:], FACTORS)
+        avar, terms = overlapping_avar(expected[-LENGTH:], FACTORS)
         assert np.array_equal(window.terms(), terms)
         assert window.avar()[terms > 0] == pytest.approx(avar[terms > 0], rel=1e-9)
 
@@ -539,13 +539,13 @@ def test_the_slope_of_an_axis_that_began_anew_is_that_of_its_own_samples():
     values = made(LENGTH) + 1e-3 * np.arange(LENGTH)[:, None]
     window = AllanWindow(LENGTH, FACTORS)
     window.update(values)
-    window.forget(4, 60)
+    window.discard(4, 60)
     lengths = np.full(6, LENGTH)
     lengths[4] = 60
     assert np.isnan(window.slope()[4])
-    assert window.slope(lengths)[4] == pytest.approx(slope(values[-60:])[4], rel=1e-6)
-    assert window.slope(lengths)[[0, 5]] == pytest.approx(slope(values)[[0, 5]], rel=1e-6)
-    expected = slopes(values[-60:], FACTORS)[:, 4]
+    assert window.slope(lengths)[4] == pytest.approx(slope_of_recording(values[-60:])[4], rel=1e-6)
+    assert window.slope(lengths)[[0, 5]] == pytest.approx(slope_of_recording(values)[[0, 5]], rel=1e-6)
+    expected = slope_per_tau(values[-60:], FACTORS)[:, 4]
     there = np.isfinite(expected)
     assert window.slopes(lengths)[there, 4] == pytest.approx(expected[there], rel=1e-6)
 
@@ -568,14 +568,14 @@ def test_a_small_gap_leaves_the_slope(gap):
     whole.update(values)
     values[at : at + missing] = np.nan
     window.update(values)
-    np.testing.assert_allclose(window.slope(), slope(values), rtol=1e-9)
+    np.testing.assert_allclose(window.slope(), slope_of_recording(values), rtol=1e-9)
     np.testing.assert_allclose(window.slope(), whole.slope(), rtol=0.01)
     # a missing sample stands for the level, here up to the whole ramp away
     np.testing.assert_allclose(window.slopes()[3:], whole.slopes()[3:], rtol=0.05)
-    np.testing.assert_allclose(slopes(values, factors)[3:], whole.slopes()[3:], rtol=0.05)
+    np.testing.assert_allclose(slope_per_tau(values, factors)[3:], whole.slopes()[3:], rtol=0.05)
     values[:100] = np.nan
     window.update(values)
     assert np.isnan(window.slope()).all()
-    assert np.isnan(slope(values)).all()
+    assert np.isnan(slope_of_recording(values)).all()
     assert np.isnan(window.slopes()).all()
-    assert np.isnan(slopes(values, factors)).all()
+    assert np.isnan(slope_per_tau(values, factors)).all()

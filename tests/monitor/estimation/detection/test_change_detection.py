@@ -7,8 +7,8 @@ from scipy.signal import lfilter
 from drivers.errors import ConfigError
 from drivers.sample import AXES
 from monitor.estimation.detection.change_detection import LEARN_S, ChangeDetector
-from monitor.estimation.detection.change_kernel import TICK, F, N, S
-from monitor.estimation.detection.change_size import Octaves, named
+from monitor.estimation.detection.change_kernel import TICK_SAMPLES, F, N, S
+from monitor.estimation.detection.change_size import Octaves, identify_noise_change
 from monitor.noise.effects.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.bias_instability import BiasInstability
 from monitor.noise.effects.quantization_noise import QuantizationNoise
@@ -94,7 +94,7 @@ def test_a_missing_sample_costs_its_own_differences_only():
     detector.update(values)
     terms = detector._state.band[GZ, :9, N]
     pairs = 4096 // (2 << np.arange(9))
-    short = 2 ** np.arange(9) < TICK
+    short = 2 ** np.arange(9) < TICK_SAMPLES
     # blocks of a tick and more bear the loss of a sixteenth
     assert np.array_equal(terms, pairs - short) or terms[8] == 0.0
     assert np.array_equal(terms[:5], pairs[:5] - 1)
@@ -290,19 +290,19 @@ MIX = {"Q": 2e-6, "N": 1.5e-4, "B": 4e-5, "K": 1.5e-6}
 
 @pytest.mark.parametrize(("letter", "factor"), [("N", 1.5), ("N", 0.7), ("Q", 10.0), ("B", 10.0), ("K", 100.0)])
 def test_exact_variances_name_the_letter_that_changed(letter, factor):
-    what = named(octaves(MIX, MIX | {letter: factor * MIX[letter]}), 100.0)
+    what = identify_noise_change(octaves(MIX, MIX | {letter: factor * MIX[letter]}), 100.0)
     assert list(what) == [letter]
     assert what[letter][1] == pytest.approx(factor * MIX[letter], rel=0.05)
 
 
 def test_two_letters():
-    what = named(octaves(MIX, MIX | {"Q": 2e-5, "N": 3e-4}, terms=100_000.0), 100.0)
+    what = identify_noise_change(octaves(MIX, MIX | {"Q": 2e-5, "N": 3e-4}, terms=100_000.0), 100.0)
     assert list(what) == ["Q", "N"]
 
 
 def test_nothing_known_names_nothing():
     none = np.zeros(12)
-    assert named(Octaves(none, none, none, none), 100.0) == {}
+    assert identify_noise_change(Octaves(none, none, none, none), 100.0) == {}
 
 
 # --- learning and refusing
@@ -310,9 +310,9 @@ def test_nothing_known_names_nothing():
 
 def test_learned_after_its_time():
     detector = ChangeDetector(100.0)
-    detector.update(white(int(LEARN_S * 100) - TICK))
+    detector.update(white(int(LEARN_S * 100) - TICK_SAMPLES))
     assert not detector.learned.any()
-    detector.update(white(4 * TICK))
+    detector.update(white(4 * TICK_SAMPLES))
     assert detector.learned.all()
     assert detector.watched[:, 0].sum() >= 6
     detector.restart(GZ)

@@ -4,13 +4,22 @@ import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
 
-from monitor.estimation.allan.batch import overlapping
+from monitor.estimation.allan.batch import overlapping_avar
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.detection import line_detection
-from monitor.estimation.detection.line_detection import BLOCK, LACKING, LEAST, MATTERS, ROWS, added, lines, outliers
+from monitor.estimation.detection.line_detection import (
+    BLOCK,
+    MAX_MISSING_SHARE,
+    MIN_LINE_SHARE,
+    MIN_STRETCHES,
+    ROWS,
+    detect_lines,
+    line_share,
+    outlier_share,
+)
 
 RATE_HZ = 100.0
-FEWEST = line_detection.FEWEST_ROWS * LEAST
+FEWEST = line_detection.MIN_ROWS * MIN_STRETCHES
 """Samples with which there is a spectrum."""
 
 
@@ -20,17 +29,17 @@ def white(n, seed=0):
 
 def curve_of(values):
     factors = 2 ** np.arange(max(int(np.log2(len(values))) - 1, 1))
-    avar, terms = overlapping(values, factors)
+    avar, terms = overlapping_avar(values, factors)
     unused = np.full_like(avar, np.nan)
     return AllanCurve(factors / RATE_HZ, factors, avar, terms, unused, unused, unused, len(values))
 
 
 def found(values, moving=None):
-    return lines(values, np.zeros(len(values), bool) if moving is None else moving, RATE_HZ, curve_of(values))
+    return detect_lines(values, np.zeros(len(values), bool) if moving is None else moving, RATE_HZ, curve_of(values))
 
 
 def shares(values, moving=None):
-    return outliers(values, np.zeros(len(values), bool) if moving is None else moving)
+    return outlier_share(values, np.zeros(len(values), bool) if moving is None else moving)
 
 
 def with_line(n, amplitude, hz, seed=0):
@@ -56,7 +65,7 @@ def with_resonance(n, rms, hz, q, seed=0):
 
 @pytest.mark.parametrize(("n", "hz"), [(60_000, 0.31), (60_000, 17.3), (60_000, 48.7), (10_000, 5.0), (10_000, 17.3)])
 def test_a_line_is_told_with_frequency_amplitude_and_share(n, hz):
-    rows = min(ROWS, 1 << int(np.log2(n // LEAST)))
+    rows = min(ROWS, 1 << int(np.log2(n // MIN_STRETCHES)))
     values = with_line(n, 2e-3, hz)
     [line] = found(values)
     assert (line.axis, line.wide) == (1, False)
@@ -79,7 +88,7 @@ def test_its_share_is_what_the_curve_has_more():
 def test_what_adds_less_than_matters_is_not_told():
     strong, weak = with_line(600_000, 2.5e-4, 21.0), with_line(600_000, 2.5e-5, 21.0)
     [line] = found(strong)
-    assert line.share > MATTERS
+    assert line.share > MIN_LINE_SHARE
     assert found(weak) == []
     # clear enough to be found, and left out for its share alone
     parts = [
@@ -88,8 +97,8 @@ def test_what_adds_less_than_matters_is_not_told():
     ]
     assert len(line_detection._peaks(line_detection._spectrum(np.stack(parts)), len(parts))) == 1
     quiet = curve_of(strong)
-    quiet.avar[:] *= 2.0 * line.share / MATTERS
-    assert lines(strong, np.zeros(600_000, bool), RATE_HZ, quiet) == []
+    quiet.avar[:] *= 2.0 * line.share / MIN_LINE_SHARE
+    assert detect_lines(strong, np.zeros(600_000, bool), RATE_HZ, quiet) == []
 
 
 def test_the_strongest_of_an_axis_come_first_and_no_more_than_three():
@@ -97,7 +106,7 @@ def test_the_strongest_of_an_axis_come_first_and_no_more_than_three():
     for hz, amplitude in ((7.0, 1e-3), (11.0, 3e-3), (23.0, 2e-3), (37.0, 1.5e-3)):
         values[:, 4] += amplitude * np.sin(2.0 * np.pi * hz * np.arange(60_000) / RATE_HZ)
     told = found(values)
-    assert [line.axis for line in told] == [4] * line_detection.LINES
+    assert [line.axis for line in told] == [4] * line_detection.MAX_LINES
     assert sorted(told, key=lambda line: -line.share) == told
     assert told[0].frequency_hz == pytest.approx(11.0, abs=0.02)
 
@@ -132,7 +141,7 @@ def test_missing_and_moving_samples_keep_a_line():
 
 def test_with_more_missing_than_may_be_there_is_no_answer():
     values = with_line(60_000, 2e-3, 17.3)
-    values[np.random.default_rng(1).random(60_000) < 1.5 * LACKING] = np.nan
+    values[np.random.default_rng(1).random(60_000) < 1.5 * MAX_MISSING_SHARE] = np.nan
     assert found(values) == []
     assert np.isnan(shares(values)).all()
 
@@ -220,7 +229,7 @@ def test_what_a_line_adds_at_each_averaging_time(hz):
     without, values = curve_of(white(60_000)), with_line(60_000, 5e-4, hz)
     [line] = found(values)
     more = 1.0 - without.avar[:, 1] / curve_of(values).avar[:, 1]
-    told = added(line, curve_of(values))
+    told = line_share(line, curve_of(values))
     assert told[:9] == pytest.approx(more[:9], abs=0.03)
     assert told.max() == pytest.approx(line.share)
 
@@ -246,7 +255,7 @@ def test_next_to_no_samples_are_no_error(n):
     values = np.ones((n, 6))
     nothing = np.full((1, 6), np.nan)
     curve = AllanCurve(np.ones(1), np.ones(1, np.int64), nothing, nothing, nothing, nothing, nothing, n)
-    assert lines(values, np.zeros(n, bool), RATE_HZ, curve) == []
+    assert detect_lines(values, np.zeros(n, bool), RATE_HZ, curve) == []
     assert shares(values).shape == (6,)
 
 

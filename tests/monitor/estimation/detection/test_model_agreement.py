@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from drivers.sample import Event
-from monitor.estimation.detection.model_agreement import KIND, RENEWED, Agreement
-from monitor.estimation.detection.model_gap import FEWEST, AxisGap, ModelGap
+from monitor.estimation.detection.model_agreement import KIND, RENEWED, ModelAgreement
+from monitor.estimation.detection.model_gap import MIN_SAMPLES, AxisGap, ModelGap
 
 STEP = 100  # samples from look to look
 WINDOW = 40_000
@@ -21,7 +21,7 @@ class Looks:
     """A device seen every STEP samples, 10 ms each."""
 
     def __init__(self) -> None:
-        self.agreement = Agreement()
+        self.agreement = ModelAgreement()
         self.samples = WINDOW
 
     def see(self, samples: int, **gaps: float) -> list[Event]:
@@ -44,7 +44,7 @@ def test_a_gap_that_stays_is_told_once_with_where_and_how_much() -> None:
         "gz disagrees with its model at τ 0.08 to 0.32 s: deviation 1.5 times the model's, "
         "6 σ apart where chance stays below 4.0"
     )
-    assert event.what == {
+    assert event.values == {
         "model": {"agrees": False, "gap": 6.0, "threshold": 4.0, "ratio": 1.5, "tau_lo": 0.08, "tau_hi": 0.32}
     }
     assert event.t_ns - (event.since_ns or 0) == HOLD * 10_000_000
@@ -64,19 +64,19 @@ def test_a_gap_that_comes_and_goes_is_no_event() -> None:
 def test_what_is_beyond_all_chance_is_told_sooner() -> None:
     looks = Looks()
     looks.see(STEP, gz=2.0)
-    assert looks.see(FEWEST, gz=20.0) == []
+    assert looks.see(MIN_SAMPLES, gz=20.0) == []
     assert len(looks.see(STEP, gz=20.0)) == 1
-    assert FEWEST < HOLD
+    assert MIN_SAMPLES < HOLD
 
 
 def test_it_agrees_again_only_below_the_lower_limit() -> None:
     looks = Looks()
-    looks.see(FEWEST + STEP, gz=20.0)
+    looks.see(MIN_SAMPLES + STEP, gz=20.0)
     assert looks.agreement.verdicts == {"gz": False}
     assert looks.see(10 * HOLD, gz=3.5) == []
     assert looks.see(HOLD, gz=1.5) == []
     (event,) = looks.see(STEP, gz=1.5)
-    assert (event.kind, event.what["model"]["agrees"]) == (KIND, True)
+    assert (event.kind, event.values["model"]["agrees"]) == (KIND, True)
     assert event.text == "gz agrees with its model again: 1.5 σ apart at most"
     assert looks.agreement.verdicts == {"gz": True}
     assert len(looks.see(2 * HOLD, gz=6.0)) == 1
@@ -84,14 +84,14 @@ def test_it_agrees_again_only_below_the_lower_limit() -> None:
 
 def test_there_is_no_verdict_before_one_is_sure() -> None:
     looks = Looks()
-    looks.see(FEWEST, gz=20.0)
+    looks.see(MIN_SAMPLES, gz=20.0)
     assert looks.agreement.verdicts == {}
     assert len(looks.see(STEP, gz=20.0)) == 1
 
 
 def test_an_axis_that_cannot_be_judged_for_a_while_keeps_its_verdict() -> None:
     looks = Looks()
-    looks.see(FEWEST + STEP, gz=20.0)
+    looks.see(MIN_SAMPLES + STEP, gz=20.0)
     assert looks.see(HOLD) == []
     assert looks.agreement.verdicts == {"gz": False}
     assert looks.see(HOLD, gz=20.0) == []

@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from drivers.sample import AXES, block
+from drivers.sample import AXES, make_block
 from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.detection.model_gap import FEWEST, FEWEST_EDF, ModelInForce, limit, normal_score, samples_of
+from monitor.estimation.detection.model_gap import (
+    MIN_EDF,
+    MIN_SAMPLES,
+    ModelComparison,
+    max_z_limit,
+    normal_score,
+    samples_of,
+)
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.estimator import Estimator
 from monitor.noise.effect import Effect
@@ -39,7 +46,7 @@ def model_of(*effects: Effect, axes: tuple[str, ...] = AXES) -> NoiseModel:
 def estimate(values: np.ndarray, window: int | None = None) -> Estimate:
     """One look at samples [n, 6]."""
     estimator = Estimator(RATE, (window or len(values)) / RATE)
-    estimator.update(block(np.arange(len(values)) * 10_000_000, values.copy()))
+    estimator.update(make_block(np.arange(len(values)) * 10_000_000, values.copy()))
     return estimator.get(fitted=False)
 
 
@@ -63,8 +70,8 @@ def simulated(model: NoiseModel, n: int, seed: int) -> Estimate:
 def test_scores_of_a_true_model_are_those_of_chance(effects: tuple[Effect, ...]) -> None:
     """At every τ: a wrong number of degrees of freedom would show in the spread."""
     model = model_of(*effects)
-    in_force = ModelInForce(model, 12_000)
-    looks = [in_force.look(simulated(model, 12_000, seed)) for seed in range(40)]
+    in_force = ModelComparison(model, 12_000)
+    looks = [in_force.compare(simulated(model, 12_000, seed)) for seed in range(40)]
     assert all(list(look.axes) == list(AXES) for look in looks)
     z = np.array([one.z for look in looks for one in look.axes.values()])
     judged = ~np.isnan(z).any(axis=0)
@@ -81,29 +88,29 @@ def test_scores_of_a_true_model_are_those_of_chance(effects: tuple[Effect, ...])
 def test_what_is_wrong_is_found_where_it_is_and_as_large_as_it_is() -> None:
     true = model_of(*CLASSIC)
     measured = true + NoiseModel({"gz": (Sinusoidal(amplitude=6e-4, frequency=5.0),)})
-    look = ModelInForce(true, 30_000).look(simulated(measured, 30_000, 5))
+    look = ModelComparison(true, 30_000).compare(simulated(measured, 30_000, 5))
     gz = look.axes["gz"]
     assert gz.passes
     lo, hi = gz.tau_s
     assert lo <= 0.08 <= hi  # a line is largest at half its period
-    assert look.tau_s[gz.at] in (0.04, 0.08)
-    assert gz.gap == np.nanmax(np.abs(gz.z)) == abs(gz.z[gz.at])
-    tau = look.tau_s[gz.at : gz.at + 1]
+    assert look.tau_s[gz.row] in (0.04, 0.08)
+    assert gz.gap == np.nanmax(np.abs(gz.z)) == abs(gz.z[gz.row])
+    tau = look.tau_s[gz.row : gz.row + 1]
     expected = np.sqrt(measured.avar("gz", tau, 1 / RATE) / true.avar("gz", tau, 1 / RATE))[0]
     assert gz.ratio == pytest.approx(expected, rel=0.03)
     assert not any(look.axes[axis].passes for axis in AXES if axis != "gz")
 
 
 def test_a_sensor_that_is_too_quiet_is_found_too() -> None:
-    look = ModelInForce(model_of(WHITE), 10_000).look(simulated(model_of(AngleRandomWalk(N=1.2e-4)), 10_000, 1))
-    assert all(one.passes and one.z[one.at] < 0.0 and one.ratio == pytest.approx(0.8, rel=0.06)
+    look = ModelComparison(model_of(WHITE), 10_000).compare(simulated(model_of(AngleRandomWalk(N=1.2e-4)), 10_000, 1))
+    assert all(one.passes and one.z[one.row] < 0.0 and one.ratio == pytest.approx(0.8, rel=0.06)
                for one in look.axes.values())  # fmt: skip
 
 
 def test_a_part_of_a_percent_is_told_where_the_window_allows_it() -> None:
     """z is in the window's own standard deviations: at one sample, 1/√edf of the deviation."""
     n = 100_000
-    look = ModelInForce(model_of(WHITE), n).look(simulated(model_of(AngleRandomWalk(N=1.5e-4 * 1.02)), n, 3))
+    look = ModelComparison(model_of(WHITE), n).compare(simulated(model_of(AngleRandomWalk(N=1.5e-4 * 1.02)), n, 3))
     shortest = [one.z[0] for one in look.axes.values()]
     assert np.mean(shortest) == pytest.approx(0.04 / np.sqrt(2 / (2 * n / 3)), rel=0.25)  # edf = 2/3 n
 
@@ -112,17 +119,17 @@ def test_axes_without_a_model_or_without_samples_are_not_judged() -> None:
     model = model_of(WHITE, axes=("gx", "gz")) + NoiseModel({"ay": (Bias(value=1.0),)})
     heated = model + NoiseModel({"gx": (TemperatureBias(coefficient=1e-3, reference=20.0),)})
     values = model_of(WHITE).simulate(5000, RATE, 1)
-    assert list(ModelInForce(model, 5000).look(estimate(values)).axes) == ["gx", "gz"]
-    assert list(ModelInForce(heated, 5000).look(estimate(values)).axes) == ["gz"]  # its temperature is not known
+    assert list(ModelComparison(model, 5000).compare(estimate(values)).axes) == ["gx", "gz"]
+    assert list(ModelComparison(heated, 5000).compare(estimate(values)).axes) == ["gz"]  # its temperature is not known
     values[:, 2] = np.nan
-    assert list(ModelInForce(model, 5000).look(estimate(values)).axes) == ["gx"]
+    assert list(ModelComparison(model, 5000).compare(estimate(values)).axes) == ["gx"]
 
 
 def test_too_few_samples_are_no_look() -> None:
-    in_force = ModelInForce(model_of(WHITE), 5000)
-    values = model_of(WHITE).simulate(FEWEST, RATE, 1)
-    assert in_force.look(estimate(values[:-1], 5000)).axes == {}
-    assert list(in_force.look(estimate(values, 5000)).axes) == list(AXES)
+    in_force = ModelComparison(model_of(WHITE), 5000)
+    values = model_of(WHITE).simulate(MIN_SAMPLES, RATE, 1)
+    assert in_force.compare(estimate(values[:-1], 5000)).axes == {}
+    assert list(in_force.compare(estimate(values, 5000)).axes) == list(AXES)
 
 
 def test_an_axis_that_began_anew_is_judged_by_its_own_samples() -> None:
@@ -130,11 +137,11 @@ def test_an_axis_that_began_anew_is_judged_by_its_own_samples() -> None:
     estimator = Estimator(RATE, 200.0)
     values = model.simulate(20_000, RATE, 1)
     values[:17_000, 2] *= 3.0
-    estimator.update(block(np.arange(20_000) * 10_000_000, values.copy()))
-    in_force = ModelInForce(model, estimator.length)
-    assert in_force.look(estimator.get(fitted=False)).axes["gz"].passes
+    estimator.update(make_block(np.arange(20_000) * 10_000_000, values.copy()))
+    in_force = ModelComparison(model, estimator.length)
+    assert in_force.compare(estimator.get(fitted=False)).axes["gz"].passes
     estimator.restart(2, 3000)
-    look = in_force.look(estimator.get(fitted=False))
+    look = in_force.compare(estimator.get(fitted=False))
     assert not look.axes["gz"].passes
     assert (look.axes["gz"].samples, look.axes["gx"].samples) == (3000, 20_000)
     assert samples_of(estimator.get(fitted=False).curve, 2) == 3000
@@ -146,34 +153,34 @@ def test_gaps_in_the_samples_cost_certainty_and_nothing_else() -> None:
     model = model_of(*CLASSIC)
     values = model.simulate(30_000, RATE, 2)
     values[np.random.default_rng(1).random(30_000) < 0.01] = np.nan
-    look = ModelInForce(model, 30_000).look(estimate(values))
+    look = ModelComparison(model, 30_000).compare(estimate(values))
     assert list(look.axes) == list(AXES)
     assert not any(one.passes for one in look.axes.values())
 
 
 def test_a_rate_known_better_is_another_label() -> None:
     model = model_of(WHITE)
-    in_force = ModelInForce(model, 10_000)
+    in_force = ModelComparison(model, 10_000)
     found = simulated(model, 10_000, 4)
-    before = in_force.look(found).axes["gz"]
+    before = in_force.compare(found).axes["gz"]
     curve: AllanCurve = replace(found.curve, tau_s=found.curve.factors / 104.0)
-    after = in_force.look(replace(found, rate_hz=104.0, curve=curve)).axes["gz"]
+    after = in_force.compare(replace(found, rate_hz=104.0, curve=curve)).axes["gz"]
     assert after.model == pytest.approx(before.model * np.sqrt(1.04))  # N over the root of a shorter τ
-    assert in_force.look(found).axes["gz"].gap == before.gap
+    assert in_force.compare(found).axes["gz"].gap == before.gap
 
 
 def test_scores_against_the_distribution_itself() -> None:
     """The cube root against the exact quantiles, out to those that decide."""
-    for edf in (FEWEST_EDF, 10.0, 1000.0):
+    for edf in (MIN_EDF, 10.0, 1000.0):
         z = np.array([-1.5, 0.0, 2.0, 3.0, 3.8])
         exact = chi2.ppf(norm.cdf(z), edf) / edf
         assert normal_score(exact, np.full(5, edf)) == pytest.approx(z, abs=0.26 if edf < 5 else 0.05)
-    assert np.isnan(normal_score(np.ones(1), np.array([FEWEST_EDF - 0.01]))[0])
+    assert np.isnan(normal_score(np.ones(1), np.array([MIN_EDF - 0.01]))[0])
 
 
 def test_limits_pay_for_every_number() -> None:
     rng = np.random.default_rng(1)
     largest = np.abs(rng.standard_normal((200_000, 12))).max(axis=1)
-    assert np.mean(largest > limit(0.05, 12)) == pytest.approx(0.05, abs=0.002)
+    assert np.mean(largest > max_z_limit(0.05, 12)) == pytest.approx(0.05, abs=0.002)
     together = 0.8 * rng.standard_normal((200_000, 1)) + 0.6 * rng.standard_normal((200_000, 12))
-    assert np.mean(np.abs(together).max(axis=1) > limit(0.05, 12)) < 0.05
+    assert np.mean(np.abs(together).max(axis=1) > max_z_limit(0.05, 12)) < 0.05

@@ -5,9 +5,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from drivers.sample import AXES, block
-from monitor.estimation.detection.motion_detection import BLOCK_S, Rest, block_size, find
-from monitor.estimation.detection.motion_kernel import AFTER, LEARNED
+from drivers.sample import AXES, make_block
+from monitor.estimation.detection.motion_detection import BLOCK_S, MotionDetector, block_size, detect_motion
+from monitor.estimation.detection.motion_kernel import REFERENCE_BLOCKS, REMOVED_AFTER
 from tests.support.recordings import recordings
 
 RATE = 100.0
@@ -32,12 +32,12 @@ def turned_by_hand(values, since_s, until_s, rate=RATE):
 
 def stream(values, edges, lost_before=None, rate=RATE):
     """Rows in blocks cut at the edges, all that comes out joined, and the detector."""
-    rest = Rest(rate)
+    rest = MotionDetector(rate)
     out, most = [], 0
     given = taken = 0
     for a, b in pairwise(edges):
         lost = lost_before if lost_before and a == lost_before else 0
-        came = rest.update(block(np.arange(a, b), values[a:b].copy(), lost=lost))
+        came = rest.update(make_block(np.arange(a, b), values[a:b].copy(), lost=lost))
         out += came
         given, taken = given + b - a, taken + sum(len(one) for one in came)
         most = max(most, given - taken)
@@ -47,7 +47,7 @@ def stream(values, edges, lost_before=None, rate=RATE):
 
 def test_a_motion_is_struck_out_with_its_onset_and_its_end():
     values = turned_by_hand(still(60), 30.0, 34.3)
-    mask, (motion,) = find(values, RATE)
+    mask, (motion,) = detect_motion(values, RATE)
     assert motion.kind == "motion"
     assert 29.0 <= motion.since / RATE <= 30.0
     assert 34.3 <= motion.until / RATE <= 35.5
@@ -73,7 +73,7 @@ def test_any_cut_gives_the_same(cut):
         "whole": (0, 4000),
         "odd": sorted({0, 4000, *np.random.default_rng(1).integers(1, 4000, 60).tolist()}),
     }[cut]
-    mask, motions = find(values, RATE)
+    mask, motions = detect_motion(values, RATE)
     assert [one.kind for one in motions] == ["motion", "knock"]
     out, t, rest, _ = stream(values, list(edges))
     assert np.array_equal(out, np.where(mask[:, None], np.nan, values), equal_nan=True)
@@ -91,31 +91,31 @@ def test_samples_are_held_back_for_two_blocks():
 
 def test_missing_samples_keep_their_places():
     values = turned_by_hand(still(40), 30.0, 32.0)
-    _, (motion,) = find(values, RATE)
+    _, (motion,) = detect_motion(values, RATE)
     kept = np.delete(values, slice(1000, 1260), axis=0)
     edges = [*range(0, 1000, 100), *range(1000, len(kept), 100), len(kept)]
-    rest = Rest(RATE)
+    rest = MotionDetector(RATE)
     for a, b in pairwise(edges):
-        rest.update(block(np.arange(a, b), kept[a:b].copy(), lost=260 if a == 1000 else 0))
+        rest.update(make_block(np.arange(a, b), kept[a:b].copy(), lost=260 if a == 1000 else 0))
     rest.flush()
     (found,) = rest.take()
     assert (found.kind, found.since, found.until) == (motion.kind, motion.since, motion.until)
 
 
 def test_a_very_long_pause_is_no_work():
-    rest = Rest(RATE)
-    rest.update(block(np.arange(2000), still(20)))
-    rest.update(block(np.arange(2000), still(20, seed=1), lost=10**12))
+    rest = MotionDetector(RATE)
+    rest.update(make_block(np.arange(2000), still(20)))
+    rest.update(make_block(np.arange(2000), still(20, seed=1), lost=10**12))
     rest.flush()
     assert rest.take() == []
 
 
 def test_moving_is_shown_while_it_lasts():
     values = turned_by_hand(still(30), 20.0, 23.0)
-    rest = Rest(RATE)
+    rest = MotionDetector(RATE)
     shown = []
     for a in range(0, 3000, 10):
-        rest.update(block(np.arange(a, a + 10), values[a : a + 10].copy()))
+        rest.update(make_block(np.arange(a, a + 10), values[a : a + 10].copy()))
         shown.append(rest.moving)
     seconds = np.flatnonzero(shown) / 10.0
     assert 20.0 < seconds[0] < 20.6
@@ -129,18 +129,18 @@ def test_a_knock_rings_and_an_outlier_does_not():
     values[2000, 5] += 5.0  # one sample: for the statistics of outliers
     t = np.arange(12) / RATE
     values[4000:4012, 5] += 4.0 * np.exp(-t / 0.03) * np.cos(2 * np.pi * 31 * t)
-    mask, (knock,) = find(values, RATE)
+    mask, (knock,) = detect_motion(values, RATE)
     assert (knock.kind, knock.axis) == ("knock", "az")
     assert knock.since <= 4000 < knock.until
     assert knock.text == "knocked: az up to 410 mg"
-    assert mask.sum() <= (2 + 1 + AFTER) * block_size(RATE)
+    assert mask.sum() <= (2 + 1 + REMOVED_AFTER) * block_size(RATE)
 
 
 def test_another_orientation_is_handling_and_rest_soon_after():
     values = turned_by_hand(still(60), 30.0, 32.0)
     values[3200:, 3:] += [9.81 * np.sin(0.5), 0.0, 9.81 * (np.cos(0.5) - 1.0)]
     values[3200:, 0] += 2e-3  # g-sensitivity
-    mask, (motion,) = find(values, RATE)
+    mask, (motion,) = detect_motion(values, RATE)
     assert motion.kind == "handling/orientation"
     assert motion.until / RATE < 34.5
     assert not mask[3450:].any()
@@ -152,7 +152,7 @@ def test_a_recording_that_begins_in_motion(moving_s):
     turned_by_hand(values, 0.0, moving_s)
     values[: round(moving_s * RATE), 0] += 0.4 * np.sin(np.arange(round(moving_s * RATE)) / 9.0)
     turned_by_hand(values, 70.0, 72.0)
-    mask, motions = find(values, RATE)
+    mask, motions = detect_motion(values, RATE)
     assert mask[: round(moving_s * RATE)].mean() > 0.8
     assert not mask[round((moving_s + 5.0) * RATE) : 6900].any()
     assert 69.0 < motions[-1].since / RATE <= 70.0
@@ -165,7 +165,7 @@ def test_a_slow_start_in_motion_is_unlearned_when_rest_comes():
     values[:1500, :3] += 0.05 * np.sin(2 * np.pi * np.outer(t, [3.1, 4.3, 5.9]))
     values[:1500, 3:] += 0.4 * np.sin(2 * np.pi * np.outer(t, [3.7, 4.9, 6.1]))
     turned_by_hand(values, 60.0, 62.0)
-    _, motions = find(values, RATE)
+    _, motions = detect_motion(values, RATE)
     assert [round(one.since / RATE) for one in motions] == [59] or [round(one.since / RATE) for one in motions] == [60]
 
 
@@ -173,11 +173,11 @@ def test_a_new_vibration_is_motion_for_a_minute_and_rest_then():
     values = still(240)
     rows = np.arange(len(values) - 10000)
     values[10000:, 3:] += 0.2 * np.sin(2 * np.pi * 17.3 / RATE * rows)[:, None]
-    mask, (motion,) = find(values, RATE)
+    mask, (motion,) = detect_motion(values, RATE)
     assert motion.since / RATE == pytest.approx(100.0, abs=0.5)
     assert 60.0 <= motion.seconds <= 67.0
     assert not mask[motion.until :].any()
-    assert LEARNED * BLOCK_S == 60.0
+    assert REFERENCE_BLOCKS * BLOCK_S == 60.0
 
 
 def test_motion_that_goes_on_is_never_taken_for_rest():
@@ -185,14 +185,14 @@ def test_motion_that_goes_on_is_never_taken_for_rest():
     rng = np.random.default_rng(5)
     wander = np.convolve(rng.standard_normal(len(values) + 199), np.ones(200) / 200, "valid")
     values[6000:, :3] += 3.0 * wander[6000:, None]
-    mask, _ = find(values, RATE)
+    mask, _ = detect_motion(values, RATE)
     assert mask[6100:].mean() > 0.9
 
 
 def test_a_constant_rate_held_for_long_is_rest_after_ten_seconds():
     values = still(60)
     values[2000:, 2] += 0.5
-    mask, (motion,) = find(values, RATE)
+    mask, (motion,) = detect_motion(values, RATE)
     assert motion.seconds == pytest.approx(10.0, abs=1.0)
     assert not mask[motion.until :].any()
 
@@ -236,7 +236,7 @@ def test_what_is_no_motion(disturbed):
             values[k] += 0.95 * (values[k - 1] - LYING)
     elif disturbed == "ramp":
         values += 10 * NOISE * t / 60.0
-    mask, motions = find(values, RATE)
+    mask, motions = detect_motion(values, RATE)
     assert not mask.any(), [one.text for one in motions]
 
 
@@ -244,7 +244,7 @@ def test_what_is_no_motion(disturbed):
 def test_any_rate(rate):
     length_s = max(60.0, 300 / rate)
     values = turned_by_hand(still(length_s, rate=rate), length_s / 2, length_s / 2 + max(3.0, 20 / rate), rate)
-    _, motions = find(values, rate)
+    _, motions = detect_motion(values, rate)
     assert len(motions) == 1
     assert motions[0].since / rate <= length_s / 2 < motions[0].until / rate
 
@@ -252,17 +252,17 @@ def test_any_rate(rate):
 def test_axes_that_are_absent_and_values_that_never_change():
     values = turned_by_hand(still(60), 30.0, 33.0)
     values[:, 1:] = np.nan
-    _, (motion,) = find(values, RATE)
+    _, (motion,) = detect_motion(values, RATE)
     assert motion.axis == "gx"
-    assert find(np.full((3000, 6), np.nan), RATE)[1] == []
-    assert find(np.full((3000, 6), 1.5), RATE)[1] == []
-    assert find(np.empty((0, 6)), RATE)[0].shape == (0,)
+    assert detect_motion(np.full((3000, 6), np.nan), RATE)[1] == []
+    assert detect_motion(np.full((3000, 6), 1.5), RATE)[1] == []
+    assert detect_motion(np.empty((0, 6)), RATE)[0].shape == (0,)
 
 
 def test_a_constant_that_begins_to_toggle_is_no_motion():
     values = np.zeros((12000, 6))
     values[6000:] = 0.01 * (np.random.default_rng(0).random((6000, 6)) < 0.2)
-    assert find(values, RATE)[1] == []
+    assert detect_motion(values, RATE)[1] == []
 
 
 def recording(name):
@@ -289,13 +289,13 @@ def recording(name):
 )
 def test_static_recordings_stay_at_rest(name, most):
     values, rate = recording(name)
-    assert find(values, rate)[0].mean() <= most
+    assert detect_motion(values, rate)[0].mean() <= most
 
 
 @pytest.mark.data
 def test_moved_by_hand_on_the_bench():
     values, rate = recording("px4-bench/bench-69s")
-    _, (motion,) = find(values, rate)
+    _, (motion,) = detect_motion(values, rate)
     assert motion.since / rate == pytest.approx(1.9, abs=0.4)
     assert motion.until / rate == pytest.approx(6.9, abs=0.5)
 
@@ -304,7 +304,7 @@ def test_moved_by_hand_on_the_bench():
 @pytest.mark.parametrize("unit", ["imu1", "imu2", "imu3"])
 def test_on_the_ground_and_in_flight(unit):
     values, rate = recording(f"autopilot-3imu/{unit}")
-    mask, _ = find(values, rate)
+    mask, _ = detect_motion(values, rate)
     assert not mask[round(20 * rate) : round(55 * rate)].any()
     assert mask[round(72 * rate) :].mean() > 0.99
 
@@ -313,7 +313,7 @@ def test_on_the_ground_and_in_flight(unit):
 @pytest.mark.parametrize("unit", range(5))
 def test_hand_rotations_and_standstills(unit):
     values, rate = recording(f"mpu9150-rotations/unit{unit}")
-    mask, motions = find(values, rate)
+    mask, motions = detect_motion(values, rate)
     turning = np.abs(values[:, :3] - np.median(values[:, :3], axis=0)).max(axis=1) > 0.3
     assert mask[turning].mean() > 0.95
     assert 0.4 < mask.mean() < 0.65
@@ -323,7 +323,7 @@ def test_hand_rotations_and_standstills(unit):
 @pytest.mark.data
 def test_a_car_that_parks_and_drives_off():
     values, rate = recording("can-car/drive-a")
-    mask, _ = find(values, rate)
+    mask, _ = detect_motion(values, rate)
     for parked in ((54, 80), (178, 204), (286, 320)):
         assert not mask[round(parked[0] * rate) : round(parked[1] * rate)].any()
     for driving in ((212, 222), (330, 344)):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from drivers.sample import block
-from monitor.estimation.detection.signal_monitor import Watch
+from drivers.sample import make_block
+from monitor.estimation.detection.signal_monitor import SignalMonitor
 
 RATE_HZ = 100.0
 STEP_NS = 10_000_000
@@ -21,7 +21,7 @@ def feed(watch, values, size=250, lost=0):
     for at in range(0, len(values), size):
         part = values[at : at + size]
         t_ns = FIRST_NS + STEP_NS * (np.arange(at, at + len(part)) + lost)
-        out += watch.update(block(t_ns, part, lost=lost if at == 0 else 0))
+        out += watch.update(make_block(t_ns, part, lost=lost if at == 0 else 0))
     return out
 
 
@@ -33,11 +33,11 @@ def seconds(t_ns):
 def test_louder_noise_is_an_event_with_its_time_and_a_restart_with_its_samples(lost):
     values = noise(40_000)
     values[30_000:, 1] *= 2.0
-    watch = Watch(RATE_HZ)
+    watch = SignalMonitor(RATE_HZ)
     feed(watch, values, lost=lost)
     (event,) = watch.take_events()
     assert (event.kind, event.axis) == ("noise_changed", "gy")
-    assert event.what["N"]["after"] / event.what["N"]["before"] == pytest.approx(2.0, rel=0.15)
+    assert event.values["N"]["after"] / event.values["N"]["before"] == pytest.approx(2.0, rel=0.15)
     assert seconds(event.since_ns) == pytest.approx(300.0 + lost / RATE_HZ, abs=1.0)
     assert seconds(event.since_ns) < seconds(event.t_ns) < 310.0 + lost / RATE_HZ
     (restart,) = watch.take_restarts()
@@ -51,7 +51,7 @@ def test_louder_noise_is_an_event_with_its_time_and_a_restart_with_its_samples(l
 def test_motion_is_told_and_left_out_only_where_that_is_wanted(leave_out):
     values = noise(12_000)
     values[8_000:8_300, 0] += 0.5 * np.sin(np.arange(300) / 15.0)
-    watch = Watch(RATE_HZ, leave_out)
+    watch = SignalMonitor(RATE_HZ, leave_out)
     passed = feed(watch, values)
     assert not watch.moving
     passed += watch.flush()
@@ -65,30 +65,30 @@ def test_motion_is_told_and_left_out_only_where_that_is_wanted(leave_out):
     (event,) = watch.take_events()
     assert (event.kind, event.axis) == ("moved", "gx")
     assert seconds(event.since_ns) == pytest.approx(80.0, abs=0.6)
-    assert event.what["moved"]["peak"] == pytest.approx(0.5, rel=0.1)
+    assert event.values["moved"]["peak"] == pytest.approx(0.5, rel=0.1)
 
 
 @pytest.mark.parametrize("leave_out", [False, True])
 def test_what_is_at_rest_can_be_had_whatever_is_handed_on(leave_out):
     values = noise(12_000)
     values[8_000:8_300, 0] += 0.5 * np.sin(np.arange(300) / 15.0)
-    watch = Watch(RATE_HZ, leave_out, keep_still=True)
+    watch = SignalMonitor(RATE_HZ, leave_out, keep_still=True)
     feed(watch, values)
-    still = np.concatenate([one.values for one in watch.take_still()])
+    still = np.concatenate([one.values for one in watch.take_samples_at_rest()])
     assert len(still) < len(values)  # the last are not judged yet
     watch.flush()
-    still = np.concatenate([still, *(one.values for one in watch.take_still())])
+    still = np.concatenate([still, *(one.values for one in watch.take_samples_at_rest())])
     struck = np.isnan(still[:, 0])
     assert struck.sum() == watch.moved_samples > 300
     assert np.array_equal(still[~struck], values[~struck])
-    assert watch.take_still() == []
+    assert watch.take_samples_at_rest() == []
     assert watch.handled == 0
 
 
 def test_still_samples_are_kept_only_for_who_wants_them():
-    watch = Watch(RATE_HZ)
+    watch = SignalMonitor(RATE_HZ)
     feed(watch, noise(1000))
-    assert watch.take_still() == []
+    assert watch.take_samples_at_rest() == []
 
 
 def test_being_left_in_another_orientation_is_counted():
@@ -96,7 +96,7 @@ def test_being_left_in_another_orientation_is_counted():
     values[:, 5] += 9.81
     values[6_000:6_200, 1] += 1.0
     values[6_100:, 3:6] = noise(12_000, 1)[6_100:, 3:6] + [9.81, 0.0, 0.0]
-    watch = Watch(RATE_HZ)
+    watch = SignalMonitor(RATE_HZ)
     feed(watch, values)
     watch.flush()
     assert watch.handled == 1
@@ -105,7 +105,7 @@ def test_being_left_in_another_orientation_is_counted():
 def test_motion_is_no_change_of_noise():
     values = noise(30_000)
     values[20_000:21_000, 3:] += 2.0 * np.random.default_rng(1).standard_normal((1000, 3))
-    watch = Watch(RATE_HZ)
+    watch = SignalMonitor(RATE_HZ)
     feed(watch, values)
     assert {event.kind for event in watch.take_events()} == {"moved"}
     assert not watch.take_restarts()
@@ -114,7 +114,7 @@ def test_motion_is_no_change_of_noise():
 def test_who_wants_no_changes_looks_for_none():
     values = noise(20_000)
     values[10_000:] *= 3.0
-    watch = Watch(RATE_HZ, alarms_per_day=0.0)
+    watch = SignalMonitor(RATE_HZ, alarms_per_day=0.0)
     feed(watch, values)
     assert "noise_changed" not in {event.kind for event in watch.take_events()}
 
@@ -122,12 +122,12 @@ def test_who_wants_no_changes_looks_for_none():
 def test_a_rate_that_is_another_begins_to_learn_anew_and_keeps_its_counts():
     values = noise(12_000)
     values[8_000:8_300, 0] += 0.5 * np.sin(np.arange(300) / 15.0)
-    watch = Watch(RATE_HZ)
+    watch = SignalMonitor(RATE_HZ)
     feed(watch, values)
     moved = watch.moved_samples
-    watch.relabel(RATE_HZ * 1.001)
+    watch.set_rate(RATE_HZ * 1.001)
     assert watch.moved_samples == moved > 0
-    watch.relabel(RATE_HZ * 2.0)
+    watch.set_rate(RATE_HZ * 2.0)
     assert watch.moved_samples == moved
     feed(watch, noise(1000, 5))
     assert watch.moved_samples == moved
@@ -138,12 +138,12 @@ def test_at_another_rate_nothing_that_was_held_back_is_lost(at):
     """Also in the middle of a motion, which is told."""
     values = noise(12_000)
     values[7_700:8_000, 0] += 0.5 * np.sin(np.arange(300) / 15.0)
-    watch, passed = Watch(RATE_HZ, leave_out=True), []
+    watch, passed = SignalMonitor(RATE_HZ, leave_out=True), []
     for first in range(0, len(values), 130):
         part = values[first : first + 130]
-        passed += watch.update(block(STEP_NS * np.arange(first, first + len(part)), part))
+        passed += watch.update(make_block(STEP_NS * np.arange(first, first + len(part)), part))
         if first <= at < first + 130:
-            watch.relabel(1.05 * RATE_HZ)
+            watch.set_rate(1.05 * RATE_HZ)
     passed += watch.flush()
     assert np.array_equal(np.concatenate([one.t_ns for one in passed]), STEP_NS * np.arange(12_000))
     assert {event.kind for event in watch.take_events()} == {"moved"}
@@ -155,12 +155,12 @@ def test_after_an_outage_of_years_changes_are_learned_anew_with_their_times(leav
     lost = 10**10
     values = noise(30_000)
     values[20_000:, 3] *= 2.0
-    watch = Watch(RATE_HZ, leave_out)
+    watch = SignalMonitor(RATE_HZ, leave_out)
     feed(watch, noise(5_000, 9))
     t_ns = FIRST_NS + STEP_NS * (5_000 + lost + np.arange(len(values)))
-    handed_on = watch.update(block(t_ns[:250], values[:250], lost=lost))
+    handed_on = watch.update(make_block(t_ns[:250], values[:250], lost=lost))
     for at in range(250, len(values), 250):
-        handed_on += watch.update(block(t_ns[at : at + 250], values[at : at + 250]))
+        handed_on += watch.update(make_block(t_ns[at : at + 250], values[at : at + 250]))
         if restarts := watch.take_restarts():
             break
     (event,) = watch.take_events()

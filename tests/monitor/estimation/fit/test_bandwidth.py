@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfilt
 
-from drivers.sample import block
-from monitor.estimation.allan.batch import overlapping
+from drivers.sample import make_block
+from monitor.estimation.allan.batch import overlapping_avar
 from monitor.estimation.analysis import analyze
 from monitor.estimation.estimator import Estimator
-from monitor.estimation.fit.bandwidth import LowPass, power, seen
+from monitor.estimation.fit.bandwidth import LowPass, is_in_spectrum, power_spectrum
 
 RATE_HZ = 100.0
 N = 1.5e-4
@@ -22,7 +22,7 @@ def filtered(order, cutoff_hz, n, seed=1):
 
 
 def analyzed(values):
-    return analyze([block(np.arange(len(values)) * 10_000_000, values)], RATE_HZ)
+    return analyze([make_block(np.arange(len(values)) * 10_000_000, values)], RATE_HZ)
 
 
 def held(found):
@@ -34,7 +34,7 @@ def held(found):
 def test_a_column_is_the_allan_variance_of_filtered_noise(order, cutoff_hz):
     factors = np.array([1, 2, 5, 16, 100, 1000])
     values = filtered(order, cutoff_hz, 400_000)
-    measured = overlapping(values, factors)[0].mean(axis=1) / (N**2 * RATE_HZ)
+    measured = overlapping_avar(values, factors)[0].mean(axis=1) / (N**2 * RATE_HZ)
     stated = LowPass("digital", order, cutoff_hz / RATE_HZ).avar(factors)
     assert measured[:4] == pytest.approx(stated[:4], rel=0.02)
     assert measured == pytest.approx(stated, rel=0.12)
@@ -45,7 +45,7 @@ def test_an_analogue_filter_is_that_of_a_much_faster_digital_one(cutoff_hz):
     sections = butter(2, cutoff_hz, fs=20 * RATE_HZ, output="sos")
     fast = sosfilt(sections, np.random.default_rng(2).standard_normal((2_000_000, 6)), axis=0)[20_000:]
     factors = np.array([1, 2, 8, 64])
-    measured = overlapping(fast[::20], factors)[0].mean(axis=1)
+    measured = overlapping_avar(fast[::20], factors)[0].mean(axis=1)
     stated = LowPass("sampled", 2, cutoff_hz / RATE_HZ).avar(factors)
     assert measured / stated == pytest.approx(np.full(4, (measured / stated).mean()), rel=0.04)
 
@@ -74,10 +74,10 @@ def test_white_noise_and_lines_have_no_bandwidth():
 def test_the_live_estimate_finds_it_too():
     values = filtered(2, 20.0, 120_000)
     estimator = Estimator(RATE_HZ, 1200.0)
-    estimator.update(block(np.arange(len(values)) * 10_000_000, values))
+    estimator.update(make_block(np.arange(len(values)) * 10_000_000, values))
     before = estimator.get()
     for _ in range(6 * 65):  # pieces of six searches
-        estimator.step()
+        estimator.step_slow_statistics()
     after = estimator.get()
     assert np.isnan(before.fitted[0]).any() or (before.fitted[0] != after.fitted[0]).any()
     c = after.coefficients
@@ -92,24 +92,26 @@ def test_what_does_not_fall_beyond_the_cutoff_is_no_filter():
     values = N * np.sqrt(RATE_HZ) * rng.standard_normal((200_000, 6))
     sections = butter(2, [3.0, 5.0], "bandpass", fs=RATE_HZ, output="sos")
     values += 20.0 * N * np.sqrt(RATE_HZ) * sosfilt(sections, rng.standard_normal((200_000, 6)), axis=0)
-    found = analyze([block(np.arange(len(values)) * 10_000_000, values)], RATE_HZ)
+    found = analyze([make_block(np.arange(len(values)) * 10_000_000, values)], RATE_HZ)
     assert (found.fit.misfit > 1.0).all() or (found.fit.left_out > 0).all()
     assert np.isnan(found.bandwidth_hz).all()
 
 
 def test_a_spectrum_is_asked_by_medians():
-    spectrum = power(filtered(2, 20.0, 100_000)[:, 0])
-    assert seen(LowPass("digital", 2, 0.2), spectrum)
-    assert not seen(LowPass("digital", 2, 0.05), spectrum)
-    assert not seen(LowPass("digital", 2, 0.001), spectrum)  # lower than any of its bins
+    spectrum = power_spectrum(filtered(2, 20.0, 100_000)[:, 0])
+    assert is_in_spectrum(LowPass("digital", 2, 0.2), spectrum)
+    assert not is_in_spectrum(LowPass("digital", 2, 0.05), spectrum)
+    assert not is_in_spectrum(LowPass("digital", 2, 0.001), spectrum)  # lower than any of its bins
     spectrum[700:703] *= 1e6  # a line beyond the cutoff
-    assert seen(LowPass("digital", 2, 0.2), spectrum)
-    assert power(np.zeros(100)).size == 0
-    assert not seen(LowPass("digital", 2, 0.2), power(np.zeros(100)))
+    assert is_in_spectrum(LowPass("digital", 2, 0.2), spectrum)
+    assert power_spectrum(np.zeros(100)).size == 0
+    assert not is_in_spectrum(LowPass("digital", 2, 0.2), power_spectrum(np.zeros(100)))
 
 
 def test_a_spectrum_is_that_of_the_samples_there_are():
     there = filtered(2, 20.0, 100_000)[:, 0]
     absent = np.full(100_000, np.nan)
-    assert np.median(power(np.concatenate([absent, there])) / power(there)) == pytest.approx(1.0, rel=0.2)
-    assert power(absent).size == 0
+    assert np.median(power_spectrum(np.concatenate([absent, there])) / power_spectrum(there)) == pytest.approx(
+        1.0, rel=0.2
+    )
+    assert power_spectrum(absent).size == 0

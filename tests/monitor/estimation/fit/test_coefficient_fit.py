@@ -8,10 +8,10 @@ from scipy.signal import butter, sosfilt
 from scipy.stats import binom
 
 from drivers.sample import AXES
-from monitor.estimation.allan.batch import cluster_sizes, overlapping
-from monitor.estimation.allan.uncertainty import intervals, table
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar
+from monitor.estimation.allan.uncertainty import covariance_table, intervals
 from monitor.estimation.fit.coefficient_fit import UNIT_SOURCES, Fit, design, fit, slope_of_thirds
-from monitor.estimation.fit.coefficients import LETTERS, Status
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.noise.effect import Source
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
@@ -36,9 +36,9 @@ def slope(values: np.ndarray) -> np.ndarray:
 
 def fit_values(values: np.ndarray, with_slope: bool = True, **more) -> Fit:
     factors = cluster_sizes(len(values), RATE_HZ)
-    avar, terms = overlapping(values, factors)
+    avar, terms = overlapping_avar(values, factors)
     given = {"slope": slope(values)} if with_slope else {}
-    return fit(design(factors, RATE_HZ), table(len(values), factors), avar, terms, **given, **more)
+    return fit(design(factors, RATE_HZ), covariance_table(len(values), factors), avar, terms, **given, **more)
 
 
 @cache
@@ -49,7 +49,7 @@ def fits(sources: tuple[Source, ...], with_slope: bool = True) -> tuple[list[Fit
     for seed in range(RECORDS // 6):
         values = model.simulate(N, RATE_HZ, seed)
         looked.append(fit_values(values, with_slope))
-        deviations.append(overlapping(values, cluster_sizes(N, RATE_HZ))[0])
+        deviations.append(overlapping_avar(values, cluster_sizes(N, RATE_HZ))[0])
     return looked, np.array(deviations)
 
 
@@ -61,7 +61,7 @@ def exact_curve(theta: np.ndarray, n: int = N) -> Fit:
     """The fit of the curve of a model itself, the same on six axes."""
     factors = cluster_sizes(n, RATE_HZ)
     avar = sum(t * s.avar(factors / RATE_HZ, 1.0 / RATE_HZ) for t, s in zip(theta, UNIT_SOURCES, strict=True))
-    t = table(n, factors)
+    t = covariance_table(n, factors)
     columns = np.repeat(avar[:, None], 6, axis=1)
     return fit(design(factors, RATE_HZ), t, columns, np.repeat(t.terms[:, None], 6, axis=1))
 
@@ -98,7 +98,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(row):
     looked, _ = fits(MIX)
     held = (gather(looked, "lo")[row] <= TRUTH[row]) & (TRUTH[row] <= gather(looked, "hi")[row])
     # 95 % two-sided, up to 98 or down to 92 for one τ or letter; one in 1000 counts falls outside
-    assert held.sum() >= binom.ppf(0.0005, RECORDS, 0.92), LETTERS[row]
+    assert held.sum() >= binom.ppf(0.0005, RECORDS, 0.92), SYMBOLS[row]
 
 
 def test_intervals_of_deviations_hold_the_truth():
@@ -130,7 +130,7 @@ def test_errors_are_near_the_cramer_rao_limit():
 @pytest.mark.parametrize("absent", ["Q", "B", "K"])
 def test_a_term_that_is_not_there_seldom_enters(absent):
     looked, _ = fits(tuple(source for source in MIX if not hasattr(source, absent)))
-    entered = (gather(looked, "status")[LETTERS.index(absent)] == Status.ESTIMATED).sum()
+    entered = (gather(looked, "status")[SYMBOLS.index(absent)] == Status.ESTIMATED).sum()
     assert entered <= binom.ppf(0.999, RECORDS, 0.04)
 
 
@@ -172,7 +172,7 @@ def test_hysteresis_enters_late_and_leaves_late():
     theta = np.array([0.0, 1.5e-4, 4e-5, 0.0, 0.0]) ** 2
     never, always = np.zeros((5, 6), bool), np.ones((5, 6), bool)
     factors = cluster_sizes(N, RATE_HZ)
-    t = table(N, factors)
+    t = covariance_table(N, factors)
     # between 1.5 and 3 σ a term stays as it was: find such a size of B
     entered = []
     for b in np.linspace(1e-5, 1e-4, 60):
@@ -192,8 +192,8 @@ def test_hysteresis_enters_late_and_leaves_late():
 def test_too_few_tau_is_unestimated_but_has_degrees_of_freedom():
     factors = 2 ** np.arange(MIN_ROWS - 1)
     values = np.random.default_rng(0).standard_normal((64, 6))
-    avar, terms = overlapping(values, factors)
-    result = fit(design(factors, RATE_HZ), table(64, factors), avar, terms)
+    avar, terms = overlapping_avar(values, factors)
+    result = fit(design(factors, RATE_HZ), covariance_table(64, factors), avar, terms)
     assert (result.coefficients.status == Status.UNESTIMATED).all()
     assert np.isnan(result.coefficients.hi).all()
     assert np.isnan(result.fitted).all()
@@ -245,9 +245,9 @@ def test_where_the_terms_are_no_description_none_is_more_than_the_curve():
     t = np.arange(400_000) / 100.0
     values = 1e-3 * np.random.default_rng(5).standard_normal((t.size, 6)) + 0.05 * np.sin(np.pi * t)[:, None]
     factors = cluster_sizes(t.size, 100.0)
-    avar, terms = overlapping(values, factors)
+    avar, terms = overlapping_avar(values, factors)
     columns = design(factors, 100.0)
-    found = fit(columns, table(t.size, factors), avar, terms)
+    found = fit(columns, covariance_table(t.size, factors), avar, terms)
     assert (found.misfit > 1.0).all()
     c = found.coefficients
     for axis in range(6):

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from drivers.sample import AXES, block
+from drivers.sample import AXES, make_block
 from monitor.estimation.allan.batch import cluster_sizes
-from monitor.estimation.allan.uncertainty import AxisTables, Tables
+from monitor.estimation.allan.uncertainty import AxisCovarianceTables, CovarianceTables
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.estimator import Estimator
 from monitor.estimation.fit.coefficient_fit import design, fit
-from monitor.estimation.fit.continuous_refit import Refit
+from monitor.estimation.fit.continuous_refit import ContinuousRefit
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
 from monitor.noise.model import NoiseModel
 
@@ -27,7 +27,7 @@ def simulated(n, *more, seed=0):
 def follow(values, blocks=(1000,)):
     """The course of the coefficients of values [n, 6], and the window they end with."""
     window = AllanWindow(LENGTH, FACTORS)
-    refit = Refit(window, FACTORS.size, AxisTables(FACTORS, LENGTH))
+    refit = ContinuousRefit(window, FACTORS.size, AxisCovarianceTables(FACTORS, LENGTH))
     courses, at, k, lengths = [], 0, 0, np.zeros(6, np.int64)
     while at < len(values):
         courses.append(refit.update(DESIGN, values[at : at + blocks[k % len(blocks)]], lengths))
@@ -38,7 +38,7 @@ def follow(values, blocks=(1000,)):
 
 def fresh(window, before):
     """A fit from nothing to the curve of a window; diagonal weights, as at every sample."""
-    tables = Tables(FACTORS, LENGTH)
+    tables = CovarianceTables(FACTORS, LENGTH)
     slope = window.slope() * RATE_HZ
     slopes = window.slopes() * RATE_HZ
     return fit(DESIGN, tables.at(window.n), window.avar(), window.terms(), before, slope, slopes, full=False)
@@ -131,11 +131,11 @@ def test_a_term_on_the_verge_costs_no_fit_at_every_sample():
     estimator = Estimator(1.0, float(length), tuple(sizes.astype(float).tolist()), every_sample=True)
     walk = np.cumsum(1e-4 * np.sqrt(3.0) * 30.0 / length * rng.standard_normal((2 * length + 1000, 6)), axis=0)
     values = walk + 1e-4 * rng.standard_normal(walk.shape)
-    estimator.update(block(np.arange(2 * length), values[: 2 * length]))
+    estimator.update(make_block(np.arange(2 * length), values[: 2 * length]))
     refit, anew = estimator._refit, np.zeros(6, int)
     verge = 0
     for i in range(2 * length, len(values)):
-        estimator.update(block(np.array([i]), values[i : i + 1]))
+        estimator.update(make_block(np.array([i]), values[i : i + 1]))
         anew += refit._ages == 0
         verge += int((refit._answer.status[:, 3] == 1).sum())
     assert verge > 1000

@@ -15,7 +15,7 @@ from drivers.errors import ConfigError, NotReady
 from monitor.common.config_files import CONFIG_FOLDER
 from monitor.noise.model import NoiseModel
 from monitor.publishing import exporters
-from monitor.publishing.exporters.kalman import MARKOV_PEAK, MARKOV_PEAK_AT, process_noise, transition
+from monitor.publishing.exporters.kalman import MARKOV_PEAK_AT, MARKOV_PEAK_RATIO, process_noise, transition
 
 MODEL = """
 sample_rate = 200.0
@@ -131,7 +131,7 @@ def test_a_recording_that_does_not_say_enough_is_no_answer() -> None:
     empty = exporters.from_analysis('{"schema": "imu-monitor/analyze/1", "samples": 3, "notes": ["few"], "axes": {}}')
     with pytest.raises(NotReady, match="a longer recording is needed"):
         exporters.export(empty, "kalman")
-    without_accelerometers = exporters.Noise({"gx": analysed().axes["gx"]}, 100.0, "", measured=True)
+    without_accelerometers = exporters.NoiseCoefficients({"gx": analysed().axes["gx"]}, 100.0, "", measured=True)
     with pytest.raises(NotReady, match="accel axes"):
         exporters.export(without_accelerometers, "kalibr")
 
@@ -230,7 +230,7 @@ def test_the_markov_process_peaks_where_it_is_said_to() -> None:
 
     peak = minimize_scalar(deviation, bounds=(-1.0, 2.0), method="bounded")
     assert math.exp(peak.x) == pytest.approx(MARKOV_PEAK_AT, rel=2e-3)
-    assert -peak.fun == pytest.approx(MARKOV_PEAK, rel=2e-3)
+    assert -peak.fun == pytest.approx(MARKOV_PEAK_RATIO, rel=2e-3)
 
 
 def test_flicker_without_a_middle_needs_a_correlation_time() -> None:

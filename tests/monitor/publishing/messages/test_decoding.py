@@ -12,13 +12,13 @@ from tests.monitor.publishing import made
 
 
 def through_messages(estimate: object, **changed: object) -> object:
-    allan = json.loads(encoding.allan("a", 1.76e9, estimate)) | changed  # type: ignore[arg-type]
+    allan = json.loads(encoding.encode_allan("a", 1.76e9, estimate)) | changed  # type: ignore[arg-type]
     noise = remote_device.noise(
         remote_device.read(
             remote_device.CoefficientsMessage, topics.COEFFICIENTS, encoding.coefficients("a", 1.76e9, estimate)
         )  # type: ignore[arg-type]
     )
-    return decoding.estimate(
+    return decoding.to_estimate(
         remote_device.read(remote_device.AllanMessage, topics.ALLAN, json.dumps(allan).encode()), noise
     )
 
@@ -42,7 +42,7 @@ def test_the_fitted_curve_is_that_of_the_standard() -> None:
     coefficients.value[:] = np.nan
     coefficients.value[1, 0] = 3.0
     coefficients.value[2, 1] = 2.0
-    fitted = decoding.fitted(np.array([1.0, 9.0]), coefficients)
+    fitted = decoding.fitted_variance(np.array([1.0, 9.0]), coefficients)
     assert fitted[:, 0] == pytest.approx([9.0, 1.0])
     assert fitted[:, 1] == pytest.approx([1.7651, 1.7651], rel=1e-4)
     assert np.isnan(fitted[:, 2:]).all()
@@ -59,10 +59,10 @@ def test_what_is_no_curve_is_refused(changed: dict[str, object]) -> None:
 
 def test_health_and_events() -> None:
     sent = made.health(text="viewer is slow")
-    got = decoding.health(remote_device.status(encoding.status("a", 1.0, sent)))
+    got = decoding.to_health(remote_device.status(encoding.status("a", 1.0, sent)))
     assert got.text == "viewer is slow"
     assert (got.received, got.uptime_s, got.memory_bytes) == (sent.received, sent.uptime_s, sent.memory_bytes)
     happened = Event("noise_changed", 10**18, "gz rose", "gz", {"N": {"before": 1.0, "after": 2.0}})
-    read = decoding.event(remote_device.event(encoding.event("a", 1e9, 5, happened, None)))
-    assert (read.kind, read.axis, read.text, read.what) == ("noise_changed", "gz", "gz rose", happened.what)
+    read = decoding.to_event(remote_device.event(encoding.event("a", 1e9, 5, happened, None)))
+    assert (read.kind, read.axis, read.text, read.values) == ("noise_changed", "gz", "gz rose", happened.values)
     assert read.axis in AXES

@@ -9,12 +9,12 @@ import pytest
 
 from drivers.sample import AXES, Event
 from monitor.common import topics
-from monitor.estimation.allan.dynamic_allan import dynamic
+from monitor.estimation.allan.dynamic_allan import compute_dynamic_allan
 from monitor.estimation.allan.hadamard import hadamard_curve
 from monitor.estimation.allan.total import total_curve
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.detection.motion_detection import Motion
-from monitor.estimation.fit.coefficients import LETTERS
+from monitor.estimation.fit.coefficients import SYMBOLS
 from monitor.publishing.messages import encoding
 from tests.monitor.publishing import made
 
@@ -38,7 +38,7 @@ def gyro_z_only() -> Any:
 
 
 ALL = {
-    topics.ALLAN: encoding.allan("bench-1", UNIX_S, made.estimate()),
+    topics.ALLAN: encoding.encode_allan("bench-1", UNIX_S, made.estimate()),
     topics.COEFFICIENTS: encoding.coefficients("bench-1", UNIX_S, made.estimate()),
     topics.TOTAL: encoding.total("bench-1", UNIX_S, 360_000, *made.slow_curves()),
     topics.GAP: encoding.gap("bench-1", UNIX_S, made.look(gz=False, gx=True)),
@@ -69,9 +69,9 @@ def test_coefficients() -> None:
     assert found["window"] == 3600.0
     assert found["rate"] == 100.0
     assert list(found["axes"]) == list(AXES)
-    assert all(list(axis) == list(LETTERS) for axis in found["axes"].values())
+    assert all(list(axis) == list(SYMBOLS) for axis in found["axes"].values())
     n = found["axes"]["gz"]["N"]
-    at = LETTERS.index("N"), AXES.index("gz")
+    at = SYMBOLS.index("N"), AXES.index("gz")
     assert n == {
         "value": estimate.coefficients.value[at],
         "lo": estimate.coefficients.lo[at],
@@ -159,13 +159,13 @@ def test_too_few_data_are_null_and_say_so() -> None:
 def test_axes_that_are_not_measured_are_absent() -> None:
     estimate = gyro_z_only()
     assert list(parsed(encoding.coefficients("a", UNIX_S, estimate))["axes"]) == ["gz"]
-    assert list(parsed(encoding.allan("a", UNIX_S, estimate))["axes"]) == ["gz"]
+    assert list(parsed(encoding.encode_allan("a", UNIX_S, estimate))["axes"]) == ["gz"]
 
 
 def test_allan() -> None:
     estimate = gyro_z_only()
     estimate.curve.avar[-1, 2] = estimate.curve.lo[-1, 2] = estimate.curve.hi[-1, 2] = np.nan
-    found = parsed(encoding.allan("a", UNIX_S, estimate))
+    found = parsed(encoding.encode_allan("a", UNIX_S, estimate))
     assert found["tau"] == estimate.curve.tau_s.tolist()
     assert set(found["axes"]["gz"]) == {"deviation", "lo", "hi"}
     gz = found["axes"]["gz"]
@@ -180,7 +180,7 @@ def test_event() -> None:
         5,
         "gz angle random walk rose by 47 %",
         axis="gz",
-        what={"N": {"before": 1.5e-4, "after": 2.2e-4}},
+        values={"N": {"before": 1.5e-4, "after": 2.2e-4}},
         since_ns=1,
         sigma=9.1,
     )
@@ -236,7 +236,7 @@ def analyzed(**more: Any) -> dict[str, Any]:
             result,
             total_curve(values, 100.0, theta, np.array([1, 1000, 2900])),
             hadamard_curve(values, 100.0, theta, np.array([1, 1000])),
-            dynamic(values, 100.0, 10.0, (0.01, 0.1, 0.2, 0.4, 1.0), step_s=5.0),
+            compute_dynamic_allan(values, 100.0, 10.0, (0.01, 0.1, 0.2, 0.4, 1.0), step_s=5.0),
         )
     )
 
@@ -259,7 +259,7 @@ def test_an_analysis_has_all_its_curves_beside_each_other() -> None:
 
 def test_of_k_or_r_each_names_the_other() -> None:
     axes = analyzed()["axes"]
-    assert [axes["gy"]["coefficients"][letter].get("or") for letter in LETTERS] == [None, None, None, "R", "K"]
+    assert [axes["gy"]["coefficients"][letter].get("or") for letter in SYMBOLS] == [None, None, None, "R", "K"]
     assert not any("or" in one for one in axes["gz"]["coefficients"].values())
 
 

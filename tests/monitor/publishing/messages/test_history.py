@@ -11,36 +11,36 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.sample import AXES
-from monitor.estimation.fit.coefficients import LETTERS
-from monitor.history.bucket import STATES, Row, merged
-from monitor.history.minute_aggregation import Minutes
-from monitor.history.query import WHAT, Question
-from monitor.history.reading import Past, table
-from monitor.history.sqlite_store import PastEvent
-from monitor.history.time_ranges import Span
+from monitor.estimation.fit.coefficients import SYMBOLS
+from monitor.history.bucket import STATES, HistoryRow, merge_rows
+from monitor.history.minute_aggregation import MinuteAggregator
+from monitor.history.query import PARTS, HistoryQuery
+from monitor.history.reading import HistoryTable, build_table
+from monitor.history.sqlite_store import StoredEvent
+from monitor.history.time_ranges import TimeRange
 from monitor.publishing.messages import history
 from tests.monitor.publishing.made import estimate, health
 
 T0 = 1_760_000_040.0
-EVENT = PastEvent(T0 + 30.0, "noise_changed", "gz rose", "gz", {"N": {"before": 1e-4, "after": 2e-4}}, T0, 9.1, 3)
-ALL = Question(what=WHAT)
+EVENT = StoredEvent(T0 + 30.0, "noise_changed", "gz rose", "gz", {"N": {"before": 1e-4, "after": 2e-4}}, T0, 9.1, 3)
+ALL = HistoryQuery(what=PARTS)
 
 
-def made() -> Past:
+def made() -> HistoryTable:
     """Three minutes: R not estimated, then bounded; then the device is lost."""
-    minutes = Minutes()
+    minutes = MinuteAggregator()
     looks = [(0.0, 1000.0), (20.0, 1200.0), (60.0, 3600.0), (70.0, 3500.0)]
     rows = [minutes.estimate(T0 + at, estimate(seconds=seconds, seed=i)) for i, (at, seconds) in enumerate(looks)]
     rows.append(minutes.health(T0 + 75.0, health(received=7000)))
     rows.append(minutes.temperature(T0 + 76.0, np.array([21.5])))
     rows.append(minutes.health(T0 + 130.0, health(state="lost", received=7000, rate_hz=None, latency_p99_s=None)))
-    rows.append(minutes.end())
-    full: list[Row] = [row for row in rows if row is not None]
-    return table("bench-1", Span(T0, T0 + 180.0), 60, full, [EVENT], 1)
+    rows.append(minutes.flush())
+    full: list[HistoryRow] = [row for row in rows if row is not None]
+    return build_table("bench-1", TimeRange(T0, T0 + 180.0), 60, full, [EVENT], 1)
 
 
 def test_the_layout_is_the_documented_one() -> None:
-    said = json.loads(history.history(made(), ALL, T0 + 130.0, 7000))
+    said = json.loads(history.encode_history(made(), ALL, T0 + 130.0, 7000))
     assert (said["schema"], said["device"], said["t"], said["samples"]) == (
         "imu-monitor/history/1", "bench-1", T0 + 130.0, 7000,
     )  # fmt: skip
@@ -74,22 +74,22 @@ def test_the_layout_is_the_documented_one() -> None:
 
 
 def test_only_what_is_asked_for_is_said() -> None:
-    asked = Question(what=("coefficients",), axes=("gz",), letters=("B", "N"))
-    said = json.loads(history.history(made(), asked, T0, 1))
+    asked = HistoryQuery(what=("coefficients",), axes=("gz",), letters=("B", "N"))
+    said = json.loads(history.encode_history(made(), asked, T0, 1))
     assert set(said) & {"deviations", "status", "events"} == set()
     assert {axis: list(letters) for axis, letters in said["axes"].items()} == {"gz": ["B", "N"]}
 
 
 def test_what_is_read_is_what_was_kept() -> None:
     kept = made()
-    found = history.read(history.history(kept, ALL, T0, 1))
+    found = history.decode_history(history.encode_history(kept, ALL, T0, 1))
     assert (found.device, found.span, found.step_s) == (kept.device, kept.span, kept.step_s)
     assert (found.events, found.events_in_all) == (kept.events, kept.events_in_all)
     np.testing.assert_array_equal(found.start_s, kept.start_s)
     np.testing.assert_array_equal(found.width_s, kept.width_s)
     np.testing.assert_array_equal(found.counts, kept.counts)
     np.testing.assert_array_equal(found.state, kept.state)
-    names = [f"{axis}.{letter}" for axis in AXES for letter in LETTERS]
+    names = [f"{axis}.{letter}" for axis in AXES for letter in SYMBOLS]
     for name in [*names, "rate", "memory", "temperature", *(f"gz.sigma.{tau}" for tau in kept.taus())]:
         for part in ("low", "high", "last"):
             np.testing.assert_array_equal(getattr(found.column(name), part), getattr(kept.column(name), part), name)
@@ -100,12 +100,12 @@ def test_what_is_read_is_what_was_kept() -> None:
 
 
 def test_a_bound_within_a_bucket_of_estimates_is_not_shown_as_its_interval() -> None:
-    minutes, rows = Minutes(), []
+    minutes, rows = MinuteAggregator(), []
     for i, seconds in enumerate((3600.0, 200.0)):  # B is estimated, then only bounded
         rows.append(minutes.estimate(T0 + i, estimate(seconds=seconds)))
-    row = merged([one for one in (*rows, minutes.end()) if one is not None], int(T0), 60)
-    one = table("a", Span(T0, T0 + 60.0), 60, [row], [], 0)
-    letter = json.loads(history.history(one, ALL, T0, 1))["axes"]["gz"]["B"]
+    row = merge_rows([one for one in (*rows, minutes.flush()) if one is not None], int(T0), 60)
+    one = build_table("a", TimeRange(T0, T0 + 60.0), 60, [row], [], 0)
+    letter = json.loads(history.encode_history(one, ALL, T0, 1))["axes"]["gz"]["B"]
     assert (letter["status"], letter["n"]) == (["estimated"], [1])
     assert letter["lo"][0] < letter["value"][0] < letter["hi"][0]
 
@@ -113,7 +113,7 @@ def test_a_bound_within_a_bucket_of_estimates_is_not_shown_as_its_interval() -> 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_any_payload_is_an_answer_or_a_value_error(data: st.DataObject) -> None:
-    said = json.loads(history.history(made(), ALL, T0, 1))
+    said = json.loads(history.encode_history(made(), ALL, T0, 1))
     junk = st.sampled_from([None, [], {}, -1, 1e300, 10**30, "x", [None], [[1.0]], {"gz": 1}, [1.0, None, "x"]])
     for _ in range(data.draw(st.integers(1, 3))):
         at = said
@@ -124,7 +124,7 @@ def test_any_payload_is_an_answer_or_a_value_error(data: st.DataObject) -> None:
                 break
             at = at[key]
     try:
-        found = history.read(msgspec.json.encode(said))
+        found = history.decode_history(msgspec.json.encode(said))
     except ValueError:
         return
     assert len(found) == len(found.width_s) == len(found.state)
@@ -133,7 +133,7 @@ def test_any_payload_is_an_answer_or_a_value_error(data: st.DataObject) -> None:
 
 def test_texts_of_strangers_do_not_steer_the_terminal() -> None:
     strange = replace(made(), device="a\x1b[31m", events=(replace(EVENT, text="b\x1b]0;c\x07", kind="k\n"),))
-    found = history.read(history.history(strange, ALL, T0, 1))
+    found = history.decode_history(history.encode_history(strange, ALL, T0, 1))
     assert (found.device, found.events[0].kind, found.events[0].text) == ("a [31m", "k ", "b ]0;c ")
 
 

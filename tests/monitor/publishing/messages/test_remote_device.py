@@ -7,7 +7,7 @@ import pytest
 
 from monitor.common import topics
 from monitor.publishing.messages import encoding, remote_device
-from monitor.publishing.messages.remote_device import Heard
+from monitor.publishing.messages.remote_device import RemoteDevice
 from tests.monitor.publishing import made
 
 
@@ -69,9 +69,9 @@ def test_a_status_word_of_a_coefficient_that_is_not_known() -> None:
         remote_device.noise(remote_device.read(remote_device.CoefficientsMessage, topics.COEFFICIENTS, payload))
 
 
-def device(**changed: object) -> Heard:
+def device(**changed: object) -> RemoteDevice:
     payload = encoding.status("a", 1.0, made.health(**changed))
-    return Heard("imu/a", 100.0, status=remote_device.read(remote_device.StatusMessage, topics.STATUS, payload))
+    return RemoteDevice("imu/a", 100.0, status=remote_device.read(remote_device.StatusMessage, topics.STATUS, payload))
 
 
 def test_a_device_that_speaks_is_what_it_says() -> None:
@@ -81,23 +81,23 @@ def test_a_device_that_speaks_is_what_it_says() -> None:
 
 def test_silence() -> None:
     one = device()
-    assert one.state(100.0 + remote_device.SILENT_S - 0.1) == "running"
-    assert one.state(100.0 + remote_device.SILENT_S + 0.1) == "silent"
-    one.there = True
-    assert one.state(100.0 + remote_device.SILENT_S + 0.1) == "silent"
-    one.there = False
-    assert one.state(100.0 + remote_device.GONE_S - 0.1) == "running"
-    assert one.state(100.0 + remote_device.GONE_S + 0.1) == "gone"
+    assert one.state(100.0 + remote_device.SILENCE_TIMEOUT_S - 0.1) == "running"
+    assert one.state(100.0 + remote_device.SILENCE_TIMEOUT_S + 0.1) == "silent"
+    one.token_exists = True
+    assert one.state(100.0 + remote_device.SILENCE_TIMEOUT_S + 0.1) == "silent"
+    one.token_exists = False
+    assert one.state(100.0 + remote_device.GONE_TIMEOUT_S - 0.1) == "running"
+    assert one.state(100.0 + remote_device.GONE_TIMEOUT_S + 0.1) == "gone"
 
 
 def test_a_replay_that_has_ended_is_not_missed() -> None:
     one = device(state="ended")
-    one.there = False
+    one.token_exists = False
     assert one.state(1e6) == "ended"
 
 
 def test_nothing_known_but_its_presence() -> None:
-    assert Heard("imu/a", 100.0, there=True).state(100.1) == "present"
+    assert RemoteDevice("imu/a", 100.0, token_exists=True).state(100.1) == "present"
 
 
 def test_ranks_and_words_of_trouble() -> None:
@@ -105,39 +105,39 @@ def test_ranks_and_words_of_trouble() -> None:
     assert device(state="waiting").rank(100.0) == 1
     assert device().rank(100.0) == 2
     assert device(state="ended").rank(100.0) == 3
-    assert device().trouble() == ""
-    assert device(outputs={"zenoh": "off", "viewer": "ok"}).trouble() == ""
+    assert device().problems() == ""
+    assert device(outputs={"zenoh": "off", "viewer": "ok"}).problems() == ""
     stalled = device(outputs={"zenoh": "ok", "viewer": "stalled"}, text="odd", overflowed=1200)
     assert stalled.rank(100.0) == 1
-    assert stalled.trouble().startswith("odd; viewer: stalled; 1,200 samples overwritten")
+    assert stalled.problems().startswith("odd; viewer: stalled; 1,200 samples overwritten")
     elsewhere = device(outputs={"zenoh": "ok, but the port is busy"})
-    assert (elsewhere.rank(100.0), elsewhere.trouble()) == (2, "zenoh: ok, but the port is busy")
+    assert (elsewhere.rank(100.0), elsewhere.problems()) == (2, "zenoh: ok, but the port is busy")
 
 
 def test_a_topic_of_two_parts_and_keys_that_are_none() -> None:
-    assert remote_device.split("a/b/c/command/reset") == ("a/b/c", topics.RESET)
-    assert remote_device.split("status") is None
-    assert remote_device.split("/status") is None
-    assert remote_device.split("imu/bench-1/statuses") is None
+    assert remote_device.split_key("a/b/c/command/reset") == ("a/b/c", topics.RESET)
+    assert remote_device.split_key("status") is None
+    assert remote_device.split_key("/status") is None
+    assert remote_device.split_key("imu/bench-1/statuses") is None
 
 
 def test_disagreement_with_a_model_is_trouble_and_ranks_before_what_runs_well() -> None:
     status = remote_device.read(remote_device.StatusMessage, topics.STATUS, encoding.status("a", 1.0, made.health()))
     payload = encoding.gap("a", 1.0, made.look(scale=1.2, gz=False, gx=True))
-    one = Heard("imu/a", 0.0, status)
+    one = RemoteDevice("imu/a", 0.0, status)
     assert one.rank(0.0) == 2
     one.gap = remote_device.read(remote_device.GapMessage, topics.GAP, payload)
     assert one.rank(0.0) == 1
     found = one.gap.axes["gz"]
     lo, hi = found.where.tau
-    assert one.trouble() == f"gz disagrees with its model: {found.gap:.3g} σ at τ {lo:.3g} to {hi:.3g} s"
+    assert one.problems() == f"gz disagrees with its model: {found.gap:.3g} σ at τ {lo:.3g} to {hi:.3g} s"
     one.gap = remote_device.read(remote_device.GapMessage, topics.GAP, encoding.gap("a", 1.0, made.look(gz=True)))
-    assert (one.rank(0.0), one.trouble()) == (2, "")
+    assert (one.rank(0.0), one.problems()) == (2, "")
 
 
 def test_a_limit_that_is_passed_is_trouble() -> None:
     one = device(crossed=("gz N",))
     assert one.rank(100.0) == 1
-    assert one.trouble() == "beyond its limit: gz N"
+    assert one.problems() == "beyond its limit: gz N"
     many = device(crossed=tuple(f"gz {i}" for i in range(100)))
-    assert many.trouble() == "beyond its limit: gz 0, gz 1, gz 2, gz 3, gz 4, gz 5 and 94 more"
+    assert many.problems() == "beyond its limit: gz 0, gz 1, gz 2, gz 3, gz 4, gz 5 and 94 more"

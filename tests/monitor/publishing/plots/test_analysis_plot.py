@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConfigError
-from monitor.estimation.allan.dynamic_allan import Dynamic, dynamic
+from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.fit.coefficients import Status
 from monitor.publishing.plots import allan_figure, analysis_plot, dynamic_figure
-from monitor.publishing.plots.allan_figure import Beside
-from monitor.publishing.plots.dynamic_figure import Mark
+from monitor.publishing.plots.allan_figure import OtherDeviation
+from monitor.publishing.plots.dynamic_figure import ChangeMark
 from tests.monitor.publishing import made
 
 
 @pytest.fixture(scope="module")
-def changing() -> Dynamic:
+def changing() -> DynamicAllan:
     """White noise that doubles halfway, on the gyroscopes."""
     values = np.random.default_rng(1).standard_normal((6000, 6))
     values[3000:, :3] *= 2.0
-    return dynamic(values, 10.0, 60.0, step_s=9.0)
+    return compute_dynamic_allan(values, 10.0, 60.0, step_s=9.0)
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -123,7 +123,7 @@ def test_total_deviation_goes_on_where_the_allan_deviation_ends() -> None:
     longest = estimate.curve.tau_s[-1]
     tau_s = longest * np.array([0.5, 1.0, 2.0, 4.0])
     deviation = np.full((4, 6), 3.0e-5)
-    total = Beside("total", tau_s, deviation, 0.5 * deviation, np.full((4, 6), np.nan), only_beyond=True)
+    total = OtherDeviation("total", tau_s, deviation, 0.5 * deviation, np.full((4, 6), np.nan), only_beyond=True)
     axes = panel(estimate=estimate, others=[total])
     open_marks = [line.get_xdata() for line in axes.lines if line.get_markerfacecolor() == "white"]
     beyond = [x.tolist() for x in open_marks if len(x)]
@@ -146,12 +146,12 @@ def test_k_or_r_is_said_of_bounds_only() -> None:
     assert not analysis_plot.k_or_r(made.estimate(), "K", "gx")
 
 
-def test_dynamic_curves_stand_below_in_the_same_picture(tmp_path: Path, changing: Dynamic) -> None:
+def test_dynamic_curves_stand_below_in_the_same_picture(tmp_path: Path, changing: DynamicAllan) -> None:
     pytest.importorskip("matplotlib")
     path = tmp_path / "plot.png"
     estimate = made.estimate()
     estimate.curve.avar[:, 3:] = np.nan
-    analysis_plot.allan_plot(estimate, path, "bench-1", dynamic=changing, marks=[Mark(300.0, "gz")])
+    analysis_plot.allan_plot(estimate, path, "bench-1", dynamic=changing, marks=[ChangeMark(300.0, "gz")])
     image = pixels(path)
     below = dynamic_figure.height_inches(changing, "gyro") * analysis_plot.DPI
     assert image.shape[0] == pytest.approx(analysis_plot.INCHES[1] * analysis_plot.DPI + below, abs=2)
@@ -162,24 +162,24 @@ def test_dynamic_curves_stand_below_in_the_same_picture(tmp_path: Path, changing
     assert red.any()
 
 
-def test_colours_are_of_the_deviation_over_its_median(changing: Dynamic) -> None:
+def test_colours_are_of_the_deviation_over_its_median(changing: DynamicAllan) -> None:
     relative = dynamic_figure.relative(changing)
     assert np.nanmedian(relative, axis=0) == pytest.approx(np.ones(relative.shape[1:]))
     assert relative[-1, 0, 0] / relative[0, 0, 0] == pytest.approx(2.0, rel=0.1)
     assert relative[-1, 0, 5] / relative[0, 0, 5] == pytest.approx(1.0, rel=0.1)
 
 
-def test_only_coefficients_that_are_estimated_have_a_panel(changing: Dynamic) -> None:
+def test_only_coefficients_that_are_estimated_have_a_panel(changing: DynamicAllan) -> None:
     status = np.full_like(changing.status, Status.UPPER_BOUND)
     status[:, 1] = Status.ESTIMATED
-    assert dynamic_figure.letters(replace(changing, status=status), "gyro") == ("N",)
+    assert dynamic_figure.panel_letters(replace(changing, status=status), "gyro") == ("N",)
     status[:2, 3, 1] = Status.ESTIMATED  # for a moment only
-    assert "K" not in dynamic_figure.letters(replace(changing, status=status), "gyro")
+    assert "K" not in dynamic_figure.panel_letters(replace(changing, status=status), "gyro")
     status[:20, 3, 1] = Status.ESTIMATED
-    assert "K" in dynamic_figure.letters(replace(changing, status=status), "gyro")
+    assert "K" in dynamic_figure.panel_letters(replace(changing, status=status), "gyro")
 
 
-def test_an_axis_without_data_has_no_surface(changing: Dynamic) -> None:
+def test_an_axis_without_data_has_no_surface(changing: DynamicAllan) -> None:
     deviation = changing.deviation.copy()
     deviation[:, :, 1] = np.nan
     assert dynamic_figure.axes_shown(replace(changing, deviation=deviation), "gyro") == ("gx", "gz")
@@ -187,7 +187,7 @@ def test_an_axis_without_data_has_no_surface(changing: Dynamic) -> None:
 
 def test_one_single_step_can_be_drawn() -> None:
     figure = pytest.importorskip("matplotlib.figure").Figure()
-    once = dynamic(np.random.default_rng(2).standard_normal((600, 6)), 10.0, 60.0, (0.1,))
+    once = compute_dynamic_allan(np.random.default_rng(2).standard_normal((600, 6)), 10.0, 60.0, (0.1,))
     assert once.t_s.size == 1
     dynamic_figure.dynamic_panels(figure, once, "gyro")
     figure.draw_without_rendering()

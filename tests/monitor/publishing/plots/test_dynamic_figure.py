@@ -6,23 +6,31 @@ import numpy as np
 import pytest
 
 from drivers.sample import AXES
-from monitor.estimation.allan.dynamic_allan import Dynamic, dynamic
+from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.fit.coefficients import Status
 from monitor.publishing.plots.allan_figure import COLOURS, DARK
-from monitor.publishing.plots.dynamic_figure import APART, BANDS, Clock, Mark, _group_times, dynamic_panels, letters
+from monitor.publishing.plots.dynamic_figure import (
+    BANDS,
+    MIN_LABEL_DISTANCE,
+    ChangeMark,
+    TimeUnit,
+    _group_times,
+    dynamic_panels,
+    panel_letters,
+)
 
 
 @pytest.fixture(scope="module")
-def white() -> Dynamic:
+def white() -> DynamicAllan:
     """White noise of ten minutes, windows of one."""
-    return dynamic(np.random.default_rng(1).standard_normal((6000, 6)), 10.0, 60.0, step_s=9.0)
+    return compute_dynamic_allan(np.random.default_rng(1).standard_normal((6000, 6)), 10.0, 60.0, step_s=9.0)
 
 
-def panels(found: Dynamic, marks: list[Mark], kind: str = "gyro"):
+def panels(found: DynamicAllan, marks: list[ChangeMark], kind: str = "gyro"):
     figure = pytest.importorskip("matplotlib.figure").Figure(figsize=(7.2, 8.0), layout="constrained")
     dynamic_panels(figure, found, kind, marks)
     figure.draw_without_rendering()
-    count = 3 + len(letters(found, kind))
+    count = 3 + len(panel_letters(found, kind))
     return figure.axes[:count]
 
 
@@ -35,28 +43,28 @@ def lines_at(panel, colour: str) -> list[float]:
     ]
 
 
-def test_a_change_is_marked_in_its_surface_and_through_the_courses(white: Dynamic) -> None:
-    gx, gy, gz, *courses = panels(white, [Mark(300.0, "gy"), Mark(240.0, "az")])
+def test_a_change_is_marked_in_its_surface_and_through_the_courses(white: DynamicAllan) -> None:
+    gx, gy, gz, *courses = panels(white, [ChangeMark(300.0, "gy"), ChangeMark(240.0, "az")])
     assert [lines_at(panel, DARK) for panel in (gx, gy, gz)] == [[], [300.0], []]
     assert [[text.get_text() for text in panel.texts] for panel in (gx, gy, gz)] == [[], ["change"], []]
     assert courses
     assert all(lines_at(course, COLOURS[1]) == [300.0] for course in courses)
     assert not any(lines_at(course, COLOURS[2]) for course in courses)  # az stands in the other figure
-    ax, ay, az, *_ = panels(white, [Mark(300.0, "gy"), Mark(240.0, "az")], "accel")
+    ax, ay, az, *_ = panels(white, [ChangeMark(300.0, "gy"), ChangeMark(240.0, "az")], "accel")
     assert [lines_at(panel, DARK) for panel in (ax, ay, az)] == [[], [], [240.0]]
 
 
-def test_marks_outside_the_time_axis_are_not_drawn(white: Dynamic) -> None:
-    drawn = panels(white, [Mark(5.0, "gx"), Mark(5000.0, "gx")])
+def test_marks_outside_the_time_axis_are_not_drawn(white: DynamicAllan) -> None:
+    drawn = panels(white, [ChangeMark(5.0, "gx"), ChangeMark(5000.0, "gx")])
     assert not any(panel.texts or lines_at(panel, DARK) for panel in drawn)
     assert drawn[0].get_xlim() == pytest.approx((55.5 / 60.0, (float(white.t_s[-1]) + 4.5) / 60.0))
 
 
-def test_words_stay_inside_and_apart(white: Dynamic) -> None:
+def test_words_stay_inside_and_apart(white: DynamicAllan) -> None:
     """However many changes there are, and at the very end."""
     end = float(white.t_s[-1])
     times = [60.0, 62.0, 200.0, 230.0, 231.0, 400.0, 470.0, end - 3.0, end]
-    gx, *_ = panels(white, [Mark(time, "gx") for time in times])
+    gx, *_ = panels(white, [ChangeMark(time, "gx") for time in times])
     assert len(lines_at(gx, DARK)) == len(times)
     counted = [text.get_text().split() for text in gx.texts]
     assert sum(int(words[0]) if len(words) == 2 else 1 for words in counted) == len(times)
@@ -74,13 +82,13 @@ def test_heaps_lie_apart_whatever_the_times() -> None:
     assert len(heaps) > 3
     assert (np.diff(middles) >= 8.0).all()
     assert _group_times([], 1.0) == []
-    assert APART < 0.5
+    assert MIN_LABEL_DISTANCE < 0.5
 
 
-def test_courses_hold_their_values_and_most_of_their_bands(white: Dynamic) -> None:
+def test_courses_hold_their_values_and_most_of_their_bands(white: DynamicAllan) -> None:
     *_, n = panels(white, [])
     gyros = [AXES.index(axis) for axis in ("gx", "gy", "gz")]
-    assert letters(white, "gyro")[-1] == "N"
+    assert panel_letters(white, "gyro")[-1] == "N"
     estimated = white.status[:, 1, gyros] == Status.ESTIMATED
     factor = np.degrees(1.0) * 60.0
     low, high = n.get_ylim()
@@ -95,4 +103,4 @@ def test_courses_hold_their_values_and_most_of_their_bands(white: Dynamic) -> No
     ("span_s", "name"), [(599.0, "s"), (600.0, "min"), (10_800.0, "h"), (259_200.0, "d"), (1e9, "d")]
 )
 def test_the_time_axis_has_the_unit_of_its_span(span_s: float, name: str) -> None:
-    assert Clock.of(span_s).name == name
+    assert TimeUnit.of(span_s).name == name

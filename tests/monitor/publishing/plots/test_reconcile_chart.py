@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from monitor.publishing.plots.reconcile_chart import along, chart, height_of, near, plotted, view_at
-from monitor.reconcile.result import View, Where
+from monitor.reconcile.result import Location, PlotData
 from tests.monitor.reconcile import samples
 
 SVG = "{http://www.w3.org/2000/svg}"
 START = samples.look("gz", n_true=samples.MORE_N, line=True)
 PSD, ALLAN, LEVEL, DISTRIBUTION = START.views
-PEAK = Where(frequency=(17.1, 17.5))
+PEAK = Location(frequency=(17.1, 17.5))
 
 
 def drawing(
-    *views: View, where: Where | None = None, width: float = 400.0, height: float = 250.0
+    *views: PlotData, where: Location | None = None, width: float = 400.0, height: float = 250.0
 ) -> ElementTree.Element:
     text = chart([(f"panel {i}", view) for i, view in enumerate(views)], "gz", width, height, where)
     return ElementTree.fromstring(text.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1))
@@ -120,13 +120,13 @@ def test_a_narrow_place_has_a_panel_of_its_own_and_a_wide_one_has_not() -> None:
     assert part.x[-1] > 17.5
     assert part.x.size < PSD.x.size / 4
     assert part.measured.max() == PSD.measured[np.argmin(np.abs(PSD.x - 17.3))]
-    assert near(ALLAN, Where(tau=(0.01, 0.64))) is None
-    assert near(ALLAN, Where(tau=(1.0, 1.1))) is None  # three points are no picture
-    assert near(PSD, Where()) is None
+    assert near(ALLAN, Location(tau=(0.01, 0.64))) is None
+    assert near(ALLAN, Location(tau=(1.0, 1.1))) is None  # three points are no picture
+    assert near(PSD, Location()) is None
 
 
 def test_each_place_lies_along_the_views_that_know_it() -> None:
-    where = Where(frequency=(1, 2), tau=(3, 4), time=(5, 6), temperature=(7, 8), value=(9, 10))
+    where = Location(frequency=(1, 2), tau=(3, 4), time=(5, 6), temperature=(7, 8), value=(9, 10))
     assert [along(view, where) for view in START.views] == [(1, 2), (3, 4), (5, 6), None]
     assert along(replace(LEVEL, x_name="temperature", x_unit="°C"), where) == (7, 8)
     assert along(replace(LEVEL, x_name="lag"), where) == (3, 4)
@@ -134,6 +134,6 @@ def test_each_place_lies_along_the_views_that_know_it() -> None:
 
 
 def test_a_lens_without_picture_borrows_the_one_along_its_place() -> None:
-    assert view_at(START.views, "allan", Where()) is ALLAN
+    assert view_at(START.views, "allan", Location()) is ALLAN
     assert view_at(START.views, "lines", PEAK) is PSD
-    assert view_at(START.views, "other_axes", Where(source="ax")) is None
+    assert view_at(START.views, "other_axes", Location(source="ax")) is None

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConfigError
-from monitor.estimation.allan.dynamic_allan import Dynamic, dynamic
+from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.analysis import Analysis
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from monitor.noise.model import NoiseModel
-from monitor.publishing.plots.dynamic_figure import Mark
+from monitor.publishing.plots.dynamic_figure import ChangeMark
 from monitor.publishing.reports import analysis_report
 from tests.monitor.publishing import made
 
@@ -28,7 +28,7 @@ def analysis(**changed: object) -> Analysis:
 
 
 @pytest.fixture(scope="module")
-def long() -> Dynamic:
+def long() -> DynamicAllan:
     """As many steps as there can be, and many letters in."""
     sources = (
         QuantizationNoise(Q=2e-4),
@@ -37,9 +37,9 @@ def long() -> Dynamic:
         RateRandomWalk(K=3e-4),
     )
     model = NoiseModel(dict.fromkeys(("gx", "gy", "gz", "ax", "ay", "az"), sources))
-    found = dynamic(model.simulate(12_400, 20.0, 1), 20.0, 500.0, step_s=1.0)
+    found = compute_dynamic_allan(model.simulate(12_400, 20.0, 1), 20.0, 500.0, step_s=1.0)
     assert found.t_s.size == 121
-    return Dynamic(
+    return DynamicAllan(
         np.linspace(500.0, 3000.0, 484), found.window_s, found.rate_hz, found.tau_s,
         *(np.concatenate([part, part[::-1]] * 2) for part in (
             found.deviation, found.lo, found.hi, found.value, found.value_lo, found.value_hi, found.status
@@ -112,9 +112,9 @@ def test_the_facts_of_the_recording_are_on_the_page() -> None:
     assert dict(analysis_report.facts(analysis()))["missing samples"] == "none"
 
 
-def test_the_page_is_complete_in_itself_and_below_a_megabyte(tmp_path: Path, long: Dynamic) -> None:
+def test_the_page_is_complete_in_itself_and_below_a_megabyte(tmp_path: Path, long: DynamicAllan) -> None:
     path = tmp_path / "report.html"
-    analysis_report.html_report(analysis(), path, "a <b> & c", dynamic=long, marks=[Mark(1500.0, "gz")])
+    analysis_report.html_report(analysis(), path, "a <b> & c", dynamic=long, marks=[ChangeMark(1500.0, "gz")])
     text = path.read_text("utf-8")
     assert path.stat().st_size < 1_000_000
     page = Page(text)

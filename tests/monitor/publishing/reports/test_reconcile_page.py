@@ -65,7 +65,7 @@ def test_a_step_says_where_what_why_and_how_sure() -> None:
     words = read("explained").words
     step = samples.explained().axes["gz"].steps[0]
     for said in (
-        "Step 1: added sinusoidal", EFFECTS["sinusoidal"].means, step.because,
+        "Step 1: added sinusoidal", EFFECTS["sinusoidal"].description, step.because,
         "Where: spectrum, 17.1 … 17.5 Hz: gap 41.2, threshold 2.60", "99.8 %",
         "Tried for the same gap and less likely: narrowband (0.2 %)", "39.7 → 1.00, threshold 2.60",
         "Step 2: retuned angle random walk", "None: a known term of another size is not held out.",

@@ -5,30 +5,33 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from monitor.noise.effect import units
+from monitor.noise.effect import parameter_units
 from monitor.noise.effects import EFFECTS, AngleRandomWalk
 from monitor.noise.model import NoiseModel
 from monitor.publishing.reports import reconcile_sentences as words
-from monitor.reconcile.result import Bounds, Reconciliation, RunnerUp, Step, Where
+from monitor.reconcile.result import Location, ParameterInterval, Reconciliation, ReconciliationStep, RunnerUp
 from tests.monitor.reconcile import samples
 
 NO_MODEL = NoiseModel({})
 
 
-def one(effect: str, axis: str = "gz", kind: str = "added", **parameters: Bounds) -> Step:
+def one(effect: str, axis: str = "gz", kind: str = "added", **parameters: ParameterInterval) -> ReconciliationStep:
     step = samples.explained().axes["gz"].steps[0]
     return replace(step, effect=effect, parameters=parameters, kind=kind)
 
 
-def short(effect: str, axis: str = "gz", **parameters: Bounds) -> list[str]:
+def short(effect: str, axis: str = "gz", **parameters: ParameterInterval) -> list[str]:
     return [found.short for found in words.parameters(one(effect, **parameters), axis, NO_MODEL)]
 
 
 @pytest.mark.parametrize("axis", ["gz", "az"])
 @pytest.mark.parametrize("effect", list(EFFECTS))
 def test_every_parameter_of_every_effect_has_a_unit_of_the_field(effect: str, axis: str) -> None:
-    known = {name: pair[axis == "az"] for name, pair in units(EFFECTS[effect]).items()}
-    given = {name: Bounds("ax") if si == "axis" else Bounds(2.0, 1.9, 2.1) for name, si in known.items()}
+    known = {name: pair[axis == "az"] for name, pair in parameter_units(EFFECTS[effect]).items()}
+    given = {
+        name: ParameterInterval("ax") if si == "axis" else ParameterInterval(2.0, 1.9, 2.1)
+        for name, si in known.items()
+    }
     for found in words.parameters(one(effect, **given), axis, NO_MODEL):
         assert "rad" not in found.unit.replace("µrad", "")
         assert found.value
@@ -38,32 +41,34 @@ def test_every_parameter_of_every_effect_has_a_unit_of_the_field(effect: str, ax
 
 
 def test_a_value_has_the_digits_that_its_interval_allows() -> None:
-    assert short("sinusoidal", frequency=Bounds(17.300012, 17.299912, 17.300112)) == ["17.300012 ± 0.000100 Hz"]
-    assert short("bias_step", time=Bounds(1800.0, 1799.0, 1801.0)) == ["1800.0 ± 1.0 s"]
-    assert short("poisson_steps", rate=Bounds(0.01, 0.002, 0.03)) == ["0.010 (0.002 … 0.030) 1/s"]
-    assert short("bias_step", height=Bounds(-1e-4, -1.1e-4, -0.9e-4)) == ["−20.6 ± 2.1 °/h"]
+    assert short("sinusoidal", frequency=ParameterInterval(17.300012, 17.299912, 17.300112)) == [
+        "17.300012 ± 0.000100 Hz"
+    ]
+    assert short("bias_step", time=ParameterInterval(1800.0, 1799.0, 1801.0)) == ["1800.0 ± 1.0 s"]
+    assert short("poisson_steps", rate=ParameterInterval(0.01, 0.002, 0.03)) == ["0.010 (0.002 … 0.030) 1/s"]
+    assert short("bias_step", height=ParameterInterval(-1e-4, -1.1e-4, -0.9e-4)) == ["−20.6 ± 2.1 °/h"]
 
 
 def test_sizes_choose_their_unit_and_known_names_have_theirs() -> None:
-    assert short("saturation", limit=Bounds(5.0)) == ["286 °/s"]
-    assert short("resolution", step=Bounds(1e-5)) == ["2.06 °/h"]
-    assert short("resolution", "az", step=Bounds(0.00980665)) == ["1000 µg"]
-    assert short("saturation", "az", limit=Bounds(19.6)) == ["19.6 m/s²"]
-    assert short("sinusoidal", phase=Bounds(np.pi / 2)) == ["90.0 °"]
-    assert short("outliers", fraction=Bounds(0.001, 0.0009, 0.0011)) == ["0.100 ± 0.010 %"]
-    assert short("bandwidth_limit", order=Bounds(2)) == ["2"]
-    (leak,) = short("g_sensitivity", coefficient=Bounds(np.radians(1.0) / 3600 / 9.80665))
+    assert short("saturation", limit=ParameterInterval(5.0)) == ["286 °/s"]
+    assert short("resolution", step=ParameterInterval(1e-5)) == ["2.06 °/h"]
+    assert short("resolution", "az", step=ParameterInterval(0.00980665)) == ["1000 µg"]
+    assert short("saturation", "az", limit=ParameterInterval(19.6)) == ["19.6 m/s²"]
+    assert short("sinusoidal", phase=ParameterInterval(np.pi / 2)) == ["90.0 °"]
+    assert short("outliers", fraction=ParameterInterval(0.001, 0.0009, 0.0011)) == ["0.100 ± 0.010 %"]
+    assert short("bandwidth_limit", order=ParameterInterval(2)) == ["2"]
+    (leak,) = short("g_sensitivity", coefficient=ParameterInterval(np.radians(1.0) / 3600 / 9.80665))
     assert leak == "1.00 °/h/g"
 
 
 def test_an_axis_is_a_value_without_interval() -> None:
-    (found,) = words.parameters(one("cross_axis", source=Bounds("gx")), "gz", NO_MODEL)
+    (found,) = words.parameters(one("cross_axis", source=ParameterInterval("gx")), "gz", NO_MODEL)
     assert (found.value, found.interval, found.unit, found.short) == ("gx", "", "", "gx")
 
 
 def test_a_retuned_term_stands_beside_what_the_model_had() -> None:
     model = NoiseModel({"gz": (AngleRandomWalk(N=1.5e-4),)})
-    bounds = {"N": Bounds(1.8e-4, 1.79e-4, 1.81e-4)}
+    bounds = {"N": ParameterInterval(1.8e-4, 1.79e-4, 1.81e-4)}
     (retuned,) = words.parameters(one("angle_random_walk", kind="retuned", **bounds), "gz", model)
     assert retuned.given == "0.516 °/√h"
     (added,) = words.parameters(one("angle_random_walk", kind="added", **bounds), "gz", model)
@@ -73,17 +78,17 @@ def test_a_retuned_term_stands_beside_what_the_model_had() -> None:
 @pytest.mark.parametrize(
     ("where", "said"),
     [
-        (Where(), "everywhere"),
-        (Where(frequency=(17.1, 17.5)), "17.1 … 17.5 Hz"),
-        (Where(tau=(0.01, 0.64)), "τ = 0.01 … 0.64 s"),
-        (Where(time=(1800.0, 1800.01)), "t = 1800 s"),
-        (Where(temperature=(20.0, 35.5)), "20 … 35.5 °C"),
-        (Where(value=(-5.0, 5.0)), "−286.5 … 286.5 °/s"),
-        (Where(time=(0.0, 60.0), source="ax"), "t = 0 … 60 s, from ax"),
+        (Location(), "everywhere"),
+        (Location(frequency=(17.1, 17.5)), "17.1 … 17.5 Hz"),
+        (Location(tau=(0.01, 0.64)), "τ = 0.01 … 0.64 s"),
+        (Location(time=(1800.0, 1800.01)), "t = 1800 s"),
+        (Location(temperature=(20.0, 35.5)), "20 … 35.5 °C"),
+        (Location(value=(-5.0, 5.0)), "−286.5 … 286.5 °/s"),
+        (Location(time=(0.0, 60.0), source="ax"), "t = 0 … 60 s, from ax"),
     ],
 )
-def test_a_place_is_said_with_its_unit(where: Where, said: str) -> None:
-    assert words.place(where, "gz") == said
+def test_a_place_is_said_with_its_unit(where: Location, said: str) -> None:
+    assert words.format_range(where, "gz") == said
 
 
 @pytest.mark.parametrize(
@@ -107,9 +112,9 @@ def test_the_verdict_is_a_plain_sentence(made: Reconciliation, said: str) -> Non
 
 def test_runners_up_are_named_with_their_share() -> None:
     step = samples.explained().axes["gz"].steps[0]
-    assert words.why_not(step) == (
+    assert words.alternatives_sentence(step) == (
         "Tried for the same gap and less likely: narrowband (0.2 %) and sample rate error (< 0.1 %)."
     )
-    assert words.why_not(replace(step, runners_up=())) == "No other effect came near."
-    alone = words.why_not(replace(step, runners_up=(RunnerUp("bias_step", 0.31),)))
+    assert words.alternatives_sentence(replace(step, runners_up=())) == "No other effect came near."
+    alone = words.alternatives_sentence(replace(step, runners_up=(RunnerUp("bias_step", 0.31),)))
     assert alone == "Tried for the same gap and less likely: bias step (31.0 %)."

@@ -3,13 +3,23 @@
 import numpy as np
 import pytest
 
-from monitor.publishing.rerun.allan_chart import FILL_STEPS, HEIGHT, WIDTH, Scale, band, decades, grid, runs, whiskers
-from monitor.publishing.rerun.decimation import ROWS_PER_FLUSH, ROWS_PER_S, extremes, means
+from monitor.publishing.rerun.allan_chart import (
+    FILL_STEPS,
+    HEIGHT,
+    WIDTH,
+    Scale,
+    band,
+    decades,
+    finite_sections,
+    grid,
+    interval_strokes,
+)
+from monitor.publishing.rerun.decimation import ROWS_PER_FLUSH, ROWS_PER_S, average_buckets, decimate_extremes
 
 
 def test_decades_become_the_corners_of_the_box():
     scale = Scale((-2, 3), (0, 3))
-    at = scale.place(np.array([0.01, 1000.0, 1.0]), np.array([1000.0, 1.0, 0.0]))
+    at = scale.to_chart(np.array([0.01, 1000.0, 1.0]), np.array([1000.0, 1.0, 0.0]))
     assert at[0] == pytest.approx([0.0, 0.0])
     assert at[1] == pytest.approx([WIDTH, HEIGHT])
     assert np.isnan(at[2, 1])
@@ -18,7 +28,7 @@ def test_decades_become_the_corners_of_the_box():
 def test_white_noise_falls_by_half_a_decade_a_decade():
     scale = Scale((0, 4), (0, 4))
     tau = np.array([1.0, 10.0, 100.0])
-    at = scale.place(tau, 1000.0 / np.sqrt(tau))
+    at = scale.to_chart(tau, 1000.0 / np.sqrt(tau))
     assert np.diff(at[:, 1]) / HEIGHT * 4 == pytest.approx(0.5)
 
 
@@ -39,7 +49,7 @@ def test_every_decade_has_a_labelled_tick():
 
 def test_a_missing_point_breaks_a_line():
     line = np.array([[0.0, 1], [1, 1], [2, np.nan], [3, 1], [4, 1], [5, 1], [6, np.nan], [7, 1]])
-    assert [part[:, 0].tolist() for part in runs(line)] == [[0, 1], [3, 4, 5]]
+    assert [part[:, 0].tolist() for part in finite_sections(line)] == [[0, 1], [3, 4, 5]]
 
 
 def test_a_band_fills_between_its_edges_and_stays_in_the_box():
@@ -49,13 +59,13 @@ def test_a_band_fills_between_its_edges_and_stays_in_the_box():
     assert strokes.shape == (FILL_STEPS, 2, 2)
     assert (strokes[:, 0, 1] >= strokes[:, 1, 1]).all()
     assert strokes[..., 1].max() == HEIGHT
-    assert whiskers(low, high)[1, :, 1].tolist() == [HEIGHT, 2.0]
+    assert interval_strokes(low, high)[1, :, 1].tolist() == [HEIGHT, 2.0]
 
 
 def test_a_slow_device_is_drawn_sample_by_sample():
     t = 1.76e9 + np.arange(50) / 100
     y = np.sin(t)
-    drawn_t, drawn = extremes(t, y)
+    drawn_t, drawn = decimate_extremes(t, y)
     assert (drawn_t == t).all()
     assert (drawn == y).all()
 
@@ -65,7 +75,7 @@ def test_a_fast_device_keeps_its_outlier_and_few_rows():
     t = 1.76e9 + np.arange(20_000) / 4000
     y = rng.standard_normal(t.size)
     y[7777], y[11] = 40.0, np.nan
-    drawn_t, drawn = extremes(t, y)
+    drawn_t, drawn = decimate_extremes(t, y)
     assert drawn.size <= ROWS_PER_S * 5.0
     assert drawn.max() == 40.0
     assert drawn_t[drawn.argmax()] == t[7777]
@@ -75,13 +85,13 @@ def test_a_fast_device_keeps_its_outlier_and_few_rows():
 
 def test_the_cost_of_a_flush_is_bounded_whatever_it_brings():
     t = 1.76e9 + np.arange(400_000) / 100
-    drawn_t, _ = extremes(t, np.random.default_rng(1).standard_normal(t.size))
+    drawn_t, _ = decimate_extremes(t, np.random.default_rng(1).standard_normal(t.size))
     assert drawn_t.size <= ROWS_PER_FLUSH + 4
 
 
 def test_temperature_is_averaged():
     t = 1.76e9 + np.arange(1000) / 1000
-    mean_t, mean = means(t, np.where(t - 1.76e9 < 0.5, 20.0, 30.0), 2.0)
+    mean_t, mean = average_buckets(t, np.where(t - 1.76e9 < 0.5, 20.0, 30.0), 2.0)
     assert mean.tolist() == [20.0, 30.0]
     assert mean_t - 1.76e9 == pytest.approx([0.2495, 0.7495], abs=1e-6)
-    assert means(t, np.full(1000, np.nan), 2.0)[0].size == 0
+    assert average_buckets(t, np.full(1000, np.nan), 2.0)[0].size == 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from monitor.estimation.estimate import Estimate
-from monitor.publishing.rerun.allan_history import COLUMNS, Surface
+from monitor.publishing.rerun.allan_history import COLUMNS, AllanHistory
 from tests.monitor.publishing import made
 
 ESTIMATE = made.estimate()
@@ -17,7 +17,7 @@ def scaled(factor: float) -> Estimate:
 
 
 def test_a_column_is_the_geometric_mean_of_its_estimates() -> None:
-    surface = Surface(column_s=2.0)
+    surface = AllanHistory(column_s=2.0)
     done = [surface.add(float(t), scaled(factor)) for t, factor in enumerate((1.0, 4.0, 2.0, 8.0, 8.0))]
     assert done == [False, False, True, False, True]
     assert surface.ends_s == [2.0, 4.0]
@@ -27,7 +27,7 @@ def test_a_column_is_the_geometric_mean_of_its_estimates() -> None:
 
 
 def test_the_history_stays_bounded_and_keeps_its_whole_span() -> None:
-    surface = Surface(column_s=1.0)
+    surface = AllanHistory(column_s=1.0)
     most = 0
     for t in range(5000):
         surface.add(float(t), scaled(2.0 if t < 2500 else 6.0))
@@ -45,7 +45,7 @@ def test_the_history_stays_bounded_and_keeps_its_whole_span() -> None:
 
 
 def test_other_averaging_times_or_an_earlier_time_begin_anew() -> None:
-    surface = Surface(column_s=1.0)
+    surface = AllanHistory(column_s=1.0)
     for t in range(10):
         surface.add(float(t), ESTIMATE)
     assert len(surface.ends_s) == 9
@@ -63,7 +63,7 @@ def test_what_is_not_measured_has_no_colour() -> None:
     avar[:, 4] = np.nan
     avar[-1, 0] = 0.0
     some = replace(ESTIMATE, curve=replace(ESTIMATE.curve, avar=avar))
-    surface = Surface(column_s=1.0)
+    surface = AllanHistory(column_s=1.0)
     assert surface.relative().shape == (0, 0, 6)
     for t in range(3):
         surface.add(float(t), some)

@@ -2,12 +2,12 @@
 
 import threading
 
-from monitor.publishing.rerun.bounded_queue import Backlog
+from monitor.publishing.rerun.bounded_queue import BoundedQueue
 from tests.support.waiting import FOREVER_S
 
 
 def test_the_oldest_give_way_and_are_counted():
-    backlog = Backlog[int](limit=10)
+    backlog = BoundedQueue[int](limit=10)
     for i in range(25):
         backlog.push(i, 1)
     assert backlog.dropped == 15
@@ -16,13 +16,13 @@ def test_the_oldest_give_way_and_are_counted():
 
 
 def test_one_message_heavier_than_the_limit_is_kept():
-    backlog = Backlog[str](limit=10)
+    backlog = BoundedQueue[str](limit=10)
     backlog.push("a", 3)
     backlog.push("heavy", 99)
     assert backlog.take(0.0) == ["heavy"]
 
 
 def test_taking_waits_for_a_message():
-    backlog = Backlog[str](limit=10)
+    backlog = BoundedQueue[str](limit=10)
     threading.Timer(0.05, backlog.push, ("late", 1)).start()
     assert backlog.take(FOREVER_S) == ["late"]

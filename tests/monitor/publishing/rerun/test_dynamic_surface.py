@@ -38,7 +38,7 @@ def test_time_goes_right_and_averaging_time_goes_up() -> None:
     assert (image[-rows:, 0] == palette[2 * dynamic_surface.SHADES]).all()
     assert (image[:rows, -1] == palette[0]).all()
     sixth = COLUMNS // 6  # few columns are wide ones: they fill the picture
-    assert (image[7 * rows : 8 * rows, 2 * sixth + 2 : 3 * sixth - 2] == palette[dynamic_surface.NOTHING]).all()
+    assert (image[7 * rows : 8 * rows, 2 * sixth + 2 : 3 * sixth - 2] == palette[dynamic_surface.NO_VALUE_INDEX]).all()
     assert (image[: 7 * rows, : 5 * sixth - 2] == palette[dynamic_surface.SHADES]).all()
     assert (image[:rows, 5 * sixth + 6 :] == palette[0]).all()
 
@@ -62,7 +62,7 @@ def test_a_recording_holds_surfaces_labels_and_marks(tmp_path: Path) -> None:
     for i in range(12):
         scene.estimate("bench-1", T0 + i, made.estimate(T0 + i, seed=i))
     what = {"N": {"before": 1.5e-4, "after": 3.0e-4}, "floor": {"after": 1.0}}
-    scene.event("bench-1", T0 + 9, Event("noise_changed", 0, "gz is louder", axis="gz", what=what))
+    scene.event("bench-1", T0 + 9, Event("noise_changed", 0, "gz is louder", axis="gz", values=what))
     stream.flush()
     stream.disconnect()
     cells: dict[str, list[object]] = {}

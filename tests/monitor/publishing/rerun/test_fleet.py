@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from drivers.sample import Event, block
-from drivers.zenoh.sample_message import pack
+from drivers.sample import Event, make_block
+from drivers.zenoh.sample_message import encode_samples
 from monitor.common import topics
 from monitor.publishing.messages import encoding
 from monitor.publishing.rerun.fleet import FleetView, detail_key
 from monitor.publishing.rerun.panels import fleet_text
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
-from monitor.publishing.terminal.live_table import Board
-from monitor.publishing.zenoh.publisher import ZenohOut
-from monitor.publishing.zenoh.subscriber import Message, ZenohIn
+from monitor.publishing.terminal.live_table import DeviceStates
+from monitor.publishing.zenoh.publisher import ZenohPublisher
+from monitor.publishing.zenoh.subscriber import Message, ZenohSubscriber
 from monitor.settings.loading import ZenohTable
 from tests.monitor.publishing import made
 from tests.support.ports import free_endpoint
@@ -40,11 +40,11 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, m
     endpoint, path = free_endpoint(), tmp_path / "fleet.rrd"
     stop, told = threading.Event(), []
     viewer = RerunView(ViewerSettings(mode=str(path)), [DeviceInfo("imu/nose", "over zenoh")], fleet=True)
-    out = ZenohOut(ZenohTable(listen=(), connect=(endpoint,)), ["nose", "tail"])
+    out = ZenohPublisher(ZenohTable(listen=(), connect=(endpoint,)), ["nose", "tail"])
     with (
         router(endpoint),
         contextlib.closing(out),
-        contextlib.closing(ZenohIn("imu/**", [endpoint], None, ["imu/nose"])) as arriving,
+        contextlib.closing(ZenohSubscriber("imu/**", [endpoint], None, ["imu/nose"])) as arriving,
         contextlib.closing(viewer),
     ):
         fleet = FleetView(arriving, viewer, ["imu/nose"])
@@ -60,15 +60,15 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, m
         looking.start()
         wait_for(lambda: out.state == arriving.state == viewer.state == "ok")
         t_s, values, temperature_c = made.samples(1.76e9, 0.1)
-        rows = block((t_s * 1e9).astype("int64"), values, temperature_c)
+        rows = make_block((t_s * 1e9).astype("int64"), values, temperature_c)
 
         def publish() -> None:
             for device in ("nose", "tail"):
-                out.alive(device, True)
+                out.set_alive(device, True)
                 out.put(topics.STATUS, device, encoding.status(device, time.time(), made.health()))
                 out.put(topics.COEFFICIENTS, device, encoding.coefficients(device, 1.76e9, made.estimate()))
-                out.put(topics.ALLAN, device, encoding.allan(device, 1.76e9, made.estimate()))
-                out.put(topics.SAMPLES, device, pack(device, 10, rows))
+                out.put(topics.ALLAN, device, encoding.encode_allan(device, 1.76e9, made.estimate()))
+                out.put(topics.SAMPLES, device, encode_samples(device, 10, rows))
             stop.wait(0.2)
 
         topics_shown = ("samples", "coefficients", "allan", "status")
@@ -94,7 +94,7 @@ def test_a_status_without_a_time_has_a_row_and_is_not_drawn(monkeypatch: pytest.
     viewer = RerunView(ViewerSettings(mode="none"), [DeviceInfo("imu/a")], fleet=True)
     drawn: list[float] = []
     monkeypatch.setattr(viewer, "health", lambda _device, wall_s, _health: drawn.append(wall_s))
-    fleet = FleetView(ZenohIn("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
+    fleet = FleetView(ZenohSubscriber("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
     fleet.take(Message("imu/a/status", encoding.status("a", None, made.health(state="waiting"))))
     (known,) = fleet.board.devices(time.monotonic())
     assert known.status is not None
@@ -107,7 +107,7 @@ def test_a_status_without_a_time_has_a_row_and_is_not_drawn(monkeypatch: pytest.
 
 def test_hostile_messages_change_nothing_and_are_counted() -> None:
     viewer = RerunView(ViewerSettings(mode="none"), [DeviceInfo("imu/a")], fleet=True)
-    fleet = FleetView(ZenohIn("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
+    fleet = FleetView(ZenohSubscriber("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
     fleet.take(Message("imu/a/coefficients", encoding.coefficients("a", 1.0, made.estimate())))
     for key, payload in {
         "imu/a/samples": b"\x81" * 10_000,
@@ -121,13 +121,13 @@ def test_hostile_messages_change_nothing_and_are_counted() -> None:
 
 
 def test_the_table_has_trouble_first_and_texts_of_others_cannot_leave_their_cell() -> None:
-    board = Board(lambda: 10.0)
+    board = DeviceStates(lambda: 10.0)
     for device, changed in {
         "well": {},
         "bad": {"state": "lost", "text": "gone | <img src=x> [a](http://b)\n\n# head"},
     }.items():
-        board.take(f"imu/{device}/status", encoding.status(device, 1.0, made.health(**changed)))
-        board.take(f"imu/{device}/coefficients", encoding.coefficients(device, 1.0, made.estimate()))
+        board.process_message(f"imu/{device}/status", encoding.status(device, 1.0, made.health(**changed)))
+        board.process_message(f"imu/{device}/coefficients", encoding.coefficients(device, 1.0, made.estimate()))
     text = fleet_text(board.devices(10.0), 10.0, 40, "1 of 2 there")
     lines = text.splitlines()
     assert lines[0] == "**2** devices: **1** lost, **1** running; N in °/√h"

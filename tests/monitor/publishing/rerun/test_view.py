@@ -32,10 +32,12 @@ T0 = 1.76e9
 
 
 @pytest.fixture
-def server() -> Iterator[sinks.Child]:
+def server() -> Iterator[sinks.ViewerProcess]:
     """A Rerun server on loopback that someone else started, with ``port`` and ``web_port``."""
     port, web_port = free_port(), free_port()
-    child = sinks.Child(["--serve-web", "--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(web_port)])
+    child = sinks.ViewerProcess(
+        ["--serve-web", "--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(web_port)]
+    )
     child.port = port  # type: ignore[attr-defined]
     wait_for(lambda: sinks.is_rerun(port))
     yield child
@@ -154,7 +156,7 @@ def column(cells: dict[str, list[object]], name: str) -> np.ndarray:
     )
 
 
-def test_a_frozen_viewer_delays_nobody_and_is_said(server: sinks.Child) -> None:
+def test_a_frozen_viewer_delays_nobody_and_is_said(server: sinks.ViewerProcess) -> None:
     view = RerunView(ViewerSettings("native", port=server.port), DEVICE)  # type: ignore[attr-defined]
     view.start()
     wait_for(lambda: view.state == "ok")
@@ -168,7 +170,7 @@ def test_a_frozen_viewer_delays_nobody_and_is_said(server: sinks.Child) -> None:
     view.close()
 
 
-def test_a_stalled_view_counts_what_it_drops(server: sinks.Child, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stalled_view_counts_what_it_drops(server: sinks.ViewerProcess, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rerun_view, "BACKLOG_BYTES", 100_000)
     view = RerunView(ViewerSettings("native", port=server.port), DEVICE)  # type: ignore[attr-defined]
     view.start()
@@ -181,7 +183,7 @@ def test_a_stalled_view_counts_what_it_drops(server: sinks.Child, monkeypatch: p
     view.close(1.0)  # returns, although the viewer stays frozen
 
 
-def test_a_process_with_a_frozen_viewer_exits(server: sinks.Child) -> None:
+def test_a_process_with_a_frozen_viewer_exits(server: sinks.ViewerProcess) -> None:
     """Rerun's exit handler and its destructors would wait for the viewer for ever."""
     program = f"""
         import os, signal, time
@@ -208,7 +210,9 @@ def test_a_process_with_a_frozen_viewer_exits(server: sinks.Child) -> None:
     assert done.stdout == "closed\n"
 
 
-def test_a_viewer_that_dies_is_said_and_joined_again(server: sinks.Child, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_viewer_that_dies_is_said_and_joined_again(
+    server: sinks.ViewerProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(rerun_view, "RETRY_S", (0.1,))
     monkeypatch.setattr(sinks, "has_desktop", lambda: False)
     port = server.port  # type: ignore[attr-defined]
@@ -218,7 +222,7 @@ def test_a_viewer_that_dies_is_said_and_joined_again(server: sinks.Child, monkey
     server.kill()
     wait_for(lambda: view.state != "ok")
     feed(view, 1)
-    again = sinks.Child(
+    again = sinks.ViewerProcess(
         ["--serve-web", "--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(free_port())]
     )
     try:

@@ -15,7 +15,7 @@ from drivers.sample import Event
 from monitor.common import topics
 from monitor.publishing.messages import encoding
 from monitor.publishing.terminal import live_table
-from monitor.publishing.terminal.live_table import Board
+from monitor.publishing.terminal.live_table import DeviceStates
 from tests.monitor.publishing import made
 
 NOW_S = 100.0
@@ -35,25 +35,27 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def board(clock: Clock) -> Board:
-    return Board(clock)
+def board(clock: Clock) -> DeviceStates:
+    return DeviceStates(clock)
 
 
-def status(board: Board, device: str, prefix: str = "imu", **changed: object) -> None:
-    board.take(topics.STATUS.key(prefix, device), encoding.status(device, 1.76e9, made.health(**changed)))
+def status(board: DeviceStates, device: str, prefix: str = "imu", **changed: object) -> None:
+    board.process_message(topics.STATUS.key(prefix, device), encoding.status(device, 1.76e9, made.health(**changed)))
 
 
-def noise(board: Board, device: str, seconds: float = 3600.0, scale: float = 1.0) -> None:
+def noise(board: DeviceStates, device: str, seconds: float = 3600.0, scale: float = 1.0) -> None:
     estimate = made.estimate(seconds=seconds, scale=scale)
-    board.take(topics.COEFFICIENTS.key("imu", device), encoding.coefficients(device, 1.76e9, estimate))
+    board.process_message(topics.COEFFICIENTS.key("imu", device), encoding.coefficients(device, 1.76e9, estimate))
 
 
-def event(board: Board, device: str, text: str) -> None:
+def event(board: DeviceStates, device: str, text: str) -> None:
     payload = encoding.event(device, 1.76e9, 1, Event("noise_changed", 0, text), None)
-    board.take(topics.EVENT.key("imu", device), payload)
+    board.process_message(topics.EVENT.key("imu", device), payload)
 
 
-def shown(board: Board, width: int = 120, now_s: float = NOW_S, height: int = 50, is_terminal: bool = False) -> str:
+def shown(
+    board: DeviceStates, width: int = 120, now_s: float = NOW_S, height: int = 50, is_terminal: bool = False
+) -> str:
     console = Console(width=width, height=height, file=io.StringIO(), force_terminal=is_terminal, record=True)
     console.print(board.table(now_s))
     return console.export_text()
@@ -63,12 +65,12 @@ def row(text: str, device: str) -> str:
     return next(line for line in text.splitlines() if line.startswith(f"{device} "))
 
 
-def test_nothing_heard_yet(board: Board) -> None:
+def test_nothing_heard_yet(board: DeviceStates) -> None:
     board.note = "nobody at tcp/127.0.0.1:7450; trying again"
     assert " ".join(shown(board).split()) == "imu-monitor 0 devices nobody at tcp/127.0.0.1:7450; trying again"
 
 
-def test_one_row_a_device_with_all_its_numbers(board: Board) -> None:
+def test_one_row_a_device_with_all_its_numbers(board: DeviceStates) -> None:
     for device, scale in (("bench-1", 1.0), ("bench-2", 2.0)):
         status(board, device)
         noise(board, device, scale=scale)
@@ -83,7 +85,7 @@ def test_one_row_a_device_with_all_its_numbers(board: Board) -> None:
 
 
 @pytest.mark.parametrize("width", [80, 100, 120, 160, 200])
-def test_nothing_is_cut_off_at_any_usual_width(board: Board, width: int) -> None:
+def test_nothing_is_cut_off_at_any_usual_width(board: DeviceStates, width: int) -> None:
     for device in ("bench-1", "bench-2"):
         status(board, device, received=28_812_345, lost=48_123)
         noise(board, device)
@@ -95,25 +97,25 @@ def test_nothing_is_cut_off_at_any_usual_width(board: Board, width: int) -> None
     assert ("0.515" in text) == (width != 100)  # two digits where three do not fit in a line
 
 
-def test_a_line_a_device_from_100_columns_on(board: Board) -> None:
+def test_a_line_a_device_from_100_columns_on(board: DeviceStates) -> None:
     for device in ("a", "b", "c"):
         status(board, device)
         noise(board, device)
     assert [len(shown(board, width).splitlines()) for width in (79, 100, 160)] == [1 + 1 + 9, 1 + 2 + 3, 1 + 2 + 3]
 
 
-def test_bounds_and_too_few_data_are_marked(board: Board) -> None:
+def test_bounds_and_too_few_data_are_marked(board: DeviceStates) -> None:
     for device in ("early", "other"):
         status(board, device)
     noise(board, "early", seconds=100.0)
     assert row(shown(board, 160), "early").count("≤") == 3  # B of the gyroscopes
     unknown = made.estimate()
     unknown.coefficients.status[:] = 0
-    board.take("imu/early/coefficients", encoding.coefficients("early", 1.0, unknown))
+    board.process_message("imu/early/coefficients", encoding.coefficients("early", 1.0, unknown))
     assert row(shown(board, 160), "early").count("—") == 9
 
 
-def test_trouble_comes_first_and_has_a_sign_and_a_word(board: Board) -> None:
+def test_trouble_comes_first_and_has_a_sign_and_a_word(board: DeviceStates) -> None:
     status(board, "a-good")
     status(board, "b-ended", state="ended")
     status(board, "c-waiting", state="waiting", text="waiting for serial /dev/ttyUSB3", rate_hz=None)
@@ -136,7 +138,7 @@ def test_trouble_comes_first_and_has_a_sign_and_a_word(board: Board) -> None:
     ]  # fmt: skip
 
 
-def test_hostile_messages_leave_a_bounded_board(board: Board) -> None:
+def test_hostile_messages_leave_a_bounded_board(board: DeviceStates) -> None:
     status(board, "good")
     known = encoding.status("good", 1.0, made.health())
     deep = known[:-1] + b',"more":' + b"[" * 20_000 + b"]" * 20_000 + b"}"
@@ -146,11 +148,11 @@ def test_hostile_messages_leave_a_bounded_board(board: Board) -> None:
         + b"}}"
     )
     for payload in (b"x" * 100_000, deep, known.replace(b'"received":', b'"received":1'.ljust(500, b"0") + b',"x":')):
-        board.take("imu/good/status", payload)
-    board.take("imu/good/coefficients", many_axes)
+        board.process_message("imu/good/status", payload)
+    board.process_message("imu/good/coefficients", many_axes)
     assert board.malformed == 4
     long = json.loads(known) | {"text": "x" * 60_000, "outputs": {f"o{i}": "y" * 500 for i in range(100)}}
-    board.take("imu/good/status", json.dumps(long).encode())
+    board.process_message("imu/good/status", json.dumps(long).encode())
     held = board._devices["imu/good"].status
     assert held is not None
     assert len(held.text) + sum(len(a) + len(b) for a, b in held.outputs.items()) < 10_000
@@ -160,18 +162,18 @@ def test_hostile_messages_leave_a_bounded_board(board: Board) -> None:
 def test_devices_beyond_the_bound_are_passed_over_until_others_have_been_silent_for_long(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(live_table, "DEVICES", 3)
+    monkeypatch.setattr(live_table, "MAX_DEVICES", 3)
     clock = [0.0]
-    board = Board(lambda: clock[0])
+    board = DeviceStates(lambda: clock[0])
     payload = encoding.status("a", 1.0, made.health())
     for device in ("a", "b", "c", "d", "x" * 300):
-        board.take(f"imu/{device}/status", payload)
-        board.alive(f"imu/{device}/alive", True)
+        board.process_message(f"imu/{device}/status", payload)
+        board.set_token(f"imu/{device}/alive", True)
     assert list(board._devices) == ["imu/a", "imu/b", "imu/c"]
     assert board.passed_over == 4
-    clock[0] = live_table.FORGET_S + 1.0
-    board.take("imu/a/status", payload)
-    board.take("imu/e/status", payload)
+    clock[0] = live_table.FORGET_AFTER_S + 1.0
+    board.process_message("imu/a/status", payload)
+    board.process_message("imu/e/status", payload)
     assert sorted(board._devices) == ["imu/a", "imu/c", "imu/e"]
 
 
@@ -180,25 +182,25 @@ def test_states_have_different_signs_for_different_ranks() -> None:
     assert len({signs[state] for state in ("running", "waiting", "lost", "silent", "ended", "present")}) == 6
 
 
-def test_a_device_that_goes_is_marked(board: Board, clock: Clock) -> None:
+def test_a_device_that_goes_is_marked(board: DeviceStates, clock: Clock) -> None:
     status(board, "a")
-    board.alive("imu/a/alive", True)
-    board.alive("imu/a/alive", False)
+    board.set_token("imu/a/alive", True)
+    board.set_token("imu/a/alive", False)
     assert row(shown(board, now_s=NOW_S + 3.0), "a").split()[1:3] == ["✖", "gone"]
     clock.now_s = NOW_S + 10.0
-    board.alive("imu/a/alive", True)
+    board.set_token("imu/a/alive", True)
     status(board, "a")
     assert row(shown(board, now_s=NOW_S + 10.5), "a").split()[1:3] == ["●", "running"]
 
 
-def test_a_device_of_which_only_the_presence_is_known(board: Board) -> None:
-    board.alive("imu/new/alive", True)
+def test_a_device_of_which_only_the_presence_is_known(board: DeviceStates) -> None:
+    board.set_token("imu/new/alive", True)
     assert row(shown(board), "new").split()[:3] == ["new", "○", "present"]
-    board.alive("imu/other/status", True)
+    board.set_token("imu/other/status", True)
     assert "other" not in shown(board)
 
 
-def test_devices_of_several_prefixes_show_their_whole_key(board: Board) -> None:
+def test_devices_of_several_prefixes_show_their_whole_key(board: DeviceStates) -> None:
     status(board, "a", prefix="lab")
     status(board, "a", prefix="roof/north")
     text = shown(board)
@@ -206,7 +208,7 @@ def test_devices_of_several_prefixes_show_their_whole_key(board: Board) -> None:
     assert row(text, "roof/north/a")
 
 
-def test_one_device_alone_shows_every_coefficient_with_its_interval(board: Board) -> None:
+def test_one_device_alone_shows_every_coefficient_with_its_interval(board: DeviceStates) -> None:
     status(board, "a")
     noise(board, "a", seconds=1000.0)
     text = shown(board, 140)
@@ -249,18 +251,18 @@ def test_axes_whose_slow_part_is_temperature_are_marked() -> None:
     assert "†" not in console.export_text()
 
 
-def test_a_gyroscope_alone_has_no_accelerometer_columns(board: Board) -> None:
+def test_a_gyroscope_alone_has_no_accelerometer_columns(board: DeviceStates) -> None:
     whole = made.estimate()
     whole.curve.avar[:, 3:] = float("nan")
     status(board, "a")
-    board.take("imu/a/coefficients", encoding.coefficients("a", 1.0, whole))
+    board.process_message("imu/a/coefficients", encoding.coefficients("a", 1.0, whole))
     text = shown(board, 160)
     assert "°/√h" in text
     assert "m/s/√h" not in text
     assert "Accelerometers" not in text
 
 
-def test_the_last_events(board: Board) -> None:
+def test_the_last_events(board: DeviceStates) -> None:
     for i in range(9):
         event(board, "a", f"event {i}")
     lines = shown(board).splitlines()[-live_table.EVENTS :]
@@ -268,27 +270,27 @@ def test_the_last_events(board: Board) -> None:
     assert all(len(line.split("  ")[0]) == 8 for line in lines)
 
 
-def test_a_time_that_is_no_date(board: Board) -> None:
+def test_a_time_that_is_no_date(board: DeviceStates) -> None:
     payload = encoding.event("a", 1e300, 1, Event("moved", 0, "moved"), None)
-    board.take("imu/a/event", payload)
+    board.process_message("imu/a/event", payload)
     assert "1e+300 s  a  moved" in shown(board)
 
 
-def test_malformed_messages_are_counted_and_change_nothing(board: Board) -> None:
+def test_malformed_messages_are_counted_and_change_nothing(board: DeviceStates) -> None:
     status(board, "a")
     before = shown(board)
     for topic in (topics.STATUS, topics.COEFFICIENTS, topics.GAP, topics.EVENT):
         for payload in (b"", b"{", b"null", b'{"schema":"imu-monitor/status/9"}', b"\xff"):
-            board.take(topic.key("imu", "a"), payload)
-            board.take(topic.key("imu", "nobody"), payload)
-    board.take("imu/a/samples", b"not read")
-    board.take("imu/a/mood", b"not known")
+            board.process_message(topic.key("imu", "a"), payload)
+            board.process_message(topic.key("imu", "nobody"), payload)
+    board.process_message("imu/a/samples", b"not read")
+    board.process_message("imu/a/mood", b"not known")
     assert board.malformed == 40
     after = shown(board)
     assert after.replace("  40 malformed messages", "") == before
 
 
-def test_a_sender_cannot_steer_the_terminal(board: Board) -> None:
+def test_a_sender_cannot_steer_the_terminal(board: DeviceStates) -> None:
     evil = "\x1b[2J\x1b]0;owned\x07[red]x[/red]\r\n\x9b31m"
     status(board, "a" + evil.replace("\n", ""), state=evil, text=evil, outputs={evil: evil})
     event(board, "a", evil)
@@ -299,7 +301,7 @@ def test_a_sender_cannot_steer_the_terminal(board: Board) -> None:
     assert all(character.isprintable() or character == "\n" for character in text)
 
 
-def test_more_devices_than_lines(board: Board) -> None:
+def test_more_devices_than_lines(board: DeviceStates) -> None:
     for i in range(100):
         status(board, f"device-{i:03}")
     status(board, "zz", state="lost")
@@ -312,11 +314,11 @@ def test_more_devices_than_lines(board: Board) -> None:
     assert shown(board, 120).count("device-") == 100  # a file takes them all
 
 
-def test_two_threads_at_once(board: Board) -> None:
+def test_two_threads_at_once(board: DeviceStates) -> None:
     def feed() -> None:
         for i in range(300):
             status(board, f"d{i}")
-            board.alive(f"imu/d{i}/alive", True)
+            board.set_token(f"imu/d{i}/alive", True)
 
     feeder = threading.Thread(target=feed)
     feeder.start()
@@ -334,9 +336,9 @@ def test_watch_refuses_what_zenoh_refuses() -> None:
         live_table.watch(connect=["nowhere"], console=console, once_s=0.0)
 
 
-def test_a_device_that_disagrees_with_its_model_says_so(board: Board) -> None:
+def test_a_device_that_disagrees_with_its_model_says_so(board: DeviceStates) -> None:
     status(board, "a")
-    board.take("imu/a/gap", encoding.gap("a", 1.0, made.look(scale=1.2, gz=False)))
+    board.process_message("imu/a/gap", encoding.gap("a", 1.0, made.look(scale=1.2, gz=False)))
     assert "gz disagrees with its model: " in shown(board, 160)
-    board.take("imu/a/gap", encoding.gap("a", 1.0, made.look(gz=True)))
+    board.process_message("imu/a/gap", encoding.gap("a", 1.0, made.look(gz=True)))
     assert "disagrees" not in shown(board, 160)

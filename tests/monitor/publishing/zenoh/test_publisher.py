@@ -17,7 +17,7 @@ import pytest
 import zenoh
 
 from monitor.common import topics
-from monitor.publishing.zenoh.publisher import Command, ZenohOut
+from monitor.publishing.zenoh.publisher import Command, ZenohPublisher
 from monitor.settings.loading import ZenohTable
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -33,8 +33,8 @@ def endpoint() -> str:
 
 
 @contextlib.contextmanager
-def started(**settings: Any) -> Iterator[ZenohOut]:
-    out = ZenohOut(ZenohTable(**settings), DEVICES)
+def started(**settings: Any) -> Iterator[ZenohPublisher]:
+    out = ZenohPublisher(ZenohTable(**settings), DEVICES)
     out.start()
     try:
         yield out
@@ -43,7 +43,7 @@ def started(**settings: Any) -> Iterator[ZenohOut]:
 
 
 @contextlib.contextmanager
-def through_a_router(endpoint: str) -> Iterator[tuple[ZenohOut, Any]]:
+def through_a_router(endpoint: str) -> Iterator[tuple[ZenohPublisher, Any]]:
     """A daemon that is open, and a client beside it."""
     with (
         router(endpoint),
@@ -109,18 +109,18 @@ def test_presence_comes_and_goes_with_the_samples(endpoint: str) -> None:
             assert tuple(seen) == expected
             seen.clear()
 
-        out.alive("bench-1", True)
+        out.set_alive("bench-1", True)
         follows(("imu/bench-1/alive", True))
-        out.alive("bench-1", True)  # said twice, shown once
-        out.alive("bench-2", True)
+        out.set_alive("bench-1", True)  # said twice, shown once
+        out.set_alive("bench-2", True)
         follows(("imu/bench-2/alive", True))
-        out.alive("bench-1", False)
+        out.set_alive("bench-1", False)
         follows(("imu/bench-1/alive", False))
         out.close()
         follows(("imu/bench-2/alive", False))
 
 
-def answering(out: ZenohOut, known: str = "reset") -> threading.Thread:
+def answering(out: ZenohPublisher, known: str = "reset") -> threading.Thread:
     """What the service's loop does with one command."""
 
     def answer() -> None:
@@ -241,7 +241,7 @@ def test_a_router_that_comes_later(endpoint: str) -> None:
         assert out.state.startswith("Unable to connect")
         assert out.state.endswith("trying again")
         assert ".rs" not in out.state
-        out.alive("bench-1", True)
+        out.set_alive("bench-1", True)
         out.put(topics.STATUS, "bench-1", b"dropped, as nobody is there")
         with router(endpoint), session(connect=[endpoint]) as client:
             wait_for(lambda: out.state == "ok")
@@ -251,7 +251,7 @@ def test_a_router_that_comes_later(endpoint: str) -> None:
 
 
 def test_closing_while_it_waits_for_a_router(endpoint: str) -> None:
-    out = ZenohOut(ZenohTable(mode="client", connect=(endpoint,)), DEVICES)
+    out = ZenohPublisher(ZenohTable(mode="client", connect=(endpoint,)), DEVICES)
     out.start()
     wait_for(lambda: out.state != "not open yet")
     out.close()
@@ -273,7 +273,7 @@ def test_a_subscriber_that_takes_nothing_holds_nobody_up(endpoint: str) -> None:
 def test_no_session_at_all() -> None:
     with started(mode="none") as out:
         assert out.state == "off"
-        out.alive("bench-1", True)
+        out.set_alive("bench-1", True)
         out.put(topics.STATUS, "bench-1", b"x")
     assert not any("commands of" in thread.name for thread in threading.enumerate())
 

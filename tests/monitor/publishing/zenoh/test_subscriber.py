@@ -22,8 +22,8 @@ from drivers.errors import ConfigError
 from monitor.common import topics
 from monitor.publishing.messages import encoding
 from monitor.publishing.terminal import live_table
-from monitor.publishing.zenoh.publisher import ZenohOut
-from monitor.publishing.zenoh.subscriber import Message, ZenohIn
+from monitor.publishing.zenoh.publisher import ZenohPublisher
+from monitor.publishing.zenoh.subscriber import Message, ZenohSubscriber
 from monitor.settings.loading import ZenohTable
 from tests.monitor.publishing import made
 from tests.support.ports import free_endpoint
@@ -37,10 +37,10 @@ def endpoint() -> str:
 
 
 @contextlib.contextmanager
-def daemon(endpoint: str, device: str, mode: str = "peer") -> Iterator[ZenohOut]:
+def daemon(endpoint: str, device: str, mode: str = "peer") -> Iterator[ZenohPublisher]:
     """A daemon's session that sends status ten times a second, and what no watcher needs beside it."""
     settings = ZenohTable(listen=(endpoint,)) if mode == "peer" else ZenohTable(mode="client", connect=(endpoint,))
-    out = ZenohOut(settings, [device])
+    out = ZenohPublisher(settings, [device])
     ending = threading.Event()
 
     def talk() -> None:
@@ -51,7 +51,7 @@ def daemon(endpoint: str, device: str, mode: str = "peer") -> Iterator[ZenohOut]
             out.put(topics.ALLAN, device, b"curve")
 
     out.start()
-    out.alive(device, True)
+    out.set_alive(device, True)
     talker = threading.Thread(target=talk)
     talker.start()
     try:
@@ -63,13 +63,13 @@ def daemon(endpoint: str, device: str, mode: str = "peer") -> Iterator[ZenohOut]
 
 
 @contextlib.contextmanager
-def listening(keyexpr: str, *connect: str) -> Iterator[tuple[ZenohIn, list[Message]]]:
-    with contextlib.closing(ZenohIn(keyexpr, connect)) as arriving:
+def listening(keyexpr: str, *connect: str) -> Iterator[tuple[ZenohSubscriber, list[Message]]]:
+    with contextlib.closing(ZenohSubscriber(keyexpr, connect)) as arriving:
         arriving.start()
         yield arriving, []
 
 
-def keys(arriving: ZenohIn, so_far: list[Message]) -> set[str]:
+def keys(arriving: ZenohSubscriber, so_far: list[Message]) -> set[str]:
     so_far += arriving.take(0.1)
     return {one.key for one in so_far}
 
@@ -139,10 +139,10 @@ def test_through_a_router(endpoint: str) -> None:
 
 def test_a_daemon_that_is_a_peer_is_heard_through_a_router(endpoint: str) -> None:
     """A router passes nothing on from a peer to a peer."""
-    out = ZenohOut(ZenohTable(listen=(free_endpoint(),), connect=(endpoint,)), ["a"])
+    out = ZenohPublisher(ZenohTable(listen=(free_endpoint(),), connect=(endpoint,)), ["a"])
     with router(endpoint), contextlib.closing(out), listening("imu/**", endpoint) as (arriving, got):
         out.start()
-        out.alive("a", True)
+        out.set_alive("a", True)
 
         def both() -> bool:
             out.put(topics.STATUS, "a", encoding.status("a", time.time(), made.health()))
@@ -156,7 +156,7 @@ def test_two_ways_to_the_same_daemon_bring_each_message_once(tmp_path: Path) -> 
     with (
         session(mode="router", listen=[first]),
         session(mode="router", listen=[second], connect=[first]),
-        contextlib.closing(ZenohOut(ZenohTable(config=patient, mode="client", connect=(first,)), ["a"])) as out,
+        contextlib.closing(ZenohPublisher(ZenohTable(config=patient, mode="client", connect=(first,)), ["a"])) as out,
         listening("imu/**", first, second) as (arriving, got),
     ):
         out.start()
@@ -182,7 +182,7 @@ def test_who_comes_late_gets_the_last_values_and_events(endpoint: str) -> None:
     with (
         session(mode="router", listen=[endpoint]),
         session(mode="router", listen=[far], connect=[endpoint]),
-        contextlib.closing(ZenohOut(ZenohTable(listen=(), connect=(endpoint,)), ["a"])) as out,
+        contextlib.closing(ZenohPublisher(ZenohTable(listen=(), connect=(endpoint,)), ["a"])) as out,
     ):
         out.start()
         wait_for(lambda: out.state == "ok")
@@ -211,29 +211,29 @@ def test_a_message_that_is_too_long_does_not_arrive_and_those_after_it_do(endpoi
 def test_closing_at_any_moment_leaves_no_thread(endpoint: str) -> None:
     before = threading.active_count()
     for wait_s in (0.0, 0.3, 0.8):
-        arriving = ZenohIn("imu/**", [endpoint])
+        arriving = ZenohSubscriber("imu/**", [endpoint])
         arriving.start()
         time.sleep(wait_s)
         arriving.close()
         assert threading.active_count() == before
-    ZenohIn().close()  # never started
+    ZenohSubscriber().close()  # never started
 
 
 @pytest.mark.parametrize("keyexpr", ["", "imu//a", "/imu", "imu/**x", "a?b"])
 def test_no_key_expression(keyexpr: str) -> None:
     with pytest.raises(ConfigError, match="key expression") as raised:
-        ZenohIn(keyexpr)
+        ZenohSubscriber(keyexpr)
     assert ".rs" not in str(raised.value)
 
 
 def test_a_topic_that_is_not_shown() -> None:
     with pytest.raises(ConfigError, match="nothing to show of it; shown are status, coefficients, event, alive"):
-        ZenohIn("imu/a/samples")
+        ZenohSubscriber("imu/a/samples")
 
 
 def test_no_endpoint() -> None:
     with pytest.raises(ConfigError, match='connect "localhost:7450": no endpoint'):
-        ZenohIn("imu/**", ["tcp/127.0.0.1:1", "localhost:7450"])
+        ZenohSubscriber("imu/**", ["tcp/127.0.0.1:1", "localhost:7450"])
 
 
 # --- watch

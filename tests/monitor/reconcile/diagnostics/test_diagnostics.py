@@ -8,15 +8,15 @@ from scipy.signal import periodogram
 from monitor.noise.effects import AngleRandomWalk, NoiseStep, RateRandomWalk, Resolution, Sinusoidal
 from monitor.reconcile.diagnostics import diagnostics
 from monitor.reconcile.diagnostics.diagnostics import (
-    course_gain,
-    line_peaks,
-    noise_course,
+    find_line_peaks,
+    noise_deviation_over_time,
     power_gain,
-    sight,
+    regressor_gain,
     step_gains,
+    whiten_axis,
 )
-from monitor.reconcile.likelihood.hypothesis import believed
-from monitor.reconcile.preparation.cosine_bins import transform
+from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes
+from monitor.reconcile.preparation.cosine_bins import cosine_transform
 from tests.monitor.reconcile.axes import RATE_HZ, WHITE, N, axes, axis, correlated, seen, time_s, walk, white
 
 n = 4800
@@ -41,7 +41,7 @@ def test_gain_of_a_step_at_each_time_is_that_of_least_squares(model):
     view = seen(axis(y), model)
     gains, times_s = step_gains(view)
     for at in (0, 1, 700, int(np.argmax(gains)), gains.size - 2, gains.size - 1):
-        step = transform(np.where(np.arange(n) >= round(times_s[at] * RATE_HZ), 1.0, 0.0))
+        step = cosine_transform(np.where(np.arange(n) >= round(times_s[at] * RATE_HZ), 1.0, 0.0))
         assert gains[at] == pytest.approx(least_squares(view, [step]), rel=1e-6, abs=1e-9)
     assert times_s[np.argmax(gains)] == pytest.approx(17.0, abs=0.05)
 
@@ -49,10 +49,10 @@ def test_gain_of_a_step_at_each_time_is_that_of_least_squares(model):
 def test_gain_of_a_course_is_that_of_least_squares():
     t = time_s(n)
     view = seen(axis(drawn(1) + 1e-4 * t), MODEL)
-    columns = [transform(t), transform(t**2), transform(np.cos(t))]
-    assert course_gain(view, columns[:1]) == pytest.approx(least_squares(view, columns[:1]), rel=1e-6)
-    assert course_gain(view, columns) == pytest.approx(least_squares(view, columns), rel=1e-5)
-    assert course_gain(view, [columns[0], columns[0]]) == pytest.approx(course_gain(view, columns[:1]), rel=1e-4)
+    columns = [cosine_transform(t), cosine_transform(t**2), cosine_transform(np.cos(t))]
+    assert regressor_gain(view, columns[:1]) == pytest.approx(least_squares(view, columns[:1]), rel=1e-6)
+    assert regressor_gain(view, columns) == pytest.approx(least_squares(view, columns), rel=1e-5)
+    assert regressor_gain(view, [columns[0], columns[0]]) == pytest.approx(regressor_gain(view, columns[:1]), rel=1e-4)
 
 
 def test_gain_of_power_is_that_of_a_variance_of_its_own():
@@ -71,7 +71,7 @@ def test_gain_of_power_is_that_of_a_variance_of_its_own():
 def test_peaks_of_the_periodogram_are_those_of_scipy():
     rng = np.random.default_rng(3)
     w = rng.standard_normal(n) + 0.3 * np.sin(2 * np.pi * 7.3 * time_s(n)) + 0.2 * np.cos(2 * np.pi * 31.0 * time_s(n))
-    (first, f1), (second, f2), (third, _) = line_peaks(w, RATE_HZ, 3)
+    (first, f1), (second, f2), (third, _) = find_line_peaks(w, RATE_HZ, 3)
     assert (f1, f2) == (pytest.approx(7.3, abs=0.02), pytest.approx(31.0, abs=0.02))
     assert first > second > third
     f, power = periodogram(w, RATE_HZ, detrend=False, scaling="density", nfft=2 * n)
@@ -84,7 +84,7 @@ def test_peaks_of_the_periodogram_are_those_of_scipy():
 
 def test_autocorrelation_is_the_sum_of_products():
     view = seen(axis(drawn(4) + correlated(n, np.random.default_rng(5), 4e-4, 0.03)), MODEL)
-    products = [view.white[:-lag] @ view.white[lag:] / n for lag in range(1, diagnostics.LAGS + 1)]
+    products = [view.white[:-lag] @ view.white[lag:] / n for lag in range(1, diagnostics.MAX_LAG_SAMPLES + 1)]
     found = diagnostics.autocorrelation(view)
     best = int(np.argmax(np.square(products)))
     assert found.gain == pytest.approx(0.5 * n * products[best] ** 2)
@@ -127,11 +127,11 @@ def test_fast_series_is_white_whatever_the_spectrum_is():
 
 
 def test_noise_steps_of_a_model_are_in_its_course():
-    course = noise_course((WHITE, NoiseStep(time=12.0, ratio=3.0)), n, RATE_HZ)
+    course = noise_deviation_over_time((WHITE, NoiseStep(time=12.0, ratio=3.0)), n, RATE_HZ)
     assert np.mean(course**2) == pytest.approx(1.0)
     assert course[1200] / course[1199] == pytest.approx(3.0)
     assert np.unique(course).size == 2
-    np.testing.assert_array_equal(noise_course((WHITE,), n, RATE_HZ), np.ones(n))
+    np.testing.assert_array_equal(noise_deviation_over_time((WHITE,), n, RATE_HZ), np.ones(n))
     y = white(n, np.random.default_rng(9)) * np.where(time_s(n) < 12.0, 1.0, 3.0)
     effects = (AngleRandomWalk(N=N), NoiseStep(time=12.0, ratio=3.0))
     assert diagnostics.variance(seen(axis(y), effects)).gain < 15.0
@@ -167,12 +167,12 @@ def test_the_axis_that_leaks_is_named():
     view = seen(one, MODEL)
     found = diagnostics.other_axes(view)
     assert found.where.source == "gy"
-    assert found.gain == pytest.approx(least_squares(view, [transform(gy)]), rel=1e-6)
+    assert found.gain == pytest.approx(least_squares(view, [cosine_transform(gy)]), rel=1e-6)
 
 
 def test_courses_that_were_fitted_are_taken_out():
     line = 1e-3 * np.sin(2 * np.pi * 7.3 * time_s(n))
     one = axis(drawn(15) + line)
     model = (*MODEL, Sinusoidal(amplitude=1.0, frequency=7.3, phase=0.0))
-    view = sight(one, believed(one, model).likely)
+    view = whiten_axis(one, fit_with_given_sizes(one, model).likely)
     assert diagnostics.lines(view).gain < 20.0 < diagnostics.lines(seen(one, MODEL)).gain

@@ -4,23 +4,28 @@ import numpy as np
 import pytest
 from scipy.stats import expon
 
-from monitor.reconcile.diagnostics.diagnostics import LENSES, Finding
-from monitor.reconcile.diagnostics.gap import ACCUSED, Null, nulls, scores
-from monitor.reconcile.result import Where
+from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS, Finding
+from monitor.reconcile.diagnostics.gap import (
+    FALSE_ALARM_PROBABILITY,
+    NullDistribution,
+    null_distributions,
+    score_findings,
+)
+from monitor.reconcile.result import Location
 
 START = 5.0  # nats: gains are START and an exponential of mean one, as the largest of many χ²/2
 
 
 def simulated(count, rng, shift=0.0):
-    gains = START + shift + rng.exponential(size=(count, len(LENSES)))
-    return [{lens: Finding(float(g), Where()) for lens, g in zip(LENSES, row, strict=True)} for row in gains]
+    gains = START + shift + rng.exponential(size=(count, len(DIAGNOSTICS)))
+    return [{lens: Finding(float(g), Location()) for lens, g in zip(DIAGNOSTICS, row, strict=True)} for row in gains]
 
 
 def thresholds(runs, names, seeds):
     found = []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
-        each = nulls({name: simulated(runs, rng) for name in names}, len(names))
+        each = null_distributions({name: simulated(runs, rng) for name in names}, len(names))
         found += [(one.null95, one.threshold) for of_axis in each.values() for one in of_axis.values()]
     return np.array(found)
 
@@ -30,7 +35,7 @@ def test_levels_are_those_of_an_exponential():
     null95, threshold = np.median(thresholds(6, names, 20), axis=0)
     assert null95 == pytest.approx(START + expon.isf(0.05), abs=0.4)
     # once in 100 recordings, of all lenses and axes together
-    assert threshold == pytest.approx(START + expon.isf(0.01 / (len(LENSES) * 6)), rel=0.15)
+    assert threshold == pytest.approx(START + expon.isf(0.01 / (len(DIAGNOSTICS) * 6)), rel=0.15)
 
 
 def test_a_true_model_is_rarely_accused():
@@ -38,20 +43,20 @@ def test_a_true_model_is_rarely_accused():
     names, accused, recordings = ("gx", "gy", "gz"), 0, 0
     for seed in range(60):
         rng = np.random.default_rng([seed, 1])
-        null = nulls({name: simulated(6, rng) for name in names}, 3)
-        limits = np.array([[null[name][lens].threshold for lens in LENSES] for name in names])
-        gains = START + rng.exponential(size=(100, 3, len(LENSES)))
+        null = null_distributions({name: simulated(6, rng) for name in names}, 3)
+        limits = np.array([[null[name][lens].threshold for lens in DIAGNOSTICS] for name in names])
+        gains = START + rng.exponential(size=(100, 3, len(DIAGNOSTICS)))
         accused += np.count_nonzero((gains > limits).any(axis=(1, 2)))
         recordings += 100
-    assert accused / recordings < 2.0 * ACCUSED
+    assert accused / recordings < 2.0 * FALSE_ALARM_PROBABILITY
     assert accused > 0
 
 
 def test_more_axes_ask_for_more():
     rng = np.random.default_rng(3)
     few = simulated(6, rng)
-    one, six = nulls({"gz": few}, 1)["gz"], nulls({"gz": few}, 6)["gz"]
-    for lens in LENSES:
+    one, six = null_distributions({"gz": few}, 1)["gz"], null_distributions({"gz": few}, 6)["gz"]
+    for lens in DIAGNOSTICS:
         assert six[lens].threshold > one[lens].threshold > one[lens].null95
         # of log 6 nats of an exponential of mean one to 1.3, unless the largest gain decides
         assert six[lens].threshold - one[lens].threshold < 1.3 * np.log(6.0) + 1e-9
@@ -59,23 +64,25 @@ def test_more_axes_ask_for_more():
 
 def test_an_axis_of_its_own_kind_has_its_own_threshold():
     rng = np.random.default_rng(4)
-    found = nulls({"gx": simulated(6, rng), "gy": simulated(6, rng), "gz": simulated(6, rng, shift=200.0)}, 3)
-    for lens in LENSES:
+    found = null_distributions(
+        {"gx": simulated(6, rng), "gy": simulated(6, rng), "gz": simulated(6, rng, shift=200.0)}, 3
+    )
+    for lens in DIAGNOSTICS:
         assert found["gz"][lens].threshold > 200.0 + START
         assert found["gz"][lens].null95 > 200.0 + START - 1.0
 
 
 def test_a_lens_that_never_sees_anything_has_a_threshold():
-    nothing = [{lens: Finding(0.0, Where()) for lens in LENSES}] * 6
-    for one in nulls({"gz": nothing}, 1)["gz"].values():
+    nothing = [{lens: Finding(0.0, Location()) for lens in DIAGNOSTICS}] * 6
+    for one in null_distributions({"gz": nothing}, 1)["gz"].values():
         assert 0.0 < one.null95 < one.threshold < np.inf
 
 
 def test_a_gap_is_in_standard_deviations():
-    seen = {lens: Finding(0.5 * k**2, Where(tau=(1.0, 2.0))) for k, lens in enumerate(LENSES)}
-    found = scores(seen, dict.fromkeys(LENSES, Null(2.0, 8.0)))
-    assert [score.lens for score in found] == list(LENSES)
-    assert [score.gap for score in found] == pytest.approx(np.arange(len(LENSES)))
+    seen = {lens: Finding(0.5 * k**2, Location(tau=(1.0, 2.0))) for k, lens in enumerate(DIAGNOSTICS)}
+    found = score_findings(seen, dict.fromkeys(DIAGNOSTICS, NullDistribution(2.0, 8.0)))
+    assert [score.lens for score in found] == list(DIAGNOSTICS)
+    assert [score.gap for score in found] == pytest.approx(np.arange(len(DIAGNOSTICS)))
     assert {(score.null95, score.threshold) for score in found} == {(2.0, 4.0)}
-    assert [score.passes for score in found] == [k > 4 for k in range(len(LENSES))]
+    assert [score.passes for score in found] == [k > 4 for k in range(len(DIAGNOSTICS))]
     assert found[0].where.tau == (1.0, 2.0)

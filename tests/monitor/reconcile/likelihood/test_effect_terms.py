@@ -3,46 +3,54 @@
 import numpy as np
 import pytest
 
-from monitor.noise.effect import Block, Leak, Source
+from monitor.noise.effect import Leak, SampleBlockContext, Source
 from monitor.noise.effects import EFFECTS, CrossAxis, Sinusoidal, TemperatureBias
-from monitor.reconcile.likelihood.effect_terms import COURSE, NOISE, basis, columns, resized, size, sized
+from monitor.reconcile.likelihood.effect_terms import (
+    DETERMINISTIC_SIZE_PARAMETERS,
+    NOISE_SIZE_PARAMETERS,
+    regressors,
+    size,
+    unit_spectrum,
+    with_factors,
+    with_size,
+)
 from tests.contracts.effect_examples import effect
 from tests.monitor.reconcile.axes import RATE_HZ, warmth
 
-NOISES = [EFFECTS[kind.name] for kind in NOISE]
-COURSES = [kind for kind in COURSE if not issubclass(kind, Leak)]
+NOISES = [EFFECTS[kind.name] for kind in NOISE_SIZE_PARAMETERS]
+COURSES = [kind for kind in DETERMINISTIC_SIZE_PARAMETERS if not issubclass(kind, Leak)]
 n = 3000
 
 
 def drawn(one):
     values = np.zeros(n)
-    one.start(RATE_HZ, np.random.default_rng(1)).add(values, Block(0, warmth(n), np.empty(n)))
+    one.start(RATE_HZ, np.random.default_rng(1)).add(values, SampleBlockContext(0, warmth(n), np.empty(n)))
     return values
 
 
 def test_every_source_has_its_place():
     beside = {"bias", "outliers"}  # a mean is always free; outliers are single samples
     kinds = {kind for name, kind in EFFECTS.items() if issubclass(kind, Source | Leak) and name not in beside}
-    assert set(NOISE) | set(COURSE) == kinds
-    assert not set(NOISE) & set(COURSE)
+    assert set(NOISE_SIZE_PARAMETERS) | set(DETERMINISTIC_SIZE_PARAMETERS) == kinds
+    assert not set(NOISE_SIZE_PARAMETERS) & set(DETERMINISTIC_SIZE_PARAMETERS)
 
 
 @pytest.mark.parametrize("kind", NOISES, ids=lambda kind: kind.name)
 def test_a_spectrum_grows_with_the_square_of_the_size(kind):
     one = effect(kind.name)
     f_hz, tau0_s = np.geomspace(0.01, 0.5 * RATE_HZ, 40), 1.0 / RATE_HZ
-    np.testing.assert_allclose(size(one) ** 2 * basis(one, f_hz, tau0_s), one.psd(f_hz, tau0_s), rtol=1e-12)
-    bigger = resized(one, 7.0)
-    np.testing.assert_allclose(49.0 * basis(one, f_hz, tau0_s), bigger.psd(f_hz, tau0_s), rtol=1e-12)
-    assert size(resized(one, -7.0)) == 7.0
+    np.testing.assert_allclose(size(one) ** 2 * unit_spectrum(one, f_hz, tau0_s), one.psd(f_hz, tau0_s), rtol=1e-12)
+    bigger = with_size(one, 7.0)
+    np.testing.assert_allclose(49.0 * unit_spectrum(one, f_hz, tau0_s), bigger.psd(f_hz, tau0_s), rtol=1e-12)
+    assert size(with_size(one, -7.0)) == 7.0
 
 
 @pytest.mark.parametrize("kind", COURSES, ids=lambda kind: kind.name)
 def test_columns_times_factors_are_the_series(kind):
     one = effect(kind.name)
-    made = columns(one, n, RATE_HZ, warmth(n))
+    made = regressors(one, n, RATE_HZ, warmth(n))
     factors = np.array([0.8, -1.7])[: len(made)]
-    fitted = sized(one, factors)
+    fitted = with_factors(one, factors)
     want = drawn(fitted)
     summed = sum(factor * column for factor, column in zip(factors, made, strict=True))
     if kind.name == "rate_ramp":  # a ramp's R is a size without a sign
@@ -54,28 +62,28 @@ def test_columns_times_factors_are_the_series(kind):
 
 def test_phase_of_a_line_is_in_its_two_columns():
     line = Sinusoidal(amplitude=0.4, frequency=7.3, phase=2.2)
-    made = np.stack(columns(line, n, RATE_HZ, None))
+    made = np.stack(regressors(line, n, RATE_HZ, None))
     factors, *_ = np.linalg.lstsq(made.T, drawn(line), rcond=None)
-    back = sized(line, factors)
+    back = with_factors(line, factors)
     assert back.amplitude == pytest.approx(0.4)
     assert back.phase == pytest.approx(2.2)
 
 
 def test_a_curve_over_temperature_has_two_columns_and_a_line_one():
     straight = TemperatureBias(coefficient=0.3, reference=25.0)
-    assert len(columns(straight, n, RATE_HZ, warmth(n))) == 1
+    assert len(regressors(straight, n, RATE_HZ, warmth(n))) == 1
     bent = TemperatureBias(coefficient=0.3, reference=25.0, quadratic=-0.04)
-    one, two = columns(bent, n, RATE_HZ, warmth(n))
+    one, two = regressors(bent, n, RATE_HZ, warmth(n))
     np.testing.assert_allclose(one, warmth(n) - 25.0, atol=1e-12)
     np.testing.assert_allclose(two, (warmth(n) - 25.0) ** 2, atol=1e-12)
 
 
 def test_size_keeps_its_sign_where_it_has_one():
-    assert size(resized(effect("bias_step"), -2.0)) == -2.0
-    assert size(resized(effect("sinusoidal"), -2.0)) == 2.0
-    assert size(resized(effect("rate_ramp"), -2.0)) == 2.0
+    assert size(with_size(effect("bias_step"), -2.0)) == -2.0
+    assert size(with_size(effect("sinusoidal"), -2.0)) == 2.0
+    assert size(with_size(effect("rate_ramp"), -2.0)) == 2.0
 
 
 def test_a_leak_has_no_series_of_its_own():
     with pytest.raises(TypeError, match="another axis"):
-        columns(CrossAxis(source="gx", coefficient=0.1), n, RATE_HZ, None)
+        regressors(CrossAxis(source="gx", coefficient=0.1), n, RATE_HZ, None)

@@ -5,16 +5,16 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from monitor.reconcile.likelihood.hidden_state import (
-    FACTOR,
-    Peak,
-    Rest,
-    anywhere,
+    MAX_LOG_PARAMETER_RANGE,
+    BackgroundNoise,
+    LikelihoodMaximum,
+    block_markov_noise,
     block_means,
-    flicker,
-    kalman,
-    markov,
+    flicker_processes,
+    kalman_log_likelihood,
     maximise,
-    parts,
+    prior_level_variance,
+    state_space_noise,
 )
 from tests.monitor.reconcile.made import BLOCK_S, dense
 
@@ -22,37 +22,39 @@ from tests.monitor.reconcile.made import BLOCK_S, dense
 @pytest.mark.parametrize(
     "rest",
     [
-        Rest(1.0),
-        Rest(1.0, walk=0.02),
-        Rest(1.0, walk=0.02, correlated=((0.7, 20.0), (0.4, 1.0), (2.0, 9000.0))),
-        Rest(1e-3, correlated=((0.7, 20.0),)),
+        BackgroundNoise(1.0),
+        BackgroundNoise(1.0, walk=0.02),
+        BackgroundNoise(1.0, walk=0.02, correlated=((0.7, 20.0), (0.4, 1.0), (2.0, 9000.0))),
+        BackgroundNoise(1e-3, correlated=((0.7, 20.0),)),
     ],
 )
 def test_filter_is_the_dense_gaussian_likelihood(rest):
     covariance = dense(rest, 300, start=5.0)
     means = np.linalg.cholesky(covariance) @ np.random.default_rng(0).standard_normal(300)
-    around = parts(rest, BLOCK_S, 300 * BLOCK_S)
-    found = kalman(means, around.table, around.white, 5.0)
+    around = state_space_noise(rest, BLOCK_S, 300 * BLOCK_S)
+    found = kalman_log_likelihood(means, around.table, around.white, 5.0)
     assert found == pytest.approx(multivariate_normal.logpdf(means, cov=covariance), abs=1e-6)
 
 
 def test_slow_process_is_a_random_walk_in_a_block():
     for block_s in (0.0999, 0.1001):  # either side of where a series takes over
-        row, own = markov(1.0, 10.0, block_s)
+        row, own = block_markov_noise(1.0, 10.0, block_s)
         walk = 2.0 / 10.0 * block_s
         assert row[2:] == pytest.approx((walk, 0.5 * walk), rel=0.02)
         assert own == pytest.approx(walk / 3.0, rel=0.02)
-    assert markov(1.0, 10.0, 0.0999)[1] / 0.0999 == pytest.approx(markov(1.0, 10.0, 0.1001)[1] / 0.1001, rel=1e-4)
+    assert block_markov_noise(1.0, 10.0, 0.0999)[1] / 0.0999 == pytest.approx(
+        block_markov_noise(1.0, 10.0, 0.1001)[1] / 0.1001, rel=1e-4
+    )
 
 
 def test_flicker_is_one_over_f_until_white_noise_rules():
-    rest, span_s = Rest(2.25e-8, flicker=9e-10), 3600.0
+    rest, span_s = BackgroundNoise(2.25e-8, flicker=9e-10), 3600.0
     f = np.geomspace(1.0 / span_s, rest.flicker / (2.0 * np.pi * rest.white), 50)
-    summed = sum(2.0 * s * s * t / (1.0 + (2.0 * np.pi * f * t) ** 2) for s, t in flicker(rest, 1.0, span_s))
+    summed = sum(2.0 * s * s * t / (1.0 + (2.0 * np.pi * f * t) ** 2) for s, t in flicker_processes(rest, 1.0, span_s))
     assert summed == pytest.approx(rest.flicker / (2.0 * np.pi * f), rel=0.25)
     inside = f > 4.0 / span_s
     assert summed[inside] == pytest.approx(rest.flicker / (2.0 * np.pi * f[inside]), rel=0.12)
-    assert flicker(Rest(1.0), 1.0, span_s) == []
+    assert flicker_processes(BackgroundNoise(1.0), 1.0, span_s) == []
 
 
 def test_maximum_and_its_width():
@@ -75,7 +77,7 @@ def test_no_interval_without_a_peak():
     flat = maximise(lambda a, b: -0.0 * a * b, (1.0, 1.0))
     assert np.isnan(flat.deviation).all()
     assert flat.bounds(0).lo is None
-    assert Peak(0.0, np.array([1.0]), np.array([FACTOR])).bounds(0).hi is None
+    assert LikelihoodMaximum(0.0, np.array([1.0]), np.array([MAX_LOG_PARAMETER_RANGE])).bounds(0).hi is None
 
 
 def test_search_does_not_leave_the_neighbourhood_of_its_start():
@@ -88,8 +90,8 @@ def test_block_means():
     means, block_s = block_means(y, 0.01, 0.1)
     assert block_s == pytest.approx(0.1)
     assert means + y[:1000].mean() == pytest.approx([y[10 * k : 10 * k + 10].mean() for k in range(100)])
-    assert anywhere(means) == pytest.approx(100.0 * means.var())
+    assert prior_level_variance(means) == pytest.approx(100.0 * means.var())
     with pytest.raises(ValueError, match="at least 16"):
         block_means(y, 0.01, 1.0)
     with pytest.raises(ValueError, match="above zero"):
-        parts(Rest(0.0, walk=1.0), 1.0, 100.0)
+        state_space_noise(BackgroundNoise(0.0, walk=1.0), 1.0, 100.0)

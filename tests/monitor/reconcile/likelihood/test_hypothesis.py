@@ -13,7 +13,14 @@ from monitor.noise.effects import (
     RateRandomWalk,
     Sinusoidal,
 )
-from monitor.reconcile.likelihood.hypothesis import believed, refined, settled, shape_bounds, size_bounds, with_shape
+from monitor.reconcile.likelihood.hypothesis import (
+    fit_with_fewest_changes,
+    fit_with_given_sizes,
+    refine_shape,
+    shape_bounds,
+    size_bounds,
+    with_shape,
+)
 from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, K, N, axis, correlated, time_s, walk, white
 
 n = 20_000
@@ -29,9 +36,9 @@ def test_a_true_model_is_believed():
     freed = 0
     for seed in range(20):
         one = axis(drawn(seed))
-        state = settled(one, (), MODEL)
+        state = fit_with_fewest_changes(one, (), MODEL)
         freed += state.freed
-        assert believed(one, MODEL).likely.log_likelihood <= state.likely.log_likelihood + 1e-6
+        assert fit_with_given_sizes(one, MODEL).likely.log_likelihood <= state.likely.log_likelihood + 1e-6
     assert freed <= 1  # another size that gains this much: once in some hundred
 
 
@@ -39,17 +46,17 @@ def test_a_true_model_is_believed():
 def test_a_wrong_size_is_another_size_and_the_right_one_stays(wrong, at):
     one = axis(drawn(1))
     given = (AngleRandomWalk(N=wrong[0] * N), RateRandomWalk(K=wrong[1] * 3e-5))
-    state = settled(one, (), given)
+    state = fit_with_fewest_changes(one, (), given)
     assert state.likely.noises == (at,)
     assert state.freed == 1
     assert state.effects[1 - at] == given[1 - at]
     found = (state.effects[0].N / N, state.effects[1].K / 3e-5)[at]
     assert found == pytest.approx(1.0, abs=0.4 if at else 0.02)
-    assert state.score > believed(one, given).score
+    assert state.score > fit_with_given_sizes(one, given).score
 
 
 def test_both_wrong_sizes_are_found():
-    state = settled(axis(drawn(2)), (), (AngleRandomWalk(N=1.3 * N), RateRandomWalk(K=2e-4)))
+    state = fit_with_fewest_changes(axis(drawn(2)), (), (AngleRandomWalk(N=1.3 * N), RateRandomWalk(K=2e-4)))
     assert state.freed == 2
     assert pytest.approx(N, rel=0.03) == state.effects[0].N
     assert pytest.approx(3e-5, rel=0.5) == state.effects[1].K
@@ -57,10 +64,10 @@ def test_both_wrong_sizes_are_found():
 
 def test_what_was_found_is_always_fitted():
     y = drawn(3) + 5e-5 * time_s(n)
-    state = settled(axis(y), (RateRamp(R=1.0),), MODEL)
+    state = fit_with_fewest_changes(axis(y), (RateRamp(R=1.0),), MODEL)
     assert state.freed == 0
     assert pytest.approx(5e-5, abs=5 * state.likely.error(2)) == state.effects[2].R
-    alone = settled(axis(drawn(3)), (AngleRandomWalk(N=7.0), RateRandomWalk(K=3.0)), ())
+    alone = fit_with_fewest_changes(axis(drawn(3)), (AngleRandomWalk(N=7.0), RateRandomWalk(K=3.0)), ())
     assert pytest.approx(N, rel=0.03) == alone.effects[0].N
     assert alone.freed == 0  # nothing was given
 
@@ -69,7 +76,7 @@ def test_a_shape_is_at_the_top_of_its_profile():
     rng = np.random.default_rng(4)
     one = axis(white(n, rng) + correlated(n, rng, 4e-4, 0.5))
     effects = (WHITE, ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.8))
-    found = refined(one, effects, 1, ["correlation_time"], 3.0)
+    found = refine_shape(one, effects, 1, ["correlation_time"], 3.0)
 
     def loss(x):
         return -one.fit(with_shape(effects, 1, "correlation_time", float(np.exp(x)))).log_likelihood
@@ -83,8 +90,10 @@ def test_a_shape_is_at_the_top_of_its_profile():
 def test_an_interval_of_a_shape_ends_where_its_profile_has_fallen():
     rng = np.random.default_rng(5)
     one = axis(white(n, rng) + correlated(n, rng, 4e-4, 0.5))
-    effects = refined(one, (WHITE, ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.5)), 1, ["correlation_time"])
-    state = settled(one, effects, ())
+    effects = refine_shape(
+        one, (WHITE, ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.5)), 1, ["correlation_time"]
+    )
+    state = fit_with_fewest_changes(one, effects, ())
     found = shape_bounds(one, state, 1, "correlation_time")
     assert found.lo < found.value < found.hi
     assert found.lo < 0.5 < found.hi
@@ -100,8 +109,10 @@ def test_intervals_of_a_line_hold_its_frequency():
         rng = np.random.default_rng(seed)
         y = white(n, rng) + 3e-4 * np.sin(2.0 * np.pi * 17.3 * time_s(n) + 1.0)
         one = axis(y)
-        effects = refined(one, (WHITE, Sinusoidal(amplitude=1e-4, frequency=17.3, phase=0.0)), 1, ["frequency"], 1.0001)
-        state = settled(one, effects, ())
+        effects = refine_shape(
+            one, (WHITE, Sinusoidal(amplitude=1e-4, frequency=17.3, phase=0.0)), 1, ["frequency"], 1.0001
+        )
+        state = fit_with_fewest_changes(one, effects, ())
         found = shape_bounds(one, state, 1, "frequency")
         inside.append(found.lo < 17.3 < found.hi)
         error = np.sqrt(6.0 / n) / (np.pi * n / RATE_HZ) * N * RATE_HZ**0.5 / 3e-4
@@ -113,7 +124,7 @@ def test_intervals_of_sizes():
     inside = []
     for seed in range(40):
         y = drawn(seed, np.where(time_s(n) < 80.0, 0.0, -3e-4))
-        state = settled(axis(y), (*MODEL, BiasStep(time=80.0, height=1.0)), ())
+        state = fit_with_fewest_changes(axis(y), (*MODEL, BiasStep(time=80.0, height=1.0)), ())
         white_noise, _, step = (size_bounds(state.likely, at) for at in range(3))
         inside += [white_noise.lo < N < white_noise.hi, step.lo < -3e-4 < step.hi]
         assert white_noise.lo * white_noise.hi == pytest.approx(white_noise.value**2)
@@ -122,10 +133,10 @@ def test_intervals_of_sizes():
 
 def test_a_size_that_is_held_or_zero_has_no_interval():
     one = axis(white(n, np.random.default_rng(0)))
-    held = size_bounds(believed(one, (WHITE, WALK)).likely, 0)
+    held = size_bounds(fit_with_given_sizes(one, (WHITE, WALK)).likely, 0)
     assert (held.value, held.lo, held.hi) == (N, None, None)
     for seed in range(8):  # K is at its bound in about half of the cases
-        state = settled(axis(white(n, np.random.default_rng(seed))), (WHITE, RateRandomWalk(K=K)), ())
+        state = fit_with_fewest_changes(axis(white(n, np.random.default_rng(seed))), (WHITE, RateRandomWalk(K=K)), ())
         if state.effects[1].K == 0.0:
             assert size_bounds(state.likely, 1).lo is None
             break

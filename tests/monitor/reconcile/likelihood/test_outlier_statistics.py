@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor.reconcile.likelihood.outlier_statistics import outliers
+from monitor.reconcile.likelihood.outlier_statistics import fit_outliers
 
 N = 60_000
 
@@ -22,7 +22,7 @@ def contaminated(share, scale, seed=0, n=N):
 @pytest.mark.parametrize("unit", [1e-4, 1.0])
 def test_outliers_show_share_and_scale(share, scale, unit):
     w, which = contaminated(share, scale)
-    found = outliers(unit * w)
+    found = fit_outliers(unit * w)
     assert found.fraction.value == pytest.approx(share, rel=0.3)
     assert found.scale.value == pytest.approx(scale * unit, rel=0.3)
     assert found.noise == pytest.approx(unit, rel=0.02)
@@ -39,20 +39,20 @@ def test_outliers_show_share_and_scale(share, scale, unit):
 def test_intervals_hold_the_truth():
     inside = 0
     for seed in range(40):
-        found = outliers(contaminated(4e-3, 5.0, seed)[0])
+        found = fit_outliers(contaminated(4e-3, 5.0, seed)[0])
         inside += (found.fraction.lo < 4e-3 < found.fraction.hi) + (found.scale.lo < 5.0 < found.scale.hi)
     assert 68 <= inside <= 80  # of 80 at 95 %
 
 
 def test_a_gaussian_gains_little():
-    gains = [found.gain for found in (outliers(noise(seed)) for seed in range(30)) if found is not None]
+    gains = [found.gain for found in (fit_outliers(noise(seed)) for seed in range(30)) if found is not None]
     assert len(gains) < 30
     assert max(gains) < 10.0
 
 
 @pytest.mark.parametrize("freedom", [3, 6, 12])
 def test_noise_of_students_t_is_not_a_mixture(freedom):
-    found = outliers(np.random.default_rng(0).standard_t(freedom, 4 * N))
+    found = fit_outliers(np.random.default_rng(0).standard_t(freedom, 4 * N))
     assert found.gain > 100.0
     assert found.over_student < -5.0
     assert found.vuong_z < -2.0
@@ -60,7 +60,7 @@ def test_noise_of_students_t_is_not_a_mixture(freedom):
 
 
 def test_laplacian_noise_fits_no_mixture():
-    assert outliers(np.random.default_rng(0).laplace(size=N)).misfit_z > 5.0
+    assert fit_outliers(np.random.default_rng(0).laplace(size=N)).misfit_z > 5.0
 
 
 def bursts():
@@ -87,14 +87,14 @@ def jumps():
 
 @pytest.mark.parametrize("make", [bursts, evening, breathing, jumps])
 def test_what_keeps_together_is_no_outlier(make):
-    found = outliers(make())
+    found = fit_outliers(make())
     assert found.gain > 20.0
     assert found.clustering_z > 6.0
 
 
 def test_light_tails_have_no_outliers():
     for w in (np.random.default_rng(0).random(N) - 0.5, noise() + np.where(noise(1) > 0.0, 2.0, -2.0)):
-        found = outliers(w)
+        found = fit_outliers(w)
         assert found is None or found.gain < 5.0
 
 
@@ -102,11 +102,11 @@ def test_missing_samples_are_passed_over():
     w, _ = contaminated(0.01, 6.0)
     with_holes = w.copy()
     with_holes[::3] = np.nan
-    found = outliers(with_holes)
+    found = fit_outliers(with_holes)
     assert found.fraction.value == pytest.approx(0.01, rel=0.3)
     assert not found.mask[::3].any()
 
 
 @pytest.mark.parametrize("w", [np.zeros(500), np.full(500, np.nan), np.arange(5.0)])
 def test_what_says_nothing_gives_nothing(w):
-    assert outliers(w) is None
+    assert fit_outliers(w) is None

@@ -7,8 +7,8 @@ import pytest
 from scipy.special import logsumexp
 
 from monitor.reconcile.likelihood import poisson_steps
-from monitor.reconcile.likelihood.hidden_state import Rest, kalman, parts
-from monitor.reconcile.likelihood.poisson_steps import steps_or_walk
+from monitor.reconcile.likelihood.hidden_state import BackgroundNoise, kalman_log_likelihood, state_space_noise
+from monitor.reconcile.likelihood.poisson_steps import compare_steps_with_random_walk
 from tests.monitor.reconcile.made import BLOCK_S, HOUR, TAU0_S, N, dense, jumps, walk, white
 
 RATE, HEIGHT = 0.05, 2.0  # of the short series, beside white noise of density one
@@ -38,11 +38,11 @@ def enumerated(means, covariance):
 
 
 def likelihood(means, rest, rate, height, start):
-    around = parts(rest, BLOCK_S, means.size * BLOCK_S)
+    around = state_space_noise(rest, BLOCK_S, means.size * BLOCK_S)
     return poisson_steps.log_likelihood(means, around, start, rate * BLOCK_S, height)
 
 
-@pytest.mark.parametrize("rest", [Rest(1.0), Rest(1.0, walk=0.02, correlated=((1.0, 30.0),))])
+@pytest.mark.parametrize("rest", [BackgroundNoise(1.0), BackgroundNoise(1.0, walk=0.02, correlated=((1.0, 30.0),))])
 def test_nearly_equals_the_sum_over_all_sets_of_jumps(rest):
     off = []
     for seed in range(4):
@@ -57,27 +57,36 @@ def test_nearly_equals_the_sum_over_all_sets_of_jumps(rest):
 def test_many_small_jumps_are_a_random_walk():
     K = 0.1
     rng = np.random.default_rng(0)
-    means = np.linalg.cholesky(dense(Rest(1.0, walk=K * K), 300)) @ rng.standard_normal(300)
-    around = parts(Rest(1.0, walk=K * K), BLOCK_S, 300 * BLOCK_S)
-    gaussian = kalman(means, around.table, around.white, 9.0)
+    means = np.linalg.cholesky(dense(BackgroundNoise(1.0, walk=K * K), 300)) @ rng.standard_normal(300)
+    around = state_space_noise(BackgroundNoise(1.0, walk=K * K), BLOCK_S, 300 * BLOCK_S)
+    gaussian = kalman_log_likelihood(means, around.table, around.white, 9.0)
     often = 20.0 / BLOCK_S
-    assert likelihood(means, Rest(1.0), often, K / often**0.5, 9.0) == pytest.approx(gaussian, abs=1e-4)
+    assert likelihood(means, BackgroundNoise(1.0), often, K / often**0.5, 9.0) == pytest.approx(gaussian, abs=1e-4)
 
 
-@pytest.mark.parametrize("rest", [Rest(N * N), Rest(N * N, walk=(1e-6) ** 2), Rest(N * N, correlated=((2e-5, 50.0),))])
+@pytest.mark.parametrize(
+    "rest",
+    [
+        BackgroundNoise(N * N),
+        BackgroundNoise(N * N, walk=(1e-6) ** 2),
+        BackgroundNoise(N * N, correlated=((2e-5, 50.0),)),
+    ],
+)
 def test_tells_jumps_from_a_walk(rest):
     for seed in range(2):
         rng = np.random.default_rng(seed)
         around = white(HOUR, rng) + walk(HOUR, rest.walk**0.5, rng)
-        assert steps_or_walk(around + jumps(HOUR, 0.005, 2e-4, rng), TAU0_S, rest, 1.4e-5).gain > 10.0
-        assert abs(steps_or_walk(around + walk(HOUR, 1.4e-5, rng), TAU0_S, rest, 1.4e-5).gain) < 3.0
+        assert compare_steps_with_random_walk(around + jumps(HOUR, 0.005, 2e-4, rng), TAU0_S, rest, 1.4e-5).gain > 10.0
+        assert abs(compare_steps_with_random_walk(around + walk(HOUR, 1.4e-5, rng), TAU0_S, rest, 1.4e-5).gain) < 3.0
 
 
 def test_parameters_lie_in_their_intervals_and_jumps_are_counted():
     inside, counted = [], []
     for seed in range(8):
         rng = np.random.default_rng(seed)
-        found = steps_or_walk(white(HOUR, rng) + jumps(HOUR, 0.01, 3e-4, rng), TAU0_S, Rest(N * N), 2e-5)
+        found = compare_steps_with_random_walk(
+            white(HOUR, rng) + jumps(HOUR, 0.01, 3e-4, rng), TAU0_S, BackgroundNoise(N * N), 2e-5
+        )
         for name, true in (("rate", 0.01), ("height", 3e-4)):
             inside.append(found.first[name].lo < true < found.first[name].hi)
             assert found.first[name].hi / found.first[name].lo < 5.0
@@ -88,13 +97,15 @@ def test_parameters_lie_in_their_intervals_and_jumps_are_counted():
 
 def test_walk_gets_its_own_size():
     rng = np.random.default_rng(3)
-    found = steps_or_walk(white(HOUR, rng) + walk(HOUR, 1e-5, rng), TAU0_S, Rest(N * N), 2e-5).second["K"]
+    found = compare_steps_with_random_walk(
+        white(HOUR, rng) + walk(HOUR, 1e-5, rng), TAU0_S, BackgroundNoise(N * N), 2e-5
+    ).second["K"]
     assert found.lo < 1e-5 < found.hi < 1.6 * found.lo
 
 
 def test_known_walk_is_not_counted_twice():
     rng = np.random.default_rng(4)
     y = white(HOUR, rng) + walk(HOUR, 1e-5, rng) + jumps(HOUR, 0.005, 4e-4, rng)
-    found = steps_or_walk(y, TAU0_S, Rest(N * N, walk=1e-10), 3e-5)
+    found = compare_steps_with_random_walk(y, TAU0_S, BackgroundNoise(N * N, walk=1e-10), 3e-5)
     assert found.gain > 10.0
     assert found.first["height"].lo < 4e-4 < found.first["height"].hi

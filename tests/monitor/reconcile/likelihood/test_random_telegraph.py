@@ -8,8 +8,8 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from monitor.reconcile.likelihood import random_telegraph
-from monitor.reconcile.likelihood.hidden_state import Rest, block_means, parts
-from monitor.reconcile.likelihood.random_telegraph import telegraph_or_correlated
+from monitor.reconcile.likelihood.hidden_state import BackgroundNoise, block_means, state_space_noise
+from monitor.reconcile.likelihood.random_telegraph import compare_telegraph_with_correlated
 from tests.monitor.reconcile.made import BLOCK_S, HOUR, TAU0_S, N, dense, two_levels, walk, wandering, white
 
 A, DWELL = 3.0, 20.0  # of the short series, beside white noise of density one
@@ -50,18 +50,20 @@ def short(rest, m, seed, start=0.0):
 
 
 def likelihood(means, rest, start):
-    around = parts(rest, BLOCK_S, means.size * BLOCK_S)
+    around = state_space_noise(rest, BLOCK_S, means.size * BLOCK_S)
     return random_telegraph.log_likelihood(means, around, start, A, BLOCK_S / DWELL)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_equals_the_sum_over_all_paths_where_the_rest_is_white(seed):
-    means = short(Rest(1.0), 7, seed)
-    assert likelihood(means, Rest(1.0), 0.0) == pytest.approx(enumerated(means, dense(Rest(1.0), 7)), abs=1e-9)
+    means = short(BackgroundNoise(1.0), 7, seed)
+    assert likelihood(means, BackgroundNoise(1.0), 0.0) == pytest.approx(
+        enumerated(means, dense(BackgroundNoise(1.0), 7)), abs=1e-9
+    )
 
 
 def test_equals_the_forward_algorithm_where_the_rest_is_white():
-    means = short(Rest(1.0), 300, 1)
+    means = short(BackgroundNoise(1.0), 300, 1)
     share, total = np.array([0.5, 0.5]), 0.0
     for z in means:
         new = np.zeros(2)
@@ -71,10 +73,10 @@ def test_equals_the_forward_algorithm_where_the_rest_is_white():
                 new[1 - level if ends_other else level] += share[level] * probability * density
         total += np.log(new.sum())
         share = new / new.sum()
-    assert likelihood(means, Rest(1.0), 0.0) == pytest.approx(total, abs=1e-8)
+    assert likelihood(means, BackgroundNoise(1.0), 0.0) == pytest.approx(total, abs=1e-8)
 
 
-@pytest.mark.parametrize("rest", [Rest(1.0, walk=0.02), Rest(1.0, correlated=((1.0, 30.0),))])
+@pytest.mark.parametrize("rest", [BackgroundNoise(1.0, walk=0.02), BackgroundNoise(1.0, correlated=((1.0, 30.0),))])
 def test_merging_costs_little_where_it_is_not(rest):
     off = []
     for seed in range(5):
@@ -86,7 +88,7 @@ def test_merging_costs_little_where_it_is_not(rest):
 
 def test_unknown_level_is_an_average_over_levels():
     """Within a nat, also where a first dwell of 200 blocks could as well be in the lower level."""
-    rest = Rest(1.0)
+    rest = BackgroundNoise(1.0)
     for seed, still in ((0, 0), (1, 0), (2, 200)):
         rng = np.random.default_rng(seed)
         means = np.concatenate([short(rest, 400, seed), np.full(still, 0.5 * A) + rng.standard_normal(still) / 3**0.5])
@@ -98,7 +100,7 @@ def test_unknown_level_is_an_average_over_levels():
 
 
 def contest(y, rest=None, sigma=2e-4, time_s=10.0):
-    return telegraph_or_correlated(y, TAU0_S, Rest(N * N) if rest is None else rest, sigma, time_s)
+    return compare_telegraph_with_correlated(y, TAU0_S, BackgroundNoise(N * N) if rest is None else rest, sigma, time_s)
 
 
 @pytest.mark.parametrize("time_s", [3.0, 10.0, 60.0])
@@ -107,7 +109,7 @@ def test_tells_which_of_both(time_s, K):
     for seed in range(2):
         rng = np.random.default_rng(seed)
         around = white(HOUR, rng) + walk(HOUR, K, rng)
-        rest = Rest(N * N, walk=K**2)
+        rest = BackgroundNoise(N * N, walk=K**2)
         assert contest(around + two_levels(HOUR, 4e-4, 2.0 * time_s, rng), rest, 2e-4, time_s).gain > 20.0
         assert contest(around + wandering(HOUR, 2e-4, time_s, rng), rest, 2e-4, time_s).gain < -20.0
 
@@ -142,7 +144,7 @@ def test_offset_and_unit_do_not_matter():
     y = white(HOUR, rng) + two_levels(HOUR, 3e-4, 20.0, rng)
     plain = contest(y)
     assert contest(y + 9.81).gain == pytest.approx(plain.gain, abs=1e-3)
-    scaled = contest(1e3 * y, Rest(1e6 * N * N), 0.2)
+    scaled = contest(1e3 * y, BackgroundNoise(1e6 * N * N), 0.2)
     assert scaled.gain == pytest.approx(plain.gain, abs=1e-3)
     assert scaled.first["amplitude"].value == pytest.approx(1e3 * plain.first["amplitude"].value, rel=1e-6)
 
@@ -157,9 +159,11 @@ def test_a_start_far_off_finds_the_same_levels():
 
 def test_blocks_follow_the_correlation_time():
     means, block_s = block_means(
-        np.random.default_rng(0).standard_normal(HOUR), TAU0_S, random_telegraph.block_for(3600.0, TAU0_S, 8.0, 4.0)
+        np.random.default_rng(0).standard_normal(HOUR),
+        TAU0_S,
+        random_telegraph.block_length_s(3600.0, TAU0_S, 8.0, 4.0),
     )
     assert (means.size, block_s) == (3600, pytest.approx(1.0))
-    assert random_telegraph.block_for(3600.0, TAU0_S, 5000.0, 100.0) == pytest.approx(18.0)
-    assert random_telegraph.block_for(3600.0, TAU0_S, 64.0, 2.0) == pytest.approx(2.0)
-    assert random_telegraph.block_for(3600.0, TAU0_S, 64.0, 1e-3) == pytest.approx(20 * TAU0_S)
+    assert random_telegraph.block_length_s(3600.0, TAU0_S, 5000.0, 100.0) == pytest.approx(18.0)
+    assert random_telegraph.block_length_s(3600.0, TAU0_S, 64.0, 2.0) == pytest.approx(2.0)
+    assert random_telegraph.block_length_s(3600.0, TAU0_S, 64.0, 1e-3) == pytest.approx(20 * TAU0_S)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor.reconcile.likelihood.variance_history import tiles, variance_course
+from monitor.reconcile.likelihood.variance_history import find_least_constant_tiles, fit_variance_history
 
 N = 60_000
 TAU0 = 0.01
@@ -20,7 +20,7 @@ def noise(seed=0):
 def test_a_step_of_the_noise_shows_time_and_ratio(at, ratio, unit):
     w = unit * noise()
     w[at:] *= ratio
-    step = variance_course(w, TAU0).step
+    step = fit_variance_history(w, TAU0).step
     assert step.time.value == pytest.approx(at * TAU0, abs=0.6)
     assert step.ratio.value == pytest.approx(ratio, rel=0.08)
     assert step.time.lo <= step.time.value <= step.time.hi
@@ -35,7 +35,7 @@ def test_the_gain_is_the_likelihood_ratio_of_the_best_time():
         return -0.5 * part.size * np.log(np.mean(part**2))
 
     gains = [like(w[:k]) + like(w[k:]) - like(w) for k in range(16, 685)]
-    step = variance_course(w, TAU0).step
+    step = fit_variance_history(w, TAU0).step
     assert step.gain == pytest.approx(max(gains), rel=1e-9)
     assert step.time.value == pytest.approx(TAU0 * (16 + int(np.argmax(gains))))
 
@@ -45,7 +45,7 @@ def test_intervals_hold_the_truth():
     for seed in range(60):
         w = noise(seed)
         w[20_000:] *= 1.1
-        step = variance_course(w, TAU0).step
+        step = fit_variance_history(w, TAU0).step
         inside += (step.time.lo <= 200.0 <= step.time.hi) + (step.ratio.lo <= 1.1 <= step.ratio.hi)
     assert 106 <= inside <= 120  # of 120 at 95 %
 
@@ -53,16 +53,16 @@ def test_intervals_hold_the_truth():
 def test_one_step_leaves_nothing_and_several_are_told_one_after_the_other():
     w = noise()
     w[20_000:] *= 1.3
-    assert [one.gain > 12.0 for one in variance_course(w, TAU0).changes] == [True, False]
+    assert [one.gain > 12.0 for one in fit_variance_history(w, TAU0).changes] == [True, False]
     w[45_000:] *= 0.8
-    changes = variance_course(w, TAU0).changes
+    changes = fit_variance_history(w, TAU0).changes
     assert sorted(one.time.value for one in changes[:2]) == pytest.approx([200.0, 450.0], abs=3.0)
     assert changes[2].gain < 12.0
 
 
 @pytest.mark.parametrize("frequency", [0.007, 0.11, 0.6])
 def test_breathing_noise_is_periodic_before_it_is_a_step(frequency):
-    found = variance_course(noise() * np.exp(0.15 * np.sin(2.0 * np.pi * frequency * T)), TAU0)
+    found = fit_variance_history(noise() * np.exp(0.15 * np.sin(2.0 * np.pi * frequency * T)), TAU0)
     assert found.periodic.frequency == pytest.approx(frequency, rel=0.02)
     assert found.periodic.depth == pytest.approx(0.15, rel=0.3)
     assert found.periodic.gain > 50.0
@@ -70,19 +70,19 @@ def test_breathing_noise_is_periodic_before_it_is_a_step(frequency):
 
 
 def test_a_trend_gains_more_than_a_step():
-    found = variance_course(noise() * np.linspace(0.8, 1.2, N), TAU0)
+    found = fit_variance_history(noise() * np.linspace(0.8, 1.2, N), TAU0)
     assert found.trend > found.step.gain + 20.0
 
 
 def test_wandering_noise_gains_more_than_one_step():
     walk = np.repeat(np.random.default_rng(1).standard_normal(N // 500), 500)
-    found = variance_course(noise() * np.exp(0.2 * walk), TAU0)
+    found = fit_variance_history(noise() * np.exp(0.2 * walk), TAU0)
     assert found.wander > 100.0
     assert found.wander > found.step.gain + 50.0
 
 
 def test_steady_noise_gains_little():
-    courses = [variance_course(noise(seed), TAU0) for seed in range(30)]
+    courses = [fit_variance_history(noise(seed), TAU0) for seed in range(30)]
     assert max(one.step.gain for one in courses) < 12.0
     assert max(one.trend for one in courses) < 9.0
     assert max(one.periodic.gain for one in courses) < 18.0
@@ -91,7 +91,7 @@ def test_steady_noise_gains_little():
 
 def test_the_energies_are_those_of_the_blocks():
     w = noise()
-    found = variance_course(w, TAU0)
+    found = fit_variance_history(w, TAU0)
     length = round(found.block_s / TAU0)
     assert found.energy[7] == pytest.approx(np.mean(w[7 * length : 8 * length] ** 2))
 
@@ -102,7 +102,7 @@ def within(pair, value):
 
 def test_a_line_that_comes_and_goes_is_found_in_time_and_frequency():
     w = noise() + np.where((T > 200.0) & (T < 330.0), 0.3, 0.0) * np.sin(2.0 * np.pi * 31.4 * T)
-    found = tiles(w, TAU0)
+    found = find_least_constant_tiles(w, TAU0)
     assert found.gain > 50.0
     assert found.ratio > 2.0
     assert within(found.frequency, 31.4)
@@ -113,7 +113,7 @@ def test_a_line_that_comes_and_goes_is_found_in_time_and_frequency():
 def test_a_burst_of_all_frequencies_is_found_in_time():
     w = noise()
     w[41_000:41_100] *= 3.0
-    found = tiles(w, TAU0)
+    found = find_least_constant_tiles(w, TAU0)
     assert found.gain > 30.0
     assert within(found.time, 410.5)
 
@@ -121,7 +121,7 @@ def test_a_burst_of_all_frequencies_is_found_in_time():
 def test_a_pause_is_found_too():
     w = noise()
     w[30_000:34_000] *= 0.7
-    found = tiles(w, TAU0)
+    found = find_least_constant_tiles(w, TAU0)
     assert found.ratio < 0.8
     assert found.gain > 30.0
 
@@ -135,30 +135,33 @@ def test_a_pause_is_found_too():
     ids=["modulated line", "chirp"],
 )
 def test_lines_that_do_not_stay_as_they_are_make_a_row_uneven(add):
-    found = tiles(noise() + add, TAU0)
+    found = find_least_constant_tiles(noise() + add, TAU0)
     assert found.row_gain > 20.0
 
 
 @pytest.mark.parametrize("amplitude", [0.0, 0.5, 3.0])
 def test_steady_noise_and_steady_lines_gain_little(amplitude):
-    found = [tiles(noise(seed) + amplitude * np.sin(2.0 * np.pi * 17.0 * T + seed), TAU0) for seed in range(10)]
+    found = [
+        find_least_constant_tiles(noise(seed) + amplitude * np.sin(2.0 * np.pi * 17.0 * T + seed), TAU0)
+        for seed in range(10)
+    ]
     assert max(one.gain for one in found) < 20.0
     assert max(one.row_gain for one in found) < 18.0
 
 
 def test_the_unit_makes_no_difference():
-    one, other = tiles(noise(), TAU0), tiles(1e-4 * noise(), TAU0)
+    one, other = find_least_constant_tiles(noise(), TAU0), find_least_constant_tiles(1e-4 * noise(), TAU0)
     assert one.gain == pytest.approx(other.gain)
     assert one.time == other.time
 
 
-@pytest.mark.parametrize("look", [variance_course, tiles])
+@pytest.mark.parametrize("look", [fit_variance_history, find_least_constant_tiles])
 def test_too_few_samples_are_refused(look):
     with pytest.raises(ValueError, match="samples are too few"):
         look(noise()[:200], TAU0)
 
 
 def test_short_recordings_have_short_pieces_only():
-    found = tiles(noise()[:5_000], TAU0)
+    found = find_least_constant_tiles(noise()[:5_000], TAU0)
     assert found.seconds == (2.56, 2.56)
     assert found.gain < 15.0

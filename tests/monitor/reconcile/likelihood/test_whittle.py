@@ -5,16 +5,18 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
-from monitor.reconcile.likelihood.whittle import Sums, maximise, sums
-from monitor.reconcile.preparation.cosine_bins import bins, transform
+from monitor.reconcile.likelihood.whittle import BinSums, bin_sums, maximise_whittle
+from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequency_bins
 
 n = 160
-D = np.array([transform(row) for row in np.eye(n)]).T  # [n − 1, n]: coefficients of a series
+D = np.array([cosine_transform(row) for row in np.eye(n)]).T  # [n − 1, n]: coefficients of a series
 STEPS = np.tril(np.ones((n, n)))
 COVARIANCES = np.array([D @ D.T, D @ STEPS @ STEPS.T @ D.T])  # of white noise and of a random walk
 BASES = np.diagonal(COVARIANCES, axis1=1, axis2=2).copy()
 T = np.arange(n)
-REGRESSORS = np.array([transform(T / n), transform(np.where(T > 60, 1.0, 0.0)), transform(np.cos(0.3 * T))])
+REGRESSORS = np.array(
+    [cosine_transform(T / n), cosine_transform(np.where(T > 60, 1.0, 0.0)), cosine_transform(np.cos(0.3 * T))]
+)
 NONE = np.zeros((0, n - 1))
 BETA = (3.0, -2.0, 1.0)
 
@@ -22,7 +24,7 @@ BETA = (3.0, -2.0, 1.0)
 def drawn(seed, theta=(1.0, 0.02), beta=(0.0, 0.0, 0.0)):
     rng = np.random.default_rng(seed)
     y = theta[0] ** 0.5 * rng.standard_normal(n) + theta[1] ** 0.5 * np.cumsum(rng.standard_normal(n))
-    return transform(y) + np.asarray(beta) @ REGRESSORS
+    return cosine_transform(y) + np.asarray(beta) @ REGRESSORS
 
 
 def whole(theta):
@@ -38,8 +40,8 @@ def dense(y, theta, beta=(0.0, 0.0, 0.0)):
 def fit(y, regressors=NONE, start=(1.0, 1.0), constant=0.0):
     """Each coefficient in a bin of its own."""
     products = np.einsum("ik,jk->ijk", regressors, regressors)
-    found = Sums(y**2, regressors * y, products)
-    return maximise(np.ones(n - 1), found, BASES, np.full(n - 1, constant), np.array(start))
+    found = BinSums(y**2, regressors * y, products)
+    return maximise_whittle(np.ones(n - 1), found, BASES, np.full(n - 1, constant), np.array(start))
 
 
 @pytest.mark.long
@@ -117,11 +119,13 @@ def test_errors_are_those_of_many_runs():
 
 def test_a_bin_of_many_is_the_sum_of_its_coefficients():
     rng = np.random.default_rng(1)
-    binned = bins(3000, 100.0)
+    binned = frequency_bins(3000, 100.0)
     y = rng.standard_normal(2999)
     regressors = rng.standard_normal((2, 2999))
     bases = np.array([np.ones(binned.count.size), 1.0 / binned.f_hz])
-    found = maximise(binned.count, sums(binned, y, regressors), bases, np.zeros(binned.count.size), np.ones(2))
+    found = maximise_whittle(
+        binned.count, bin_sums(binned, y, regressors), bases, np.zeros(binned.count.size), np.ones(2)
+    )
     each = binned.spread(found.variance)
     left = y - found.beta @ regressors
     assert found.log_likelihood == pytest.approx(-0.5 * np.sum(np.log(each) + left**2 / each))

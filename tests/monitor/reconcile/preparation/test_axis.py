@@ -21,9 +21,9 @@ from monitor.noise.effects import (
     TemperatureBias,
 )
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.likelihood.hypothesis import believed
-from monitor.reconcile.preparation.axis import Courses
-from monitor.reconcile.preparation.cosine_bins import bins, transform
+from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes
+from monitor.reconcile.preparation.axis import RegressorCache
+from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequency_bins
 from tests.monitor.reconcile.axes import (
     RATE_HZ,
     TERMS,
@@ -58,7 +58,7 @@ def test_spectrum_is_the_one_that_the_model_states(name):
     effects = COMPANY[name]
     y = NoiseModel({"gz": effects}).simulate(n, RATE_HZ, 3)[:, 2].copy()
     one = axis(y, effects)
-    found = believed(one, effects)
+    found = fit_with_given_sizes(one, effects)
     expected = NoiseModel({"gz": effects}).psd("gz", one.bins.f_hz, 1.0 / RATE_HZ)
     # a little white noise behind a filter is fitted too
     np.testing.assert_allclose(found.likely.fitted.variance / RATE_HZ, expected, rtol=0.02, atol=3e-5 * expected.max())
@@ -101,7 +101,7 @@ def test_courses_and_noises_are_fitted_together():
     assert bias.coefficient == pytest.approx(1e-4, abs=4 * errors[2])
     assert leak.coefficient == pytest.approx(-0.03, abs=4 * errors[3])
     assert errors[1] == pytest.approx(N * RATE_HZ**0.5 * np.sqrt(2.0 / n), rel=0.05)
-    clean = transform(gz - line - 1e-4 * (warm - 25.0) + 0.03 * gx)
+    clean = cosine_transform(gz - line - 1e-4 * (warm - 25.0) + 0.03 * gx)
     assert np.std(one.residual(found) - clean) < 0.03 * np.std(clean)
 
 
@@ -121,11 +121,11 @@ def test_courses_of_any_size_beside_the_same_noise():
     rng = np.random.default_rng(3)
     one = axis(white(n, rng) + 3e-5 * time_s(n))
     found = one.fit((WHITE, RateRamp(R=1.0)), frozenset({0}))
-    same = one.at(found, found.fitted.beta)
+    same = one.with_beta(found, found.fitted.beta)
     assert same.log_likelihood == pytest.approx(found.log_likelihood, abs=1e-6)
     error = found.error(1)
     for shift in (-2.0, 1.0, 3.0):  # standard errors: a parabola
-        moved = one.at(found, found.fitted.beta + shift * error)
+        moved = one.with_beta(found, found.fitted.beta + shift * error)
         assert found.log_likelihood - moved.log_likelihood == pytest.approx(0.5 * shift**2, rel=1e-3)
 
 
@@ -150,10 +150,10 @@ def test_a_stop_band_is_not_heard():
     one = axis(y, effects)
     power = one.bins.sums(one.coefficients**2) / one.bins.count
     below = power < 1e-5 * np.median(power)
-    assert not one.heard[below].any()
-    assert one.heard[one.bins.f_hz < 1.0].all()
+    assert not one.used_bins[below].any()
+    assert one.used_bins[one.bins.f_hz < 1.0].all()
     whole = axis(white(n, np.random.default_rng(0)))
-    assert whole.heard[whole.bins.count > 4].all()
+    assert whole.used_bins[whole.bins.count > 4].all()
 
 
 def test_nameless_bases_are_fitted_besides():
@@ -171,7 +171,7 @@ def test_nameless_bases_are_fitted_besides():
 def test_other_bins_are_the_same_axis():
     rng = np.random.default_rng(7)
     one = axis(white(n, rng) + walk(n, rng))
-    finer = one.rebinned(bins(n, RATE_HZ, [(20.0, 0.1)]))
+    finer = one.rebinned(frequency_bins(n, RATE_HZ, [(20.0, 0.1)]))
     assert finer.bins.count.size > one.bins.count.size
     np.testing.assert_array_equal(finer.coefficients, one.coefficients)
     assert (finer.name, finer.n, finer.rate_hz) == ("gz", n, RATE_HZ)
@@ -179,14 +179,14 @@ def test_other_bins_are_the_same_axis():
 
 
 def test_a_course_is_made_once_for_all_sizes():
-    made = Courses(n, RATE_HZ, warmth(n))
+    made = RegressorCache(n, RATE_HZ, warmth(n))
     one = made.columns(Sinusoidal(amplitude=3.0, frequency=5.0, phase=1.0))
     assert made.columns(Sinusoidal(amplitude=0.1, frequency=5.0, phase=2.0)) is one
     assert made.columns(Sinusoidal(amplitude=0.1, frequency=5.1, phase=2.0)) is not one
     sine = np.sin(2.0 * np.pi * 5.0 * time_s(n))
-    np.testing.assert_allclose(one[0], transform(sine), atol=1e-9)
+    np.testing.assert_allclose(one[0], cosine_transform(sine), atol=1e-9)
     bias = TemperatureBias(coefficient=4.0, reference=25.0)
-    np.testing.assert_allclose(made.columns(bias)[0], transform(warmth(n)), atol=1e-9)
+    np.testing.assert_allclose(made.columns(bias)[0], cosine_transform(warmth(n)), atol=1e-9)
 
 
 def test_terms_of_size_zero_stay_as_small_as_they_are():

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter, periodogram
 
-from monitor.reconcile.preparation.cosine_bins import bins, series, transform
+from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequency_bins, inverse_cosine_transform
 
 
 def matrix(n):
@@ -17,9 +17,9 @@ def matrix(n):
 
 def test_transform_is_the_cosine_sum_without_the_mean():
     y = np.random.default_rng(0).standard_normal(200) + 7.0
-    assert transform(y) == pytest.approx(matrix(200) @ y, abs=1e-12)
-    assert np.sum(transform(y) ** 2) == pytest.approx(np.sum((y - y.mean()) ** 2))
-    assert series(transform(y)) == pytest.approx(y - y.mean(), abs=1e-12)
+    assert cosine_transform(y) == pytest.approx(matrix(200) @ y, abs=1e-12)
+    assert np.sum(cosine_transform(y) ** 2) == pytest.approx(np.sum((y - y.mean()) ** 2))
+    assert inverse_cosine_transform(cosine_transform(y)) == pytest.approx(y - y.mean(), abs=1e-12)
 
 
 def test_white_noise_and_random_walk_have_independent_coefficients():
@@ -36,7 +36,7 @@ def test_white_noise_and_random_walk_have_independent_coefficients():
 def test_variance_of_a_coefficient_is_the_spectrum(pole):
     n, runs, rate_hz = 1024, 400, 50.0
     drawn = lfilter([1.0], [1.0, -pole], np.random.default_rng(3).standard_normal((runs, n + 200)))[:, 200:]
-    ours = np.mean([transform(y) ** 2 for y in drawn], axis=0) / rate_hz
+    ours = np.mean([cosine_transform(y) ** 2 for y in drawn], axis=0) / rate_hz
     f, one_sided = periodogram(drawn, rate_hz, detrend="constant")
     peers = one_sided.mean(axis=0)[1:-1] / 2.0
     density = 1.0 / np.abs(1.0 - pole * np.exp(-2j * np.pi * f[1:-1] / rate_hz)) ** 2 / rate_hz
@@ -54,7 +54,7 @@ def test_variance_of_a_coefficient_is_the_spectrum(pole):
 )
 @settings(max_examples=60, deadline=None)
 def test_every_coefficient_is_in_one_bin(n, rate_hz, peaks):
-    found = bins(n, rate_hz, [(middle * rate_hz, width * rate_hz) for middle, width in peaks])
+    found = frequency_bins(n, rate_hz, [(middle * rate_hz, width * rate_hz) for middle, width in peaks])
     assert found.count.min() >= 1
     assert found.first[0] == 0
     np.testing.assert_array_equal(found.first[1:], np.cumsum(found.count)[:-1])
@@ -67,7 +67,7 @@ def test_every_coefficient_is_in_one_bin(n, rate_hz, peaks):
 
 def test_bins_are_narrow_where_spectra_are_steep():
     n, rate_hz = 360_000, 100.0
-    found = bins(n, rate_hz)
+    found = frequency_bins(n, rate_hz)
     step_hz = 0.5 * rate_hz / n
     width_hz = found.count * step_hz
     assert np.all(found.count[:20] == 1)
@@ -75,14 +75,14 @@ def test_bins_are_narrow_where_spectra_are_steep():
     assert np.all(width_hz[slow] < 0.1 * found.f_hz[slow])
     assert width_hz.max() <= 0.1 + 2 * step_hz
     assert np.all(width_hz[high] <= 0.1 * (0.5 * rate_hz - found.f_hz[high]) + 2 * step_hz)
-    around = bins(n, rate_hz, [(17.3, 0.02)])
+    around = frequency_bins(n, rate_hz, [(17.3, 0.02)])
     near = np.abs(around.f_hz - 17.3) < 0.02
     assert np.count_nonzero(near) > 10
     assert np.max((around.count * step_hz)[near]) < 0.01
 
 
 def test_sums_are_those_of_each_bin_and_spread_is_their_way_back():
-    found = bins(5000, 100.0, [(10.0, 0.5)])
+    found = frequency_bins(5000, 100.0, [(10.0, 0.5)])
     values = np.random.default_rng(0).standard_normal(4999)
     direct, at = [], 0
     for count in found.count.astype(int):

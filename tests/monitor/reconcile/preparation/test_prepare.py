@@ -5,7 +5,13 @@ import pytest
 
 from drivers.sample import AXES
 from monitor.noise.effects import AngleRandomWalk, Outliers, Resolution, SampleHold, Saturation
-from monitor.reconcile.preparation.prepare import again, look_at_values, may_leak, mend, without_sources
+from monitor.reconcile.preparation.prepare import (
+    may_leak,
+    measure_value_statistics,
+    repair_again,
+    repair_samples,
+    without_sources,
+)
 from tests.monitor.reconcile.axes import RATE_HZ, WHITE, N, axes, axis, correlated, white
 
 n = 12_000
@@ -24,9 +30,9 @@ def test_holes_are_filled_from_around_them():
     lost[5000:5100] = True
     holed[lost] = np.nan
     one = axis(holed, (WHITE,))
-    np.testing.assert_array_equal(one.y[~lost], y[~lost])
-    assert np.isfinite(one.y).all()
-    assert np.std(one.y[lost] - y[lost]) < 0.5 * np.std(y)
+    np.testing.assert_array_equal(one.repaired[~lost], y[~lost])
+    assert np.isfinite(one.repaired).all()
+    assert np.std(one.repaired[lost] - y[lost]) < 0.5 * np.std(y)
     assert np.isnan(one.raw[lost]).all()
 
 
@@ -44,12 +50,12 @@ def test_repeats_are_mended_where_the_model_has_them():
     held[0] = False
     for at in np.flatnonzero(held):
         y[at] = y[at - 1]
-    shown = look_at_values(y)
+    shown = measure_value_statistics(y)
     assert shown.repeats is not None
     assert shown.repeats.fraction.value == pytest.approx(0.2, abs=0.03)
-    as_it_is = mend(y, shown, (WHITE,), np.random.default_rng(RNG))
+    as_it_is = repair_samples(y, shown, (WHITE,), np.random.default_rng(RNG))
     np.testing.assert_array_equal(as_it_is, y)
-    put_right = mend(y, shown, (WHITE, SampleHold(fraction=0.2)), np.random.default_rng(RNG))
+    put_right = repair_samples(y, shown, (WHITE, SampleHold(fraction=0.2)), np.random.default_rng(RNG))
     assert np.count_nonzero(np.diff(put_right) == 0.0) == 0
     np.testing.assert_array_equal(put_right[~held], y[~held])
     assert np.std(put_right) == pytest.approx(SIGMA, rel=0.03)
@@ -59,16 +65,16 @@ def test_clipped_samples_are_drawn_from_beyond_the_limit():
     y = noise()
     limit = 2.0 * SIGMA
     clipped = np.clip(y, -limit, limit)
-    shown = look_at_values(clipped)
+    shown = measure_value_statistics(clipped)
     assert shown.clipped is not None
-    mended = mend(clipped, shown, (WHITE, Saturation(limit=limit)), np.random.default_rng(RNG))
+    mended = repair_samples(clipped, shown, (WHITE, Saturation(limit=limit)), np.random.default_rng(RNG))
     at_limit = np.abs(clipped) >= limit
     np.testing.assert_array_equal(mended[~at_limit], clipped[~at_limit])
     assert np.all(np.abs(mended[at_limit]) >= limit * (1 - 1e-9))
     assert np.all(np.sign(mended[at_limit]) == np.sign(clipped[at_limit]))
     assert np.std(clipped) < 0.97 * SIGMA
     assert np.std(mended) == pytest.approx(SIGMA, rel=0.025)
-    np.testing.assert_array_equal(mend(clipped, shown, (WHITE,), np.random.default_rng(RNG)), clipped)
+    np.testing.assert_array_equal(repair_samples(clipped, shown, (WHITE,), np.random.default_rng(RNG)), clipped)
 
 
 def test_outliers_are_taken_for_missing_where_the_model_has_them():
@@ -76,10 +82,10 @@ def test_outliers_are_taken_for_missing_where_the_model_has_them():
     far = rng.choice(n, 30, replace=False)
     y[far] += 20.0 * SIGMA * rng.choice([-1.0, 1.0], 30)
     plain = axis(y, (WHITE,))
-    np.testing.assert_array_equal(plain.y, y)
+    np.testing.assert_array_equal(plain.repaired, y)
     mended = axis(y, (WHITE, Outliers(fraction=30 / n, scale=20.0 * SIGMA)))
-    assert np.abs(mended.y[far]).max() < 6.0 * SIGMA
-    changed = np.flatnonzero(mended.y != y)
+    assert np.abs(mended.repaired[far]).max() < 6.0 * SIGMA
+    changed = np.flatnonzero(mended.repaired != y)
     assert set(far) <= set(changed)
     assert changed.size < 40
     np.testing.assert_array_equal(mended.raw, y)
@@ -97,10 +103,10 @@ def test_the_same_generator_gives_the_same_axis():
 def test_put_right_for_other_effects_is_prepared_for_them():
     y = np.clip(noise(), -1.5 * SIGMA, 1.5 * SIGMA)
     model = (WHITE, Saturation(limit=1.5 * SIGMA))
-    later = again(axis(y, (WHITE,)), model, np.random.default_rng(0))
+    later = repair_again(axis(y, (WHITE,)), model, np.random.default_rng(0))
     np.testing.assert_allclose(later.coefficients, axis(y, model).coefficients)
-    back = again(later, (WHITE,), np.random.default_rng(0))
-    np.testing.assert_array_equal(back.y, y)
+    back = repair_again(later, (WHITE,), np.random.default_rng(0))
+    np.testing.assert_array_equal(back.repaired, y)
 
 
 def test_which_axes_may_leak_into_which():
@@ -116,11 +122,11 @@ def test_which_axes_may_leak_into_which():
 
 def test_what_the_values_show():
     y = noise()
-    shown = look_at_values(y)
+    shown = measure_value_statistics(y)
     assert shown.levels is None
-    coarse = look_at_values(4e-4 * np.rint(y / 4e-4))
+    coarse = measure_value_statistics(4e-4 * np.rint(y / 4e-4))
     assert coarse.levels is not None
     assert coarse.levels.step.value == pytest.approx(4e-4)
     # repeats of coarse values are no repeats of samples
     one = axis(4e-4 * np.rint(y / 4e-4), (WHITE, Resolution(step=4e-4)))
-    np.testing.assert_array_equal(one.y, one.raw)
+    np.testing.assert_array_equal(one.repaired, one.raw)

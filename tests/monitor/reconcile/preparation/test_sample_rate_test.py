@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from monitor.noise.effect import Block, Leak, Source
+from monitor.noise.effect import Leak, SampleBlockContext, Source
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, Narrowband, SampleRateError, Sinusoidal
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.likelihood.effect_terms import COURSE, NOISE
-from monitor.reconcile.preparation.sample_rate_test import restated, wrong_clock
+from monitor.reconcile.likelihood.effect_terms import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS
+from monitor.reconcile.preparation.sample_rate_test import detect_sample_rate_error, in_stated_time
 from tests.contracts.effect_examples import effect
 from tests.monitor.reconcile.axes import GYRO_AXES, RATE_HZ, WALK, WHITE, axes, recording, warmth
 
@@ -16,40 +16,40 @@ RATIO = 1.13
 
 
 @pytest.mark.parametrize(
-    "kind", [kind for kind in NOISE if kind.name != "quantization_noise"], ids=lambda kind: kind.name
+    "kind", [kind for kind in NOISE_SIZE_PARAMETERS if kind.name != "quantization_noise"], ids=lambda kind: kind.name
 )
 def test_a_spectrum_is_that_of_the_resampled_noise(kind):
     """In stated time f is f/r and a density r times as much: S'(f) = r S(rf), of samples τ0/r apart."""
     one, tau0_s = effect(kind.name), 1.0 / RATE_HZ
     f_hz = np.geomspace(0.01, 0.499 * RATE_HZ, 50)
     expected = RATIO * one.psd(RATIO * f_hz, tau0_s / RATIO)
-    np.testing.assert_allclose(restated(one, RATIO).psd(f_hz, tau0_s), expected, rtol=1e-9)
+    np.testing.assert_allclose(in_stated_time(one, RATIO).psd(f_hz, tau0_s), expected, rtol=1e-9)
     clocked = NoiseModel({"gz": (one, SampleRateError(ratio=RATIO))})
-    np.testing.assert_allclose(restated(one, RATIO).psd(f_hz, tau0_s), clocked.psd("gz", f_hz, tau0_s), rtol=1e-9)
+    np.testing.assert_allclose(in_stated_time(one, RATIO).psd(f_hz, tau0_s), clocked.psd("gz", f_hz, tau0_s), rtol=1e-9)
 
 
-COURSES = [kind for kind in COURSE if not issubclass(kind, Leak)]
+COURSES = [kind for kind in DETERMINISTIC_SIZE_PARAMETERS if not issubclass(kind, Leak)]
 
 
 @pytest.mark.parametrize("kind", COURSES, ids=lambda kind: kind.name)
 def test_a_course_is_that_of_samples_at_the_true_rate(kind):
     def drawn(one: Source, rate_hz: float):
         values = np.zeros(n)
-        one.start(rate_hz, np.random.default_rng(1)).add(values, Block(0, warmth(n), np.empty(n)))
+        one.start(rate_hz, np.random.default_rng(1)).add(values, SampleBlockContext(0, warmth(n), np.empty(n)))
         return values
 
     one = effect(kind.name)
-    true, stated = drawn(one, RATIO * RATE_HZ), drawn(restated(one, RATIO), RATE_HZ)
+    true, stated = drawn(one, RATIO * RATE_HZ), drawn(in_stated_time(one, RATIO), RATE_HZ)
     np.testing.assert_allclose(stated, true, atol=1e-6 * np.abs(true).max())
 
 
 def test_there_and_back():
     for name in sorted(set(EFFECTS) - {"bias", "sample_rate_error"}):
-        back = restated(restated(effect(name), RATIO), 1.0 / RATIO)
+        back = in_stated_time(in_stated_time(effect(name), RATIO), 1.0 / RATIO)
         for parameter in back.__dataclass_fields__:
             want = getattr(effect(name), parameter)
             assert getattr(back, parameter) == (want if want is None or isinstance(want, str) else pytest.approx(want))
-        assert restated(effect(name), 1.0) == effect(name)
+        assert in_stated_time(effect(name), 1.0) == effect(name)
 
 
 LINE = Sinusoidal(amplitude=3e-4, frequency=17.3, phase=0.4)
@@ -69,7 +69,7 @@ def measured(feature, ratio, seed=1):
 
 @pytest.mark.parametrize("ratio", [1.0007, 0.992, 1.05])
 def test_the_ratio_is_found_by_a_line(ratio):
-    found = wrong_clock(*measured((LINE, OTHER), ratio))
+    found = detect_sample_rate_error(*measured((LINE, OTHER), ratio))
     assert found is not None
     assert found.axis == "gy"
     assert found.ratio.value == pytest.approx(ratio, abs=3e-5)
@@ -80,7 +80,7 @@ def test_the_ratio_is_found_by_a_line(ratio):
 
 
 def test_the_ratio_is_found_by_a_resonance():
-    found = wrong_clock(*measured((RESONANCE, HUM), 1.02))
+    found = detect_sample_rate_error(*measured((RESONANCE, HUM), 1.02))
     assert found is not None
     assert found.ratio.lo < 1.02 < found.ratio.hi
     assert found.axis == "gy"
@@ -88,25 +88,25 @@ def test_the_ratio_is_found_by_a_resonance():
 
 
 def test_one_line_that_moved_is_no_clock():
-    assert wrong_clock(*measured((LINE,), 1.0007)) is None
+    assert detect_sample_rate_error(*measured((LINE,), 1.0007)) is None
 
 
 def test_a_clock_that_is_right_is_left_alone():
     for seed in range(3):
-        assert wrong_clock(*measured((LINE, RESONANCE), 1.0, seed)) is None
+        assert detect_sample_rate_error(*measured((LINE, RESONANCE), 1.0, seed)) is None
 
 
 def test_without_a_feature_nobody_can_tell():
-    assert wrong_clock(*measured((), 1.01)) is None
+    assert detect_sample_rate_error(*measured((), 1.01)) is None
 
 
 def test_a_line_that_went_away_is_no_clock():
     every, effects = measured((), 1.0)
-    assert wrong_clock(every, {**effects, "gy": (*effects["gy"], LINE)}) is None
+    assert detect_sample_rate_error(every, {**effects, "gy": (*effects["gy"], LINE)}) is None
 
 
 def test_white_noise_alone_reads_as_another_size():
-    assert pytest.approx(1.1) == restated(AngleRandomWalk(N=1.0), 1.21).N
+    assert pytest.approx(1.1) == in_stated_time(AngleRandomWalk(N=1.0), 1.21).N
 
 
 def test_a_line_that_stands_where_it_was_says_that_the_clock_is_right():
@@ -117,4 +117,4 @@ def test_a_line_that_stands_where_it_was_says_that_the_clock_is_right():
     moved = [Sinusoidal(amplitude=one.amplitude, frequency=one.frequency / 1.02, phase=0.0) for one in (LINE, OTHER)]
     drawn = recording(plain + NoiseModel({"gy": (*moved, third)}), n, 1)
     effects = {name: tuple(model.effects[name]) for name in GYRO_AXES}
-    assert wrong_clock(axes(dict(drawn.values), effects), effects) is None
+    assert detect_sample_rate_error(axes(dict(drawn.values), effects), effects) is None

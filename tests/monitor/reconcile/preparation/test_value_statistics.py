@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor.reconcile.preparation.value_statistics import clipped, levels, repeats
+from monitor.reconcile.preparation.value_statistics import detect_clipping, detect_quantization, detect_repeats
 
 N = 30_000
 DEGREE = np.pi / 180.0
@@ -26,7 +26,7 @@ def as_float32(x):
 @pytest.mark.parametrize("step", [1.37e-5, 2.1e-3, 0.07, 0.61, 1.9])
 @pytest.mark.parametrize("scale", [1.5e-3, 1.0, 400.0])
 def test_values_on_a_grid_show_its_step(step, scale):
-    found = levels(scale * step * np.rint((noise() + 3.3) / step))
+    found = detect_quantization(scale * step * np.rint((noise() + 3.3) / step))
     assert found.step.value == pytest.approx(scale * step, rel=1e-9)
     assert found.step.lo <= scale * step <= found.step.hi * (1.0 + 1e-12)
     assert abs(found.offset) < 1e-6 * scale * step
@@ -37,11 +37,11 @@ def test_values_on_a_grid_show_its_step(step, scale):
 def test_a_grid_survives_float32_and_nine_digits(step):
     y = 1e-3 * step * np.rint((noise() + 3.3) / step)
     for written in (as_float32(y), np.array([float(f"{x:.9g}") for x in y])):
-        assert levels(written).step.value == pytest.approx(1e-3 * step, rel=1e-4)
+        assert detect_quantization(written).step.value == pytest.approx(1e-3 * step, rel=1e-4)
 
 
 def test_a_grid_off_zero_shows_where_it_stands():
-    found = levels(0.25 * np.rint(noise() / 0.25) + 9.81)
+    found = detect_quantization(0.25 * np.rint(noise() / 0.25) + 9.81)
     assert found.offset == pytest.approx(9.81 - 39 * 0.25, abs=1e-9)
 
 
@@ -61,40 +61,40 @@ def test_a_grid_off_zero_shows_where_it_stands():
     ids=["float64", "float32", "float32 of g", "decimals", "decimals of g", "digits", "degrees", "float32 deg", "g"],
 )
 def test_what_numbers_and_texts_have_of_themselves_is_no_grid(written):
-    assert levels(written(noise())) is None
+    assert detect_quantization(written(noise())) is None
 
 
 def test_decimals_as_coarse_as_the_noise_are_a_grid_whoever_wrote_them():
-    assert levels(noise().round(0)).step.value == pytest.approx(1.0)
-    assert levels(0.01 * noise().round(0)).coarse > 0.5
+    assert detect_quantization(noise().round(0)).step.value == pytest.approx(1.0)
+    assert detect_quantization(0.01 * noise().round(0)).coarse > 0.5
 
 
 def test_one_value_off_the_grid_is_enough():
     y = 0.1 * np.rint(noise() / 0.1)
     y[777] += 0.031
-    assert levels(y) is None
+    assert detect_quantization(y) is None
 
 
 @pytest.mark.parametrize("y", [np.zeros(0), np.full(100, np.nan), np.ones(5000), np.arange(9.0)])
 def test_what_says_nothing_gives_nothing(y):
-    assert levels(y) is None
-    assert clipped(y) is None
-    assert repeats(y) is None
+    assert detect_quantization(y) is None
+    assert detect_clipping(y) is None
+    assert detect_repeats(y) is None
 
 
 def test_missing_samples_are_passed_over():
     y = held(np.clip(noise(), -2.5, 2.5), 0.02)[0]
     y[noise(3) > 1.0] = np.nan
-    assert clipped(y).limit.value == 2.5
-    assert repeats(y, limit=2.5).fraction.value == pytest.approx(0.02, rel=0.3)
-    assert levels(0.1 * np.rint(y / 0.1)).step.value == pytest.approx(0.1)
+    assert detect_clipping(y).limit.value == 2.5
+    assert detect_repeats(y, limit=2.5).fraction.value == pytest.approx(0.02, rel=0.3)
+    assert detect_quantization(0.1 * np.rint(y / 0.1)).step.value == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("limit", [0.5, 1.5, 3.0])
 @pytest.mark.parametrize("mean", [0.0, -0.4])
 def test_clipped_noise_shows_its_limit(limit, mean):
     x = noise() + mean
-    found = clipped(np.clip(x, -limit, limit))
+    found = detect_clipping(np.clip(x, -limit, limit))
     assert found.limit.lo <= limit <= found.limit.hi
     assert found.count == np.count_nonzero(np.abs(x) >= limit)
     assert found.upper
@@ -105,15 +105,15 @@ def test_clipped_noise_shows_its_limit(limit, mean):
 
 def test_one_end_alone_and_an_end_that_is_passed_elsewhere():
     x = noise()
-    one = clipped(np.clip(x + 2.0, -3.5, 3.5))
+    one = detect_clipping(np.clip(x + 2.0, -3.5, 3.5))
     assert (one.upper, one.lower, one.symmetric) == (True, False, True)
-    passed = clipped(np.minimum(x, 2.0))
+    passed = detect_clipping(np.minimum(x, 2.0))
     assert (passed.upper, passed.lower, passed.symmetric) == (True, False, False)
 
 
 @pytest.mark.parametrize("step", [0.1, 0.4])
 def test_clipped_and_stepped_noise_shows_its_limit_to_half_a_step(step):
-    found = clipped(step * np.rint(np.clip(noise(n=360_000), -1.9, 1.9) / step), step)
+    found = detect_clipping(step * np.rint(np.clip(noise(n=360_000), -1.9, 1.9) / step), step)
     assert found.limit.lo <= 1.9 <= found.limit.hi
     assert found.gain > 50.0
 
@@ -137,14 +137,14 @@ def line(n=N):
 )
 @pytest.mark.parametrize("step", [0.0, 0.05, 0.5])
 def test_what_is_not_clipped_is_not_called_clipped(x, step):
-    found = clipped(step * np.rint(x / step) if step else x, step)
+    found = detect_clipping(step * np.rint(x / step) if step else x, step)
     assert found is None or found.gain < 8.0
 
 
 @pytest.mark.parametrize("share", [5e-4, 0.02, 0.4])
 def test_repeats_of_continuous_values_are_each_known(share):
     y, which = held(noise(), share)
-    found = repeats(y)
+    found = detect_repeats(y)
     assert np.array_equal(found.mask, which)
     assert found.fraction.lo <= share <= found.fraction.hi
     assert found.gain > 20.0
@@ -153,7 +153,7 @@ def test_repeats_of_continuous_values_are_each_known(share):
 @pytest.mark.parametrize("step", [1e-3, 0.1, 0.7])
 def test_repeats_of_stepped_values_are_counted(step):
     y = step * np.rint(held(noise(n=200_000), 0.05)[0] / step)
-    found = repeats(y, step)
+    found = detect_repeats(y, step)
     assert found.fraction.value == pytest.approx(0.05, rel=0.15)
     assert found.fraction.lo < found.fraction.value < found.fraction.hi
     assert not found.mask.any()
@@ -163,7 +163,7 @@ def test_repeats_of_stepped_values_are_counted(step):
 def test_clipped_samples_are_no_repeats():
     y = np.clip(noise(), -1.0, 1.0)
     assert np.count_nonzero(np.diff(y) == 0.0) > 1000
-    assert repeats(y, limit=1.0) is None
+    assert detect_repeats(y, limit=1.0) is None
 
 
 @pytest.mark.parametrize(
@@ -180,10 +180,10 @@ def test_clipped_samples_are_no_repeats():
 )
 @pytest.mark.parametrize("step", [0.0, 0.01, 0.3, 0.9, 3.0])
 def test_what_is_not_held_is_not_called_held(x, step):
-    found = repeats(step * np.rint(x / step) if step else x, step)
+    found = detect_repeats(step * np.rint(x / step) if step else x, step)
     assert found is None or found.gain < 8.0
 
 
 def test_repeats_of_a_grid_that_was_not_told_are_not_taken_for_known_ones():
-    found = repeats(0.05 * np.rint(noise() / 0.05))
+    found = detect_repeats(0.05 * np.rint(noise() / 0.05))
     assert found is None or (found.gain < 8.0 and not found.mask.any())

@@ -20,10 +20,10 @@ from monitor.noise.effects import (
     TurnOnTransient,
 )
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.diagnostics.diagnostics import sight
-from monitor.reconcile.likelihood.hypothesis import believed
+from monitor.reconcile.diagnostics.diagnostics import whiten_axis
+from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes
 from monitor.reconcile.search import candidates
-from monitor.reconcile.search.candidates import PRICE, line_frequency, peaks
+from monitor.reconcile.search.candidates import PENALTY_NATS, find_spectral_peaks, line_frequency
 from tests.monitor.reconcile.axes import (
     RATE_HZ,
     TERMS,
@@ -51,103 +51,108 @@ def noise(seed=0):
 
 def asked(family, one, model=MODEL):
     """What a family offers, by name."""
-    state = believed(one, model)
-    return {effect.name: effect for effect in family(one, state, sight(one, state.likely))}
+    state = fit_with_given_sizes(one, model)
+    return {effect.name: effect for effect in family(one, state, whiten_axis(one, state.likely))}
 
 
 def test_every_effect_of_the_vocabulary_has_a_price():
     # a mean is always free, and the clock is asked for all axes together
-    assert set(PRICE) - {"power_law"} == set(EFFECTS) - {"bias", "sample_rate_error"}
-    assert min(PRICE.values()) > 0.0
+    assert set(PENALTY_NATS) - {"power_law"} == set(EFFECTS) - {"bias", "sample_rate_error"}
+    assert min(PENALTY_NATS.values()) > 0.0
 
 
 def test_classic_terms_that_are_lacking():
-    assert set(asked(candidates.noises, axis(noise()))) == {"quantization_noise", "bias_instability"}
-    assert set(asked(candidates.noises, axis(noise()), TERMS)) == {"quantization_noise"}
+    assert set(asked(candidates.propose_classic_terms, axis(noise()))) == {"quantization_noise", "bias_instability"}
+    assert set(asked(candidates.propose_classic_terms, axis(noise()), TERMS)) == {"quantization_noise"}
     model = (QuantizationNoise(Q=1e-8), *TERMS)
-    assert asked(candidates.noises, axis(noise()), model) == {}
+    assert asked(candidates.propose_classic_terms, axis(noise()), model) == {}
 
 
 @pytest.mark.parametrize("correlation_s", [0.05, 0.5, 5.0])
 def test_correlation_time(correlation_s):
     y = noise() + correlated(n, np.random.default_rng(1), 5e-4, correlation_s)
-    found = asked(candidates.correlated, axis(y))["exponentially_correlated"]
+    found = asked(candidates.propose_correlated_noise, axis(y))["exponentially_correlated"]
     assert isinstance(found, ExponentiallyCorrelated)
     assert found.correlation_time == pytest.approx(correlation_s, rel=0.35)
 
 
 def test_a_correlation_as_long_as_the_recording_is_left_to_the_walk():
-    assert asked(candidates.correlated, axis(noise() + walk(n, np.random.default_rng(2), 1e-3)), (WHITE,)) == {}
+    assert (
+        asked(candidates.propose_correlated_noise, axis(noise() + walk(n, np.random.default_rng(2), 1e-3)), (WHITE,))
+        == {}
+    )
 
 
 def test_a_resonance():
     y = noise() + ringing(n, np.random.default_rng(3), 5e-4, 17.3, 1.0)
-    found = asked(candidates.ringing, axis(y))["narrowband"]
+    found = asked(candidates.propose_resonances, axis(y))["narrowband"]
     assert isinstance(found, Narrowband)
     assert found.frequency == pytest.approx(17.3, abs=0.2)
     assert found.bandwidth == pytest.approx(1.0, rel=0.3)
     one = axis(y)
-    middle, width = peaks(sight(one, believed(one, MODEL).likely))[0]
+    middle, width = find_spectral_peaks(whiten_axis(one, fit_with_given_sizes(one, MODEL).likely))[0]
     assert middle == pytest.approx(17.3, abs=0.5)
     assert 0.2 < width < 5.0
-    assert asked(candidates.ringing, axis(noise())) == {}
+    assert asked(candidates.propose_resonances, axis(noise())) == {}
 
 
 def test_a_line():
     """Far closer than a bin of the periodogram, which is 1/240 Hz."""
     y = noise() + 2e-4 * np.sin(2 * np.pi * 17.3042 * time_s(n))
     one = axis(y)
-    found = asked(candidates.oscillations, one)["sinusoidal"]
+    found = asked(candidates.propose_sinusoids, one)["sinusoidal"]
     assert isinstance(found, Sinusoidal)
     assert found.frequency == pytest.approx(17.3042, abs=5e-4)
-    view = sight(one, believed(one, MODEL).likely)
+    view = whiten_axis(one, fit_with_given_sizes(one, MODEL).likely)
     t = time_s(n)
     best = minimize_scalar(
         lambda f: -abs(np.exp(-2j * np.pi * f * t) @ view.white), bounds=(17.303, 17.306), method="bounded"
     )
     assert line_frequency(view, 17.303) == pytest.approx(best.x, abs=1e-5)
-    assert asked(candidates.oscillations, axis(noise(5))) == {}
+    assert asked(candidates.propose_sinusoids, axis(noise(5))) == {}
 
 
 @pytest.mark.parametrize("order", [1, 2, 4])
 def test_a_filter(order):
     y = NoiseModel({"gz": (WHITE, BandwidthLimit(cutoff=14.0, order=order))}).simulate(n, RATE_HZ, 6)[:, 2].copy()
-    found = asked(candidates.low_pass, axis(y), (WHITE,))["bandwidth_limit"]
+    found = asked(candidates.propose_low_pass, axis(y), (WHITE,))["bandwidth_limit"]
     assert isinstance(found, BandwidthLimit)
     assert found.order == order
     assert found.cutoff == pytest.approx(14.0, rel=0.05)
-    assert asked(candidates.low_pass, axis(y), (WHITE, found)) == {}
+    assert asked(candidates.propose_low_pass, axis(y), (WHITE, found)) == {}
 
 
 def test_what_follows_the_clock():
     t = time_s(n)
     y = noise() + 1e-3 * np.exp(-t / 9.0) - 5e-4 * (t >= 130.0)
-    found = asked(candidates.drifts, axis(y))
+    found = asked(candidates.propose_drifts, axis(y))
     assert isinstance(found["rate_ramp"], RateRamp)
     transient, step = found["turn_on_transient"], found["bias_step"]
     assert isinstance(transient, TurnOnTransient)
     assert isinstance(step, BiasStep)
-    alone = asked(candidates.drifts, axis(noise() + 1e-3 * np.exp(-t / 9.0)))["turn_on_transient"]
+    alone = asked(candidates.propose_drifts, axis(noise() + 1e-3 * np.exp(-t / 9.0)))["turn_on_transient"]
     assert alone.time_constant == pytest.approx(9.0, rel=0.3)
-    stepped = asked(candidates.drifts, axis(noise() - 5e-4 * (t >= 130.0)))["bias_step"]
+    stepped = asked(candidates.propose_drifts, axis(noise() - 5e-4 * (t >= 130.0)))["bias_step"]
     assert stepped.time == pytest.approx(130.0, abs=0.5)
-    with_ramp = asked(candidates.drifts, axis(noise()), (*MODEL, RateRamp(R=1e-6)))
+    with_ramp = asked(candidates.propose_drifts, axis(noise()), (*MODEL, RateRamp(R=1e-6)))
     assert "rate_ramp" not in with_ramp
 
 
 def test_what_follows_temperature():
     warm = warmth(n)
-    found = asked(candidates.warmth, axis(noise() + 3e-4 * (warm - 25.0), temperature_c=warm))
+    found = asked(candidates.propose_temperature_effects, axis(noise() + 3e-4 * (warm - 25.0), temperature_c=warm))
     assert isinstance(found["temperature_bias"], TemperatureBias)
     inside = np.empty(n)  # 20 s behind
     inside[0] = warm[0]
     for k in range(1, n):
         inside[k] = warm[k - 1] + (inside[k - 1] - warm[k - 1]) * np.exp(-1.0 / (20.0 * RATE_HZ))
-    late = asked(candidates.warmth, axis(noise() + 3e-4 * (inside - 25.0), temperature_c=warm))["temperature_lag"]
+    late = asked(candidates.propose_temperature_effects, axis(noise() + 3e-4 * (inside - 25.0), temperature_c=warm))[
+        "temperature_lag"
+    ]
     assert isinstance(late, TemperatureLag)
     assert late.time_constant == pytest.approx(20.0, rel=0.3)
-    assert asked(candidates.warmth, axis(noise())) == {}
-    assert asked(candidates.warmth, axis(noise(), temperature_c=np.full(n, 25.0))) == {}
+    assert asked(candidates.propose_temperature_effects, axis(noise())) == {}
+    assert asked(candidates.propose_temperature_effects, axis(noise(), temperature_c=np.full(n, 25.0))) == {}
 
 
 def test_other_axes_by_their_kind():
@@ -156,21 +161,21 @@ def test_other_axes_by_their_kind():
     every = axes(values, (WHITE,))
     found = {}
     for name, one in every.items():
-        state = believed(one, (WHITE,))
-        offered = candidates.leaks(one, state, sight(one, state.likely))
+        state = fit_with_given_sizes(one, (WHITE,))
+        offered = candidates.propose_leaks(one, state, whiten_axis(one, state.likely))
         found[name] = {(type(effect), effect.source) for effect in offered}
     assert found["gz"] == {(CrossAxis, "gy"), (GSensitivity, "ax"), (GSensitivity, "az")}
     assert found["ax"] == {(CrossAxis, "az")}
     known = (WHITE, CrossAxis(source="gy", coefficient=0.1))
-    state = believed(every["gz"], known)
-    rest = candidates.leaks(every["gz"], state, sight(every["gz"], state.likely))
+    state = fit_with_given_sizes(every["gz"], known)
+    rest = candidates.propose_leaks(every["gz"], state, whiten_axis(every["gz"], state.likely))
     assert {effect.source for effect in rest} == {"ax", "az"}
 
 
 def test_sizes_of_first_guesses_do_not_matter():
     """What a family offers is fitted by whoever tries it: the unit of the axis changes no shape."""
     y = noise() + correlated(n, np.random.default_rng(8), 5e-4, 0.5)
-    one = asked(candidates.correlated, axis(y))["exponentially_correlated"]
+    one = asked(candidates.propose_correlated_noise, axis(y))["exponentially_correlated"]
     scaled = (type(WHITE)(N=1e4 * N), type(WALK)(K=1e4 * WALK.K))
-    other = asked(candidates.correlated, axis(1e4 * y), scaled)["exponentially_correlated"]
+    other = asked(candidates.propose_correlated_noise, axis(1e4 * y), scaled)["exponentially_correlated"]
     assert other.correlation_time == pytest.approx(one.correlation_time, rel=1e-2)

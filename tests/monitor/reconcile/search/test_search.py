@@ -11,9 +11,9 @@ from monitor.noise.effects import (
     RateRandomWalk,
     Sinusoidal,
 )
-from monitor.reconcile.likelihood.hypothesis import believed, settled
-from monitor.reconcile.search.search import Search, pruned, search
-from monitor.reconcile.search.trials import tried
+from monitor.reconcile.likelihood.hypothesis import fit_with_fewest_changes, fit_with_given_sizes
+from monitor.reconcile.search.search import Search, drop_unneeded_effects, search_axis
+from monitor.reconcile.search.trials import trial_groups
 from tests.monitor.reconcile.axes import (
     RATE_HZ,
     STRICT,
@@ -44,7 +44,7 @@ def noise(seed=0):
 
 
 def looked(y, model=MODEL, temperature_c=None) -> Search:
-    return search(axis(y, model, temperature_c), model, STRICT, np.random.default_rng(0))
+    return search_axis(axis(y, model, temperature_c), model, STRICT, np.random.default_rng(0))
 
 
 def names(found):
@@ -161,7 +161,7 @@ def test_what_is_worth_nothing_is_dropped():
     idle = ExponentiallyCorrelated(sigma=1e-6, correlation_time=1.0)
     line = Sinusoidal(amplitude=1.0, frequency=17.3, phase=0.0)
     last = RateRandomWalk(K=1e-9)  # what was just found is not asked
-    state = pruned(one, settled(one, (idle, line, last), MODEL))
+    state = drop_unneeded_effects(one, fit_with_fewest_changes(one, (idle, line, last), MODEL))
     assert [type(effect) for effect in state.effects] == [AngleRandomWalk, RateRandomWalk, Sinusoidal, RateRandomWalk]
 
 
@@ -170,7 +170,9 @@ def test_candidates_on_a_true_model_are_not_worth_their_price():
     wrong = 0
     for seed in range(6):
         one = axis(noise(20 + seed), MODEL)
-        trials = [each for kind in tried(one, believed(one, MODEL), seen(one, MODEL)) for each in kind]
+        trials = [
+            each for kind in trial_groups(one, fit_with_given_sizes(one, MODEL), seen(one, MODEL)) for each in kind
+        ]
         assert trials
         wrong += max(each.value for each in trials) > 0.0
     assert wrong <= 1

@@ -12,16 +12,16 @@ from monitor.noise.effects import (
     Sinusoidal,
 )
 from monitor.reconcile.diagnostics.diagnostics import Finding
-from monitor.reconcile.diagnostics.gap import Null
-from monitor.reconcile.likelihood.hypothesis import settled
-from monitor.reconcile.result import Where
-from monitor.reconcile.search.withdrawal import upheld
+from monitor.reconcile.diagnostics.gap import NullDistribution
+from monitor.reconcile.likelihood.hypothesis import fit_with_fewest_changes
+from monitor.reconcile.result import Location
+from monitor.reconcile.search.withdrawal import supported_effects
 from tests.monitor.reconcile.axes import WALK, WHITE, axes, white
 
 MODEL = (WHITE, WALK)
-QUIET = {lens: Finding(1.0, Where(frequency=(1.0, 2.0))) for lens in ("psd", "lines", "spectrogram")}
-QUIET |= {lens: Finding(1.0, Where()) for lens in ("level", "other_axes", "tails", "variance")}
-NULL = dict.fromkeys(QUIET, Null(6.0, 12.0))
+QUIET = {lens: Finding(1.0, Location(frequency=(1.0, 2.0))) for lens in ("psd", "lines", "spectrogram")}
+QUIET |= {lens: Finding(1.0, Location()) for lens in ("level", "other_axes", "tails", "variance")}
+NULL = dict.fromkeys(QUIET, NullDistribution(6.0, 12.0))
 
 
 def lines(*f_hz):
@@ -31,8 +31,8 @@ def lines(*f_hz):
 def kept(found, seen=QUIET, closing=None):
     rng = np.random.default_rng(1)
     one = axes({"gz": white(20_000, rng), "gx": white(20_000, rng)}, MODEL)["gz"]
-    state = settled(one, found, MODEL)
-    return [type(effect) for effect in upheld(state, closing or {}, seen, NULL)]
+    state = fit_with_fewest_changes(one, found, MODEL)
+    return [type(effect) for effect in supported_effects(state, closing or {}, seen, NULL)]
 
 
 def test_lines_apart_from_each_other_stand():
@@ -58,32 +58,32 @@ def test_three_harmonics_may_be_a_motor():
 
 @pytest.mark.parametrize(("left", "stands"), [(50.0, False), (15.0, True)])
 def test_a_resonance_stands_when_it_closed_most_of_its_gap(left, stands):
-    seen = {**QUIET, "psd": Finding(left, Where(frequency=(16.0, 18.0)))}
+    seen = {**QUIET, "psd": Finding(left, Location(frequency=(16.0, 18.0)))}
     found = (Narrowband(sigma=1e-4, frequency=17.0, bandwidth=1.0),)
     assert bool(kept(found, seen, {Narrowband: 200.0})) == stands
 
 
 def test_a_low_pass_stands_whatever_is_left_elsewhere():
-    seen = {**QUIET, "psd": Finding(150.0, Where(frequency=(0.1, 0.2)))}
+    seen = {**QUIET, "psd": Finding(150.0, Location(frequency=(0.1, 0.2)))}
     assert kept((BandwidthLimit(cutoff=20.0, order=2),), seen, {BandwidthLimit: 200.0}) == [BandwidthLimit]
-    above = {**QUIET, "psd": Finding(150.0, Where(frequency=(30.0, 40.0)))}
+    above = {**QUIET, "psd": Finding(150.0, Location(frequency=(30.0, 40.0)))}
     assert kept((BandwidthLimit(cutoff=20.0, order=2),), above, {BandwidthLimit: 200.0}) == []
 
 
 @pytest.mark.parametrize(("left", "stands"), [(150.0, False), (50.0, True)])
 def test_a_leak_stands_when_it_closed_most_of_what_other_axes_show(left, stands):
-    seen = {**QUIET, "other_axes": Finding(left, Where(source="ay"))}
+    seen = {**QUIET, "other_axes": Finding(left, Location(source="ay"))}
     assert bool(kept((CrossAxis(source="gx", coefficient=0.01),), seen, {CrossAxis: 200.0})) == stands
 
 
 @pytest.mark.parametrize(("left", "stands"), [(50.0, False), (15.0, True)])
 def test_steps_stand_when_the_level_rests_after_them(left, stands):
-    seen = {**QUIET, "level": Finding(left, Where(time=(100.0, 100.0)))}
+    seen = {**QUIET, "level": Finding(left, Location(time=(100.0, 100.0)))}
     assert bool(kept((BiasStep(time=60.0, height=1.0),), seen, {BiasStep: 200.0})) == stands
 
 
 @pytest.mark.parametrize(("left", "stands"), [(2500.0, False), (1500.0, True)])
 def test_a_smooth_spectrum_stands_unless_far_more_is_unsteady(left, stands):
-    seen = {**QUIET, "variance": Finding(left, Where(time=(100.0, 200.0)))}
+    seen = {**QUIET, "variance": Finding(left, Location(time=(100.0, 200.0)))}
     found = (ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.5), *lines(17.3))
     assert len(kept(found, seen, {ExponentiallyCorrelated: 20.0})) == 1 + stands

@@ -5,19 +5,19 @@ from typing import Any
 
 import pytest
 
-from monitor.reconcile.likelihood.effect_terms import ONCE
-from monitor.reconcile.result import Bounds, Reconciliation, Score, Step, Where
-from monitor.reconcile.several_recordings.absence import Absence, Shown, absence
-from monitor.reconcile.several_recordings.comparison import Run
+from monitor.reconcile.likelihood.effect_terms import ONE_TIME_EFFECTS
+from monitor.reconcile.result import Location, ParameterInterval, Reconciliation, ReconciliationStep, Score
+from monitor.reconcile.several_recordings.absence import Absence, StrongestObservation, explain_absence
+from monitor.reconcile.several_recordings.comparison import NamedResult
 from tests.monitor.reconcile.runs_made import LENS, line, run, step
 
 
-def shown(one: Step, gap: float = 30.0, seconds: float = 600.0) -> Shown:
-    return Shown(one, run("one", one).result.axes["gz"], gap, seconds)
+def shown(one: ReconciliationStep, gap: float = 30.0, seconds: float = 600.0) -> StrongestObservation:
+    return StrongestObservation(one, run("one", one).result.axes["gz"], gap, seconds)
 
 
-def said(one: Shown, other: Run) -> Absence:
-    return absence(one, other.name, other.result)
+def said(one: StrongestObservation, other: NamedResult) -> Absence:
+    return explain_absence(one, other.name, other.result)
 
 
 def seen_through(score: Score, seconds: float = 600.0) -> Reconciliation:
@@ -49,7 +49,7 @@ def test_chance_is_left_room(gap: float, meaning: str) -> None:
     assert said(shown(line(), gap), run("two")).meaning == meaning
 
 
-@pytest.mark.parametrize("effect", sorted(ONCE))
+@pytest.mark.parametrize("effect", sorted(ONE_TIME_EFFECTS))
 def test_what_happens_once_may_differ(effect: str) -> None:
     given: dict[str, dict[str, Any]] = {
         "bias_step": {"time": 9.0, "height": 1.0},
@@ -76,21 +76,21 @@ def test_what_is_left_over_through_the_same_lens_is_no_contradiction() -> None:
 
 
 def test_a_leak_needs_its_source() -> None:
-    one = shown(step("cross_axis", source=Bounds("gx"), coefficient=0.1))
+    one = shown(step("cross_axis", source=ParameterInterval("gx"), coefficient=0.1))
     assert said(one, run("two")).meaning == "too_faint"
     both = run("two").result
     with_source = replace(both, axes={**both.axes, "gx": run("two", axis="gx").result.axes["gx"]})
-    assert absence(one, "two", with_source).meaning == "may_differ"
+    assert explain_absence(one, "two", with_source).meaning == "may_differ"
 
 
 @pytest.mark.parametrize(
     ("swing", "meaning"), [((20.0, 30.0), "contradiction"), ((24.0, 25.0), "too_faint"), (None, "too_faint")]
 )
 def test_a_temperature_effect_needs_temperature_that_changes(swing: tuple[float, float] | None, meaning: str) -> None:
-    warm = Score("temperature", Where(temperature=(20.0, 30.0)), 30.0, 2.0, 4.0)
-    one = replace(step("temperature_bias", coefficient=1e-3, reference=Bounds(25.0)), found=warm)
-    other = seen_through(replace(warm, where=Where(temperature=swing), gap=1.0))
-    assert absence(shown(one), "two", other).meaning == meaning
+    warm = Score("temperature", Location(temperature=(20.0, 30.0)), 30.0, 2.0, 4.0)
+    one = replace(step("temperature_bias", coefficient=1e-3, reference=ParameterInterval(25.0)), found=warm)
+    other = seen_through(replace(warm, where=Location(temperature=swing), gap=1.0))
+    assert explain_absence(shown(one), "two", other).meaning == meaning
 
 
 def test_a_ramp_fades_faster_with_the_length() -> None:
@@ -100,6 +100,6 @@ def test_a_ramp_fades_faster_with_the_length() -> None:
 
 
 def test_nothing_is_said_without_the_lens_or_the_axis() -> None:
-    assert absence(shown(line()), "two", seen_through(replace(LENS, lens="psd"))).meaning == "may_differ"
+    assert explain_absence(shown(line()), "two", seen_through(replace(LENS, lens="psd"))).meaning == "may_differ"
     assert said(shown(line()), run("two", axis="gx")).because == "gz is not in it"
     assert said(shown(line(), gap=0.0), run("two")).meaning == "may_differ"

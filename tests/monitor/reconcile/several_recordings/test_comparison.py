@@ -5,17 +5,17 @@ from dataclasses import replace
 import pytest
 
 from monitor.noise.effects import AngleRandomWalk, BandwidthLimit, BiasStep, Sinusoidal, TemperatureBias
-from monitor.reconcile.result import Bounds
-from monitor.reconcile.several_recordings.comparison import AxisRuns, Run, Seen, compare
+from monitor.reconcile.result import ParameterInterval
+from monitor.reconcile.several_recordings.comparison import AxisRuns, MatchedEffect, NamedResult, compare
 from tests.monitor.reconcile import samples
 from tests.monitor.reconcile.runs_made import LENS, around, known_lines, line, run, step, with_axes
 
 
-def gz(*runs: Run) -> AxisRuns:
+def gz(*runs: NamedResult) -> AxisRuns:
     return compare(runs).axes["gz"]
 
 
-def only(found: tuple[Seen, ...]) -> Seen:
+def only(found: tuple[MatchedEffect, ...]) -> MatchedEffect:
     (one,) = found
     return one
 
@@ -129,7 +129,7 @@ def test_of_several_lines_in_the_model_the_retuned_one_is_replaced() -> None:
 
 
 def test_what_has_no_interval_stays_as_the_first_recording_has_it() -> None:
-    low_pass = step("bandwidth_limit", cutoff=around(20.0, 0.1), order=Bounds(2))
+    low_pass = step("bandwidth_limit", cutoff=around(20.0, 0.1), order=ParameterInterval(2))
     c = compare([run("a", low_pass), run("b", low_pass)])
     found = c.model.effects["gz"][-1]
     assert found == BandwidthLimit(cutoff=20.0, order=2)
@@ -139,8 +139,10 @@ def test_what_has_no_interval_stays_as_the_first_recording_has_it() -> None:
 def test_a_curved_temperature_effect_is_pooled_at_one_reference() -> None:
     """The same curve, 2e-4 (T − 20) + 1e-5 (T − 20)², told at 20 °C and at 30 °C."""
     curve = around(1e-5, 1e-7)
-    first = step("temperature_bias", coefficient=around(2e-4, 4e-6), quadratic=curve, reference=Bounds(20.0))
-    second = step("temperature_bias", coefficient=around(4e-4, 4e-6), quadratic=curve, reference=Bounds(30.0))
+    first = step("temperature_bias", coefficient=around(2e-4, 4e-6), quadratic=curve, reference=ParameterInterval(20.0))
+    second = step(
+        "temperature_bias", coefficient=around(4e-4, 4e-6), quadratic=curve, reference=ParameterInterval(30.0)
+    )
     c = compare([run("a", first), run("b", second)])
     seen = only(c.axes["gz"].common)
     assert seen.consistent is True

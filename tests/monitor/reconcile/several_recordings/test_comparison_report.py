@@ -4,19 +4,19 @@ import json
 from dataclasses import replace
 from typing import Any
 
-from monitor.reconcile.result import Bounds
+from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.several_recordings.comparison import Comparison, compare
-from monitor.reconcile.several_recordings.comparison_report import to_json
+from monitor.reconcile.several_recordings.comparison_report import encode_comparison
 from tests.monitor.reconcile.runs_made import line, run, step
 
 
 def made() -> Comparison:
-    leak = step("cross_axis", source=Bounds("gx"), coefficient=Bounds(0.1))
+    leak = step("cross_axis", source=ParameterInterval("gx"), coefficient=ParameterInterval(0.1))
     return compare([run("a", line()), run("b", line(), leak)], None, {"c": "too short"})
 
 
 def written(c: Comparison) -> dict[str, Any]:
-    return dict(json.loads(to_json(c)))
+    return dict(json.loads(encode_comparison(c)))
 
 
 def test_keys_are_those_of_the_schema() -> None:
@@ -53,4 +53,4 @@ def test_what_is_no_number_is_null() -> None:
 
 
 def test_the_same_comparison_gives_the_same_bytes() -> None:
-    assert to_json(made()) == to_json(made())
+    assert encode_comparison(made()) == encode_comparison(made())

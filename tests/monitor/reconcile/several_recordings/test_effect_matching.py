@@ -6,8 +6,14 @@ import pytest
 
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, Sinusoidal
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.result import Bounds
-from monitor.reconcile.several_recordings.effect_matching import PLACES, distance, effect_of, place, place_name
+from monitor.reconcile.result import ParameterInterval
+from monitor.reconcile.several_recordings.effect_matching import (
+    IDENTIFYING_PARAMETERS,
+    distance,
+    effect_of,
+    identifying_parameter,
+    identifying_parameter_name,
+)
 from tests.monitor.reconcile.runs_made import around, line, step
 
 LINES = NoiseModel(
@@ -21,9 +27,9 @@ LINES = NoiseModel(
 )
 
 
-@pytest.mark.parametrize("effect", PLACES)
+@pytest.mark.parametrize("effect", IDENTIFYING_PARAMETERS)
 def test_a_place_is_a_parameter_of_its_effect(effect: str) -> None:
-    assert place_name(effect) in {f.name for f in fields(EFFECTS[effect])}  # type: ignore[arg-type]
+    assert identifying_parameter_name(effect) in {f.name for f in fields(EFFECTS[effect])}  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -35,12 +41,14 @@ def test_a_place_is_a_parameter_of_its_effect(effect: str) -> None:
         ("exponentially_correlated", around(10.0, 0.1), around(19.0, 0.1), True),
         ("exponentially_correlated", around(10.0, 0.1), around(40.0, 0.1), False),
         ("bias_step", around(100.0, 0.1), around(300.0, 0.1), False),
-        ("g_sensitivity", Bounds("ax"), Bounds("ax"), True),
-        ("g_sensitivity", Bounds("ax"), Bounds("ay"), False),
+        ("g_sensitivity", ParameterInterval("ax"), ParameterInterval("ax"), True),
+        ("g_sensitivity", ParameterInterval("ax"), ParameterInterval("ay"), False),
         ("outliers", None, None, True),
     ],
 )  # fmt: skip
-def test_places_drift_with_their_sensors(effect: str, a: Bounds | None, b: Bounds | None, same: bool) -> None:
+def test_places_drift_with_their_sensors(
+    effect: str, a: ParameterInterval | None, b: ParameterInterval | None, same: bool
+) -> None:
     assert (distance(effect, a, b) is not None) is same
     assert (distance(effect, b, a) is not None) is same
 
@@ -59,5 +67,5 @@ def test_a_step_is_found_in_the_model_by_its_parameters() -> None:
 
 def test_the_place_of_a_retuned_line_is_that_in_the_model() -> None:
     retuned = step("sinusoidal", kind="retuned", amplitude=1.01)
-    assert place(retuned, "gz", LINES) == Bounds(30.0)
-    assert place(step("angle_random_walk", kind="retuned", N=1e-4), "gz", LINES) is None
+    assert identifying_parameter(retuned, "gz", LINES) == ParameterInterval(30.0)
+    assert identifying_parameter(step("angle_random_walk", kind="retuned", N=1e-4), "gz", LINES) is None

@@ -5,18 +5,23 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from monitor.reconcile.result import Bounds
-from monitor.reconcile.several_recordings.pooled_parameters import DISAGREE, agreement, deviations, pooled
+from monitor.reconcile.result import ParameterInterval
+from monitor.reconcile.several_recordings.pooled_parameters import (
+    MIN_AGREEMENT_PROBABILITY,
+    agreement,
+    distance_in_sigma,
+    pool_parameter,
+)
 
 Z95 = 1.959964  # normal distribution, two-sided
 
 
-def normal(value: float, deviation: float) -> Bounds:
-    return Bounds(value, value - Z95 * deviation, value + Z95 * deviation)
+def normal(value: float, deviation: float) -> ParameterInterval:
+    return ParameterInterval(value, value - Z95 * deviation, value + Z95 * deviation)
 
 
 def test_the_mean_is_weighed_by_the_inverse_of_the_variances() -> None:
-    both = pooled([normal(1.0, 0.1), normal(1.3, 0.2)])
+    both = pool_parameter([normal(1.0, 0.1), normal(1.3, 0.2)])
     mean = (1.0 / 0.01 + 1.3 / 0.04) / (1 / 0.01 + 1 / 0.04)
     half = Z95 / np.sqrt(1 / 0.01 + 1 / 0.04)
     assert [both.bounds.value, both.bounds.lo, both.bounds.hi] == pytest.approx([mean, mean - half, mean + half])
@@ -25,7 +30,7 @@ def test_the_mean_is_weighed_by_the_inverse_of_the_variances() -> None:
 
 
 def test_intervals_that_are_even_as_factors_are_averaged_as_logarithms() -> None:
-    both = pooled([Bounds(1.0, 0.5, 2.0), Bounds(4.0, 2.0, 8.0)])
+    both = pool_parameter([ParameterInterval(1.0, 0.5, 2.0), ParameterInterval(4.0, 2.0, 8.0)])
     assert both.bounds.value == pytest.approx(2.0)
     assert both.bounds.lo is not None
     assert both.bounds.hi is not None
@@ -34,16 +39,16 @@ def test_intervals_that_are_even_as_factors_are_averaged_as_logarithms() -> None
 
 def test_where_recordings_differ_the_interval_holds_their_scatter() -> None:
     values = [normal(v, 0.01) for v in (1.0, 2.0, 3.0)]
-    together = pooled(values)
+    together = pool_parameter(values)
     assert together.p is not None
-    assert together.p < DISAGREE
+    assert together.p < MIN_AGREEMENT_PROBABILITY
     assert together.bounds.hi is not None
     # χ²/ν is the sample variance over 0.01²: the interval is that of a mean of three values that scatter by 1
     assert together.bounds.hi - 2.0 == pytest.approx(Z95 / np.sqrt(3))
 
 
 def test_the_same_interval_twice_counts_twice() -> None:
-    both = pooled([normal(1.0, 0.1)] * 2)
+    both = pool_parameter([normal(1.0, 0.1)] * 2)
     assert both.freedom == 1
     assert both.p == 1.0
     assert both.bounds.hi == pytest.approx(1.0 + Z95 * 0.1 / np.sqrt(2))
@@ -52,27 +57,27 @@ def test_the_same_interval_twice_counts_twice() -> None:
 @pytest.mark.parametrize("runs", [2, 5])
 def test_p_is_even_where_all_measure_the_same(runs: int) -> None:
     rng = np.random.default_rng(3)
-    p = [pooled([normal(10.0 + rng.standard_normal(), 1.0) for _ in range(runs)]).p for _ in range(2000)]
+    p = [pool_parameter([normal(10.0 + rng.standard_normal(), 1.0) for _ in range(runs)]).p for _ in range(2000)]
     assert stats.kstest(np.array(p, float), "uniform").pvalue > 0.001
 
 
 def test_nothing_is_made_of_what_has_no_interval() -> None:
-    assert pooled([Bounds("ax"), Bounds("ax")]).bounds == Bounds("ax")
-    assert pooled([Bounds(2.0), Bounds(2.0)]).p is None
-    one = pooled([Bounds(5.0), normal(1.0, 0.1), Bounds(7.0, 6.0, np.inf)])
+    assert pool_parameter([ParameterInterval("ax"), ParameterInterval("ax")]).bounds == ParameterInterval("ax")
+    assert pool_parameter([ParameterInterval(2.0), ParameterInterval(2.0)]).p is None
+    one = pool_parameter([ParameterInterval(5.0), normal(1.0, 0.1), ParameterInterval(7.0, 6.0, np.inf)])
     assert (one.bounds, one.p) == (normal(1.0, 0.1), None)
     assert agreement([one]) is None
 
 
 def test_several_parameters_are_judged_together() -> None:
-    parameters = [pooled([normal(0.0, 1.0), normal(d, 1.0)]) for d in (1.0, 2.0)]
+    parameters = [pool_parameter([normal(0.0, 1.0), normal(d, 1.0)]) for d in (1.0, 2.0)]
     assert agreement(parameters) == pytest.approx(stats.chi2(2).sf(0.5 + 2.0))
 
 
 def test_deviations_are_counted_on_the_scale_of_the_interval() -> None:
-    assert deviations(normal(1.0, 0.1), 1.2) == pytest.approx(2.0)
+    assert distance_in_sigma(normal(1.0, 0.1), 1.2) == pytest.approx(2.0)
     factor = 1.5
-    log_even = Bounds(1.0, factor**-Z95, factor**Z95)
-    assert deviations(log_even, factor**3) == pytest.approx(3.0)
-    assert deviations(log_even, 0.0) == np.inf
-    assert deviations(Bounds(1.0), 7.0) == 0.0
+    log_even = ParameterInterval(1.0, factor**-Z95, factor**Z95)
+    assert distance_in_sigma(log_even, factor**3) == pytest.approx(3.0)
+    assert distance_in_sigma(log_even, 0.0) == np.inf
+    assert distance_in_sigma(ParameterInterval(1.0), 7.0) == 0.0
