@@ -38,11 +38,11 @@ value = 9.8
 """
 
 
-def noise(text: str = MODEL) -> exporters.Noise:
+def noise(text: str = MODEL) -> exporters.NoiseCoefficients:
     return exporters.from_model(NoiseModel.from_toml(text), "bench-1.toml")
 
 
-def analysed(status: str = "upper_bound") -> exporters.Noise:
+def analysed(status: str = "upper_bound") -> exporters.NoiseCoefficients:
     """gx and gy as ``analyze --json`` writes them; K of gy estimated, of gx with this status."""
 
     def one(value: float | None, hi: float | None, status: str) -> dict[str, Any]:
