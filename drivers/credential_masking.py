@@ -30,7 +30,7 @@ def mask_secrets(text: str) -> str:
 
 
 def has_secret(text: str) -> bool:
-    """Return True if the text contains a secret that ``masked`` would replace.
+    """Return True if the text contains a secret that ``mask_secrets`` would replace.
 
     >>> has_secret('password: "x"'), has_secret('listen_private_key: "key.pem"'), has_secret("password: null")
     (True, False, False)

@@ -1,7 +1,7 @@
 """Safe opening and reading of files whose names come from a configuration, a folder or the command line.
 
 ``open_regular`` opens regular files only. It refuses a FIFO, a socket, a device or a directory with a one-line error,
-and it never blocks. ``read`` reads a whole small file, such as a configuration, a model or a CAN database.
+and it never blocks. ``read_small_file`` reads a whole small file, such as a configuration, a model or a CAN database.
 """
 
 import errno
@@ -11,7 +11,10 @@ from pathlib import Path
 from typing import IO, Final
 
 MAX_BYTES: Final = 32_000_000
-"""Maximum size of a file that ``read`` accepts. The largest CAN databases of whole vehicles have some megabytes."""
+"""Maximum size of a file that ``read_small_file`` accepts.
+
+The largest CAN databases of whole vehicles have some megabytes.
+"""
 FILE_KINDS: Final = {
     stat.S_IFIFO: "a FIFO",
     stat.S_IFSOCK: "a socket",

@@ -5,8 +5,8 @@ these entry points checks its numbers against one of the quantities below. The c
 value that overflows, divides by zero or asks for more memory than exists. The ranges are wider than those of any known
 sensor or use. They are narrow enough that products, squares and quotients of the numbers stay finite.
 
-A field of a settings struct names its quantity in its type: ``Annotated[float, RATE_HZ.meta]``. ``out_of_range`` reads
-the quantity from the type, and checks a value that msgspec has converted to that type.
+A field of a settings struct names its quantity in its type: ``Annotated[float, RATE_HZ.meta]``. ``find_out_of_range``
+reads the quantity from the type, and checks a value that msgspec has converted to that type.
 """
 
 from collections.abc import Iterator, Mapping
@@ -78,7 +78,7 @@ class Quantity:
 
     @property
     def meta(self) -> msgspec.Meta:
-        """Annotation for a field of this quantity, which ``out_of_range`` reads."""
+        """Annotation for a field of this quantity, which ``find_out_of_range`` reads."""
         return msgspec.Meta(extra={"quantity": self})
 
 

@@ -3,8 +3,8 @@
 The folder of a device holds segments such as ``00000042_2026-11-22T03-00-00Z.arrows``. The number gives their order,
 whatever the clock of the host did. The time is that of the first row, for the user. The columns are ``t`` (Unix time in
 s), six axes and ``temperature``. The columns ``ticks`` and ``lost`` (samples missing just before the row) allow the
-daemon to continue from a segment. Every batch contains the state of the daemon at its end (``State``). A segment of raw
-bytes holds chunks as they were received: ``t_ns`` (Unix time), ``address``, ``data``, ``attachment``.
+daemon to continue from a segment. Every batch contains the state of the daemon at its end (``DaemonState``). A segment
+of raw bytes holds chunks as they were received: ``t_ns`` (Unix time), ``address``, ``data``, ``attachment``.
 
 A growing segment is not compressed, so that each batch can be read on its own. It can be read up to its last complete
 batch. A segment that has ended is written again in large compressed batches. The new file replaces the old one
@@ -40,7 +40,7 @@ NAME: Final = re.compile(r"(\d{8})_[0-9TZ-]+\.arrows")
 SCHEMA: Final = "imu-monitor/recording/1"
 RAW_BATCH_BYTES: Final = 4_000_000
 MAX_BATCH_BYTES: Final = 64_000_000
-"""Maximum unpacked size of a batch, far above what ``SegmentWriter`` and ``pack`` write."""
+"""Maximum unpacked size of a batch, far above what ``SegmentWriter`` and ``compress_segment`` write."""
 MAX_LOST_SAMPLES: Final = 10**11
 """Maximum number of samples missing at one place, more than any clock reports."""
 

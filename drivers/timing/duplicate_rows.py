@@ -4,7 +4,8 @@ A row is a repeat if an earlier row has the same key and the same values. If key
 (many rows share a key but differ in their values), no row is called a repeat. Rows whose given times form a steady
 sequence in another order are sorted. Times that only jitter are not sorted, since the order of arrival is then correct.
 
-``Telling`` limits the rate of the events about these rows. This module uses only the key and the values of a sample.
+``EventRateLimiter`` limits the rate of the events about these rows. This module uses only the key and the values of a
+sample.
 """
 
 from collections import deque

@@ -1,7 +1,8 @@
 """Message format of samples: conversion between ``SampleBlock`` and the msgpack map of ``<prefix>/<device>/samples``.
 
-Only this module knows the layout. The daemon publishes with ``pack``, the ``samples`` decoder reads with ``unpack``,
-and a replayed recording uses the same message. The format is documented in ``docs/samples-format.md``.
+Only this module knows the layout. The daemon publishes with ``encode_samples``, the ``samples`` decoder reads with
+``decode_samples``, and a replayed recording uses the same message. The format is documented in
+``docs/samples-format.md``.
 
 If the rows are evenly spaced to within half a microsecond, ``t`` is the Unix time of the newest sample in seconds,
 ``t0`` that of the first sample, and ``rate`` the sample rate in Hz. Otherwise ``t`` holds the time of each row as

@@ -90,7 +90,7 @@ def make(request: Request, tell: ProgressCallback = lambda _what, _share: None) 
     ------
     RecordingError, ConfigError
         The recording cannot be read, it does not allow a requested τ, rate or window, or there is not enough memory.
-    TooShort
+    TooFewSamples
         The recording has too few samples for any result.
     """
     try:

@@ -101,7 +101,7 @@ def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = lamb
 
     Parameters
     ----------
-    request : RunsRequest
+    request : ComparisonRequest
         Recordings and model to compare.
     tell : callable, optional
         Progress callback.

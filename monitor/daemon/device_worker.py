@@ -1,6 +1,6 @@
 """Worker of one device: reader thread, ring buffer, processing pipeline and publication of the results.
 
-``Station.work`` is one round of the main loop for the device. It takes the new samples, updates the estimate and
+``DeviceWorker.work`` is one round of the main loop for the device. It takes the new samples, updates the estimate and
 publishes the results that are due. It calls the outputs in order. No output blocks: each has a queue, or drops data.
 """
 
@@ -127,7 +127,7 @@ class Output:
             Time of the interval.
         received : int
             Number of samples of the device since the start.
-        look : ThermalLook
+        look : ThermalUpdate
             Mean of the interval and its prediction.
         """
 
@@ -155,7 +155,7 @@ class Output:
             Name of the device.
         unix_s : float
             Time of the interval.
-        look : DriftLook
+        look : DriftUpdate
             Drift, innovations and models.
         """
 
@@ -329,7 +329,7 @@ class DeviceWorker:
 
     @property
     def read_attempts(self) -> int | None:
-        """Number of read attempts of the reader thread, see ``Driver.turns``.
+        """Number of read attempts of the reader thread, see ``Driver.iterations``.
 
         None for a replayed recording, whose reader may block while the ring buffer is full, and for a reader that has
         ended.

@@ -170,8 +170,8 @@ def is_warm(group: KernelGroup) -> bool:
 def compile_from_stdin(stdin: IO[str], stdout: IO[str]) -> NoReturn:
     """Compile the parts whose names arrive line by line, and answer each line with the same line.
 
-    This function is the child's side of ``prepare``. The process ends when its standard input closes, even in the
-    middle of a compilation, because its parent has ended then.
+    This function is the child's side of ``prepare_kernels``. The process ends when its standard input closes, even in
+    the middle of a compilation, because its parent has ended then.
 
     Parameters
     ----------

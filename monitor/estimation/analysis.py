@@ -4,11 +4,11 @@ The results are the reference for the live estimator. The recording is first res
 that also stamps live samples. Missing samples become NaN. All findings about the time stamps are listed in
 ``Analysis.notes``.
 
-``analyze`` computes the curve and the fit. ``events_of`` looks for motion, noise changes, spectral lines and outliers
-in the same samples. It is a separate step because it takes longer than the curve.
+``analyze`` computes the curve and the fit. ``detect_events`` looks for motion, noise changes, spectral lines and
+outliers in the same samples. It is a separate step because it takes longer than the curve.
 
 Samples in motion are removed from the curve only on request, since a rest that was wrongly detected as motion would be
-lost. ``events_of`` always ignores them.
+lost. ``detect_events`` always ignores them.
 """
 
 from collections.abc import Iterable, Sequence
@@ -89,7 +89,7 @@ def analyze(
     Raises
     ------
     NotReady
-        If the recording has fewer than ``FEWEST`` samples, or fewer at rest.
+        If the recording has fewer than ``MIN_SAMPLES`` samples, or fewer at rest.
     ConfigError
         If none of the listed τ is possible.
     """

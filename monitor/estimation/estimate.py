@@ -1,4 +1,4 @@
-"""Result of the estimator at one moment: ``Estimate``, and the per-sample coefficients ``Course``."""
+"""Result of the estimator at one moment: ``Estimate``, and the per-sample coefficients ``CoefficientHistory``."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -40,7 +40,7 @@ class Estimate:
     fitted: Floats  # [m, 6] Allan variance of the fitted model at curve.tau_s; NaN without a fit, or outside it
     coefficients: Coefficients
     k_or_r: NDArray[np.bool_]  # [6] True if the window drifts, but random walk and ramp cannot be distinguished
-    display_curve: AllanCurve | None = None  # same τ, each over its own shorter span; see ``window.quick_spans``
+    display_curve: AllanCurve | None = None  # same τ, each over its own shorter span; see ``window.display_spans``
     history: CoefficientHistory | None = None  # since the previous estimate, if a fit at every sample is requested
 
     def without_coefficients(self) -> "Estimate":

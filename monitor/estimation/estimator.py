@@ -7,8 +7,8 @@ Optionally, the coefficients are also updated after every sample, by the linear 
 
 A cluster is a number of samples. The sample rate only sets the labels of the τ axis and the units of the coefficients.
 
-The fit uses one fixed window. For display, each τ has a second, shorter span (``Estimate.recent``), which shows a
-change of N within half a minute.
+The fit uses one fixed window. For display, each τ has a second, shorter span (``Estimate.display_curve``), which shows
+a change of N within half a minute.
 """
 
 from collections import deque
@@ -161,7 +161,7 @@ class Estimator:
     def fit_state(self) -> tuple[NDArray[np.bool_], Floats]:
         """Return the terms in the newest fit and the squared coefficients θ in SI, both of shape (5, 6).
 
-        ``start_from`` accepts both as the start of the next fit.
+        ``restore_fit`` accepts both as the start of the next fit.
         """
         return (self._entered if self._refit is None else self._refit.entered).copy(), self._theta.copy()
 
@@ -200,7 +200,7 @@ class Estimator:
         Raises
         ------
         NotReady
-            If the window holds fewer than ``FEWEST`` samples.
+            If the window holds fewer than ``MIN_SAMPLES`` samples.
         """
         n = self._window.n
         if n < MIN_SAMPLES:

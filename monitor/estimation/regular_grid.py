@@ -7,7 +7,7 @@ Rows that repeat an earlier row with its time stamp are dropped. Rows that repea
 are kept, since they are what the register of the sensor held. A stated rate is used even if the time stamps contradict
 it.
 
-All findings are returned as notes, at most ``NOTES`` from the clock. A resolution as coarse as the noise is
+All findings are returned as notes, at most ``MAX_CLOCK_NOTES`` from the clock. A resolution as coarse as the noise is
 noted as well.
 """
 
@@ -79,7 +79,7 @@ def resample_to_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tu
 def resample_with_temperature(
     blocks: Sequence[SampleBlock], rate_hz: float | None
 ) -> tuple[Floats, Floats, float, list[str]]:
-    """Do the same as ``on_grid`` and also return the temperature.
+    """Do the same as ``resample_to_grid`` and also return the temperature.
 
     Parameters
     ----------

@@ -193,7 +193,7 @@ def unpack_statistics(data: bytes, count: int) -> tuple[Ints, Singles, Singles, 
     Parameters
     ----------
     data
-        Bytes made by ``pack``.
+        Bytes made by ``pack_statistics``.
     count
         Number of columns.
 

@@ -1,8 +1,8 @@
 """Read the stored results of a time range as one table with a limited number of buckets.
 
-``read`` merges the rows of each bucket while it reads them from disk. Memory therefore depends on the number of points
-requested and not on the length of the time range. A bucket is never narrower than the stored rows of its time. Merging
-(see ``bucket``) preserves the extremes.
+``read_history`` merges the rows of each bucket while it reads them from disk. Memory therefore depends on the number of
+points requested and not on the length of the time range. A bucket is never narrower than the stored rows of its time.
+Merging (see ``bucket``) preserves the extremes.
 """
 
 import math

@@ -1,14 +1,14 @@
 """History on disk: one SQLite file in WAL mode, with one writer and any number of readers in threads and processes.
 
-Rows have three levels: one minute for a week, 15 minutes for three months, and six hours without limit. Age is
-counted from a device's newest row, or from the current time if the newest row lies in the future. ``Store.thin``
-merges the rows of one wider bucket per transaction, so each moment belongs to exactly one row even if the process is
-killed. A row for an existing bucket is merged with the stored row. Restarts, late rows and repeated replays therefore
-leave one row per bucket.
+Rows have three levels: one minute for a week, 15 minutes for three months, and six hours without limit. Age is counted
+from a device's newest row, or from the current time if the newest row lies in the future.
+``HistoryStore.merge_old_rows`` merges the rows of one wider bucket per transaction, so each moment belongs to exactly
+one row even if the process is killed. A row for an existing bucket is merged with the stored row. Restarts, late rows
+and repeated replays therefore leave one row per bucket.
 
 All events are kept up to EVENTS_AT_MOST per device. Beyond that limit, only the first, the last and the most
 significant event of each kind, axis and day are kept. If this is not sufficient, the same is done per month and then
-per year. ``stands_for`` of the last event counts the deleted ones.
+per year. ``represented_events`` of the last event counts the deleted ones.
 
 A file that is damaged, was written by a newer version, or is not a history is never modified. RecordingError names the
 cause. Errors of a full or read-only disk are raised as ``sqlite3.Error``. A transaction is complete or has no effect.
@@ -389,7 +389,7 @@ class HistoryStore:
 
 
 class HistoryReader:
-    """Reader of a history file; all its results belong to one moment. Created by ``reading``."""
+    """Reader of a history file; all its results belong to one moment. Created by ``open_history``."""
 
     def __init__(self, db: sqlite3.Connection, path: Path) -> None:
         self._db = db

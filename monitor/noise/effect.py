@@ -5,12 +5,12 @@ There are four kinds of effects. A ``Source`` adds to the rate of its axis. Its 
 sampled series that it simulates, so that fit, simulation and comparison use the same physics. ``avar`` is the
 overlapping Allan variance of samples ``tau0_s`` apart, and ``psd`` is their two-sided spectrum up to half the sample
 rate. A ``Leak`` adds a share of the measurement of another axis. ``NoiseStep`` changes the size of white noise. A
-``Transform`` acts on the sum, in the order of ``monitor.noise.effects.ORDER``.
+``Transform`` acts on the sum, in the order of ``monitor.noise.effects.TRANSFORM_ORDER``.
 
-``start`` begins an endless series. A ``Series`` adds its next samples to a block, and a ``Running`` transform changes a
-block in place. Both depend only on their random generator and on the index of the sample, not on how the series is
-divided into blocks. Their memory does not grow. ``truth`` returns the randomly drawn values that the parameters do not
-contain.
+``start`` begins an endless series. A ``NoiseSeries`` adds its next samples to a block, and a ``RunningTransform``
+transform changes a block in place. Both depend only on their random generator and on the index of the sample, not on
+how the series is divided into blocks. Their memory does not grow. ``truth`` returns the randomly drawn values that the
+parameters do not contain.
 
 If a variance depends on more than the model, such as the length of the recording or the temperature, it is NaN. No
 effect does I/O, reads a clock or keeps global random state.

@@ -45,7 +45,7 @@ class LowPass(RunningTransform):
     Parameters
     ----------
     sections : ndarray, shape (n, 5)
-        Sections as ``butterworth`` returns them.
+        Sections as ``butterworth_sections`` returns them.
     """
 
     def __init__(self, sections: Floats) -> None:

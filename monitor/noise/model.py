@@ -1,7 +1,7 @@
 """Noise model of an IMU: the effects of each axis in one object, for fit, simulation and comparison.
 
-Sources and leaks of an axis add up. Its transforms act on the sum in the order of ``ORDER``. ``avar`` and ``psd``
-describe the whole axis, including linear transforms and leaks. They use closed forms where these exist, and one
+Sources and leaks of an axis add up. Its transforms act on the sum in the order of ``TRANSFORM_ORDER``. ``avar`` and
+``psd`` describe the whole axis, including linear transforms and leaks. They use closed forms where these exist, and one
 integral after a filter. They are NaN if they depend on something that a model does not contain, such as temperature,
 the length of a recording, or the position of a rate between two quantisation steps.
 

@@ -1,9 +1,9 @@
 """Result types of ``reconcile``, as used by the report, the JSON output and the viewer.
 
-A ``Reconciliation`` holds one ``AxisResult`` for each axis. An ``AxisResult`` holds one ``Step`` for each effect that
-was added or whose size was changed, and a ``Score`` for each difference that is left. A ``View`` holds the data of one
-plot: the measurement of one axis and the expectation of the model under test. All values are in SI units of the axis.
-Times are in seconds from the start of the recording.
+A ``Reconciliation`` holds one ``AxisResult`` for each axis. An ``AxisResult`` holds one ``ReconciliationStep`` for each
+effect that was added or whose size was changed, and a ``Score`` for each difference that is left. A ``PlotData`` holds
+the data of one plot: the measurement of one axis and the expectation of the model under test. All values are in SI
+units of the axis. Times are in seconds from the start of the recording.
 """
 
 from collections.abc import Mapping

@@ -4,8 +4,8 @@ Each sample has at most one fault. The fault depends only on the number of the s
 in which samples are sent. A sample of several chunks (CAN frames) has its fault in the last chunk. A CAN frame with a
 flipped bit does not arrive, because the checksum of the bus rejects it.
 
-``Truth`` counts the faults, so that a test can compare them with the counts of the reader. The module does no input or
-output.
+``FaultCounts`` counts the faults, so that a test can compare them with the counts of the reader. The module does no
+input or output.
 """
 
 from dataclasses import dataclass, replace

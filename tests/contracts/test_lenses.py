@@ -1,4 +1,5 @@
-"""What every lens must pass, found by listing ``LENSES``: no gap where there is none, a null that holds, no memory.
+"""What every lens must pass, found by listing ``DIAGNOSTICS``: no gap where there is none, a null that holds, no
+memory.
 
 Noise is made by SciPy, white with a random walk; two minutes, beside a temperature and another axis.
 """

@@ -150,7 +150,7 @@ class Recorder:
     storage : Storage
         Folder, limits of age and disk use, and segment length.
     origins : sequence of Origin
-        Recordings to write, each with its device and kind, see ``segment.Origin``.
+        Recordings to write, each with its device and kind, see ``segment.SegmentMetadata``.
     opening : callable, optional
         Opens a segment. Tests pass functions that simulate slow and broken disks.
     """

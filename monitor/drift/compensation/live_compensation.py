@@ -1,7 +1,7 @@
 """Live drift compensation of one device: the samples of a stream without the drift of their gyros.
 
-Each interval produces a ``DriftLook``. An event reports a model that no longer fits, or a step of the bias. The caller
-identifies the models beside the stream, because an identification takes some 50 ms. The property ``due`` of the
+Each interval produces a ``DriftUpdate``. An event reports a model that no longer fits, or a step of the bias. The
+caller identifies the models beside the stream, because an identification takes some 50 ms. The property ``due`` of the
 compensator names the axes, and ``adopt`` takes the identified models.
 """
 

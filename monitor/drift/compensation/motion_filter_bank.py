@@ -108,7 +108,7 @@ def filter_sample(z, bank, ages, table, first, sums, feedback, keep):  # type: i
     ages : ndarray, shape (filters, 2), int64
         Ages and gate exceedances of the filters. They are updated in place.
     table, first : ndarray
-        Gains and first rows as ``gains`` returns them.
+        Gains and first rows as ``gain_table`` returns them.
     sums : ndarray, shape (filters + 1, 2)
         Sums of the squares of estimate and residual, in case the sample turns out to be at rest. They are updated in
         place.
@@ -201,7 +201,7 @@ def update_rest_noise(bank, sums, count, intervals):  # type: ignore[no-untyped-
     bank : ndarray, shape (filters + 1, 5)
         State of the filters. It is updated in place.
     sums : ndarray, shape (filters + 1, 2)
-        Sums of ``follow`` over the samples of the interval.
+        Sums of ``filter_sample`` over the samples of the interval.
     count : float
         Number of these samples.
     intervals : int

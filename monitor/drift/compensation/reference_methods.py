@@ -1,7 +1,8 @@
 """Published methods that remove drift and noise from a finished recording, with one interface, for comparison.
 
 All three methods learn from samples at rest and then treat the recording as one signal. None of them detects motion.
-``emd`` and ``wavelet`` need future samples. ``ar`` needs a signal that is similar to the noise at rest.
+``filter_emd_modes`` and ``shrink_wavelets`` need future samples. ``autoregressive_filter`` needs a signal that is
+similar to the noise at rest.
 """
 
 from collections.abc import Callable
@@ -86,7 +87,7 @@ def autoregressive_filter(x: Floats, learned: Floats) -> Floats:
 def filter_emd_modes(x: Floats, learned: Floats) -> Floats:
     """Filter the noise modes of an empirical mode decomposition (Huang et al. 1998).
 
-    The modes whose autocorrelation falls within MAX_NOISE_LAG samples are filtered as in ``ar``.
+    The modes whose autocorrelation falls within MAX_NOISE_LAG samples are filtered as in ``autoregressive_filter``.
 
     Parameters
     ----------

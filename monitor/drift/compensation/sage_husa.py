@@ -209,7 +209,7 @@ def _correct(row, e):  # type: ignore[no-untyped-def]
 
 @compiled
 def refilter_history(row, z, scatter, least):  # type: ignore[no-untyped-def]
-    """Filter all remembered intervals again after ``adopt``.
+    """Filter all remembered intervals again after ``set_model``.
 
     Parameters
     ----------

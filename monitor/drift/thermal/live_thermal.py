@@ -1,7 +1,7 @@
 """Live models of bias against temperature for one device.
 
 The input consists of blocks of samples in order, with NaN for samples in motion. At the end of every interval, a
-``ThermalLook`` holds the measured and the predicted mean of each axis. Changes that temperature does not explain are
+``ThermalUpdate`` holds the measured and the predicted mean of each axis. Changes that temperature does not explain are
 reported as events. Nothing is stored or computed before the first temperature has been received.
 
 ``update`` takes a few ms at the end of an interval. ``step`` chooses models in small pieces between the intervals.

@@ -1,9 +1,9 @@
 """Online model of bias against temperature for one axis: each interval is predicted before it is used for the fit.
 
 The model of the earlier intervals predicts each interval, multi-step and one-step. Only then is the interval used, and
-``Recursion`` updates the coefficients. Form and time constants are chosen again when the number of known intervals has
-grown by the factor GROWN. A choice takes up to a second. ``step`` therefore does one piece of it at a time, on the
-intervals that were known at its start.
+``RecursiveThermalFit`` updates the coefficients. Form and time constants are chosen again when the number of known
+intervals has grown by the factor GROWN. A choice takes up to a second. ``step`` therefore does one piece of it at a
+time, on the intervals that were known at its start.
 
 Intervals that stay outside their prediction are a suspected change (``residual_alarm``). Until it is resolved, no
 routine choice is started, because a new form could fit the change and hide it. Intervals far outside their prediction

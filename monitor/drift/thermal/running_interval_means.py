@@ -1,4 +1,4 @@
-"""Interval means of live samples, equal to those of ``interval_means`` for a whole recording.
+"""Interval means of live samples, equal to those of ``compute_interval_means`` for a whole recording.
 
 Only sums are stored. Blocks of samples must arrive in order, with the number of missing samples before each block.
 Every interval is returned when it ends. An interval has a fixed number of samples, including missing ones. Rows are
@@ -42,7 +42,7 @@ class RunningIntervalMeans:
 
     Examples
     --------
-    >>> means = RunningMeans(50)
+    >>> means = RunningIntervalMeans(50)
     >>> ramp = np.repeat(np.arange(100.0)[:, None], 6, axis=1)
     >>> [(one.bias[0].item(), one.temperature_c) for one in means.update(ramp, np.full(100, 25.0), 0)]
     [(24.5, 25.0), (74.5, 25.0)]

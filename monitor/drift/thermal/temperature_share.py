@@ -107,7 +107,7 @@ def remove_temperature(result: Analysis, temperature_c: Floats, each: EachAxis =
 
     Returns
     -------
-    WithoutTemperature or None
+    TemperatureShare or None
         None if no axis depends on temperature.
     """
     rate_hz = result.estimate.rate_hz

@@ -9,7 +9,7 @@ over FOLDS parts of the record that are each predicted from the others. A form t
 is rejected, because slow heating leaves one end of a polynomial unconstrained. Lags and powers beyond the third need a
 margin in AICc.
 
-The search takes some 50 ms to a second. ``fitting`` divides it into pieces of less than a millisecond.
+The search takes some 50 ms to a second. ``fit_in_steps`` divides it into pieces of less than a millisecond.
 
 The method follows Wang et al., bias modelling of MEMS gyroscopes under small temperature changes (72 h, means of 1 h).
 The constant and the fed-back outputs are additions to the paper.

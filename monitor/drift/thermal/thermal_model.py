@@ -134,7 +134,7 @@ def predict_with_variance(
     sizes : ndarray, shape (terms + k,)
         Coefficients of the columns.
     bends : ndarray, shape (n, k)
-        Derivatives of ``slopes``.
+        Derivatives of ``time_constant_derivatives``.
     measured : ndarray, shape (n,), or None
         Measured bias, rad/s or m/s². Each value except the last is known to the next interval. None selects multi-step.
 
@@ -225,7 +225,7 @@ def combine_derivatives(shape: ThermalModelForm, of_each: Floats, sizes: Floats)
     shape : Shape
         Form of the model.
     of_each : ndarray, shape (n, 2 k)
-        Derivatives of the columns, from ``derivatives``.
+        Derivatives of the columns, from ``regressor_derivatives``.
     sizes : ndarray, shape (terms + k,)
         Coefficients of the columns.
     """

@@ -82,7 +82,7 @@ def overlapping_avar(values: Floats, factors: Ints, each: EachAxis = map) -> tup
 
 
 def overlapping_avar_axis(rate: Floats, factors: Ints) -> Column:
-    """Return the overlapping Allan variance of one axis and the number of its terms, see ``overlapping``.
+    """Return the overlapping Allan variance of one axis and the number of its terms, see ``overlapping_avar``.
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ whole recording averages out. The terms use the hysteresis of a repeated fit, so
 before.
 
 Only full windows are reported, so that all time steps are equally certain. The number of steps is limited to
-``MOST_STEPS``, so the memory does not grow with the length of the recording. Every sample enters all windows that
+``MAX_STEPS``, so the memory does not grow with the length of the recording. Every sample enters all windows that
 contain it. A change is fully visible one window length after it happened; until then the window mixes old and new
 noise.
 """
@@ -74,7 +74,7 @@ def compute_dynamic_allan(
         Grid of averaging times, or a tuple of averaging times in seconds, within the window.
     step_s : float or None
         Time between two windows in seconds. None means a twentieth of the window. The step is made longer if there
-        would be more than ``MOST_STEPS`` steps.
+        would be more than ``MAX_STEPS`` steps.
     progress : Progress or None
         Called with the completed share, 0 to 1.
 

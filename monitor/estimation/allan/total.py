@@ -7,10 +7,10 @@ integrated rate (NIST SP 1065 eq. 25). In phase: d_i = x*_{i-m} − 2 x*_i + x*_
 = 2 x_0 − x_j at the front and likewise at the back. For m ≤ i ≤ n − m these are the terms of the overlapping Allan
 variance.
 
-``total`` returns the uncorrected variances. ``total_curve`` corrects them to the Allan variance of the same noise.
-E[TOTVAR] is computed exactly for any mixture of noises. For τ ≤ T/2 it is AVAR (1 − a τ/T), with a = 0, 0.481 and 0.750
-for white, flicker and random walk noise (SP 1065 table 7) and −4/3 for quantization. The degrees of freedom are exact
-as well. Formulas for a single power law hold for neither.
+``total_variance`` returns the uncorrected variances. ``total_curve`` corrects them to the Allan variance of the same
+noise. E[TOTVAR] is computed exactly for any mixture of noises. For τ ≤ T/2 it is AVAR (1 − a τ/T), with a = 0, 0.481
+and 0.750 for white, flicker and random walk noise (SP 1065 table 7) and −4/3 for quantization. The degrees of freedom
+are exact as well. Formulas for a single power law hold for neither.
 
 The intervals are χ² and end at T/2. With known noise they would hold up to T, but the correction relies on the noise
 fitted to the same record. Beyond T/2, nominal 95 % intervals contain the true value in only 67 to 92 of 100 records.

@@ -7,8 +7,8 @@ B², K²) of its terms (Isserlis: Cov(d², e²) = 2 Cov(d, e)²),
 
 Here r denotes the second differences, over clusters of m_i and of m_j samples, of the generalised autocovariance of
 phase (Q δ, N −|t|/2, B t² ln|t| / 2π, K (|t|³ − |t|)/12: discrete sums of white noise). w(c) is the number of pairs of
-terms that are c samples apart, and M is the number of terms. ``table`` computes C once for a window length and a list
-of cluster sizes. A fit then only needs products.
+terms that are c samples apart, and M is the number of terms. ``covariance_table`` computes C once for a window length
+and a list of cluster sizes. A fit then only needs products.
 
 The result is the exact number of degrees of freedom of mixed noise, edf = 2 σ⁴ / Cov_ii. The usual formulas (Greenhall
 & Riley, PTTI 2003) hold for one power law at a time and are 15–25 % off near m = 1. They are not used, because the
@@ -59,7 +59,7 @@ class CovarianceTable:
     terms: Ints  # [m] number of second differences in a window without gaps; ≤ 0 if the window is too short
     covariance: Floats  # [m, m, 10] C^ab_ij of the pairs a ≤ b; NaN if the window is too short
     slope: Floats  # [4] variance of the slope of thirds, for unit θ
-    bend: Floats  # [m, 4] covariance of this slope with the slope seen by each τ (``window_kernel.mean_bend``)
+    bend: Floats  # [m, 4] covariance of this slope with the slope seen by each τ (see ``window_kernel``)
 
 
 class CovarianceTables:

@@ -207,7 +207,7 @@ class AllanWindow:
         advance(self._ints, self._floats, self._missing, self._taus, 0, n)
 
     def stage(self, values: Floats) -> None:
-        """Copy up to ``STAGE`` samples [n, 6] to the input buffer of compiled code (``parts``)."""
+        """Copy up to ``STAGE_SAMPLES`` samples [n, 6] to the input buffer of compiled code (``parts``)."""
         # copied, because each new memory layout or access flag of an array triggers a compilation of seconds
         self._stage[: len(values)] = values
 

@@ -95,9 +95,9 @@ cut_ints, cut_floats = compiled(view_ints), compiled(view_floats)
 def advance(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, start: int, n: int) -> None:
     """Advance the window by n samples from the input buffer, from row ``start`` on.
 
-    Phase is first written for a run of up to ``RUN`` samples. Then each τ takes its terms along that run. This keeps
-    the number of memory streams small, so that the processor can prefetch them. A loop over all τ per sample would need
-    a hundred streams.
+    Phase is first written for a run of up to ``RUN_SAMPLES`` samples. Then each τ takes its terms along that run. This
+    keeps the number of memory streams small, so that the processor can prefetch them. A loop over all τ per sample
+    would need a hundred streams.
 
     Parameters
     ----------
@@ -421,7 +421,7 @@ def slope_of_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int
 def mean_second_differences(
     phase: Ints, missing: NDArray[np.int32], newest: int, lengths: Ints, factors: Ints, out: Floats
 ) -> None:
-    """Compute ``mean_bend`` of all τ and axes.
+    """Compute ``mean_second_difference`` of all τ and axes.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Compiled kernel of the change detector: Haar differences of every octave, their CUSUMs and the alarm state.
 
-Samples are processed in ticks of 32, with NaN for missing ones, and the results are stored in ``State``. The kernel
-stops when an alarm has reached its waiting time. The decision is therefore made at the same sample for any division of
-the input into blocks.
+Samples are processed in ticks of 32, with NaN for missing ones, and the results are stored in ``ChangeState``. The
+kernel stops when an alarm has reached its waiting time. The decision is therefore made at the same sample for any
+division of the input into blocks.
 
 - **Cascade.** A binary counter of block sums: octave j joins two blocks of m = 2^j samples to one difference z = (mean
   − mean')/√2, whose mean square is the Allan variance at m. It then passes their sum to the next octave. Differences of
@@ -488,7 +488,7 @@ def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, now: in
 
 @compiled
 def _confirm(s: ChangeState, axis: int, mean: float, now: int) -> None:
-    """Confirm a step that stays at its height for ``CONFIRM`` pairs, and discard it otherwise."""
+    """Confirm a step that stays at its height for ``CONFIRM_PAIRS`` pairs, and discard it otherwise."""
     step = s.step[axis]
     if np.abs(mean - step[AFTER]) > 0.5 * np.abs(step[AFTER] - step[BEFORE]):
         step[0] = -1.0

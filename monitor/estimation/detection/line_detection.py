@@ -2,15 +2,15 @@
 
 The input is a recording on a regular grid and its Allan curve. The results are a ``Line`` for each relevant peak, and
 the share of outliers of each axis. Both use at most ``MAX_STRETCHES`` stretches of ``ROWS`` samples, spread over the
-recording, so that the longest recording takes no more than a second. Stretches with more than ``LACKING`` missing
-samples are skipped.
+recording, so that the longest recording takes no more than a second. Stretches with more than ``MAX_MISSING_SHARE``
+missing samples are skipped.
 
 - **Lines.** The periodograms (Hann) of the stretches are averaged (Welch 1967). A peak exceeds the medians of the bins
   on both sides by ``MIN_PEAK_SIGMA`` and by the factor ``MIN_PEAK_RATIO``. The search uses single bins for lines and
   bins ``WIDE_BINS`` times wider for resonances. The power of a peak is the part above the level on both sides of its
-  feet. A peak is reported if it adds ``MATTERS`` or more of the Allan variance at some τ. A line of amplitude A adds A²
-  sin⁴(πfτ) / (m sin(πf/rate))² (the sine of IEEE Std 952, annex C, averaged over m samples instead of continuously). A
-  resonance is treated as a line of the same power.
+  feet. A peak is reported if it adds ``MIN_LINE_SHARE`` or more of the Allan variance at some τ. A line of amplitude A
+  adds A² sin⁴(πfτ) / (m sin(πf/rate))² (the sine of IEEE Std 952, annex C, averaged over m samples instead of
+  continuously). A resonance is treated as a line of the same power.
 - **Outliers** deviate by more than ``OUTLIER_SIGMA`` σ of their stretch from the median of the ``BLOCK`` samples around
   them. They also deviate by half as much from the median of the ``NEIGHBOURS`` samples on each side, which excludes
   slopes and curvature within the block. σ is estimated from the median distance, which changes by an eighth if one

@@ -1,8 +1,8 @@
 """Comparison of the Allan curve of the live window with the curve of the noise model of the sensor, for each axis.
 
-For each axis of the model, the comparison gives the difference at each τ in standard deviations, the largest
-difference (the gap), its τ, and the limits for chance. ``model_agreement.Agreement`` converts successive comparisons
-into events. It keeps a decision until new samples have confirmed another one.
+For each axis of the model, the comparison gives the difference at each τ in standard deviations, the largest difference
+(the gap), its τ, and the limits for chance. ``model_agreement.ModelAgreement`` converts successive comparisons into
+events. It keeps a decision until new samples have confirmed another one.
 
 If the model is true, ν σ²(τ)/σ²_model(τ) is approximately χ² with ν degrees of freedom. The cube root of χ² is
 approximately normal (Wilson & Hilferty, PNAS 17, 1931), which gives
@@ -12,7 +12,7 @@ approximately normal (Wilson & Hilferty, PNAS 17, 1931), which gives
 ν = 2 σ⁴_model/Var is computed from the model and not from the fit. For Q N B K of the model, Var is the exact
 covariance of ``uncertainty``. For its other effects (resonance, low-pass, correlated noise), Var is the integral 4/M ∫
 (S G)² df of M terms with the kernel G of the variance. The integral is accurate if the window is long compared with the
-memory of the noise. τ with fewer than ``FEWEST_EDF`` degrees of freedom are not compared, because a sum of squares then
+memory of the noise. τ with fewer than ``MIN_EDF`` degrees of freedom are not compared, because a sum of squares then
 differs too much from χ².
 
 For normal z_i with any correlation, P(all |z_i| < c) ≥ ∏ P(|z_i| < c) (Šidák, J. Am. Stat. Assoc. 62, 1967). The limits
@@ -253,7 +253,7 @@ def _axis_gap(
 
 
 def normal_score(ratio: Floats, edf: Floats) -> Floats:
-    """Return the distance of χ²/ν from one in standard deviations, by its cube root; NaN below ``FEWEST_EDF``.
+    """Return the distance of χ²/ν from one in standard deviations, by its cube root; NaN below ``MIN_EDF``.
 
     In the example, 129.561 is the 97.5 % point of χ² with 100 degrees of freedom.
 

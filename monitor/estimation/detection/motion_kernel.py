@@ -2,9 +2,9 @@
 
 A block is described by two numbers per axis: the logarithm of its variance and its mean. Both exclude the sample
 furthest from the mean, because an outlier is isolated while a knock rings. The reference is the median and the
-half-width between the quartiles of both numbers over the last ``LEARNED`` blocks at rest. It is computed exactly by
-insertion into a sorted ring. Up to a quarter of unusual blocks does not affect it, and drift within the ring widens the
-accepted band.
+half-width between the quartiles of both numbers over the last ``REFERENCE_BLOCKS`` blocks at rest. It is computed
+exactly by insertion into a sorted ring. Up to a quarter of unusual blocks does not affect it, and drift within the ring
+widens the accepted band.
 
 A block is moving if the variance of any axis is too large or its mean is off. If all axes are still at a new mean, this
 is a new orientation, and the reference is shifted. A disturbance that persists steadily replaces the reference. Blocks
@@ -43,7 +43,7 @@ DRIFT: Final = 100.0
 QUIETER: Final = log(9.0)
 """Distance of the log variance below the lower quartile that replaces the reference.
 
-If most axes are this quiet for ``LEAST`` blocks, the reference was learned in motion.
+If most axes are this quiet for ``MIN_REFERENCE_BLOCKS`` blocks, the reference was learned in motion.
 """
 NEVER_AT_REST: Final = (0.1,) * 3 + (1.0,) * 3
 """Limits in rad/s and m/s² that no MEMS sensor exceeds at rest.
@@ -387,7 +387,7 @@ def _begin_anew(blocks: int, s: MotionState) -> None:
 
 @compiled
 def _steady(size: int, s: MotionState) -> bool:
-    """Return True if the last ``LEARNED`` blocks are one steady state.
+    """Return True if the last ``REFERENCE_BLOCKS`` blocks are one steady state.
 
     Both halves must agree, without bursts and without a mean that wanders.
     """

@@ -38,7 +38,7 @@ class QuantizationStep:
 
 
 def find_coarse_axes(values: Floats) -> list[QuantizationStep]:
-    """Return the axes whose values [n, 6] have steps of at least ``COARSE`` of their noise.
+    """Return the axes whose values [n, 6] have steps of at least ``MIN_STEP_TO_NOISE`` of their noise.
 
     >>> noise = np.random.default_rng(0).standard_normal((20_000, 6))
     >>> noise[:, 4] = noise[:, 4].round()

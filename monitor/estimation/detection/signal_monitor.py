@@ -41,7 +41,7 @@ class SignalMonitor:
     alarms_per_day : float
         Accepted false alarms of the change detector per day. 0 disables the change detection.
     keep_still : bool
-        True to make the samples at rest available from ``take_still``, independent of ``leave_out``.
+        True to make the samples at rest available from ``take_samples_at_rest``, independent of ``leave_out``.
     """
 
     def __init__(
@@ -73,7 +73,10 @@ class SignalMonitor:
         return self._moved_before + self._rest.moved_samples
 
     def set_rate(self, rate_hz: float) -> None:
-        """Set a more accurate sample rate. If it differs by more than ``OTHER_RATE``, the detectors start again."""
+        """Set a more accurate sample rate.
+
+        If it differs by more than ``MAX_RATE_CHANGE``, the detectors start again.
+        """
         if abs(rate_hz / self._rate_hz - 1.0) > MAX_RATE_CHANGE:
             self._pending = self.flush()
             self._moved_before += self._rest.moved_samples

@@ -145,7 +145,7 @@ def is_in_spectrum(low_pass: LowPass, power: Floats) -> bool:
     low_pass : LowPass
         Filter to test.
     power : ndarray of float64, shape (POWER_BINS + 1,)
-        Spectrum of the axis, from ``power``.
+        Spectrum of the axis, from ``power_spectrum``.
     """
     f = np.arange(power.size) / (2.0 * max(power.size - 1, 1))
     below = (f >= low_pass.cutoff / 4.0) & (f <= low_pass.cutoff / 2.0) & (f >= 3.0 / (2.0 * POWER_BINS))
@@ -228,7 +228,7 @@ def find_low_pass(design: Design, table: CovarianceTable, measured: MeasuredCurv
     measured : MeasuredCurve
         Measured curve of a single axis.
     power : ndarray of float64
-        Spectrum of the axis, from ``power``.
+        Spectrum of the axis, from ``power_spectrum``.
     """
     search = search_low_pass(design, table, measured, power)
     while True:
@@ -255,7 +255,7 @@ def search_low_pass(
     measured : MeasuredCurve
         Measured curve of a single axis.
     power : ndarray of float64
-        Spectrum of the axis, from ``power``.
+        Spectrum of the axis, from ``power_spectrum``.
     """
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
     grids: list[list[float]] = []

@@ -76,7 +76,7 @@ class ContinuousRefit:
         Window that is advanced only by this object.
     rows : int
         Number of rows of the window that are fitted, from the first.
-    tables : AxisTables
+    tables : AxisCovarianceTables
         Covariances of these rows, for the length of each axis.
     """
 
@@ -128,7 +128,7 @@ class ContinuousRefit:
         return course
 
     def _advance(self, design: Design, values: Floats, lengths: Ints, course: Floats) -> None:
-        """Advance by up to ``STAGE`` samples and write the coefficients into ``course``."""
+        """Advance by up to ``STAGE_SAMPLES`` samples and write the coefficients into ``course``."""
         self._window.stage(values)
         to_si = design.rate_hz**TO_SI
         done = 0

@@ -1,8 +1,8 @@
 """Compiled kernel of the fit: weights and a non-negative solution, one axis after another.
 
 All quantities are in units of one sample: the Allan variance in the unit of the axis, and θ as in ``uncertainty``. The
-results are written to arrays of the caller with one row per axis (``term_selection.Answer``, ``term_selection.Gains``).
-A result that stays NaN could not be computed.
+results are written to arrays of the caller with one row per axis (``term_selection.FitOutput``,
+``term_selection.Gains``). A result that stays NaN could not be computed.
 
 For given weights, the solution is linear in the curve. The rows of this linear map are stored together with the limits
 within which they are as good as a new fit. ``continuous_refit`` applies them to the curve after every sample.

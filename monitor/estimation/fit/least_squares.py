@@ -66,7 +66,7 @@ def whiten(rows, theta, covariance, stretch, columns, blind, variance, weighted)
     Parameters
     ----------
     rows, theta, covariance, stretch, columns, blind, variance
-        See ``weigh``.
+        See ``weight_columns``.
     weighted : ndarray of float64, shape (m, 5)
         Result.
 

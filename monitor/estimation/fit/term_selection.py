@@ -20,7 +20,8 @@ MAX_THETA_CHANGE: Final = 0.4
 """Gains are recomputed when a θ has moved by this share (a coefficient by a fifth) and by more than its own scatter."""
 
 MAX_THETA_SIGMA: Final = 1.0
-"""Distance in σ that a θ may move before its gains are recomputed, if this is more than the share ``MOVED``."""
+"""Distance in σ that a θ may move before its gains are recomputed, if this is more than the share ``MAX_THETA_CHANGE``.
+"""
 
 DETECTABLE_SIGMA: Final = 3.0
 """Size in σ at which an absent term would be detected."""
@@ -134,7 +135,7 @@ def select_terms(  # type: ignore[no-untyped-def]
     rows : ndarray of int64
         Rows in use.
     stretch, covariance, weighted, normal
-        See ``least_squares.weigh`` and ``least_squares.normal_equations``.
+        See ``least_squares.weight_columns`` and ``least_squares.normal_equations``.
     thresholds : tuple of float
         Thresholds in σ to add and to drop a term.
     straight : bool
@@ -206,11 +207,11 @@ def tighten_bounds(  # type: ignore[no-untyped-def]
     rows : ndarray of int64
         Rows in use.
     stretch, columns, covariance
-        See ``least_squares.weigh``.
+        See ``least_squares.weight_columns``.
     misfit : float
         Factor by which variances are widened.
     found, c0 : ndarray of float64
-        Unconstrained solution and its variance for absent terms, from ``judge``.
+        Unconstrained solution and its variance for absent terms, from ``select_terms``.
     theta, hi, status : ndarray, shape (5,)
         Results of the axis; ``hi`` is updated in place.
     """
@@ -339,7 +340,7 @@ def store_linear_map(  # type: ignore[no-untyped-def]
     Parameters
     ----------
     axis : int
-        Row of ``answer`` and ``gains``.
+        Row of ``empty_fit_output`` and ``empty_gains``.
     rows : ndarray of int64
         Rows in use.
     weighted, normal
@@ -349,9 +350,9 @@ def store_linear_map(  # type: ignore[no-untyped-def]
     thresholds : tuple of float
         Thresholds in σ to add and to drop a term.
     found, c0, enters
-        Results of ``judge``.
+        Results of ``select_terms``.
     most : float
-        Result of ``judge_ramp``; NaN without a slope.
+        Result of ``select_ramp``; NaN without a slope.
     columns : ndarray of float64, shape (m, 5)
         Columns of the fit.
     slope : float

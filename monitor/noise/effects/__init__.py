@@ -1,6 +1,6 @@
 """Effects of a noise model, one per file.
 
-``EFFECTS`` lists them by their name in model files. ``ORDER`` is the order in which transforms act.
+``EFFECTS`` lists them by their name in model files. ``TRANSFORM_ORDER`` is the order in which transforms act.
 """
 
 from typing import Final

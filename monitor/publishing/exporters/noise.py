@@ -1,9 +1,9 @@
 """Noise coefficients to export, and the comments that are common to all formats.
 
-A ``Noise`` object holds Q, N, B, K and R of each axis in SI. From a model file, all of them are values. From
-``analyze --json``, those with status ``estimated`` are values, those with ``upper_bound`` are marked as bounds, and
-others are absent. Effects without a letter (a spectral line, a bias, …) are kept by name, so that a comment can name
-them as omitted.
+A ``NoiseCoefficients`` object holds Q, N, B, K and R of each axis in SI. From a model file, all of them are values.
+From ``analyze --json``, those with status ``estimated`` are values, those with ``upper_bound`` are marked as bounds,
+and others are absent. Effects without a letter (a spectral line, a bias, …) are kept by name, so that a comment can
+name them as omitted.
 """
 
 import math

@@ -1,6 +1,6 @@
 """Views as drawings: measured, what the model expects, and the band that simulated recordings stay in; text to SVG.
 
-In come ``View``s of one lens (before and after a step, or one alone), out goes one SVG element: panels side by side
+In come ``PlotData``s of one lens (before and after a step, or one alone), out goes one SVG element: panels side by side
 with a common height, so that a gap that closes is seen to close. The axes are in the field's units; the unit stands
 with the name above the panel, where nothing can cover it. A curve of more points than pixels keeps the smallest and
 the largest of each pixel. Written by hand, not by matplotlib: a report has dozens of panels, and one takes a

@@ -1,10 +1,9 @@
 """Viewer for the devices of many daemons: ``imu-monitor view``.
 
 Messages from zenoh are drawn as a table of all devices, those with problems first, and a list of all events. Devices
-selected for detail also have samples, Allan plots and coefficients over time, as in the viewer of a daemon. Samples
-and curves are subscribed to only for these, so the other devices cost only their status and coefficients. ``Board``
-holds the state of the devices, ``decoding`` converts messages into results, and ``RerunView`` draws in its own
-thread.
+selected for detail also have samples, Allan plots and coefficients over time, as in the viewer of a daemon. Samples and
+curves are subscribed to only for these, so the other devices cost only their status and coefficients. ``DeviceStates``
+holds the state of the devices, ``decoding`` converts messages into results, and ``RerunView`` draws in its own thread.
 """
 
 import threading

@@ -1,6 +1,6 @@
 """Output of the Rerun stream: a viewer window, a page in the browser, or a file.
 
-``open_output`` returns an ``Output``: a Rerun stream and the child process that belongs to it. ``ViewerTrouble``
+``open_output`` returns an ``Output``: a Rerun stream and the child process that belongs to it. ``ViewerError``
 states in one line what is wrong, and the caller repeats the attempt later. The viewer program is started directly,
 because its Python wrapper would leave it running when killed. It listens on the loopback interface only, and its usage
 statistics are off. For the daemon, a window and a page are both a Rerun server in a separate process. The data of the
@@ -124,7 +124,7 @@ class Output:
         ------
         ViewerClosed
             A user closed the window.
-        ViewerTrouble
+        ViewerError
             The viewer ended for another reason.
         """
         if self.child is not None and self.child.exited_normally():
@@ -228,7 +228,7 @@ def free_port(wanted: int, taken: int | None = None) -> int:
 
     Raises
     ------
-    ViewerTrouble
+    ViewerError
         PORTS_TRIED ports are in use.
     """
     for port in range(wanted, min(wanted + PORTS_TRIED, 65536)):
@@ -263,7 +263,7 @@ def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[
 
     Raises
     ------
-    ViewerTrouble
+    ViewerError
         The output cannot be opened.
     ViewerClosed
         Only an open viewer may be joined, and there is none.
@@ -382,7 +382,7 @@ def _stream(recording_id: str) -> rr.RecordingStream:
 
 
 def _wait_for(port: int, child: ViewerProcess, given_up: Callable[[], bool]) -> None:
-    """Wait until the viewer listens; end it and raise ViewerTrouble if it does not."""
+    """Wait until the viewer listens; end it and raise ViewerError if it does not."""
     end = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < end and not given_up():
         trouble = child.exit_reason()

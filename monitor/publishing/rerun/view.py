@@ -417,7 +417,7 @@ class RerunView:
             scene.past(device, past)
 
     def _draw(self, output: "Output", scene: "Scene") -> None:
-        """Draw new data until closed; raise ViewerTrouble if the viewer has ended."""
+        """Draw new data until closed; raise ViewerError if the viewer has ended."""
         queue = _Pending(plot_every_s=1.0)
         shown: tuple[DeviceInfo, ...] | None = None
         begun: set[str] = set()

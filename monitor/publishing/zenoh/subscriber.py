@@ -301,7 +301,7 @@ def topic_keys(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
 
 
 def client_configurations(connect: Sequence[str], file: Path | None) -> dict[str, "zenoh.Config"]:
-    """Return the zenoh configuration of a client session for each endpoint (see ``ZenohIn``).
+    """Return the zenoh configuration of a client session for each endpoint (see ``ZenohSubscriber``).
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Diagnostics: functions that measure how far an axis differs from a model, for measured and simulated recordings
 alike.
 
-A diagnostic takes a ``Sight``: an axis whitened by a model. If the model is true, the whitened coefficients are
+A diagnostic takes a ``WhitenedAxis``: an axis whitened by a model. If the model is true, the whitened coefficients are
 independent with variance one, and so are the samples of the whitened series. Each diagnostic tests one kind of
 departure from this. It returns the largest gain in ln L, in nats, that such a departure would bring at one place,
 together with the place. The gains of a true model are nearly the same for every model and every length. The thresholds

@@ -1,10 +1,10 @@
 """Role of each effect in the likelihood of an axis: noise variance, regressor or transform.
 
-Each effect has one **size** that scales it, and **shape parameters** that do not. The variance of a ``NOISE`` effect is
-proportional to the square of its size. Its basis is its spectrum with size one. A ``COURSE`` effect is a deterministic
-series times its size. Its regressor is the series with size one that the simulation also uses, so that fit and
-simulation agree. A ``Leak`` is a deterministic effect whose series is another axis. A transform changes the bases of
-all effects before it.
+Each effect has one **size** that scales it, and **shape parameters** that do not. The variance of a
+``NOISE_SIZE_PARAMETERS`` effect is proportional to the square of its size. Its basis is its spectrum with size one. A
+``DETERMINISTIC_SIZE_PARAMETERS`` effect is a deterministic series times its size. Its regressor is the series with size
+one that the simulation also uses, so that fit and simulation agree. A ``Leak`` is a deterministic effect whose series
+is another axis. A transform changes the bases of all effects before it.
 """
 
 from dataclasses import replace

@@ -5,10 +5,10 @@ moments as a random walk. Only the distributions differ. Both effects of a pair 
 the same data with the same additional noise. The result is a ``ModelComparison``. Its gain is the logarithm of the
 ratio of the two likelihoods, each at its maximum. The caller subtracts penalties for parameters and prior odds.
 
-The data are block means. The additional noise is a ``Rest``: white, random walk, flicker and exponentially correlated
-noise. It is written as a sum of independent first-order processes whose block means are known given their value at the
-start of the block. Each block thus needs one step of a Kalman filter, and averaging adds no error. The first level has
-a nearly flat prior, the same for both effects.
+The data are block means. The additional noise is a ``BackgroundNoise``: white, random walk, flicker and exponentially
+correlated noise. It is written as a sum of independent first-order processes whose block means are known given their
+value at the start of the block. Each block thus needs one step of a Kalman filter, and averaging adds no error. The
+first level has a nearly flat prior, the same for both effects.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,15 +1,15 @@
 """Variance of white residuals as a function of time, for all frequencies together and for each band.
 
-``variance_course`` fits a step of the variance at every time, and alternatives to a step: a trend, a periodic
+``fit_variance_history`` fits a step of the variance at every time, and alternatives to a step: a trend, a periodic
 variation, several steps and a slow random variation. The alternatives are fitted to the energies of blocks (χ²;
 log-linear variances). Every gain is a log-likelihood gain over a constant variance, so that the gains are comparable. A
 step is accepted if it gains more than its alternatives and nothing is left after it.
 
-``tiles`` cuts the recording into pieces and takes the Fourier transform of each piece midway between the usual
-frequencies. There white noise is independent everywhere and a steady line has a steady power. Every rectangle of 2^a
-pieces by 2^b frequencies is compared with the rest of its frequencies, so that a steady line or a coloured spectrum has
-no influence. Every row of rectangles is also compared with a constant row. Long pieces detect lines that vary, and
-short pieces detect bursts.
+``find_least_constant_tiles`` cuts the recording into pieces and takes the Fourier transform of each piece midway
+between the usual frequencies. There white noise is independent everywhere and a steady line has a steady power. Every
+rectangle of 2^a pieces by 2^b frequencies is compared with the rest of its frequencies, so that a steady line or a
+coloured spectrum has no influence. Every row of rectangles is also compared with a constant row. Long pieces detect
+lines that vary, and short pieces detect bursts.
 
 All statistics are ratios of energies. They have no unit, and their distribution under white Gaussian noise depends only
 on the number of samples. Outliers violate this and must be replaced before.

@@ -1,13 +1,13 @@
 """Replacement of missing, wrong and clipped samples by plausible random draws.
 
-``filled`` draws each missing sample from its neighbourhood. The draw is the mean of good neighbours plus the deviation
-of a randomly chosen neighbour from its own mean. Level, drift and white noise thus continue through the gap. The
-neighbourhood is as wide as the drift allows. The mean carries the noise of the samples it is made of. If p percent of
-the samples are missing and the noise is white, frequencies below the inverse of the neighbourhood length are therefore
-2p percent too high. Other frequencies are not affected. A long gap is filled along a line between the levels at its
-ends. Its random walk is as strong as that of the recording over such a time.
+``fill_missing`` draws each missing sample from its neighbourhood. The draw is the mean of good neighbours plus the
+deviation of a randomly chosen neighbour from its own mean. Level, drift and white noise thus continue through the gap.
+The neighbourhood is as wide as the drift allows. The mean carries the noise of the samples it is made of. If p percent
+of the samples are missing and the noise is white, frequencies below the inverse of the neighbourhood length are
+therefore 2p percent too high. Other frequencies are not affected. A long gap is filled along a line between the levels
+at its ends. Its random walk is as strong as that of the recording over such a time.
 
-``unclipped`` draws from the tail of a Gaussian beyond the limit. The local mean of this Gaussian accounts for the
+``restore_clipped`` draws from the tail of a Gaussian beyond the limit. The local mean of this Gaussian accounts for the
 clipped samples.
 
 The input arrays are not changed, and good samples keep their values.

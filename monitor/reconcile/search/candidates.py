@@ -1,9 +1,9 @@
 """Candidate effects for one axis, with starting values from the data.
 
 Each function examines one family of effects. It returns effects whose shape parameters are the best of their family,
-given the effects that are already in the model. The caller fits their sizes. ``PRICE`` is the penalty in nats that an
-effect must exceed. It consists of the gain that chance gives a true model, an allowance for effects that can occur at
-many places, and an allowance for fitted shape parameters. The values are empirical.
+given the effects that are already in the model. The caller fits their sizes. ``PENALTY_NATS`` is the penalty in nats
+that an effect must exceed. It consists of the gain that chance gives a true model, an allowance for effects that can
+occur at many places, and an allowance for fitted shape parameters. The values are empirical.
 """
 
 from collections.abc import Callable

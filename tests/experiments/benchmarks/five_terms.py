@@ -73,7 +73,7 @@ def _of_fit(result: Analysis, model: NoiseModel) -> Iterator[tuple[str, str]]:
 
 
 def _of_events(result: Analysis, model: NoiseModel) -> Iterator[tuple[str, str]]:
-    """Of what ``events_of`` looks for, where it stands as numbers: each thing is sought once, as there."""
+    """Of what ``detect_events`` looks for, where it stands as numbers: each thing is sought once, as there."""
     values, rate_hz = result.values, result.estimate.rate_hz
     moving, _ = detect_motion(values, rate_hz)
     for line in detect_lines(values, moving, rate_hz, result.estimate.curve):

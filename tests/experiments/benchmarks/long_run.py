@@ -4,8 +4,8 @@
 
 9.81 on every axis under noise of 1e-4, in a window of an hour at 100 Hz; a thousand samples in each million are
 missing, and once, a tenth of the way in, a transient of 10⁶ times the noise passes through. It prints the largest
-relative difference between the Allan variances of the window and of ``batch.overlapping`` over the very samples that it
-holds, as often as the run passes a power of ten, and at its end.
+relative difference between the Allan variances of the window and of ``batch.overlapping_avar`` over the very samples
+that it holds, as often as the run passes a power of ten, and at its end.
 """
 
 import argparse

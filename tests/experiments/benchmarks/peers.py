@@ -12,7 +12,7 @@ intervals.
   it: only those beyond the number that the same ranking takes for the baseline's own wavelet variance are a name.
 - *GMWM beside the baseline*: as strong as it can be made here; the baseline's wavelet variance is a part of every
   model, and what is ranked is what to add to it. More of a term that the baseline has is no name, but retuned.
-- *five-term fit*: coefficients and notes of ``analyze``, see ``five_terms``.
+- *five-term fit*: coefficients and notes of ``analyze``, see ``fit_five_terms``.
 - *reconcile*: in this process.
 
 All run in one thread. Seconds are processor seconds of this process, of the whole answer, over the number of axes.
