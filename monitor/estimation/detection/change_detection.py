@@ -14,7 +14,7 @@ its last change. The detector returns a ``Change`` of one of three kinds:
   constant was measured at thresholds of 8 to 12, where alarms are frequent, and is used at 13 to 20
   (``tests/experiments/benchmarks/changes.py``).
 - **Learning.** A band can raise an alarm when its reference has ``MIN_REFERENCE_TERMS`` terms and ``LEARN_S`` have
-passed. This takes
+  passed. This takes
   a minute for the shortest octaves and 128 clusters for the longer ones, and longer for correlated terms. A change
   within this time is not detected. A reference is kept while nothing is detected, so it becomes more accurate. A slow
   drift of the noise is compared with all the past, so it is eventually reported as a change. The disadvantage is that
