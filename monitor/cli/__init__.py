@@ -199,19 +199,19 @@ def analyze(
     wanted = offline.Request(recording, rate, options.tau(tau), window_s, rest, bool(json or plot), last_s)
     try:
         with output.progress() as tell:
-            output.prepare_kernels(tell)
-            results = offline.make(wanted, tell)
+            output.compile_kernels(tell)
+            results = offline.run_analysis(wanted, tell)
     except offline.TooFewSamples as error:
         if json is not None:
             output.write("--json", json, encoding.encode_failed_analysis(str(error), error.samples) + b"\n")
         raise
     if json is not None:
-        payload = encoding.analysis(
+        payload = encoding.encode_analysis(
             results.analysis, results.total, results.hadamard, results.dynamic, results.without_temperature
         )
         output.write("--json", json, payload + b"\n")
     if plot is not None:
-        offline.draw(results, plot, recording.name)
+        offline.draw_plots(results, plot, recording.name)
     if json != Path("-"):
         output.print_analysis(results.analysis)
     if results.lacking:
@@ -248,7 +248,7 @@ def simulate(
     request = simulation.Request(noise, out, length_s, seed, rate, temperature_from, truth, model)
     terminal_session.end_on_sigterm()
     with output.progress() as tell:
-        result = simulation.make(request, tell)
+        result = simulation.run_simulation(request, tell)
     if json is not None:
         output.write("--json", json, result.to_json() + b"\n")
     if json != Path("-"):
@@ -291,14 +291,16 @@ def reconcile(
     terminal_session.end_on_sigterm()
     try:
         with output.progress() as tell:
-            output.prepare_kernels(tell)
+            output.compile_kernels(tell)
             if several:
                 every = reconciling.ComparisonRequest(tuple(recordings), tested, out, seed, rate, last_s)
                 runs = reconciling.compare_recordings(every, tell)
-                data, show = comparison_report.encode_comparison(runs), partial(text.tell_runs, runs)
+                data, show = comparison_report.encode_comparison(runs), partial(text.print_comparison, runs)
             else:
-                one = reconciling.make(reconciling.Request(recordings[0], tested, out, seed, rate, last_s=last_s), tell)
-                data, show = report.encode_report(one), partial(text.tell, one)
+                one = reconciling.run_reconciliation(
+                    reconciling.Request(recordings[0], tested, out, seed, rate, last_s=last_s), tell
+                )
+                data, show = report.encode_report(one), partial(text.print_report, one)
     except NotReady:
         if json is not None:
             output.write("--json", json, (out / reconciling.REPORT).read_bytes() + b"\n")
@@ -343,19 +345,19 @@ def thermal_fit(
     _check_thermal(json, plot)
     output.check_place("--out", out)
     interval_s, last_s = options.duration("--interval", interval), options.duration("--last", last)
-    study = thermal.fit(recording, interval_s, rate, last_s)
+    study = thermal.fit_recording(recording, interval_s, rate, last_s)
     if json is not None:
-        output.write("--json", json, text.study_json(study) + b"\n")
+        output.write("--json", json, text.encode_thermal_fit(study) + b"\n")
     if not study.fits:
         raise NotReady("; ".join(f"{axis}: {why}" for axis, why in study.refused.items()))
     if out is not None:
-        output.write("--out", out, thermal.to_file(study) + b"\n")
+        output.write("--out", out, thermal.write_model_file(study) + b"\n")
     if plot is not None:
         from monitor.publishing.plots.thermal_plot import study_plot
 
         study_plot(study, plot)
     if Path("-") not in (json, out):
-        text.tell(study, Console())
+        text.print_thermal_fit(study, Console())
 
 
 @thermal_app.command("predict")
@@ -374,9 +376,11 @@ def thermal_predict(
     from monitor.publishing.terminal import thermal_text as text
 
     _check_thermal(json, plot)
-    outlook = thermal.predict(recording, thermal.from_file(model), rate, options.duration("--last", last))
+    outlook = thermal.predict_recording(
+        recording, thermal.read_model_file(model), rate, options.duration("--last", last)
+    )
     if json is not None:
-        output.write("--json", json, text.outlook_json(outlook) + b"\n")
+        output.write("--json", json, text.encode_thermal_prediction(outlook) + b"\n")
     if not outlook.judged:
         raise NotReady("; ".join(f"{axis}: {why}" for axis, why in outlook.refused.items()))
     if plot is not None:
@@ -384,7 +388,7 @@ def thermal_predict(
 
         outlook_plot(outlook, plot)
     if json != Path("-"):
-        text.tell_outlook(outlook, Console())
+        text.print_thermal_prediction(outlook, Console())
 
 
 def _check_thermal(json: Path | None, plot: Path | None) -> None:

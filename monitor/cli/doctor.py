@@ -32,7 +32,7 @@ def doctor(
         output.write("--json", json, msgspec.json.encode({"schema": SCHEMA, "findings": findings}) + b"\n")
     if json != Path("-"):
         _print(findings)
-    if checks.worst(findings) == "wrong":
+    if checks.worst_mark(findings) == "wrong":
         raise typer.Exit(WRONG)
 
 

@@ -44,13 +44,13 @@ def compensate(
     last_s = options.duration("--last", last)
     wanted = compensating.Request(recording, out, method, rate, options.order(order), last_s)
     with output.progress() as tell:
-        output.prepare_kernels(tell)
-        result = compensating.make(wanted, tell)
+        output.compile_kernels(tell)
+        result = compensating.run_compensation(wanted, tell)
     if json is not None:
-        output.write("--json", json, text.to_json(result) + b"\n")
+        output.write("--json", json, text.encode_compensation(result) + b"\n")
     if plot is not None:
         from monitor.publishing.plots.compensate_plot import compensate_plot
 
         compensate_plot(result, plot)
     if json != Path("-"):
-        text.tell(result, Console())
+        text.print_compensation(result, Console())

@@ -69,11 +69,11 @@ def history(
     if json == Path("-"):
         return
     console = Console()
-    history_text.tell(past, axes, SYMBOLS if axis else history_text.LETTERS, console)
+    history_text.print_history(past, axes, SYMBOLS if axis else history_text.LETTERS, console)
     if axis is not None and len(past):
         few_s = max(width_of(past.span, None, MAX_TABLE_ROWS), past.step_s)
         few = past if few_s == past.step_s else get(HistoryQuery(asked.span, few_s, ("coefficients", "status"), axes))
-        history_text.tell_course(few, axis, SYMBOLS, console)
+        history_text.print_axis_history(few, axis, SYMBOLS, console)
 
 
 def _check_output_files(json: Path | None, out: Path | None, plot: Path | None) -> None:

@@ -11,7 +11,7 @@ from drivers.errors import ConfigError
 if TYPE_CHECKING:
     from monitor.estimation.analysis import Analysis
 
-Tell = Callable[[str, float | None], None]
+ProgressCallback = Callable[[str, float | None], None]
 """Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
 
 
@@ -62,7 +62,7 @@ def write(option: str, path: Path, data: bytes) -> None:
 
 
 @contextlib.contextmanager
-def progress() -> Iterator[Tell]:
+def progress() -> Iterator[ProgressCallback]:
     """Show a progress bar on a terminal, or nothing if the output is piped; yield the callback that updates it."""
     from rich.console import Console
     from rich.progress import Progress
@@ -76,7 +76,7 @@ def progress() -> Iterator[Tell]:
         yield lambda what, share: bar.update(task, description=what, total=share and 1.0, completed=share or 0.0)
 
 
-def prepare_kernels(tell: Tell) -> None:
+def compile_kernels(tell: ProgressCallback) -> None:
     """Compile the kernels for the analysis of recordings in parallel, if they are not in the cache on disk."""
     from monitor.daemon import kernel_compilation
 

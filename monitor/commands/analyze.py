@@ -76,7 +76,7 @@ class Results:
     )
 
 
-def make(request: Request, tell: ProgressCallback = lambda _what, _share: None) -> Results:
+def run_analysis(request: Request, tell: ProgressCallback = lambda _what, _share: None) -> Results:
     """Read a recording and analyse it.
 
     Parameters
@@ -133,7 +133,7 @@ def _make(request: Request, tell: ProgressCallback) -> Results:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def draw(results: Results, path: Path, title: str) -> None:
+def draw_plots(results: Results, path: Path, title: str) -> None:
     """Draw the results as a picture, or write them as a page if the file name ends in .html.
 
     Parameters

@@ -52,7 +52,7 @@ class Request:
     last_s: float | None = None  # length of the end of the recording that is used; None for all
 
 
-def make(request: Request, tell: ProgressCallback = lambda _what, _share: None) -> CompensationResult:
+def run_compensation(request: Request, tell: ProgressCallback = lambda _what, _share: None) -> CompensationResult:
     """Compensate a recording and write the result.
 
     Parameters

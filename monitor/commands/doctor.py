@@ -82,21 +82,27 @@ class Finding:
 
 def examine(path: Path | None = None) -> list[Finding]:
     """Check the machine, and the configuration if a path is given."""
-    found = [*libraries(), *packages(sys.path), *kernels(), *clock(), *unit()]
+    found = [*check_libraries(), *check_packages(sys.path), *check_kernels(), *check_clock(), *check_systemd_unit()]
     if path is None:
         return found
     config, wrong = read(path)
     found = [*wrong, *found]
     if path.is_file():
-        found += permissions(path)
+        found += check_permissions(path)
     if config is None:
         return found
     for one in config.table["device"]:
-        found += device(str(one["name"]), one["driver"])
-    found += [*zenoh(config), *viewer(config), *storage(config), *metrics(config), *reconcile(config)]
+        found += check_device(str(one["name"]), one["driver"])
+    found += [
+        *check_zenoh(config),
+        *check_viewer(config),
+        *check_storage(config),
+        *check_metrics(config),
+        *check_reconcile(config),
+    ]
     for hook in config.hooks:
         if hook.command:
-            found += permissions(Path(hook.command[0]), f"hook {Path(hook.command[0]).name}", secret=False)
+            found += check_permissions(Path(hook.command[0]), f"hook {Path(hook.command[0]).name}", secret=False)
     return found
 
 
@@ -112,7 +118,7 @@ def read(path: Path) -> tuple[Config | None, list[Finding]]:
     return config, [Finding("well", "configuration", f"{path}: {count} device{'' if count == 1 else 's'}")]
 
 
-def permissions(path: Path, about: str = "permissions", secret: bool = True) -> list[Finding]:
+def check_permissions(path: Path, about: str = "permissions", secret: bool = True) -> list[Finding]:
     """Check who may write a file that controls the service, and who may read a file that may contain a password.
 
     Parameters
@@ -147,7 +153,7 @@ def permissions(path: Path, about: str = "permissions", secret: bool = True) -> 
 # --- devices
 
 
-def device(name: str, driver: Mapping[str, Any]) -> list[Finding]:
+def check_device(name: str, driver: Mapping[str, Any]) -> list[Finding]:
     """Check the link of a device without opening it.
 
     Parameters
@@ -160,9 +166,11 @@ def device(name: str, driver: Mapping[str, Any]) -> list[Finding]:
     about = f"device {name}"
     match driver.get("link"):
         case "serial":
-            return serial_port(about, str(driver.get("port")))
+            return check_serial_port(about, str(driver.get("port")))
         case "can":
-            return can_interface(about, str(driver.get("interface", "socketcan")), str(driver.get("channel", "can0")))
+            return check_can_interface(
+                about, str(driver.get("interface", "socketcan")), str(driver.get("channel", "can0"))
+            )
         case "zenoh":
             endpoints = driver.get("connect", [])
             return [one for endpoint in endpoints for one in reachable(about, str(endpoint))]
@@ -170,7 +178,7 @@ def device(name: str, driver: Mapping[str, Any]) -> list[Finding]:
             return [Finding("well", about, f"link {other}: nothing to look for on this machine")]
 
 
-def serial_port(about: str, port: str) -> list[Finding]:
+def check_serial_port(about: str, port: str) -> list[Finding]:
     """Check that a serial port exists, is accessible and is not used by another program.
 
     Parameters
@@ -215,7 +223,9 @@ def processes_using(port: Path) -> Iterator[str]:
             continue
 
 
-def can_interface(about: str, interface: str, channel: str, sysfs: Path = Path("/sys/class/net")) -> list[Finding]:
+def check_can_interface(
+    about: str, interface: str, channel: str, sysfs: Path = Path("/sys/class/net")
+) -> list[Finding]:
     """Check that the package for a CAN interface is installed, and that a socketcan interface exists and is up.
 
     Parameters
@@ -254,7 +264,7 @@ def can_interface(about: str, interface: str, channel: str, sysfs: Path = Path("
 # --- outputs
 
 
-def zenoh(config: Config) -> list[Finding]:
+def check_zenoh(config: Config) -> list[Finding]:
     """Check the ports to listen on, the routers to connect to, and the zenoh configuration file."""
     own = config.zenoh
     if own.mode == "none":
@@ -267,7 +277,7 @@ def zenoh(config: Config) -> list[Finding]:
             text = f"{endpoint}: whoever reaches this machine may read all and command it"
             found.append(Finding("doubt", "zenoh", text, "listen on 127.0.0.1, or use TLS and access control"))
     if own.config is not None:
-        found += permissions(own.config, "zenoh file")
+        found += check_permissions(own.config, "zenoh file")
     return found
 
 
@@ -321,7 +331,7 @@ def reachable(about: str, endpoint: str) -> list[Finding]:
         return [Finding("doubt", about, text, "start it, or look at cables and firewalls; the service tries again")]
 
 
-def viewer(config: Config) -> list[Finding]:
+def check_viewer(config: Config) -> list[Finding]:
     """Check that the viewer is installed, if the configuration uses it."""
     if config.viewer.mode == "none":
         return []
@@ -331,7 +341,7 @@ def viewer(config: Config) -> list[Finding]:
     return [Finding("well", "viewer", f"rerun-sdk is there, mode {config.viewer.mode}")]
 
 
-def metrics(config: Config) -> list[Finding]:
+def check_metrics(config: Config) -> list[Finding]:
     """Check the library and the port for Prometheus, and who can reach the port."""
     own = config.metrics
     if own is None:
@@ -347,7 +357,7 @@ def metrics(config: Config) -> list[Finding]:
     return found
 
 
-def reconcile(config: Config) -> list[Finding]:
+def check_reconcile(config: Config) -> list[Finding]:
     """Check that ``command/reconcile`` can be answered, if a folder is configured for its reports."""
     missing = missing_packages("reconcile")
     if not missing or not any(one.reconcile_folder for one in config.devices):
@@ -356,7 +366,7 @@ def reconcile(config: Config) -> list[Finding]:
     return [Finding("doubt", "reconcile", text, 'pip install "imu-monitor[reconcile]"')]
 
 
-def storage(config: Config) -> list[Finding]:
+def check_storage(config: Config) -> list[Finding]:
     """Check the library for recordings, the storage folder and the free disk space."""
     own = config.storage
     if own is None:
@@ -374,11 +384,11 @@ def storage(config: Config) -> list[Finding]:
     except OSError as error:
         text = f"{own.folder}: cannot be written: {error.strerror or error}"
         return [*found, Finding("wrong", "storage", text, f"make it, and have {_user(os.geteuid())} own it")]
-    found += in_use(own)
+    found += check_in_use(own)
     return [*found, *disk_space(own, bytes_a_day(config), usage.total, usage.free)]
 
 
-def in_use(own: Storage) -> list[Finding]:
+def check_in_use(own: Storage) -> list[Finding]:
     """Check whether another process records into the storage folder or writes its history there."""
     wanted = {RECORDING_LOCK: own.record or own.raw, HISTORY_LOCK: own.history}
     holders = sorted({held for name, on in wanted.items() if on and (held := lock_holder(own.folder, name))})
@@ -440,7 +450,7 @@ def disk_space(own: Storage, a_day: float | None, total: int, available: int) ->
 # --- the machine
 
 
-def libraries() -> list[Finding]:
+def check_libraries() -> list[Finding]:
     """Check the version of each library against the requirements of this program."""
     wanted = list(requirements())
     if not wanted:
@@ -517,7 +527,7 @@ def satisfies(version: str, wanted: str) -> bool:
     return True
 
 
-def packages(module_path: Sequence[str]) -> list[Finding]:
+def check_packages(module_path: Sequence[str]) -> list[Finding]:
     """Report foreign packages and modules that have the name of one of the program's packages and are found first.
 
     Parameters
@@ -544,7 +554,7 @@ def packages(module_path: Sequence[str]) -> list[Finding]:
     return found or [Finding("well", "packages", f"{' and '.join(PACKAGES)} are the program's own, in {own}")]
 
 
-def kernels() -> list[Finding]:
+def check_kernels() -> list[Finding]:
     """Check that the kernels are compiled and cached on disk."""
     from monitor.common.compiled import cache_folder
     from monitor.daemon.kernel_compilation import SERVICE, is_warm
@@ -559,7 +569,7 @@ def kernels() -> list[Finding]:
     return [Finding("well", "kernels", f"compiled and kept in {folder}")]
 
 
-def clock() -> list[Finding]:
+def check_clock() -> list[Finding]:
     """Check that the host clock is synchronised, because results carry its time."""
     state = _adjtimex()
     if state is None:
@@ -570,7 +580,7 @@ def clock() -> list[Finding]:
     return [Finding("well", "clock", "synchronised")]
 
 
-def unit() -> list[Finding]:
+def check_systemd_unit() -> list[Finding]:
     """Check the service under systemd, if it is installed there."""
     if shutil.which("systemctl") is None or not Path("/run/systemd/system").is_dir():
         return []
@@ -676,7 +686,7 @@ def _read(path: Path) -> str:
         return ""
 
 
-def worst(findings: Iterable[Finding]) -> Mark:
+def worst_mark(findings: Iterable[Finding]) -> Mark:
     """Return the worst mark of all findings."""
     marks = {one.mark for one in findings}
     return "wrong" if "wrong" in marks else "doubt" if "doubt" in marks else "well"

@@ -63,7 +63,7 @@ class ComparisonRequest:
     last_s: float | None = None  # length of the end of each recording that is used; None for all
 
 
-def make(request: Request, tell: ProgressCallback = lambda _what, _share: None) -> Reconciliation:
+def run_reconciliation(request: Request, tell: ProgressCallback = lambda _what, _share: None) -> Reconciliation:
     """Compare one recording with a model and write the report.
 
     Parameters
@@ -88,11 +88,11 @@ def make(request: Request, tell: ProgressCallback = lambda _what, _share: None) 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             result = reconcile(recording, request.model, request.seed, pool.map, lambda what: tell(what, None))
     except NotReady as error:
-        _write(request.out / REPORT, no_answer(str(error), len(found)))
+        _write(request.out / REPORT, write_failure(str(error), len(found)))
         raise
     result = replace(result, notes=(*request.notes, *found.notes, *notes, *result.notes))
     tell("writing", None)
-    write(result, request.out, request.recording.name)
+    write_report(result, request.out, request.recording.name)
     return result
 
 
@@ -122,7 +122,7 @@ def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = lamb
         notes = (f"The model under test are the five terms of {fitted_to}.",) if fitted_to and at > 1 else ()
         one = Request(path, model, request.out / name, request.seed, request.rate_hz, notes, request.last_s)
         try:
-            result = make(one, _tell_for(tell, f"{name}, {at} of {len(named)}"))
+            result = run_reconciliation(one, _tell_for(tell, f"{name}, {at} of {len(named)}"))
         except NotReady as error:
             silent[name] = str(error)
             if model is None:
@@ -133,15 +133,15 @@ def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = lamb
     if len(runs) < 2:
         why = "; ".join(f"{name}: {said}" for name, said in silent.items())
         why = f"two recordings at least are compared with each other, and {len(runs)} can be: {why}"
-        _write(request.out / REPORT, no_answer(why, 0, comparison_report.SCHEMA))
+        _write(request.out / REPORT, write_failure(why, 0, comparison_report.SCHEMA))
         raise NotReady(why)
     tell("writing", None)
     comparison = compare(runs, fitted_to, silent)
-    write_runs(comparison, request.out)
+    write_comparison(comparison, request.out)
     return comparison
 
 
-def write_runs(result: Comparison, folder: Path) -> None:
+def write_comparison(result: Comparison, folder: Path) -> None:
     """Write the report on all recordings together.
 
     Parameters
@@ -151,11 +151,11 @@ def write_runs(result: Comparison, folder: Path) -> None:
     folder : Path
         Folder of the report.
     """
-    from monitor.publishing.reports.comparison_page import page
+    from monitor.publishing.reports.comparison_page import render_page
 
     _write(folder / REPORT, comparison_report.encode_comparison(result))
     _write(folder / "model.toml", result.model.to_toml().encode())
-    _write(folder / "report.html", page(result).encode())
+    _write(folder / "report.html", render_page(result).encode())
 
 
 def unique_names(recordings: Sequence[Path]) -> dict[str, Path]:
@@ -197,7 +197,7 @@ def _tell_for(tell: ProgressCallback, which: str) -> ProgressCallback:
     return lambda what, share: tell(f"{which}: {what}", share)
 
 
-def write(result: Reconciliation, folder: Path, title: str) -> None:
+def write_report(result: Reconciliation, folder: Path, title: str) -> None:
     """Write the four files of a report.
 
     Parameters
@@ -209,11 +209,11 @@ def write(result: Reconciliation, folder: Path, title: str) -> None:
     title : str
         Title of the page.
     """
-    from monitor.publishing.reports.reconcile_page import page
+    from monitor.publishing.reports.reconcile_page import render_page
 
     _write(folder / REPORT, encode_report(result))
     _write(folder / "model.toml", result.model.to_toml().encode())
-    _write(folder / "report.html", page(result, title).encode())
+    _write(folder / "report.html", render_page(result, title).encode())
     try:
         from monitor.publishing.reports.reconcile_rrd import write_rrd
     except ImportError:  # the library of the viewer is optional
@@ -222,7 +222,7 @@ def write(result: Reconciliation, folder: Path, title: str) -> None:
         write_rrd(result, place)
 
 
-def no_answer(why: str, samples: int, schema: str = SCHEMA) -> bytes:
+def write_failure(why: str, samples: int, schema: str = SCHEMA) -> bytes:
     """Return the content of ``report.json`` if there is no verdict.
 
     Parameters

@@ -30,10 +30,10 @@ TRUTH_SCHEMA: Final = "imu-monitor/truth/1"
 """Schema of the file with the truth."""
 RESULT_SCHEMA: Final = "imu-monitor/simulate/1"
 """Schema of the result as JSON."""
-ROWS: Final = 1 << 16
+CHUNK_ROWS: Final = 1 << 16
 """Number of rows that are drawn and written at a time."""
 
-Tell = Callable[[str, float | None], None]
+ProgressCallback = Callable[[str, float | None], None]
 """Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
 
 
@@ -94,7 +94,7 @@ class Result:
         )
 
 
-def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
+def run_simulation(request: Request, tell: ProgressCallback = lambda _what, _share: None) -> Result:
     """Simulate a recording and write it.
 
     Parameters
@@ -131,7 +131,7 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
         stream = request.model.stream(rate_hz, request.seed, temperature_c)
     except ConfigError as error:
         raise ConfigError(f"{request.name}: {error}") from error
-    first = stream.draw_with_temperature(min(n, ROWS))
+    first = stream.draw_with_temperature(min(n, CHUNK_ROWS))
     temperature = not bool(np.isnan(first.temperature_c).all())
     truth = request.out.with_name(request.out.name + ".truth.json") if request.truth else None
     result = Result(request.out, n, rate_hz, request.seed, axes, temperature, truth)
@@ -144,7 +144,7 @@ def make(request: Request, tell: Tell = lambda _what, _share: None) -> Result:
     return result
 
 
-def _write(result: Result, stream: ModelStream, first: SimulatedSamples, tell: Tell) -> None:
+def _write(result: Result, stream: ModelStream, first: SimulatedSamples, tell: ProgressCallback) -> None:
     """Write the recording block by block."""
     with open_recording_writer(result.out, result.axes, result.temperature) as append:
         block, written = first, 0
@@ -154,7 +154,7 @@ def _write(result: Result, stream: ModelStream, first: SimulatedSamples, tell: T
             tell("simulating", written / result.samples)
             if written == result.samples:
                 break
-            block = stream.draw_with_temperature(min(ROWS, result.samples - written))
+            block = stream.draw_with_temperature(min(CHUNK_ROWS, result.samples - written))
         tell("finishing the file", None)  # some formats are compressed only at the end
 
 

@@ -57,7 +57,7 @@ class ModelFile(msgspec.Struct):
     axes: dict[str, AxisRow]
 
 
-def fit(
+def fit_recording(
     recording: Path, interval_s: float | None = None, rate_hz: float | None = None, last_s: float | None = None
 ) -> ThermalFitReport:
     """Fit a thermal model to each axis of a recording.
@@ -90,7 +90,7 @@ def fit(
     return ThermalFitReport(recording.name, interval, means, fits, refused, notes)
 
 
-def predict(
+def predict_recording(
     recording: Path, models: Mapping[str, ThermalModel], rate_hz: float | None = None, last_s: float | None = None
 ) -> ThermalPredictionReport:
     """Predict the bias of a recording with thermal models of an earlier recording.
@@ -125,13 +125,13 @@ def predict(
     return ThermalPredictionReport(recording.name, interval, means, judged, refused, notes)
 
 
-def to_file(study: ThermalFitReport) -> bytes:
+def write_model_file(study: ThermalFitReport) -> bytes:
     """Return the content of the model file with all axes that were fitted."""
     rows = {axis: _row(one.model) for axis, one in study.fits.items()}
     return msgspec.json.format(msgspec.json.encode(ModelFile(SCHEMA, study.interval_s, rows)), indent=1)
 
 
-def from_file(path: Path) -> dict[str, ThermalModel]:
+def read_model_file(path: Path) -> dict[str, ThermalModel]:
     """Read the model of each axis from a file or pipe.
 
     Raises

@@ -47,15 +47,15 @@ class ZenohOutput(Output):
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         """Publish the Allan curve and the coefficients."""
         self._zenoh.put(topics.ALLAN, device, encoding.encode_allan(device, unix_s, estimate))
-        self._zenoh.put(topics.COEFFICIENTS, device, encoding.coefficients(device, unix_s, estimate))
+        self._zenoh.put(topics.COEFFICIENTS, device, encoding.encode_coefficients(device, unix_s, estimate))
 
     def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
         """Publish the comparison of the window with the model in force."""
-        self._zenoh.put(topics.GAP, device, encoding.gap(device, unix_s, gap))
+        self._zenoh.put(topics.GAP, device, encoding.encode_gap(device, unix_s, gap))
 
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
         """Publish the total and Hadamard deviations."""
-        self._zenoh.put(topics.TOTAL, device, encoding.total(device, unix_s, received, total, hadamard))
+        self._zenoh.put(topics.TOTAL, device, encoding.encode_total(device, unix_s, received, total, hadamard))
 
     def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Publish a block of compensated samples as one msgpack batch."""
@@ -64,16 +64,16 @@ class ZenohOutput(Output):
 
     def thermal(self, device: str, unix_s: float, received: int, look: ThermalUpdate) -> None:
         """Publish the mean of an interval and its prediction from temperature."""
-        self._zenoh.put(topics.THERMAL, device, encoding.thermal(device, unix_s, received, look))
+        self._zenoh.put(topics.THERMAL, device, encoding.encode_thermal(device, unix_s, received, look))
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Publish an event."""
-        payload = encoding.event(device, unix_s, received, event, encoding.event_start_s(unix_s, event))
+        payload = encoding.encode_event(device, unix_s, received, event, encoding.event_start_s(unix_s, event))
         self._zenoh.put(topics.EVENT, device, payload)
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Publish the status."""
-        self._zenoh.put(topics.STATUS, device, encoding.status(device, unix_s, health))
+        self._zenoh.put(topics.STATUS, device, encoding.encode_status(device, unix_s, health))
 
 
 class ViewerOutput(Output):
@@ -133,11 +133,11 @@ class HistoryOutput(Output):
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Aggregate the temperature of the samples."""
         unix_s = float((samples.t_ns + offset_ns)[-1]) / 1e9
-        self._writer.put_row(device, self._minutes_of(device).temperature(unix_s, samples.temperature_c))
+        self._writer.put_row(device, self._minutes_of(device).add_temperature(unix_s, samples.temperature_c))
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         """Aggregate the coefficients, and the deviations on a coarse grid."""
-        self._writer.put_row(device, self._minutes_of(device).estimate(unix_s, estimate))
+        self._writer.put_row(device, self._minutes_of(device).add_estimate(unix_s, estimate))
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Store an event."""
@@ -153,7 +153,7 @@ class HistoryOutput(Output):
         self.received[device] = health.received
         if unix_s is None:
             return
-        self._writer.put_row(device, self._minutes_of(device).health(unix_s, health))
+        self._writer.put_row(device, self._minutes_of(device).add_health(unix_s, health))
 
     def device_removed(self, device: str) -> None:
         """Store the last minute of a device that was removed."""
@@ -227,19 +227,21 @@ class TableOutput(Output):
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Add an event to the lines below the table."""
         self.board.process_message(
-            topics.EVENT.key(PREFIX, device), encoding.event(device, unix_s, received, event, None)
+            topics.EVENT.key(PREFIX, device), encoding.encode_event(device, unix_s, received, event, None)
         )
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Update the row of a device."""
-        self.board.process_message(topics.STATUS.key(PREFIX, device), encoding.status(device, unix_s, health))
+        self.board.process_message(topics.STATUS.key(PREFIX, device), encoding.encode_status(device, unix_s, health))
         if device in self._latest:
             at_s, estimate = self._latest.pop(device)
             self.board.process_message(
-                topics.COEFFICIENTS.key(PREFIX, device), encoding.coefficients(device, at_s, estimate)
+                topics.COEFFICIENTS.key(PREFIX, device), encoding.encode_coefficients(device, at_s, estimate)
             )
         if device in self._gaps:
-            self.board.process_message(topics.GAP.key(PREFIX, device), encoding.gap(device, *self._gaps.pop(device)))
+            self.board.process_message(
+                topics.GAP.key(PREFIX, device), encoding.encode_gap(device, *self._gaps.pop(device))
+            )
         if self._redraw is not None:
             self._redraw()
 

@@ -435,7 +435,9 @@ class Service:
             case "reset":
                 station.reset()
                 received = station.driver.counts.received
-                command.answer(encoding.reply(station.name, station.now_unix_s(), received, "the window is empty"))
+                command.answer(
+                    encoding.encode_reply(station.name, station.now_unix_s(), received, "the window is empty")
+                )
                 _log.info("reset", device=station.name)
             case "reconcile":
                 self._reconcile(command, station)

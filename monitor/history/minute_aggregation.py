@@ -35,7 +35,7 @@ class MinuteAggregator:
         self._counts = (0, 0, 0, 0)  # increments within this minute
         self._state = 0
 
-    def estimate(self, unix_s: float, estimate: Estimate) -> HistoryRow | None:
+    def add_estimate(self, unix_s: float, estimate: Estimate) -> HistoryRow | None:
         """Add an estimate, and return the previous row if the estimate begins a new one.
 
         Parameters
@@ -57,7 +57,7 @@ class MinuteAggregator:
         self._estimates.add(self._numbers.convert(estimate))
         return full
 
-    def temperature(self, unix_s: float, temperature_c: Floats) -> HistoryRow | None:
+    def add_temperature(self, unix_s: float, temperature_c: Floats) -> HistoryRow | None:
         """Add the mean temperature of a batch, and return the previous row if a new one begins.
 
         Parameters
@@ -74,7 +74,7 @@ class MinuteAggregator:
         self._temperature.add(np.array([there.mean()]))
         return full
 
-    def health(self, unix_s: float, health: Health) -> HistoryRow | None:
+    def add_health(self, unix_s: float, health: Health) -> HistoryRow | None:
         """Add a health report, and return the previous row if a new one begins.
 
         Parameters

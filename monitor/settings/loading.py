@@ -71,14 +71,14 @@ T_co = TypeVar("T_co", bound=msgspec.Struct, covariant=True)
 
 UNITS_S: Final = {"": 1.0, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 WINDOW_SAMPLES: Final = (100, 10_000_000)
-WINDOW_LONGEST_S: Final = 40 * 86400.0
+MAX_WINDOW_S: Final = 40 * 86400.0
 THERMAL_SAMPLES: Final = 8
 """In an interval at the least: its scatter tells how well its mean is known."""
-THERMAL_LONGEST_S: Final = 86400.0
+MAX_THERMAL_INTERVAL_S: Final = 86400.0
 SEGMENT_S: Final = (10.0, 86400.0)
 DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
 IS_ENDPOINT: Final = re.compile(r"[a-z]+/.+")
-LONGEST_QUOTE: Final = 60
+MAX_QUOTED_CHARACTERS: Final = 60
 """Characters of a wrong value that a message repeats."""
 LISTEN: Final = re.compile(r"(\[[0-9a-fA-F:]+\]|[\w.-]+):([0-9]{1,5})", re.ASCII)
 MEMORY: Final = re.compile(r"([0-9]{1,20}(?:\.[0-9]{1,20})?)\s*(?:([kMGT]?)(i?)B|%)")
@@ -234,7 +234,7 @@ def examine(path: Path, *, pipe: bool = False) -> Reading:
     except (OSError, UnicodeDecodeError) as error:
         return Reading(None, [f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"])
     try:
-        table = toml_text.tables(text)
+        table = toml_text.format_tables(text)
     except ConfigError as error:
         return Reading(None, [f"{path}: {error}"])
     reader = _Reader(path.resolve().parent)
@@ -660,13 +660,13 @@ def viewer_mode(mode: str) -> str:
 def _shortened(value: object) -> str:
     """Enough of a text to recognise it in a message."""
     text = str(value)
-    return text if len(text) <= LONGEST_QUOTE else f"{text[:LONGEST_QUOTE]}…"
+    return text if len(text) <= MAX_QUOTED_CHARACTERS else f"{text[:MAX_QUOTED_CHARACTERS]}…"
 
 
 def _possible_window(window_s: float, rate_hz: float | None) -> None:
     if rate_hz is None:
-        if window_s > WINDOW_LONGEST_S:
-            raise ConfigError(f"{window_s:g} s; at most {WINDOW_LONGEST_S:g} s")
+        if window_s > MAX_WINDOW_S:
+            raise ConfigError(f"{window_s:g} s; at most {MAX_WINDOW_S:g} s")
         return
     low, high = WINDOW_SAMPLES
     if not low <= window_s * rate_hz <= high:
@@ -689,9 +689,9 @@ def _thermal_interval(value: float | str, rate_hz: float | None) -> float | None
     except ConfigError:
         raise ConfigError(f'"{value}" is neither a duration nor "off"; write seconds, or "10min", "1h"') from None
     shortest_s = THERMAL_SAMPLES / rate_hz if rate_hz else 0.0
-    if not shortest_s <= interval_s <= THERMAL_LONGEST_S:
+    if not shortest_s <= interval_s <= MAX_THERMAL_INTERVAL_S:
         few = f"{shortest_s:g} s ({THERMAL_SAMPLES} samples)" if rate_hz else f"{THERMAL_SAMPLES} samples"
-        raise ConfigError(f"{interval_s:g} s; possible are {few} to {THERMAL_LONGEST_S:g} s")
+        raise ConfigError(f"{interval_s:g} s; possible are {few} to {MAX_THERMAL_INTERVAL_S:g} s")
     return interval_s
 
 

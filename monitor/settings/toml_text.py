@@ -8,10 +8,10 @@ from typing import Any, Final
 
 from drivers.errors import ConfigError
 
-LARGEST: Final = 1 << 63
+MAX_INTEGER: Final = 1 << 63
 
 
-def tables(text: str) -> dict[str, Any]:
+def format_tables(text: str) -> dict[str, Any]:
     """The tables of the text.
 
     >>> tables("a = 1")
@@ -31,7 +31,7 @@ def tables(text: str) -> dict[str, Any]:
 
 
 def _check(value: Any) -> None:
-    if isinstance(value, int) and not -LARGEST <= value < LARGEST:
+    if isinstance(value, int) and not -MAX_INTEGER <= value < MAX_INTEGER:
         raise ValueError("a whole number beyond 64 bits")
     for one in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
         _check(one)

@@ -18,7 +18,7 @@ from drivers.quantities import Quantity, find_out_of_range
 
 WRONG: Final = object()
 """Stands for a value that cannot be converted."""
-LONGEST: Final = 60
+MAX_SHOWN_CHARACTERS: Final = 60
 """Characters of a value that a message quotes."""
 
 Hook = Callable[[type, Any], Any]
@@ -98,10 +98,10 @@ def shown(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
-        return f'"{value}"' if len(value) <= LONGEST else f'"{value[:LONGEST]}…"'
+        return f'"{value}"' if len(value) <= MAX_SHOWN_CHARACTERS else f'"{value[:MAX_SHOWN_CHARACTERS]}…"'
     if isinstance(value, list | dict):
         return "a list" if isinstance(value, list) else "a table"
-    return str(value)[:LONGEST]
+    return str(value)[:MAX_SHOWN_CHARACTERS]
 
 
 def _rest(value: Any, kind: Any, hook: Hook, problems: list[Problem]) -> Any:

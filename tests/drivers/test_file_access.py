@@ -25,6 +25,6 @@ def test_what_is_too_large_is_one_line_for_every_reader(tmp_path: Path) -> None:
     config, wrong = loading.read(path)
     assert config is None
     assert "more than 32 MB" in wrong[0]
-    for read in (read_model, thermal.from_file):
+    for read in (read_model, thermal.read_model_file):
         with pytest.raises(ConfigError, match="more than 32 MB"):
             read(path)

@@ -152,7 +152,7 @@ def test_a_thermal_model(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "name"
     make(kind, path)
     with pytest.raises(ConfigError, match=KINDS[kind]):
-        thermal.from_file(path)
+        thermal.read_model_file(path)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".bin", ".log", ".blf", ".asc", ".csv.gz"])

@@ -39,7 +39,7 @@ import numpy as np
 
 from drivers.recordings import save_samples
 from drivers.sample import Floats
-from monitor.commands.reconcile import Request, make
+from monitor.commands.reconcile import Request, run_reconciliation
 from monitor.common import config_files
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
@@ -343,8 +343,10 @@ def remember(path: Path, device: str, now_s: float) -> None:
     for i in range(1430):
         if not 800 <= i < 860:
             scale = (1.0 + wander[i]) * (1.5 if i == 500 else 1.0)
-            rows.append(minutes.estimate(now_s - 86_400.0 + 60.0 * i, like(scale, rng)))
-            rows.append(minutes.temperature(now_s - 86_400.0 + 60.0 * i, np.array([24.0 + 4.0 * np.sin(i / 229.0)])))
+            rows.append(minutes.add_estimate(now_s - 86_400.0 + 60.0 * i, like(scale, rng)))
+            rows.append(
+                minutes.add_temperature(now_s - 86_400.0 + 60.0 * i, np.array([24.0 + 4.0 * np.sin(i / 229.0)]))
+            )
     store = HistoryStore(path)
     times = [now_s - 86_400.0 + 60.0 * i for i in (500, 800, 860)]
     told = [("noise_changed", "gz angle random walk rose by 50 %"), ("link_lost", "/dev/ttyUSB0: gone"),
@@ -437,7 +439,7 @@ def hidden(folder: Path) -> AxisResult:
         assert rate_hz is not None
         n = round(HOUR_S * rate_hz)
         save_samples(source, np.arange(n) / rate_hz, model.simulate(n, rate_hz, 1), None)
-    return make(Request(source, read_model(MODEL), folder / "result")).axes["gz"]
+    return run_reconciliation(Request(source, read_model(MODEL), folder / "result")).axes["gz"]
 
 
 def looked_at(result: AxisResult, when: str, path: Path) -> Path:

@@ -103,7 +103,7 @@ class Hooks(Output):
         wanted = [one for one in self.hooks if _matches(one, device, event.kind)]
         if not wanted:
             return
-        payload = encoding.event(device, unix_s, received, event, encoding.event_start_s(unix_s, event))
+        payload = encoding.encode_event(device, unix_s, received, event, encoding.event_start_s(unix_s, event))
         named = {"IMU_MONITOR_DEVICE": device, "IMU_MONITOR_KIND": event.kind, "IMU_MONITOR_AXIS": event.axis or ""}
         for hook in wanted:
             if not self._may_run(hook, event.kind, device):

@@ -141,7 +141,7 @@ class Reconciler:
             command.refuse(str(error))
             self._finished.put(Finished(job.device, f"reconcile failed: {error}"))
             return
-        command.answer(encoding.reconciled(job.device, job.unix_s, job.samples, result, status, folder))
+        command.answer(encoding.encode_reconciled(job.device, job.unix_s, job.samples, result, status, folder))
         self._finished.put(Finished(job.device, format_result(result, status)))
 
     def _reconcile(self, job: Job) -> tuple[dict[str, Any], int, str | None]:

@@ -55,7 +55,7 @@ def encode_allan(device: str, unix_s: float, estimate: Estimate) -> bytes:
     return _encode(topics.ALLAN, device, unix_s, estimate.samples, _window_payload(estimate, tau=tau, axes=axes))
 
 
-def coefficients(device: str, unix_s: float, estimate: Estimate) -> bytes:
+def encode_coefficients(device: str, unix_s: float, estimate: Estimate) -> bytes:
     """Encode ``imu/<device>/coefficients``: Q, N, B, K and R of each measured axis with interval and status.
 
     Parameters
@@ -74,7 +74,7 @@ def coefficients(device: str, unix_s: float, estimate: Estimate) -> bytes:
     return _encode(topics.COEFFICIENTS, device, unix_s, estimate.samples, _window_payload(estimate, axes=axes))
 
 
-def gap(device: str, unix_s: float, look: ModelGap) -> bytes:
+def encode_gap(device: str, unix_s: float, look: ModelGap) -> bytes:
     """Encode ``imu/<device>/gap``: measured deviations and those of the model in use.
 
     Only axes that can be tested are included.
@@ -116,7 +116,7 @@ def gap(device: str, unix_s: float, look: ModelGap) -> bytes:
     return _encode(topics.GAP, device, unix_s, look.samples, payload)
 
 
-def thermal(device: str, unix_s: float, samples: int, look: ThermalUpdate) -> bytes:
+def encode_thermal(device: str, unix_s: float, samples: int, look: ThermalUpdate) -> bytes:
     """Encode ``imu/<device>/thermal``: the mean bias of an interval and its prediction; ``t`` is the interval's end.
 
     ``multi_step`` is predicted from the temperature alone, ``one_step`` also from the preceding bias. Both are null if
@@ -149,7 +149,7 @@ def thermal(device: str, unix_s: float, samples: int, look: ThermalUpdate) -> by
     return _encode(topics.THERMAL, device, unix_s, samples, payload)
 
 
-def total(device: str, unix_s: float, samples: int, total: TotalCurve, hadamard: HadamardCurve) -> bytes:
+def encode_total(device: str, unix_s: float, samples: int, total: TotalCurve, hadamard: HadamardCurve) -> bytes:
     """Encode ``imu/<device>/total``: total and Hadamard deviation of each measured axis, each with its own τ.
 
     Parameters
@@ -208,7 +208,7 @@ def coefficient_table(all_axes: Coefficients, axis: int, k_or_r: bool = False) -
     }
 
 
-def event(device: str, unix_s: float, samples: int, what: Event, since_s: float | None) -> bytes:
+def encode_event(device: str, unix_s: float, samples: int, what: Event, since_s: float | None) -> bytes:
     """Encode ``imu/<device>/event``.
 
     Parameters
@@ -248,7 +248,7 @@ def event_start_s(unix_s: float, what: Event) -> float | None:
     return None if what.since_ns is None else unix_s - (what.t_ns - what.since_ns) / 1e9
 
 
-def status(device: str, unix_s: float | None, health: Health) -> bytes:
+def encode_status(device: str, unix_s: float | None, health: Health) -> bytes:
     """Encode ``imu/<device>/status``.
 
     Parameters
@@ -281,7 +281,7 @@ def status(device: str, unix_s: float | None, health: Health) -> bytes:
     return _encode(topics.STATUS, device, unix_s, health.received, payload)
 
 
-def reply(device: str, unix_s: float | None, samples: int, text: str) -> bytes:
+def encode_reply(device: str, unix_s: float | None, samples: int, text: str) -> bytes:
     """Encode the reply to ``imu/<device>/command/<verb>``.
 
     Parameters
@@ -298,7 +298,7 @@ def reply(device: str, unix_s: float | None, samples: int, text: str) -> bytes:
     return _encode(topics.RESET, device, unix_s, samples, {"text": text})
 
 
-def reconciled(
+def encode_reconciled(
     device: str, unix_s: float, samples: int, result: Mapping[str, Any], status: int, folder: str | None
 ) -> bytes:
     """Encode the reply to ``imu/<device>/command/reconcile``: the keys of the report, exit status and folder.
@@ -322,7 +322,7 @@ def reconciled(
     return _encode(topics.RECONCILE, device, unix_s, samples, {**own, "exit": status, "folder": folder})
 
 
-def analysis(
+def encode_analysis(
     result: Analysis,
     total: TotalCurve | None = None,
     hadamard: HadamardCurve | None = None,

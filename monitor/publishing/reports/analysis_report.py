@@ -107,14 +107,14 @@ def html_report(
     ConfigError
         matplotlib or Jinja2 is missing, or the file cannot be written.
     """
-    page = html(analysis, title, others, dynamic, marks)
+    page = render_page(analysis, title, others, dynamic, marks)
     try:
         path.write_text(page, "utf-8")
     except OSError as error:
         raise ConfigError(f"cannot write the report {path}: {error}") from error
 
 
-def html(
+def render_page(
     analysis: Analysis,
     title: str = "",
     others: Sequence[OtherDeviation] = (),

@@ -90,7 +90,7 @@ class SingleRow:
     elsewhere: tuple[tuple[str, str, str, str], ...]  # recording, meaning as in the JSON and as text, and reason
 
 
-def page(c: Comparison) -> str:
+def render_page(c: Comparison) -> str:
     """Return the page as text.
 
     Raises

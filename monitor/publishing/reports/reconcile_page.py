@@ -105,7 +105,7 @@ class Agreeing:
     views: tuple[tuple[str, ...], ...]  # SVG of each axis
 
 
-def page(r: Reconciliation, title: str = "") -> str:
+def render_page(r: Reconciliation, title: str = "") -> str:
     """Return the page as text.
 
     Parameters

@@ -20,7 +20,7 @@ ARMA_COEFFICIENT_NAMES: Final = ("phi1", "phi2", "theta1")
 """JSON keys of the ARMA coefficients."""
 
 
-def tell(result: CompensationResult, console: Console) -> None:
+def print_compensation(result: CompensationResult, console: Console) -> None:
     """Print the results of the compensation.
 
     Parameters
@@ -58,7 +58,7 @@ def tell(result: CompensationResult, console: Console) -> None:
     console.print(f"{result.out} written", highlight=False, soft_wrap=True)
 
 
-def to_json(result: CompensationResult) -> bytes:
+def encode_compensation(result: CompensationResult) -> bytes:
     """Encode the results as JSON, in SI units."""
     whole = {
         "schema": SCHEMA,

@@ -32,7 +32,7 @@ WIDTH_UNITS: Final = ((86_400, "d"), (3600, "h"), (60, "min"), (1, "s"))
 """Units of bucket widths, the largest first."""
 
 
-def tell(past: HistoryTable, axes: tuple[str, ...], letters: tuple[str, ...], console: Console) -> None:
+def print_history(past: HistoryTable, axes: tuple[str, ...], letters: tuple[str, ...], console: Console) -> None:
     """Print the summary of a history: one line per axis and letter, then status and events.
 
     Parameters
@@ -53,10 +53,10 @@ def tell(past: HistoryTable, axes: tuple[str, ...], letters: tuple[str, ...], co
             console.print(Padding(_summary(past, kind, shown, letters), (1, 0, 0, 0)))
     for line in status_lines(past):
         console.print(line, highlight=False)
-    tell_events(past, console)
+    print_events(past, console)
 
 
-def tell_course(past: HistoryTable, axis: str, letters: tuple[str, ...], console: Console) -> None:
+def print_axis_history(past: HistoryTable, axis: str, letters: tuple[str, ...], console: Console) -> None:
     """Print one axis over time: one line per bucket, with the extremes of each coefficient.
 
     Parameters
@@ -90,7 +90,7 @@ def tell_course(past: HistoryTable, axis: str, letters: tuple[str, ...], console
     console.print(Padding(table, (1, 0, 0, 0)))
 
 
-def tell_events(past: HistoryTable, console: Console) -> None:
+def print_events(past: HistoryTable, console: Console) -> None:
     """Print the newest MAX_EVENTS events.
 
     Parameters

@@ -29,7 +29,7 @@ RESULT_STYLES: Final = {
 """Symbol and colour of each result."""
 
 
-def tell(r: Reconciliation, console: Console) -> None:
+def print_report(r: Reconciliation, console: Console) -> None:
     """Print the result of a reconciliation.
 
     Parameters
@@ -85,7 +85,7 @@ def _verdict(verdict: str) -> Text:
     return Text(f"{sign} {words.RESULT_TEXTS[verdict]}", style=style)
 
 
-def tell_runs(c: Comparison, console: Console) -> None:
+def print_comparison(c: Comparison, console: Console) -> None:
     """Print the comparison of several recordings.
 
     Parameters

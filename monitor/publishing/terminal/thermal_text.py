@@ -28,7 +28,7 @@ ONE_WAY: Final = (
 DRIFT_WITH_TIME: Final = "temperature only rose or only fell, so a drift with time by itself can look the same"
 
 
-def tell(study: ThermalFitReport, console: Console) -> None:
+def print_thermal_fit(study: ThermalFitReport, console: Console) -> None:
     """Print the results of a thermal model fit.
 
     Parameters
@@ -55,7 +55,7 @@ def tell(study: ThermalFitReport, console: Console) -> None:
     _print_notes(study.refused, notes, console)
 
 
-def tell_outlook(outlook: ThermalPredictionReport, console: Console) -> None:
+def print_thermal_prediction(outlook: ThermalPredictionReport, console: Console) -> None:
     """Print the predictions of thermal models for a recording, and their errors.
 
     Parameters
@@ -111,7 +111,7 @@ def notes_on_hysteresis(study: ThermalFitReport) -> list[str]:
     ]
 
 
-def study_json(study: ThermalFitReport) -> bytes:
+def encode_thermal_fit(study: ThermalFitReport) -> bytes:
     """Encode the results of a thermal model fit as JSON, in SI units."""
     axes: dict[str, Any] = {}
     for axis, one in study.fits.items():
@@ -139,7 +139,7 @@ def study_json(study: ThermalFitReport) -> bytes:
     return _json(FIT_SCHEMA, study.recording, study.interval_s, axes, study.refused, study.notes)
 
 
-def outlook_json(outlook: ThermalPredictionReport) -> bytes:
+def encode_thermal_prediction(outlook: ThermalPredictionReport) -> bytes:
     """Encode predictions and measured means as JSON, in SI units."""
     axes = {axis: _prediction_of_axis(outlook.means[axis], one) for axis, one in outlook.judged.items()}
     return _json(PREDICT_SCHEMA, outlook.recording, outlook.interval_s, axes, outlook.refused, outlook.notes)

@@ -164,7 +164,7 @@ def noise_deviation_over_time(effects: Effects, n: int, rate_hz: float) -> Float
     return np.asarray(course / np.sqrt(np.mean(course**2)))
 
 
-def psd(seen: WhitenedAxis) -> Finding:
+def diagnose_psd(seen: WhitenedAxis) -> Finding:
     """Find the range of frequency bins, of any width, whose power differs most from its expectation."""
     bins = even_bins(seen.axis.n, seen.axis.rate_hz)  # the same bins for recordings with and without peaks
     power = np.concatenate([[0.0], np.cumsum(bins.sums(seen.whitened**2))])
@@ -203,7 +203,7 @@ def power_gain(ratio: Floats, count: Floats) -> Floats:
     return np.asarray(0.5 * count * (safe - 1.0 - np.log(safe)))
 
 
-def lines(seen: WhitenedAxis) -> Finding:
+def diagnose_lines(seen: WhitenedAxis) -> Finding:
     """Find a steady oscillation: the largest value of the periodogram at twice the usual resolution."""
     found = find_line_peaks(seen.white, seen.axis.rate_hz, 1)
     gain, f_hz = found[0]
@@ -255,7 +255,7 @@ def periodogram(white: Floats) -> Floats:
     return np.asarray(power)
 
 
-def level(seen: WhitenedAxis) -> Finding:
+def diagnose_level(seen: WhitenedAxis) -> Finding:
     """Find a change of the level: a step at any time, a slope, or a transient after the start.
 
     If the model itself contains jumps, a change of the level is no evidence, because whitening does not remove jumps.
@@ -327,7 +327,7 @@ def regressor_gain(seen: WhitenedAxis, columns: list[Floats]) -> float:
     return float(0.5 * solved @ (right / scale))
 
 
-def autocorrelation(seen: WhitenedAxis) -> Finding:
+def diagnose_autocorrelation(seen: WhitenedAxis) -> Finding:
     """Find the lag at which the whitened series is most strongly correlated with itself."""
     n = seen.white.size
     turned = rfft(seen.white, next_fast_len(n + MAX_LAG_SAMPLES, real=True))
@@ -340,7 +340,7 @@ def autocorrelation(seen: WhitenedAxis) -> Finding:
     return Finding(float(gains[at]), Location(tau=(lag_s, lag_s)))
 
 
-def temperature(seen: WhitenedAxis) -> Finding:
+def diagnose_temperature(seen: WhitenedAxis) -> Finding:
     """Find a dependence of the level on the temperature, with and without delay."""
     warmth = seen.axis.temperature_c
     if warmth is None:
@@ -357,7 +357,7 @@ def temperature(seen: WhitenedAxis) -> Finding:
     return Finding(best, place)
 
 
-def other_axes(seen: WhitenedAxis) -> Finding:
+def diagnose_other_axes(seen: WhitenedAxis) -> Finding:
     """Find the axis that leaks most strongly into this axis."""
     best = Finding(0.0, Location())
     for name, coefficients in seen.axis.others.items():
@@ -367,14 +367,14 @@ def other_axes(seen: WhitenedAxis) -> Finding:
     return best
 
 
-def variance(seen: WhitenedAxis) -> Finding:
+def diagnose_variance(seen: WhitenedAxis) -> Finding:
     """Find a variation of the noise variance in time: a step, a trend, a period or a slow random variation."""
     found = seen.course
     gain = max(found.step.gain, found.trend, found.periodic.gain, found.wander)
     return Finding(gain, Location(time=(found.step.time.lo, found.step.time.hi)))
 
 
-def spectrogram(seen: WhitenedAxis) -> Finding:
+def diagnose_spectrogram(seen: WhitenedAxis) -> Finding:
     """Find the place in time and frequency whose power is least constant: a rectangle or a whole row."""
     found = least_constant_tiles(seen)
     if found.gain >= found.row_gain:
@@ -390,13 +390,13 @@ def least_constant_tiles(seen: WhitenedAxis) -> SpectrogramExtremes:
     )
 
 
-def tails(seen: WhitenedAxis) -> Finding:
+def diagnose_tails(seen: WhitenedAxis) -> Finding:
     """Find outliers in the distribution of the samples."""
     found = seen.outliers
     return Finding(found.gain if found else 0.0, Location())
 
 
-def values(seen: WhitenedAxis) -> Finding:
+def diagnose_values(seen: WhitenedAxis) -> Finding:
     """Find quantization, clipping or repeats in the measured values that the model does not contain."""
     have = {type(effect) for effect in seen.likely.effects}
     shown = seen.axis.shown
@@ -410,15 +410,15 @@ def values(seen: WhitenedAxis) -> Finding:
 
 
 DIAGNOSTICS: Final[dict[str, Diagnostic]] = {
-    "values": values,
-    "psd": psd,
-    "lines": lines,
-    "autocorrelation": autocorrelation,
-    "level": level,
-    "temperature": temperature,
-    "other_axes": other_axes,
-    "tails": tails,
-    "variance": variance,
-    "spectrogram": spectrogram,
+    "values": diagnose_values,
+    "psd": diagnose_psd,
+    "lines": diagnose_lines,
+    "autocorrelation": diagnose_autocorrelation,
+    "level": diagnose_level,
+    "temperature": diagnose_temperature,
+    "other_axes": diagnose_other_axes,
+    "tails": diagnose_tails,
+    "variance": diagnose_variance,
+    "spectrogram": diagnose_spectrogram,
 }
 """Diagnostics by name, in the order of the report."""

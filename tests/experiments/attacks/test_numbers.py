@@ -27,7 +27,7 @@ from drivers.quantities import Quantity
 from drivers.recordings import load_samples
 from drivers.sample import AXES
 from monitor import cli
-from monitor.commands.analyze import Request, make
+from monitor.commands.analyze import Request, run_analysis
 from monitor.common import config_files
 from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
@@ -466,14 +466,14 @@ def test_every_supported_rate_is_answered(rate_hz: float, tmp_path: Path) -> Non
     """Both ends of the range, and a sensor of vibration; slow sensors are above, by their time stamps."""
     path = tmp_path / "r.npz"
     np.savez(path, t=np.arange(2000) / rate_hz, **columns(2000))
-    found = make(Request(path, total_and_hadamard=True, window_s=500.0 / rate_hz))
+    found = run_analysis(Request(path, total_and_hadamard=True, window_s=500.0 / rate_hz))
     assert found.analysis.estimate.rate_hz == pytest.approx(rate_hz, rel=1e-3)
 
 
 def answer_or_refuse(request: Request) -> bool:
     """Return True if there is an answer; a warning is an error here."""
     try:
-        make(request)
+        run_analysis(request)
     except ImuError:
         return False
     return True

@@ -74,13 +74,15 @@ class Side:
 
 def sides(recording: Path, model: str, seed: int) -> tuple[Side, Side]:
     """The recording, and the model for as long."""
-    recorded = analyze.make(analyze.Request(recording)).analysis
+    recorded = analyze.run_analysis(analyze.Request(recording)).analysis
     estimate = recorded.estimate
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "simulated.npz"
         seconds = estimate.curve.n / estimate.rate_hz
-        simulate.make(simulate.Request(load_model(model, Path.cwd()), out, seconds, seed, estimate.rate_hz, name=model))
-        simulated = analyze.make(analyze.Request(out)).analysis
+        simulate.run_simulation(
+            simulate.Request(load_model(model, Path.cwd()), out, seconds, seed, estimate.rate_hz, name=model)
+        )
+        simulated = analyze.run_analysis(analyze.Request(out)).analysis
     return Side("recorded", recorded), Side("simulated", simulated)
 
 

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from drivers.recordings import load_samples
 from drivers.sample import AXES, Floats, make_block
-from monitor.commands.compensate import METHODS, Request, make
+from monitor.commands.compensate import METHODS, Request, run_compensation
 from monitor.daemon.arma_worker import ArmaWorker
 from monitor.drift.compensation import sage_husa
 from monitor.drift.compensation.arma import fit_arma
@@ -162,7 +162,7 @@ def _judged(recording: Path, method: str) -> Floats:
 def _axes(recording: Path, method: str) -> list[AxisCompensation]:
     """What compensation made of each axis; the recording that comes out is not kept."""
     with tempfile.TemporaryDirectory() as folder:
-        return list(make(Request(recording, Path(folder) / "out.npz", method)).axes.values())
+        return list(run_compensation(Request(recording, Path(folder) / "out.npz", method)).axes.values())
 
 
 def _row(rows: Floats) -> list[str]:

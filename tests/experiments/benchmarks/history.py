@@ -70,7 +70,7 @@ def cost() -> None:
     minutes, rows = MinuteAggregator(), []
     begun = time.perf_counter()
     for i in range(20_000):
-        rows.append(minutes.estimate(T0 + 0.1 * i, looks[i % 50]))
+        rows.append(minutes.add_estimate(T0 + 0.1 * i, looks[i % 50]))
     each = (time.perf_counter() - begun) / 20_000
     full = [row for row in rows if row is not None]
     print(f"an estimate: {each * 1e6:.1f} µs in the loop; {len(full[0].names)} numbers")

@@ -19,7 +19,7 @@ from drivers.recordings import segment
 from drivers.recordings.segment import DaemonState, SegmentWriter
 from drivers.sample import make_block
 from monitor.commands import doctor
-from monitor.commands.doctor import SAMPLE_BYTES, Finding, bytes_a_day, disk_space, examine, satisfies, worst
+from monitor.commands.doctor import SAMPLE_BYTES, Finding, bytes_a_day, disk_space, examine, satisfies, worst_mark
 from monitor.common.compiled import cache_folder
 from monitor.common.config_files import CONFIG_FOLDER
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, FolderLock
@@ -72,7 +72,7 @@ def test_a_file_that_is_not_there_is_wrong_and_the_machine_is_looked_at_still(tm
     found = examine(tmp_path / "none.toml")
     assert "no such file" in one_of(found, "configuration").text
     assert of(found, "clock")
-    assert worst(found) == "wrong"
+    assert worst_mark(found) == "wrong"
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_a_bus_is_there_and_up_or_what_to_do_is_said(tmp_path: Path) -> None:
     interface("eth0", "1", "0x1003")
 
     def said(name: str) -> tuple[str, str]:
-        (found,) = doctor.can_interface("device a", "socketcan", name, tmp_path)
+        (found,) = doctor.check_can_interface("device a", "socketcan", name, tmp_path)
         return found.mark, found.text
 
     assert said("can0") == ("well", "can0: is up")
@@ -180,7 +180,7 @@ def test_a_bus_is_there_and_up_or_what_to_do_is_said(tmp_path: Path) -> None:
 
 def test_a_package_that_the_interface_lacks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "msgpack", None)  # as if it were not installed
-    (found,) = doctor.can_interface("device a", "udp_multicast", "239.74.163.2")
+    (found,) = doctor.check_can_interface("device a", "udp_multicast", "239.74.163.2")
     assert (found.mark, found.text) == ("wrong", "CAN interface udp_multicast needs the package msgpack")
     assert found.do == 'pip install "imu-monitor[multicast]"'
 
@@ -276,7 +276,7 @@ def test_what_a_sample_is_said_to_take_is_what_it_takes(tmp_path: Path) -> None:
 
 
 def test_the_libraries_here_are_those_that_are_required() -> None:
-    found = doctor.libraries()
+    found = doctor.check_libraries()
     assert [one.mark for one in found] == ["well"], found
     required = {name: optional for name, _, optional in doctor.requirements()}
     assert required["numpy"] is False
@@ -321,7 +321,7 @@ def test_kernels_that_cannot_be_kept_are_told(tmp_path: Path) -> None:
 
 
 def test_the_clock_is_asked_and_an_answer_given() -> None:
-    (found,) = doctor.clock()
+    (found,) = doctor.check_clock()
     assert found.mark in ("well", "doubt")
     assert bool(found.do) == ("not synchronised" in found.text)
 

@@ -27,7 +27,7 @@ FILES = ["report.html", "report.json", "model.toml"]
 
 
 def recorded(path: Path, model: NoiseModel, seed: int, seconds: float = 600.0) -> Path:
-    simulate.make(simulate.Request(model, path, seconds, seed))
+    simulate.run_simulation(simulate.Request(model, path, seconds, seed))
     return path
 
 
@@ -161,7 +161,7 @@ def test_what_cannot_be_compared_is_refused_before_the_work(tmp_path: Path, monk
     def worked(*_: object) -> Reconciliation:
         raise AssertionError("worked")
 
-    monkeypatch.setattr(reconcile, "make", worked)
+    monkeypatch.setattr(reconcile, "run_reconciliation", worked)
     (tmp_path / "a.csv").touch()
     (tmp_path / "b").mkdir()
     a, b = tmp_path / "a.csv", tmp_path / "b"

@@ -27,7 +27,7 @@ def gathered(minutes: MinuteAggregator, *rows: HistoryRow | None) -> list[Histor
 def test_every_estimate_is_in_one_row(looks: list[tuple[float, int]]) -> None:
     looks = sorted(looks)
     minutes = MinuteAggregator()
-    rows = gathered(minutes, *[minutes.estimate(T0 + at, ESTIMATES[i]) for at, i in looks])
+    rows = gathered(minutes, *[minutes.add_estimate(T0 + at, ESTIMATES[i]) for at, i in looks])
     assert [row.start_s for row in rows] == sorted({int((T0 + at) // 60) * 60 for at, _ in looks})
     for row in rows:
         inside = [value(i) for at, i in looks if row.start_s <= T0 + at < row.end_s]
@@ -39,18 +39,18 @@ def test_counts_are_what_came_in_the_minute_and_a_restart_begins_at_nothing() ->
     minutes = MinuteAggregator()
     reports = [(0.0, 100, 1), (59.0, 6000, 1), (60.0, 6100, 2), (90.0, 50, 0), (119.0, 3000, 5)]
     rows = gathered(
-        minutes, *[minutes.health(T0 + at, health(received=received, lost=lost)) for at, received, lost in reports]
+        minutes, *[minutes.add_health(T0 + at, health(received=received, lost=lost)) for at, received, lost in reports]
     )
     assert [row.counts[:2] for row in rows] == [(6000, 1), (100 + 3000, 1 + 5)]
 
 
 def test_a_row_has_the_worst_state_and_the_temperature() -> None:
     minutes = MinuteAggregator()
-    minutes.temperature(T0, np.array([20.0, np.nan, 22.0]))
-    minutes.temperature(T0 + 1.0, np.array([np.nan]))
-    minutes.temperature(T0 + 2.0, np.array([30.0]))
-    minutes.health(T0 + 3.0, health(state="lost", rate_hz=None, latency_p99_s=None))
-    minutes.health(T0 + 4.0, health(state="running"))
+    minutes.add_temperature(T0, np.array([20.0, np.nan, 22.0]))
+    minutes.add_temperature(T0 + 1.0, np.array([np.nan]))
+    minutes.add_temperature(T0 + 2.0, np.array([30.0]))
+    minutes.add_health(T0 + 3.0, health(state="lost", rate_hz=None, latency_p99_s=None))
+    minutes.add_health(T0 + 4.0, health(state="running"))
     (row,) = gathered(minutes)
     assert STATES[row.state] == "lost"
     assert numbers_of(row, "temperature") == (2, 21.0, 30.0, 30.0)
@@ -59,7 +59,7 @@ def test_a_row_has_the_worst_state_and_the_temperature() -> None:
 
 def test_a_moment_late_is_counted_with_the_others_and_an_older_time_is_not() -> None:
     minutes = MinuteAggregator()
-    rows = [minutes.estimate(T0 + at, ESTIMATES[0]) for at in (0.0, -0.5, 1.0, -600.0, 2.0)]
+    rows = [minutes.add_estimate(T0 + at, ESTIMATES[0]) for at in (0.0, -0.5, 1.0, -600.0, 2.0)]
     assert [(row.start_s, int(row.n[0])) for row in gathered(minutes, *rows)] == [
         (T0, 3),
         (T0 - 600.0, 1),
@@ -72,7 +72,7 @@ def test_an_axis_that_comes_within_a_minute_makes_two_rows_of_it() -> None:
     avar[:, 3:] = np.nan
     fewer = replace(ESTIMATES[0], curve=replace(ESTIMATES[0].curve, avar=avar))
     minutes = MinuteAggregator()
-    rows = gathered(minutes, *[minutes.estimate(T0 + i, one) for i, one in enumerate((fewer, fewer, ESTIMATES[0]))])
+    rows = gathered(minutes, *[minutes.add_estimate(T0 + i, one) for i, one in enumerate((fewer, fewer, ESTIMATES[0]))])
     assert [(row.start_s, numbers_of(row, "gz.N")[0], numbers_of(row, "az.N")[0]) for row in rows] == [
         (T0, 2, 0),
         (T0, 1, 1),
@@ -82,5 +82,5 @@ def test_an_axis_that_comes_within_a_minute_makes_two_rows_of_it() -> None:
 def test_where_nothing_came_there_is_no_row() -> None:
     minutes = MinuteAggregator()
     assert minutes.flush() is None
-    assert minutes.temperature(T0, np.array([np.nan])) is None
+    assert minutes.add_temperature(T0, np.array([np.nan])) is None
     assert minutes.flush() is None

@@ -57,7 +57,7 @@ def printed(tell, *arguments: object, width: int = 110) -> str:
 
 def test_the_summary_has_first_last_extremes_and_what_happened() -> None:
     past = made()
-    text = printed(history_text.tell, past, AXES, ("N", "R"))
+    text = printed(history_text.print_history, past, AXES, ("N", "R"))
     assert "bench-1: 2025-11-21 00:00 to 2025-11-22 00:00 UTC, 44 rows of 30 min, 7,920,000 samples" in text
     n = past.column("gz.N")
     unit = unit_of("N", "gz")
@@ -75,7 +75,7 @@ def test_the_summary_has_first_last_extremes_and_what_happened() -> None:
 
 
 def test_one_axis_over_time_has_a_line_a_bucket() -> None:
-    text = printed(history_text.tell_course, made(), "gz", SYMBOLS)
+    text = printed(history_text.print_axis_history, made(), "gz", SYMBOLS)
     lines = [line for line in text.splitlines() if line.startswith("2025-11-21")]
     assert len(lines) == 44
     assert lines[7].split()[3].startswith(f"{1e-4 * unit_of('N', 'gz').factor:.1f}")
@@ -85,7 +85,7 @@ def test_one_axis_over_time_has_a_line_a_bucket() -> None:
 
 def test_a_span_of_events_alone_is_printed() -> None:
     past = build_table("bench-1", TimeRange(T0, T0 + 60.0), 60, [], EVENTS, 2)
-    text = printed(history_text.tell, past, AXES, SYMBOLS)
+    text = printed(history_text.print_history, past, AXES, SYMBOLS)
     assert "no rows between 2025-11-21 00:00:00" in text
     assert "gz noisier" in text
 

@@ -109,7 +109,7 @@ def daemon(file: Path) -> Iterator[ZenohPublisher]:
 
     def work() -> None:
         while not ending.wait(0.1):
-            out.put(topics.STATUS, "nose", encoding.status("nose", time.time(), made.health()))
+            out.put(topics.STATUS, "nose", encoding.encode_status("nose", time.time(), made.health()))
             while not out.commands.empty():
                 out.commands.get_nowait().answer(b'"done"')
 

@@ -3,12 +3,12 @@
 import pytest
 
 from drivers.errors import ConfigError
-from monitor.settings.toml_text import tables
+from monitor.settings.toml_text import format_tables
 
 
 def test_whole_numbers_of_64_bits() -> None:
     text = "a = 9223372036854775807\nb = [-9223372036854775808]\n[c]\nd = 1e300"
-    assert tables(text) == {"a": 2**63 - 1, "b": [-(2**63)], "c": {"d": 1e300}}
+    assert format_tables(text) == {"a": 2**63 - 1, "b": [-(2**63)], "c": {"d": 1e300}}
 
 
 @pytest.mark.parametrize(
@@ -25,5 +25,5 @@ def test_whole_numbers_of_64_bits() -> None:
 )
 def test_what_is_wrong_is_one_line(text: str, why: str) -> None:
     with pytest.raises(ConfigError, match=why) as error:
-        tables(text)
+        format_tables(text)
     assert "\n" not in str(error.value)

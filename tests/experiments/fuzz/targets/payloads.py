@@ -162,7 +162,7 @@ def thermal_model(data: bytes) -> None:
     path = folder() / "thermal.json"
     path.write_bytes(data)
     try:
-        models = thermal.from_file(path)
+        models = thermal.read_model_file(path)
     except ConfigError as error:
         one_line(error)
         return

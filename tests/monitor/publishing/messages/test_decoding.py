@@ -15,7 +15,7 @@ def through_messages(estimate: object, **changed: object) -> object:
     allan = json.loads(encoding.encode_allan("a", 1.76e9, estimate)) | changed  # type: ignore[arg-type]
     noise = remote_device.noise(
         remote_device.read(
-            remote_device.CoefficientsMessage, topics.COEFFICIENTS, encoding.coefficients("a", 1.76e9, estimate)
+            remote_device.CoefficientsMessage, topics.COEFFICIENTS, encoding.encode_coefficients("a", 1.76e9, estimate)
         )  # type: ignore[arg-type]
     )
     return decoding.to_estimate(
@@ -59,10 +59,10 @@ def test_what_is_no_curve_is_refused(changed: dict[str, object]) -> None:
 
 def test_health_and_events() -> None:
     sent = made.health(text="viewer is slow")
-    got = decoding.to_health(remote_device.status(encoding.status("a", 1.0, sent)))
+    got = decoding.to_health(remote_device.status(encoding.encode_status("a", 1.0, sent)))
     assert got.text == "viewer is slow"
     assert (got.received, got.uptime_s, got.memory_bytes) == (sent.received, sent.uptime_s, sent.memory_bytes)
     happened = Event("noise_changed", 10**18, "gz rose", "gz", {"N": {"before": 1.0, "after": 2.0}})
-    read = decoding.to_event(remote_device.event(encoding.event("a", 1e9, 5, happened, None)))
+    read = decoding.to_event(remote_device.event(encoding.encode_event("a", 1e9, 5, happened, None)))
     assert (read.kind, read.axis, read.text, read.values) == ("noise_changed", "gz", "gz rose", happened.values)
     assert read.axis in AXES

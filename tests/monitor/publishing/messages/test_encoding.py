@@ -39,14 +39,16 @@ def gyro_z_only() -> Any:
 
 ALL = {
     topics.ALLAN: encoding.encode_allan("bench-1", UNIX_S, made.estimate()),
-    topics.COEFFICIENTS: encoding.coefficients("bench-1", UNIX_S, made.estimate()),
-    topics.TOTAL: encoding.total("bench-1", UNIX_S, 360_000, *made.slow_curves()),
-    topics.GAP: encoding.gap("bench-1", UNIX_S, made.look(gz=False, gx=True)),
-    topics.THERMAL: encoding.thermal("bench-1", UNIX_S, 360_000, made.thermal_look()),
-    topics.EVENT: encoding.event("bench-1", UNIX_S, 360_000, Event("link_back", 0, "back"), None),
-    topics.STATUS: encoding.status("bench-1", UNIX_S, made.health()),
-    topics.RESET: encoding.reply("bench-1", UNIX_S, 360_000, "the window is empty"),
-    topics.RECONCILE: encoding.reconciled("bench-1", UNIX_S, 360_000, {"schema": "x", "verdict": "agrees"}, 0, None),
+    topics.COEFFICIENTS: encoding.encode_coefficients("bench-1", UNIX_S, made.estimate()),
+    topics.TOTAL: encoding.encode_total("bench-1", UNIX_S, 360_000, *made.slow_curves()),
+    topics.GAP: encoding.encode_gap("bench-1", UNIX_S, made.look(gz=False, gx=True)),
+    topics.THERMAL: encoding.encode_thermal("bench-1", UNIX_S, 360_000, made.thermal_look()),
+    topics.EVENT: encoding.encode_event("bench-1", UNIX_S, 360_000, Event("link_back", 0, "back"), None),
+    topics.STATUS: encoding.encode_status("bench-1", UNIX_S, made.health()),
+    topics.RESET: encoding.encode_reply("bench-1", UNIX_S, 360_000, "the window is empty"),
+    topics.RECONCILE: encoding.encode_reconciled(
+        "bench-1", UNIX_S, 360_000, {"schema": "x", "verdict": "agrees"}, 0, None
+    ),
 }
 
 
@@ -120,7 +122,7 @@ def test_thermal() -> None:
 
 def test_gap() -> None:
     look = made.look(made.estimate(seconds=600.0), scale=1.1, gz=False, gx=True)
-    found = parsed(encoding.gap("a", UNIX_S, look))
+    found = parsed(encoding.encode_gap("a", UNIX_S, look))
     assert (found["rate"], found["window"], found["filled"]) == (100.0, 3600.0, 600.0)
     assert found["tau"] == look.tau_s.tolist()
     assert list(found["axes"]) == list(AXES)
@@ -139,12 +141,12 @@ def test_gap() -> None:
 def test_where_a_model_knows_nothing_it_says_null() -> None:
     look = made.look(made.estimate(seconds=600.0))
     look.axes["gz"].z[0] = np.nan
-    assert parsed(encoding.gap("a", UNIX_S, look))["axes"]["gz"]["z"][0] is None
+    assert parsed(encoding.encode_gap("a", UNIX_S, look))["axes"]["gz"]["z"][0] is None
 
 
 def test_the_reports_own_words_are_kept_and_the_head_is_ours() -> None:
     result = {"schema": "x", "samples": 5, "verdict": "explained", "axes": {"gz": {"steps": []}}}
-    found = parsed(encoding.reconciled("a", UNIX_S, 360_000, result, 3, "/reports/a"))
+    found = parsed(encoding.encode_reconciled("a", UNIX_S, 360_000, result, 3, "/reports/a"))
     assert (found["schema"], found["samples"]) == ("imu-monitor/reconcile/1", 360_000)
     assert (found["verdict"], found["axes"], found["exit"], found["folder"]) == (
         "explained", {"gz": {"steps": []}}, 3, "/reports/a"
@@ -152,13 +154,13 @@ def test_the_reports_own_words_are_kept_and_the_head_is_ours() -> None:
 
 
 def test_too_few_data_are_null_and_say_so() -> None:
-    found = parsed(encoding.coefficients("a", UNIX_S, made.estimate(seconds=600.0)))
+    found = parsed(encoding.encode_coefficients("a", UNIX_S, made.estimate(seconds=600.0)))
     assert found["axes"]["ax"]["R"] == {"value": None, "lo": None, "hi": None, "status": "unestimated"}
 
 
 def test_axes_that_are_not_measured_are_absent() -> None:
     estimate = gyro_z_only()
-    assert list(parsed(encoding.coefficients("a", UNIX_S, estimate))["axes"]) == ["gz"]
+    assert list(parsed(encoding.encode_coefficients("a", UNIX_S, estimate))["axes"]) == ["gz"]
     assert list(parsed(encoding.encode_allan("a", UNIX_S, estimate))["axes"]) == ["gz"]
 
 
@@ -184,7 +186,7 @@ def test_event() -> None:
         since_ns=1,
         sigma=9.1,
     )
-    found = parsed(encoding.event("bench-1", UNIX_S, 7, what, 1763699980.0))
+    found = parsed(encoding.encode_event("bench-1", UNIX_S, 7, what, 1763699980.0))
     assert {key: found[key] for key in list(found)[4:]} == {
         "kind": "noise_changed",
         "axis": "gz",
@@ -197,7 +199,7 @@ def test_event() -> None:
 
 def test_status() -> None:
     health = made.health(outputs={"zenoh": "ok", "viewer": "stalled"}, text="…", rate_hz=None, latency_p99_s=None)
-    found = parsed(encoding.status("bench-1", UNIX_S, health))
+    found = parsed(encoding.encode_status("bench-1", UNIX_S, health))
     assert {key: found[key] for key in list(found)[4:]} == {
         "state": "running",
         "rate": None,
@@ -232,7 +234,7 @@ def analyzed(**more: Any) -> dict[str, Any]:
     theta = np.zeros((5, 6)) + made.true_coefficients() ** 2
     values = 1e-3 * np.random.default_rng(1).standard_normal((3000, 6))
     return parsed(
-        encoding.analysis(
+        encoding.encode_analysis(
             result,
             total_curve(values, 100.0, theta, np.array([1, 1000, 2900])),
             hadamard_curve(values, 100.0, theta, np.array([1, 1000])),
@@ -306,7 +308,7 @@ def test_dynamic_curves_are_lists_by_time_step() -> None:
 
 
 def test_what_was_not_made_is_absent() -> None:
-    found = parsed(encoding.analysis(made.analysis()))
+    found = parsed(encoding.encode_analysis(made.analysis()))
     assert "dynamic" not in found
     assert list(found["axes"]["gz"]) == ["allan", "coefficients", "bandwidth"]
     assert found["motions"] == found["changes"] == []

@@ -30,10 +30,10 @@ def made() -> HistoryTable:
     """Three minutes: R not estimated, then bounded; then the device is lost."""
     minutes = MinuteAggregator()
     looks = [(0.0, 1000.0), (20.0, 1200.0), (60.0, 3600.0), (70.0, 3500.0)]
-    rows = [minutes.estimate(T0 + at, estimate(seconds=seconds, seed=i)) for i, (at, seconds) in enumerate(looks)]
-    rows.append(minutes.health(T0 + 75.0, health(received=7000)))
-    rows.append(minutes.temperature(T0 + 76.0, np.array([21.5])))
-    rows.append(minutes.health(T0 + 130.0, health(state="lost", received=7000, rate_hz=None, latency_p99_s=None)))
+    rows = [minutes.add_estimate(T0 + at, estimate(seconds=seconds, seed=i)) for i, (at, seconds) in enumerate(looks)]
+    rows.append(minutes.add_health(T0 + 75.0, health(received=7000)))
+    rows.append(minutes.add_temperature(T0 + 76.0, np.array([21.5])))
+    rows.append(minutes.add_health(T0 + 130.0, health(state="lost", received=7000, rate_hz=None, latency_p99_s=None)))
     rows.append(minutes.flush())
     full: list[HistoryRow] = [row for row in rows if row is not None]
     return build_table("bench-1", TimeRange(T0, T0 + 180.0), 60, full, [EVENT], 1)
@@ -102,7 +102,7 @@ def test_what_is_read_is_what_was_kept() -> None:
 def test_a_bound_within_a_bucket_of_estimates_is_not_shown_as_its_interval() -> None:
     minutes, rows = MinuteAggregator(), []
     for i, seconds in enumerate((3600.0, 200.0)):  # B is estimated, then only bounded
-        rows.append(minutes.estimate(T0 + i, estimate(seconds=seconds)))
+        rows.append(minutes.add_estimate(T0 + i, estimate(seconds=seconds)))
     row = merge_rows([one for one in (*rows, minutes.flush()) if one is not None], int(T0), 60)
     one = build_table("a", TimeRange(T0, T0 + 60.0), 60, [row], [], 0)
     letter = json.loads(history.encode_history(one, ALL, T0, 1))["axes"]["gz"]["B"]

@@ -13,7 +13,7 @@ from tests.monitor.publishing import made
 
 def test_coefficients_come_back_as_they_were() -> None:
     estimate = made.estimate(seconds=1000.0)
-    payload = encoding.coefficients("a", 1.0, estimate)
+    payload = encoding.encode_coefficients("a", 1.0, estimate)
     found = remote_device.noise(remote_device.read(remote_device.CoefficientsMessage, topics.COEFFICIENTS, payload))
     for name in ("value", "lo", "hi", "status"):
         np.testing.assert_array_equal(getattr(found.coefficients, name), getattr(estimate.coefficients, name))
@@ -24,7 +24,7 @@ def test_coefficients_come_back_as_they_were() -> None:
 def test_what_is_seen_is_what_the_window_holds() -> None:
     """Not what came since the start: after a reset that is more."""
     estimate = dataclasses.replace(made.estimate(seconds=1800.0), samples=10_000_000)
-    payload = encoding.coefficients("a", 1.0, estimate)
+    payload = encoding.encode_coefficients("a", 1.0, estimate)
     assert (
         remote_device.noise(remote_device.read(remote_device.CoefficientsMessage, topics.COEFFICIENTS, payload)).seen_s
         == 1800.0
@@ -32,7 +32,7 @@ def test_what_is_seen_is_what_the_window_holds() -> None:
 
 
 def test_what_a_newer_daemon_adds_is_passed_over() -> None:
-    payload = encoding.status("a", 1.0, made.health())[:-1] + b',"novelty":[1,{"x":null}]}'
+    payload = encoding.encode_status("a", 1.0, made.health())[:-1] + b',"novelty":[1,{"x":null}]}'
     assert remote_device.read(remote_device.StatusMessage, topics.STATUS, payload).received == 360_000
     axes = b'{"gz":{"N":{"value":1e-4,"lo":1e-5,"hi":1e-3,"status":"estimated"},"Z":{"status":"new"}},"mx":{}}'
     payload = b'{"schema":"imu-monitor/coefficients/1","samples":5,"axes":' + axes + b"}"
@@ -42,7 +42,7 @@ def test_what_a_newer_daemon_adds_is_passed_over() -> None:
 
 
 def test_a_status_may_have_no_time_yet() -> None:
-    assert remote_device.status(encoding.status("a", None, made.health())).t is None
+    assert remote_device.status(encoding.encode_status("a", None, made.health())).t is None
 
 
 @pytest.mark.parametrize(
@@ -53,9 +53,9 @@ def test_a_status_may_have_no_time_yet() -> None:
         b"[]",
         b"\xff\xfe",
         b"{}",
-        encoding.status("a", 1.0, made.health()).replace(b"status/1", b"status/2"),
-        encoding.status("a", 1.0, made.health()).replace(b'"received":360000', b'"received":"many"'),
-        encoding.reply("a", 1.0, 5, "x"),
+        encoding.encode_status("a", 1.0, made.health()).replace(b"status/1", b"status/2"),
+        encoding.encode_status("a", 1.0, made.health()).replace(b'"received":360000', b'"received":"many"'),
+        encoding.encode_reply("a", 1.0, 5, "x"),
     ],
 )
 def test_anything_else_is_a_value_error(payload: bytes) -> None:
@@ -64,13 +64,13 @@ def test_anything_else_is_a_value_error(payload: bytes) -> None:
 
 
 def test_a_status_word_of_a_coefficient_that_is_not_known() -> None:
-    payload = encoding.coefficients("a", 1.0, made.estimate()).replace(b'"estimated"', b'"guessed"')
+    payload = encoding.encode_coefficients("a", 1.0, made.estimate()).replace(b'"estimated"', b'"guessed"')
     with pytest.raises(ValueError, match="guessed"):
         remote_device.noise(remote_device.read(remote_device.CoefficientsMessage, topics.COEFFICIENTS, payload))
 
 
 def device(**changed: object) -> RemoteDevice:
-    payload = encoding.status("a", 1.0, made.health(**changed))
+    payload = encoding.encode_status("a", 1.0, made.health(**changed))
     return RemoteDevice("imu/a", 100.0, status=remote_device.read(remote_device.StatusMessage, topics.STATUS, payload))
 
 
@@ -122,8 +122,10 @@ def test_a_topic_of_two_parts_and_keys_that_are_none() -> None:
 
 
 def test_disagreement_with_a_model_is_trouble_and_ranks_before_what_runs_well() -> None:
-    status = remote_device.read(remote_device.StatusMessage, topics.STATUS, encoding.status("a", 1.0, made.health()))
-    payload = encoding.gap("a", 1.0, made.look(scale=1.2, gz=False, gx=True))
+    status = remote_device.read(
+        remote_device.StatusMessage, topics.STATUS, encoding.encode_status("a", 1.0, made.health())
+    )
+    payload = encoding.encode_gap("a", 1.0, made.look(scale=1.2, gz=False, gx=True))
     one = RemoteDevice("imu/a", 0.0, status)
     assert one.rank(0.0) == 2
     one.gap = remote_device.read(remote_device.GapMessage, topics.GAP, payload)
@@ -131,7 +133,9 @@ def test_disagreement_with_a_model_is_trouble_and_ranks_before_what_runs_well() 
     found = one.gap.axes["gz"]
     lo, hi = found.where.tau
     assert one.problems() == f"gz disagrees with its model: {found.gap:.3g} σ at τ {lo:.3g} to {hi:.3g} s"
-    one.gap = remote_device.read(remote_device.GapMessage, topics.GAP, encoding.gap("a", 1.0, made.look(gz=True)))
+    one.gap = remote_device.read(
+        remote_device.GapMessage, topics.GAP, encoding.encode_gap("a", 1.0, made.look(gz=True))
+    )
     assert (one.rank(0.0), one.problems()) == (2, "")
 
 

@@ -74,7 +74,7 @@ class Page(HTMLParser):
 
 def test_numbers_stand_with_unit_interval_or_word() -> None:
     result = analysis()
-    page = Page(analysis_report.html(result, "bench-1"))
+    page = Page(analysis_report.render_page(result, "bench-1"))
     value, lo, hi = (part[1, 2] * np.degrees(1) * 60 for part in vars_of(result))
     cells = [" ".join(cell.split()) for cell in page.cells]
     assert f"{value:.3f} °/√h {lo:.3f} … {hi:.3f}" in cells
@@ -91,7 +91,7 @@ def vars_of(result: Analysis) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_what_is_not_known_is_said_in_words() -> None:
     few = made.analysis(seconds=200.0)
     few.estimate.curve.avar[:, 3:] = np.nan
-    text = analysis_report.html(few)
+    text = analysis_report.render_page(few)
     assert text.count("(too few data)") == 3  # R, on three axes
     assert "— <small>(too few data)</small>" in " ".join(text.split())
     assert "<h2>Notes</h2>" not in text
@@ -138,7 +138,7 @@ def test_the_page_is_complete_in_itself_and_below_a_megabyte(tmp_path: Path, lon
 def test_a_recording_without_accelerometers_has_one_column() -> None:
     result = analysis()
     result.estimate.curve.avar[:, 3:] = np.nan
-    text = analysis_report.html(result)
+    text = analysis_report.render_page(result)
     assert text.count("<svg") == 1
     assert "Accelerometers" not in text
 
@@ -146,14 +146,14 @@ def test_a_recording_without_accelerometers_has_one_column() -> None:
 def test_the_same_analysis_gives_the_same_page() -> None:
     result = analysis()
     result.estimate.curve.avar[:, 3:] = np.nan
-    assert analysis_report.html(result, "x") == analysis_report.html(result, "x")
+    assert analysis_report.render_page(result, "x") == analysis_report.render_page(result, "x")
 
 
 @pytest.mark.parametrize("name", ["matplotlib.figure", "jinja2"])
 def test_without_its_libraries_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ConfigError, match=r"pip install \"imu-monitor\[plot\]\""):
-        analysis_report.html(analysis())
+        analysis_report.render_page(analysis())
 
 
 def test_a_folder_that_is_not_there_is_a_wrong_request(tmp_path: Path) -> None:

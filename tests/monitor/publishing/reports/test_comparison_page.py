@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from drivers.errors import ConfigError
-from monitor.publishing.reports.comparison_page import page
+from monitor.publishing.reports.comparison_page import render_page
 from monitor.reconcile.several_recordings.comparison import Comparison, compare
 from tests.monitor.publishing.reports.test_reconcile_page import Text
 from tests.monitor.reconcile.runs_made import LENS, line, run, step, with_axes
@@ -30,7 +30,7 @@ def joined(text: str) -> str:
 
 
 def test_the_table_has_axes_and_recordings() -> None:
-    text = Text(page(made()))
+    text = Text(render_page(made()))
     heads, *rows = text.rows[:4]
     assert heads == [
         "axis", "cold <1> 1 h 00 min, 360,000 samples at 100 Hz".replace("1 h 00 min", "10 min 00 s"),
@@ -44,38 +44,38 @@ def test_the_table_has_axes_and_recordings() -> None:
 
 
 def test_a_common_effect_has_every_recording_and_the_pooled_value() -> None:
-    text = Text(page(made()))
+    text = Text(render_page(made()))
     table = {row[0]: row[1:] for row in text.rows}
     assert table["warm"] == ["31.35 ± 0.62 °/h", "17.3000 ± 0.0010 Hz", "99.0 %", ""]
     assert table["all together"][0] == "29.7 ± 2.8 °/h"  # they differ: its interval holds their scatter
     assert "sizes differ (p < 0.001)" in text.words
-    assert page(made()).count('<svg class="strip"') == 4
+    assert render_page(made()).count('<svg class="strip"') == 4
 
 
 def test_a_single_effect_says_why_it_is_not_in_the_others() -> None:
-    (row,) = (row for row in Text(page(made())).rows if "bias step" in " ".join(row))
+    (row,) = (row for row in Text(render_page(made())).rows if "bias step" in " ".join(row))
     assert row[2] == "warm"
     assert "cold <1>: may differ what happens once need not happen in another recording" in row[3]
     assert "c: may differ" in row[3]
 
 
 def test_the_page_is_complete_in_itself_and_escaped() -> None:
-    text = page(made())
+    text = render_page(made())
     assert not re.search(r"<script|<link|@import|url\(|\bsrc=|http(?!://www.w3.org)", text)
     assert re.findall(r'href="([^"]*)"', text) == ["cold%20%3C1%3E/report.html", "warm/report.html", "c/report.html"]
     assert "<1>" not in text
     assert "nan" not in "".join(re.findall(r"<svg.*?</svg>", text, flags=re.S))
-    assert text == page(made())
+    assert text == render_page(made())
 
 
 def test_what_was_left_out_and_what_the_model_was_is_told() -> None:
-    words = joined(Text(page(made())).words)
+    words = joined(Text(render_page(made())).words)
     assert "short: 200 samples; too few" in words
     assert "3 recordings beside the five classic terms, fitted to cold <1>. Common to all: sinusoidal (gz)." in words
 
 
 def test_recordings_that_agree_make_a_short_page() -> None:
-    words = joined(Text(page(compare([run("a"), run("b")]))).words)
+    words = joined(Text(render_page(compare([run("a"), run("b")]))).words)
     assert "2 recordings beside the model: none differs by more than chance." in words
     assert "No effect was found in every recording." in words
     assert "No effect was found in some recordings only." in words
@@ -84,4 +84,4 @@ def test_recordings_that_agree_make_a_short_page() -> None:
 def test_without_its_library_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "jinja2", None)
     with pytest.raises(ConfigError, match=r"pip install \"imu-monitor\[plot\]\""):
-        page(made())
+        render_page(made())

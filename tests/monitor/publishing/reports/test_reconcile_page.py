@@ -9,7 +9,7 @@ import pytest
 
 from drivers.errors import ConfigError
 from monitor.noise.effects import EFFECTS
-from monitor.publishing.reports.reconcile_page import page
+from monitor.publishing.reports.reconcile_page import render_page
 from tests.monitor.reconcile import samples
 
 pytest.importorskip("jinja2")
@@ -45,7 +45,7 @@ class Text(HTMLParser):
 
 
 def read(name: str) -> Text:
-    return Text(page(getattr(samples, name)(), "bench-1"))
+    return Text(render_page(getattr(samples, name)(), "bench-1"))
 
 
 def test_the_verdict_stands_on_top_with_a_table_of_the_axes() -> None:
@@ -84,13 +84,13 @@ def test_every_lens_stands_before_and_after_each_step() -> None:
     rows = read("explained").rows
     assert ["spectrum", "17.1 … 17.5 Hz", "41.2", "4.60", "2.60", "1.90", ""] in rows
     assert ["Allan deviation", "τ = 0.01 … 0.64 s", "8.70", "0.70", "2.40", "1.60", ""] in rows
-    text = page(made)
+    text = render_page(made)
     assert text.count(">before</text>") == text.count(">after</text>") == 2 * len(made.axes["gz"].start.views)
 
 
 def test_what_agrees_is_short_and_shows_its_lenses() -> None:
     made = samples.agrees()
-    text = page(made, "bench-1")
+    text = render_page(made, "bench-1")
     assert text.count("<svg viewBox") == sum(len(result.start.views) for result in made.axes.values())
     assert "Step" not in text
     assert "Left over" not in text
@@ -116,7 +116,7 @@ def test_what_is_left_over_stands_after_the_steps() -> None:
 
 
 def test_the_page_is_complete_in_itself_and_escaped() -> None:
-    text = page(samples.explained(), "a <b> & c")
+    text = render_page(samples.explained(), "a <b> & c")
     assert not re.search(r"<script|<link|@import|url\(|\bsrc=|\bhref=|http(?!://www.w3.org)", text)
     assert "a &lt;b&gt; &amp; c" in text
     assert "12 missing samples &lt;in 1 gap&gt; &amp; filled" in text
@@ -125,14 +125,14 @@ def test_the_page_is_complete_in_itself_and_escaped() -> None:
 
 
 def test_two_steps_stay_small() -> None:
-    assert len(page(samples.explained()).encode()) < 1_000_000
+    assert len(render_page(samples.explained()).encode()) < 1_000_000
 
 
 def test_the_same_reconciliation_gives_the_same_page() -> None:
-    assert page(samples.explained(), "x") == page(samples.explained(), "x")
+    assert render_page(samples.explained(), "x") == render_page(samples.explained(), "x")
 
 
 def test_without_its_library_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "jinja2", None)
     with pytest.raises(ConfigError, match=r"pip install \"imu-monitor\[plot\]\""):
-        page(samples.agrees())
+        render_page(samples.agrees())

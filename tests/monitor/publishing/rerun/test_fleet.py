@@ -65,8 +65,8 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, m
         def publish() -> None:
             for device in ("nose", "tail"):
                 out.set_alive(device, True)
-                out.put(topics.STATUS, device, encoding.status(device, time.time(), made.health()))
-                out.put(topics.COEFFICIENTS, device, encoding.coefficients(device, 1.76e9, made.estimate()))
+                out.put(topics.STATUS, device, encoding.encode_status(device, time.time(), made.health()))
+                out.put(topics.COEFFICIENTS, device, encoding.encode_coefficients(device, 1.76e9, made.estimate()))
                 out.put(topics.ALLAN, device, encoding.encode_allan(device, 1.76e9, made.estimate()))
                 out.put(topics.SAMPLES, device, encode_samples(device, 10, rows))
             stop.wait(0.2)
@@ -74,7 +74,9 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, m
         topics_shown = ("samples", "coefficients", "allan", "status")
         wait_for(lambda: publish() or taken >= {f"imu/nose/{topic}" for topic in topics_shown} | {"imu/tail/status"})
         publish()  # an Allan curve that comes before any coefficients is not drawn
-        out.put(topics.EVENT, "tail", encoding.event("tail", 1.76e9, 5, Event("moved", 0, "gz moved", "gz"), None))
+        out.put(
+            topics.EVENT, "tail", encoding.encode_event("tail", 1.76e9, 5, Event("moved", 0, "gz moved", "gz"), None)
+        )
         wait_for(lambda: "imu/tail/event" in taken and len(fleet.board.devices(time.monotonic())) == 2)
         tables = len(drawn)
         wait_for(lambda: len(drawn) >= tables + 2, "two more tables")
@@ -95,12 +97,12 @@ def test_a_status_without_a_time_has_a_row_and_is_not_drawn(monkeypatch: pytest.
     drawn: list[float] = []
     monkeypatch.setattr(viewer, "health", lambda _device, wall_s, _health: drawn.append(wall_s))
     fleet = FleetView(ZenohSubscriber("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
-    fleet.take(Message("imu/a/status", encoding.status("a", None, made.health(state="waiting"))))
+    fleet.take(Message("imu/a/status", encoding.encode_status("a", None, made.health(state="waiting"))))
     (known,) = fleet.board.devices(time.monotonic())
     assert known.status is not None
     assert known.status.state == "waiting"
     assert drawn == []
-    fleet.take(Message("imu/a/status", encoding.status("a", 5.0, made.health())))
+    fleet.take(Message("imu/a/status", encoding.encode_status("a", 5.0, made.health())))
     assert drawn == [5.0]
     assert fleet.malformed == fleet.board.malformed == 0
 
@@ -108,7 +110,7 @@ def test_a_status_without_a_time_has_a_row_and_is_not_drawn(monkeypatch: pytest.
 def test_hostile_messages_change_nothing_and_are_counted() -> None:
     viewer = RerunView(ViewerSettings(mode="none"), [DeviceInfo("imu/a")], fleet=True)
     fleet = FleetView(ZenohSubscriber("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
-    fleet.take(Message("imu/a/coefficients", encoding.coefficients("a", 1.0, made.estimate())))
+    fleet.take(Message("imu/a/coefficients", encoding.encode_coefficients("a", 1.0, made.estimate())))
     for key, payload in {
         "imu/a/samples": b"\x81" * 10_000,
         "imu/a/allan": b'{"schema":"imu-monitor/allan/1","tau":[1]}',
@@ -126,8 +128,8 @@ def test_the_table_has_trouble_first_and_texts_of_others_cannot_leave_their_cell
         "well": {},
         "bad": {"state": "lost", "text": "gone | <img src=x> [a](http://b)\n\n# head"},
     }.items():
-        board.process_message(f"imu/{device}/status", encoding.status(device, 1.0, made.health(**changed)))
-        board.process_message(f"imu/{device}/coefficients", encoding.coefficients(device, 1.0, made.estimate()))
+        board.process_message(f"imu/{device}/status", encoding.encode_status(device, 1.0, made.health(**changed)))
+        board.process_message(f"imu/{device}/coefficients", encoding.encode_coefficients(device, 1.0, made.estimate()))
     text = fleet_text(board.devices(10.0), 10.0, 40, "1 of 2 there")
     lines = text.splitlines()
     assert lines[0] == "**2** devices: **1** lost, **1** running; N in °/√h"

@@ -40,16 +40,20 @@ def board(clock: Clock) -> DeviceStates:
 
 
 def status(board: DeviceStates, device: str, prefix: str = "imu", **changed: object) -> None:
-    board.process_message(topics.STATUS.key(prefix, device), encoding.status(device, 1.76e9, made.health(**changed)))
+    board.process_message(
+        topics.STATUS.key(prefix, device), encoding.encode_status(device, 1.76e9, made.health(**changed))
+    )
 
 
 def noise(board: DeviceStates, device: str, seconds: float = 3600.0, scale: float = 1.0) -> None:
     estimate = made.estimate(seconds=seconds, scale=scale)
-    board.process_message(topics.COEFFICIENTS.key("imu", device), encoding.coefficients(device, 1.76e9, estimate))
+    board.process_message(
+        topics.COEFFICIENTS.key("imu", device), encoding.encode_coefficients(device, 1.76e9, estimate)
+    )
 
 
 def event(board: DeviceStates, device: str, text: str) -> None:
-    payload = encoding.event(device, 1.76e9, 1, Event("noise_changed", 0, text), None)
+    payload = encoding.encode_event(device, 1.76e9, 1, Event("noise_changed", 0, text), None)
     board.process_message(topics.EVENT.key("imu", device), payload)
 
 
@@ -111,7 +115,7 @@ def test_bounds_and_too_few_data_are_marked(board: DeviceStates) -> None:
     assert row(shown(board, 160), "early").count("≤") == 3  # B of the gyroscopes
     unknown = made.estimate()
     unknown.coefficients.status[:] = 0
-    board.process_message("imu/early/coefficients", encoding.coefficients("early", 1.0, unknown))
+    board.process_message("imu/early/coefficients", encoding.encode_coefficients("early", 1.0, unknown))
     assert row(shown(board, 160), "early").count("—") == 9
 
 
@@ -140,7 +144,7 @@ def test_trouble_comes_first_and_has_a_sign_and_a_word(board: DeviceStates) -> N
 
 def test_hostile_messages_leave_a_bounded_board(board: DeviceStates) -> None:
     status(board, "good")
-    known = encoding.status("good", 1.0, made.health())
+    known = encoding.encode_status("good", 1.0, made.health())
     deep = known[:-1] + b',"more":' + b"[" * 20_000 + b"]" * 20_000 + b"}"
     many_axes = (
         b'{"schema":"imu-monitor/coefficients/1","samples":1,"axes":{'
@@ -165,7 +169,7 @@ def test_devices_beyond_the_bound_are_passed_over_until_others_have_been_silent_
     monkeypatch.setattr(live_table, "MAX_DEVICES", 3)
     clock = [0.0]
     board = DeviceStates(lambda: clock[0])
-    payload = encoding.status("a", 1.0, made.health())
+    payload = encoding.encode_status("a", 1.0, made.health())
     for device in ("a", "b", "c", "d", "x" * 300):
         board.process_message(f"imu/{device}/status", payload)
         board.set_token(f"imu/{device}/alive", True)
@@ -255,7 +259,7 @@ def test_a_gyroscope_alone_has_no_accelerometer_columns(board: DeviceStates) -> 
     whole = made.estimate()
     whole.curve.avar[:, 3:] = float("nan")
     status(board, "a")
-    board.process_message("imu/a/coefficients", encoding.coefficients("a", 1.0, whole))
+    board.process_message("imu/a/coefficients", encoding.encode_coefficients("a", 1.0, whole))
     text = shown(board, 160)
     assert "°/√h" in text
     assert "m/s/√h" not in text
@@ -271,7 +275,7 @@ def test_the_last_events(board: DeviceStates) -> None:
 
 
 def test_a_time_that_is_no_date(board: DeviceStates) -> None:
-    payload = encoding.event("a", 1e300, 1, Event("moved", 0, "moved"), None)
+    payload = encoding.encode_event("a", 1e300, 1, Event("moved", 0, "moved"), None)
     board.process_message("imu/a/event", payload)
     assert "1e+300 s  a  moved" in shown(board)
 
@@ -338,7 +342,7 @@ def test_watch_refuses_what_zenoh_refuses() -> None:
 
 def test_a_device_that_disagrees_with_its_model_says_so(board: DeviceStates) -> None:
     status(board, "a")
-    board.process_message("imu/a/gap", encoding.gap("a", 1.0, made.look(scale=1.2, gz=False)))
+    board.process_message("imu/a/gap", encoding.encode_gap("a", 1.0, made.look(scale=1.2, gz=False)))
     assert "gz disagrees with its model: " in shown(board, 160)
-    board.process_message("imu/a/gap", encoding.gap("a", 1.0, made.look(gz=True)))
+    board.process_message("imu/a/gap", encoding.encode_gap("a", 1.0, made.look(gz=True)))
     assert "disagrees" not in shown(board, 160)

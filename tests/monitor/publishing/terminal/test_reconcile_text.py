@@ -6,7 +6,7 @@ import pytest
 from rich.cells import cell_len
 from rich.console import Console
 
-from monitor.publishing.terminal.reconcile_text import tell, tell_runs
+from monitor.publishing.terminal.reconcile_text import print_comparison, print_report
 from monitor.reconcile.result import Reconciliation
 from monitor.reconcile.several_recordings.comparison import Comparison, compare
 from tests.monitor.reconcile import samples
@@ -15,7 +15,7 @@ from tests.monitor.reconcile.runs_made import line, run, step, with_axes
 
 def told(r: Reconciliation, width: int = 140) -> list[str]:
     console = Console(width=width, file=io.StringIO(), record=True)
-    tell(r, console)
+    print_report(r, console)
     return console.export_text().splitlines()
 
 
@@ -62,7 +62,7 @@ def test_long_lines_wrap_inside_their_column(width: int) -> None:
 
 def told_runs(c: Comparison, width: int = 140) -> list[str]:
     console = Console(width=width, file=io.StringIO(), record=True)
-    tell_runs(c, console)
+    print_comparison(c, console)
     return console.export_text().splitlines()
 
 

@@ -45,8 +45,8 @@ def daemon(endpoint: str, device: str, mode: str = "peer") -> Iterator[ZenohPubl
 
     def talk() -> None:
         while not ending.wait(0.1):
-            out.put(topics.STATUS, device, encoding.status(device, time.time(), made.health()))
-            out.put(topics.COEFFICIENTS, device, encoding.coefficients(device, time.time(), made.estimate()))
+            out.put(topics.STATUS, device, encoding.encode_status(device, time.time(), made.health()))
+            out.put(topics.COEFFICIENTS, device, encoding.encode_coefficients(device, time.time(), made.estimate()))
             out.put(topics.SAMPLES, device, b"raw")
             out.put(topics.ALLAN, device, b"curve")
 
@@ -145,7 +145,7 @@ def test_a_daemon_that_is_a_peer_is_heard_through_a_router(endpoint: str) -> Non
         out.set_alive("a", True)
 
         def both() -> bool:
-            out.put(topics.STATUS, "a", encoding.status("a", time.time(), made.health()))
+            out.put(topics.STATUS, "a", encoding.encode_status("a", time.time(), made.health()))
             return keys(arriving, got) >= {"imu/a/status", "imu/a/alive"}
 
         wait_for(both)

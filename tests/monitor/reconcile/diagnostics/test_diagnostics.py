@@ -85,7 +85,7 @@ def test_peaks_of_the_periodogram_are_those_of_scipy():
 def test_autocorrelation_is_the_sum_of_products():
     view = seen(axis(drawn(4) + correlated(n, np.random.default_rng(5), 4e-4, 0.03)), MODEL)
     products = [view.white[:-lag] @ view.white[lag:] / n for lag in range(1, diagnostics.MAX_LAG_SAMPLES + 1)]
-    found = diagnostics.autocorrelation(view)
+    found = diagnostics.diagnose_autocorrelation(view)
     best = int(np.argmax(np.square(products)))
     assert found.gain == pytest.approx(0.5 * n * products[best] ** 2)
     assert found.where.tau == (pytest.approx((best + 1) / RATE_HZ),) * 2
@@ -96,9 +96,9 @@ def test_power_over_frequency_is_at_least_that_of_every_bin():
     bins = view.axis.bins
     each = power_gain(bins.sums(view.whitened**2) / bins.count, bins.count)
     whole = power_gain(np.array([np.mean(view.whitened**2)]), np.array([n - 1.0]))[0]
-    found = diagnostics.psd(view)
+    found = diagnostics.diagnose_psd(view)
     assert found.gain >= each.max() - 1e-9
-    wider = diagnostics.psd(seen(axis(1.2 * drawn(6)), MODEL))
+    wider = diagnostics.diagnose_psd(seen(axis(1.2 * drawn(6)), MODEL))
     assert wider.gain > 0.8 * (whole + n / 2 * (0.44 - np.log(1.44)))
     lo, hi = wider.where.frequency
     assert hi - lo > 10.0
@@ -122,8 +122,8 @@ def test_fast_series_is_white_whatever_the_spectrum_is():
     view = seen(axis(y), (WHITE,))
     assert np.mean(view.white**2) > 2.0
     assert np.mean(view.fast**2) == pytest.approx(1.0, abs=0.05)
-    assert diagnostics.tails(view).gain < 5.0
-    assert diagnostics.variance(view).gain < 15.0
+    assert diagnostics.diagnose_tails(view).gain < 5.0
+    assert diagnostics.diagnose_variance(view).gain < 15.0
 
 
 def test_noise_steps_of_a_model_are_in_its_course():
@@ -134,20 +134,20 @@ def test_noise_steps_of_a_model_are_in_its_course():
     np.testing.assert_array_equal(noise_deviation_over_time((WHITE,), n, RATE_HZ), np.ones(n))
     y = white(n, np.random.default_rng(9)) * np.where(time_s(n) < 12.0, 1.0, 3.0)
     effects = (AngleRandomWalk(N=N), NoiseStep(time=12.0, ratio=3.0))
-    assert diagnostics.variance(seen(axis(y), effects)).gain < 15.0
-    assert diagnostics.variance(seen(axis(y), (AngleRandomWalk(N=2.5 * N),))).gain > 300.0
+    assert diagnostics.diagnose_variance(seen(axis(y), effects)).gain < 15.0
+    assert diagnostics.diagnose_variance(seen(axis(y), (AngleRandomWalk(N=2.5 * N),))).gain > 300.0
 
 
 def test_what_a_model_has_is_no_finding():
     y = 5e-4 * np.rint(white(n, np.random.default_rng(10)) / 5e-4)
-    assert diagnostics.values(seen(axis(y), (WHITE,))).gain > 1000.0
+    assert diagnostics.diagnose_values(seen(axis(y), (WHITE,))).gain > 1000.0
     model = (WHITE, Resolution(step=5e-4))
-    assert diagnostics.values(seen(axis(y, model), model)).gain < 1.0
+    assert diagnostics.diagnose_values(seen(axis(y, model), model)).gain < 1.0
 
 
 def test_ends_of_the_range_have_their_value_as_place():
     y = np.clip(white(n, np.random.default_rng(11)), -1.5e-3, 1.5e-3)
-    found = diagnostics.values(seen(axis(y), (WHITE,)))
+    found = diagnostics.diagnose_values(seen(axis(y), (WHITE,)))
     assert found.gain > 100.0
     lo, hi = found.where.value
     assert lo <= 1.5e-3 * (1 + 1e-9)
@@ -156,8 +156,8 @@ def test_ends_of_the_range_have_their_value_as_place():
 
 def test_no_temperature_and_no_other_axis_is_no_finding():
     view = seen(axis(drawn(12)), MODEL)
-    assert diagnostics.temperature(view).gain == 0.0
-    assert diagnostics.other_axes(view).gain == 0.0
+    assert diagnostics.diagnose_temperature(view).gain == 0.0
+    assert diagnostics.diagnose_other_axes(view).gain == 0.0
 
 
 def test_the_axis_that_leaks_is_named():
@@ -165,7 +165,7 @@ def test_the_axis_that_leaks_is_named():
     gx, gy = correlated(n, rng, 1e-2, 1.0), correlated(n, rng, 1e-2, 1.0)
     one = axes({"gx": gx, "gy": gy, "gz": drawn(14) + 0.03 * gy}, {"gx": (), "gy": (), "gz": MODEL})["gz"]
     view = seen(one, MODEL)
-    found = diagnostics.other_axes(view)
+    found = diagnostics.diagnose_other_axes(view)
     assert found.where.source == "gy"
     assert found.gain == pytest.approx(least_squares(view, [cosine_transform(gy)]), rel=1e-6)
 
@@ -175,4 +175,4 @@ def test_courses_that_were_fitted_are_taken_out():
     one = axis(drawn(15) + line)
     model = (*MODEL, Sinusoidal(amplitude=1.0, frequency=7.3, phase=0.0))
     view = whiten_axis(one, fit_with_given_sizes(one, model).likely)
-    assert diagnostics.lines(view).gain < 20.0 < diagnostics.lines(seen(one, MODEL)).gain
+    assert diagnostics.diagnose_lines(view).gain < 20.0 < diagnostics.diagnose_lines(seen(one, MODEL)).gain
