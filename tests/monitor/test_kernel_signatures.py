@@ -17,13 +17,13 @@ PROGRAM = """
 
     import numpy as np
 
-    from drivers.sample import block
-    from monitor import kernels
-    from monitor.compiled import Kernel
-    from monitor.drift import heat
-    from monitor.drift.compensator import Compensator
-    from monitor.estimate.estimator import Estimator
-    from monitor.estimate.watch import Watch
+    from drivers.sample import make_block
+    from monitor.daemon import kernel_compilation
+    from monitor.common.compiled import Kernel
+    from monitor.drift.compensation.compensator import Compensator
+    from monitor.drift.thermal import thermal_response
+    from monitor.estimation.detection.signal_monitor import SignalMonitor
+    from monitor.estimation.estimator import Estimator
 
 
     def compiled():
@@ -36,7 +36,7 @@ PROGRAM = """
         return {name: (len(one.signatures), len(one.intermediate.signatures)) for name, one in found.items()}
 
 
-    for part in kernels.SERVICE.parts:
+    for part in kernel_compilation.SERVICE.parts:
         part.prepare()
     before = compiled()
 
@@ -44,13 +44,13 @@ PROGRAM = """
     values = 1e-3 * rng.standard_normal((12_000, 6))
     values[6000:6400, 0] += np.sin(np.arange(400) / 20)  # motion
     values[9000:, 1] *= 3.0  # a change of noise
-    watch = Watch(100.0, leave_out=True)
+    watch = SignalMonitor(100.0, leave_out=True)
     estimators = [Estimator(100.0, 60.0), Estimator(100.0, 60.0, every_sample=True)]
     gyro = Compensator(100.0)
     for start in range(0, len(values), 50):
-        samples = block(np.arange(start, start + 50), values[start : start + 50])
-        gyro.update(samples.values, lost=3 if start == 5000 else 0)
-        gyro.update(np.asfortranarray(values[start : start + 50]))
+        samples = make_block(np.arange(start, start + 50), values[start : start + 50])
+        gyro.compensate(samples.values, lost=3 if start == 5000 else 0)
+        gyro.compensate(np.asfortranarray(values[start : start + 50]))
         for still in watch.update(samples):
             for one in estimators:
                 one.update(still)
@@ -62,10 +62,10 @@ PROGRAM = """
     found = watch.take_events()
     for one in estimators:
         one.restart(2, 1000)
-        while one.step() is None:
+        while one.step_slow_statistics() is None:
             pass
     gyro.error
-    heat.lagged(values[:, 0].copy(), 0.5)
+    thermal_response.first_order_lag(values[:, 0].copy(), 0.5)
     print(json.dumps([before, compiled(), len(found)]))
 """
 

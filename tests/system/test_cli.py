@@ -921,9 +921,9 @@ import monitor.commands.analyze as offline
 from monitor.cli import main
 def told(values, rate_hz, window_s, tau, progress):
     print("working", file=sys.stderr, flush=True)
-    from monitor.estimate.dynamic import dynamic
-    return dynamic(values, rate_hz, window_s, tau, progress=progress)
-offline.dynamic = told
+    from monitor.estimation.allan.dynamic_allan import compute_dynamic_allan
+    return compute_dynamic_allan(values, rate_hz, window_s, tau, progress=progress)
+offline.compute_dynamic_allan = told
 main()
 """
     with daemon([sys.executable, "-c", source, "analyze", str(tmp_path / "long.npz"), "--window", "1000"]) as one:
@@ -1064,9 +1064,9 @@ main()
 COUNTED_DEMO = """
 import json, sys
 import monitor.daemon.service
-from drivers.sample import join
+from drivers.sample import concatenate_blocks
 from monitor.cli import main
-from tests.walk.rig import Caught
+from tests.system.rig import Caught
 run = monitor.daemon.service.Service.run
 def counted(self, *arguments):
     caught = Caught()
@@ -1074,7 +1074,7 @@ def counted(self, *arguments):
     run(self, *arguments)
     truth = self.virtual["demo"].truth
     if "demo" in caught.blocks:
-        numbers = (join(caught.blocks["demo"]).ticks // 10_000_000).tolist()
+        numbers = (concatenate_blocks(caught.blocks["demo"]).ticks // 10_000_000).tolist()
         print(json.dumps([numbers, truth.made, truth.dropped]), file=sys.stderr)
 monitor.daemon.service.Service.run = counted
 sys.argv[0] = "imu-monitor"
@@ -1328,7 +1328,7 @@ def test_an_unexpected_error_is_one_line(
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("monitor.commands.analyze.make", fail)
+    monkeypatch.setattr("monitor.commands.analyze.run_analysis", fail)
     done = call("analyze", "a.csv")
     assert line in done.only_line()
     assert len(done.err) < 1000

@@ -46,7 +46,7 @@ mode = "none"
 MANY_LINES = """
 import structlog
 from monitor.cli import main
-from monitor.service import Service
+from monitor.daemon.service import Service
 run = Service.run
 def run_after_many_lines(self, seconds=None):
     for number in range(1000):
@@ -59,7 +59,7 @@ SLOW_TO_STOP = """
 import sys, time
 from pathlib import Path
 from monitor.cli import main
-from monitor.service import Service
+from monitor.daemon.service import Service
 def drain(self):
     Path(sys.argv[2]).with_name("stopping").touch()
     time.sleep(600.0)

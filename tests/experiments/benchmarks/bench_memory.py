@@ -33,11 +33,11 @@ import numpy as np
 said("NumPy")
 import numba
 said("Numba")
-from drivers.sample import block
-from monitor import kernels
-from monitor.estimate.estimator import Estimator
+from drivers.sample import make_block
+from monitor.daemon import kernel_compilation
+from monitor.estimation.estimator import Estimator
 said("drivers and monitor.estimation")
-for _ in kernels.prepare(kernels.SERVICE, lambda _: None, processes=0):
+for _ in kernel_compilation.prepare_kernels(kernel_compilation.SERVICE, lambda _: None, processes=0):
     pass
 said("compiled kernels")
 estimator = Estimator(rate_hz, window_s)
@@ -47,7 +47,7 @@ for start in range(0, n + rows, rows):
     values = 1e-4 * rng.standard_normal((rows, 6)) + [0.0, 0.0, 0.0, 0.0, 0.0, 9.81]
     if every:
         values[start // rows % every :: every] = np.nan
-    estimator.update(block(start + np.arange(rows), values))
+    estimator.update(make_block(start + np.arange(rows), values))
 said("a full window")
 estimator.get()
 said("curve, fit and intervals")

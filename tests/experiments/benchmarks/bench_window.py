@@ -37,12 +37,12 @@ FIRST_USE: Final = """
 import time
 start = time.perf_counter()
 import numpy as np
-from drivers.sample import block
-from monitor.estimate.estimator import Estimator
+from drivers.sample import make_block
+from monitor.estimation.estimator import Estimator
 imported = time.perf_counter()
 estimator = Estimator(100.0, 60.0)
 values = np.random.default_rng(0).standard_normal((1000, 6))
-estimator.update(block(np.arange(1000), values, np.full(1000, np.nan), np.arange(1000)))
+estimator.update(make_block(np.arange(1000), values, np.full(1000, np.nan), np.arange(1000)))
 estimator.get()
 print(imported - start, time.perf_counter() - imported)
 """

@@ -20,7 +20,7 @@ def test_without_a_place_for_the_cache() -> None:
     program = """
         from numba.core import caching
         caching.CompileResultCacheImpl._locator_classes = []  # as of a read-only system and a user without a home
-        from monitor.compiled import compiled
+        from monitor.common.compiled import compiled
 
         @compiled
         def twice(x):
@@ -29,7 +29,7 @@ def test_without_a_place_for_the_cache() -> None:
         assert twice(21) == 42
         assert twice.nopython_signatures
     """
-    root = Path(monitor.common.compiled.__file__).parents[1]
+    root = Path(monitor.common.compiled.__file__).parents[2]
     subprocess.run([sys.executable, "-c", textwrap.dedent(program)], cwd=root, timeout=PATIENCE_S, check=True)
 
 

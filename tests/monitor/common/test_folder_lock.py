@@ -16,7 +16,7 @@ from monitor.common.folder_lock import RECORDING_LOCK, FolderLock, lock_holder
 HOLDER = """
 import subprocess, sys
 from pathlib import Path
-from monitor.folder_lock import FolderLock
+from monitor.common.folder_lock import FolderLock
 lock = FolderLock(Path(sys.argv[1]), sys.argv[2])
 assert lock.hold() == ""
 child = subprocess.Popen([sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE, close_fds=False)

@@ -20,11 +20,12 @@ ANSWERS_NONE = "import sys\nsys.exit(1)"
 COUNT_COMPILATIONS = """
 import sys
 from drivers.errors import ConfigError
-from monitor import compiled, kernels
+from monitor.common import compiled
+from monitor.daemon import kernel_compilation
 from monitor.cli.warm_up import warm_up
 from numba.core import event
 with event.install_recorder("numba:compile") as recorder:
-    for group in kernels.GROUPS:
+    for group in kernel_compilation.GROUPS:
         for part in group.parts:
             part.prepare()
 print([str(each.data["dispatcher"]) for _, each in recorder.buffer if each.is_start])

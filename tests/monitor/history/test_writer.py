@@ -273,7 +273,7 @@ def test_a_queue_that_is_full_drops_and_counts(tmp_path: Path, monkeypatch: pyte
 
 def test_a_file_that_is_held_by_another_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(writers, "RETRY_S", 0.05)
-    monkeypatch.setattr("monitor.history.sqlite_store.BUSY_S", 0.05)
+    monkeypatch.setattr("monitor.history.sqlite_store.BUSY_TIMEOUT_S", 0.05)
     path = tmp_path / "h.sqlite"
     HistoryStore(path).close()
     with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as other, started(path) as writer:

@@ -20,18 +20,18 @@ mode = "none"
 """
 WATCH = """
 import contextlib, sys, time
-from monitor.publish.terminal import Board, note
-from monitor.publish.zenoh_in import ZenohIn
+from monitor.publishing.terminal.live_table import DeviceStates
+from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 
-board = Board()
-with contextlib.closing(ZenohIn("imu/**", [sys.argv[1]])) as arriving:
+board = DeviceStates()
+with contextlib.closing(ZenohSubscriber("imu/**", [sys.argv[1]])) as arriving:
     arriving.start()
     while True:
         for message in arriving.take(0.2):
             if message.payload is None:
-                board.alive(message.key, message.there)
+                board.set_token(message.key, message.there)
             else:
-                board.take(message.key, message.payload)
+                board.process_message(message.key, message.payload)
         now_s = time.monotonic()
         states = [one.state(now_s) for one in board.devices(now_s)] or ["nobody"]
         received = [one.status.received for one in board.devices(now_s) if one.status] or [0]

@@ -188,8 +188,8 @@ def test_a_process_with_a_frozen_viewer_exits(server: sinks.ViewerProcess) -> No
     program = f"""
         import os, signal, time
         import numpy as np
-        from monitor.publish.rerun_view import RerunView
-        from monitor.publish.viewer import DeviceInfo, ViewerSettings
+        from monitor.publishing.rerun.view import RerunView
+        from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
         view = RerunView(ViewerSettings("native", port={server.port}), [DeviceInfo("d")])
         view.start()
         while view.state != "ok":
@@ -277,8 +277,8 @@ def test_a_killed_daemon_takes_its_viewer_along() -> None:
     port, web_port = free_port(), free_port()
     program = f"""
         import time
-        from monitor.publish.rerun_view import RerunView
-        from monitor.publish.viewer import DeviceInfo, ViewerSettings
+        from monitor.publishing.rerun.view import RerunView
+        from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
         RerunView(ViewerSettings("web", {port}, {web_port}), [DeviceInfo("d")]).start()
         time.sleep({FOREVER_S})
     """
@@ -335,8 +335,8 @@ def test_without_rerun_the_service_goes_on(monkeypatch: pytest.MonkeyPatch) -> N
 def test_mode_none_imports_and_starts_nothing() -> None:
     program = """
         import sys, threading
-        from monitor.publish.rerun_view import RerunView
-        from monitor.publish.viewer import DeviceInfo, ViewerSettings
+        from monitor.publishing.rerun.view import RerunView
+        from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
         view = RerunView(ViewerSettings("none"), [DeviceInfo("d")])
         view.start()
         view.close()

@@ -281,12 +281,12 @@ def test_no_session_at_all() -> None:
 def test_a_process_that_forgets_to_close_still_ends(endpoint: str) -> None:
     code = f"""
         import time
-        from monitor.publish.zenoh_out import ZenohOut
-        from monitor.settings import ZenohTable
-        out = ZenohOut(ZenohTable(listen=("{endpoint}",)), ["a"])
+        from monitor.publishing.zenoh.publisher import ZenohPublisher
+        from monitor.settings.schema import ZenohTable
+        out = ZenohPublisher(ZenohTable(listen=("{endpoint}",)), ["a"])
         out.start()
         while out.state != "ok":
             time.sleep(0.02)
-        out.alive("a", True)
+        out.set_alive("a", True)
     """
     subprocess.run([sys.executable, "-c", textwrap.dedent(code)], timeout=PATIENCE_S, check=True)

@@ -264,7 +264,7 @@ def test_watch_prints_plain_tables_where_there_is_no_terminal(endpoint: str) -> 
 def test_watch_on_a_terminal_ends_with_ctrl_c_and_exit_0(endpoint: str) -> None:
     code = f"""
         from rich.console import Console
-        from monitor.publish.terminal import watch
+        from monitor.publishing.terminal.live_table import watch
         watch(connect=["{endpoint}"], console=Console(force_terminal=True, width=120))
     """
     with daemon(endpoint, "a"):
